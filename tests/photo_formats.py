@@ -234,3 +234,15 @@ def _write_binary(folder: Path, entries: list, camera: Camera, size: tuple[int, 
     (folder / "images.bin").write_bytes(content)
     point = struct.pack("<Q3d3BdQ2I2I", 11, 0, 0, 5, 1, 2, 3, 0.5, 2, 1, 0, 2, 0)
     (folder / "points3D.bin").write_bytes(struct.pack("<Q", 1) + point)
+
+
+def noisy_photos(folder: Path, count: int = 7, step: float = 0.1) -> Path:
+    """Nerfstudio photos of noise, 24 x 20, by cameras `step` apart that look the same way."""
+    (folder / "images").mkdir(parents=True)
+    random = np.random.default_rng(0)
+    for index in range(count):
+        pixels = random.integers(0, 256, (20, 24, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / "images" / f"{index}.png")
+    camera = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 10, "w": 24, "h": 20}
+    (folder / "transforms.json").write_text(json.dumps(row_of_frames(count, step=step, **camera)))
+    return folder

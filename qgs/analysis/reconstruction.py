@@ -37,9 +37,8 @@ def choose_frames(
     """Input frames and novel frames, from 0 to total - 1.
 
     frames: the inputs; None spreads `inputs` of them, ends included, over the middle `span` frames.
-    compare: the novel ones; None spreads at most NOVEL between the inputs. held_out: frames that
-    training left out; inputs are then chosen from the others, and these are compared.
-    Raises ValueError for frames that do not exist, come twice, or are both input and novel.
+    compare: the novel ones; None spreads at most NOVEL between the inputs, `held_out` ones first,
+    which are no inputs. Raises ValueError for frames that do not exist or come twice.
     """
     usable = [frame for frame in range(total) if frame not in held_out]
     if frames is None:
@@ -48,23 +47,18 @@ def choose_frames(
         span = min(max(span, inputs), len(usable))
         first = (len(usable) - span) // 2
         frames = _evenly(usable[first : first + span], inputs)
-    _refuse_missing(frames, total)
     if compare is None:
         between = [f for f in range(min(frames), max(frames) + 1) if f not in frames]
         between = [f for f in between if f in held_out] or between
         compare = _evenly(between, min(NOVEL, len(between)))
-    _refuse_missing(compare, total)
     every = [*frames, *compare]
+    if missing := [frame for frame in every if not 0 <= frame < total]:
+        raise ValueError(f"frames {listed(missing)} do not exist; the photos are 0..{total - 1}")
     if twice := sorted({frame for frame in every if every.count(frame) > 1}):
         raise ValueError(
             f"frames named twice: {listed(twice)}; inputs and compared frames must differ"
         )
     return tuple(frames), tuple(compare)
-
-
-def _refuse_missing(frames: Sequence[int], total: int) -> None:
-    if missing := [frame for frame in frames if not 0 <= frame < total]:
-        raise ValueError(f"frames {listed(missing)} do not exist; the photos are 0..{total - 1}")
 
 
 def _evenly(frames: Sequence[int], count: int) -> tuple[int, ...]:
@@ -204,17 +198,8 @@ def reconstruct_sample(
         kind = "seen in training" if frame in seen else "novel"
         others = {name: values[index] for name, values in baselines.items()}
         scores.append(ViewScore(frame, kind, quality[count + index], others))
-    return Reconstruction(
-        model=model,
-        sample=sample,
-        prediction=prediction,
-        gaussians=gaussians,
-        rendering=rendering,
-        scores=scores,
-        world=world,
-        tuning=tuning,
-        refinement=refinement,
-    )
+    result = Reconstruction(model, sample, prediction, gaussians, rendering, scores, world)
+    return replace(result, tuning=tuning, refinement=refinement)
 
 
 def sample_cameras(sample: Sample) -> Cameras:

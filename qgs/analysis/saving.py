@@ -9,17 +9,9 @@ import torch
 from torch import Tensor
 
 from qgs.analysis.reconstruction import Reconstruction, sample_cameras
+from qgs.drawing import images
 from qgs.drawing.figures import figure_picture, grid_figure
-from qgs.drawing.images import (
-    Picture,
-    depth_picture,
-    depth_range,
-    finer,
-    rgb_picture,
-    side_by_side,
-    write_gif,
-    write_png,
-)
+from qgs.drawing.images import Picture, depth_picture, depth_range, rgb_picture
 from qgs.geometry.poses import look_at
 from qgs.io.files import replacing_entries, write_text
 from qgs.io.gaussians import save_gaussians, save_ply, scene_writers
@@ -38,7 +30,7 @@ def orbit_path(
 ) -> Cameras:
     """`orbit` about the middle of the rendered `depths`, at least `side` pixels large."""
     near, far = depth_range(depths)
-    return finer(orbit(inputs, (near + far) / 2, frames), side)
+    return images.finer(orbit(inputs, (near + far) / 2, frames), side)
 
 
 def orbit(inputs: Cameras, depth: float, frames: int) -> Cameras:
@@ -78,10 +70,11 @@ def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
         save_ply(result.gaussians, fresh / "gaussians.ply")
         for i, score in enumerate(result.scores):
             name = f"{score.frame:05d}_{score.kind.split()[0]}.png"
-            write_png(side_by_side([rows["photo"][i], rows["render"][i]]), fresh / "views" / name)
-            write_png(rows["depth"][i], fresh / "depth" / name)
-        write_png(overview(result), fresh / "overview.png")
-        write_gif([rgb_picture(f) for f in frames], fresh / "orbit.gif", FRAMES_PER_SECOND)
+            pair = images.side_by_side([rows["photo"][i], rows["render"][i]])
+            images.write_png(pair, fresh / "views" / name)
+            images.write_png(rows["depth"][i], fresh / "depth" / name)
+        images.write_png(overview(result), fresh / "overview.png")
+        images.write_gif([rgb_picture(f) for f in frames], fresh / "orbit.gif", FRAMES_PER_SECOND)
         write_text(fresh / "cameras.json", json.dumps(_camera_record(result, path), indent=1))
         names = sorted(entry.name for entry in fresh.iterdir())
     return [out / name for name in names]

@@ -36,9 +36,8 @@ def read_photos(
     """Photos and cameras of a folder, or its URL, as Views (1, V) in the photos' own world.
 
     size: (H, W) to crop and resize to; of the first photo by default. frames: numbers or file
-    names; all by default. scene: name, where the folder holds several. Formats are those of
-    `qgs reconstruct`. Raises FileNotFoundError, ValueError, and TooLargeError for more photos than
-    fit into memory.
+    names; all by default. scene: name, where the folder holds several. Raises FileNotFoundError,
+    ValueError, and TooLargeError for more photos than fit into memory.
     """
     sources, path = installed_sources(), fspath(folder)
     found = named_scene(open_for(path, size, None, sources)[0], path, scene)
@@ -193,10 +192,9 @@ def named_scene(source: SceneSource, path: str, name: str | None) -> Scene:
 
 
 def frame_list(frames: Frames, option: str, scene: Scene) -> list[int]:
-    """Frame numbers of "0,8,x.jpg" or [0, 8, "x.jpg"].
+    """Frame numbers of "0,8,x.jpg" or [0, 8, "x.jpg"]; folders of a photo may be left out.
 
-    Folders of a photo may be left out. Raises ValueError for what is neither a number nor the name
-    of one photo of `scene`.
+    Raises ValueError for what is neither a number nor the name of one photo of `scene`.
     """
     names = [scene.frame_name(frame) for frame in range(len(scene))]
     numbers: list[int] = []

@@ -5,14 +5,7 @@ import sys
 
 import typer
 
-from qgs.cli import (
-    convert,
-    evaluate,
-    inspect,
-    reconstruct,
-    train,
-    weights,
-)
+from qgs.cli import convert, evaluate, inspect, reconstruct, train, weights
 from qgs.cli.plugin_commands import CommandGroup
 
 app = typer.Typer(

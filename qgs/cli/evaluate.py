@@ -12,15 +12,8 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from qgs.cli.options import (
-    Checkpoint,
-    Device,
-    Overrides,
-    Threads,
-    Tune,
-    tuning_settings,
-    use_threads,
-)
+from qgs.cli import options
+from qgs.cli.options import Checkpoint, Device, Overrides, Threads, Tune
 
 if TYPE_CHECKING:
     from qgs.composer import Recipe
@@ -54,7 +47,7 @@ def evaluate(
     settings = list(overrides or ())
     if index is not None:
         settings.append(f"evaluation.index={json.dumps(index, ensure_ascii=False)}")
-    settings += tuning_settings(tune)
+    settings += options.tuning_settings(tune)
     console = Console()
 
     from qgs.composer import resolve
@@ -63,7 +56,7 @@ def evaluate(
     from qgs.engine.folder import RunFolder
     from qgs.io.checkpoint import CheckpointFile
 
-    use_threads(threads)
+    options.use_threads(threads)
     for setting in settings:
         if re.split("[.=]", setting)[0] not in SECTIONS:
             raise ValueError(
@@ -89,9 +82,8 @@ def evaluate(
 def evaluation_folder(checkpoint: Path, other: bool, own: bool = True) -> Path:
     """RUN/evaluation for RUN/checkpoint.safetensors, RUN/evaluation_ema for checkpoint_ema, ...
 
-    For `other` settings than the recipe's the first unused of RUN/evaluation-2, -3, ... A
-    checkpoint that is not the user's `own` is judged into the working directory, and nothing there
-    is used again.
+    For `other` settings than the recipe's the first unused of RUN/evaluation-2, -3, ... Of a
+    checkpoint that is not the user's `own`, a new folder in the working directory.
     """
     checkpoint = checkpoint if own else Path(checkpoint.name)
     label = checkpoint.stem.removeprefix("checkpoint").removeprefix("_")

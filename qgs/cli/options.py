@@ -32,9 +32,20 @@ Size: TypeAlias = Annotated[
         metavar="HxW", help="Height and width of the photos; the recipe's data.image_size."
     ),
 ]
-
-
-SET_HELP = "Change an option of the recipe's `views`, such as views.scale=auto; repeatable."
+Inputs: TypeAlias = Annotated[
+    int | None, typer.Option(min=1, help="Number of input views; default: the recipe's.")
+]
+Frames: TypeAlias = Annotated[
+    str | None,
+    typer.Option(help="Input photos, by number or file name, such as 0,8,x.jpg; default: spread."),
+]
+SceneName: TypeAlias = Annotated[
+    str | None, typer.Option("--scene", help="Name of the scene, where there are several.")
+]
+ViewsSettings: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Change an option of the recipe's `views`; repeatable."),
+]
 TUNE_HELP = (
     "Fit the queries to the input photos first, in so many steps, or with latents:STEPS what the "
     "model reads of them; 0 for none."

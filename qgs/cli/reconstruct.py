@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from qgs.cli.options import SET_HELP, Checkpoint, Device, Size, Tune, parse_size, tuning_settings
+from qgs.cli import options
+from qgs.cli.options import Checkpoint, Device, Frames, Inputs, SceneName, Size, Tune, ViewsSettings
 from qgs.extensions import function
 from qgs.wording import numbered
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
 
     from qgs.analysis.reconstruction import Reconstruction
     from qgs.composer import Recipe
@@ -28,15 +28,8 @@ def reconstruct(
         str, typer.Argument(help="Folder of photos and cameras, chunks or archives, or its URL.")
     ],
     out: Annotated[Path, typer.Option(help="Folder for the results, or .ply/.splat file.")],
-    inputs: Annotated[
-        int | None, typer.Option(min=1, help="Number of input views; default: the recipe's.")
-    ] = None,
-    frames: Annotated[
-        str | None,
-        typer.Option(
-            help="Input photos, by number or file name, such as 0,8,x.jpg; default: spread."
-        ),
-    ] = None,
+    inputs: Inputs = None,
+    frames: Frames = None,
     holdout: Annotated[
         str | None, typer.Option(help="Photos to compare with; default: six between the inputs.")
     ] = None,
@@ -56,14 +49,12 @@ def reconstruct(
         int | None,
         typer.Option(min=1, help="Gaussians after --refine; default: as many as predicted."),
     ] = None,
-    overrides: Annotated[list[str] | None, typer.Option("--set", help=SET_HELP)] = None,
+    overrides: ViewsSettings = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")
     ] = False,
     size: Size = None,
-    scene_name: Annotated[
-        str | None, typer.Option("--scene", help="Name of the scene, where there are several.")
-    ] = None,
+    scene_name: SceneName = None,
     device: Device = "auto",
 ) -> None:
     """Reconstruct a scene: PLY, renders beside photos, depth, an orbit, cameras.
@@ -76,7 +67,7 @@ def reconstruct(
             f"{out} is a file or holds some; choose another --out, or add --overwrite to replace "
             "the files of the same names"
         )
-    pixels, fine = parse_size(size), parse_size(refine_size, "--refine-size")
+    pixels, fine = options.parse_size(size), options.parse_size(refine_size, "--refine-size")
     if refine is None and (refine_size or refine_inputs or gaussians):
         raise ValueError("--refine-size, --refine-inputs and --gaussians need --refine SECONDS")
     if refine is not None and not 0 < refine < float("inf"):
@@ -93,7 +84,7 @@ def reconstruct(
 
     console = Console()
     model = load(checkpoint, choose_device(device))
-    recipe = resolve(model.recipe or {}, tuning_settings(tune))
+    recipe = resolve(model.recipe or {}, options.tuning_settings(tune))
     tunes = tune is not None and recipe.evaluation.tuning_steps
     result = run(
         model,
@@ -137,13 +128,7 @@ def tuned(
 
 
 def show(result: Reconstruction, what: str, console: Console) -> None:
-    """Print the scores and the remarks of `result`."""
-    console.print(score_table(result, what))
-    console.print("\n".join(result.remarks), soft_wrap=True, highlight=False, markup=False)
-
-
-def score_table(result: Reconstruction, what: str = "") -> Table:
-    """PSNR of every rendered view and of the baselines, inputs first, and the means by kind.
+    """Print PSNR of all views and of the baselines, means by kind, and the remarks.
 
     what: put before the number of Gaussians.
     """
@@ -169,4 +154,5 @@ def score_table(result: Reconstruction, what: str = "") -> Table:
             means = [shown(sum(values) / len(rows)) for values in zip(*rows, strict=True)]
             table.add_row(f"{kind}, mean", str(len(rows)), *means, style="bold")
             table.add_section()
-    return table
+    console.print(table)
+    console.print("\n".join(result.remarks), soft_wrap=True, highlight=False, markup=False)

@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 import torch
 from commands import run_qgs
-from photo_formats import row_of_frames
+from photo_formats import noisy_photos
 from PIL import Image
 from varying_head import VaryingHead
 
 import qgs
 from qgs.geometry.poses import look_at
-from qgs.geometry.transforms import matrix_to_quat, quat_to_matrix
 from qgs.io.gaussians import load_ply
 from qgs.renderers import AutoRenderer
-from qgs.types import Cameras, Views
+from qgs.types import Cameras, Views, map_tensors
 
 RECIPE = {
     "recipe": 1,
@@ -40,15 +39,7 @@ def model():
 
 @pytest.fixture
 def photos(tmp_path):
-    folder = tmp_path / "photos"
-    (folder / "images").mkdir(parents=True)
-    rng = np.random.default_rng(0)
-    for index in range(7):
-        pixels = rng.integers(0, 256, (20, 24, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / "images" / f"{index}.png")
-    camera = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 10, "w": 24, "h": 20}
-    (folder / "transforms.json").write_text(json.dumps(row_of_frames(7, step=5.0, **camera)))
-    return folder
+    return noisy_photos(tmp_path / "photos", step=5.0)
 
 
 def somewhere(count: int = 3) -> Views:
@@ -71,15 +62,10 @@ def test_a_folder_is_reconstructed_as_by_the_command(model, photos, tmp_path):
     loaded = qgs.load(tmp_path / "model.safetensors")
     result = loaded.reconstruct(photos, frames=[1, "5.png"], overrides=["views.scale=auto"])
     result.save(tmp_path / "b")
-    assert (tmp_path / "b/gaussians.ply").read_bytes() == (
-        tmp_path / "a/gaussians.ply"
-    ).read_bytes()
-    assert (tmp_path / "b/cameras.json").read_text() == (tmp_path / "a/cameras.json").read_text()
-    assert {f.name for f in (tmp_path / "a").iterdir()} == {
-        f.name for f in (tmp_path / "b").iterdir()
-    }
-    assert "input 1 (images/1.png)" in repr(result)
-    assert len(repr(result)) < 1500
+    for name in ("gaussians.ply", "cameras.json"):
+        assert (tmp_path / "b" / name).read_bytes() == (tmp_path / "a" / name).read_bytes()
+    one, other = (sorted(f.name for f in (tmp_path / x).iterdir()) for x in "ab")
+    assert one == other
     assert result._repr_png_().startswith(b"\x89PNG")
 
 
@@ -137,44 +123,21 @@ def test_harmonics_are_turned_into_the_world_of_the_photos(model, tmp_path, monk
     assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "placed.ply").read_bytes()
 
 
-def test_rotations_become_quaternions():
-    quats = torch.nn.functional.normalize(
-        torch.randn(50, 4, generator=torch.Generator().manual_seed(0)), dim=-1
-    )
-    quats = torch.cat([quats, torch.eye(4), torch.tensor([[1e-4, 1, 0, 0], [0, 0.6, 0.8, 0]])])
-    for rotation in quat_to_matrix(torch.nn.functional.normalize(quats, dim=-1)):
-        torch.testing.assert_close(
-            quat_to_matrix(matrix_to_quat(rotation)), rotation, atol=1e-5, rtol=0
-        )
-
-
-def test_the_model_stays_as_it_was(model):
-    model = qgs.compose(RECIPE).train()
-    model.reconstruct(somewhere())
-    assert model.training
-
-
 def test_what_cannot_be_reconstructed_is_refused(model, photos):
     views = somewhere()
-    with pytest.raises(ValueError, match=r"values from .* divide 8-bit values by 255"):
-        model.reconstruct(Views(views.images * 255, views.cameras))
-    two = Views(
-        views.images.repeat(2, 1, 1, 1, 1),
-        Cameras(
-            views.cameras.c2w.repeat(2, 1, 1, 1), views.cameras.intrinsics.repeat(2, 1, 1), (16, 24)
-        ),
-    )
-    with pytest.raises(ValueError, match="one scene is reconstructed at a time, got 2"):
-        model.reconstruct(two)
-    with pytest.raises(ValueError, match="are for folders"):
-        model.reconstruct(views, size=(16, 24))
-    with pytest.raises(ValueError, match=r"views.*seed=1"):
-        model.reconstruct(views, overrides=["seed=1"])
-    with pytest.raises(ValueError, match=r"frames: '9\.png' is no photo"):
-        model.reconstruct(photos, frames=["9.png"])
+    two = map_tensors(lambda tensor: torch.cat([tensor, tensor]), views)
+    for given, options, word in (
+        (Views(views.images * 255, views.cameras), {}, "255"),
+        (two, {}, "one scene"),
+        (views, {"size": (16, 24)}, "folders"),
+        (views, {"overrides": ["seed=1"]}, "seed=1"),
+        (photos, {"frames": ["9.png"]}, r"9\.png"),
+    ):
+        with pytest.raises(ValueError, match=word):
+            model.reconstruct(given, **options)
     by_hand = qgs.compose(RECIPE)
     by_hand.recipe = None
-    with pytest.raises(ValueError, match="has no recipe"):
+    with pytest.raises(ValueError, match="recipe"):
         by_hand.reconstruct(views)
 
 
@@ -210,7 +173,6 @@ def test_a_loaded_model_checks_the_first_views_that_it_reconstructs(loaded, capl
     model(views)
     model(views)
     assert caplog.text.count("not at the origin of the model's world") == 1
-    assert "model.reconstruct(views)" in caplog.text
     caplog.clear()
     own = loaded().reconstruct(views).sample.inputs
     loaded()(own)

@@ -40,14 +40,6 @@ def test_a_traced_pass_predicts_the_same(model, views):
     assert torch.equal(plain.gaussians.means, traced.gaussians.means)
 
 
-def test_the_last_pass_counts(model, views):
-    with qgs.trace(model, layers=[1]) as trace:
-        model(views)
-        first = trace.layers[1]
-        model(views)
-    assert trace.layers[1] is not first
-
-
 def test_what_cannot_be_told_is_recorded_as_absent(model, views, monkeypatch):
     monkeypatch.setattr(type(model.decoder[0].self_attention), "explain", lambda *_: None)
     with qgs.trace(model, layers=[1]) as trace:
@@ -62,15 +54,6 @@ def test_hooks_go_away_even_on_errors(model, views):
     with pytest.raises(ValueError, match="patches"), qgs.trace(model):
         model(odd)
     assert hook_count(model) == 0
-
-
-def test_nothing_recorded_needs_gradients(model, views):
-    model.train()
-    with qgs.trace(model, layers=[2], queries=[0]) as trace:
-        model(views)
-    layer = trace.layers[2]
-    assert not layer.before.features.requires_grad
-    assert not layer.cross_attention.weights.requires_grad
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """`qgs eval` as a user types it: indices, tuning, batches."""
 
 import json
-import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -54,7 +53,6 @@ def test_an_index_becomes_a_protocol_of_its_name(runs: Path, index: Path, tmp_pa
     told = summary(tmp_path / "out")
     assert told["protocol"]["name"] == "two_rooms"
     assert told["protocol"]["settings"]["views"]["index"]["scenes"] == 3
-    assert "over 2 of 3 scenes; missing: absent" in result.output
     assert str(tmp_path) not in (tmp_path / "out" / "summary.json").read_text()
 
 
@@ -64,7 +62,6 @@ def test_tuning_goes_into_a_folder_of_its_own_and_is_told(runs: Path) -> None:
     before = [file.read_bytes() for file in files]
     result = evaluated(run, "--tune", 2)
     assert result.exit_code == 0, result.output
-    assert "queries tuned on the input views: 2 steps of Adam" in result.output
     assert summary(run / "evaluation-2")["tuning"]["steps"] == 2
     assert [file.read_bytes() for file in files] == before
 
@@ -124,22 +121,9 @@ def test_strict_evaluations_that_lack_a_scene_exit_with_1(
     assert evaluated(*words).exit_code == 0
     strict = evaluated(*words, "--strict")
     assert strict.exit_code == 1
-    assert "over 2 of 3 scenes; missing: absent" in strict.output
     assert len(summary(tmp_path / "out")["missing"]) == 1
     index.write_text(json.dumps({"test/000001": {"context": [0, 3], "target": [1]}}))
     assert evaluated(*words, "--strict").exit_code == 0
-
-
-def test_averaged_weights_of_a_run_are_told(runs: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    run.mkdir()
-    for name in ("checkpoint", "checkpoint_ema"):
-        shutil.copy(runs / "locus" / "checkpoint.safetensors", run / f"{name}.safetensors")
-    hint = f"qgs eval {run / 'checkpoint_ema.safetensors'}"
-    few = ("--set", "evaluation.scenes=1")
-    assert hint in evaluated(run, *few).output
-    assert hint not in evaluated(run / "checkpoint_ema.safetensors", *few).output
-    assert hint not in evaluated(runs / "locus", *few, "--out", tmp_path / "out").output
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from commands import run_qgs
 from qgs import DISTRIBUTIONS
 from qgs.cli import COMMANDS
 from qgs.cli.plugin_commands import GROUP, HELP
-from qgs.extensions import ExtensionError, function
 
 Offer = Callable[..., None]
 APP = """
@@ -49,11 +48,6 @@ def test_our_own_commands_are_listed_by_what_they_do() -> None:
             assert told in listed, entry.name
             own = typer.main.get_command(entry.load()).help or ""
             assert own.startswith(HELP[entry.name]), entry.name
-
-
-def test_offered_commands_offer_no_completion_that_would_not_work(offer: Offer) -> None:
-    offer("paint")
-    assert "completion" not in run_qgs("paint", "--help").output
 
 
 def test_it_is_listed_without_an_import_and_imported_when_called(offer: Offer) -> None:
@@ -111,9 +105,3 @@ def test_a_command_of_this_repository_names_its_distribution(
     assert "run `pip install query-gaussians-bench`" in str(result.exception)
     assert run_qgs("nothing").exit_code == 2
     assert DISTRIBUTIONS[GROUP].keys().isdisjoint(COMMANDS)
-
-
-def test_a_function_of_a_missing_distribution_says_what_to_install(monkeypatch) -> None:
-    monkeypatch.setattr("qgs.extensions.installed", lambda group: ())
-    with pytest.raises(ExtensionError, match="pip install query-gaussians-refine"):
-        function("qgs.refiners", "gaussians")

@@ -59,13 +59,6 @@ def test_a_copy_brings_what_it_extends_and_overwrites_nothing(elsewhere: Path) -
     assert not Path("mine/rooms/locus_64.yaml").exists()
 
 
-def test_a_text_is_shown_and_a_wrong_name_told() -> None:
-    shown = run_qgs("recipes", "tiny/locus.yaml").stdout
-    assert shown == (RECIPES / "tiny/locus.yaml").read_text(encoding="utf-8")
-    assert "did you mean `tiny/locus.yaml`?" in str(run_qgs("recipes", "tiny/locs.yaml").exception)
-    assert "give its name before --out" in str(run_qgs("recipes", "--out", "x").exception)
-
-
 def test_the_recipes_of_a_wheel_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     inside = tmp_path / "site" / "qgs" / "recipes" / "tiny"
     inside.mkdir(parents=True)

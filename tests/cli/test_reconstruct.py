@@ -1,12 +1,11 @@
 import json
-import re
 import shutil
 from functools import partial
 
 import numpy as np
 import pytest
 from commands import MODEL, run_qgs
-from photo_formats import opened, row_of_frames
+from photo_formats import noisy_photos, opened, row_of_frames
 from PIL import Image
 from plyfile import PlyData
 
@@ -34,16 +33,7 @@ def checkpoint(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
-    """Seven noisy photos of 24x20 pixels, taken along a line."""
-    folder = tmp_path_factory.mktemp("photos")
-    (folder / "images").mkdir()
-    rng = np.random.default_rng(0)
-    for index in range(7):
-        pixels = rng.integers(0, 256, (20, 24, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / "images" / f"{index}.png")
-    camera = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 10, "w": 24, "h": 20}
-    (folder / "transforms.json").write_text(json.dumps(row_of_frames(7, step=0.1, **camera)))
-    return folder
+    return noisy_photos(tmp_path_factory.mktemp("photos") / "row")
 
 
 def test_everything_is_written(checkpoint, photos, tmp_path):
@@ -52,13 +42,8 @@ def test_everything_is_written(checkpoint, photos, tmp_path):
     out = tmp_path / "scene"
     assert PlyData.read(out / "gaussians.ply")["vertex"].count == 32
     cameras = json.loads((out / "cameras.json").read_text())
-    assert [(view["frame"], view["kind"]) for view in cameras["views"]] == [
-        (1, "input"),
-        (5, "input"),
-        (2, "novel"),
-        (3, "novel"),
-        (4, "novel"),
-    ]
+    assert [view["frame"] for view in cameras["views"]] == [1, 5, 2, 3, 4]
+    assert [view["kind"] for view in cameras["views"]] == ["input"] * 2 + ["novel"] * 3
     back = cameras["to_photos"]
     for view in cameras["views"]:
         centre = np.array([*(np.array(view["c2w"])[:3, 3] / back["scale"]), 1])
@@ -69,15 +54,6 @@ def test_everything_is_written(checkpoint, photos, tmp_path):
     assert Image.open(out / "depth" / "00005_input.png").size == (16, 16)
     assert Image.open(out / "overview.png").size[0] > 500
     assert Image.open(out / "orbit.gif").n_frames == len(cameras["orbit"])
-    for word in ("novel, mean", "nearest input", "mean colour"):
-        assert word in result.output
-
-
-def test_named_frames_are_used(checkpoint, photos, tmp_path):
-    result = run(checkpoint, photos, "--out", tmp_path, "--frames", "0,3,6", "--holdout", "1")
-    assert result.exception is None
-    views = json.loads((tmp_path / "cameras.json").read_text())["views"]
-    assert [view["frame"] for view in views] == [0, 3, 6, 1]
 
 
 def test_what_a_user_made_is_kept(checkpoint, photos, tmp_path):
@@ -103,16 +79,11 @@ def test_photos_seen_in_training_are_not_called_novel(photos, tmp_path):
     result = run(file, photos, "--out", tmp_path / "a")
     assert result.exception is None
     views = json.loads((tmp_path / "a" / "cameras.json").read_text())["views"]
-    assert [(view["frame"], view["kind"]) for view in views] == [
-        (0, "input"),
-        (6, "input"),
-        (1, "novel"),
-        (4, "novel"),
-    ]
+    assert [view["frame"] for view in views] == [0, 6, 1, 4]
+    assert [view["kind"] for view in views] == ["input"] * 2 + ["novel"] * 2
     result = run(file, photos, "--out", tmp_path / "b", "--frames", "0,6", "--holdout", "1,3")
     views = json.loads((tmp_path / "b" / "cameras.json").read_text())["views"]
     assert [view["kind"] for view in views] == ["input", "input", "novel", "seen in training"]
-    assert "seen in training, mean" in result.output
 
 
 def test_photos_are_named_by_number_or_file(checkpoint, photos, tmp_path):
@@ -122,15 +93,12 @@ def test_photos_are_named_by_number_or_file(checkpoint, photos, tmp_path):
     views = json.loads((tmp_path / "cameras.json").read_text())["views"]
     assert [view["frame"] for view in views] == [0, 3, 1, 2]
     assert [view["photo"] for view in views] == [f"images/{i}.png" for i in (0, 3, 1, 2)]
-    for label in ("0 (0.png)", "3 (3.png)", "1 (1.png)"):
-        assert label in result.output
 
 
 def test_photos_that_are_not_there_are_refused(photos, tmp_path):
     scene = opened(photos).scenes("train")[0]
     assert frame_list("0,8", "--frames", scene) == [0, 8]
-    ends = r"of 0 \(images/0\.png\) to 6 \(images/6\.png\)"
-    with pytest.raises(ValueError, match=rf"--frames: '0-8' is no photo\. .*{ends}"):
+    with pytest.raises(ValueError, match=r"--frames: '0-8' is no photo"):
         frame_list("0-8", "--frames", scene)
     for folder in "ab":
         shutil.copytree(photos / "images", tmp_path / folder)
@@ -144,20 +112,11 @@ def test_photos_that_are_not_there_are_refused(photos, tmp_path):
         frame_list("1.png", "--frames", twins)
 
 
-def test_a_damaged_domain_is_told_before_the_work(photos, tmp_path, monkeypatch):
-    file = tmp_path / "checkpoint.safetensors"
-    qgs.save(qgs.compose(RECIPE), file, extra={"trained_on": "[]"})
-    monkeypatch.setattr("qgs.analysis.scenes.choose_sample", None)
-    result = run(file, photos, "--out", tmp_path / "out")
-    assert re.search(r"checkpoint\.safetensors is damaged: .*trained_on", str(result.exception))
-
-
 def test_tuned_tokens_meet_the_inputs_better_and_are_told(checkpoint, photos, tmp_path):
     weights = checkpoint.read_bytes()
     assert run(checkpoint, photos, "--out", tmp_path / "plain").exception is None
     result = run(checkpoint, photos, "--out", tmp_path / "tuned", "--tune", 3)
     assert result.exception is None
-    assert "3 steps of tuning the queries: photometric loss of the inputs" in result.output
     plain, tuned = (
         json.loads((tmp_path / name / "cameras.json").read_text()) for name in ("plain", "tuned")
     )
@@ -169,36 +128,21 @@ def test_tuned_tokens_meet_the_inputs_better_and_are_told(checkpoint, photos, tm
     assert checkpoint.read_bytes() == weights
 
 
-def test_a_refined_scene_lies_beside_the_prediction(checkpoint, photos, tmp_path):
-    more = ("--refine", 0.5, "--gaussians", 50, "--refine-size", "20x24")
-    result = run(checkpoint, photos, "--out", tmp_path, *more)
-    assert result.exception is None, result.exception
-    for said in ("feed-forward, 32 Gaussians", "refined, 50 Gaussians", "on 4 photos of 24 x 20"):
-        assert said in " ".join(result.output.split())
-    first, refined = (
-        json.loads((tmp_path / name / "cameras.json").read_text()) for name in (".", "refined")
-    )
-    assert [view["frame"] for view in first["views"]] == [1, 5, 2, 3, 4]
-    assert [view["frame"] for view in refined["views"]] == [1, 5, 2, 3, 4]
-    assert (first["views"][0]["size"], refined["views"][0]["size"]) == ([16, 16], [20, 24])
-    assert first["refinement"] is None
-    assert refined["refinement"]["frames"] == [0, 1, 5, 6]
-    assert refined["refinement"]["curve"][-1]["gaussians"] == 50
-    assert refined["to_photos"] == first["to_photos"]
-    assert PlyData.read(tmp_path / "gaussians.ply")["vertex"].count == 32
-    assert PlyData.read(tmp_path / "refined" / "gaussians.ply")["vertex"].count == 50
-
-
 def test_inputs_alone_are_refined_on_and_photos_held_out_of_training_never(photos, tmp_path):
     data = {"type": "qgs/photos", "path": str(photos), "image_size": [16, 16], "holdout": 3}
     file = tmp_path / "checkpoint.safetensors"
     qgs.save(qgs.compose({**RECIPE, "data": data}), file)
-    cases = {"all": ((), [0, 2, 5, 6]), "inputs": (("--refine-inputs",), [0, 6])}
+    larger = ("--gaussians", 50, "--refine-size", "20x24")
+    cases = {"all": (larger, [0, 2, 5, 6]), "inputs": (("--refine-inputs",), [0, 6])}
     for name, (more, frames) in cases.items():
         chosen = ("--frames", "0,6", "--holdout", "1,3", "--refine", 0.05)
         assert run(file, photos, "--out", tmp_path / name, *chosen, *more).exception is None
         record = json.loads((tmp_path / name / "refined" / "cameras.json").read_text())
         assert record["refinement"]["frames"] == frames  # 4 was held out of training
+    refined = json.loads((tmp_path / "all" / "refined" / "cameras.json").read_text())
+    assert refined["views"][0]["size"] == [20, 24]
+    for folder, count in (("all", 32), ("all/refined", 50)):
+        assert PlyData.read(tmp_path / folder / "gaussians.ply")["vertex"].count == count
 
 
 @pytest.mark.parametrize(
@@ -227,4 +171,3 @@ def test_the_world_is_scaled_as_asked_for(checkpoint, photos, tmp_path, caplog):
         assert run(checkpoint, photos, *options).exception is None
         record = json.loads((out / "cameras.json").read_text())
         assert record["to_photos"]["scale"] == pytest.approx(factor)
-    assert "look at no common point" in caplog.text

@@ -7,11 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
-
-pytest.importorskip("viser", reason="viser is not installed: pip install query-gaussians-viewer")
-
 from browser import CHROMIUM, Page, chromium
+from PIL import Image
 from qgs_viewer.page import scene_html
 from qgs_viewer.panel import Panel
 from qgs_viewer.server import quiet_server
@@ -60,13 +57,7 @@ def test_the_viewer(model: str, tmp_path: Path) -> None:
         page.until("its name", f"document.body.innerText.includes({source.title!r})")
         assert page.evaluate("document.querySelector('#named')") is None
 
-        for x, y in (
-            (620, 380),
-            (560, 300),
-            (700, 420),
-            (500, 250),
-            (600, 500),
-        ):  # action one: a click
+        for x, y in ((620, 380), (560, 300), (700, 420), (500, 250), (600, 500)):
             page.click(x, y)
             if waited(page, lambda: panel.choice.query is not None):
                 break

@@ -2,18 +2,12 @@ import json
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 import yaml
 from commands import MODEL, run_qgs
-from photo_formats import row_of_frames
-from PIL import Image
+from photo_formats import noisy_photos
 from plyfile import PlyData
-from qgs_viewer.contest import (
-    checkpoints,
-    judge,
-    resolve_fairly,
-)
+from qgs_viewer.contest import checkpoints, judge, resolve_fairly
 from qgs_viewer.curves import curves_of
 from qgs_viewer.demo import new_folder
 
@@ -50,8 +44,6 @@ def test_recipes_are_trained_compared_and_reported(recipes, tmp_path):
     for name, queries in (("few", 8), ("more", 12)):
         assert (out / name / "checkpoint.safetensors").is_file()
         assert PlyData.read(out / name / "example.ply")["vertex"].count == 4 * queries
-        assert name in result.output
-    assert "Mean colour" in result.output
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") > 10
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
@@ -74,12 +66,6 @@ def test_all_systems_can_be_compared():
     assert compared["c3g"].training.judge_inputs
 
 
-def test_budget_and_seed_are_those_asked_for(recipes):
-    for recipe in resolve_fairly(recipes, seconds=7, seed=3).values():
-        assert recipe.training.seconds == 7
-        assert recipe.tree["seed"] == 3
-
-
 @pytest.fixture(scope="module")
 def domain():
     """What the views of RECIPE are like: it takes a second."""
@@ -100,20 +86,6 @@ def models(tmp_path, monkeypatch, domain):
     return files
 
 
-def photos_in(folder, count, step):
-    """Photos of noise, 24 x 20, by cameras `step` apart that look the same way."""
-    (folder / "images").mkdir(parents=True)
-    rng = np.random.default_rng(0)
-    for index in range(count):
-        pixels = rng.integers(0, 256, (20, 24, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / "images" / f"{index}.png")
-    camera = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 10, "w": 24, "h": 20}
-    (folder / "transforms.json").write_text(
-        json.dumps(row_of_frames(count, step=step, **camera)), encoding="utf-8"
-    )
-    return folder
-
-
 def test_trained_models_are_shown_on_rooms_they_never_saw(models, tmp_path):
     result = run_qgs("demo", *models)
     assert result.exit_code == 0, result.output
@@ -123,9 +95,7 @@ def test_trained_models_are_shown_on_rooms_they_never_saw(models, tmp_path):
         assert not (ply.parent / "checkpoint.safetensors").exists()
     page = (tmp_path / "demo" / "report.html").read_text()
     assert "test/000001" in page
-    for text in (page, result.output):
-        assert "few: step 7,000 of 150,000; more: step 7,000 of 150,000" in text
-        assert "Mean colour" in text
+    assert "few: step 7,000 of 150,000; more: step 7,000 of 150,000" in page
     assert "<h2>Training</h2>" not in page
 
 
@@ -139,8 +109,7 @@ def test_a_report_of_runs_shows_how_they_were_trained(models, tmp_path):
     assert result.exit_code == 0, result.output
     page = (tmp_path / "report" / "report.html").read_text()
     assert "<h2>Training</h2>" in page
-    assert "run: report/run/example.ply" in result.output, "no checkpoint was written there"
-    photos = photos_in(tmp_path / "mine", 6, step=0.1)
+    photos = noisy_photos(tmp_path / "mine", 6, step=0.1)
     assert run_qgs("report", "run", "--photos", photos).exit_code == 0
     assert "<h2>Your photos</h2>" in (tmp_path / "report-2" / "report.html").read_text()
 
@@ -158,22 +127,10 @@ def test_a_checkpoint_has_a_history_of_its_own_or_of_its_run(tmp_path):
     assert [curves_of(file).steps for file in (own, other)] == [[1], [2]]
 
 
-@pytest.mark.parametrize("count", [3, 20])
-def test_photos_far_from_the_training_are_said_to_be(models, tmp_path, count):
-    result = run_qgs("demo", photos_in(tmp_path / "mine", count, step=5.0), *models)
-    assert result.exit_code == 0, result.output
-    assert result.output.count("few, more: the views lie outside what this model was trained") == 1
-    assert result.output.count("(views.scale: auto)") == 1
-    apart = re.search(r"the input cameras stand \S+( to \S+)? apart \(trained: ", result.output)
-    assert bool(apart) == (count == 3), "of many photos in a row, neighbours stand close enough"
-    page = (tmp_path / "demo" / "report.html").read_text()
-    assert page.index("lie outside what this model") < page.index("<table>")
-
-
 def test_photos_in_another_unit_are_judged_alike(models, tmp_path):
     figures = []
     for name, unit in (("a", 0.01), ("b", 7.0)):
-        photos = photos_in(tmp_path / name, 12, step=unit)
+        photos = noisy_photos(tmp_path / name, 12, step=unit)
         entry = judge(checkpoints(models[1:2]), str(photos), "cpu")[0]
         figures.append(entry.evaluation.means()["psnr"])
         assert entry.recipe.views.scale == "auto"

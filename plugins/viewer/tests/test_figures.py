@@ -10,21 +10,11 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from PIL import Image
-from qgs_viewer.figures import (
-    anchors,
-    attention,
-    dispersion,
-    global_gaussians,
-    graph,
-    novel_views,
-    refinement,
-)
+from qgs_viewer.figures import anchors, attention, dispersion, global_gaussians, novel_views
 from qgs_viewer.figures.exhibits import Exhibition, NothingToShowError
-from qgs_viewer.figures.layers import chosen_layers
-from qgs_viewer.figures.overview import overview, seen_points
-from qgs_viewer.figures.paper import DPI, WIDTH, new_figure, write_figure
-from qgs_viewer.figures.plan import plan_of
-from qgs_viewer.pictures import color_error, error_picture
+from qgs_viewer.figures.outside import overview, plan_of, seen_points
+from qgs_viewer.figures.paper import DPI, WIDTH, chosen_layers, new_figure, write_figure
+from qgs_viewer.pictures import error_picture
 from small import KINDS, QUERIES, SIDE, exhibit_of, exhibition_of, sample_of
 
 import qgs
@@ -55,12 +45,6 @@ def errors_of(show: Exhibition) -> torch.Tensor:
                 image = model.render(model(sample.inputs).gaussians, views.cameras).rgb[0, 0]
             found.append((image.clamp(0, 1) - views.images[0, 0]).abs().mean(0))
     return torch.stack(found)
-
-
-def test_colours_beyond_white_and_black_are_no_error() -> None:
-    images = torch.tensor([1.5, -0.5, 0.25]).view(3, 1, 1)
-    truth = torch.tensor([1.0, 0.0, 1.0]).view(3, 1, 1)
-    torch.testing.assert_close(color_error(images, truth), torch.tensor([[[0.25]]]))
 
 
 def test_novel_views_show_the_middle_target_with_its_score_and_error() -> None:
@@ -123,7 +107,7 @@ def test_bars_are_the_metric_of_each_scene() -> None:
 
 
 def test_anchors_are_shown_layer_by_layer_of_models_that_have_them() -> None:
-    made = anchors.made(exhibition_of(*PAIR))
+    made = anchors.anchors(exhibition_of(*PAIR))
     axes = made.figure.axes
     layers = chosen_layers(exhibit_of("locus").look.depth, anchors.LAYERS, 0)
     titles = [axis.get_title(loc="left") for axis in axes]
@@ -131,7 +115,7 @@ def test_anchors_are_shown_layer_by_layer_of_models_that_have_them() -> None:
     assert "Not shown: tokengs" in made.caption
     assert len(pictures(axes)) == len(axes) == len(layers) + 1
     with pytest.raises(NothingToShowError, match="tokengs: the queries have no anchors"):
-        anchors.made(exhibition_of("tokengs"))
+        anchors.anchors(exhibition_of("tokengs"))
 
 
 def test_attention_is_that_of_a_trace_and_its_anchor_lies_where_it_was() -> None:
@@ -145,12 +129,12 @@ def test_attention_is_that_of_a_trace_and_its_anchor_lies_where_it_was() -> None
         found = attention.part_maps(shown, shown.look.attention(query, layer), part)
         expected = getattr(traced, part)[0, :, 0].mean(0).view(record.grid)
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
-    axes = attention.made(exhibition_of(*PAIR, query=query)).figure.axes
-    assert words(axes) == ["none"] * len(chosen_layers(shown.look.depth, attention.LAYERS))
+    axes = attention.cross_attention(exhibition_of(*PAIR, query=query)).figure.axes
+    assert words(axes) == ["none"] * len(chosen_layers(shown.look.depth, attention.CROSS_LAYERS))
     dots = [line for axis in axes for line in axis.lines if line.get_marker() == "o"]
     drawn = np.array([np.concatenate([d.get_xdata(), d.get_ydata()]) for d in dots])
     camera = shown.sample.inputs.cameras[:, :1].to(torch.float64)
-    for chosen in chosen_layers(shown.look.depth, attention.LAYERS):
+    for chosen in chosen_layers(shown.look.depth, attention.CROSS_LAYERS):
         support = shown.look.support(chosen - 1)
         assert support is not None
         local = to_camera(support.centers[:, [query]], camera)[0, 0]
@@ -167,47 +151,37 @@ def test_edges_lead_to_the_queries_that_are_read_most(kind: str) -> None:
     traced = record.layers[layer].self_attention
     assert traced is not None
     shares = traced.weights[0, :, 0].mean(0)
-    order = [i for i in shares.argsort(descending=True).tolist() if i != query][: graph.EDGES]
-    found, relative = graph.strongest_edges(shown, query, layer, "weights")
+    order = [i for i in shares.argsort(descending=True).tolist() if i != query][: attention.EDGES]
+    found, relative = attention.strongest_edges(shown, query, layer, "weights")
     assert found.tolist() == order
     torch.testing.assert_close(relative, shares[order] / shares[order[0]], rtol=1e-4, atol=1e-6)
-    axis = graph.made(exhibition_of(kind, query=query)).figure.axes[-1]
+    axis = attention.self_attention(exhibition_of(kind, query=query)).figure.axes[-1]
     (edges,) = (c for c in axis.collections if isinstance(c, LineCollection))
-    nodes = graph.nodes_of(shown, layer)
-    places = plan_of(shown, graph.nodes_of(shown, shown.look.depth)).of(nodes).numpy()
+    nodes = attention.nodes_of(shown, layer)
+    places = plan_of(shown, attention.nodes_of(shown, shown.look.depth)).of(nodes).numpy()
     expected = [[places[query], places[other]] for other in order]
     np.testing.assert_allclose(edges.get_segments(), expected, atol=1e-9)
-
-
-def test_nodes_are_anchors_or_amid_the_gaussians_that_are_seen() -> None:
-    anchored, plain = exhibit_of("locus"), exhibit_of("tokengs")
-    support = anchored.look.support(1)
-    assert support is not None
-    torch.testing.assert_close(graph.nodes_of(anchored, 2), support.centers[0])
-    members = plain.gaussians.means[0].view(QUERIES, -1, 3).double()
-    nodes = graph.nodes_of(plain, 2)
-    assert ((nodes >= members.amin(1) - 1e-9) & (nodes <= members.amax(1) + 1e-9)).all()
 
 
 @pytest.mark.parametrize("kind", ["locus", "ellipsoid"])
 def test_radii_and_steps_are_those_of_the_states(kind: str) -> None:
     shown = exhibit_of(kind)
-    for layer, found in enumerate(refinement.radii(shown)):
+    for layer, found in enumerate(anchors.radii(shown)):
         support = shown.look.support(layer)
         assert support is not None
         expected = support.axes[0].norm(dim=-2).prod(-1) ** (1 / 3)
         np.testing.assert_allclose(found, expected, rtol=1e-4)
-    _, radius, step = refinement.made(exhibition_of("tokengs", kind)).figure.axes
+    _, radius, step = anchors.refinement(exhibition_of("tokengs", kind)).figure.axes
     np.testing.assert_allclose(
-        radius.lines[0].get_ydata(), np.median(refinement.radii(shown), 1), rtol=1e-6
+        radius.lines[0].get_ydata(), np.median(anchors.radii(shown), 1), rtol=1e-6
     )
-    first = (refinement.ways(shown)[1] - refinement.ways(shown)[0]).norm(dim=-1)
+    first = (anchors.ways(shown)[1] - anchors.ways(shown)[0]).norm(dim=-1)
     assert step.lines[0].get_ydata()[0] == pytest.approx(float(first.quantile(0.5)), rel=1e-6)
 
 
 def test_the_overview_stands_behind_and_above_and_sees_the_scene() -> None:
     shown, inputs = exhibit_of("locus"), sample_of().inputs.cameras
-    points = seen_points(shown.model, shown.gaussians, inputs)
+    points = seen_points(shown)
     camera = overview(inputs, points, (300, 400))
     local = to_camera(points[None], camera)[0, 0]
     pixels = to_pixels(local, camera.intrinsics[0, 0])

@@ -1,19 +1,19 @@
+import math
 from copy import deepcopy
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from qgs_viewer.choice import FAINT, Choice, faded, ink, painted, query_color
-from qgs_viewer.look import NEUTRAL, look_inside
-from qgs_viewer.pictures import attention_parts
+from qgs_viewer.choice import FAINT, Choice, painted, query_color
+from qgs_viewer.look import NEUTRAL, Look, look_inside
+from qgs_viewer.pictures import attention_pictures_of
+from qgs_viewer.server import first_eye, quiet_server, stand, up_of
 from small import KINDS, QUERIES, SIDE, model_of, source_of
 
 import qgs
-from qgs.drawing.figures import INK
+from qgs.geometry.poses import look_at
 from qgs.geometry.transforms import to_camera, to_pixels
-
-pytest.importorskip("viser", reason="viser is not installed: pip install query-gaussians-viewer")
+from qgs.types import Cameras, Gaussians, Views
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -44,7 +44,7 @@ def test_attention_is_that_of_a_trace(kind: str) -> None:
         torch.testing.assert_close(found.weights, expected.weights)
     assert look.attention(5, 0) is None
     parts = {"content", "result"} if kind == "tokengs" else {"content", "geometry", "result"}
-    assert attention_parts(look, 5, 1).keys() == parts
+    assert attention_pictures_of(look, 5, 1, 32).keys() == parts
 
 
 def test_gaussians_belong_to_queries_in_order() -> None:
@@ -98,14 +98,6 @@ def test_other_inputs_leave_the_scene_where_it_is() -> None:
         torch.testing.assert_close(turned, every.c2w[list(frames), :3, :3], rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("frames", "said"), [((), "choose one at least"), ((9,), "do not exist"), ((1, 1), "twice")]
-)
-def test_frames_that_do_not_fit_are_refused(frames: tuple[int, ...], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
-        source_of("tokengs").look(frames)
-
-
 def test_a_picked_query_stands_out() -> None:
     look = source_of("locus").look((1, 4))
     mine = np.zeros(look.gaussians.count, bool)
@@ -130,11 +122,36 @@ def test_the_background_is_that_of_the_model() -> None:
     assert look_inside(model, look.views).background == (0.1, 0.2, 0.3)
 
 
-def test_what_pales_goes_towards_the_background() -> None:
-    look = replace(source_of("locus").look((1, 4)), background=(0.0, 0.5, 1.0))
-    assert faded((255, 0, 0), np.array([[1.0], [0.0]]), look).tolist() == [
-        [255, 0, 0],
-        [0, 128, 255],
-    ]
-    assert ink(look) == INK
-    assert min(ink(replace(look, background=(0.1, 0.1, 0.1)))) > 200
+def around(turn: float, count: int = 8, up: tuple[float, float, float] = (0, 0, 1)) -> Look:
+    """Cameras on a part `turn` of a circle of radius 3, upright by `up`, around a small cloud."""
+    angles = torch.arange(count) / count * turn * 2 * math.pi
+    eye = torch.stack([3 * angles.cos(), 3 * angles.sin(), torch.full((count,), 0.5)], -1)
+    c2w = look_at(eye, -eye, -torch.tensor(up).float().expand_as(eye))
+    lenses = torch.tensor([64.0, 64, 32, 32]).expand(1, count, 4)
+    views = Views(torch.rand(1, count, 3, 64, 64), Cameras(c2w[None], lenses, (64, 64)))
+    means = torch.randn(1, 50, 3) * 0.2
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(1, 50, 4)
+    sizes, solid = torch.full((1, 50, 3), 0.05), torch.full((1, 50), 0.9)
+    return Look(Gaussians(means, sizes, quats, solid, means.sigmoid()), views)
+
+
+def test_cameras_around_something_are_seen_from_outside() -> None:
+    look = around(1.0)
+    eye, target = first_eye(look)
+    middle = look.gaussians.means[0].double().median(0).values.numpy()
+    assert abs(target - middle).max() < 1e-6
+    assert ((eye - middle) ** 2).sum() ** 0.5 > 4
+    assert eye[2] > 0.5  # above them
+
+
+def test_up_is_that_of_the_cameras() -> None:
+    for turn in (0.2, 1.0):
+        up = up_of(around(turn))
+        assert float(up[2]) > 0.95
+        assert float(up.norm()) == pytest.approx(1)
+    look = around(0.2)
+    with quiet_server() as server:
+        stand(server, look)
+        assert server.initial_camera.up[2] > 0.95
+    eye, target = first_eye(look)
+    assert (target - eye) @ (torch.zeros(3).numpy() - eye) > 0

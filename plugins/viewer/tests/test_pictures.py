@@ -132,12 +132,6 @@ def test_a_query_picture_is_grey_but_for_its_queries(model, gaussians, cameras):
     assert np.ptp(none.astype(int), axis=-1).max() == 0
 
 
-def test_finer_cameras_see_the_same_points_at_the_same_place(cameras):
-    fine = finer(cameras, 128)
-    assert fine.size == (128, 128)
-    torch.testing.assert_close(fine.intrinsics, cameras.intrinsics * 4)
-
-
 def test_depth_pictures_share_a_scale_and_show_where_nothing_is():
     depth = torch.tensor([[[0.0, 1.0], [2.0, 3.0]]])
     assert depth_range(depth)[0] == pytest.approx(1.0, abs=0.1)
@@ -202,10 +196,3 @@ def test_running_mean_keeps_a_line_straight():
     np.testing.assert_allclose(running_mean(line), line)
     noisy = line + np.random.default_rng(0).normal(size=200)
     assert np.abs(running_mean(noisy) - line).max() < 1.5
-
-
-@pytest.mark.parametrize(("end", "most"), [(0, 0.3), (-1, 0.1)])
-def test_one_odd_value_at_an_end_bends_no_running_mean(end: int, most: float) -> None:
-    values = np.full(4000, 3.0)
-    values[end] = 13.0
-    assert np.abs(running_mean(values) - 3).max() < most

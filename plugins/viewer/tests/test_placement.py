@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -14,7 +12,6 @@ from qgs_viewer.placement import (
 )
 from scipy.spatial.transform import Rotation
 
-from qgs.data.scenes import warn_once
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.renderers.reference import TorchRenderer
 from qgs.types import Cameras, Gaussians
@@ -134,13 +131,3 @@ def test_small_gaussians_beside_large_ones_survive_half_precision() -> None:
     np.testing.assert_allclose(kept, sizes, rtol=1e-3)
     lost = np.sqrt(covariances.astype(np.float16)[:, 0, 0].astype(np.float64))
     assert abs(lost[1] / sizes[1] - 1) > 0.01  # without it
-
-
-def test_colours_are_those_of_degree_0_which_is_told(caplog: pytest.LogCaptureFixture) -> None:
-    gaussians = cloud(5)
-    plain = splats(gaussians, a_placement())
-    assert caplog.text == ""
-    warn_once.cache_clear()
-    varying = splats(replace(gaussians, sh=torch.ones(1, 5, 15, 3)), a_placement())
-    assert "depend on the direction; those of degree 0 are shown" in caplog.text
-    np.testing.assert_array_equal(varying.colors, plain.colors)

@@ -2,26 +2,17 @@
 
 import io
 import re
-from collections.abc import Sequence
-from importlib.metadata import entry_points
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-import torch
-from PIL import Image
-
-pytest.importorskip("viser", reason="viser is not installed: pip install query-gaussians-viewer")
-
 from browser import CHROMIUM, Page, chromium
-from qgs_viewer.figures import dispersion
+from PIL import Image
 from qgs_viewer.figures.exhibits import Exhibit, exhibit
-from qgs_viewer.report import GROUP, Contender, Report, Shown, report_html
+from qgs_viewer.report import Contender, Report, report_html
 from qgs_viewer.section import (
-    dispersion_section,
     scene_section,
-    sections,
 )
 from small import VIEWS, Walk, model_of
 
@@ -53,36 +44,8 @@ def page_of_two_scenes() -> str:
     return report_html(report)
 
 
-def shown_of(samples: Sequence[Sample]) -> Shown:
-    with torch.no_grad():
-        return [(one, [one.model(s.inputs) for s in samples]) for one in contenders()]
-
-
 def exhibits() -> list[Exhibit]:
     return [exhibit(one.name, one.model, sample_of(1, 2)) for one in contenders()]
-
-
-def test_the_viewer_offers_its_sections() -> None:
-    found = [e.load() for e in entry_points(group=GROUP) if e.module.startswith("qgs_view")]
-    assert found == [sections]
-
-
-def test_bars_are_of_every_scene_of_the_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn, draw = [], dispersion.figure
-    monkeypatch.setattr(
-        dispersion, "figure", lambda *given: drawn.append(draw(*given)) or drawn[-1]
-    )
-    samples = [sample_of(1, 2), make_sample(Walk(), (0, 4), (1, 2), VIEWS, mirror=False)]
-    shown = shown_of(samples)
-    assert dispersion_section(shown, samples).figures
-    (mean, median) = drawn[0].axes
-    for number, (_, predictions) in enumerate(shown):
-        for axis, middle in ((mean, np.mean), (median, np.median)):
-            for bar, prediction in zip(axis.containers[number], predictions, strict=True):
-                queries = prediction.gaussians.means.view(12, -1, 3)
-                distances = (queries - queries.mean(1, keepdim=True)).norm(dim=-1).numpy()
-                assert bar.get_height() == pytest.approx(float(middle(distances)), rel=1e-4)
-    assert not dispersion_section(shown_of(samples[:1]), samples[:1]).figures, "the table says it"
 
 
 def test_the_section_has_all_models_and_the_code_of_the_viewer_once() -> None:

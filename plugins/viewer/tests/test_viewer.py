@@ -2,38 +2,41 @@
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
+from html import unescape
+from io import BytesIO
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import viser
+from PIL import Image
+from qgs_viewer.choice import Choice
 from qgs_viewer.look import Look
+from qgs_viewer.page import scene_html
+from qgs_viewer.panel import Panel, plain
+from qgs_viewer.server import quiet_server
+from qgs_viewer.stage import Stage
 from small import QUERIES, source_of
 
 from qgs.types import Gaussians
 
-viser = pytest.importorskip(
-    "viser", reason="viser is not installed: pip install query-gaussians-viewer"
-)
-
 
 @pytest.fixture(scope="module")
-def server() -> Iterator["viser.ViserServer"]:
-    from qgs_viewer.server import quiet_server
-
+def server() -> Iterator[viser.ViserServer]:
     with quiet_server() as server:
         yield server
 
 
 @pytest.fixture
-def panel(server: "viser.ViserServer", request: pytest.FixtureRequest):
-    from qgs_viewer.panel import Panel
-
+def panel(server: viser.ViserServer, request: pytest.FixtureRequest):
     server.scene.reset()
     server.gui.reset()
     return Panel(server, source_of(getattr(request, "param", "locus")))
 
 
-def nodes(server: "viser.ViserServer") -> set[str]:
+def nodes(server: viser.ViserServer) -> set[str]:
     names = ("/gaussians", "/views/0", "/views/1", "/views/2", "/anchors", "/support", "/path")
     return {n for n in (*names, "/reading") if server.scene.get_handle_by_name(n) is not None}
 
@@ -61,10 +64,6 @@ def test_a_query_is_picked_and_followed_through_the_layers(server, panel) -> Non
 
 
 def test_text_is_shown_as_it_is(server) -> None:
-    from html import unescape
-
-    from qgs_viewer.panel import Panel, plain
-
     text = "<script>alert(1)</script> *a* _b_ [c](d) `e` {f} # ~~g~~ | \\ &lt;"
     assert re.sub(r"&#\d+;", "", plain(text)).replace(" ", "").isalnum()
     assert unescape(plain(text)) == text
@@ -82,7 +81,7 @@ def test_text_is_shown_as_it_is(server) -> None:
     assert "<script" not in "".join(contents)
 
 
-def all_handles(gui: "viser.GuiApi") -> Iterator[object]:
+def all_handles(gui: viser.GuiApi) -> Iterator[object]:
     waiting = list(gui._container_handle_from_uuid["root"]._children.values())
     while waiting:
         handle = waiting.pop()
@@ -90,15 +89,13 @@ def all_handles(gui: "viser.GuiApi") -> Iterator[object]:
         waiting += getattr(handle, "_children", {}).values()
 
 
-def button_of(server: "viser.ViserServer", label: str) -> "viser.GuiButtonHandle":
+def button_of(server: viser.ViserServer, label: str) -> viser.GuiButtonHandle:
     buttons = [h for h in all_handles(server.gui) if isinstance(h, viser.GuiButtonHandle)]
     (found,) = [button for button in buttons if button.label == label]
     return found
 
 
 def test_a_picked_query_is_let_go(server, panel) -> None:
-    from types import SimpleNamespace
-
     button = button_of(server, "Show all (Esc)")
     assert not button.visible
     panel.pick(3)
@@ -116,14 +113,6 @@ def test_a_picked_query_is_let_go(server, panel) -> None:
 @pytest.mark.parametrize("background", [(0.5, 0.5, 0.5), (0.0, 0.25, 1.0)])
 def test_gaussians_stand_before_the_background_of_their_model(background) -> None:
     """In a browser and in pages alike: what a scene serialises is what a page draws."""
-    from dataclasses import replace
-    from io import BytesIO
-
-    from PIL import Image
-    from qgs_viewer.choice import Choice
-    from qgs_viewer.server import quiet_server
-    from qgs_viewer.stage import Stage
-
     look = replace(source_of("locus").look((1, 4)), background=background)
     with quiet_server() as own:
         Stage(own.scene).put(look, Choice())
@@ -136,8 +125,6 @@ def test_gaussians_stand_before_the_background_of_their_model(background) -> Non
 
 @pytest.mark.parametrize("error", [ValueError("too few"), OSError("no photo")])
 def test_what_is_refused_is_told_and_taken_back(panel, monkeypatch, error: Exception) -> None:
-    from types import SimpleNamespace
-
     def fails(frames: object) -> None:
         raise error
 
@@ -222,9 +209,6 @@ def test_read_patches_stand_before_their_photos(server, panel) -> None:
 
 
 def test_a_page_is_small_and_asks_for_nothing() -> None:
-    from qgs_viewer.choice import Choice
-    from qgs_viewer.page import scene_html
-
     count, make = 4096, torch.manual_seed(0)
     quats = torch.nn.functional.normalize(torch.randn(1, count, 4, generator=make), dim=-1)
     draw = (torch.rand(1, count, n, generator=make) for n in (3, 3, 3))

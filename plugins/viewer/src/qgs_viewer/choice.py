@@ -23,8 +23,8 @@ _PALE = 0.4
 class Choice:
     """What is shown. query: the picked one. layer: of supports and attention, 0 the start.
 
-    others: what becomes of the Gaussians of other queries once one is picked. patches: how many of
-    those that it reads get a line. by_query: colours of queries instead of the scene's.
+    others: how Gaussians of other queries look once one is picked. patches: number of lines to
+    those that it reads. by_query: colours of queries instead of the scene's.
     """
 
     by_query: bool = False
@@ -43,14 +43,14 @@ def query_color(query: int) -> Color:
     return round(red * 255), round(green * 255), round(blue * 255)
 
 
-def query_colors(count: int) -> np.ndarray:
-    """`query_color` of the first `count` queries, uint8 (count, 3)."""
-    return np.array([query_color(query) for query in range(count)], np.uint8).reshape(-1, 3)
+def look_colors(look: Look) -> np.ndarray:
+    """`query_color` of every query, uint8 (N, 3)."""
+    return np.array([query_color(query) for query in range(look.queries)], np.uint8).reshape(-1, 3)
 
 
 def anchor_colors(look: Look, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
     """Which anchors are shown, by number, and their colours uint8."""
-    colors, numbers = query_colors(look.queries), np.arange(look.queries)
+    colors, numbers = look_colors(look), np.arange(look.queries)
     if choice.query is None or choice.others == "shown":
         return numbers, colors
     if choice.others == "hidden":
@@ -78,7 +78,7 @@ def painted(look: Look, choice: Choice) -> Splats:
         return found
     colors, opacities = found.colors, found.opacities
     if choice.by_query:
-        colors = query_colors(queries).repeat(len(colors) // queries, 0).astype(np.float32) / 255
+        colors = look_colors(look).repeat(len(colors) // queries, 0).astype(np.float32) / 255
     if choice.query is not None and choice.others != "shown":
         mine = np.zeros(len(colors), bool)
         mine[look.members(choice.query)] = True

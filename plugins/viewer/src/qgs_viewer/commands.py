@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from qgs.cli.options import SET_HELP, Device, Size, parse_size
+from qgs.cli.options import Device, Frames, Inputs, SceneName, Size, ViewsSettings, parse_size
 from qgs.wording import listed
 
 if TYPE_CHECKING:
@@ -35,20 +35,11 @@ def view(
             "unseen room."
         ),
     ] = None,
-    scene: Annotated[
-        str | None, typer.Option(help="Name of the scene, where there are several.")
-    ] = None,
-    inputs: Annotated[
-        int | None, typer.Option(min=1, help="Number of input views; default: the recipe's.")
-    ] = None,
-    frames: Annotated[
-        str | None, typer.Option(help="Input photos, by number or file name, such as 0,8,x.jpg.")
-    ] = None,
+    scene: SceneName = None,
+    inputs: Inputs = None,
+    frames: Frames = None,
     size: Size = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", help=SET_HELP),
-    ] = None,
+    overrides: ViewsSettings = None,
     query: Annotated[
         int | None, typer.Option(min=0, help="Query that is picked at first; default: none.")
     ] = None,
@@ -100,11 +91,7 @@ def view(
         write_text(html, page)
         console.print(f"wrote {html}", soft_wrap=True)
         if look.queries:
-            console.print(
-                "The page can be turned; to pick queries in it, leave out --html, or choose one "
-                "for the page with --query.",
-                soft_wrap=True, highlight=False,
-            )  # fmt: skip
+            console.print("--query picks a query in it; without --html the viewer does.")
         return
 
     from qgs_viewer.panel import Panel
@@ -115,11 +102,9 @@ def view(
         refuse_missing(query, panel.look)
         if query is not None:
             panel.pick(query)
-        name = "localhost" if host in {"127.0.0.1", "0.0.0.0"} else host
-        port = server.get_port()
-        where = f"http://{name}:{port}"
-        others = f", for other machines http://{_own_address()}:{port}" if host == "0.0.0.0" else ""
-        text = f"{opened.title}: {where}{others} (Ctrl-C ends it)"
+        name, port = {"127.0.0.1": "localhost"}.get(host, host), server.get_port()
+        where = f"http://{socket.gethostname() if host == '0.0.0.0' else name}:{port}"
+        text = f"{opened.title}: {where} (Ctrl-C ends it)"
         console.print(text, soft_wrap=True, highlight=False, markup=False)
         if show:
             webbrowser.open(where)
@@ -132,13 +117,3 @@ def refuse_missing(query: int | None, look: Look) -> None:
     if query is not None and query >= look.queries:
         there = f"there are 0 to {look.queries - 1}" if look.queries else "no query is known of it"
         raise ValueError(f"--query {query} cannot be picked: {there}")
-
-
-def _own_address() -> str:
-    """The address that this machine has for others; its name where no network is up."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))  # sends nothing: it only chooses the way out
-        except OSError:
-            return socket.gethostname()
-        return str(probe.getsockname()[0])

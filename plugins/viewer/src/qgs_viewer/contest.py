@@ -52,7 +52,7 @@ OF_THE_METHOD = ("optimizer.parts", "training.judge_inputs", "evaluation.tuning"
 
 @dataclass(frozen=True)
 class Entry:
-    """One model with its recipe and evaluation."""
+    """A judged model with its recipe."""
 
     recipe: Recipe
     contender: Contender
@@ -101,15 +101,12 @@ def compete(name: str, recipe: Recipe, run: Path, device: str = "auto") -> Entry
 
 
 def checkpoints(names: Sequence[str]) -> dict[str, Path]:
-    """The files of the models `names` (see `checkpoint_path`), by short name."""
+    """Short name to file of each model (see `checkpoint_path`)."""
     return dict(zip(short_names(names), map(checkpoint_path, names), strict=True))
 
 
 def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[Entry]:
-    """The models in `files`, of `checkpoints`, on unseen scenes, or on held-out photos.
-
-    Raises as `CheckpointFile` and the data do, and ValueError where the recipes do not judge alike.
-    """
+    """The models in `files` on unseen scenes, or on held-out photos; raises as `recipes_alike`."""
     recipes, entries = recipes_alike(files, photos), []
     for name, path in files.items():
         with CheckpointFile(path) as file:
@@ -121,9 +118,9 @@ def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[En
 
 
 def recipes_alike(files: Mapping[str, Path], photos: str | None) -> dict[str, Recipe]:
-    """The recipes of `files`, of `checkpoints`; with the data at `photos` in place of their own.
+    """The recipes of `files`, with the data at `photos` in place of their own.
 
-    Raises as `CheckpointFile` and the data do, and ValueError where they do not judge alike.
+    Raises ValueError where they do not judge alike, and as `CheckpointFile` and the data do.
     """
     recipes = dict[str, Recipe]()
     for name, path in files.items():
@@ -211,16 +208,10 @@ def progress(files: Mapping[str, Path]) -> str:
     return "; ".join(texts)
 
 
-def baselines(entry: Entry) -> dict[str, dict[str, float | None]]:
-    """Scores, by name, of what needs no model on the views that `entry` was judged on."""
-    return {n.replace("_", " ").capitalize(): entry.evaluation.means(n) for n in BASELINES}
-
-
-def table_of(entries: Sequence[Entry], title: str = "Unseen scenes") -> Table:
+def table_of(report: Report) -> Table:
     """The comparison as a table for the terminal."""
-    rows = [entry.contender for entry in entries]
-    columns = entries[0].evaluation.columns
-    table = Table(title=title, caption="best in green", box=box.SIMPLE_HEAD)
+    rows, columns = report.contenders, report.columns
+    table = Table(title=report.scenes, caption="best in green", box=box.SIMPLE_HEAD)
     table.pad_edge, table.collapse_padding = False, True
     table.add_column("", no_wrap=True)
     for heading in (*(column.title for column in columns.values()), "Gaussians", "parameters"):
@@ -234,7 +225,7 @@ def table_of(entries: Sequence[Entry], title: str = "Unseen scenes") -> Table:
             cells.append(f"[green]{cell}[/green]" if is_best else cell)
         table.add_row(c.name, *cells, f"{c.gaussians:,}", f"{c.parameters / 1e6:.2f} M")
     table.add_section()
-    for baseline, scores in baselines(entries[0]).items():
+    for baseline, scores in report.baselines.items():
         cells = [column.shown(scores[name]) for name, column in columns.items()]
         table.add_row(baseline, *cells, "–", "–", style="dim")
     return table
@@ -248,20 +239,20 @@ def report_of(
     notes: Sequence[str] = (),
 ) -> Report:
     """The comparison, pictured on PICTURED_SCENES test scenes; the rest as in `Report`."""
-    recipe = entries[0].recipe
+    recipe, evaluation = entries[0].recipe, entries[0].evaluation
     few = recipe.evaluation.model_copy(update={"scenes": PICTURED_SCENES, "samples": 1})
     source = recipe.build_data()
     samples = evaluation_samples(source, recipe.views, few)[:PICTURED_SCENES]
     height, width = recipe.tree["data"]["image_size"]
     plugins = {name: v for entry in entries for name, v in entry.recipe.plugin_versions.items()}
     software = {"torch": torch.__version__, **plugins}
-    device = f"CPU with {os.cpu_count()} cores ({platform.machine()})"
-    if torch.cuda.is_available():
-        device = torch.cuda.get_device_name()
+    gpu = torch.cuda.is_available()
+    cores = f"CPU with {os.cpu_count()} cores ({platform.machine()})"
+    device = torch.cuda.get_device_name() if gpu else cores
     threads = counted(torch.get_num_threads(), "thread")
     names = listed((entry.contender.name for entry in entries), most=3)
     return Report(
-        columns=entries[0].evaluation.columns,
+        columns=evaluation.columns,
         title=f"{names}: {scenes.lower()}",
         lede=lede,
         scenes=scenes,
@@ -269,7 +260,7 @@ def report_of(
         meanings=[summary_of(p.component) for at, p in recipe.parts.items() if at[0] == "metrics"],
         commands=NEXT,
         contenders=[entry.contender for entry in entries],
-        baselines=baselines(entries[0]),
+        baselines={n.replace("_", " ").capitalize(): evaluation.means(n) for n in BASELINES},
         samples=samples,
         depths=[true_depth(source, sample) for sample in samples],
         facts={

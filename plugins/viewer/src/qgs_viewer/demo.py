@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,7 +13,7 @@ from rich.console import Console
 from qgs.cli.options import Device, Photos, Runs
 
 if TYPE_CHECKING:
-    from qgs_viewer.contest import Entry
+    from qgs_viewer.report import Report
 
 MODELS = ("rooms/tokengs-64", "rooms/locus-64")
 RECIPES = ("recipes/tiny/tokengs.yaml", "recipes/tiny/locus.yaml")
@@ -109,7 +109,7 @@ def show_trained(
     for note in notes:
         console.print(note, soft_wrap=True, highlight=False, markup=False)
     facts = {"Training": contest.progress(files)}
-    _write(entries, lede, facts, target, console, scenes, notes)
+    write(contest.report_of(entries, lede, facts, scenes, notes), target, console)
 
 
 def compare_trainings(
@@ -119,9 +119,8 @@ def compare_trainings(
     from qgs.engine.guard import TrainingError
     from qgs_viewer import contest
 
-    console = Console()
+    console, entries = Console(), []
     resolved = contest.resolve_fairly([Path(recipe) for recipe in recipes], seconds, seed)
-    entries = []
     for number, (name, recipe) in enumerate(resolved.items(), start=1):
         console.print(f"[bold]{number}/{len(resolved)}  {name}[/bold]  {seconds:g} s of training")
         try:
@@ -131,31 +130,23 @@ def compare_trainings(
             raise typer.Exit(1) from None
     facts = {"Budget": f"{seconds:g} seconds of training each, seed {seed}"}
     lede = "Trained by one command on the same scenes, judged on scenes that none of them saw."
-    _write(entries, lede, facts, target, console)
+    write(contest.report_of(entries, lede, facts), target, console)
 
 
-def _write(
-    entries: Sequence[Entry],
-    lede: str,
-    facts: Mapping[str, str],
-    target: Path,
-    console: Console,
-    scenes: str = "Unseen scenes",
-    notes: Sequence[str] = (),
-) -> None:
-    """Show the table; write the report and, by every model, the first scene as a PLY."""
+def write(report: Report, target: Path, console: Console) -> None:
+    """Show the table; write the report and, of every model, the first scene as a PLY."""
     import torch
 
     from qgs.io.files import write_text
     from qgs.io.gaussians import save_ply
-    from qgs_viewer import contest
+    from qgs_viewer.contest import table_of
     from qgs_viewer.report import report_html
 
-    console.print(contest.table_of(entries, scenes))
-    for name, fact in facts.items():
-        console.print(f"{name}: {fact}", soft_wrap=True, highlight=False, style="dim")
-    console.print("Writing the report", style="dim")
-    report = contest.report_of(entries, lede, facts, scenes, notes)
+    console.print(table_of(report))
+    for name in ("Training", "Budget"):
+        if name in report.facts:
+            fact = f"{name}: {report.facts[name]}"
+            console.print(fact, soft_wrap=True, highlight=False, style="dim")
     page = target / "report.html"
     write_text(page, report_html(report))
     console.print(f"\n[bold]Report:[/bold] {page.resolve()}", soft_wrap=True)

@@ -14,13 +14,12 @@ from qgs.types import Gaussians, ImageMemory, QueryState, SpatialSupport, Views
 from qgs_viewer.placement import Placement, Splats, on_photo, patch_centers, splats
 
 Background = tuple[float, float, float]
-NEUTRAL: Background = RendererConfig().background
-"""Behind Gaussians that nothing is known of: what models are trained with unless told otherwise."""
+NEUTRAL: Background = RendererConfig().background  # of models, unless their recipe changes it
 
 
 @dataclass(frozen=True)
 class Inside:
-    """What a model had in hand: the image memory, and the state after each layer, 0 the start."""
+    """A model's image memory, and its state after each layer, 0 the start."""
 
     model: QueryGaussianModel
     memory: ImageMemory
@@ -29,10 +28,10 @@ class Inside:
 
 @dataclass(frozen=True)
 class Look:
-    """Gaussians (1, G), the views (1, V) they were made of with labels, and their place.
+    """Gaussians (1, G), the input views (1, V) with labels, and the placement in the shown world.
 
-    inside: None where no model is known, so that there are no queries. frames: numbers of the views
-    in their scene. background: RGB in [0, 1] that the Gaussians are meant to be seen before.
+    inside: None without a model; then there are no queries. frames: numbers of the views in their
+    scene. background: RGB in [0, 1] behind the Gaussians.
     """
 
     gaussians: Gaussians
@@ -69,10 +68,7 @@ class Look:
         return slice(query * each, (query + 1) * each)
 
     def support(self, layer: int) -> SpatialSupport | None:
-        """Supports (1, N) after a layer in the shown world, layer 0 the learned start.
-
-        None for queries without a position.
-        """
+        """Supports (1, N) after a layer, 0 the start, in the shown world; None without anchors."""
         if self.inside is None:
             return None
         found = self.inside.model.queries.support(self.inside.states[layer])
@@ -84,11 +80,11 @@ class Look:
     def attention(self, query: int, layer: int) -> AttentionWeights | None:
         """What a query reads in a layer, (1, h, 1, M), patches of `grid`.
 
-        None if it tells nothing, in layer 0, and where what is read are no patches of photos.
+        None where it is not explained, in layer 0, and of tokens that are no patches of photos.
         """
         if self.inside is None or self.inside.memory.grid is None:
             return None
-        return self._told("cross_attention", query, layer)
+        return self._explained("cross_attention", query, layer)
 
     @property
     def grid(self) -> tuple[int, int, int]:
@@ -99,9 +95,9 @@ class Look:
 
     def self_attention(self, query: int, layer: int) -> AttentionWeights | None:
         """The queries that a query reads in a layer, (1, h, 1, N); None as for `attention`."""
-        return self._told("self_attention", query, layer)
+        return self._explained("self_attention", query, layer)
 
-    def _told(self, part: str, query: int, layer: int) -> AttentionWeights | None:
+    def _explained(self, part: str, query: int, layer: int) -> AttentionWeights | None:
         if self.inside is None or not layer:
             return None
         self.trace([query])
@@ -132,7 +128,7 @@ class Look:
     def strongest(self, query: int, layer: int, count: int, depth: float) -> "Reading | None":
         """The `count` patches that a query attends to most, on photos `depth` from their cameras.
 
-        Mean over heads. None where attention tells nothing, or tokens are no patches.
+        Mean over heads; None as for `attention`.
         """
         weights = self.attention(query, layer)
         if weights is None or self.views is None:
@@ -149,10 +145,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Reading:
-    """Patches that a query reads: points (k, 3) in the shown world, shares (k,) of attention.
-
-    side: width of a patch there.
-    """
+    """Patches: points (k, 3) and width `side` in the shown world, shares (k,) of attention."""
 
     points: Tensor
     shares: Tensor

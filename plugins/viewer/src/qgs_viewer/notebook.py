@@ -24,20 +24,20 @@ def pipeline_svg(
 ) -> str:
     """Boxes and arrows in the colour of the text around.
 
-    kinds, counts: by slot, those of decoder layers as "decoder.SLOT": components, parameters.
+    kinds, counts: components and parameters by slot, of decoder layers as "decoder.SLOT".
     learned: whether queries start from parameters alone, and only the decoder reads photos.
     """
 
-    def told(*slots: str) -> list[str]:
+    def lines_of(*slots: str) -> list[str]:
         lines = [f"{slot.split('.')[-1]}: {kinds[slot]}" for slot in slots if kinds[slot]]
         return [*lines, f"{sum(counts[slot] for slot in slots):,} parameters"]
 
     inside = [slot for slot in counts if slot.startswith("decoder.")]
     columns = [  # of boxes, of lines
         [["views", "photos", "cameras"]],
-        [told("encoder"), told("queries")],
-        [[f"{depth} decoder layers", *told(*inside)]],
-        [told("head", "centers")],
+        [lines_of("encoder"), lines_of("queries")],
+        [[f"{depth} decoder layers", *lines_of(*inside)]],
+        [lines_of("head", "centers")],
         [["Gaussians"]],
     ]
     lows = [sum(len(box) * LINE + 6 + PAD for box in column) + PAD for column in columns]

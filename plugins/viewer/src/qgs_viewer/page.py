@@ -25,11 +25,10 @@ if (origin === "null") window.Worker = class extends Worker {
 def scene_html(
     look: Look, choice: Choice | None = None, *, dark: bool = False, start: Look | None = None
 ) -> str:
-    """A page on which `look` can be turned: Gaussians, photos, anchors, and a picked query.
+    """A page on which `look` can be turned: 0.8 MB of viser's code and 40 bytes a Gaussian.
 
-    choice: what is shown of it; by default the scene with the anchors of the last layer. start:
-    whose first view and size of photos are taken, by default its own. Some 0.8 MB for viser's own
-    code, and about 40 bytes more a Gaussian.
+    choice: by default the scene with the anchors of the last layer. start: look that gives the
+    first view and the size of photos, by default its own.
     """
     start = start or look
     with quiet_server() as server:
@@ -43,8 +42,8 @@ def scene_html(
 def scenes_html(looks: Mapping[str, Look], choices: Mapping[str, Choice] | None = None) -> str:
     """A page of scenes side by side, by name, all seen from `shared_start` at first.
 
-    choices: what is shown of each, by default what `scene_html` shows. The page holds viser's code
-    once, and is dark where the page or the system around it is.
+    choices: by default as in `scene_html`. The page holds viser's code once, and is dark where the
+    page or the system around it is.
     """
     start = shared_start(looks.values())
     chosen = choices or {}

@@ -20,7 +20,7 @@ from qgs_viewer.sources import ModelSource, Source
 from qgs_viewer.stage import Stage
 
 MOST_BOXES = 24
-"""Up to so many photos each have a check box; more are named in a line of text."""
+"""Photos that each have a check box; more are named in a line of text."""
 PHOTO_SIDE = 192
 """Pixels on the longer side of photos that show attention."""
 NONE = -1
@@ -58,12 +58,11 @@ class Panel:
 
     def _head(self) -> None:
         gui, queries = self.server.gui, self.look.queries
-        told = f"**{plain(self.source.title)}**\n\n{self.look.gaussians.count:,} Gaussians"
+        text = f"**{plain(self.source.title)}**\n\n{self.look.gaussians.count:,} Gaussians"
         if queries:
-            told += f" of {queries:,} queries. Click on one"
-            told += " or" if self.look.support(0) is None else ", on an anchor, or"
-            told += " type its number; Esc, or a click beside everything, shows all again."
-        gui.add_markdown(told)
+            text += f" of {queries:,} queries. Click on one (or on an anchor), or type its number; "
+            text += "Esc, or a click beside everything, shows all again."
+        gui.add_markdown(text)
         if queries:
             names = ("of the scene", "by query")
             self.colors = gui.add_dropdown("colours", names, initial_value=names[0])
@@ -81,23 +80,20 @@ class Panel:
             self._on(self.number, self._picked)
             self.everything = gui.add_button("Show all (Esc)", visible=False)
             self.everything.on_click(lambda _: self.pick(None))
-            gui.add_command("Show all queries", hotkey="escape").on_trigger(
-                lambda _: self.pick(None)
-            )
+            escape = gui.add_command("Show all queries", hotkey="escape")
+            escape.on_trigger(lambda _: self.pick(None))
             self.others = gui.add_dropdown("other queries", get_args(Others), initial_value="faint")
             self._on(self.others, lambda: {"others": self.others.value})
             hint = "Supports are those after this layer; 0 is the learned start."
             self.layer = gui.add_slider("layer", 0, depth, 1, depth, hint=hint)
             self._on(self.layer, lambda: {"layer": int(self.layer.value)})
-            hint = (
-                "Lines to so many patches that the query attends to most; broad and strong is much."
-            )
+            hint = "Lines to the patches that the query attends to most; broad and strong is much."
             self.patches = gui.add_slider("patches", 0, 96, 1, self.choice.patches, hint=hint)
             self._on(self.patches, lambda: {"patches": int(self.patches.value)})
             if self.look.support(0) is not None:
                 self.anchors = gui.add_checkbox("all anchors", True)
                 self._on(self.anchors, lambda: {"anchors": self.anchors.value})
-            self._said = gui.add_markdown("")
+            self._text = gui.add_markdown("")
             blank = np.full((8, 8, 3), 255, np.uint8)
             add = partial(gui.add_image, blank, visible=False, format="png")
             self.pictures = {part: add(label=_CAPTIONS[part]) for part in PARTS}
@@ -111,11 +107,10 @@ class Panel:
 
     def _inputs(self) -> None:
         gui, labels = self.server.gui, self.source.labels
+        self.boxes: list[Any] = []
         with gui.add_folder("reconstructed from"):
             if len(labels) <= MOST_BOXES:
-                gui.add_markdown(
-                    "Ticked photos are the inputs. Tick others: the scene is made anew."
-                )
+                gui.add_markdown("Ticked photos are the inputs. Tick others to change them.")
                 chosen = set(self.source.frames)
                 self.boxes = [gui.add_checkbox(x, f in chosen) for f, x in enumerate(labels)]
                 for box in self.boxes:
@@ -148,10 +143,7 @@ class Panel:
         self.number.value = NONE if query is None else query  # calls back
 
     def take(self, frames: Sequence[int]) -> None:
-        """Reconstruct from these frames, unless they are shown.
-
-        Raises ValueError for frames that do not fit, and OSError as photos do.
-        """
+        """Reconstruct from these frames. Raises ValueError where they do not fit, and OSError."""
         with self._lock:
             if tuple(frames) == tuple(self.look.frames):
                 return
@@ -172,33 +164,26 @@ class Panel:
             if part in found:
                 handle.image = sheet(found[part])
         self.everything.visible = query is not None
-        self._said.content = "" if query is None else told(look, query, layer)
+        self._text.content = "" if query is None else description(look, query, layer)
 
     def _reframed(self, event: Any) -> None:
+        """Reconstruct from the chosen photos; if they do not fit, reset the boxes, not the text."""
         with self._lock:
             if self._resetting:
                 return
             try:
-                self.take(self._frames())
+                if self.boxes:
+                    self.take([frame for frame, box in enumerate(self.boxes) if box.value])
+                else:
+                    assert isinstance(self.source, ModelSource)
+                    self.take(frame_list(self.frames.value, "frames", self.source.scene))
             except (ValueError, OSError) as error:
-                self._reset_boxes()
+                self._resetting = True
+                for frame, box in enumerate(self.boxes):
+                    box.value = frame in self.look.frames
+                self._resetting = False
                 if event.client is not None:
                     event.client.add_notification("Not reconstructed", str(error), color="red")
-
-    def _reset_boxes(self) -> None:
-        """Check boxes say again what is shown; what was typed stays, to be mended."""
-        if len(self.source.labels) > MOST_BOXES:
-            return
-        self._resetting = True
-        for frame, box in enumerate(self.boxes):
-            box.value = frame in self.look.frames
-        self._resetting = False
-
-    def _frames(self) -> list[int]:
-        if len(self.source.labels) <= MOST_BOXES:
-            return [frame for frame, box in enumerate(self.boxes) if box.value]
-        assert isinstance(self.source, ModelSource)
-        return frame_list(self.frames.value, "frames", self.source.scene)
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         with self._lock:
@@ -223,8 +208,8 @@ def plain(text: str) -> str:
     return re.sub(r"[^\w\s]|_", lambda sign: f"&#{ord(sign[0])};", " ".join(text.split()))
 
 
-def told(look: Look, query: int, layer: int) -> str:
-    """Where a query's anchor is, how large, how far it moved, and what it reads, in words."""
+def description(look: Look, query: int, layer: int) -> str:
+    """A query's Gaussians, its anchor after a layer, and why no attention is shown, as Markdown."""
     members, lines = look.members(query), [f"**query {query}**, layer {layer}"]
     lines.append(f"Gaussians {members.start} to {members.stop - 1}")
     found = look.support(layer)

@@ -49,8 +49,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class Splats:
-    """G Gaussians as viewers take them: float32 centers (G, 3), covariances (G, 3, 3), opacities
-    (G, 1), and colors (G, 3) in [0, 1]."""
+    """G Gaussians: float32 centers (G, 3), covariances (G, 3, 3), opacities (G, 1), RGB (G, 3)."""
 
     centers: np.ndarray
     covariances: np.ndarray

@@ -47,10 +47,10 @@ class Contender:
 class Report:
     """A comparison of `contenders`, in order, by `columns`: each score and how it is shown.
 
-    baselines: by name, their scores on the same views. samples: the scenes to picture, `scenes` in
-    a heading. depths: for each the true depth (T, 1, H, W) of its targets in the model's units,
-    where known. facts: what was run where. lede: what it shows, in a sentence or two. notes: what
-    to know before the figures. meanings: of the columns. commands: what each does, to go on with.
+    baselines: name to scores on the same views. samples: the pictured scenes, headed `scenes`.
+    depths: for each the true depth (T, 1, H, W) of its targets in the model's units, where known.
+    lede: a sentence or two below the title. notes: remarks above the table. meanings: of the
+    columns. commands: next commands, with what each does.
     """
 
     columns: Mapping[str, Column]

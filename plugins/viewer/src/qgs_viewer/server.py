@@ -54,7 +54,7 @@ def up_of(look: Look) -> torch.Tensor:
 def first_eye(look: Look) -> tuple[np.ndarray, np.ndarray]:
     """Where the viewer stands at first and what it looks at, both (3,), shown world.
 
-    Behind cameras that look the same way; outside of those that stand around something.
+    Behind cameras that look the same way; outside of those that surround something.
     """
     middle = look.placement.points(look.gaussians.means[0]).median(0).values
     unit = distance_to(look)

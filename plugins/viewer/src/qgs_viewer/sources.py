@@ -1,12 +1,15 @@
 """From what a user names to something that gives looks: a PLY, a reconstruction, a model."""
 
+import json
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from qgs.analysis.reconstruction import choose_frames, choose_sample
@@ -22,50 +25,44 @@ from qgs.io.gaussians import load_ply
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras
 from qgs.wording import listed
-from qgs_viewer.files import CAMERAS, PLY, REFINED, Finished, read_finished
-from qgs_viewer.look import Look, look_inside
+from qgs_viewer.look import NEUTRAL, Look, look_inside
 from qgs_viewer.placement import Placement
 
+PLY, CAMERAS = "gaussians.ply", "cameras.json"
+"""Files in the folder of a finished reconstruction."""
+REFINED = "refined"
+"""The folder in it with the result of `--refine`."""
 SAME = 0.02
 """Median distance of means, per spread of the scene, up to which a model made a PLY's Gaussians.
 
 A finished reconstruction keeps its photos in 8 bits, which moves means by some thousandths."""
 
 
-class Source(ABC):
-    """What is looked at. title: its name. notes: what is to be said of it. frames: of the inputs
-    at first. labels: of all frames; none where the inputs cannot be changed."""
+class Source:
+    """Something to look at: Gaussians of no known model, whose inputs cannot be changed.
 
-    title: str
-    notes: Sequence[str] = ()
+    notes: remarks for the user. frames: of the inputs at first. labels: of all frames; none where
+    the inputs cannot be changed.
+    """
+
     frames: Sequence[int] = ()
     labels: Sequence[str] = ()
 
-    @abstractmethod
+    def __init__(self, title: str, notes: Sequence[str] = (), fixed: Look | None = None) -> None:
+        self.title, self.notes, self.fixed = title, notes, fixed
+
     def look(self, frames: Sequence[int]) -> Look:
         """The scene as made of these frames. Raises ValueError for frames that do not fit."""
+        assert self.fixed is not None
+        return self.fixed
 
     def cameras(self) -> Cameras | None:
         """Cameras (F,) of all frames in the shown world; None without."""
         return None
 
 
-class FixedSource(Source):
-    """Gaussians that no model is known of, whose inputs cannot be changed."""
-
-    def __init__(self, fixed: Look, title: str, notes: Sequence[str]) -> None:
-        self.fixed, self.title, self.notes = fixed, title, notes
-
-    def look(self, frames: Sequence[int]) -> Look:
-        """The one look there is."""
-        return self.fixed
-
-
 class ModelSource(Source):
-    """A model with a scene. The shown world is that of the first look.
-
-    Frames may be any of the scene: another number than the recipe's is what the user asks for.
-    """
+    """A model with a scene, of any number of its frames. The first look's world is shown."""
 
     def __init__(
         self,
@@ -76,8 +73,9 @@ class ModelSource(Source):
         title: str,
         notes: Sequence[str] = (),
     ) -> None:
+        super().__init__(title, notes)
         self.model, self.scene, self.views = model, scene, views
-        self.frames, self.title, self.notes = tuple(frames), title, notes
+        self.frames = tuple(frames)
         self.labels = [scene.label(frame) for frame in range(len(scene))]
         self.world = own_world(scene, self.frames, views)
 
@@ -103,7 +101,7 @@ class ModelSource(Source):
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the command was asked for, beside SOURCE; see `qgs view --help`."""
+    """Options of `qgs view`."""
 
     photos: str | None = None
     scene: str | None = None
@@ -127,70 +125,123 @@ def open_source(name: str, wanted: Wanted) -> Source:
         raise ValueError(
             f"{listed(given)}: only for a model, and {name} holds Gaussians; leave that out"
         )
-    return _of_finished(path, wanted.device) if finished else _of_ply(path)
-
-
-def _of_ply(path: Path) -> Source:
+    if finished:
+        return _of_finished(path, wanted.device)
     note = "A PLY file tells neither queries nor photos; name the model to see them."
-    return FixedSource(Look(load_ply(path)), path.name, (note,))
+    return Source(path.name, (note,), Look(load_ply(path)))
+
+
+class FinishedScene(Scene):
+    """The views that a reconstruction was compared with, as frames in its world."""
+
+    def __init__(self, name: str, folder: Path, views: Sequence[dict[str, Any]]) -> None:
+        self.name, self._folder, self._views = name, folder, views
+
+    @property
+    def cameras(self) -> Cameras:
+        """All views of cameras.json."""
+        c2w = torch.tensor([view["c2w"] for view in self._views], dtype=torch.float64)
+        lenses = torch.tensor([view["intrinsics"] for view in self._views], dtype=torch.float64)
+        height, width = self._views[0]["size"]
+        return Cameras(c2w, lenses, (height, width))
+
+    def images(self, frames: Sequence[int]) -> Tensor:
+        """Photos, the left part of the pictures in views/."""
+        height, width = self.cameras.size
+        pictures = []
+        for view in (self._views[frame] for frame in frames):
+            name = f"{view['frame']:05d}_{view['kind'].split()[0]}.png"
+            with Image.open(self._folder / "views" / name) as image:
+                pixels = np.array(image.convert("RGB"))[:height, :width]
+            pictures.append(torch.from_numpy(pixels).permute(2, 0, 1).float() / 255)
+        return torch.stack(pictures)
+
+    def label(self, frame: int) -> str:
+        """The photo's file, or its number in the scene, not its place in cameras.json."""
+        view = self._views[frame]
+        return str(view.get("photo") or f"frame {view['frame']}")
+
+    def frame_name(self, frame: int) -> str:
+        """The photo's file, or its number in the scene."""
+        return self.label(frame).removeprefix("frame ")
+
+
+def read_finished(folder: Path) -> tuple[Look, FinishedScene, Mapping[str, Any]]:
+    """What `qgs reconstruct --out FOLDER` wrote, the look without queries, and cameras.json.
+
+    Raises ValueError with the file that is broken.
+    """
+    path, gaussians = folder / CAMERAS, load_ply(folder / PLY)
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        views = record["views"]
+        scene = FinishedScene(str(record["scene"]), folder, views)
+        inputs = tuple(place for place, view in enumerate(views) if view["kind"] == "input")
+        scene.images(range(len(views)))  # fails now where a picture is missing
+        red, green, blue = (min(max(float(c), 0), 1) for c in record.get("background") or NEUTRAL)
+        photos = views_in((torch.eye(4).double(), torch.ones(())), scene, inputs)
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise ValueError(
+            f"{path} is no record of a reconstruction ({type(error).__name__}: {error}); make it "
+            "again with `qgs reconstruct`, or view the PLY alone"
+        ) from error
+    labels = [scene.label(frame) for frame in inputs]
+    look = Look(gaussians, photos, labels, inputs, background=(red, green, blue))
+    return look, scene, record
 
 
 def _of_finished(folder: Path, device: str) -> Source:
-    found = read_finished(folder)
-    title = f"{found.scene.name} ({folder.name})"
-    views = views_in((torch.eye(4).double(), torch.ones(())), found.scene, tuple(found.inputs))
-    labels = [found.scene.label(frame) for frame in found.inputs]
-    plain = Look(found.gaussians, views, labels, tuple(found.inputs), background=found.background)
-    refined = folder / REFINED
-    there = (refined / CAMERAS).is_file()
-    beside = [f"refined on photos: `qgs view {refined}`."] if there else []
-    if note := _no_queries(found, folder):
-        return FixedSource(plain, title, (note, *beside))
+    plain, scene, record = read_finished(folder)
+    title, name = f"{scene.name} ({folder.name})", str(record.get("model") or "")
+    there = (folder / REFINED / CAMERAS).is_file()
+    beside = [f"refined on photos: `qgs view {folder / REFINED}`."] if there else []
+    if note := _no_queries(record, name, folder):
+        return Source(title, (note, *beside), plain)
     try:
-        with CheckpointFile(found.model) as file:
+        with CheckpointFile(name) as file:
             model, recipe = file.model(device), file.recipe
-        fixed = _finished_views(found, recipe.views)
-        source = ModelSource(model, found.scene, fixed, found.inputs, title, beside)
-        means = source.look(found.inputs).gaussians.means
+        views = _finished_views(scene, plain.frames, recipe.views)
+        source = ModelSource(model, scene, views, plain.frames, title, beside)
+        means = source.look(plain.frames).gaussians.means
     except (ValueError, OSError) as error:
         note = f"Its model cannot be used, so its queries are not shown: {error}"
-        return FixedSource(plain, title, (note, *beside))
-    if differs := _difference(means, found.gaussians.means):
-        note = f"{found.model} makes other Gaussians today ({differs}): its queries are not shown."
-        return FixedSource(plain, title, (note, *beside))
+        return Source(title, (note, *beside), plain)
+    if differs := _difference(means, plain.gaussians.means):
+        note = f"{name} makes other Gaussians today ({differs}): its queries are not shown."
+        return Source(title, (note, *beside), plain)
     return source
 
 
-def _no_queries(found: Finished, folder: Path) -> str:
+def _no_queries(record: Mapping[str, Any], model: str, folder: Path) -> str:
     """Why the queries of a reconstruction are not shown; "" where they are."""
-    if found.changed == "refined":
+    if record.get("refinement"):
         beside = folder.resolve().parent if folder.resolve().name == REFINED else None
         where = f": `qgs view {beside}`" if beside and (beside / CAMERAS).is_file() else ""
         return f"It was refined; only the prediction of the model has queries{where}."
-    if found.changed == "tuned":
+    if record.get("tuning"):
         return "It was tuned on its photos, so its model alone does not make these Gaussians."
-    if not found.model:
+    if not model:
         return "Its cameras.json names no model, so its queries are not known."
-    if "://" in found.model:  # nothing is fetched because a file says so
-        return f"Its queries are not shown; to fetch the model: `qgs view {found.model} PHOTOS`."
+    if "://" in model:  # nothing is fetched because a file says so
+        return f"Its queries are not shown; to fetch the model: `qgs view {model} PHOTOS`."
     return ""
 
 
-def _finished_views(found: Finished, views: ViewsConfig) -> ViewsConfig:
+def _finished_views(scene: Scene, inputs: Sequence[int], views: ViewsConfig) -> ViewsConfig:
     """How inputs come from the world of a reconstruction, which is scaled, into the model's.
 
     `constant` and `auto` have one factor for all inputs, now 1; `distance` has one for each choice
     of inputs. Where it gives another than 1 for the first ones, `--set views.scale` overrode it.
     """
     if views.scale == "distance":
-        _, factor = own_world(found.scene, tuple(found.inputs), views)
+        _, factor = own_world(scene, tuple(inputs), views)
         if math.isclose(float(factor), 1, rel_tol=1e-3):
             return views
     return views.model_copy(update={"scale": "constant", "scale_factor": 1.0})
 
 
 def _difference(means: Tensor, others: Tensor) -> str:
-    """How `means` differ from `others`, in words; "" where they are the same."""
+    """How `means` differ from `others`; "" where they are the same."""
     if means.shape != others.shape:
         return f"{means.shape[1]:,} instead of {others.shape[1]:,}"
     means, others = means.cpu().double(), others.cpu().double()

@@ -42,9 +42,9 @@ class Stage:
     def put(
         self, look: Look, choice: Choice, every: Cameras | None = None, unit: float | None = None
     ) -> None:
-        """Draw a look that was not there before. every: cameras of all frames, drawn thin.
+        """Draw a new look. every: cameras of all frames, drawn thin.
 
-        unit: what photos and anchors are sized by, by default `distance_to` the look.
+        unit: length that sizes photos and anchors, by default `distance_to` the look.
         """
         self.unit = unit or distance_to(look)
         plain = np.full((8, 8, 3), 255.0) * look.background
@@ -68,8 +68,8 @@ class Stage:
             return
         shown = painted(look, choice)
         factor = shown.magnification
-        parts = (shown.centers * factor, shown.covariances * factor**2)
-        parts = (*parts, shown.colors, shown.opacities)
+        sizes = shown.centers * factor, shown.covariances * factor**2
+        parts = *sizes, shown.colors, shown.opacities
         if self._gaussians is None:
             self._gaussians = self.scene.add_gaussian_splats("/gaussians", *parts, scale=1 / factor)
         else:
@@ -150,9 +150,8 @@ class Stage:
     def _draw_reading(self, look: Look, choice: Choice) -> None:
         """Lines from where the query was when it read to the patches that it read most.
 
-        What is read more is stronger in colour, by its share of the most that is read, and has a
-        broader line. A square of half its width marks each patch, a little nearer to the camera
-        than the photo, which would hide it.
+        Colour and width grow with the share of the most that is read. A square of half its width
+        marks each patch, a little nearer to the camera than the photo, which would hide it.
         """
         reading = None
         if choice.query is not None and choice.layer and choice.patches:
@@ -203,9 +202,9 @@ def frustum_lines(eyes: Tensor, ends: Tensor) -> Tensor:
 
 
 def distance_to(look: Look) -> float:
-    """How far the scene is from the input cameras: the median of what they see of it, shown world.
+    """Median depth of the opaque Gaussians that the input cameras see, shown world.
 
-    Without cameras, how far Gaussians are from their middle. What is nearly clear does not count.
+    Without cameras the median distance of the Gaussians from their middle.
     """
     gaussians = look.gaussians
     solid = gaussians.means[0, gaussians.opacities[0] > SOLID].detach().cpu()
