@@ -69,7 +69,10 @@ def test_inference_leaves_the_model_alone_and_a_step_trains_every_part() -> None
     assert [name for name in same if not name.endswith("k_norm.bias")] == []
 
 
-@pytest.mark.parametrize(("operation", "least", "most"), [("forward", 1, 3), ("step", 4, math.inf)])
+@pytest.mark.parametrize(
+    ("operation", "least", "most"),
+    [("forward", 1, 3), pytest.param("step", 4, math.inf, marks=pytest.mark.slow)],
+)
 def test_memory_of_a_fresh_process(operation: Operation, least: float, most: float) -> None:
     """A step holds weights, gradients and two moments."""
     ballast = torch.zeros(2**26)  # 256 MiB that the other process must not count
