@@ -40,14 +40,6 @@ def test_a_traced_pass_predicts_the_same(model, views):
     assert torch.equal(plain.gaussians.means, traced.gaussians.means)
 
 
-def test_what_cannot_be_told_is_recorded_as_absent(model, views, monkeypatch):
-    monkeypatch.setattr(type(model.decoder[0].self_attention), "explain", lambda *_: None)
-    with qgs.trace(model, layers=[1]) as trace:
-        model(views)
-    assert trace.layers[1].self_attention is None
-    assert "ContentSelfAttention" in trace.layers[1].absent["self_attention"]
-
-
 def test_hooks_go_away_even_on_errors(model, views):
     images = torch.zeros(1, 2, 3, 36, 36)
     odd = Views(images, Cameras(views.cameras.c2w, views.cameras.intrinsics, (36, 36)))

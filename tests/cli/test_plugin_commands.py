@@ -65,7 +65,6 @@ def test_it_is_listed_without_an_import_and_imported_when_called(offer: Offer) -
     [
         ("import no_such_package", "`_test_colours:plugin`: ModuleNotFoundError: No module named"),
         ("plugin = 3", "not a typer.Typer; update colours 2.1"),
-        ("", "AttributeError"),
         ("raise SystemExit('no display')", "SystemExit: no display; update colours 2.1"),
     ],
 )

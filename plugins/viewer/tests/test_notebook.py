@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from qgs_viewer.notebook import model_html, prediction_png, show_pictures
+from qgs_viewer.notebook import prediction_png, show_pictures
 from small import model_of, sample_of
 
 import qgs
-from qgs.composer import resolve
 from qgs.types import Gaussians
 
 SPACE = "{http://www.w3.org/2000/svg}"
@@ -39,13 +38,6 @@ def test_a_model_shows_the_way_from_views_to_gaussians(known):
     assert_tidy(svg)
     assert len(list(svg.iter(f"{SPACE}path"))) == 5, "arrows"
     assert "#" not in html[: html.index("<table>")], "it takes the colours of its page"
-
-
-def test_queries_made_of_photos_without_decoder_layers_are_drawn_so():
-    pytest.importorskip("qgs_gslrm")
-    svg = picture_in(model_html(resolve("recipes/tiny/gslrm.yaml").build_model("meta")))
-    assert_tidy(svg)
-    assert len(list(svg.iter(f"{SPACE}path"))) == 6, "an arrow to the queries too"
 
 
 def picture_in(html):

@@ -182,29 +182,6 @@ def test_a_distribution_adds_a_section_with_a_page(install):
     assert pages == ['<p title="a">&lt;</p>']
 
 
-SEVERAL = """
-from qgs_viewer.report import ReportSection, Tile
-import numpy as np
-
-def plugin(shown, samples):
-    for (contender, predictions) in shown:
-        for sample, prediction in zip(samples, predictions, strict=True):
-            picture = np.full((2, 2, 3), prediction.gaussians.count, np.uint8)
-            tile = Tile(picture, f"{prediction.gaussians.count} of {sample.scene}")
-            yield ReportSection(f"Mine of {sample.scene}", "", {contender.name: [tile]})
-    raise ValueError("no more")
-"""
-
-
-def test_one_function_gives_several_sections_of_all_scenes(install, caplog):
-    install("qgs-mine", "mine", SEVERAL, group=GROUP)
-    warn_once.cache_clear()
-    page = page_of(PLAIN, "plain")
-    assert page.index("<h2>Mine of test/000000</h2>") < page.index("<h2>Mine of test/000001</h2>")
-    assert "32 of test/000001" in page
-    assert "fails: ValueError: no more" in caplog.text, "what came before it stays"
-
-
 @pytest.mark.parametrize(
     "source",
     [

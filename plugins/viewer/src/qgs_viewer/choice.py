@@ -11,12 +11,9 @@ from qgs_viewer.look import Look
 from qgs_viewer.placement import Splats
 
 Others = Literal["shown", "faint", "hidden"]
-DARK = 0.3
-"""Mean of a background below which dark lines could not be seen."""
-FAINT = 0.12
-"""Opacity of the Gaussians of other queries, as a part of their own."""
-_PALE = 0.4
-"""Part of the background in the colours of Gaussians that are not picked."""
+DARK = 0.3  # mean of a background below which dark lines could not be seen
+FAINT = 0.12  # opacity of the Gaussians of other queries, as a part of their own
+_PALE = 0.4  # part of the background in the colours of Gaussians that are not picked
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import os
 import platform
 import signal
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +31,8 @@ from qgs_viewer.curves import Curves, curves_of
 from qgs_viewer.report import Contender, Report
 
 PICTURED_SCENES = 6
-WINDOWS = 6
-"""Scenes, and windows of a scene, that are judged of a user's photos."""
-HOLDOUT = 8
-"""Every n-th of a user's photos is held out; of fewer photos the middle one."""
+WINDOWS = 6  # scenes, and windows of a scene, that are judged of a user's photos
+HOLDOUT = 8  # every n-th of a user's photos is held out; of fewer photos the middle one
 AUTO_SCALE = "Each scene is scaled until what its cameras look at is 1 away (views.scale: auto)."
 NEXT = {
     "qgs demo PHOTOS": "shows this on a folder of your own photos, with camera poses",
@@ -52,11 +50,12 @@ OF_THE_METHOD = ("optimizer.parts", "training.judge_inputs", "evaluation.tuning"
 
 @dataclass(frozen=True)
 class Entry:
-    """A judged model with its recipe."""
+    """A judged model with its recipe. progress: how far its training has come."""
 
     recipe: Recipe
     contender: Contender
     evaluation: Evaluation
+    progress: str = ""
 
 
 def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:
@@ -110,10 +109,17 @@ def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[En
     recipes, entries = recipes_alike(files, photos), []
     for name, path in files.items():
         with CheckpointFile(path) as file:
-            model = file.model(choose_device(device))
+            model, step, training = (
+                file.model(choose_device(device)),
+                file.step,
+                file.recipe.training,
+            )
+        of = "" if training.seconds else f" of {training.steps:,}"
+        progress = "not known" if step is None else f"step {step:,}{of}"
         evaluation = evaluate(model, recipes[name], trained_on=model.trained_on)
         text = about(path) or describe(recipes[name])
-        entries.append(entry_of(name, recipes[name], evaluation, model, text, curves_of(path)))
+        entry = entry_of(name, recipes[name], evaluation, model, text, curves_of(path))
+        entries.append(replace(entry, progress=f"{name}: {progress}"))
     return entries
 
 
@@ -195,17 +201,6 @@ def remarks(entries: Sequence[Entry]) -> list[str]:
             models.setdefault(remark, []).append(entry.contender.name)
     texts = [f"{', '.join(names)}: {remark}." for remark, names in models.items()]
     return [*texts, AUTO_SCALE] if entries[0].recipe.views.scale == "auto" else texts
-
-
-def progress(files: Mapping[str, Path]) -> str:
-    """How far the training of each model in `files` has come, of the steps of its recipe."""
-    texts = []
-    for name, path in files.items():
-        with CheckpointFile(path) as file:
-            step, training = file.step, file.recipe.training
-        of = "" if training.seconds else f" of {training.steps:,}"
-        texts.append(f"{name}: " + ("not known" if step is None else f"step {step:,}{of}"))
-    return "; ".join(texts)
 
 
 def table_of(report: Report) -> Table:

@@ -108,7 +108,7 @@ def show_trained(
     notes = contest.remarks(entries) if photos is not None else []
     for note in notes:
         console.print(note, soft_wrap=True, highlight=False, markup=False)
-    facts = {"Training": contest.progress(files)}
+    facts = {"Training": "; ".join(entry.progress for entry in entries)}
     write(contest.report_of(entries, lede, facts, scenes, notes), target, console)
 
 

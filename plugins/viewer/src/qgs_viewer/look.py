@@ -58,9 +58,9 @@ class Look:
         """All Gaussians in the shown world."""
         return splats(self.gaussians, self.placement)
 
-    def query_of(self, gaussian: int) -> int | None:
-        """The query that a Gaussian is of; None without a model."""
-        return gaussian * self.queries // self.gaussians.count if self.queries else None
+    def query_of(self, gaussian: int) -> int:
+        """The query that a Gaussian belongs to."""
+        return gaussian * self.queries // self.gaussians.count
 
     def members(self, query: int) -> slice:
         """The Gaussians of a query."""

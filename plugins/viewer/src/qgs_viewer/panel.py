@@ -19,12 +19,9 @@ from qgs_viewer.server import stand
 from qgs_viewer.sources import ModelSource, Source
 from qgs_viewer.stage import Stage
 
-MOST_BOXES = 24
-"""Photos that each have a check box; more are named in a line of text."""
-PHOTO_SIDE = 192
-"""Pixels on the longer side of photos that show attention."""
-NONE = -1
-"""The number in the field `query` while none is picked."""
+MOST_BOXES = 24  # photos that each have a check box; more are named in a line of text
+PHOTO_SIDE = 192  # pixels on the longer side of photos that show attention
+NONE = -1  # in the field `query` while none is picked
 _CAPTIONS = {
     "content": "content: logits of what patches show",
     "geometry": "geometry: what rays and anchor add",

@@ -11,8 +11,7 @@ from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Cameras, Gaussians
 
-LEAST_WEIGHT = 0.02
-"""Blending weight on a clicked ray below which a Gaussian counts as not hit."""
+LEAST_WEIGHT = 0.02  # blending weight on a clicked ray below which a Gaussian is not hit
 
 _FLOAT16 = 2.0**15
 

@@ -1,8 +1,10 @@
 """report.html: what was trained and how it compares, in one self-contained page."""
 
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
+from importlib.resources import files
 from typing import Any
 
 import torch
@@ -82,8 +84,8 @@ Shown = Sequence[tuple[Contender, Sequence[Prediction]]]
 class Tile:
     """A picture, or the frames of an animation. legend: queries in it, in their colours.
 
-    page: HTML that a reader can open in its place, in a frame of its own. It needs no network, is
-    dark where `prefers-color-scheme` is, and has no access to the report. Raises ValueError.
+    page: HTML without network that a reader can open in its place, in a frame without access to
+    the report, dark where `prefers-color-scheme` is. Raises ValueError.
     """
 
     image: Picture | list[Picture]
@@ -107,8 +109,8 @@ class ReportSection:
 
     def __post_init__(self) -> None:
         tiles = [tile for tiles in self.figures.values() for tile in tiles]
-        if wrong := [type(tile).__name__ for tile in tiles if not isinstance(tile, Tile)]:
-            raise TypeError(f"it has {wrong[0]} among its figures, not a Tile")
+        if not all(isinstance(tile, Tile) for tile in tiles):
+            raise TypeError("its figures must be Tiles")
 
 
 @torch.no_grad()
@@ -132,7 +134,7 @@ def report_html(report: Report) -> str:
 
 
 def offered_sections(shown: Shown, samples: Sequence[Sample]) -> Iterator[ReportSection]:
-    """Sections of installed distributions, in order of their names; what fails is said and left."""
+    """Sections of installed distributions by name; those that fail are left out with a warning."""
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         try:
             made = entry.load()(shown, samples)
@@ -175,10 +177,10 @@ def pictured_scene(
         "Error": {n: [Tile(error_picture(e, most)) for e in maps] for n, maps in errors.items()},
         "Depth": {n: [Tile(depth_picture(d, near, far)) for d in m] for n, m in depths.items()},
     }
-    span = f"{min(inputs)} to {max(inputs)}" if len(inputs) > 1 else str(*inputs)
+    span = f"frames {min(inputs)} to {max(inputs)}" if len(inputs) > 1 else f"frame {inputs[0]}"
     return {
         "name": sample.scene,
-        "frames": f"frame{'s' if len(inputs) > 1 else ''} {span}",
+        "frames": span,
         "inputs": _photos(sample.inputs.images[0], frames[: len(inputs)]),
         "kinds": kinds,
         "most": most,
@@ -198,11 +200,7 @@ def orbit(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
         path = orbit_path(cameras, depths, ORBIT_FRAMES, SIDE)
         frames = [rgb_picture(image) for image in render(prediction.gaussians, path).rgb[0]]
         figures.append(Tile(frames, contender.name))
-    return ReportSection(
-        "A walk through the reconstruction",
-        "The first scene above from a loop past its input cameras. Nothing here is a photo.",
-        {"": figures},
-    )
+    return titled("orbit", {"": figures})
 
 
 def queries(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
@@ -213,14 +211,7 @@ def queries(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
         chosen = notable_queries(contender.model, prediction.gaussians, cameras, QUERIES)
         picture = query_picture(contender.model, prediction.gaussians, chosen, cameras)
         figures.append(Tile(picture, contender.name, chosen))
-    return ReportSection(
-        "What single queries stand for",
-        "All Gaussians of five queries in colour, over the scene in grey. Lines lead from each "
-        "Gaussian to the centroid of those of its query; the mean length of these lines is the "
-        "dispersion of the query. The queries are the heaviest well inside "
-        "this view that also stand apart from each other.",
-        {"": figures},
-    )
+    return titled("queries", {"": figures})
 
 
 def anchors(exhibits: Sequence[Exhibit]) -> ReportSection:
@@ -236,15 +227,7 @@ def anchors(exhibits: Sequence[Exhibit]) -> ReportSection:
         captions += [f"after layer {layer}" for layer in layers[1:]]
         tiles = map(Tile, shown.anchors(layers, chosen, SIDE), captions)
         figures[shown.name] = [*tiles]
-    return ReportSection(
-        "Where queries look",
-        "Every query’s anchor on the first input view, as a dot; twelve that matter to this view "
-        "with their support, the ball or ellipsoid around an anchor that says how far about it a "
-        "query looks and places its Gaussians, where all of it lies before the camera. Photos move "
-        "the anchors from their start layer by layer; a learned start is the same for every scene.",
-        figures,
-        width=180,
-    )
+    return titled("anchors", figures, width=180)
 
 
 def attention(exhibits: Sequence[Exhibit]) -> ReportSection:
@@ -259,23 +242,25 @@ def attention(exhibits: Sequence[Exhibit]) -> ReportSection:
                 for part in ("content", "geometry", "result")
                 if part in parts
             ]
-    return ReportSection(
-        "What one query reads",
-        "Cross-attention of the heaviest query over the patches of the input views in the last "
-        "layer, averaged over heads: strong colour is much. A geometry bias, where there is one, "
-        "is added to the content logits before the softmax; what it hides is pale.",
-        figures,
-        width=240,
-    )
+    return titled("attention", figures, width=240)
 
 
 def training_curves(exhibits: Sequence[Exhibit]) -> ReportSection:
     """Loss and PSNR for every model whose training has a history."""
     curves = {shown.name: shown.curves for shown in exhibits if shown.curves}
-    return drawn_section("Training", "", curves_figure(curves) if curves else None)
+    return drawn_section("training", curves_figure(curves) if curves else None)
 
 
-def drawn_section(title: str, text: str, figure: Figure | None) -> ReportSection:
+def titled(
+    name: str, figures: Mapping[str, Sequence[Tile]], width: int = 300, **numbers: int
+) -> ReportSection:
+    """A section with its title and text in template/sections.toml, `numbers` filled in."""
+    file = files("qgs_viewer") / "template" / "sections.toml"
+    words = tomllib.loads(file.read_text(encoding="utf-8"))[name]
+    return ReportSection(words["title"], words["text"].format(**numbers), figures, width)
+
+
+def drawn_section(name: str, figure: Figure | None, **numbers: int) -> ReportSection:
     """A section of one figure; without one it is left out of the report."""
     tiles = [Tile(figure_picture(figure, dpi=144))] if figure else []
-    return ReportSection(title, text, {"": tiles} if tiles else {}, width=600)
+    return titled(name, {"": tiles} if tiles else {}, 600, **numbers)

@@ -12,10 +12,8 @@ import viser
 from qgs_viewer.look import Look
 from qgs_viewer.stage import distance_to
 
-FIELD_OF_VIEW = 0.95
-"""Of the viewer's window, vertical, radians."""
-SHORT = 0.3
-"""Length of the mean of unit vectors below which they have no direction in common."""
+FIELD_OF_VIEW = 0.95  # of the viewer's window, vertical, radians
+SHORT = 0.3  # length of the mean of unit vectors below which they have no direction in common
 
 
 @contextmanager

@@ -215,8 +215,9 @@ def _of_finished(folder: Path, device: str) -> Source:
 def _no_queries(record: Mapping[str, Any], model: str, folder: Path) -> str:
     """Why the queries of a reconstruction are not shown; "" where they are."""
     if record.get("refinement"):
-        beside = folder.resolve().parent if folder.resolve().name == REFINED else None
-        where = f": `qgs view {beside}`" if beside and (beside / CAMERAS).is_file() else ""
+        above, name = folder.resolve().parent, folder.resolve().name
+        beside = name == REFINED and (above / CAMERAS).is_file()
+        where = f": `qgs view {above}`" if beside else ""
         return f"It was refined; only the prediction of the model has queries{where}."
     if record.get("tuning"):
         return "It was tuned on its photos, so its model alone does not make these Gaussians."

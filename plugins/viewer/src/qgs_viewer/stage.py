@@ -16,16 +16,11 @@ from qgs_viewer.choice import Choice, anchor_colors, faded, ink, painted, query_
 from qgs_viewer.look import Look
 from qgs_viewer.placement import corners, on_photo
 
-PHOTO_SIDE = 256
-"""Pixels on the longer side of photos in the scene: small ones are enlarged, large ones reduced."""
-FRUSTUM = 0.12
-"""Depth of a camera's frustum, per distance from the input cameras to the scene."""
-WIDER = (0.25, 0.6)
-"""Shares of the most that is read from which lines are broader."""
-FAINTEST = 0.08
-"""Strength of the colour of what is hardly read."""
-SOLID = 0.1
-"""Opacity of the Gaussians that tell how large a scene is."""
+PHOTO_SIDE = 256  # pixels on the longer side of photos: small ones are enlarged, large reduced
+FRUSTUM = 0.12  # depth of a camera's frustum, per distance from the input cameras to the scene
+WIDER = (0.25, 0.6)  # shares of the most that is read from which lines are broader
+FAINTEST = 0.08  # strength of the colour of what is hardly read
+SOLID = 0.1  # opacity of the Gaussians that count for the size of a scene
 _VIEWS = "/views"
 _EDGES = ((0, 1), (1, 2), (2, 3), (3, 0))
 

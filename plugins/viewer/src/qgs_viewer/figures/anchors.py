@@ -17,10 +17,8 @@ from qgs_viewer.figures.paper import Made, chosen_layers, new_figure, paper_styl
 from qgs_viewer.queries import DrawnQuery, query_picture
 
 QUERIES = 6
-LAYERS = 4
-"""States that are shown, the learned start among them."""
-BANDS = ((5, 95, 0.18), (25, 75, 0.35))
-"""Percentiles between which a band lies, and how opaque it is."""
+LAYERS = 4  # states that are shown, the learned start among them
+BANDS = ((5, 95, 0.18), (25, 75, 0.35))  # percentiles between which a band lies, and its opacity
 
 
 def anchors(show: Exhibition) -> Made:
@@ -28,11 +26,8 @@ def anchors(show: Exhibition) -> Made:
     exhibits, query = show.anchored, show.query
     count = QUERIES if query is None else 1
     which = f"{count} that matter to this view and stand apart" if query is None else "the query"
-    caption = (
-        f"Anchors in scene {show.samples[0].scene}: every query's anchor as a dot on the first "
-        f"input view; {which} with the support in colour, where all of it lies before the camera. "
-        "From the learned start, the same for every scene, each layer moves them. Last column: the "
-        f"Gaussians of these queries, with lines to their centroids.{show.without_anchors}"
+    caption = paper.caption(
+        "anchors", scene=show.samples[0].scene, which=which, without=show.without_anchors
     )
     chosen = {e.name: e.notable(count, e.sample.inputs.cameras[:, :1], query) for e in exhibits}
     return Made(anchors_figure(exhibits, chosen), caption)
@@ -65,14 +60,7 @@ def anchors_figure(exhibits: Sequence[Exhibit], chosen: dict[str, list[DrawnQuer
 def refinement(show: Exhibition) -> Made:
     """See `refinement_figure`. Raises NothingToShowError where no model has anchors."""
     exhibits = show.anchored
-    caption = (
-        f"Refinement of anchors in scene {show.samples[0].scene}. Left: the way of every anchor "
-        "from its learned start (circle) to the last layer (dot), darker by layer, from above, "
-        "with input cameras as triangles and Gaussians as pale dots. Right: radius by layer (of an "
-        "ellipsoid the geometric mean of its semi-axes), layer 0 the learned start, and how far "
-        "each layer moves an anchor; the line is the median over queries, bands hold 50 % and 90 % "
-        f"of them. Units of the models' world.{show.without_anchors}"
-    )
+    caption = paper.caption("refinement", scene=show.samples[0].scene, without=show.without_anchors)
     return Made(refinement_figure(exhibits), caption)
 
 

@@ -26,15 +26,11 @@ from qgs_viewer.queries import (
 
 CROSS_LAYERS = 3
 SELF_LAYERS = 2
-VIEWS = 2
-"""Input views that are shown."""
+VIEWS = 2  # input views that are shown
 PARTS = {"content": "content logits", "geometry": "geometry bias", "weights": "attention"}
-PHOTO = 256
-"""Pixels on the longer side of a photo."""
-QUERIES = 5
-"""Queries whose self-attention is shown."""
-EDGES = 10
-"""Edges of each of them, to those that it attends to most."""
+PHOTO = 256  # pixels on the longer side of a photo
+QUERIES = 5  # queries whose self-attention is shown
+EDGES = 10  # edges of each of them, to those that it attends to most
 
 
 def cross_attention(show: Exhibition) -> Made:
@@ -46,12 +42,8 @@ def cross_attention(show: Exhibition) -> Made:
     named = ", ".join(f"{name} query {query.index}" for name, query in queries.items())
     views = len(show.samples[0].input_frames)
     photos = f"{VIEWS} of {views}" if views > VIEWS else "the"
-    caption = (
-        f"Cross-attention of one query ({named}) over the patches of {photos} input "
-        f"photos of scene {show.samples[0].scene}, means over heads, in several layers. "
-        "Content logits, the bias that geometry adds to them where there is one, and the attention "
-        "that results; strong colour is much, the photos of one part share one scale from their "
-        "least to their greatest value. Blue: the query's anchor when it read, and its support."
+    caption = paper.caption(
+        "cross_attention", queries=named, photos=photos, scene=show.samples[0].scene
     )
     return Made(cross_attention_figure(shown, queries), caption)
 
@@ -125,15 +117,8 @@ def self_attention(show: Exhibition) -> Made:
     if not shown:
         raise NothingToShowError("none of these models reports its self-attention")
     count = QUERIES if show.query is None else 1
-    nodes = "at its anchor before the layer where it has one, else amid those of "
-    nodes += "its Gaussians that the inputs see"
-    caption = (
-        f"Self-attention in scene {show.samples[0].scene} seen from above, input cameras as "
-        f"triangles, Gaussians as pale dots in their colours. Every dark dot is a query, {nodes}. "
-        f"Lines lead from {count} chosen queries (discs) to the {EDGES} queries that each attends "
-        "to most, itself left out; broader is more, mean over heads. Lines that leave the plan "
-        "lead to queries outside it."
-    )
+    scene = show.samples[0].scene
+    caption = paper.caption("self_attention", scene=scene, count=count, edges=EDGES)
     if any(_parts(e) != ["weights"] for e in shown):
         caption += " Where geometry adds a bias, content and bias have their own panels."
     return Made(self_attention_figure(shown, chosen), caption)

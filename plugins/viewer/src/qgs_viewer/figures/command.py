@@ -41,9 +41,7 @@ def figures(
 ) -> None:
     """Figures of trained models for a paper, as PDF and PNG.
 
-    Models stand side by side; figures.md explains each figure. Gaussians of a query in the whole
-    scene, novel views with depth and error, anchors and supports, cross- and self-attention,
-    dispersion by scene, refinement by layer, training curves.
+    Models stand side by side; figures.md explains each figure.
     """
     from qgs.engine.distributed import choose_device
     from qgs_viewer.demo import new_folder

@@ -12,18 +12,15 @@ from qgs.data.sampling import Sample
 from qgs.drawing.figures import categorical, hex_color
 from qgs.metrics.dispersion import token_dispersion
 from qgs.types import Gaussians
+from qgs_viewer.figures import paper
 from qgs_viewer.figures.exhibits import Exhibition, sample_name
 from qgs_viewer.figures.paper import Made, new_figure, paper_style
 
-FAR_APART = 20
-"""Ratio of the greatest value to the least from which the scale is logarithmic."""
-LONGEST = 40
-"""Scenes of which each is named under its bars; of more every n-th."""
-FEWEST = 8
-"""Scenes that there is room for, so that the bars of few are not broad."""
+FAR_APART = 20  # ratio of the greatest value to the least from which the scale is logarithmic
+LONGEST = 40  # scenes that are named each under its bars; of more every n-th
+FEWEST = 8  # scenes that there is room for, so that the bars of few are not broad
 IN_A_LINE = 3  # names of models in the legend
-LETTERS = 110
-"""Letters that fit below all bars side by side."""
+LETTERS = 110  # that fit below all bars side by side
 
 
 def made(show: Exhibition) -> Made:
@@ -34,14 +31,7 @@ def made(show: Exhibition) -> Made:
         with torch.no_grad():
             scenes = [model(sample.inputs.to(device)).gaussians for sample in show.samples]
         found[name] = dispersions(scenes, model.head.gaussians_per_query)
-    caption = (
-        f"Dispersion of queries on {len(show.samples)} test samples: the distance of Gaussians to "
-        "the centroid of those of their query, its mean (above; a few far Gaussians rule it) and "
-        "its median (below) over all Gaussians of a scene, in units of the models' world; dashed "
-        "the mean over scenes. Small where a query stands for one place. Where the values lie far "
-        "apart the scale is logarithmic: then the ends of bars count, not their lengths. Several "
-        "samples of one scene go by their input frames."
-    )
+    caption = paper.caption("dispersion", count=len(show.samples))
     return Made(figure(found, scene_labels(show.samples)), caption)
 
 

@@ -17,8 +17,7 @@ from qgs_viewer.placement import corners, on_photo
 from qgs_viewer.queries import DrawnQuery, query_picture
 from qgs_viewer.stage import FRUSTUM, frustum_lines
 
-SHAPE = (3, 4)
-"""Height to width of a panel."""
+SHAPE = (3, 4)  # height to width of a panel
 
 
 def made(show: Exhibition) -> Made:
@@ -32,12 +31,12 @@ def made(show: Exhibition) -> Made:
         for name, query in chosen.items()
     ]
     why = "The one that was asked for" if show.query is not None else "The heaviest one well inside"
-    caption = (
-        f"Scene {show.samples[0].scene} from outside, behind and above the input cameras (drawn as "
-        "frusta), framed anew for each model. Left all Gaussians; right those of one query in "
-        "colour, at no less than half opacity, with lines to their centroid, over the scene in "
-        f"pale grey. {why}{' the first target view' * (show.query is None)} is shown. "
-        f"{'; '.join(sizes)}. Lines that leave the panel lead to Gaussians outside it."
+    caption = paper.caption(
+        "global_gaussians",
+        scene=show.samples[0].scene,
+        why=why,
+        where=" the first target view" * (show.query is None),
+        sizes="; ".join(sizes),
     )
     return Made(figure(show.exhibits, chosen), caption)
 

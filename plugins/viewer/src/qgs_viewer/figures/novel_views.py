@@ -20,8 +20,7 @@ from qgs_viewer.figures.paper import WIDTH, Made, blank_panel, new_figure, pictu
 from qgs_viewer.pictures import ERROR_MAP, color_error, error_picture
 
 SCENES = 3
-INPUTS = 2
-"""Input views of each scene that are shown."""
+INPUTS = 2  # input views of each scene that are shown
 TITLES = ("error", "depth", "true depth", "render", "truth", *["inputs"] * INPUTS)
 """Of columns, from the right; the true depth has one only where it is known."""
 TRUE = " of the models' and the true depth, which is shown where it is known"
@@ -32,14 +31,13 @@ def made(show: Exhibition) -> Made:
     samples, depths, first = show.samples[:SCENES], show.depths[:SCENES], show.samples[0]
     target = first.label(first.target_frames[len(first.target_frames) // 2])
     more = len(first.input_frames) - INPUTS
-    caption = (
-        f"Novel views of {', '.join(sample_name(s, samples) for s in samples)}, each from "
-        f"{len(first.input_frames)} photos{f', {INPUTS} of them shown' if more > 0 else ''}. Of "
-        f"each the middle target is shown (in the first, frame {target}), with PSNR. Depth: "
-        "light is near, dark is far; all maps of a scene have the scale told in the first of them "
-        f"(2nd to 98th percentile{TRUE * _known(depths)}, units of the models' world); grey is "
-        "nothing. Error: mean over channels of the absolute difference from the truth, one scale "
-        "in all, to their 98th percentile. Pixels as rendered."
+    caption = paper.caption(
+        "novel_views",
+        scenes=", ".join(sample_name(s, samples) for s in samples),
+        photos=len(first.input_frames),
+        shown=f", {INPUTS} of them shown" if more > 0 else "",
+        frame=target,
+        true=TRUE * _known(depths),
     )
     return Made(figure(show.models, samples, depths), caption)
 

@@ -17,19 +17,12 @@ from qgs_viewer.figures.exhibits import Exhibit
 from qgs_viewer.figures.paper import INK_HEX
 from qgs_viewer.stage import SOLID
 
-TILT, TURN = math.radians(28), math.radians(24)
-"""How far the overview looks down, and from the side."""
-TANGENT = math.tan(math.radians(20))
-"""Of half its narrower angle of view."""
-SURE = 0.05
-"""Length of a mean of unit axes from which it is a direction."""
-INSIDE = 0.96
-"""Share of the seen points that the overview frames."""
-PLAN_SHAPE = 1.15
-"""Width to height of a plan."""
-PLAN_MARGIN = 1.2
-PLAN_OUTSIDE = 0.03
-"""Share of the points that may lie outside of a plan on either side."""
+TILT, TURN = math.radians(28), math.radians(24)  # how far the overview looks down, from the side
+TANGENT = math.tan(math.radians(20))  # of half its narrower angle of view
+INSIDE = 0.96  # share of the seen points that it frames
+SURE = 0.05  # length of a mean of unit axes from which it is a direction
+PLAN_SHAPE, PLAN_MARGIN = 1.15, 1.2  # width to height
+PLAN_OUTSIDE = 0.03  # share of the points that may lie outside of a plan on either side
 
 
 @torch.no_grad()

@@ -1,8 +1,10 @@
 """The look of figures in papers: sizes, type, pictures as panels, and how they are written."""
 
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -16,12 +18,10 @@ from qgs.drawing.figures import INK, figure_style, hex_color
 from qgs.drawing.images import Picture
 from qgs.io.files import replacing
 
-WIDTH = 7.0
-"""Inches of a figure across a page of two columns."""
+WIDTH = 7.0  # inches of a figure across a page of two columns
 DPI = 220
 PAD = 2.5  # points between a panel and its label
-SIDE = 512
-"""Pixels on the longer side of pictures that models render for a panel."""
+SIDE = 512  # pixels on the longer side of pictures that models render for a panel
 INK_HEX = hex_color(INK)
 
 
@@ -57,6 +57,13 @@ def paper_style() -> Iterator[None]:
     }
     with figure_style(), rc_context(sizes):
         yield
+
+
+def caption(name: str, **values: object) -> str:
+    """The caption of a figure in template/captions.toml, `values` filled in."""
+    file = files("qgs_viewer") / "template" / "captions.toml"
+    found: str = tomllib.loads(file.read_text(encoding="utf-8"))[name]["caption"]
+    return found.format(**values)
 
 
 def new_figure(height: float, gap: float = 0.02, width: float = WIDTH) -> Figure:
