@@ -177,7 +177,7 @@ def pictured_scene(
         "Error": {n: [Tile(error_picture(e, most)) for e in maps] for n, maps in errors.items()},
         "Depth": {n: [Tile(depth_picture(d, near, far)) for d in m] for n, m in depths.items()},
     }
-    span = f"frames {min(inputs)} to {max(inputs)}" if len(inputs) > 1 else f"frame {inputs[0]}"
+    span = f"frames {min(inputs)} to {max(inputs)}" if len(inputs) > 1 else f"frame {min(inputs)}"
     return {
         "name": sample.scene,
         "frames": span,
