@@ -88,6 +88,8 @@ LOSS_LIMITS: list[tuple[str, str, float, float, dict[str, Any]]] = [
     ("locus/anchor_visibility", "near", 0.025, 0.9, {"behind_camera": "invisible"}),
     ("locus/anchor_visibility", "z_guard", 1e-3, 0.9, {"clamp": None}),
     ("qgs/opacity", "eps", 1e-6, 0.1, {}),
+    ("qgs/depth_surface", "beta", 0.05, 1.0, {}),
+    ("qgs/depth_surface", "near", 0.025, 2.0, {}),
 ]
 """Loss, its option, published default, another value, options beside which it matters."""
 
@@ -152,7 +154,7 @@ def loss_value(kind: str, options: dict[str, Any]) -> Tensor:
     images = torch.zeros(1, 1, 3, 16, 16)
     cameras = Cameras(torch.eye(4)[None, None], torch.tensor([[[16.0, 16, 8, 8]]]), (16, 16))
     rendering = Rendering(images, images[:, :, :1], images[:, :, :1])
-    views = Views(images, cameras)
+    views = Views(images, cameras, depths=torch.full((1, 1, 1, 16, 16), 1.5))
     (term,) = loss(LayerPrediction(gaussians, state), rendering, views, views).values()
     return term.detach()
 

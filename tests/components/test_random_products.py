@@ -2,11 +2,10 @@
 
 import random
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import torch
 from qgs_plugintools import Case
-from qgs_plugintools.exercise import variants
 from qgs_plugintools.inputs import Maker, Sizes
 from qgs_plugintools.plugins import cases_of
 
@@ -88,10 +87,14 @@ def _component(random: random.Random, slot: str, kind: str) -> dict[str, Any]:
         options["time_channels"] = random.choice([0, 0, 2])
     if "gaussians_per_query" in options and random.random() < 0.2:
         options["gaussians_per_query"] = random.choice([1, 3, 4])
-    for option, _, changed in variants(component.Config.model_construct(**options)):
-        choice = getattr(changed, option)
-        if isinstance(choice, bool | str) and random.random() < 0.06:
-            options[option] = choice
+    given_or_default = component.Config.model_construct(**options)
+    for option, field in fields.items():
+        is_choice = get_origin(field.annotation) is Literal
+        choices = get_args(field.annotation) if is_choice else (True, False)
+        for choice in choices if is_choice or field.annotation is bool else ():
+            changes = choice != getattr(given_or_default, option)
+            if changes and isinstance(choice, bool | str) and random.random() < 0.06:
+                options[option] = choice
     return {"type": kind, **options}
 
 
@@ -138,7 +141,8 @@ def _train(recipe: Recipe) -> None:
     case = Case(LatentQueries.Config())
     views = Maker(case, SIZES, torch.Generator().manual_seed(0)).target()
     times = torch.linspace(0, 1, SIZES.views).expand(SIZES.batch, -1)
-    inputs = replace(views, times=times, target_time=times[:, :1])
+    depths = torch.ones_like(views.images[:, :, :1])
+    inputs = replace(views, times=times, target_time=times[:, :1], depths=depths)
     model = recipe.build_model()
     outcome = TrainingPass.of(recipe, model.train())(inputs, views.select([1, 2]))
     outcome.total.backward()
