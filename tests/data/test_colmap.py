@@ -1,8 +1,6 @@
 """COLMAP models: camera models, lenses, names, and models that are broken."""
 
 import struct
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -87,7 +85,7 @@ def test_lenses_bend_as_pycolmap_bends(tmp_path, camera):
 def test_other_camera_models_are_refused_and_listed(tmp_path):
     camera = ("FOV", 7, (50.0, 50.0, 20.0, 15.0, 0.9))
     folder = write_colmap(tmp_path, synthetic(tmp_path / "p", 2), "binary", camera)
-    with pytest.raises(ValueError, match=r"view_000\.png.*FOV is not known.*image_undistorter"):
+    with pytest.raises(ValueError, match=r"view_000\.png.*FOV"):
         read(folder)
     listed = frames(folder)
     assert len(listed) == 2
@@ -143,45 +141,31 @@ def test_quaternions_of_any_length_and_no_rotation_at_all(tmp_path):
 BROKEN = {
     "no count": ("images.bin", 4),
     "a pose cut off": ("images.bin", 60),
-    "a name cut off": ("images.bin", 76),
     "points cut off": ("images.bin", 110),
     "an image cut off": ("images.bin", 200),
     "a camera cut off": ("cameras.bin", 40),
     "an unknown camera": ("cameras.bin", struct.pack("<QIiQQ3d", 1, 7, 99, 40, 30, 1, 1, 1)),
-    "no camera": ("cameras.bin", struct.pack("<Q", 0)),
+    "no image in text": ("images.txt", b"1 1 0 0 0 0 0 1 a.png\n\n"),
+    "no number": ("images.txt", b"1 1 0 0 0 zero 0 1 7 a.png\n\n"),
+    "no such camera": ("images.txt", b"1 1 0 0 0 0 0 1 8 a.png\n\n"),
 }
 """A file of the model, and its size or its content."""
 
 
 @pytest.mark.parametrize("what", BROKEN)
-def test_broken_binary_models_are_told(tmp_path, what):
-    folder = write_colmap(tmp_path, synthetic(tmp_path / "photos", 2), "binary")
+def test_broken_models_are_told(tmp_path, what):
     name, content = BROKEN[what]
+    kind = "text" if name.endswith("txt") else "binary"
+    folder = write_colmap(tmp_path, synthetic(tmp_path / "photos", 2), kind)
     file = folder / "sparse" / "0" / name
     file.write_bytes(content if isinstance(content, bytes) else file.read_bytes()[:content])
-    with pytest.raises(ValueError, match=r"COLMAP model .*sparse/0 .*cannot be read: .*again"):
-        read(folder)
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("1 1 0 0 0 0 0 1 a.png", "where an image was expected"),
-        ("one 1 0 0 0 0 0 1 7 a.png", "where an image was expected"),
-        ("1 1 0 0 0 zero 0 1 7 a.png", "cannot be read"),
-        ("1 1 0 0 0 0 0 1 8 a.png", "cannot be read"),
-    ],
-)
-def test_broken_text_models_are_told(tmp_path, line, message):
-    folder = write_colmap(tmp_path, synthetic(tmp_path / "photos", 2), "text")
-    (folder / "sparse" / "0" / "images.txt").write_text(f"{line}\n\n")
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=r"sparse/0"):
         read(folder)
 
 
 def test_photos_beside_the_model_are_needed(tmp_path):
     folder = write_colmap(tmp_path, synthetic(tmp_path / "photos", 2), "text", images="pictures")
-    with pytest.raises(FileNotFoundError, match="neither a folder `images` nor a scaled copy"):
+    with pytest.raises(FileNotFoundError, match="`images`"):
         read(folder)
     assert read(folder, images="pictures").frame_name(1) == "pictures/view_001.png"
 
@@ -190,18 +174,8 @@ def test_a_missing_package_is_told(tmp_path, monkeypatch):
     photos = synthetic(tmp_path / "photos", 2)
     folder = write_colmap(tmp_path, photos, "text")
     monkeypatch.setattr("qgs.data.photos.colmap.find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match=r'pip install "query-gaussians\[colmap\]"'):
+    with pytest.raises(MissingExtraError, match="colmap"):
         read(folder)
     assert formats_of(opened_path(folder)) == ["colmap"]
     write_nerfstudio(folder, replace(photos, intrinsics=(50.0, 50.0, 20.0, 15.0)))
     assert len(read(folder)) == 2
-
-
-def test_pycolmap_is_imported_for_models_alone(tmp_path):
-    folder = write_nerfstudio(tmp_path, synthetic(tmp_path / "photos", 2))
-    code = (
-        "import sys; from qgs.data import PhotosSource as Source;"
-        f"Source(Source.Config(path={str(folder)!r})); print('pycolmap' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"

@@ -115,7 +115,7 @@ def test_what_a_folder_holds_most_is_read_in_a_told_order(tmp_path, caplog):
     assert_same(scene(tmp_path), photos)
     assert "`format: llff` reads the other" in caplog.text
     assert first.cameras.shape == (6,)
-    with pytest.raises(FileNotFoundError, match=r"transforms\.json, which nerfstudio needs.*llff"):
+    with pytest.raises(FileNotFoundError, match=r"transforms\.json"):
         scene(tmp_path, format="nerfstudio")
 
 
@@ -162,7 +162,7 @@ def test_scenes_split_by_folder(tmp_path):
     source = opened(tmp_path)
     assert [len(source.scenes(split)) for split in ("train", "test")] == [2, 1]
     assert source.scenes("test")[0].name == "c"
-    with pytest.raises(ValueError, match=r"6 poses, but .* has 5 images"):
+    with pytest.raises(ValueError, match="5 images"):
         _ = source.scenes("train")[1]
 
 

@@ -47,27 +47,13 @@ def assert_same(first: Sequence[Batch], second: Sequence[Batch]) -> None:
             assert torch.equal(ours.cameras.intrinsics, theirs.cameras.intrinsics)
 
 
-@pytest.mark.parametrize("skips", [False, True])
-def test_running_out_of_memory_is_no_bad_sample(tmp_path, monkeypatch, skips):
-    recipe = photos(tmp_path / "shelf")
-
+def test_running_out_of_memory_is_no_bad_sample(tmp_path, monkeypatch):
     def full(*_):
         raise MemoryError
 
     monkeypatch.setattr("qgs.data.images.decode_rgb", full)
     with pytest.raises(MemoryError):
-        batches(recipe, 1, 2, skips=skips)
-
-
-def test_the_reason_of_a_bad_sample_is_never_empty(tmp_path, monkeypatch):
-    recipe = photos(tmp_path / "shelf")
-
-    def fail(*_):
-        raise KeyError
-
-    monkeypatch.setattr("qgs.data.photos.source.PhotoScene.images", fail)
-    with pytest.raises(SampleError, match=r"shelf.*KeyError$"):
-        batches(recipe, 1, 2)
+        batches(photos(tmp_path / "shelf"), 1, 2, skips=True)
 
 
 def test_worker_processes_change_nothing_and_end_with_the_stream(tmp_path):
@@ -100,8 +86,8 @@ def test_closing_ends_the_thread():
     assert not [t for t in threading.enumerate() if t.name.startswith("qgs-loader")]
 
 
-@pytest.mark.parametrize("processes", [2, 3])
-def test_processes_share_what_one_would_see(processes):
+def test_processes_share_what_one_would_see():
+    processes = 3
     alone = batches(ROOMS, 3, 2 * processes)
     for rank in range(processes):
         share = Share(rank, processes)
@@ -114,27 +100,13 @@ def test_processes_share_what_one_would_see(processes):
         assert_same(batches(ROOMS, 1, 2, share=share, start=2), part[2:])
 
 
-def test_the_seed_decides():
-    first = training_batches(ROOMS.build_data(), ROOMS.views, 5, 0)
-    second = training_batches(ROOMS.build_data(), ROOMS.views, 5, 1)
-    assert next(first).scenes != next(second).scenes
-
-
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_broken_image_is_named_with_its_scene_and_file(tmp_path, workers):
     recipe = photos(tmp_path / "shelf", broken=5)
     recipe = resolve(recipe.tree, ["views.gap=[7, 7]"])
-    with pytest.raises(SampleError, match=r"'shelf': .*005?\.png|'shelf': .*5\.png"):
+    with pytest.raises(SampleError, match=r"'shelf': .*5\.png"):
         batches(recipe, 1, 1, workers=workers)
     assert not multiprocessing.active_children()
-
-
-def test_data_that_vanished_is_told_by_workers_too(tmp_path):
-    recipe = photos(tmp_path / "shelf")
-    source = recipe.build_data()
-    (tmp_path / "shelf" / "transforms.json").unlink()
-    with pytest.raises(SampleError, match=r"transforms\.json|shelf"):
-        next(training_batches(source, recipe.views, 1, 0, workers=1))
 
 
 class Grouped(Lines):
