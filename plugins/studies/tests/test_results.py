@@ -39,6 +39,12 @@ published: {full: 24.0, less: 23.0, other: 22.0}
 COLUMNS = {"psnr": {"heading": "PSNR", "better": "higher", "digits": 2, "unit": "dB"}}
 
 
+def csv_rows(found: Results) -> list[dict[str, str]]:
+    write_files(found)
+    with (found.plan.folder / "table.csv").open() as file:
+        return [*csv.DictReader(file)]
+
+
 NEAREST = 15.5
 """PSNR of the nearest input in every scene."""
 
@@ -150,7 +156,7 @@ def test_verdicts_and_the_answer(tmp_path: Path, offset: float, answer: str, ver
     first, other, noisy = (judgement.verdict for judgement in found.judgements())
     assert (first, noisy) == ("seen", "seen")
     assert other == verdict
-    assert found.rank_correlation() is None, "of three variants any order is likely"
+    assert found.rank_correlation()[0] is None, "of three variants any order is likely"
 
 
 def test_seeds_that_disagree_leave_it_open_however_sure_the_scenes_are(tmp_path: Path) -> None:
@@ -176,11 +182,9 @@ def test_seeds_that_disagree_leave_it_open_however_sure_the_scenes_are(tmp_path:
 
 def test_files_hold_the_same_numbers(tmp_path: Path) -> None:
     found = results(tmp_path, simple)
-    write_files(found)
+    rows = {(r["evaluation"], r["variant"]): r for r in csv_rows(found)}
     write_figures(found)
     record = json.loads((tmp_path / "results.json").read_text())
-    with (tmp_path / "table.csv").open() as file:
-        rows = {(r["evaluation"], r["variant"]): r for r in csv.DictReader(file)}
     assert len(rows) == len(record["table"]) == 6
     for row in record["table"]:
         assert float(rows[row["evaluation"], row["variant"]]["mean"]) == row["mean"]
@@ -210,19 +214,13 @@ def test_numbers_of_unlike_protocols_are_not_compared(tmp_path: Path) -> None:
     assert (record["difference"], record["low"]) == ("", "")
 
 
-def csv_rows(found: Results) -> list[dict[str, str]]:
-    write_files(found)
-    with (found.plan.folder / "table.csv").open() as file:
-        return [*csv.DictReader(file)]
-
-
 def test_without_an_evaluation_that_all_share_there_is_no_answer(tmp_path: Path) -> None:
     text = STUDY.replace("seeds:", "differs: [views.inputs, losses.visibility]\nseeds:")
     found = results(tmp_path, simple, views=lambda variant, evaluation: variant, text=text)
     assert found.answer().startswith("Not known: ")
     assert "sets views.inputs" in found.answer()
     assert found.answer().endswith("2 seen, 1 undecided.")
-    assert found.rank_correlation() is None
+    assert found.rank_correlation()[0] is None
     assert {row["difference"] for row in csv_rows(found)} == {""}
 
 
@@ -258,8 +256,8 @@ def test_a_variant_with_one_seed_so_far_does_not_hide_what_is_known(tmp_path: Pa
     for seed in (1, 2):
         shutil.rmtree(run_of(tmp_path, "other", seed).folder)
     answer = Results(plan).answer()
-    assert answer.startswith("No: less is worse than full, PSNR ")
-    assert answer.endswith("2 of 9 runs are missing.")
+    assert answer.startswith("No: less is worse than full")
+    assert "2 of 9 runs" in answer
 
 
 def test_a_variant_without_the_metric_is_a_row_of_dashes(tmp_path: Path) -> None:
@@ -288,7 +286,7 @@ def test_a_sure_lead_counts_beside_a_larger_one_that_is_not(tmp_path: Path) -> N
         (1, 8, "one training a side"),
         (3, 1, "one scene"),
         (1, 1, "one training a side and one scene"),
-        (0, 8, "no seed of which all its runs are finished"),
+        (0, 8, "no seed and scene with `psnr` in all its runs"),
     ],
 )
 def test_why_there_is_no_verdict(tmp_path: Path, seeds: int, scenes: int, reason: str) -> None:
@@ -305,32 +303,22 @@ def test_why_there_is_no_verdict(tmp_path: Path, seeds: int, scenes: int, reason
 
 def test_published_values_are_shown_and_ranked_from_five_variants_on(tmp_path: Path) -> None:
     names = ("full", "less", "other", "four", "five")
-    recipes = ", ".join(f"{name}: tiny/locus.yaml" for name in names)
-    text = STUDY.replace(
-        "full: tiny/locus.yaml, less: tiny/locus.yaml, other: tiny/locus.yaml", recipes
-    )
-    published = ", ".join(f"{name}: {24 - place / 2}" for place, name in enumerate(names))
-    text = text.replace("full: 24.0, less: 23.0, other: 22.0", published)
+    text = STUDY.replace("{full:", "{four: tiny/locus.yaml, five: tiny/locus.yaml, full:", 1)
+    text = text.replace("other: 22.0", "other: 22.0, four: 21.5, five: 21.0")
 
     def score(variant: str, evaluation: str, seed: int, scene: int) -> float:
         return 20.0 - names.index(variant) + 0.01 * scene + 0.001 * seed
 
     found = results(tmp_path, score, text=text)
-    assert found.rank_correlation() == pytest.approx(1.0)
+    assert found.rank_correlation() == (pytest.approx(1.0), 5)
     head, *rows = table_rows(found)
-    assert [row[head.index("published")] for row in rows][:2] == ["24.000", "23.500"]
+    shown = {row[0]: row[head.index("published")] for row in rows}
+    assert (shown["full"], shown["four"]) == ("24.000", "21.500")
 
 
-@pytest.mark.parametrize("notes", ["", "- one note\n- and another\n"])
-def test_the_evidence_page_takes_studies_of_one_seed_with_notes_and_without(
-    tmp_path: Path, notes: str
-) -> None:
+def test_the_evidence_page_takes_studies_of_one_seed(tmp_path: Path) -> None:
     write_files(results(tmp_path, simple, seeds=1))
-    table, text = tmp_path / "table.md", (tmp_path / "table.md").read_text()
-    table.write_text(text[: text.index("\n\n- ")] + "\n\n" + notes)
-    page = fill_evidence.page_of(tmp_path)
-    assert "| noisy | 23.01 (–) |" in page
-    assert page.endswith(notes or "|\n")
+    assert "| noisy | 23.01 (–) |" in fill_evidence.page_of(tmp_path)
 
 
 @pytest.mark.parametrize("seeds", [3, 9])

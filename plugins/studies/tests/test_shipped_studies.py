@@ -26,10 +26,6 @@ def test_every_study_composes(file: str, tmp_path: Path) -> None:
         assert len(planned(study, tmp_path / "out").runs) >= 6
 
 
-def test_most_studies_are_there_in_both_sizes() -> None:
-    assert len(BOTH) >= 8
-
-
 @pytest.mark.parametrize("name", BOTH)
 def test_both_sizes_ask_the_same(name: str) -> None:
     tiny, published = (read_study(STUDIES / size / name) for size in ("tiny", "published"))
@@ -61,8 +57,6 @@ def test_the_table_of_scenes_left_out_compares_the_same_seeds(tmp_path: Path) ->
         (folder / "scenes.csv").write_text(f"{head}\nw0,{psnr},9.0,7.0\n")
         (folder / "protocol.json").write_text("{}")
 
-    with pytest.raises(ValueError, match="has no finished study"):
-        leave_one_scene_out.table_rows(tmp_path)
     scores = {"locus": ("10.0", "12.0", "20.0"), "tokengs": ("11.0", "13.0")}
     for variant, values in scores.items():
         for seed, value in enumerate(values):
@@ -75,5 +69,5 @@ def test_the_table_of_scenes_left_out_compares_the_same_seeds(tmp_path: Path) ->
         ["mean of full rows", "11.00", "12.00", "9.00", "7.00", ""],
     ]
     judge("walk/tokengs/seed-0", "")
-    with pytest.raises(ValueError, match="has no model_psnr of some windows"):
+    with pytest.raises(ValueError, match="model_psnr"):
         leave_one_scene_out.table_rows(tmp_path)

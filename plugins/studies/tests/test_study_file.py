@@ -57,9 +57,8 @@ def test_a_variant_is_the_base_or_its_own_recipe_with_the_budget(tmp_path: Path)
     [("seconds: 30", 20_000, 30.0), ("images: 4001", 1001, None)],
 )
 def test_budgets(tmp_path: Path, budget: str, steps: int, seconds: float | None) -> None:
-    recipes = composed(read(tmp_path, SOUND.replace("steps: 200", budget)))
-    training = recipes["full"].training  # batches of 2 with 2 targets
-    assert (training.steps, training.seconds) == (steps, seconds)
+    training = composed(read(tmp_path, SOUND.replace("steps: 200", budget)))["full"].training
+    assert (training.steps, training.seconds) == (steps, seconds), "batches of 2 with 2 targets"
 
 
 def test_a_study_extends_another_and_replaces_variants_by_name(tmp_path: Path) -> None:

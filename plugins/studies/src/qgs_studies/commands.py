@@ -56,9 +56,6 @@ def study(
     threads: Annotated[
         int | None, typer.Option(min=1, help="CPU threads of a run; default: cores / workers.")
     ] = None,
-    runs: Annotated[
-        int | None, typer.Option(min=1, help="Most runs that this call makes; default: all.")
-    ] = None,
     only: Annotated[
         int | None, typer.Option(min=0, help="Train the run of this number, from 0, alone.")
     ] = None,
@@ -95,7 +92,8 @@ def study(
     ...). Studies that come with qgs: studies/tiny/structural.yaml and others.
     """
     from qgs.wording import counted
-    from qgs_studies.output import show, write_all
+    from qgs_studies.output import show
+    from qgs_studies.page import write_all
     from qgs_studies.plan import planned, write_plan
     from qgs_studies.results import Results
     from qgs_studies.study import read_study
@@ -123,7 +121,7 @@ def study(
 
         threads = threads or max(usable_cores() // workers, 1)
         chosen = plan.runs if only is None else [plan.runs[only]]
-        queue = Queue(plan, workers, threads, device, console, runs, _gpus(device), chosen)
+        queue = Queue(plan, workers, threads, device, console, _gpus(device), chosen)
         stopped, failed = queue.work(), len(queue.failures)
     results = Results(plan)
     if results.columns:

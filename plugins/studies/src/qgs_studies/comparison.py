@@ -4,7 +4,7 @@ Several trainings of one recipe count as one side, whose interval then covers tr
 """
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -136,10 +136,15 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Comparisons:
-    """The first results against each other. protocols: result to its protocol's name and hash."""
+    """The first results against each of the others."""
 
-    protocols: Mapping[str, str]
     pairs: Sequence[Comparison]
+
+    @property
+    def protocols(self) -> dict[str, str]:
+        """Name and hash of the protocol of each result."""
+        every = [self.pairs[0].first, *(pair.second for pair in self.pairs)]
+        return {r.name: f"{r.protocol.name}, sha256 {r.protocol.sha256}" for r in every}
 
     def show(self, console: Console) -> None:
         """Print a table for each pair."""
@@ -151,7 +156,7 @@ class Comparisons:
     def write(self, folder: Path) -> None:
         """Write comparison.json and comparison.md into `folder`."""
         record = {
-            "protocols": dict(self.protocols),
+            "protocols": self.protocols,
             "bootstrap": {"resamples": RESAMPLES, "confidence": CONFIDENCE, "seed": SEED},
             "pairs": [pair.record() for pair in self.pairs],
         }
@@ -206,8 +211,7 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
         metrics = [name for name in first.columns if name in other.columns]
         found = (_difference(metric, first, other, shared) for metric in metrics)
         pairs.append(Comparison(first, other, shared, moved, [d for d in found if d]))
-    protocols = {r.name: f"{r.protocol.name}, sha256 {r.protocol.sha256}" for r in results}
-    return Comparisons(protocols, pairs)
+    return Comparisons(pairs)
 
 
 def grouped(results: Sequence[StoredResults]) -> Sequence[StoredResults]:

@@ -1,6 +1,6 @@
 """Figures of a study: points of every seed with intervals, learning curves."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -27,12 +27,10 @@ _POINT: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 3.5}
 
 
 def write_figures(results: Results) -> None:
-    """OUT/figures: values and curves, as PDF and PNG; values of every evaluation."""
-    figures = {
-        f"values-{n}" if n else "values": values_figure(results, n) for n in _judged(results)
-    }
-    figures["curves"] = curves_figure(results)
-    for name, figure in figures.items():
+    """OUT/figures: values of every evaluation and curves, as PDF and PNG."""
+    names = results.plan.evaluations
+    figures = {f"values-{n}" if n else "values": values_figure(results, n) for n in names}
+    for name, figure in {**figures, "curves": curves_figure(results)}.items():
         if figure is None:
             continue
         for suffix in ("pdf", "png"):
@@ -42,10 +40,6 @@ def write_figures(results: Results) -> None:
                     figure.savefig(path, format=suffix, dpi=160, metadata=metadata)
 
 
-def _judged(results: Results) -> list[str]:
-    return [name for name in results.plan.evaluations if results.rows(name)]
-
-
 def values_figure(results: Results, evaluation: str = MAIN) -> Figure | None:
     """The study's metric of every seed, and the differences to the reference with intervals."""
     rows = [row for row in results.rows(evaluation) if results.metric in row.scores]
@@ -53,7 +47,9 @@ def values_figure(results: Results, evaluation: str = MAIN) -> Figure | None:
         return None
     column, metric = results.column, results.metric
     unit = f", {column.unit}" if column.unit else ""
-    seeds = _colors(results.plan.study.settings.seeds)
+    several = results.plan.study.settings.seeds
+    apart = len(several) <= len(CATEGORICAL)  # else all seeds have one colour
+    seeds = {seed: hex_color(categorical(n * apart)) for n, seed in enumerate(several)}
     with figure_style():
         figure = Figure(figsize=(8.4, 1.2 + 0.32 * len(rows)), layout="constrained")
         left, right = figure.subplots(1, 2, sharey=True)
@@ -75,12 +71,6 @@ def values_figure(results: Results, evaluation: str = MAIN) -> Figure | None:
         if evaluation:
             figure.suptitle(evaluation, x=0.01, ha="left", fontsize=9)
     return figure
-
-
-def _colors(seeds: Sequence[int]) -> dict[int, str]:
-    """A colour for each seed; one for all where there are not so many."""
-    apart = len(seeds) <= len(CATEGORICAL)
-    return {seed: hex_color(categorical(n * apart)) for n, seed in enumerate(seeds)}
 
 
 def _points(axes: Axes, place: int, values: Mapping[int, float], seeds: Mapping[int, str]) -> None:

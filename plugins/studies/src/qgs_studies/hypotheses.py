@@ -42,12 +42,13 @@ def parsed(text: str, variants: Iterable[str], evaluations: Iterable[str]) -> Co
         if not whole or any(not match[1] for match in matches[1:]):
             raise OptionError(f"`{side}` in `{text}` is no sum of variants", _FORM)
         for sign, variant, evaluation in (match.groups() for match in matches):
-            if variant not in variants:
-                fix = did_you_mean(variant, variants, "variants")
-                raise OptionError(f"there is no variant `{variant}` in `{text}`", fix)
-            if evaluation and evaluation not in evaluations:
-                fix = did_you_mean(evaluation, evaluations, "evaluations")
-                raise OptionError(f"there is no evaluation `{evaluation}` in `{text}`", fix)
+            for noun, name, known in (
+                ("variant", variant, variants),
+                ("evaluation", evaluation, evaluations),
+            ):
+                if name and name not in known:
+                    fix = did_you_mean(name, known, f"{noun}s")
+                    raise OptionError(f"there is no {noun} `{name}` in `{text}`", fix)
             term = variant, evaluation or MAIN
             terms[term] = terms.get(term, 0) + factor * (-1 if sign == "-" else 1)
     terms = {term: coefficient for term, coefficient in terms.items() if coefficient}

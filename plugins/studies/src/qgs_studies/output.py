@@ -3,7 +3,6 @@
 import csv
 import io
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -90,13 +89,16 @@ def write_files(results: Results) -> None:
 
     The numbers of all but times.csv follow from the runs alone, to the last digit.
     """
-    folder = results.plan.folder
-    write_text(folder / "results.json", as_json(record(results)))
-    write_text(folder / "table.csv", _csv(_table_records(results)))
-    write_text(folder / "runs.csv", _csv(_run_records(results)))
-    write_text(folder / "times.csv", _csv(_time_records(results)))
-    write_text(folder / "table.md", markdown(results))
-    write_text(folder / "table.tex", latex(results))
+    texts = {
+        "results.json": as_json(record(results)),
+        "table.csv": _csv(_table_records(results)),
+        "runs.csv": _csv(_run_records(results)),
+        "times.csv": _csv(_time_records(results)),
+        "table.md": markdown(results),
+        "table.tex": latex(results),
+    }
+    for name, text in texts.items():
+        write_text(results.plan.folder / name, text)
 
 
 def record(results: Results) -> dict[str, Any]:
@@ -122,7 +124,7 @@ def record(results: Results) -> dict[str, Any]:
             }
             for j in results.judgements()
         ],
-        "rank_correlation": results.rank_correlation(),
+        "rank_correlation": results.rank_correlation()[0],
         "notes": results.notes(),
     }
 
@@ -230,15 +232,3 @@ def _csv(records: Sequence[dict[str, Any]]) -> str:
     writer.writeheader()
     writer.writerows(records)
     return text.getvalue()
-
-
-def write_all(results: Results) -> Path:
-    """All files, the figures and the page; the page."""
-    from qgs_studies.figures import write_figures
-    from qgs_studies.page import study_html
-
-    write_files(results)
-    write_figures(results)
-    page = results.plan.folder / "study.html"
-    write_text(page, study_html(results))
-    return page

@@ -1,6 +1,7 @@
 """study.html: the answer, the verdicts, the tables, the figures, what differs."""
 
 import json
+from pathlib import Path
 from typing import Any
 
 from qgs.analysis.shown import parameter_counts
@@ -8,12 +9,22 @@ from qgs.composer import Recipe
 from qgs.drawing.figures import figure_picture
 from qgs.drawing.images import data_uri
 from qgs.drawing.pages import page_environment
-from qgs_studies.figures import curves_figure, values_figure
-from qgs_studies.output import hypothesis_rows, table_rows
+from qgs.io.files import write_text
+from qgs_studies.figures import curves_figure, values_figure, write_figures
+from qgs_studies.output import hypothesis_rows, table_rows, write_files
 from qgs_studies.plan import differences
 from qgs_studies.results import Results
 
 _DPI = 150
+
+
+def write_all(results: Results) -> Path:
+    """All files, the figures and the page; the page."""
+    write_files(results)
+    write_figures(results)
+    page = results.plan.folder / "study.html"
+    write_text(page, study_html(results))
+    return page
 
 
 def study_html(results: Results) -> str:
@@ -61,15 +72,16 @@ def _size(recipe: Recipe) -> str:
 
 def _changes(results: Results) -> dict[str, list[tuple[str, str, str]]]:
     """Of every variant the options that differ from the reference's: path, its, the other's."""
-    recipes = results.plan.recipes
-    reference = recipes[results.plan.study.settings.reference]
-    found = {}
-    for name, recipe in recipes.items():
-        if recipe is not reference:
-            changed = differences(recipe, reference).items()
-            found[name] = [(path, _shown(ours), _shown(theirs)) for path, (ours, theirs) in changed]
-    return found
+    recipes, reference = results.plan.recipes, results.plan.study.settings.reference
 
+    def shown(value: Any) -> str:
+        return "–" if value is None else json.dumps(value)
 
-def _shown(value: Any) -> str:
-    return "–" if value is None else json.dumps(value)
+    return {
+        name: [
+            (path, shown(ours), shown(theirs))
+            for path, (ours, theirs) in differences(recipe, recipes[reference]).items()
+        ]
+        for name, recipe in recipes.items()
+        if name != reference
+    }

@@ -32,7 +32,7 @@ _PATIENCE = 120.0  # seconds that stopped runs have to save
 class Queue:
     """Trains the missing ones of `runs`, all of the plan by default; see `work`.
 
-    threads: of each run. most: runs that are started at most. gpus: one for each worker in turn.
+    threads: of each run. gpus: one for each worker in turn.
     failures: runs that failed in this call, and why.
     """
 
@@ -41,20 +41,18 @@ class Queue:
     threads: int
     device: str
     console: Console
-    most: int | None = None
     gpus: Sequence[str] = ()
     runs: Sequence[Run] = ()
     failures: dict[Run, str] = field(default_factory=dict)
     _processes: dict[Run, tuple[subprocess.Popen[bytes], int]] = field(default_factory=dict)
     _deaths: dict[Run, tuple[int, int]] = field(default_factory=dict)
-    _started: int = 0
     _stopping: str | None = None
 
     def __post_init__(self) -> None:
         self.runs = self.runs or self.plan.runs
 
     def work(self) -> str | None:
-        """Run until nothing is missing, or `most` runs were made; the signal that ended it, if any.
+        """Run until nothing is missing; the signal that ended it, if any.
 
         Waits for runs that another queue of this machine has, and continues them if it dies. A run
         that fails is reported, and not tried again by this call.
@@ -67,7 +65,9 @@ class Queue:
         done = set(filter(self.plan.done, self.runs))
         try:
             with self.console.status(self._left()) as status:
-                while self._step():
+                waiting = True
+                while waiting:
+                    waiting = self._step()
                     for run in self.runs:
                         if run not in done and self.plan.done(run):
                             done.add(run)
@@ -95,20 +95,19 @@ class Queue:
             if code is None:
                 continue
             del self._processes[run]
-            if code == TAKEN:
-                self._started -= 1
-            elif code and not self._stopping and not self._goes_on(run, code):
+            ended = code in (0, TAKEN)
+            if not ended and not self._stopping and not self._goes_on(run, code):
                 self._fail(run, code)
         if self._stopping:
             return False
         over = {*self.failures, *self.plan.ended}
         missing = [run for run in self.runs if run not in over and not self.plan.done(run)]
         for run in sorted(missing, key=lambda run: run.failure.is_file()):  # failed ones last
-            if len(self._processes) >= self.workers or self._started == self.most:
+            if len(self._processes) >= self.workers:
                 break
             if run not in self._processes and is_free(run):
                 self._start(run)
-        return bool(missing if self.most is None else self._processes)
+        return bool(missing)
 
     def _start(self, run: Run) -> None:
         used = {slot for _, slot in self._processes.values()}
@@ -132,7 +131,6 @@ class Queue:
                 process_group=0,  # a Ctrl-C reaches the queue alone, which stops its runs once
             )
         self._processes[run] = process, slot
-        self._started += 1
 
     def _goes_on(self, run: Run, code: int) -> bool:
         """True to continue a run whose process was killed, unless DEATHS in a row saved nothing."""
@@ -145,7 +143,6 @@ class Queue:
         if self._deaths[run][1] >= DEATHS:
             return False
         self._say(f"{run}: its process {_end(code)}; it continues from its last save")
-        self._started -= 1
         return True
 
     def _fail(self, run: Run, code: int) -> None:

@@ -9,7 +9,7 @@ against the same scene.
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from scipy.stats import spearmanr
@@ -18,13 +18,13 @@ from qgs.contracts import Column
 from qgs.engine.evaluation import SECTIONS
 from qgs.metrics.baselines import BASELINES
 from qgs.wording import counted, listed
-from qgs_studies.hypotheses import MAIN, Contrast
+from qgs_studies.hypotheses import MAIN
 from qgs_studies.intervals import CONFIDENCE, CROSSED, crossed_interval, interval
 from qgs_studies.plan import Plan, Run
 from qgs_studies.stored import StoredResults, read_results
 from qgs_studies.study import Hypothesis
 
-Verdict: TypeAlias = Literal["seen", "contradicted", "undecided"]
+SEEN, CONTRADICTED, UNDECIDED = "seen", "contradicted", "undecided"
 Terms: TypeAlias = Mapping[tuple[str, str], int]
 
 _RANKED = 5  # variants of which a rank correlation says anything
@@ -82,7 +82,6 @@ class Row:
     """
 
     variant: str
-    evaluation: str
     seeds: Sequence[int]
     scores: Mapping[str, Estimate]
     differences: Mapping[str, Estimate]
@@ -96,7 +95,7 @@ class Judgement:
     hypothesis: Hypothesis
     metric: str
     estimate: Estimate | None
-    verdict: Verdict
+    verdict: str
     reason: str = ""
 
 
@@ -132,19 +131,18 @@ class Results:
 
     def rows(self, evaluation: str = MAIN) -> list[Row]:
         """Variants that have results by `evaluation`, in the order of the study."""
-        reference, rows = self.plan.study.settings.reference, []
+        rows = []
         for variant in self.plan.recipes:
             by_seed = self._stored.get((variant, evaluation), {})
             if not by_seed:
                 continue
             apart = self._apart(variant, evaluation)
-            compared = variant != reference and not self._unlike(apart)
             scores, differences = (
                 {m: e for m in self.columns if (e := self.estimate(terms, m))}
-                for terms in ({(variant, evaluation): 1}, apart if compared else {})
+                for terms in ({(variant, evaluation): 1}, {} if self._unlike(apart) else apart)
             )
             steps = sorted({s.step for s in by_seed.values() if s.step is not None})
-            rows.append(Row(variant, evaluation, sorted(by_seed), scores, differences, steps))
+            rows.append(Row(variant, sorted(by_seed), scores, differences, steps))
         return rows
 
     def baselines(self, evaluation: str = MAIN) -> dict[str, dict[str, float]]:
@@ -164,9 +162,25 @@ class Results:
 
     def judgements(self) -> list[Judgement]:
         """The hypotheses in their order."""
-        settings = self.plan.study.settings
-        pairs = zip(settings.hypotheses, self.plan.study.contrasts, strict=True)
-        return [self._judged(hypothesis, contrast) for hypothesis, contrast in pairs]
+        study, found = self.plan.study, list[Judgement]()
+        for hypothesis, contrast in zip(study.settings.hypotheses, study.contrasts, strict=True):
+            metric, verdict, reasons = hypothesis.metric or self.metric, UNDECIDED, list[str]()
+            estimate = self.estimate(contrast.terms, metric)
+            if estimate is None:
+                reasons = [f"no seed and scene with `{metric}` in all its runs"]
+            elif len(estimate.by_seed) < 2 or estimate.scenes < 2:
+                few = ["one training a side"] * (len(estimate.by_seed) < 2)
+                reasons = [" and ".join(few + ["one scene"] * (estimate.scenes < 2))]
+            else:
+                if estimate.clear(contrast.sign):
+                    verdict = SEEN
+                elif estimate.clear(-contrast.sign):
+                    verdict = CONTRADICTED
+                else:
+                    reasons = ["the interval holds 0"]
+                reasons += ["judged by unlike protocols"] * self._unlike(contrast.terms)
+            found.append(Judgement(hypothesis, metric, estimate, verdict, ", ".join(reasons)))
+        return found
 
     @property
     def shared(self) -> str | None:
@@ -177,15 +191,21 @@ class Results:
         self, terms: Terms, metric: str, confidence: float = CONFIDENCE
     ) -> Estimate | None:
         """The sum of means that `terms` weigh; None where they share no seed or no scene."""
-        seeds, scenes = self._common(terms, metric)
+        stored, value = [self._stored.get(term, {}) for term in terms], f"model_{metric}"
+        seeds = [s for s in self.plan.study.settings.seeds if all(s in part for part in stored)]
+        every = [part[seed].scenes for part in stored for seed in seeds]
+        first = every[0] if every else {}
+        scenes = [name for name in first if all(value in part.get(name, ()) for part in every)]
         if not scenes:
             return None
-        value = f"model_{metric}"
         values = np.array(
             [
                 [
-                    sum(w * self._stored[term][seed].scenes[s][value] for term, w in terms.items())
-                    for s in scenes
+                    sum(
+                        weight * part[seed].scenes[scene][value]
+                        for part, weight in zip(stored, terms.values(), strict=True)
+                    )
+                    for scene in scenes
                 ]
                 for seed in seeds
             ]
@@ -301,9 +321,10 @@ class Results:
             of = f"{len(self.missing)} of {len(self.plan.runs)}"
             notes.append(f"{of} runs are missing: {listed(self.missing)}")
         notes += [f"{run} failed: {run.failed}" for run in self.failed]
-        if (rank := self.rank_correlation()) is not None:
-            of = f"{len(self._published())} variants"
-            notes.append(f"rank correlation with the published order (Spearman, {of}): {rank:+.2f}")
+        rank, of = self.rank_correlation()
+        if rank is not None:
+            order = f"the published order (Spearman, {of} variants)"
+            notes.append(f"rank correlation with {order}: {rank:+.2f}")
         for name in self.plan.evaluations:
             if len(self._protocols(name)) > 1:
                 found = [v for v in self.plan.recipes if self._unlike(self._apart(v, name))]
@@ -314,26 +335,21 @@ class Results:
                 notes.append(f"scenes without a score in some run: {listed(sorted(lacking))}")
         return notes
 
-    def rank_correlation(self) -> float | None:
+    def rank_correlation(self) -> tuple[float | None, int]:
         """Of our means with the published ones, by `shared`; None for fewer than five variants.
+
+        The second is the number of variants that have both.
 
         Of three, one order in six is the published one by chance; of five, one in 120.
         """
-        pairs = self._published()
-        if len(pairs) < _RANKED:
-            return None
-        published, ours = zip(*pairs, strict=True)
-        return float(spearmanr(published, ours)[0])  # type: ignore[arg-type]  # a named tuple
-
-    def _published(self) -> list[tuple[float, float]]:
-        """Published value and ours, of every variant that has both."""
-        published = self.plan.study.settings.published
-        rows = [] if self.shared is None else self.rows(self.shared)
-        return [
-            (published[row.variant], row.scores[self.metric].mean)
-            for row in rows
-            if row.variant in published and self.metric in row.scores
-        ]
+        published, ours = self.plan.study.settings.published, dict[str, float]()
+        for row in [] if self.shared is None else self.rows(self.shared):
+            if row.variant in published and self.metric in row.scores:
+                ours[row.variant] = row.scores[self.metric].mean
+        if len(ours) < _RANKED:
+            return None, len(ours)
+        found = spearmanr([published[variant] for variant in ours], [*ours.values()])
+        return float(found[0]), len(ours)  # type: ignore[arg-type]  # a named tuple
 
     def shown(self, value: float | None, metric: str | None = None, sign: bool = True) -> str:
         """A difference or a mean, one digit finer than evaluations show it."""
@@ -374,34 +390,3 @@ class Results:
         several = [hashes for _, hashes in sums if len(hashes) > 1]
         names = [evaluation for (evaluation, hashes), weight in sums.items() if weight and hashes]
         return bool(several) or len(set(names)) < len(names)
-
-    def _common(self, terms: Terms, metric: str) -> tuple[list[int], list[str]]:
-        """Seeds that all `terms` have, and the scenes that have the metric in all of these runs."""
-        stored = [self._stored.get(term, {}) for term in terms]
-        seeds = [s for s in self.plan.study.settings.seeds if all(s in part for part in stored)]
-        every = [part[seed].scenes for part in stored for seed in seeds]
-        first, value = every[0] if every else {}, f"model_{metric}"
-        return seeds, [n for n in first if all(value in part.get(n, ()) for part in every)]
-
-    def _judged(self, hypothesis: Hypothesis, contrast: Contrast) -> Judgement:
-        metric = hypothesis.metric or self.metric
-        estimate = self.estimate(contrast.terms, metric)
-        if estimate is None:
-            reason = f"no scene has `{metric}` in all its runs"
-            if not self._common(contrast.terms, metric)[0]:
-                reason = "no seed of which all its runs are finished"
-            elif metric not in self.columns:
-                reason = f"the runs did not measure `{metric}`"
-            return Judgement(hypothesis, metric, None, "undecided", reason)
-        lacking = ["one training a side"] * (len(estimate.by_seed) < 2)
-        lacking += ["one scene"] * (estimate.scenes < 2)
-        if lacking:
-            return Judgement(hypothesis, metric, estimate, "undecided", " and ".join(lacking))
-        verdict: Verdict = "undecided"
-        if estimate.clear(contrast.sign):
-            verdict = "seen"
-        elif estimate.clear(-contrast.sign):
-            verdict = "contradicted"
-        reasons = ["the interval holds 0"] * (verdict == "undecided")
-        reasons += ["judged by unlike protocols"] * self._unlike(contrast.terms)
-        return Judgement(hypothesis, metric, estimate, verdict, ", ".join(reasons))
