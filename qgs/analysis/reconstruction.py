@@ -106,9 +106,8 @@ class ViewScore:
 class Reconstruction:
     """Gaussians (1, G) of a sample by `model`, in its world, rendered from all views of the sample.
 
-    prediction: None where the Gaussians were tuned or refined. world: reference pose (4, 4) and
-    scale, as of `own_world`. tuning: record of the tuning of queries, refinement: of Gaussians;
-    None without. remarks: sentences on the photos and the result.
+    prediction: None where the Gaussians were tuned or refined; `tuning`, `refinement` are the
+    records. world: reference pose (4, 4) and scale, as of `own_world`. remarks: for the user.
     """
 
     model: QueryGaussianModel
@@ -124,7 +123,7 @@ class Reconstruction:
 
     @property
     def worse_than_nearest(self) -> str:
-        """As `qgs.metrics.baselines`, on the compared views."""
+        """See `qgs.metrics.baselines`; on the compared views."""
         rows = [(s.psnr, s.baselines["nearest_input"]) for s in self.scores if s.baselines]
         if not rows:
             return ""

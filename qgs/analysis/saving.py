@@ -55,9 +55,8 @@ def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
     """Write gaussians.ply, overview.png, views/, depth/, orbit.gif and cameras.json into `out`.
 
     All is in the model's world; cameras.json has the similarity to that of the photos. Earlier
-    files and folders of these names are replaced, all at the end.
-    With the suffix of a scene writer (.ply, .splat, ...) `out` is one file of the Gaussians, in the
-    world of the photos.
+    entries of these names are replaced, all at the end. With the suffix of a scene writer (.ply,
+    .splat, ...) `out` is one file of the Gaussians, in the world of the photos.
     """
     if out.suffix.lower() in scene_writers():
         save_gaussians(result.in_photos_world, out)

@@ -159,8 +159,7 @@ def chosen_scene(
 ) -> tuple[Scene, Sequence[int]]:
     """The scene called `name` at `path`, or the only one, and the frames a model was trained on.
 
-    size: (H, W) of its images, the recipe's by default. Raises as `named_scene`, and ValueError
-    where neither gives a size.
+    size: (H, W) of its images, the recipe's by default. Raises ValueError without either.
     """
     if recipe.data_config is None and size is None:
         raise ValueError(
@@ -174,10 +173,7 @@ def chosen_scene(
 
 
 def named_scene(source: SceneSource, path: str, name: str | None) -> Scene:
-    """The scene called `name` of `source`, opened at `path`, or the only one.
-
-    Raises ValueError when there are several and none is named, and when none has the name.
-    """
+    """The scene called `name` of `source`, opened at `path`, or the only one; else ValueError."""
     splits: tuple[Split, ...] = ("train", "test")
     places: dict[str, tuple[Split, int]] = {
         known: (split, place) for split in splits for place, known in enumerate(source.names(split))

@@ -57,12 +57,9 @@ def evaluate(
     from qgs.io.checkpoint import CheckpointFile
 
     options.use_threads(threads)
-    for setting in settings:
-        if re.split("[.=]", setting)[0] not in SECTIONS:
-            raise ValueError(
-                f"--set {setting} would change the trained model; an evaluation can only set "
-                + ", ".join(SECTIONS)
-            )
+    if foreign := [text for text in settings if re.split("[.=]", text)[0] not in SECTIONS]:
+        allowed = ", ".join(SECTIONS)
+        raise ValueError(f"--set {foreign[0]} would change the trained model; only {allowed} can")
     with CheckpointFile(run) as file:
         checkpoint, recipe, step = file.path, file.recipe, file.step
         if settings:
@@ -71,10 +68,9 @@ def evaluate(
     own = Path(run).expanduser().exists()  # so that results may be written beside it
     folder = out or evaluation_folder(checkpoint, bool(settings), own)
     evaluation = evaluate_into(model, recipe, step, folder, console, batch, model.trained_on)
-    trained = RunFolder(checkpoint.parent)
-    if checkpoint.name == trained.checkpoint.name and trained.checkpoint_ema.is_file():
-        hint = f"averaged weights of the run are evaluated by: qgs eval {trained.checkpoint_ema}"
-        console.print(hint, soft_wrap=True, markup=False)
+    averaged = RunFolder(checkpoint.parent).checkpoint_ema
+    if checkpoint.name == "checkpoint.safetensors" and averaged.is_file():
+        console.print(f"averaged weights: qgs eval {averaged}", soft_wrap=True, markup=False)
     if strict and evaluation.missing:
         raise typer.Exit(1)
 

@@ -63,10 +63,7 @@ def reconstruct(
     The result of --refine is written to OUT/refined, beside the prediction of the model.
     """
     if not overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
-        raise FileExistsError(
-            f"{out} is a file or holds some; choose another --out, or add --overwrite to replace "
-            "the files of the same names"
-        )
+        raise FileExistsError(f"{out} is not empty: choose another --out, or add --overwrite")
     pixels, fine = options.parse_size(size), options.parse_size(refine_size, "--refine-size")
     if refine is None and (refine_size or refine_inputs or gaussians):
         raise ValueError("--refine-size, --refine-inputs and --gaussians need --refine SECONDS")

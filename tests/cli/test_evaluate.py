@@ -1,6 +1,7 @@
 """`qgs eval` as a user types it: indices, tuning, batches."""
 
 import json
+import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -124,6 +125,13 @@ def test_strict_evaluations_that_lack_a_scene_exit_with_1(
     assert len(summary(tmp_path / "out")["missing"]) == 1
     index.write_text(json.dumps({"test/000001": {"context": [0, 3], "target": [1]}}))
     assert evaluated(*words, "--strict").exit_code == 0
+
+
+def test_averaged_weights_of_a_run_are_named(runs: Path, tmp_path: Path) -> None:
+    for name in ("checkpoint", "checkpoint_ema"):
+        shutil.copy(runs / "locus" / "checkpoint.safetensors", tmp_path / f"{name}.safetensors")
+    result = evaluated(tmp_path, "--set", "evaluation.scenes=1")
+    assert f"qgs eval {tmp_path / 'checkpoint_ema.safetensors'}" in result.output
 
 
 @pytest.mark.parametrize(

@@ -1,17 +1,22 @@
 """`qgs train` and `qgs eval` as a user types them."""
 
 import json
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import run_qgs, sets
+from commands import MODEL, run_qgs, sets
 from typer.testing import Result
 
+from qgs.cli.train import with_absolute_path
+from qgs.composer import resolve
 from qgs.engine import training
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "tiny" / "locus.yaml"
+FINETUNE = RECIPE.parents[1] / "locus" / "dl3dv_4096_2views.yaml"
+ROOMS = "data={type: rooms/procedural, image_size: [16, 16]}"
 QUICK = (
     "data.image_size=[32, 32]",
     "views.targets=2",
@@ -98,3 +103,48 @@ def test_a_collapse_is_told_without_a_traceback(tmp_path: Path) -> None:
     assert isinstance(result.exception, SystemExit)
     assert "training collapsed" in result.output
     assert (tmp_path / "run" / "checkpoint.safetensors").is_file()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ((), "no evaluation index at .*datasets/dl3dv/evaluation_2views.json"),
+        (("evaluation.index=null", "init_from=null"), "datasets/dl3dv"),
+        (("evaluation.index=null", "plugins=[rooms]", ROOMS), "runs/locus/dl3dv"),
+    ],
+)
+def test_what_is_missing_is_told_before_training(
+    overrides: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = run_qgs("train", FINETUNE, "--out", "run", "--device", "cpu", *sets(*overrides))
+    assert isinstance(result.exception, FileNotFoundError)
+    with pytest.raises(FileNotFoundError, match=message):
+        raise result.exception
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ("photos", "{here}/photos"),
+        ("../photos", "{above}/photos"),
+        ("~/photos", "{home}/photos"),
+        ("/data/photos", "/data/photos"),
+        ("memory://bucket/photos", "memory://bucket/photos"),
+        ("zip://a::file://{here}/photos.zip", "zip://a::file://{here}/photos.zip"),
+    ],
+)
+def test_paths_become_absolute_and_urls_stay(given, expected, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = {"here": tmp_path, "above": tmp_path.parent, "home": Path.home()}
+    zipfile.ZipFile(tmp_path / "photos.zip", "w").close()
+    data = {"type": "qgs/photos", "path": given.format(**names), "image_size": [16, 16]}
+    recipe = with_absolute_path(resolve({"recipe": 1, "model": MODEL, "data": data}))
+    assert recipe.tree["data"]["path"] == expected.format(**names)
+
+
+def test_data_without_a_path_stays():
+    data = {"type": "rooms/procedural", "image_size": [16, 16]}
+    recipe = resolve({"recipe": 1, "model": MODEL, "plugins": ["rooms"], "data": data})
+    assert with_absolute_path(recipe).tree == recipe.tree

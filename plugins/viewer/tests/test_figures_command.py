@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from commands import run_qgs
 from PIL import Image
+from qgs_viewer.figures.command import NAMES
 from qgs_viewer.figures.gallery import FIGURES
 
 import qgs
@@ -30,6 +31,7 @@ def test_figures_are_written_and_explained(checkpoint: Path, tmp_path: Path) -> 
     written = {"dispersion.pdf", "dispersion.png", "figures.md"}
     assert {file.name for file in out.iterdir()} == written
     assert "![dispersion](dispersion.png)" in (out / "figures.md").read_text()
+    assert tuple(FIGURES) == NAMES
     again = run_qgs("figures", checkpoint, "--out", out)
     assert isinstance(again.exception, FileExistsError)
 

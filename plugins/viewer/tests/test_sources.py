@@ -112,6 +112,13 @@ def test_a_reconstruction_keeps_its_background(finished: Path, tmp_path: Path) -
         open_source(str(folder), Wanted())
 
 
+def test_another_model_of_the_name_is_noticed(finished: Path, tmp_path: Path) -> None:
+    qgs.save(model_of("tokengs"), tmp_path / "other.safetensors")
+    record = {"model": str(tmp_path / "other.safetensors")}
+    source = open_source(str(changed_copy(finished, tmp_path, **record)), Wanted())
+    assert not isinstance(source, ModelSource)
+
+
 @pytest.mark.parametrize("text", ["{", '{"views": []}', '{"scene": "x", "views": [{"kind": 1}]}'])
 def test_a_broken_record_is_told_with_its_file(finished: Path, tmp_path: Path, text: str) -> None:
     folder = changed_copy(finished, tmp_path)

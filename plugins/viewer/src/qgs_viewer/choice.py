@@ -20,8 +20,7 @@ _PALE = 0.4  # part of the background in the colours of Gaussians that are not p
 class Choice:
     """What is shown. query: the picked one. layer: of supports and attention, 0 the start.
 
-    others: how Gaussians of other queries look once one is picked. patches: number of lines to
-    those that it reads. by_query: colours of queries instead of the scene's.
+    others: how Gaussians of other queries look. patches: number of lines to those that are read.
     """
 
     by_query: bool = False

@@ -51,10 +51,8 @@ def demo(
 ) -> None:
     """Trained models on rooms that none has seen, or on your photos; writes report.html.
 
-    Photos need camera poses, as Nerfstudio, COLMAP, Blender or LLFF write them.
-
-    With --train: the tiny TokenGS and LocusGS, or the recipes that are named, trained on the same
-    rooms and compared.
+    Photos need camera poses, as Nerfstudio, COLMAP, Blender or LLFF write them. With --train the
+    tiny TokenGS and LocusGS, or the named recipes, are trained on the same rooms and compared.
     """
     if train and models:
         raise ValueError("--model names trained models; leave out --train, or name recipes")

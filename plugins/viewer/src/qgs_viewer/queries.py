@@ -110,7 +110,7 @@ def support_picture(
 
 
 def patch_maps(rows_hM: Tensor, grid: tuple[int, int, int]) -> np.ndarray:
-    """Scores (h, M) of image tokens as one map per view (V, H/P, W/P), the mean over heads.
+    """Scores (h, M) of image tokens as maps (V, H/P, W/P), the mean over heads.
 
     Heads that a mask keeps from a token (-inf) do not count; NaN where none sees it.
     """
@@ -119,10 +119,7 @@ def patch_maps(rows_hM: Tensor, grid: tuple[int, int, int]) -> np.ndarray:
 
 
 def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]:
-    """Each photo in pale grey, coloured by its map; the views share one scale.
-
-    Tokens without a score (NaN) have the colour of nothing.
-    """
+    """Each photo in pale grey, coloured by its map on one scale; NaN has the colour of nothing."""
     seen = maps[np.isfinite(maps)]
     low, high = (float(seen.min()), float(seen.max())) if seen.size else (0.0, 1.0)
     hidden = [~np.isfinite(view) for view in maps]

@@ -30,10 +30,7 @@ from qgs_viewer.queries import DrawnQuery, notable_queries, query_picture
 
 @dataclass(frozen=True)
 class Contender:
-    """A trained model. scores: means of `Report.columns`. recipe: YAML.
-
-    about: what kind of model it is, in a sentence or two. curves: of its training.
-    """
+    """A trained model. scores: means of `Report.columns`. recipe: YAML. about: its kind."""
 
     name: str
     model: QueryGaussianModel
@@ -69,8 +66,7 @@ class Report:
     commands: Mapping[str, str] = field(default_factory=dict)
 
 
-GROUP = "qgs.report"
-"""Group of entry points NAME = "module:function": as `orbit`, or a generator of sections."""
+GROUP = "qgs.report"  # entry points NAME = "module:function": like `orbit`, or a generator
 SIDE = 256  # pixels on the longer side of pictures that models render for show
 QUERIES = 5
 ANCHORS = 12
@@ -153,9 +149,9 @@ def offered_sections(shown: Shown, samples: Sequence[Sample]) -> Iterator[Report
 def pictured_scene(
     shown: Sequence[tuple[Contender, Prediction]], sample: Sample, depth: Tensor | None
 ) -> dict[str, Any]:
-    """Name, inputs and pictures of a scene by kind and column. depth: the true one (T, 1, H, W).
+    """Name, inputs and pictures of a scene by kind and column; `most`: the brightest error.
 
-    most: the error that is brightest, the same for all.
+    depth: the true one (T, 1, H, W).
     """
     views = sample.targets.select(slice(TARGETS))
     inputs, truth = sample.input_frames, views.images[0]

@@ -26,11 +26,14 @@ _EDGES = ((0, 1), (1, 2), (2, 3), (3, 0))
 
 
 class Stage:
-    """What is in a scene of viser. Everything drawn has one name and replaces what had it."""
+    """What is in a scene of viser. Everything drawn has one name and replaces what had it.
+
+    photo_depth: of photos before their cameras. anchor_radius: viser's `point_size`, half a width.
+    """
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self.scene = scene
-        self.unit = 1.0
+        self.photo_depth, self.anchor_radius = FRUSTUM, 0.01
         self._gaussians: viser.GaussianSplatHandle | None = None
         self._painted: tuple[Look, Choice] | None = None
 
@@ -41,7 +44,8 @@ class Stage:
 
         unit: length that sizes photos and anchors, by default `distance_to` the look.
         """
-        self.unit = unit or distance_to(look)
+        unit = unit or distance_to(look)
+        self.photo_depth, self.anchor_radius = FRUSTUM * unit, 0.01 * unit
         plain = np.full((8, 8, 3), 255.0) * look.background
         self.scene.set_background_image(plain.round().astype(np.uint8), "png")
         self._draw_photos(look, every)
@@ -71,16 +75,6 @@ class Stage:
             self._gaussians.set_gaussians(*parts)
             self._gaussians.scale = 1 / factor
         self._painted = look, paint
-
-    @property
-    def photo_depth(self) -> float:
-        """How far before its camera a photo stands, shown world."""
-        return FRUSTUM * self.unit
-
-    @property
-    def anchor_radius(self) -> float:
-        """Half the width of an anchor's dot, shown world; viser's `point_size` is such a half."""
-        return 0.01 * self.unit
 
     def _draw_photos(self, look: Look, every: Cameras | None) -> None:
         self.scene.remove_by_name(_VIEWS)

@@ -176,9 +176,9 @@ def strongest_edges(shown: Exhibit, query: int, layer: int, part: str) -> tuple[
 
 
 def nodes_of(shown: Exhibit, layer: int) -> Tensor:
-    """World points (N, 3) of the queries before a layer, float64.
+    """World points (N, 3) of the queries before a layer, float64: anchors, else means of Gaussians.
 
-    Without anchors the mean of their Gaussians, weighted by their blending in the input views.
+    Means are weighted by the blending in the input views.
     """
     support = shown.look.support(layer - 1)
     if support is not None:

@@ -21,10 +21,7 @@ class NothingToShowError(ValueError):
 
 @dataclass(frozen=True)
 class Exhibit:
-    """A model by name, and its look at the inputs of `sample`, in the model's own world.
-
-    curves: of its training, where known.
-    """
+    """A model by name, its look at the inputs of `sample` in its own world, and its training."""
 
     name: str
     look: Look
@@ -52,10 +49,7 @@ class Exhibit:
         return self.look.gaussians
 
     def notable(self, count: int, cameras: Cameras, query: int | None = None) -> list[DrawnQuery]:
-        """`query`, or the `count` most notable ones in the first of cameras (1, V).
-
-        Raises ValueError for a query that does not exist.
-        """
+        """`query`, or the `count` most notable ones in the first of cameras (1, V); ValueError."""
         if query is None:
             return notable_queries(self.model, self.gaussians, cameras, count)
         if not 0 <= query < self.look.queries:
@@ -81,7 +75,7 @@ class Exhibition:
 
     @property
     def models(self) -> Mapping[str, QueryGaussianModel]:
-        """The models by name."""
+        """By name."""
         return {exhibit.name: exhibit.model for exhibit in self.exhibits}
 
     @property

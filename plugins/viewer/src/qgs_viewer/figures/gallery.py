@@ -55,8 +55,8 @@ def open_exhibition(
 ) -> Exhibition:
     """The models `runs` on the scenes of their recipe's evaluation, or on photos held out.
 
-    scene: of the exhibits and of the first samples; the first one by default. Raises as
-    `contest.recipes_alike` and the data do, and ValueError for an unknown scene or query.
+    scene: of the exhibits and of the first samples; the first one by default. Raises ValueError for
+    an unknown scene or query, and as `contest.recipes_alike`.
     """
     files = contest.checkpoints(runs)
     recipe = next(iter(contest.recipes_alike(files, photos).values()))
@@ -89,10 +89,7 @@ def refuse_unknown(names: Sequence[str]) -> None:
 
 
 def write_all(show: Exhibition, folder: Path, names: Sequence[str] = ()) -> Iterator[str]:
-    """Write the figures `names`, all by default, and yield a line on each once it is written.
-
-    Figures that these models have nothing for are left out.
-    """
+    """Write the figures `names`, all by default, and yield a line on each."""
     texts = [f"# {' and '.join(show.models)}", *show.notes]
     for name in names or FIGURES:
         try:
