@@ -11,6 +11,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin
 from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails, to_jsonable_python
 
+from qgs.components.schedules import SCHEDULES
 from qgs.composer.errors import Problems, did_you_mean, nearest
 from qgs.composer.places import Place
 from qgs.composer.registry import InstalledPlugin, Registry, available_plugins, component_failure
@@ -24,7 +25,7 @@ from qgs.contracts import (
     TrainingConfig,
     ViewsConfig,
 )
-from qgs.contracts.schedule import SCHEDULES, Schedule, at_step, number_kinds
+from qgs.contracts.schedule import Schedule, at_step, number_kinds
 
 ConfigT = TypeVar("ConfigT", bound=ComponentConfig)
 _BOOLS = {"on": "true", "yes": "true", "y": "true", "off": "false", "no": "false", "n": "false"}

@@ -3,12 +3,13 @@
 import inspect
 from typing import Any
 
+from qgs.components.schedules import SCHEDULES
 from qgs.composer.decode import SETTINGS
 from qgs.composer.registry import Registry
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, SLOTS
 from qgs.composer.yaml_text import KeyPath
 from qgs.contracts import Component, ComponentConfig
-from qgs.contracts.schedule import SCHEDULES, Schedule
+from qgs.contracts.schedule import Schedule
 
 _NAMES = {"type": "array", "items": {"type": "string"}}
 _NULL = {"type": "null"}

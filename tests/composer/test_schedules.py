@@ -10,10 +10,11 @@ import yaml
 
 import qgs
 from qgs.components import MlpFeedForward
+from qgs.components.schedules import SCHEDULES
 from qgs.composer import Recipe, RecipeError, resolve
 from qgs.composer.recipe import annotated
 from qgs.contracts import ComponentConfig
-from qgs.contracts.schedule import SCHEDULES, at_step, follow, number_kinds
+from qgs.contracts.schedule import at_step, follow, number_kinds
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 DILATION = "model.renderer.dilation"

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from line_scenes import Line
 
+from qgs.components.schedules import Linear
 from qgs.composer import resolve
 from qgs.contracts import ViewsConfig
-from qgs.contracts.schedule import END, Linear
+from qgs.contracts.schedule import END
 from qgs.data.evaluation import evaluation_samples
 from qgs.data.samplers import Bounded, Span
 from qgs.data.sampling import draw_frames
