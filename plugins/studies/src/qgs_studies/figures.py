@@ -20,7 +20,7 @@ from qgs.drawing.figures import (
 from qgs.io.files import read_records, replacing
 from qgs.metrics.images import Psnr
 from qgs_studies.hypotheses import MAIN
-from qgs_studies.results import Results, Row
+from qgs_studies.results import Results
 
 _POINTS = 200  # of a learning curve
 _POINT: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 3.5}
@@ -56,7 +56,12 @@ def values_figure(results: Results, evaluation: str = MAIN) -> Figure | None:
         for place, row in enumerate(rows):
             _points(left, place, row.scores[metric].by_seed, seeds)
             left.plot(row.scores[metric].mean, place, "|", color=hex_color(INK), markersize=14)
-            _difference(right, place, row, metric, seeds)
+            if apart := row.differences.get(metric):
+                if apart.low is not None and apart.high is not None:
+                    ends, at = [apart.low, apart.high], [place, place]
+                    right.plot(ends, at, color=hex_color(INK), linewidth=1.2)
+                _points(right, place, apart.by_seed, seeds)
+                right.plot(apart.mean, place, "|", color=hex_color(INK), markersize=14)
         right.axvline(0, color=hex_color(MUTED), linewidth=0.9)
         left.set(yticks=range(len(rows)), yticklabels=[row.variant for row in rows])
         left.invert_yaxis()
@@ -79,16 +84,6 @@ def _points(axes: Axes, place: int, values: Mapping[int, float], seeds: Mapping[
         if seed in values:
             shift = 0.22 * (number - (len(seeds) - 1) / 2) / max(len(seeds) - 1, 1)
             axes.plot(values[seed], place + shift, color=color, **_POINT)
-
-
-def _difference(axes: Axes, place: int, row: Row, metric: str, seeds: Mapping[int, str]) -> None:
-    apart = row.differences.get(metric)
-    if apart is None:
-        return
-    if apart.low is not None and apart.high is not None:
-        axes.plot([apart.low, apart.high], [place, place], color=hex_color(INK), linewidth=1.2)
-    _points(axes, place, apart.by_seed, seeds)
-    axes.plot(apart.mean, place, "|", color=hex_color(INK), markersize=14)
 
 
 def curves_figure(results: Results) -> Figure | None:

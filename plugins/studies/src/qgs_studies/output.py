@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -75,10 +75,8 @@ def steps_shown(steps: Sequence[int]) -> str:
 def show(results: Results, console: Console) -> None:
     """Print the answer, the table of the study's metric, the verdicts."""
     console.print(results.answer(), highlight=False, soft_wrap=True, markup=False)
-    for name in results.plan.evaluations:
-        rows = [row[:6] for row in table_rows(results, name)]
-        if len(rows) > 1:
-            print_table(console, name, rows, **COMPACT)
+    for name, rows in _tables(results):
+        print_table(console, name, [row[:6] for row in rows], **COMPACT)
     if len(rows := hypothesis_rows(results)) > 1:
         print_table(console, "", [[*row[:1], *row[2:5]] for row in rows], **COMPACT)
     print_lines(console, results.notes())
@@ -134,24 +132,27 @@ def markdown(results: Results) -> str:
     parts = [results.answer()]
     if len(rows := hypothesis_rows(results)) > 1:
         parts.append(markdown_table(rows))
-    for name in results.plan.evaluations:
-        rows = table_rows(results, name)
-        if len(rows) > 1:
-            parts += [f"**{name}**"] * bool(name) + [markdown_table(rows)]
+    for name, rows in _tables(results):
+        parts += [f"**{name}**"] * bool(name) + [markdown_table(rows)]
     return "\n\n".join([*parts, bullets(results.notes())]) + "\n"
 
 
 def latex(results: Results) -> str:
     """A booktabs table of the study's metric for each evaluation, ready for a paper."""
     parts = [f"% {results.answer()}", "% needs \\usepackage{booktabs}"]
-    for name in results.plan.evaluations:
-        head, *rows = [[*row[:5]] for row in table_rows(results, name)]
-        if not rows:
-            continue
+    for name, table in _tables(results):
+        head, *rows = [row[:5] for row in table]
         lines = [r"\begin{tabular}{lrrrr}", r"\toprule"]
         lines += [_latex_row(head), r"\midrule", *map(_latex_row, rows)]
         parts += [*[f"% {name}"] * bool(name), *lines, r"\bottomrule", r"\end{tabular}"]
     return "\n".join(parts) + "\n"
+
+
+def _tables(results: Results) -> Iterator[tuple[str, list[list[str]]]]:
+    """Name and rows of the table of every evaluation that has results."""
+    for name in results.plan.evaluations:
+        if len(rows := table_rows(results, name)) > 1:
+            yield name, rows
 
 
 def _latex_row(cells: Iterable[str]) -> str:
