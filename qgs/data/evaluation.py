@@ -1,9 +1,8 @@
 """Which views an evaluation compares: drawn by seed, or named by an index file."""
 
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, TypeAlias
 
 import numpy as np
 import torch
@@ -59,7 +58,7 @@ def read_index(path: str) -> EvaluationIndex:
             f"there is no evaluation index at {path}; evaluation.index is a JSON file of the form "
             f"{_FORM}, relative to the working directory"
         )
-    written = read_json(file, f"write {_FORM}", object_pairs_hook=_without_repeats)
+    written = read_json(file, f"write {_FORM}")
     try:
         index = TypeAdapter(dict[str, IndexEntry | None]).validate_python(written)
     except ValidationError as error:
@@ -69,12 +68,6 @@ def read_index(path: str) -> EvaluationIndex:
     if not any(index.values()):
         raise ValueError(f"the evaluation index {path} names no scene to judge")
     return index
-
-
-def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    if repeated := [key for key, count in Counter(key for key, _ in pairs).items() if count > 1]:
-        raise ValueError(f"written twice: {listed(repeated)}")
-    return dict(pairs)
 
 
 @dataclass(frozen=True)
@@ -115,7 +108,6 @@ class EvaluationPlan:
         self._sampler = sampler or Span(Span.Config())
         names = source.names("test")
         self._places = {name: place for place, name in enumerate(names)}
-        self._times = Counter(names)
         entries = dict.fromkeys(names[: evaluation.scenes], True) if index is None else index
         self.wanted = tuple(name for name, entry in entries.items() if entry)
         self.null = tuple(name for name, entry in entries.items() if not entry)
@@ -127,8 +119,6 @@ class EvaluationPlan:
             try:
                 if name not in self._places:
                     raise ValueError("not among the test scenes of the data")
-                if self._times[name] > 1:
-                    raise ValueError(f"{self._times[name]} test scenes of the data have this name")
                 place = self._places[name]
                 scene = self._scenes[place]
                 noise = np.random.default_rng([self._evaluation.seed, place])
@@ -229,9 +219,6 @@ def _named(scene: Scene, index: EvaluationIndex) -> tuple[Frames, Frames]:
         )
     outside = [f for f in (*entry.context, *entry.target) if not 0 <= f < len(scene)]
     if outside:
-        which = f"frame{'s' if len(outside) > 1 else ''} {listed(outside)}"
-        ends = f"frames {scene.label(0)} to {scene.label(len(scene) - 1)}"
-        raise ValueError(
-            f"{which} {'are' if len(outside) > 1 else 'is'} out of range, it has {ends}"
-        )
+        ends = f"{scene.label(0)} to {scene.label(len(scene) - 1)}"
+        raise ValueError(f"the index names frames {listed(outside)}, the scene has {ends}")
     return tuple(entry.context), tuple(entry.target)

@@ -70,11 +70,9 @@ def framing(scene: Scene, frame: int) -> str:
     left, top, right, bottom = crop.box
     cut = 1 - (right - left) * (bottom - top) / (stored[0] * stored[1])
     part = f"the middle {right - left:.0f} x {bottom - top:.0f} ({cut:.0%} is cut off)"
-    done = "reduced" if crop.scale < 1 else "enlarged"
-    scaled = "" if crop.scale == 1 else f", {done} to {size[1]} x {size[0]}"
     return (
         f"the model sees {part if cut >= 0.01 else 'all'} of photos such as frame "
-        f"{scene.label(frame)}, {stored[1]} x {stored[0]} pixels{scaled}"
+        f"{scene.label(frame)}, {stored[1]} x {stored[0]} pixels, at {size[1]} x {size[0]}"
     )
 
 
@@ -185,15 +183,11 @@ def eight_bits(image: Image.Image) -> Image.Image:
     Raises OSError where no number is known to be white: float, 32-bit and LAB files.
     """
     if image.mode.startswith("I;16"):
-        return Image.fromarray(_scaled(np.array(image)))
+        numbers = np.array(image).astype(np.uint32)
+        return Image.fromarray(((numbers + 128) // 257).astype(np.uint8))  # rounded, 65535 is 255
     if image.mode not in _EIGHT_BITS:
         raise OSError(f"its pixels are of the kind {image.mode!r}: give 8 or 16 bits a channel")
     return image
-
-
-def _scaled(numbers: np.ndarray) -> np.ndarray:
-    """16 bits to 8, rounded."""
-    return ((numbers.astype(np.uint32) + 128) // 257).astype(np.uint8)
 
 
 def decode_mask(file: IO[bytes]) -> np.ndarray:

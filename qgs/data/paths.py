@@ -6,7 +6,7 @@ import io
 import json
 import zipfile
 import zlib
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import IO, Any
 
 from upath import UPath
@@ -37,14 +37,6 @@ def is_local(path: Path | UPath) -> bool:
     return isinstance(path, Path)
 
 
-def opened_archive(path: UPath) -> UPath:
-    """The top folder of the zip archive `path`, local or remote.
-
-    The archive is open as long as paths made from the returned one live.
-    """
-    return UPath(f"zip:///::{path}")
-
-
 def listing(folder: UPath) -> list[UPath]:
     """The content of `folder`; nothing where it is no folder."""
     try:
@@ -71,21 +63,14 @@ def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
     return content
 
 
-def read_json(path: UPath, fix: str, **options: Any) -> Any:
+def read_json(path: UPath, fix: str) -> Any:
     """The content of a JSON file.
 
-    fix: what to do, for the message. options: of `json.loads`. Raises ValueError for a file that
-    is no JSON, FileNotFoundError for none.
+    fix: the remedy, for messages. Raises ValueError for a file that is no JSON, FileNotFoundError.
     """
     try:
-        return json.loads(read_file(path, _LARGEST_JSON), **options)
+        return json.loads(read_file(path, _LARGEST_JSON))
     except FileNotFoundError:
         raise
     except (ValueError, OSError, RecursionError) as error:
         raise ValueError(f"{path} is not valid JSON ({error}): {fix}") from error
-
-
-def stays_inside(name: str) -> bool:
-    """Whether a relative name, with either kind of slash, stays inside the folder it starts in."""
-    parts = PurePosixPath(name.replace("\\", "/")).parts
-    return bool(parts) and parts[0] != "/" and ".." not in parts and ":" not in parts[0]

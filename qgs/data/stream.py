@@ -85,17 +85,13 @@ class SceneOrder:
     """The scenes of an endless sequence of samples: a function of (groups, seed) alone.
 
     Each epoch visits the `groups` (see `SceneSource.groups`) in a random order, and the scenes of
-    each at random. Raises ValueError unless the groups hold each of `count` scenes once.
+    each at random.
     """
 
     def __init__(self, groups: Sequence[Sequence[int]], count: int, seed: int) -> None:
         self._groups = [np.asarray(group, np.int64) for group in groups if len(group)]
         listed = np.concatenate([np.empty(0, np.int64), *self._groups])
-        if not np.array_equal(np.sort(listed), np.arange(count)):
-            raise ValueError(
-                f"the data source has {count} training scenes, but its groups list "
-                f"{len(listed)} indices, not each scene once; this is a mistake of the data source"
-            )
+        assert np.array_equal(np.sort(listed), np.arange(count)), "groups hold every scene once"
         self._count, self._seed = count, seed
         self._epoch = lru_cache(maxsize=2)(self._draw_epoch)
 

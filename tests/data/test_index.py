@@ -61,7 +61,6 @@ def test_a_published_index_is_read(tmp_path: Path) -> None:
         ('{"a": {"context": [0.5], "target": [1]}}', "a.context.0: Input should be a valid int"),
         ('["a"]', "file: Input should be a valid dictionary"),
         ('{"a": null}', "names no scene to judge"),
-        ('{"a": null, "a": {"context": [0], "target": [1]}}', "written twice: a"),
         ('{"a": ', "Expecting value"),
     ],
 )
@@ -90,24 +89,20 @@ def test_samples_are_those_of_the_index_in_its_order() -> None:
 
 
 def test_what_is_not_judged_is_named() -> None:
-    source = Strips(Strip("good"), Strip("short", 4), Strip("spare"), Strip("twin"), Strip("twin"))
+    source = Strips(Strip("good"), Strip("short", 4), Strip("spare"))
     index = {
         "gone": entry([0, 1], [2]),
         "good": entry([0, 2], [1]),
         "nil": None,
         "short": entry([0, 4], [-1]),
-        "twin": entry([0, 2], [1]),
     }
     plan = EvaluationPlan(source, VIEWS, EvaluationConfig(), index)
-    assert plan.wanted == ("gone", "good", "short", "twin")
+    assert plan.wanted == ("gone", "good", "short")
     assert plan.null == ("nil",)
     assert plan.unlisted == ("spare",)
     failures = {s.scene: s.reason for s in plan.samples() if isinstance(s, SceneFailure)}
-    assert failures == {
-        "gone": "not among the test scenes of the data",
-        "short": "frames 4, -1 are out of range, it has frames 0 to 3",
-        "twin": "2 test scenes of the data have this name",
-    }
+    assert failures.keys() == {"gone", "short"}
+    assert "4, -1" in failures["short"]
 
 
 def test_scenes_that_do_not_decode_are_told_and_the_rest_goes_on() -> None:

@@ -9,15 +9,7 @@ from photo_formats import opened, scene, synthetic, write_nerfstudio
 from upath import UPath
 
 from qgs.contracts import ViewsConfig
-from qgs.data.paths import (
-    is_local,
-    open_file,
-    opened_archive,
-    opened_path,
-    read_file,
-    read_json,
-    stays_inside,
-)
+from qgs.data.paths import is_local, open_file, opened_path, read_file, read_json
 from qgs.data.stream import SampleStream
 
 
@@ -29,16 +21,6 @@ def test_local_paths_are_told_from_urls(tmp_path, monkeypatch):
     assert not is_local(opened_path("memory://a"))
     with pytest.raises(ValueError, match="nosuch://a"):
         opened_path("nosuch://a")
-
-
-@pytest.mark.parametrize("name", ["a", "a/b.torch", "a..b", ".hidden", "a\\b"])
-def test_names_that_stay_inside(name):
-    assert stays_inside(name)
-
-
-@pytest.mark.parametrize("name", ["..", "a/../b", "/a", "\\a", "a\\..\\..\\b", "c:/a", "", "C:a"])
-def test_names_that_lead_outside(name):
-    assert not stays_inside(name)
 
 
 def test_photos_of_a_store_are_read_several_at_a_time(tmp_path, monkeypatch):
@@ -69,7 +51,7 @@ def test_files_that_are_read_whole_have_a_limit(tmp_path):
         read_json(UPath(tmp_path / "huge.json"), "")
     with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("large", bytes(10**6))
-    member = opened_archive(UPath(tmp_path / "a.zip")) / "large"
+    member = UPath(f"zip:///::{tmp_path / 'a.zip'}") / "large"
     assert len(open_file(member).read()) == 10**6
     with pytest.raises(OSError, match=r"large.*a\.zip is larger than 1 kB"):
         read_file(member, 1000)

@@ -154,7 +154,7 @@ def test_what_is_missing_is_told_in_the_same_line_as_the_score(tiny: Tiny, tmp_p
     assert evaluation.wanted == ("test/000000", "test/000001", "gone")
     summary = evaluation.summary()
     assert summary["missing"] == {
-        "test/000001": "frame 99 is out of range, it has frames 0 to 7",
+        "test/000001": "the index names frames 99, the scene has 0 to 7",
         "gone": "not among the test scenes of the data",
     }
     assert (summary["scenes"], summary["scenes_in_protocol"]) == (1, 3)

@@ -11,7 +11,7 @@ import photo_formats
 import pytest
 import torch
 from PIL import Image
-from qgs_datasets.chunk_files import camera_problems, load_chunk, parse_record
+from qgs_datasets.chunk_files import camera_problems, load_chunk, parse_record, stays_inside
 from qgs_datasets.chunks import ChunksSource
 from upath import UPath
 
@@ -260,6 +260,16 @@ def test_an_index_does_not_lead_outside(tmp_path):
     (tmp_path / "train" / "index.json").write_text("[1]")
     with pytest.raises(ValueError, match="must map each scene's key"):
         opened(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["a", "a/b.torch", "a..b", ".hidden", "a\\b"])
+def test_names_that_stay_inside(name):
+    assert stays_inside(name)
+
+
+@pytest.mark.parametrize("name", ["..", "a/../b", "/a", "\\a", "a\\..\\..\\b", "c:/a", "", "C:a"])
+def test_names_that_lead_outside(name):
+    assert not stays_inside(name)
 
 
 def test_folders_that_are_not_there(tmp_path):

@@ -67,7 +67,6 @@ def write_llff(folder, photos):
 
 
 def write_colmap(folder, photos):
-    pytest.importorskip("pycolmap")
     return photo_formats.write_colmap(folder, photos, "binary")
 
 

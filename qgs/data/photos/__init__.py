@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from upath import UPath
 
 from qgs.data.photos.cameras import CamerasJson
@@ -11,7 +9,7 @@ from qgs.data.photos.checks import with_equal_times
 from qgs.data.photos.colmap import Colmap
 from qgs.data.photos.llff import Llff
 from qgs.data.photos.nerfstudio import Blender, Nerfstudio
-from qgs.data.photos.reader import IMAGE_SUFFIXES, Listing, PhotoReader
+from qgs.data.photos.reader import Listing, PhotoReader
 from qgs.data.scenes import warn_once
 from qgs.extensions import ExtensionError, installed, load
 from qgs.wording import listed
@@ -63,34 +61,21 @@ def read_listing(folder: UPath, format: str = "auto", images: str | None = None)
             f"folder that holds {listings}"
         )
     held = formats_of(folder)
-    wanted = [name for name in held if format in ("auto", name)]
-    if not wanted and format != "auto":
-        other = f"; it can be read as {', '.join(held)}" if held else ""
+    if held and format not in ("auto", *held):
         needed = known[format].listing
-        raise FileNotFoundError(f"{folder} has no {needed}, which {format} needs{other}")
-    if not wanted:
+        raise FileNotFoundError(
+            f"{folder} has no {needed}, which {format} needs; it can be read as {', '.join(held)}"
+        )
+    if not held:
         inside = listed(sorted(item.name for item in folder.iterdir()))
         raise FileNotFoundError(
-            f"{folder} has no transforms.json nor another listing of cameras; it holds "
-            f"{inside or 'nothing'} (images: {listed(_image_counts(folder)) or 'none'}). Camera "
-            "poses are needed: make them with COLMAP or with nerfstudio's `ns-process-data`, or "
-            f"give the folder that holds one of {listings}. The smallest transforms.json that "
-            f"would do: {_SMALLEST}"
+            f"{folder} lists no cameras; it holds {inside or 'nothing'}. Make poses with COLMAP or "
+            f"nerfstudio's `ns-process-data`, or give the folder that holds one of {listings}. A "
+            f"minimal transforms.json: {_SMALLEST}"
         )
-    if len(wanted) > 1:
+    if format == "auto" and len(held) > 1:
         warn_once(
             f"{folder} holds photos in {len(held)} formats ({', '.join(held)}) and is read as "
             f"{held[0]}; `format: {held[1]}` reads the other"
         )
-    return with_equal_times(known[wanted[0]].read(folder, images))
-
-
-def _image_counts(folder: UPath, name: str = "", depth: int = 3) -> Iterator[str]:
-    """How many images `folder` and the folders in it hold."""
-    items = sorted(folder.iterdir(), key=lambda item: item.name)
-    items = [item for item in items if not item.name.startswith(".")]
-    if count := sum(item.name.lower().endswith(IMAGE_SUFFIXES) for item in items):
-        yield f"{count} in {name or 'it'}"
-    for item in items if depth else ():
-        if item.is_dir():
-            yield from _image_counts(item, f"{name}{item.name}/", depth - 1)
+    return with_equal_times(known[held[0] if format == "auto" else format].read(folder, images))

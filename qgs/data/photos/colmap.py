@@ -1,38 +1,40 @@
 """COLMAP: a sparse model, text or binary, beside a folder of photos.
 
-Points, which are most of a model, are not read, and models may lie on any file system, which
-pycolmap's own readers do not offer; pycolmap says what the parameters of a camera model mean.
+Points, which are most of a model, are not read, and models may lie on any file system; pycolmap
+offers neither. The formats are described at colmap.github.io/format.html.
 """
 
 import io
 import math
 import struct
 from collections.abc import Iterator, Sequence
-from importlib.util import find_spec
 from pathlib import PurePosixPath
 from typing import IO, Any, TypeAlias
 
 import numpy as np
+import torch
 from upath import UPath
 
-from qgs.contracts import MissingExtraError
 from qgs.data.lenses import Fisheye, Lens, RadialTangential, bending
 from qgs.data.paths import open_file
-from qgs.data.photos.checks import FrameProblem, listed_size
+from qgs.data.photos.checks import listed_size
 from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_folder
+from qgs.geometry.transforms import quat_to_matrix
 from qgs.wording import name_shown
 
 _PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
-_LENSES: dict[str, type[Lens] | None] = {
-    "SIMPLE_PINHOLE": None,
-    "PINHOLE": None,
-    "SIMPLE_RADIAL": RadialTangential,
-    "RADIAL": RadialTangential,
-    "OPENCV": RadialTangential,
-    "OPENCV_FISHEYE": Fisheye,
-    "SIMPLE_RADIAL_FISHEYE": Fisheye,
-    "RADIAL_FISHEYE": Fisheye,
+_MODELS: dict[str, tuple[int, str, type[Lens] | None]] = {
+    "SIMPLE_PINHOLE": (0, "f cx cy", None),
+    "PINHOLE": (1, "fx fy cx cy", None),
+    "SIMPLE_RADIAL": (2, "f cx cy k1", RadialTangential),
+    "RADIAL": (3, "f cx cy k1 k2", RadialTangential),
+    "OPENCV": (4, "fx fy cx cy k1 k2 p1 p2", RadialTangential),
+    "OPENCV_FISHEYE": (5, "fx fy cx cy k1 k2 k3 k4", Fisheye),
+    "SIMPLE_RADIAL_FISHEYE": (8, "f cx cy k1", Fisheye),
+    "RADIAL_FISHEYE": (9, "f cx cy k1 k2", Fisheye),
 }
+"""Number in binary files, parameters in their order, and lens of every camera model."""
+_NAMES = {number: name for name, (number, _, _) in _MODELS.items()}
 _BYTES_OF_A_POINT = 24  # x, y and the point's number
 
 
@@ -50,13 +52,8 @@ class Colmap(PhotoReader):
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """See `PhotoReader`. Raises MissingExtraError without pycolmap."""
+        """See `PhotoReader`."""
         model, suffix = next(_models(folder))
-        if find_spec("pycolmap") is None:
-            raise MissingExtraError(
-                f"reading the COLMAP model {model} needs pycolmap, which is not installed: run "
-                '`pip install "query-gaussians[colmap]"`'
-            )
         read_cameras, read_images = _READ[suffix]
         try:
             cameras = {number: _camera(*camera) for number, camera in read_cameras(model)}
@@ -122,12 +119,10 @@ def _lines(file: UPath, after: int = 0) -> Iterator[str]:
 
 
 def _binary_cameras(model: UPath) -> Iterator[Camera]:
-    import pycolmap
-
     with open_file(model / "cameras.bin") as file:
         for _ in range(_unpacked("<Q", file)[0]):
             number, kind, width, height = _unpacked("<IiQQ", file)
-            name = pycolmap.CameraModelId(kind).name
+            name = _NAMES.get(kind, f"number {kind}")
             parameters = _unpacked(f"<{len(_parameters(name))}d", file)
             yield number, (name, width, height, parameters)
 
@@ -153,43 +148,30 @@ def _unpacked(format: str, file: IO[bytes]) -> tuple[Any, ...]:
 
 
 def _parameters(model: str) -> list[str]:
-    """Names of the parameters of a camera model. Raises ValueError for one unknown to pycolmap."""
-    import pycolmap
-
-    kind = pycolmap.CameraModelId.__members__.get(model)
-    if kind is None:
-        raise ValueError(f"there is no camera model {model}")
-    return pycolmap.Camera.create_from_model_id(1, kind, 1.0, 1, 1).params_info.split(", ")
+    """Names of the parameters of a camera model."""
+    if model not in _MODELS:
+        known = ", ".join(_MODELS)
+        fix = f"undistort the photos with `colmap image_undistorter`, or use one of {known}"
+        raise ValueError(f"the camera model {model} is not known: {fix}")
+    return _MODELS[model][1].split()
 
 
 def _camera(model: str, width: int, height: int, parameters: Sequence[float]) -> dict[str, Any]:
     """Fields of a `PhotoFrame` that the camera took."""
     values = dict(zip(_parameters(model), parameters, strict=True))
     size, problems = listed_size(height, width)
-    fields: dict[str, Any] = {"size": size, "problems": problems}
-    if model not in _LENSES:
-        fix = f"undistort with `colmap image_undistorter`, or use one of {', '.join(_LENSES)}"
-        problem = FrameProblem("lens", f"the camera model {model} is not known", fix)
-        return {**fields, "intrinsics": (math.nan,) * 4, "problems": (problem,)}
     focal = values.pop("f", math.nan)
     fx, fy = values.pop("fx", focal), values.pop("fy", focal)
-    fields["intrinsics"] = (fx, fy, values.pop("cx"), values.pop("cy"))
-    lens = _LENSES[model]
-    if lens is not None:
-        fields["lens"] = bending(lens(**{"k1" if k == "k" else k: v for k, v in values.items()}))
-    return fields
+    intrinsics = fx, fy, values.pop("cx"), values.pop("cy")
+    kind = _MODELS[model][2]
+    lens = bending(kind(**values)) if kind else None
+    return {"size": size, "problems": problems, "intrinsics": intrinsics, "lens": lens}
 
 
 def _c2w(*cam_from_world: float) -> np.ndarray:
     """OpenCV camera-to-world; COLMAP gives world-to-camera, with a quaternion of any length."""
-    import pycolmap
-
-    w, x, y, z, *translation = cam_from_world
-    quaternion = np.array([x, y, z, w])
-    length = np.linalg.norm(quaternion)
-    if not 0 < length < math.inf:
-        return np.full((4, 4), np.nan)
-    c2w = np.eye(4)
-    rotation = pycolmap.Rotation3d(quaternion / length).matrix().T
+    quaternion, translation = torch.tensor(cam_from_world, dtype=torch.float64).split([4, 3])
+    rotation = quat_to_matrix(quaternion / quaternion.norm()).T  # NaN for no rotation at all
+    c2w = torch.eye(4, dtype=torch.float64)
     c2w[:3, :3], c2w[:3, 3] = rotation, -rotation @ translation
-    return c2w
+    return c2w.numpy()

@@ -17,6 +17,7 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from upath import UPath
 
 from qgs.data.images import decode_mask, encoded_size
 from qgs.data.lenses import Intrinsics, Size
-from qgs.data.paths import is_local, listing, open_file, read_json, stays_inside
+from qgs.data.paths import is_local, listing, open_file, read_json
 from qgs.data.photos.checks import (
     LARGEST_SIDE,
     FrameProblem,
@@ -286,6 +287,12 @@ def has_chunks(folder: UPath) -> bool:
     return folder.is_dir() and (
         (folder / INDEX).is_file() or any(item.suffix == SUFFIX for item in folder.iterdir())
     )
+
+
+def stays_inside(name: str) -> bool:
+    """Whether a relative name, with either kind of slash, stays inside the folder it starts in."""
+    parts = PurePosixPath(name.replace("\\", "/")).parts
+    return bool(parts) and parts[0] != "/" and ".." not in parts and ":" not in parts[0]
 
 
 def read_chunk_index(path: UPath) -> dict[str, str]:

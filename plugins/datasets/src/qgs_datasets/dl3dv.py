@@ -10,7 +10,7 @@ from pydantic import Field
 from upath import UPath
 
 from qgs.contracts import SceneSource
-from qgs.data.paths import opened_archive, opened_path, read_file, read_json
+from qgs.data.paths import opened_path, read_file, read_json
 from qgs.data.photos import formats_of
 from qgs.data.photos.source import PhotoScene, PhotosConfig, image_cache
 from qgs.data.scenes import LazyScenes, LazySource, warn_once
@@ -140,7 +140,7 @@ def scene_folder(place: UPath) -> UPath:
     tops = [place]
     if place.suffix == ".zip":
         try:
-            top = opened_archive(place)
+            top = UPath(f"zip:///::{place}")  # open as long as paths below it live
             folders = (item for item in top.iterdir() if item.is_dir())
             tops = [top, *(item for item in folders if item.name not in _INSIDE)]
         except (zipfile.BadZipFile, OSError) as error:
