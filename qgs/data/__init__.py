@@ -2,8 +2,8 @@
 
 from qgs.contracts import Component
 from qgs.data.photos.source import PhotosSource
-from qgs.data.samplers import Bounded, Span
+from qgs.data.samplers import Span
 
-COMPONENTS: tuple[type[Component], ...] = (PhotosSource, Span, Bounded)
+COMPONENTS: tuple[type[Component], ...] = (PhotosSource, Span)
 
 __all__ = ["COMPONENTS", "PhotosSource"]

@@ -8,17 +8,13 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
-from contextlib import closing
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from qgs.contracts import SceneSource, ViewsConfig
 from qgs.data.scenes import warn_once
-from qgs.data.stream import training_batches
 from qgs.geometry.poses import first_camera, largest_distance, look_at_depth, mean_camera
 from qgs.types import Cameras, Views
 
@@ -54,6 +50,7 @@ class Domain:
         """Count samples in: cameras (B, V_in) and (B, V_out) in the model's frame."""
         for name, values in _measured(inputs, targets):
             told = values[~values.isnan()].tolist()
+            # four digits: the state of a run is JSON, and the comparison allows 10 %
             self.values.setdefault(name, []).extend(float(f"{value:.4g}") for value in told)
         self.samples += len(inputs.c2w)
 
@@ -79,6 +76,7 @@ class Domain:
     @property
     def text(self) -> str:
         """Its ranges as JSON; null stands for infinity."""
+        # JSON has no infinity, which is the depth of parallel axes
         plain = {k: [v if math.isfinite(v) else None for v in r] for k, r in self.ranges.items()}
         return json.dumps({"samples": self.samples, "ranges": plain})
 
@@ -105,10 +103,7 @@ class Domain:
 def verdict(trained: Domain, found: Domain) -> str:
     """A sentence on views against those of the training; `trained` is empty if unknown."""
     if not trained.values:
-        return (
-            "whether the views are like those that this model was trained on is not known: its "
-            "checkpoint does not tell, since an older qgs or other code trained it"
-        )
+        return "the checkpoint does not tell on which views this model was trained"
     if apart := trained.differences(found):
         return (
             f"the views lie outside what this model was trained on: {', '.join(apart)}. Expect a "
@@ -132,64 +127,52 @@ def odd_images(images: Tensor) -> str:
     )
 
 
-def warn_of_unlike(
-    views: Views, settings: Mapping[str, Any] | None, trained: Domain | None
-) -> None:
-    """Warn where `views` cannot be what a model was trained on.
-
-    settings: `views` of its recipe. Looks at values, but not while a CUDA graph is captured.
-    """
-    c2w = views.cameras.c2w
-    if c2w.is_meta or (c2w.is_cuda and torch.cuda.is_current_stream_capturing()):
-        return
-    told = [odd_images(views.images)] if views.images.numel() else []
-    if settings is not None and c2w.numel():
-        first = settings["frame"] == "first_cam"
-        place = (first_camera if first else mean_camera)(c2w)
-        if float((place - torch.eye(4).to(place)).abs().max()) > 0.05:
-            distance = float(place[..., :3, 3].norm(dim=-1).max())
-            told.append(
-                f"the {'first' if first else 'mean'} camera is not at the origin of the model's "
-                f"world, looking along +z, but {distance:.3g} away or turned; cameras are OpenCV "
-                "camera-to-world (x right, y down, z forward; of OpenGL axes negate columns 1, 2)"
-            )
-    reach = (trained.ranges if trained else {}).get("baseline", (0.0, math.inf))[1]
-    apart = float(largest_distance(c2w).max()) if c2w.numel() else 0.0
-    if apart > GROSS * reach:
-        told.append(f"input cameras stand {apart:.3g} apart, in training at most {reach:.3g}")
-    if told := [*filter(None, told)]:
-        warn_once(
-            f"{'; '.join(told)}. Expect a poor result. `model.reconstruct(views)` brings cameras "
-            "in any frame and unit to those of the model"
-        )
-
-
 class FirstViews:
-    """Forward pre-hook that checks the first views of a model in evaluation, and no later ones.
+    """Forward pre-hook that warns where the first views in evaluation cannot be like the trained.
 
-    Looking at values waits for the device, which costs every further pass more than it tells.
-    settings, trained: see `warn_of_unlike`.
+    settings: `views` of the model's recipe. Later views are not checked: looking at values waits
+    for the device.
     """
 
     def __init__(self, settings: Mapping[str, Any] | None, trained: Domain | None) -> None:
         self.settings, self.trained, self.pending = settings, trained, True
 
     def __call__(self, model: nn.Module, args: tuple[Any, ...]) -> None:
-        """Warn if the first argument is Views that are unlike those of the training."""
+        """Check the first argument if it is Views, but not while a CUDA graph is captured."""
         if model.training or not self.pending or torch.compiler.is_compiling():
             return
+        # before anything can raise: a check that fails once would fail in every pass
         self.pending = False
-        if args and isinstance(args[0], Views):
-            warn_of_unlike(args[0], self.settings, self.trained)
+        views = args[0] if args else None
+        if not isinstance(views, Views) or views.cameras.c2w.is_meta or not views.images.numel():
+            return
+        # a graph cannot wait for the device, which a look at values does
+        if views.cameras.c2w.is_cuda and torch.cuda.is_current_stream_capturing():
+            return
+        if told := [*filter(None, self._faults(views))]:
+            warn_once(
+                f"{'; '.join(told)}. Expect a poor result. `model.reconstruct(views)` brings "
+                "cameras in any frame and unit to those of the model"
+            )
 
-
-def trained_domain(source: SceneSource, views: ViewsConfig, seed: int) -> Domain:
-    """The domain of the first SAMPLES training samples, as training itself finds it."""
-    domain, size = Domain(), 16
-    with closing(training_batches(source, views, size, seed)) as batches:
-        for batch in islice(batches, SAMPLES // size):
-            domain.see(batch.inputs.cameras, batch.targets.cameras)
-    return domain
+    def _faults(self, views: Views) -> Iterator[str]:
+        c2w = views.cameras.c2w
+        yield odd_images(views.images)
+        if self.settings is not None:
+            first = self.settings["frame"] == "first_cam"
+            place = (first_camera if first else mean_camera)(c2w)
+            # exact up to the rounding of poses; worlds of other conventions differ by far more
+            if float((place - torch.eye(4).to(place)).abs().max()) > 0.05:
+                distance = float(place[..., :3, 3].norm(dim=-1).max())
+                yield (
+                    f"the {'first' if first else 'mean'} camera is not at the origin of the "
+                    f"model's world, looking along +z, but {distance:.3g} away or turned; cameras "
+                    "are OpenCV camera-to-world (x right, y down, z forward; of OpenGL axes negate "
+                    "columns 1, 2)"
+                )
+        reach = (self.trained.ranges if self.trained else {}).get("baseline", (0.0, math.inf))[1]
+        if (apart := float(largest_distance(c2w).max())) > GROSS * reach:
+            yield f"input cameras stand {apart:.3g} apart, in training at most {reach:.3g}"
 
 
 def _measured(inputs: Cameras, targets: Cameras) -> Iterator[tuple[str, Tensor]]:
@@ -197,12 +180,14 @@ def _measured(inputs: Cameras, targets: Cameras) -> Iterator[tuple[str, Tensor]]
     count = inputs.c2w.shape[1]
     yield "views", torch.tensor([float(count)])
     if count > 1:
+        # float64: in float32 a cosine near 1 is off by angles of 0.02 degrees
         c2w = inputs.c2w.double()
         yield "baseline", torch.cdist(c2w[..., :3, 3], c2w[..., :3, 3]).amax((-2, -1))
         axes = c2w[..., :3, 2]
         cosines = (axes @ axes.transpose(-2, -1)).amin((-2, -1)).clamp(-1, 1)
         yield "turn", cosines.arccos().rad2deg()
     depths = torch.stack([look_at_depth(c2w) for c2w in torch.cat([inputs.c2w, targets.c2w], 1)])
+    # axes that meet behind the cameras look apart, as parallel ones do
     yield "depth", torch.where(depths > 0, depths, math.inf)
     halves = inputs.size[1] / 2 / inputs.intrinsics[..., 0].double()
     yield "fov", 2 * halves.arctan().rad2deg()

@@ -121,6 +121,7 @@ class EvaluationPlan:
                     raise ValueError("not among the test scenes of the data")
                 place = self._places[name]
                 scene = self._scenes[place]
+                # a generator for each scene: a failing one changes no noise of the others
                 noise = np.random.default_rng([self._evaluation.seed, place])
                 for inputs, targets in self._choices(scene, place):
                     if self.framing is None:
@@ -137,6 +138,7 @@ class EvaluationPlan:
         elif scene.held_out:
             windows = held_out_windows(scene, self._views)
             count = min(self._evaluation.scenes, len(windows))
+            # evenly thinned, so that both ends of a long scene are judged
             kept = np.linspace(0, len(windows) - 1, count).round().astype(int)
             yield from (windows[i] for i in kept)
         else:
@@ -170,6 +172,7 @@ def true_depth(source: SceneSource, sample: Sample) -> Tensor | None:
     if depth is None:
         return None
     own = scene.cameras[[sample.input_frames[0], *sample.target_frames]].c2w
+    # the ratio of distances between cameras is the scale that `make_sample` chose
     ours = torch.cat([sample.inputs.cameras.c2w[0, :1], sample.targets.cameras.c2w[0]])
     return depth * float(largest_distance(ours) / largest_distance(own))
 
@@ -198,6 +201,7 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Fra
         if frame in covered:
             continue
         centre = int(np.searchsorted(starts, when[frame]))
+        # centred, and at the ends of the scene shifted into it
         first = min(max(centre - (gap + 1) // 2, 0), len(usable) - 1 - gap)
         span = usable[first : first + gap + 1]
         start, end = when[span[0][0]], when[span[-1][0]]
@@ -212,6 +216,7 @@ def _named(scene: Scene, index: EvaluationIndex) -> tuple[Frames, Frames]:
     """The frames of `scene` that `index` names; raises ValueError where it lacks one."""
     entry = index[scene.name]
     assert entry is not None
+    # frames are positions, which a missing image moves
     if scene.missing:
         raise ValueError(
             f"{len(scene.missing)} of its listed images do not exist, so that positions "

@@ -34,7 +34,7 @@ def _recognises(kind: str, source: type[Component], path: UPath) -> bool:
     assert issubclass(source, SceneSource)
     try:
         return source.recognises(path)
-    except Exception as error:
+    except Exception as error:  # of a plugin, which must not hinder the others
         if kind.startswith("qgs/"):
             raise
         warn_once(f"{kind} is not asked whether it reads {path}: it raises {one_line(error)}")

@@ -99,12 +99,8 @@ def gap_range(count: int, views: ViewsConfig, scene: Scene) -> tuple[int, int]:
             f"[{low}, {high}] asks for: its gap is {count - 1}"
         )
     high = min(high, count - 1)
+    # each input takes a frame of its own
     return max(min(low, high), views.inputs - 1), high
-
-
-def image_bytes(frames: int, size: tuple[int, int]) -> int:
-    """Bytes of RGB images of (H, W) `size` in float32."""
-    return frames * 3 * size[0] * size[1] * torch.float32.itemsize
 
 
 def refuse_too_many(frames: int, scene: Scene) -> None:
@@ -112,7 +108,7 @@ def refuse_too_many(frames: int, scene: Scene) -> None:
     height, width = scene.cameras.size
     refuse_beyond_memory(
         f"a sample of {frames} images of {height} x {width}",
-        {"images": image_bytes(frames, (height, width))},
+        {"images": frames * 3 * height * width * torch.float32.itemsize},
         "Ask for fewer views (views.inputs, views.targets, --inputs, --holdout) or smaller images "
         "(data.image_size, --size).",
     )
@@ -189,6 +185,7 @@ def make_sample(
         c2w = both.cameras.c2w[0].clone()
         c2w[:count] = shaken(c2w[:count], math.radians(views.pose_noise), noise)
         both = replace(both, cameras=replace(both.cameras, c2w=c2w[None]))
+        # the first camera is exact, and with it its depth map
         if both.depths is not None:
             both.depths[:, 1:count] = 0
     both = mirrored_views(both) if mirror else both
@@ -221,11 +218,13 @@ def views_in(
     refuse_too_many(len(frames), scene)
     wanted = sorted(set(frames))
     place = {frame: i for i, frame in enumerate(wanted)}
+    # a frame that is input and target, or target twice, is decoded once
     order = [place[frame] for frame in frames]
     images, masks = scene.images(wanted), scene.masks(wanted)
     surface = scene.depths(wanted) if depths else None
     cameras = scene.cameras[list(frames)]
     reference, scale = world
+    # float32 only now: coordinates of maps have seven digits before the point
     c2w = scaled(relative_to(reference, cameras.c2w), scale).float()
     if surface is not None:  # z of cameras scales with their translations
         surface = torch.from_numpy(surface.numpy()[order] * np.float32(scale.item()))[None]
@@ -254,6 +253,7 @@ def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[T
     every = scene.cameras.c2w
     c2w = every[list(input_frames)]
     reference = (first_camera if views.frame == "first_cam" else mean_camera)(c2w)
+    # of all cameras: the scale of a scene does not depend on which inputs are drawn
     if views.scale == "auto":
         return reference, auto_scale(every, scene.name)
     factor = torch.tensor(views.scale_factor, dtype=c2w.dtype)

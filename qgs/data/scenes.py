@@ -53,6 +53,7 @@ class BoundedCache(Generic[Value]):
         self._kept: OrderedDict[Hashable, tuple[Value, int]] = OrderedDict()
         self._total, self._lock = 0, Lock()
 
+    # copies in workers start empty: locks cannot be pickled, and images would be sent for nothing
     def __reduce__(self) -> tuple[object, ...]:
         return type(self), (self._limit, self._cost)
 
@@ -62,6 +63,7 @@ class BoundedCache(Generic[Value]):
             if key in self._kept:
                 self._kept.move_to_end(key)
                 return self._kept[key][0]
+        # made outside of the lock, so that threads decode side by side; two may make the same
         value = make()
         cost = self._cost(value) if self._cost else 1
         with self._lock:

@@ -102,6 +102,7 @@ class SceneOrder:
 
     def _draw_epoch(self, epoch: int) -> np.ndarray:
         rng = np.random.default_rng([self._seed, 0, epoch])
+        # groups in turn, such as files of scenes: each is opened once an epoch
         shuffled = rng.permutation(len(self._groups))
         return np.concatenate([rng.permutation(self._groups[index]) for index in shuffled])
 
@@ -185,6 +186,7 @@ class _Batches(Dataset[Batch | _Failure]):
         self._stream: SampleStream | None = SampleStream(source, *options)
         self._size, self._share = batch_size, share
 
+    # open scenes hold files and caches, which cannot be sent to a worker
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_stream": None}
 

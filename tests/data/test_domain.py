@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 from commands import MODEL
+from training_runs import trained_domain
 
 from qgs.composer import resolve
-from qgs.data.domain import KEY, Domain, trained_domain, verdict
+from qgs.data.domain import KEY, Domain, verdict
 from qgs.engine.training import train
 from qgs.geometry.poses import look_at
 from qgs.io.checkpoint import CheckpointFile, save
@@ -107,7 +108,7 @@ def test_the_sentence() -> None:
     outside = trained.differences(wide)
     assert [float(re.search(r"[\d.]+", text)[0]) for text in outside] == [3, 3, 90, 152]
     assert all(text in verdict(trained, wide) for text in outside)
-    assert "not known" in verdict(Domain(), within)
+    assert "checkpoint does not tell" in verdict(Domain(), within)
 
 
 def test_checkpoints_tell_what_they_were_trained_on_also_when_a_run_is_continued(tmp_path) -> None:

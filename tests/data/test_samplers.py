@@ -1,26 +1,15 @@
-"""Samplers of views: bounds of the gap, how they follow the training, and that seeds decide."""
-
-from itertools import islice
+"""The default sampler of views: its draws, and a schedule of its gap."""
 
 import numpy as np
-import pytest
 from line_scenes import Line
 
 from qgs.components.schedules import Linear
-from qgs.composer import resolve
 from qgs.contracts import ViewsConfig
 from qgs.contracts.schedule import END
-from qgs.data.evaluation import evaluation_samples
-from qgs.data.samplers import Bounded, Span
+from qgs.data.samplers import Span
 from qgs.data.sampling import draw_frames
-from qgs.data.stream import training_batches
 
-OPTIONS = {"min_gap": 6, "max_gap": 12, "initial_min_gap": 4, "initial_max_gap": 6}
 VIEWS = ViewsConfig(inputs=2, targets=3, gap=(2, 5))
-
-
-def bounded(**options) -> Bounded:
-    return Bounded(Bounded.Config(**(OPTIONS | {"margin": 1, "warm_up_steps": 100} | options)))
 
 
 def test_the_default_draws_as_ever() -> None:
@@ -32,62 +21,9 @@ def test_the_default_draws_as_ever() -> None:
         assert first.random() == second.random(), "the generator is where it was"
 
 
-@pytest.mark.parametrize(
-    ("step", "bounds"),
-    [(0, (4, 6)), (50, (5, 9)), (99, (5, 11)), (100, (6, 12)), (500, (6, 12)), (END, (6, 12))],
-)
-def test_the_gap_widens_as_in_pixelsplat(step: int, bounds: tuple[int, int]) -> None:
-    """initial + int((final - initial) * step / warm_up_steps), at most the final number."""
-    sampler, gaps, places = bounded(), set[int](), set[int]()
-    for seed in range(400):
-        rng = np.random.default_rng(seed)
-        (left, right), targets = sampler.draw(Line(30), VIEWS, rng, step)
-        gaps.add(right - left)
-        places.update(target - left for target in targets)
-        assert all(left + 1 <= target <= right - 1 for target in targets)
-        assert len(targets) == 3
-    assert (min(gaps), max(gaps)) == bounds
-    assert min(places) == 1
-
-
-def test_short_scenes_and_several_inputs() -> None:
-    rng = np.random.default_rng(0)
-    assert bounded().draw(Line(5), VIEWS, rng, END)[0] == (0, 4)
-    with pytest.raises(ValueError, match="5 frames"):
-        bounded(margin=3).draw(Line(5), VIEWS, rng, END)
-    inputs, _ = bounded().draw(Line(30), ViewsConfig(inputs=4, targets=1), rng, END)
-    assert len({*inputs}) == 4
-    assert list(inputs) == sorted(inputs)
-
-
 def test_a_schedule_moves_the_gap_of_the_default() -> None:
     sampler = Span(Span.Config(min_gap=2))
     sampler.schedules = {"max_gap": Linear(schedule="linear", values=(2, 10), at=(0, 100))}
     for step, largest in ((0, 2), (50, 6), (100, 10), (END, 10)):
         drawn = [sampler.draw(Line(30), VIEWS, np.random.default_rng(k), step) for k in range(200)]
         assert max(right - left for (left, right), _ in drawn) == largest
-
-
-def gaps(batches) -> list[int]:
-    return [frames[-1] - frames[0] for batch in batches for frames in batch.input_frames]
-
-
-def test_a_training_widens_the_gap_and_resumes_where_it_was() -> None:
-    """Two samples a batch, two batches a step: the warm-up of 5 steps ends with sample 20."""
-    options = ["view_sampler.warm_up_steps=5", "view_sampler.initial_max_gap=2"]
-    recipe = resolve("tiny/tokengs_bounded.yaml", [*options, "data.image_size=[16, 16]"])
-    source, sampler = recipe.build_data(), recipe.build_view_sampler()
-
-    def stream(start: int, count: int):
-        batches = training_batches(source, recipe.views, 2, 0, start, sampler=sampler, accumulate=2)
-        return gaps(islice(batches, count))
-
-    whole = stream(0, 14)
-    assert stream(9, 5) == whole[18:]
-    assert {*whole[:4]} == {2}
-    assert max(whole[4:]) > 3
-    limits = [sampler.gaps(k // 4) for k in range(28)]
-    assert all(low <= gap <= high for gap, (low, high) in zip(whole, limits, strict=True))
-    samples = evaluation_samples(source, recipe.views, recipe.evaluation, sampler)
-    assert {3, 7} >= {min(found := [s.input_frames[-1] - s.input_frames[0] for s in samples])}
-    assert max(found) > 3

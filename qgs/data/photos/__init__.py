@@ -33,6 +33,7 @@ def readers() -> dict[str, type[PhotoReader]]:
     """
     found = {reader.name: reader for reader in READERS}
     for entry in installed(GROUP):
+        # a broken distribution must not hinder folders of other formats
         try:
             found.setdefault(entry.name, load(entry, PhotoReader))
         except ExtensionError as error:

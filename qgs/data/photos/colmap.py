@@ -79,6 +79,7 @@ class Colmap(PhotoReader):
 def _models(folder: UPath) -> Iterator[tuple[UPath, str]]:
     """The models in `folder` and the suffix of their files, in the order of preference."""
     for place in _PLACES:
+        # binary keeps all digits of a pose
         for suffix in ("bin", "txt"):
             files = (folder / place / f"{name}.{suffix}" for name in ("cameras", "images"))
             if all(file.is_file() for file in files):

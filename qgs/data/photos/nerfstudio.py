@@ -51,6 +51,7 @@ class Nerfstudio(PhotoReader):
             return Listing(file, with_images(frames, folder, images))
         top = {PurePosixPath(frame.name).parts[:1] for frame in frames}
         if top == {("images",)} and not (folder / "images").is_dir():
+            # DL3DV ships reduced copies alone, under the listing of the full size
             for copy in _REDUCED:
                 if (folder / copy).is_dir():
                     moved = with_images(frames, folder, copy)
@@ -83,6 +84,7 @@ class Blender(PhotoReader):
         for part, split in _BLENDER_SPLITS.items():
             file = folder / f"transforms_{part}.json"
             if file.is_file():
+                # these scenes have no masks but their alpha channel
                 frames += [
                     replace(frame, split=split, mask=frame.mask or frame.path)
                     for frame in read_transforms(file)
@@ -99,6 +101,7 @@ def read_transforms(file: UPath) -> list[PhotoFrame]:
     folder = file.parent
     frames = [_frame(folder, data, entry, None) for entry in entries]
     try:
+        # an angle of view needs the image's size; a header is read only where nothing lists one
         if any(frame.problems and not frame.size for frame in frames):
             present = existing(frame.path for frame in frames)
             first = next((frame.path for frame in frames if frame.path in present), None)
@@ -207,27 +210,24 @@ def _lens(values: Mapping[str, Any]) -> Lens | None:
         known = ", ".join(sorted((*_PINHOLE, _FISHEYE)))
         fix = f"undistort the photos first, or export one of {known}"
         raise _UnreadableError("lens", f"the camera model {model!r} is not known", fix)
+    # a coefficient that is not applied would bend poses and pixels apart in silence
     for key in _OTHER if fisheye else (*_OTHER, "k4"):
-        if _coefficient(values, key):
+        if _finite(values, key, "lens"):
             reason = f"{key!r} is set, which belongs to another camera model"
             fix = "undistort the photos first, or export without it"
             raise _UnreadableError("lens", reason, fix)
     kind = Fisheye if fisheye else RadialTangential
-    return bending(kind(**{field.name: _coefficient(values, field.name) for field in fields(kind)}))
+    names = (field.name for field in fields(kind))
+    return bending(kind(**{name: _finite(values, name, "lens") or 0.0 for name in names}))
 
 
-def _coefficient(values: Mapping[str, Any], key: str) -> float:
-    """A distortion coefficient; 0 where it is absent or null."""
-    return _finite(values, key, "lens", "the distortion ") or 0.0
-
-
-def _finite(values: Mapping[str, Any], key: str, field: str, kind: str = "") -> float | None:
+def _finite(values: Mapping[str, Any], key: str, field: str) -> float | None:
     """A number for a `field` of `PhotoFrame`; None where it is absent or null."""
     if values.get(key) is None:
         return None
     number = _number(values, key)
     if number is None or not math.isfinite(number):
-        reason = f"{kind}{key!r} must be a finite number, got {values[key]!r}"
+        reason = f"{key!r} must be a finite number, got {values[key]!r}"
         raise _UnreadableError(field, reason, "correct it")
     return number
 
@@ -242,10 +242,8 @@ def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[
         if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
             raise ValueError(f"{key!r} must be a list of file names, got {given!r}")
         names = set(map(image_name, given))
-        for name in sorted(names - known):
-            raise ValueError(
-                f"{key!r} names {name}, which no frame has: add the frame, or remove the name"
-            )
+        if unknown := sorted(names - known):
+            raise ValueError(f"{key!r} names {unknown[0]}, which no frame has: remove the name")
         splits[split] |= names
     train, test = splits["train"], splits["test"]
     rest = ("unused" if test else "test") if train else ("train" if test else None)

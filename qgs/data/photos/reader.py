@@ -111,6 +111,7 @@ def existing(paths: Iterable[UPath]) -> set[UPath]:
         by_folder.setdefault(str(path.parent), []).append(path)
     held: set[UPath] = set()
     for inside in by_folder.values():
+        # one request for a folder; asking a store for each photo takes minutes
         names = {item.name for item in listing(inside[0].parent)}
         held.update(path for path in inside if path.name in names)
     return held
@@ -135,6 +136,7 @@ def image_folder(folder: UPath, wanted: str | None) -> UPath:
             f"{folder} has neither a folder `images` nor a scaled copy such as images_4: name the "
             "folder of photos as `images`"
         )
+    # `images` counts as reduced by 1
     return min(copies, key=lambda item: int(item.name.partition("_")[2] or 1))
 
 

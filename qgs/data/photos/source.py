@@ -296,6 +296,7 @@ def present_frames(
     there = existing(frame.path for frame in frames)
     present = [frame for frame in frames if frame.path in there]
     missing = [str(frame.path) for frame in frames if frame.path not in there]
+    # before the count: a wrong listing explains missing images
     require_sound(listing.file, present if len(present) > 1 else frames)
     if len(present) < 2:
         raise FileNotFoundError(

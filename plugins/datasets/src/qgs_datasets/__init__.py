@@ -1,13 +1,14 @@
 """Published data sets as `qgs` reads them: chunks in pixelSplat's format, and DL3DV's archives."""
 
 from qgs.contracts import Plugin
+from qgs_datasets.bounded import Bounded
 from qgs_datasets.chunks import ChunksSource
 from qgs_datasets.dl3dv import Dl3dvSource
 
 plugin = Plugin(
     name="datasets",
     contract_version=1,
-    components=(ChunksSource, Dl3dvSource),
+    components=(ChunksSource, Dl3dvSource, Bounded),
     examples=(
         ChunksSource.Config(path="chunks"),  # type: ignore[call-arg]
         Dl3dvSource.Config(path="dl3dv"),  # type: ignore[call-arg]
