@@ -15,7 +15,7 @@ from rich.console import Console
 from qgs.composer import Recipe
 from qgs.contracts import SceneSource, ViewsConfig
 from qgs.data.domain import SAMPLES, Domain
-from qgs.data.sampling import Batch
+from qgs.data.samples import Batch
 from qgs.data.stream import SampleStream, training_batches
 from qgs.engine.distributed import StopRequest
 from qgs.engine.folder import RunFolder

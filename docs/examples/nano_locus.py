@@ -265,7 +265,7 @@ def loss(p: Weights, inputs: Sequence[Tensor], targets: Sequence[Tensor]) -> Ten
     return total
 
 
-# ---- Data and the loop: qgs/data/sampling.py, qgs/engine/training.py ----
+# ---- Data and the loop: qgs/data/samples.py, qgs/engine/training.py ----
 def blobs(views: int, size: int = 32) -> tuple[Tensor, Tensor, Tensor]:
     """A scene of 40 random blobs from cameras side by side; the first is the world's frame."""
     g = {"means": torch.rand(1, 40, 3) * 1.6 + torch.tensor([-0.8, -0.8, 1])}

@@ -17,7 +17,7 @@ from torch import Tensor
 import qgs
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Loss
-from qgs.data.sampling import Batch
+from qgs.data.samples import Batch
 from qgs.data.stream import training_batches
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import Scene, ViewsConfig
-from qgs.data.sampling import Sample, make_sample, moments, own_world, spread
+from qgs.data.samples import Sample, make_sample, moments, own_world, spread
 from qgs.geometry.poses import relative_to, scaled
 from qgs.geometry.transforms import moved
 from qgs.metrics.baselines import BASELINES, worse_than_nearest

@@ -15,7 +15,7 @@ from qgs.contracts import Component, Scene, SceneSource, Split
 from qgs.data.domain import Domain, odd_images, verdict
 from qgs.data.images import framing
 from qgs.data.recognition import open_for
-from qgs.data.sampling import training_frames, views_in
+from qgs.data.samples import training_frames, views_in
 from qgs.data.scenes import warn_once
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Views

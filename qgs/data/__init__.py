@@ -2,7 +2,7 @@
 
 from qgs.contracts import Component
 from qgs.data.photos.source import PhotosSource
-from qgs.data.samplers import Span
+from qgs.data.view_samplers import Span
 
 COMPONENTS: tuple[type[Component], ...] = (PhotosSource, Span)
 

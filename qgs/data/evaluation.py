@@ -13,8 +13,8 @@ from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewSampler, Vie
 from qgs.contracts.schedule import END
 from qgs.data.images import framing
 from qgs.data.paths import opened_path, read_json
-from qgs.data.samplers import Span
-from qgs.data.sampling import Frames, Sample, gap_range, make_sample, moments, spread
+from qgs.data.samples import Frames, Sample, gap_range, make_sample, moments, spread
+from qgs.data.view_samplers import Span
 from qgs.geometry.poses import largest_distance
 from qgs.wording import listed
 

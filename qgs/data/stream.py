@@ -20,8 +20,8 @@ from torch.utils.data import DataLoader, Dataset
 
 from qgs.contracts import SceneSource, ViewSampler, ViewsConfig
 from qgs.data.evaluation import one_line
-from qgs.data.samplers import Span
-from qgs.data.sampling import Batch, Sample, collate, make_sample
+from qgs.data.samples import Batch, Sample, collate, make_sample
+from qgs.data.view_samplers import Span
 from qgs.memory import is_out_of_memory
 
 

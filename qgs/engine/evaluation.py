@@ -14,7 +14,7 @@ from qgs.composer.registry import BUILTIN, component_failure
 from qgs.contracts import Column, Metric, MetricInput, SceneSource
 from qgs.data.domain import Domain, verdict
 from qgs.data.evaluation import EvaluationPlan, SceneFailure, one_line, true_depth
-from qgs.data.sampling import Sample, stack_views
+from qgs.data.samples import Sample, stack_views
 from qgs.engine.protocol import index_of, protocol_of
 from qgs.engine.results import TUNING, Evaluation, SceneScore
 from qgs.engine.tuning import tune, tuning_loss

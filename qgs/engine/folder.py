@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from qgs.composer import Recipe, RecipeError, resolve
 from qgs.composer.recipe import flat
 from qgs.data.domain import KEY, SAMPLES, Domain
-from qgs.data.sampling import Batch
+from qgs.data.samples import Batch
 from qgs.io.checkpoint import load_weights, save, unique_tensors
 from qgs.io.files import is_leftover, naming_full_disk, read_records, write_text
 from qgs.io.models import CHECKPOINT

@@ -9,7 +9,7 @@ from accelerate import Accelerator
 from torch import Tensor, nn
 
 from qgs.contracts import TrainingConfig
-from qgs.data.sampling import Batch
+from qgs.data.samples import Batch
 from qgs.engine.distributed import gathered
 from qgs.engine.folder import Saver
 from qgs.engine.incidents import Report, first_bad_tensor, save_batches, save_incident

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from qgs.data.sampling import Batch
+from qgs.data.samples import Batch
 from qgs.engine.training_pass import TrainingPass
 from qgs.io.checkpoint import save, unique_tensors
 from qgs.io.files import write_text

@@ -12,7 +12,7 @@ from accelerate import Accelerator
 
 from qgs.composer import Recipe
 from qgs.data.evaluation import EvaluationPlan
-from qgs.data.sampling import Sample
+from qgs.data.samples import Sample
 from qgs.drawing.images import (
     Picture,
     depth_picture,

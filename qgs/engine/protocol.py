@@ -10,7 +10,7 @@ from qgs.composer import Recipe
 from qgs.contracts import Metric, SceneSource, SceneSourceConfig
 from qgs.contracts.schedule import END, at_step
 from qgs.data.evaluation import EvaluationIndex, read_index
-from qgs.data.samplers import Span
+from qgs.data.view_samplers import Span
 from qgs.engine.tuning import tuning_loss
 
 

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from qgs.contracts import Column
 from qgs.data.evaluation import GIVEN, SceneFailure, given_targets
-from qgs.data.sampling import Frames
+from qgs.data.samples import Frames
 from qgs.engine.protocol import Protocol
 from qgs.io.files import write_text
 from qgs.metrics.baselines import BASELINES

@@ -22,7 +22,7 @@ from qgs.composer.flow import keys_are_read
 from qgs.composer.recipe import annotated
 from qgs.contracts import Outcome, TrainingConfig
 from qgs.contracts.schedule import follow
-from qgs.data.sampling import Batch
+from qgs.data.samples import Batch
 from qgs.data.stream import Feed, SampleError, Share, scenes_fingerprint, training_batches
 from qgs.engine.distributed import (
     RandomStates,

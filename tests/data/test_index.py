@@ -17,7 +17,7 @@ from qgs.data.evaluation import (
     SceneFailure,
     read_index,
 )
-from qgs.data.sampling import Sample
+from qgs.data.samples import Sample
 
 VIEWS = ViewsConfig(inputs=2, gap=(2, 5))
 

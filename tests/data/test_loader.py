@@ -13,7 +13,7 @@ from photo_formats import synthetic, write_nerfstudio
 
 from qgs.composer import Recipe, resolve
 from qgs.contracts import ViewsConfig
-from qgs.data.sampling import Batch
+from qgs.data.samples import Batch
 from qgs.data.stream import SampleError, Share, scenes_fingerprint, training_batches
 
 TINY = Path(__file__).parents[2] / "recipes" / "tiny" / "tokengs.yaml"

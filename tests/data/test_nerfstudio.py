@@ -16,7 +16,7 @@ from qgs.data.lenses import Fisheye, RadialTangential
 from qgs.data.paths import opened_path
 from qgs.data.photos.checks import intrinsics_problems, pose_problems, size_problems
 from qgs.data.photos.nerfstudio import image_name, read_transforms
-from qgs.data.sampling import make_sample
+from qgs.data.samples import make_sample
 
 
 @pytest.fixture

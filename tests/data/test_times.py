@@ -23,7 +23,7 @@ from qgs.composer import RecipeError, resolve
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.data import PhotosSource
 from qgs.data.evaluation import evaluation_samples, held_out_windows
-from qgs.data.sampling import collate, draw_frames, make_sample
+from qgs.data.samples import collate, draw_frames, make_sample
 
 VIEWS = ViewsConfig(inputs=2, targets=2, gap=(2, 4))
 

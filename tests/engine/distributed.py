@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from qgs.composer import resolve
-from qgs.data.sampling import Batch
+from qgs.data.samples import Batch
 from qgs.data.stream import SampleError, SampleStream, Share, training_batches
 from qgs.engine import training
 from qgs.engine.training import train

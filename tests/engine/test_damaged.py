@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from training_runs import Tiny, change_batches, run
 
 import qgs
-from qgs.data.sampling import Batch
+from qgs.data.samples import Batch
 from qgs.data.stream import MAX_REPLACED, SampleError, SampleStream
 from qgs.engine import training
 from qgs.engine.folder import read_state

@@ -12,7 +12,7 @@ import torch
 from safetensors import SafetensorError
 from training_runs import QUIET, Tiny, change_batches, losses, run, run_calling, same, weights
 
-from qgs.data.sampling import Batch
+from qgs.data.samples import Batch
 from qgs.data.stream import WorkerError
 from qgs.engine import periodic
 from qgs.engine.distributed import StopRequest, signal

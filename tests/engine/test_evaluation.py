@@ -20,7 +20,7 @@ from training_runs import Tiny, same
 from qgs.composer import Recipe
 from qgs.contracts import Scene
 from qgs.data.evaluation import evaluation_samples
-from qgs.data.sampling import Sample
+from qgs.data.samples import Sample
 from qgs.engine.evaluation import evaluate
 from qgs.engine.results import METHODS, Evaluation
 from qgs.metrics.baselines import mean_colour, nearest_input
@@ -200,7 +200,7 @@ def test_a_failure_anywhere_ends_neither_evaluation_nor_in_silence(
 
     monkeypatch.setattr(type(victim), "images", decoded)
     monkeypatch.setattr(type(model.encoder), "forward", encoded)
-    monkeypatch.setattr("qgs.data.samplers.Span.draw", lambda *_: ((0, 3), (1, 2)))
+    monkeypatch.setattr("qgs.data.view_samplers.Span.draw", lambda *_: ((0, 3), (1, 2)))
     evaluation = evaluate(model, recipe, batch=4)
     assert [score.scene for score in evaluation.scores] == ["test/000003"]
     reasons = [failure.reason for failure in evaluation.missing]

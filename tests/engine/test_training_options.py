@@ -22,7 +22,7 @@ from training_runs import (
 import qgs
 from qgs.composer import Recipe
 from qgs.contracts import MissingExtraError
-from qgs.data.sampling import Batch
+from qgs.data.samples import Batch
 from qgs.engine import tracking as trackers
 from qgs.engine.folder import read_state
 from qgs.engine.guard import MAX_SKIPPED, NonFiniteError

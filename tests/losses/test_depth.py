@@ -11,7 +11,7 @@ from PIL import Image
 
 from qgs.composer import resolve
 from qgs.contracts import ViewsConfig
-from qgs.data.sampling import make_sample, stack_views
+from qgs.data.samples import make_sample, stack_views
 from qgs.engine.training import train
 from qgs.losses.depth import DepthSurface, surface_errors
 from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering, Views

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from qgs.data.sampling import stack_views
+from qgs.data.samples import stack_views
 from qgs.metrics.baselines import mean_colour, nearest_input
 from qgs.types import Cameras, Views
 

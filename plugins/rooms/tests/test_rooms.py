@@ -6,7 +6,7 @@ from pydantic import ValidationError
 from qgs_rooms.source import RoomsSource
 from qgs_viewer.curves import curves_of
 
-from qgs.data.sampling import mirrored_views
+from qgs.data.samples import mirrored_views
 from qgs.geometry.rays import pixel_directions
 from qgs.io.models import checkpoint_path
 from qgs.types import Cameras, Views

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from qgs.composer import resolve
 from qgs.contracts import Scene, ViewsConfig
-from qgs.data.sampling import Sample, make_sample
+from qgs.data.samples import Sample, make_sample
 from qgs.geometry.poses import look_at
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras

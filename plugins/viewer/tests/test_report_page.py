@@ -17,7 +17,7 @@ from qgs_viewer.section import (
 from small import VIEWS, Walk, model_of
 
 from qgs.contracts import Column
-from qgs.data.sampling import Sample, make_sample
+from qgs.data.samples import Sample, make_sample
 
 KINDS = ("tokengs", "locus")
 SHOWN = "[...document.querySelectorAll('article')].map(a => a.checkVisibility())"

@@ -7,7 +7,7 @@ from rich.console import Console
 
 from qgs.analysis.reconstruction import Reconstruction, reconstruct_sample
 from qgs.contracts import Scene
-from qgs.data.sampling import Sample, training_frames, views_in
+from qgs.data.samples import Sample, training_frames, views_in
 from qgs.types import Views
 from qgs_refine.refining import refine
 

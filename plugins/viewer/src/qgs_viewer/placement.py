@@ -31,7 +31,7 @@ class Placement:
 
     @staticmethod
     def between(world: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]) -> "Placement":
-        """From a model's `world`, as of `qgs.data.sampling.own_world`, into the `other` one."""
+        """From a model's `world`, as of `qgs.data.samples.own_world`, into the `other` one."""
         (pose, scale), (other_pose, other_scale) = world, other
         both = torch.linalg.inv(other_pose.double()) @ pose.double()
         factor = float(other_scale) / float(scale)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from qgs.analysis.saving import orbit_path
 from qgs.contracts import Column, LearnedQueries
-from qgs.data.sampling import Sample
+from qgs.data.samples import Sample
 from qgs.data.scenes import warn_once
 from qgs.drawing import images
 from qgs.drawing.figures import figure_picture, hex_color

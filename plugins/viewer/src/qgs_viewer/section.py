@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import torch
 
-from qgs.data.sampling import Sample
+from qgs.data.samples import Sample
 from qgs.drawing.images import rgb_picture, side_by_side
 from qgs.geometry.poses import look_at
 from qgs.types import Cameras

@@ -18,7 +18,7 @@ from qgs.composer import Recipe, resolve
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import Domain, verdict
 from qgs.data.images import framing
-from qgs.data.sampling import make_sample, own_world, views_in
+from qgs.data.samples import make_sample, own_world, views_in
 from qgs.geometry.poses import relative_to, scaled
 from qgs.io.checkpoint import CheckpointFile
 from qgs.io.gaussians import load_ply

@@ -8,7 +8,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from qgs.data.sampling import Sample
+from qgs.data.samples import Sample
 from qgs.drawing.figures import categorical, hex_color
 from qgs.metrics.dispersion import token_dispersion
 from qgs.types import Gaussians

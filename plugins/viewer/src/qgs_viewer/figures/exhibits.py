@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from qgs.data.sampling import Sample
+from qgs.data.samples import Sample
 from qgs.drawing.images import Picture, enlarged, rgb_picture
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, SpatialSupport, map_tensors

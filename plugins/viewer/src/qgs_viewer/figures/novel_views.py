@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from qgs.data.sampling import Sample
+from qgs.data.samples import Sample
 from qgs.drawing.images import DEPTH_MAP, depth_picture, depth_range, rgb_picture
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel

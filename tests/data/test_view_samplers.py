@@ -6,8 +6,8 @@ from line_scenes import Line
 from qgs.components.schedules import Linear
 from qgs.contracts import ViewsConfig
 from qgs.contracts.schedule import END
-from qgs.data.samplers import Span
-from qgs.data.sampling import draw_frames
+from qgs.data.samples import draw_frames
+from qgs.data.view_samplers import Span
 
 VIEWS = ViewsConfig(inputs=2, targets=3, gap=(2, 5))
 

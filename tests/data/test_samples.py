@@ -9,7 +9,7 @@ from line_scenes import Line, Lines
 from qgs.composer import resolve
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.data.evaluation import evaluation_samples, held_out_windows
-from qgs.data.sampling import collate, draw_frames, make_sample, mirrored_views, stack_views
+from qgs.data.samples import collate, draw_frames, make_sample, mirrored_views, stack_views
 from qgs.data.stream import training_batches
 from qgs.engine.protocol import protocol_of
 from qgs.geometry.poses import look_at, look_at_depth

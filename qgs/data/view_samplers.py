@@ -5,7 +5,7 @@ from pydantic import Field
 
 from qgs.contracts import Frames, Scene, ViewSampler, ViewsConfig
 from qgs.contracts.component import ComponentConfig
-from qgs.data.sampling import draw_frames
+from qgs.data.samples import draw_frames
 
 
 class Span(ViewSampler):
