@@ -24,11 +24,10 @@ from qgs_bench.run import in_turn, quartiles
 from qgs_ellipsoid.fields import anchor_rotation
 from qgs_ellipsoid.ray_bias import EllipsoidBias
 from qgs_ellipsoid.ray_bias import ray_tokens as ellipsoid_tokens
+from qgs_locus.kernels.attention_bias import biased_attention
 from qgs_locus.ray_bias import RayBias
 from qgs_locus.ray_bias import ray_tokens as locus_tokens
 from torch import Tensor
-
-from qgs.kernels.attention_bias import biased_attention
 
 ROOT = Path(__file__).parents[1]
 TINY = ("tokengs", "locus", "ellipsoid", "c3g", "gslrm", "globalsplat")
@@ -74,7 +73,7 @@ def steps(out: Path) -> Iterator[Step]:
         file = ("--json", f"bench-{precision}.json", "--rounds", "30", "--warmup", "5")
         command = ["qgs", "bench", *PAIR, *options, *file]
         yield Step(f"latency and memory at published size, {precision}", command)
-    yield Step("Triton kernels", [*tests, "tests/kernels/test_attention_triton.py"])
+    yield Step("Triton kernels", [*tests, "plugins/ellipsoid/tests/test_attention_triton.py"])
     yield Step("attention against float64, timed", [python, __file__, "--attention"])
     sweep = ("--sweep", "views=2..32", "--sweep", "queries=256..16384", "--json", "sweep.json")
     options = ("--device", "cuda", "--rounds", "5")

@@ -17,7 +17,6 @@ from qgs.components.queries import LatentQueries
 from qgs.components.supervision import LayerSupervision
 from qgs.components.weights import TOKENGS
 from qgs.contracts import Component
-from qgs.kernels.attention_bias import AttentionBias, Kernel
 
 COMPONENTS: tuple[type[Component], ...] = (
     MultiViewViT,
@@ -39,14 +38,12 @@ __all__ = [
     "COMPONENTS",
     "NORM_EPS",
     "TOKENGS",
-    "AttentionBias",
     "ContentCrossAttention",
     "ContentSelfAttention",
     "CrossAttentionCore",
     "CrossSelfMlp",
     "FreeCenters",
     "GaussianHead",
-    "Kernel",
     "LatentQueries",
     "LayerScale",
     "LayerSupervision",

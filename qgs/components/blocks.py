@@ -9,7 +9,6 @@ from einops import rearrange
 from torch import Tensor, nn
 
 from qgs.contracts import AttentionWeights
-from qgs.kernels.attention_bias import AttentionBias, biased_attention
 
 NORM_EPS = 1e-5
 """Added to the variance by every LayerNorm of both releases (PyTorch's default)."""
@@ -113,34 +112,20 @@ class CrossAttentionCore(nn.Module):
         return self.q_norm(split_heads(self.q_proj(self.norm(x_BND)), self.heads))
 
     def forward(
-        self,
-        x_BND: Tensor,
-        k_BhMd: Tensor,
-        v_BhMd: Tensor,
-        bias: Tensor | AttentionBias | None = None,
+        self, x_BND: Tensor, k_BhMd: Tensor, v_BhMd: Tensor, bias: Tensor | None = None
     ) -> Tensor:
-        """(B, N, D). bias: (B, N, M) for all heads, or (B, h, N, M), -inf hides a token; or a
-        function of query and token, of which the N x M values never exist at once."""
+        """(B, N, D). bias: (B, N, M) for all heads, or (B, h, N, M), -inf hides a token."""
         # Keys are normalised by their encoder, in float32 under autocast, as these queries are.
         q_BhNd, k_BhMd = self.project(x_BND).to(v_BhMd.dtype), k_BhMd.to(v_BhMd.dtype)
-        if isinstance(bias, AttentionBias):
-            read_BhNd = biased_attention(q_BhNd, k_BhMd, v_BhMd, bias)
-            return self.out_proj(merge_heads(read_BhNd))
         bias_BhNM = None if bias is None else _by_head(bias).to(v_BhMd.dtype)
         read_BhNd = F.scaled_dot_product_attention(q_BhNd, k_BhMd, v_BhMd, attn_mask=bias_BhNM)
         return self.out_proj(merge_heads(read_BhNd))
 
     def explain(
-        self,
-        x_BND: Tensor,
-        k_BhMd: Tensor,
-        queries: Tensor,
-        bias: Tensor | AttentionBias | None = None,
+        self, x_BND: Tensor, k_BhMd: Tensor, queries: Tensor, bias: Tensor | None = None
     ) -> AttentionWeights:
         """Attention of the queries with indices `queries` (Q,), with the bias as in `forward`."""
         q_BhQd = self.project(x_BND)[:, :, queries]
-        if isinstance(bias, AttentionBias):
-            return attention_weights(q_BhQd, k_BhMd, bias.dense(queries)[:, None])
         full = (len(x_BND), -1, x_BND.shape[1], k_BhMd.shape[2])
         bias_BhQM = None if bias is None else _by_head(bias).expand(full)[:, :, queries]
         return attention_weights(q_BhQd, k_BhMd, bias_BhQM)

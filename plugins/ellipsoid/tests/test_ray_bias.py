@@ -10,11 +10,10 @@ from qgs_ellipsoid.ray_bias import (
     EllipsoidBias,
     ray_tokens,
 )
+from qgs_locus.kernels.attention_bias import BLOCK
 from qgs_locus.ray_bias import RayBias
 from qgs_locus.ray_bias import ray_tokens as isotropic_tokens
 from torch import Tensor
-
-from qgs.kernels.attention_bias import BLOCK
 
 ONE = torch.ones((), dtype=torch.float64)
 

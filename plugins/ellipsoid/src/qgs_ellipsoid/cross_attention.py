@@ -2,9 +2,9 @@
 
 from qgs_locus.cross_attention import RayBiasedCrossAttention
 from qgs_locus.fields import CENTER
+from qgs_locus.kernels.attention_bias import AttentionBias
 from torch import Tensor
 
-from qgs.components import AttentionBias
 from qgs.contracts import Fields
 from qgs.types import ImageMemory, QueryState
 from qgs_ellipsoid.fields import RAW_RADII, ROTATION, anchor_rotation, shape_fields

@@ -10,10 +10,10 @@ centre cof(W) (m - mu x d), as W a x W b = cof(W) (a x b). The minimum is
 from typing import Any, Self
 
 import torch
+from qgs_locus.kernels.attention_bias import AttentionBias, Kernel
 from qgs_locus.ray_bias import clamped
 from torch import Tensor
 
-from qgs.components import AttentionBias, Kernel
 from qgs.geometry.precision import full_precision
 from qgs.geometry.rays import normalised_rays
 from qgs_ellipsoid.rotations import unit

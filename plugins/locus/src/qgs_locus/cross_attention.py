@@ -8,8 +8,8 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from qgs.components import NORM_EPS, AttentionBias, CrossAttentionCore
-from qgs.components.blocks import attention_weights
+from qgs.components import NORM_EPS, CrossAttentionCore
+from qgs.components.blocks import attention_weights, merge_heads
 from qgs.contracts import (
     AttentionWeights,
     CrossAttention,
@@ -29,6 +29,7 @@ from qgs_locus.fields import (
     radius_field,
     support_radius,
 )
+from qgs_locus.kernels.attention_bias import AttentionBias, biased_attention
 from qgs_locus.ray_bias import RayBias, dense_bias, ray_tokens
 
 
@@ -106,8 +107,11 @@ class RayBiasedCrossAttention(CrossAttention):
         return RayBias.of(state[CENTER], sigma_sq, rays_B6M, config.bias_min, self.gamma)
 
     def forward(self, state: QueryState, memory: ImageMemory) -> Tensor:
-        bias = self.bias(state, memory)
-        return self.core(state.features, memory["keys"], memory["values"], bias)
+        q_BhNd, v_BhMd = self.core.project(state.features), memory["values"]
+        # As in `CrossAttentionCore`: norms give float32 under autocast.
+        q_BhNd, k_BhMd = q_BhNd.to(v_BhMd.dtype), memory["keys"].to(v_BhMd.dtype)
+        read_BhNd = biased_attention(q_BhNd, k_BhMd, v_BhMd, self.bias(state, memory))
+        return self.core.out_proj(merge_heads(read_BhNd))
 
     def explain(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> AttentionWeights:
         q_BhQd = self.core.project(state.features)[:, :, queries]

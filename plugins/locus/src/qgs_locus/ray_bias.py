@@ -9,9 +9,9 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from qgs.components import AttentionBias, Kernel
 from qgs.geometry.precision import full_precision
 from qgs.geometry.rays import normalised_rays
+from qgs_locus.kernels.attention_bias import AttentionBias, Kernel
 
 
 @full_precision

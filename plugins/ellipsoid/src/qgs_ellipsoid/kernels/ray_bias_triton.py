@@ -1,10 +1,11 @@
-"""`EllipsoidBias` in Triton, for the kernels of `qgs.kernels.attention_triton`.
+"""`EllipsoidBias` in Triton, for the kernels of `qgs_locus.kernels.attention_triton`.
 
 Queries are rows: mu, cof(W) and W by rows, gamma / 2, gamma * bias_min. Tokens have nine numbers:
 m, d, d / |d|.
 """
 
-from qgs.kernels.attention_triton import jit, tl
+import triton.language as tl  # pyright: ignore[reportMissingImports]
+from qgs_locus.kernels.attention_triton import jit
 
 
 @jit

@@ -1,9 +1,11 @@
-"""`RayBias` in Triton, for the kernels of `qgs.kernels.attention_triton`.
+"""`RayBias` in Triton, for the kernels of `qgs_locus.kernels.attention_triton`.
 
 Queries are rows (x, y, z, gamma / (2 sigma^2), gamma * bias_min); tokens have six numbers, m and d.
 """
 
-from qgs.kernels.attention_triton import jit, tl
+import triton.language as tl  # pyright: ignore[reportMissingImports]
+
+from qgs_locus.kernels.attention_triton import jit
 
 
 @jit

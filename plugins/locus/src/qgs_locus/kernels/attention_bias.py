@@ -21,8 +21,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from qgs.geometry.precision import full_precision
-from qgs.kernels.attention_choice import AttentionKernel, chosen_kernel
 from qgs.threads import can_compile, in_threads
+from qgs_locus.kernels.attention_choice import AttentionKernel, chosen_kernel
 
 T = TypeVar("T")
 Kernel: TypeAlias = Callable[..., None]
@@ -63,7 +63,7 @@ class AttentionBias(ABC):
         return None
 
     def triton_functions(self) -> tuple[Any, Any] | None:
-        """`value` and `gradients` for `qgs.kernels.attention_triton`; None for none."""
+        """`value` and `gradients` for `qgs_locus.kernels.attention_triton`; None for none."""
         return None
 
     @full_precision
@@ -169,7 +169,7 @@ def biased_attention(
         mask_B1NM = bias.dense()[:, None].to(q_BhNd.dtype)
         return F.scaled_dot_product_attention(*qkv, attn_mask=mask_B1NM)
     if chosen == "triton":
-        from qgs.kernels.attention_triton import TritonAttention  # needs triton
+        from qgs_locus.kernels.attention_triton import TritonAttention  # needs triton
 
         functions = bias.triton_functions()
         return _outside_graphs(TritonAttention.apply)(*qkv, *of_bias, functions)

@@ -23,11 +23,9 @@ import torch.nn.functional as F
 from qgs_ellipsoid.fields import anchor_rotation
 from qgs_ellipsoid.ray_bias import EllipsoidBias
 from qgs_ellipsoid.ray_bias import ray_tokens as ellipsoid_tokens
+from qgs_locus.kernels.attention_bias import AttentionBias, biased_attention
 from qgs_locus.ray_bias import RayBias, ray_tokens
 from torch import Tensor
-
-from qgs.components import AttentionBias
-from qgs.kernels.attention_bias import biased_attention
 
 HAS_TRITON = find_spec("triton") is not None
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
@@ -36,7 +34,7 @@ DEVICE = "cuda" if torch.cuda.is_available() and not INTERPRETED else "cpu"
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(
-        not HAS_TRITON, reason='needs triton: pip install "query-gaussians[triton]"'
+        not HAS_TRITON, reason='needs triton: pip install "query-gaussians-locus[triton]"'
     ),
 ]
 runs = pytest.mark.skipif(
@@ -51,7 +49,7 @@ Leaves = dict[str, Tensor]
 @pytest.mark.skipif(DEVICE == "cuda" or INTERPRETED, reason="the tests of this file run here")
 def test_kernels_pass_under_the_interpreter() -> None:
     command = [sys.executable, "-m", "pytest", "-q", "-m", "slow", "-p", "no:cacheprovider"]
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     result = subprocess.run(
         [*command, __file__],
         cwd=root,
@@ -253,7 +251,7 @@ def test_kernels_compile_for_gpus_that_are_not_here(
     jit = import_module("triton.runtime.jit").JITFunction
     driver = import_module("triton.runtime.driver").driver
     target = import_module("triton.backends.compiler").GPUTarget("cuda", arch, 32)
-    attention = import_module("qgs.kernels.attention_triton").TritonAttention
+    attention = import_module("qgs_locus.kernels.attention_triton").TritonAttention
     compiled, run = [], jit.run
 
     def compile_alone(self: Any, *args: Any, grid: Any, warmup: bool, **kwargs: Any) -> None:

@@ -6,12 +6,10 @@ from typing import Any, cast
 import pytest
 import torch
 import torch.nn.functional as F
+from qgs_locus.kernels import attention_choice
+from qgs_locus.kernels.attention_bias import AttentionBias, biased_attention
+from qgs_locus.kernels.attention_choice import SHARE, attention_kernel, chosen_kernel, plain_bytes
 from torch import Tensor
-
-from qgs.components import AttentionBias
-from qgs.kernels import attention_choice
-from qgs.kernels.attention_bias import biased_attention
-from qgs.kernels.attention_choice import SHARE, attention_kernel, chosen_kernel, plain_bytes
 
 
 class Nearness(AttentionBias):

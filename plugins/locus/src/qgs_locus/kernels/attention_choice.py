@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from qgs.kernels.attention_bias import AttentionBias
+    from qgs_locus.kernels.attention_bias import AttentionBias
 
 AttentionKernel: TypeAlias = Literal["auto", "plain", "blocks", "triton"]
 """plain: torch's attention with the bias of all pairs. blocks: torch, block by block."""

@@ -13,7 +13,7 @@ the G numbers of a token at `tokens + g * step`:
 - `gradients(queries, tokens, step, gradient, sums)`: the F tensors (n,) of the tuple `sums`, with
   the gradients of the queries' numbers added, given that of the bias (n, m).
 
-Axes: as `qgs.kernels.attention_bias`; W: the least power of two from d on.
+Axes: as `qgs_locus.kernels.attention_bias`; W: the least power of two from d on.
 """
 
 from typing import Any

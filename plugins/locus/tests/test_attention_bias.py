@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from qgs_locus.kernels import attention_bias
+from qgs_locus.kernels.attention_bias import BLOCK, AttentionBias, biased_attention
 from torch import Tensor
 
-from qgs.components import AttentionBias, CrossAttentionCore
-from qgs.kernels import attention_bias, kernel
-from qgs.kernels.attention_bias import BLOCK, biased_attention
+from qgs.kernels import kernel
 
 
 class Nearness(AttentionBias):
@@ -205,7 +205,7 @@ def test_what_is_frozen_gets_no_gradient_and_the_others_get_the_same(
 
 
 @pytest.mark.parametrize("kind", [Nearness, CompiledNearness])
-def test_an_explanation_makes_the_rows_that_are_asked_for(
+def test_rows_that_are_asked_for_are_made_alone(
     kind: type[AttentionBias], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows: list[int] = []
@@ -215,10 +215,8 @@ def test_an_explanation_makes_the_rows_that_are_asked_for(
         rows.append(len(queries))
         write(self, queries, tokens, out)
 
+    bias, chosen = kind(torch.randn(2, 9, 4), torch.randn(2, 3, 11)), torch.tensor([7, 2, 7])
+    dense = bias.dense()
     monkeypatch.setattr(AttentionBias, "write", counting)
-    bias = kind(torch.randn(2, 9, 4), torch.randn(2, 3, 11))
-    keys, chosen = torch.randn(2, 2, 11, 4), torch.tensor([7, 2, 7])
-    explained = CrossAttentionCore(8, 2).explain(torch.randn(2, 9, 8), keys, chosen, bias)
+    assert torch.equal(bias.dense(chosen), dense[:, chosen])
     assert rows == [3, 3]
-    assert explained.geometry is not None
-    assert torch.equal(explained.geometry, bias.dense()[:, None, chosen])
