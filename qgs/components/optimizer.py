@@ -73,6 +73,7 @@ class OneCycleAdamW(Optimizer):
         """The schedule's rate, else the one-cycle rate."""
         if self.follows_schedule:
             return super().learning_rate(step, seconds)
+        # steps - 1: the last step has the last rate, as in torch's OneCycleLR.
         of_steps, of_seconds = step / max(self.training.steps - 1, 1), seconds / self.budget
         used = min(max(of_steps, of_seconds), 1.0)
         if self._descent_starts is None:

@@ -76,6 +76,7 @@ def _turn(*coefficients: float) -> float:
     Beyond it the polynomial shows the same photo again, mirrored.
     """
     slope = [1.0, *((2 * i + 3) * k for i, k in enumerate(coefficients))]
+    # Numerical roots of a real polynomial have small imaginary parts.
     roots = np.roots(slope[::-1])
     real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
     return float(real.min()) if len(real) else math.inf
@@ -100,6 +101,7 @@ def undistorted(
     for top in range(0, height, _ROWS):  # photos of phones would take gigabytes at once
         block = slice(top, top + _ROWS)
         directions = torch.stack(torch.broadcast_tensors(x, y[block]), -1)  # (rows, W, 2)
+        # From the pinhole's pixel to the photo's: the distortion is given in this direction.
         source = focal * lens.distorted(directions) + centre
         grid = source / torch.tensor([width, height]) * 2 - 1  # -1 to 1 across the photo
         seen = lens.sees(directions) & (grid.abs() <= 1).all(-1)

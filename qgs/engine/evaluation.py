@@ -106,6 +106,7 @@ class Measures:
 
     def __init__(self, recipe: Recipe) -> None:
         self._parts = recipe.parts
+        # eval(): layers of a learned metric may differ in training.
         self.metrics = {name: metric.eval() for name, metric in recipe.build_metrics().items()}
         self.needed = {need for metric in self.metrics.values() for need in metric.needs}
         self._owners: dict[str, Metric] = {}
@@ -123,6 +124,7 @@ class Measures:
         """A sample's values by METHOD_NAME, without those that lack what they need."""
         values: dict[str, float] = {}
         for label, metric in self.metrics.items():
+            # A baseline has no Gaussians and no depth: it has a dash in that column.
             if metric.unavailable or any(getattr(given, need) is None for need in metric.needs):
                 continue
             with self._named(label, "forward"):
@@ -186,6 +188,7 @@ class _Scorer:
         """The score of every sample, up to `batch` with inputs of one shape at a time."""
         waiting: list[Sample] = []
         for sample in samples:
+            # In their order: a failed scene is reported where it would have been judged.
             if isinstance(sample, SceneFailure):
                 yield sample
                 continue
@@ -199,6 +202,7 @@ class _Scorer:
 
     @torch.no_grad()
     def _together(self, samples: Sequence[Sample]) -> list[SceneScore | SceneFailure]:
+        # Tuning changes the state of one scene, so tuned scenes run one by one.
         if len(samples) > 1 and not self._tune:
             with suppress(Exception):  # then each runs by itself, to find the one that fails
                 inputs = stack_views([sample.inputs for sample in samples]).to(self._device)
@@ -211,6 +215,7 @@ class _Scorer:
     ) -> SceneScore | SceneFailure:
         values: dict[str, float] = {}
         try:
+            # Seen before the model runs: a failing scene counts among the cameras too.
             self.seen.see(sample.inputs.cameras, sample.targets.cameras)
             inputs = sample.inputs.to(self._device)
             if self._tune:
@@ -232,6 +237,7 @@ class _Scorer:
         targets = sample.targets.to(self._device)
         self.gaussians = max(self.gaussians, gaussians.count)
         rendering = self._model.render(gaussians, targets.cameras)
+        # Depth maps cost as much as photos to decode.
         depth = true_depth(self._source, sample) if "true_depth" in self._measures.needed else None
         if depth is not None:
             depth = depth[None].to(self._device)

@@ -93,6 +93,7 @@ class PeriodicEvaluation:
     def _evaluate(self, step: int) -> None:
         records = [self._record("raw", step)]
         if self._average:
+            # The average is judged second: it is applied to the weights for as long as that takes.
             with self._average.applied():
                 records.append(self._record("ema", step))
         picture = self._picture()
@@ -132,6 +133,7 @@ class PeriodicEvaluation:
             index_of(recipe),
             recipe.build_view_sampler(),
         )
+        # A broken test scene has been reported by the scores; pictures take the next one.
         usable = (sample for sample in plan.samples() if isinstance(sample, Sample))
         model.eval()
         try:

@@ -76,10 +76,12 @@ def protocol_of(
         views = recipe.views.model_dump(mode="json", include={"inputs", "targets", "gap"})
         rule = evaluation.model_dump(include={"scenes", "samples", "seed"})
         judged: dict[str, Any] = {"drawn": {**views, **rule, "names": list(scenes)}}
+        # The default sampler is what `gap` says; any other one draws other views.
         sampler = recipe.parts["view_sampler",]
         if sampler.options != Span.Config().model_dump() or sampler.type != "qgs/span":
             judged["drawn"]["sampler"] = {"type": sampler.type, **sampler.options}
     else:
+        # An index names scenes and frames itself, whatever the split.
         left_out |= source.split_options
         data = config.model_dump(mode="json", exclude=left_out, exclude_defaults=True)
         judged = {"index": {n: entry.model_dump() if entry else None for n, entry in index.items()}}
@@ -101,7 +103,7 @@ def protocol_of(
     factor = () if recipe.views.scale == "auto" else ("scale_factor",)
     noise = {"noise": [recipe.views.pose_noise, evaluation.seed]} if recipe.views.pose_noise else {}
     content = {
-        "format": 2,
+        "format": 1,
         "image_size": list(config.image_size),
         "crop": "centre crop to the aspect ratio of image_size, then Lanczos resize",
         "data": data,
@@ -111,6 +113,7 @@ def protocol_of(
         "metrics": metrics,
         "tuning": tuning,
     }
+    # The name is for people: it is not part of the hash.
     file = (evaluation.index or "drawn").replace("\\", "/").rsplit("/", 1)[-1]
     return Protocol(evaluation.protocol or file.removesuffix(".json"), content)
 

@@ -69,6 +69,7 @@ def tune(
     optimizer = torch.optim.Adam(leaves, lr=rate)
 
     def predicted() -> tuple[Prediction, Tensor]:
+        # The part that is fixed was computed once, outside.
         if what == "queries":
             prediction = model.predict(memory, tuned, ())
         else:
