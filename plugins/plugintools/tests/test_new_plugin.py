@@ -62,21 +62,7 @@ def test_names_that_are_taken_as_they_are(name: str) -> None:
     assert load_mapping(text, "recipe.yaml", Problems())["plugins"][-1] == name
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "Far Sighted",
-        "../escape",
-        "2fast",
-        "a--b",
-        "",
-        "qgs-more",
-        "locus",
-        "null",
-        "class",
-        "torch",
-    ],
-)
+@pytest.mark.parametrize("name", ["Far Sighted", "../escape", "", "locus", "class", "torch"])
 def test_names_that_are_refused(name: str, tmp_path: Path) -> None:
     result = run_qgs("new-plugin", "--", name)
     assert isinstance(result.exception, ValueError)
@@ -88,16 +74,6 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     result = run_qgs("new-plugin", "wide", "--out", "mine")
     assert isinstance(result.exception, FileExistsError)
     assert list(tmp_path.rglob("*")) == [tmp_path / "mine"]
-
-
-def test_an_sdist_holds_no_training(tmp_path: Path) -> None:
-    run_qgs("new-plugin", "wide")
-    folder = tmp_path / "qgs-wide"
-    project = tomllib.loads((folder / "pyproject.toml").read_text())
-    included = project["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
-    there = {f"/{path.name}" for path in folder.iterdir()} - {"/.gitignore", "/pyproject.toml"}
-    assert there <= set(included), "hatchling adds the other two"
-    assert not {"/run", "/run/checkpoint.safetensors"} & set(included)
 
 
 @pytest.mark.parametrize("sink", [-0.5, 1.5])
