@@ -77,19 +77,6 @@ def test_plain_photos_are_not_judged_and_that_is_told(room):
     ]
 
 
-def test_what_is_not_done_is_told(good):
-    def notes(options):
-        return check(UPath(good / "chunks"), options).notes
-
-    assert notes(Options(headers_only=True)) == [
-        "quick: only headers of images were read, and no pose was judged by photos"
-    ]
-    assert notes(Options(geometry=0)) == ["no pose was judged by photos (--geometry 0)"]
-    assert notes(Options(geometry=1)) == [
-        "poses were judged by photos in 1 of 2 scenes; --geometry 2 judges all"
-    ]
-
-
 def test_masks_that_are_missing_or_damaged(room):
     (room.path / "masks").mkdir()
     (room.path / "masks" / "1.png").write_bytes(b"no image")
@@ -103,18 +90,6 @@ def test_masks_that_are_missing_or_damaged(room):
     )
     assert second.startswith("error: room, frame 1 (images/1.jpg): ")
     assert "1.png cannot be read as the mask of a photo" in second
-
-
-def test_many_missing_masks_are_one_line_that_names_no_single_one(room):
-    def masked(data):
-        for frame in data["frames"]:
-            frame["mask_path"] = frame["file_path"].replace("images", "masks")
-
-    room.listing(masked)
-    assert told(room.path, geometry=0) == [
-        "error: room, frames 0-5 (images/0.jpg to images/5.jpg): its mask does not exist in masks: "
-        "add it, or list no mask"
-    ]
 
 
 def test_other_data_sets_beside_scenes_are_named(room, chunks, tmp_path):

@@ -2,11 +2,7 @@ import re
 import shutil
 
 import pytest
-import torch
 from commands import run_qgs
-from qgs_datatools.check import CheckReport, SceneReport
-
-from qgs.geometry.poses import look_at
 
 
 @pytest.fixture(scope="module")
@@ -42,29 +38,6 @@ def test_a_sound_set_has_exit_code_0_and_a_table(sound):
     assert lines[-1] == f"{sound}: 1 scene, 0 errors, 0 warnings"
 
 
-def around(name, radius):
-    """A scene of cameras that look at the origin from a circle."""
-    angles = torch.linspace(0, 2, 7)
-    eyes = radius * torch.stack([angles.sin(), 0 * angles, -angles.cos()], -1)
-    c2w = look_at(eyes, -eyes, torch.tensor([0.0, 1, 0]).expand(7, 3))
-    return SceneReport(name, name, "colmap", c2w=c2w[:, :3].numpy())
-
-
-@pytest.mark.parametrize(
-    ("scenes", "said"),
-    [
-        ([around("a", 4)], "is a factor of 0.25"),
-        ([around("a", 4), around("b", 2)], "is a factor of 0.375, from 0.25 to 0.5"),
-        (
-            [around("a", 4), SceneReport("walk", "walk", "colmap")],
-            "is a factor of 0.25 and finds no common point that the cameras look at in walk",
-        ),
-    ],
-)
-def test_the_factor_of_an_automatic_scale_is_told(scenes, said):
-    assert CheckReport("", scenes, [], [], 0, []).auto_scale == f"views.scale: auto {said}"
-
-
 def test_errors_have_exit_code_1_and_one_line_each(broken):
     result = run(broken, "--geometry", 0)
     assert result.exit_code == 1
@@ -74,13 +47,6 @@ def test_errors_have_exit_code_1_and_one_line_each(broken):
     )
     assert "note: no pose was judged by photos (--geometry 0)" in result.output
     assert result.output.splitlines()[-1] == f"{broken}: 2 scenes, 1 error, 0 warnings"
-
-
-def test_a_path_that_is_no_data_set_is_a_mistake(tmp_path):
-    result = run(tmp_path / "nowhere")
-    assert isinstance(result.exception, FileNotFoundError)
-    (tmp_path / "empty").mkdir()
-    assert "holds nothing" in str(run(tmp_path / "empty").exception)
 
 
 def test_the_page_needs_no_other_file(broken, tmp_path):

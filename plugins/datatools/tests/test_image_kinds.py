@@ -127,13 +127,6 @@ def test_a_photo_turned_by_exif_keeps_its_stored_pixels_and_is_told(tmp_path, ca
     assert "mogrify -auto-orient" in line
 
 
-def test_a_photo_listed_with_its_turned_size_is_refused(tmp_path):
-    folder = photo_set(tmp_path, encoded(RGB.transpose(1, 0, 2)))
-    with pytest.raises(ValueError, match=r"4 x 6 pixels, but listed as 6 x 4.*where EXIF does"):
-        pixels(folder)
-    assert len(told(folder)) == 1
-
-
 def marked(value: int, dtype=np.uint8) -> Image.Image:
     """The right half is modelled, with this number."""
     mask = np.zeros(SIZE, dtype)

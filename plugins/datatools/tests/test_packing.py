@@ -1,7 +1,6 @@
 import io
 import json
 import os
-import shutil
 import signal
 import time
 from functools import partial
@@ -13,7 +12,6 @@ import torch
 from commands import run_qgs
 from PIL import Image
 from qgs_datasets.chunks import ChunksSource
-from qgs_datasets.dl3dv import Dl3dvSource
 from qgs_datatools import packing
 from upath import UPath
 
@@ -222,18 +220,6 @@ def test_scenes_that_cannot_be_read_are_left_out_by_name(tmp_path):
         packing.pack(before, broken_alone, UPath(tmp_path / "none"), {}, leave_out_broken=True)
 
 
-def test_archives_of_dl3dv(tmp_path):
-    many(tmp_path / "scenes", 3)
-    for scene in (tmp_path / "scenes").iterdir():
-        shutil.make_archive(str(tmp_path / "1K" / scene.name), "zip", scene.parent, scene.name)
-    (tmp_path / "1K" / "s1.zip").write_bytes(b"cut off")
-    before = photo_formats.opened(tmp_path / "1K", SIZE, Dl3dvSource)
-    result = pack(before, tmp_path / "chunks", leave_out_broken=True)
-    assert (result.scenes["train"], result.kept) == (2, 4)
-    assert "s1.zip is no zip archive" in result.left_out["s1"]
-    same(before.scenes("train")[2], packed(tmp_path / "chunks").scenes("train")[1])
-
-
 def packed_until_killed(before, out, seconds: float) -> bool:
     """Pack in a process of its own, killed after `seconds`; whether it was."""
     process = os.fork()
@@ -256,24 +242,6 @@ def test_a_killed_packing_goes_on(tmp_path):
     after = packed(out)
     assert len(after.scenes("train")) == 40
     assert all(len(scene.images([1])) for scene in after.scenes("train"))
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("", r"packing\.json is not valid JSON .*: move it away .*, or give a new folder"),
-        ("{}", r"packing\.json was not written by a packing: move it away"),
-        ("[1]", "was not written by a packing"),
-        ('{"settings": {}, "files": {"train": []}}', "was not written by a packing"),
-    ],
-)
-def test_a_journal_that_packing_did_not_write(tmp_path, content, message):
-    before = source(many(tmp_path / "scenes"))
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "packing.json").write_text(content)
-    with pytest.raises(ValueError, match=message):
-        pack(before, tmp_path / "out")
-    assert (tmp_path / "out" / "packing.json").read_text() == content
 
 
 def command(*words) -> str:
@@ -310,20 +278,3 @@ def test_the_command_packs_the_data_of_a_recipe(tmp_path):
 @pytest.fixture(params=["{}", "file://{}", "memory://urls{}"])
 def folder(request, tmp_path) -> UPath:
     return opened_path(request.param.format(tmp_path / "folder"))
-
-
-def write_half(file: UPath) -> None:
-    with packing.opened_replacing(file) as opened:
-        opened.write(b"half")
-        raise KeyError
-
-
-def test_files_appear_whole_or_not_at_all(folder):
-    file = folder / "a.bin"
-    packing.write_bytes(file, b"first")
-    with pytest.raises(KeyError):
-        write_half(file)
-    assert file.read_bytes() == b"first"
-    packing.write_bytes(file, b"second")
-    assert file.read_bytes() == b"second"
-    assert [item.name for item in folder.iterdir()] == ["a.bin"]

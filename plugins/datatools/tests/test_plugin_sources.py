@@ -83,21 +83,6 @@ def test_masks_are_looked_at(tapes, monkeypatch):
     assert f"error: b, frames 0-5 (0 to 5): {reason}" in output
 
 
-def test_a_folder_of_images_that_is_not_read_is_refused(tapes):
-    refused = run("check", tapes, "--images", "images_4").exception
-    assert str(refused) == "tapes/tape has no option `images`: leave --images out"
-
-
-def test_plugins_that_cannot_be_used_are_told(tapes, tmp_path):
-    with (tmp_path / "site" / "qgs_tapes-1.0.dist-info" / "entry_points.txt").open("a") as file:
-        file.write("bad = no_such_module:plugin\n")
-    sources._installed.cache_clear()
-    told = "left out: the plugin `bad` of qgs-tapes 1.0 cannot be imported"
-    assert f"note: {told}" in run("check", tapes, "--quick").output
-    assert told in run("pack", tapes, "--out", tmp_path / "chunks").output
-    assert told in str(run("check", tapes, "--format", "bad/source").exception)
-
-
 def test_pack(tapes, tmp_path):
     packed = run("pack", tapes, "--out", tmp_path / "chunks", "--set", "image_size=[16, 16]")
     assert packed.exception is None, packed.output
