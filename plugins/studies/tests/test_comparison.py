@@ -9,7 +9,7 @@ import pytest
 from commands import SMALL, run_qgs
 from qgs_studies.comparison import compare
 from qgs_studies.intervals import crossed_error, crossed_interval, paired_interval
-from qgs_studies.stored import StoredResults, read_results
+from qgs_studies.stored import StoredResults
 from scipy import stats
 
 import qgs
@@ -89,20 +89,6 @@ def test_trainings_of_one_recipe_are_one_side_paired_by_seed() -> None:
     text = compare([*ours, *theirs]).markdown()
     assert "r/a: seed 2 left out" in text
     assert "1.90 times" in text
-
-
-def test_an_interval_over_scenes_says_nothing_of_training() -> None:
-    ours = [training(f"r/a/{s}", "A", s, a=10.0 + s, b=12.0 - s) for s in range(3)]
-    text = compare([*ours, training("r/b", "B", 0, a=9.0, b=11.0)]).markdown()
-    assert "says nothing of training" in text
-
-
-def test_folders_without_results_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
-        read_results(tmp_path)
-    (tmp_path / "summary.json").write_text("{}")
-    with pytest.raises(ValueError, match="qgs eval"):
-        read_results(tmp_path)
 
 
 def test_two_runs_compare_scene_by_scene(tmp_path: Path) -> None:

@@ -135,17 +135,6 @@ time.sleep(600)
     assert is_free(run)
 
 
-def test_a_study_is_checked_and_given_to_slurm_without_training(study: Path) -> None:
-    out = study.parent / "out"
-    result = run_qgs("study", study, "--out", out, "--slurm")
-    assert result.exit_code == 0, result.output
-    script = (out / "slurm.sh").read_text()
-    assert "#SBATCH --array=0,1,2,3" in script
-    assert f"study {study} --out {out} --threads 1" in script
-    assert "--only $SLURM_ARRAY_TASK_ID" in script
-    assert not (out / "runs").exists()
-
-
 def test_the_last_whole_record_tells_how_far_a_run_is(tmp_path: Path) -> None:
     history = tmp_path / "history.jsonl"
     assert last_record(history) == (0, 0.0)

@@ -12,7 +12,7 @@ from typing import Any
 import fill_evidence
 import numpy as np
 import pytest
-from qgs_studies.figures import values_figure, write_figures
+from qgs_studies.figures import write_figures
 from qgs_studies.intervals import crossed_interval
 from qgs_studies.output import latex, markdown, table_rows, write_files
 from qgs_studies.plan import Plan, run_of
@@ -119,20 +119,6 @@ def test_trainings_that_failed_are_in_the_answer(tmp_path: Path) -> None:
     assert "other seed 0 failed: CollapseError: training collapsed at step 7: it" in found.notes()
 
 
-def test_variants_that_a_copied_photo_beats_are_in_the_answer(tmp_path: Path) -> None:
-    def score(variant: str, evaluation: str, seed: int, scene: int) -> float:
-        return simple(variant, evaluation, seed, scene) - 8.0  # means of 15.5, and 14.5 of `less`
-
-    found = results(tmp_path, score)
-    means = {row.variant: row.scores["psnr"].mean for row in found.rows()}
-    worse = ", ".join(name for name, mean in means.items() if mean < NEAREST)
-    assert "less" in worse
-    told = f" Worse than the nearest input photo, copied (PSNR 15.500): {worse}."
-    assert found.answer().endswith(told)
-    dashes = ["–"] * 5
-    assert table_rows(found)[-1] == ["nearest input", "15.500", *dashes, "–", "–"]
-
-
 @pytest.mark.parametrize(
     ("offset", "answer", "verdict"),
     [
@@ -212,16 +198,6 @@ def test_numbers_of_unlike_protocols_are_not_compared(tmp_path: Path) -> None:
     assert (record["difference"], record["low"]) == ("", "")
 
 
-def test_without_an_evaluation_that_all_share_there_is_no_answer(tmp_path: Path) -> None:
-    text = STUDY.replace("seeds:", "differs: [views.inputs, losses.visibility]\nseeds:")
-    found = results(tmp_path, simple, views=lambda variant, evaluation: variant, text=text)
-    assert found.answer().startswith("Not known: ")
-    assert "sets views.inputs" in found.answer()
-    assert found.answer().endswith("2 seen, 1 undecided.")
-    assert found.rank_correlation()[0] is None
-    assert {row["difference"] for row in csv_rows(found)} == {""}
-
-
 def lead(size: float, wobble: float) -> Score:
     """Of `other`: by so much, more or less from seed to seed."""
 
@@ -249,15 +225,6 @@ def test_the_best_of_several_is_better_when_chance_has_several_tries(tmp_path: P
     assert "(95 % interval [+" in two.answer()
 
 
-def test_a_variant_with_one_seed_so_far_does_not_hide_what_is_known(tmp_path: Path) -> None:
-    plan = results(tmp_path, lead(5.0, 0.1)).plan
-    for seed in (1, 2):
-        shutil.rmtree(run_of(tmp_path, "other", seed).folder)
-    answer = Results(plan).answer()
-    assert answer.startswith("No: less is worse than full")
-    assert "2 of 9 runs" in answer
-
-
 def test_a_variant_without_the_metric_is_a_row_of_dashes(tmp_path: Path) -> None:
     plan = results(tmp_path, simple).plan
     for seed in range(3):
@@ -268,35 +235,6 @@ def test_a_variant_without_the_metric_is_a_row_of_dashes(tmp_path: Path) -> None
     assert row[1:6] == ["–"] * 5
     write_files(found)
     assert "\n,less,0,\n" in (tmp_path / "runs.csv").read_text()
-
-
-def test_a_sure_lead_counts_beside_a_larger_one_that_is_not(tmp_path: Path) -> None:
-    def score(variant: str, evaluation: str, seed: int, scene: int) -> float:
-        sure = 1.5 * (variant == "less")
-        return lead(0.9, 2.0)(variant, evaluation, seed, scene) + sure
-
-    assert results(tmp_path, score).answer().startswith("Yes: less, of 2 variants, is better than")
-
-
-@pytest.mark.parametrize(
-    ("seeds", "scenes", "reason"),
-    [
-        (1, 8, "one training a side"),
-        (3, 1, "one scene"),
-        (1, 1, "one training a side and one scene"),
-        (0, 8, "no seed and scene with `psnr` in all its runs"),
-    ],
-)
-def test_why_there_is_no_verdict(tmp_path: Path, seeds: int, scenes: int, reason: str) -> None:
-    text = STUDY.replace("note: degrades more", "metric: lpips")
-    found = results(tmp_path, simple, seeds, scenes, text=text)
-    judged, *_, unmeasured = found.judgements()
-    assert (judged.verdict, judged.reason) == ("undecided", reason)
-    assert unmeasured.reason
-    assert found.answer().startswith("Not known")
-    if scenes == 1:
-        assert "says nothing of " in found.answer()
-        assert "one scene is too few for an interval" in found.notes()
 
 
 def test_published_values_are_shown_and_ranked_from_five_variants_on(tmp_path: Path) -> None:
@@ -317,14 +255,3 @@ def test_published_values_are_shown_and_ranked_from_five_variants_on(tmp_path: P
 def test_the_evidence_page_takes_studies_of_one_seed(tmp_path: Path) -> None:
     write_files(results(tmp_path, simple, seeds=1))
     assert "| noisy | 23.01 (–) |" in fill_evidence.page_of(tmp_path)
-
-
-@pytest.mark.parametrize("seeds", [3, 9])
-def test_figures_name_the_seeds(tmp_path: Path, seeds: int) -> None:
-    text = STUDY.replace("[0, 1, 2]", str(list(range(seeds))))
-    figure = values_figure(results(tmp_path, simple, seeds=seeds, text=text))
-    assert figure
-    named = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-    assert named == (["seed 0", "seed 1", "seed 2"] if seeds == 3 else [])
-    points = [line for line in figure.axes[0].lines if line.get_marker() == "o"]
-    assert len({line.get_color() for line in points}) == (3 if seeds == 3 else 1)

@@ -173,29 +173,6 @@ def test_variants_judged_by_the_same_index_under_two_names_are_alike(
         composed(read(tmp_path, text))
 
 
-def test_a_budget_that_the_optimiser_cannot_use_names_the_variant(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="warmup") as caught:
-        composed(read(tmp_path, SOUND.replace("200", "50")))
-    assert "`full`" in caught.value.__notes__[0]
-
-
-@pytest.mark.parametrize(
-    ("changed", "option"),
-    [
-        ("losses: {photometric: {l1_weight: 0.5}}", "losses.photometric"),
-        ("init_from: rooms/locus-64", "init_from"),
-    ],
-)
-def test_losses_and_the_start_are_alike_unless_the_study_says_otherwise(
-    tmp_path: Path, changed: str, option: str
-) -> None:
-    text = SOUND.replace("{type: qgs/content}}}}", "{type: qgs/content}}}, " + changed + "}")
-    with pytest.raises(RecipeError, match=f"`differs: \\[{option}\\]`"):
-        composed(read(tmp_path, text))
-    said = text.replace("differs: [", f"differs: [{option}, ")
-    assert [*composed(read(tmp_path, said))] == ["full", "flat", "tokengs"]
-
-
 def test_a_metric_that_cannot_be_measured_here_is_refused_before_training(tmp_path: Path) -> None:
     text = SOUND + "metric: lpips\noverlay: {metrics: {lpips: {type: qgs/lpips}}}\n"
     with pytest.raises(OptionError, match="lpips"):
