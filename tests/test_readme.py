@@ -47,10 +47,6 @@ def test_paths_exist() -> None:
     assert [path for path in paths if not (ROOT / path).exists()] == []
 
 
-def test_the_readme_is_short() -> None:
-    assert len(README.splitlines()) <= 120
-
-
 def shown_scores() -> dict[str, tuple[str, ...]]:
     """PSNR, SSIM, Gaussians and parameters of each model in the README, and of the nearest photo.
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 from photo_formats import synthetic, write_nerfstudio
-from qgs_rooms.source import RoomScene, RoomsSource
+from qgs_rooms.source import RoomsSource
 from rich.console import Console
 from training_runs import Tiny, same
 
@@ -26,8 +26,6 @@ from qgs.engine.results import METHODS, Evaluation
 from qgs.metrics.baselines import mean_colour, nearest_input
 from qgs.metrics.dispersion import token_dispersion
 from qgs.metrics.images import Psnr, psnr, ssim
-from qgs.metrics.lpips import Lpips
-from qgs.perceptual import PerceptualDistance
 
 FILES = ["protocol.json", "scenes.csv", "summary.json", "table.md"]
 
@@ -137,15 +135,6 @@ def test_batches_pass_through_the_model_together(tiny: Tiny, tmp_path: Path) -> 
     assert sizes == [(2, 2), (1, 3), (1, 1)]
 
 
-def test_frames_that_a_model_is_given_and_judged_on_are_told(tiny: Tiny, tmp_path: Path) -> None:
-    recipe = tiny("tokengs", write_index(tmp_path, room0=([0, 4], [4, 2, 0]), room1=([0, 4], [2])))
-    evaluation = evaluate(recipe.build_model(), recipe)
-    assert evaluation.summary()["context_and_target"] == {"test/000000": [0, 4]}
-    expected = "1 scene with frames as context and as target"
-    (line,) = (line for line in shown(evaluation).splitlines() if expected in line)
-    assert line.endswith("test/000000 (0, 4)")
-
-
 def test_what_is_missing_is_told_in_the_same_line_as_the_score(tiny: Tiny, tmp_path: Path) -> None:
     index = write_index(
         tmp_path, room0=([0, 3], [1, 2]), room1=([0, 99], [1]), gone=([0, 3], [1]), nil=None
@@ -226,33 +215,6 @@ def test_photo_folders_are_judged_on_held_out_frames_beside_a_broken_one(
     assert all(summary["missing"].values())
 
 
-def test_no_scene_at_all_and_an_empty_batch_are_errors(tiny: Tiny, tmp_path: Path) -> None:
-    recipe = tiny("tokengs", write_index(tmp_path, a=([0], [1]), b=([0], [1])))
-    model = recipe.build_model()
-    with pytest.raises(ValueError, match="none of 2 scenes could be judged; the first, a: not amo"):
-        evaluate(model, recipe)
-    with pytest.raises(ValueError, match="at least 1, got 0"):
-        evaluate(model, recipe, batch=0)
-
-
-def test_what_is_said_of_some_scenes_is_said_of_them_alone(
-    tiny: Tiny, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of two scenes one has a held-out frame; of all photos only the first is as it is stored."""
-    held_out = property(lambda scene: (3,) if scene.name == "test/000000" else ())
-    monkeypatch.setattr(RoomScene, "held_out", held_out)
-    asked: list[int] = []
-    told = lambda scene, frame: "" if not asked.append(frame) and len(asked) == 1 else "cut"  # noqa: E731
-    monkeypatch.setattr("qgs.data.evaluation.framing", told)
-    recipe = tiny("tokengs", "evaluation.samples=3")
-    evaluation = evaluate(recipe.build_model(), recipe)
-    assert [len(score.views) for score in evaluation.scores] == [1, 3]
-    said = "evaluation.samples=3 changed nothing for 1 of 2 scenes, since no views were drawn: "
-    assert f"{said}1 of 1 held-out frames are judged, each once" in evaluation.remarks
-    assert len(asked) == 1
-    assert "cut" not in evaluation.remarks
-
-
 def test_failed_samples_fail_their_scene(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe = tiny("tokengs", "evaluation.samples=3")
     score, factors = Psnr.forward, chain([1] * (2 * len(METHODS) - 1), [math.inf], repeat(1))
@@ -260,43 +222,6 @@ def test_failed_samples_fail_their_scene(tiny: Tiny, monkeypatch: pytest.MonkeyP
     evaluation = evaluate(recipe.build_model(), recipe)
     assert [failure.scene for failure in evaluation.missing] == ["test/000000"]
     assert [len(score.views) for score in evaluation.scores] == [3]
-
-
-def test_the_table_shows_all_methods_and_why_a_column_is_empty(tiny: Tiny, tmp_path: Path) -> None:
-    recipe = tiny("tokengs", f"metrics.lpips={{type: qgs/lpips, weights: {tmp_path / 'none.pth'}}}")
-    evaluation = evaluate(recipe.build_model(), recipe)
-    text = " ".join(shown(evaluation).split())
-    for word in ("model", "nearest input", "mean colour", "PSNR ↑", "SSIM ↑", "LPIPS ↓"):
-        assert word in text
-    assert f"LPIPS is empty: {Lpips(Lpips.Config(weights='none.pth')).unavailable}" in text
-    assert evaluation.mean("lpips") is None
-
-
-def test_the_form_of_ssim_is_named_where_it_is_not_the_default(tiny: Tiny) -> None:
-    plain, sample = tiny("tokengs"), tiny("tokengs", "metrics.ssim.covariance=sample")
-    model = plain.build_model()
-    evaluations = [evaluate(model, recipe) for recipe in (plain, sample)]
-    first, second = (e.mean("ssim", "mean_colour") for e in evaluations)
-    assert 0 < abs(first - second) < 1e-3
-    assert "covariance" not in shown(evaluations[0])
-    assert "covariance" in shown(evaluations[1])
-
-
-def test_lpips_fills_its_column_where_it_can(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
-    recipe = tiny("tokengs", "metrics.lpips={type: qgs/lpips, weights: mine.pth}")
-    asked = []
-    monkeypatch.setattr(PerceptualDistance, "load", lambda self, weights: asked.append(weights))
-    monkeypatch.setattr(
-        Lpips, "distance", lambda self, images, truth: (images - truth).abs().mean((-3, -2, -1))
-    )
-    evaluation = evaluate(recipe.build_model(), recipe)
-    assert asked == ["mine.pth"]
-    sample = first_sample(recipe)
-    copied = nearest_input(sample.inputs, sample.targets.cameras)
-    expected = float((copied - sample.targets.images).abs().mean())
-    assert evaluation.scores[0].values["nearest_input_lpips"] == pytest.approx(expected, rel=1e-5)
-    assert evaluation.summary()["incomplete"] == {}
-    assert "is empty" not in shown(evaluation)
 
 
 def test_tuned_evaluations_say_so_and_score_the_tuned_tokens(tiny: Tiny) -> None:

@@ -8,18 +8,16 @@ import torch
 from rich.console import Console
 from safetensors.torch import load_file
 from torch import Tensor
-from training_runs import Tiny, same
+from training_runs import Tiny
 
 from qgs.composer import Recipe, resolve
 from qgs.engine.initial import initialise
 from qgs.engine.training import train
 from qgs.io.checkpoint import save
-from qgs.io.tensors import CheckpointError
 from qgs.model import QueryGaussianModel
 
 COUNT = 24
 GROWTH_NOISE = 0.01  # LocusGS release
-GAUSSIANS = "head.gaussians_per_query=5"
 PER_QUERY = {"tokengs": ["features"], "locus": ["features", "center", "raw_radius"]}
 
 
@@ -84,13 +82,6 @@ def test_shrinking_keeps_the_first(learned: Tiny, name: str) -> None:
     assert "queries.features: 24 -> 10, the first are kept" in told
 
 
-def test_the_same_size_is_taken_as_it_is(learned: Tiny) -> None:
-    recipe = learned("locus")
-    model, told = started(recipe)
-    assert same(model.state_dict(), old_weights(recipe))
-    assert told == [f"weights start from {recipe.tree['init_from']}"]
-
-
 def test_the_recipes_seed_decides_the_noise(learned: Tiny) -> None:
     def features(seed: int) -> torch.Tensor:
         torch.rand(seed)  # the global random state plays no part
@@ -100,13 +91,6 @@ def test_the_recipes_seed_decides_the_noise(learned: Tiny) -> None:
     assert torch.equal(features(1), features(1))
     assert not torch.equal(features(1), features(2))
     assert torch.equal(features(1)[:COUNT], features(2)[:COUNT])
-
-
-def test_a_recipe_without_it_starts_from_its_own_seed(tiny: Tiny) -> None:
-    recipe = tiny("tokengs")
-    model, told = started(recipe)
-    assert told == []
-    assert same(model.state_dict(), recipe.build_model().state_dict())
 
 
 def test_larger_patches_give_the_tokens_of_coarser_images(learned: Tiny) -> None:
@@ -119,39 +103,6 @@ def test_larger_patches_give_the_tokens_of_coarser_images(learned: Tiny) -> None
     assert torch.allclose(tokens, started(coarse)[0].encoder.rgb_embedding(images[0]), atol=1e-5)
     name = "encoder.ray_embedding.proj.weight"
     assert f"{name}: (32, 6, 8, 8) -> (32, 6, 16, 16)" in told
-
-
-def test_every_difference_is_told_with_the_options_that_fit(learned: Tiny) -> None:
-    options = (GAUSSIANS, "queries.count=48", "head.norm=false")
-    recipe = learned("tokengs", *(f"model.{option}" for option in options))
-    model = recipe.build_model()
-    before = {key: tensor.clone() for key, tensor in model.state_dict().items()}
-    with pytest.raises(CheckpointError) as caught:
-        initialise(model, recipe)
-    for words in (
-        "init_from",
-        "shape of head.linear.weight: (56, 32) in the file, (70, 32) in the recipe",
-        "unexpected: head.norm.weight",
-        "model.head.gaussians_per_query: 4 (here 5)",
-        "model.head.norm: true (here false)",
-    ):
-        assert words in str(caught.value)
-    assert (
-        "queries" not in str(caught.value).split("to a multiple, the size of patches may differ")[1]
-    )
-    assert same(model.state_dict(), before)
-
-
-def test_options_that_no_weight_shows_are_told(tiny: Tiny, learned: Tiny) -> None:
-    options = ("model.head.scale_cap=0.3", "model.queries.init_radius=0.7")
-    _, told = started(learned("locus", *options))
-    cap = tiny("locus").tree["model"]["head"]["scale_cap"]
-    assert told[1:] == [f"learned with model.head.scale_cap: {cap} (here 0.3)"]
-
-
-def test_anchors_are_not_taken_from_a_model_without(learned: Tiny) -> None:
-    with pytest.raises(CheckpointError, match=r"missing: queries\.center"):
-        started(learned("locus", of="tokengs"))
 
 
 def test_training_starts_from_a_run(tiny: Tiny, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from rich.console import Console
 from torch import Tensor
 from training_runs import Tiny
 
-from qgs.composer import PluginError, Recipe, RecipeError, resolve
+from qgs.composer import Recipe, RecipeError, resolve
 from qgs.contracts import (
     CONTRACT_VERSION,
     Column,
@@ -25,11 +25,10 @@ from qgs.contracts import (
 )
 from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.engine.distributed import make_accelerator
-from qgs.engine.evaluation import Evaluation, Measures, evaluate
+from qgs.engine.evaluation import Evaluation, evaluate
 from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.protocol import protocol_of
 from qgs.engine.tracking import Trackers
-from qgs.engine.training import train
 
 
 class MeanAbsoluteError(Metric):
@@ -159,30 +158,6 @@ def test_what_a_metric_needs(mine: Tiny, monkeypatch: pytest.MonkeyPatch) -> Non
     assert set(evaluation.incomplete) == {"mask_mean"}
     told = "masked is over 1 of 2 scenes: it needs masks, not known for 1 of 2 scenes"
     assert told in shown(evaluation)
-
-
-def test_two_values_of_one_name_are_refused(mine: Tiny) -> None:
-    recipe = mine("metrics={mask_mean: {type: mine/mae}, mask: {type: mine/masked}}")
-    with pytest.raises(ValueError, match="two values of the metrics are called mask_mean"):
-        Measures(recipe)
-
-
-def test_a_metric_that_cannot_be_shown_is_refused_before_training(
-    mine: Tiny, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    recipe = mine("metrics={mask: {type: mine/masked}}")
-    monkeypatch.setattr(Masked, "columns", lambda self: self.no)
-    with pytest.raises(PluginError, match="`columns` of `mine/masked` raises AttributeError"):
-        train(recipe, tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_metric_that_fails_is_named(mine: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
-    recipe = mine("metrics={mask: {type: mine/masked}}")
-    monkeypatch.setattr(Masked, "needs", ())
-    monkeypatch.setattr(Masked, "forward", lambda self, given: {"typo": torch.zeros(1)})
-    with pytest.raises(ValueError, match=r"`forward` of `mine/masked` raises.*\['typo'\]"):
-        evaluate(recipe.build_model(), recipe)
 
 
 def test_written_metrics_lie_over_the_default_ones(tiny: Tiny) -> None:

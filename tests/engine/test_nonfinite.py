@@ -195,12 +195,6 @@ def test_an_incident_can_be_seen_again(step: Step, tmp_path: Path) -> None:
     assert step.batches[0].scenes[0] not in told or step.batches[0].scenes[0] in bad.scenes
 
 
-def test_what_cannot_be_repeated_is_told_so(step: Step, tmp_path: Path) -> None:
-    told, in_data = guard_of(step, tmp_path).look_into(3, step.batches, "loss is nan")
-    assert "repeating the step gave finite numbers" in told
-    assert not in_data
-
-
 def test_the_number_of_saved_incidents_is_bounded(step: Step, tmp_path: Path) -> None:
     step.gradients = lambda batches: {}
     guard, count = guard_of(step, tmp_path), MAX_SAVED + 2

@@ -10,9 +10,7 @@ from torch import Tensor
 from training_runs import TWO, Tiny, first_batch, run, run_calling, same, weights
 
 import qgs
-from qgs.composer import Recipe, resolve
 from qgs.composer.registry import load_plugin
-from qgs.contracts import Objective, Outcome, Passes
 from qgs.engine.distributed import StopRequest
 from qgs.engine.training import Trainer
 from qgs.engine.training_pass import TrainingPass
@@ -36,23 +34,6 @@ def test_terms_of_both_passes_are_recorded(tiny: Tiny, tmp_path: Path, two: None
     assert qgs.load(result.folder.checkpoint).recipe["objective"]["type"] == "two/two_passes"
 
 
-def test_what_is_watched_tells_the_judgements_apart(tiny: Tiny, two: None) -> None:
-    recipe = tiny("tokengs", *TWO)
-    step, batch, seen = (
-        TrainingPass.of(recipe, recipe.build_model().train()),
-        first_batch(recipe),
-        [],
-    )
-    step.hook = lambda name, _: seen.append(name)
-    for _ in range(2):
-        seen.clear()
-        step(batch.inputs, batch.targets)
-        told = [name for name in seen if name.startswith("gradient")]
-        assert told == [
-            f"gradient of layer {n}{j}" for j in ("", " in judgement 2") for n in (2, 4)
-        ]
-
-
 def test_it_resumes_and_another_is_refused(tiny: Tiny, tmp_path: Path, two: None) -> None:
     def stop_early(trainer: Trainer, stop: StopRequest) -> None:
         if trainer.step == 1:
@@ -64,31 +45,6 @@ def test_it_resumes_and_another_is_refused(tiny: Tiny, tmp_path: Path, two: None
     with pytest.raises(ValueError, match=r"objective\.depth_weight"):
         run(tiny("tokengs", *TWO, "objective.depth_weight=0.5"), parts, resume=True)
     assert same(weights(whole), weights(run(recipe, parts, resume=True)))
-
-
-class Renames(Objective):
-    """Calls a term of its own as `name` says."""
-
-    def __init__(self, name: str) -> None:
-        super().__init__(self.Config())
-        self.name = name
-
-    def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
-        outcome = passes.judge(passes.predict(inputs), targets, inputs)
-        return Outcome.mean([outcome], **{self.name: torch.tensor(1.0)})
-
-
-@pytest.mark.parametrize(
-    ("name", "seen"),
-    [("mse", r"have terms \['mse'\] already"), ("alpha", r"\['alpha'\], as other numbers")],
-)
-def test_a_name_that_is_taken_is_refused(tiny: Tiny, name: str, seen: str) -> None:
-    recipe = tiny("tokengs")
-    batch = first_batch(recipe)
-    model = recipe.build_model().train()
-    step = TrainingPass(model, recipe.build_losses(), objective=Renames(name))
-    with pytest.raises(ValueError, match=seen):
-        step(batch.inputs, batch.targets)
 
 
 def test_input_views_are_judged_too(tiny: Tiny) -> None:
@@ -119,13 +75,6 @@ def test_views_are_joined_in_order_and_only_with_their_like() -> None:
     for unlike in (views(2), views(2, masks=True, width=4)):
         with pytest.raises(ValueError, match=r"masks|sizes"):
             one.joined(unlike)
-
-
-def test_a_recipe_names_its_objective(tiny: Tiny) -> None:
-    recipe = tiny("tokengs")
-    assert recipe.tree["objective"] == {"type": "qgs/one_pass"}
-    again: Recipe = resolve(recipe.tree)
-    assert again.tree == recipe.tree
 
 
 def test_the_objective_of_two_passes_keeps_the_contract(two: None) -> None:

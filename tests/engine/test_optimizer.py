@@ -1,10 +1,8 @@
 """Which parameters decay, learn slower or stay; an optimiser of a plugin; the moving average."""
 
-import math
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -12,11 +10,9 @@ from refusals import refused
 from torch import nn
 from training_runs import Tiny, run, same, weights
 
-from qgs.components.optimizer import OneCycleAdamW
 from qgs.composer import resolve
-from qgs.engine.folder import read_state, write_state
+from qgs.engine.folder import read_state
 from qgs.engine.parameters import MovingAverage, make_optimizer, parameter_groups
-from qgs.io.checkpoint import unique_tensors
 
 
 def undecayed_names(module: nn.Module) -> set[str]:
@@ -31,13 +27,6 @@ def test_the_head_and_1d_parameters_do_not_decay(tiny: Tiny, name: str) -> None:
     expected = {n for n, p in model.named_parameters() if p.ndim == 1 or n.startswith("head.")}
     assert undecayed_names(model) == expected
     assert undecayed_names(nn.ModuleDict({"model": model})) == {f"model.{n}" for n in expected}
-
-
-def test_queries_anchors_and_gammas_decay(tiny: Tiny) -> None:
-    model = tiny("locus").build_model("meta")
-    decayed = set(dict(model.named_parameters())) - undecayed_names(model)
-    gammas = {f"decoder.{i}.cross_attention.raw_gamma" for i in range(model.depth)}
-    assert {"queries.features", "queries.center", "queries.raw_radius"} | gammas <= decayed
 
 
 def test_every_trained_parameter_is_in_one_group(tiny: Tiny) -> None:
@@ -122,13 +111,6 @@ def test_a_pattern_that_matches_nothing_ends_the_start(
     assert not (tmp_path / "run").exists()
 
 
-def test_everything_frozen_is_refused(tiny: Tiny) -> None:
-    recipe = tiny("tokengs", 'optimizer.parts={"*": 0}')
-    model = recipe.build_model("meta")
-    with pytest.raises(ValueError, match="nothing to train"):
-        make_optimizer(model, recipe.build_optimizer(), recipe.rate_factors(model))
-
-
 def test_a_factor_scales_the_step(tiny: Tiny, tmp_path: Path) -> None:
     """The first step of AdamW without decay is the learning rate, whatever the gradient."""
     options = ("training.steps=1", "optimizer.warmup=0", "optimizer.weight_decay=0.0")
@@ -204,24 +186,6 @@ def test_moments_of_any_shape_and_none_are_restored(
     assert same(weights(again), weights(through))
 
 
-def test_an_optimiser_may_keep_any_json_values(
-    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run(tiny("tokengs", "training.steps=3"), tmp_path / "run")
-    saved = read_state(tmp_path / "run" / "state.safetensors")
-    told = {"best": math.inf, "last_epoch": -1, "seen": 0.5}
-    write_state(
-        tmp_path / "run" / "state.safetensors",
-        saved.recipe.tree,
-        {**saved.parts, "schedule": told},
-    )
-    restored: list[Any] = []
-    monkeypatch.setattr(OneCycleAdamW, "state", lambda self: {"best": 0.0, "seen": 0})
-    monkeypatch.setattr(OneCycleAdamW, "load_state", lambda self, state: restored.append(state))
-    assert run(tiny("tokengs"), tmp_path / "run", resume=True).resumed_at == 3
-    assert restored == [told]
-
-
 def test_parameters_that_no_gradient_reaches_do_not_hinder_going_on(
     tiny: Tiny, tmp_path: Path
 ) -> None:
@@ -279,17 +243,3 @@ def test_it_is_applied_for_a_while_only() -> None:
 def test_the_average_of_half_precision_weights_is_float32() -> None:
     average = MovingAverage(Small().to(torch.bfloat16), 0.999)
     assert average.state()["first.weight"].dtype == torch.float32
-
-
-def test_a_restored_average_goes_on_alike(tiny: Tiny) -> None:
-    model = tiny("locus").build_model()
-    average, restored = MovingAverage(model, 0.9), MovingAverage(model, 0.9)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.add_(0.1)
-    average.update()
-    restored.load_state(average.state())
-    average.update()
-    restored.update()
-    assert average.state().keys() == unique_tensors(model).keys()
-    assert all(torch.equal(t, average.state()[name]) for name, t in restored.state().items())

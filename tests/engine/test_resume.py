@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
-from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,12 +17,11 @@ import numpy as np
 import pytest
 import torch
 from accelerate import Accelerator
-from training_runs import QUIET, Tiny, run, run_calling, same, weights
+from training_runs import Tiny, run, run_calling, same, weights
 
 from qgs.composer import Recipe
 from qgs.engine.distributed import RandomStates, StopRequest
 from qgs.engine.folder import OtherRunError, RunFolder, read_state, write_state
-from qgs.engine.tracking import TrainingProgress
 from qgs.engine.training import Trainer
 from qgs.io.checkpoint import CheckpointFile
 from qgs.io.tensors import CheckpointError
@@ -121,16 +119,6 @@ def test_a_stopped_run_goes_on_where_it_stopped(tiny: Tiny, tmp_path: Path) -> N
     assert_equal_runs(tmp_path / "through", tmp_path / "stopped")
 
 
-def test_a_run_stopped_before_it_showed_signs_of_life_goes_on_too(
-    tiny: Tiny, tmp_path: Path
-) -> None:
-    recipe = tiny("tokengs", "model.head.opacity_bias=-20.0", "training.steps=12")
-    with closing(Trainer(recipe, tmp_path / "run")) as trainer:
-        trainer.run(TrainingProgress(QUIET), StopRequest(signal.SIGTERM))
-    assert CheckpointFile(tmp_path / "run" / "checkpoint.safetensors").step == 0
-    assert Trainer(recipe, tmp_path / "run", resume=True).resumed_at == 1
-
-
 def test_resume_starts_a_run_that_is_new_and_leaves_a_finished_one(
     tiny: Tiny, tmp_path: Path
 ) -> None:
@@ -225,19 +213,6 @@ def test_other_scenes_are_refused(tiny: Tiny, tmp_path: Path) -> None:
     change_counters(tmp_path / "run", scenes="others")
     with pytest.raises(OtherRunError, match="other training scenes"):
         resumed(recipe, tmp_path / "run")
-
-
-def test_folders_without_a_run_are_refused(tiny: Tiny, tmp_path: Path) -> None:
-    recipe = tiny("tokengs")
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="holds no run"):
-        resumed(recipe, tmp_path)
-    with pytest.raises(FileExistsError, match="is a file"):
-        resumed(recipe, tmp_path / "notes.txt")
-    (tmp_path / "checkpoint.safetensors").touch()
-    with pytest.raises(FileExistsError, match="cannot be continued"):
-        resumed(recipe, tmp_path)
-    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_one_process_at_a_time_trains_in_a_folder(tiny: Tiny, tmp_path: Path) -> None:

@@ -3,32 +3,15 @@
 import io
 import json
 import re
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from unittest.mock import Mock, call
 
-import numpy as np
 import pytest
 from rich.console import Console
 from training_runs import Tiny, run, tensorboard_events
 
-from qgs.contracts import MissingExtraError
-from qgs.engine.distributed import make_accelerator
 from qgs.engine.tracking import Trackers, TrainingProgress
-
-
-def picture() -> np.ndarray:
-    return np.random.default_rng(0).integers(0, 256, (6, 9, 3), dtype=np.uint8)
-
-
-def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("qgs.engine.tracking.find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match=r'pip install "query-gaussians\[wandb\]"'):
-        Trackers(("wandb",))
-    Trackers(()).log({"loss": 1.0}, 1)
-
 
 FILE_TRACKER = """
 import json
@@ -60,23 +43,6 @@ def test_a_distribution_offers_a_tracker_by_an_entry_point(
         Trackers(("linez",))
 
 
-def test_tensorboard_gets_numbers_options_and_pictures(tiny: Tiny, tmp_path: Path) -> None:
-    pytest.importorskip("tensorboard", reason="the extra `tensorboard` is not installed")
-    tracking = Trackers(("tensorboard",))
-    tracking.open(tmp_path, tiny("locus"))
-    for step in (1, 2):
-        tracking.log({"loss": 1 / step, "psnr": 20.0 + step}, step)
-    tracking.picture("evaluation", picture(), 2)
-    tracking.close()
-    events = tensorboard_events(tmp_path)
-    found = [(event.step, event.value) for event in events.Scalars("loss")]
-    assert found == [(1, 1.0), (2, 0.5)]
-    (image,) = events.Images("evaluation")
-    assert (image.step, image.height, image.width) == (2, 6, 9)
-    options = next((tmp_path / "tensorboard").glob("*/hparams.yml")).read_text()
-    assert "model.width: 32" in options
-
-
 def test_a_resumed_run_takes_back_what_was_told_of_lost_steps(tiny: Tiny, tmp_path: Path) -> None:
     pytest.importorskip("tensorboard", reason="the extra `tensorboard` is not installed")
     for first, value in ((1, 1.0), (3, 2.0)):
@@ -88,33 +54,6 @@ def test_a_resumed_run_takes_back_what_was_told_of_lost_steps(tiny: Tiny, tmp_pa
         time.sleep(1.1)  # files of one second are read in the order of a number in their names
     events = tensorboard_events(tmp_path).Scalars("loss")
     assert [(e.step, e.value) for e in events] == [(1, 1.0), (2, 1.0), (3, 2.0), (4, 2.0)]
-
-
-def test_wandb_continues_one_run(
-    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A mock stands in for wandb, whose package is large."""
-    make_accelerator("cpu")
-    wandb = Mock()
-    wandb.Image = lambda image: image
-    monkeypatch.setitem(sys.modules, "wandb", wandb)
-    monkeypatch.setattr("qgs.engine.tracking.find_spec", lambda name: object())
-    for _ in range(2):
-        tracking = Trackers(("wandb",))
-        tracking.open(tmp_path / "run", tiny("locus"))
-        tracking.log({"loss": 0.5}, 3)
-        tracking.picture("evaluation", picture(), 3)
-        tracking.close()
-    calls = [name for name, *_ in wandb.mock_calls]
-    assert calls == ["init", "config.update", "init().log", "init().log", "init().finish"] * 2
-    first, second = (made.kwargs for made in wandb.init.call_args_list)
-    assert first == second, "the same id"
-    assert (first["project"], first["name"]) == ("qgs", "run")
-    assert Path(first["dir"]) == tmp_path / "run"
-    numbers, images, *_ = wandb.init.return_value.log.call_args_list
-    assert numbers == call({"loss": 0.5}, step=3)
-    assert np.array_equal(images.args[0]["evaluation"][0], picture())
-    assert images.kwargs == {"step": 3}
 
 
 def shown(monkeypatch: pytest.MonkeyPatch, *steps: tuple[int, int, float, float]) -> list[str]:
@@ -134,11 +73,6 @@ def left(line: str) -> str:
     return found[1]
 
 
-def test_the_first_step_has_no_speed_yet(monkeypatch: pytest.MonkeyPatch) -> None:
-    (line,) = shown(monkeypatch, (1, 8, 0.0, 0.01))
-    assert line.split() == ["step", "1", "loss", "0.1000", "PSNR", "20.00"]
-
-
 def test_time_left_is_what_the_rest_takes_at_this_speed(monkeypatch: pytest.MonkeyPatch) -> None:
     *_, line = shown(monkeypatch, (1, 8, 0.0, 0.01), (26, 208, 100.0, 0.26))
     assert left(line) == "0:04:56", "0.74 of the budget, 100 s for each 0.25"
@@ -151,8 +85,3 @@ def test_a_resumed_run_counts_from_where_it_resumed(monkeypatch: pytest.MonkeyPa
     *_, line = shown(monkeypatch, first, second)
     assert left(line) == "0:00:40"
     assert "80 images/s" in line
-
-
-def test_slow_steps_are_told_as_a_part_of_an_image(monkeypatch: pytest.MonkeyPatch) -> None:
-    *_, line = shown(monkeypatch, (1, 1, 0.0, 0.0), (5, 5, 10.0, 0.5))
-    assert "0.4 images/s" in line

@@ -15,7 +15,6 @@ from qgs.composer import resolve
 from qgs.data.stream import training_batches
 from qgs.engine.folder import RunFolder
 from qgs.io.checkpoint import CheckpointFile
-from qgs.io.models import checkpoint_path
 
 
 @pytest.mark.parametrize("name", ["tokengs", "locus"])
@@ -44,12 +43,6 @@ def test_a_run_leaves_recipe_history_and_checkpoint(tiny: Tiny, tmp_path: Path) 
         torch.testing.assert_close(
             loaded(batch.inputs).gaussians.means, result.model(batch.inputs).gaussians.means
         )
-
-
-def test_the_same_recipe_trains_the_same(tiny: Tiny, tmp_path: Path) -> None:
-    runs = [run_anywhere(tiny("locus"), tmp_path / name) for name in ("a", "b")]
-    losses = [[record["loss"] for record in run.folder.history()] for run in runs]
-    assert losses[0] == losses[1]
 
 
 def test_accumulated_batches_are_one_larger_batch(tiny: Tiny, tmp_path: Path) -> None:
@@ -122,15 +115,3 @@ def test_a_start_that_fails_leaves_no_folder(tiny: Tiny, tmp_path: Path) -> None
     with pytest.raises(ValueError, match=r"views\.gap"):
         run_anywhere(tiny("tokengs", "views.inputs=9", "views.gap=[2, 3]"), out)
     assert not out.exists()
-
-
-def test_the_thread_that_reads_ahead_ends_with_the_run(tiny: Tiny, tmp_path: Path) -> None:
-    run_anywhere(tiny("tokengs"), tmp_path / "run")
-    assert not [t for t in threading.enumerate() if t.name.startswith("qgs-loader")]
-
-
-def test_the_checkpoint_of_a_run_is_found(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="give a run folder"):
-        checkpoint_path(tmp_path)
-    (tmp_path / "checkpoint.safetensors").touch()
-    assert checkpoint_path(tmp_path) == checkpoint_path(tmp_path / "checkpoint.safetensors")

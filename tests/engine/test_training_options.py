@@ -43,19 +43,6 @@ def bad_batches(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return spoil
 
 
-def test_rendering_in_parts_trains_the_same(tiny: Tiny, tmp_path: Path) -> None:
-    histories = []
-    for render_views in (0, 1, 2):
-        recipe = tiny("locus", f"training.render_views={render_views}", "views.targets=3")
-        histories.append(run(recipe, tmp_path / str(render_views)).folder.history())
-    for history in histories[1:]:
-        for record, wanted in zip(history, histories[0], strict=True):
-            measured = record.keys() - {"seconds"}
-            assert {k: record[k] for k in measured} == pytest.approx(
-                {k: wanted[k] for k in measured}, rel=1e-4
-            )
-
-
 def test_the_average_is_saved_and_judged_at_the_end(tiny: Tiny, tmp_path: Path) -> None:
     plain = run(tiny("locus"), tmp_path / "plain")
     averaged = run(tiny("locus", "training.ema=0.5"), tmp_path / "ema")

@@ -23,7 +23,6 @@ from qgs.io.tensors import shapes_of
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 LOCUS = published("locus_full_a")
-SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8", "model.decoder.depth=2")
 GOLDEN = ["tokengs_a", "tokengs_latent_a", "tokengs_multiscale_a", "tokengs_dynamic_a",
           "locus_full_a", "locus_no_radius_state_a", "locus_content_cross_attn_a"]  # fmt: skip
 
@@ -133,42 +132,6 @@ def test_every_difference_is_listed_at_once() -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ("name", "wrong", "words"),
-    [
-        (
-            "locus_full_a",
-            "model.queries.count=13",
-            "shape of gs_tokens: (12, 64) in the file, (13, 64)",
-        ),
-        ("locus_full_a", "model.decoder.depth=3", "missing: enc_dec_backbone.decoder_blocks.2."),
-        ("locus_full_a", "model.head.norm=true", "no published name: head.norm.weight"),
-        ("locus_full_a", "model.decoder.refinement.radius=false", "unexpected: "),
-        (
-            "locus_full_a",
-            "model.decoder.layers={0: {self_attention: {type: qgs/content}}}",
-            "layers differ in their self_attention",
-        ),
-    ],
-)
-def test_weights_of_another_recipe_are_refused(
-    imported: Callable[..., Path], tmp_path: Path, name: str, wrong: str, words: str
-) -> None:
-    fitting = resolve(imported(name).with_suffix(".yaml")).tree
-    weights, out = tmp_path / f"{name}.safetensors", tmp_path / "x.safetensors"
-    with pytest.raises(PublishedError) as caught:
-        import_weights(weights, resolve(fitting, [wrong]), out)
-    assert str(caught.value).startswith(str(weights))
-    assert words in str(caught.value)
-    assert not out.exists()
-
-
-def test_names_of_no_published_model(tmp_path: Path) -> None:
-    save_file({"some.layer": torch.zeros(3)}, tmp_path / "w.safetensors")
-    with pytest.raises(PublishedError, match=r"some\.layer"):
-        import_weights(tmp_path / "w.safetensors", None, tmp_path / "o.safetensors")
-
-
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
 def test_other_precisions_are_converted_only_on_demand(tmp_path: Path, dtype: torch.dtype) -> None:
     weights = {name: tensor.to(dtype) for name, tensor in published("tokengs_a").items()}
@@ -219,14 +182,6 @@ def test_nothing_is_overwritten(imported: Callable[..., Path]) -> None:
         imported("tokengs_a")
 
 
-@pytest.mark.parametrize("name", ["bla.yaml", "bla"])
-def test_a_checkpoint_is_named_safetensors(tmp_path: Path, name: str) -> None:
-    save_file(published("tokengs_a"), tmp_path / "w.safetensors")
-    with pytest.raises(ValueError, match=r"\.safetensors"):
-        import_weights(tmp_path / "w.safetensors", None, tmp_path / name)
-    assert not (tmp_path / name).exists()
-
-
 def test_no_checkpoint_stays_without_its_recipe(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -248,17 +203,6 @@ def test_the_recipe_that_fits_takes_overrides(tmp_path: Path) -> None:
     written = resolve(out.with_suffix(".yaml"))
     assert written.tree == done.recipe.tree == qgs.load(out).recipe
     assert (written.views.inputs, written.tree["data"]["image_size"]) == (3, [16, 24])
-
-
-def test_options_that_no_weight_shows_are_listed(
-    imported: Callable[..., Path], tmp_path: Path
-) -> None:
-    fitting = resolve(imported("tokengs_a").with_suffix(".yaml")).tree
-    weights = tmp_path / "tokengs_a.safetensors"
-    changed = ["model.head.quat_eps=1e-4", "model.queries.std=0.5", "seed=3"]
-    done = import_weights(weights, resolve(fitting, changed), tmp_path / "o.safetensors")
-    assert done.settings == {"model.head.quat_eps": ("0.0001", "1.0e-12")}
-    assert import_weights(weights, resolve(fitting), tmp_path / "p.safetensors").settings == {}
 
 
 @pytest.mark.parametrize("prefix", ["model.", "module.", "ema_model.module.", "net._orig_mod."])
