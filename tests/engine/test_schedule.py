@@ -64,12 +64,6 @@ def test_a_linear_warm_up_and_an_end_above_the_first_rate() -> None:
     assert rates[-1] == pytest.approx(1e-5)
 
 
-def test_a_warm_up_that_never_ends_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"optimizer\.warmup"):
-        adamw(10, 10).check()
-    adamw(10, 10, seconds=5.0).check()
-
-
 def test_steps_take_over_when_time_is_plenty() -> None:
     timed = adamw(50, 10, seconds=1e6)
     plain = adamw(50, 10)

@@ -51,19 +51,6 @@ def test_every_parameter_gets_a_finite_gradient(tiny: Tiny, name: str) -> None:
         assert parameter.grad.isfinite().all(), parameter_name
 
 
-def test_two_losses_with_one_term_are_refused(tiny: Tiny) -> None:
-    recipe = tiny("tokengs", "losses.again={type: qgs/visibility}")
-    batch = first_batch(recipe)
-    objective = TrainingPass(recipe.build_model().train(), recipe.build_losses())
-    with pytest.raises(ValueError, match=r"losses\.again .*\['visibility'\]"):
-        objective(batch.inputs, batch.targets)
-
-
-def test_no_loss_at_all_is_refused(tiny: Tiny) -> None:
-    with pytest.raises(ValueError, match="at least one loss"):
-        TrainingPass(tiny("tokengs").build_model("meta"), {})
-
-
 TARGETS = 5
 Setting: TypeAlias = Callable[..., tuple]
 RENDERERS = ("qgs/torch", "qgs/cpu")
@@ -285,23 +272,6 @@ def test_without_gradients_it_only_measures(setting: Setting) -> None:
         outcome = TrainingPass(model, losses, 2)(*batch)
     assert not outcome.total.requires_grad
     assert float(outcome.total) == pytest.approx(float(sum(outcome.terms.values())))
-
-
-def test_every_shipped_loss_says_which_renderings_it_needs() -> None:
-    from qgs_locus.visibility import AnchorVisibility
-
-    from qgs.losses import COMPONENTS
-
-    said = {loss.name: loss.renderings for loss in (*COMPONENTS, AnchorVisibility)}
-    assert said == {
-        "photometric": "each",
-        "mask": "each",
-        "visibility": "none",
-        "anchor_visibility": "none",
-        "opacity": "none",
-        "lpips": "each",
-        "depth_surface": "none",
-    }
 
 
 @pytest.mark.slow

@@ -4,10 +4,9 @@ import pytest
 import torch
 from training_runs import Tiny
 
-from qgs.composer import Recipe, RecipeError
+from qgs.composer import Recipe
 from qgs.data.evaluation import evaluation_samples
 from qgs.engine.tuning import tune, tuning_loss
-from qgs.losses import Photometric
 from qgs.model import QueryGaussianModel
 from qgs.types import QueryState, Views, map_tensors
 
@@ -79,11 +78,6 @@ def test_every_floating_field_is_tuned_and_no_other(
     assert torch.equal(last["stranger.label"], numbers)
 
 
-def test_recipes_without_a_photometric_loss_take_the_published_one(tiny: Tiny) -> None:
-    recipe = tiny("tokengs", "losses={look: {type: qgs/visibility}}")
-    assert tuning_loss(recipe).config == Photometric.Config()
-
-
 def test_a_forward_pass_starts_from_the_given_state(tiny: Tiny) -> None:
     model, inputs = model_and_inputs(tiny("locus"))
     start = model.queries.start(1)
@@ -116,13 +110,3 @@ def test_latents_are_tuned_and_nothing_else(tiny: Tiny) -> None:
     assert all(torch.equal(tensor, before[key]) for key, tensor in model.state_dict().items())
     untuned = model(inputs).gaussians.means
     assert not torch.equal(tuning.prediction.gaussians.means, untuned)
-
-
-def test_latents_of_an_encoder_without_any_are_refused(tiny: Tiny) -> None:
-    with pytest.raises(RecipeError, match=r"(?s)`qgs/multiview_vit` .* no latents .*`queries`"):
-        tiny("tokengs", "evaluation.tuning=latents")
-    recipe = tiny("tokengs")
-    assert recipe.evaluation.rate == 1e-4
-    model, inputs = model_and_inputs(recipe)
-    with pytest.raises(ValueError, match="no latents to tune: the encoder, MultiViewViT"):
-        tune(model, inputs, tuning_loss(recipe), 1, what="latents")

@@ -11,7 +11,6 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 import qgs
-from qgs.data.scenes import warn_once
 from qgs.io.gaussians import (
     OPACITY_EPS,
     PROPERTIES,
@@ -176,19 +175,6 @@ def test_other_files_are_refused_by_name(tmp_path: Path) -> None:
             load_ply(tmp_path / f"{name}.ply")
     with pytest.raises(FileNotFoundError):
         load_ply(tmp_path / "none.ply")
-
-
-def test_a_warning_names_what_a_format_cannot_hold(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    gaussians, _ = with_harmonics(random_gaussians(1, 4), 3)
-    gaussians = replace(gaussians, features=torch.ones(1, 4, 2))
-    warn_once.cache_clear()
-    save_ply(gaussians, tmp_path / "scene.ply")
-    assert "`features`" in caplog.text
-    assert "`sh`" not in caplog.text
-    save_splat(gaussians, tmp_path / "scene.splat")
-    assert "`sh`" in caplog.text
 
 
 def test_the_bytes_of_a_splat_file(tmp_path: Path) -> None:
