@@ -178,7 +178,7 @@ def test_an_incident_can_be_seen_again(step: Step, tmp_path: Path) -> None:
             torch.testing.assert_close(
                 file.get_tensor(name)[2:], tensor, rtol=0, atol=0, equal_nan=True
             )
-    example = GUIDE.read_text(encoding="utf-8").split("To see it again:\n\n```python\n")[1]
+    example = GUIDE.read_text(encoding="utf-8").split("incidents/step-N")[1].split("```python\n")[1]
     ran: dict[str, Any] = {}
     exec(example.split("```")[0].replace("RUN/incidents", str(tmp_path / "incidents")), ran)
     saved = ran["views"](ran["saved"], "targets")
