@@ -15,7 +15,6 @@ from training_runs import trained_domain
 import qgs
 from qgs.composer import resolve
 from qgs.data.domain import KEY
-from qgs.engine.guard import CollapseError
 
 RECIPE = {
     "recipe": 1,
@@ -138,22 +137,6 @@ def test_photos_in_another_unit_are_judged_alike(models, tmp_path):
     assert figures[0] == pytest.approx(figures[1], abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["--seconds", 3],
-        ["--train", "--model", "rooms/locus-64"],
-        ["one", "two"],
-        ["--model", "none.safetensors"],
-        ["recipes/tiny/locus.yaml"],
-    ],
-)
-def test_options_without_meaning_are_refused(words, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert isinstance(run_qgs("demo", *words).exception, ValueError | FileNotFoundError)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert new_folder(None).name == "demo"
@@ -162,14 +145,3 @@ def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
     (tmp_path / "demo" / "report.html").touch()
     with pytest.raises(FileExistsError, match="not empty"):
         new_folder(tmp_path / "demo")
-
-
-def test_a_collapse_ends_the_demo_with_its_reason(recipes, tmp_path, monkeypatch):
-    def collapse(*_):
-        raise CollapseError("training collapsed at step 7")
-
-    monkeypatch.setattr("qgs_viewer.contest.compete", collapse)
-    out = tmp_path / "demo"
-    result = run_qgs("demo", "--train", recipes[0], "--out", out)
-    assert result.exit_code == 1
-    assert "collapsed at step 7" in result.stderr

@@ -10,12 +10,12 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from PIL import Image
-from qgs_viewer.figures import anchors, attention, dispersion, global_gaussians, novel_views
+from qgs_viewer.figures import anchors, attention, dispersion, novel_views
 from qgs_viewer.figures.exhibits import Exhibition, NothingToShowError
-from qgs_viewer.figures.outside import overview, plan_of, seen_points
+from qgs_viewer.figures.outside import plan_of
 from qgs_viewer.figures.paper import DPI, WIDTH, chosen_layers, new_figure, write_figure
 from qgs_viewer.pictures import error_picture
-from small import KINDS, QUERIES, SIDE, exhibit_of, exhibition_of, sample_of
+from small import QUERIES, SIDE, exhibit_of, exhibition_of
 
 import qgs
 from qgs.contracts import MetricInput
@@ -161,56 +161,6 @@ def test_edges_lead_to_the_queries_that_are_read_most(kind: str) -> None:
     places = plan_of(shown, attention.nodes_of(shown, shown.look.depth)).of(nodes).numpy()
     expected = [[places[query], places[other]] for other in order]
     np.testing.assert_allclose(edges.get_segments(), expected, atol=1e-9)
-
-
-@pytest.mark.parametrize("kind", ["locus", "ellipsoid"])
-def test_radii_and_steps_are_those_of_the_states(kind: str) -> None:
-    shown = exhibit_of(kind)
-    for layer, found in enumerate(anchors.radii(shown)):
-        support = shown.look.support(layer)
-        assert support is not None
-        expected = support.axes[0].norm(dim=-2).prod(-1) ** (1 / 3)
-        np.testing.assert_allclose(found, expected, rtol=1e-4)
-    _, radius, step = anchors.refinement(exhibition_of("tokengs", kind)).figure.axes
-    np.testing.assert_allclose(
-        radius.lines[0].get_ydata(), np.median(anchors.radii(shown), 1), rtol=1e-6
-    )
-    first = (anchors.ways(shown)[1] - anchors.ways(shown)[0]).norm(dim=-1)
-    assert step.lines[0].get_ydata()[0] == pytest.approx(float(first.quantile(0.5)), rel=1e-6)
-
-
-def test_the_overview_stands_behind_and_above_and_sees_the_scene() -> None:
-    shown, inputs = exhibit_of("locus"), sample_of().inputs.cameras
-    points = seen_points(shown)
-    camera = overview(inputs, points, (300, 400))
-    local = to_camera(points[None], camera)[0, 0]
-    pixels = to_pixels(local, camera.intrinsics[0, 0])
-    inside = ((pixels > 0) & (pixels < torch.tensor([400, 300]))).all(-1) & (local[:, 2] > 0)
-    assert inside.float().mean() > 0.85
-    eye = to_camera(camera.c2w[:, 0, :3, 3][None].view(1, 1, 3), inputs)[0, :, 0]
-    assert (eye[:, 1] < 0).all()
-    assert (eye[:, 2] < 0).all()
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_gaussians_of_the_query_that_was_asked_for(kind: str) -> None:
-    made = global_gaussians.made(exhibition_of(kind, query=7))
-    means = exhibit_of(kind).gaussians.means[0].view(QUERIES, -1, 3)[7]
-    distance = float((means - means.mean(0)).norm(dim=-1).mean())
-    said = f"query 7: mean distance to centroid {distance:.3g}"
-    assert said in words(made.figure.axes)
-    with pytest.raises(ValueError, match=f"{kind} has no query {QUERIES}; its queries are 0 to"):
-        global_gaussians.made(exhibition_of(kind, query=QUERIES))
-
-
-@pytest.mark.parametrize(
-    ("depth", "most", "first", "expected"),
-    [(12, 3, 1, [1, 7, 12]), (4, 4, 0, [0, 1, 3, 4]), (1, 3, 1, [1]), (2, 3, 1, [1, 2])],
-)
-def test_layers_are_spread_ends_included(
-    depth: int, most: int, first: int, expected: list[int]
-) -> None:
-    assert chosen_layers(depth, most, first) == expected
 
 
 def test_files_are_of_the_width_of_a_page_with_text_and_the_same_each_time(tmp_path: Path) -> None:

@@ -36,16 +36,6 @@ def test_figures_are_written_and_explained(checkpoint: Path, tmp_path: Path) -> 
     assert isinstance(again.exception, FileExistsError)
 
 
-@pytest.mark.parametrize(
-    "options", [["--only", "nothing"], ["--scene", "kitchen"], ["--query", "12"]]
-)
-def test_what_there_is_not_is_refused(checkpoint: Path, tmp_path: Path, options: list[str]) -> None:
-    done = run_qgs("figures", checkpoint, "--out", tmp_path / "out", *options)
-    assert isinstance(done.exception, ValueError)
-    assert options[1] in str(done.exception)
-    assert not (tmp_path / "out").exists()
-
-
 def test_the_scene_that_was_asked_for_comes_first(checkpoint: Path) -> None:
     from qgs_viewer.figures.gallery import open_exhibition
 

@@ -8,7 +8,7 @@ from qgs_viewer.choice import FAINT, Choice, painted, query_color
 from qgs_viewer.look import NEUTRAL, Look, look_inside
 from qgs_viewer.pictures import attention_pictures_of
 from qgs_viewer.server import first_eye, quiet_server, stand, up_of
-from small import KINDS, QUERIES, SIDE, model_of, source_of
+from small import KINDS, SIDE, model_of, source_of
 
 import qgs
 from qgs.geometry.poses import look_at
@@ -47,14 +47,6 @@ def test_attention_is_that_of_a_trace(kind: str) -> None:
     assert attention_pictures_of(look, 5, 1, 32).keys() == parts
 
 
-def test_gaussians_belong_to_queries_in_order() -> None:
-    look = source_of("locus").look((1, 4))
-    each = look.gaussians.count // QUERIES
-    for query in (0, 7, QUERIES - 1):
-        members = look.members(query)
-        assert [look.query_of(g) for g in range(look.gaussians.count)[members]] == [query] * each
-
-
 def test_lines_end_on_the_patches_that_are_read_most() -> None:
     look = source_of("locus").look((1, 4))
     assert look.views is not None
@@ -74,15 +66,6 @@ def test_lines_end_on_the_patches_that_are_read_most() -> None:
         middle = torch.tensor([(column + 0.5) * patch, (row + 0.5) * patch]).double()
         torch.testing.assert_close(pixel, middle, rtol=0, atol=1e-3)
         assert seen[view, place, 2] == pytest.approx(0.4)
-
-
-def test_lines_start_at_the_anchor_or_amid_the_gaussians() -> None:
-    anchored, plain = (source_of(kind).look((1, 4)) for kind in ("locus", "tokengs"))
-    support = anchored.support(1)
-    assert support is not None
-    torch.testing.assert_close(anchored.hub(3, 1), support.centers[0, 3])
-    mean = plain.gaussians.means[0, plain.members(3)].double().mean(0)
-    torch.testing.assert_close(plain.hub(3, 1), mean)
 
 
 def test_other_inputs_leave_the_scene_where_it_is() -> None:

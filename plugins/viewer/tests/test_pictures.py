@@ -15,7 +15,7 @@ from qgs_viewer.queries import (
     washed,
 )
 
-from qgs.drawing.figures import CATEGORICAL, running_mean
+from qgs.drawing.figures import CATEGORICAL
 from qgs.drawing.images import NOTHING, depth_picture, depth_range, enlarged, finer, rgb_picture
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.types import SpatialSupport
@@ -67,32 +67,11 @@ def test_a_centre_is_drawn_where_it_lies_though_its_support_reaches_behind_the_c
     assert abs(rows.mean() + 0.5 - scale * lens[3].item()) < 1
 
 
-def test_support_picture_draws_the_chosen_in_their_colour(cameras):
-    photo = np.full((128, 128, 3), 255, np.uint8)
-    center = torch.tensor([[[0.0, 0.0, 2.0]]])
-    support = SpatialSupport(center, torch.eye(3)[None, None] * 0.5)
-    plain = support_picture(photo, support, cameras[:, :1], {})
-    drawn = support_picture(photo, support, cameras[:, :1], {0: CATEGORICAL[0]})
-    changed = (np.abs(plain.astype(int) - drawn) > 40).any(-1)
-    rows, columns = np.nonzero(changed)
-    radius = 4 * 32 * 0.5 / np.sqrt(2**2 - 0.5**2)
-    assert abs((columns.max() - columns.min()) / 2 - radius) < 3
-    assert abs(rows.mean() - 64) < 2
-
-
 def test_rendered_weights_add_up_to_the_coverage(model, gaussians, cameras):
     weights = rendered_weights(model, gaussians, cameras)
     alpha = model.render(gaussians, cameras).alpha
     assert weights.shape == (1, gaussians.count)
     torch.testing.assert_close(weights.sum(), alpha.sum(), rtol=1e-4, atol=1e-3)
-
-
-def test_paint_does_not_depend_on_the_direction(model, gaussians, cameras):
-    """Nor do weights on colours that harmonics make black."""
-    dark = replace(gaussians, sh=torch.full((1, gaussians.count, 3, 3), -9.0))
-    dark = replace(dark, features=gaussians.means)
-    weights = rendered_weights(model, gaussians, cameras)
-    assert torch.equal(rendered_weights(model, dark, cameras), weights)
 
 
 def test_notable_queries_are_heavy_well_inside_the_picture_and_apart(model, gaussians, cameras):
@@ -189,10 +168,3 @@ def test_curves_of_hours_which_may_hold_pauses_are_drawn_by_steps():
         for axis in curves_figure(curves).axes:
             assert axis.get_xlabel() == unit
             assert all(list(line.get_xdata()) == list(place) for line in axis.lines)
-
-
-def test_running_mean_keeps_a_line_straight():
-    line = np.linspace(3, 9, 200)
-    np.testing.assert_allclose(running_mean(line), line)
-    noisy = line + np.random.default_rng(0).normal(size=200)
-    assert np.abs(running_mean(noisy) - line).max() < 1.5

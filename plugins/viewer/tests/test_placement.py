@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 import torch
 from qgs_viewer.placement import (
     Placement,
@@ -7,7 +6,6 @@ from qgs_viewer.placement import (
     hit,
     near_ray,
     on_photo,
-    patch_centers,
     splats,
 )
 from scipy.spatial.transform import Rotation
@@ -90,15 +88,6 @@ def two(opacity: float, depth: float = 2.0) -> Splats:
     return Splats(centers, covariances, opacities, np.ones((2, 3), np.float32))
 
 
-@pytest.mark.parametrize(
-    ("scene", "expected"),
-    [(two(0.9), 0), (two(0.1), 1), (two(0.9, -2.0), 1)],
-    ids=["the nearer hides", "the nearer is clear", "behind the eye"],
-)
-def test_what_a_ray_hits(scene: Splats, expected: int) -> None:
-    assert hit(scene, np.zeros(3), AHEAD) == expected
-
-
 def test_a_ray_past_everything_hits_nothing() -> None:
     assert hit(two(0.9), np.array([3.0, 0, 0]), AHEAD) is None
     assert near_ray(two(0.9).centers, np.array([3.0, 0, 0]), AHEAD, 0.1) is None
@@ -115,11 +104,6 @@ def test_a_point_on_a_photo_is_seen_at_its_pixel() -> None:
     seen = to_camera(points, cameras[None])
     torch.testing.assert_close(to_pixels(seen[0], cameras.intrinsics), pixels[None])
     torch.testing.assert_close(seen[0, 0, :, 2], torch.full((2,), 0.7).double())
-
-
-def test_patches_are_in_the_order_of_tokens() -> None:
-    found = patch_centers((2, 2, 4), (32, 64))
-    assert found.tolist()[:5] == [[8, 8], [24, 8], [40, 8], [56, 8], [8, 24]]
 
 
 def test_small_gaussians_beside_large_ones_survive_half_precision() -> None:

@@ -36,21 +36,6 @@ def _only_sections_of_the_test(monkeypatch):
     )
 
 
-def anchored() -> dict:
-    pytest.importorskip("qgs_locus")
-    model = {
-        **PLAIN["model"],
-        "queries": {"type": "locus/anchored", "count": 8, "std": 1.0, "init_radius": 0.3},
-        "decoder": {
-            "depth": 2,
-            "cross_attention": {"type": "locus/ray_biased"},
-            "refinement": {"type": "locus/refine"},
-        },
-        "centers": {"type": "locus/radius_scaled"},
-    }
-    return {**PLAIN, "plugins": ["locus", "rooms"], "model": model}
-
-
 def page_of(tree: dict, name: str) -> str:
     recipe = resolve(tree)
     source = recipe.build_data()
@@ -82,23 +67,6 @@ def page_of(tree: dict, name: str) -> str:
         commands={"qgs list": "lists"},
     )
     return report_html(report)
-
-
-def test_anchors_are_shown_layer_by_layer_and_attention_with_its_geometry():
-    page = page_of(anchored(), "with anchors")
-    assert "learned start" in page
-    assert "after layer 2" in page
-    assert "geometry bias" in page
-
-
-def test_sections_are_those_of_which_the_model_has_something():
-    page = page_of(PLAIN, "plain")
-    assert "Where queries look" not in page
-    assert "What one query reads" in page
-    for cell in ('<td class="best">12.34</td>', '<td class="best">0.500</td>', "<td>11.11</td>"):
-        assert cell in page
-    assert 'Small, see <a href="https://example.org/small"' in page
-    assert page.index("The photos lie outside.") < page.index("<table>")
 
 
 def test_names_cannot_break_the_page():

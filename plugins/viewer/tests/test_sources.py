@@ -89,17 +89,6 @@ def test_without_its_model_it_is_shown_as_it_is(
     assert look.views.images.shape[1] == 2
 
 
-def test_prediction_and_refined_scene_name_each_other(finished: Path, tmp_path: Path) -> None:
-    folder = changed_copy(finished, tmp_path)
-    assert not open_source(str(folder), Wanted()).notes
-    changed_copy(finished, folder, refinement={"steps": 3}).rename(folder / "refined")
-    predicted = open_source(str(folder), Wanted())
-    assert isinstance(predicted, ModelSource)
-    assert f"refined on photos: `qgs view {folder / 'refined'}`" in predicted.notes[0]
-    refined = open_source(str(folder / "refined"), Wanted())
-    assert f"`qgs view {folder.resolve()}`" in refined.notes[0]
-
-
 def test_a_reconstruction_keeps_its_background(finished: Path, tmp_path: Path) -> None:
     folder = changed_copy(finished, tmp_path, model="", background=[0.0, 0.5, 1.0])
     assert open_source(str(folder), Wanted()).look(()).background == (0.0, 0.5, 1.0)
@@ -109,21 +98,6 @@ def test_a_reconstruction_keeps_its_background(finished: Path, tmp_path: Path) -
     assert open_source(str(folder), Wanted()).look(()).background == NEUTRAL
     (folder / "cameras.json").write_text(json.dumps({**told, "background": [0.5]}))
     with pytest.raises(ValueError, match=r"cameras\.json is no record"):
-        open_source(str(folder), Wanted())
-
-
-def test_another_model_of_the_name_is_noticed(finished: Path, tmp_path: Path) -> None:
-    qgs.save(model_of("tokengs"), tmp_path / "other.safetensors")
-    record = {"model": str(tmp_path / "other.safetensors")}
-    source = open_source(str(changed_copy(finished, tmp_path, **record)), Wanted())
-    assert not isinstance(source, ModelSource)
-
-
-@pytest.mark.parametrize("text", ["{", '{"views": []}', '{"scene": "x", "views": [{"kind": 1}]}'])
-def test_a_broken_record_is_told_with_its_file(finished: Path, tmp_path: Path, text: str) -> None:
-    folder = changed_copy(finished, tmp_path)
-    (folder / "cameras.json").write_text(text)
-    with pytest.raises(ValueError, match=r"cameras\.json is no record of a reconstruction"):
         open_source(str(folder), Wanted())
 
 

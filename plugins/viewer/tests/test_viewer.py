@@ -123,21 +123,6 @@ def test_gaussians_stand_before_the_background_of_their_model(background) -> Non
     np.testing.assert_allclose(pixels, 255 * np.array([background] * len(pixels)), atol=1)
 
 
-@pytest.mark.parametrize("error", [ValueError("too few"), OSError("no photo")])
-def test_what_is_refused_is_told_and_taken_back(panel, monkeypatch, error: Exception) -> None:
-    def fails(frames: object) -> None:
-        raise error
-
-    told: list[str] = []
-    client = SimpleNamespace(add_notification=lambda _, text, color: told.append(text))
-    monkeypatch.setattr(panel.source, "look", fails)
-    for frame in (0, 1):
-        panel.boxes[frame]._impl.value = frame == 0  # as messages of a browser set it
-    panel._reframed(SimpleNamespace(client=client))
-    assert told == [str(error)]
-    assert [frame for frame, box in enumerate(panel.boxes) if box.value] == [1, 4]
-
-
 @pytest.mark.parametrize("panel", ["tokengs"], indirect=True)
 def test_a_model_without_anchors_has_the_rest(server, panel) -> None:
     panel.pick(3)
@@ -175,37 +160,6 @@ def test_a_click_picks_by_anchor_or_by_gaussian(panel) -> None:
     way = panel.look.splats.centers[gaussian] - eye
     assert panel.under(eye, way / np.linalg.norm(way)) is not None
     assert panel.under(eye, np.array([0.0, 0.0, -1.0])) is None
-
-
-def test_what_is_hidden_is_not_picked(panel) -> None:
-    support = panel.look.support(panel.look.depth)
-    eye = np.array([0.0, 0.0, -3.0])
-    ways = [support.centers[0, query].numpy() - eye for query in range(QUERIES)]
-    panel.choose(query=5, others="hidden")
-    picked = {panel.under(eye, way / np.linalg.norm(way)) for way in ways}
-    assert picked <= {5, None}
-    assert 5 in picked
-
-
-def test_read_patches_stand_before_their_photos(server, panel) -> None:
-    panel.pick(3)
-    marks = server.scene.get_handle_by_name("/patches")
-    assert len(marks.points) == panel.choice.patches
-    assert len(np.unique(marks.colors, axis=0)) > 1
-    points = np.array(marks.points)
-    apart = np.linalg.norm(points[:, None] - points, axis=-1)
-    assert 2 * marks.point_size < np.min(apart[apart > 1e-6]) < 8 * marks.point_size
-    cameras, depth = panel.look.views.cameras[0], panel.stage.photo_depth
-    local = (
-        torch.linalg.inv(cameras.c2w.double())
-        @ torch.cat(
-            [torch.from_numpy(np.array(marks.points)).double(), torch.ones(len(marks.points), 1)], 1
-        ).mT
-    )
-    before = local[:, 2]  # depths (V, k): each patch is on one of the photos
-    assert (((before > 0.9 * depth) & (before < depth)).any(0)).all()
-    panel.choose(patches=0)
-    assert server.scene.get_handle_by_name("/patches") is None
 
 
 def test_a_page_is_small_and_asks_for_nothing() -> None:
