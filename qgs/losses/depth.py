@@ -1,5 +1,8 @@
 """`qgs/depth_surface`: Gaussians on the surface that depth maps show."""
 
+import logging
+from functools import cache
+
 import torch
 import torch.nn.functional as F
 from pydantic import Field
@@ -9,11 +12,16 @@ from qgs.contracts import Loss
 from qgs.geometry.precision import full_precision
 from qgs.types import LayerPrediction, Rendering, Views
 
+_log = logging.getLogger(__name__)
+
 
 class DepthSurface(Loss):
     """Smooth L1 between the camera-frame z of each Gaussian's centre and the depth map behind it.
 
-    Of all target views, and input views if asked for, that have depth maps (`Views.depths`).
+    Of all target views, and input views if asked for, that have depth maps (`Views.depths`), the
+    view with the smallest error counts for a centre: a surface hidden in one view is not drawn to
+    what hides it there, and centres on surfaces that any view shows have the loss 0. A batch
+    without depth maps has the loss 0; the first one is logged as a warning.
     """
 
     name = "depth_surface"
@@ -33,23 +41,31 @@ class DepthSurface(Loss):
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> Tensor:
-        """See `Loss`. Raises ValueError for views without depth maps."""
+        """See `Loss`."""
         views = [target, inputs] if self.config.inputs else [target]
         measured = [view for view in views if view.depths is not None]
-        if not measured:
-            raise ValueError(
-                "the loss qgs/depth_surface needs depth maps, and no scene of this batch has "
-                "any: give `depth_file_path` in transforms.json, or take the loss out"
-            )
         means, mask = prediction.gaussians.means, prediction.state.mask
+        if not measured:
+            _warn_once()
+            return 0 * means.sum()
         found = [
             surface_errors(means, view, self.config.beta, self.config.near) for view in measured
         ]
         errors, seen = (torch.cat(parts, 1) for parts in zip(*found, strict=True))  # (B, V, G)
         if mask is not None:  # places without a query have Gaussians that nobody sees
             seen = seen & mask.repeat_interleave(means.shape[1] // mask.shape[1], 1)[:, None]
+        nearest = (errors + torch.where(seen, 0.0, torch.inf)).amin(1)  # (B, G), inf where unseen
         # a scene in which no centre meets a measured pixel has the loss 0, with a gradient of 0
-        return ((errors * seen).sum((1, 2)) / seen.sum((1, 2)).clamp_min(1)).mean()
+        total = nearest.masked_fill(nearest.isinf(), 0).sum(1)
+        return (total / seen.any(1).sum(1).clamp_min(1)).mean()
+
+
+@cache
+def _warn_once() -> None:
+    _log.warning(
+        "a batch has no depth maps, so the loss qgs/depth_surface is 0 for it: where no scene has "
+        "any, give `depth_file_path` in transforms.json, or take the loss out"
+    )
 
 
 @full_precision
@@ -74,7 +90,7 @@ def surface_errors(
         # nearest pixel, as depths of both sides of an edge have no meaningful mean
         column, row = (focal * local[..., :2] / safe + centre).floor().unbind(-1)
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > near)
-        place = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
+        place = torch.where(inside, row * width + column, 0)  # also where a centre is NaN
         depth = views.depths.flatten(2).gather(2, place.long())  # (B, V, G)
         seen = inside & (depth > 0)
     error = F.smooth_l1_loss(z, torch.where(seen, depth, z), beta=beta, reduction="none")

@@ -13,7 +13,7 @@ from qgs.composer import resolve
 from qgs.contracts import ViewsConfig
 from qgs.data.samples import make_sample, stack_views
 from qgs.engine.training import train
-from qgs.losses.depth import DepthSurface, surface_errors
+from qgs.losses.depth import DepthSurface, _warn_once, surface_errors
 from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering, Views
 
 ROOMS = {
@@ -68,9 +68,50 @@ def test_by_hand() -> None:
     assert means.grad is not None
     assert means.grad[0, :, 2].tolist() == pytest.approx([0.5, -0.25, 0, 0, 0])
     assert not means.grad[0, :, :2].any()
-    blind = Views(wall().images, wall().cameras)
-    with pytest.raises(ValueError, match="depth maps"):
-        loss.term(prediction(means), nothing, blind, blind)
+
+
+def term(means: torch.Tensor, views: Views) -> torch.Tensor:
+    nothing = Rendering(*(torch.zeros(1, 0, c, 4, 4) for c in (3, 1, 1)))
+    loss = DepthSurface(DepthSurface.Config(beta=0.2, near=0.1, inputs=False))
+    return loss.term(prediction(means), nothing, views, views)
+
+
+def test_a_batch_without_depth_maps_adds_nothing_and_is_logged_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    _warn_once.cache_clear()
+    means = POINTS.clone().requires_grad_()
+    for _ in range(2):
+        value = term(means, Views(wall().images, wall().cameras))
+        value.backward()
+        assert value.item() == 0
+    assert means.grad is not None
+    assert not means.grad.any()
+    assert caplog.text.count("no depth maps") == 1
+
+
+def test_a_centre_that_is_nan_gives_nan() -> None:
+    means = POINTS.clone()
+    means[0, 1] = torch.nan
+    assert term(means, wall()).isnan()
+
+
+def test_a_hidden_surface_is_not_drawn_to_what_hides_it() -> None:
+    """A screen at z = 1 hides the wall at z = 2 from the first camera; the second is behind it."""
+    c2w = torch.eye(4).repeat(1, 2, 1, 1)
+    c2w[0, 1, 2, 3] = 1.0
+    cameras = Cameras(c2w, torch.full((1, 2, 4), 2.0), (4, 4))
+    views = Views(torch.zeros(1, 2, 3, 4, 4), cameras, depths=torch.ones(1, 2, 1, 4, 4))
+    means = torch.tensor([[[0.2, 0.1, 1.0], [0.2, 0.1, 2.0], [-0.3, -0.2, 2.0]]])
+    _, seen = surface_errors(means, views, 0.2, 0.1)
+    assert seen[0].tolist() == [[True, True, True], [False, True, True]]
+    means.requires_grad_()
+    value = term(means, views)
+    value.backward()
+    assert value.item() == 0
+    assert means.grad is not None
+    assert not means.grad.any()
+    assert term(means.detach() + torch.tensor([0, 0, 0.1]), views) > 0
 
 
 @pytest.mark.parametrize("mirror", [False, True])
