@@ -2,9 +2,10 @@
 
     python docs/examples/train_by_hand.py recipes/tiny/locus.yaml --steps 200 --out scene.ply
 
-The recipe gives the model, the data and the losses; the loop is plain PyTorch, to copy and change.
-`qgs train` adds: resuming, several processes, mixed precision, schedules, evaluation, and a watch
-for steps that are not finite.
+The recipe gives the model, the data with its sampler of views, and the losses; the loop is plain
+PyTorch, to copy and change. It ignores the recipe's optimiser, its schedules and its section
+`training`: rate, batch size and clipping stand below. `qgs train` follows them, and adds resuming,
+several processes, mixed precision, evaluation, and a watch for steps that are not finite.
 """
 
 import argparse
@@ -45,7 +46,14 @@ def train(recipe: Recipe, steps: int) -> qgs.QueryGaussianModel:
     optimizer = torch.optim.AdamW(groups, lr=1e-3, betas=(0.9, 0.95))
     warmup = torch.optim.lr_scheduler.LinearLR(optimizer, 0.01, total_iters=20)
     # Batches are endless; batch k depends on the seed and k alone.
-    batches = training_batches(recipe.build_data(), recipe.views, batch_size=2, seed=recipe.seed)
+    batches = training_batches(
+        recipe.build_data(),
+        recipe.views,
+        batch_size=2,
+        seed=recipe.seed,
+        sampler=recipe.build_view_sampler(),
+        depths=any(loss.reads_depths for loss in losses.values()),
+    )
     for step, batch in enumerate(islice(batches, steps)):
         loss = loss_of(model, losses, batch)
         optimizer.zero_grad()
