@@ -176,7 +176,8 @@ def test_sources_travel_to_workers_without_their_cache(tmp_path):
 
 
 CSV = """
-from qgs.data.photos.reader import Listing, PhotoReader
+import numpy as np
+from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader
 
 
 class Csv(PhotoReader):
@@ -184,7 +185,13 @@ class Csv(PhotoReader):
 
     @classmethod
     def read(cls, folder, images):
-        return Listing(folder / cls.listing, [])
+        frames = []
+        for line in (folder / cls.listing).read_text().splitlines():
+            name, *values = line.split(",")
+            fx, fy, cx, cy, *pose = map(float, values)
+            c2w = np.array(pose).reshape(4, 4)
+            frames.append(PhotoFrame(name, folder / name, c2w, (fx, fy, cx, cy)))
+        return Listing(folder / cls.listing, frames)
 """
 
 
@@ -202,9 +209,19 @@ def test_a_distribution_adds_a_format(tmp_path, monkeypatch, caplog):
     assert PhotosSource.Config(path="photos", format="csv").format == "csv"
     with pytest.raises(FileNotFoundError, match=r"transforms\.json.*poses\.csv \(csv\)"):
         formats.read_listing(folder)
-    (folder / "poses.csv").touch()
+    photos = synthetic(tmp_path / "photos", count=2)
+    lines = [
+        ",".join(map(str, [file.name, *photos.intrinsics, *pose.flatten().tolist()]))
+        for file, pose in zip(photos.files, photos.c2w, strict=True)
+    ]
+    (folder / "poses.csv").write_text("\n".join(lines))
     assert formats.formats_of(folder) == ["csv"]
     assert formats.read_listing(folder).file.name == "poses.csv"
+    read = scene(folder, photos.size, format="csv", holdout=0)
+    assert_same(read, photos)
+    expected = np.stack([np.asarray(Image.open(file)) for file in photos.files])
+    found = read.images([0, 1]).mul(255).round().permute(0, 2, 3, 1)
+    np.testing.assert_array_equal(found, expected)
     assert formats.readers()["nerfstudio"] in formats.READERS, "installing changes no other format"
     assert "csv-photos 1.0" in caplog.text, "what cannot be loaded is logged with its distribution"
 
