@@ -245,6 +245,31 @@ def test_broken_scenes_can_be_listed():
     assert "NaN" in str(next(camera_problems(faulty, 2)))
 
 
+HUGE = torch.zeros(1, dtype=torch.uint8).expand(10**12)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("images", [HUGE]),
+        ("masks", [HUGE] * 4),
+        ("timestamps", HUGE),
+        ("held_out", HUGE),
+        ("cameras", torch.zeros(1).expand(4, 18)),
+        ("cameras", torch.zeros(4, 18).to_sparse()),
+        ("cameras", torch.zeros(4, 18, device="meta")),
+    ],
+)
+def test_a_small_file_does_not_fill_the_memory(tmp_path, name, value):
+    write(tmp_path, {"a.torch": [record("s0", **{name: value})]})
+    assert (tmp_path / "a.torch").stat().st_size < 20_000
+    with pytest.raises(
+        ValueError, match=rf"a\.torch: scene 's0': '{name}' holds a tensor"
+    ) as error:
+        opened(tmp_path).scenes("train")[0].cameras  # noqa: B018
+    assert "\n" not in str(error.value)
+
+
 def test_an_index_does_not_lead_outside(tmp_path):
     data_set(tmp_path)
     for name in ("../test/a.torch", str(tmp_path / "test" / "a.torch"), "c:\\a.torch"):

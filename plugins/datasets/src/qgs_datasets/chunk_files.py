@@ -104,6 +104,11 @@ def parse_record(file: str, data: Any) -> Record:
             "is it a chunk of RealEstate10K's format?"
         )
     where = f"{file}: scene {data['key']!r}"
+    for name in ("cameras", "images", "sizes", "masks", "timestamps", "held_out", "times"):
+        value = data.get(name)
+        for item in value if isinstance(value, list | tuple) else [value]:
+            plain = not isinstance(item, Tensor) or _is_plain(item)
+            _expect(plain, where, f"{name!r} holds a tensor whose numbers are not all stored")
     images = _files(where, "images", data.get("images"))
     count = len(images)
     _expect(count > 0, where, "there are no frames")
@@ -143,6 +148,17 @@ def a_type(value: object) -> str:
     """The type of `value` with its article, such as "an int"."""
     name = type(value).__name__
     return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
+
+
+def _is_plain(data: Tensor) -> bool:
+    """Whether its numbers are all stored: an expanded tensor of a small file can fill the memory.
+
+    Sparse, quantised and nested tensors and those of other devices are refused too.
+    """
+    strided = data.layout == torch.strided and data.device.type == "cpu"
+    if not strided or data.is_quantized or data.is_nested:
+        return False
+    return data.numel() * data.itemsize <= data.untyped_storage().nbytes()
 
 
 def _tensor(where: str, name: str, data: Any, shape: tuple[int, ...]) -> Tensor:
