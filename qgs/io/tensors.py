@@ -31,7 +31,8 @@ class TensorFile:
 
     path: of the file. metadata: its text entries.
     Before it maps anything, safetensors compares the sizes in the header with the size of the file.
-    Raises FileNotFoundError, and CheckpointError for anything but a whole safetensors file.
+    Raises OSError and MemoryError of the system, and CheckpointError for anything but a whole
+    safetensors file.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -57,9 +58,11 @@ class TensorFile:
     def _whole(self) -> Iterator[None]:
         try:
             yield
-        # A wrong header makes safetensors and torch raise anything; MemoryError: a sparse file.
+        # A wrong header makes safetensors and torch raise anything.
         except Exception as error:
-            if kind := pickle_kind(self.path):
+            if isinstance(error, MemoryError) or getattr(error, "errno", None) is not None:
+                raise  # the system's, such as a failing disk
+            if kind := pickle_kind(self.path):  # opens it: PermissionError is of here
                 raise CheckpointError(
                     f"{self.path} is {kind}, which can run code when it is read; use the "
                     "safetensors file of the run, or name published weights .pt"

@@ -256,3 +256,16 @@ def test_forged_metadata_is_one_error_with_the_file_and_no_file_is_followed(
     assert str(caught.value).startswith(str(path))
     assert "the: secret" not in str(caught.value)
     assert len(str(caught.value)) < 2000
+
+
+@pytest.mark.parametrize("error", [PermissionError(13, "no"), OSError(5, "disk"), MemoryError()])
+def test_errors_of_the_system_are_no_damage(
+    saved: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def fails(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(tensors_module, "safe_open", fails)
+    with pytest.raises(type(error)) as raised:
+        CheckpointFile(saved)
+    assert raised.value is error
