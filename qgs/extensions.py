@@ -28,26 +28,34 @@ def installed(group: str) -> tuple[EntryPoint, ...]:
 
 def load(entry: EntryPoint, base: type[T]) -> type[T]:
     """The class that `entry` names, a subclass of `base`. Raises ExtensionError."""
-    of = f" of {entry.dist.name} {entry.dist.version}" if entry.dist else ""
-    where = f"{entry.group} {entry.name!r}{of} ({entry.value})"
+    offered = imported(entry)
+    if not (isinstance(offered, type) and issubclass(offered, base)):
+        raise ExtensionError(f"{_where(entry)} is no subclass of {base.__name__}: update it")
+    return offered
+
+
+def imported(entry: EntryPoint) -> Any:
+    """What `entry` names. Raises ExtensionError with its distribution."""
     try:
-        offered = entry.load()
+        return entry.load()
     except Exception as error:  # importing runs the distribution's code
         reason = f"{type(error).__name__}: {error}"
-        raise ExtensionError(f"{where} cannot be imported ({reason}): update it") from error
-    if not (isinstance(offered, type) and issubclass(offered, base)):
-        raise ExtensionError(f"{where} is no subclass of {base.__name__}: update it")
-    return offered
+        raise ExtensionError(f"{_where(entry)} cannot be imported ({reason}): update it") from error
+
+
+def _where(entry: EntryPoint) -> str:
+    of = f" of {entry.dist.name} {entry.dist.version}" if entry.dist else ""
+    return f"{entry.group} {entry.name!r}{of} ({entry.value})"
 
 
 def function(group: str, name: str) -> Any:
     """The function that entry point `name` of `group` offers.
 
-    Raises ExtensionError with the distribution to install where none does.
+    Raises ExtensionError with the distribution to install where none does, or to update.
     """
     for entry in installed(group):
         if entry.name == name:
-            return entry.load()
+            return imported(entry)
     missing = DISTRIBUTIONS[group][name]
     raise ExtensionError(f"this needs {missing}: run `pip install {missing}`")
 

@@ -78,7 +78,10 @@ def reconstruct(
     from qgs.composer import resolve
     from qgs.engine.distributed import choose_device
     from qgs.io.checkpoint import load
+    from qgs.io.gaussians import scene_writers
 
+    if find := scene_writers().get(out.suffix.lower()):
+        find()  # one that cannot be imported is an error now, not after the work
     console = Console()
     model = load(checkpoint, choose_device(device))
     recipe = resolve(model.recipe or {}, options.tuning_settings(tune))

@@ -1,6 +1,7 @@
 """Gaussians as files: PLY of the 3DGS release, .splat, and formats that distributions add."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from plyfile import PlyData, PlyElement, PlyElementParseError, PlyHeaderParseErr
 from torch import Tensor
 
 from qgs.data.scenes import warn_once
-from qgs.extensions import installed
+from qgs.extensions import imported, installed
 from qgs.geometry.harmonics import SH_C0
 from qgs.io.files import replacing
 from qgs.types import SH_COUNTS, Gaussians, map_tensors, named_tensors
@@ -52,17 +53,17 @@ def save_gaussians(gaussians: Gaussians, path: str | Path) -> None:
             f"{path} must end in {listed(writers, between=' or ')}; for .spz, .sog and others give "
             "a PLY to PlayCanvas' converter: `npx @playcanvas/splat-transform IN.ply OUT.sog`"
         )
-    writers[suffix](gaussians, path)
+    writers[suffix]()(gaussians, path)
 
 
-def scene_writers() -> Mapping[str, Callable[[Gaussians, str | Path], None]]:
-    """Suffix to the function that writes such files, own ones and those of WRITER_GROUP."""
+def scene_writers() -> Mapping[str, Callable[[], Callable[[Gaussians, str | Path], None]]]:
+    """Suffix to what finds the function that writes such files, own ones and of WRITER_GROUP.
 
-    def added(name: str) -> Callable[[Gaussians, str | Path], None]:
-        return lambda gaussians, path: offered[name].load()(gaussians, path)
-
-    offered = {f".{entry.name.lower()}": entry for entry in installed(WRITER_GROUP)}
-    return {name: added(name) for name in offered} | {".ply": save_ply, ".splat": save_splat}
+    Finding one raises ExtensionError where its distribution cannot be imported.
+    """
+    own = {".ply": lambda: save_ply, ".splat": lambda: save_splat}
+    added = {f".{e.name.lower()}": partial(imported, e) for e in installed(WRITER_GROUP)}
+    return {**added, **own}
 
 
 def save_ply(gaussians: Gaussians, path: str | Path) -> None:

@@ -265,7 +265,7 @@ def test_errors_of_the_system_are_no_damage(
     def fails(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(tensors_module, "safe_open", fails)
+    monkeypatch.setattr("qgs.io.tensors.safe_open", fails)
     with pytest.raises(type(error)) as raised:
         CheckpointFile(saved)
     assert raised.value is error

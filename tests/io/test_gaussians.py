@@ -11,6 +11,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 import qgs
+from qgs.extensions import ExtensionError
 from qgs.io.gaussians import (
     OPACITY_EPS,
     PROPERTIES,
@@ -233,3 +234,14 @@ def test_an_installed_distribution_adds_a_format(install, tmp_path: Path) -> Non
     assert (tmp_path / "a.XYZ").read_text() == "5"
     with pytest.raises(ValueError, match=r"\.xyz"):
         save_gaussians(random_gaussians(5), tmp_path / "a.abc")
+
+
+def test_a_format_that_cannot_be_imported_is_refused_before_the_work(
+    install, tmp_path: Path
+) -> None:
+    install("qgs-xyz", "xyz", "import no_such_package", group="qgs.scene_writers")
+    with pytest.raises(ExtensionError, match=r"qgs-xyz 1\.2"):
+        save_gaussians(random_gaussians(5), tmp_path / "a.xyz")
+    missing = tmp_path / "missing.safetensors"  # not even read
+    error = run_qgs("reconstruct", missing, tmp_path, "--out", tmp_path / "a.xyz").exception
+    assert isinstance(error, ExtensionError)
