@@ -12,7 +12,7 @@ import kill
 import pytest
 from commands import run_qgs
 from qgs_studies.plan import Run, planned, run_of
-from qgs_studies.queue import Queue, last_record
+from qgs_studies.queue import Queue, _end, last_record
 from qgs_studies.results import Results
 from qgs_studies.study import read_study
 from qgs_studies.work import is_free, locked
@@ -141,3 +141,10 @@ def test_the_last_whole_record_tells_how_far_a_run_is(tmp_path: Path) -> None:
     lines = [json.dumps({"step": n, "seconds": n / 2, "loss": "x" * 100}) for n in range(1, 90)]
     history.write_text("\n".join(lines) + '\n{"step": 90, "sec')
     assert last_record(history) == (89, 44.5)
+
+
+def test_a_damaged_last_line_and_an_exit_code_of_no_signal_end_no_study(tmp_path: Path) -> None:
+    history = tmp_path / "history.jsonl"
+    history.write_text('{"step": 3, "seconds": 1.5}\n{"step": 4, "sec\n')
+    assert last_record(history) == (3, 1.5)
+    assert (_end(255), _end(-9)) == ("ended with exit code 255", "was ended by SIGKILL")

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
@@ -190,8 +191,9 @@ def _and_folder(run: Run) -> str:
 
 def _end(code: int) -> str:
     """How a process ended, by its exit code."""
-    if code < 0 or code > 128:
-        return f"was ended by {signal.Signals(-code if code < 0 else code - 128).name}"
+    number = -code if code < 0 else code - 128
+    if number in set(signal.Signals):
+        return f"was ended by {signal.Signals(number).name}"
     return f"ended with exit code {code}"
 
 
@@ -202,7 +204,8 @@ def last_record(history: Path) -> tuple[int, float]:
     with history.open("rb") as file:
         file.seek(max(history.stat().st_size - _TAIL, 0))
         lines = file.read().decode(errors="replace").split("\n")[:-1]
-    if not lines:
-        return 0, 0.0
-    record: Mapping[str, float] = json.loads(lines[-1])  # a line is whole once its end is written
-    return int(record["step"]), float(record["seconds"])
+    for line in reversed(lines):
+        with suppress(ValueError, TypeError, KeyError, RecursionError):  # a damaged line
+            record: Mapping[str, float] = json.loads(line)
+            return int(record["step"]), float(record["seconds"])
+    return 0, 0.0
