@@ -36,6 +36,7 @@ TRAINING = (
     "data.samples=1",
     "training.seconds=null",
     "optimizer.warmup=2",
+    "optimizer.learning_rate=1e-4",  # one that does not collapse on a single sample
     "evaluation.scenes=1",
 )
 
