@@ -107,3 +107,21 @@ def test_every_recipe_has_its_place_in_the_documents() -> None:
     )
     assert [file for file in FILES if file not in named | tiny] == []
     assert sorted(named - set(FILES)) == []
+
+
+@pytest.mark.parametrize("model", ["tokengs", "locus"])
+@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if "4096" in name])
+def test_finetunes_change_no_more_than_they_say(model: str, name: str) -> None:
+    base = resolve(RECIPES / model / f"{name.partition('_')[0]}.yaml")
+    finetune = resolve(RECIPES / model / f"{name}.yaml")
+    assert finetune.init_from == f"runs/{model}/{name.partition('_')[0]}"
+    assert base.tree["model"]["queries"]["count"] == 1024
+    grown = {**base.tree["model"]["queries"], "count": 4096}
+    assert finetune.tree["model"] == {**base.tree["model"], "queries": grown}
+    assert finetune.tree["losses"] == base.tree["losses"]
+    assert finetune.training.steps in (20 * 500, 80 * 500)
+    rate = finetune.tree["optimizer"]
+    assert (rate["learning_rate"], rate["warmup"]) == (4e-5, 400)
+    assert base.training.steps == 300 * 500
+    rate = base.tree["optimizer"]
+    assert (rate["learning_rate"], rate["warmup"]) == (4e-4, 2000)

@@ -3,6 +3,7 @@
 import json
 import os
 import pickle  # noqa: TID251
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from safetensors.torch import load_file, save_file
 import qgs
 from qgs.composer import RecipeError, resolve
 from qgs.composer.registry import available_plugins
+from qgs.io import tensors as tensors_module
 from qgs.io.checkpoint import (
     CheckpointFile,
     load_weights,
@@ -269,3 +271,24 @@ def test_errors_of_the_system_are_no_damage(
     with pytest.raises(type(error)) as raised:
         CheckpointFile(saved)
     assert raised.value is error
+
+
+def test_loading_opens_the_file_once(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened, counting = [], True
+    whole = tensors_module.safe_open  # in Rust: seen by no audit hook
+
+    def counted(path: Any, *arguments: Any) -> Any:
+        opened.append(str(path))
+        return whole(path, *arguments)
+
+    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+        if counting and event == "open":
+            opened.append(str(arguments[0]))
+
+    monkeypatch.setattr(tensors_module, "safe_open", counted)
+    sys.addaudithook(hook)
+    qgs.load(saved)
+    with CheckpointFile(saved) as file:
+        _ = file.model(), file.recipe, file.tensors, file.step, file.domain, file.extra
+    counting = False
+    assert opened.count(str(saved)) == 2
