@@ -5,7 +5,7 @@ import sys
 
 import typer
 
-from qgs.cli import convert, evaluate, inspect, reconstruct, train, weights
+from qgs.cli import evaluate, inspect, reconstruct, train, weights
 from qgs.cli.plugin_commands import CommandGroup
 
 app = typer.Typer(
@@ -26,7 +26,7 @@ COMMANDS = {
     "train": train.train,
     "eval": evaluate.evaluate,
     "reconstruct": reconstruct.reconstruct,
-    "convert": convert.convert,
+    "convert": weights.convert,
     "import": weights.import_,
     "export": weights.export,
 }
@@ -43,7 +43,7 @@ def main() -> None:
         app()
     except (ValueError, OSError, RuntimeError, MemoryError) as error:
         from qgs.contracts.component import MissingExtraError
-        from qgs.memory import is_out_of_memory
+        from qgs.machine import is_out_of_memory
 
         if is_out_of_memory(error):
             error.add_note("Out of memory: take fewer or smaller images, a smaller batch or model")

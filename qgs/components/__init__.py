@@ -11,10 +11,9 @@ from qgs.components.decoder import (
 )
 from qgs.components.encoder import MultiViewViT
 from qgs.components.head import GaussianHead
-from qgs.components.objective import OnePass
 from qgs.components.optimizer import OneCycleAdamW
 from qgs.components.queries import LatentQueries
-from qgs.components.supervision import LayerSupervision
+from qgs.components.supervision import LayerSupervision, OnePass
 from qgs.components.weights import TOKENGS
 from qgs.contracts import Component
 

@@ -4,7 +4,17 @@ from collections.abc import Iterable, Mapping
 
 from pydantic import Field, field_validator
 
-from qgs.contracts import ComponentConfig, OptionError, Problem, RecipeContext, Supervision
+from qgs.contracts import (
+    ComponentConfig,
+    Objective,
+    OptionError,
+    Outcome,
+    Passes,
+    Problem,
+    RecipeContext,
+    Supervision,
+)
+from qgs.types import Views
 
 
 class LayerSupervision(Supervision):
@@ -51,3 +61,12 @@ class LayerSupervision(Supervision):
         # They sum to 1, so that the learning rate does not depend on how many there are.
         total = count * (count + 1) / 2
         return {number: rank / total for rank, number in enumerate(self.config.layers, start=1)}
+
+
+class OnePass(Objective):
+    """The recipe's losses of one prediction from all input views."""
+
+    name = "one_pass"
+
+    def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
+        return passes.judge(passes.predict(inputs), targets, inputs)

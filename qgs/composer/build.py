@@ -27,7 +27,7 @@ from qgs.contracts import (
     SceneSource,
 )
 from qgs.contracts.component import MissingExtraError
-from qgs.memory import is_out_of_memory
+from qgs.machine import is_out_of_memory
 from qgs.model import QueryGaussianModel
 
 

@@ -27,7 +27,7 @@ from qgs.composer.registry import Registry, load_plugins
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
 from qgs.composer.yaml_text import KeyPath, ListNode, MapNode, from_plain, inline
 from qgs.contracts.schedule import Schedule
-from qgs.memory import refuse_beyond_memory
+from qgs.machine import refuse_beyond_memory
 from qgs.model import QueryGaussianModel
 
 

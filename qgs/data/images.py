@@ -16,7 +16,7 @@ from upath import UPath
 from qgs.contracts import Scene
 from qgs.data.paths import LARGEST, open_file
 from qgs.data.scenes import warn_once
-from qgs.memory import in_words, is_out_of_memory
+from qgs.machine import in_words, is_out_of_memory
 from qgs.wording import name_shown
 
 TURNED = "have an EXIF orientation, which is not followed: they are read as they are stored"

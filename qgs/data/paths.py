@@ -11,7 +11,7 @@ from typing import IO, Any
 
 from upath import UPath
 
-from qgs.memory import in_words
+from qgs.machine import in_words
 
 LARGEST = 500_000_000
 """Bytes of a file that is read as a whole, such as an uncompressed photo of 120 million pixels."""

@@ -26,7 +26,7 @@ from qgs.geometry.poses import (
     relative_to,
     scaled,
 )
-from qgs.memory import refuse_beyond_memory
+from qgs.machine import refuse_beyond_memory
 from qgs.types import Cameras, Views, concatenated, map_tensors
 from qgs.wording import listed, numbered
 

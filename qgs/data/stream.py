@@ -22,7 +22,7 @@ from qgs.contracts import SceneSource, ViewSampler, ViewsConfig
 from qgs.data.evaluation import one_line
 from qgs.data.samples import Batch, Sample, collate, make_sample
 from qgs.data.view_samplers import Span
-from qgs.memory import is_out_of_memory
+from qgs.machine import is_out_of_memory
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.tracking import Trackers, TrainingProgress
 from qgs.engine.training_pass import TrainingPass
 from qgs.io.files import write_text
-from qgs.memory import is_out_of_memory
+from qgs.machine import is_out_of_memory
 from qgs.model import QueryGaussianModel
 
 ELSEWHERE = "another process of this training has no next batch; see its own message"

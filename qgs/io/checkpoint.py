@@ -27,7 +27,7 @@ from qgs.io.tensors import (
     shapes_of,
     write_tensors,
 )
-from qgs.memory import TooLargeError
+from qgs.machine import TooLargeError
 from qgs.model import QueryGaussianModel
 from qgs.wording import listed
 

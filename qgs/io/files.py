@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from qgs.memory import in_words
+from qgs.machine import in_words
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 

@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from qgs.contracts import MissingExtraError, Renderer, RendererConfig
+from qgs.machine import can_compile, in_threads
 from qgs.renderers.inputs import background_of, check_inputs, colors_of, raise_precision
 from qgs.renderers.reference import CLAMP_MARGIN, resolve
-from qgs.threads import can_compile, in_threads
 from qgs.types import Cameras, Gaussians, Rendering
 
 _TILE = 16

@@ -2,7 +2,7 @@
 
 import pytest
 
-from qgs.memory import TooLargeError, in_words, refuse_beyond_memory
+from qgs.machine import TooLargeError, in_words, refuse_beyond_memory
 
 
 def test_only_what_does_not_fit_is_refused() -> None:

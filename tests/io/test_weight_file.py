@@ -10,8 +10,8 @@ import torch
 from safetensors.torch import save, save_file
 from torch import Tensor
 
+from qgs.io.published import read_weight_file
 from qgs.io.tensors import CheckpointError
-from qgs.io.weight_file import read_weight_file
 
 WEIGHTS = {"a.weight": torch.arange(6.0).view(2, 3), "b": torch.tensor(1.5)}
 

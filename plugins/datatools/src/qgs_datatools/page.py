@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
+from qgs.drawing import page_environment
 from qgs.drawing.figures import INK, figure_picture, figure_style, hex_color
 from qgs.drawing.images import Picture, data_uri
-from qgs.drawing.pages import page_environment
 from qgs_datatools.check import CheckReport, SceneReport
 from qgs_datatools.epipolar import Pair
 from qgs_datatools.geometry import Geometry

@@ -116,7 +116,7 @@ def study(
         return
     stopped, failed = None, 0
     if workers and missing:
-        from qgs.threads import usable_cores
+        from qgs.machine import usable_cores
         from qgs_studies.queue import Queue
 
         threads = threads or max(usable_cores() // workers, 1)

@@ -6,9 +6,9 @@ from typing import Any
 
 from qgs.analysis.shown import parameter_counts
 from qgs.composer import Recipe
+from qgs.drawing import page_environment
 from qgs.drawing.figures import figure_picture
 from qgs.drawing.images import data_uri
-from qgs.drawing.pages import page_environment
 from qgs.io.files import write_text
 from qgs_studies.figures import curves_figure, values_figure, write_figures
 from qgs_studies.output import hypothesis_rows, table_rows, write_files

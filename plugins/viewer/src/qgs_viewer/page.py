@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 
-from qgs.drawing.pages import page_environment
+from qgs.drawing import page_environment
 from qgs_viewer.choice import Choice
 from qgs_viewer.look import Look
 from qgs_viewer.server import quiet_server, stand

@@ -15,10 +15,9 @@ from qgs.analysis.saving import orbit_path
 from qgs.contracts import Column, LearnedQueries
 from qgs.data.samples import Sample
 from qgs.data.scenes import warn_once
-from qgs.drawing import images
+from qgs.drawing import images, page_environment
 from qgs.drawing.figures import figure_picture, hex_color
 from qgs.drawing.images import Picture, depth_picture, depth_range, rgb_picture
-from qgs.drawing.pages import page_environment
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Prediction

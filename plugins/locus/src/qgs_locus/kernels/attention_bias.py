@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from qgs.geometry.precision import full_precision
-from qgs.threads import can_compile, in_threads
+from qgs.machine import can_compile, in_threads
 from qgs_locus.kernels.attention_choice import AttentionKernel, chosen_kernel
 
 T = TypeVar("T")

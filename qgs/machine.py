@@ -1,9 +1,16 @@
-"""How much memory is available, errors for what does not fit, and signs that it ran out."""
+"""This machine: memory, and what does not fit into it; cores, and work on all of them."""
 
+import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
+from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
+
+import torch
 
 
 class TooLargeError(ValueError):
@@ -57,3 +64,39 @@ def in_words(size: int) -> str:
     units = ("bytes", "kB", "MB", "GB", "TB", "PB")
     power = min((len(str(abs(size))) - 1) // 3, len(units) - 1)
     return f"{size / 1000**power:.3g} {units[power]}"
+
+
+def can_compile() -> bool:
+    """Whether numba is installed, which `qgs.kernels` needs."""
+    return find_spec("numba") is not None
+
+
+def usable_cores() -> int:
+    """CPU cores that this process may use; all of the machine where the system does not say."""
+    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ()
+    return len(allowed) or os.cpu_count() or 1
+
+
+def in_threads(unit: Callable[..., None], work: Iterable[tuple[Any, ...]]) -> None:
+    """Call `unit(*item)` for every item of `work`, and wait.
+
+    Every unit of work writes to its own memory, so their order does not matter. A unit must not
+    call this itself: it would wait for the threads that it holds.
+    """
+    items = list(work)
+    if len(items) == 1:
+        unit(*items[0])
+    else:
+        futures = [_threads(torch.get_num_threads()).submit(unit, *item) for item in items]
+        wait(futures)  # all of them, also where one fails: nobody writes when this returns
+        for future in futures:
+            future.result()
+
+
+@lru_cache(maxsize=1)
+def _threads(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, thread_name_prefix="qgs-kernel")
+
+
+if hasattr(os, "register_at_fork"):  # threads do not survive a fork
+    os.register_at_fork(after_in_child=_threads.cache_clear)
