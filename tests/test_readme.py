@@ -8,8 +8,7 @@ import pytest
 import yaml
 from qgs_viewer import contest
 
-from qgs.cli import COMMANDS
-from qgs.cli.plugin_commands import GROUP
+from qgs.cli import COMMANDS, GROUP
 from qgs.composer.slots import SECTIONS, SLOTS
 
 ROOT = Path(__file__).parents[1]

@@ -10,8 +10,7 @@ import typer
 from commands import run_qgs
 
 from qgs import DISTRIBUTIONS
-from qgs.cli import COMMANDS
-from qgs.cli.plugin_commands import GROUP, HELP
+from qgs.cli import COMMANDS, GROUP, HELP
 
 Offer = Callable[..., None]
 APP = """
@@ -97,7 +96,7 @@ def test_a_command_of_this_repository_names_its_distribution(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     nothing = entry_points(group="no.such.group")
-    monkeypatch.setattr("qgs.cli.plugin_commands.entry_points", lambda **_: nothing)
+    monkeypatch.setattr("qgs.cli.entry_points", lambda **_: nothing)
     result = run_qgs("data", "check", "photos")
     assert "run `pip install query-gaussians-datatools`" in str(result.exception)
     result = run_qgs("bench", "tiny/locus.yaml")
