@@ -17,7 +17,7 @@ class TooLargeError(ValueError):
     """A request that does not fit into memory; the message has the numbers."""
 
 
-def refuse_beyond_memory(
+def refuse_more_than_memory(
     what: str, needed: Mapping[str, int], advice: str, available: int | None = None
 ) -> None:
     """Raise TooLargeError when the sum of `needed` is more than the available memory.
@@ -29,8 +29,8 @@ def refuse_beyond_memory(
     if total > limit:
         parts = sorted(needed.items(), key=lambda part: -part[1])[:3]
         raise TooLargeError(
-            f"{what} takes {in_words(total)} of memory at least, and {in_words(limit)} are "
-            f"available: {', '.join(f'{name} {in_words(size)}' for name, size in parts)}. {advice}"
+            f"{what} takes {with_unit(total)} of memory at least, and {with_unit(limit)} are "
+            f"available: {', '.join(f'{name} {with_unit(size)}' for name, size in parts)}. {advice}"
         )
 
 
@@ -59,7 +59,7 @@ def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and from_torch)
 
 
-def in_words(size: int) -> str:
+def with_unit(size: int) -> str:
     """Bytes with a unit: 1.5 GB."""
     units = ("bytes", "kB", "MB", "GB", "TB", "PB")
     power = min((len(str(abs(size))) - 1) // 3, len(units) - 1)

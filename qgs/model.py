@@ -108,9 +108,9 @@ class QueryGaussianModel(nn.Module):
         """Run all decoder layers and decode Gaussians after the chosen ones.
 
         memory: the encoder's output. state: the queries before the first layer, of as many scenes.
-        layers: numbers of the layers to decode besides the last (1 is the first; a decoder of
-            depth 0 has 0, the state before any layer); None for the supervised ones in training,
-            and for the last alone in evaluation.
+        layers: numbers of the layers to decode; the last always is (1 is the first; a decoder
+            of depth 0 has 0, the state before any layer); None for the supervised ones in
+            training, and for the last alone in evaluation.
         Raises ValueError for a layer that does not exist and for another number of scenes.
         """
         if layers is None:

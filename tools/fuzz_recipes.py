@@ -22,7 +22,7 @@ from fuzzing import FaultError, Use, fuzz, refused
 
 from qgs.composer import PluginError, RecipeError, resolve
 from qgs.composer.recipe import annotated, flat
-from qgs.composer.registry import load_sound_plugins
+from qgs.composer.registry import load_usable_plugins
 from qgs.composer.slots import SLOTS
 from qgs.contracts import MissingExtraError
 
@@ -44,7 +44,7 @@ OVERLAYS = ("finetune/dl3dv", "rooms/budget", "studies/")
 NAMES = [name for name in FOUND if not name.startswith(OVERLAYS)]
 WRITTEN = {name: yaml.safe_load((RECIPES / name).read_text(encoding="utf-8")) for name in NAMES}
 OPTIONS = {name: flat(resolve(RECIPES / name).tree) for name in NAMES}
-REGISTRY, _ = load_sound_plugins()
+REGISTRY, _ = load_usable_plugins()
 TYPES = sorted(kind for slot in SLOTS for kind in REGISTRY.components(slot))
 
 

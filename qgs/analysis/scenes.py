@@ -10,9 +10,9 @@ from torch import Tensor
 
 from qgs.analysis.reconstruction import Reconstruction, choose_sample, reconstruct_sample
 from qgs.composer import Recipe, resolve
-from qgs.composer.registry import load_sound_plugins
+from qgs.composer.registry import load_usable_plugins
 from qgs.contracts import Component, Scene, SceneSource, Split
-from qgs.data.domain import Domain, odd_images, verdict
+from qgs.data.domain import Domain, value_range_problem, verdict
 from qgs.data.images import framing
 from qgs.data.recognition import open_for
 from qgs.data.samples import training_frames, views_in
@@ -122,7 +122,7 @@ class GivenScene(Scene):
                 f"one scene is reconstructed at a time, got {views.images.shape[0]}; of several "
                 "take one, such as map_tensors(lambda x: x[:1], views)"
             )
-        if fault := odd_images(views.images):
+        if fault := value_range_problem(views.images):
             raise ValueError(fault)
         if views.target_time is not None:
             raise ValueError(
@@ -148,7 +148,7 @@ class GivenScene(Scene):
 
 def installed_sources() -> dict[str, type[Component]]:
     """All installed sources of data, by PLUGIN/NAME; warns of plugins that cannot be loaded."""
-    registry, broken = load_sound_plugins()
+    registry, broken = load_usable_plugins()
     for problem in broken:
         warn_once(f"left out: {problem}")
     return registry.components("data")

@@ -17,18 +17,18 @@ GROUP = "qgs.commands"
 HELP = {
     "data": "Check and pack data sets.",
     "view": "Turn a reconstruction in the browser, pick a query, see its anchor and what it reads.",
-    "demo": "Trained models on rooms that none has seen, or on your photos; writes report.html.",
-    "report": "Judge trained models side by side and picture their scenes; writes report.html.",
+    "demo": "Trained models on rooms unseen in training, or on your photos; writes report.html.",
+    "report": "Evaluate trained models and show their scenes side by side; writes report.html.",
     "figures": "Figures of trained models for a paper, as PDF and PNG.",
     "compare": "Compare the results of the first RUN with those of each other, scene by scene.",
     "study": (
-        "Train every variant with every seed, judge them alike, and answer: better, and how sure?"
+        "Train every variant with every seed, evaluate all by one protocol, and compare the scores."
     ),
     "bench": "Size, latency and memory of models: any number of recipes in turn.",
     "new-plugin": "Write a plugin to start from: one component, its contract tests, a recipe.",
-    "check-plugin": "Hold every component of a plugin to its contract.",
+    "check-plugin": "Test every component of a plugin against its contract.",
 }
-"""What the commands of this repository's other distributions do; their entry points cannot tell."""
+"""Help of the commands of this repository's other distributions; entry points hold none."""
 
 
 class CommandGroup(TyperGroup):
@@ -124,7 +124,7 @@ def main() -> None:
             raise
         # A note of several lines is the traceback of another process.
         notes = [note for note in getattr(error, "__notes__", ()) if "\n" not in note]
-        told = f"error: {str(error) or type(error).__name__}"
-        for line in (told, *notes, "(QGS_DEBUG=1 shows where it was raised)"):
+        message = f"error: {str(error) or type(error).__name__}"
+        for line in (message, *notes, "(QGS_DEBUG=1 shows where it was raised)"):
             print(line, file=sys.stderr)
         raise SystemExit(2) from None

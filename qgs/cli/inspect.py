@@ -24,9 +24,9 @@ def list_components(
 ) -> None:
     """Installed components by slot, and trained models; with NAME all options and meanings."""
     from qgs.cli.tables import details, overview
-    from qgs.composer.registry import load_sound_plugins
+    from qgs.composer.registry import load_usable_plugins
 
-    registry, broken = load_sound_plugins()
+    registry, broken = load_usable_plugins()
     for part in details(name, registry) if name else overview(registry):
         Console().print(part, highlight=False)
     for message in broken:
@@ -76,11 +76,11 @@ def schema(
     ] = None,
 ) -> None:
     """JSON Schema of a recipe with everything that is installed."""
-    from qgs.composer.registry import load_sound_plugins
+    from qgs.composer.registry import load_usable_plugins
     from qgs.composer.schema import recipe_schema
     from qgs.io.files import write_text
 
-    text = json.dumps(recipe_schema(load_sound_plugins()[0]), indent=1) + "\n"
+    text = json.dumps(recipe_schema(load_usable_plugins()[0]), indent=1) + "\n"
     typer.echo(text, nl=False) if out is None else write_text(out, text)
 
 

@@ -47,8 +47,8 @@ ViewsSettings: TypeAlias = Annotated[
     typer.Option("--set", help="Change an option of the recipe's `views`; repeatable."),
 ]
 TUNE_HELP = (
-    "Fit the queries to the input photos first, in so many steps, or with latents:STEPS what the "
-    "model reads of them; 0 for none."
+    "Fit the queries to the input photos first, for STEPS steps, or with latents:STEPS the "
+    "features of the photos; 0 for none."
 )
 Tune: TypeAlias = Annotated[str | None, typer.Option(metavar="[WHAT:]STEPS", help=TUNE_HELP)]
 
@@ -56,7 +56,7 @@ Tune: TypeAlias = Annotated[str | None, typer.Option(metavar="[WHAT:]STEPS", hel
 def tuning_settings(tune: str | None) -> list[str]:
     """The settings that --tune stands for; WHAT alone takes 50 steps (TokenGS).
 
-    Raises ValueError for a text that says neither what to tune nor how often.
+    Raises ValueError for any other text.
     """
     if tune is None:
         return []

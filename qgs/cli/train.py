@@ -43,7 +43,7 @@ def train(
     use_threads(threads)
     console = Console()
     resolved = with_absolute_path(resolve(recipe, overrides or ()))
-    index_of(resolved)  # an index that is not there is told now, not after the training
+    index_of(resolved)  # a missing index raises now, not after the training
     try:
         result = train_model(resolved, out, console=console, device=device, resume=resume)
     except TrainingError as error:

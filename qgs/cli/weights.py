@@ -43,7 +43,7 @@ def import_(
         lines += [f"  {path}: {a} ({name}: {b})" for path, (a, b) in done.settings.items()]
     lines.append(f"wrote {out}")
     if done.recipe_file:
-        lines.append(f"wrote {done.recipe_file}; names and shapes could not tell:")
+        lines.append(f"wrote {done.recipe_file}; names and shapes do not determine:")
         lines += [f"  {choice}" for choice in done.layout.undecided]
     typer.echo("\n".join(lines))
 

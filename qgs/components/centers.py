@@ -19,13 +19,13 @@ def posact(
 
     input_limit: |t| is clamped to it. output_limit: the size of the result is (LocusGS release: 100
     and 1000; TokenGS: none). The slope is 1 at 0, so that a head which starts at zero can learn,
-    and 0 beyond a limit.
+    and 0 outside a limit.
     """
     if input_limit is not None:  # exp of a stray output would be infinite
         t = t.clamp(-input_limit, input_limit)
     if output_limit is not None:
-        beyond = math.log1p(output_limit) + 1  # an exponential that overflows has slope 0 * inf
-        t = t.clamp(-beyond, beyond)
+        end = math.log1p(output_limit) + 1  # an exponential that overflows has slope 0 * inf
+        t = t.clamp(-end, end)
     # expm1, not exp - 1, which has no digits left where t is near 0.
     result = torch.where(t >= 0, torch.expm1(t), -torch.expm1(-t))
     return result if output_limit is None else result.clamp(-output_limit, output_limit)

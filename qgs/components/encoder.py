@@ -84,7 +84,7 @@ class PatchViT(PatchEncoder):
 
         A patch of f x f times the pixels then gives the token of the small one on means of f x f.
         """
-        own = self.state_dict()  # its shapes tell the size of our patches
+        own = self.state_dict()  # its shapes give the size of our patches
         return {
             name: _larger(kernel, own[name].shape[-1]) if name.endswith(_KERNEL) else kernel
             for name, kernel in learned.items()

@@ -56,7 +56,7 @@ class GaussianHead(Head):
         # Small weights: all Gaussians of a query start at one place, near one size and grey.
         nn.init.zeros_(self.linear.bias)
         nn.init.trunc_normal_(self.linear.weight, std=config.init_std)
-        if config.position_std is not None:  # positions that start apart divide the scene sooner
+        if config.position_std is not None:  # spread initial positions divide the scene sooner
             rows_K3D = torch.empty(config.gaussians_per_query, CHANNELS[0], dims.width)
             nn.init.trunc_normal_(rows_K3D, std=config.position_std)
             with torch.no_grad():

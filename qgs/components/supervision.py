@@ -45,14 +45,14 @@ class LayerSupervision(Supervision):
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         depth = context.dims.depth
-        beyond = [n for n in config.layers if n > depth or (n == 0 and depth)]
-        if beyond and not depth:
-            reason = f"layers {beyond} do not exist in a decoder of depth 0"
+        missing = [n for n in config.layers if n > depth or (n == 0 and depth)]
+        if missing and not depth:
+            reason = f"layers {missing} do not exist in a decoder of depth 0"
             yield Problem("layers", reason, "write [0], the queries as they start")
-        elif beyond:
+        elif missing:
             yield Problem(
                 "layers",
-                f"layers {beyond} do not exist in a decoder of depth {context.dims.depth}",
+                f"layers {missing} do not exist in a decoder of depth {context.dims.depth}",
                 f"choose layers from 1 to {context.dims.depth}, or raise model.decoder.depth",
             )
 

@@ -27,7 +27,7 @@ from qgs.composer.registry import Registry, load_plugins
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
 from qgs.composer.yaml_text import KeyPath, ListNode, MapNode, from_plain, inline
 from qgs.contracts.schedule import Schedule
-from qgs.machine import refuse_beyond_memory
+from qgs.machine import refuse_more_than_memory
 from qgs.model import QueryGaussianModel
 
 
@@ -84,7 +84,7 @@ class Recipe:
             state = build_model(*arguments, "meta").state_dict()
             sizes = {name: x.numel() * x.element_size() for name, x in state.items()}
             fix = "Lower the option of the model that makes the largest of them."
-            refuse_beyond_memory("the model with its weights", sizes, fix)
+            refuse_more_than_memory("the model with its weights", sizes, fix)
         model = build_model(*arguments, device)
         if pretrained:
             load_pretrained(model)

@@ -127,7 +127,7 @@ def load_plugins(tree: MapNode, problems: Problems, given: Sequence[Plugin] = ()
     return Registry(plugins, unusable=frozenset(seen.keys() - plugins.keys()))
 
 
-def load_sound_plugins() -> tuple[Registry, list[str]]:
+def load_usable_plugins() -> tuple[Registry, list[str]]:
     """The components of every installed plugin that can be used, and why the others cannot."""
     plugins, broken = {"qgs": builtin()}, []
     available = available_plugins()

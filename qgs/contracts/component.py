@@ -75,8 +75,7 @@ class RecipeContext:
     """The rest of a recipe, as far as `Component.problems` sees it.
 
     image_size: (H, W) of the data's images; None for a recipe without data. inputs: how many input
-    views a training sample has; None likewise. times: whether the data may tell when a photo was
-    taken.
+    views a training sample has; None likewise. times: whether photos of the data may have times.
     """
 
     dims: ModelDims

@@ -105,7 +105,7 @@ class CrossAttention(ModelComponent):
 
 
 class SelfAttention(ModelComponent):
-    """QueryState -> update (B, N, D). Permuting queries and fields permutes the update alike."""
+    """QueryState -> update (B, N, D). Permuting queries and fields permutes the update."""
 
     slot: ClassVar[str] = "self_attention"
 

@@ -13,7 +13,7 @@ GAUSSIAN_FIELDS: Fields = {
     "gaussians.sh": FieldSpec(("C", 3)),
     "gaussians.features": FieldSpec(("F",)),
 }
-"""What a head may give besides the attributes that every Gaussian has."""
+"""Optional outputs of a head; the other attributes are those of every Gaussian."""
 
 
 class Head(ModelComponent):

@@ -62,7 +62,7 @@ class MetricInput(TensorContainer):
 class Metric(Component, torch.nn.Module):
     """MetricInput -> values. Called without gradients, for every sample and every method.
 
-    definition: what is measured, in words; part of the evaluation protocol, as the options are:
+    definition: text, what is measured; part of the evaluation protocol, as the options are:
     change it when values change. not_in_protocol: options that change no value, such as a path.
     needs: parts of the input without which there is no value. column: how the value is shown.
     unavailable: why there are no values here: what `load_pretrained` misses.

@@ -21,10 +21,10 @@ class Plugin:
     contract_version: the CONTRACT_VERSION that the components were written for.
     components: component classes; a `name` is unique within its slot.
     layouts: weights that other codebases publish and these components can load.
-    examples: options that `qgs check-plugin` tries besides the defaults of every component.
+    examples: options that `qgs check-plugin` tries in addition to the defaults of every component.
     models: files of trained models by name, relative to the folder of the module that the entry
-        point names; PLUGIN/NAME stands for the path in every command. A card beside the file tells
-        what the model is: models/mine.md for models/mine.safetensors.
+        point names; PLUGIN/NAME stands for the path in every command. A card in the same
+        folder describes the model: models/mine.md for models/mine.safetensors.
     exemptions: checks of the contract suite that a component is known to fail, and why; by class,
         or by options where it passes with others.
     """

@@ -42,7 +42,7 @@ class Queries(ModelComponent):
         """A state dict for these queries, made of one `learned` with another number of queries.
 
         learned: on the CPU; shapes differ from ours in the first axis alone, the queries.
-        Shrinking keeps the first N. Growing keeps all; query i beyond them copies query i modulo
+        Shrinking keeps the first N. Growing keeps all; each new query i copies query i modulo
         their number, plus noise of N(0, 0.01) on all parameters (LocusGS release, finetuning).
         """
         own = {name: values.shape for name, values in self.state_dict().items()}

@@ -24,7 +24,7 @@ class Schedule(ComponentConfig):
 
     @property
     def corners(self) -> tuple[int, ...]:
-        """Steps besides 0 between which the number goes one way: its extremes are at these."""
+        """Steps, without 0, between which the number is monotonic: its extremes are at these."""
         return ()
 
 

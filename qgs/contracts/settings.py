@@ -61,7 +61,8 @@ class TrainingConfig(ComponentConfig):
     clip: float = Field(default=1.0, gt=0)
     """Largest norm of the gradient; a larger one is scaled down to it."""
     precision: Literal["float32", "bf16"] = "bf16"
-    """What the model computes in; bf16 is torch's autocast, weights stay float32."""
+    """What the model computes in; bf16 is torch's autocast, weights stay float32. See
+    `qgs.engine.precision`."""
     save_every: int = Field(default=1000, ge=0)
     """Steps between checkpoints; 0 saves at the end and before evaluations only."""
     collapse_window: int = Field(default=50, ge=10, le=100)
@@ -82,8 +83,8 @@ class TrainingConfig(ComponentConfig):
     evaluate_every: int = Field(default=0, ge=0)
     """Steps between evaluations with pictures; 0 for none."""
     trackers: tuple[str, ...] = ()
-    """Where numbers and pictures go besides the folder of the run: tensorboard, wandb, or what
-    plugins offer."""
+    """Further destinations of numbers and pictures: tensorboard, wandb, or a plugin's; the folder
+    of the run always has them."""
 
 
 class EvaluationConfig(ComponentConfig):

@@ -40,11 +40,11 @@ class WeightLayout:
     name: what the codebase calls its model. source: where it is published.
     components: slot to the component types that the codebase has; other slots may hold any.
     renames: the first that applies to a name counts.
-    marks: published names that tell this layout from others; a file of it has them all.
-    unused: from a published name to that of a parameter stored beside it, which their code ignores.
+    marks: published names by which this layout is recognised; a file of it has them all.
+    unused: from a published name to that of a parameter stored with it, which their code ignores.
     read: names and shapes of a whole state dict to a recipe that fits, a mapping with `recipe: 1`;
         raises LayoutError.
-    undecided: what names and shapes leave open, in words, and what `read` chooses: the published.
+    undecided: text: what names and shapes leave open, and that `read` chooses the published value.
     """
 
     name: str

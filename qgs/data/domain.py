@@ -25,13 +25,13 @@ OUTLIERS = 0.02
 TOLERANCE = 1.1
 """Views are outside where they leave the trained range by more than this factor."""
 GROSS = 5.0
-"""Input cameras this many times as far apart as in training are no mere extrapolation."""
+"""The first views give a warning where their baseline is this many times that of the training."""
 KEY = "trained_on"
-"""Where a checkpoint's extra metadata holds `Domain.text`."""
+"""Key of `Domain.text` in the extra metadata of a checkpoint."""
 
 WORDS = {
     "views": "there are {} input views",
-    "baseline": "the input cameras stand {} apart",
+    "baseline": "the largest distance between input cameras is {}",
     "turn": "their axes differ by {} degrees",
     "depth": "what they look at is {} away",
     "fov": "their field of view is {} degrees wide",
@@ -47,16 +47,16 @@ class Domain:
     samples: int = 0
 
     def see(self, inputs: Cameras, targets: Cameras) -> None:
-        """Count samples in: cameras (B, V_in) and (B, V_out) in the model's frame."""
+        """Add samples: cameras (B, V_in) and (B, V_out) in the model's frame."""
         for name, values in _measured(inputs, targets):
-            told = values[~values.isnan()].tolist()
+            known = values[~values.isnan()].tolist()
             # four digits: the state of a run is JSON, and the comparison allows 10 %
-            self.values.setdefault(name, []).extend(float(f"{value:.4g}") for value in told)
+            self.values.setdefault(name, []).extend(float(f"{value:.4g}") for value in known)
         self.samples += len(inputs.c2w)
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """The span of each but for OUTLIERS of its values at either end."""
+        """(least, largest) of each name, without OUTLIERS of its values at either end."""
         ordered = {name: sorted(values) for name, values in self.values.items() if values}
         places = {name: int(OUTLIERS * len(values)) for name, values in ordered.items()}
         return {name: (v[places[name]], v[-1 - places[name]]) for name, v in ordered.items()}
@@ -82,31 +82,31 @@ class Domain:
 
     @classmethod
     def read(cls, plain: Mapping[str, Any]) -> Domain:
-        """What `text` wrote, parsed. Raises as `load_state`."""
-        told, domain = plain["ranges"].items(), cls()
-        ends = {k: [math.inf if v is None else v for v in (low, high)] for k, (low, high) in told}
+        """The domain of a parsed `text`. Raises as `load_state`."""
+        ranges, domain = plain["ranges"].items(), cls()
+        ends = {k: [math.inf if v is None else v for v in (low, high)] for k, (low, high) in ranges}
         domain.load_state({"samples": plain["samples"], "values": ends})
         return domain
 
     def differences(self, found: Domain) -> list[str]:
-        """A phrase for each range that `found` leaves."""
-        told, seen = [], found.ranges
+        """A phrase for each range of the training that the range of `found` exceeds."""
+        phrases, seen = [], found.ranges
         for name, trained in self.ranges.items():
             if name in seen and not _inside(seen[name], trained):
                 words = WORDS[name].format(_shown(seen[name]))
                 if seen[name][0] == math.inf:
                     words = "their axes meet at no point before them"
-                told.append(f"{words} (trained: {_shown(trained)})")
-        return told
+                phrases.append(f"{words} (trained: {_shown(trained)})")
+        return phrases
 
 
 def verdict(trained: Domain, found: Domain) -> str:
-    """A sentence on views against those of the training; `trained` is empty if unknown."""
+    """A sentence that compares views with the training's; `trained` is empty if unknown."""
     if not trained.values:
-        return "the checkpoint does not tell on which views this model was trained"
-    if apart := trained.differences(found):
+        return "the checkpoint does not record the views on which this model was trained"
+    if outside := trained.differences(found):
         return (
-            f"the views lie outside what this model was trained on: {', '.join(apart)}. Expect a "
+            f"the views lie outside what this model was trained on: {', '.join(outside)}. Expect a "
             "poor result; choose other input views (--frames), or train on views like these"
         )
     return (
@@ -115,8 +115,8 @@ def verdict(trained: Domain, found: Domain) -> str:
     )
 
 
-def odd_images(images: Tensor) -> str:
-    """What is wrong with the range of `images` (..., H, W), of each eighth pixel; "" if nothing."""
+def value_range_problem(images: Tensor) -> str:
+    """An error where values of `images` (..., H, W) leave [0, 1], else ""; reads each 8th pixel."""
     # resampling overshoots [0, 1] a little at edges
     low, high = map(float, images[..., ::8, ::8].aminmax())
     if low >= -0.5 and high <= 1.5:
@@ -128,7 +128,7 @@ def odd_images(images: Tensor) -> str:
 
 
 class FirstViews:
-    """Forward pre-hook that warns where the first views in evaluation cannot be like the trained.
+    """Forward pre-hook that warns where the first views in evaluation cannot be as in training.
 
     settings: `views` of the model's recipe. Later views are not checked: looking at values waits
     for the device.
@@ -149,15 +149,15 @@ class FirstViews:
         # a graph cannot wait for the device, which a look at values does
         if views.cameras.c2w.is_cuda and torch.cuda.is_current_stream_capturing():
             return
-        if told := [*filter(None, self._faults(views))]:
+        if faults := [*filter(None, self._faults(views))]:
             warn_once(
-                f"{'; '.join(told)}. Expect a poor result. `model.reconstruct(views)` brings "
+                f"{'; '.join(faults)}. Expect a poor result. `model.reconstruct(views)` brings "
                 "cameras in any frame and unit to those of the model"
             )
 
     def _faults(self, views: Views) -> Iterator[str]:
         c2w = views.cameras.c2w
-        yield odd_images(views.images)
+        yield value_range_problem(views.images)
         if self.settings is not None:
             first = self.settings["frame"] == "first_cam"
             place = (first_camera if first else mean_camera)(c2w)
@@ -171,8 +171,8 @@ class FirstViews:
                     "columns 1, 2)"
                 )
         reach = (self.trained.ranges if self.trained else {}).get("baseline", (0.0, math.inf))[1]
-        if (apart := float(largest_distance(c2w).max())) > GROSS * reach:
-            yield f"input cameras stand {apart:.3g} apart, in training at most {reach:.3g}"
+        if (baseline := float(largest_distance(c2w).max())) > GROSS * reach:
+            yield f"the baseline of the inputs is {baseline:.3g}, in training at most {reach:.3g}"
 
 
 def _measured(inputs: Cameras, targets: Cameras) -> Iterator[tuple[str, Tensor]]:
@@ -187,7 +187,7 @@ def _measured(inputs: Cameras, targets: Cameras) -> Iterator[tuple[str, Tensor]]
         cosines = (axes @ axes.transpose(-2, -1)).amin((-2, -1)).clamp(-1, 1)
         yield "turn", cosines.arccos().rad2deg()
     depths = torch.stack([look_at_depth(c2w) for c2w in torch.cat([inputs.c2w, targets.c2w], 1)])
-    # axes that meet behind the cameras look apart, as parallel ones do
+    # axes that meet behind the cameras diverge in front of them: no depth, as of parallel ones
     yield "depth", torch.where(depths > 0, depths, math.inf)
     halves = inputs.size[1] / 2 / inputs.intrinsics[..., 0].double()
     yield "fov", 2 * halves.arctan().rad2deg()
@@ -198,6 +198,6 @@ def _inside(found: tuple[float, float], trained: tuple[float, float]) -> bool:
 
 
 def _shown(values: tuple[float, float]) -> str:
-    """A range in words, three digits."""
+    """A range as text, three digits."""
     low, high = (f"{value:.3g}" if math.isfinite(value) else "infinitely far" for value in values)
     return low if low == high else f"{low} to {high}"

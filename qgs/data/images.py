@@ -16,7 +16,7 @@ from upath import UPath
 from qgs.contracts import Scene
 from qgs.data.paths import LARGEST, open_file
 from qgs.data.scenes import warn_once
-from qgs.machine import in_words, is_out_of_memory
+from qgs.machine import is_out_of_memory, with_unit
 from qgs.wording import name_shown
 
 TURNED = "have an EXIF orientation, which is not followed: they are read as they are stored"
@@ -162,7 +162,7 @@ def load_array(file: IO[bytes]) -> np.ndarray:
     of_version = {(1, 0): np.lib.format.read_array_header_1_0}
     shape, _, dtype = of_version.get(version, np.lib.format.read_array_header_2_0)(file)
     if (size := math.prod(shape) * dtype.itemsize) > LARGEST:
-        raise ValueError(f"it has {in_words(size)}: scale it down")
+        raise ValueError(f"it has {with_unit(size)}: scale it down")
     file.seek(0)
     return np.load(file, allow_pickle=False)
 

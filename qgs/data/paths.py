@@ -11,7 +11,7 @@ from typing import IO, Any
 
 from upath import UPath
 
-from qgs.machine import in_words
+from qgs.machine import with_unit
 
 LARGEST = 500_000_000
 """Bytes of a file that is read as a whole, such as an uncompressed photo of 120 million pixels."""
@@ -59,7 +59,7 @@ def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
     except _DAMAGED as error:
         raise OSError(f"{path} is damaged: {error}") from error
     if len(content) > most:
-        raise OSError(f"{path} is larger than {in_words(most)}")
+        raise OSError(f"{path} is larger than {with_unit(most)}")
     return content
 
 

@@ -26,7 +26,7 @@ from qgs.geometry.poses import (
     relative_to,
     scaled,
 )
-from qgs.machine import refuse_beyond_memory
+from qgs.machine import refuse_more_than_memory
 from qgs.types import Cameras, Views, concatenated, map_tensors
 from qgs.wording import listed, numbered
 
@@ -104,9 +104,9 @@ def gap_range(count: int, views: ViewsConfig, scene: Scene) -> tuple[int, int]:
 
 
 def refuse_too_many(frames: int, scene: Scene) -> None:
-    """Raise TooLargeError when so many images of `scene` do not fit into memory."""
+    """Raise TooLargeError when that many images of `scene` do not fit into memory."""
     height, width = scene.cameras.size
-    refuse_beyond_memory(
+    refuse_more_than_memory(
         f"a sample of {frames} images of {height} x {width}",
         {"images": frames * 3 * height * width * torch.float32.itemsize},
         "Ask for fewer views (views.inputs, views.targets, --inputs, --holdout) or smaller images "
@@ -205,9 +205,9 @@ def shaken(c2w: Tensor, angle: float, rng: np.random.Generator) -> Tensor:
     """Poses (F, 4, 4), all but the first off by `angle`, see `ViewsConfig.pose_noise`; radians."""
     turns, moves = torch.from_numpy(rng.normal(0, angle, (2, len(c2w), 3))).to(c2w)
     cross = torch.linalg.cross(turns[:, None], torch.eye(3).to(c2w)[None]).mT
-    off, apart = c2w.clone(), (c2w[:, :3, 3] - c2w[0, :3, 3]).norm(dim=-1, keepdim=True)
+    off, distances = c2w.clone(), (c2w[:, :3, 3] - c2w[0, :3, 3]).norm(dim=-1, keepdim=True)
     off[1:, :3, :3] = (c2w[:, :3, :3] @ torch.linalg.matrix_exp(cross))[1:]
-    off[1:, :3, 3] += (moves * apart)[1:]
+    off[1:, :3, 3] += (moves * distances)[1:]
     return off
 
 

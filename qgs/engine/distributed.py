@@ -25,6 +25,8 @@ from accelerate.utils import (
 )
 from torch import Tensor
 
+from qgs.engine.precision import ACCELERATE
+
 TIMEOUT = timedelta(hours=24)
 """How long processes wait while one evaluates or saves. NCCL's default of 10 minutes would end such
 runs; a process that died is noticed by the launcher, which ends the others."""
@@ -40,8 +42,7 @@ def make_accelerator(device: str, unread: bool = False) -> Accelerator:
     """
     group = InitProcessGroupKwargs(timeout=TIMEOUT)
     parallel = DistributedDataParallelKwargs(find_unused_parameters=unread)
-    # Autocast is the trainer's own: losses and geometry must stay float32.
-    options = {"cpu": device == "cpu", "mixed_precision": "no"}
+    options = {"cpu": device == "cpu", "mixed_precision": ACCELERATE}
     accelerator = Accelerator(**options, kwargs_handlers=[group, parallel])
     if accelerator.distributed_type not in _PARALLEL:
         kind = accelerator.distributed_type.value

@@ -262,7 +262,7 @@ class GoodWeights:
     """Copies in host memory of the weights at the last two times that the model was healthy.
 
     A collapse is noticed late, and the newer copy may already be on its way down; `tensors` after
-    `step` optimiser steps are the older one. Copies lie a fifth of a window apart at first and a
+    `step` optimiser steps are the older one. Copies are made every fifth of a window at first and a
     window in long runs, and none is made while the images are worse than they were.
 
     keep: whether this process holds the copies; one of several suffices.

@@ -114,7 +114,7 @@ class _Watch:
             self._see(name, views)
 
     def _see_output(self, name: str, module: nn.Module, arguments: Any, output: Any) -> None:
-        # Shared modules run several times a step; the number tells which call it was.
+        # Shared modules run several times a step; the number shows which call it was.
         self._calls[name] += 1
         call = f" (call {self._calls[name]})" if self._calls[name] > 1 else ""
         self._see(f"output{call} of {name}", output)
@@ -148,8 +148,8 @@ def save_incident(
 def save_batches(path: Path, batches: Sequence[Batch]) -> None:
     """Write the batches of a step, one after the other, as a safetensors file.
 
-    inputs.images, inputs.cameras.c2w and .intrinsics, inputs.masks where there are any, and the
-    same of targets; FRAMES are metadata, in JSON.
+    inputs.images, inputs.cameras.c2w and .intrinsics, inputs.masks and .depths where there are
+    any, and the same of targets; FRAMES are metadata, in JSON.
     """
     parts: dict[str, list[Tensor]] = {}
     for batch in batches:

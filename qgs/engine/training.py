@@ -38,6 +38,7 @@ from qgs.engine.guard import Guard, OutOfMemoryError, not_finite
 from qgs.engine.initial import initialise
 from qgs.engine.parameters import MovingAverage, OptimizerState, make_optimizer
 from qgs.engine.periodic import PeriodicEvaluation
+from qgs.engine.precision import autocast
 from qgs.engine.tracking import Trackers, TrainingProgress
 from qgs.engine.training_pass import TrainingPass
 from qgs.io.files import write_text
@@ -447,7 +448,7 @@ def compute_gradients(
         # Only the last batch exchanges gradients between processes.
         with nullcontext() if number == len(batches) else accelerator.no_sync(objective):
             inputs, targets = batch.inputs.to(device), batch.targets.to(device)
-            with torch.autocast(device.type, torch.bfloat16, enabled=config.precision == "bf16"):
+            with autocast(config.precision, device.type):
                 outcome: Outcome = objective(inputs, targets)
             accelerator.backward(outcome.total / len(batches))
         found = {"loss": outcome.total.detach(), **outcome.terms, **outcome.signs}

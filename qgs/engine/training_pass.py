@@ -11,6 +11,7 @@ from qgs.components import OnePass
 from qgs.composer import Recipe
 from qgs.contracts import Loss, Objective, Outcome
 from qgs.contracts.schedule import follow
+from qgs.engine.precision import no_autocast
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import (
@@ -210,7 +211,7 @@ class DetachedLayer:
         loss = _sum(weighted)
         if not loss.requires_grad:
             return
-        with torch.autocast(loss.device.type, enabled=False):  # gradients as autograd's backward
+        with no_autocast(loss.device.type):
             found = torch.autograd.grad(loss, list(self._copies.values()), allow_unused=True)
         for name, gradient in zip(self._copies, found, strict=True):
             if gradient is not None:

@@ -209,7 +209,7 @@ def export_checkpoint(name: str | os.PathLike[str], out: str | Path, half: bool 
             tensors = {n: t.half() if t.is_floating_point() else t for n, t in tensors.items()}
         if broken := nonfinite(tensors.items()):
             raise CheckpointError(
-                f"{file.path} has weights that float16 cannot hold (beyond 65504): "
+                f"{file.path} has weights that float16 cannot hold (larger than 65504): "
                 f"{listed(broken)}; ship it as it is"
             )
         write_checkpoint(out, tensors, file.recipe.tree, file.extra)

@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from qgs.machine import in_words
+from qgs.machine import with_unit
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -56,7 +56,7 @@ def naming_full_disk(path: Path) -> Iterator[None]:
             raise
         free = shutil.disk_usage(path.parent).free
         raise DiskFullError(
-            f"{path} could not be written ({error.strerror}); {in_words(free)} are free. Earlier "
+            f"{path} could not be written ({error.strerror}); {with_unit(free)} are free. Earlier "
             "files are whole: free space and repeat the command, a training with --resume"
         ) from error
 

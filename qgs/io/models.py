@@ -96,7 +96,7 @@ def _downloaded(url: str) -> Path:
                 with source.open("rb") as remote, temporary.open("wb") as local:
                     shutil.copyfileobj(remote, local, 2**20)
                 with safe_open(temporary, "pt"):
-                    pass  # its header tells the size, so one that is cut off is refused
+                    pass  # its header holds the size, so a truncated file is refused
         except Exception as error:  # whatever the file system of the URL raises
             reason = str(error) or type(error).__name__
             raise OSError(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from qgs.composer import Recipe, RecipeError, resolve
 from qgs.composer.recipe import differing_predictions
-from qgs.composer.registry import load_registry, load_sound_plugins
+from qgs.composer.registry import load_registry, load_usable_plugins
 from qgs.composer.yaml_text import dump
 from qgs.contracts import LayoutError, WeightLayout
 from qgs.contracts.weights import Shapes
@@ -103,7 +103,7 @@ class Names:
     """The parameters of one recipe's model under both names.
 
     shapes: of our parameters. published: our name to the published one, both unique.
-    unnamed: ours that the codebase has no name for. unused: what a published file may hold besides.
+    unnamed: ours that the codebase has no name for. unused: what a published file may also hold.
     """
 
     layout: WeightLayout
@@ -182,7 +182,7 @@ def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
 
 def recognise(shapes: Shapes) -> tuple[WeightLayout | None, list[WeightLayout]]:
     """The layout, of any installed plugin, that a state dict is of; and all that there are."""
-    layouts = _layouts(load_sound_plugins()[0].plugins.values())
+    layouts = _layouts(load_usable_plugins()[0].plugins.values())
     found = [layout for layout in layouts if set(layout.marks) <= set(shapes)]
     # A codebase's later release has all names of the earlier one.
     return max(found, key=lambda layout: len(layout.marks), default=None), layouts

@@ -111,7 +111,7 @@ class TensorFile:
             return resolve(tree)
 
     def refuse_newer(self, key: str, ours: int) -> None:
-        """Raise CheckpointError where the format version in the entry `key` is beyond `ours`."""
+        """Raise CheckpointError where the format version in the entry `key` is above `ours`."""
         with self.entry(key) as text:
             written = int(text[:20])
         if written > ours:

@@ -11,7 +11,7 @@ Sums are 5 planes: w r, w g, w b, w z, w.
 For each row of a tile, the buffer holds blocks of 16 lanes: the transmittance; 1 until the pixel
 stops, then 0; the sums (forward) or what `_load_gradients` puts there (backward).
 
-The backward pass repeats the forward one, so both skip and stop alike. With v_i = dL/dw_i,
+The backward pass repeats the forward one, with the same skips and the same end. With v_i = dL/dw_i,
 transmittance T_i and the rest S_i = sum_{j>i} w_j v_j, dL/dalpha_i = T_i v_i - S_i / (1 - alpha_i).
 """
 

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from qgs.contracts import MissingExtraError, Renderer, RendererConfig
+from qgs.contracts.renderer import background_of, check_inputs, colors_of, raise_precision
 from qgs.machine import can_compile, in_threads
-from qgs.renderers.inputs import background_of, check_inputs, colors_of, raise_precision
 from qgs.renderers.reference import CLAMP_MARGIN, resolve
 from qgs.types import Cameras, Gaussians, Rendering
 

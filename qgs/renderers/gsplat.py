@@ -10,7 +10,7 @@ from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Problem, RecipeContext, Renderer, RendererConfig
 from qgs.contracts.component import MissingExtraError
-from qgs.renderers.inputs import background_of, check_inputs, colors_of
+from qgs.contracts.renderer import background_of, check_inputs, colors_of
 from qgs.types import Cameras, Gaussians, Rendering
 
 

@@ -11,8 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.contracts import Renderer, RendererConfig
+from qgs.contracts.renderer import background_of, check_inputs, colors_of, raise_precision
 from qgs.geometry.transforms import quat_to_matrix
-from qgs.renderers.inputs import background_of, check_inputs, colors_of, raise_precision
 from qgs.types import Cameras, Gaussians, Rendering
 
 CLAMP_MARGIN = 0.15  # of the image's width or height: beyond it the Jacobian is held constant

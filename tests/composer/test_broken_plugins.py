@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from qgs.cli import app
 from qgs.composer import RecipeError, compose, resolve
-from qgs.composer.registry import available_plugins, load_sound_plugins
+from qgs.composer.registry import available_plugins, load_usable_plugins
 from qgs.contracts import CONTRACT_VERSION, LearnedQueries, Plugin
 
 IMPORTS = """
@@ -73,7 +73,7 @@ def test_two_distributions_with_one_plugin_name(write, install):
 def test_broken_plugins_and_impostors_hide_no_other_plugin(write, install):
     install("impostor", "qgs", f"{IMPORTS}plugin = Plugin('qgs', CONTRACT_VERSION, ())")
     install("qgs-raises", "raises", "raise RuntimeError('no luck')")
-    registry, broken = load_sound_plugins()
+    registry, broken = load_usable_plugins()
     assert sum("impostor 1.2" in message or "qgs-raises 1.2" in message for message in broken) == 2
     assert "qgs/latent" in registry.components("queries")
     resolve(write("recipe: 1\n"))

@@ -108,7 +108,7 @@ def test_the_sentence() -> None:
     outside = trained.differences(wide)
     assert [float(re.search(r"[\d.]+", text)[0]) for text in outside] == [3, 3, 90, 152]
     assert all(text in verdict(trained, wide) for text in outside)
-    assert "checkpoint does not tell" in verdict(Domain(), within)
+    assert "checkpoint does not record" in verdict(Domain(), within)
 
 
 def test_checkpoints_tell_what_they_were_trained_on_also_when_a_run_is_continued(tmp_path) -> None:

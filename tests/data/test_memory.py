@@ -2,11 +2,11 @@
 
 import pytest
 
-from qgs.machine import TooLargeError, in_words, refuse_beyond_memory
+from qgs.machine import TooLargeError, refuse_more_than_memory, with_unit
 
 
 def test_only_what_does_not_fit_is_refused() -> None:
-    refuse_beyond_memory("this", {"a": 4, "b": 6}, "Less.", 10)
+    refuse_more_than_memory("this", {"a": 4, "b": 6}, "Less.", 10)
     with pytest.raises(TooLargeError, match=r"11 bytes.*10 bytes.*b 7 bytes, a 4"):
-        refuse_beyond_memory("this", {"a": 4, "b": 7}, "Less.", 10)
-    assert [in_words(n) for n in (999, 1500, 2 * 10**30)] == ["999 bytes", "1.5 kB", "2e+15 PB"]
+        refuse_more_than_memory("this", {"a": 4, "b": 7}, "Less.", 10)
+    assert [with_unit(n) for n in (999, 1500, 2 * 10**30)] == ["999 bytes", "1.5 kB", "2e+15 PB"]

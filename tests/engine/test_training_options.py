@@ -4,7 +4,7 @@ import json
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import torch
@@ -21,11 +21,12 @@ from training_runs import (
 
 import qgs
 from qgs.composer import Recipe
-from qgs.contracts import MissingExtraError
+from qgs.contracts import MissingExtraError, TrainingConfig
 from qgs.data.samples import Batch
 from qgs.engine import tracking as trackers
 from qgs.engine.folder import read_state
 from qgs.engine.guard import MAX_SKIPPED, NonFiniteError
+from qgs.engine.precision import DTYPES
 from qgs.io.checkpoint import CheckpointFile
 
 
@@ -185,3 +186,7 @@ def test_tensorboard_gets_what_the_history_gets(tiny: Tiny, tmp_path: Path) -> N
     (judged,) = events.Scalars("evaluation/raw/psnr")
     assert judged.step == 4
     assert len(events.Images("evaluation")) == 1
+
+
+def test_every_precision_of_a_recipe_has_its_dtype() -> None:
+    assert get_args(TrainingConfig.model_fields["precision"].annotation) == tuple(DTYPES)

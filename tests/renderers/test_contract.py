@@ -9,7 +9,7 @@ import torch
 from qgs.contracts import RendererConfig
 from qgs.geometry.harmonics import seen_colors
 from qgs.geometry.transforms import moved, quat_to_matrix
-from qgs.renderers import TorchRenderer, inputs
+from qgs.renderers import TorchRenderer
 from qgs.types import Cameras, Gaussians, Rendering, named_tensors
 
 IMAGES = ("rgb", "alpha", "depth")
@@ -123,7 +123,8 @@ def test_features_are_blended_as_colours_over_nothing(build, make_scene):
 
 def test_without_harmonics_and_features_nothing_more_is_computed(build, make_scene, monkeypatch):
     gaussians, cameras = make_scene(views=2)
-    monkeypatch.setattr(inputs, "seen_colors", lambda *_: pytest.fail("there are no harmonics"))
+    given = "qgs.contracts.renderer.seen_colors"
+    monkeypatch.setattr(given, lambda *_: pytest.fail("there are no harmonics"))
     assert build()(gaussians, cameras).features is None
 
 

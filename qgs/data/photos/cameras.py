@@ -72,7 +72,7 @@ class CamerasJson(PhotoReader):
 
 
 def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
-    """What is said of each camera, with what is said of all. ValueError."""
+    """The entry of each camera, with defaults from the top level. Raises ValueError."""
     top = data if isinstance(data, Mapping) else {}
     given = next((top[key] for key in _LISTS if isinstance(top.get(key), list)), data)
     if not isinstance(given, list):

@@ -1,4 +1,4 @@
-"""What cannot be right about a listed photo: its pose, its intrinsics, its size."""
+"""Problems of a listed photo: its pose, its intrinsics, its size."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -12,21 +12,21 @@ from qgs.data.scenes import warn_once
 from qgs.wording import listed, numbered
 
 LARGEST_SIDE = 10**6  # pixels of a listed photo
-_FARTHEST = 1e12  # a camera's coordinate beyond is none, and its square leaves float32
+_FARTHEST = 1e12  # largest coordinate of a camera; the square of larger ones overflows float32
 _RIGID = 1e-3  # of rotations against orthonormality
 _SAME_ASPECT = 0.01  # relative difference between the file's and the listing's aspect ratio
-_SQUARE = 0.1  # relative difference of sides, or of fx and fy, that is none
+_SQUARE = 0.1  # relative difference of sides, or of fx and fy, that counts as equal
 _NORMALISED = 5.0  # a focal length below is in units of the image, not of its pixels
 _FOCAL = (0.1, 30.0)  # of the longer side: angles of view of 157 and 2 degrees
 
 
 def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
-    """What is wrong with a pose (4, 4): NaN, mirrored, sheared or scaled."""
+    """Problems of a pose (4, 4): NaN, mirrored, sheared or scaled."""
     if not np.isfinite(c2w).all():
         yield FrameProblem("c2w", "the pose has NaN or infinite numbers", "remove the frame")
         return
     if np.abs(c2w).max() > _FARTHEST:
-        reason = f"the pose has a number beyond {_FARTHEST:.0e}"
+        reason = f"the pose has a number larger than {_FARTHEST:.0e}"
         yield FrameProblem("c2w", reason, "correct it, or remove the frame")
         return
     rotation = c2w[:3, :3]
@@ -48,17 +48,17 @@ def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
 
 
 def intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> Iterator[FrameProblem]:
-    """What is wrong with fx, fy, cx, cy in pixels of `size` (H, W); not all of it is fatal."""
+    """Problems of fx, fy, cx, cy in pixels of `size` (H, W); not all are fatal."""
 
     def problem(reason: str, fix: str, *, fatal: bool = True) -> FrameProblem:
-        said = f"fx {fx:.6g}, fy {fy:.6g}, cx {cx:.6g}, cy {cy:.6g}"
+        values = f"fx {fx:.6g}, fy {fy:.6g}, cx {cx:.6g}, cy {cy:.6g}"
         pixels = "" if size is None or fatal else f", {size[1]} x {size[0]} pixels"
-        return FrameProblem("intrinsics", f"{reason} ({said}{pixels})", fix, fatal)
+        return FrameProblem("intrinsics", f"{reason} ({values}{pixels})", fix, fatal)
 
     fx, fy, cx, cy = intrinsics
     if not all(map(math.isfinite, intrinsics)) or fx <= 0 or fy <= 0:
-        fix = "focal lengths must be positive; export the intrinsics again"
-        yield problem("intrinsics are no numbers of a camera", fix)
+        fix = "export the intrinsics again"
+        yield problem("intrinsics are not finite, or focal lengths not positive", fix)
         return
     in_pixels = size is not None and max(size) > 20 * _NORMALISED
     if max(fx, fy) < _NORMALISED and (in_pixels or max(abs(cx), abs(cy)) <= 1):
@@ -85,7 +85,7 @@ def intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> Iterator[F
 
 
 def size_problems(size: Size, listed: Size | None) -> Iterator[FrameProblem]:
-    """What is wrong with an image file of `size` (H, W); one scaled to it is right."""
+    """Problems of an image file of `size` (H, W); a scaled copy of `listed` has none."""
     if listed is None:
         return
     ratio = size[1] * listed[0] / (size[0] * listed[1])
@@ -103,11 +103,11 @@ def size_problems(size: Size, listed: Size | None) -> Iterator[FrameProblem]:
 
 
 def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FrameProblem, ...]]:
-    """The size (H, W) that a listing gives, None and why where no photo can have it."""
+    """The listed size (H, W); None, and the problem, where no photo can have it."""
     if all(1 <= side <= LARGEST_SIDE for side in (height, width)):
         return (round(height), round(width)), ()
-    said = f"{str(width)[:12]} x {str(height)[:12]}"
-    reason = f"the listed size, {said} pixels, is none of a photo"
+    size = f"{str(width)[:12]} x {str(height)[:12]}"
+    reason = f"the listed size, {size} pixels, is impossible for a photo"
     return None, (FrameProblem("size", reason, "correct the width and height"),)
 
 
@@ -116,22 +116,22 @@ def with_equal_times(listing: Listing) -> Listing:
     count, without = len(listing.frames), sum(frame.time is None for frame in listing.frames)
     reason = f"it has no 'time', like {without} of {count} frames, and the others have"
     problem = FrameProblem("time", reason, "write it for each, or for none where nothing moves")
-    said = [
+    frames = [
         replace(frame, problems=frame.problems or (problem,)) if frame.time is None else frame
         for frame in listing.frames
     ]
-    return replace(listing, frames=said) if 0 < without < count else listing
+    return replace(listing, frames=frames) if 0 < without < count else listing
 
 
 def frame_problems(frame: PhotoFrame) -> Iterator[FrameProblem]:
-    """Everything that is wrong with `frame` as listed, without opening its image."""
+    """All problems of `frame` as listed; its image is not opened."""
     yield from frame.problems
     if not frame.problems:
         yield from pose_problems(frame.c2w)
         yield from intrinsics_problems(frame.intrinsics, frame.size)
 
 
-def require_sound(listing: object, frames: Sequence[PhotoFrame]) -> None:
+def refuse_fatal_problems(listing: object, frames: Sequence[PhotoFrame]) -> None:
     """Raise ValueError for the first fatal problem, with its frame; log the others."""
     doubtful: list[str] = []
     for index, frame in enumerate(frames):

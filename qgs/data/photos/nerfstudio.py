@@ -210,7 +210,7 @@ def _lens(values: Mapping[str, Any]) -> Lens | None:
         known = ", ".join(sorted((*_PINHOLE, _FISHEYE)))
         fix = f"undistort the photos first, or export one of {known}"
         raise _UnreadableError("lens", f"the camera model {model!r} is not known", fix)
-    # a coefficient that is not applied would bend poses and pixels apart in silence
+    # an ignored coefficient would shift pixels against the poses without an error
     for key in _OTHER if fisheye else (*_OTHER, "k4"):
         if _finite(values, key, "lens"):
             reason = f"{key!r} is set, which belongs to another camera model"

@@ -20,7 +20,7 @@ _COPY = re.compile(r"images(_\d+)?")
 
 @dataclass(frozen=True)
 class FrameProblem(Problem):
-    """A fault of a `PhotoFrame`'s field. fatal: whether `require_sound` refuses the frame."""
+    """A fault of a `PhotoFrame`'s field. fatal: see `refuse_fatal_problems`."""
 
     fatal: bool = True
 

@@ -28,7 +28,7 @@ from qgs.data.images import (
 from qgs.data.lenses import Mode, Size, undistorted
 from qgs.data.paths import is_local, opened_path, read_file
 from qgs.data.photos import formats_of, read_listing, readers
-from qgs.data.photos.checks import require_sound, size_problems
+from qgs.data.photos.checks import refuse_fatal_problems, size_problems
 from qgs.data.photos.reader import PhotoFrame, existing
 from qgs.data.scenes import (
     BoundedCache,
@@ -72,7 +72,7 @@ class PhotosConfig(SceneSource.Config):
 
 
 def image_cache(limit: int = 512 * 2**20) -> BoundedCache[np.ndarray]:
-    """A cache of decoded images, up to so many bytes."""
+    """A cache of decoded images, with a limit in bytes."""
     return BoundedCache(limit, attrgetter("nbytes"))
 
 
@@ -104,10 +104,10 @@ class PhotoScene(EncodedScene):
         known: dict[object, Size] = {}
         intrinsics: list[Tensor] = []
         for frame in self._frames:
-            alike = (frame.path.parent, frame.size) if frame.size else frame.path
-            if alike not in known:
-                known[alike] = _checked(image_size(frame.path), frame, frame.path)
-            size = known[alike]
+            kind = (frame.path.parent, frame.size) if frame.size else frame.path
+            if kind not in known:
+                known[kind] = _checked(image_size(frame.path), frame, frame.path)
+            size = known[kind]
             stored = torch.tensor(frame.at_size(size), dtype=torch.float64)
             intrinsics.append(CropResize(size, self._config.image_size).intrinsics(stored))
         c2w = torch.from_numpy(np.stack([frame.c2w for frame in self._frames]))
@@ -297,7 +297,7 @@ def present_frames(
     present = [frame for frame in frames if frame.path in there]
     missing = [str(frame.path) for frame in frames if frame.path not in there]
     # before the count: a wrong listing explains missing images
-    require_sound(listing.file, present if len(present) > 1 else frames)
+    refuse_fatal_problems(listing.file, present if len(present) > 1 else frames)
     if len(present) < 2:
         raise FileNotFoundError(
             f"{listing.file} names {len(frames)} images, of which {len(present)} exist "

@@ -7,7 +7,7 @@ from typing import get_args
 import numpy as np
 from upath import UPath
 
-from qgs.composer.registry import Registry, load_sound_plugins
+from qgs.composer.registry import Registry, load_usable_plugins
 from qgs.contracts import Component, Scene, SceneSource, Split
 from qgs.data.photos.reader import PhotoFrame
 from qgs.data.recognition import recognised
@@ -23,7 +23,7 @@ _SIZE = (256, 256)  # of the images that a source is asked for
 
 @cache
 def _installed() -> tuple[Registry, list[str]]:
-    return load_sound_plugins()
+    return load_usable_plugins()
 
 
 def sources() -> dict[str, type[Component]]:

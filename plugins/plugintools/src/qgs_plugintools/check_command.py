@@ -23,7 +23,7 @@ def check_plugin(
     name: Annotated[str, typer.Argument(help="Name of the plugin, as in `plugins: [NAME]`.")],
     core: Annotated[bool, typer.Option("--core", help="Leave out the slower checks.")] = False,
 ) -> None:
-    """Hold every component of a plugin to its contract.
+    """Test every component of a plugin against its contract.
 
     Exit code 1 if one does not keep it, or cannot be built or called here. Components are checked
     with their default options and with the plugin's `examples`.

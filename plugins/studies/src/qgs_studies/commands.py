@@ -10,7 +10,7 @@ from rich.console import Console
 
 from qgs.cli.options import Device
 
-app = typer.Typer(help="Train variants of a model by seeds, and tell what differs.")
+app = typer.Typer(help="Train variants of a model by seeds, and compare them.")
 compare_app = typer.Typer(help="Compare results of evaluations.")
 
 
@@ -65,7 +65,7 @@ def study(
     ] = False,
     device: Device = "auto",
 ) -> None:
-    """Train every variant with every seed, judge them alike, and answer: better, and how sure?
+    """Train every variant with every seed, evaluate all by one protocol, and compare the scores.
 
     It is checked as a whole before anything trains. Give the same command
     again at any time: each run is trained once, a killed one continues,

@@ -49,7 +49,7 @@ def demo(
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """Trained models on rooms that none has seen, or on your photos; writes report.html.
+    """Trained models on rooms unseen in training, or on your photos; writes report.html.
 
     Photos need camera poses, as Nerfstudio, COLMAP, Blender or LLFF write them. With --train the
     tiny TokenGS and LocusGS, or the named recipes, are trained on the same rooms and compared.
@@ -78,7 +78,7 @@ def report(
     ] = None,
     device: Device = "auto",
 ) -> None:
-    """Judge trained models side by side and picture their scenes; writes report.html."""
+    """Evaluate trained models and show their scenes side by side; writes report.html."""
     show_trained(runs, photos, new_folder(out, "report"), device)
 
 

@@ -1,0 +1,28 @@
+"""Precision of training: what the forward pass, the gradients and the weights are computed in.
+
+`training.precision` chooses among DTYPES. Weights, optimiser state and gradients of weights are
+float32 in all of them; bfloat16 has the exponents of float32, so no GradScaler is needed. Geometry
+leaves autocast by itself, see `qgs.geometry.precision`.
+"""
+
+import torch
+
+DTYPES: dict[str, torch.dtype | None] = {"float32": None, "bf16": torch.bfloat16}
+"""Values of `training.precision` to the dtype of autocast, None without autocast."""
+
+ACCELERATE = "no"
+"""accelerate's own mixed precision, off: it would run geometry and losses in half precision too."""
+
+
+def autocast(precision: str, device: str) -> torch.autocast:
+    """The autocast of a forward pass; precision: one of DTYPES; device: a type such as "cuda"."""
+    dtype = DTYPES[precision]
+    return torch.autocast(device, dtype, enabled=dtype is not None)
+
+
+def no_autocast(device: str) -> torch.autocast:
+    """Switch autocast off, for gradients that are taken inside the forward pass.
+
+    A backward pass runs in the dtypes of the forward operations; autocast would cast it again.
+    """
+    return torch.autocast(device, enabled=False)
