@@ -3,10 +3,12 @@
 A distribution adds a tracker by an entry point in the group `qgs.trackers` that names a `Tracker`.
 """
 
+import logging
 import time
 import uuid
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from importlib.util import find_spec
 from pathlib import Path
@@ -29,6 +31,8 @@ GROUP = "qgs.trackers"
 
 _REFRESH_SECONDS = 0.25
 _LOG_SECONDS = 15.0
+
+_log = logging.getLogger(__name__)
 
 
 class Tracker(ABC):
@@ -122,35 +126,51 @@ def tracker_kind(name: str) -> type[Tracker]:
 class Trackers:
     """The trackers of a recipe, opened when the run's folder exists; all on the main process.
 
+    One that fails is logged, closed and left out from then on: training goes on without it.
     Raises as `tracker_kind`.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
-        self._kinds = [tracker_kind(name) for name in names]
-        self._open: list[Tracker] = []
+        self._kinds = {name: tracker_kind(name) for name in names}
+        self._open: dict[str, Tracker] = {}
 
     def open(self, run: Path, recipe: Recipe, step: int = 0) -> None:
         """Track into the folder `run` from step `step` + 1 on; log the options of `recipe`."""
         # Trackers take plain values only; lists and nulls become text.
         options = flat(recipe.tree).items()
         plain = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in options}
-        self._open = [kind(run, plain, step) for kind in self._kinds]
+        for name, kind in self._kinds.items():
+            with self._left_out_if_it_fails(name):
+                self._open[name] = kind(run, plain, step)
 
     def log(self, values: Mapping[str, float], step: int) -> None:
         """Numbers of a step, by name."""
-        for tracker in self._open:
-            tracker.log(values, step)
+        for name, tracker in [*self._open.items()]:
+            with self._left_out_if_it_fails(name):
+                tracker.log(values, step)
 
     def picture(self, name: str, picture: np.ndarray, step: int) -> None:
         """A uint8 (H, W, 3) picture."""
-        for tracker in self._open:
-            tracker.picture(name, picture, step)
+        for kind, tracker in [*self._open.items()]:
+            with self._left_out_if_it_fails(kind):
+                tracker.picture(name, picture, step)
 
     def close(self) -> None:
         """End tracking."""
-        for tracker in self._open:
-            tracker.close()
-        self._open = []
+        for name in [*self._open]:
+            with self._left_out_if_it_fails(name):
+                self._open.pop(name).close()
+
+    @contextmanager
+    def _left_out_if_it_fails(self, name: str) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # a service that is down, or whatever a distribution raises
+            reason = f"{type(error).__name__}: {error}"
+            _log.warning("the tracker %s fails and is left out from now on: %s", name, reason)
+            if failed := self._open.pop(name, None):
+                with suppress(Exception):  # it was reported
+                    failed.close()
 
 
 class TrainingProgress:

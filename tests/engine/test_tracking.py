@@ -43,6 +43,41 @@ def test_a_distribution_offers_a_tracker_by_an_entry_point(
         Trackers(("linez",))
 
 
+FAILING_TRACKER = """
+from qgs.engine.tracking import Tracker
+
+class Failing(Tracker):
+    def __init__(self, run, options, step):
+        self.closed = run / "closed"
+        if FAILS == "open":
+            raise OSError("no service")
+    def log(self, values, step):
+        raise OSError("no service")
+    def close(self):
+        self.closed.touch()
+
+plugin = Failing
+"""
+
+
+@pytest.mark.parametrize("fails", ["open", "log"])
+def test_a_tracker_that_fails_is_left_out_and_the_training_goes_on(
+    fails: str,
+    tiny: Tiny,
+    tmp_path: Path,
+    install: Callable[..., None],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    install("qgs-lines", "lines", FILE_TRACKER, group="qgs.trackers")
+    code = f"FAILS = {fails!r}\n{FAILING_TRACKER}"
+    install(f"qgs-{fails}-fails", f"{fails}-fails", code, group="qgs.trackers")
+    result = run(tiny("tokengs", f"training.trackers=[{fails}-fails, lines]"), tmp_path / "run")
+    assert [f"{fails}-fails" in record.message for record in caplog.records].count(True) == 1
+    assert (tmp_path / "run" / "closed").exists() == (fails == "log")
+    lines = (tmp_path / "run" / "lines.jsonl").read_text().splitlines()
+    assert len(lines) == 1 + result.steps
+
+
 def test_a_resumed_run_takes_back_what_was_told_of_lost_steps(tiny: Tiny, tmp_path: Path) -> None:
     pytest.importorskip("tensorboard", reason="the extra `tensorboard` is not installed")
     for first, value in ((1, 1.0), (3, 2.0)):
