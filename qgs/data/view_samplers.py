@@ -1,9 +1,11 @@
 """Samplers of views: which frames of a scene a training sample shows."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from pydantic import Field
 
-from qgs.contracts import Frames, Scene, ViewSampler, ViewsConfig
+from qgs.contracts import Frames, Problem, RecipeContext, Scene, ViewSampler, ViewsConfig
 from qgs.contracts.component import ComponentConfig
 from qgs.data.samples import draw_frames
 
@@ -24,6 +26,12 @@ class Span(ViewSampler):
         """Largest gap; null for that of `views.gap`. A schedule lets it grow with training."""
 
     config: Config
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """See `Component`."""
+        if config.min_gap and config.max_gap and config.min_gap > config.max_gap:
+            yield Problem("min_gap", "it is larger than `max_gap`", "raise `max_gap`")
 
     def draw(
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
