@@ -63,19 +63,25 @@ class OptimizerState:
         self._optimizer = optimizer
 
     def state(self) -> dict[str, Any]:
-        """Tensors and JSON values, PARAMETER/KEY."""
-        return {
+        """Tensors and JSON values, PARAMETER/KEY; under "keys" the keys of every parameter."""
+        kept = self._optimizer.state_dict()["state"]
+        keys = {name: [*kept.get(place, ())] for place, name in enumerate(self._names)}
+        return {"keys": keys} | {
             f"{self._names[place]}/{key}": value
-            for place, values in self._optimizer.state_dict()["state"].items()
+            for place, values in kept.items()
             for key, value in values.items()
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state()` gave; options of the groups stay."""
-        kept: dict[int, dict[str, Any]] = {}
-        for path, value in state.items():
-            name, _, key = path.rpartition("/")
-            kept.setdefault(self._names.index(name), {})[key] = value
+        """Restore what `state()` gave; options of the groups stay.
+
+        Raises KeyError with what is missing, ValueError for what is not of these parameters.
+        """
+        # A parameter without a gradient has no moments, so that only "keys" shows what is missing.
+        keys = [(place, name, state["keys"][name]) for place, name in enumerate(self._names)]
+        kept = {p: {key: state[f"{name}/{key}"] for key in own} for p, name, own in keys if own}
+        if len(state) > 1 + sum(map(len, kept.values())):
+            raise ValueError("it has values of unknown parameters")
         groups = self._optimizer.state_dict()["param_groups"]
         self._optimizer.load_state_dict({"state": kept, "param_groups": groups})
 

@@ -48,9 +48,10 @@ def copied(trained: Path, tmp_path: Path) -> Path:
         lambda t: t.update({f"weights/{WEIGHT}": t[f"weights/{WEIGHT}"][:1].clone()}),
         lambda t: t.pop(f"ema/{WEIGHT}"),
         lambda t: t.update({"moments/foo/exp_avg": torch.ones(1)}),
+        lambda t: t.pop(f"moments/model.{WEIGHT}/exp_avg"),
         lambda t: [t.pop(name) for name in list(t) if name.startswith("random/")],
     ],
-    ids=["another shape", "missing", "unknown parameter", "a part without tensors"],
+    ids=["another shape", "missing", "unknown parameter", "moment", "a part without tensors"],
 )
 def test_a_state_with_other_tensors_is_refused_and_nothing_is_replaced(
     copied: Path, tiny: Tiny, change: Any
