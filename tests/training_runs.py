@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -13,8 +12,6 @@ import torch
 from rich.console import Console
 
 from qgs.composer import Recipe
-from qgs.contracts import SceneSource, ViewsConfig
-from qgs.data.domain import SAMPLES, Domain
 from qgs.data.samples import Batch
 from qgs.data.stream import SampleStream, training_batches
 from qgs.engine.distributed import StopRequest
@@ -101,12 +98,3 @@ def tensorboard_events(folder: Path) -> Any:
     name = "tensorboard.backend.event_processing.event_accumulator"
     module = pytest.importorskip(name, reason="the extra `tensorboard` is not installed")
     return module.EventAccumulator(str(folder / "tensorboard")).Reload()
-
-
-def trained_domain(source: SceneSource, views: ViewsConfig, seed: int) -> Domain:
-    """The domain of the first SAMPLES training samples, as training itself finds it."""
-    domain, size = Domain(), 16
-    with closing(training_batches(source, views, size, seed)) as batches:
-        for batch in islice(batches, SAMPLES // size):
-            domain.see(batch.inputs.cameras, batch.targets.cameras)
-    return domain

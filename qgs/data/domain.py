@@ -18,11 +18,9 @@ from qgs.data.scenes import warn_once
 from qgs.geometry.poses import first_camera, largest_distance, look_at_depth, mean_camera
 from qgs.types import Cameras, Views
 
-SAMPLES = 256
-"""Training samples that are measured, the first ones."""
-OUTLIERS = 0.02
+OUTLIERS = 0.002
 """Share of the values at either end of a range that does not count, such as parallel axes."""
-TOLERANCE = 1.1
+TOLERANCE = 1.25
 """Views are outside where they leave the trained range by more than this factor."""
 GROSS = 5.0
 """The first views give a warning where their baseline is this many times that of the training."""
@@ -50,7 +48,7 @@ class Domain:
         """Add samples: cameras (B, V_in) and (B, V_out) in the model's frame."""
         for name, values in _measured(inputs, targets):
             known = values[~values.isnan()].tolist()
-            # four digits: the state of a run is JSON, and the comparison allows 10 %
+            # four digits are what `text` needs: the comparison allows 25 %
             self.values.setdefault(name, []).extend(float(f"{value:.4g}") for value in known)
         self.samples += len(inputs.c2w)
 
@@ -61,18 +59,6 @@ class Domain:
         places = {name: int(OUTLIERS * len(values)) for name, values in ordered.items()}
         return {name: (v[places[name]], v[-1 - places[name]]) for name, v in ordered.items()}
 
-    def state(self) -> dict[str, Any]:
-        """See `qgs.engine.folder.Stateful`."""
-        return {"samples": self.samples, "values": self.values}
-
-    def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state`. Raises ValueError, TypeError or KeyError for anything else."""
-        values = {name: [*map(float, state["values"][name])] for name in state["values"]}
-        numbers = [int(state["samples"]), *(n for v in values.values() for n in v)]
-        if not (values.keys() <= WORDS.keys() and all(n >= 0 for n in numbers)):
-            raise ValueError(f"these are no ranges of views: {str(state)[:100]}")
-        self.samples, self.values = int(state["samples"]), values
-
     @property
     def text(self) -> str:
         """Its ranges as JSON; null stands for infinity."""
@@ -82,10 +68,15 @@ class Domain:
 
     @classmethod
     def read(cls, plain: Mapping[str, Any]) -> Domain:
-        """The domain of a parsed `text`. Raises as `load_state`."""
-        ranges, domain = plain["ranges"].items(), cls()
-        ends = {k: [math.inf if v is None else v for v in (low, high)] for k, (low, high) in ranges}
-        domain.load_state({"samples": plain["samples"], "values": ends})
+        """The domain of a parsed `text`. Raises ValueError, TypeError or KeyError."""
+        ends = {
+            name: [math.inf if end is None else float(end) for end in (low, high)]
+            for name, (low, high) in plain["ranges"].items()
+        }
+        domain = cls(ends, int(plain["samples"]))
+        numbers = [domain.samples, *(end for both in ends.values() for end in both)]
+        if not (ends.keys() <= WORDS.keys() and all(n >= 0 for n in numbers)):
+            raise ValueError(f"these are no ranges of views: {str(plain)[:100]}")
         return domain
 
     def differences(self, found: Domain) -> list[str]:

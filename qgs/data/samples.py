@@ -182,9 +182,7 @@ def make_sample(
     if both.times is not None:
         both = replace(both, target_time=_asked(both.times, count))
     if noise is not None and views.pose_noise:
-        c2w = both.cameras.c2w[0].clone()
-        c2w[:count] = shaken(c2w[:count], math.radians(views.pose_noise), noise)
-        both = replace(both, cameras=replace(both.cameras, c2w=c2w[None]))
+        both = replace(both, cameras=with_noise(both.cameras, count, views, noise))
         # the first camera is exact, and with it its depth map
         if both.depths is not None:
             both.depths[:, 1:count] = 0
@@ -199,6 +197,15 @@ def _asked(times: Tensor, inputs: int) -> Tensor | None:
     """The time (1, 1) of targets, or the inputs' median, of all (1, V); None for several times."""
     asked = times[:, inputs:].unique() if times.shape[1] > inputs else times.median()
     return asked.reshape(1, 1) if asked.numel() == 1 else None
+
+
+def with_noise(
+    cameras: Cameras, inputs: int, views: ViewsConfig, rng: np.random.Generator
+) -> Cameras:
+    """Cameras (1, F), the first `inputs` of them with `views.pose_noise`."""
+    c2w = cameras.c2w[0].clone()
+    c2w[:inputs] = shaken(c2w[:inputs], math.radians(views.pose_noise), rng)
+    return replace(cameras, c2w=c2w[None])
 
 
 def shaken(c2w: Tensor, angle: float, rng: np.random.Generator) -> Tensor:
@@ -222,19 +229,23 @@ def views_in(
     order = [place[frame] for frame in frames]
     images, masks = scene.images(wanted), scene.masks(wanted)
     surface = scene.depths(wanted) if depths else None
-    cameras = scene.cameras[list(frames)]
-    reference, scale = world
-    # float32 only now: coordinates of maps have seven digits before the point
-    c2w = scaled(relative_to(reference, cameras.c2w), scale).float()
     if surface is not None:  # z of cameras scales with their translations
-        surface = torch.from_numpy(surface.numpy()[order] * np.float32(scale.item()))[None]
+        surface = torch.from_numpy(surface.numpy()[order] * np.float32(world[1].item()))[None]
     return Views(
         torch.from_numpy(images.numpy()[order])[None],
-        Cameras(c2w[None], cameras.intrinsics.float()[None], cameras.size),
+        cameras_in(world, scene, frames),
         None if masks is None else torch.from_numpy(masks.numpy()[order])[None],
         None if scene.times is None else from_0_to_1(scene.times[list(frames)])[None].float(),
         depths=surface,
     )
+
+
+def cameras_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> Cameras:
+    """Cameras (1, F) of these frames in a world as of `own_world`, float32; decodes no image."""
+    cameras, (reference, scale) = scene.cameras[list(frames)], world
+    # float32 only now: coordinates of maps have seven digits before the point
+    c2w = scaled(relative_to(reference, cameras.c2w), scale).float()
+    return Cameras(c2w[None], cameras.intrinsics.float()[None], cameras.size)
 
 
 def from_0_to_1(times: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import threading
 import traceback
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import count, islice
@@ -19,10 +20,20 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from qgs.contracts import SceneSource, ViewSampler, ViewsConfig
+from qgs.data.domain import Domain
 from qgs.data.evaluation import one_line
-from qgs.data.samples import Batch, Sample, collate, make_sample
+from qgs.data.samples import (
+    Batch,
+    Sample,
+    cameras_in,
+    collate,
+    make_sample,
+    own_world,
+    with_noise,
+)
 from qgs.data.view_samplers import Span
 from qgs.machine import is_out_of_memory
+from qgs.types import Cameras
 
 
 @dataclass(frozen=True)
@@ -33,6 +44,8 @@ class Share:
     processes: int = 1
 
 
+MEASURED = 512
+"""Samples whose cameras `trained_domain` measures."""
 MAX_REPLACED = 10
 """Scenes that are tried instead of one that fails; then training stops."""
 
@@ -71,6 +84,26 @@ def training_batches(
     options = (views, seed, skips, sampler, per_step, depths)
     batches = _Batches(source, options, batch_size, share)
     return _from_workers(batches, start, workers) if workers else _from_thread(batches, start)
+
+
+def trained_domain(
+    source: SceneSource,
+    views: ViewsConfig,
+    seed: int,
+    sampler: ViewSampler | None = None,
+    steps: int = 0,
+) -> Domain:
+    """The ranges of the cameras of MEASURED training samples; no image is decoded.
+
+    The scenes are the first ones of the training, and the samples those of steps spread evenly
+    from 0 to `steps`, since the options of `sampler` may follow them. A scene that fails is left
+    out: training itself reports it.
+    """
+    stream, domain = SampleStream(source, views, seed, sampler=sampler), Domain()
+    for number in range(MEASURED):
+        with suppress(Exception):  # whatever a reader raises
+            domain.see(*stream.cameras(number, round(number / (MEASURED - 1) * steps)))
+    return domain
 
 
 def scenes_fingerprint(source: SceneSource) -> str:
@@ -150,6 +183,16 @@ class SampleStream:
         raise SampleError(
             f"{MAX_REPLACED + 1} samples in a row cannot be made, the last: {left_out[-1]}"
         )
+
+    def cameras(self, number: int, step: int) -> tuple[Cameras, Cameras]:
+        """Of the inputs and targets (1, V) of a sample as drawn after `step` optimiser steps."""
+        rng = np.random.default_rng([self._seed, 1, number])
+        scene = self._scenes[self.order.scene(number)]
+        inputs, targets = self._sampler.draw(scene, self._views, rng, step)
+        world, count = own_world(scene, inputs, self._views), len(inputs)
+        both = cameras_in(world, scene, (*inputs, *targets))
+        both = with_noise(both, count, self._views, rng) if self._views.pose_noise else both
+        return both[:, :count], both[:, count:]
 
     def _made(self, number: int, attempt: int) -> Sample:
         """Sample `number`, or its replacement after `attempt` failures."""

@@ -3,7 +3,7 @@
 import fcntl
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +15,7 @@ from torch import Tensor, nn
 
 from qgs.composer import Recipe, RecipeError, resolve
 from qgs.composer.recipe import flat
-from qgs.data.domain import KEY, SAMPLES, Domain
-from qgs.data.samples import Batch
+from qgs.data.domain import KEY, Domain
 from qgs.io.checkpoint import load_weights, save, unique_tensors
 from qgs.io.files import is_leftover, naming_full_disk, read_records, write_text
 from qgs.io.models import CHECKPOINT
@@ -178,22 +177,20 @@ class Saver:
     """Writes the checkpoint and the state of a run; of several processes, the main one writes.
 
     parts: everything that continues the run, by name; checkpoints hold "weights" and "ema".
-    domain: cameras of the first samples, which checkpoints carry too.
+    domain: ranges of the training views, which checkpoints carry.
     Each file appears whole or not at all. All processes must call each method together.
     """
 
     def __init__(
-        self, accelerator: Accelerator, folder: RunFolder, model: QueryGaussianModel
+        self,
+        accelerator: Accelerator,
+        folder: RunFolder,
+        model: QueryGaussianModel,
+        domain: Domain,
     ) -> None:
         self._accelerator, self.folder, self.model = accelerator, folder, model
-        self.domain = Domain()
-        self.parts: dict[str, Stateful] = {"weights": _Weights(model), "domain": self.domain}
-
-    def see(self, batches: Sequence[Batch]) -> None:
-        """Count the cameras of a step's batches into `domain`, until it has enough."""
-        for batch in batches:
-            if self.domain.samples < SAMPLES:
-                self.domain.see(batch.inputs.cameras, batch.targets.cameras)
+        self.domain = domain
+        self.parts: dict[str, Stateful] = {"weights": _Weights(model)}
 
     def save(self, step: int, state_only: bool = False) -> None:
         """Save the run after `step` optimiser steps; `state_only` leaves the checkpoints."""

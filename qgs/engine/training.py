@@ -20,10 +20,18 @@ from torch import Tensor, nn
 from qgs.composer import Recipe
 from qgs.composer.flow import keys_are_read
 from qgs.composer.recipe import annotated
-from qgs.contracts import Outcome, TrainingConfig
+from qgs.contracts import Outcome, SceneSource, TrainingConfig, ViewSampler
 from qgs.contracts.schedule import follow
+from qgs.data.domain import Domain
 from qgs.data.samples import Batch
-from qgs.data.stream import Feed, SampleError, Share, scenes_fingerprint, training_batches
+from qgs.data.stream import (
+    Feed,
+    SampleError,
+    Share,
+    scenes_fingerprint,
+    trained_domain,
+    training_batches,
+)
 from qgs.engine.distributed import (
     RandomStates,
     StopRequest,
@@ -148,7 +156,8 @@ class Trainer:
                 "step_size": self._batch_samples * self.config.accumulate,
                 "scenes": scenes_fingerprint(source),
             }
-            self._build_parts()
+            sampler = recipe.build_view_sampler()
+            self._build_parts(self._domain(source, sampler))
             if saved is not None:
                 self.saver.restore(saved)
             self.resumed_at = self.step if saved is not None else None
@@ -162,7 +171,7 @@ class Trainer:
                 share=Share(self.accelerator.process_index, self.accelerator.num_processes),
                 workers=self.config.workers,
                 skips=self.config.on_bad_sample == "skip",
-                sampler=recipe.build_view_sampler(),
+                sampler=sampler,
                 accumulate=self.config.accumulate,
                 depths=self.training_pass.reads_depths,
             )
@@ -201,10 +210,17 @@ class Trainer:
         self._gradients = partial(compute_gradients, accelerator, wrapped, self.config)
         self.average = MovingAverage(self.model, self.config.ema) if self.config.ema else None
 
-    def _build_parts(self) -> None:
+    def _domain(self, source: SceneSource, sampler: ViewSampler) -> Domain:
+        """What checkpoints carry; only the main process writes them."""
+        if not self.accelerator.is_main_process:
+            return Domain()
+        recipe, steps = self.recipe, self.config.steps
+        return trained_domain(source, recipe.views, recipe.seed, sampler, steps)
+
+    def _build_parts(self, domain: Domain) -> None:
         """What watches, saves and judges; `saver.parts` is everything that continues the run."""
         accelerator, training_pass = self.accelerator, self.training_pass
-        self.saver = Saver(accelerator, self.folder, self.model)
+        self.saver = Saver(accelerator, self.folder, self.model, domain)
         self.guard = Guard(accelerator, training_pass, self.saver, self.config, self._gradients)
         self.evaluations = PeriodicEvaluation(
             accelerator, self.recipe, self.model, self.average, self.folder.path, self.trackers
@@ -264,7 +280,7 @@ class Trainer:
             self._open_folder()  # an incident is saved in it
             self.guard.leave_out(self.step, batches, symptom)
         else:
-            self._update(numbers, batches)
+            self._update(numbers)
         self.step += 1
         self.samples += self._batch_samples * len(batches)
         self._follow_schedules()
@@ -285,13 +301,12 @@ class Trainer:
         self.torch_optimizer.zero_grad(set_to_none=True)
         return rate
 
-    def _update(self, numbers: Mapping[str, float], batches: Sequence[Batch]) -> None:
+    def _update(self, numbers: Mapping[str, float]) -> None:
         with self._memory_explained():
             self.torch_optimizer.step()
         if self.average:
             self.average.update()
         self.guard.passed(numbers)
-        self.saver.see(batches)
 
     def _save_and_evaluate(
         self, stop: StopRequest, asked_to_stop: bool, no_data: bool

@@ -8,11 +8,11 @@ import torch
 from commands import MODEL, run_qgs
 from photo_formats import row_of_frames
 from PIL import Image
-from training_runs import trained_domain
 
 import qgs
 from qgs.composer import resolve
 from qgs.data.domain import KEY
+from qgs.data.stream import trained_domain
 
 
 def test_an_evaluation_names_its_photos_and_says_where_a_copy_is_better(tmp_path):

@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 from commands import MODEL
-from training_runs import trained_domain
 
 from qgs.composer import resolve
 from qgs.data.domain import KEY, Domain, verdict
+from qgs.data.evaluation import evaluation_samples
+from qgs.data.stream import MEASURED, trained_domain
 from qgs.engine.training import train
 from qgs.geometry.poses import look_at
 from qgs.io.checkpoint import CheckpointFile, save
@@ -76,9 +77,9 @@ def test_a_few_pairs_of_parallel_axes_do_not_make_every_depth_one_that_was_train
     near = around([0, 0, 2], [[-0.5, 0, 0], [0.5, 0, 0]])
     parallel = replace(near, c2w=near.c2w.clone())
     parallel.c2w[..., :3, :3] = torch.eye(3)
-    mixed = domain(*[near] * 97, *[parallel] * 3)
+    mixed = domain(*[near] * 498, *[parallel] * 2)
     assert mixed.ranges["depth"] == pytest.approx((2.062, math.inf))
-    mixed = domain(*[near] * 98, *[parallel] * 2)
+    mixed = domain(*[near] * 499, parallel)
     assert mixed.ranges["depth"] == pytest.approx((2.062, 2.062))
     assert "meet at no point before them" in mixed.differences(domain(parallel))[-1]
 
@@ -113,22 +114,44 @@ def test_the_sentence() -> None:
 
 def test_checkpoints_tell_what_they_were_trained_on_also_when_a_run_is_continued(tmp_path) -> None:
     recipe = resolve(RECIPE)
+    expected = trained_domain(recipe.build_data(), recipe.views, recipe.seed, steps=6)
     whole = train(recipe, tmp_path / "whole").folder
     half = train(resolve(RECIPE, ["training.steps=3"]), tmp_path / "half").folder
-    told = CheckpointFile(half.checkpoint).domain
-    assert told.samples == 6
     shutil.copy(whole.checkpoint, half.checkpoint)  # as after a kill before the state was written
     train(recipe, tmp_path / "half", resume=True)
-    found = CheckpointFile(whole.checkpoint).domain
-    assert CheckpointFile(half.checkpoint).domain == found != told
-    first = trained_domain(recipe.build_data(), recipe.views, recipe.seed)
-    assert found.samples == 12
-    assert first.samples == 256
-    assert not first.differences(found)
+    for folder in (whole, half):
+        found = CheckpointFile(folder.checkpoint).domain
+        assert (found.ranges, found.samples) == (expected.ranges, MEASURED)
+
+
+GROWING = "view_sampler.max_gap={schedule: linear, values: [4, 20], at: [0, 10]}"
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("locus", ["training.steps=12"]), ("tokengs", ["training.steps=12", GROWING]),
+     ("tokengs_bounded", [])],
+)  # fmt: skip
+def test_the_own_test_data_of_a_recipe_lie_inside(name: str, options: list[str]) -> None:
+    recipe = resolve(f"recipes/tiny/{name}.yaml", options)
+    source, sampler = recipe.build_data(), recipe.build_view_sampler()
+    steps = recipe.training.steps
+    trained = trained_domain(source, recipe.views, recipe.seed, sampler, steps)
+    test = Domain()
+    for sample in evaluation_samples(source, recipe.views, recipe.evaluation, sampler):
+        test.see(sample.inputs.cameras, sample.targets.cameras)
+    assert trained.differences(test) == []
+
+
+def test_a_scene_that_fails_is_left_out_of_the_ranges(monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe = resolve(RECIPE)
+    source = recipe.build_data()
+    monkeypatch.setattr(type(source.scenes("train")[0]), "cameras", None)
+    assert trained_domain(source, recipe.views, 0).samples == 0
 
 
 def test_a_cut_checkpoint_does_not_hinder_going_on(tmp_path: Path) -> None:
     folder = train(resolve(RECIPE, ["training.steps=3"]), tmp_path / "run").folder
     folder.checkpoint.write_bytes(folder.checkpoint.read_bytes()[:1000])
     train(resolve(RECIPE), tmp_path / "run", resume=True)
-    assert CheckpointFile(folder.checkpoint).domain.samples == 12
+    assert CheckpointFile(folder.checkpoint).domain.samples == MEASURED

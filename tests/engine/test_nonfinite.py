@@ -15,6 +15,7 @@ from training_runs import Tiny
 
 import qgs
 from qgs.composer import Recipe
+from qgs.data.domain import Domain
 from qgs.data.stream import training_batches
 from qgs.engine.distributed import make_accelerator
 from qgs.engine.folder import RunFolder, Saver
@@ -156,7 +157,7 @@ def test_gradients_are_named_backwards(step: Step, monkeypatch: pytest.MonkeyPat
 
 
 def guard_of(step: Step, folder: Path) -> Guard:
-    saver = Saver(step.accelerator, RunFolder(folder), step.model)
+    saver = Saver(step.accelerator, RunFolder(folder), step.model, Domain())
     return Guard(step.accelerator, step.objective, saver, step.recipe.training, step.gradients)
 
 

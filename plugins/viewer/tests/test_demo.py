@@ -10,11 +10,11 @@ from plyfile import PlyData
 from qgs_viewer.contest import checkpoints, judge, resolve_fairly
 from qgs_viewer.curves import curves_of
 from qgs_viewer.demo import new_folder
-from training_runs import trained_domain
 
 import qgs
 from qgs.composer import resolve
 from qgs.data.domain import KEY
+from qgs.data.stream import trained_domain
 
 RECIPE = {
     "recipe": 1,
