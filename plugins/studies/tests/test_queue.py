@@ -12,7 +12,7 @@ import kill
 import pytest
 from commands import run_qgs
 from qgs_studies.plan import Run, planned, run_of
-from qgs_studies.queue import Queue, _end, last_record
+from qgs_studies.queue import Queue, _end, _signal, last_record
 from qgs_studies.results import Results
 from qgs_studies.study import read_study
 from qgs_studies.work import is_free, locked
@@ -148,3 +148,4 @@ def test_a_damaged_last_line_and_an_exit_code_of_no_signal_end_no_study(tmp_path
     history.write_text('{"step": 3, "seconds": 1.5}\n{"step": 4, "sec\n')
     assert last_record(history) == (3, 1.5)
     assert (_end(255), _end(-9)) == ("ended with exit code 255", "was ended by SIGKILL")
+    assert [_signal(code) for code in (255, 137, -9, 1)] == [0, 9, 9, 0], "others go on"

@@ -135,7 +135,7 @@ class Queue:
 
     def _goes_on(self, run: Run, code: int) -> bool:
         """True to continue a run whose process was killed, unless DEATHS in a row saved nothing."""
-        if 0 <= code <= 128:
+        if not _signal(code):
             return False
         state = run.folder / "state.safetensors"
         saved = state.stat().st_mtime_ns if state.is_file() else 0
@@ -150,7 +150,7 @@ class Queue:
         why = f"its process {_end(code)}"
         if code == FAILED and run.failure.is_file():
             why = run.failed
-        elif code < 0 or code > 128:
+        elif _signal(code):
             why += f" {DEATHS} times without a save between; memory may be short"
             write_text(run.failure, f"{why}\n")  # the killed process could not
         self.failures[run] = why
@@ -191,10 +191,15 @@ def _and_folder(run: Run) -> str:
 
 def _end(code: int) -> str:
     """How a process ended, by its exit code."""
-    number = -code if code < 0 else code - 128
-    if number in set(signal.Signals):
+    if number := _signal(code):
         return f"was ended by {signal.Signals(number).name}"
     return f"ended with exit code {code}"
+
+
+def _signal(code: int) -> int:
+    """The signal that ended a process; 0 for another end, such as the exit code 255."""
+    number = -code if code < 0 else code - 128
+    return number if number in set(signal.Signals) else 0
 
 
 def last_record(history: Path) -> tuple[int, float]:
