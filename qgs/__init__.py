@@ -41,6 +41,7 @@ DISTRIBUTIONS = {
         "compare": "query-gaussians-studies",
         "study": "query-gaussians-studies",
         "bench": "query-gaussians-bench",
+        "import": "query-gaussians-published",
     }
     | dict.fromkeys(("view", "demo", "report", "figures"), "query-gaussians-viewer")
     | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),

@@ -9,7 +9,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from qgs import DISTRIBUTIONS
-from qgs.cli import evaluate, inspect, reconstruct, train, weights
+from qgs.cli import convert, evaluate, inspect, reconstruct, train
 
 GROUP = "qgs.commands"
 """Group of entry points NAME = "module:app", where `app` is a `typer.Typer`."""
@@ -25,6 +25,7 @@ HELP = {
         "Train every variant with every seed, evaluate all by one protocol, and compare the scores."
     ),
     "bench": "Size, latency and memory of models: any number of recipes in turn.",
+    "import": "Turn published weights into a checkpoint; every tensor is accounted for.",
     "new-plugin": "Write a plugin to start from: one component, its contract tests, a recipe.",
     "check-plugin": "Test every component of a plugin against its contract.",
 }
@@ -97,9 +98,8 @@ COMMANDS = {
     "train": train.train,
     "eval": evaluate.evaluate,
     "reconstruct": reconstruct.reconstruct,
-    "convert": weights.convert,
-    "import": weights.import_,
-    "export": weights.export,
+    "convert": convert.convert,
+    "export": convert.export,
 }
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)

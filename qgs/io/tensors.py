@@ -3,7 +3,7 @@
 import json
 import os
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
@@ -159,13 +159,10 @@ def nonfinite(tensors: Iterable[tuple[str, Tensor]]) -> list[str]:
     return [name for name, is_finite in zip(names, flags, strict=True) if not is_finite]
 
 
-def differing_tensors(file: Shapes, recipe: Shapes, unused: Collection[str] = ()) -> list[str]:
-    """Differences in names and shapes between a file and the model of a recipe, one line each.
-
-    unused: names that the file may hold although the model lacks them.
-    """
+def differing_tensors(file: Shapes, recipe: Shapes) -> list[str]:
+    """Differences in names and shapes between a file and the model of a recipe, one line each."""
     found = [f"missing: {name}" for name in recipe if name not in file]
-    found += [f"unexpected: {name}" for name in file if name not in recipe and name not in unused]
+    found += [f"unexpected: {name}" for name in file if name not in recipe]
     return found + [
         f"shape of {name}: {file[name]} in the file, {shape} in the recipe"
         for name, shape in recipe.items()

@@ -9,13 +9,13 @@ import torch
 from published.files import read_golden
 from published.models import LAST_NORM, READ_NORM, RECIPES
 from published.recording import model_tensors
+from qgs_published.names import names_of
 from safetensors.torch import save_file
 from torch import Tensor
 
 from qgs.composer import resolve
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.io.checkpoint import unique_tensors
-from qgs.io.published import names_of
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Views
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from qgs_published.names import names_of
 from torch import Tensor
 
 from published.files import GoldenFile, GoldenFileError
@@ -11,7 +12,6 @@ from published.recording import model_tensors
 from published.tokengs import tokengs_recipe
 from qgs.composer import resolve
 from qgs.contracts.weights import real_ratio
-from qgs.io.published import names_of
 from qgs.types import Cameras, Views
 
 RECIPES: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-PUBLISHED = Path(__file__).parents[2] / "recipes/locus/dl3dv_4096_4views.yaml"
+PUBLISHED = Path(__file__).parents[3] / "recipes/locus/dl3dv_4096_4views.yaml"
 WRITE = """
 import sys, torch
 from safetensors.torch import save_file
 from qgs.composer import resolve
-from qgs.io.published import names_of
+from qgs_published.names import names_of
 recipe = resolve(sys.argv[1])
 names = names_of(recipe)
 tensors = {theirs: torch.randn(names.shapes[ours]) for ours, theirs in names.published.items()}

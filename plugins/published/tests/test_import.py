@@ -7,8 +7,11 @@ from typing import Any
 
 import pytest
 import torch
-from golden_weights import published
+from qgs_published.importing import import_weights
+from qgs_published.names import PublishedError, names_of
+from qgs_published.recognition import fitting_recipe
 from qgs_tokengs2026.weights import TOKENGS_2026_6
+from safetensors import safe_open
 from safetensors.torch import load_file, save, save_file
 from torch import Tensor
 
@@ -18,10 +21,20 @@ from qgs.components import TOKENGS
 from qgs.composer import resolve
 from qgs.composer.recipe import differing_predictions
 from qgs.io.checkpoint import CheckpointFile
-from qgs.io.published import PublishedError, fitting_recipe, import_weights, names_of
 from qgs.io.tensors import shapes_of
 
-RECIPES = Path(__file__).parents[2] / "recipes"
+ROOT = Path(__file__).parents[3]
+RECIPES = ROOT / "recipes"
+
+
+def published(name: str) -> dict[str, Tensor]:
+    """The state dict in a golden file, such as "locus_full_a"; a new mapping each time."""
+    with safe_open(ROOT / "tests" / "golden" / f"{name}.safetensors", "pt") as file:
+        prefix, names = "weights.", list(file.keys())
+        weights = {n.removeprefix(prefix): n for n in names if n.startswith(prefix)}
+        return {name: file.get_tensor(stored) for name, stored in weights.items()}
+
+
 LOCUS = published("locus_full_a")
 GOLDEN = ["tokengs_a", "tokengs_latent_a", "tokengs_multiscale_a", "tokengs_dynamic_a",
           "locus_full_a", "locus_no_radius_state_a", "locus_content_cross_attn_a"]  # fmt: skip
@@ -181,7 +194,7 @@ def test_no_checkpoint_stays_without_its_recipe(
     def full(path: Path, text: str) -> None:
         raise OSError("no space left")
 
-    monkeypatch.setattr("qgs.io.published.write_text", full)
+    monkeypatch.setattr("qgs_published.importing.write_text", full)
     save_file(published("tokengs_a"), tmp_path / "w.safetensors")
     with pytest.raises(OSError, match="no space left"):
         import_weights(tmp_path / "w.safetensors", None, tmp_path / "c.safetensors")

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 import torch
+from qgs_published.weight_files import read_weight_file
 from safetensors.torch import save, save_file
 from torch import Tensor
 
-from qgs.io.published import read_weight_file
 from qgs.io.tensors import CheckpointError
 
 WEIGHTS = {"a.weight": torch.arange(6.0).view(2, 3), "b": torch.tensor(1.5)}

@@ -1,0 +1,1 @@
+"""Published weights become checkpoints of qgs: `importing` is `qgs import` in Python."""
