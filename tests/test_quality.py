@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 SOURCES = ("qgs", "plugins", "tests", "tools", "docs/examples")
 TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_LINES = 600
-MAX_CORE_LINES, MAX_CORE_FILES = 17_700, 130
+MAX_CORE_LINES, MAX_CORE_FILES = 17_400, 129
 MAX_PYTHON_LINES, MAX_LINES_OF_TESTS = 67_500, 26_000
 MACHINE_PATH = re.compile(r"(?<![\w.$}])/(?:home|root|work|Users|opt|mnt|tmp)/\w")
 
