@@ -12,7 +12,7 @@ from qgs_datatools.findings import Finding
 _SAME = 2e-6  # of a rotation's entries, and of coordinates that float32 holds
 _DOUBLE = 1e-9  # of coordinates that float64 holds, after they were computed
 _FLOAT32 = 2e-7  # of coordinates that were float32 before they were written
-_OF_EXTENT = 1e-4  # of the cameras' extent: farther apart, they stand apart
+_OF_EXTENT = 1e-4  # of the cameras' extent: the largest distance that counts as none
 _FAR_OFF_CENTRE = 0.25  # of a side, from the middle
 
 
@@ -49,22 +49,22 @@ def _of_intrinsics(intrinsics: Intrinsics, size: Size | None) -> list[FrameProbl
 
 
 def sharing_findings(
-    scene: DecodedScene, sound: Sequence[int], *, float32: bool
+    scene: DecodedScene, usable: Sequence[int], *, float32: bool
 ) -> Iterator[Finding]:
-    """Frames of `sound` that share a pose or a place. float32: the precision of the format."""
-    if len(sound) < 2:
+    """Frames of `usable` that share a pose or a place. float32: the precision of the format."""
+    if len(usable) < 2:
         return
-    poses = np.stack([scene.photos[frame].listed.c2w for frame in sound])
+    poses = np.stack([scene.photos[frame].listed.c2w for frame in usable])
     near, one_point = _tolerances(poses, float32)
     if np.ptp(poses[:, :3, 3], axis=0).max() <= one_point:
-        reason = f"all {len(sound)} cameras stand on one point, so that no depth can be told"
-        yield scene.finding(sound, reason, "export the poses with their translations")
+        reason = f"all {len(usable)} cameras stand on one point, so that depth is undetermined"
+        yield scene.finding(usable, reason, "export the poses with their translations")
         return
     for place in _groups(poses[:, :3, 3], near):
         groups = _groups(poses[place, :3, :3].reshape(len(place), 9), _SAME)
-        firsts = [sound[place[alike[0]]] for alike in groups]
-        for first, alike in zip(firsts, groups, strict=True):
-            for other in (sound[place[index]] for index in alike[1:]):
+        firsts = [usable[place[same[0]]] for same in groups]
+        for first, same in zip(firsts, groups, strict=True):
+            for other in (usable[place[index]] for index in same[1:]):
                 if scene.photos[first].listed.time == scene.photos[other].listed.time:
                     yield _duplicate(scene, first, other)
         if len(groups) > 1:
@@ -72,13 +72,13 @@ def sharing_findings(
             yield scene.finding(
                 rest,
                 f"the camera stands on the same point as that of {scene.label(first)}, a zero "
-                "baseline, so that the two tell no depth",
+                "baseline, which determines no depth",
                 "correct the position, or remove one of the frames",
             )
 
 
 def _tolerances(poses: np.ndarray, float32: bool) -> tuple[float, float]:
-    """How far two cameras, and all, may be apart on one point, given their poses' precision."""
+    """Distances up to which two cameras, and all, share a point, by the poses' precision."""
     rotations, centres = poses[:, :3, :3], poses[:, :3, 3]
     off_rigid = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
     distance, extent = np.abs(centres).max(), np.ptp(centres, axis=0).max()
@@ -100,8 +100,8 @@ def _groups(rows: np.ndarray, tolerance: float) -> list[list[int]]:
         groups[index] = [index]
         low, high = np.searchsorted(sorted_, rows[index, 0] + np.array([-1.0, 1.0]) * tolerance)
         near = order[low : high + 1]
-        alike = near[np.abs(rows[near] - rows[index]).max(1) <= tolerance]
-        leader[alike[leader[alike] < 0]] = index
+        same = near[np.abs(rows[near] - rows[index]).max(1) <= tolerance]
+        leader[same[leader[same] < 0]] = index
     return list(groups.values())
 
 

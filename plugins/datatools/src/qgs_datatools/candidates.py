@@ -40,7 +40,7 @@ class Photo:
 class Candidate:
     """A scene to check. scene: its name in indices. photos: raises ValueError or OSError.
 
-    missing: names of listed images that do not exist and are none of `photos`; raises alike.
+    missing: names of listed images that do not exist and are none of `photos`; raises the same.
     """
 
     name: str

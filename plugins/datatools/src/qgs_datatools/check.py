@@ -17,7 +17,7 @@ from qgs.wording import listed
 from qgs_datatools.cameras import camera_findings, sharing_findings
 from qgs_datatools.candidates import Candidate
 from qgs_datatools.chunks import chunk_folders
-from qgs_datatools.decoding import DecodedScene, decode, file_findings, said, size_findings
+from qgs_datatools.decoding import DecodedScene, decode, error_text, file_findings, size_findings
 from qgs_datatools.findings import Finding, errors_of, merged
 from qgs_datatools.folders import dl3dv_scenes, photo_folders
 from qgs_datatools.geometry import TOO_FEW, Geometry, geometry_findings, judge_scene
@@ -81,8 +81,8 @@ class SceneReport:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What was found. general: findings about files of the data set. judged: scenes whose poses
-    were to be judged against photos. indices: each in words. notes: what was not done, and why.
+    """The result of `check`. general: findings about files of the data set. judged: how many scenes
+    had their poses matched with photos. indices: a line for each. notes: omitted checks, and why.
     """
 
     path: str
@@ -94,17 +94,17 @@ class CheckReport:
 
     @property
     def auto_scale(self) -> str:
-        """The factors of `views.scale: auto` in words; empty without scenes."""
+        """The factors of `views.scale: auto` as text; empty without scenes."""
         depths = [scene.look_at_depth for scene in self.scenes]
         factors = sorted(1 / depth for depth in depths if depth)
         none = [scene.name for scene in self.scenes if not scene.look_at_depth]
-        said = []
+        parts = []
         if factors:
             middle, ends = np.median(factors), f", from {factors[0]:.4g} to {factors[-1]:.4g}"
-            said += [f"is a factor of {middle:.4g}{ends if len(factors) > 1 else ''}"]
+            parts += [f"is a factor of {middle:.4g}{ends if len(factors) > 1 else ''}"]
         if none:
-            said += [f"finds no common point that the cameras look at in {listed(none)}"]
-        return f"views.scale: auto {' and '.join(said)}" if said else ""
+            parts += [f"finds no common point that the cameras look at in {listed(none)}"]
+        return f"views.scale: auto {' and '.join(parts)}" if parts else ""
 
     @property
     def findings(self) -> list[Finding]:
@@ -137,11 +137,11 @@ def check(
         *(kind for kind in sources() if kind.partition("/")[0] not in OF_FILES),
     )
     if options.format not in formats:
-        told = "; ".join([", ".join(formats), *left_out()])
-        raise ValueError(f"there is no format {options.format!r}: use one of {told}")
+        usable = "; ".join([", ".join(formats), *left_out()])
+        raise ValueError(f"there is no format {options.format!r}: use one of {usable}")
     if path.is_file() and path.suffix in (".json", ".npy"):
         path = path.parent
-    candidates, general, told = _candidates(path, options)
+    candidates, general, reported = _candidates(path, options)
     if not candidates and not general:
         read_listing(path, _photo_format(options))  # raises: what is missing for a photo folder
         raise FileNotFoundError(f"{path} holds no {options.format}: leave --format out")
@@ -155,7 +155,7 @@ def check(
         held[report.scene].append(Held(report.split, report.numbered or None))
     summaries: list[str] = []
     for file in dict.fromkeys(file.resolve() for file in (*indices, *found_indices(path))):
-        findings, summary = index_findings(file, held, told)
+        findings, summary = index_findings(file, held, reported)
         general += findings
         summaries += [summary] if summary else []
     notes = [*left_out(), *notes]
@@ -194,7 +194,7 @@ def _photo_format(options: Options) -> str:
 
 
 def _scenes_to_judge(count: int, options: Options) -> tuple[set[int], list[str]]:
-    """The scenes whose poses are judged against photos, and what to tell of the others."""
+    """Numbers of the scenes whose poses are matched with photos, and a note on the others."""
     if options.headers_only:
         return set(), ["quick: only headers of images were read, and no pose was judged by photos"]
     if not options.geometry:
@@ -205,7 +205,7 @@ def _scenes_to_judge(count: int, options: Options) -> tuple[set[int], list[str]]
 
 
 def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) -> SceneReport:
-    """Check one scene; whatever is wrong with it becomes a finding. Raises as `check`."""
+    """Check one scene; every fault becomes a finding. Raises as `check`."""
     name = candidate.name
     report = SceneReport(name, candidate.scene, candidate.kind, candidate.split)
     try:
@@ -213,7 +213,7 @@ def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) 
     except Exception as error:  # whatever a reader raises; the other scenes go on
         reason, colon, fix = str(error).rpartition(": ")  # messages end with a remedy
         if not colon or not isinstance(error, OSError | ValueError):
-            reason, fix = said(error), "get the files again, or mend what reads them"
+            reason, fix = error_text(error), "get the files again, or mend what reads them"
         return replace(report, findings=[Finding(name, reason, fix)])
     reason = f"listed images that do not exist: {listed(missing, 3)}; later frames move up"
     fix = "add the files, or take them out of what lists them"
@@ -241,9 +241,9 @@ def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) 
     findings = merged([*absent, *files, *sizes, *poses, *others, *sharing])
     geometry = None
     if with_geometry:
-        unsound = _frames([*sizes, *others, *sharing])
-        sound = [f for f in placed if f not in unsound and scene.decoded[f].size is not None]
-        geometry = judge_scene(scene, sound, candidate.convention)
+        faulty = _frames([*sizes, *others, *sharing])
+        usable = [f for f in placed if f not in faulty and scene.decoded[f].size is not None]
+        geometry = judge_scene(scene, usable, candidate.convention)
         explained = errors_of(findings) and geometry.unjudged != TOO_FEW
         if geometry.distances or not explained:
             findings += geometry_findings(scene, geometry, candidate.convention)

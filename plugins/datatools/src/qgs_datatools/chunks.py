@@ -52,10 +52,10 @@ def chunk_folders(path: UPath) -> list[ChunkFolder]:
         folders.append(folder)
     if len(folders) == 2:
         for key in sorted(folders[0].found & folders[1].found):
-            folders[0].tell(
+            folders[0].report(
                 key,
-                "the scene is in train and in test, so that models are judged on what they have "
-                "seen",
+                "the scene is in train and in test, so that models are evaluated on scenes "
+                "of their training",
                 "remove it from one of the two",
                 warning=True,
             )
@@ -63,7 +63,7 @@ def chunk_folders(path: UPath) -> list[ChunkFolder]:
 
 
 class ChunkFolder:
-    """What a folder of chunks holds. split: train, test or empty. index, found: scenes."""
+    """Content of a folder of chunks. split: train, test or empty. index, found: scenes."""
 
     def __init__(self, split: str) -> None:
         self.split = split
@@ -75,44 +75,44 @@ class ChunkFolder:
         self._keys: dict[str, set[str]] = {}  # scenes by file, of files that could be read
         self._broken: set[str] = set()  # files with entries that are no scenes
 
-    def tell(self, scene: str, reason: str, fix: str, *, warning: bool = False) -> None:
+    def report(self, scene: str, reason: str, fix: str, *, warning: bool = False) -> None:
         """Add a finding."""
         severity = "warning" if warning else "error"
         self.findings.append(Finding(scene, reason, fix, severity=severity))
 
     def read_index(self, file: UPath) -> bool:
-        """Note what index.json says; whether there is a readable one."""
+        """Read index.json; whether there is a readable one."""
         if not file.is_file():
             return False
         try:
             self.index = read_chunk_index(file)
         except (OSError, ValueError) as error:
-            self.tell(self._label(INDEX), str(error), "write it anew: scene to chunk file, in JSON")
+            self.report(self._label(INDEX), str(error), "write it anew: scene to file, in JSON")
             return False
         for key, name in self.index.items():
             self._placed[name].append(key)
         return True
 
     def add_chunk(self, file: UPath) -> None:
-        """Note the scenes of a file as candidates, and tell of entries that cannot be parsed."""
+        """Add the scenes of a file as candidates, and findings on entries that cannot be parsed."""
         label = self._label(file.name)
         try:
             entries = load_chunk(file)
         except (OSError, ValueError) as error:
-            said = " ".join(str(error).replace(f"{file} ", "the file ").split())
-            reason = said.rpartition(": ")[0] or said  # without the remedy behind the last colon
-            self.tell(label, reason + self._lost(file.name), _REPACK)
+            text = " ".join(str(error).replace(f"{file} ", "the file ").split())
+            reason = text.rpartition(": ")[0] or text  # without the remedy behind the last colon
+            self.report(label, reason + self._lost(file.name), _REPACK)
             return
         keys = self._keys[file.name] = set()
         if not entries:
-            self.tell(label, "the chunk holds no scene", _REPACK)
+            self.report(label, "the chunk holds no scene", _REPACK)
         strange: list[Any] = []
         for place, entry in enumerate(entries):
             key = entry.get("key") if isinstance(entry, Mapping) else None
             if not isinstance(key, str):
                 strange.append(entry)
             elif key in self.found:
-                self.tell(
+                self.report(
                     key,
                     f"the scene is in {label}, and was in this split before",
                     "remove one of the two, or pack the data set again with `qgs data pack`",
@@ -124,7 +124,7 @@ class ChunkFolder:
                 self.candidates.append(Candidate(key, key, "chunks", OPENCV, photos, self.split))
         if strange:
             self._broken.add(file.name)
-            self.tell(
+            self.report(
                 label,
                 f"{len(strange)} of its {len(entries)} entries are no mappings with a 'key' (the "
                 f"first is {a_type(strange[0])})" + self._lost(file.name),
@@ -132,26 +132,26 @@ class ChunkFolder:
             )
 
     def compare_index(self, files: set[str]) -> None:
-        """Tell where the index and the folder's `files` differ."""
+        """Report where the index and the folder's `files` differ."""
         if not self.index:
-            self.tell(self._label(INDEX), "it names no scene", "remove it, or write it anew")
+            self.report(self._label(INDEX), "it names no scene", "remove it, or write it anew")
         for name, keys in self._placed.items():
             if name not in files:
-                self.tell(
+                self.report(
                     self._label(name),
                     f"the chunk does not exist; {INDEX} places there {_counted(keys)}",
                     f"download the chunk, or take its scenes out of {INDEX}",
                 )
         for key, name in self.index.items():
             if name in self._keys and key not in self._keys[name] and name not in self._broken:
-                self.tell(
+                self.report(
                     key,
                     f"{self._label(INDEX)} places the scene in {name}, which does not hold it",
                     f"take the scene out of {INDEX}, or get the chunk that holds it",
                 )
         for name, keys in self._keys.items():
             for key in sorted(keys - self.index.keys()):
-                self.tell(
+                self.report(
                     key,
                     f"{self._label(name)} holds the scene, but {self._label(INDEX)} does not name "
                     "it, so that it is never read",
@@ -163,7 +163,7 @@ class ChunkFolder:
         return f"{self.split}/{name}" if self.split else name
 
     def _lost(self, name: str) -> str:
-        """The scenes that a broken file was to hold, in words."""
+        """Text on the scenes that the index places in a broken file."""
         keys = [k for k in self._placed.get(name, ()) if k not in self._keys.get(name, ())]
         return f"; {INDEX} places there {_counted(keys)}" if keys else ""
 

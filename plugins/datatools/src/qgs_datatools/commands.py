@@ -85,8 +85,8 @@ def _print(console: Console, result: CheckReport) -> None:
         _line(console, f"note: {note}")
     warnings = len(result.findings) - result.errors
     counts = {"scene": len(result.scenes), "error": result.errors, "warning": warnings}
-    said = (f"{count} {what}{'' if count == 1 else 's'}" for what, count in counts.items())
-    _line(console, f"{result.path}: {', '.join(said)}")
+    parts = (f"{count} {what}{'' if count == 1 else 's'}" for what, count in counts.items())
+    _line(console, f"{result.path}: {', '.join(parts)}")
 
 
 def _line(console: Console, text: str) -> None:

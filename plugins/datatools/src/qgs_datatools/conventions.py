@@ -26,7 +26,7 @@ class Misreading:
 
 
 Convention = Mapping[str, Misreading]
-"""A way of writing poses: what else files that are said to follow it may hold by mistake."""
+"""A pose convention: by name, the mistakes that files of this convention often have."""
 
 OPENGL: Convention = {
     "flipped": Misreading(

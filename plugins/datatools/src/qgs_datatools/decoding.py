@@ -39,7 +39,7 @@ _COPY = re.compile(r"images_\d+")
 class Decoded:
     """size: (H, W), None where it cannot be decoded. digest: of the bytes. turned: by EXIF.
 
-    error: of the photo, in words; other_errors: of its mask and depth map, with what to do.
+    error: text on the photo; other_errors: texts on its mask and depth map, each with a remedy.
     """
 
     size: Size | None = None
@@ -97,19 +97,19 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
                 eight_bits(image)
                 turned = orientation(image) != 1  # EXIF may stand behind the pixels
     except Exception as error:  # whatever a reader raises; the other photos go on
-        return Decoded(error=said(error))
+        return Decoded(error=error_text(error))
     digest = hashlib.blake2b(data, digest_size=16).digest()
     others = () if headers_only else tuple(_other_errors(photo, size))
     return Decoded(size, digest, turned, other_errors=others)
 
 
-def said(error: Exception) -> str:
-    """What an exception says, with its kind where that is no way to tell of a bad file."""
+def error_text(error: Exception) -> str:
+    """The message of an exception; with its type where it is not an error of reading a file."""
     return str(error) if isinstance(error, _ERRORS) and str(error) else one_line(error)
 
 
 def _other_errors(photo: Photo, size: Size) -> Iterator[tuple[str, str]]:
-    """What is wrong with the mask and the depth map of a photo of `size`, and what to do."""
+    """Faults of the mask and the depth map of a photo of `size`, and remedies."""
     mask, depth = photo.listed.mask, photo.listed.depth
     read_mask = photo.read_mask
     if mask is not None and photo.mask_exists and mask != photo.listed.path:
@@ -121,12 +121,12 @@ def _other_errors(photo: Photo, size: Size) -> Iterator[tuple[str, str]]:
             problems = () if found is None else size_problems(found.shape[:2], size)
             reasons = [f"{file or 'its mask'}: {problem.reason}" for problem in problems]
         except Exception as error:
-            reasons = [said(error)]
+            reasons = [error_text(error)]
         yield from ((reason, f"replace the {kind}") for reason in reasons)
 
 
 def file_findings(scene: DecodedScene, listing: str) -> Iterator[Finding]:
-    """What is missing or damaged. listing: what lists the photos, in words."""
+    """Missing and damaged files. listing: name of the file that lists the photos."""
     for frame, (photo, result) in enumerate(zip(scene.photos, scene.decoded, strict=True)):
         if photo.listed.name and not photo.exists:
             fix = f"add the file, or remove the frame from {listing}"
@@ -181,25 +181,25 @@ class _Sized:
 def size_findings(scene: DecodedScene) -> Iterator[Finding]:
     """Photos of another shape than listed, of another scale than the rest, or that shrank unasked.
 
-    Intrinsics follow a scaled copy of the whole scene: it is told only where its folder is not
-    named as one (images_4), and an error where they fit the files and not the listed size.
+    Intrinsics follow a scaled copy of the whole scene: it is reported only where its folder is
+    not named as one (images_4), and an error where they fit the files and not the listed size.
     """
-    alike: list[_Sized] = []
+    rescaled: list[_Sized] = []
     for frame, (photo, result) in enumerate(zip(scene.photos, scene.decoded, strict=True)):
         if result.size is None or photo.listed.size is None:
             continue
         item = _Sized(frame, photo.listed, result.size, photo.listed.size)
         if item.is_as_listed_or_scaled:
-            alike.append(item)
+            rescaled.append(item)
             continue
         problem = next(size_problems(item.file, item.listed), None)
         fix = "give the original image, or correct the listed size"
         reason, fix = (problem.reason, problem.fix) if problem else (item.reason, fix)
         yield scene.finding([frame], reason, fix)
-    if not alike:
+    if not rescaled:
         return
-    usual = median_low(item.file[1] / item.listed[1] for item in alike)
-    for item in alike:
+    usual = median_low(item.file[1] / item.listed[1] for item in rescaled)
+    for item in rescaled:
         if not item.has_scale(usual):
             reason = f"{item.reason}, another scale than the rest of the scene"
             yield scene.finding(
@@ -207,7 +207,7 @@ def size_findings(scene: DecodedScene) -> Iterator[Finding]:
             )
     if usual == 1:
         return
-    scaled = [item for item in alike if item.has_scale(usual)]
+    scaled = [item for item in rescaled if item.has_scale(usual)]
     fits_files = median(item.off_centre(item.file) for item in scaled) <= _CENTRED
     if fits_files and median(item.off_centre(item.listed) for item in scaled) > _CENTRED:
         severity: Severity = "error"
@@ -216,8 +216,6 @@ def size_findings(scene: DecodedScene) -> Iterator[Finding]:
         return
     else:
         severity = "warning"
-        fix = (
-            "nothing if they are a scaled copy: intrinsics are scaled alike; else correct the size"
-        )
+        fix = "nothing if they are a scaled copy: intrinsics are scaled too; else correct the size"
     for item in scaled:
         yield scene.finding([item.frame], item.reason, fix, severity)

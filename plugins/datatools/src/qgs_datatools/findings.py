@@ -31,7 +31,7 @@ class Finding:
 
     @property
     def place(self) -> str:
-        """The frames in words; empty where the whole scene is meant."""
+        """The frames as text; empty where the whole scene is meant."""
         if not self.frames:
             return ""
         names = [name for name in self.names if name]
@@ -52,10 +52,10 @@ def errors_of(findings: Iterable[Finding]) -> list[Finding]:
 
 
 def spans(numbers: Iterable[int]) -> str:
-    """Numbers in words, such as 0-3, 7; after eight runs the rest is counted."""
+    """Numbers as text, such as 0-3, 7; after eight runs the rest is counted."""
     # numbers of one run are all equally far ahead of their places
-    alike = groupby(enumerate(sorted(set(numbers))), lambda item: item[1] - item[0])
-    runs = [[number for _, number in run] for _, run in alike]
+    grouped = groupby(enumerate(sorted(set(numbers))), lambda item: item[1] - item[0])
+    runs = [[number for _, number in run] for _, run in grouped]
     shown = [f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs[:8]]
     more = sum(map(len, runs[8:]))
     return ", ".join(shown) + (f" and {more} more" if more else "")
@@ -63,10 +63,10 @@ def spans(numbers: Iterable[int]) -> str:
 
 def merged(findings: Sequence[Finding]) -> list[Finding]:
     """One finding for all frames with the same fault; for more than three, the same remedy."""
-    alike = _together(findings, attrgetter("reason", "fix", "severity"))
-    kinds = Counter(finding.fix for finding in alike)
-    few = [finding for finding in alike if kinds[finding.fix] <= _FEW]
-    many = [finding for finding in alike if kinds[finding.fix] > _FEW]
+    equal = _together(findings, attrgetter("reason", "fix", "severity"))
+    kinds = Counter(finding.fix for finding in equal)
+    few = [finding for finding in equal if kinds[finding.fix] <= _FEW]
+    many = [finding for finding in equal if kinds[finding.fix] > _FEW]
     return [*few, *_together(many, attrgetter("fix", "severity"))]
 
 

@@ -20,7 +20,7 @@ _RGB_TO_GREY = np.array([0.299, 0.587, 0.114]) / 255
 _STARTS = 5
 _GAPS = (8, 4, 2, 1)
 _NO_BASELINE = 1e-4  # of the cameras' extent: poses so close say nothing about their lines
-_ONE_PAIR = 3 * TOLERANCE  # a pair off by more is told though the others agree
+_ONE_PAIR = 3 * TOLERANCE  # a pair off by more is reported though the others agree
 _NONSENSE = 0.02  # of the diagonal: no lens or rounding explains more
 
 
@@ -64,14 +64,14 @@ class Geometry:
         return self.fraction <= TOLERANCE and self.better is None
 
 
-def judge_scene(scene: DecodedScene, sound: Sequence[int], convention: Convention) -> Geometry:
-    """Match up to five pairs, spread over the frames that are `sound`."""
-    if len(sound) < 2:
-        return Geometry(unjudged="fewer than 2 sound frames")
-    matcher = _Matcher(scene, sound)
+def judge_scene(scene: DecodedScene, usable: Sequence[int], convention: Convention) -> Geometry:
+    """Match up to five pairs, spread over the frames that are `usable`."""
+    if len(usable) < 2:
+        return Geometry(unjudged="fewer than 2 usable frames")
+    matcher = _Matcher(scene, usable)
     if not np.ptp(matcher.centres, axis=0).any():
         return Geometry(unjudged="all cameras on one point")
-    starts = np.linspace(0, len(sound) - 2, _STARTS).round().astype(int).tolist()
+    starts = np.linspace(0, len(usable) - 2, _STARTS).round().astype(int).tolist()
     pairs = [pair for start in dict.fromkeys(starts) for pair in islice(matcher.pairs(start), 1)]
     if not pairs:
         return Geometry(unjudged=TOO_FEW)
@@ -126,8 +126,8 @@ class _Matcher:
         near = np.argsort(np.linalg.norm(self.centres - self.centres[start], axis=1))
         extent = np.ptp(self.centres, axis=0).max()
         for place in dict.fromkeys([*forward, *near[1:4].tolist()]):
-            apart = np.linalg.norm(self.centres[place] - self.centres[start])
-            if place != start and apart > _NO_BASELINE * extent:
+            distance = np.linalg.norm(self.centres[place] - self.centres[start])
+            if place != start and distance > _NO_BASELINE * extent:
                 yield place
 
 

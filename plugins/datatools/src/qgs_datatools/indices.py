@@ -35,16 +35,19 @@ def _is_index(file: UPath) -> bool:
 
 
 def index_findings(
-    file: UPath, scenes: Mapping[str, Sequence[Held]], told: Container[str] = ()
+    file: UPath, scenes: Mapping[str, Sequence[Held]], reported: Container[str] = ()
 ) -> tuple[list[Finding], str | None]:
-    """What the index names and is not there or `told`; the index in words, None if it is none."""
+    """Findings on entries of the index that neither exist nor are `reported`; a line on the index.
+
+    The line is None where the file is no index.
+    """
     try:
         index = read_index(str(file))
     except ValueError as error:
         return [Finding(file.name, str(error), "correct the file, or get it again")], None
     findings: list[Finding] = []
     for name, entry in index.items():
-        if entry is not None and (name in scenes or name not in told):
+        if entry is not None and (name in scenes or name not in reported):
             findings += _entry_findings(file.name, name, entry, scenes.get(name, ()))
     null = sum(entry is None for entry in index.values())  # scenes that are never judged
     return findings, f"{file}: {len(index)} scenes, {null} of them without frames (null)"

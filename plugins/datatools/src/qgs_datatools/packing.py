@@ -65,7 +65,7 @@ def _places(source: SceneSource, split: Split) -> dict[str, tuple[Split, int]]:
     for index, name in enumerate(source.names(split)):
         if name in places:
             raise ValueError(
-                f"two scenes are called {name!r}, and chunks tell scenes by their names: rename one"
+                f"two scenes are called {name!r}, and chunks identify scenes by name: rename one"
             )
         places[name] = split, index
     return places
@@ -104,10 +104,10 @@ def open_journal(folder: UPath, settings: Mapping[str, Any]) -> Journal:
     before = content["settings"]
     other = [key for key in {**before, **settings} if before.get(key) != settings.get(key)]
     if content.get("version") != _VERSION or other:
-        said = "; ".join(f"{key} was {before.get(key)}, is {settings.get(key)}" for key in other)
+        changed = "; ".join(f"{key} was {before.get(key)}, is {settings.get(key)}" for key in other)
         raise ValueError(
-            f"{folder} holds an unfinished packing with other settings ({said}): give those again "
-            "to finish it, or give a new folder"
+            f"{folder} holds an unfinished packing with other settings ({changed}): give those "
+            "again to finish it, or give a new folder"
         )
     return Journal(folder, settings, content["files"])
 
@@ -161,7 +161,7 @@ def pack(
 
     An interrupted packing goes on after its last complete chunk, if `settings`, which decide what
     the source holds, are the same; index.json comes last. leave_out_broken: unreadable scenes are
-    left out, named in the result and tried again. progress: told each scene that is dealt with.
+    left out, named in the result and tried again. progress: called with each finished scene.
     Raises FileExistsError for a folder with other content, ValueError and OSError as the scenes do.
     """
     encoding = encoding or Encoding()

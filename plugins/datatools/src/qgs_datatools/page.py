@@ -56,7 +56,7 @@ def _pictured(scene: SceneReport) -> dict[str, Any]:
 
 
 def frusta_figure(scene: SceneReport) -> Figure | None:
-    """At most 120 cameras with sound poses, their mean up axis upwards; None without any."""
+    """At most 120 cameras with valid poses, their mean up axis upwards; None without any."""
     if not len(scene.c2w):
         return None
     kept = np.unique(np.linspace(0, len(scene.c2w) - 1, _CAMERAS).round().astype(int))
@@ -149,10 +149,10 @@ def pair_figure(pair: Pair, geometry: Geometry) -> Figure:
 def _spread(points: np.ndarray, count: int) -> Sequence[int]:
     """Indices of points far from each other, the first one nearest the mean."""
     chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmin())]
-    apart = np.full(len(points), np.inf)
+    distances = np.full(len(points), np.inf)
     while len(chosen) < min(count, len(points)):
-        apart = np.minimum(apart, np.linalg.norm(points - points[chosen[-1]], axis=1))
-        chosen.append(int(apart.argmax()))
+        distances = np.minimum(distances, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        chosen.append(int(distances.argmax()))
     return chosen
 
 

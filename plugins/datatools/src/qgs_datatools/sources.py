@@ -27,13 +27,13 @@ def _installed() -> tuple[Registry, list[str]]:
 
 
 def sources() -> dict[str, type[Component]]:
-    """The sources of qgs and of every sound plugin that read a path, by PLUGIN/NAME."""
+    """The sources of qgs and of every usable plugin that read a path, by PLUGIN/NAME."""
     found = _installed()[0].components("data")
     return {kind: source for kind, source in found.items() if "path" in source.Config.model_fields}
 
 
 def left_out() -> list[str]:
-    """What to tell of the plugins that cannot be used."""
+    """A note on each plugin that cannot be used."""
     return [f"left out: {problem}" for problem in _installed()[1]]
 
 

@@ -13,7 +13,7 @@ from qgs.types import Cameras, Gaussians, Views
 
 _DEPTHS, _NEAREST, _FARTHEST = 56, 0.1, 4.0  # number of hypotheses; their range over the size
 _OTHERS = 6  # photos that a pixel is compared with; the better half counts, for occlusions
-_APART, _TURNED = 0.06, 10.0  # best baseline over the size; weight of 1 - cosine of the axes
+_BASELINE, _TURNED = 0.06, 10.0  # best baseline over the size; weight of 1 - cosine of the axes
 _PATCH = 1  # radius in pixels of the compared patch
 _MAX_COST = 0.3  # truncation of a difference of colours; half of it outside a photo
 _NO_EVIDENCE = 1e-4  # cost per e-fold of depth away from the size: breaks ties only
@@ -93,7 +93,7 @@ def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float
 def _others(cameras: Cameras, photo: int, size: float) -> list[int]:
     """Photos with the best baseline and direction for matching `photo`; itself if alone."""
     eyes, axes = cameras.c2w[0, :, :3, 3], cameras.c2w[0, :, :3, 2]
-    apart = (eyes - eyes[photo]).norm(dim=-1) / size
-    unlike = (apart.clamp_min(1e-6) / _APART).log().abs() + _TURNED * (1 - axes @ axes[photo])
+    baseline = (eyes - eyes[photo]).norm(dim=-1) / size
+    unlike = (baseline.clamp_min(1e-6) / _BASELINE).log().abs() + _TURNED * (1 - axes @ axes[photo])
     unlike[photo] = math.inf
     return unlike.topk(min(_OTHERS, max(len(eyes) - 1, 1)), largest=False).indices.tolist()

@@ -194,7 +194,7 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
             unequal = sorted(k for k in {*ours, *theirs} if ours.get(k) != theirs.get(k))
             raise ValueError(
                 f"{first.name} was judged by {first.protocol}, {other.name} by {other.protocol}, "
-                f"which differ in {', '.join(unequal)}: evaluate both alike, or add "
+                f"which differ in {', '.join(unequal)}: evaluate both by one protocol, or add "
                 "--across-protocols to compare them all the same"
             )
         shared = [name for name in first.scenes if name in other.scenes]

@@ -79,7 +79,7 @@ def values_figure(results: Results, evaluation: str = MAIN) -> Figure | None:
 
 
 def _points(axes: Axes, place: int, values: Mapping[int, float], seeds: Mapping[int, str]) -> None:
-    """A point for each seed, of its colour in all rows, a little apart."""
+    """A point for each seed, of its colour in all rows, slightly shifted."""
     for number, (seed, color) in enumerate(seeds.items()):
         if seed in values:
             shift = 0.22 * (number - (len(seeds) - 1) / 2) / max(len(seeds) - 1, 1)

@@ -216,7 +216,7 @@ def _run_records(results: Results) -> list[dict[str, Any]]:
 
 
 def _time_records(results: Results) -> list[dict[str, Any]]:
-    """What the clock said of every run, which no other machine or day repeats."""
+    """Measured times of every run, which no other machine or day repeats."""
     found = []
     for run in results.plan.runs:
         step, seconds = last_record(run.folder / "history.jsonl")

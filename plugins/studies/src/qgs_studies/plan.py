@@ -237,8 +237,8 @@ def _with_budget(study: Study, recipe: Recipe) -> Recipe:
         changes = {"steps": max(math.ceil(budget.images / a_step), 1), "seconds": None}
     tree = {**recipe.tree, "training": {**recipe.tree["training"], **changes}}
     resolved = resolve(tree)
-    told = dict.fromkeys((f"training.{name}" for name in changes), "the study's budget")
-    return replace(resolved, provenance={**recipe.provenance, **told})
+    origins = dict.fromkeys((f"training.{name}" for name in changes), "the study's budget")
+    return replace(resolved, provenance={**recipe.provenance, **origins})
 
 
 def _check_equal(study: Study, recipes: Mapping[str, Recipe], problems: Problems) -> None:

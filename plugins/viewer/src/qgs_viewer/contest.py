@@ -1,4 +1,4 @@
-"""Models side by side: trained under one budget or loaded, judged alike, and reported."""
+"""Models side by side: trained under one budget or loaded, one protocol of evaluation, a report."""
 
 import os
 import platform
@@ -20,7 +20,8 @@ from qgs.composer.schema import summary_of
 from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.data.recognition import open_for
 from qgs.engine.distributed import choose_device
-from qgs.engine.evaluation import Evaluation, evaluate
+from qgs.engine.evaluation import evaluate
+from qgs.engine.results import Evaluation
 from qgs.engine.training import train
 from qgs.io.checkpoint import CheckpointFile
 from qgs.io.models import about, checkpoint_path
@@ -126,7 +127,7 @@ def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[En
 def recipes_alike(files: Mapping[str, Path], photos: str | None) -> dict[str, Recipe]:
     """The recipes of `files`, with the data at `photos` in place of their own.
 
-    Raises ValueError where they do not judge alike, and as `CheckpointFile` and the data do.
+    Raises ValueError where their protocols differ, and as `CheckpointFile` and the data do.
     """
     recipes = dict[str, Recipe]()
     for name, path in files.items():

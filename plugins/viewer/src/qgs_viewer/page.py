@@ -9,7 +9,7 @@ from qgs_viewer.server import quiet_server, stand
 from qgs_viewer.stage import Stage, distance_to
 
 _DATA = '__VISER_EMBED_DATA__="'
-# Pages of file://, and frames in them, may not have workers of blobs, which Chromium tells only
+# Pages of file://, and frames in them, may not have workers of blobs, which Chromium reports only
 # after the worker was made. viser makes another one where that fails at once; without a worker
 # it never sorts Gaussians anew.
 _WORKERS = """<script>

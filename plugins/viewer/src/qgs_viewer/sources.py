@@ -127,7 +127,7 @@ def open_source(name: str, wanted: Wanted) -> Source:
         )
     if finished:
         return _of_finished(path, wanted.device)
-    note = "A PLY file tells neither queries nor photos; name the model to see them."
+    note = "A PLY file holds neither queries nor photos; name the model to see them."
     return Source(path.name, (note,), Look(load_ply(path)))
 
 

@@ -25,7 +25,7 @@ def anchors(show: Exhibition) -> Made:
     """See `anchors_figure`. Raises NothingToShowError where no model has anchors."""
     exhibits, query = show.anchored, show.query
     count = QUERIES if query is None else 1
-    which = f"{count} that matter to this view and stand apart" if query is None else "the query"
+    which = f"{count} spread over this view, of large weight" if query is None else "the query"
     caption = paper.caption(
         "anchors", scene=show.samples[0].scene, which=which, without=show.without_anchors
     )

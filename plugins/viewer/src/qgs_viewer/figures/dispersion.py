@@ -59,7 +59,7 @@ def scene_labels(samples: Sequence[Sample]) -> list[str]:
 def figure(values: Mapping[str, Mapping[str, Sequence[float]]], labels: Sequence[str]) -> Figure:
     """Bars by scene for each model by name and each of its values; its mean as a dashed line."""
     kinds = list(next(iter(values.values())))
-    lines = -(-len(values) // IN_A_LINE) - 1  # of the legend, besides its first
+    lines = -(-len(values) // IN_A_LINE) - 1  # of the legend, after its first
     drawn = new_figure((1.55 + 0.16 * lines) * len(kinds) + 0.3, gap=0.04)
     axes = drawn.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0]
     for axis, kind in zip(axes, kinds, strict=True):

@@ -71,11 +71,11 @@ def open_exhibition(
     for name, file in files.items():
         model = load(file, device)
         exhibits.append(exhibit(name, model, samples[0], curves_of(file)))
-        if photos is not None and (said := verdict(model.trained_on or Domain(), found)):
-            notes.setdefault(said, []).append(name)
+        if photos is not None and (remark := verdict(model.trained_on or Domain(), found)):
+            notes.setdefault(remark, []).append(name)
         if query is not None:
             exhibits[-1].notable(1, exhibits[-1].sample.inputs.cameras, query)
-    remarks = [f"{', '.join(models)}: {said}." for said, models in notes.items()]
+    remarks = [f"{', '.join(models)}: {remark}." for remark, models in notes.items()]
     if recipe.views.scale == "auto":
         remarks.append(contest.AUTO_SCALE)
     depths = [true_depth(source, sample) for sample in samples]

@@ -67,7 +67,7 @@ def caption(name: str, **values: object) -> str:
 
 
 def new_figure(height: float, gap: float = 0.02, width: float = WIDTH) -> Figure:
-    """An empty figure, inches, whose panels stand `gap` inches apart at least."""
+    """An empty figure, inches, with at least `gap` inches between panels."""
     figure = Figure(figsize=(width, height))
     figure.set_layout_engine(ConstrainedLayoutEngine(w_pad=gap, h_pad=gap, wspace=0, hspace=0))
     return figure
