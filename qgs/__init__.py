@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from qgs.analysis.trace import trace
     from qgs.composer import compose
     from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
-    from qgs.extensions import refine
     from qgs.io.checkpoint import load, save
     from qgs.io.gaussians import load_ply, save_ply
     from qgs.model import QueryGaussianModel
@@ -45,7 +44,9 @@ DISTRIBUTIONS = {
     }
     | dict.fromkeys(("view", "demo", "report", "figures"), "query-gaussians-viewer")
     | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),
-    "qgs.refiners": dict.fromkeys(("gaussians", "reconstruction"), "query-gaussians-refine"),
+    "qgs.refiners": dict.fromkeys(
+        ("gaussians", "reconstruction", "tuned", "tuner", "tuning_loss"), "query-gaussians-refine"
+    ),
 }
 """This repository's other distributions, by entry point; messages name those that are missing."""
 
@@ -70,7 +71,6 @@ _ELSEWHERE = {
     "load": "qgs.analysis",
     "load_ply": "qgs.io.gaussians",
     "read_photos": "qgs.analysis.scenes",
-    "refine": "qgs.extensions",
     "save": "qgs.io.checkpoint",
     "save_ply": "qgs.io.gaussians",
     "trace": "qgs.analysis.trace",
@@ -97,6 +97,17 @@ __all__ = [
     "save_ply",
     "trace",
 ]
+
+
+def refine(gaussians: Gaussians, views: Views, seconds: float, **options: Any) -> Any:
+    """Optimise Gaussians (1, G) of one scene on its photos `views` (1, V) for some seconds.
+
+    Returns a `qgs_refine.RefinedScene`, whose `gaussians` are the result; `options` as in
+    `qgs_refine.refine`. Raises ExtensionError where query-gaussians-refine is not installed.
+    """
+    from qgs.extensions import function
+
+    return function("qgs.refiners", "gaussians")(gaussians, views, seconds, **options)
 
 
 def __getattr__(name: str) -> Any:

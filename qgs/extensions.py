@@ -6,12 +6,9 @@ import os
 import sys
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from qgs import DISTRIBUTIONS
-
-if TYPE_CHECKING:  # types import torch, which `qgs --help` does without
-    from qgs.types import Gaussians, Views
 
 T = TypeVar("T")
 
@@ -58,15 +55,6 @@ def function(group: str, name: str) -> Any:
             return imported(entry)
     missing = DISTRIBUTIONS[group][name]
     raise ExtensionError(f"this needs {missing}: run `pip install {missing}`")
-
-
-def refine(gaussians: Gaussians, views: Views, seconds: float, **options: Any) -> Any:
-    """Optimise Gaussians (1, G) of one scene on its photos `views` (1, V) for some seconds.
-
-    Returns a `qgs_refine.RefinedScene`, whose `gaussians` are the result; `options` as in
-    `qgs_refine.refine`. Raises ExtensionError where query-gaussians-refine is not installed.
-    """
-    return function("qgs.refiners", "gaussians")(gaussians, views, seconds, **options)
 
 
 @lru_cache(maxsize=16)

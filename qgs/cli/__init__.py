@@ -2,7 +2,7 @@
 
 import os
 import sys
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from typing import Any
 
 import typer
@@ -10,6 +10,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from qgs import DISTRIBUTIONS
 from qgs.cli import convert, evaluate, inspect, reconstruct, train
+from qgs.extensions import installed
 
 GROUP = "qgs.commands"
 """Group of entry points NAME = "module:app", where `app` is a `typer.Typer`."""
@@ -38,14 +39,14 @@ class CommandGroup(TyperGroup):
     def list_commands(self, ctx: Any) -> list[str]:
         """Names, our own first."""
         own = super().list_commands(ctx)
-        return [*own, *sorted(entry_points(group=GROUP).names - {*own})]
+        return [*own, *sorted({entry.name for entry in installed(GROUP)} - {*own})]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """The command of that name; one of a distribution is not imported yet."""
         own = super().get_command(ctx, cmd_name)
         if own is not None:
             return own
-        if offers := [*entry_points(group=GROUP, name=cmd_name)]:
+        if offers := [entry for entry in installed(GROUP) if entry.name == cmd_name]:
             return OfferedCommand(cmd_name, offers)
         if missing := DISTRIBUTIONS[GROUP].get(cmd_name):
             raise ValueError(f"`qgs {cmd_name}` is not installed: run `pip install {missing}`")

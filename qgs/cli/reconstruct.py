@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from qgs.analysis.reconstruction import Reconstruction
-    from qgs.composer import Recipe
-    from qgs.model import QueryGaussianModel
-    from qgs.types import Gaussians, Views
 
 
 def reconstruct(
@@ -86,6 +83,7 @@ def reconstruct(
     model = load(checkpoint, choose_device(device))
     recipe = resolve(model.recipe or {}, options.tuning_settings(tune))
     tunes = tune is not None and recipe.evaluation.tuning_steps
+    tuned = function("qgs.refiners", "tuned") if tunes else None
     result = run(
         model,
         photos,
@@ -95,7 +93,7 @@ def reconstruct(
         size=pixels,
         scene=scene_name,
         overrides=overrides or (),
-        tune=partial(tuned, model, recipe, console) if tunes else None,
+        tune=partial(tuned, model, recipe, console) if tuned else None,
     )
     show(result, "feed-forward" if refine else "", console)
     paths = result.save(out)
@@ -108,23 +106,6 @@ def reconstruct(
         paths += better.save(single if paths == [out] else out / "refined")
     for path in paths:
         console.print(f"wrote {path}", soft_wrap=True)
-
-
-def tuned(
-    model: QueryGaussianModel, recipe: Recipe, console: Console, inputs: Views
-) -> tuple[Gaussians, dict[str, Any]]:
-    """Gaussians of queries or latents tuned on `inputs`, and a record of that."""
-    from qgs.engine.tuning import tune, tuning_loss
-
-    settings = recipe.evaluation
-    what, steps, rate = settings.tuning, settings.tuning_steps, settings.rate
-    inputs = inputs.to(next(model.parameters()).device)
-    tuning = tune(model, inputs, tuning_loss(recipe), steps, rate, what)
-    before, after = tuning.losses[0], tuning.losses[-1]
-    losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
-    console.print(f"{steps} steps of tuning the {what}: {losses}", highlight=False)
-    record = {"what": what, "steps": steps, "rate": rate}
-    return tuning.prediction.gaussians, {**record, "loss_before": before, "loss_after": after}
 
 
 def show(result: Reconstruction, what: str, console: Console) -> None:

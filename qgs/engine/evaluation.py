@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -17,7 +16,7 @@ from qgs.data.evaluation import EvaluationPlan, SceneFailure, one_line, true_dep
 from qgs.data.samples import Sample, stack_views
 from qgs.engine.protocol import index_of, protocol_of
 from qgs.engine.results import TUNING, Evaluation, SceneScore
-from qgs.engine.tuning import tune, tuning_loss
+from qgs.extensions import function
 from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.dispersion import OPACITY_USED
 from qgs.model import QueryGaussianModel
@@ -177,10 +176,8 @@ class _Scorer:
         for metric in measures.metrics.values():
             metric.to(self._device)
         self._tune = None
-        if steps := recipe.evaluation.tuning_steps:
-            rate, what = recipe.evaluation.rate, recipe.evaluation.tuning
-            loss = tuning_loss(recipe)
-            self._tune = partial(tune, model, loss=loss, steps=steps, rate=rate, what=what)
+        if recipe.evaluation.tuning_steps:
+            self._tune = function("qgs.refiners", "tuner")(model, recipe)
 
     def scores(
         self, samples: Iterable[Sample | SceneFailure], batch: int

@@ -11,7 +11,7 @@ from qgs.contracts import Metric, SceneSource, SceneSourceConfig
 from qgs.contracts.schedule import END, at_step
 from qgs.data.evaluation import EvaluationIndex, read_index
 from qgs.data.view_samplers import Span
-from qgs.engine.tuning import tuning_loss
+from qgs.extensions import function
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def protocol_of(
             "steps": evaluation.tuning_steps,
             "rate": evaluation.rate,
             "optimizer": "Adam",
-            "loss": tuning_loss(recipe).config.model_dump(mode="json"),
+            "loss": function("qgs.refiners", "tuning_loss")(recipe).config.model_dump(mode="json"),
         }
     for path, chosen in recipe.parts.items():
         metric = chosen.component

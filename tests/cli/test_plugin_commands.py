@@ -95,8 +95,7 @@ def test_own_commands_are_never_hidden(offer: Offer) -> None:
 def test_a_command_of_this_repository_names_its_distribution(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    nothing = entry_points(group="no.such.group")
-    monkeypatch.setattr("qgs.cli.entry_points", lambda **_: nothing)
+    monkeypatch.setattr("qgs.cli.installed", lambda group: ())
     result = run_qgs("data", "check", "photos")
     assert "run `pip install query-gaussians-datatools`" in str(result.exception)
     result = run_qgs("bench", "tiny/locus.yaml")

@@ -2,11 +2,11 @@
 
 import pytest
 import torch
+from qgs_refine.tuning import tune, tuning_loss
 from training_runs import Tiny
 
 from qgs.composer import Recipe
 from qgs.data.evaluation import evaluation_samples
-from qgs.engine.tuning import tune, tuning_loss
 from qgs.model import QueryGaussianModel
 from qgs.types import QueryState, Views, map_tensors
 

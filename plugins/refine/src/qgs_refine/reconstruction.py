@@ -1,15 +1,19 @@
-"""`qgs reconstruct --refine`: a reconstruction, refined on the photos of its scene."""
+"""`--refine` and `--tune` of `qgs reconstruct`: Gaussians fitted to the photos of their scene."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from typing import Any
 
 from rich.console import Console
 
 from qgs.analysis.reconstruction import Reconstruction, reconstruct_sample
+from qgs.composer import Recipe
 from qgs.contracts import Scene
 from qgs.data.samples import Sample, training_frames, views_in
-from qgs.types import Views
+from qgs.model import QueryGaussianModel
+from qgs.types import Gaussians, Views
 from qgs_refine.refining import refine
+from qgs_refine.tuning import tuner
 
 
 def refine_reconstruction(
@@ -67,3 +71,17 @@ def _photos(
     photos, compared = every.select(slice(len(frames))), every.select(slice(len(frames), None))
     own = photos.select([frames.index(frame) for frame in inputs])
     return replace(start.sample, inputs=own, targets=compared), photos, frames
+
+
+def tuned(
+    model: QueryGaussianModel, recipe: Recipe, console: Console, inputs: Views
+) -> tuple[Gaussians, dict[str, Any]]:
+    """Gaussians of queries or latents tuned on `inputs`, and a record of that."""
+    settings = recipe.evaluation
+    what, steps = settings.tuning, settings.tuning_steps
+    tuning = tuner(model, recipe)(inputs.to(next(model.parameters()).device))
+    before, after = tuning.losses[0], tuning.losses[-1]
+    losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
+    console.print(f"{steps} steps of tuning the {what}: {losses}", highlight=False)
+    record = {"what": what, "steps": steps, "rate": settings.rate}
+    return tuning.prediction.gaussians, {**record, "loss_before": before, "loss_after": after}

@@ -1,7 +1,8 @@
 """Tuning at test time: the queries or latents of a scene, fitted to its input views (TokenGS)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -32,6 +33,13 @@ def tuning_loss(recipe: Recipe) -> Photometric:
         if isinstance(loss, Photometric) and any(loss.weights()):
             return loss
     return Photometric(Photometric.Config())
+
+
+def tuner(model: QueryGaussianModel, recipe: Recipe) -> Callable[[Views], Tuning]:
+    """`tune` with the options of `recipe`'s `evaluation`."""
+    settings = recipe.evaluation
+    what, steps, rate = settings.tuning, settings.tuning_steps, settings.rate
+    return partial(tune, model, loss=tuning_loss(recipe), steps=steps, rate=rate, what=what)
 
 
 def tune(
