@@ -9,7 +9,7 @@ import torch
 from published.files import read_golden
 from published.models import LAST_NORM, READ_NORM, RECIPES
 from published.recording import model_tensors
-from qgs_published.names import names_of
+from qgs_published.layouts import names_of
 from safetensors.torch import save_file
 from torch import Tensor
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from qgs_published.names import names_of
+from qgs_published.layouts import names_of
 from torch import Tensor
 
 from published.files import GoldenFile, GoldenFileError

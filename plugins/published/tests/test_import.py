@@ -1,22 +1,20 @@
 """Published weights become checkpoints: every tensor accounted for, or nothing is written."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from commands import run_qgs
+from published.files import read_golden
 from qgs_published.importing import import_weights
-from qgs_published.names import PublishedError, names_of
-from qgs_published.recognition import fitting_recipe
+from qgs_published.layouts import PublishedError, fitting_recipe, names_of
 from qgs_tokengs2026.weights import TOKENGS_2026_6
-from safetensors import safe_open
 from safetensors.torch import load_file, save, save_file
 from torch import Tensor
 
 import qgs
-from qgs.cli import main
 from qgs.components import TOKENGS
 from qgs.composer import resolve
 from qgs.composer.recipe import differing_predictions
@@ -29,10 +27,7 @@ RECIPES = ROOT / "recipes"
 
 def published(name: str) -> dict[str, Tensor]:
     """The state dict in a golden file, such as "locus_full_a"; a new mapping each time."""
-    with safe_open(ROOT / "tests" / "golden" / f"{name}.safetensors", "pt") as file:
-        prefix, names = "weights.", list(file.keys())
-        weights = {n.removeprefix(prefix): n for n in names if n.startswith(prefix)}
-        return {name: file.get_tensor(stored) for name, stored in weights.items()}
+    return read_golden(ROOT / f"tests/golden/{name}.safetensors").weights()
 
 
 LOCUS = published("locus_full_a")
@@ -220,38 +215,21 @@ def test_one_prefix_of_all_names_is_removed(tmp_path: Path, prefix: str) -> None
     assert done.count == 109
 
 
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """`run("import", ..., code=0)`: the output of the command; its exit code is checked."""
-
-    def call(*words: object, code: int = 0) -> str:
-        monkeypatch.setattr(sys, "argv", ["qgs", *map(str, words)])
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        assert (stopped.value.code or 0) == code
-        told = capsys.readouterr()
-        return told.err if code else told.out
-
-    return call
-
-
-def test_the_command_lists_every_tensor_and_setting(
-    run: Callable[..., str], tmp_path: Path
-) -> None:
+def test_the_command_lists_every_tensor_and_setting(tmp_path: Path) -> None:
     weights, out = tmp_path / "locus.safetensors", tmp_path / "c.safetensors"
     save_file(LOCUS, weights)
     option = "model.head.scale_cap=0.1"
-    told = run("import", weights, "--recipe", "auto", "--out", out, "--set", option)
+    told = run_qgs("import", weights, "--recipe", "auto", "--out", out, "--set", option).output
     assert "LocusGS (leo-frank/LocusGS): 109 tensors used" in told
     assert "  enc_dec_backbone.decoder_blocks.1.gs_cross_attn.tau_sample\n" in told
     assert "model.head.scale_cap: 0.1 (LocusGS: 0.075)" in told
     again = tmp_path / "again.safetensors"
-    run("import", weights, "--recipe", out.with_suffix(".yaml"), "--out", again)
+    run_qgs("import", weights, "--recipe", out.with_suffix(".yaml"), "--out", again)
     assert qgs.load(again).recipe == qgs.load(out).recipe
     half = tmp_path / "half.safetensors"
     half.write_bytes(save({name: tensor.half() for name, tensor in LOCUS.items()}))
     before = sorted(tmp_path.iterdir())
     words = ("import", half, "--recipe", "auto", "--out", tmp_path / "new" / "x.safetensors")
-    assert run(*words, code=2).count("error:") == 1
+    assert isinstance(run_qgs(*words).exception, PublishedError)
     assert sorted(tmp_path.iterdir()) == before
-    assert "converted to float32: 109 of 109 are float16" in run(*words, "--to-float32")
+    assert "converted to float32: 109 of 109 are float16" in run_qgs(*words, "--to-float32").output

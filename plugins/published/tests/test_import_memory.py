@@ -11,7 +11,7 @@ WRITE = """
 import sys, torch
 from safetensors.torch import save_file
 from qgs.composer import resolve
-from qgs_published.names import names_of
+from qgs_published.layouts import names_of
 recipe = resolve(sys.argv[1])
 names = names_of(recipe)
 tensors = {theirs: torch.randn(names.shapes[ours]) for ours, theirs in names.published.items()}

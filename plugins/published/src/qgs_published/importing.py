@@ -16,8 +16,7 @@ from qgs.io.checkpoint import new_checkpoint_path, refuse_nonfinite, write_check
 from qgs.io.files import refuse_existing, write_text
 from qgs.io.tensors import shapes_of
 from qgs.wording import listed
-from qgs_published.names import Names, PublishedError, names_of
-from qgs_published.recognition import fitting_recipe, without_prefix
+from qgs_published.layouts import Names, PublishedError, fitting_recipe, names_of, recognise
 from qgs_published.weight_files import WeightFile, read_weight_file
 
 
@@ -61,7 +60,7 @@ def import_weights(
     recipe_file = out.with_suffix(".yaml") if recipe is None else None
     if recipe_file:
         refuse_existing(recipe_file)
-    file = without_prefix(read_weight_file(weights))
+    file = _without_prefix(read_weight_file(weights))
     shapes = shapes_of(file.tensors)
     text = ""
     if recipe is None:
@@ -92,6 +91,24 @@ def import_weights(
     dropped = tuple(name for name in names.unused if name in file.tensors)
     notes = (*file.notes, *converted)
     return Transfer(names.layout, recipe, len(tensors), dropped, settings, notes, recipe_file)
+
+
+def _without_prefix(file: WeightFile) -> WeightFile:
+    """`file` without a prefix that all its names share, where published names remain; with a note.
+
+    Training frameworks prepend the attribute that holds the model (`model.`, `module.`).
+    """
+    modules = next(iter(file.tensors)).split(".")[:-1]
+    for depth in range(1, len(modules) + 1):
+        prefix = ".".join(modules[:depth]) + "."
+        tensors = {name.removeprefix(prefix): tensor for name, tensor in file.tensors.items()}
+        if (
+            all(name.startswith(prefix) for name in file.tensors)
+            and recognise(shapes_of(tensors))[0]
+        ):
+            note = f"took {prefix!r} off all {len(tensors)} names"
+            return WeightFile(file.path, tensors, (*file.notes, note))
+    return file
 
 
 def _as_float32(

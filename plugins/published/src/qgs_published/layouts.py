@@ -1,13 +1,14 @@
-"""The names of parameters: ours, and those of the codebase that publishes the weights."""
+"""Published codebases: their names for our parameters, and the recipe that their shapes give."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor
 
-from qgs.composer import Recipe
-from qgs.composer.registry import InstalledPlugin, load_registry
-from qgs.contracts import WeightLayout
+from qgs.composer import Recipe, RecipeError, resolve
+from qgs.composer.registry import InstalledPlugin, load_registry, load_usable_plugins
+from qgs.contracts import LayoutError, WeightLayout
 from qgs.contracts.weights import Shapes
 from qgs.io.checkpoint import unique_tensors
 from qgs.io.tensors import differing_tensors, shapes_of
@@ -59,7 +60,7 @@ def names_of(recipe: Recipe) -> Names:
     """
     registry = load_registry([name for name in recipe.plugin_versions if name != "qgs"])
     reasons = []
-    for layout in layouts_of(registry.plugins.values()):
+    for layout in _layouts(registry.plugins.values()):
         found = _unknown_components(recipe, layout)
         if not found:
             return _names_in(recipe, layout)
@@ -67,8 +68,7 @@ def names_of(recipe: Recipe) -> Names:
     raise PublishedError("no published layout can hold this model:" + "".join(reasons))
 
 
-def layouts_of(plugins: Iterable[InstalledPlugin]) -> list[WeightLayout]:
-    """The layouts that `plugins` declare, in their order."""
+def _layouts(plugins: Iterable[InstalledPlugin]) -> list[WeightLayout]:
     return [layout for installed in plugins for layout in installed.plugin.layouts]
 
 
@@ -102,3 +102,34 @@ def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
     unnamed = tuple(name for name in shapes if name not in published)
     unused = tuple(layout.unused_names(published.values()))
     return Names(layout, shapes, published, unnamed, unused)
+
+
+def recognise(shapes: Shapes) -> tuple[WeightLayout | None, list[WeightLayout]]:
+    """The layout that fits a state dict best, None without one, and the layouts of all plugins."""
+    layouts = _layouts(load_usable_plugins()[0].plugins.values())
+    found = [layout for layout in layouts if set(layout.marks) <= set(shapes)]
+    # A codebase's later release has all names of the earlier one.
+    return max(found, key=lambda layout: len(layout.marks), default=None), layouts
+
+
+def fitting_recipe(shapes: Shapes, origin: str) -> tuple[WeightLayout, dict[str, Any]]:
+    """The layout of a state dict and the recipe that its sizes give, a plain mapping.
+
+    Raises PublishedError, about `origin`, when no installed layout knows the names or when names
+    and shapes make no recipe.
+    """
+    layout, known = recognise(shapes)
+    if layout is None:
+        names = "; ".join(f"{one.name} has {', '.join(one.marks)}" for one in known)
+        raise PublishedError(
+            f"{origin} has the names of no published model that is known here ({names}); its "
+            f"names are {listed(shapes, 3)}"
+        )
+    try:
+        tree = layout.read(shapes)
+        resolve(tree)
+    except (LayoutError, RecipeError) as error:
+        raise PublishedError(
+            f"{origin} looks like {layout.name}, but no recipe fits its shapes: {error}"
+        ) from error
+    return layout, tree
