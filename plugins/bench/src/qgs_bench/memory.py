@@ -25,7 +25,7 @@ class Peak:
 def peak_memory(recipe: Recipe, operation: Operation, workload: Workload, threads: int) -> Peak:
     """Build the model in a fresh process, run `operation` there, and return the peak.
 
-    Raises ChildProcessError, with what the process said last, when it failed or was killed.
+    Raises ChildProcessError, with the last output of the process, when it failed or was killed.
     """
     order = json.dumps([dict(recipe.tree), operation, asdict(workload), threads])
     command = [sys.executable, "-m", "qgs_bench.memory"]

@@ -227,15 +227,16 @@ def camera_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
 
 
 def unit_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
-    """What is wrong with the unit of a frame's intrinsics, fractions of the image's sides."""
+    """Problems of the unit of a frame's intrinsics, fractions of the image's sides."""
     values = record.cameras[frame, :4].tolist()
     focal = max(values[:2])
     divided_twice = 0 < focal < _DIVIDED_TWICE
     if divided_twice or focal >= _IN_PIXELS:
-        said = ", ".join(f"{value:.6g}" for value in values)
+        numbers = ", ".join(f"{value:.6g}" for value in values)
+        unit = "divided twice" if divided_twice else "like pixels"
         yield FrameProblem(
             "intrinsics",
-            f"the intrinsics ({said}) look {'divided twice' if divided_twice else 'like pixels'}",
+            f"the intrinsics ({numbers}) look {unit}",
             "chunks hold fx and cx divided once by the image's width, fy and cy by its height",
         )
 

@@ -37,7 +37,7 @@ class PosedPatches(PatchEncoder):
         lens_width: int = Field(default=64, ge=1)
         """Numbers that are made of focal lengths and principal point."""
         bands: int = Field(default=4, ge=0)
-        """Frequencies at which the place of a camera is told, besides the place itself."""
+        """Frequencies of the encoding of a camera's position, which has the position itself too."""
         registers: int = Field(default=4, ge=0)
         """Learned tokens behind those of the patches."""
 

@@ -199,7 +199,7 @@ class Maker:
         return self.case.slot == "renderer" or f"gaussians.{name}" in required
 
     def prediction(self) -> LayerPrediction:
-        """Gaussians, and the state they are said to come from."""
+        """Gaussians, and the state that stands for their origin."""
         return LayerPrediction(self.gaussians(), self.state())
 
     def rendering(self, views: int | None = None) -> Rendering:

@@ -71,7 +71,7 @@ def exemptions_of(installed: InstalledPlugin, cases: list[Case]) -> list[Mapping
 def check_plugin(name: str, tiers: Iterable[Tier] = TIERS) -> Iterator[CheckResult]:
     """Run every check on every case of the plugin `name`, case by case.
 
-    Raises PluginError for a plugin that is unusable or has unsound examples or exemptions, and
+    Raises PluginError for a plugin that is unusable or has invalid examples or exemptions, and
     ValueError for no tiers and for unknown ones.
     """
     wanted, installed = checked_tiers(tiers), load_plugin(name)

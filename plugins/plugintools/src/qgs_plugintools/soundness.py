@@ -33,7 +33,7 @@ def component_fault(component: object) -> str:
         return "which implements no slot's contract"
     if not isinstance(name, str):
         return "which has no `name`"
-    if not re.fullmatch(r"[^\s/]+", name):  # else `type: PLUGIN/NAME` could not be told apart
+    if not re.fullmatch(r"[^\s/]+", name):  # else `type: PLUGIN/NAME` would be ambiguous
         return f"whose name {name!r} is empty or has a slash or a blank"
     if inspect.isabstract(component):
         return f"which leaves {', '.join(sorted(component.__abstractmethods__))} abstract"
@@ -42,7 +42,7 @@ def component_fault(component: object) -> str:
         if not (isinstance(given, tuple) and given and set(given) <= set(DEVICES)):
             return f"whose `devices` is {given!r}; give some of {DEVICES} as a tuple"
     if issubclass(component, Metric) and not getattr(component, "definition", ""):
-        return "which gives no `definition`; say in words what it measures, since protocols hash it"
+        return "which gives no `definition`; describe what it measures, since protocols hash it"
     config: object = component.Config
     if not (inspect.isclass(config) and issubclass(config, ComponentConfig)):
         return "whose Config is no ComponentConfig"

@@ -91,7 +91,7 @@ class RequiresTooMuch(ContentCrossAttention):
         return MEMORY_FIELDS
 
 
-@mutant("writes_equal_provides", "writes place.center besides")
+@mutant("writes_equal_provides", "writes place.center, which")
 class WritesMore(NoRefinement):
     def forward(self, state):
         return state.replace(fields={"place.center": state.features[..., :3].clone()})

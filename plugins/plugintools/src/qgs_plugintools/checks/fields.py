@@ -170,12 +170,12 @@ def check_writes_equal_provides(case: Case) -> None:
         provided = case.component.fields_written(case.config)
         kept = {n for n, x in output.fields.items() if n in before and _same(x, before[n])}
         written = set(output.fields) - kept
-        for told, names in (
-            ("it writes {} besides", written - set(provided)),
+        for fault, names in (
+            ("it writes {}, which it does not provide", written - set(provided)),
             ("it does not write {}", set(provided) - written),
             ("it loses {}", set(before) - set(output.fields)),
         ):
-            expect(not names, f"in {mode} {told.format(', '.join(sorted(names)))}")
+            expect(not names, f"in {mode} {fault.format(', '.join(sorted(names)))}")
         if case.slot == "refinement":
             passed = _same(output.features, inputs["state"].features)
             expect(passed, f"in {mode} it changes the features, which a refinement passes on")

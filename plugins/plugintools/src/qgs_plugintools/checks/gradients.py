@@ -44,7 +44,7 @@ READ = {
 @check(READ)
 def check_gradients_reach_inputs(case: Case) -> None:
     """What a component reads gets a gradient: the inputs of its slot and the fields it requires.
-    One stopped on purpose, as of reference points, is told as an expected failure of this check and
+    One stopped on purpose, as of reference points, is an expected failure of this check and
     of `gradients_match_differences`.
 
     A component that requires nothing and gives zeros alone is an ablation, and passes.

@@ -112,7 +112,7 @@ def check_moves_to_a_device(case: Case) -> None:
 
 @contextmanager
 def _autocast_accepts_meta() -> Iterator[None]:
-    """`torch.autocast(x.device.type, enabled=False)` is sound code, which torch refuses on meta."""
+    """`torch.autocast(x.device.type, enabled=False)` is valid code, which torch refuses on meta."""
     start = torch.autocast.__init__
 
     def begin(self: Any, device_type: str, *args: Any, **kwargs: Any) -> None:

@@ -39,7 +39,7 @@ def check_head_gives_gaussians(case: Case) -> None:
     With initial parameters too, for ordinary features. `sh` and `features` are there if the head
     provides them.
     """
-    told = {name.removeprefix("gaussians.") for name in case.component.fields_written(case.config)}
+    named = {name.removeprefix("gaussians.") for name in case.component.fields_written(case.config)}
     modules = [(case.build(), 1.0, "with initial parameters,")]
     modules += [(case.lively(), f, f"for features times {f:g}") for f in (0.0, 1.0, 100.0)]
     state = inputs_of(case)["state"]
@@ -49,7 +49,8 @@ def check_head_gives_gaussians(case: Case) -> None:
                 out = module(state.replace(features=factor * state.features))
             given = {name for name in ("sh", "features") if getattr(out, name) is not None}
             expect(
-                given == told, f"in {mode} it gives {given or None}, and provides {told or None}"
+                given == named,
+                f"in {mode} it gives {given or None}, and provides {named or None}",
             )
             _expect_valid(out, factor > 1, f"in {mode}, {where}")
 
