@@ -20,8 +20,9 @@ class DepthSurface(Loss):
 
     Of all target views, and input views if asked for, that have depth maps (`Views.depths`), the
     view with the smallest error counts for a centre: a surface hidden in one view is not drawn to
-    what hides it there, and centres on surfaces that any view shows have the loss 0. A batch
-    without depth maps has the loss 0; the first one is logged as a warning.
+    what hides it there, and centres on surfaces that any view shows have the loss 0. A view that
+    is both target and input (`training.judge_inputs`) thus counts once. A batch without depth maps
+    has the loss 0; the first one is logged as a warning.
     """
 
     name = "depth_surface"

@@ -76,6 +76,19 @@ def term(means: torch.Tensor, views: Views) -> torch.Tensor:
     return loss.term(prediction(means), nothing, views, views)
 
 
+def test_a_view_that_is_target_and_input_counts_once() -> None:
+    """As of `training.judge_inputs`: the nearest of equal views is one view."""
+    found = []
+    for inputs in (False, True):
+        means = POINTS.clone().requires_grad_()
+        nothing = Rendering(*(torch.zeros(1, 0, c, 4, 4) for c in (3, 1, 1)))
+        loss = DepthSurface(DepthSurface.Config(inputs=inputs))
+        value = loss.term(prediction(means), nothing, wall(), wall())
+        found.append((value.detach(), *torch.autograd.grad(value, means)))
+    assert float(found[0][0]) > 0
+    torch.testing.assert_close(found[1], found[0])
+
+
 def test_a_batch_without_depth_maps_adds_nothing_and_is_logged_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
