@@ -27,7 +27,6 @@ from qgs.engine import tracking as trackers
 from qgs.engine.folder import read_state
 from qgs.engine.guard import MAX_SKIPPED, NonFiniteError
 from qgs.engine.precision import DTYPES
-from qgs.io.checkpoint import CheckpointFile
 
 
 @pytest.fixture
@@ -118,7 +117,6 @@ def test_a_bad_step_is_skipped_on_demand(
     with caplog.at_level(logging.WARNING):
         result = run(recipe, tmp_path / "run")
     assert result.steps == 4
-    assert CheckpointFile(result.folder.checkpoint).domain.samples == 2 * recipe.training.batch_size
     told = [r.message for r in caplog.records if "is skipped" in r.message]
     assert [message.split(" is skipped")[0] for message in told] == ["step 2", "step 4"]
     folder = result.folder.path
