@@ -12,8 +12,7 @@ ROOT = Path(__file__).parents[1]
 SOURCES = ("qgs", "plugins", "tests", "tools", "docs/examples")
 TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_LINES = 600
-MAX_CORE_LINES, MAX_CORE_FILES = 17_400, 129
-MAX_PYTHON_LINES, MAX_LINES_OF_TESTS = 67_500, 26_000
+MAX_CORE_LINES, MAX_CORE_FILES, MAX_LINES_OF_CORE_TESTS = 17_300, 128, 14_700
 MACHINE_PATH = re.compile(r"(?<![\w.$}])/(?:home|root|work|Users|opt|mnt|tmp)/\w")
 
 
@@ -47,7 +46,10 @@ def test_types() -> None:
 
 
 def test_files_are_short_and_sizes_only_fall() -> None:
-    """The limits are the sizes that were reached; they are lowered, never raised."""
+    """The limits are the sizes that were reached; they are lowered, never raised.
+
+    Only the core has some: what is new goes into plugins, which may grow.
+    """
     lengths = {
         str(path.relative_to(ROOT)): len(path.read_text(encoding="utf-8").splitlines())
         for path in files(SOURCES, {".py"})
@@ -56,9 +58,8 @@ def test_files_are_short_and_sizes_only_fall() -> None:
     core = [lines for name, lines in lengths.items() if name.startswith("qgs/")]
     assert 0 < len(core) <= MAX_CORE_FILES
     assert sum(core) <= MAX_CORE_LINES
-    assert sum(lengths.values()) <= MAX_PYTHON_LINES
-    tests = [lines for name, lines in lengths.items() if "tests" in Path(name).parts]
-    assert sum(tests) <= MAX_LINES_OF_TESTS
+    tests = [lines for name, lines in lengths.items() if name.startswith("tests/")]
+    assert 0 < sum(tests) <= MAX_LINES_OF_CORE_TESTS
 
 
 def lines_with(pattern: re.Pattern[str]) -> list[str]:
