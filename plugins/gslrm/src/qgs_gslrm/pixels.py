@@ -1,7 +1,6 @@
 """`gslrm/pixels`, `gslrm/pixel_head`, `gslrm/along_rays`: a query for each image token, Gaussians
 of its pixels, means along their rays."""
 
-import math
 from collections.abc import Iterable
 from typing import Literal
 
@@ -84,15 +83,18 @@ def patch_rays_at(patch_BN43: Tensor, count: int) -> tuple[Tensor, Tensor]:
     square as K allows: through those of its pixels where K is their number.
     """
     origin_BN3, corner_BN3, across_BN3, down_BN3 = patch_BN43.unbind(-2)
-    # The divisor next to the square root: K cells as nearly square as K allows.
-    rows = next(n for n in range(math.isqrt(count), 0, -1) if count % n == 0)
+    index_K = torch.arange(count, device=patch_BN43.device)
+    # The divisor next to the square root: K cells as nearly square as K allows. It stays a tensor,
+    # since torch.compile would make a graph for each K that Python divides.
+    n_K = index_K + 1
+    rows = torch.where((count % n_K == 0) & (n_K * n_K <= count), n_K, 1).amax()
     columns = count // rows
-    u_c = (torch.arange(columns).to(patch_BN43) + 0.5) / columns
-    v_r = (torch.arange(rows).to(patch_BN43) + 0.5) / rows
-    along_BNc3 = across_BN3[..., None, :] * u_c[:, None]
-    along_BNr3 = corner_BN3[..., None, :] + down_BN3[..., None, :] * v_r[:, None]
-    directions = rearrange(along_BNr3, "b n r x -> b n r 1 x") + along_BNc3[..., None, :, :]
-    return origin_BN3[..., None, :], directions.flatten(2, 3)
+    u_K1 = ((index_K % columns).to(patch_BN43) + 0.5)[:, None] / columns
+    v_K1 = ((index_K // columns).to(patch_BN43) + 0.5)[:, None] / rows
+    corner_BN13, across_BN13, down_BN13 = (
+        x[..., None, :] for x in (corner_BN3, across_BN3, down_BN3)
+    )
+    return origin_BN3[..., None, :], corner_BN13 + down_BN13 * v_K1 + across_BN13 * u_K1
 
 
 class AlongRays(Centers):
