@@ -48,7 +48,8 @@ def train_in_two_processes(recipe: Recipe, run: Path, spoil: str = "") -> None:
     assert said[0][1:] == said[1][1:] == ("4", said[0][2]), "the same weights everywhere"
 
 
-@pytest.mark.parametrize("accumulate", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("accumulate", [1, 2])
 def test_two_processes_have_the_loss_curve_of_one(
     tiny: Tiny, tmp_path: Path, accumulate: int
 ) -> None:

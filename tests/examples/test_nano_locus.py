@@ -13,7 +13,7 @@ from qgs.engine.training_pass import TrainingPass
 from qgs.types import Cameras, Gaussians, Views
 
 ROOT = Path(__file__).parents[2]
-SIZE = (32, 48)
+SIZE = (16, 24)
 MAX_LINES = 300
 torch.set_num_threads(1)
 
@@ -47,7 +47,7 @@ def views(count: int, seed: int) -> Views:
     cross = torch.linalg.cross(angle[..., None, :].expand(2, count, 3, 3), c2w[..., :3, :3], dim=-1)
     c2w[..., :3, :3] = torch.linalg.matrix_exp(cross)
     c2w[..., :3, 3] = torch.randn(2, count, 3, generator=generator) * 0.2
-    intrinsics = torch.tensor([40.0, 42.0, 23.0, 17.0]).expand(2, count, 4)
+    intrinsics = torch.tensor([20.0, 21.0, 11.5, 8.5]).expand(2, count, 4)
     images = torch.rand(2, count, 3, *SIZE, generator=generator)
     return Views(images, Cameras(c2w, intrinsics, SIZE))
 

@@ -175,6 +175,13 @@ class Case:
                 parameter += NOISE * torch.randn(parameter.shape, generator=generator).to(parameter)
         return module
 
+    def with_at_most(self, **sizes: int) -> "Case":
+        """With options that are larger lowered to these; itself where the component refuses it."""
+        lower = {n: x for n, x in sizes.items() if (getattr(self.config, n, None) or 0) > x}
+        config = self.config.model_copy(update=lower)
+        smaller = replace(self, config=config, state_dict=None)
+        return self if smaller.problems(smaller.size) else smaller
+
     def with_dims(self, **sizes: int) -> "Case":
         """The same component in a model of other sizes."""
         return replace(self, dims=replace(self.dims, **sizes), state_dict=None)
