@@ -8,12 +8,13 @@ import torch
 from rich.console import Console
 from safetensors.torch import load_file
 from torch import Tensor
-from training_runs import Tiny
+from training_runs import Tiny, same
 
 from qgs.composer import Recipe, resolve
 from qgs.engine.initial import initialise
 from qgs.engine.training import train
 from qgs.io.checkpoint import save
+from qgs.io.tensors import CheckpointError
 from qgs.model import QueryGaussianModel
 
 COUNT = 24
@@ -80,6 +81,26 @@ def test_shrinking_keeps_the_first(learned: Tiny, name: str) -> None:
         after = model.queries.get_parameter(parameter)
         assert torch.equal(after, old_weights(recipe)[f"queries.{parameter}"][:10])
     assert "queries.features: 24 -> 10, the first are kept" in told
+
+
+@pytest.mark.parametrize(
+    ("of", "option", "named"),
+    [
+        ("", "model.head.gaussians_per_query=2", "model.head.gaussians_per_query: 4 (here 2)"),
+        ("locus", "seed=1", "queries.center"),
+    ],
+)
+def test_weights_that_do_not_fit_are_refused_and_none_is_taken(
+    learned: Tiny, of: str, option: str, named: str
+) -> None:
+    recipe = learned("tokengs", option, of=of)
+    model = recipe.build_model()
+    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    with pytest.raises(CheckpointError) as caught:
+        initialise(model, recipe)
+    assert f"init_from: {recipe.tree['init_from']} does not fit" in str(caught.value)
+    assert named in str(caught.value)
+    assert same(before, model.state_dict())
 
 
 def test_the_recipes_seed_decides_the_noise(learned: Tiny) -> None:

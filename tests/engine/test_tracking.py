@@ -3,11 +3,16 @@
 import io
 import json
 import re
+import sys
 import time
 from collections.abc import Callable
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
+from accelerate import PartialState
 from rich.console import Console
 from training_runs import Tiny, run, tensorboard_events
 
@@ -89,6 +94,33 @@ def test_a_resumed_run_takes_back_what_was_told_of_lost_steps(tiny: Tiny, tmp_pa
         time.sleep(1.1)  # files of one second are read in the order of a number in their names
     events = tensorboard_events(tmp_path).Scalars("loss")
     assert [(e.step, e.value) for e in events] == [(1, 1.0), (2, 1.0), (3, 2.0), (4, 2.0)]
+
+
+def test_a_resumed_run_goes_on_in_its_run_of_wandb(
+    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wandb = MagicMock(__spec__=ModuleSpec("wandb", None), Image=lambda picture: picture.shape)
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    PartialState(cpu=True)  # accelerate's trackers ask it which process they are in
+    for step in (0, 4):
+        tracking = Trackers(("wandb",))
+        tracking.open(tmp_path / "chairs", tiny("locus"), step)
+        tracking.log({"loss": 0.5}, step + 1)
+        tracking.picture("views", np.zeros((2, 3, 3), np.uint8), step + 1)
+        tracking.close()
+    first, second = (call.kwargs for call in wandb.init.call_args_list)
+    assert first == second
+    assert (first["name"], first["resume"]) == ("chairs", "allow")
+    assert first["id"] == (tmp_path / "chairs" / "wandb" / "id").read_text()
+    assert wandb.config.update.call_args.args[0]["model.width"] == 32
+    own = wandb.init.return_value
+    logged = [(call.args[0], call.kwargs["step"]) for call in own.log.call_args_list]
+    assert logged == [
+        entry
+        for step in (1, 5)
+        for entry in (({"loss": 0.5}, step), ({"views": [(2, 3, 3)]}, step))
+    ]
+    assert own.finish.call_count == 2
 
 
 def shown(monkeypatch: pytest.MonkeyPatch, *steps: tuple[int, int, float, float]) -> list[str]:
