@@ -5,10 +5,8 @@ import runpy
 from pathlib import Path
 
 import pytest
-import yaml
 
 import qgs
-from qgs.composer import resolve
 
 EXAMPLE = Path(__file__).parents[2] / "docs/examples/train_by_hand.py"
 MAX_LINES = 120
@@ -17,9 +15,7 @@ MAX_LINES = 120
 def test_it_trains_and_saves_a_scene(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recipe, out = tmp_path / "recipe.yaml", tmp_path / "scene.ply"
-    small = resolve(EXAMPLE.parents[2] / "recipes/tiny/locus.yaml", ["data.image_size=[16, 16]"])
-    recipe.write_text(yaml.safe_dump(dict(small.tree)))
+    recipe, out = EXAMPLE.parents[2] / "recipes/tiny/locus.yaml", tmp_path / "scene.ply"
     command = [EXAMPLE, recipe, "--steps", "11", "--out", out]
     monkeypatch.setattr("sys.argv", [str(argument) for argument in command])
     runpy.run_path(str(EXAMPLE), run_name="__main__")

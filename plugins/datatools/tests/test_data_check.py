@@ -1,11 +1,8 @@
 import re
 import shutil
-from unittest.mock import Mock
 
 import pytest
 from commands import run_qgs
-
-from qgs.io.files import DiskFullError
 
 
 @pytest.fixture(scope="module")
@@ -64,16 +61,6 @@ def test_the_page_needs_no_other_file(broken, tmp_path):
     assert "the image does not exist" in html
     assert html.count('alt="cameras of') == 2
     assert html.count('alt="worst pair of') == 1
-
-
-def test_a_page_that_cannot_be_written_leaves_the_one_before(sound, tmp_path, monkeypatch):
-    page = tmp_path / "check.html"
-    page.write_text("of yesterday")
-    monkeypatch.setattr("qgs.io.files.os.replace", Mock(side_effect=OSError(28, "disk full")))
-    result = run(sound, "--quick", "--report", page)
-    assert isinstance(result.exception, DiskFullError)
-    assert [file.name for file in tmp_path.iterdir()] == ["check.html"]
-    assert page.read_text() == "of yesterday"
 
 
 def test_quick_reads_headers_only(room):
