@@ -29,7 +29,9 @@ Device: TypeAlias = Annotated[
 Size: TypeAlias = Annotated[
     str | None,
     typer.Option(
-        metavar="HxW", help="Height and width of the photos; the recipe's data.image_size."
+        metavar="HxW",
+        help="Height and width of the photos; default: whole photos, the shorter side as in the "
+        "recipe's data.image_size.",
     ),
 ]
 Inputs: TypeAlias = Annotated[

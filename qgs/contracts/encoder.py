@@ -60,6 +60,14 @@ class Encoder(ModelComponent):
         """
         return dict(learned)
 
+    @classmethod
+    def size_multiple(cls, config: ComponentConfig) -> int | None:
+        """Of which both sides of an image must be multiples; None: it takes the trained size alone.
+
+        Photos of a user are then seen whole, in their own aspect, and are not cropped.
+        """
+        return None
+
     @abstractmethod
     def forward(self, views: Views) -> ImageMemory:
         """Encode all views of each scene together."""
@@ -93,6 +101,12 @@ class PatchEncoder(Encoder):
                 f"patches of {patch} do not divide images of {size[0]} x {size[1]} (H x W)",
                 f"set data.image_size to {nearest}, or choose a patch_size that divides both sides",
             )
+
+    @classmethod
+    def size_multiple(cls, config: ComponentConfig) -> int:
+        """The side of a patch."""
+        assert isinstance(config, PatchEncoder.Config)
+        return config.patch_size
 
     def grid(self, views: Views) -> tuple[int, int, int]:
         """(V, H/P, W/P); raises ValueError where patches do not divide the images."""

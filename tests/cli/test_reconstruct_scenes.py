@@ -4,6 +4,7 @@ import json
 import shutil
 import zipfile
 from functools import partial
+from unittest.mock import Mock
 
 import pytest
 import tape_source
@@ -14,7 +15,7 @@ from qgs_datatools import packing
 from upath import UPath
 
 import qgs
-from qgs.analysis.scenes import chosen_scene
+from qgs.analysis.scenes import chosen_scene, whole_size
 from qgs.composer import resolve
 from qgs.data import PhotosSource
 
@@ -60,6 +61,30 @@ def test_a_scene_of_a_trained_set_is_known_for_what_it_is(folders):
     for other in (folders / "test" / "c", folders.parent / "llff"):
         scene, seen = chosen(trained, other)
         assert (scene.held_out, list(seen)) == ((), [])
+
+
+@pytest.mark.parametrize(
+    ("stored", "multiple", "whole"),
+    [
+        ((1280, 720), 4, (112, 64)),
+        ((360, 540), 4, (64, 96)),
+        ((30, 40), 16, (64, 80)),
+        ((30, 40), None, (64, 64)),
+        ((512, 512), 4, (64, 64)),
+        (None, 4, (64, 64)),
+    ],
+)
+def test_photos_of_another_kind_are_seen_whole(stored, multiple, whole):
+    scene = Mock(cameras=Mock(size=(64, 64)), stored_size=lambda frame: stored)
+    assert whole_size(scene, multiple) == whole
+
+
+def test_the_whole_size_is_a_default(folders):
+    trained = recipe(type="rooms/procedural")
+    assert chosen(trained, folders.parent / "llff")[0].cameras.size == (16, 24)
+    assert chosen(trained, folders.parent / "llff", SIZE)[0].cameras.size == SIZE
+    trained = recipe(type="qgs/photos", path=str(folders))
+    assert chosen(trained, folders / "a")[0].cameras.size == SIZE
 
 
 def test_one_scene_of_chunks(folders, tmp_path):

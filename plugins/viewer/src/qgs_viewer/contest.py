@@ -5,6 +5,7 @@ import platform
 import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import yaml
 from rich import box
 from rich.table import Table
 
-from qgs.analysis.scenes import installed_sources
+from qgs.analysis.scenes import Size, installed_sources, size_multiple, whole_size
 from qgs.composer import Recipe, resolve
 from qgs.composer.schema import summary_of
 from qgs.data.evaluation import evaluation_samples, true_depth
@@ -105,9 +106,11 @@ def checkpoints(names: Sequence[str]) -> dict[str, Path]:
     return dict(zip(short_names(names), map(checkpoint_path, names), strict=True))
 
 
-def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[Entry]:
+def judge(
+    files: Mapping[str, Path], photos: str | None, device: str, size: Size | None = None
+) -> list[Entry]:
     """The models in `files` on unseen scenes, or on held-out photos; raises as `recipes_alike`."""
-    recipes, entries = recipes_alike(files, photos), []
+    recipes, entries = recipes_alike(files, photos, size), []
     for name, path in files.items():
         with CheckpointFile(path) as file:
             model, step, training = (
@@ -124,8 +127,12 @@ def judge(files: Mapping[str, Path], photos: str | None, device: str) -> list[En
     return entries
 
 
-def recipes_alike(files: Mapping[str, Path], photos: str | None) -> dict[str, Recipe]:
+def recipes_alike(
+    files: Mapping[str, Path], photos: str | None, size: Size | None = None
+) -> dict[str, Recipe]:
     """The recipes of `files`, with the data at `photos` in place of their own.
+
+    size: (H, W) of the photos, by default one that all models take and at which they are whole.
 
     Raises ValueError where their protocols differ, and as `CheckpointFile` and the data do.
     """
@@ -134,21 +141,26 @@ def recipes_alike(files: Mapping[str, Path], photos: str | None) -> dict[str, Re
         with CheckpointFile(path) as file:
             recipes[name] = file.recipe
     if photos is not None:
-        recipes = {name: _on_photos(recipe, photos) for name, recipe in recipes.items()}
+        multiple = size_multiple(recipes.values())
+        recipes = {n: _on_photos(recipe, photos, size, multiple) for n, recipe in recipes.items()}
     refuse_unequal(recipes, JUDGED)
     return recipes
 
 
-def _on_photos(recipe: Recipe, photos: str) -> Recipe:
+def _on_photos(recipe: Recipe, photos: str, size: Size | None, multiple: int | None) -> Recipe:
     """`recipe` with the data at `photos`, some of them held out, in place of its own.
 
     Data that it was not trained on has a unit of its own, so a constant `views.scale` becomes auto.
     """
     sources = installed_sources()
-    source, own = open_for(photos, None, recipe.data_config, sources)
+    source, own = open_for(photos, size, recipe.data_config, sources)
+    first = next(chain(source.scenes("test"), source.scenes("train")), None)
+    if size is None and not own and first is not None:
+        size = whole_size(first, multiple)
     views = {} if own or recipe.views.scale != "constant" else {"scale": "auto"}
     kind = next(name for name, component in sources.items() if component is type(source))
     options = source.config.model_dump(mode="json")
+    options["image_size"] = [*(size or source.config.image_size)]
     if options.get("holdout") == 0:
         fewest = min((len(scene) for scene in source.scenes("test")), default=HOLDOUT)
         options["holdout"] = min(HOLDOUT, fewest)

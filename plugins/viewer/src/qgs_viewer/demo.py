@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from qgs.cli.options import Device, Photos, Runs
+from qgs.cli.options import Device, Photos, Runs, Size, parse_size
 
 if TYPE_CHECKING:
     from qgs_viewer.report import Report
@@ -47,6 +47,7 @@ def demo(
     out: Annotated[
         Path | None, typer.Option(help="New folder for everything; default: demo, demo-2, ...")
     ] = None,
+    size: Size = None,
     device: Device = "auto",
 ) -> None:
     """Trained models on rooms unseen in training, or on your photos; writes report.html.
@@ -62,11 +63,13 @@ def demo(
         raise ValueError(f"{given[0]} is a recipe, no folder of photos: add --train to train it")
     if not train and len(given or ()) > 1:
         raise ValueError(f"one folder of photos is shown at a time, got {', '.join(given or ())}")
+    if size is not None and (train or not given):
+        raise ValueError("--size is for photos: name a folder of them, or leave it out")
     target = new_folder(out)
     if train:
         compare_trainings(given or RECIPES, seconds or 120, seed or 0, target, device)
     else:
-        show_trained(models, given[0] if given else None, target, device)
+        show_trained(models, given[0] if given else None, target, device, size)
 
 
 @report_app.command()
@@ -76,14 +79,21 @@ def report(
     out: Annotated[
         Path | None, typer.Option(help="New folder for the page; default: report, report-2, ...")
     ] = None,
+    size: Size = None,
     device: Device = "auto",
 ) -> None:
     """Evaluate trained models and show their scenes side by side; writes report.html."""
-    show_trained(runs, photos, new_folder(out, "report"), device)
+    if size is not None and photos is None:
+        raise ValueError("--size is for photos: give --photos, or leave it out")
+    show_trained(runs, photos, new_folder(out, "report"), device, size)
 
 
 def show_trained(
-    models: Sequence[str] | None, photos: str | None, target: Path, device: str
+    models: Sequence[str] | None,
+    photos: str | None,
+    target: Path,
+    device: str,
+    size: str | None = None,
 ) -> None:
     """Judge `models`, by default those that come with qgs, and write their report."""
     from qgs_viewer import contest
@@ -97,7 +107,7 @@ def show_trained(
         raise
     scenes = "Unseen scenes" if photos is None else "Your photos"
     console.print(f"Reconstructing: {scenes.lower()}", style="dim")
-    entries = contest.judge(files, photos, device)
+    entries = contest.judge(files, photos, device, parse_size(size))
     lede = "These trained models come with qgs, and none has seen the scenes below."
     if photos is not None:
         lede = "Trained models on your photos, judged on those between their inputs."
