@@ -24,6 +24,11 @@ NOVEL = 6
 """Views that are compared with by default, at most."""
 KINDS = ("input", "novel", "seen in training")
 """A compared view of a folder that the model was trained on is novel if it was held out."""
+OF_PHOTOS = (
+    "try another scale of the world (--scale), then inputs nearer to the views that are wanted "
+    "(--frames), or refine the result (--refine)"
+)
+"""Remedies where the nearest photo is better than a reconstruction."""
 
 
 def choose_frames(
@@ -128,7 +133,8 @@ class Reconstruction:
         if not rows:
             return ""
         model, nearest = (sum(values) / len(rows) for values in zip(*rows, strict=True))
-        return worse_than_nearest(Psnr.column, model, nearest)
+        remedy = "refine for longer, or on more photos" if self.refinement else OF_PHOTOS
+        return worse_than_nearest(Psnr.column, model, nearest, remedy)
 
     @property
     def in_photos_world(self) -> Gaussians:

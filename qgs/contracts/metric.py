@@ -35,6 +35,13 @@ class Column:
         known = [value for value in values if value is not None]
         return (max if self.better == "higher" else min)(known, default=None)
 
+    def beats(self, value: float | None, other: float | None) -> bool:
+        """Whether `value` is better than `other` in the digits that tables show."""
+        # 14.463 and 14.457 both read 14.46: a sentence that ranks them would puzzle its reader
+        if value is None or other is None or self.shown(value) == self.shown(other):
+            return False
+        return self.best((value, other)) == value
+
 
 @dataclass(frozen=True)
 class MetricInput(TensorContainer):

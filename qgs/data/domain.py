@@ -35,6 +35,15 @@ WORDS = {
     "fov": "their field of view is {} degrees wide",
 }
 """What is measured of a sample, lengths in the model's units."""
+REMEDIES = {
+    "--scale": ("another scale of the world", {"baseline", "depth", "fov"}),
+    "--frames": ("other input views", {"baseline", "turn", "depth"}),
+    "--inputs": ("another number of them", {"views"}),
+}
+"""What may bring views into the trained range, by option of `qgs reconstruct`, and which of WORDS
+it helps. The scale comes first: it costs nothing and moves baseline and depth together."""
+OF_RECIPES = {"--scale": "views.scale", "--frames": "views.gap", "--inputs": "views.inputs"}
+"""The same options in recipes, for commands that evaluate one."""
 
 
 @dataclass
@@ -79,26 +88,34 @@ class Domain:
             raise ValueError(f"these are no ranges of views: {str(plain)[:100]}")
         return domain
 
-    def differences(self, found: Domain) -> list[str]:
-        """A phrase for each range of the training that the range of `found` exceeds."""
-        phrases, seen = [], found.ranges
+    def differences(self, found: Domain) -> dict[str, str]:
+        """By name a phrase for each range of the training that the range of `found` exceeds."""
+        phrases, seen = dict[str, str](), found.ranges
         for name, trained in self.ranges.items():
             if name in seen and not _inside(seen[name], trained):
                 words = WORDS[name].format(_shown(seen[name]))
                 if seen[name][0] == math.inf:
                     words = "their axes meet at no point before them"
-                phrases.append(f"{words} (trained: {_shown(trained)})")
+                phrases[name] = f"{words} (trained: {_shown(trained)})"
         return phrases
 
 
-def verdict(trained: Domain, found: Domain) -> str:
-    """A sentence that compares views with the training's; `trained` is empty if unknown."""
+def verdict(trained: Domain, found: Domain, options: Mapping[str, str] = {}) -> str:
+    """A sentence that compares views with the training's, and what may help.
+
+    trained: empty if unknown. options: other names of those of REMEDIES, such as OF_RECIPES.
+    """
     if not trained.values:
         return "the checkpoint does not record the views on which this model was trained"
     if outside := trained.differences(found):
+        remedies = [
+            f"{what} ({options.get(option, option)})"
+            for option, (what, helped) in REMEDIES.items()
+            if helped & outside.keys()
+        ]
         return (
-            f"the views lie outside what this model was trained on: {', '.join(outside)}. Expect a "
-            "poor result; choose other input views (--frames), or train on views like these"
+            f"the views lie outside what this model was trained on: {', '.join(outside.values())}. "
+            f"The result may be poor: try {', then '.join(remedies)}, or train on views like these"
         )
     return (
         "the cameras lie within what this model was trained on, in distance, direction, depth and "

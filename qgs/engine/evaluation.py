@@ -11,7 +11,7 @@ import torch
 from qgs.composer import Recipe
 from qgs.composer.registry import BUILTIN, component_failure
 from qgs.contracts import Column, Metric, MetricInput, SceneSource
-from qgs.data.domain import Domain, verdict
+from qgs.data.domain import OF_RECIPES, Domain, verdict
 from qgs.data.evaluation import EvaluationPlan, SceneFailure, one_line, true_depth
 from qgs.data.samples import Sample, stack_views
 from qgs.engine.protocol import index_of, protocol_of
@@ -24,6 +24,12 @@ from qgs.types import Gaussians, Views
 
 SECTIONS = ("plugins", "data", "views", "evaluation", "metrics")
 """Sections of a recipe that decide which views are scored, and how."""
+
+OF_OTHER_DATA = (
+    "try another scale of the world (views.scale), then inputs nearer to the views that are wanted "
+    "(views.gap), or train on photos like these"
+)
+"""Remedies where a model is judged on data that it was not trained on."""
 
 
 def evaluate(
@@ -74,13 +80,17 @@ def evaluate(
         held_out=None if index else _held_out(source, scores),
         step=step,
     )
-    likeness = "" if trained_on is None else verdict(trained_on, scorer.seen)
-    remarks = (likeness, plan.framing, *_remarks(evaluation, plan, recipe))
+    likeness = "" if trained_on is None else verdict(trained_on, scorer.seen, OF_RECIPES)
+    own = recipe.tree["data"] == (model.recipe or {}).get("data")
+    remedy = "train for longer" if own else OF_OTHER_DATA
+    remarks = (likeness, plan.framing, *_remarks(evaluation, plan, recipe, remedy))
     return replace(evaluation, remarks=[*filter(None, remarks)])
 
 
-def _remarks(evaluation: Evaluation, plan: EvaluationPlan, recipe: Recipe) -> Iterator[str]:
-    """Remarks on the scores; "" for those that do not apply."""
+def _remarks(
+    evaluation: Evaluation, plan: EvaluationPlan, recipe: Recipe, remedy: str
+) -> Iterator[str]:
+    """Remarks on the scores; "" for those that do not apply. remedy: see `worse_than_nearest`."""
     scores, samples = evaluation.scores, recipe.evaluation.samples
     fixed = [score for score in scores if score.scene not in plan.drawn]
     if samples > 1 and fixed:
@@ -93,7 +103,7 @@ def _remarks(evaluation: Evaluation, plan: EvaluationPlan, recipe: Recipe) -> It
     if evaluation.columns and not any(score.given for score in scores):
         name, column = next(iter(evaluation.columns.items()))
         nearest = evaluation.mean(name, "nearest_input")
-        yield worse_than_nearest(column, evaluation.mean(name), nearest)
+        yield worse_than_nearest(column, evaluation.mean(name), nearest, remedy)
 
 
 class Measures:

@@ -202,6 +202,11 @@ class Trainer:
         self.model = recipe.build_model(accelerator.device, pretrained=initial).train()
         self.notes = [f"warning: {text}" for text in recipe.warnings]
         self.notes += initialise(self.model, recipe) if initial else []
+        if self.config.seconds:  # often inherited by recipes and options that set only the steps
+            self.notes.append(
+                f"stops after {self.config.seconds:g} s (training.seconds) or "
+                f"{self.config.steps:,} steps (training.steps), whichever comes first"
+            )
         self.training_pass = TrainingPass.of(recipe, self.model).to(accelerator.device)
         factors = recipe.rate_factors(self.training_pass)
         optimizer = make_optimizer(self.training_pass, self.optimizer, factors)

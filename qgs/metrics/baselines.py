@@ -29,14 +29,15 @@ BASELINES = {"nearest_input": nearest_input, "mean_colour": mean_colour}
 """By their names in results; tables write blanks for underscores."""
 
 
-def worse_than_nearest(column: Column, model: float | None, nearest: float | None) -> str:
-    """A remark where `nearest_input` scores better than the model, else ""."""
-    if model is None or nearest is None or column.best((model, nearest)) == model:
+def worse_than_nearest(
+    column: Column, model: float | None, nearest: float | None, remedy: str
+) -> str:
+    """A remark with `remedy` where `nearest_input` scores better than the model, else ""."""
+    if not column.beats(nearest, model):
         return ""
     return (
         f"the result is worse than the nearest photo, copied: {column.heading} "
-        f"{column.shown(model)} against {column.shown(nearest)}; choose inputs nearer to the views "
-        "that are wanted, or train on photos like these"
+        f"{column.shown(model)} against {column.shown(nearest)}; {remedy}"
     )
 
 

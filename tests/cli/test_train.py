@@ -1,6 +1,7 @@
 """`qgs train` and `qgs eval` as a user types them."""
 
 import json
+import re
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -42,6 +43,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_training_ends_with_an_evaluation(run: Path) -> None:
     files = {"checkpoint.safetensors", "history.jsonl", "recipe.yaml", "state.safetensors"}
     assert {path.name for path in run.iterdir()} == {"evaluation", *files}
+
+
+def test_a_budget_of_time_is_named_beside_that_of_steps(tmp_path: Path) -> None:
+    result = train(tmp_path / "run", *sets("training.seconds=77"))
+    assert result.exit_code == 0, result.output
+    assert re.search(r"77 s.* 2 steps", result.output)
 
 
 def test_resume_leaves_a_finished_run_and_refuses_another_recipe(run: Path) -> None:

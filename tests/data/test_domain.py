@@ -12,7 +12,7 @@ import torch
 from commands import MODEL
 
 from qgs.composer import resolve
-from qgs.data.domain import KEY, Domain, verdict
+from qgs.data.domain import KEY, OF_RECIPES, Domain, verdict
 from qgs.data.evaluation import evaluation_samples
 from qgs.data.stream import MEASURED, trained_domain
 from qgs.engine.training import train
@@ -81,7 +81,7 @@ def test_a_few_pairs_of_parallel_axes_do_not_make_every_depth_one_that_was_train
     assert mixed.ranges["depth"] == pytest.approx((2.062, math.inf))
     mixed = domain(*[near] * 499, parallel)
     assert mixed.ranges["depth"] == pytest.approx((2.062, 2.062))
-    assert "meet at no point before them" in mixed.differences(domain(parallel))[-1]
+    assert "meet at no point before them" in mixed.differences(domain(parallel))["depth"]
 
 
 @pytest.mark.parametrize(
@@ -107,9 +107,22 @@ def test_the_sentence() -> None:
     assert not trained.differences(within)
     wide = domain(around([0, 0, 1.5], [[-1.5, 0, 0], [1.5, 0, 0], [0, 0, 0]], focal=4.0))
     outside = trained.differences(wide)
-    assert [float(re.search(r"[\d.]+", text)[0]) for text in outside] == [3, 3, 90, 152]
-    assert all(text in verdict(trained, wide) for text in outside)
+    assert [float(re.findall(r"[\d.]+", text)[0]) for text in outside.values()] == [3, 3, 90, 152]
+    assert all(text in verdict(trained, wide) for text in outside.values())
     assert "checkpoint does not record" in verdict(Domain(), within)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "focal", "options"),
+    [(-0.9, 0.9, 8.0, ["--scale", "--frames"]), (-0.1, 0.1, 4.0, ["--scale"])],
+)
+def test_what_helps_is_named_and_the_scale_comes_first(first, second, focal, options) -> None:
+    """A baseline that is too wide, and a field of view that is."""
+    trained = domain(around([0, 0, 1], [[-0.1, 0, 0], [0.1, 0, 0]]))
+    found = domain(around([0, 0, 1], [[first, 0, 0], [second, 0, 0]], focal=focal))
+    text = verdict(trained, found)
+    assert re.findall(r"--\w+", text) == options
+    assert "--" not in verdict(trained, found, OF_RECIPES)
 
 
 def test_checkpoints_tell_what_they_were_trained_on_also_when_a_run_is_continued(tmp_path) -> None:
@@ -140,7 +153,7 @@ def test_the_own_test_data_of_a_recipe_lie_inside(name: str, options: list[str])
     test = Domain()
     for sample in evaluation_samples(source, recipe.views, recipe.evaluation, sampler):
         test.see(sample.inputs.cameras, sample.targets.cameras)
-    assert trained.differences(test) == []
+    assert not trained.differences(test)
 
 
 def test_a_scene_that_fails_is_left_out_of_the_ranges(monkeypatch: pytest.MonkeyPatch) -> None:

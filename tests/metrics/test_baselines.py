@@ -2,11 +2,13 @@
 
 import math
 
+import pytest
 import torch
 from torch import Tensor
 
+from qgs.contracts import Column
 from qgs.data.samples import stack_views
-from qgs.metrics.baselines import mean_colour, nearest_input
+from qgs.metrics.baselines import mean_colour, nearest_input, worse_than_nearest
 from qgs.types import Cameras, Views
 
 
@@ -61,3 +63,21 @@ def test_mean_colour_is_flat_and_the_best_flat_guess() -> None:
     assert float(found.std((-1, -2)).max()) < 1e-6
     errors = [(inputs.images - found[:, :1] - d).square().mean() for d in (0, 0.01, -0.01)]
     assert errors[0] < min(errors[1:])
+
+
+@pytest.mark.parametrize(
+    ("better", "model", "nearest", "remarked"),
+    [
+        ("higher", 14.457, 14.463, False),
+        ("higher", 14.454, 14.463, True),
+        ("lower", 0.31, 0.30, True),
+        ("lower", 0.304, 0.301, False),
+        ("higher", 15.0, None, False),
+    ],
+)
+def test_a_model_is_worse_only_where_the_shown_figures_differ(
+    better, model, nearest, remarked
+) -> None:
+    text = worse_than_nearest(Column("score", better, 2), model, nearest, "try this")
+    assert bool(text) == remarked
+    assert ("try this" in text) == remarked

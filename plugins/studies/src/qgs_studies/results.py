@@ -235,7 +235,7 @@ class Results:
             return
         nearest = self.baselines(self.shared).get("nearest_input", {}).get(self.metric)
         means = {r.variant: r.scores[self.metric].mean for r in self.rows(self.shared) if r.scores}
-        worse = [v for v, m in means.items() if nearest and self.sign * (m - nearest) < 0]
+        worse = [v for v, mean in means.items() if self.column.beats(nearest, mean)]
         if worse:
             value = f"{self.column.heading} {self.shown(nearest, sign=False)}"
             yield f"Worse than the nearest input photo, copied ({value}): {listed(worse)}."

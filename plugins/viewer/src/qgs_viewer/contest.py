@@ -229,7 +229,8 @@ def table_of(report: Report) -> Table:
         cells = []
         for name, column in columns.items():
             score, cell = c.scores[name], column.shown(c.scores[name])
-            is_best = score is not None and score == best[name]
+            # cells that read alike are both best
+            is_best = score is not None and cell == column.shown(best[name])
             cells.append(f"[green]{cell}[/green]" if is_best else cell)
         table.add_row(c.name, *cells, f"{c.gaussians:,}", f"{c.parameters / 1e6:.2f} M")
     table.add_section()
