@@ -31,7 +31,7 @@ DISTRIBUTIONS = {
     "qgs.plugins": {
         name: f"query-gaussians-{name}"
         for name in (
-            *("locus", "ellipsoid", "c3g", "gslrm", "globalsplat", "tokengs2026"),
+            *("locus", "ellipsoid", "c3g", "gslrm", "globalsplat", "mvsplat", "tokengs2026"),
             *("rooms", "datasets"),
         )
     },

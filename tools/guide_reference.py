@@ -15,7 +15,8 @@ from qgs.composer.slots import SLOTS
 from qgs.composer.yaml_text import dump
 from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
 
-PLUGINS = ("locus", "ellipsoid", "c3g", "gslrm", "globalsplat", "tokengs2026", "rooms", "datasets")
+PLUGINS = ("locus", "ellipsoid", "c3g", "gslrm", "globalsplat", "mvsplat", "tokengs2026")
+PLUGINS += ("rooms", "datasets")
 
 SECTIONS: Mapping[str, type[ComponentConfig]] = {
     "Top level": RecipeSettings,

@@ -16,7 +16,8 @@ from qgs.composer.yaml_text import inline
 from qgs.contracts import Component
 from qgs.engine.training_pass import TrainingPass
 
-PLUGINS = ["locus", "ellipsoid", "gslrm", "c3g", "globalsplat", "tokengs2026", "datasets"]
+PLUGINS = ["locus", "ellipsoid", "gslrm", "c3g", "globalsplat", "mvsplat", "tokengs2026"]
+PLUGINS += ["datasets"]
 LAYER = ("layer", *SUBLAYER_SLOTS, "refinement")
 DRAWN = ("encoder", "queries", *LAYER, "head", "centers", "objective", "losses")
 DRAWS, LEAST = 300, 60
