@@ -10,7 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from qgs.analysis.inputs import NOVEL, choose_windows
 from qgs.contracts import Scene, ViewsConfig
+from qgs.data.domain import Domain
 from qgs.data.samples import Sample, make_sample, moments, own_world, spread
 from qgs.geometry.poses import relative_to, scaled
 from qgs.geometry.transforms import moved
@@ -20,8 +22,6 @@ from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Prediction, Rendering
 from qgs.wording import listed
 
-NOVEL = 6
-"""Views that are compared with by default, at most."""
 KINDS = ("input", "novel", "seen in training")
 """A compared view of a folder that the model was trained on is novel if it was held out."""
 OF_PHOTOS = (
@@ -79,16 +79,23 @@ def choose_sample(
     inputs: int | None,
     frames: Sequence[int] | None,
     compare: Sequence[int] | None,
+    trained_on: Domain | None = None,
 ) -> tuple[Sample, tuple[Tensor, Tensor]]:
-    """The views of `scene` that `choose_frames` picks, and their world as of `own_world`.
+    """Inputs and compared views of `scene`, and their world as of `own_world`.
 
-    Where times are known, inputs spread over them, and views compared by default are of one.
+    trained_on: of the model, where the photos are none of its training's kind: inputs are then
+    those of `choose_windows`, otherwise those of `choose_frames`. Where times are known, inputs
+    spread over them, and views compared by default are of one.
     """
     wanted, span = inputs or views.inputs, views.gap[1] + 1
     usable = moments(scene)
     if scene.times is not None and frames is None and wanted <= len(usable):
         first = max(len(usable) - max(span, wanted), 0) // 2
         frames = spread(usable[first : len(usable) - first], wanted)
+    elif frames is None and trained_on is not None:
+        of = views.model_copy(update={"inputs": wanted})
+        frames, novel = choose_windows(scene, of, trained_on)[0]
+        compare = novel if compare is None else compare
     picked = choose_frames(len(scene), wanted, span, frames, compare, held_out=scene.held_out)
     if scene.times is not None and compare is None and picked[1]:
         moment = scene.times[picked[1][len(picked[1]) // 2]]

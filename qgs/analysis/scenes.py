@@ -66,7 +66,7 @@ def reconstruct(
     photos: a folder of photos and cameras, or its URL; or Views (1, V) in any world, of which all
         are inputs unless `frames` says otherwise. OpenCV cameras, images in [0, 1].
     inputs: how many; the recipe's number by default.
-    frames: which photos, by number or file name; spread by default.
+    frames: which photos, by number or file name; by default see `qgs.analysis.inputs`.
     compare: photos to compare with; of a folder, some between the inputs by default.
     size: (H, W) of the photos of a folder; by default see `chosen_scene`.
     scene: name, where a folder holds several.
@@ -93,7 +93,8 @@ def reconstruct(
         found, seen = chosen_scene(recipe, fspath(photos), size, scene)
     wanted = None if frames is None else frame_list(frames, "frames", found)
     against = None if compare is None else frame_list(compare, "compare", found)
-    sample, world = choose_sample(found, recipe.views, inputs, wanted, against)
+    trained_on = None if seen else model.trained_on or Domain()
+    sample, world = choose_sample(found, recipe.views, inputs, wanted, against, trained_on)
     training = model.training
     try:
         tuned, record = tune(sample.inputs) if tune else (None, None)

@@ -258,10 +258,12 @@ def _of_model(name: str, wanted: Wanted) -> Source:
         recipe = resolve(recipe.tree, wanted.overrides)
     scene = _scene(recipe, wanted)
     chosen = None if wanted.frames is None else frame_list(wanted.frames, "--frames", scene)
-    sample, _ = choose_sample(scene, recipe.views, wanted.inputs, chosen, None)
+    trained = model.trained_on or Domain()
+    unlike = None if wanted.photos is None else trained
+    sample, _ = choose_sample(scene, recipe.views, wanted.inputs, chosen, None, unlike)
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
-    frames, trained = sample.input_frames, model.trained_on or Domain()
+    frames = sample.input_frames
     notes = [*filter(None, (verdict(trained, found), framing(scene, frames[0])))]
     return ModelSource(model, scene, recipe.views, frames, f"{name}: {scene.name}", notes)
 
