@@ -17,7 +17,7 @@ from qgs.contracts import Component
 from qgs.engine.training_pass import TrainingPass
 
 PLUGINS = ["locus", "ellipsoid", "gslrm", "c3g", "globalsplat", "mvsplat", "tokengs2026"]
-PLUGINS += ["datasets"]
+PLUGINS += ["dinov2", "datasets"]
 LAYER = ("layer", *SUBLAYER_SLOTS, "refinement")
 DRAWN = ("encoder", "queries", *LAYER, "head", "centers", "objective", "losses")
 DRAWS, LEAST = 300, 60
