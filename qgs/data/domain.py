@@ -43,7 +43,12 @@ REMEDIES = {
 """What may bring views into the trained range, by option of `qgs reconstruct`, and which of WORDS
 it helps. The scale comes first: it costs nothing and moves baseline and depth together."""
 OF_RECIPES = {"--scale": "views.scale", "--frames": "views.gap", "--inputs": "views.inputs"}
-"""The same options in recipes, for commands that evaluate one."""
+"""The same in recipes, for commands that evaluate one."""
+OF_SHOWN = {
+    "--scale": "--scale",
+    **{n: f"{n} of qgs reconstruct" for n in ("--frames", "--inputs")},
+}
+"""The same for commands that choose the input views of photos themselves."""
 
 
 @dataclass

@@ -26,8 +26,8 @@ SECTIONS = ("plugins", "data", "views", "evaluation", "metrics")
 """Sections of a recipe that decide which views are scored, and how."""
 
 OF_OTHER_DATA = (
-    "try another scale of the world (views.scale), then inputs nearer to the views that are wanted "
-    "(views.gap), or train on photos like these"
+    "try another scale of the world ({--scale}), then inputs nearer to the views that are wanted "
+    "({--frames}), or train on photos like these"
 )
 """Remedies where a model is judged on data that it was not trained on."""
 
@@ -39,13 +39,15 @@ def evaluate(
     batch: int = 1,
     observe: Callable[[int, int], None] | None = None,
     trained_on: Domain | None = None,
+    options: Mapping[str, str] = OF_RECIPES,
 ) -> Evaluation:
     """Evaluate `model` by the metrics of `recipe` on its test views, where the model is.
 
     A scene that fails is named in the result with the reason, and the others go on. Restores the
     model's mode. step: optimiser steps behind the weights. batch: scenes in one forward pass; with
     tuning each passes alone. observe: called with (scenes done, all scenes). trained_on: the domain
-    of the model, empty where it is unknown; None leaves out the remark on it.
+    of the model, empty where it is unknown; None leaves out the remark on it. options: what remarks
+    call those of `qgs.data.domain.REMEDIES`.
     Raises what opening the data source or the index and `Measures` raise, and ValueError when no
     scene could be scored or `batch` is less than 1.
     """
@@ -80,9 +82,9 @@ def evaluate(
         held_out=None if index else _held_out(source, scores),
         step=step,
     )
-    likeness = "" if trained_on is None else verdict(trained_on, scorer.seen, OF_RECIPES)
+    likeness = "" if trained_on is None else verdict(trained_on, scorer.seen, options)
     own = recipe.tree["data"] == (model.recipe or {}).get("data")
-    remedy = "train for longer" if own else OF_OTHER_DATA
+    remedy = "train for longer" if own else OF_OTHER_DATA.format_map(options)
     remarks = (likeness, plan.framing, *_remarks(evaluation, plan, recipe, remedy))
     return replace(evaluation, remarks=[*filter(None, remarks)])
 

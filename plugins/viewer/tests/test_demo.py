@@ -1,5 +1,8 @@
+import html
 import json
 import re
+import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -145,3 +148,40 @@ def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
     (tmp_path / "demo" / "report.html").touch()
     with pytest.raises(FileExistsError, match="not empty"):
         new_folder(tmp_path / "demo")
+
+
+def next_lines(output):
+    """The commands below `Next:`, split as a shell would."""
+    return [
+        shlex.split(line, comments=True) for line in output.partition("Next:\n")[2].splitlines()
+    ]
+
+
+def test_the_next_commands_exist_and_name_the_photos_and_a_model(models, tmp_path):
+    photos = noisy_photos(tmp_path / "my photos", 12, step=0.1)
+    result = run_qgs("demo", photos, *models)
+    assert result.exit_code == 0, result.output
+    commands = next_lines(result.output)
+    assert [command[1] for command in commands] == ["reconstruct", "view"]
+    for _, name, *words in commands:
+        assert words[0] in models
+        assert words[1] == str(photos)
+        options = run_qgs(name, "--help").output
+        assert all(word in options for word in words if word.startswith("--"))
+    page = (tmp_path / "demo" / "report.html").read_text()
+    assert "my photos" in page.partition("Next:")[2].partition("</p>")[0]
+    written = run_qgs(*commands[0][1:-1], "1")
+    assert written.exit_code == 0, written.output
+    assert (tmp_path / "demo" / "scene" / "refined").is_dir()
+
+
+def test_the_page_has_the_remarks_and_warnings_that_were_printed(models, tmp_path, caplog):
+    photos = noisy_photos(tmp_path / "mine", 12, step=0.1)
+    shutil.copy(photos / "transforms.json", photos / "transforms_train.json")
+    result = run_qgs("demo", photos, *models)
+    page = html.unescape((tmp_path / "demo" / "report.html").read_text())
+    notes = page.partition("How they compare</h2>")[2].partition("<div")[0]
+    for remark in re.findall("<p>(.*)</p>", notes):
+        assert remark in result.output + caplog.text
+    assert "2 formats" in notes
+    assert "few, more: the model sees" in notes

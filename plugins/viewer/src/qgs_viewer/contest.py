@@ -18,6 +18,7 @@ from rich.table import Table
 from qgs.analysis.scenes import Size, installed_sources, size_multiple, whole_size
 from qgs.composer import Recipe, resolve
 from qgs.composer.schema import summary_of
+from qgs.data.domain import OF_RECIPES, OF_SHOWN
 from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.data.recognition import open_for
 from qgs.engine.distributed import choose_device
@@ -36,13 +37,6 @@ PICTURED_SCENES = 6
 WINDOWS = 6  # scenes, and windows of a scene, that are judged of a user's photos
 HOLDOUT = 8  # every n-th of a user's photos is held out; of fewer photos the middle one
 AUTO_SCALE = "Each scene is scaled until what its cameras look at is 1 away (views.scale: auto)."
-NEXT = {
-    "qgs demo PHOTOS": "shows this on a folder of your own photos, with camera poses",
-    "qgs reconstruct MODEL PHOTOS --out scene --refine 30": "reconstructs and refines them",
-    "qgs view MODEL PHOTOS": "shows the scene in the browser, to turn and to pick queries in",
-    "qgs recipes": "lists recipes, each a model to train or to change",
-}
-"""Commands that a reader of a report may want, and what they do."""
 JUDGED = ("data", "views", "evaluation", "metrics")
 TRAINED = ("optimizer", "training")
 """Sections of recipes that must be equal, so that only the models differ."""
@@ -120,7 +114,8 @@ def judge(
             )
         of = "" if training.seconds else f" of {training.steps:,}"
         progress = "not known" if step is None else f"step {step:,}{of}"
-        evaluation = evaluate(model, recipes[name], trained_on=model.trained_on)
+        options = OF_RECIPES if photos is None else OF_SHOWN
+        evaluation = evaluate(model, recipes[name], trained_on=model.trained_on, options=options)
         text = about(path) or describe(recipes[name])
         entry = entry_of(name, recipes[name], evaluation, model, text, curves_of(path))
         entries.append(replace(entry, progress=f"{name}: {progress}"))
@@ -207,10 +202,11 @@ def describe(recipe: Recipe) -> str:
 
 
 def remarks(entries: Sequence[Entry]) -> list[str]:
-    """The remarks of all evaluations, each once with the models that it is about."""
+    """The remarks of all evaluations and scenes without scores, each once with its models."""
     models: dict[str, list[str]] = {}
     for entry in entries:
-        for remark in entry.evaluation.remarks:
+        missing = [f"{f.scene} is not judged: {f.reason}" for f in entry.evaluation.missing]
+        for remark in (*entry.evaluation.remarks, *missing):
             models.setdefault(remark, []).append(entry.contender.name)
     texts = [f"{', '.join(names)}: {remark}." for remark, names in models.items()]
     return [*texts, AUTO_SCALE] if entries[0].recipe.views.scale == "auto" else texts
@@ -244,6 +240,7 @@ def report_of(
     entries: Sequence[Entry],
     lede: str,
     facts: Mapping[str, str],
+    commands: Mapping[str, str],
     scenes: str = "Unseen scenes",
     notes: Sequence[str] = (),
 ) -> Report:
@@ -267,7 +264,7 @@ def report_of(
         scenes=scenes,
         notes=notes,
         meanings=[summary_of(p.component) for at, p in recipe.parts.items() if at[0] == "metrics"],
-        commands=NEXT,
+        commands=commands,
         contenders=[entry.contender for entry in entries],
         baselines={n.replace("_", " ").capitalize(): evaluation.means(n) for n in BASELINES},
         samples=samples,

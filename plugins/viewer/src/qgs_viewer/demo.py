@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,6 +15,7 @@ from rich.console import Console
 from qgs.cli.options import Device, Photos, Runs, Size, parse_size
 
 if TYPE_CHECKING:
+    from qgs_viewer.contest import Entry
     from qgs_viewer.report import Report
 
 MODELS = ("rooms/tokengs-64", "rooms/locus-64")
@@ -97,6 +100,7 @@ def show_trained(
 ) -> None:
     """Judge `models`, by default those that come with qgs, and write their report."""
     from qgs_viewer import contest
+    from qgs_viewer.hints import next_commands
 
     console = Console()
     try:
@@ -107,17 +111,17 @@ def show_trained(
         raise
     scenes = "Unseen scenes" if photos is None else "Your photos"
     console.print(f"Reconstructing: {scenes.lower()}", style="dim")
-    entries = contest.judge(files, photos, device, parse_size(size))
+    with kept_warnings() as notes:
+        entries = contest.judge(files, photos, device, parse_size(size))
     lede = "These trained models come with qgs, and none has seen the scenes below."
     if photos is not None:
         lede = "Trained models on your photos, judged on those between their inputs."
     elif models:
         lede = "Trained models, judged on the test split of their recipe."
-    notes = contest.remarks(entries) if photos is not None else []
-    for note in notes:
-        console.print(note, soft_wrap=True, highlight=False, markup=False)
     facts = {"Training": "; ".join(entry.progress for entry in entries)}
-    write(contest.report_of(entries, lede, facts, scenes, notes), target, console)
+    commands = next_commands(models or MODELS, entries, target, photos, size)
+    notes += show_remarks(entries, console)
+    write(contest.report_of(entries, lede, facts, commands, scenes, notes), target, console)
 
 
 def compare_trainings(
@@ -126,6 +130,7 @@ def compare_trainings(
     """Train `recipes` one after the other under one budget, and write their report."""
     from qgs.engine.guard import TrainingError
     from qgs_viewer import contest
+    from qgs_viewer.hints import next_commands
 
     console, entries = Console(), []
     resolved = contest.resolve_fairly([Path(recipe) for recipe in recipes], seconds, seed)
@@ -138,7 +143,36 @@ def compare_trainings(
             raise typer.Exit(1) from None
     facts = {"Budget": f"{seconds:g} seconds of training each, seed {seed}"}
     lede = "Trained by one command on the same scenes, judged on scenes that none of them saw."
-    write(contest.report_of(entries, lede, facts), target, console)
+    commands = next_commands([str(target / name) for name in resolved], entries, target)
+    notes = show_remarks(entries, console)
+    write(contest.report_of(entries, lede, facts, commands, notes=notes), target, console)
+
+
+@contextmanager
+def kept_warnings() -> Iterator[list[str]]:
+    """Warnings of qgs inside the block, which are shown as well, for the page that comes of it."""
+    kept, logger = list[str](), logging.getLogger("qgs")
+    collector = logging.Handler(logging.WARNING)
+    collector.emit = lambda record: kept.append(record.getMessage())
+    # Python prints warnings itself only where no logger on the way has a handler
+    handlers = [collector] if logger.hasHandlers() else [collector, logging.StreamHandler()]
+    for handler in handlers:
+        logger.addHandler(handler)
+    try:
+        yield kept
+    finally:
+        for handler in handlers:
+            logger.removeHandler(handler)
+
+
+def show_remarks(entries: Sequence[Entry], console: Console) -> list[str]:
+    """Print the remarks on `entries`, and return them for the page."""
+    from qgs_viewer.contest import remarks
+
+    notes = remarks(entries)
+    for note in notes:
+        console.print(note, soft_wrap=True, highlight=False, markup=False)
+    return notes
 
 
 def write(report: Report, target: Path, console: Console) -> None:
@@ -168,7 +202,8 @@ def write(report: Report, target: Path, console: Console) -> None:
         console.print(f"{contender.name}: {there}", soft_wrap=True)
     console.print("Next:")
     for command, what in report.commands.items():
-        console.print(f"  {command}  {what}", soft_wrap=True, highlight=False)
+        line = f"  {command}  # {what}"  # a comment to the shell, so that lines can be pasted
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 def new_folder(out: Path | None, name: str = "demo") -> Path:

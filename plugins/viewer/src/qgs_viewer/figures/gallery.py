@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from qgs.data.domain import OF_RECIPES, Domain, verdict
+from qgs.data.domain import OF_SHOWN, Domain, verdict
 from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.io.checkpoint import load
 from qgs.io.files import write_text
@@ -72,7 +72,7 @@ def open_exhibition(
         model = load(file, device)
         exhibits.append(exhibit(name, model, samples[0], curves_of(file)))
         if photos is not None and (
-            remark := verdict(model.trained_on or Domain(), found, OF_RECIPES)
+            remark := verdict(model.trained_on or Domain(), found, OF_SHOWN)
         ):
             notes.setdefault(remark, []).append(name)
         if query is not None:
