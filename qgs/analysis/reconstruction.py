@@ -11,8 +11,10 @@ import torch
 from torch import Tensor
 
 from qgs.analysis.inputs import NOVEL, choose_windows
+from qgs.analysis.scale import FoundScale
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import Domain
+from qgs.data.evaluation import ViewsOf
 from qgs.data.samples import Sample, make_sample, moments, own_world, spread
 from qgs.geometry.poses import relative_to, scaled
 from qgs.geometry.transforms import moved
@@ -80,12 +82,14 @@ def choose_sample(
     frames: Sequence[int] | None,
     compare: Sequence[int] | None,
     trained_on: Domain | None = None,
+    views_of: ViewsOf | None = None,
 ) -> tuple[Sample, tuple[Tensor, Tensor]]:
     """Inputs and compared views of `scene`, and their world as of `own_world`.
 
     trained_on: of the model, where the photos are none of its training's kind: inputs are then
-    those of `choose_windows`, otherwise those of `choose_frames`. Where times are known, inputs
-    spread over them, and views compared by default are of one.
+    those of `choose_windows`, otherwise those of `choose_frames`. views_of: makes the settings of
+    the chosen views, such as their scale; None takes `views`. Where times are known, inputs spread
+    over them, and views compared by default are of one.
     """
     wanted, span = inputs or views.inputs, views.gap[1] + 1
     usable = moments(scene)
@@ -100,6 +104,7 @@ def choose_sample(
     if scene.times is not None and compare is None and picked[1]:
         moment = scene.times[picked[1][len(picked[1]) // 2]]
         picked = picked[0], tuple(frame for frame in picked[1] if scene.times[frame] == moment)
+    views = views_of(scene, *picked) if views_of else views
     sample = make_sample(scene, *picked, views, mirror=False)
     return sample, own_world(scene, picked[0], views)
 
@@ -120,6 +125,7 @@ class Reconstruction:
 
     prediction: None where the Gaussians were tuned or refined; `tuning`, `refinement` are the
     records. world: reference pose (4, 4) and scale, as of `own_world`. remarks: for the user.
+    scale: how the scale was found, None where it was set.
     """
 
     model: QueryGaussianModel
@@ -132,6 +138,7 @@ class Reconstruction:
     tuning: Mapping[str, Any] | None = None
     refinement: Mapping[str, Any] | None = None
     remarks: Sequence[str] = ()
+    scale: FoundScale | None = None
 
     @property
     def worse_than_nearest(self) -> str:
@@ -165,10 +172,11 @@ class Reconstruction:
         return write_reconstruction(self, Path(out))
 
     def __repr__(self) -> str:
-        """Scene, views with PSNR, and the remarks."""
+        """Scene, views with PSNR, the scale that was found, and the remarks."""
         views = [f"{s.kind} {self.sample.label(s.frame)} {s.psnr:.2f} dB" for s in self.scores]
         heading = f"Reconstruction of {self.sample.scene}: {self.gaussians.count:,} Gaussians"
-        return "\n  ".join([heading, *views, *self.remarks])
+        scale = [self.scale.text] if self.scale else []
+        return "\n  ".join([heading, *views, *scale, *self.remarks])
 
     def _repr_png_(self) -> bytes:
         from qgs.analysis.saving import overview

@@ -119,6 +119,7 @@ def _camera_record(result: Reconstruction, path: Cameras) -> dict[str, Any]:
             "rule": "a point p of this world is reference_c2w applied to p / scale in the photos'",
             "reference_c2w": reference.tolist(),
             "scale": float(scale),
+            "search": result.scale.record if result.scale else None,
         },
         "views": [
             {"frame": s.frame, "photo": names.get(s.frame), "kind": s.kind}

@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from qgs.analysis.reconstruction import Reconstruction, choose_sample, reconstruct_sample
+from qgs.analysis.scale import ScaleSearch, photo_settings
 from qgs.composer import Recipe, resolve
 from qgs.composer.registry import load_usable_plugins
 from qgs.contracts import Component, Encoder, Scene, SceneSource, Split
 from qgs.data.domain import Domain, value_range_problem, verdict
 from qgs.data.images import framing
-from qgs.data.recognition import open_for
+from qgs.data.recognition import is_training_data, open_for
 from qgs.data.samples import training_frames, views_in
 from qgs.data.scenes import warn_once
 from qgs.model import QueryGaussianModel
@@ -61,7 +62,10 @@ def reconstruct(
     overrides: Sequence[str] = (),
     tune: Tuning | None = None,
 ) -> Reconstruction:
-    """Reconstruct one scene as `qgs reconstruct` does, in the frame and scale of the recipe.
+    """Reconstruct one scene as `qgs reconstruct` does, in the frame of the recipe.
+
+    The scale is the recipe's; where that is a constant and the model was not trained on these
+    photos, it is searched, see `qgs.analysis.scale`.
 
     photos: a folder of photos and cameras, or its URL; or Views (1, V) in any world, of which all
         are inputs unless `frames` says otherwise. OpenCV cameras, images in [0, 1].
@@ -87,20 +91,23 @@ def reconstruct(
     if isinstance(photos, Views):
         if size is not None or scene is not None:
             raise ValueError("`size` and `scene` are for folders: Views have one scene and size")
-        found, seen = GivenScene(photos), ()
+        found, seen, own = GivenScene(photos), (), False
         frames = range(len(found)) if frames is None and inputs is None else frames
     else:
         found, seen = chosen_scene(recipe, fspath(photos), size, scene)
+        own = is_training_data(fspath(photos), recipe.data_config)
     wanted = None if frames is None else frame_list(frames, "frames", found)
     against = None if compare is None else frame_list(compare, "compare", found)
+    search = ScaleSearch(model, photo_settings(recipe.views, own, overrides))
     trained_on = None if seen else model.trained_on or Domain()
-    sample, world = choose_sample(found, recipe.views, inputs, wanted, against, trained_on)
+    sample, world = choose_sample(found, recipe.views, inputs, wanted, against, trained_on, search)
     training = model.training
     try:
         tuned, record = tune(sample.inputs) if tune else (None, None)
         result = reconstruct_sample(model.eval(), sample, world, seen, tuned, record)
     finally:
         model.train(training)
+    result = replace(result, scale=next(iter(search.found.values()), None))
     return replace(result, remarks=_remarks(result, found))
 
 
@@ -109,7 +116,8 @@ def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
     sample, found = result.sample, Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
     likeness = verdict(result.model.trained_on or Domain(), found)
-    remarks = likeness, framing(scene, sample.input_frames[0]), result.worse_than_nearest
+    poor = result.scale.poor if result.scale else ""
+    remarks = likeness, poor, framing(scene, sample.input_frames[0]), result.worse_than_nearest
     return [*filter(None, remarks)]
 
 

@@ -48,6 +48,12 @@ ViewsSettings: TypeAlias = Annotated[
     list[str] | None,
     typer.Option("--set", help="Change an option of the recipe's `views`; repeatable."),
 ]
+Scale: TypeAlias = Annotated[
+    float | None,
+    typer.Option(
+        help="Factor of the cameras' translations; default: found, see `qgs reconstruct`."
+    ),
+]
 TUNE_HELP = (
     "Fit the queries to the input photos first, for STEPS steps, or with latents:STEPS the "
     "features of the photos; 0 for none."
@@ -68,6 +74,15 @@ def tuning_settings(tune: str | None) -> list[str]:
     what, steps = match[1] or match[3], match[2]
     settings = [f"evaluation.tuning_steps={steps or 50}"]
     return [*settings, *([f"evaluation.tuning={what}"] if what else [])]
+
+
+def scale_settings(scale: float | None) -> list[str]:
+    """The settings that --scale stands for. Raises ValueError for a factor that is not above 0."""
+    if scale is None:
+        return []
+    if not 0 < scale < float("inf"):
+        raise ValueError(f"--scale must be a factor above 0, such as 0.4, got {scale:g}")
+    return ["views.scale=constant", f"views.scale_factor={scale}"]
 
 
 def use_threads(threads: int | None) -> None:

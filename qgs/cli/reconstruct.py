@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from qgs.cli import options
-from qgs.cli.options import Checkpoint, Device, Frames, Inputs, SceneName, Size, Tune, ViewsSettings
+from qgs.cli.options import (
+    Checkpoint,
+    Device,
+    Frames,
+    Inputs,
+    Scale,
+    SceneName,
+    Size,
+    Tune,
+    ViewsSettings,
+)
 from qgs.extensions import function
 from qgs.wording import numbered
 
@@ -46,6 +56,7 @@ def reconstruct(
         int | None,
         typer.Option(min=1, help="Gaussians after --refine; default: as many as predicted."),
     ] = None,
+    scale: Scale = None,
     overrides: ViewsSettings = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")
@@ -57,6 +68,7 @@ def reconstruct(
     """Reconstruct a scene: PLY, renders beside photos, depth, an orbit, cameras.
 
     Of a folder that the model was trained on, held-out photos are compared with where there are.
+    For other photos the scale of the world is the one at which the model renders them best.
     The result of --refine is written to OUT/refined, beside the prediction of the model.
     """
     if not overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
@@ -92,7 +104,7 @@ def reconstruct(
         compare=holdout,
         size=pixels,
         scene=scene_name,
-        overrides=overrides or (),
+        overrides=[*(overrides or ()), *options.scale_settings(scale)],
         tune=partial(tuned, model, recipe, console) if tuned else None,
     )
     show(result, "feed-forward" if refine else "", console)
@@ -116,6 +128,7 @@ def show(result: Reconstruction, what: str, console: Console) -> None:
     from rich.table import Table
 
     from qgs.analysis.reconstruction import KINDS
+    from qgs.analysis.scale import summary
     from qgs.metrics.baselines import BASELINES
     from qgs.metrics.images import Psnr
 
@@ -136,4 +149,7 @@ def show(result: Reconstruction, what: str, console: Console) -> None:
             table.add_row(f"{kind}, mean", str(len(rows)), *means, style="bold")
             table.add_section()
     console.print(table)
-    console.print("\n".join(result.remarks), soft_wrap=True, highlight=False, markup=False)
+    found = [summary([result.scale])] if result.scale else []
+    console.print(
+        "\n".join([*found, *result.remarks]), soft_wrap=True, highlight=False, markup=False
+    )

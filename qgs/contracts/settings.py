@@ -22,12 +22,13 @@ class ViewsConfig(ComponentConfig):
     count too; it shrinks to what a scene has, with a warning where that is below min."""
     frame: Literal["first_cam", "mean_cam"] = "first_cam"
     """The camera that becomes the identity: the first input, or the mean of the inputs."""
-    scale: Literal["constant", "distance", "auto"] = "constant"
+    scale: Literal["constant", "distance", "auto", "search"] = "constant"
     """Translations are multiplied by `scale_factor`; with "distance", they are divided by the
     largest distance from the first input camera to another one before. "auto" takes one factor per
-    scene, which brings the point nearest to the optical axes of all its cameras to a depth of 1."""
+    scene, which brings the point nearest to the optical axes of all its cameras to a depth of 1.
+    "search", for reconstructions alone, takes the one at which the model renders photos best."""
     scale_factor: float = Field(default=0.15, gt=0)
-    """Factor of all translations, see `scale`; no effect with "auto"."""
+    """Factor of all translations, see `scale`; no effect with "auto" and "search"."""
     mirror: float = Field(default=0.5, ge=0, le=1)
     """Probability of mirroring a training sample in x."""
     pose_noise: float = Field(default=0.0, ge=0, le=45)

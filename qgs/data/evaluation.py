@@ -1,6 +1,6 @@
 """Which views an evaluation compares: drawn by seed, or named by an index file."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
@@ -34,6 +34,9 @@ class IndexEntry(BaseModel):
 
 EvaluationIndex: TypeAlias = Mapping[str, IndexEntry | None]
 """Scene name to its frames; None for a scene that is listed but not judged."""
+
+ViewsOf: TypeAlias = Callable[[Scene, Frames, Frames], ViewsConfig]
+"""From a scene, input and target frames to the settings with which their sample is made."""
 
 GIVEN = "frames as context and as target"
 """What `given_targets` are; a score on them means nothing, the nearest input view is perfect."""
@@ -85,7 +88,7 @@ class EvaluationPlan:
     of a scene with held-out frames `held_out_windows`, evenly thinned to `evaluation.scenes`; of
     the others `evaluation.samples` samples, inputs drawn by `sampler` (default: `Span`) as at the
     end of training with `evaluation.seed`, targets the other frames of the span, or of one time.
-    Targets of T times are T samples.
+    Targets of T times are T samples. views_of: makes the settings of a sample, such as its scale.
 
     wanted, null, unlisted: see `qgs.engine.results.Evaluation`. framing: of the first photo, and
     drawn: scenes of which samples were, once `samples` has run. Raises ValueError without scenes.
@@ -98,6 +101,7 @@ class EvaluationPlan:
         evaluation: EvaluationConfig,
         index: EvaluationIndex | None = None,
         sampler: ViewSampler | None = None,
+        views_of: ViewsOf | None = None,
     ) -> None:
         self.framing: str | None = None
         self.drawn = set[str]()
@@ -105,6 +109,7 @@ class EvaluationPlan:
         if not len(self._scenes):
             raise ValueError(f"the data source {type(source).name!r} has no test scenes")
         self._views, self._evaluation, self._index = views, evaluation, index
+        self._views_of = views_of or (lambda *window: views)
         self._sampler = sampler or Span(Span.Config())
         names = source.names("test")
         self._places = {name: place for place, name in enumerate(names)}
@@ -126,8 +131,9 @@ class EvaluationPlan:
                 for inputs, targets in self._choices(scene, place):
                     if self.framing is None:
                         self.framing = framing(scene, inputs[0])
+                    views = self._views_of(scene, inputs, targets)
                     for part in [targets] if scene.times is None else moments(scene, targets):
-                        yield make_sample(scene, inputs, part, self._views, False, noise)
+                        yield make_sample(scene, inputs, part, views, False, noise)
             except Exception as error:  # whatever a reader raises; the other scenes go on
                 yield SceneFailure(name, one_line(error))
 
@@ -155,10 +161,12 @@ def evaluation_samples(
     views: ViewsConfig,
     evaluation: EvaluationConfig,
     sampler: ViewSampler | None = None,
+    views_of: ViewsOf | None = None,
 ) -> Sequence[Sample]:
     """Samples of a plan without an index; raises ValueError for the first scene that fails."""
     samples: list[Sample] = []
-    for sample in EvaluationPlan(source, views, evaluation, sampler=sampler).samples():
+    plan = EvaluationPlan(source, views, evaluation, sampler=sampler, views_of=views_of)
+    for sample in plan.samples():
         if isinstance(sample, SceneFailure):
             raise ValueError(f"scene {sample.scene!r} cannot be judged: {sample.reason}")
         samples.append(sample)

@@ -41,6 +41,16 @@ def _recognises(kind: str, source: type[Component], path: UPath) -> bool:
         return False
 
 
+def is_training_data(path: str, trained: SceneSourceConfig | None) -> bool:
+    """Whether a model with the data `trained` was trained on the data at `path`."""
+    root = getattr(trained, "path", None)
+    if trained is None or not isinstance(root, str):
+        return False
+    source = component_of(trained)
+    assert issubclass(source, SceneSource)
+    return source.trains_on(opened_path(root).resolve(), opened_path(path).resolve())
+
+
 def open_for(
     path: str,
     image_size: tuple[int, int] | None,
@@ -53,13 +63,10 @@ def open_for(
     image_size: (H, W), by default that of `trained`. Raises as `recognised` and the source do.
     """
     size = image_size or (trained or SceneSourceConfig()).image_size
-    place = opened_path(path)
-    root = getattr(trained, "path", None)
-    if trained is not None and isinstance(root, str):
+    if trained is not None and is_training_data(path, trained):
         source = component_of(trained)
         assert issubclass(source, SceneSource)
-        if source.trains_on(opened_path(root).resolve(), place.resolve()):
-            return source(trained.model_copy(update={"path": path, "image_size": size})), True
-    source = sources[recognised(place, sources)]
+        return source(trained.model_copy(update={"path": path, "image_size": size})), True
+    source = sources[recognised(opened_path(path), sources)]
     assert issubclass(source, SceneSource)
     return source(source.config_for(path, size, trained)), False

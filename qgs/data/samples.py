@@ -258,9 +258,15 @@ def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[T
     """The world in which a model sees these inputs of `scene`: reference pose and scale.
 
     A point p of it is, in the scene's world, the reference (4, 4) applied to p / scale (0-d).
-    Raises ValueError for `scale: distance` when the input cameras stand on one point, and as
-    `auto_scale`.
+    Raises ValueError for `scale: distance` when the input cameras stand on one point, for `search`,
+    which needs a model, and as `auto_scale`.
     """
+    if views.scale == "search":
+        raise ValueError(
+            "views.scale: search finds the scale at which a trained model renders photos best, so "
+            "it is for qgs reconstruct, view, demo and report --photos alone; write auto, distance "
+            "or constant"
+        )
     every = scene.cameras.c2w
     c2w = every[list(input_frames)]
     reference = (first_camera if views.frame == "first_cam" else mean_camera)(c2w)

@@ -100,7 +100,7 @@ def protocol_of(
             options = chosen.config.model_dump(mode="json", exclude=set(metric.not_in_protocol))
             metrics[path[-1]] = {"type": chosen.type, "definition": metric.definition, **options}
     # Options without effect are left out: they must not part equal protocols.
-    factor = () if recipe.views.scale == "auto" else ("scale_factor",)
+    factor = () if recipe.views.scale in ("auto", "search") else ("scale_factor",)
     noise = {"noise": [recipe.views.pose_noise, evaluation.seed]} if recipe.views.pose_noise else {}
     content = {
         "format": 1,

@@ -136,7 +136,7 @@ def test_photos_in_another_unit_are_judged_alike(models, tmp_path):
         photos = noisy_photos(tmp_path / name, 12, step=unit)
         entry = judge(checkpoints(models[1:2]), str(photos), "cpu")[0]
         figures.append(entry.evaluation.means()["psnr"])
-        assert entry.recipe.views.scale == "auto"
+        assert entry.recipe.views.scale == "search"
     assert figures[0] == pytest.approx(figures[1], abs=1e-3)
 
 

@@ -11,7 +11,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from qgs.cli.options import Device, Frames, Inputs, SceneName, Size, ViewsSettings, parse_size
+from qgs.cli.options import (
+    Device,
+    Frames,
+    Inputs,
+    Scale,
+    SceneName,
+    Size,
+    ViewsSettings,
+    parse_size,
+    scale_settings,
+)
 from qgs.wording import listed
 
 if TYPE_CHECKING:
@@ -39,6 +49,7 @@ def view(
     inputs: Inputs = None,
     frames: Frames = None,
     size: Size = None,
+    scale: Scale = None,
     overrides: ViewsSettings = None,
     query: Annotated[
         int | None, typer.Option(min=0, help="Query that is picked at first; default: none.")
@@ -76,7 +87,8 @@ def view(
     if html is not None:
         refuse_existing(html)
     console = Console()
-    wanted = Wanted(photos, scene, frames, inputs, pixels, overrides or (), choose_device(device))
+    settings = [*(overrides or ()), *scale_settings(scale)]
+    wanted = Wanted(photos, scene, frames, inputs, pixels, settings, choose_device(device))
     opened = open_source(source, wanted)
     for note in opened.notes:
         console.print(note, soft_wrap=True, highlight=False, markup=False)

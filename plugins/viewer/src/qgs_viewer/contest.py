@@ -15,6 +15,7 @@ import yaml
 from rich import box
 from rich.table import Table
 
+from qgs.analysis.scale import ScaleSearch, photo_settings, summary
 from qgs.analysis.scenes import Size, installed_sources, size_multiple, whole_size
 from qgs.composer import Recipe, resolve
 from qgs.composer.schema import summary_of
@@ -28,7 +29,6 @@ from qgs.engine.training import train
 from qgs.io.checkpoint import CheckpointFile
 from qgs.io.models import about, checkpoint_path
 from qgs.metrics.baselines import BASELINES
-from qgs.model import QueryGaussianModel
 from qgs.wording import counted, listed, short_names
 from qgs_viewer.curves import Curves, curves_of
 from qgs_viewer.report import Contender, Report
@@ -46,11 +46,15 @@ OF_THE_METHOD = ("optimizer.parts", "training.judge_inputs", "evaluation.tuning"
 
 @dataclass(frozen=True)
 class Entry:
-    """A judged model with its recipe. progress: how far its training has come."""
+    """A judged model with its recipe. progress: how far its training has come.
+
+    search: the scales that were found for it.
+    """
 
     recipe: Recipe
     contender: Contender
     evaluation: Evaluation
+    search: ScaleSearch
     progress: str = ""
 
 
@@ -92,7 +96,8 @@ def compete(name: str, recipe: Recipe, run: Path, device: str = "auto") -> Entry
     evaluation = evaluate(result.model, recipe, result.steps)
     evaluation.write(result.folder.evaluation)
     curves = curves_of(result.folder.checkpoint)
-    return entry_of(name, recipe, evaluation, result.model, describe(recipe), curves)
+    search = ScaleSearch(result.model, recipe.views)
+    return entry_of(name, recipe, evaluation, search, describe(recipe), curves)
 
 
 def checkpoints(names: Sequence[str]) -> dict[str, Path]:
@@ -101,10 +106,14 @@ def checkpoints(names: Sequence[str]) -> dict[str, Path]:
 
 
 def judge(
-    files: Mapping[str, Path], photos: str | None, device: str, size: Size | None = None
+    files: Mapping[str, Path],
+    photos: str | None,
+    device: str,
+    size: Size | None = None,
+    overrides: Sequence[str] = (),
 ) -> list[Entry]:
     """The models in `files` on unseen scenes, or on held-out photos; raises as `recipes_alike`."""
-    recipes, entries = recipes_alike(files, photos, size), []
+    recipes, entries = recipes_alike(files, photos, size, overrides), []
     for name, path in files.items():
         with CheckpointFile(path) as file:
             model, step, training = (
@@ -114,20 +123,25 @@ def judge(
             )
         of = "" if training.seconds else f" of {training.steps:,}"
         progress = "not known" if step is None else f"step {step:,}{of}"
-        options = OF_RECIPES if photos is None else OF_SHOWN
-        evaluation = evaluate(model, recipes[name], trained_on=model.trained_on, options=options)
-        text = about(path) or describe(recipes[name])
-        entry = entry_of(name, recipes[name], evaluation, model, text, curves_of(path))
+        recipe, options = recipes[name], OF_RECIPES if photos is None else OF_SHOWN
+        search, domain = ScaleSearch(model, recipe.views), model.trained_on
+        evaluation = evaluate(model, recipe, trained_on=domain, options=options, views_of=search)
+        text = about(path) or describe(recipe)
+        entry = entry_of(name, recipe, evaluation, search, text, curves_of(path))
         entries.append(replace(entry, progress=f"{name}: {progress}"))
     return entries
 
 
 def recipes_alike(
-    files: Mapping[str, Path], photos: str | None, size: Size | None = None
+    files: Mapping[str, Path],
+    photos: str | None,
+    size: Size | None = None,
+    overrides: Sequence[str] = (),
 ) -> dict[str, Recipe]:
     """The recipes of `files`, with the data at `photos` in place of their own.
 
     size: (H, W) of the photos, by default one that all models take and at which they are whole.
+    overrides: settings of `views`, such as a scale.
 
     Raises ValueError where their protocols differ, and as `CheckpointFile` and the data do.
     """
@@ -137,7 +151,10 @@ def recipes_alike(
             recipes[name] = file.recipe
     if photos is not None:
         multiple = size_multiple(recipes.values())
-        recipes = {n: _on_photos(recipe, photos, size, multiple) for n, recipe in recipes.items()}
+        recipes = {
+            name: resolve(_on_photos(recipe, photos, size, multiple).tree, overrides)
+            for name, recipe in recipes.items()
+        }
     refuse_unequal(recipes, JUDGED)
     return recipes
 
@@ -145,14 +162,14 @@ def recipes_alike(
 def _on_photos(recipe: Recipe, photos: str, size: Size | None, multiple: int | None) -> Recipe:
     """`recipe` with the data at `photos`, some of them held out, in place of its own.
 
-    Data that it was not trained on has a unit of its own, so a constant `views.scale` becomes auto.
+    Data that it was not trained on has a unit of its own, see `photo_settings`.
     """
     sources = installed_sources()
     source, own = open_for(photos, size, recipe.data_config, sources)
     first = next(chain(source.scenes("test"), source.scenes("train")), None)
     if size is None and not own and first is not None:
         size = whole_size(first, multiple)
-    views = {} if own or recipe.views.scale != "constant" else {"scale": "auto"}
+    scale = photo_settings(recipe.views, own).scale
     kind = next(name for name, component in sources.items() if component is type(source))
     options = source.config.model_dump(mode="json")
     options["image_size"] = [*(size or source.config.image_size)]
@@ -164,7 +181,7 @@ def _on_photos(recipe: Recipe, photos: str, size: Size | None, multiple: int | N
         "data": {"type": kind, **options},
         "plugins": [*dict.fromkeys([*recipe.tree["plugins"], *{kind.split("/")[0]} - {"qgs"}])],
         "evaluation": {**recipe.tree["evaluation"], "scenes": WINDOWS, "index": None},
-        "views": {**recipe.tree["views"], **views},
+        "views": {**recipe.tree["views"], "scale": scale},
     }
     return resolve(tree)
 
@@ -173,14 +190,18 @@ def entry_of(
     name: str,
     recipe: Recipe,
     evaluation: Evaluation,
-    model: QueryGaussianModel,
+    search: ScaleSearch,
     text: str,
     curves: Curves | None = None,
 ) -> Entry:
-    """A judged model, which moves to the CPU. text: its `about`; curves: see `Contender`."""
+    """A judged model, which moves to the CPU. text: its `about`; curves: see `Contender`.
+
+    search: with the model, and the scales of the windows that it was judged on.
+    """
+    model = search.model.cpu()
     contender = Contender(
         name=name,
-        model=model.cpu(),
+        model=model,
         scores=evaluation.means(),
         gaussians=evaluation.gaussians,
         parameters=sum(p.numel() for p in model.parameters()),
@@ -188,7 +209,7 @@ def entry_of(
         about=text,
         curves=curves,
     )
-    return Entry(recipe, contender, evaluation)
+    return Entry(recipe, contender, evaluation, search)
 
 
 def describe(recipe: Recipe) -> str:
@@ -209,7 +230,14 @@ def remarks(entries: Sequence[Entry]) -> list[str]:
         for remark in (*entry.evaluation.remarks, *missing):
             models.setdefault(remark, []).append(entry.contender.name)
     texts = [f"{', '.join(names)}: {remark}." for remark, names in models.items()]
-    return [*texts, AUTO_SCALE] if entries[0].recipe.views.scale == "auto" else texts
+    auto = [AUTO_SCALE] if entries[0].recipe.views.scale == "auto" else []
+    return [*scales(entries), *texts, *auto]
+
+
+def scales(entries: Sequence[Entry]) -> list[str]:
+    """A sentence for each model whose scales were searched."""
+    found = {entry.contender.name: entry.search.found.values() for entry in entries}
+    return [f"{name}: {summary(windows)}." for name, windows in found.items() if windows]
 
 
 def table_of(report: Report) -> Table:
@@ -248,7 +276,12 @@ def report_of(
     recipe, evaluation = entries[0].recipe, entries[0].evaluation
     few = recipe.evaluation.model_copy(update={"scenes": PICTURED_SCENES, "samples": 1})
     source = recipe.build_data()
-    samples = evaluation_samples(source, recipe.views, few)[:PICTURED_SCENES]
+    searched = entries if recipe.views.scale == "search" else entries[:1]
+    pictured = [
+        evaluation_samples(source, recipe.views, few, views_of=entry.search)[:PICTURED_SCENES]
+        for entry in searched
+    ] * (len(entries) // len(searched))
+    samples = pictured[0]
     height, width = recipe.tree["data"]["image_size"]
     plugins = {name: v for entry in entries for name, v in entry.recipe.plugin_versions.items()}
     software = {"torch": torch.__version__, **plugins}
@@ -265,7 +298,10 @@ def report_of(
         notes=notes,
         meanings=[summary_of(p.component) for at, p in recipe.parts.items() if at[0] == "metrics"],
         commands=commands,
-        contenders=[entry.contender for entry in entries],
+        contenders=[
+            replace(entry.contender, samples=own)
+            for entry, own in zip(entries, pictured, strict=True)
+        ],
         baselines={n.replace("_", " ").capitalize(): evaluation.means(n) for n in BASELINES},
         samples=samples,
         depths=[true_depth(source, sample) for sample in samples],

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from qgs.cli.options import Device, Photos, Runs, Size, parse_size
+from qgs.cli.options import Device, Photos, Runs, Scale, Size, parse_size, scale_settings
 
 if TYPE_CHECKING:
     from qgs_viewer.contest import Entry
@@ -51,6 +51,7 @@ def demo(
         Path | None, typer.Option(help="New folder for everything; default: demo, demo-2, ...")
     ] = None,
     size: Size = None,
+    scale: Scale = None,
     device: Device = "auto",
 ) -> None:
     """Trained models on rooms unseen in training, or on your photos; writes report.html.
@@ -66,13 +67,13 @@ def demo(
         raise ValueError(f"{given[0]} is a recipe, no folder of photos: add --train to train it")
     if not train and len(given or ()) > 1:
         raise ValueError(f"one folder of photos is shown at a time, got {', '.join(given or ())}")
-    if size is not None and (train or not given):
-        raise ValueError("--size is for photos: name a folder of them, or leave it out")
+    if (size, scale) != (None, None) and (train or not given):
+        raise ValueError("--size and --scale are for photos: name a folder, or leave them out")
     target = new_folder(out)
     if train:
         compare_trainings(given or RECIPES, seconds or 120, seed or 0, target, device)
     else:
-        show_trained(models, given[0] if given else None, target, device, size)
+        show_trained(models, given[0] if given else None, target, device, size, scale)
 
 
 @report_app.command()
@@ -83,12 +84,13 @@ def report(
         Path | None, typer.Option(help="New folder for the page; default: report, report-2, ...")
     ] = None,
     size: Size = None,
+    scale: Scale = None,
     device: Device = "auto",
 ) -> None:
     """Evaluate trained models and show their scenes side by side; writes report.html."""
-    if size is not None and photos is None:
-        raise ValueError("--size is for photos: give --photos, or leave it out")
-    show_trained(runs, photos, new_folder(out, "report"), device, size)
+    if (size, scale) != (None, None) and photos is None:
+        raise ValueError("--size and --scale are for photos: give --photos, or leave them out")
+    show_trained(runs, photos, new_folder(out, "report"), device, size, scale)
 
 
 def show_trained(
@@ -97,6 +99,7 @@ def show_trained(
     target: Path,
     device: str,
     size: str | None = None,
+    scale: float | None = None,
 ) -> None:
     """Judge `models`, by default those that come with qgs, and write their report."""
     from qgs_viewer import contest
@@ -112,7 +115,7 @@ def show_trained(
     scenes = "Unseen scenes" if photos is None else "Your photos"
     console.print(f"Reconstructing: {scenes.lower()}", style="dim")
     with kept_warnings() as notes:
-        entries = contest.judge(files, photos, device, parse_size(size))
+        entries = contest.judge(files, photos, device, parse_size(size), scale_settings(scale))
     lede = "These trained models come with qgs, and none has seen the scenes below."
     if photos is not None:
         lede = "Trained models on your photos, judged on those between their inputs."
@@ -182,7 +185,7 @@ def write(report: Report, target: Path, console: Console) -> None:
     from qgs.io.files import write_text
     from qgs.io.gaussians import save_ply
     from qgs_viewer.contest import table_of
-    from qgs_viewer.report import report_html
+    from qgs_viewer.report import report_html, samples_of
 
     console.print(table_of(report))
     for name in ("Training", "Budget"):
@@ -195,7 +198,7 @@ def write(report: Report, target: Path, console: Console) -> None:
     for contender in report.contenders:
         run = target / contender.name
         with torch.no_grad():
-            gaussians = contender.model(report.samples[0].inputs).gaussians
+            gaussians = contender.model(samples_of(contender, report.samples)[0].inputs).gaussians
         save_ply(gaussians, run / "example.ply")
         files = run / "checkpoint.safetensors", run / "example.ply"
         there = ", ".join(str(file) for file in files if file.is_file())

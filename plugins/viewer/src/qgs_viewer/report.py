@@ -18,6 +18,7 @@ from qgs.data.scenes import warn_once
 from qgs.drawing import images, page_environment
 from qgs.drawing.figures import figure_picture, hex_color
 from qgs.drawing.images import Picture, depth_picture, depth_range, rgb_picture
+from qgs.geometry.poses import largest_distance
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Prediction
@@ -29,7 +30,10 @@ from qgs_viewer.queries import DrawnQuery, notable_queries, query_picture
 
 @dataclass(frozen=True)
 class Contender:
-    """A trained model. scores: means of `Report.columns`. recipe: YAML. about: its kind."""
+    """A trained model. scores: means of `Report.columns`. recipe: YAML. about: its kind.
+
+    samples: those of the report in the scale that was found for it; () where it is the same.
+    """
 
     name: str
     model: QueryGaussianModel
@@ -39,6 +43,7 @@ class Contender:
     recipe: str
     about: str = ""
     curves: Curves | None = None
+    samples: Sequence[Sample] = ()
 
 
 @dataclass(frozen=True)
@@ -112,20 +117,31 @@ class ReportSection:
 def report_html(report: Report) -> str:
     """The whole page; it needs no other file and no network."""
     samples = report.samples
-    shown = [(c, [c.model(sample.inputs) for sample in samples]) for c in report.contenders]
-    exhibits = [exhibit(c.name, c.model, samples[0], c.curves) for c in report.contenders]
+    shown = [(c, [c.model(s.inputs) for s in samples_of(c, samples)]) for c in report.contenders]
+    exhibits = [
+        exhibit(c.name, c.model, samples_of(c, samples)[0], c.curves) for c in report.contenders
+    ]
     sections = [
         *(orbit(shown, samples), *offered_sections(shown, samples), queries(shown, samples)),
         *(anchors(exhibits), attention(exhibits), training_curves(exhibits)),
     ]
     scenes = [
-        pictured_scene([(c, predictions[number]) for c, predictions in shown], sample, depth)
+        pictured_scene(
+            [(c, predictions[number], samples_of(c, samples)[number]) for c, predictions in shown],
+            sample,
+            depth,
+        )
         for number, (sample, depth) in enumerate(zip(samples, report.depths, strict=True))
     ]
     environment = page_environment("qgs_viewer", uri=images.data_uri, hex=hex_color)
     template = environment.get_template("report.html")
     sections = [section for section in sections if section.figures]
     return template.render(report=report, scenes=scenes, sections=sections)
+
+
+def samples_of(contender: Contender, samples: Sequence[Sample]) -> Sequence[Sample]:
+    """`samples` of a report in the scale in which this model sees them."""
+    return contender.samples or samples
 
 
 def offered_sections(shown: Shown, samples: Sequence[Sample]) -> Iterator[ReportSection]:
@@ -146,11 +162,11 @@ def offered_sections(shown: Shown, samples: Sequence[Sample]) -> Iterator[Report
 
 
 def pictured_scene(
-    shown: Sequence[tuple[Contender, Prediction]], sample: Sample, depth: Tensor | None
+    shown: Sequence[tuple[Contender, Prediction, Sample]], sample: Sample, depth: Tensor | None
 ) -> dict[str, Any]:
     """Name, inputs and pictures of a scene by kind and column; `most`: the brightest error.
 
-    depth: the true one (T, 1, H, W).
+    shown: each with the sample in its own scale. depth: the true one (T, 1, H, W).
     """
     views = sample.targets.select(slice(TARGETS))
     inputs, truth = sample.input_frames, views.images[0]
@@ -158,13 +174,14 @@ def pictured_scene(
     colors = {"Truth": _photos(truth, frames[len(inputs) :])}
     depths = {} if depth is None else {"Truth": depth[:TARGETS]}
     errors = {}
-    for contender, prediction in shown:
-        rendering = contender.model.render(prediction.gaussians, views.cameras)
+    for contender, prediction, own in shown:
+        cameras = own.targets.select(slice(TARGETS)).cameras
+        rendering = contender.model.render(prediction.gaussians, cameras)
         scores = psnr(rendering.rgb[0], truth).tolist()
         quality = [f"{Psnr.column.shown(score)} {Psnr.column.unit}" for score in scores]
         colors[contender.name] = _photos(rendering.rgb[0], quality)
         errors[contender.name] = color_error(rendering.rgb[0], truth)
-        depths[contender.name] = rendering.depth[0]
+        depths[contender.name] = rendering.depth[0] * ratio(sample, own)
     near, far = depth_range(torch.cat(list(depths.values())))
     most = depth_range(torch.cat(list(errors.values())))[1]
     kinds = {
@@ -182,6 +199,15 @@ def pictured_scene(
     }
 
 
+def ratio(sample: Sample, own: Sample) -> float:
+    """Length in the world of `sample` of what has length 1 in that of `own`, of the same views."""
+    far, other = (
+        float(largest_distance(torch.cat([s.inputs.cameras.c2w, s.targets.cameras.c2w], 1)))
+        for s in (sample, own)
+    )
+    return far / other if other else 1.0
+
+
 def _photos(images: Tensor, captions: Sequence[str]) -> list[Tile]:
     return [Tile(rgb_picture(i), caption) for i, caption in zip(images, captions, strict=False)]
 
@@ -190,7 +216,8 @@ def orbit(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
     """A loop past the input cameras, around what they see."""
     figures = []
     for contender, (prediction, *_) in shown:
-        cameras, render = samples[0].inputs.cameras, contender.model.render
+        cameras = samples_of(contender, samples)[0].inputs.cameras
+        render = contender.model.render
         depths = render(prediction.gaussians, cameras).depth
         path = orbit_path(cameras, depths, ORBIT_FRAMES, SIDE)
         frames = [rgb_picture(image) for image in render(prediction.gaussians, path).rgb[0]]
@@ -201,8 +228,9 @@ def orbit(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
 def queries(shown: Shown, samples: Sequence[Sample]) -> ReportSection:
     """The most notable queries of each model, seen from the first target view."""
     figures = []
-    cameras = images.finer(samples[0].targets.cameras[:, :1], SIDE)
     for contender, (prediction, *_) in shown:
+        cameras = samples_of(contender, samples)[0].targets.cameras[:, :1]
+        cameras = images.finer(cameras, SIDE)
         chosen = notable_queries(contender.model, prediction.gaussians, cameras, QUERIES)
         picture = query_picture(contender.model, prediction.gaussians, chosen, cameras)
         figures.append(Tile(picture, contender.name, chosen))

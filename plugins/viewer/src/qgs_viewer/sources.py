@@ -13,11 +13,13 @@ from PIL import Image
 from torch import Tensor
 
 from qgs.analysis.reconstruction import choose_frames, choose_sample
+from qgs.analysis.scale import ScaleSearch, photo_settings, summary
 from qgs.analysis.scenes import chosen_scene, frame_list, named_scene
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import Domain, verdict
 from qgs.data.images import framing
+from qgs.data.recognition import is_training_data
 from qgs.data.samples import make_sample, own_world, views_in
 from qgs.geometry.poses import relative_to, scaled
 from qgs.io.checkpoint import CheckpointFile
@@ -259,13 +261,21 @@ def _of_model(name: str, wanted: Wanted) -> Source:
     scene = _scene(recipe, wanted)
     chosen = None if wanted.frames is None else frame_list(wanted.frames, "--frames", scene)
     trained = model.trained_on or Domain()
+    own = wanted.photos is None or is_training_data(wanted.photos, recipe.data_config)
+    search = ScaleSearch(model, photo_settings(recipe.views, own, wanted.overrides))
     unlike = None if wanted.photos is None else trained
-    sample, _ = choose_sample(scene, recipe.views, wanted.inputs, chosen, None, unlike)
+    sample, _ = choose_sample(scene, recipe.views, wanted.inputs, chosen, None, unlike, search)
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
-    frames = sample.input_frames
-    notes = [*filter(None, (verdict(trained, found), framing(scene, frames[0])))]
-    return ModelSource(model, scene, recipe.views, frames, f"{name}: {scene.name}", notes)
+    frames, scales = sample.input_frames, [*search.found.values()]
+    notes = [
+        *([summary(scales)] if scales else []),
+        *(verdict(trained, found), *(scale.poor for scale in scales), framing(scene, frames[0])),
+    ]
+    notes = [note for note in notes if note]
+    # inputs that are chosen later keep the scale
+    views = search(scene, frames, sample.target_frames)
+    return ModelSource(model, scene, views, frames, f"{name}: {scene.name}", notes)
 
 
 def _scene(recipe: Recipe, wanted: Wanted) -> Scene:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+from qgs.analysis.scale import ScaleSearch, summary
 from qgs.data.domain import OF_SHOWN, Domain, verdict
 from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.io.checkpoint import load
@@ -55,22 +56,26 @@ def open_exhibition(
 ) -> Exhibition:
     """The models `runs` on the scenes of their recipe's evaluation, or on photos held out.
 
+    A scale that is searched is that of the first model, for all figures to have one world.
+
     scene: of the exhibits and of the first samples; the first one by default. Raises ValueError for
     an unknown scene or query, and as `contest.recipes_alike`.
     """
     files = contest.checkpoints(runs)
     recipe = next(iter(contest.recipes_alike(files, photos).values()))
     source = recipe.build_data()
-    samples = evaluation_samples(source, recipe.views, recipe.evaluation)
+    models = {name: load(file, device) for name, file in files.items()}
+    first = next(iter(models))
+    search = ScaleSearch(models[first], recipe.views)
+    samples = evaluation_samples(source, recipe.views, recipe.evaluation, views_of=search)
     names = dict.fromkeys(sample.scene for sample in samples)
     if scene is not None and scene not in names:
         raise ValueError(f"--scene: {scene!r} is not judged; scenes are {listed(names)}")
     samples = sorted(samples, key=lambda sample: sample.scene != scene)
     exhibits, found, notes = [], Domain(), dict[str, list[str]]()
     found.see(samples[0].inputs.cameras, samples[0].targets.cameras)
-    for name, file in files.items():
-        model = load(file, device)
-        exhibits.append(exhibit(name, model, samples[0], curves_of(file)))
+    for name, model in models.items():
+        exhibits.append(exhibit(name, model, samples[0], curves_of(files[name])))
         if photos is not None and (
             remark := verdict(model.trained_on or Domain(), found, OF_SHOWN)
         ):
@@ -78,6 +83,8 @@ def open_exhibition(
         if query is not None:
             exhibits[-1].notable(1, exhibits[-1].sample.inputs.cameras, query)
     remarks = [f"{', '.join(models)}: {remark}." for remark, models in notes.items()]
+    if search.found:
+        remarks.append(f"{first}: {summary(search.found.values())}.")
     if recipe.views.scale == "auto":
         remarks.append(contest.AUTO_SCALE)
     depths = [true_depth(source, sample) for sample in samples]
