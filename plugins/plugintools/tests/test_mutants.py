@@ -42,7 +42,7 @@ def test_the_mutant_is_caught_by_the_check_that_is_meant(mutant: Mutant) -> None
 SOUND = [
     component
     for component in vars(sound).values()
-    if getattr(component, "__module__", "") == sound.__name__
+    if getattr(component, "__module__", "") == sound.__name__ and "name" in vars(component)
 ]
 
 
@@ -54,13 +54,19 @@ def test_a_sound_component_passes(component: type[Component]) -> None:
 
 
 FAR = sound.SeesFar.Config(depth=8, layer_scale=1.0)
+GRID = ("tokens_are_those_of_the_grid",)
 GRADIENTS = ("render_gradients_match_differences", "camera_gradients_match_differences")
 
 
 @pytest.mark.parametrize(
     ("checks", "case"),
     [
-        (["tokens_are_those_of_the_grid"], Case(FAR)),
+        (GRID, Case(FAR)),
+        *[
+            (GRID, Case(encoder.Config(patch_size=patch), image_size=size))
+            for encoder in (sound.ConvolvesByThree, sound.ConvolvesByFour)
+            for patch, size in [(4, None), (16, None), (8, (64, 64)), (8, (16, 24))]
+        ],
         (["saved_weights_load"], Case(ContentCrossAttention.Config(), ModelDims(48, 3, 1))),
         (GRADIENTS, Case(TorchRenderer.Config(dilation=0.1))),
         (GRADIENTS, Case(TorchRenderer.Config(dilation=1.0))),

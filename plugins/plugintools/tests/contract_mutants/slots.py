@@ -3,7 +3,9 @@
 from dataclasses import replace
 
 import torch
+import torch.nn.functional as F
 from contract_mutants.mutant import mutant
+from contract_mutants.sound import StridedConvolutions
 from qgs_tokengs2026.latents import LatentBottleneck
 from torch import Tensor, nn
 
@@ -150,7 +152,7 @@ class RoundsItsRays(ChangedEncoder):
         return replace(memory, patch_rays=memory.patch_rays.bfloat16().to(memory.patch_rays))
 
 
-@mutant("tokens_are_those_of_the_grid", "token of `keys` at (1, 1, 1)")
+@mutant("tokens_are_those_of_the_grid", "of `keys`, 8% of what changes a token comes from its own")
 class OrdersTokensByColumn(ChangedEncoder):
     def result(self, memory):
         def turned(x: Tensor, tokens: int) -> Tensor:
@@ -159,6 +161,32 @@ class OrdersTokensByColumn(ChangedEncoder):
 
         keys, values = turned(memory.keys, 2), turned(memory.values, 2)
         return replace(memory, keys=keys, values=values, features=turned(memory.features, 1))
+
+
+@mutant("tokens_are_those_of_the_grid", "if tokens were ordered by view, column, row")
+class ConvolvesAndOrdersByColumn(StridedConvolutions):
+    def ordered(self, x_BVDHW):
+        return x_BVDHW.mT.reshape(x_BVDHW.shape)
+
+
+@mutant("tokens_are_those_of_the_grid", "(+0, +0, -1) of it", options={"kernel": 4})
+class ConvolvesAndShiftsByAColumn(StridedConvolutions):
+    def ordered(self, x_BVDHW):
+        return F.pad(x_BVDHW, (1, -1))
+
+
+@mutant("tokens_are_those_of_the_grid", "of what changes a token comes from its own patch")
+class ConvolvesAndRollsRows(StridedConvolutions):
+    """Up, against the half patch that these convolutions are off."""
+
+    def ordered(self, x_BVDHW):
+        return x_BVDHW.roll(-1, -2)
+
+
+@mutant("tokens_are_those_of_the_grid", "hardly more than from others")
+class PoolsEachView(StridedConvolutions):
+    def ordered(self, x_BVDHW):
+        return x_BVDHW.mean((-1, -2), keepdim=True).expand_as(x_BVDHW)
 
 
 @mutant("tokens_are_those_of_the_grid", "`values` stays as it is")

@@ -1,12 +1,15 @@
 """Components that keep the contract in ways that a check could take for a fault."""
 
 from dataclasses import replace
+from itertools import pairwise
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from contract_mutants.mutant import named
 from contract_mutants.renderers import RefusesWhatItDeclares
 from contract_mutants.spatial import PlacesByALayer
+from einops import rearrange
 from torch import nn
 
 from qgs.components import (
@@ -15,15 +18,18 @@ from qgs.components import (
     MultiViewViT,
 )
 from qgs.components.blocks import merge_heads
+from qgs.components.encoder import keys_and_values
 from qgs.contracts import (
     MEMORY_FIELDS,
     ComponentConfig,
     FieldSpec,
     LearnedQueries,
+    PatchEncoder,
     SelfAttention,
 )
+from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.losses import Opacity
-from qgs.types import QueryState
+from qgs.types import ImageMemory, QueryState
 
 
 @named
@@ -114,6 +120,45 @@ class SeesFar(MultiViewViT):
     def embed(self, views, plucker):
         seen = self.stem(views.images.flatten(0, 1)).unflatten(0, views.images.shape[:2])
         return super().embed(replace(views, images=seen), plucker)
+
+
+class StridedConvolutions(PatchEncoder):
+    """Each halves the sides. Kernels of 3 put a token's centre nearly half a patch off."""
+
+    class Config(PatchEncoder.Config):
+        kernel: int = 3
+        patch_size: Literal[4, 8, 16] = 8
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        sizes = pairwise([9, *[dims.width] * (config.patch_size.bit_length() - 1)])
+        layers = [(nn.Conv2d(i, o, config.kernel, 2, padding=1), nn.GELU()) for i, o in sizes]
+        self.layers = nn.Sequential(*(part for layer in layers for part in layer))
+        self.kv_proj = nn.Linear(dims.width, 2 * dims.width)
+        self.k_norm = nn.LayerNorm(dims.width // dims.heads)
+
+    def ordered(self, x_BVDHW):
+        return x_BVDHW
+
+    def forward(self, views):
+        rays = plucker_rays(views.cameras)
+        x = self.layers(torch.cat([views.images, rays], 2).flatten(0, 1))
+        x = self.ordered(x.unflatten(0, views.images.shape[:2]))
+        features = rearrange(x, "b v d h w -> b (v h w) d")
+        keys, values = keys_and_values(features, self.kv_proj, self.k_norm)
+        rays = patch_rays(rays, self.config.patch_size)
+        return ImageMemory(features, keys, values, rays, self.grid(views))
+
+
+@named
+class ConvolvesByThree(StridedConvolutions):
+    class Config(StridedConvolutions.Config): ...
+
+
+@named
+class ConvolvesByFour(StridedConvolutions):
+    class Config(StridedConvolutions.Config):
+        kernel: int = 4
 
 
 @named

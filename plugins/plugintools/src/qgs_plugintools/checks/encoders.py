@@ -26,6 +26,21 @@ from qgs_plugintools.trees import (
 
 Patch = tuple[int, int, int]  # view, row and column
 
+_SIDE = 6
+"""Rows and columns of patches that are changed, a scene each."""
+
+_LEAST_SHARE = 0.6
+"""Of the largest mean share at one displacement. Strided 3 x 3 convolutions, whose centres are
+nearly half a patch off, have 0.75 to 1.5; tokens shifted by one at most 0.5."""
+
+_LEAST_GAIN, _GOOD_GAIN = 1.5, 3
+"""Share of a token's own patch over the mean of a view's: what it must have, and what shows the
+true order. Strided convolutions have at least 6, a random ViT of 8 blocks 11."""
+
+_ORDER = (
+    'order the tokens by view, then row, then column: `rearrange(x, "b v d h w -> b (v h w) d")`'
+)
+
 
 @check({"encoder"})
 def check_patch_rays_are_those_of_the_grid(case: Case) -> None:
@@ -48,11 +63,11 @@ def check_patch_rays_are_those_of_the_grid(case: Case) -> None:
 def check_tokens_are_those_of_the_grid(case: Case) -> None:
     """What one patch shows changes its own token most: that of its place in `grid`, if any.
 
-    True of most of the patches, since a token may see far beyond its own. Keys may be those of the
-    rays alone.
+    In the mean over the patches, and half a patch off is allowed: the centres of strided
+    convolutions stand there. Keys may be those of the rays alone.
     """
     module = case.build().eval()
-    for where, views in _wide_and_tall(case):
+    for where, views in _wide_and_tall(case, _size_of_a_large_grid(case, module)):
         views = map_tensors(lambda x: x[:1], views)
         memory = module(views)
         if memory.grid is None:
@@ -60,9 +75,8 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
             expect(not declared, "`provides` says that there is a grid, and there is none")
             continue
         patch, grid = _patch_size(where, views, memory), memory.grid
-        tokens = torch.randperm(math.prod(grid), generator=torch.Generator().manual_seed(0))
-        places = _places(tokens[:12], grid)
-        changed = module(_one_patch_each(views, places, patch))
+        tokens = torch.arange(math.prod(grid)).view(grid)[:, :_SIDE, :_SIDE].flatten()
+        changed = module(_one_patch_each(views, _places(tokens, grid), patch))
         for name in ("keys", "values", "features"):
             if getattr(memory, name) is None:
                 continue
@@ -71,14 +85,8 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
             if not change.any():
                 expect(name == "keys", f"{where}, `{name}` stays as it is when the images change")
                 continue
-            moved = _places(change.argmax(-1), grid)
-            astray = [pair for pair in zip(places, moved, strict=True) if pair[0] != pair[1]]
-            one, other = astray[0] if astray else (None, None)
-            expect(
-                2 * len(astray) < len(places),
-                f"{where}, a change at view, row, column {one} changes most the token of "
-                f"`{name}` at {other}, and so do {len(astray)} of {len(places)}",
-            )
+            found = _misplaced(change, tokens, grid)
+            expect(not found, f"{where}, of `{name}`, {found}")
 
 
 @check({"encoder"})
@@ -101,13 +109,23 @@ def check_project_makes_the_memory_again(case: Case) -> None:
     expect(bool(difference(memory, other)), "other features make the same memory")
 
 
-def _wide_and_tall(case: Case) -> Iterator[tuple[str, Views]]:
-    """Views of the size of the case and, where the component takes them, turned by 90 degrees."""
-    height, width = case.size
-    for size in dict.fromkeys([(height, width), (width, height)]):
-        if size == case.size or not case.problems(size):
+def _wide_and_tall(case: Case, size: tuple[int, int] | None = None) -> Iterator[tuple[str, Views]]:
+    """Views of `size` (H, W), by default that of the case, and turned by 90 degrees if possible."""
+    height, width = first = size or case.size
+    for size in dict.fromkeys([first, (width, height)]):
+        if size == first or not case.problems(size):
             where = f"with images of {size[0]} x {size[1]}"
             yield where, inputs_of(case, Sizes(image=size))["views"]
+
+
+def _size_of_a_large_grid(case: Case, module: Encoder) -> tuple[int, int]:
+    """(H, W) of the case, doubled if its grid is so small that most tokens are at a border."""
+    height, width = case.size
+    grid = module(inputs_of(case)["views"]).grid
+    large = 2 * height, 2 * width
+    if grid is None or case.image_size or min(grid[1:]) > 3 or case.problems(large):
+        return case.size
+    return large
 
 
 def _patch_size(where: str, views: Views, memory: ImageMemory) -> int:
@@ -124,6 +142,40 @@ def _patch_size(where: str, views: Views, memory: ImageMemory) -> int:
 
 def _places(tokens: Tensor, grid: Patch) -> list[Patch]:
     return [*zip(*(x.tolist() for x in torch.unravel_index(tokens, grid)), strict=True)]
+
+
+def _misplaced(change: Tensor, changed: Tensor, grid: Patch) -> str:
+    """How tokens of the `grid` stand off their patches, with the remedy; "" if they do not.
+
+    change: (T, M), of each token by each of the patches that were `changed` (T,).
+    """
+    # Shares of what changes a token: near borders, and after norms, some tokens change more.
+    share = change / change.sum(0).clamp_min(1e-30)
+    places = torch.stack(torch.unravel_index(changed, grid), -1)
+    steps = (places - places[:, None]).flatten(0, 1)  # from the patch to the token
+    known, kind = steps.unique(dim=0, return_inverse=True)
+    mean = share.new_zeros(len(known)).index_add(0, kind, share[:, changed].flatten())
+    mean = mean / kind.bincount()
+    own = mean[(known == 0).all(-1)].item()
+    most, at = mean.max(0)
+    views, rows, columns = grid
+    by_column = torch.arange(math.prod(grid)).view(views, columns, rows).mT.flatten()
+    exchanged = share[range(len(changed)), by_column[changed]].mean().item()
+    seen = f"{own:.0%} of what changes a token comes from its own patch"
+    of_view = len(changed) / views
+    if exchanged * of_view > _GOOD_GAIN and exchanged > 2 * own:
+        return f"{seen}, {exchanged:.0%} if tokens were ordered by view, column, row; {_ORDER}"
+    if of_view > 4 and max(own, most / 2) * of_view < _LEAST_GAIN:
+        return (
+            f"{seen}, hardly more than from others: let it show in each token what its patch shows"
+        )
+    if own < _LEAST_SHARE * most:
+        step = ", ".join(f"{-x:+d}" for x in known[at].tolist())
+        return (
+            f"{seen}, {most:.0%} from the patch at view, row, column ({step}) of it; "
+            f"{_ORDER}, and pad so that the pixels which a token sees are centred on its patch"
+        )
+    return ""
 
 
 def _one_patch_each(views: Views, places: list[Patch], patch: int) -> Views:
