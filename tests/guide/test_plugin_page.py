@@ -16,10 +16,11 @@ from qgs_locus.cross_attention import RayBiasedCrossAttention
 from qgs_plugintools import Case, cases_of, checks_for, run_check
 from qgs_plugintools.inputs import inputs_of
 from qgs_plugintools.new_command import rendered
+from training_runs import run
 
-from qgs.composer import RecipeError
+from qgs.composer import RecipeError, registry
 from qgs.composer.recipe import resolve
-from qgs.composer.registry import InstalledPlugin
+from qgs.composer.registry import InstalledPlugin, load_plugin
 from qgs.contracts import ModelDims
 from qgs.types import QueryState
 
@@ -60,10 +61,10 @@ def test_the_page_shows_what_new_plugin_writes() -> None:
     assert blocks("plugin.md", "toml").popitem()[1] in written["pyproject.toml"]
 
 
-@pytest.mark.parametrize("number", range(7))
+@pytest.mark.parametrize("number", range(8))
 def test_components_keep_their_contracts(package: ModuleType, number: int) -> None:
     cases = cases_of(InstalledPlugin(package.plugin))
-    assert len(cases) == 7, "one of each component, and one more of its examples"
+    assert len(cases) == 8, "one of each component, and one more of its examples"
     case = cases[number]
     outcomes = [run_check(check, case) for check in checks_for(case, ["core"])]
     assert [outcome.message for outcome in outcomes if outcome.verdict == "failed"] == []
@@ -132,3 +133,19 @@ def test_every_second_head_reads_close_rays_alone_and_says_so(
     assert (~hidden).any(-1).all()
     assert not (hidden & kept).any()
     assert (explained.weights[:, 1][hidden] == 0).all()
+
+
+def test_the_encoder_trains(
+    folder: Path, package: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(folder)
+    fewer = ["training.steps=3", "optimizer.warmup=1"]
+    recipe = resolve("cnn.yaml", fewer, plugins=[package.plugin])
+    installed = {"sightline": InstalledPlugin(package.plugin)}
+    monkeypatch.setattr(registry, "load_plugin", lambda n: installed.get(n) or load_plugin(n))
+    start = recipe.build_model("cpu").encoder
+    result = run(recipe, tmp_path / "run")
+    learned = result.model.encoder
+    assert isinstance(learned, package.ConvolutionalEncoder)
+    changes = [p - q for p, q in zip(learned.parameters(), start.parameters(), strict=True)]
+    assert all(0 < x.abs().max() < 0.1 for x in changes)

@@ -11,7 +11,9 @@ pytestmark = pytest.mark.slow
 
 BLOCK = re.compile(r'^```(\w+)(?: title="([^"]*)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
 TRAINING = "qgs train recipe.yaml --out run"
-SHORTER = " --set training.steps=3 --set optimizer.warmup=1 --set evaluation.scenes=1"
+ONE_SCENE = " --set evaluation.scenes=1"
+SHORTER = " --set training.steps=3 --set optimizer.warmup=1" + ONE_SCENE
+STEPS = "training.steps=50"
 
 
 def script_of(page: str) -> Iterator[str]:
@@ -19,7 +21,7 @@ def script_of(page: str) -> Iterator[str]:
     for kind, title, text in BLOCK.findall(page):
         verb, colon, path = title.partition(": ")
         if kind == "bash":
-            yield text.replace(TRAINING, TRAINING + SHORTER)
+            yield text.replace(TRAINING, TRAINING + SHORTER).replace(STEPS, STEPS + ONE_SCENE)
         elif colon:
             yield f"test {'-e' if verb == 'change' else '! -e'} {path}\n"
             yield f"cat > {path} <<'END OF FILE'\n{text}END OF FILE\n"

@@ -72,7 +72,7 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
         memory = module(views)
         if memory.grid is None:
             declared = "memory.grid" in case.component.fields_written(case.config)
-            expect(not declared, "`provides` says that there is a grid, and there is none")
+            expect(not declared, "`writes` has memory.grid, but `grid` of the ImageMemory is None")
             continue
         patch, grid = _patch_size(where, views, memory), memory.grid
         tokens = torch.arange(math.prod(grid)).view(grid)[:, :_SIDE, :_SIDE].flatten()
