@@ -1,5 +1,12 @@
 """MVSplat and DepthSplat for qgs: depth from a plane sweep, one Gaussian per pixel."""
 
 from qgs.contracts import Plugin
+from qgs_mvsplat.head import RayHead
+from qgs_mvsplat.mvsplat import MVSplatEncoder
+from qgs_mvsplat.pixels import OnRays, PixelQueries
 
-plugin = Plugin(name="mvsplat", contract_version=1, components=())
+plugin = Plugin(
+    name="mvsplat",
+    contract_version=1,
+    components=(MVSplatEncoder, PixelQueries, RayHead, OnRays),
+)

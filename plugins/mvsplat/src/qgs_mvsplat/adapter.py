@@ -1,0 +1,137 @@
+"""Colours and rotations of the pixelSplat family: e3nn's harmonics, turned, in our basis."""
+
+import math
+from functools import cache
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from qgs.geometry.harmonics import rotated
+from qgs.geometry.precision import full_precision
+
+SH_DEGREE = 3
+"""Largest degree that the rasteriser of the released code and ours read."""
+QUAT_EPS = 1e-8
+
+
+def coefficients(degree: int) -> int:
+    """Harmonics of degrees 0 to `degree`."""
+    return (degree + 1) ** 2
+
+
+def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
+    """Real harmonics of degrees 0 to `degree` at unit `directions` (..., 3): (..., K).
+
+    Each degree l has its functions in e3nn's order, m from -l to l about the axis y, with azimuth
+    from z to x, so that degree 1 is (x, y, z); orthonormal but for a factor for all.
+    """
+    x, y, z = directions.unbind(-1)
+    cosine, sine = [torch.ones_like(x)], [torch.zeros_like(x)]
+    for _ in range(degree):  # of m times the azimuth, times sin^m of the angle to the pole
+        c, s = cosine[-1], sine[-1]
+        cosine, sine = [*cosine, z * c - x * s], [*sine, z * s + x * c]
+    found: dict[tuple[int, int], Tensor] = {}
+    for m in range(degree + 1):
+        # Associated Legendre functions over sin^m, by their recurrence in l.
+        legendre = [torch.zeros_like(y), torch.full_like(y, math.prod(range(1, 2 * m, 2)))]
+        for n in range(m + 1, degree + 1):
+            following = (2 * n - 1) * y * legendre[-1] - (n + m - 1) * legendre[-2]
+            legendre.append(following / (n - m))
+        for n in range(m, degree + 1):
+            ratio = math.factorial(n - m) / math.factorial(n + m)
+            scale = math.sqrt((2 * n + 1) * ratio * (2 if m else 1))
+            found[n, m] = scale * legendre[n - m + 1] * cosine[m]
+            found[n, -m] = scale * legendre[n - m + 1] * sine[m] if m else found[n, 0]
+    return torch.stack([found[n, m] for n in range(degree + 1) for m in range(-n, n + 1)], -1)
+
+
+@cache
+def _samples() -> Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return F.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=-1)
+
+
+@cache
+def _inverse_at_samples(degree: int) -> Tensor:
+    return torch.linalg.pinv(e3nn_harmonics(_samples(), degree))
+
+
+@full_precision
+def turn_of_harmonics(rotation: Tensor, degree: int) -> Tensor:
+    """Wigner matrices (..., K, K) of e3nn's basis: coefficients in a world turned by (..., 3, 3).
+
+    By least squares in float64 from values at directions all around, which is exact, and keeps the
+    digits that Euler angles of small tilts lose in the released code.
+    """
+    directions, inverse = (x.to(rotation.device) for x in (_samples(), _inverse_at_samples(degree)))
+    turned = torch.einsum("...ij,sj->...si", rotation.double(), directions)
+    # Y(R d) = D Y(d) for every direction d.
+    return (inverse @ e3nn_harmonics(turned, degree)).mT.to(rotation.dtype)
+
+
+@cache
+def _basis_change(count: int) -> Tensor:
+    # The family's rasteriser evaluates the functions of 3DGS at (z, x, y) of a direction.
+    cycle = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=torch.float64)
+    return rotated(torch.eye(count, dtype=torch.float64), cycle)
+
+
+def band_mask(degree: int) -> Tensor:
+    """What the family multiplies raw coefficients (K) with: 1, then .1 / 4^l in degree l."""
+    each = [1.0, *(0.1 * 0.25**n for n in range(1, degree + 1))]
+    return torch.tensor([x for n, x in enumerate(each) for _ in range(2 * n + 1)])
+
+
+@full_precision
+def world_harmonics(rotation: Tensor, degree: int) -> Tensor:
+    """(..., K, K): from raw coefficients in a camera's frame to ours in the world.
+
+    rotation: camera to world (..., 3, 3). degree: at most SH_DEGREE. The turn comes before the
+    change of basis, and they do not commute: the family turns in e3nn's basis, but its rasteriser
+    has other signs there; published weights expect that order.
+    """
+    turn = turn_of_harmonics(rotation, degree) * band_mask(degree).to(rotation)
+    change = torch.eye(coefficients(degree), dtype=torch.float64)
+    if degree:
+        change[1:, 1:] = _basis_change(coefficients(degree) - 1)
+    return change.to(rotation) @ turn
+
+
+def quaternions(rotation: Tensor) -> Tensor:
+    """Unit quaternions (..., 4), w x y z, of rotations (..., 3, 3), up to sign."""
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotation.unbind(-2))
+    # 4 q q^T: every row is the quaternion times four of its numbers; the largest loses no digits.
+    rows = [
+        [1 + a + e + i, h - f, c - g, d - b],
+        [h - f, 1 + a - e - i, b + d, c + g],
+        [c - g, b + d, 1 - a + e - i, f + h],
+        [d - b, c + g, f + h, 1 - a - e + i],
+    ]
+    outer = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1, keepdim=True)[..., None]
+    row = outer.gather(-2, largest.expand(*largest.shape[:-1], 4))[..., 0, :]
+    return F.normalize(row, dim=-1)
+
+
+def quat_product(left: Tensor, right: Tensor) -> Tensor:
+    """Quaternion products (..., 4), w x y z."""
+    w, v = left[..., :1], left[..., 1:]
+    w2, v2 = right[..., :1], right[..., 1:]
+    real = w * w2 - (v * v2).sum(-1, keepdim=True)
+    return torch.cat([real, w * v2 + w2 * v + torch.linalg.cross(v, v2, dim=-1)], -1)
+
+
+def camera_quaternions(raw_xyzw: Tensor) -> Tensor:
+    """Raw quaternions (..., 4), x y z w, over their length; a zero one stays zero."""
+    return raw_xyzw / (raw_xyzw.norm(dim=-1, keepdim=True) + QUAT_EPS)
+
+
+def world_quaternions(camera_xyzw: Tensor, turn_wxyz: Tensor) -> Tensor:
+    """Unit quaternions (..., 4), w x y z, in the world; a zero one is no rotation at all."""
+    own = camera_xyzw.roll(1, -1)
+    length = own.norm(dim=-1, keepdim=True)
+    identity = own.new_tensor([1.0, 0.0, 0.0, 0.0])
+    # The smallest number keeps the division of unused zeros finite, and its gradient too.
+    own = torch.where(length > 0, own / length.clamp_min(torch.finfo(own.dtype).tiny), identity)
+    return F.normalize(quat_product(turn_wxyz, own), dim=-1)

@@ -1,0 +1,68 @@
+"""The CNN of GMFlow and UniMatch in front of the multi-view transformer: features at 1/4 or 1/8."""
+
+from typing import NamedTuple
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+WIDTHS = (64, 96, 128)
+"""Channels of the three stages (released code)."""
+
+
+class Stages(NamedTuple):
+    """Maps of the three stages, and `features`, a 1x1 convolution of the last."""
+
+    first: Tensor
+    second: Tensor
+    third: Tensor
+    features: Tensor
+
+
+class ResidualBlock(nn.Module):
+    """relu(skip(x) + relu(norm(conv(relu(norm(conv x)))))): (N, C, H, W) -> (N, C', H/s, W/s)."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
+        self.conv2 = nn.Conv2d(outputs, outputs, 3, padding=1, bias=False)
+        # The norm behind it takes the bias away again; published files have one nevertheless.
+        self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride))
+        if stride == 1 and inputs == outputs:
+            self.downsample = None
+
+    def forward(self, x_NCHW: Tensor) -> Tensor:
+        skip = x_NCHW if self.downsample is None else F.instance_norm(self.downsample(x_NCHW))
+        x_NCHW = F.relu(F.instance_norm(self.conv1(x_NCHW)))
+        # The branch is rectified before the sum as well (released code).
+        return F.relu(skip + F.relu(F.instance_norm(self.conv2(x_NCHW))))
+
+
+class CNN(nn.Module):
+    """7x7 convolution to half size, three stages of two residual blocks, 1x1 convolution.
+
+    strides: of the second and of the third stage. Instance norms have neither parameters nor
+    running statistics, so that training and evaluation agree.
+    """
+
+    def __init__(self, width: int, strides: tuple[int, int]) -> None:
+        super().__init__()
+        first, second, third = WIDTHS
+        self.conv1 = nn.Conv2d(3, first, 7, 2, padding=3, bias=False)
+        self.layer1 = _stage(first, first, 1)
+        self.layer2 = _stage(first, second, strides[0])
+        self.layer3 = _stage(second, third, strides[1])
+        self.conv2 = nn.Conv2d(third, width, 1)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+
+    def forward(self, images_N3HW: Tensor) -> Stages:
+        """The maps of images that are normalised."""
+        first = self.layer1(F.relu(F.instance_norm(self.conv1(images_N3HW))))
+        second = self.layer2(first)
+        third = self.layer3(second)
+        return Stages(first, second, third, self.conv2(third))
+
+
+def _stage(inputs: int, outputs: int, stride: int) -> nn.Sequential:
+    return nn.Sequential(ResidualBlock(inputs, outputs, stride), ResidualBlock(outputs, outputs, 1))

@@ -1,0 +1,89 @@
+"""`mvsplat/gaussians`: the activations of MVSplat's numbers for each pixel."""
+
+import torch
+from einops import rearrange
+from pydantic import Field
+from torch import Tensor
+
+from qgs.contracts import Fields, Head
+from qgs.contracts.head import GAUSSIAN_FIELDS
+from qgs.geometry.harmonics import SH_C0
+from qgs.geometry.precision import full_precision
+from qgs.types import GaussianAttributes, QueryState
+from qgs_mvsplat.adapter import camera_quaternions, world_quaternions
+from qgs_mvsplat.pixels import CHANNELS, PIXEL, PIXEL_FIELDS, TURN, FromPixels, depths, turned
+
+SCALE_FACTOR = 0.1
+
+
+class RayHead(Head):
+    """One Gaussian for each query of `mvsplat/pixels`; it has no parameters.
+
+    Scales are (min + (max - min) sigmoid) * t * .1 * (1 / fx + 1 / fy), focal lengths in pixels:
+    a sum over both axes, no mean. The opacity p is that of a sigmoid, then
+    (1 - (1 - p)^e + p^(1 / e)) / 2 with e = 2^opacity_exponent.
+    """
+
+    name = "gaussians"
+    scheduled = frozenset({"opacity_exponent"})
+
+    class Config(FromPixels):
+        scale_min: float = Field(default=0.5, gt=0)
+        """Least standard deviation, tenths of the size that two pixels have at its depth."""
+        scale_max: float = Field(default=15.0, gt=0)
+        """Largest standard deviation, likewise."""
+        opacity_exponent: float = Field(default=0.0, ge=-10, le=10)
+        """Exponent of the opacity map as a power of 2; 0 for none (published)."""
+
+    config: Config
+
+    @property
+    def gaussians_per_query(self) -> int:
+        return 1
+
+    @classmethod
+    def fields_read(cls, config: Config) -> Fields:
+        return {"state.features": turned(config.sh_degree), **PIXEL_FIELDS}
+
+    @classmethod
+    def fields_written(cls, config: Config) -> Fields:
+        return {"gaussians.sh": GAUSSIAN_FIELDS["gaussians.sh"]} if config.sh_degree else {}
+
+    def forward(self, state: QueryState) -> GaussianAttributes:
+        return _decoded(state.features, state[PIXEL], state[TURN], self.config)
+
+
+@full_precision
+def _decoded(
+    features_BNC: Tensor, pixel_BN43: Tensor, turn_BN4: Tensor, config: RayHead.Config
+) -> GaussianAttributes:
+    raw_BN1C = features_BNC[:, :, None]
+    parts = raw_BN1C.split([*CHANNELS, raw_BN1C.shape[-1] - sum(CHANNELS)], -1)
+    log_depth, logit, place, scale, rotation, sh = parts
+    colors, sh = split_harmonics(sh)
+    factor = config.scale_min + (config.scale_max - config.scale_min) * scale.sigmoid()
+    size = SCALE_FACTOR * pixel_BN43[:, :, 2:].norm(dim=-1).sum(-1)[..., None, None]
+    return GaussianAttributes(
+        offsets=torch.cat([place, log_depth], -1),
+        scales=factor * depths(log_depth) * size,
+        quats=world_quaternions(camera_quaternions(rotation), turn_BN4[:, :, None]),
+        opacities=mapped_opacity(logit[..., 0].sigmoid(), config.opacity_exponent),
+        colors=colors,
+        sh=sh,
+    )
+
+
+def split_harmonics(sh_BNKC: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Colour of degree 0 (B, N, K, 3), and coefficients (B, N, K, C, 3), None without others."""
+    sh_BNKC3 = rearrange(sh_BNKC, "... (x c) -> ... c x", x=3)
+    # Nothing is added for the colour of the photo: zeros are grey.
+    colors, rest = 0.5 + SH_C0 * sh_BNKC3[..., 0, :], sh_BNKC3[..., 1:, :]
+    return colors, rest if rest.shape[-2] else None
+
+
+def mapped_opacity(p: Tensor, exponent: float) -> Tensor:
+    """Opacities of probabilities; those themselves for an exponent of 0."""
+    if exponent == 0:
+        return p
+    power = 2.0**exponent
+    return 0.5 * (1 - (1 - p) ** power + p ** (1 / power))

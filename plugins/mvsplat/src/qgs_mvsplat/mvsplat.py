@@ -1,0 +1,235 @@
+"""`mvsplat/mvsplat`: CNN, window transformer, plane sweep and two U-Nets (arXiv 2403.14627)."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.contracts import (
+    ComponentConfig,
+    Encoder,
+    Fields,
+    ModelDims,
+    Problem,
+    RecipeContext,
+    memory_fields,
+)
+from qgs.geometry.precision import full_precision
+from qgs.types import Cameras, ImageMemory, Views
+from qgs_mvsplat.cnn import CNN
+from qgs_mvsplat.convolutions import conv3, imagenet_normalized, resized, two_convolutions
+from qgs_mvsplat.pixels import CHANNELS, predicted
+from qgs_mvsplat.sweep import (
+    cost_volume,
+    cyclic_neighbours,
+    feature_lenses,
+    inverse_depth_candidates,
+    relative_poses,
+)
+from qgs_mvsplat.unet import OverViews, UNet, group_norm
+from qgs_mvsplat.windows import WindowTransformer, with_positions
+
+FACTOR = 4
+"""Size of an image over that of its features."""
+
+
+class Backbone(nn.Module):
+    """Features of all views at 1/4 of the images, of the CNN and of the transformer behind it."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.backbone = CNN(width, (2, 1))
+        self.transformer = WindowTransformer(width)
+
+    def forward(self, images_BV3HW: Tensor, neighbours_BVJ: Tensor) -> tuple[Tensor, Tensor]:
+        """Both (B, V, D, H/4, W/4)."""
+        normalized = imagenet_normalized(images_BV3HW).flatten(0, 1)
+        cnn = self.backbone(normalized).features.unflatten(0, images_BV3HW.shape[:2])
+        return cnn, self.transformer(with_positions(cnn), neighbours_BVJ)
+
+
+class MVSplatEncoder(Encoder):
+    """Every pixel's depth and raw Gaussian, from features of all views and a plane sweep.
+
+    The memory has a token for each pixel, with the numbers of `qgs_mvsplat.pixels.CHANNELS` and
+    harmonics. Views are compared in their order. A single view is compared with itself. D, the
+    model's width, is that of the features (published: 128).
+    """
+
+    name = "mvsplat"
+    ordered_views = True
+
+    class Config(ComponentConfig):
+        candidates: int = Field(default=128, ge=2)
+        """Depths that the plane sweep compares, evenly in inverse depth from `near` to `far`."""
+        near: float = Field(default=1.0, gt=0)
+        """Least depth, world units."""
+        far: float = Field(default=100.0, gt=0)
+        """Largest depth, world units."""
+        cost_width: int = Field(default=128, ge=32, multiple_of=32)
+        """Channels of the U-Net over the cost volume."""
+        cost_levels: int = Field(default=3, ge=1, le=6)
+        """Levels of that U-Net; the lowest has attention over all views."""
+        depth_width: int = Field(default=32, ge=32, multiple_of=32)
+        """Channels of the U-Net that refines depths at full size."""
+        depth_levels: int = Field(default=5, ge=1, le=8)
+        """Levels of that U-Net; the lowest has attention over all views."""
+        sh_degree: int = Field(default=4, ge=0, le=4)
+        """Degree of the spherical harmonics; those above 3 are not rendered."""
+
+    config: Config
+
+    @classmethod
+    def fields_written(cls, config: Config) -> Fields:
+        return {"memory.features": predicted(config.sh_degree), **memory_fields("grid")}
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        if config.far <= config.near:
+            reason = f"far must be beyond near, got near {config.near:g} and far {config.far:g}"
+            yield Problem("far", reason, "give the depths at which the scene begins and ends")
+        yield from size_problems(_multiple(config), context)
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.backbone = Backbone(dims.width)
+        self.depth_predictor = DepthPredictor(config, dims.width)
+
+    def forward(self, views: Views) -> ImageMemory:
+        """Raises ValueError for images that the U-Nets and windows do not divide."""
+        check_size(views, _multiple(self.config))
+        scenes, count = views.cameras.shape
+        near, far = (
+            views.cameras.c2w.new_full((scenes, count), x)
+            for x in (self.config.near, self.config.far)
+        )
+        raw_BVCHW = self.predict(views, near, far)
+        features = rearrange(raw_BVCHW, "b v c h w -> b (v h w) c")
+        return ImageMemory(features, grid=(count, *views.cameras.size))
+
+    def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
+        """Numbers of every pixel (B, V, C, H, W), for depths between `near` and `far`."""
+        neighbours = cyclic_neighbours(*views.cameras.shape).to(near_BV.device)
+        # The transformer reads other views in ascending order, the sweep in cyclic order.
+        cnn, features = self.backbone(views.images, neighbours.sort(-1).values)
+        sweep = Sweep(views.cameras, neighbours, near_BV, far_BV)
+        return self.depth_predictor(views.images, cnn, features, sweep)
+
+
+class Sweep(NamedTuple):
+    """What the plane sweep reads of cameras (B, V): neighbours (B, V, J), near and far (B, V)."""
+
+    cameras: Cameras
+    neighbours: Tensor
+    near: Tensor
+    far: Tensor
+
+
+class DepthPredictor(nn.Module):
+    """From features at 1/4 to depths and raw Gaussians at full size."""
+
+    def __init__(self, config: MVSplatEncoder.Config, width: int) -> None:
+        super().__init__()
+        count, cost, fine = config.candidates, config.cost_width, config.depth_width
+        gaussian = sum(CHANNELS[2:]) + 3 * (config.sh_degree + 1) ** 2
+        matched = count + width
+        self.corr_refine_net = OverViews(
+            *(conv3(matched, cost), group_norm(cost), nn.GELU()),
+            *(UNet(cost, config.cost_levels, pre_norm=False), conv3(cost, count)),
+        )
+        self.regressor_residual = nn.Conv2d(matched, count, 1)
+        self.depth_head_lowres = two_convolutions(count, 2 * count, count)
+        upscale = nn.Upsample(scale_factor=FACTOR, mode="bilinear", align_corners=True)
+        # GELU comes behind the resizing, not in front of it.
+        self.upsampler = nn.Sequential(conv3(2 * width, width), upscale, nn.GELU())
+        self.proj_feature = conv3(width, fine)
+        self.refine_unet = OverViews(
+            *(conv3(3 + fine + 2, fine), nn.GroupNorm(4, fine), nn.GELU()),
+            UNet(fine, config.depth_levels, pre_norm=False),
+        )
+        self.to_gaussians = two_convolutions(fine + 3 + width, 2 * gaussian, gaussian)
+        self.to_disparity = two_convolutions(fine, 2 * fine, 2)
+
+    def forward(
+        self, images_BV3HW: Tensor, cnn_BVDhw: Tensor, features_BVDhw: Tensor, sweep: Sweep
+    ) -> Tensor:
+        """(B, V, C, H, W): logarithm of the depth, opacity logit, raw Gaussian."""
+        views = images_BV3HW.shape[1]
+        # These networks see images in [0, 1]; only the CNN's are normalised.
+        images_N3HW, cnn_NDhw = images_BV3HW.flatten(0, 1), cnn_BVDhw.flatten(0, 1)
+        features_NDhw = features_BVDhw.flatten(0, 1)
+        disparity_N1hw, confidence_N1hw = self.match(features_BVDhw, sweep)
+        disparity_N1HW = resized(disparity_N1hw, images_N3HW.shape[2:])
+        confidence_N1HW = F.interpolate(confidence_N1hw, scale_factor=FACTOR, mode="nearest")
+        full_NDHW = self.upsampler(torch.cat([features_NDhw, cnn_NDhw], 1))
+        projected = self.proj_feature(full_NDHW)
+        seen = torch.cat([images_N3HW, projected, disparity_N1HW, confidence_N1HW], 1)
+        refined = self.refine_unet(seen, views)
+        raw = self.to_gaussians(torch.cat([refined, images_N3HW, full_NDHW], 1))
+        change_N1HW, logit_N1HW = self.to_disparity(refined).split(1, 1)
+        log_depth = refined_log_depth(disparity_N1HW, change_N1HW, sweep.near, sweep.far)
+        return torch.cat([log_depth, logit_N1HW, raw], 1).unflatten(0, (-1, views))
+
+    def match(self, features_BVDhw: Tensor, sweep: Sweep) -> tuple[Tensor, Tensor]:
+        """Inverse depth and largest probability (B V, 1, h, w) of the candidates at 1/4."""
+        count = self.regressor_residual.out_channels
+        candidates_BVD = inverse_depth_candidates(sweep.near, sweep.far, count)
+        volume_BVDhw = cost_volume(
+            features_BVDhw,
+            candidates_BVD[..., None, None],
+            feature_lenses(sweep.cameras, features_BVDhw.shape[3:]),
+            relative_poses(sweep.cameras.c2w, sweep.neighbours),
+            sweep.neighbours,
+        )
+        matched = torch.cat([volume_BVDhw, features_BVDhw], 2).flatten(0, 1)
+        refined = self.corr_refine_net(matched, features_BVDhw.shape[1])
+        refined = refined + self.regressor_residual(matched)
+        logits_NDhw = self.depth_head_lowres(refined)
+        return expected_disparity(logits_NDhw, candidates_BVD.flatten(0, 1)[..., None, None])
+
+
+@full_precision
+def expected_disparity(logits_NDhw: Tensor, candidates_NDhw: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean of candidates under the softmax of logits, and its largest probability."""
+    probability = logits_NDhw.softmax(1)
+    disparity = (probability * candidates_NDhw).sum(1, keepdim=True)
+    return disparity, probability.amax(1, keepdim=True)
+
+
+@full_precision
+def refined_log_depth(
+    disparity_N1HW: Tensor, change_N1HW: Tensor, near_BV: Tensor, far_BV: Tensor
+) -> Tensor:
+    """Logarithm of the depth (B V, 1, H, W), between near and far."""
+    least, most = (1 / x.flatten()[:, None, None, None] for x in (far_BV, near_BV))
+    fine = (disparity_N1HW + change_N1HW).clamp(least, most)
+    return -fine.log()
+
+
+def _multiple(config: MVSplatEncoder.Config) -> int:
+    """What sides of images are multiples of, in pixels: for windows and levels of U-Nets."""
+    levels = FACTOR * 2 ** (config.cost_levels - 1), 2 ** (config.depth_levels - 1)
+    return max(2 * FACTOR, *levels)
+
+
+def size_problems(multiple: int, context: RecipeContext) -> Iterable[Problem]:
+    """Images of a recipe whose sides are no multiples."""
+    size = context.image_size
+    if size and any(side % multiple for side in size):
+        nearest = [max(round(side / multiple), 1) * multiple for side in size]
+        reason = f"images of {size[0]} x {size[1]} (H x W) are no multiples of {multiple} pixels"
+        yield Problem("", reason, f"set data.image_size to {nearest}")
+
+
+def check_size(views: Views, multiple: int) -> None:
+    """Raise ValueError for images whose sides are no multiples."""
+    height, width = views.cameras.size
+    if height % multiple or width % multiple:
+        raise ValueError(
+            f"images of {height} x {width} (H x W) are no multiples of {multiple} pixels; "
+            "resize or crop the views"
+        )

@@ -1,0 +1,148 @@
+"""`mvsplat/pixels`, `mvsplat/on_rays`: a query for each pixel, means on the rays through it."""
+
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from einops import repeat
+from pydantic import Field
+from torch import Tensor
+
+from qgs.contracts import Centers, ComponentConfig, Fields, FieldSpec, Queries, memory_fields
+from qgs.geometry.precision import full_precision
+from qgs.types import Cameras, ImageMemory, QueryState, Views
+from qgs_mvsplat.adapter import SH_DEGREE, coefficients, quaternions, world_harmonics
+
+PIXEL, TURN = "mvsplat.pixel", "mvsplat.turn"
+PIXEL_FIELDS: Fields = {
+    PIXEL: FieldSpec(
+        (4, 3),
+        frame="world",
+        encoding="camera centre; directions of z = 1: upper left corner, step across, step down",
+    ),
+    TURN: FieldSpec((4,), frame="world", encoding="unit quaternion w x y z, camera to world"),
+}
+"""The rays through a pixel, and the rotation of its camera."""
+
+CHANNELS = (1, 1, 2, 3, 4)
+"""Per pixel: logarithm of the depth (world units), opacity logit, raw place in the pixel, raw
+scales, raw quaternion x y z w in the camera's frame; behind them harmonics, colour by colour."""
+LOG_DEPTH = 20.0
+"""Bound of the logarithm of a depth, so that any features give a finite place and a scale."""
+
+
+class FromPixels(ComponentConfig):
+    """Options of what reads the numbers that MVSplat and DepthSplat predict for each pixel."""
+
+    sh_degree: int = Field(default=4, ge=0, le=4)
+    """Degree of the spherical harmonics that are predicted, as of the encoder; those above 3 are
+    not rendered."""
+
+
+def predicted(sh_degree: int) -> FieldSpec:
+    """Numbers of a pixel in the memory, harmonics in the camera's frame and e3nn's basis."""
+    return FieldSpec((sum(CHANNELS) + 3 * coefficients(sh_degree),))
+
+
+def turned(sh_degree: int) -> FieldSpec:
+    """Numbers of a query: the same, harmonics in the world and our basis, at most degree 3."""
+    return predicted(min(sh_degree, SH_DEGREE))
+
+
+class PixelQueries(Queries):
+    """A query for each pixel, which knows the rays through its pixel and its camera's rotation.
+
+    Its features are the encoder's numbers, harmonics turned into the world.
+    """
+
+    name = "pixels"
+
+    class Config(FromPixels):
+        pass
+
+    config: Config
+
+    @classmethod
+    def fields_read(cls, config: Config) -> Fields:
+        return {"memory.features": predicted(config.sh_degree), **memory_fields("grid")}
+
+    @classmethod
+    def fields_written(cls, config: Config) -> Fields:
+        return {"state.features": turned(config.sh_degree), **PIXEL_FIELDS}
+
+    def forward(self, memory: ImageMemory, views: Views) -> QueryState:
+        assert memory.grid is not None
+        degree = min(self.config.sh_degree, SH_DEGREE)
+        features = in_world(memory.features, views.cameras.c2w[..., :3, :3], degree)
+        _, rows, columns = memory.grid
+        return QueryState(features, pixel_fields(views.cameras, rows, columns))
+
+
+@full_precision
+def in_world(features_BMC: Tensor, rotation_BV33: Tensor, degree: int) -> Tensor:
+    """Numbers of pixels, ordered by view, with harmonics of up to `degree` turned."""
+    views, first = rotation_BV33.shape[1], sum(CHANNELS)
+    sh_BVPXK = features_BMC[..., first:].unflatten(1, (views, -1)).unflatten(-1, (3, -1))
+    sh_BVPXK = sh_BVPXK[..., : coefficients(degree)]
+    world = torch.einsum("bvkl,bvpxl->bvpxk", world_harmonics(rotation_BV33, degree), sh_BVPXK)
+    return torch.cat([features_BMC[..., :first], world.flatten(1, 2).flatten(2)], -1)
+
+
+@full_precision
+def pixel_fields(cameras: Cameras, rows: int, columns: int) -> dict[str, Tensor]:
+    """PIXEL_FIELDS of images (B, V) seen as rows x columns pixels: (B, V*rows*columns, ...)."""
+    (height, width), c2w = cameras.size, cameras.c2w
+    left = torch.arange(columns).to(c2w) * (width / columns)
+    upper = torch.arange(rows).to(c2w) * (height / rows)
+    fx, fy, cx, cy = (x_BV[..., None] for x_BV in cameras.intrinsics.unbind(-1))
+    x_BVRC = repeat((left - cx) / fx, "b v c -> b v r c", r=rows)
+    y_BVRC = repeat((upper - cy) / fy, "b v r -> b v r c", c=columns)
+    right_BV3, down_BV3, ahead_BV3 = c2w[..., :3, :3].unbind(-1)
+
+    def each(x_BV3: Tensor) -> Tensor:
+        return x_BV3[:, :, None, None]
+
+    corner = x_BVRC[..., None] * each(right_BV3) + y_BVRC[..., None] * each(down_BV3)
+    corner = corner + each(ahead_BV3)
+    across, below = right_BV3 * (width / columns / fx), down_BV3 * (height / rows / fy)
+    others = (each(x).expand_as(corner) for x in (c2w[..., :3, 3], across, below))
+    origin, across, below = others
+    pixel = torch.stack([origin, corner, across, below], -2).flatten(1, 3)
+    turn = each(quaternions(c2w[..., :3, :3])).expand(*corner.shape[:-1], 4).flatten(1, 3)
+    return {PIXEL: pixel, TURN: turn}
+
+
+class OnRays(Centers):
+    """mean = o + t d; d goes through the place of the Gaussian in its pixel.
+
+    Offsets are two raw numbers, whose sigmoids are that place from the upper left corner, and the
+    logarithm of t in world units.
+    """
+
+    name = "on_rays"
+    reads = PIXEL_FIELDS
+
+    class Config(ComponentConfig):
+        measure: Literal["distance", "depth"] = "distance"
+        """Whether t counts along the ray (MVSplat), or along the camera's axis (DepthSplat). In
+        MVSplat it was found as a depth by the plane sweep; its weights expect the difference."""
+
+    config: Config
+
+    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
+        return _placed(offsets, state[PIXEL], self.config.measure == "distance")
+
+
+@full_precision
+def _placed(offsets_BNK3: Tensor, pixel_BN43: Tensor, distance: bool) -> Tensor:
+    origin, corner, across, down = pixel_BN43[:, :, None].unbind(-2)
+    u, v = offsets_BNK3[..., :2].sigmoid()[..., None].unbind(-2)
+    direction = corner + u * across + v * down
+    if distance:
+        direction = F.normalize(direction, dim=-1)
+    return origin + depths(offsets_BNK3[..., 2:]) * direction
+
+
+def depths(log_depth: Tensor) -> Tensor:
+    """Depths, world units, of their logarithms."""
+    return log_depth.clamp(-LOG_DEPTH, LOG_DEPTH).exp()

@@ -1,0 +1,107 @@
+"""The plane sweep: how well the features of a view agree with those of others at each depth."""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from qgs.geometry.precision import full_precision
+from qgs.types import Cameras
+
+MIN_DEPTH = 1e-3
+"""Bound of z in another camera, world units: points behind it land far outside of its image."""
+MAX_SAMPLES = 1 << 24
+"""Numbers that a chunk of candidates may sample at once (64 MiB in float32)."""
+
+
+def cyclic_neighbours(scenes: int, views: int) -> Tensor:
+    """The views (B, V, V - 1) that follow each view, around; a single view is its own neighbour."""
+    view = torch.arange(views)
+    step = torch.arange(1, max(views, 2))
+    return ((view[:, None] + step) % views).expand(scenes, -1, -1)
+
+
+@full_precision
+def inverse_depth_candidates(near_BV: Tensor, far_BV: Tensor, count: int) -> Tensor:
+    """(B, V, D), linear from 1/far to 1/near, both included."""
+    step_D = torch.linspace(0, 1, count).to(near_BV)
+    least = 1 / far_BV[..., None]
+    return least + step_D * (1 / near_BV[..., None] - least)
+
+
+@full_precision
+def relative_poses(c2w_BV44: Tensor, neighbours_BVJ: Tensor) -> Tensor:
+    """From the camera of each view to those of its neighbours: (B, V, J, 4, 4)."""
+    scenes = torch.arange(len(c2w_BV44), device=c2w_BV44.device)[:, None, None]
+    return c2w_BV44[scenes, neighbours_BVJ].inverse() @ c2w_BV44[:, :, None]
+
+
+@full_precision
+def feature_lenses(cameras: Cameras, size: tuple[int, int]) -> Tensor:
+    """Intrinsics (B, V, 4) of cameras whose images are of `size`, (H, W)."""
+    scale = (size[1] / cameras.size[1], size[0] / cameras.size[0])
+    return cameras.intrinsics * cameras.intrinsics.new_tensor([*scale, *scale])
+
+
+@full_precision
+def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
+    """Where pixels of a view at given depths stand in another: (N, D, h, w, 2), for `grid_sample`.
+
+    depth_NDhw: camera-frame z, world units, sizes of 1 are expanded over h, w: use h, w of the map.
+    """
+    height, width = depth_NDhw.shape[-2:]
+    fx, fy, cx, cy = (x[:, None, None] for x in lens_N4.unbind(-1))
+    # Pixels count from 0 without the half that rays have; published weights expect the difference.
+    x_w = torch.arange(width).to(depth_NDhw)
+    y_h1 = torch.arange(height).to(depth_NDhw)[:, None]
+    ray = ((x_w - cx) / fx).expand(-1, height, -1), ((y_h1 - cy) / fy).expand(-1, -1, width)
+    ray_Nhw3 = torch.stack([*ray, torch.ones_like(ray[0])], -1)
+    turned_Nhw3 = torch.einsum("nij,nhwj->nhwi", pose_N44[:, :3, :3], ray_Nhw3)
+    point = turned_Nhw3[:, None] * depth_NDhw[..., None] + pose_N44[:, None, None, None, :3, 3]
+    z = point[..., 2].clamp_min(MIN_DEPTH)
+    # The lens of the view itself stands for that of the other as well (released code): views with
+    # other lenses are warped wrongly, as the weights expect.
+    u = fx[:, None] * point[..., 0] / z + cx[:, None]
+    v = fy[:, None] * point[..., 1] / z + cy[:, None]
+    return torch.stack([2 * u / (width - 1) - 1, 2 * v / (height - 1) - 1], -1)
+
+
+def warped(features_NCHW: Tensor, grid_NDhw2: Tensor) -> Tensor:
+    """Features of another view at the places of a grid: (N, C, D, h, w), zeros outside."""
+    flat = grid_NDhw2.flatten(1, 2).to(features_NCHW)
+    sampled = F.grid_sample(features_NCHW, flat, "bilinear", "zeros", align_corners=True)
+    return sampled.unflatten(2, grid_NDhw2.shape[1:3])
+
+
+def cost_volume(
+    features_BVChw: Tensor,
+    inverse_depth_BVDhw: Tensor,
+    lens_BV4: Tensor,
+    poses_BVJ44: Tensor,
+    neighbours_BVJ: Tensor,
+) -> Tensor:
+    """Mean correlation with the neighbours (B, V, D, h, w): <f, f'> / sqrt(C), 0 outside.
+
+    inverse_depth_BVDhw: candidates, world units; h and w may be 1 for one set for all pixels.
+    """
+    scenes, views, channels, height, width = features_BVChw.shape
+    depth_NDhw = (1 / inverse_depth_BVDhw.detach()).flatten(0, 1)
+    depth_NDhw = depth_NDhw.expand(-1, -1, height, width)
+    own_NChw, lens_N4 = features_BVChw.flatten(0, 1), lens_BV4.flatten(0, 1)
+    batch = torch.arange(scenes, device=features_BVChw.device)[:, None]
+    count = depth_NDhw.shape[1]
+    chunk = max(1, MAX_SAMPLES // own_NChw.numel())
+    volume = 0.0
+    for index in range(neighbours_BVJ.shape[-1]):
+        other_NChw = features_BVChw[batch, neighbours_BVJ[..., index]].flatten(0, 1)
+        pose_N44 = poses_BVJ44[:, :, index].flatten(0, 1)
+        parts = []
+        for start in range(0, count, chunk):
+            with torch.no_grad():  # the sweep moves features, it does not learn where to look
+                grid = warp_grid(depth_NDhw[:, start : start + chunk], lens_N4, pose_N44)
+            sampled_NCDhw = warped(other_NChw, grid)
+            parts.append(torch.einsum("nchw,ncdhw->ndhw", own_NChw, sampled_NCDhw))
+        volume = volume + torch.cat(parts, 1)
+    volume = volume / (math.sqrt(channels) * neighbours_BVJ.shape[-1])
+    return volume.unflatten(0, (scenes, views))
