@@ -23,6 +23,7 @@ PIXEL_FIELDS: Fields = {
     TURN: FieldSpec((4,), frame="world", encoding="unit quaternion w x y z, camera to world"),
 }
 """The rays through a pixel, and the rotation of its camera."""
+RAY_FIELD: Fields = {PIXEL: PIXEL_FIELDS[PIXEL]}
 
 CHANNELS = (1, 1, 2, 3, 4)
 """Per pixel: logarithm of the depth (world units), opacity logit, raw place in the pixel, raw
@@ -120,7 +121,7 @@ class OnRays(Centers):
     """
 
     name = "on_rays"
-    reads = PIXEL_FIELDS
+    reads = RAY_FIELD
 
     class Config(ComponentConfig):
         measure: Literal["distance", "depth"] = "distance"

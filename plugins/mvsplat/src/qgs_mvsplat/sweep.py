@@ -1,6 +1,7 @@
 """The plane sweep: how well the features of a view agree with those of others at each depth."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -38,7 +39,7 @@ def relative_poses(c2w_BV44: Tensor, neighbours_BVJ: Tensor) -> Tensor:
 
 
 @full_precision
-def feature_lenses(cameras: Cameras, size: tuple[int, int]) -> Tensor:
+def feature_lenses(cameras: Cameras, size: Sequence[int]) -> Tensor:
     """Intrinsics (B, V, 4) of cameras whose images are of `size`, (H, W)."""
     scale = (size[1] / cameras.size[1], size[0] / cameras.size[0])
     return cameras.intrinsics * cameras.intrinsics.new_tensor([*scale, *scale])
@@ -92,7 +93,7 @@ def cost_volume(
     batch = torch.arange(scenes, device=features_BVChw.device)[:, None]
     count = depth_NDhw.shape[1]
     chunk = max(1, MAX_SAMPLES // own_NChw.numel())
-    volume = 0.0
+    total_NDhw = depth_NDhw.new_zeros(())
     for index in range(neighbours_BVJ.shape[-1]):
         other_NChw = features_BVChw[batch, neighbours_BVJ[..., index]].flatten(0, 1)
         pose_N44 = poses_BVJ44[:, :, index].flatten(0, 1)
@@ -102,6 +103,6 @@ def cost_volume(
                 grid = warp_grid(depth_NDhw[:, start : start + chunk], lens_N4, pose_N44)
             sampled_NCDhw = warped(other_NChw, grid)
             parts.append(torch.einsum("nchw,ncdhw->ndhw", own_NChw, sampled_NCDhw))
-        volume = volume + torch.cat(parts, 1)
-    volume = volume / (math.sqrt(channels) * neighbours_BVJ.shape[-1])
-    return volume.unflatten(0, (scenes, views))
+        total_NDhw = total_NDhw + torch.cat(parts, 1)
+    mean_NDhw = total_NDhw / (math.sqrt(channels) * neighbours_BVJ.shape[-1])
+    return mean_NDhw.unflatten(0, (scenes, views))

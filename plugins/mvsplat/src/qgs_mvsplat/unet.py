@@ -112,7 +112,8 @@ class UNet(nn.Module):
         up: list[list[nn.Module]] = []
         for level in range(levels):
             down.append(block(width, lowest=level == levels - 1))
-            down += [[Downsample(width)]] if level < levels - 1 else []
+            if level < levels - 1:
+                down.append([Downsample(width)])
         for level in reversed(range(levels)):
             up += [block(2 * width, lowest=level == levels - 1) for _ in range(2)]
             up[-1] += [Upsample(width)] if level else []

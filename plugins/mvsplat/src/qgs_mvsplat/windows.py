@@ -77,8 +77,9 @@ class Attention(nn.Module):
 
     def __init__(self, width: int, mlp: bool) -> None:
         super().__init__()
-        for name in ("q_proj", "k_proj", "v_proj", "merge"):
-            setattr(self, name, nn.Linear(width, width, bias=False))
+        self.q_proj, self.k_proj, self.v_proj, self.merge = (
+            nn.Linear(width, width, bias=False) for _ in range(4)
+        )
         self.norm1 = nn.LayerNorm(width)
         if mlp:
             hidden = 2 * EXPANSION * width
