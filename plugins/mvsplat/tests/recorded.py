@@ -69,11 +69,16 @@ def encoder_of(released: Released) -> MVSplatEncoder:
         cost_levels=len(options["costvolume_unet_channel_mult"]),
         depth_width=options["depth_unet_feat_dim"],
         depth_levels=len(options["depth_unet_channel_mult"]),
-        sh_degree=options["gaussian_adapter"]["sh_degree"],
+        features=options["d_feature"],
     )
-    encoder = MVSplatEncoder(config, ModelDims(options["d_feature"], 1, 0)).eval()
+    encoder = MVSplatEncoder(config, dims_of(released)).eval()
     encoder.load_state_dict(released.weights())
     return encoder
+
+
+def dims_of(released: Released) -> ModelDims:
+    """The model is as wide as a pixel has numbers."""
+    return ModelDims(11 + 3 * (released.options["gaussian_adapter"]["sh_degree"] + 1) ** 2, 1, 0)
 
 
 @torch.no_grad()
@@ -138,11 +143,10 @@ def gaussians(released: Released, raw_BVCHW: Tensor) -> dict[str, Tensor]:
     views, size = cameras.shape[1], cameras.size
     raw = raw_BVCHW.movedim(2, -1)
     memory = ImageMemory(raw.flatten(1, 3), grid=(views, *size))
-    state = PixelQueries(PixelQueries.Config(sh_degree=degree), ModelDims(32, 1, 0))(
-        memory, released.views()
-    )
-    out = RayHead(RayHead.Config(sh_degree=degree), ModelDims(32, 1, 0))(state)
-    means = OnRays(OnRays.Config(), ModelDims(32, 1, 0))(out.offsets, state)
+    dims = dims_of(released)
+    state = PixelQueries(PixelQueries.Config(), dims)(memory, released.views())
+    out = RayHead(RayHead.Config(), dims)(state)
+    means = OnRays(OnRays.Config(), dims)(out.offsets, state)
     factors = quat_to_matrix(out.quats) * out.scales[..., None, :]
     turn = turn_of_harmonics(cameras.c2w[..., :3, :3], degree) * band_mask(degree)
     sh = raw[..., 11:].unflatten(-1, (3, -1))

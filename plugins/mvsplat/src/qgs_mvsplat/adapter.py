@@ -87,14 +87,15 @@ def band_mask(degree: int) -> Tensor:
 def world_harmonics(rotation: Tensor, degree: int) -> Tensor:
     """(..., K, K): from raw coefficients in a camera's frame to ours in the world.
 
-    rotation: camera to world (..., 3, 3). degree: at most SH_DEGREE. The turn comes before the
+    rotation: camera to world (..., 3, 3). degree: those above SH_DEGREE stay in e3nn's basis. The
+    turn comes before the
     change of basis, and they do not commute: the family turns in e3nn's basis, but its rasteriser
     has other signs there; published weights expect that order.
     """
     turn = turn_of_harmonics(rotation, degree) * band_mask(degree).to(rotation)
     change = torch.eye(coefficients(degree), dtype=torch.float64)
-    if degree:
-        change[1:, 1:] = _basis_change(coefficients(degree) - 1)
+    count = coefficients(min(degree, SH_DEGREE))
+    change[1:count, 1:count] = _basis_change(count - 1)
     return change.to(rotation) @ turn
 
 

@@ -1,17 +1,28 @@
 """`mvsplat/gaussians`: the activations of MVSplat's numbers for each pixel."""
 
+from collections.abc import Iterable
+from typing import ClassVar
+
 import torch
 from einops import rearrange
 from pydantic import Field
 from torch import Tensor
 
-from qgs.contracts import Fields, Head
+from qgs.contracts import ComponentConfig, Fields, Head, Problem, RecipeContext
 from qgs.contracts.head import GAUSSIAN_FIELDS
 from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.precision import full_precision
 from qgs.types import GaussianAttributes, QueryState
-from qgs_mvsplat.adapter import camera_quaternions, world_quaternions
-from qgs_mvsplat.pixels import CHANNELS, PIXEL, PIXEL_FIELDS, TURN, FromPixels, depths, turned
+from qgs_mvsplat.adapter import SH_DEGREE, camera_quaternions, coefficients, world_quaternions
+from qgs_mvsplat.pixels import (
+    CHANNELS,
+    PIXEL,
+    PIXEL_FIELDS,
+    TURN,
+    degree_of,
+    depths,
+    width_problems,
+)
 
 SCALE_FACTOR = 0.1
 
@@ -27,7 +38,10 @@ class RayHead(Head):
     name = "gaussians"
     scheduled = frozenset({"opacity_exponent"})
 
-    class Config(FromPixels):
+    reads = PIXEL_FIELDS
+    writes: ClassVar[Fields] = {"gaussians.sh": GAUSSIAN_FIELDS["gaussians.sh"]}
+
+    class Config(ComponentConfig):
         scale_min: float = Field(default=0.5, gt=0)
         """Least standard deviation, tenths of the size that two pixels have at its depth."""
         scale_max: float = Field(default=15.0, gt=0)
@@ -42,12 +56,8 @@ class RayHead(Head):
         return 1
 
     @classmethod
-    def fields_read(cls, config: Config) -> Fields:
-        return {"state.features": turned(config.sh_degree), **PIXEL_FIELDS}
-
-    @classmethod
-    def fields_written(cls, config: Config) -> Fields:
-        return {"gaussians.sh": GAUSSIAN_FIELDS["gaussians.sh"]} if config.sh_degree else {}
+    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
+        return width_problems(context)
 
     def forward(self, state: QueryState) -> GaussianAttributes:
         return _decoded(state.features, state[PIXEL], state[TURN], self.config)
@@ -55,12 +65,10 @@ class RayHead(Head):
 
 @full_precision
 def _decoded(
-    features_BNC: Tensor, pixel_BN43: Tensor, turn_BN4: Tensor, config: RayHead.Config
+    features_BND: Tensor, pixel_BN43: Tensor, turn_BN4: Tensor, config: RayHead.Config
 ) -> GaussianAttributes:
-    raw_BN1C = features_BNC[:, :, None]
-    parts = raw_BN1C.split([*CHANNELS, raw_BN1C.shape[-1] - sum(CHANNELS)], -1)
-    log_depth, logit, place, scale, rotation, sh = parts
-    colors, sh = split_harmonics(sh)
+    raw_BN1C, sh = features_BND[:, :, None, : sum(CHANNELS)], harmonics_of(features_BND)[:, :, None]
+    log_depth, logit, place, scale, rotation = raw_BN1C.split(CHANNELS, -1)
     factor = config.scale_min + (config.scale_max - config.scale_min) * scale.sigmoid()
     size = SCALE_FACTOR * pixel_BN43[:, :, 2:].norm(dim=-1).sum(-1)[..., None, None]
     return GaussianAttributes(
@@ -68,17 +76,18 @@ def _decoded(
         scales=factor * depths(log_depth) * size,
         quats=world_quaternions(camera_quaternions(rotation), turn_BN4[:, :, None]),
         opacities=mapped_opacity(logit[..., 0].sigmoid(), config.opacity_exponent),
-        colors=colors,
-        sh=sh,
+        # Nothing is added for the colour of the photo: zeros are grey.
+        colors=0.5 + SH_C0 * sh[..., 0, :],
+        sh=sh[..., 1:, :],
     )
 
 
-def split_harmonics(sh_BNKC: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Colour of degree 0 (B, N, K, 3), and coefficients (B, N, K, C, 3), None without others."""
-    sh_BNKC3 = rearrange(sh_BNKC, "... (x c) -> ... c x", x=3)
-    # Nothing is added for the colour of the photo: zeros are grey.
-    colors, rest = 0.5 + SH_C0 * sh_BNKC3[..., 0, :], sh_BNKC3[..., 1:, :]
-    return colors, rest if rest.shape[-2] else None
+def harmonics_of(features_BND: Tensor) -> Tensor:
+    """Coefficients (B, N, K, 3) in the numbers of pixels, of degrees that are rendered."""
+    degree, first = degree_of(features_BND.shape[-1]), sum(CHANNELS)
+    sh_BNC = features_BND[..., first : first + 3 * coefficients(degree)]
+    sh_BNK3 = rearrange(sh_BNC, "b n (x k) -> b n k x", x=3)
+    return sh_BNK3[..., : coefficients(min(degree, SH_DEGREE)), :]
 
 
 def mapped_opacity(p: Tensor, exponent: float) -> Tensor:

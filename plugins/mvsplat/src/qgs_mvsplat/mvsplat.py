@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from qgs.contracts import (
     ComponentConfig,
     Encoder,
-    Fields,
     ModelDims,
     Problem,
     RecipeContext,
@@ -22,7 +21,7 @@ from qgs.geometry.precision import full_precision
 from qgs.types import Cameras, ImageMemory, Views
 from qgs_mvsplat.cnn import CNN
 from qgs_mvsplat.convolutions import conv3, imagenet_normalized, resized, two_convolutions
-from qgs_mvsplat.pixels import CHANNELS, predicted
+from qgs_mvsplat.pixels import CHANNELS, width_problems
 from qgs_mvsplat.sweep import (
     cost_volume,
     cyclic_neighbours,
@@ -55,15 +54,18 @@ class Backbone(nn.Module):
 class MVSplatEncoder(Encoder):
     """Every pixel's depth and raw Gaussian, from features of all views and a plane sweep.
 
-    The memory has a token for each pixel, with the numbers of `qgs_mvsplat.pixels.CHANNELS` and
-    harmonics. Views are compared in their order. A single view is compared with itself. D, the
-    model's width, is that of the features (published: 128).
+    The memory has a token for each pixel. Its D numbers, the model's width, are those of
+    `qgs_mvsplat.pixels.CHANNELS` and harmonics: 86 for degree 4 (published). Views are compared in
+    their order; a single view is compared with itself.
     """
 
     name = "mvsplat"
     ordered_views = True
+    writes = memory_fields("features", "grid")
 
     class Config(ComponentConfig):
+        features: int = Field(default=128, ge=4, multiple_of=4)
+        """Width of the features that the sweep compares."""
         candidates: int = Field(default=128, ge=2)
         """Depths that the plane sweep compares, evenly in inverse depth from `near` to `far`."""
         near: float = Field(default=1.0, gt=0)
@@ -78,25 +80,20 @@ class MVSplatEncoder(Encoder):
         """Channels of the U-Net that refines depths at full size."""
         depth_levels: int = Field(default=5, ge=1, le=8)
         """Levels of that U-Net; the lowest has attention over all views."""
-        sh_degree: int = Field(default=4, ge=0, le=4)
-        """Degree of the spherical harmonics; those above 3 are not rendered."""
 
     config: Config
-
-    @classmethod
-    def fields_written(cls, config: Config) -> Fields:
-        return {"memory.features": predicted(config.sh_degree), **memory_fields("grid")}
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         if config.far <= config.near:
             reason = f"far must be beyond near, got near {config.near:g} and far {config.far:g}"
             yield Problem("far", reason, "give the depths at which the scene begins and ends")
+        yield from width_problems(context)
         yield from size_problems(_multiple(config), context)
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.backbone = Backbone(dims.width)
+        self.backbone = Backbone(config.features)
         self.depth_predictor = DepthPredictor(config, dims.width)
 
     def forward(self, views: Views) -> ImageMemory:
@@ -132,10 +129,10 @@ class Sweep(NamedTuple):
 class DepthPredictor(nn.Module):
     """From features at 1/4 to depths and raw Gaussians at full size."""
 
-    def __init__(self, config: MVSplatEncoder.Config, width: int) -> None:
+    def __init__(self, config: MVSplatEncoder.Config, numbers: int) -> None:
         super().__init__()
         count, cost, fine = config.candidates, config.cost_width, config.depth_width
-        gaussian = sum(CHANNELS[2:]) + 3 * (config.sh_degree + 1) ** 2
+        width, gaussian = config.features, numbers - sum(CHANNELS[:2])
         matched = count + width
         self.corr_refine_net = OverViews(
             *(conv3(matched, cost), group_norm(cost), nn.GELU()),

@@ -1,17 +1,26 @@
 """`mvsplat/pixels`, `mvsplat/on_rays`: a query for each pixel, means on the rays through it."""
 
+from collections.abc import Iterable
 from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from einops import repeat
-from pydantic import Field
 from torch import Tensor
 
-from qgs.contracts import Centers, ComponentConfig, Fields, FieldSpec, Queries, memory_fields
+from qgs.contracts import (
+    Centers,
+    ComponentConfig,
+    Fields,
+    FieldSpec,
+    Problem,
+    Queries,
+    RecipeContext,
+    memory_fields,
+)
 from qgs.geometry.precision import full_precision
 from qgs.types import Cameras, ImageMemory, QueryState, Views
-from qgs_mvsplat.adapter import SH_DEGREE, coefficients, quaternions, world_harmonics
+from qgs_mvsplat.adapter import coefficients, quaternions, world_harmonics
 
 PIXEL, TURN = "mvsplat.pixel", "mvsplat.turn"
 PIXEL_FIELDS: Fields = {
@@ -32,22 +41,22 @@ LOG_DEPTH = 20.0
 """Bound of the logarithm of a depth, so that any features give a finite place and a scale."""
 
 
-class FromPixels(ComponentConfig):
-    """Options of what reads the numbers that MVSplat and DepthSplat predict for each pixel."""
-
-    sh_degree: int = Field(default=4, ge=0, le=4)
-    """Degree of the spherical harmonics that are predicted, as of the encoder; those above 3 are
-    not rendered."""
+WIDTHS = {sum(CHANNELS) + 3 * coefficients(degree): degree for degree in (1, 2, 3, 4)}
+"""Widths of a model, and the degree of harmonics that they have room for."""
 
 
-def predicted(sh_degree: int) -> FieldSpec:
-    """Numbers of a pixel in the memory, harmonics in the camera's frame and e3nn's basis."""
-    return FieldSpec((sum(CHANNELS) + 3 * coefficients(sh_degree),))
+def degree_of(width: int) -> int:
+    """Degree of the harmonics in the numbers of a pixel, D = `width`; those beyond are not read."""
+    return max(degree for least, degree in WIDTHS.items() if least <= width)
 
 
-def turned(sh_degree: int) -> FieldSpec:
-    """Numbers of a query: the same, harmonics in the world and our basis, at most degree 3."""
-    return predicted(min(sh_degree, SH_DEGREE))
+def width_problems(context: RecipeContext) -> Iterable[Problem]:
+    """A model too narrow for the numbers of a pixel."""
+    least = min(WIDTHS)
+    if context.dims.width < least:
+        reason = f"the model is {context.dims.width} wide, but a pixel has {least} numbers or more"
+        fix = f"set model.width to one of {[*WIDTHS]}, for harmonics of degree 1, 2, 3, 4"
+        yield Problem("", reason, fix)
 
 
 class PixelQueries(Queries):
@@ -57,36 +66,29 @@ class PixelQueries(Queries):
     """
 
     name = "pixels"
-
-    class Config(FromPixels):
-        pass
-
-    config: Config
+    reads = memory_fields("features", "grid")
+    writes = PIXEL_FIELDS
 
     @classmethod
-    def fields_read(cls, config: Config) -> Fields:
-        return {"memory.features": predicted(config.sh_degree), **memory_fields("grid")}
-
-    @classmethod
-    def fields_written(cls, config: Config) -> Fields:
-        return {"state.features": turned(config.sh_degree), **PIXEL_FIELDS}
+    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
+        return width_problems(context)
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         assert memory.grid is not None
-        degree = min(self.config.sh_degree, SH_DEGREE)
-        features = in_world(memory.features, views.cameras.c2w[..., :3, :3], degree)
+        features = in_world(memory.features, views.cameras.c2w[..., :3, :3])
         _, rows, columns = memory.grid
         return QueryState(features, pixel_fields(views.cameras, rows, columns))
 
 
 @full_precision
-def in_world(features_BMC: Tensor, rotation_BV33: Tensor, degree: int) -> Tensor:
-    """Numbers of pixels, ordered by view, with harmonics of up to `degree` turned."""
-    views, first = rotation_BV33.shape[1], sum(CHANNELS)
-    sh_BVPXK = features_BMC[..., first:].unflatten(1, (views, -1)).unflatten(-1, (3, -1))
-    sh_BVPXK = sh_BVPXK[..., : coefficients(degree)]
+def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
+    """Numbers of pixels, ordered by view, with their harmonics turned into the world."""
+    views, degree, first = rotation_BV33.shape[1], degree_of(features_BMD.shape[-1]), sum(CHANNELS)
+    last = first + 3 * coefficients(degree)
+    sh_BVPXK = features_BMD[..., first:last].unflatten(1, (views, -1)).unflatten(-1, (3, -1))
     world = torch.einsum("bvkl,bvpxl->bvpxk", world_harmonics(rotation_BV33, degree), sh_BVPXK)
-    return torch.cat([features_BMC[..., :first], world.flatten(1, 2).flatten(2)], -1)
+    world = world.flatten(1, 2).flatten(2)
+    return torch.cat([features_BMD[..., :first], world, features_BMD[..., last:]], -1)
 
 
 @full_precision
