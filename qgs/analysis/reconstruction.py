@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from qgs.analysis.inputs import NOVEL, choose_windows
+from qgs.analysis.inputs import NOVEL, choose_windows, novel_frames
 from qgs.analysis.scale import FoundScale
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import Domain
@@ -96,9 +96,13 @@ def choose_sample(
     if scene.times is not None and frames is None and wanted <= len(usable):
         first = max(len(usable) - max(span, wanted), 0) // 2
         frames = spread(usable[first : len(usable) - first], wanted)
-    elif frames is None and trained_on is not None:
-        of = views.model_copy(update={"inputs": wanted})
-        frames, novel = choose_windows(scene, of, trained_on)[0]
+    elif scene.times is None and trained_on is not None:
+        novel = compare
+        if frames is None:
+            of = views.model_copy(update={"inputs": wanted})
+            frames, novel = choose_windows(scene, of, trained_on, held_out=compare)[0]
+        elif compare is None and {*frames} <= {*range(len(scene))}:
+            novel = novel_frames(scene, tuple(frames), trained_on)
         compare = novel if compare is None else compare
     picked = choose_frames(len(scene), wanted, span, frames, compare, held_out=scene.held_out)
     if scene.times is not None and compare is None and picked[1]:

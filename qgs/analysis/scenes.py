@@ -13,16 +13,18 @@ from qgs.analysis.reconstruction import Reconstruction, choose_sample, reconstru
 from qgs.analysis.scale import ScaleSearch, photo_settings
 from qgs.composer import Recipe, resolve
 from qgs.composer.registry import load_usable_plugins
-from qgs.contracts import Component, Encoder, Scene, SceneSource, Split
+from qgs.contracts import Component, Encoder, Scene, SceneSource, SceneSourceConfig, Split
 from qgs.data.domain import Domain, value_range_problem, verdict
 from qgs.data.images import framing
 from qgs.data.recognition import is_training_data, open_for
-from qgs.data.samples import training_frames, views_in
+from qgs.data.samples import Sample, training_frames, views_in
 from qgs.data.scenes import warn_once
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Views
-from qgs.wording import listed
+from qgs.wording import counted, listed
 
+HOLDOUT = 8
+"""Every n-th photo of a user's scene is held out, as papers on novel views do (Mip-NeRF 360)."""
 Frames: TypeAlias = str | Sequence[int | str]
 Size: TypeAlias = tuple[int, int]
 Tuning: TypeAlias = Callable[[Views], tuple[Gaussians, Mapping[str, Any]]]
@@ -71,7 +73,8 @@ def reconstruct(
         are inputs unless `frames` says otherwise. OpenCV cameras, images in [0, 1].
     inputs: how many; the recipe's number by default.
     frames: which photos, by number or file name; by default see `qgs.analysis.inputs`.
-    compare: photos to compare with; of a folder, some between the inputs by default.
+    compare: photos to compare with, "none" or no frames for none; of a folder, by default those
+        near the inputs of every eighth photo, which is held out.
     size: (H, W) of the photos of a folder; by default see `chosen_scene`.
     scene: name, where a folder holds several.
     overrides: of the recipe's `views`, such as "views.scale=auto".
@@ -94,10 +97,11 @@ def reconstruct(
         found, seen, own = GivenScene(photos), (), False
         frames = range(len(found)) if frames is None and inputs is None else frames
     else:
-        found, seen = chosen_scene(recipe, fspath(photos), size, scene)
+        found, seen = chosen_scene(recipe, fspath(photos), size, scene, compare is None)
         own = is_training_data(fspath(photos), recipe.data_config)
     wanted = None if frames is None else frame_list(frames, "frames", found)
-    against = None if compare is None else frame_list(compare, "compare", found)
+    against = [] if compare == "none" else compare
+    against = None if against is None else frame_list(against, "compare", found)
     search = ScaleSearch(model, photo_settings(recipe.views, own, overrides))
     trained_on = None if seen else model.trained_on or Domain()
     sample, world = choose_sample(found, recipe.views, inputs, wanted, against, trained_on, search)
@@ -117,8 +121,18 @@ def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
     found.see(sample.inputs.cameras, sample.targets.cameras)
     likeness = verdict(result.model.trained_on or Domain(), found)
     poor = result.scale.poor if result.scale else ""
-    remarks = likeness, poor, framing(scene, sample.input_frames[0]), result.worse_than_nearest
+    kept = framing(scene, sample.input_frames[0])
+    remarks = choice(sample, scene), likeness, poor, kept, result.worse_than_nearest
     return [*filter(None, remarks)]
+
+
+def choice(sample: Sample, scene: Scene) -> str:
+    """A sentence on the photos of `sample` and on those that `scene` holds out."""
+    names = [[scene.frame_name(f) for f in s] for s in (sample.input_frames, sample.target_frames)]
+    text = f"inputs {listed(names[0])}"
+    text += f", compared with {listed(names[1])}" if names[1] else ""
+    held = f"{len(scene.held_out)} of {counted(len(scene), 'photo')} held out"
+    return f"{text}; {held}, --holdout none holds none" if scene.held_out else text
 
 
 class GivenScene(Scene):
@@ -165,12 +179,13 @@ def installed_sources() -> dict[str, type[Component]]:
 
 
 def chosen_scene(
-    recipe: Recipe, path: str, size: Size | None, name: str | None
+    recipe: Recipe, path: str, size: Size | None, name: str | None, holdout: bool = True
 ) -> tuple[Scene, Sequence[int]]:
     """The scene called `name` at `path`, or the only one, and the frames a model was trained on.
 
     size: (H, W) of its images; by default the recipe's, or for other photos than the training's
-    `whole_size`. Raises ValueError without either.
+    `whole_size`. holdout: hold out every HOLDOUT-th photo that nobody else splits. Raises
+    ValueError without a size.
     """
     if recipe.data_config is None and size is None:
         raise ValueError(
@@ -182,9 +197,19 @@ def chosen_scene(
     if size is None and not is_training_data:
         whole = whole_size(scene, size_multiple([recipe]))
         if whole != scene.cameras.size:
-            return chosen_scene(recipe, path, whole, name)
+            return chosen_scene(recipe, path, whole, name, holdout)
+    if holdout and not is_training_data and not scene.held_out and len(scene) > 2:
+        options = held_out_of(source.config, len(scene))
+        scene = named_scene(type(source)(options), path, name)
     seen = is_training_data and scene.name in source.names("train")
     return scene, training_frames(scene) if seen else ()
+
+
+def held_out_of(config: SceneSourceConfig, photos: int) -> SceneSourceConfig:
+    """Options with every HOLDOUT-th of `photos` held out, or the middle one of fewer."""
+    if getattr(config, "holdout", None) != 0:
+        return config
+    return config.model_copy(update={"holdout": min(HOLDOUT, photos)})
 
 
 def whole_size(scene: Scene, multiple: int | None) -> Size:

@@ -38,12 +38,18 @@ def reconstruct(
     inputs: Inputs = None,
     frames: Frames = None,
     holdout: Annotated[
-        str | None, typer.Option(help="Photos to compare with; default: six between the inputs.")
+        str | None,
+        typer.Option(
+            help="Photos to compare with, or none; default: every eighth one is held out, and those "
+            "near the inputs are compared with."
+        ),
     ] = None,
     tune: Tune = None,
     refine: Annotated[
         float | None,
-        typer.Option(help="Seconds of optimising the Gaussians on all photos not compared with."),
+        typer.Option(
+            help="Seconds of optimising the Gaussians on all photos that are not held out or compared with."
+        ),
     ] = None,
     refine_size: Annotated[
         str | None,
@@ -110,7 +116,7 @@ def reconstruct(
     show(result, "feed-forward" if refine else "", console)
     paths = result.save(out)
     if refiner:
-        scene, seen = chosen_scene(recipe, photos, fine or pixels, scene_name)
+        scene, seen = chosen_scene(recipe, photos, fine or pixels, scene_name, holdout is None)
         more = {"count": gaussians, "inputs_only": refine_inputs, "seen": seen}
         better = refiner(result, scene, refine, **more, console=console)
         show(better, "refined", console)

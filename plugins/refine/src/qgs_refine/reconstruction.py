@@ -63,14 +63,21 @@ def refine_reconstruction(
 def _photos(
     scene: Scene, start: Reconstruction, inputs_only: bool
 ) -> tuple[Sample, Views, list[int]]:
-    """The sample of `start` at the size of `scene`, the photos to optimise on, and their frames."""
+    """The sample of `start` at the size of `scene`, the photos to optimise on, and their frames.
+
+    Held-out photos are compared with all together, unless others were named.
+    """
     inputs, targets = start.sample.input_frames, start.sample.target_frames
+    if {*targets} < {*scene.held_out}:  # the refined scene is the whole one, not a window
+        targets = tuple(sorted(scene.held_out))
     usable = {*inputs} if inputs_only else {*training_frames(scene), *inputs} - {*targets}
     frames = sorted(usable)
     every = views_in(start.world, scene, (*frames, *targets)).to(start.gaussians.means.device)
     photos, compared = every.select(slice(len(frames))), every.select(slice(len(frames), None))
     own = photos.select([frames.index(frame) for frame in inputs])
-    return replace(start.sample, inputs=own, targets=compared), photos, frames
+    names = {frame: scene.frame_name(frame) for frame in (*inputs, *targets)}
+    parts = {"inputs": own, "targets": compared, "target_frames": targets, "names": names}
+    return replace(start.sample, **parts), photos, frames
 
 
 def tuned(

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from qgs.analysis.reconstruction import choose_frames, choose_sample
 from qgs.analysis.scale import ScaleSearch, photo_settings, summary
-from qgs.analysis.scenes import chosen_scene, frame_list, named_scene
+from qgs.analysis.scenes import choice, chosen_scene, frame_list, named_scene
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import Domain, verdict
@@ -269,6 +269,7 @@ def _of_model(name: str, wanted: Wanted) -> Source:
     found.see(sample.inputs.cameras, sample.targets.cameras)
     frames, scales = sample.input_frames, [*search.found.values()]
     notes = [
+        *([choice(sample, scene)] if unlike else []),
         *([summary(scales)] if scales else []),
         *(verdict(trained, found), *(scale.poor for scale in scales), framing(scene, frames[0])),
     ]
