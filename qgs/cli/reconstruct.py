@@ -40,15 +40,15 @@ def reconstruct(
     holdout: Annotated[
         str | None,
         typer.Option(
-            help="Photos to compare with, or none; default: every eighth one is held out, and those "
-            "near the inputs are compared with."
+            help="Photos to compare with, or none; default: those near the inputs of every eighth "
+            "photo, which is held out."
         ),
     ] = None,
     tune: Tune = None,
     refine: Annotated[
         float | None,
         typer.Option(
-            help="Seconds of optimising the Gaussians on all photos that are not held out or compared with."
+            help="Seconds of optimising the Gaussians on all photos that are not held out."
         ),
     ] = None,
     refine_size: Annotated[

@@ -42,7 +42,7 @@ def test_everything_is_written(checkpoint, photos, tmp_path):
     out = tmp_path / "scene"
     assert PlyData.read(out / "gaussians.ply")["vertex"].count == 32
     cameras = json.loads((out / "cameras.json").read_text())
-    assert [view["frame"] for view in cameras["views"]] == [0, 2, 1]
+    assert [view["frame"] for view in cameras["views"]] == [2, 4, 3]
     assert [view["kind"] for view in cameras["views"]] == ["input", "input", "novel"]
     back = cameras["to_photos"]
     for view in cameras["views"]:
@@ -50,8 +50,8 @@ def test_everything_is_written(checkpoint, photos, tmp_path):
         world = np.array(back["reference_c2w"]) @ centre
         np.testing.assert_allclose(world, [0.1 * view["frame"], 0, 0, 1], atol=1e-6)
     np.testing.assert_allclose(cameras["views"][0]["c2w"], np.eye(4), atol=1e-6)
-    assert Image.open(out / "views" / "00001_novel.png").size == (36, 16)
-    assert Image.open(out / "depth" / "00002_input.png").size == (16, 16)
+    assert Image.open(out / "views" / "00003_novel.png").size == (36, 16)
+    assert Image.open(out / "depth" / "00004_input.png").size == (16, 16)
     assert Image.open(out / "overview.png").size[0] > 500
     assert Image.open(out / "orbit.gif").n_frames == len(cameras["orbit"])
 
@@ -69,7 +69,7 @@ def test_what_a_user_made_is_kept(checkpoint, photos, tmp_path):
     assert (tmp_path / "notes.txt").read_text() == "mine"
     assert (tmp_path / "gaussians.ply").is_file()
     assert not (tmp_path / "views" / "00099_novel.png").exists()
-    assert (tmp_path / "views" / "00001_novel.png").is_file()
+    assert (tmp_path / "views" / "00003_novel.png").is_file()
 
 
 def test_photos_seen_in_training_are_not_called_novel(photos, tmp_path):
@@ -144,6 +144,23 @@ def test_inputs_alone_are_refined_on_and_photos_held_out_of_training_never(photo
     assert refined["views"][0]["size"] == [20, 24]
     for folder, count in (("all", 32), ("all/refined", 50)):
         assert PlyData.read(tmp_path / folder / "gaussians.ply")["vertex"].count == count
+
+
+@pytest.mark.parametrize(
+    ("options", "frames", "compared"),
+    [
+        ((), [0, 1, 2, 4, 5, 6], [3]),
+        (("--holdout", "none"), [*range(7)], []),
+        (("--holdout", "1.png,3"), [0, 2, 4, 5, 6], [1, 3]),
+    ],
+)
+def test_photos_held_out_are_compared_with_and_not_refined_on(
+    checkpoint, photos, tmp_path, options, frames, compared
+):
+    assert run(checkpoint, photos, "--out", tmp_path, *options, "--refine", 0.02).exception is None
+    record = json.loads((tmp_path / "refined" / "cameras.json").read_text())
+    assert record["refinement"]["frames"] == frames
+    assert [view["frame"] for view in record["views"] if view["kind"] == "novel"] == compared
 
 
 @pytest.mark.parametrize(

@@ -68,7 +68,9 @@ def _photos(
     Held-out photos are compared with all together, unless others were named.
     """
     inputs, targets = start.sample.input_frames, start.sample.target_frames
-    if {*targets} < {*scene.held_out}:  # the refined scene is the whole one, not a window
+    if targets and {*targets} < {
+        *scene.held_out
+    }:  # the refined scene is the whole one, not a window
         targets = tuple(sorted(scene.held_out))
     usable = {*inputs} if inputs_only else {*training_frames(scene), *inputs} - {*targets}
     frames = sorted(usable)
