@@ -8,7 +8,7 @@ from typing import Any
 import guide_reference
 import pytest
 import yaml
-from guide_pages import DOCS, text_of
+from guide_pages import DOCS, all_pages
 
 from qgs.composer.decode import RecipeSettings
 from qgs.composer.registry import load_registry
@@ -17,7 +17,7 @@ from qgs.contracts import Component, ComponentConfig
 
 ROOT = DOCS.parent
 
-EQUATIONS, _, REST = text_of("equations.md").partition("## Where paper and release differ")
+EQUATIONS, _, REST = all_pages()["equations.md"].partition("## Where paper and release differ")
 DIFFERENCES, _, RELEASES = REST.partition("## Defaults that are not TokenGS's")
 
 

@@ -10,7 +10,8 @@ from posixpath import normpath
 
 import pytest
 import qgs_plugintools
-from guide_pages import DOCS, all_pages
+from guide_hooks import written
+from guide_pages import DOCS, all_pages, text_of
 
 import qgs
 
@@ -93,3 +94,18 @@ def test_the_site_is_built_without_a_warning(tmp_path) -> None:
     assert done.returncode == 0, done.stderr
     for page in ("recipes", "checks", "plugin", "api/contracts", "api/testing"):
         assert (tmp_path / page / "index.html").is_file()
+
+
+@pytest.mark.parametrize("path", PAGES)
+def test_pages_are_readable_in_the_repository(path: str) -> None:
+    """They are as `python tools/guide_hooks.py` writes them, and links lead to files."""
+    text = text_of(path)
+    assert written(text, (DOCS / path).parent) == text, "run python tools/guide_hooks.py"
+    plain = re.sub("<!--.*?-->", "", CODE.sub("code", text), flags=re.DOTALL)
+    assert not re.search(r"^:::|^!!!|\{%|\{\{", plain, re.MULTILINE)
+    ends = rf"{plain}\n# "
+    # a heading with nothing below it, or only a heading of its own level or a higher one
+    assert not re.search(r"^(#+) [^\n]*\s+(?!\1#)#{1,6} ", ends, re.MULTILINE)
+    for target in LINK.findall(plain):
+        file = (DOCS / path).parent / target.partition("#")[0]
+        assert file.exists(), f"{path} links to {target}"

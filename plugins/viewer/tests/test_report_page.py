@@ -74,6 +74,7 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
         page.open(file.as_uri())
         page.until("the script", "document.readyState == 'complete' && !!window.theme.textContent")
         _choose(page)
+        _name_at_length(page)
         _slide(page, tmp_path)
         _zoom(page)
         _darken(page)
@@ -91,6 +92,20 @@ def _choose(page: Page) -> None:
     page.evaluate("document.querySelector('.scenes > input:checked').focus()")
     page.key("ArrowLeft", 37)
     assert page.evaluate(SHOWN) == [True, False]
+
+
+def _name_at_length(page: Page) -> None:
+    """File names of 60 characters without a space push no photo out of its column."""
+    captions = "document.querySelectorAll('.scene figcaption')"
+    page.evaluate(f"{captions}.forEach(caption => caption.textContent = 'x'.repeat(60))")
+    side = "document.querySelector('.scene').querySelector('{}').getBoundingClientRect().{}"
+    assert page.evaluate(side.format(".inputs figure", "right")) <= page.evaluate(
+        side.format(".kinds", "left")
+    )
+    widths = (
+        "[...document.querySelectorAll('.scene .rows figure')].filter(f => f.checkVisibility())"
+    )
+    assert page.evaluate(f"{widths}.every(f => f.scrollWidth <= f.clientWidth + 1)")
 
 
 def _slide(page: Page, folder: Path) -> None:
