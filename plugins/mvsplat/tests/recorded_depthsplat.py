@@ -1,0 +1,185 @@
+"""Every tensor of a golden file of DepthSplat, computed by the components."""
+
+from typing import Any
+
+import torch
+from qgs_dinov2.vit import PATCH, VitConfig
+from qgs_mvsplat.adapter import band_mask, camera_quaternions, turn_of_harmonics
+from qgs_mvsplat.depthsplat import DepthPredictor, finer_candidates, nearest_neighbours
+from qgs_mvsplat.depthsplat_encoder import DepthSplatEncoder
+from qgs_mvsplat.depthsplat_head import WorldHead
+from qgs_mvsplat.mvsplat import Sweep, expected_disparity
+from qgs_mvsplat.pixels import OnRays, PixelQueries
+from qgs_mvsplat.sweep import (
+    feature_lenses,
+    inverse_depth_candidates,
+    relative_poses,
+    warp_grid,
+)
+from qgs_mvsplat.two_depths import Exchange, TwoDepths
+from qgs_mvsplat.windows import shift_mask
+from recorded import Recorder
+from released import Released
+from torch import Tensor
+
+from qgs.contracts import LayerParts, ModelDims
+from qgs.geometry.transforms import quat_to_matrix
+from qgs.types import GaussianAttributes, ImageMemory, QueryState
+
+DIMS = ModelDims(128, 1, 0)
+DEGREE = 2
+VITS = {"vits": VitConfig(), "vitb": VitConfig(width=768, depth=12, heads=12)}
+
+
+def encoder_of(released: Released) -> DepthSplatEncoder:
+    """The encoder with the options and the weights of a file."""
+    options = released.options
+    config = DepthSplatEncoder.Config(
+        scales=options["num_scales"],
+        stride=options["lowest_feature_resolution"],
+        neighbours=options["local_mv_match"],
+        vit=VITS[options["monodepth_vit_type"]],
+        coarse_depth=options["num_scales"] > 1,
+    )
+    encoder = DepthSplatEncoder(config, DIMS).eval()
+    encoder.network.load_state_dict(released.weights())
+    return encoder
+
+
+@torch.no_grad()
+def recorded(released: Released) -> dict[str, Tensor]:
+    """Every output of a golden file."""
+    encoder, views = encoder_of(released), released.views()
+    near, far = released.tensors["near"], released.tensors["far"]
+    kept = Recorder(near.shape[1])
+    watch(kept, encoder, views.cameras.size)
+    numbers = encoder.predict(views, near, far)
+    found, predictor = kept.found, encoder.network.depth_predictor
+    neighbours = nearest_neighbours(views.cameras.c2w, encoder.config.neighbours)
+    sweep = Sweep(views.cameras, neighbours, near, far)
+    size = views.cameras.size
+    grid = (size[0] // PATCH, size[1] // PATCH)
+    found["dino_positions"] = predictor.pretrained.positions(*grid)
+    first = torch.arange(near.shape[1]).expand(len(near), -1)[..., None]
+    found["neighbours"] = torch.cat([first, neighbours], -1)
+    found["shift_mask"] = shift_mask(*(side // encoder.config.stride for side in size))
+    swept(found, predictor, sweep)
+    return found | gaussians(released, numbers)
+
+
+def watch(kept: Recorder, encoder: DepthSplatEncoder, size: tuple[int, int]) -> None:
+    """Hooks on all modules whose output a file has."""
+    network, predictor = encoder.network, encoder.network.depth_predictor
+    low = (size[0] // encoder.config.stride, size[1] // encoder.config.stride)
+    kept.output("features_cnn.0", predictor.backbone.conv2)
+    transformer, vit = predictor.transformer, predictor.pretrained
+    transformer.register_forward_pre_hook(
+        lambda _, given: kept.found.update({"transformer.0": given[0]})
+    )
+    for index, layer in enumerate(transformer.layers):
+        kept.windows(f"transformer_self.{index}", layer.self_attn, low, bool(index % 2))
+        kept.windows(f"transformer.{index + 1}", layer, low, bool(index % 2))
+    transformer.register_forward_hook(lambda _, __, out: kept.found.update({"features_mv.0": out}))
+    if encoder.config.scales > 1:
+        kept.output("features_mv.1", predictor.mv_pyramid.stages[1])
+        kept.output("features_mono.1", predictor.mono_pyramid.stages[1])
+    kept.input("dino_input", vit)
+    kept.output("dino_block.0", vit.blocks[0])
+
+    def keep_all(_: Any, __: Any, out: list[Tensor]) -> None:
+        for index, x in enumerate(out):
+            kept.keep(f"dino_features.{index}", x)
+
+    vit.register_forward_hook(keep_all)
+    network.feature_upsampler.register_forward_pre_hook(
+        lambda _, given: kept.keep("features_mono_eighth.3", given[0][-1])
+    )
+    for scale in range(encoder.config.scales):
+        regressor, head = predictor.regressor[scale], predictor.depth_head[scale]
+        kept.input(f"cost_volume.{scale}", regressor, slice(predictor.candidates(scale)))
+        kept.output(f"cost_unet.{scale}.stem", regressor[2])
+        kept.unet(f"cost_unet.{scale}", regressor[3])
+        kept.output(f"cost_unet_out.{scale}", regressor)
+        kept.input(f"cost_volume_refined.{scale}", head)
+        kept.output(f"match_logits.{scale}", head)
+    for name, head in (
+        ("upsampler", predictor.upsampler),
+        ("feature_upsampler", network.feature_upsampler),
+    ):
+        for index in range(3):
+            kept.output(f"{name}.concat_projects.{index}", head.concat_projects[index])
+        for index in range(1, 5):
+            fusion = head.scratch.get_submodule(f"refinenet{index}")
+            kept.output(f"{name}.refinenet{index}", fusion)
+    kept.output("delta_inverse_depth", predictor.upsampler)
+    kept.output("upsampled_features", network.feature_upsampler)
+    network.gaussian_head.register_forward_hook(
+        lambda _, __, out: kept.keep("raw_gaussians", out.movedim(1, -1))
+    )
+    kept.input("match_probability_max", network.gaussian_regressor, slice(4, 5))
+
+
+def swept(found: dict[str, Tensor], predictor: DepthPredictor, sweep: Sweep) -> None:
+    """What the sweeps compute between modules."""
+    shape, poses = sweep.near.shape, relative_poses(sweep.cameras.c2w, sweep.neighbours)
+    counts = [predictor.candidates(scale) for scale in range(predictor.sizes.scales)]
+    candidates = inverse_depth_candidates(sweep.near, sweep.far, counts[0])
+    found["inverse_depth_candidates.0"] = candidates
+    low = found["cost_volume.0"].shape[-2:]
+    lens = feature_lenses(sweep.cameras, (low[0], low[1]))[:, :, None].expand(*poses.shape[:3], 4)
+    depth = (1 / candidates[..., ::8])[:, :, None, :, None, None].expand(*poses.shape[:3], -1, *low)
+    grid = warp_grid(*(x.flatten(0, 2) for x in (depth, lens, poses)))
+    found["warp_grid.0"] = grid.unflatten(0, poses.shape[:3])
+    candidates = candidates.flatten(0, 1)[..., None, None]
+    for scale, count in enumerate(counts):
+        if scale:
+            coarse = found["coarse_inverse_depth.0"].flatten(0, 1)
+            candidates = finer_candidates(coarse, sweep, counts[0], count)
+            found["inverse_depth_candidates.1"] = candidates.unflatten(0, shape)
+        found[f"relative_pose.{scale}"] = poses
+        logits = found[f"match_logits.{scale}"]
+        found[f"match_probability.{scale}"] = logits.softmax(2)
+        inverse = expected_disparity(logits.flatten(0, 1), candidates)[0]
+        found[f"coarse_inverse_depth.{scale}"] = inverse.unflatten(0, shape)
+
+
+def gaussians(released: Released, numbers_BVCHW: Tensor) -> dict[str, Tensor]:
+    """Outputs behind the networks, by queries, layers, head and centres."""
+    cameras = released.views().cameras
+    views, size = cameras.shape[1], cameras.size
+    numbers = numbers_BVCHW.movedim(2, -1)
+    memory = ImageMemory(numbers.flatten(1, 3), grid=(views, *size))
+    two = released.options["num_scales"] > 1
+    queries = (TwoDepths if two else PixelQueries)(PixelQueries.Config(sh_degree=DEGREE), DIMS)
+    state = queries(memory, released.views())
+    out, means = decoded(state)
+    factors = quat_to_matrix(out.quats) * out.scales[..., None, :]
+    turn = turn_of_harmonics(cameras.c2w[..., :3, :3], DEGREE) * band_mask(DEGREE)
+    sh = numbers[..., 11:38].unflatten(-1, (3, -1))
+    row, column = torch.meshgrid(*(torch.arange(n) for n in size), indexing="ij")
+    place = torch.stack([column, row], -1) + numbers[..., 2:4].sigmoid()
+    found = {
+        "depth": numbers[..., 0].exp(),
+        "ray_xy": place / torch.tensor([size[1], size[0]]),
+        "means": means,
+        "covariances": (factors @ factors.mT)[:, :, 0],
+        "opacities": out.opacities[..., 0],
+        "scales": out.scales.unflatten(1, (views, *size))[..., 0, :],
+        "rotations": camera_quaternions(numbers[..., 7:11]),
+        "harmonics": torch.einsum("bvkl,bvhwxl->bvhwxk", turn, sh).flatten(1, 3),
+    }
+    if two:
+        layer = Exchange(Exchange.Config(), LayerParts(DIMS, {}, 1.0))
+        states = [layer(state, memory)[0]]
+        states.append(layer(states[0], memory)[0])
+        depths = torch.cat([numbers[..., -1], numbers[..., 0]])
+        means = torch.cat([decoded(each)[1] for each in states])
+        found |= {"training.depths": depths.exp(), "training.means": means}
+    return found
+
+
+def decoded(state: QueryState) -> tuple[GaussianAttributes, Tensor]:
+    """Gaussians of a state and their means (B, N, 3)."""
+    out = WorldHead(WorldHead.Config(), DIMS)(state)
+    centers = OnRays(OnRays.Config(measure="depth"), DIMS)
+    return out, centers(out.offsets, state)[:, :, 0]
