@@ -40,13 +40,15 @@ class ResidualBlock(nn.Module):
 class CNN(nn.Module):
     """7x7 convolution to half size, three stages of two residual blocks, 1x1 convolution.
 
-    strides: of the second and of the third stage. Instance norms have neither parameters nor
-    running statistics, so that training and evaluation agree.
+    strides: of the second and of the third stage. widths: of all stages. Instance norms
+    have neither parameters nor running statistics, so that training and evaluation agree.
     """
 
-    def __init__(self, width: int, strides: tuple[int, int]) -> None:
+    def __init__(
+        self, width: int, strides: tuple[int, int], widths: tuple[int, int, int] = WIDTHS
+    ) -> None:
         super().__init__()
-        first, second, third = WIDTHS
+        first, second, third = widths
         self.conv1 = nn.Conv2d(3, first, 7, 2, padding=3, bias=False)
         self.layer1 = _stage(first, first, 1)
         self.layer2 = _stage(first, second, strides[0])

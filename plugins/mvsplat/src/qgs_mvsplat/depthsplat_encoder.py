@@ -72,8 +72,8 @@ class DepthSplatEncoder(Encoder):
         """Channels of both DPT heads at 1/2, 1/4, 1/8 and 1/16; ViT-B: 96, 192, 384, 768; ViT-L:
         128, 256, 512, 1024."""
         features: int = Field(default=64, ge=4, multiple_of=4)
-        """Channels of full-size features, twice those of the DPT head that corrects depths; ViT-B: 96,
-        ViT-L: 128."""
+        """Channels of full-size features, twice those of the DPT head that corrects depths; ViT-B:
+        96, ViT-L: 128."""
         regressor: int = Field(default=64, ge=1)
         """Channels between the two networks that predict Gaussians."""
         sh_degree: int = Field(default=2, ge=0, le=SH_DEGREE)

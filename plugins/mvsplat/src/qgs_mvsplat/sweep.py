@@ -60,11 +60,13 @@ def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
     ray_Nhw3 = torch.stack([*ray, torch.ones_like(ray[0])], -1)
     turned_Nhw3 = torch.einsum("nij,nhwj->nhwi", pose_N44[:, :3, :3], ray_Nhw3)
     point = turned_Nhw3[:, None] * depth_NDhw[..., None] + pose_N44[:, None, None, None, :3, 3]
-    z = point[..., 2].clamp_min(MIN_DEPTH)
+    x, y, depth = point.unbind(-1)
+    # Only the divisor is bounded (released code): behind the camera the centre is scaled as well.
+    z = depth.clamp_min(MIN_DEPTH)
     # The lens of the view itself stands for that of the other as well (released code): views with
     # other lenses are warped wrongly, as the weights expect.
-    u = fx[:, None] * point[..., 0] / z + cx[:, None]
-    v = fy[:, None] * point[..., 1] / z + cy[:, None]
+    u = (fx[:, None] * x + cx[:, None] * depth) / z
+    v = (fy[:, None] * y + cy[:, None] * depth) / z
     return torch.stack([2 * u / (width - 1) - 1, 2 * v / (height - 1) - 1], -1)
 
 
