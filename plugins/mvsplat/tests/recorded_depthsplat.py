@@ -16,7 +16,7 @@ from qgs_mvsplat.sweep import (
     relative_poses,
     warp_grid,
 )
-from qgs_mvsplat.two_depths import Exchange, TwoDepths
+from qgs_mvsplat.two_depths import Exchange
 from qgs_mvsplat.windows import shift_mask
 from recorded import Recorder
 from released import Released
@@ -26,7 +26,8 @@ from qgs.contracts import LayerParts, ModelDims
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import GaussianAttributes, ImageMemory, QueryState
 
-DIMS = ModelDims(128, 1, 0)
+DIMS = {1: ModelDims(38, 1, 0), 2: ModelDims(39, 1, 2)}
+"""Of models of one scale, and of two with both depths."""
 DEGREE = 2
 VITS = {"vits": VitConfig(), "vitb": VitConfig(width=768, depth=12, heads=12)}
 
@@ -41,7 +42,7 @@ def encoder_of(released: Released) -> DepthSplatEncoder:
         vit=VITS[options["monodepth_vit_type"]],
         coarse_depth=options["num_scales"] > 1,
     )
-    encoder = DepthSplatEncoder(config, DIMS).eval()
+    encoder = DepthSplatEncoder(config, DIMS[config.scales]).eval()
     encoder.network.load_state_dict(released.weights())
     return encoder
 
@@ -149,10 +150,9 @@ def gaussians(released: Released, numbers_BVCHW: Tensor) -> dict[str, Tensor]:
     views, size = cameras.shape[1], cameras.size
     numbers = numbers_BVCHW.movedim(2, -1)
     memory = ImageMemory(numbers.flatten(1, 3), grid=(views, *size))
-    two = released.options["num_scales"] > 1
-    queries = (TwoDepths if two else PixelQueries)(PixelQueries.Config(sh_degree=DEGREE), DIMS)
-    state = queries(memory, released.views())
-    out, means = decoded(state)
+    dims = DIMS[released.options["num_scales"]]
+    state = PixelQueries(PixelQueries.Config(), dims)(memory, released.views())
+    out, means = decoded(state, dims)
     factors = quat_to_matrix(out.quats) * out.scales[..., None, :]
     turn = turn_of_harmonics(cameras.c2w[..., :3, :3], DEGREE) * band_mask(DEGREE)
     sh = numbers[..., 11:38].unflatten(-1, (3, -1))
@@ -168,18 +168,18 @@ def gaussians(released: Released, numbers_BVCHW: Tensor) -> dict[str, Tensor]:
         "rotations": camera_quaternions(numbers[..., 7:11]),
         "harmonics": torch.einsum("bvkl,bvhwxl->bvhwxk", turn, sh).flatten(1, 3),
     }
-    if two:
-        layer = Exchange(Exchange.Config(), LayerParts(DIMS, {}, 1.0))
+    if dims.depth:
+        layer = Exchange(Exchange.Config(), LayerParts(dims, {}, 1.0))
         states = [layer(state, memory)[0]]
         states.append(layer(states[0], memory)[0])
         depths = torch.cat([numbers[..., -1], numbers[..., 0]])
-        means = torch.cat([decoded(each)[1] for each in states])
+        means = torch.cat([decoded(each, dims)[1] for each in states])
         found |= {"training.depths": depths.exp(), "training.means": means}
     return found
 
 
-def decoded(state: QueryState) -> tuple[GaussianAttributes, Tensor]:
+def decoded(state: QueryState, dims: ModelDims) -> tuple[GaussianAttributes, Tensor]:
     """Gaussians of a state and their means (B, N, 3)."""
-    out = WorldHead(WorldHead.Config(), DIMS)(state)
-    centers = OnRays(OnRays.Config(measure="depth"), DIMS)
+    out = WorldHead(WorldHead.Config(), dims)(state)
+    centers = OnRays(OnRays.Config(measure="depth"), dims)
     return out, centers(out.offsets, state)[:, :, 0]

@@ -4,17 +4,18 @@ Modules have the names of the released weights. Levels: 0, 1, 2 are 1/2, 1/4, 1/
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple, TypeAlias
 
 import torch
 import torch.nn.functional as F
-from qgs_dinov2.vit import PATCH, DinoV2
+from pydantic import Field, ValidationInfo, field_validator
+from qgs_dinov2.vit import PATCH, DinoV2, VitConfig
 from torch import Tensor, nn
 
+from qgs.contracts import ComponentConfig, OptionError
 from qgs.geometry.precision import at_least_float32, full_precision
 from qgs.types import Cameras
-from qgs_mvsplat.cnn import CNN, Stages
+from qgs_mvsplat.cnn import CNN, WIDTHS, Stages
 from qgs_mvsplat.convolutions import (
     conv3,
     imagenet_normalized,
@@ -33,49 +34,68 @@ from qgs_mvsplat.sweep import (
 from qgs_mvsplat.unet import OverViews, UNet
 from qgs_mvsplat.windows import WindowTransformer, with_positions
 
+Width: TypeAlias = Annotated[int, Field(ge=1)]
+Block: TypeAlias = Annotated[int, Field(ge=0)]
+
 GAUSSIAN_CHANNELS = 1 + 2 + 3 + 4
 """Raw opacity, place in the pixel, scale, quaternion; harmonics follow."""
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """Widths and resolutions.
+class DepthSplatConfig(ComponentConfig):
+    """DepthSplatConfig of the networks: by default of the small model on RealEstate10K."""
 
-    width: channels of the multi-view features and of the first cost volume's networks. cnn: of the
-    CNN's stages. candidates: inverse depths of the first sweep; the second has a quarter.
-    scales: sweeps, 1 or 2, the second of twice the resolution. stride: pixels a side of a feature
-    of the first. neighbours: views that each is matched with where there are more than three.
-    vit: width, depth and heads of DINOv2. blocks: those whose tokens are read.
-    dpt: channels of the DPT heads at 1/2 to 1/16. features: of full size. regressor: between the
-    two networks of Gaussians. harmonics: coefficients per colour.
-    """
+    features: int = Field(default=128, ge=16, multiple_of=16)
+    """Channels of the multi-view features and of the first cost volume's networks."""
+    cnn: tuple[Width, Width, Width] = WIDTHS
+    """Channels of the three stages of the CNN."""
+    candidates: int = Field(default=128, ge=16, multiple_of=8)
+    """Inverse depths of the first sweep, evenly between those of `far` and `near`; the second has a
+    quarter."""
+    scales: Literal[1, 2] = 1
+    """Sweeps: the second has twice the resolution, around the depths of the first."""
+    stride: Literal[4, 8] = 4
+    """Pixels a side of a feature of the first sweep."""
+    neighbours: int = Field(default=2, ge=1)
+    """Views that each view is matched with where there are more than three: the nearest."""
+    vit: VitConfig = VitConfig()
+    """DINOv2's sizes and weights."""
+    blocks: tuple[Block, Block, Block, Block] = (2, 5, 8, 11)
+    """Blocks of the ViT whose tokens are read, 0 for the first; ViT-L: 4, 11, 17, 23."""
+    dpt: tuple[Width, Width, Width, Width] = (48, 96, 192, 384)
+    """Channels of both DPT heads at 1/2, 1/4, 1/8 and 1/16; ViT-B: 96, 192, 384, 768; ViT-L: 128,
+    256, 512, 1024."""
+    full_features: int = Field(default=64, ge=4, multiple_of=4)
+    """Channels of full-size features, twice those of the DPT head that corrects depths; ViT-B: 96,
+    ViT-L: 128."""
+    regressor: int = Field(default=64, ge=1)
+    """Channels between the two networks that predict Gaussians."""
 
-    width: int
-    cnn: tuple[int, int, int]
-    candidates: int
-    scales: int
-    stride: int
-    neighbours: int
-    vit: tuple[int, int, int]
-    blocks: tuple[int, ...]
-    dpt: tuple[int, ...]
-    features: int
-    regressor: int
-    harmonics: int
-
-    @property
-    def strides(self) -> tuple[int, int]:
-        """Of the second and of the third stage of the CNN."""
-        return (1, 2) if self.stride == 4 else (2, 2)
+    @field_validator("blocks")
+    @classmethod
+    def _blocks_ascend_in_the_vit(
+        cls, blocks: tuple[int, int, int, int], info: ValidationInfo
+    ) -> tuple[int, int, int, int]:
+        depth = info.data["vit"].depth if "vit" in info.data else blocks[-1] + 1
+        if list(blocks) != sorted(set(blocks)) or blocks[-1] >= depth:
+            raise OptionError(
+                f"blocks must ascend and be less than the depth of the ViT, {depth}, got {blocks}",
+                "write such as [2, 5, 8, 11]",
+            )
+        return blocks
 
     def level(self, scale: int) -> int:
         """Of the cost volume of a scale, 0 for 1/2."""
         return self.stride.bit_length() - 2 - scale
 
     @property
-    def upsampling(self) -> int:
-        """Pixels a side of a feature of the finest cost volume."""
-        return 2 ** (self.level(self.scales - 1) + 1)
+    def finest(self) -> int:
+        """Level of the last cost volume."""
+        return self.level(self.scales - 1)
+
+    @property
+    def cnn_levels(self) -> tuple[int, int, int]:
+        """Levels of the CNN's stages."""
+        return (0, 0, 1) if self.stride == 4 else (0, 1, 2)
 
 
 class Depths(NamedTuple):
@@ -144,20 +164,21 @@ def finer_candidates(coarse_N1hw: Tensor, sweep: Sweep, first: int, count: int) 
 class DepthPredictor(nn.Module):
     """Images and cameras to depths of all pixels."""
 
-    def __init__(self, sizes: Sizes) -> None:
+    def __init__(self, sizes: DepthSplatConfig) -> None:
         super().__init__()
-        self.sizes, width, vit = sizes, sizes.width, sizes.vit[0]
-        self.backbone = CNN(width, sizes.strides, sizes.cnn)
+        self.sizes, width, vit = sizes, sizes.features, sizes.vit
+        strides = (1, 2) if sizes.stride == 4 else (2, 2)
+        self.backbone = CNN(width, strides, sizes.cnn)
         self.transformer = WindowTransformer(width)
-        self.pretrained = DinoV2(*sizes.vit)
+        self.pretrained = DinoV2(vit.width, vit.depth, vit.heads)
         if sizes.scales > 1:
-            self.mv_pyramid, self.mono_pyramid = Pyramid(width), Pyramid(vit)
+            self.mv_pyramid, self.mono_pyramid = Pyramid(width), Pyramid(vit.width)
         self.regressor, self.regressor_residual = nn.ModuleList(), nn.ModuleList()
         self.depth_head = nn.ModuleList()
         for scale in range(sizes.scales):
             count, own = self.candidates(scale), width // 2**scale
             cnn = width if scale == 0 else sizes.cnn[1]
-            inputs = count + cnn + own + vit // 2**scale
+            inputs = count + cnn + own + vit.width // 2**scale
             unet = UNet(own, 3 + scale, pre_norm=True)
             norm = nn.GroupNorm(8, own)
             last = conv3(own, own)
@@ -240,49 +261,45 @@ class DepthPredictor(nn.Module):
         """What joins the ViT's maps at 1/2, 1/4, 1/8: before and behind their own channels."""
         found: list[tuple[list[Tensor], list[Tensor]]] = [([], []) for _ in range(LEVELS)]
         stages = (cnn.first, cnn.second, cnn.features)
-        for x, level in zip(stages, cnn_levels(self.sizes), strict=True):
+        for x, level in zip(stages, self.sizes.cnn_levels, strict=True):
             found[level][0].append(x)
-        finest = self.sizes.level(self.sizes.scales - 1)
-        levels = [*map(self.sizes.level, range(len(multi))), finest]
+        levels = [*map(self.sizes.level, range(len(multi))), self.sizes.finest]
         for x, level in zip([*multi, depth], levels, strict=True):
             if x is not None:  # at 1/2 the ViT's own map comes last (released code)
                 found[level][level > 0].append(x)
         return found
 
 
-def cnn_levels(sizes: Sizes) -> tuple[int, int, int]:
-    """Levels of the CNN's maps."""
-    return (0, 0, 1) if sizes.stride == 4 else (0, 1, 2)
-
-
-def dpt_head(sizes: Sizes, depth: bool) -> DptHead:
+def dpt_head(sizes: DepthSplatConfig, depth: bool) -> DptHead:
     """A head that reads CNN, transformer and ViT; with `depth` one that also gets and gives it."""
     others = [0] * LEVELS
-    for width, level in zip((*sizes.cnn[:2], sizes.width), cnn_levels(sizes), strict=True):
+    for width, level in zip((*sizes.cnn[:2], sizes.features), sizes.cnn_levels, strict=True):
         others[level] += width
     for scale in range(sizes.scales):
-        others[sizes.level(scale)] += sizes.width // 2**scale
-    others[sizes.level(sizes.scales - 1)] += depth
-    features = sizes.features // 2 if depth else sizes.features
-    return DptHead(sizes.vit[0], sizes.dpt, features, others, depth)
+        others[sizes.level(scale)] += sizes.features // 2**scale
+    others[sizes.finest] += depth
+    features = sizes.full_features // 2 if depth else sizes.full_features
+    return DptHead(sizes.vit.width, sizes.dpt, features, others, depth)
 
 
 class DepthSplat(nn.Module):
-    """Images and cameras to depths and raw Gaussians of all pixels."""
+    """Images and cameras to depths and raw Gaussians of all pixels.
 
-    def __init__(self, sizes: Sizes) -> None:
+    harmonics: coefficients per colour.
+    """
+
+    def __init__(self, sizes: DepthSplatConfig, harmonics: int) -> None:
         super().__init__()
         self.depth_predictor = DepthPredictor(sizes)
         self.feature_upsampler = dpt_head(sizes, depth=False)
-        features, hidden = sizes.features, sizes.regressor
+        features, hidden = sizes.full_features, sizes.regressor
         self.gaussian_regressor = two_convolutions(features + 5, hidden, hidden, "zeros")
-        raw = GAUSSIAN_CHANNELS + 3 * sizes.harmonics
+        raw = GAUSSIAN_CHANNELS + 3 * harmonics
         self.gaussian_head = two_convolutions(hidden + features + 4, raw, raw, "replicate")
-        last = self.gaussian_head[2]
         with torch.no_grad():  # scales and harmonics start from their offsets alone
-            for rows in (slice(3, 6), slice(GAUSSIAN_CHANNELS, None)):
-                last.weight[rows] = 0
-                last.bias[rows] = 0
+            for parameter in self.gaussian_head[2].parameters():
+                parameter[3:6] = 0
+                parameter[GAUSSIAN_CHANNELS:] = 0
 
     def forward(
         self, images_BV3HW: Tensor, cameras: Cameras, near_BV: Tensor, far_BV: Tensor

@@ -1,17 +1,21 @@
 """`mvsplat/depthsplat_gaussians`: the activations of DepthSplat's numbers for each pixel."""
 
+from collections.abc import Iterable
+from typing import ClassVar
+
 import torch
 import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor
 
-from qgs.contracts import Fields, Head
+from qgs.contracts import ComponentConfig, Fields, Head, Problem, RecipeContext
 from qgs.contracts.head import GAUSSIAN_FIELDS
+from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.precision import full_precision
 from qgs.types import GaussianAttributes, QueryState
 from qgs_mvsplat.adapter import camera_quaternions, world_quaternions
-from qgs_mvsplat.head import split_harmonics
-from qgs_mvsplat.pixels import CHANNELS, PIXEL_FIELDS, TURN, FromPixels, turned
+from qgs_mvsplat.head import harmonics_of
+from qgs_mvsplat.pixels import CHANNELS, PIXEL_FIELDS, TURN, width_problems
 
 SCALE_SHIFT = 4.0
 """Taken off a raw scale, so that scales start at softplus(-4) = 0.018."""
@@ -24,11 +28,10 @@ class WorldHead(Head):
     """
 
     name = "depthsplat_gaussians"
+    reads: ClassVar[Fields] = {TURN: PIXEL_FIELDS[TURN]}
+    writes: ClassVar[Fields] = {"gaussians.sh": GAUSSIAN_FIELDS["gaussians.sh"]}
 
-    class Config(FromPixels):
-        sh_degree: int = Field(default=2, ge=0, le=4)
-        """Degree of the spherical harmonics that are predicted, as of the encoder; those above 3
-        are not rendered."""
+    class Config(ComponentConfig):
         scale_min: float = Field(default=1e-10, gt=0)
         """Least standard deviation, world units."""
         scale_max: float = Field(default=3.0, gt=0)
@@ -41,12 +44,8 @@ class WorldHead(Head):
         return 1
 
     @classmethod
-    def fields_read(cls, config: Config) -> Fields:
-        return {"state.features": turned(config.sh_degree), TURN: PIXEL_FIELDS[TURN]}
-
-    @classmethod
-    def fields_written(cls, config: Config) -> Fields:
-        return {"gaussians.sh": GAUSSIAN_FIELDS["gaussians.sh"]} if config.sh_degree else {}
+    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
+        return width_problems(context)
 
     def forward(self, state: QueryState) -> GaussianAttributes:
         return _decoded(state.features, state[TURN], self.config)
@@ -54,17 +53,16 @@ class WorldHead(Head):
 
 @full_precision
 def _decoded(
-    features_BNC: Tensor, turn_BN4: Tensor, config: WorldHead.Config
+    features_BND: Tensor, turn_BN4: Tensor, config: WorldHead.Config
 ) -> GaussianAttributes:
-    raw_BN1C = features_BNC[:, :, None]
-    parts = raw_BN1C.split([*CHANNELS, raw_BN1C.shape[-1] - sum(CHANNELS)], -1)
-    log_depth, logit, place, scale, rotation, sh = parts
-    colors, sh = split_harmonics(sh)
+    raw_BN1C, sh = features_BND[:, :, None, : sum(CHANNELS)], harmonics_of(features_BND)[:, :, None]
+    log_depth, logit, place, scale, rotation = raw_BN1C.split(CHANNELS, -1)
     return GaussianAttributes(
         offsets=torch.cat([place, log_depth], -1),
         scales=F.softplus(scale - SCALE_SHIFT).clamp(config.scale_min, config.scale_max),
         quats=world_quaternions(camera_quaternions(rotation), turn_BN4[:, :, None]),
         opacities=logit[..., 0].sigmoid(),
-        colors=colors,
-        sh=sh,
+        # The colour of the photo is in the constant already.
+        colors=0.5 + SH_C0 * sh[..., 0, :],
+        sh=sh[..., 1:, :],
     )

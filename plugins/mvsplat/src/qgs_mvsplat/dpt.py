@@ -7,16 +7,12 @@ Four maps of a ViT become four resolutions, 1/2 to 1/16; other features join the
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
+
+from qgs_mvsplat.convolutions import resized, two_convolutions, zeroed
 
 LEVELS = 3
 """Resolutions at which other features join: 1/2, 1/4, 1/8."""
-
-
-def resized(x: Tensor, size: Sequence[int]) -> Tensor:
-    """Maps (X, C, h, w) of another size, bilinear, corner pixels on corner pixels."""
-    return F.interpolate(x, list(size), mode="bilinear", align_corners=True)
 
 
 class ResidualUnit(nn.Module):
@@ -75,15 +71,10 @@ class Scratch(nn.Module):
 
 def _to_depth(features: int) -> nn.Sequential:
     """A correction of depth, 0 at the start."""
-    last = nn.Conv2d(16, 1, 1)
-    nn.init.zeros_(last.weight)
-    nn.init.zeros_(last.bias)
     return nn.Sequential(
-        nn.Conv2d(features, features // 2, 3, padding=1, padding_mode="replicate"),
+        *two_convolutions(features, features // 2, 16, "replicate"),
         nn.GELU(),
-        nn.Conv2d(features // 2, 16, 3, padding=1, padding_mode="replicate"),
-        nn.GELU(),
-        last,
+        zeroed(nn.Conv2d(16, 1, 1)),
     )
 
 

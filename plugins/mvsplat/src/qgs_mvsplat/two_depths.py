@@ -1,7 +1,7 @@
 """Supervision of both of DepthSplat's depths: Gaussians of all other numbers at either of them.
 
-`mvsplat/two_depths` starts queries with both, `mvsplat/exchange` is a decoder layer that exchanges
-them, so that layer 1 has the coarse and layer 2 the final depth, and `mvsplat/decayed` weighs them.
+`mvsplat/exchange` is a decoder layer that exchanges the depths, so that layer 1 has the coarse and
+layer 2 the final depth; `mvsplat/decayed` weighs them.
 """
 
 from collections.abc import Mapping
@@ -10,47 +10,23 @@ import torch
 from pydantic import Field
 
 from qgs.components.supervision import LayerSupervision
-from qgs.contracts import DecoderLayer, Fields, FieldSpec, memory_fields
-from qgs.types import ImageMemory, QueryState, Views
-from qgs_mvsplat.pixels import PixelQueries, predicted
-
-OTHER = "mvsplat.other_depth"
-OTHER_FIELD: Fields = {OTHER: FieldSpec((1,), encoding="logarithm of a depth, world units")}
-"""The depth that the features of a query do not have at this layer."""
-
-
-class TwoDepths(PixelQueries):
-    """`mvsplat/pixels` of an encoder with `coarse_depth`: the coarse one goes into a field."""
-
-    name = "two_depths"
-
-    @classmethod
-    def fields_read(cls, config: PixelQueries.Config) -> Fields:
-        channels = predicted(config.sh_degree).shape[0] + 1
-        return {"memory.features": FieldSpec((channels,)), **memory_fields("grid")}
-
-    @classmethod
-    def fields_written(cls, config: PixelQueries.Config) -> Fields:
-        return {**super().fields_written(config), **OTHER_FIELD}
-
-    def forward(self, memory: ImageMemory, views: Views) -> QueryState:
-        numbers, coarse = memory.features[..., :-1], memory.features[..., -1:]
-        state = super().forward(memory.replace(features=numbers), views)
-        return state.replace(fields={OTHER: coarse})
+from qgs.contracts import DecoderLayer
+from qgs.types import ImageMemory, QueryState
 
 
 class Exchange(DecoderLayer):
-    """Exchanges the depth in the features, channel 0, with the one in the field."""
+    """Exchanges the first and the last number of a query: its depth and the other one.
+
+    The encoder gives both with `coarse_depth`. An even number of layers ends with the final depth.
+    """
 
     name = "exchange"
-    reads = writes = OTHER_FIELD
     reads_layer_scale = False
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
         """The memory is passed on."""
-        own, rest = state.features[..., :1], state.features[..., 1:]
-        features = torch.cat([state[OTHER].to(own), rest], -1)
-        return state.replace(features=features, fields={OTHER: own.to(state[OTHER])}), memory
+        own, rest, other = state.features.tensor_split([1, state.features.shape[-1] - 1], -1)
+        return state.replace(features=torch.cat([other, rest, own], -1)), memory
 
 
 class DecayedSupervision(LayerSupervision):
