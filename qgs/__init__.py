@@ -32,7 +32,7 @@ DISTRIBUTIONS = {
         name: f"query-gaussians-{name}"
         for name in (
             *("locus", "ellipsoid", "c3g", "gslrm", "globalsplat", "mvsplat", "tokengs2026"),
-            *("dinov2", "rooms", "datasets"),
+            *("dinov2", "lpips", "rooms", "datasets"),
         )
     },
     "qgs.commands": {

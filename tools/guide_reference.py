@@ -16,7 +16,7 @@ from qgs.composer.yaml_text import dump
 from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
 
 PLUGINS = ("locus", "ellipsoid", "c3g", "gslrm", "globalsplat", "mvsplat", "tokengs2026")
-PLUGINS += ("dinov2", "rooms", "datasets")
+PLUGINS += ("dinov2", "lpips", "rooms", "datasets")
 
 SECTIONS: Mapping[str, type[ComponentConfig]] = {
     "Top level": RecipeSettings,

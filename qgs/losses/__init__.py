@@ -1,17 +1,15 @@
 """What training minimises."""
 
 from qgs.losses.depth import DepthSurface
-from qgs.losses.lpips import LpipsLoss
 from qgs.losses.opacity import Mask, Opacity, mean_of_gaussians
 from qgs.losses.photometric import Photometric
 from qgs.losses.visibility import Visibility, VisibilityOptions, view_visibility
 
-COMPONENTS = (Photometric, Visibility, Mask, Opacity, LpipsLoss, DepthSurface)
+COMPONENTS = (Photometric, Visibility, Mask, Opacity, DepthSurface)
 
 __all__ = [
     "COMPONENTS",
     "DepthSurface",
-    "LpipsLoss",
     "Mask",
     "Opacity",
     "Photometric",

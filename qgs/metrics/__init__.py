@@ -2,6 +2,5 @@
 
 from qgs.metrics.dispersion import Dispersion
 from qgs.metrics.images import Psnr, Ssim
-from qgs.metrics.lpips import Lpips
 
-COMPONENTS = (Psnr, Ssim, Lpips, Dispersion)
+COMPONENTS = (Psnr, Ssim, Dispersion)

@@ -32,7 +32,7 @@ SMALL: dict[str, Any] = {
 """In place of the defaults of options of these names."""
 
 BLOCKS = {"qgs/multiview_vit": 0, "tokengs2026/multiscale_vit": 2, "gslrm/transformer": 1}
-NOT_DRAWN = {"qgs/lpips"}
+NOT_DRAWN = {"lpips/vgg16", "dinov2/multiview_vit"}
 """What needs weights from elsewhere; `c3g/vggt_features`, which does too, has no example."""
 
 PUBLISHED: tuple[dict[str, str], ...] = (

@@ -177,10 +177,9 @@ def test_settings_that_contradict_each_other(changed: Any, sound: Any) -> None:
     assert problems_of(judged) == []
 
 
-@pytest.mark.parametrize("loss", [{"type": "qgs/lpips"}, {"padding": "valid"}])
-def test_images_that_are_too_small_for_a_loss(loss: Any) -> None:
+def test_images_that_are_too_small_for_a_loss() -> None:
     data = {"type": "qgs/photos", "path": "x", "image_size": [8, 16]}
-    losses = {"mine": {"type": "qgs/photometric", **loss}}
+    losses = {"mine": {"type": "qgs/photometric", "padding": "valid"}}
     ((option, _),) = problems_of({"losses": losses, "data": data})
     assert option.startswith("losses.mine")
     assert problems_of({"losses": losses, "data": {**data, "image_size": [16, 16]}}) == []

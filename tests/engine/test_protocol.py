@@ -71,7 +71,6 @@ def test_the_content_of_the_index_is_hashed(tiny: Tiny, file: Path, changed: dic
                 "views.frame=mean_cam",
                 "views.scale=distance",
                 "views.scale_factor=0.5",
-                "metrics.lpips={type: qgs/lpips}",
                 "metrics.ssim.covariance=sample",
                 "metrics.dispersion=null",
                 "evaluation.tuning_steps=50",

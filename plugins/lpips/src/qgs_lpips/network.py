@@ -67,7 +67,7 @@ class PerceptualDistance(nn.Module):
         if package is None or not package.submodule_search_locations:
             raise MissingExtraError(
                 "the package lpips, which holds the weights of LPIPS, is not installed: "
-                'pip install "query-gaussians[lpips]"'
+                'pip install "query-gaussians-lpips[weights]"'
             )
         linear = Path(package.submodule_search_locations[0]) / "weights" / "v0.1" / "vgg.pth"
         vgg = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / _VGG_FILE
@@ -75,7 +75,7 @@ class PerceptualDistance(nn.Module):
             place = f"at {vgg.name}" if weights else "in the cache of torch.hub"
             raise MissingExtraError(
                 f"there are no VGG-16 weights {place}: download torchvision's {_VGG_FILE} and name "
-                "it in the option `weights` of qgs/lpips"
+                "it in the option `weights` of lpips/vgg16"
             )
         try:
             read = load_file if vgg.suffix == ".safetensors" else _load_pickled

@@ -1,4 +1,4 @@
-"""`qgs/lpips`: how different rendered and true images look to VGG-16, see `qgs.perceptual`."""
+"""`lpips/vgg16` in slot `losses`: how different rendered and true images look to VGG-16."""
 
 from collections.abc import Iterable
 
@@ -7,14 +7,14 @@ from torch import Tensor
 
 from qgs.contracts import Loss, Problem, RecipeContext
 from qgs.losses.photometric import too_small
-from qgs.perceptual import SMALLEST_SIDE, PerceptualDistance
 from qgs.types import LayerPrediction, Rendering, Views
+from qgs_lpips.network import SMALLEST_SIDE, PerceptualDistance
 
 
 class LpipsLoss(Loss):
     """Mean LPIPS of the views, of VGG-16 (TokenGS 2026.6); nothing is downloaded."""
 
-    name = "lpips"
+    name = "vgg16"
     renderings = "each"
 
     class Config(Loss.Config):

@@ -1,16 +1,16 @@
-"""`qgs/lpips`: LPIPS, see `qgs.perceptual`."""
+"""`lpips/vgg16` in slot `metrics`: LPIPS of each view."""
 
 import torch
 from torch import Tensor
 
 from qgs.contracts import Column, ComponentConfig, Metric, MetricInput
-from qgs.perceptual import PerceptualDistance
+from qgs_lpips.network import PerceptualDistance
 
 
 class Lpips(Metric):
     """LPIPS, distance of each view to the truth in features of VGG-16; nothing is downloaded."""
 
-    name = "lpips"
+    name = "vgg16"
     definition = "VGG-16, version 0.1, images in [-1, 1]"
     not_in_protocol = frozenset({"weights"})
     column = Column("LPIPS", "lower")

@@ -9,15 +9,14 @@ from typing import Any
 
 import pytest
 import torch
+from qgs_lpips import Lpips, LpipsLoss
 from qgs_plugintools import Case
 from qgs_plugintools.inputs import Sizes, inputs_of
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from qgs.composer import resolve
+from qgs.composer import RecipeError, resolve
 from qgs.contracts import MissingExtraError
-from qgs.losses import LpipsLoss
-from qgs.metrics.lpips import Lpips
 
 CHANNELS = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512, 0)
 """VGG-16's convolutions; 0 is a pooling."""
@@ -132,10 +131,11 @@ def test_images_are_clipped_and_small_ones_refused(vgg: Path) -> None:
 
 
 def test_without_the_package_the_reason_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("qgs.perceptual.find_spec", lambda name: None)
+    monkeypatch.setattr("qgs_lpips.network.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match="lpips"):
         lpips_of()
-    metrics = resolve({"recipe": 1, "metrics": {"lpips": {"type": "qgs/lpips"}}}).build_metrics()
+    written = {"recipe": 1, "plugins": ["lpips"], "metrics": {"lpips": {"type": "lpips/vgg16"}}}
+    metrics = resolve(written).build_metrics()
     assert "lpips" in metrics["lpips"].unavailable  # evaluations go on without it
 
 
@@ -161,13 +161,20 @@ def loss_and_inputs(weights: object) -> tuple[LpipsLoss, dict[str, Any]]:
 def test_the_loss_is_the_mean_of_the_metric_and_pulls_towards_the_truth(vgg: Path) -> None:
     loss, given = loss_and_inputs(vgg)
     prediction, rendering, target, inputs = given.values()
-    value = loss(prediction, rendering, target, inputs)["lpips"]
+    value = loss(prediction, rendering, target, inputs)["vgg16"]
     expected = lpips_of(vgg).distance(rendering.rgb, target.images).mean() / 2
     torch.testing.assert_close(value, expected)
     rgb = rendering.rgb.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(
-        loss(prediction, replace(rendering, rgb=rgb), target, inputs)["lpips"], rgb
+        loss(prediction, replace(rendering, rgb=rgb), target, inputs)["vgg16"], rgb
     )
     step = rendering.rgb - 0.01 * gradient / gradient.abs().max()
-    assert loss(prediction, replace(rendering, rgb=step), target, inputs)["lpips"] < value
+    assert loss(prediction, replace(rendering, rgb=step), target, inputs)["vgg16"] < value
     assert not any(parameter.requires_grad for parameter in loss.parameters())
+
+
+def test_images_that_are_too_small_are_refused_with_the_recipe() -> None:
+    data = {"type": "qgs/photos", "path": "x", "image_size": [8, 16]}
+    losses = {"mine": {"type": "lpips/vgg16"}}
+    with pytest.raises(RecipeError, match="LPIPS"):
+        resolve({"recipe": 1, "plugins": ["lpips"], "losses": losses, "data": data})
