@@ -161,7 +161,9 @@ def test_what_a_metric_needs(mine: Tiny, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_written_metrics_lie_over_the_default_ones(tiny: Tiny) -> None:
-    recipe = tiny("tokengs", "metrics={lpips: {type: lpips/vgg16}, psnr: null}", "plugins=[rooms, lpips]")
+    recipe = tiny(
+        "tokengs", "metrics={lpips: {type: lpips/vgg16}, psnr: null}", "plugins=[rooms, lpips]"
+    )
     assert list(recipe.build_metrics()) == ["ssim", "dispersion", "lpips"]
     assert recipe.tree["metrics"]["psnr"] is None
     assert resolve(recipe.tree).tree == recipe.tree
