@@ -174,15 +174,8 @@ def test_variants_judged_by_the_same_index_under_two_names_are_alike(
 
 
 def test_a_metric_that_cannot_be_measured_here_is_refused_before_training(tmp_path: Path) -> None:
-<<<<<<< HEAD
     metrics = "{plugins: [lpips], metrics: {lpips: {type: lpips/vgg16}}}"
     text = SOUND + f"metric: lpips\noverlay: {metrics}\n"
-=======
-    text = (
-        SOUND
-        + "metric: lpips\noverlay: {plugins: [lpips], metrics: {lpips: {type: lpips/vgg16}}}\n"
-    )
->>>>>>> 5969849 (LPIPS: its package is optional in the tests; schema of recipes again)
     with pytest.raises(OptionError, match="lpips"):
         planned(read(tmp_path, text), tmp_path / "out")
 
