@@ -44,6 +44,7 @@ DISTRIBUTIONS = {
     }
     | dict.fromkeys(("view", "demo", "report", "figures"), "query-gaussians-viewer")
     | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),
+    "qgs.jobs": {"slurm": "query-gaussians-studies"},
     "qgs.refiners": dict.fromkeys(
         ("gaussians", "reconstruction", "tuned", "tuner", "tuning_loss"), "query-gaussians-refine"
     ),

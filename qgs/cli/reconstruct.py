@@ -69,6 +69,7 @@ def reconstruct(
     ] = False,
     size: Size = None,
     scene_name: SceneName = None,
+    threads: options.Threads = None,
     device: Device = "auto",
 ) -> None:
     """Reconstruct a scene: PLY, renders beside photos, depth, an orbit, cameras.
@@ -97,6 +98,7 @@ def reconstruct(
 
     if find := scene_writers().get(out.suffix.lower()):
         find()  # one that cannot be imported is an error now, not after the work
+    options.use_threads(threads)
     console = Console()
     model = load(checkpoint, choose_device(device))
     recipe = resolve(model.recipe or {}, options.tuning_settings(tune))

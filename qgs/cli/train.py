@@ -12,6 +12,7 @@ from rich.console import Console
 
 from qgs.cli.evaluate import evaluate_into
 from qgs.cli.options import Device, Overrides, Threads, use_threads
+from qgs.extensions import function
 from qgs.wording import listed
 
 if TYPE_CHECKING:
@@ -25,6 +26,14 @@ def train(
         bool, typer.Option("--resume", help="Continue the run in --out; start it if there is none.")
     ] = False,
     overrides: Overrides = None,
+    slurm: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Write OUT.slurm.sh, a job on N GPUs of a node; no training.",
+        ),
+    ] = None,
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
@@ -32,7 +41,10 @@ def train(
 
     Ctrl-C and SIGTERM finish the step, save, and end with 128 + the signal's number. With --resume
     the same command goes on from there, or from the last save if the process was killed, as if it
-    had never been interrupted.
+    had never been interrupted. On 8 GPUs:
+
+    \b
+        torchrun --standalone --nproc-per-node=8 -m qgs train RECIPE --out RUN
     """
     from qgs.composer import resolve
     from qgs.engine.guard import TrainingError
@@ -44,6 +56,15 @@ def train(
     console = Console()
     resolved = with_absolute_path(resolve(recipe, overrides or ()))
     index_of(resolved)  # a missing index raises now, not after the training
+    if slurm:
+        resolved.training.scenes_per_batch(slurm)
+        words = [str(recipe), "--out", str(out), "--device", device]
+        words += [word for text in overrides or () for word in ("--set", text)]
+        words += ["--threads", str(threads)] if threads else []
+        cpus = (threads or 1) + resolved.training.workers
+        script = function("qgs.jobs", "slurm")(out, words, slurm, cpus, device != "cpu")
+        console.print(f"wrote {script}; submit it with: sbatch {script}", soft_wrap=True)
+        return
     try:
         result = train_model(resolved, out, console=console, device=device, resume=resume)
     except TrainingError as error:

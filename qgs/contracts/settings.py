@@ -56,9 +56,10 @@ class TrainingConfig(ComponentConfig):
     seconds: float | None = Field(default=None, gt=0)
     """Time budget; training ends when this or `steps` is used up. null: `steps` alone."""
     batch_size: int = Field(default=16, ge=1)
-    """Scenes per batch and process."""
+    """Scenes per optimiser step, over all processes; they split evenly over processes and
+    `accumulate`."""
     accumulate: int = Field(default=1, ge=1)
-    """Batches per optimiser step."""
+    """Batches that a process makes of its scenes of a step, one after the other: less memory."""
     clip: float = Field(default=1.0, gt=0)
     """Largest norm of the gradient; a larger one is scaled down to it."""
     precision: Literal["float32", "bf16"] = "bf16"
@@ -86,6 +87,19 @@ class TrainingConfig(ComponentConfig):
     trackers: tuple[str, ...] = ()
     """Further destinations of numbers and pictures: tensorboard, wandb, or a plugin's; the folder
     of the run always has them."""
+
+    def scenes_per_batch(self, processes: int) -> int:
+        """Scenes in a batch of one of `processes`; ValueError where they do not split evenly."""
+        parts = processes * self.accumulate
+        scenes, left = divmod(self.batch_size, parts)
+        if left:
+            near = f"{scenes * parts or parts} or {(scenes or 1) * parts + parts}"
+            raise ValueError(
+                f"training.batch_size: {self.batch_size} scenes do not split evenly over "
+                f"{processes} x {self.accumulate} (processes x training.accumulate): choose a "
+                f"multiple of {parts}, such as {near}"
+            )
+        return scenes
 
 
 class EvaluationConfig(ComponentConfig):

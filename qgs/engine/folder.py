@@ -48,8 +48,7 @@ FREE = (
 
 They decide how long to train, where data lies and what is reported, not what is learnt. With
 another budget the learning rate follows the new one from there. Plugins that the model uses are
-compared by its types. `training.batch_size` and `training.accumulate` may change together, if a
-step still takes as many samples over all processes.
+compared by its types. `training.accumulate` may change too: a step sees the same samples.
 """
 
 
@@ -305,7 +304,7 @@ def saved_state(folder: RunFolder, recipe: Recipe) -> SavedState | None:
     # A run that was killed before its first save has a recipe and no state: it starts again.
     saved = read_state(folder.state) if folder.state.is_file() else None
     ours, theirs = flat(recipe.tree), flat((saved.recipe if saved else resolve(folder.recipe)).tree)
-    # Batch size and accumulation are compared by their product, in `refuse_other_data`.
+    # `refuse_other_data` compares the scenes of a step, which older runs counted by process.
     may_change = tuple(f"{k}." for k in (*FREE, "training.batch_size", "training.accumulate"))
     differing = [
         f"{key}: {ours.get(key, 'absent')} here, {theirs.get(key, 'absent')} in the run"
@@ -332,8 +331,8 @@ def refuse_other_data(saved: State, now: State, folder: RunFolder) -> None:
     if saved["step_size"] != now["step_size"]:
         raise OtherRunError(
             f"the optimiser steps of the run in {folder.path} see {saved['step_size']} samples, "
-            f"here they would see {now['step_size']}: choose training.batch_size, "
-            "training.accumulate and the number of processes with the same product"
+            f"here they would see {now['step_size']}: add "
+            f"--set training.batch_size={saved['step_size']}"
         )
     if saved["scenes"] != now["scenes"]:
         raise OtherRunError(

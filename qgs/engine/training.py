@@ -56,7 +56,7 @@ from qgs.model import QueryGaussianModel
 ELSEWHERE = "another process of this training has no next batch; see its own message"
 
 LESS_MEMORY = (
-    "lower training.batch_size, training.render_views, views.inputs, views.targets, "
+    "lower views.inputs, views.targets, training.batch_size, "
     "data.image_size, model.queries.count or model.head.gaussians_per_query"
 )
 
@@ -149,11 +149,14 @@ class Trainer:
             # its first batch depends on how many samples the restored run has seen.
             self.optimizer = recipe.build_optimizer()
             self.accelerator = make_accelerator(device, unread=not keys_are_read(recipe.parts))
+            processes = self.accelerator.num_processes
+            scenes = self.config.scenes_per_batch(processes)
+            self._batch_samples = scenes * processes
             saved = self._claim_folder()
             self._build_model(initial=saved is None)
             source = recipe.build_data()
             self._conditions = {
-                "step_size": self._batch_samples * self.config.accumulate,
+                "step_size": self.config.batch_size,
                 "scenes": scenes_fingerprint(source),
             }
             sampler = recipe.build_view_sampler()
@@ -165,10 +168,10 @@ class Trainer:
             batches = training_batches(
                 source,
                 recipe.views,
-                self.config.batch_size,
+                scenes,
                 recipe.seed,
                 start=self.samples // self._batch_samples,
-                share=Share(self.accelerator.process_index, self.accelerator.num_processes),
+                share=Share(self.accelerator.process_index, processes),
                 workers=self.config.workers,
                 skips=self.config.on_bad_sample == "skip",
                 sampler=sampler,
@@ -179,11 +182,6 @@ class Trainer:
             self.feed = Feed(batches, self.config.accumulate)
             self._fetch_first()
             self._resources = resources.pop_all()
-
-    @property
-    def _batch_samples(self) -> int:
-        """Samples of a batch over all processes."""
-        return self.config.batch_size * self.accelerator.num_processes
 
     def _claim_folder(self) -> Mapping[str, State] | None:
         """Lock the folder of a run that is continued; its saved parts, None to start at step 0."""
@@ -345,9 +343,9 @@ class Trainer:
                     self.guard.save_to_go_on(self.step)
             raise OutOfMemoryError(
                 f"out of memory in step {self.step + 1}: {str(error).splitlines()[0][:300]}. "
-                "What was saved continues with --resume, if training.batch_size is lowered where "
-                "training.accumulate is raised as much, or training.render_views is set. A new "
-                f"run takes less when you {LESS_MEMORY}."
+                "What was saved continues with --resume and a higher training.accumulate, more "
+                "processes, or fewer training.render_views. A new run also takes less when you "
+                f"{LESS_MEMORY}."
             ) from error
 
     @property

@@ -1,11 +1,45 @@
-"""The renderers: one contract, `qgs.contracts.Renderer`, and one set of contract tests."""
+"""The renderers, and the one that chooses between two by device; one contract, `Renderer`."""
 
-from qgs.contracts import Component
-from qgs.renderers.auto import AutoRenderer
+from collections.abc import Iterable
+from functools import cached_property
+
+from torch import Tensor
+
+from qgs.contracts import Component, ComponentConfig, Problem, RecipeContext, Renderer
 from qgs.renderers.cpu import CpuRenderer
 from qgs.renderers.gsplat import GsplatRenderer
 from qgs.renderers.reference import TorchRenderer
-
-COMPONENTS: tuple[type[Component], ...] = (AutoRenderer, CpuRenderer, GsplatRenderer, TorchRenderer)
+from qgs.types import Cameras, Gaussians, Rendering
 
 __all__ = ["COMPONENTS", "AutoRenderer", "CpuRenderer", "GsplatRenderer", "TorchRenderer"]
+
+
+class AutoRenderer(Renderer):
+    """gsplat for Gaussians on CUDA, `qgs/cpu` for others, whatever is installed."""
+
+    name = "auto"
+    camera_gradients = GsplatRenderer.camera_gradients
+
+    @classmethod
+    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
+        """Options that gsplat lacks: refused on the CPU too, so that a recipe means one thing."""
+        return GsplatRenderer.problems(config, context)
+
+    def forward(
+        self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
+    ) -> Rendering:
+        """See `Renderer`. Raises RuntimeError when the package it needs is not installed."""
+        renderer = self._on_cuda if gaussians.means.is_cuda else self._on_cpu
+        renderer.config = self.config  # options may follow a schedule
+        return renderer(gaussians, cameras, background)
+
+    @cached_property
+    def _on_cuda(self) -> GsplatRenderer:
+        return GsplatRenderer(self.config)
+
+    @cached_property
+    def _on_cpu(self) -> CpuRenderer:
+        return CpuRenderer(self.config)
+
+
+COMPONENTS: tuple[type[Component], ...] = (AutoRenderer, CpuRenderer, GsplatRenderer, TorchRenderer)

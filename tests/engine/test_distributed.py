@@ -54,9 +54,9 @@ def test_two_processes_have_the_loss_curve_of_one(
     tiny: Tiny, tmp_path: Path, accumulate: int
 ) -> None:
     options = ("training.save_every=2", f"training.accumulate={accumulate}", PARTS)
-    alone = tiny("locus", "training.batch_size=2", *options)
-    run(alone, tmp_path / "alone")
-    train_in_two_processes(tiny("locus", "training.batch_size=1", *options), tmp_path / "two")
+    recipe = tiny("locus", "training.batch_size=4", *options)
+    run(recipe, tmp_path / "alone")
+    train_in_two_processes(recipe, tmp_path / "two")
     assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
     names = {path.name for path in (tmp_path / "two").iterdir()}
     assert names == {
@@ -77,17 +77,17 @@ def test_two_processes_train_a_model_whose_keys_nothing_reads(tiny: Tiny, tmp_pa
 
 
 def test_two_processes_continue_what_one_began(tiny: Tiny, tmp_path: Path) -> None:
-    options = ("training.save_every=2", "training.ema=0.9", PARTS)
-    alone = tiny("locus", "training.batch_size=2", *options)
-    run(alone, tmp_path / "alone")
+    options = ("training.batch_size=2", "training.save_every=2", "training.ema=0.9", PARTS)
+    recipe = tiny("locus", *options)
+    run(recipe, tmp_path / "alone")
 
     def kill(trainer: Trainer, stop: StopRequest) -> None:
         if trainer.step == 3:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_calling(kill, alone, tmp_path / "two")
-    train_in_two_processes(tiny("locus", "training.batch_size=1", *options), tmp_path / "two")
+        run_calling(kill, recipe, tmp_path / "two")
+    train_in_two_processes(recipe, tmp_path / "two")
     assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
     ours, theirs = (
         read_state(tmp_path / name / "state.safetensors").parts for name in ("two", "alone")
@@ -103,14 +103,14 @@ def test_two_processes_continue_what_one_began(tiny: Tiny, tmp_path: Path) -> No
 def test_two_processes_make_two_passes_as_one_does(tiny: Tiny, tmp_path: Path, two: None) -> None:
     alone = tiny("locus", *TWO, "training.batch_size=2")
     run(alone, tmp_path / "alone")
-    pair = tiny("locus", *TWO, "training.batch_size=1", "training.render_views=1")
+    pair = tiny("locus", *TWO, "training.batch_size=2", "training.render_views=1")
     train_in_two_processes(pair, tmp_path / "two")
     assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
 
 
 @pytest.mark.slow
 def test_all_processes_leave_out_a_step_that_one_found_bad(tiny: Tiny, tmp_path: Path) -> None:
-    parts = ("training.batch_size=1", "training.render_views=1", "training.on_nonfinite=skip")
+    parts = ("training.batch_size=2", "training.render_views=1", "training.on_nonfinite=skip")
     judged = ("training.ema=0.9", "training.evaluate_every=2", "evaluation.scenes=1")
     train_in_two_processes(tiny("locus", *parts, *judged), tmp_path / "run", "spoil")
     run = tmp_path / "run"
@@ -135,7 +135,7 @@ def test_two_processes_stop_together_at_a_sample_that_one_cannot_make(
     tiny: Tiny, tmp_path: Path, bad: int, steps: int
 ) -> None:
     """Samples with odd numbers are those of the second process."""
-    recipe = tiny("locus", "training.batch_size=1")
+    recipe = tiny("locus", "training.batch_size=2")
     told = told_by_two(recipe, tmp_path / "run", str(bad))
     assert told.count("refused: ") == 2
     assert told.count(f"refused: scene 'x', frame {bad} (a.png): cannot be read") == 1
@@ -149,7 +149,7 @@ def test_two_processes_stop_together_at_a_sample_that_one_cannot_make(
 def test_two_processes_go_on_without_a_sample_that_one_cannot_make(
     tiny: Tiny, tmp_path: Path, bad: int
 ) -> None:
-    recipe = tiny("locus", "training.batch_size=1", "training.on_bad_sample=skip")
+    recipe = tiny("locus", "training.batch_size=2", "training.on_bad_sample=skip")
     told = told_by_two(recipe, tmp_path / "run", str(bad))
     assert told.count(f"left out: 1 times scene 'x', frame {bad}") == 2
     assert len(losses(tmp_path / "run")) == 4

@@ -73,7 +73,7 @@ CASES = [
     ("locus", ("training.ema=0.9", "training.render_views=1")),
     pytest.param(
         "tokengs",
-        ("training.accumulate=2", "training.batch_size=1", "views.mirror=0.5"),
+        ("training.accumulate=2", "views.mirror=0.5"),
         marks=pytest.mark.slow,
     ),
     pytest.param("locus", ("training.precision=bf16",), marks=pytest.mark.slow),
@@ -199,9 +199,9 @@ def test_a_step_must_see_as_many_samples(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs", "training.batch_size=2", "training.save_every=1")
     run(recipe, tmp_path / "through")
     kill_after(2, recipe, folder)
-    with pytest.raises(OtherRunError, match="see 2 samples, here they would see 3"):
+    with pytest.raises(OtherRunError, match=r"see 2 samples.*see 3.*batch_size=2"):
         resumed(tiny("tokengs", "training.batch_size=3"), folder)
-    halves = tiny("tokengs", "training.batch_size=1", "training.accumulate=2")
+    halves = tiny("tokengs", "training.batch_size=2", "training.accumulate=2")
     assert resumed(halves, folder).steps == 4
     for ours, theirs in zip(losses(folder), losses(tmp_path / "through"), strict=True):
         assert ours == pytest.approx(theirs, rel=1e-4)

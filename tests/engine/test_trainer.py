@@ -12,6 +12,7 @@ from training_runs import Tiny, run_anywhere
 
 import qgs
 from qgs.composer import resolve
+from qgs.contracts import TrainingConfig
 from qgs.data.stream import training_batches
 from qgs.engine.folder import RunFolder
 from qgs.io.checkpoint import CheckpointFile
@@ -47,13 +48,20 @@ def test_a_run_leaves_recipe_history_and_checkpoint(tiny: Tiny, tmp_path: Path) 
 
 def test_accumulated_batches_are_one_larger_batch(tiny: Tiny, tmp_path: Path) -> None:
     first = []
-    for size, count in ((2, 1), (1, 2)):
-        options = (f"batch_size={size}", f"accumulate={count}", "steps=1")
+    for count in (1, 2):
+        options = ("batch_size=2", f"accumulate={count}", "steps=1")
         recipe = tiny("tokengs", "optimizer.warmup=0", *(f"training.{o}" for o in options))
         result = run_anywhere(recipe, tmp_path / str(count))
         first.append(result.folder.history()[0])
     for key in ("loss", "mse", "visibility", "gradient"):
         assert first[0][key] == pytest.approx(first[1][key], rel=1e-4)
+
+
+@pytest.mark.parametrize(("processes", "accumulate"), [(3, 1), (1, 5), (8, 4)])
+def test_scenes_that_do_not_split_evenly_are_refused(processes: int, accumulate: int) -> None:
+    config = TrainingConfig(batch_size=16, accumulate=accumulate)
+    with pytest.raises(ValueError, match=rf"training\.batch_size: 16 .* {processes * accumulate}"):
+        config.scenes_per_batch(processes)
 
 
 def test_bf16_trains_with_finite_numbers(tiny: Tiny, tmp_path: Path) -> None:

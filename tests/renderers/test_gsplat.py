@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-import qgs.renderers.auto as auto_module
+import qgs.renderers as auto_module
 import qgs.renderers.gsplat as gsplat_module
 from qgs.contracts import ModelDims, RecipeContext, RendererConfig
 from qgs.geometry.harmonics import seen_colors

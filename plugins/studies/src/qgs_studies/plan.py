@@ -233,7 +233,7 @@ def _with_budget(study: Study, recipe: Recipe) -> Recipe:
         changes = {"steps": budget.steps, "seconds": None}
     else:
         assert budget.images is not None
-        a_step = training.batch_size * training.accumulate * recipe.views.targets
+        a_step = training.batch_size * recipe.views.targets
         changes = {"steps": max(math.ceil(budget.images / a_step), 1), "seconds": None}
     tree = {**recipe.tree, "training": {**recipe.tree["training"], **changes}}
     resolved = resolve(tree)

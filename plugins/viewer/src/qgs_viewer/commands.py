@@ -18,9 +18,11 @@ from qgs.cli.options import (
     Scale,
     SceneName,
     Size,
+    Threads,
     ViewsSettings,
     parse_size,
     scale_settings,
+    use_threads,
 )
 from qgs.wording import listed
 
@@ -70,6 +72,7 @@ def view(
     show: Annotated[
         bool, typer.Option("--open/--no-open", help="Open it in the browser of this machine.")
     ] = True,
+    threads: Threads = None,
     device: Device = "auto",
 ) -> None:
     """Turn a reconstruction in the browser, pick a query, see its anchor and what it reads.
@@ -86,6 +89,7 @@ def view(
 
     if html is not None:
         refuse_existing(html)
+    use_threads(threads)
     console = Console()
     settings = [*(overrides or ()), *scale_settings(scale)]
     wanted = Wanted(photos, scene, frames, inputs, pixels, settings, choose_device(device))

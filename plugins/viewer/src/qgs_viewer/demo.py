@@ -12,7 +12,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from qgs.cli.options import Device, Photos, Runs, Scale, Size, parse_size, scale_settings
+from qgs.cli.options import (
+    Device,
+    Photos,
+    Runs,
+    Scale,
+    Size,
+    Threads,
+    parse_size,
+    scale_settings,
+    use_threads,
+)
 
 if TYPE_CHECKING:
     from qgs_viewer.contest import Entry
@@ -52,6 +62,7 @@ def demo(
     ] = None,
     size: Size = None,
     scale: Scale = None,
+    threads: Threads = None,
     device: Device = "auto",
 ) -> None:
     """Trained models on rooms unseen in training, or on your photos; writes report.html.
@@ -69,6 +80,7 @@ def demo(
         raise ValueError(f"one folder of photos is shown at a time, got {', '.join(given or ())}")
     if (size, scale) != (None, None) and (train or not given):
         raise ValueError("--size and --scale are for photos: name a folder, or leave them out")
+    use_threads(threads)
     target = new_folder(out)
     if train:
         compare_trainings(given or RECIPES, seconds or 120, seed or 0, target, device)
@@ -85,11 +97,13 @@ def report(
     ] = None,
     size: Size = None,
     scale: Scale = None,
+    threads: Threads = None,
     device: Device = "auto",
 ) -> None:
     """Evaluate trained models and show their scenes side by side; writes report.html."""
     if (size, scale) != (None, None) and photos is None:
         raise ValueError("--size and --scale are for photos: give --photos, or leave them out")
+    use_threads(threads)
     show_trained(runs, photos, new_folder(out, "report"), device, size, scale)
 
 
