@@ -35,6 +35,8 @@ class IndexEntry(BaseModel):
 EvaluationIndex: TypeAlias = Mapping[str, IndexEntry | None]
 """Scene name to its frames; None for a scene that is listed but not judged."""
 
+WindowsOf: TypeAlias = Callable[[Scene], Sequence[tuple[Frames, Frames]]]
+"""From a scene to input and target frames of its samples."""
 ViewsOf: TypeAlias = Callable[[Scene, Frames, Frames], ViewsConfig]
 """From a scene, input and target frames to the settings with which their sample is made."""
 
@@ -89,6 +91,7 @@ class EvaluationPlan:
     the others `evaluation.samples` samples, inputs drawn by `sampler` (default: `Span`) as at the
     end of training with `evaluation.seed`, targets the other frames of the span, or of one time.
     Targets of T times are T samples. views_of: makes the settings of a sample, such as its scale.
+    windows_of: gives windows of a scene with held-out frames that does not move, instead.
 
     wanted, null, unlisted: see `qgs.engine.results.Evaluation`. framing: of the first photo, and
     drawn: scenes of which samples were, once `samples` has run. Raises ValueError without scenes.
@@ -102,6 +105,7 @@ class EvaluationPlan:
         index: EvaluationIndex | None = None,
         sampler: ViewSampler | None = None,
         views_of: ViewsOf | None = None,
+        windows_of: WindowsOf | None = None,
     ) -> None:
         self.framing: str | None = None
         self.drawn = set[str]()
@@ -110,6 +114,7 @@ class EvaluationPlan:
             raise ValueError(f"the data source {type(source).name!r} has no test scenes")
         self._views, self._evaluation, self._index = views, evaluation, index
         self._views_of = views_of or (lambda *window: views)
+        self._windows_of = windows_of
         self._sampler = sampler or Span(Span.Config())
         names = source.names("test")
         self._places = {name: place for place, name in enumerate(names)}
@@ -142,7 +147,10 @@ class EvaluationPlan:
         if self._index is not None:
             yield _named(scene, self._index)
         elif scene.held_out:
-            windows = held_out_windows(scene, self._views)
+            if self._windows_of is None or scene.times is not None:
+                windows = held_out_windows(scene, self._views)
+            else:
+                windows = self._windows_of(scene)
             count = min(self._evaluation.scenes, len(windows))
             # evenly thinned, so that both ends of a long scene are judged
             kept = np.linspace(0, len(windows) - 1, count).round().astype(int)
@@ -162,10 +170,11 @@ def evaluation_samples(
     evaluation: EvaluationConfig,
     sampler: ViewSampler | None = None,
     views_of: ViewsOf | None = None,
+    windows_of: WindowsOf | None = None,
 ) -> Sequence[Sample]:
     """Samples of a plan without an index; raises ValueError for the first scene that fails."""
     samples: list[Sample] = []
-    plan = EvaluationPlan(source, views, evaluation, sampler=sampler, views_of=views_of)
+    plan = EvaluationPlan(source, views, evaluation, None, sampler, views_of, windows_of)
     for sample in plan.samples():
         if isinstance(sample, SceneFailure):
             raise ValueError(f"scene {sample.scene!r} cannot be judged: {sample.reason}")

@@ -12,7 +12,14 @@ from qgs.composer import Recipe
 from qgs.composer.registry import BUILTIN, component_failure
 from qgs.contracts import Column, Metric, MetricInput, SceneSource
 from qgs.data.domain import OF_RECIPES, Domain, verdict
-from qgs.data.evaluation import EvaluationPlan, SceneFailure, ViewsOf, one_line, true_depth
+from qgs.data.evaluation import (
+    EvaluationPlan,
+    SceneFailure,
+    ViewsOf,
+    WindowsOf,
+    one_line,
+    true_depth,
+)
 from qgs.data.samples import Sample, stack_views
 from qgs.engine.protocol import index_of, protocol_of
 from qgs.engine.results import TUNING, Evaluation, SceneScore
@@ -41,6 +48,7 @@ def evaluate(
     trained_on: Domain | None = None,
     options: Mapping[str, str] = OF_RECIPES,
     views_of: ViewsOf | None = None,
+    windows_of: WindowsOf | None = None,
 ) -> Evaluation:
     """Evaluate `model` by the metrics of `recipe` on its test views, where the model is.
 
@@ -48,7 +56,7 @@ def evaluate(
     model's mode. step: optimiser steps behind the weights. batch: scenes in one forward pass; with
     tuning each passes alone. observe: called with (scenes done, all scenes). trained_on: the domain
     of the model, empty where it is unknown; None leaves out the remark on it. options: what remarks
-    call those of `qgs.data.domain.REMEDIES`. views_of: see `EvaluationPlan`.
+    call those of `qgs.data.domain.REMEDIES`. views_of, windows_of: see `EvaluationPlan`.
     Raises what opening the data source or the index and `Measures` raise, and ValueError when no
     scene could be scored or `batch` is less than 1.
     """
@@ -56,7 +64,8 @@ def evaluate(
         raise ValueError(f"batch is how many scenes pass together, at least 1, got {batch}")
     source, index = recipe.build_data(), index_of(recipe)
     sampler = recipe.build_view_sampler()
-    plan = EvaluationPlan(source, recipe.views, recipe.evaluation, index, sampler, views_of)
+    choices = index, sampler, views_of, windows_of
+    plan = EvaluationPlan(source, recipe.views, recipe.evaluation, *choices)
     measures = Measures(recipe)
     scorer = _Scorer(model, recipe, source, measures)
     training = model.training

@@ -55,6 +55,7 @@ def test_any_number_of_inputs_that_are_not_held_out(inputs, held_out, count):
         return
     windows = choose_windows(scene, views(inputs), TRAINED, 6)
     assert windows == choose_windows(scene, views(inputs), TRAINED, 6)
+    assert windows[:1] == choose_windows(scene, views(inputs), TRAINED)
     for chosen, targets in windows:
         assert len({*chosen}) == inputs
         assert not {*chosen} & {*held_out, *targets}

@@ -3,7 +3,7 @@
 import os
 import platform
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -15,13 +15,15 @@ import yaml
 from rich import box
 from rich.table import Table
 
+from qgs.analysis.inputs import Window, choose_windows
 from qgs.analysis.scale import ScaleSearch, photo_settings, summary
-from qgs.analysis.scenes import Size, installed_sources, size_multiple, whole_size
+from qgs.analysis.scenes import HOLDOUT, Size, installed_sources, size_multiple, whole_size
 from qgs.composer import Recipe, resolve
 from qgs.composer.schema import summary_of
-from qgs.data.domain import OF_RECIPES, OF_SHOWN
-from qgs.data.evaluation import evaluation_samples, true_depth
-from qgs.data.recognition import open_for
+from qgs.contracts import Scene, ViewsConfig
+from qgs.data.domain import OF_RECIPES, OF_SHOWN, Domain
+from qgs.data.evaluation import WindowsOf, evaluation_samples, true_depth
+from qgs.data.recognition import is_training_data, open_for
 from qgs.engine.distributed import choose_device
 from qgs.engine.evaluation import evaluate
 from qgs.engine.results import Evaluation
@@ -35,7 +37,6 @@ from qgs_viewer.report import Contender, Report
 
 PICTURED_SCENES = 6
 WINDOWS = 6  # scenes, and windows of a scene, that are judged of a user's photos
-HOLDOUT = 8  # every n-th of a user's photos is held out; of fewer photos the middle one
 AUTO_SCALE = "Each scene is scaled until what its cameras look at is 1 away (views.scale: auto)."
 JUDGED = ("data", "views", "evaluation", "metrics")
 TRAINED = ("optimizer", "training")
@@ -48,7 +49,7 @@ OF_THE_METHOD = ("optimizer.parts", "training.judge_inputs", "evaluation.tuning"
 class Entry:
     """A judged model with its recipe. progress: how far its training has come.
 
-    search: the scales that were found for it.
+    search: the scales that were found for it. windows_of: see `EvaluationPlan`.
     """
 
     recipe: Recipe
@@ -56,6 +57,7 @@ class Entry:
     evaluation: Evaluation
     search: ScaleSearch
     progress: str = ""
+    windows_of: WindowsOf | None = None
 
 
 def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:
@@ -113,7 +115,8 @@ def judge(
     overrides: Sequence[str] = (),
 ) -> list[Entry]:
     """The models in `files` on unseen scenes, or on held-out photos; raises as `recipes_alike`."""
-    recipes, entries = recipes_alike(files, photos, size, overrides), []
+    recipes, entries = recipes_alike(files, photos, size, overrides), list[Entry]()
+    windows_of: WindowsOf | None = None
     for name, path in files.items():
         with CheckpointFile(path) as file:
             model, step, training = (
@@ -121,15 +124,39 @@ def judge(
                 file.step,
                 file.recipe.training,
             )
+            data = file.recipe.data_config
         of = "" if training.seconds else f" of {training.steps:,}"
         progress = "not known" if step is None else f"step {step:,}{of}"
         recipe, options = recipes[name], OF_RECIPES if photos is None else OF_SHOWN
         search, domain = ScaleSearch(model, recipe.views), model.trained_on
-        evaluation = evaluate(model, recipe, trained_on=domain, options=options, views_of=search)
+        # those of the first model for all, so that one protocol judges them
+        if not entries and photos is not None and not is_training_data(photos, data):
+            windows_of = photo_windows(recipe.views, domain)
+        evaluation = evaluate(
+            model,
+            recipe,
+            trained_on=domain,
+            options=options,
+            views_of=search,
+            windows_of=windows_of,
+        )
         text = about(path) or describe(recipe)
         entry = entry_of(name, recipe, evaluation, search, text, curves_of(path))
-        entries.append(replace(entry, progress=f"{name}: {progress}"))
+        progress = f"{name}: {progress}"
+        entries.append(replace(entry, progress=progress, windows_of=windows_of))
     return entries
+
+
+def photo_windows(views: ViewsConfig, trained_on: Domain | None) -> WindowsOf:
+    """WINDOWS windows of each scene by `choose_windows`, chosen once."""
+    known = dict[str, list[Window]]()
+
+    def windows_of(scene: Scene) -> list[Window]:
+        if scene.name not in known:
+            known[scene.name] = choose_windows(scene, views, trained_on or Domain(), WINDOWS)
+        return known[scene.name]
+
+    return windows_of
 
 
 def recipes_alike(
@@ -231,7 +258,15 @@ def remarks(entries: Sequence[Entry]) -> list[str]:
             models.setdefault(remark, []).append(entry.contender.name)
     texts = [f"{', '.join(names)}: {remark}." for remark, names in models.items()]
     auto = [AUTO_SCALE] if entries[0].recipe.views.scale == "auto" else []
-    return [*scales(entries), *texts, *auto]
+    return [*chosen_windows(entries[0]), *scales(entries), *texts, *auto]
+
+
+def chosen_windows(entry: Entry) -> Iterator[str]:
+    """A sentence on each scene whose windows were chosen, by names of photos."""
+    for score in entry.evaluation.scores if entry.windows_of else ():
+        pairs = [[listed(score.names.get(f, str(f)) for f in p) for p in w] for w in score.views]
+        text = "; ".join(f"{inputs}, judged on held-out {targets}" for inputs, targets in pairs)
+        yield f"{score.scene}, inputs {text}."
 
 
 def scales(entries: Sequence[Entry]) -> list[str]:
@@ -278,7 +313,9 @@ def report_of(
     source = recipe.build_data()
     searched = entries if recipe.views.scale == "search" else entries[:1]
     pictured = [
-        evaluation_samples(source, recipe.views, few, views_of=entry.search)[:PICTURED_SCENES]
+        evaluation_samples(
+            source, recipe.views, few, views_of=entry.search, windows_of=entry.windows_of
+        )[:PICTURED_SCENES]
         for entry in searched
     ] * (len(entries) // len(searched))
     samples = pictured[0]
