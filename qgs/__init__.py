@@ -41,10 +41,12 @@ DISTRIBUTIONS = {
         "study": "query-gaussians-studies",
         "bench": "query-gaussians-bench",
         "import": "query-gaussians-published",
+        "scene": "query-gaussians-refine",
     }
     | dict.fromkeys(("view", "demo", "report", "figures"), "query-gaussians-viewer")
     | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),
     "qgs.jobs": {"slurm": "query-gaussians-studies"},
+    "qgs.pages": {"gaussians": "query-gaussians-viewer"},
     "qgs.refiners": dict.fromkeys(
         ("gaussians", "reconstruction", "tuned", "tuner", "tuning_loss"), "query-gaussians-refine"
     ),

@@ -18,6 +18,9 @@ GROUP = "qgs.commands"
 HELP = {
     "data": "Check and pack data sets.",
     "view": "Turn a reconstruction in the browser, pick a query, see its anchor and what it reads.",
+    "scene": (
+        "The best scene of photos in a given time: scene.ply, scene.splat, a page, held-out scores."
+    ),
     "demo": "Trained models on rooms unseen in training, or on your photos; writes report.html.",
     "report": "Evaluate trained models and show their scenes side by side; writes report.html.",
     "figures": "Figures of trained models for a paper, as PDF and PNG.",

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from qgs_refine.refining import half_swept
+from qgs_refine.refining import partly_swept
 from qgs_refine.sweeping import swept
 from torch import Tensor
 
@@ -81,8 +81,8 @@ def test_half_makes_room_and_the_most_opaque_stay() -> None:
     quats = torch.tensor([1.0, 0, 0, 0]).expand(1, 11, 4)
     given = Gaussians(torch.randn(1, 11, 3), torch.ones(1, 11, 3), quats, opacities, quats[..., 1:])
     views = photos(row_of_eyes(3))
-    mixed = half_swept(given, views, 9, generator())
+    mixed = partly_swept(given, views, 9, 0.5, generator())
     assert mixed.count == 9
     assert torch.equal(mixed.means[:, :5], given.most_opaque(5).means)
-    alone = half_swept(given, views.select([1]), 9, generator())
+    alone = partly_swept(given, views.select([1]), 9, 0.5, generator())
     assert torch.equal(alone.means, given.most_opaque(9).means)

@@ -70,6 +70,7 @@ def refine(
     seconds: float,
     *,
     count: int | None = None,
+    swept: float = 0.5,
     compared: Views | None = None,
     renderer: nn.Module | None = None,
     console: Console | None = None,
@@ -78,11 +79,11 @@ def refine(
 
     seconds: of optimisation, counted after the first step, in which kernels compile. count:
     Gaussians at the end, by default as many as given; they grow in the first part of the time.
-    The optimisation starts from the most opaque half of the given Gaussians and as many at pixels,
-    where the photos agree on a depth. compared: photos (1, W) for the curve, never optimised on.
-    renderer: `qgs/auto` by default. console: where progress is shown; nowhere by default. The first
-    Ctrl-C finishes the step and returns the result so far. Works in any world: its size is measured
-    by the distance of the Gaussians from the cameras.
+    The optimisation starts from the most opaque of the given Gaussians and, as the part `swept` of
+    all, from others at pixels, where the photos agree on a depth. compared: photos (1, W) for the
+    curve, never optimised on. renderer: `qgs/auto` by default. console: where progress is shown;
+    nowhere by default. The first Ctrl-C finishes the step and returns the result so far. Works in
+    any world: its size is measured by the distance of the Gaussians from the cameras.
 
     Raises ValueError for more than one scene, no photo, no time, and Gaussians that are not finite.
     """
@@ -91,18 +92,40 @@ def refine(
     quiet, stopping = console or Console(quiet=True), stop_requests(console is None)
     with TrainingProgress(quiet) as progress, stopping as stop, torch.enable_grad():
         renderer = renderer or AutoRenderer(AutoRenderer.Config())
-        run = _Run(gaussians, views, seconds, wanted, renderer)
+        run = _Run(gaussians, views, seconds, wanted, renderer, swept)
         curve = list(run.curve(compared, progress, stop))
         name = stop.signal.name if stop.signal else None
         refined = map_tensors(Tensor.detach, run.free.gaussians())
         return RefinedScene(refined, curve, run.step, run.spent, name)
 
 
+def seconds_of_step(gaussians: Gaussians, views: Views, renderer: nn.Module | None = None) -> float:
+    """Time of a step of `refine` with these Gaussians at the size of the photos `views` (1, V).
+
+    The least of three, after one in which kernels compile.
+    """
+    renderer = renderer or AutoRenderer(AutoRenderer.Config())
+    run, times = _Run(gaussians, views, math.inf, gaussians.count, renderer, 0.0), list[float]()
+    run.levels = run.levels[-1:]
+    with torch.enable_grad():
+        for _ in range(4):
+            began = perf_counter()
+            run.optimise()
+            times.append(perf_counter() - began)
+    return min(times[1:])
+
+
 class _Run:
     """One refinement: its Gaussians, photos by level of resolution, and clock."""
 
     def __init__(
-        self, gaussians: Gaussians, views: Views, seconds: float, wanted: int, renderer: nn.Module
+        self,
+        gaussians: Gaussians,
+        views: Views,
+        seconds: float,
+        wanted: int,
+        renderer: nn.Module,
+        swept: float,
     ) -> None:
         self.renderer, self.wanted, self.given = renderer, wanted, gaussians
         self.generator, began = torch.Generator().manual_seed(0), perf_counter()
@@ -110,7 +133,7 @@ class _Run:
         levels = [level for level in _LEVELS if level[0] == 1 or side // level[0] >= _LEAST_SIDE]
         self.levels = [(resized(views, part), end) for part, end in levels]
         self.start = min(wanted, gaussians.count)
-        gaussians = half_swept(gaussians, self.levels[0][0], self.start, self.generator)
+        gaussians = partly_swept(gaussians, self.levels[0][0], self.start, swept, self.generator)
         self.size = distance(gaussians, views)
         self.rates = {**_RATES, "means": _RATES["means"] * self.size}
         self.free = FreeGaussians(gaussians, self.rates)
@@ -131,7 +154,7 @@ class _Run:
                 due = (self.spent // (self.seconds / _POINTS) + 1) * self.seconds / _POINTS
                 yield self._point(compared)
             began = perf_counter()
-            loss, quality = self._optimise()
+            loss, quality = self.optimise()
             if self.step > 1:  # the first one compiles
                 self.spent += perf_counter() - began
             used = self.spent / self.seconds
@@ -145,7 +168,7 @@ class _Run:
         quality = mean_psnr(self.free.gaussians(), compared, self.renderer)
         return CurvePoint(self.spent, self.step, self.free.count, quality)
 
-    def _optimise(self) -> tuple[float, float]:
+    def optimise(self) -> tuple[float, float]:
         """One step on one photo, then growth if it is due; the loss and PSNR before the step."""
         used = min(self.spent / self.seconds, 1.0)
         for group in self.free.optimizer.param_groups:
@@ -178,15 +201,15 @@ class _Run:
             self.free.grow(now, self.generator)
 
 
-def half_swept(
-    gaussians: Gaussians, views: Views, count: int, generator: torch.Generator
+def partly_swept(
+    gaussians: Gaussians, views: Views, count: int, part: float, generator: torch.Generator
 ) -> Gaussians:
-    """`count` Gaussians (1, count): half the most opaque given ones, half swept from the photos.
+    """`count` Gaussians (1, count): the most opaque given ones, and a `part` swept from the photos.
 
     A single photo has no depth, so that all are given ones. Spherical harmonics and features of
     the swept ones are 0.
     """
-    new = count // 2 if views.images.shape[1] > 1 else 0
+    new = int(part * count) if views.images.shape[1] > 1 else 0
     kept = gaussians.most_opaque(count - new)
     if not new:
         return kept

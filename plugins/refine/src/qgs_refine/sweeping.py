@@ -18,7 +18,7 @@ _PATCH = 1  # radius in pixels of the compared patch
 _MAX_COST = 0.3  # truncation of a difference of colours; half of it outside a photo
 _NO_EVIDENCE = 1e-4  # cost per e-fold of depth away from the size: breaks ties only
 _AT_ONCE = 1024  # pixels, so that memory stays within 0.3 GB
-_OPACITY, _PIXELS = 0.5, 2.0  # opacity of the Gaussians; standard deviation in pixels
+_OPACITY, _PIXELS = 0.1, 2.0  # opacity of the Gaussians; standard deviation in pixels
 
 
 @torch.no_grad()

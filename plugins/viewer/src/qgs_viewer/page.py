@@ -3,8 +3,9 @@
 from collections.abc import Iterable, Mapping
 
 from qgs.drawing import page_environment
+from qgs.types import Gaussians, Views
 from qgs_viewer.choice import Choice
-from qgs_viewer.look import Look
+from qgs_viewer.look import NEUTRAL, Background, Look
 from qgs_viewer.server import quiet_server, stand
 from qgs_viewer.stage import Stage, distance_to
 
@@ -55,6 +56,12 @@ def scenes_html(looks: Mapping[str, Look], choices: Mapping[str, Choice] | None 
     shell = (pages[0][0] + _DATA, '"' + ends[0])
     template = page_environment("qgs_viewer").get_template("scenes.html")
     return template.render(shell=shell, scenes=[*zip(looks, data, strict=True)])
+
+
+def gaussians_html(gaussians: Gaussians, views: Views, background: Background = NEUTRAL) -> str:
+    """A page of Gaussians (1, G) and the cameras of some photos (1, V) in their world."""
+    frames = range(views.images.shape[1])
+    return scene_html(Look(gaussians, views, [""] * len(frames), frames, background=background))
 
 
 def shared_start(looks: Iterable[Look]) -> Look:

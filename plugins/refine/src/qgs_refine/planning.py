@@ -1,0 +1,221 @@
+"""What `qgs scene` chooses: the model, photo size and number of Gaussians that fit the time."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from qgs.analysis.inputs import choose_windows
+from qgs.analysis.scenes import Size, installed_sources, named_scene, reconstruct
+from qgs.cli.options import scale_settings
+from qgs.composer import resolve
+from qgs.composer.registry import load_usable_plugins
+from qgs.contracts import Scene
+from qgs.data.recognition import open_for
+from qgs.data.samples import views_in
+from qgs.io.checkpoint import load
+from qgs.metrics.images import psnr
+from qgs.types import Gaussians
+from qgs.wording import listed
+
+NONE = "none"
+"""As a model: the start is made of the photos alone; as a holdout: all are optimised on."""
+SIZES = range(64, 1025, 16)
+"""Shorter sides that are considered, pixels."""
+LEAST_STEPS, STEPS_OF_PHOTO = 2500, 25
+"""Steps that a refinement takes at least, and of each photo; then photos may be larger."""
+DENSITY = 0.6
+"""Gaussians over pixels of a photo: twice as many gained less than their time."""
+MOST_GAUSSIANS = 500_000
+_OF_PIXELS, _OF_GAUSSIANS = 0.77, 0.3  # exponents of the time of a step, measured on CPUs
+_COARSE = 0.6  # time of a step over that at full size, in the mean over coarse levels and growth
+_PROBE = 128  # shorter side with which a step is timed
+_SEARCH = 0.15  # part of the time in which models are compared
+_JUDGED = 4  # photos on which they are
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All that `qgs scene` chose, so that it can be run again. seconds: of refinement."""
+
+    model: str
+    frames: Sequence[str]
+    scale: float
+    size: Size
+    gaussians: int
+    seconds: float
+    holdout: str
+
+    def command(self, photos: str, out: str, scene: str | None = None) -> str:
+        """A command line that makes the scene again."""
+        height, width = self.size
+        options = {
+            "--out": out,
+            **({"--scene": scene} if scene else {}),
+            "--model": self.model,
+            **({"--frames": ",".join(self.frames)} if self.frames else {}),
+            **({"--scale": f"{self.scale:.5g}"} if self.frames else {}),
+            "--size": f"{height}x{width}",
+            "--gaussians": str(self.gaussians),
+            "--seconds": f"{self.seconds:.0f}" if self.seconds >= 10 else f"{self.seconds:.2g}",
+            "--holdout": self.holdout,
+        }
+        words = [photos, *(word for option in options.items() for word in option)]
+        return " ".join(["qgs scene", *map(shlex.quote, words)])
+
+
+def held_out_frames(scene: Scene, holdout: str) -> tuple[int, ...]:
+    """Frames that are judged and never optimised on: every n-th of "n", none of NONE.
+
+    Raises ValueError for another text.
+    """
+    if holdout == NONE:
+        return ()
+    if not holdout.isdecimal() or int(holdout) < 2:
+        raise ValueError(f"--holdout must be none or every how many, such as 8; got {holdout!r}")
+    every = int(holdout)
+    return tuple(range(every // 2, len(scene), every)) or (len(scene) // 2,) * (len(scene) > 2)
+
+
+def shipped_models() -> list[str]:
+    """Names of the models that installed plugins ship and whose files are there."""
+    registry, _ = load_usable_plugins()
+    models = [pair for plugin in registry.plugins.values() for pair in plugin.models.items()]
+    return sorted(name for name, file in models if file.is_file())
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where the optimisation begins: a model's Gaussians (1, G), or none of a model.
+
+    world: reference pose (4, 4) and scale, as of `own_world`. quality: PSNR in dB on photos near
+    the inputs.
+    """
+
+    model: str
+    world: tuple[Tensor, Tensor]
+    gaussians: Gaussians | None = None
+    frames: Sequence[str] = ()
+    quality: float = 0.0
+
+
+def best_start(
+    scenes: Scenes, models: Sequence[str], seconds: float, device: str, console: Console
+) -> Start:
+    """The start of the model that renders photos near its inputs best.
+
+    No further model is tried once _SEARCH of `seconds` is spent. Raises ValueError for no model.
+    """
+    if not models:
+        raise ValueError(
+            "no trained model is installed: install query-gaussians-rooms, or name one (--model)"
+        )
+    began, starts = perf_counter(), list[Start]()
+    for model in models:
+        if starts and perf_counter() - began > _SEARCH * seconds:
+            break
+        starts.append(_start(scenes, model, device))
+    best = max(starts, key=lambda start: start.quality)
+    if len(starts) > 1:
+        scores = listed(f"{start.model} {start.quality:.2f} dB" for start in starts)
+        console.print(f"photos near the inputs: {scores}", highlight=False, style="dim")
+    return best
+
+
+def _start(scenes: Scenes, name: str, device: str) -> Start:
+    """What a model makes of the inputs that the user named, or else of those that it takes."""
+    model, scene, scale = load(name, device), scenes.probe, scenes.scale
+    views = resolve(model.recipe or {}).views
+    result = reconstruct(
+        model,
+        scenes.photos,
+        frames=scenes.inputs or choose_windows(scene, views, model.trained_on)[0][0],
+        compare=scenes.held,
+        scene=scenes.name,
+        overrides=scale_settings(scale),
+    )
+    inputs = result.sample.input_frames
+    others = [frame for frame in scenes.frames if frame not in inputs]
+    middle = sum(inputs) / len(inputs)
+    judged = sorted(others, key=lambda frame: abs(frame - middle))[:_JUDGED] or [*inputs]
+    photos = views_in(result.world, scene, tuple(judged)).to(device)
+    with torch.no_grad():
+        rendered = model.render(result.gaussians, photos.cameras).rgb
+    quality = float(psnr(rendered, photos.images).mean())
+    names = [scene.frame_name(frame) for frame in inputs]
+    return Start(name, result.world, result.gaussians, names, quality)
+
+
+class Scenes:
+    """The photos of `qgs scene` at any size.
+
+    probe: at a small size. held: frames that are judged, and frames: those that are optimised on.
+    inputs, scale: for the model, None where it chooses.
+    """
+
+    def __init__(
+        self, photos: str, name: str | None, holdout: str, inputs: str | None, scale: float | None
+    ) -> None:
+        self.photos, self.name, self.inputs, self.scale = photos, name, inputs, scale
+        self._sources = installed_sources()
+        found = self.at(None)
+        self.probe = self.at(sized(found, _PROBE))
+        self.held = held_out_frames(found, holdout)
+        self.frames = tuple(frame for frame in range(len(found)) if frame not in self.held)
+        self.probe.held_out = self.held
+
+    def at(self, size: Size | None) -> Scene:
+        """The scene with photos of this size (H, W)."""
+        return named_scene(
+            open_for(self.photos, size, None, self._sources)[0], self.photos, self.name
+        )
+
+
+def sized(scene: Scene, side: int) -> Size:
+    """(H, W) of whole photos of `scene` with this shorter side, never larger than stored."""
+    stored = scene.stored_size(0) or scene.cameras.size
+    factor = min(side / min(stored), 1.0)
+    height, width = (max(round(factor * length), 1) for length in stored)
+    return height, width
+
+
+def affordable(
+    step: float,
+    timed: Size,
+    timed_count: int,
+    scenes: Scenes,
+    seconds: float,
+    wanted: tuple[Size | None, int | None],
+) -> tuple[Size, int]:
+    """Photo size and number of Gaussians with which `seconds` are enough steps.
+
+    step: seconds of a step at the size `timed` with `timed_count` Gaussians; the time of others
+    follows by powers. wanted: what the user set, None where it is free.
+    """
+    steps = max(LEAST_STEPS, STEPS_OF_PHOTO * len(scenes.frames))
+    best: tuple[Size, int] | None = None
+    for size in _sizes(scenes.probe, wanted[0]):
+        count = wanted[1] or min(round(DENSITY * math.prod(size)), MOST_GAUSSIANS)
+        of_pixels = (math.prod(size) / math.prod(timed)) ** _OF_PIXELS
+        time = _COARSE * step * of_pixels * (count / timed_count) ** _OF_GAUSSIANS
+        if best is not None and steps * time > seconds:
+            break
+        best = size, count
+    assert best is not None
+    return best
+
+
+def _sizes(scene: Scene, wanted: Size | None) -> Iterator[Size]:
+    """The wanted size, else those of SIZES up to the stored one, ascending."""
+    if wanted is not None:
+        yield wanted
+        return
+    sizes = [sized(scene, side) for side in SIZES]
+    yield from dict.fromkeys(sizes)
