@@ -92,7 +92,7 @@ def test_the_site_is_built_without_a_warning(tmp_path) -> None:
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     done = subprocess.run(command, cwd=DOCS.parent, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    for page in ("recipes", "checks", "plugin", "api/contracts", "api/testing"):
+    for page in ("recipes", "api/checks", "plugin", "api/contracts", "api/testing"):
         assert (tmp_path / page / "index.html").is_file()
 
 
