@@ -69,6 +69,8 @@ def encoder_of(released: Released) -> MVSplatEncoder:
         cost_levels=len(options["costvolume_unet_channel_mult"]),
         depth_width=options["depth_unet_feat_dim"],
         depth_levels=len(options["depth_unet_channel_mult"]),
+        near=1.0,
+        far=100.0,
         features=options["d_feature"],
     )
     encoder = MVSplatEncoder(config, dims_of(released)).eval()

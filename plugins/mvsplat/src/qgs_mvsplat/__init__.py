@@ -7,6 +7,7 @@ from qgs_mvsplat.head import RayHead
 from qgs_mvsplat.mvsplat import MVSplatEncoder
 from qgs_mvsplat.pixels import OnRays, PixelQueries
 from qgs_mvsplat.two_depths import DecayedSupervision, Exchange
+from qgs_mvsplat.weights import MVSPLAT
 
 plugin = Plugin(
     name="mvsplat",
@@ -15,4 +16,24 @@ plugin = Plugin(
         *(MVSplatEncoder, PixelQueries, RayHead, OnRays),
         *(DepthSplatEncoder, WorldHead, Exchange, DecayedSupervision),
     ),
+    layouts=(MVSPLAT,),
+    examples=(
+        MVSplatEncoder.Config(
+            near=0.2,
+            far=3.0,
+            features=16,
+            candidates=4,
+            cost_width=32,
+            cost_levels=2,
+            depth_levels=2,
+        ),
+        RayHead.Config(opacity_exponent=1.0),
+        OnRays.Config(measure="depth"),
+    ),
+    exemptions={
+        MVSplatEncoder: {
+            "tokens_are_those_of_the_grid": "before training, instance norms over whole maps and "
+            "the softmax over depths spread what a pixel shows over its image"
+        }
+    },
 )

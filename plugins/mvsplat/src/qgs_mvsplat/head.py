@@ -21,6 +21,7 @@ from qgs_mvsplat.pixels import (
     TURN,
     degree_of,
     depths,
+    numbers_of,
     width_problems,
 )
 
@@ -67,7 +68,8 @@ class RayHead(Head):
 def _decoded(
     features_BND: Tensor, pixel_BN43: Tensor, turn_BN4: Tensor, config: RayHead.Config
 ) -> GaussianAttributes:
-    raw_BN1C, sh = features_BND[:, :, None, : sum(CHANNELS)], harmonics_of(features_BND)[:, :, None]
+    raw_BN1C = numbers_of(features_BND)[:, :, None, : sum(CHANNELS)]
+    sh = harmonics_of(features_BND)[:, :, None]
     log_depth, logit, place, scale, rotation = raw_BN1C.split(CHANNELS, -1)
     factor = config.scale_min + (config.scale_max - config.scale_min) * scale.sigmoid()
     size = SCALE_FACTOR * pixel_BN43[:, :, 2:].norm(dim=-1).sum(-1)[..., None, None]
@@ -78,14 +80,14 @@ def _decoded(
         opacities=mapped_opacity(logit[..., 0].sigmoid(), config.opacity_exponent),
         # Nothing is added for the colour of the photo: zeros are grey.
         colors=0.5 + SH_C0 * sh[..., 0, :],
-        sh=sh[..., 1:, :],
+        sh=sh[..., 1:, :].clone(),
     )
 
 
 def harmonics_of(features_BND: Tensor) -> Tensor:
     """Coefficients (B, N, K, 3) in the numbers of pixels, of degrees that are rendered."""
     degree, first = degree_of(features_BND.shape[-1]), sum(CHANNELS)
-    sh_BNC = features_BND[..., first : first + 3 * coefficients(degree)]
+    sh_BNC = numbers_of(features_BND)[..., first : first + 3 * coefficients(degree)]
     sh_BNK3 = rearrange(sh_BNC, "b n (x k) -> b n k x", x=3)
     return sh_BNK3[..., : coefficients(min(degree, SH_DEGREE)), :]
 

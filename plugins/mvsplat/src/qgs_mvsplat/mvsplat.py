@@ -1,7 +1,7 @@
 """`mvsplat/mvsplat`: CNN, window transformer, plane sweep and two U-Nets (arXiv 2403.14627)."""
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -19,9 +19,9 @@ from qgs.contracts import (
 )
 from qgs.geometry.precision import full_precision
 from qgs.types import Cameras, ImageMemory, Views
-from qgs_mvsplat.cnn import CNN
+from qgs_mvsplat.cnn import CNN, WIDTHS
 from qgs_mvsplat.convolutions import conv3, imagenet_normalized, resized, two_convolutions
-from qgs_mvsplat.pixels import CHANNELS, width_problems
+from qgs_mvsplat.pixels import width_problems
 from qgs_mvsplat.sweep import (
     cost_volume,
     cyclic_neighbours,
@@ -39,9 +39,9 @@ FACTOR = 4
 class Backbone(nn.Module):
     """Features of all views at 1/4 of the images, of the CNN and of the transformer behind it."""
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, stages: tuple[int, int, int]) -> None:
         super().__init__()
-        self.backbone = CNN(width, (2, 1))
+        self.backbone = CNN(width, (2, 1), stages)
         self.transformer = WindowTransformer(width)
 
     def forward(self, images_BV3HW: Tensor, neighbours_BVJ: Tensor) -> tuple[Tensor, Tensor]:
@@ -54,9 +54,9 @@ class Backbone(nn.Module):
 class MVSplatEncoder(Encoder):
     """Every pixel's depth and raw Gaussian, from features of all views and a plane sweep.
 
-    The memory has a token for each pixel. Its D numbers, the model's width, are those of
-    `qgs_mvsplat.pixels.CHANNELS` and harmonics: 86 for degree 4 (published). Views are compared in
-    their order; a single view is compared with itself.
+    The memory has a token for each pixel, or square of them. Its D numbers, the model's width, are
+    those of `qgs_mvsplat.pixels.CHANNELS` and harmonics: 86 for degree 4 (published). Views are
+    compared in their order; a single view is compared with itself.
     """
 
     name = "mvsplat"
@@ -64,14 +64,19 @@ class MVSplatEncoder(Encoder):
     writes = memory_fields("features", "grid")
 
     class Config(ComponentConfig):
+        cnn_widths: tuple[int, int, int] = WIDTHS
+        """Channels of the three stages of the CNN."""
         features: int = Field(default=128, ge=4, multiple_of=4)
         """Width of the features that the sweep compares."""
+        stride: Literal[1, 2, 4] = 1
+        """Pixels along the side of the square that has a Gaussian: 1 for one per pixel
+        (published)."""
         candidates: int = Field(default=128, ge=2)
         """Depths that the plane sweep compares, evenly in inverse depth from `near` to `far`."""
-        near: float = Field(default=1.0, gt=0)
-        """Least depth, world units."""
-        far: float = Field(default=100.0, gt=0)
-        """Largest depth, world units."""
+        near: float = Field(gt=0)
+        """Least depth, world units; 1 for RealEstate10K as published, with poses as they are."""
+        far: float = Field(gt=0)
+        """Largest depth, world units; 100 as published."""
         cost_width: int = Field(default=128, ge=32, multiple_of=32)
         """Channels of the U-Net over the cost volume."""
         cost_levels: int = Field(default=3, ge=1, le=6)
@@ -93,7 +98,7 @@ class MVSplatEncoder(Encoder):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.backbone = Backbone(config.features)
+        self.backbone = Backbone(config.features, config.cnn_widths)
         self.depth_predictor = DepthPredictor(config, dims.width)
 
     def forward(self, views: Views) -> ImageMemory:
@@ -106,7 +111,7 @@ class MVSplatEncoder(Encoder):
         )
         raw_BVCHW = self.predict(views, near, far)
         features = rearrange(raw_BVCHW, "b v c h w -> b (v h w) c")
-        return ImageMemory(features, grid=(count, *views.cameras.size))
+        return ImageMemory(features, grid=(count, raw_BVCHW.shape[3], raw_BVCHW.shape[4]))
 
     def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
         """Numbers of every pixel (B, V, C, H, W), for depths between `near` and `far`."""
@@ -132,7 +137,7 @@ class DepthPredictor(nn.Module):
     def __init__(self, config: MVSplatEncoder.Config, numbers: int) -> None:
         super().__init__()
         count, cost, fine = config.candidates, config.cost_width, config.depth_width
-        width, gaussian = config.features, numbers - sum(CHANNELS[:2])
+        width, gaussian = config.features, numbers - 2
         matched = count + width
         self.corr_refine_net = OverViews(
             *(conv3(matched, cost), group_norm(cost), nn.GELU()),
@@ -140,7 +145,8 @@ class DepthPredictor(nn.Module):
         )
         self.regressor_residual = nn.Conv2d(matched, count, 1)
         self.depth_head_lowres = two_convolutions(count, 2 * count, count)
-        upscale = nn.Upsample(scale_factor=FACTOR, mode="bilinear", align_corners=True)
+        self.stride, scale = config.stride, FACTOR // config.stride
+        upscale = nn.Upsample(scale_factor=scale, mode="bilinear", align_corners=True)
         # GELU comes behind the resizing, not in front of it.
         self.upsampler = nn.Sequential(conv3(2 * width, width), upscale, nn.GELU())
         self.proj_feature = conv3(width, fine)
@@ -160,8 +166,11 @@ class DepthPredictor(nn.Module):
         images_N3HW, cnn_NDhw = images_BV3HW.flatten(0, 1), cnn_BVDhw.flatten(0, 1)
         features_NDhw = features_BVDhw.flatten(0, 1)
         disparity_N1hw, confidence_N1hw = self.match(features_BVDhw, sweep)
-        disparity_N1HW = resized(disparity_N1hw, images_N3HW.shape[2:])
-        confidence_N1HW = F.interpolate(confidence_N1hw, scale_factor=FACTOR, mode="nearest")
+        if self.stride > 1:
+            images_N3HW = F.avg_pool2d(images_N3HW, self.stride)
+        size = images_N3HW.shape[2:]
+        disparity_N1HW = resized(disparity_N1hw, size)
+        confidence_N1HW = F.interpolate(confidence_N1hw, tuple(size), mode="nearest")
         full_NDHW = self.upsampler(torch.cat([features_NDhw, cnn_NDhw], 1))
         projected = self.proj_feature(full_NDHW)
         seen = torch.cat([images_N3HW, projected, disparity_N1HW, confidence_N1HW], 1)
@@ -209,8 +218,8 @@ def refined_log_depth(
 
 def _multiple(config: MVSplatEncoder.Config) -> int:
     """What sides of images are multiples of, in pixels: for windows and levels of U-Nets."""
-    levels = FACTOR * 2 ** (config.cost_levels - 1), 2 ** (config.depth_levels - 1)
-    return max(2 * FACTOR, *levels)
+    cost, depth = (2 ** (x - 1) for x in (config.cost_levels, config.depth_levels))
+    return max(2 * FACTOR, FACTOR * cost, config.stride * depth)
 
 
 def size_problems(multiple: int, context: RecipeContext) -> Iterable[Problem]:

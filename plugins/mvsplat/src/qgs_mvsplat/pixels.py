@@ -47,7 +47,12 @@ WIDTHS = {sum(CHANNELS) + 3 * coefficients(degree): degree for degree in (1, 2, 
 
 def degree_of(width: int) -> int:
     """Degree of the harmonics in the numbers of a pixel, D = `width`; those beyond are not read."""
-    return max(degree for least, degree in WIDTHS.items() if least <= width)
+    return max((degree for least, degree in WIDTHS.items() if least <= width), default=1)
+
+
+def numbers_of(features_BND: Tensor) -> Tensor:
+    """The numbers of pixels: features, with zeros for what a narrow model has no room for."""
+    return F.pad(features_BND, (0, max(0, min(WIDTHS) - features_BND.shape[-1])))
 
 
 def width_problems(context: RecipeContext) -> Iterable[Problem]:
@@ -83,12 +88,14 @@ class PixelQueries(Queries):
 @full_precision
 def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
     """Numbers of pixels, ordered by view, with their harmonics turned into the world."""
-    views, degree, first = rotation_BV33.shape[1], degree_of(features_BMD.shape[-1]), sum(CHANNELS)
-    last = first + 3 * coefficients(degree)
-    sh_BVPXK = features_BMD[..., first:last].unflatten(1, (views, -1)).unflatten(-1, (3, -1))
+    numbers_BMC, degree = numbers_of(features_BMD), degree_of(features_BMD.shape[-1])
+    views = rotation_BV33.shape[1]
+    first, last = sum(CHANNELS), sum(CHANNELS) + 3 * coefficients(degree)
+    sh_BVPXK = numbers_BMC[..., first:last].unflatten(1, (views, -1)).unflatten(-1, (3, -1))
     world = torch.einsum("bvkl,bvpxl->bvpxk", world_harmonics(rotation_BV33, degree), sh_BVPXK)
     world = world.flatten(1, 2).flatten(2)
-    return torch.cat([features_BMD[..., :first], world, features_BMD[..., last:]], -1)
+    changed = torch.cat([numbers_BMC[..., :first], world, numbers_BMC[..., last:]], -1)
+    return changed[..., : features_BMD.shape[-1]]
 
 
 @full_precision
