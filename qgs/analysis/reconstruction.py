@@ -13,7 +13,7 @@ from torch import Tensor
 from qgs.analysis.inputs import NOVEL, choose_windows, novel_frames
 from qgs.analysis.scale import FoundScale
 from qgs.contracts import Scene, ViewsConfig
-from qgs.data.domain import Domain
+from qgs.data.domain import SEARCHED, Domain, remedies
 from qgs.data.evaluation import ViewsOf
 from qgs.data.samples import Sample, make_sample, moments, own_world, spread
 from qgs.geometry.poses import relative_to, scaled
@@ -26,11 +26,6 @@ from qgs.wording import listed
 
 KINDS = ("input", "novel", "seen in training")
 """A compared view of a folder that the model was trained on is novel if it was held out."""
-OF_PHOTOS = (
-    "try another scale of the world (--scale), then inputs nearer to the views that are wanted "
-    "(--frames), or refine the result (--refine)"
-)
-"""Remedies where the nearest photo is better than a reconstruction."""
 
 
 def choose_frames(
@@ -151,7 +146,9 @@ class Reconstruction:
         if not rows:
             return ""
         model, nearest = (sum(values) / len(rows) for values in zip(*rows, strict=True))
-        remedy = "refine for longer, or on more photos" if self.refinement else OF_PHOTOS
+        tries = remedies(("baseline", "depth"), SEARCHED if self.scale else {})
+        remedy = f"{tries}; --refine SECONDS fits the result to its photos"
+        remedy = "refine for longer, or on more photos" if self.refinement else remedy
         return worse_than_nearest(Psnr.column, model, nearest, remedy)
 
     @property

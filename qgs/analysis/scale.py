@@ -84,8 +84,8 @@ class FoundScale:
         return {"result": self.text, "further_frames": list(self.further), "tried": tried}
 
 
-def summary(found: Collection[FoundScale]) -> str:
-    """One line on the scales of one or several windows, and how to set another."""
+def summary(found: Collection[FoundScale], option: str = "--scale FACTOR") -> str:
+    """One line on the scales of one or several windows, and the option that sets another."""
     first, ordered = next(iter(found)), sorted(scale.factor for scale in found)
     text = first.text
     if len(found) > 1:
@@ -98,7 +98,7 @@ def summary(found: Collection[FoundScale]) -> str:
     poor = sum(bool(scale.poor) for scale in found)
     rest = f", no scale fits {counted(poor, 'window')}" if poor and len(found) > 1 else ""
     seconds = sum(scale.seconds for scale in found)
-    return f"{text}{rest}, {seconds:.1f} s; --scale FACTOR sets another"
+    return f"{text}{rest}, in {seconds:.1f} s" + (f"; {option} sets another" if option else "")
 
 
 class ScaleSearch:

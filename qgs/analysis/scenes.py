@@ -14,7 +14,7 @@ from qgs.analysis.scale import ScaleSearch, photo_settings
 from qgs.composer import Recipe, resolve
 from qgs.composer.registry import load_usable_plugins
 from qgs.contracts import Component, Encoder, Scene, SceneSource, SceneSourceConfig, Split
-from qgs.data.domain import Domain, value_range_problem, verdict
+from qgs.data.domain import SEARCHED, Domain, value_range_problem, verdict
 from qgs.data.images import framing
 from qgs.data.recognition import is_training_data, open_for
 from qgs.data.samples import Sample, training_frames, views_in
@@ -119,17 +119,20 @@ def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
     """What a user must know of photos and result."""
     sample, found = result.sample, Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
-    likeness = verdict(result.model.trained_on or Domain(), found)
+    options = SEARCHED if result.scale else {}
+    likeness = verdict(result.model.trained_on or Domain(), found, options)
     poor = result.scale.poor if result.scale else ""
     kept = framing(scene, sample.input_frames[0])
     remarks = choice(sample, scene), likeness, poor, kept, result.worse_than_nearest
     return [*filter(None, remarks)]
 
 
-def choice(sample: Sample, scene: Scene) -> str:
-    """A sentence on the photos of `sample` and on those that `scene` holds out."""
+def choice(sample: Sample, scene: Scene, compares: bool = True) -> str:
+    """A sentence on the photos of `sample` and, if it compares, on those that `scene` holds out."""
     names = [[scene.frame_name(f) for f in s] for s in (sample.input_frames, sample.target_frames)]
     text = f"inputs {listed(names[0])}"
+    if not compares:
+        return text
     text += f", compared with {listed(names[1])}" if names[1] else ""
     held = f"{len(scene.held_out)} of {counted(len(scene), 'photo')} held out"
     return f"{text}; {held}, --holdout none holds none" if scene.held_out else text

@@ -51,7 +51,8 @@ ViewsSettings: TypeAlias = Annotated[
 Scale: TypeAlias = Annotated[
     float | None,
     typer.Option(
-        help="Factor of the cameras' translations; default: found, see `qgs reconstruct`."
+        help="Factor of the cameras' translations; default: the one of several at which the model "
+        "renders the inputs and photos between them best."
     ),
 ]
 TUNE_HELP = (

@@ -158,6 +158,5 @@ def show(result: Reconstruction, what: str, console: Console) -> None:
             table.add_section()
     console.print(table)
     found = [summary([result.scale])] if result.scale else []
-    console.print(
-        "\n".join([*found, *result.remarks]), soft_wrap=True, highlight=False, markup=False
-    )
+    for remark in (*found, *result.remarks):
+        console.print(remark, soft_wrap=True, highlight=False, markup=False)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -49,6 +49,8 @@ OF_SHOWN = {
     **{n: f"{n} of qgs reconstruct" for n in ("--frames", "--inputs")},
 }
 """The same for commands that choose the input views of photos themselves."""
+SEARCHED = {"--scale": ""}
+"""Where the best scale was searched: another one is no remedy."""
 
 
 @dataclass
@@ -108,24 +110,33 @@ class Domain:
 def verdict(trained: Domain, found: Domain, options: Mapping[str, str] = {}) -> str:
     """A sentence that compares views with the training's, and what may help.
 
-    trained: empty if unknown. options: other names of those of REMEDIES, such as OF_RECIPES.
+    trained: empty if unknown. options: as in `remedies`.
     """
     if not trained.values:
         return "the checkpoint does not record the views on which this model was trained"
     if outside := trained.differences(found):
-        remedies = [
-            f"{what} ({options.get(option, option)})"
-            for option, (what, helped) in REMEDIES.items()
-            if helped & outside.keys()
-        ]
         return (
             f"the views lie outside what this model was trained on: {', '.join(outside.values())}. "
-            f"The result may be poor: try {', then '.join(remedies)}, or train on views like these"
+            f"Expect a worse result than inside: {remedies(outside, options)}"
         )
     return (
         "the cameras lie within what this model was trained on, in distance, direction, depth and "
         "field of view; what they show may still be new to it"
     )
+
+
+def remedies(outside: Collection[str], options: Mapping[str, str] = {}) -> str:
+    """What to try where views leave the trained range in `outside`, of WORDS.
+
+    options: other names of those of REMEDIES, such as OF_RECIPES; one without a name is left out.
+    """
+    tries = [
+        f"{what} ({options.get(option, option)})"
+        for option, (what, helped) in REMEDIES.items()
+        if helped & {*outside} and options.get(option, option)
+    ]
+    last = "train on views like these"
+    return f"try {', then '.join(tries)}, or {last}" if tries else last
 
 
 def value_range_problem(images: Tensor) -> str:

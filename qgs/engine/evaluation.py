@@ -11,7 +11,7 @@ import torch
 from qgs.composer import Recipe
 from qgs.composer.registry import BUILTIN, component_failure
 from qgs.contracts import Column, Metric, MetricInput, SceneSource
-from qgs.data.domain import OF_RECIPES, Domain, verdict
+from qgs.data.domain import OF_RECIPES, SEARCHED, Domain, remedies, verdict
 from qgs.data.evaluation import (
     EvaluationPlan,
     SceneFailure,
@@ -31,12 +31,6 @@ from qgs.types import Gaussians, Views
 
 SECTIONS = ("plugins", "data", "views", "evaluation", "metrics")
 """Sections of a recipe that decide which views are scored, and how."""
-
-OF_OTHER_DATA = (
-    "try another scale of the world ({--scale}), then inputs nearer to the views that are wanted "
-    "({--frames}), or train on photos like these"
-)
-"""Remedies where a model is judged on data that it was not trained on."""
 
 
 def evaluate(
@@ -92,9 +86,10 @@ def evaluate(
         held_out=None if index else _held_out(source, scores),
         step=step,
     )
+    options = {**options, **(SEARCHED if recipe.views.scale == "search" else {})}
     likeness = "" if trained_on is None else verdict(trained_on, scorer.seen, options)
     own = recipe.tree["data"] == (model.recipe or {}).get("data")
-    remedy = "train for longer" if own else OF_OTHER_DATA.format_map(options)
+    remedy = "train for longer" if own else remedies(("baseline", "depth"), options)
     remarks = (likeness, plan.framing, *_remarks(evaluation, plan, recipe, remedy))
     return replace(evaluation, remarks=[*filter(None, remarks)])
 

@@ -12,7 +12,7 @@ import torch
 from commands import MODEL
 
 from qgs.composer import resolve
-from qgs.data.domain import KEY, OF_RECIPES, Domain, verdict
+from qgs.data.domain import KEY, OF_RECIPES, SEARCHED, Domain, verdict
 from qgs.data.evaluation import evaluation_samples
 from qgs.data.stream import MEASURED, trained_domain
 from qgs.engine.training import train
@@ -123,6 +123,7 @@ def test_what_helps_is_named_and_the_scale_comes_first(first, second, focal, opt
     text = verdict(trained, found)
     assert re.findall(r"--\w+", text) == options
     assert "--" not in verdict(trained, found, OF_RECIPES)
+    assert re.findall(r"--\w+", verdict(trained, found, SEARCHED)) == options[1:]
 
 
 def test_checkpoints_tell_what_they_were_trained_on_also_when_a_run_is_continued(tmp_path) -> None:

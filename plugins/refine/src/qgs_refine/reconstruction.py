@@ -10,6 +10,7 @@ from qgs.analysis.reconstruction import Reconstruction, reconstruct_sample
 from qgs.composer import Recipe
 from qgs.contracts import Scene
 from qgs.data.samples import Sample, training_frames, views_in
+from qgs.metrics.images import Psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, Views
 from qgs_refine.refining import refine
@@ -45,6 +46,7 @@ def refine_reconstruction(
         f"of {width} x {height} pixels, {start.gaussians.count:,} -> {result.gaussians.count:,} "
         "Gaussians",
         highlight=False,
+        soft_wrap=True,
     )
     record = {
         "seconds": result.seconds,
@@ -57,7 +59,27 @@ def refine_reconstruction(
     found = reconstruct_sample(
         start.model, sample, start.world, seen, result.gaussians, start.tuning, record
     )
-    return replace(found, remarks=[*filter(None, [found.worse_than_nearest])])
+    remarks = found.worse_than_nearest, _worse_than_before(start, found)
+    return replace(found, remarks=[*filter(None, remarks)])
+
+
+def _worse_than_before(start: Reconstruction, found: Reconstruction) -> str:
+    """A remark where the compared photos are nearer to the prediction than to its refinement."""
+    # PSNR falls with resolution: other sizes (--refine-size) are not compared
+    if start.rendering.rgb.shape != found.rendering.rgb.shape:
+        return ""
+    means = [
+        sum(novel) / len(novel)
+        for result in (start, found)
+        if (novel := [score.psnr for score in result.scores if score.kind != "input"])
+    ]
+    shown = Psnr.column.shown
+    if not means or not Psnr.column.beats(*means):
+        return ""
+    return (
+        f"the prediction is better on the compared photos, {shown(means[0])} against "
+        f"{shown(means[1])} dB: refine for longer (--refine SECONDS), or keep the prediction"
+    )
 
 
 def _photos(

@@ -17,7 +17,7 @@ from qgs.analysis.scale import ScaleSearch, photo_settings, summary
 from qgs.analysis.scenes import choice, chosen_scene, frame_list, named_scene
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Scene, ViewsConfig
-from qgs.data.domain import Domain, verdict
+from qgs.data.domain import SEARCHED, Domain, verdict
 from qgs.data.images import framing
 from qgs.data.recognition import is_training_data
 from qgs.data.samples import make_sample, own_world, views_in
@@ -269,9 +269,11 @@ def _of_model(name: str, wanted: Wanted) -> Source:
     found.see(sample.inputs.cameras, sample.targets.cameras)
     frames, scales = sample.input_frames, [*search.found.values()]
     notes = [
-        *([choice(sample, scene)] if unlike else []),
         *([summary(scales)] if scales else []),
-        *(verdict(trained, found), *(scale.poor for scale in scales), framing(scene, frames[0])),
+        *([choice(sample, scene, compares=False)] if unlike else []),
+        verdict(trained, found, SEARCHED if scales else {}),
+        *(scale.poor for scale in scales),
+        framing(scene, frames[0]),
     ]
     notes = [note for note in notes if note]
     # inputs that are chosen later keep the scale

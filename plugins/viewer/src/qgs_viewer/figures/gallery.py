@@ -5,7 +5,7 @@ from pathlib import Path
 
 from qgs.analysis.scale import ScaleSearch, summary
 from qgs.composer import resolve
-from qgs.data.domain import OF_SHOWN, Domain, verdict
+from qgs.data.domain import OF_SHOWN, SEARCHED, Domain, verdict
 from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.data.recognition import is_training_data
 from qgs.io.checkpoint import load
@@ -81,17 +81,16 @@ def open_exhibition(
     samples = sorted(samples, key=lambda sample: sample.scene != scene)
     exhibits, found, notes = [], Domain(), dict[str, list[str]]()
     found.see(samples[0].inputs.cameras, samples[0].targets.cameras)
+    options = {**OF_SHOWN, **(SEARCHED if search.found else {})}
     for name, model in models.items():
         exhibits.append(exhibit(name, model, samples[0], curves_of(files[name])))
-        if photos is not None and (
-            remark := verdict(model.trained_on or Domain(), found, OF_SHOWN)
-        ):
+        if photos is not None and (remark := verdict(model.trained_on or Domain(), found, options)):
             notes.setdefault(remark, []).append(name)
         if query is not None:
             exhibits[-1].notable(1, exhibits[-1].sample.inputs.cameras, query)
     remarks = [f"{', '.join(models)}: {remark}." for remark, models in notes.items()]
     if search.found:
-        remarks.append(f"{first}: {summary(search.found.values())}.")
+        remarks.append(f"{first}: {summary(search.found.values(), option='')}.")
     if recipe.views.scale == "auto":
         remarks.append(contest.AUTO_SCALE)
     depths = [true_depth(source, sample) for sample in samples]
