@@ -35,7 +35,7 @@ DENSITY = 0.6
 """Gaussians over pixels of a photo: twice as many gained less than their time."""
 MOST_GAUSSIANS = 500_000
 _OF_PIXELS, _OF_GAUSSIANS = 0.77, 0.3  # exponents of the time of a step, measured on CPUs
-_COARSE = 0.6  # time of a step over that at full size, in the mean over coarse levels and growth
+_COARSE = 0.9  # time of a step in the mean over coarse levels, over that of a start at full size
 _PROBE = 128  # shorter side with which a step is timed
 _SEARCH = 0.15  # part of the time in which models are compared
 _JUDGED = 4  # photos on which they are
@@ -72,16 +72,19 @@ class Plan:
 
 
 def held_out_frames(scene: Scene, holdout: str) -> tuple[int, ...]:
-    """Frames that are judged and never optimised on: every n-th of "n", none of NONE.
+    """Frames that are judged and never optimised on, as `data.holdout` chooses them.
 
-    Raises ValueError for another text.
+    holdout: NONE, or n for every n-th photo; a split of the photos' own goes first. Of two photos
+    none. Raises ValueError for another text.
     """
     if holdout == NONE:
         return ()
     if not holdout.isdecimal() or int(holdout) < 2:
         raise ValueError(f"--holdout must be none or every how many, such as 8; got {holdout!r}")
-    every = int(holdout)
-    return tuple(range(every // 2, len(scene), every)) or (len(scene) // 2,) * (len(scene) > 2)
+    every = min(int(holdout), len(scene))
+    if scene.held_out or len(scene) < 3:
+        return tuple(scene.held_out)
+    return tuple(range(every // 2, len(scene), every))
 
 
 def shipped_models() -> list[str]:
