@@ -32,10 +32,9 @@ BASELINES, BELOW, ABOVE = (0.06, 0.25), 2.0, 4.0
 """Baselines where those of the training are unknown; how far the search goes beyond both ends."""
 NEAREST, REACH = 0.8, 6.0
 """Least depth that cameras look at where that of the training is unknown; up to REACH times it."""
-PENALTY = 5.0
-"""dB for each e-fold by which the cameras look nearer than in training, for inputs alone."""
-POOR = 15.0
-"""dB of inputs alone below which the scale is not sure."""
+PENALTY, POOR = 5.0, 15.0
+"""Of inputs alone: dB for each e-fold by which depths are below those of the training; dB below
+which the scale is not sure."""
 PIXELS = 2**18
 """Of inputs in one forward pass, which bounds memory."""
 
@@ -61,20 +60,17 @@ class FoundScale:
     @property
     def poor(self) -> str:
         """A remark where no factor gave a good result, else ""."""
-        remedy = "; choose inputs that overlap more (--frames), or give the scale (--scale)"
+        remedy = "choose inputs that overlap more (--frames), or give the scale (--scale)"
         if self.further_psnr < self.nearest:
-            return (
-                f"no scale fits: {listed(self.names)} rendered at {self.further_psnr:.1f} dB, by "
-                f"the nearest input copied {self.nearest:.1f} dB{remedy}"
-            )
-        if not self.further and self.psnr < POOR:
-            return f"the scale is not sure, for lack of photos between the inputs{remedy}"
-        return ""
+            seen = f"{listed(self.names)} rendered at {self.further_psnr:.1f} dB"
+            return f"no scale fits, {seen}, by the nearest input at {self.nearest:.1f}: {remedy}"
+        unsure = not self.further and self.psnr < POOR
+        return f"the scale is not sure without photos between the inputs: {remedy}" * unsure
 
     @property
     def text(self) -> str:
         """Factor, photos and quality."""
-        judged = " and ".join(["the inputs", *([listed(self.names)] if self.names else [])])
+        judged = " and ".join(["the inputs", *filter(None, [listed(self.names)])])
         return f"scale {self.factor:.3g}, found on {judged}: {self.psnr:.1f} dB"
 
     @property
@@ -87,18 +83,15 @@ class FoundScale:
 def summary(found: Collection[FoundScale], option: str = "--scale FACTOR") -> str:
     """One line on the scales of one or several windows, and the option that sets another."""
     first, ordered = next(iter(found)), sorted(scale.factor for scale in found)
-    text = first.text
+    text, seconds = first.text, sum(scale.seconds for scale in found)
     if len(found) > 1:
-        photos = "inputs and further photos" if first.further else "inputs"
+        poor = sum(bool(scale.poor) for scale in found)
         mean = sum(scale.psnr for scale in found) / len(found)
         text = (
-            f"scale {ordered[0]:.3g} to {ordered[-1]:.3g}, found on the {photos} of "
-            f"{counted(len(found), 'window')}: {mean:.1f} dB"
-        )
-    poor = sum(bool(scale.poor) for scale in found)
-    rest = f", no scale fits {counted(poor, 'window')}" if poor and len(found) > 1 else ""
-    seconds = sum(scale.seconds for scale in found)
-    return f"{text}{rest}, in {seconds:.1f} s" + (f"; {option} sets another" if option else "")
+            f"scale {ordered[0]:.3g} to {ordered[-1]:.3g}, found on the inputs and photos beside "
+            f"them in {len(found)} windows: {mean:.1f} dB"
+        ) + f", no scale fits {counted(poor, 'window')}" * bool(poor)
+    return f"{text}, in {seconds:.1f} s" + f"; {option} sets another" * bool(option)
 
 
 class ScaleSearch:
