@@ -29,7 +29,7 @@ FURTHER = 2
 STEP, MOST = 1.6, 16
 """Ratio of neighbouring factors at first, and how many there are before the search goes finer."""
 BASELINES, BELOW, ABOVE = (0.06, 0.25), 2.0, 4.0
-"""Baselines where those of the training are unknown; how far the search goes beyond both ends."""
+"""Baselines where those of the training are unknown; how far the search goes past both ends."""
 NEAREST, REACH = 0.8, 6.0
 """Least depth that cameras look at where that of the training is unknown; up to REACH times it."""
 PENALTY, POOR = 5.0, 15.0
@@ -135,7 +135,7 @@ def find_scale(
 ) -> FoundScale:
     """Search the factor at which `model` renders inputs and `further_photos` of `scene` best.
 
-    Factors STEP apart cover what the trained ranges allow, and more beyond an end that is best;
+    Factors STEP apart cover what the trained ranges allow, and more past an end that is best;
     thirds of a step lie around the best, and the last one is the vertex of a parabola in log scale.
     Without further photos one of three or more inputs is judged and not given to the model; of two,
     factors that bring what the cameras look at nearer than in training lose PENALTY. Where the
@@ -156,7 +156,7 @@ def find_scale(
     try:
         best = trial.best(range(0, 3 * count, 3))
         if ratio > 1:
-            while (end := trial.beyond(best)) and len(trial.tried) < MOST:
+            while (end := trial.past(best)) and len(trial.tried) < MOST:
                 best = trial.best(end)
             best = trial.best([best + place for place in (-2, -1, 1, 2)])
             best = trial.best([best + trial.vertex(best)])
@@ -258,8 +258,8 @@ class _Trial:
             self.tried.update(zip(part, zip(*columns, strict=True), strict=True))
         return max(self.tried, key=self.score)
 
-    def beyond(self, place: float) -> Sequence[float]:
-        """Places beyond the ends of those that were tried, where `place` is such an end."""
+    def past(self, place: float) -> Sequence[float]:
+        """Places past the ends of those that were tried, where `place` is such an end."""
         low, high = min(self.tried), max(self.tried)
         return [low - 6, low - 3] if place == low else [high + 3, high + 6] * (place == high)
 
