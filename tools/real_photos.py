@@ -23,6 +23,7 @@ from qgs.analysis.inputs import choose_windows
 from qgs.analysis.scale import ScaleSearch, at_factors, constant_scale
 from qgs.cli.options import parse_size
 from qgs.contracts import Frames, Scene, ViewsConfig
+from qgs.data.domain import Domain
 from qgs.data.evaluation import held_out_windows
 from qgs.data.samples import Sample, make_sample, own_world
 from qgs.io.checkpoint import load
@@ -120,7 +121,7 @@ def chosen(
 ) -> Sequence[tuple[Frames, Frames]]:
     """Inputs and targets of at most `count` windows."""
     if not spans:
-        return choose_windows(scene, views, model.trained_on, count)
+        return choose_windows(scene, views, model.trained_on or Domain(), count)
     windows = held_out_windows(scene, views)
     step = math.ceil(len(windows) / count)
     return windows[::step]

@@ -18,7 +18,6 @@ from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.data.domain import TOLERANCE, Domain
 from qgs.data.samples import Sample, make_sample
 from qgs.geometry.poses import look_at_depth, scaled
-from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Views, map_tensors
@@ -32,9 +31,10 @@ BASELINES, BELOW, ABOVE = (0.06, 0.25), 2.0, 4.0
 """Baselines where those of the training are unknown; how far the search goes past both ends."""
 NEAREST, REACH = 0.8, 6.0
 """Least depth that cameras look at where that of the training is unknown; up to REACH times it."""
-PENALTY, POOR = 5.0, 15.0
-"""Of inputs alone: dB for each e-fold by which depths are below those of the training; dB below
-which the scale is not sure."""
+PENALTY = 5.0
+"""dB for each e-fold by which depths are below those of the training, for inputs alone."""
+POOR = 14.0
+"""dB of the judged photos below which no scale fits: then novel views have 12 dB in the mean."""
 PIXELS = 2**18
 """Of inputs in one forward pass, which bounds memory."""
 
@@ -43,29 +43,27 @@ PIXELS = 2**18
 class FoundScale:
     """The best factor of all translations, and the photos that it was found on.
 
-    psnr: mean of the inputs and, counted twice, of the `further` photos, in dB. further_psnr,
-    nearest: of the further photos rendered, and of the nearest input in their place; NaN without.
-    names: of their files. tried: each factor with its psnr.
+    psnr: mean of the inputs and, counted twice, of the `further` photos, in dB. names: of their
+    files. tried: each factor with its psnr.
     """
 
     factor: float
     psnr: float
     further: Frames
     names: Sequence[str]
-    further_psnr: float
-    nearest: float
     tried: Sequence[tuple[float, float]]
     seconds: float = field(compare=False)
 
     @property
     def poor(self) -> str:
-        """A remark where no factor gave a good result, else ""."""
-        remedy = "choose inputs that overlap more (--frames), or give the scale (--scale)"
-        if self.further_psnr < self.nearest:
-            seen = f"{listed(self.names)} rendered at {self.further_psnr:.1f} dB"
-            return f"no scale fits, {seen}, by the nearest input at {self.nearest:.1f}: {remedy}"
-        unsure = not self.further and self.psnr < POOR
-        return f"the scale is not sure without photos between the inputs: {remedy}" * unsure
+        """A remark where no factor gave a good result or the inputs alone decide, else ""."""
+        if self.psnr < POOR:
+            return (
+                f"no scale fits, at the best the photos are rendered at {self.psnr:.1f} dB: choose "
+                "inputs that overlap more (--frames), or give the scale (--scale)"
+            )
+        alone = "inputs alone can mislead the search: add photos between them, or give --scale"
+        return "" if self.further else alone
 
     @property
     def text(self) -> str:
@@ -162,14 +160,11 @@ def find_scale(
             best = trial.best([best + trial.vertex(best)])
     finally:
         model.train(training)
-    copied = psnr(nearest_input(sample.inputs, sample.targets.cameras), sample.targets.images)
     return FoundScale(
         factor=trial.factor(best),
         psnr=trial.psnr(best),
         further=further,
         names=[scene.frame_name(frame) for frame in further],
-        further_psnr=trial.tried[best][1],
-        nearest=float(copied.mean()),
         tried=sorted((trial.factor(place), trial.psnr(place)) for place in trial.tried),
         seconds=time.perf_counter() - began,
     )

@@ -1,7 +1,6 @@
 """The scale of photos in another unit is found, and is the same in all commands."""
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -130,7 +129,7 @@ def test_without_further_photos_an_input_is_judged_or_inputs_alone() -> None:
     three = find_scale(model, Walk(), (0, 2, 4), (1, 3, 5), views)
     assert three.further == (2,)
     two = find_scale(model, Walk(), (1, 4), (0, 2, 3, 5), views)
-    assert (two.further, math.isnan(two.nearest)) == ((), True)
+    assert two.further == ()
     assert two.poor
     search = ScaleSearch(model, views)
     chosen = search(Walk(), (0, 2, 4), (1, 3, 5))
@@ -147,12 +146,13 @@ def test_the_range_follows_the_unit_and_the_training() -> None:
 
 
 def test_words_of_several_windows() -> None:
-    one = FoundScale(0.4, 20.0, (3,), ["3.png"], 21.0, 15.0, [(0.4, 20.0)], 0.5)
-    bad = replace(one, factor=0.6, further_psnr=14.0, names=["4.png"])
+    one = FoundScale(0.4, 20.0, (3,), ["3.png"], [(0.4, 20.0)], 0.5)
+    bad = replace(one, factor=0.6, psnr=12.3)
     assert "0.4 to 0.6" in summary([one, bad])
     assert "1 window" in summary([one, bad])
     assert "3.png" in summary([one])
-    assert "4.png" in bad.poor
+    assert "12.3 dB" in bad.poor
+    assert "alone" in replace(one, further=()).poor
     assert not one.poor
 
 
