@@ -31,15 +31,19 @@ _ORIENTATION = 0x0112  # tag of EXIF
 
 @dataclass(frozen=True)
 class CropResize:
-    """A centre crop to the target's aspect ratio, then a resize; (H, W) in pixels."""
+    """A centre crop to the target's aspect ratio, then a resize; (H, W) in pixels.
+
+    zoom: a crop smaller than the largest one by this factor.
+    """
 
     source: tuple[int, int]
     target: tuple[int, int]
+    zoom: float = 1.0
 
     @property
     def scale(self) -> float:
         """Target pixels per source pixel, the same along both axes."""
-        return max(self.target[0] / self.source[0], self.target[1] / self.source[1])
+        return self.zoom * max(self.target[0] / self.source[0], self.target[1] / self.source[1])
 
     @property
     def box(self) -> tuple[float, float, float, float]:

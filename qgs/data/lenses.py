@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -11,6 +12,7 @@ from torch import Tensor
 
 Intrinsics: TypeAlias = tuple[float, float, float, float]
 Size: TypeAlias = tuple[int, int]
+MOST_ZOOM = 2.0
 _ROWS = 64  # that are undistorted at once
 
 Mode: TypeAlias = Literal["bilinear", "nearest"]
@@ -82,6 +84,48 @@ def _turn(*coefficients: float) -> float:
     return float(real.min()) if len(real) else math.inf
 
 
+def _in_photo(
+    directions: Tensor, intrinsics: Intrinsics, lens: Lens, size: Size
+) -> tuple[Tensor, Tensor]:
+    """Where the photo shows directions (..., 2), -1 to 1 across it, and whether it does."""
+    focal, centre = torch.tensor(intrinsics).to(directions).split(2)
+    # From the pinhole's pixel to the photo's: the distortion is given in this direction.
+    source = focal * lens.distorted(directions) + centre
+    grid = source / source.new_tensor(size[::-1]) * 2 - 1
+    return grid, lens.sees(directions) & (grid.abs() <= 1).all(-1)
+
+
+@lru_cache(maxsize=4096)
+def whole_zoom(intrinsics: Intrinsics, lens: Lens | None, size: Size, target: Size) -> float:
+    """The least zoom at which the middle of an undistorted photo has no black edges.
+
+    intrinsics: in pixels of the photo, of `size` (H, W), whose middle of the aspect of `target` is
+    shown. As COLMAP's undistorter chooses cameras by default (blank_pixels 0). 1 where even
+    MOST_ZOOM leaves some.
+    """
+    if lens is None:
+        return 1.0
+    side, reach = torch.linspace(-1, 1, 65).double(), max(target[i] / size[i] for i in (0, 1))
+    ends = torch.ones_like(side)
+    edges = [(side, ends), (side, -ends), (ends, side), (-ends, side)]
+    border = torch.cat([torch.stack(edge, -1) for edge in edges])
+    middle, half = (torch.tensor(x[::-1]).double() / 2 for x in (size, target))
+    focal, centre = torch.tensor(intrinsics).double().split(2)
+
+    def whole(zoom: float) -> bool:
+        # resampling reads a pixel beyond the crop
+        points = middle + border * (half / reach / zoom + (zoom > 1))
+        return bool(_in_photo((points - centre) / focal, intrinsics, lens, size)[1].all())
+
+    if whole(1.0) or not whole(MOST_ZOOM):
+        return 1.0
+    low, high = 1.0, MOST_ZOOM
+    for _ in range(16):
+        mean = (low + high) / 2
+        low, high = (low, mean) if whole(mean) else (mean, high)
+    return high
+
+
 def undistorted(
     pixels: np.ndarray, intrinsics: Intrinsics, lens: Lens | None, mode: Mode = "bilinear"
 ) -> np.ndarray:
@@ -101,10 +145,7 @@ def undistorted(
     for top in range(0, height, _ROWS):  # photos of phones would take gigabytes at once
         block = slice(top, top + _ROWS)
         directions = torch.stack(torch.broadcast_tensors(x, y[block]), -1)  # (rows, W, 2)
-        # From the pinhole's pixel to the photo's: the distortion is given in this direction.
-        source = focal * lens.distorted(directions) + centre
-        grid = source / torch.tensor([width, height]) * 2 - 1  # -1 to 1 across the photo
-        seen = lens.sees(directions) & (grid.abs() <= 1).all(-1)
+        grid, seen = _in_photo(directions, intrinsics, lens, (height, width))
         flat = F.grid_sample(
             planes[None], grid[None], mode=mode, padding_mode="border", align_corners=False
         )[0]

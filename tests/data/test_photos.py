@@ -11,7 +11,7 @@ from photo_formats import row_of_frames
 from PIL import Image
 
 from qgs.data.images import CropResize
-from qgs.data.lenses import RadialTangential
+from qgs.data.lenses import Fisheye, RadialTangential, undistorted
 
 GLOBAL = {"fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
 
@@ -132,10 +132,27 @@ def test_where_the_lens_would_fold_the_photo_it_sees_nothing(tmp_path, model):
     turn = math.sqrt(1 / 1.8) if model == "OPENCV" else math.tan(math.sqrt(1 / 1.8))
     wide: dict = {"fl_x": 30.0, "fl_y": 30.0, "cx": 32.0, "cy": 24.0}
     path = folder(tmp_path, camera_model=model, k1=-0.6, **wide)
-    image = opened(path, image_size=(48, 64)).scenes("train")[0].images([2])[0]
+    lens = (RadialTangential if model == "OPENCV" else Fisheye)(k1=-0.6)
+    image = undistorted(np.ones((48, 64), np.uint8), (30.0, 30.0, 32.0, 24.0), lens)
     reach = math.ceil(30 * turn - 0.5)
-    assert (image[:, 24, 32 + reach :] == 0).all()
-    assert (image[2, 24, 32 : 32 + reach] > 0).all()
+    assert not image[24, 32 + reach :].any()
+    assert image[24, 32 : 32 + reach].all()
+    assert (opened(path, image_size=(48, 64)).scenes("train")[0].images([2])[0, 2] > 0).all()
+
+
+@pytest.mark.parametrize("size", [(48, 64), (24, 24)])
+def test_black_edges_of_undistorted_photos_are_cut_off(tmp_path, size):
+    distorted = folder(tmp_path, k1=0.9, cx=36.0, cy=24.0)
+    pixels = np.zeros((48, 64, 3), np.uint8)
+    pixels[:, :, 0], pixels[:, :, 1] = np.arange(64) * 3 + 9, 255
+    Image.fromarray(pixels).save(tmp_path / "images" / "0.png")
+    scene = opened(distorted, image_size=size).scenes("train")[0]
+    image, (fx, fy, cx, cy) = scene.images([0])[0] * 255, scene.cameras.intrinsics[0].tolist()
+    assert (image[1] > 240).all()  # resampling overshoots a little
+    row, column = size[0] // 2, size[1] - 4  # a pixel still shows what its camera says
+    x, y = (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy
+    expected = 36 + 100 * x * (1 + 0.9 * (x * x + y * y)) - 0.5
+    assert image[0, row, column].item() == pytest.approx(3 * expected + 9, abs=3)
 
 
 @pytest.mark.parametrize("place", range(5))

@@ -25,7 +25,7 @@ from qgs.data.images import (
     open_rgb,
     to_tensor,
 )
-from qgs.data.lenses import Mode, Size, undistorted
+from qgs.data.lenses import Mode, Size, undistorted, whole_zoom
 from qgs.data.paths import is_local, opened_path, read_file
 from qgs.data.photos import formats_of, read_listing, readers
 from qgs.data.photos.checks import refuse_fatal_problems, size_problems
@@ -109,7 +109,7 @@ class PhotoScene(EncodedScene):
                 known[kind] = _checked(image_size(frame.path), frame, frame.path)
             size = known[kind]
             stored = torch.tensor(frame.at_size(size), dtype=torch.float64)
-            intrinsics.append(CropResize(size, self._config.image_size).intrinsics(stored))
+            intrinsics.append(self._crop(frame, size).intrinsics(stored))
         c2w = torch.from_numpy(np.stack([frame.c2w for frame in self._frames]))
         return Cameras(c2w, torch.stack(intrinsics), self._config.image_size)
 
@@ -191,7 +191,13 @@ class PhotoScene(EncodedScene):
             pixels = undistorted(np.array(image), frame.at_size(size), frame.lens, mode)
             image = Image.fromarray(pixels)
         kernel = Image.Resampling.NEAREST if mode == "nearest" else Image.Resampling.LANCZOS
-        return CropResize(size, self._config.image_size).image(image, kernel)
+        return self._crop(frame, size).image(image, kernel)
+
+    def _crop(self, frame: PhotoFrame, size: Size) -> CropResize:
+        """Of a photo of `size` without distortion: what the lens did not see is cut off."""
+        target = self._config.image_size
+        zoom = whole_zoom(frame.at_size(size), frame.lens, size, target)
+        return CropResize(size, target, zoom)
 
 
 def _whole_mask(frame: PhotoFrame) -> np.ndarray:

@@ -11,8 +11,8 @@ from PIL import Image
 from torch import Tensor
 
 from qgs.contracts import Scene
-from qgs.data.images import decode_mask, decode_rgb
-from qgs.data.lenses import undistorted
+from qgs.data.images import CropResize, decode_mask, decode_rgb
+from qgs.data.lenses import undistorted, whole_zoom
 from qgs.data.scenes import EncodedFrame, EncodedScene
 
 ChunkEntry: TypeAlias = dict[str, Any]
@@ -68,6 +68,13 @@ def _stored(scene: EncodedScene, index: int, encoding: Encoding) -> tuple[Encode
     if frame.lens is not None:
         pixels = undistorted(pixels, frame.intrinsics, frame.lens)
         mask = None if mask is None else undistorted(mask, frame.intrinsics, frame.lens)
+        zoom = whole_zoom(frame.intrinsics, frame.lens, frame.size, frame.size)
+        if zoom > 1:
+            crop = CropResize(frame.size, frame.size, zoom)
+            own = crop.intrinsics(torch.tensor(frame.intrinsics, dtype=torch.float64)).tolist()
+            frame = replace(frame, intrinsics=tuple(own))
+            pixels = crop.image(Image.fromarray(pixels))
+            mask = None if mask is None else crop.image(Image.fromarray(mask))
     mask_file = None if mask is None else _file(mask)
     return replace(frame, data=encoding.image(pixels), lens=None, mask=mask_file), False
 
