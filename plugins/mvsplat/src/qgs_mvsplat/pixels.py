@@ -145,12 +145,16 @@ class OnRays(Centers):
 
 @full_precision
 def _placed(offsets_BNK3: Tensor, pixel_BN43: Tensor, distance: bool) -> Tensor:
-    origin, corner, across, down = pixel_BN43[:, :, None].unbind(-2)
-    u, v = offsets_BNK3[..., :2].sigmoid()[..., None].unbind(-2)
-    direction = corner + u * across + v * down
-    if distance:
-        direction = F.normalize(direction, dim=-1)
-    return origin + depths(offsets_BNK3[..., 2:]) * direction
+    directions = ray_directions(offsets_BNK3[..., :2], pixel_BN43, distance)
+    return pixel_BN43[:, :, None, 0] + depths(offsets_BNK3[..., 2:]) * directions
+
+
+def ray_directions(place_BNK2: Tensor, pixel_BN43: Tensor, unit: bool) -> Tensor:
+    """Of rays through raw places in pixels (B, N, K, 3): of length 1, or of z = 1."""
+    _, corner, across, down = pixel_BN43[:, :, None].unbind(-2)
+    u, v = place_BNK2.sigmoid()[..., None].unbind(-2)
+    directions = corner + u * across + v * down
+    return F.normalize(directions, dim=-1) if unit else directions
 
 
 def depths(log_depth: Tensor) -> Tensor:
