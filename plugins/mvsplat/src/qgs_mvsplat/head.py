@@ -96,5 +96,7 @@ def mapped_opacity(p: Tensor, exponent: float) -> Tensor:
     """Opacities of probabilities; those themselves for an exponent of 0."""
     if exponent == 0:
         return p
-    power = 2.0**exponent
-    return 0.5 * (1 - (1 - p) ** power + p ** (1 / power))
+    power, inside = 2.0**exponent, (p > 0) & (p < 1)
+    # 0 and 1 stay as they are; there the slope of the map may be infinite.
+    q = torch.where(inside, p, 0.5)
+    return torch.where(inside, 0.5 * (1 - (1 - q) ** power + q ** (1 / power)), p)
