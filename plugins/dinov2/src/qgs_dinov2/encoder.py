@@ -42,8 +42,8 @@ class DinoMultiViewViT(MultiViewViT):
     class Config(MultiViewViT.Config):
         patch_size: int = Field(default=16, ge=1)
         """Side of a patch, pixels of the photos; must divide both sides of the image."""
-        vit: VitConfig = VitConfig()
-        """DINOv2's sizes and weights."""
+        vit: VitConfig
+        """DINOv2's sizes and weights; `{}` for a ViT-S that starts from random numbers."""
 
     config: Config
 

@@ -1,5 +1,7 @@
 """MVSplat and DepthSplat for qgs: depth from a plane sweep, one Gaussian per pixel."""
 
+from qgs_dinov2.vit import VitConfig
+
 from qgs.contracts import Plugin
 from qgs_mvsplat.depthsplat_encoder import DepthSplatEncoder
 from qgs_mvsplat.depthsplat_head import WorldHead
@@ -8,6 +10,19 @@ from qgs_mvsplat.mvsplat import MVSplatEncoder
 from qgs_mvsplat.pixels import OnRays, PixelQueries
 from qgs_mvsplat.two_depths import DecayedSupervision, Exchange
 from qgs_mvsplat.weights import MVSPLAT
+
+_SMALL = DepthSplatEncoder.Config(
+    features=32,
+    cnn=(8, 16, 16),
+    candidates=16,
+    vit=VitConfig(width=16, depth=4, heads=2),
+    blocks=(0, 1, 2, 3),
+    dpt=(8, 8, 8, 16),
+    full_features=8,
+    regressor=8,
+)
+
+_TWO_SCALES = _SMALL.model_copy(update={"features": 64, "scales": 2, "coarse_depth": True})
 
 plugin = Plugin(
     name="mvsplat",
@@ -28,13 +43,25 @@ plugin = Plugin(
             cost_levels=1,
             depth_levels=1,
         ),
+        _SMALL,
+        _TWO_SCALES,
         RayHead.Config(opacity_exponent=1.0),
         OnRays.Config(measure="depth"),
+        WorldHead.Config(scale_max=0.1),
+        DecayedSupervision.Config(layers=(1, 2), decay=0.5),
     ),
     exemptions={
         MVSplatEncoder: {
             "tokens_are_those_of_the_grid": "before training, instance norms over whole maps and "
             "the softmax over depths spread what a pixel shows over its image"
-        }
+        },
+        DepthSplatEncoder: {
+            "parameters_learn": "zeros start behind each other, in the blocks and at the end of a "
+            "U-Net and at the end of a correction, and each takes a step to open"
+        },
+        _TWO_SCALES: {
+            "gradients_match_differences": "the second sweep takes the first one's depths without "
+            "their gradient"
+        },
     },
 )

@@ -44,8 +44,9 @@ GAUSSIAN_CHANNELS = 1 + 2 + 3 + 4
 class DepthSplatConfig(ComponentConfig):
     """DepthSplatConfig of the networks: by default of the small model on RealEstate10K."""
 
-    features: int = Field(default=128, ge=16, multiple_of=16)
-    """Channels of the multi-view features and of the first cost volume's networks."""
+    features: int = Field(default=128, ge=32, multiple_of=32)
+    """Channels of the multi-view features and of the first cost volume's networks; half as many in
+    the second's."""
     cnn: tuple[Width, Width, Width] = WIDTHS
     """Channels of the three stages of the CNN."""
     candidates: int = Field(default=128, ge=16, multiple_of=8)
@@ -57,9 +58,9 @@ class DepthSplatConfig(ComponentConfig):
     """Pixels a side of a feature of the first sweep."""
     neighbours: int = Field(default=2, ge=1)
     """Views that each view is matched with where there are more than three: the nearest."""
-    vit: VitConfig = VitConfig()
-    """DINOv2's sizes and weights."""
-    blocks: tuple[Block, Block, Block, Block] = (2, 5, 8, 11)
+    vit: VitConfig
+    """DINOv2's sizes and weights; `{}` for a ViT-S that starts from random numbers."""
+    blocks: tuple[Block, Block, Block, Block] = Field(default=(2, 5, 8, 11), validate_default=True)
     """Blocks of the ViT whose tokens are read, 0 for the first; ViT-L: 4, 11, 17, 23."""
     dpt: tuple[Width, Width, Width, Width] = (48, 96, 192, 384)
     """Channels of both DPT heads at 1/2, 1/4, 1/8 and 1/16; ViT-B: 96, 192, 384, 768; ViT-L: 128,

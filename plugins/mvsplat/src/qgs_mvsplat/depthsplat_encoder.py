@@ -57,6 +57,9 @@ class DepthSplatEncoder(Encoder):
             width = context.dims.width
             reason = f"a model of width {width} has no room for a coarse depth"
             yield Problem("coarse_depth", reason, f"set model.width to {width + 1}")
+        if config.features % (32 * config.scales):
+            reason = f"{config.features} features make no heads of 32 channels in both scales"
+            yield Problem("features", reason, "write a multiple of 64")
         yield from width_problems(context)
         yield from size_problems(_multiple(config), context)
 
