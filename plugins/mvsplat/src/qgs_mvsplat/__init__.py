@@ -5,6 +5,7 @@ from qgs_dinov2.vit import VitConfig
 from qgs.contracts import Plugin
 from qgs_mvsplat.depthsplat_encoder import DepthSplatEncoder
 from qgs_mvsplat.depthsplat_head import WorldHead
+from qgs_mvsplat.depthsplat_weights import DEPTHSPLAT
 from qgs_mvsplat.head import RayHead
 from qgs_mvsplat.mvsplat import MVSplatEncoder
 from qgs_mvsplat.pixels import OnRays, PixelQueries
@@ -50,6 +51,7 @@ plugin = Plugin(
         WorldHead.Config(scale_max=0.1),
         DecayedSupervision.Config(layers=(1, 2), decay=0.5),
     ),
+    layouts=(DEPTHSPLAT,),
     exemptions={
         MVSplatEncoder: {
             "tokens_are_those_of_the_grid": "before training, instance norms over whole maps and "
