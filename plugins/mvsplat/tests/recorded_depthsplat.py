@@ -36,6 +36,8 @@ def encoder_of(released: Released) -> DepthSplatEncoder:
     """The encoder with the options and the weights of a file."""
     options = released.options
     config = DepthSplatEncoder.Config(
+        near=0.5,
+        far=100.0,
         scales=options["num_scales"],
         stride=options["lowest_feature_resolution"],
         neighbours=options["local_mv_match"],

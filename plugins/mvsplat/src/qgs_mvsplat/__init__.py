@@ -13,6 +13,8 @@ from qgs_mvsplat.two_depths import DecayedSupervision, Exchange
 from qgs_mvsplat.weights import MVSPLAT
 
 _SMALL = DepthSplatEncoder.Config(
+    near=0.2,
+    far=3.0,
     features=32,
     cnn=(8, 16, 16),
     candidates=16,
@@ -32,7 +34,7 @@ plugin = Plugin(
         *(MVSplatEncoder, PixelQueries, RayHead, OnRays),
         *(DepthSplatEncoder, WorldHead, Exchange, DecayedSupervision),
     ),
-    layouts=(MVSPLAT,),
+    layouts=(MVSPLAT, DEPTHSPLAT),
     examples=(
         MVSplatEncoder.Config(
             near=0.2,
@@ -51,7 +53,6 @@ plugin = Plugin(
         WorldHead.Config(scale_max=0.1),
         DecayedSupervision.Config(layers=(1, 2), decay=0.5),
     ),
-    layouts=(DEPTHSPLAT,),
     exemptions={
         MVSplatEncoder: {
             "tokens_are_those_of_the_grid": "before training, instance norms over whole maps and "

@@ -34,10 +34,10 @@ class DepthSplatEncoder(Encoder):
     writes = memory_fields("features", "grid")
 
     class Config(DepthSplatConfig):
-        near: float = Field(default=0.5, gt=0)
-        """Least depth, world units."""
-        far: float = Field(default=100.0, gt=0)
-        """Largest depth, world units; 200 on DL3DV."""
+        near: float = Field(gt=0)
+        """Least depth, world units; 0.5 as published, with poses as they are."""
+        far: float = Field(gt=0)
+        """Largest depth, world units; 100 for RealEstate10K, 200 for DL3DV as published."""
         coarse_depth: bool = False
         """Whether the last of the D numbers is the logarithm of the first sweep's depth, for
         `mvsplat/exchange`; of two scales, in a model wider than the other numbers (published:

@@ -15,7 +15,7 @@ from qgs.geometry.precision import full_precision
 from qgs.types import GaussianAttributes, QueryState
 from qgs_mvsplat.adapter import camera_quaternions, world_quaternions
 from qgs_mvsplat.head import harmonics_of
-from qgs_mvsplat.pixels import CHANNELS, PIXEL_FIELDS, TURN, width_problems
+from qgs_mvsplat.pixels import CHANNELS, PIXEL_FIELDS, TURN, numbers_of, width_problems
 
 SCALE_SHIFT = 4.0
 """Taken off a raw scale, so that scales start at softplus(-4) = 0.018."""
@@ -55,7 +55,8 @@ class WorldHead(Head):
 def _decoded(
     features_BND: Tensor, turn_BN4: Tensor, config: WorldHead.Config
 ) -> GaussianAttributes:
-    raw_BN1C, sh = features_BND[:, :, None, : sum(CHANNELS)], harmonics_of(features_BND)[:, :, None]
+    raw_BN1C = numbers_of(features_BND)[:, :, None, : sum(CHANNELS)]
+    sh = harmonics_of(features_BND)[:, :, None]
     log_depth, logit, place, scale, rotation = raw_BN1C.split(CHANNELS, -1)
     return GaussianAttributes(
         offsets=torch.cat([place, log_depth], -1),
@@ -64,5 +65,5 @@ def _decoded(
         opacities=logit[..., 0].sigmoid(),
         # The colour of the photo is in the constant already.
         colors=0.5 + SH_C0 * sh[..., 0, :],
-        sh=sh[..., 1:, :],
+        sh=sh[..., 1:, :].clone(),
     )

@@ -73,11 +73,9 @@ def _read(shapes: Shapes) -> dict[str, Any]:
         "centers": {"type": "mvsplat/on_rays", "measure": "depth"},
         "supervision": supervision if two else {"type": "qgs/layers", "layers": [0]},
     }
-    losses = {
-        "photometric": {"type": "qgs/photometric", "mse_weight": 1.0, "ssim_weight": 0.0},
-        "lpips": {"type": "qgs/lpips", "weight": 0.05},
-    }
+    photometric = {"type": "qgs/photometric", "mse_weight": 1.0, "ssim_weight": 0.0}
     views = {"scale": "constant", "scale_factor": 1.0}
+    losses = {"photometric": photometric}
     plugins = ["mvsplat"]
     return {"recipe": 1, "plugins": plugins, "model": model, "views": views, "losses": losses}
 
@@ -98,7 +96,8 @@ DEPTHSPLAT = WeightLayout(
         "near and far: 0.5 and 100, of RealEstate10K (DL3DV: 0.5 and 200)",
         "views that each is matched with: the nearest 2",
         "bounds of the scales: the release's",
-        "losses: mean squared error and 0.05 LPIPS, of both depths where there are two",
+        "losses: mean squared error of both depths where there are two, to which the release adds "
+        "0.05 LPIPS (plugin `lpips`)",
         "scale of the world: as given; renderer, training: the framework's defaults",
     ),
 )

@@ -89,7 +89,7 @@ def harmonics_of(features_BND: Tensor) -> Tensor:
     degree, first = degree_of(features_BND.shape[-1]), sum(CHANNELS)
     sh_BNC = numbers_of(features_BND)[..., first : first + 3 * coefficients(degree)]
     sh_BNK3 = rearrange(sh_BNC, "b n (x k) -> b n k x", x=3)
-    return sh_BNK3[..., : coefficients(min(degree, SH_DEGREE)), :].clone()
+    return sh_BNK3[..., : coefficients(min(degree, SH_DEGREE)), :]
 
 
 def mapped_opacity(p: Tensor, exponent: float) -> Tensor:
