@@ -150,12 +150,12 @@ def test_more_time_buys_larger_photos_and_more_gaussians(photos: Path) -> None:
     scenes = Scenes(str(photos), None, "8", None, None)
     scenes.probe.stored_size = lambda frame: (720, 1280)  # type: ignore[method-assign]
     step, free = 0.01, (None, None)
-    sizes = [affordable(step, (128, 128), 2048, scenes, t, free) for t in (1, 60, 600, 1e9)]
+    sizes = [affordable(step, (128, 128), 2048, scenes, t, free) for t in (1, 120, 1200, 1e9)]
     assert sizes == sorted(sizes)
-    assert [size for size, _ in sizes][::3] == [(64, 114), (720, 1280)]
+    assert [size for size, _ in sizes][::3] == [(96, 171), (720, 1280)]
     assert len({size for size, _ in sizes}) == 4
     assert affordable(step, (128, 128), 2048, scenes, 1, ((90, 160), 77)) == ((90, 160), 77)
-    assert step * LEAST_STEPS < 60
+    assert step * LEAST_STEPS < 120
 
 
 def test_photos_are_never_enlarged(photos: Path) -> None:
