@@ -37,12 +37,11 @@ DISTRIBUTIONS = {
     },
     "qgs.commands": {
         "data": "query-gaussians-datatools",
-        "compare": "query-gaussians-studies",
-        "study": "query-gaussians-studies",
         "bench": "query-gaussians-bench",
         "import": "query-gaussians-published",
         "scene": "query-gaussians-refine",
     }
+    | dict.fromkeys(("compare", "diff", "study"), "query-gaussians-studies")
     | dict.fromkeys(("view", "demo", "report", "figures"), "query-gaussians-viewer")
     | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),
     "qgs.jobs": {"slurm": "query-gaussians-studies"},

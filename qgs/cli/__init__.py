@@ -24,6 +24,7 @@ HELP = {
     "demo": "Trained models on rooms unseen in training, or on your photos; writes report.html.",
     "report": "Evaluate trained models and show their scenes side by side; writes report.html.",
     "figures": "Figures of trained models for a paper, as PDF and PNG.",
+    "diff": "Which slots and options of two recipes differ, and what that costs in parameters.",
     "compare": "Compare the results of the first RUN with those of each other, scene by scene.",
     "study": (
         "Train every variant with every seed, evaluate all by one protocol, and compare the scores."
@@ -96,7 +97,6 @@ app = typer.Typer(
 COMMANDS = {
     "list": inspect.list_components,
     "compose": inspect.compose,
-    "diff": inspect.diff,
     "schema": inspect.schema,
     "recipes": inspect.recipes,
     "train": train.train,

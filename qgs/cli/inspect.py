@@ -1,4 +1,4 @@
-"""`qgs list`, `qgs compose`, `qgs diff`, `qgs schema`, `qgs recipes`: recipes and components."""
+"""`qgs list`, `qgs compose`, `qgs schema`, `qgs recipes`: recipes and components."""
 
 import json
 from itertools import takewhile
@@ -9,7 +9,6 @@ import typer
 from rich.console import Console
 
 from qgs.cli.options import Overrides
-from qgs.wording import short_names
 
 RecipeFile: TypeAlias = Annotated[Path, typer.Argument(help="Recipe file.")]
 
@@ -49,25 +48,6 @@ def compose(recipe: RecipeFile, overrides: Overrides = None) -> None:
     Console(stderr=True).print(parameter_table(resolved, model))
     for warning in resolved.warnings:
         typer.echo(f"warning: {warning}", err=True)
-
-
-def diff(
-    first: RecipeFile,
-    second: RecipeFile,
-    set_a: Annotated[
-        list[str] | None, typer.Option("--set-a", help="Override of the first; repeatable.")
-    ] = None,
-    set_b: Annotated[
-        list[str] | None, typer.Option("--set-b", help="Override of the second; repeatable.")
-    ] = None,
-) -> None:
-    """Which slots and options of two recipes differ, and what that costs in parameters."""
-    from qgs.cli.tables import difference_tables
-    from qgs.composer import resolve
-
-    resolved = resolve(first, set_a or ()), resolve(second, set_b or ())
-    for table in difference_tables(*resolved, *short_names([first, second])):
-        Console().print(table)
 
 
 def schema(

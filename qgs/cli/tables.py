@@ -1,4 +1,4 @@
-"""Tables of `qgs list`, `qgs compose` and `qgs diff`."""
+"""Tables of `qgs list` and `qgs compose`."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -12,7 +12,6 @@ from qgs.analysis.shown import parameter_counts
 from qgs.composer import Recipe
 from qgs.composer.decode import SETTINGS
 from qgs.composer.errors import did_you_mean
-from qgs.composer.recipe import differing_options
 from qgs.composer.registry import Registry, default_config
 from qgs.composer.schema import recipe_schema
 from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SLOTS
@@ -26,7 +25,7 @@ _WORDS = {"string": "text", "boolean": "true or false", "object": "mapping"}
 _BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
 
 
-def _table(title: str, *columns: str, right: int = 0) -> Table:
+def folded_table(title: str, *columns: str, right: int = 0) -> Table:
     """A table with folded cells; its last `right` columns are aligned to the right."""
     table = Table(title=title or None, title_justify="left")
     for index, column in enumerate(columns):
@@ -40,12 +39,12 @@ def overview(registry: Registry) -> Iterator[Table]:
     definitions = recipe_schema(registry)["$defs"]
     for name, slot in SLOTS.items():
         default = f" (default {slot.default})" if slot.default else ""
-        table = _table(recipe_path(name) + default, "type", "meaning", "origin")
+        table = folded_table(recipe_path(name) + default, "type", "meaning", "origin")
         for kind, schema in _by_type(definitions[name]).items():
             table.add_row(*map(escape, (kind, schema["description"], _release(kind, registry))))
         yield table
     if models := _models(registry):
-        table = _table("trained models", "name", "meaning", "origin")
+        table = folded_table("trained models", "name", "meaning", "origin")
         for name, file in models.items():
             table.add_row(*map(escape, (name, about(file), _release(name, registry))))
         yield table
@@ -114,7 +113,7 @@ def recipe_path(slot: str) -> str:
 
 def _options(properties: Mapping[str, Schema]) -> Table | str:
     """A table of options, given as properties of a JSON Schema."""
-    table = _table("", "option", "type", "default", "meaning")
+    table = folded_table("", "option", "type", "default", "meaning")
     for cells in _rows(properties):
         table.add_row(*map(escape, cells))
     return table if properties else "  no options"
@@ -156,7 +155,7 @@ def _type(option: Schema) -> str:
 
 def parameter_table(recipe: Recipe, model: QueryGaussianModel) -> Table:
     """Parameters of each component of `model`, built from `recipe`."""
-    table = _table("parameters", "component", "type", "parameters", right=1)
+    table = folded_table("parameters", "component", "type", "parameters", right=1)
     counts = parameter_counts(model)
     for name, count in counts.items():
         slot = name.removeprefix("decoder.")  # of the decoder, the types in all layers
@@ -167,24 +166,3 @@ def parameter_table(recipe: Recipe, model: QueryGaussianModel) -> Table:
     table.add_section()
     table.add_row("total", "", f"{sum(counts.values()):,}")
     return table
-
-
-def difference_tables(first: Recipe, second: Recipe, a: str, b: str) -> list[Table]:
-    """Slots, then options and settings, then parameters that differ in recipes called `a`, `b`.
-
-    "-" stands for an option that a recipe's component does not have.
-    """
-    slots = _table("slots that differ", "slot", a, b)
-    options = _table("options that differ", "option", a, b)
-    parameters = _table("parameters", "component", a, b, "difference", right=3)
-    for path, values in differing_options(first.tree, second.tree).items():
-        table = slots if path.endswith(".type") else options
-        cells = [escape("-" if value is None else value) for value in values]
-        table.add_row(path.removesuffix(".type"), *cells)
-    ours, theirs = (parameter_counts(r.build_model("meta")) for r in (first, second))
-    rows = [(name, count, theirs[name]) for name, count in ours.items()]
-    for name, x, y in [*rows, ("total", sum(ours.values()), sum(theirs.values()))]:
-        if name == "total":
-            parameters.add_section()
-        parameters.add_row(name, f"{x:,}", f"{y:,}", f"{y - x:+,}" if x != y else "")
-    return [slots, options, parameters]

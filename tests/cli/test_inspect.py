@@ -1,15 +1,11 @@
-"""`qgs list`, `compose`, `diff`, `schema`, and what the command does with mistakes."""
+"""`qgs list`, `compose`, `schema`, and what the command does with mistakes."""
 
 import sys
-from dataclasses import replace
-from io import StringIO
 
 import pytest
 from commands import run_qgs
-from rich.console import Console
 
 from qgs.cli import main
-from qgs.cli.tables import difference_tables
 from qgs.composer import resolve
 
 SMALL = """recipe: 1
@@ -74,23 +70,6 @@ def test_compose_prints_a_recipe_that_composes_again(recipe, tmp_path):
     assert resolve("again.yaml").tree == first.tree
     total = sum(p.numel() for p in first.build_model("meta").parameters())
     assert f"{total:,}" in parameters
-
-
-def test_words_in_brackets_are_not_taken_for_styles():
-    console = Console(width=200, record=True, file=StringIO())
-    one = resolve({"recipe": 1})
-    other = replace(one, tree={**one.tree, "plugins": ["red"]})
-    console.print(difference_tables(one, other, "a", "b")[1])
-    assert "[red]" in console.export_text()
-
-
-def test_diff_shows_what_differs(recipe, tmp_path):
-    overlay = "recipe: 1\nextends: a.yaml\nmodel: {queries: {count: 7}}\n"
-    (tmp_path / "b.yaml").write_text(overlay)
-    output = run("diff", recipe, "b.yaml")
-    assert "model.queries.count" in output
-    assert "model.width" not in output
-    assert f"{3 * 16:+,}" in output
 
 
 @pytest.mark.parametrize(
