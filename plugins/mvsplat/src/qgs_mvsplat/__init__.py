@@ -25,8 +25,6 @@ _SMALL = DepthSplatEncoder.Config(
     regressor=8,
 )
 
-_TWO_SCALES = _SMALL.model_copy(update={"features": 64, "scales": 2, "coarse_depth": True})
-
 plugin = Plugin(
     name="mvsplat",
     contract_version=1,
@@ -47,7 +45,6 @@ plugin = Plugin(
             depth_levels=1,
         ),
         _SMALL,
-        _TWO_SCALES,
         RayHead.Config(opacity_exponent=1.0),
         OnRays.Config(measure="depth"),
         WorldHead.Config(scale_max=0.1),
@@ -61,10 +58,6 @@ plugin = Plugin(
         DepthSplatEncoder: {
             "parameters_learn": "zeros start behind each other, in the blocks and at the end of a "
             "U-Net and at the end of a correction, and each takes a step to open"
-        },
-        _TWO_SCALES: {
-            "gradients_match_differences": "the second sweep takes the first one's depths without "
-            "their gradient"
         },
     },
 )
