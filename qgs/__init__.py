@@ -15,9 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+    from contextlib import AbstractContextManager
+
     from qgs.analysis.reconstruction import Reconstruction
     from qgs.analysis.scenes import read_photos
-    from qgs.analysis.trace import trace
     from qgs.composer import compose
     from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
     from qgs.io.checkpoint import load, save
@@ -38,14 +40,15 @@ DISTRIBUTIONS = {
     "qgs.commands": {
         "data": "query-gaussians-datatools",
         "bench": "query-gaussians-bench",
-        "import": "query-gaussians-published",
         "scene": "query-gaussians-refine",
     }
     | dict.fromkeys(("compare", "diff", "study"), "query-gaussians-studies")
+    | dict.fromkeys(("export", "import"), "query-gaussians-published")
     | dict.fromkeys(("view", "demo", "report", "figures"), "query-gaussians-viewer")
     | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),
     "qgs.jobs": {"slurm": "query-gaussians-studies"},
     "qgs.pages": {"gaussians": "query-gaussians-viewer"},
+    "qgs.traces": {"queries": "query-gaussians-viewer"},
     "qgs.refiners": dict.fromkeys(
         ("gaussians", "reconstruction", "tuned", "tuner", "tuning_loss"), "query-gaussians-refine"
     ),
@@ -75,7 +78,6 @@ _ELSEWHERE = {
     "read_photos": "qgs.analysis.scenes",
     "save": "qgs.io.checkpoint",
     "save_ply": "qgs.io.gaussians",
-    "trace": "qgs.analysis.trace",
 }
 """Where public names come from that are not of `qgs.types`."""
 
@@ -110,6 +112,22 @@ def refine(gaussians: Gaussians, views: Views, seconds: float, **options: Any) -
     from qgs.extensions import function
 
     return function("qgs.refiners", "gaussians")(gaussians, views, seconds, **options)
+
+
+def trace(
+    model: QueryGaussianModel,
+    layers: Collection[int] | None = None,
+    queries: Sequence[int] | None = None,
+) -> AbstractContextManager[Any]:
+    """Record states and attention weights of `queries` in `layers` (numbers; None: all of them).
+
+    Gives a `qgs_viewer.trace.Trace` of the last forward pass inside the `with` block. Raises
+    ValueError for layers or queries that do not exist, ExtensionError where
+    query-gaussians-viewer is not installed.
+    """
+    from qgs.extensions import function
+
+    return function("qgs.traces", "queries")(model, layers, queries)
 
 
 def __getattr__(name: str) -> Any:

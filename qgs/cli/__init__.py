@@ -30,6 +30,7 @@ HELP = {
         "Train every variant with every seed, evaluate all by one protocol, and compare the scores."
     ),
     "bench": "Size, latency and memory of models: any number of recipes in turn.",
+    "export": "Write a checkpoint as one new file, with --half at half the size.",
     "import": "Turn published weights into a checkpoint; every tensor is accounted for.",
     "new-plugin": "Write a plugin to start from: one component, its contract tests, a recipe.",
     "check-plugin": "Test every component of a plugin against its contract.",
@@ -103,7 +104,6 @@ COMMANDS = {
     "eval": evaluate.evaluate,
     "reconstruct": reconstruct.reconstruct,
     "convert": convert.convert,
-    "export": convert.export,
 }
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)

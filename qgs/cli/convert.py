@@ -1,25 +1,9 @@
-"""`qgs export` and `qgs convert`: checkpoints and Gaussians, written in another form."""
+"""`qgs convert`: Gaussians in another form."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
-
-from qgs.cli.options import Checkpoint
-
-
-def export(
-    checkpoint: Checkpoint,
-    out: Annotated[Path, typer.Option(help="New .safetensors file; never overwritten.")],
-    half: Annotated[
-        bool, typer.Option("--half", help="Store half precision; loading gives float32.")
-    ] = False,
-) -> None:
-    """Write a checkpoint as one new file, with --half at half the size."""
-    from qgs.io.checkpoint import export_checkpoint
-
-    export_checkpoint(checkpoint, out, half)
-    typer.echo(f"wrote {out}: {out.stat().st_size / 1e6:.1f} MB")
 
 
 def convert(

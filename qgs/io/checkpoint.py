@@ -196,25 +196,6 @@ def write_checkpoint(
     write_tensors(path, tensors, metadata)
 
 
-def export_checkpoint(name: str | os.PathLike[str], out: str | Path, half: bool = False) -> None:
-    """Write a checkpoint again. half: its real numbers as float16; all else stays as it is.
-
-    Raises as `CheckpointFile`, and CheckpointError where float16 cannot hold a weight.
-    """
-    out = new_checkpoint_path(out)
-    with CheckpointFile(name) as file:
-        tensors = file.tensors
-        refuse_nonfinite(tensors, file.path)
-        if half:
-            tensors = {n: t.half() if t.is_floating_point() else t for n, t in tensors.items()}
-        if broken := nonfinite(tensors.items()):
-            raise CheckpointError(
-                f"{file.path} has weights that float16 cannot hold (larger than 65504): "
-                f"{listed(broken)}; ship it as it is"
-            )
-        write_checkpoint(out, tensors, file.recipe.tree, file.extra)
-
-
 def new_checkpoint_path(path: str | Path) -> Path:
     """`path`; raises ValueError for another suffix, FileExistsError where something lies."""
     path = Path(path)

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from upath import UPath
 import qgs
 from qgs.composer import resolve
 from qgs.engine.initial import initialise
-from qgs.io.checkpoint import CheckpointFile, export_checkpoint, save
+from qgs.io.checkpoint import CheckpointFile, save
 from qgs.io.models import checkpoint_path
 
 RECIPE = {
@@ -128,6 +129,7 @@ def test_weights_beyond_half_precision_are_refused(shipped: Path) -> None:
     with torch.no_grad():
         model.queries.features.fill_(1e6)
     save(model, "large.safetensors")
-    with pytest.raises(ValueError, match=r"float16 cannot hold .*: queries\.features"):
-        export_checkpoint("large.safetensors", "half.safetensors", half=True)
+    result = run_qgs("export", "large.safetensors", "--half", "--out", "half.safetensors")
+    assert isinstance(result.exception, ValueError)
+    assert re.search(r"float16 cannot hold .*: queries\.features", str(result.exception))
     assert not Path("half.safetensors").exists()

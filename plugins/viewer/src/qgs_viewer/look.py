@@ -7,11 +7,11 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from qgs.analysis.trace import Trace, trace
 from qgs.contracts import AttentionWeights, RendererConfig
 from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians, ImageMemory, QueryState, SpatialSupport, Views
 from qgs_viewer.placement import Placement, Splats, on_photo, patch_centers, splats
+from qgs_viewer.trace import Trace, trace
 
 Background = tuple[float, float, float]
 NEUTRAL: Background = RendererConfig().background  # of models, unless their recipe changes it
