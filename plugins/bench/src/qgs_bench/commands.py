@@ -38,6 +38,12 @@ def bench(
             help="Time and memory at A, 2 A, ... up to B, of views, queries, size or batch.",
         ),
     ] = None,
+    predict: Annotated[
+        bool, typer.Option("--predict", help="Memory and time on this CPU, without running.")
+    ] = False,
+    within: Annotated[
+        float, typer.Option(metavar="GB", min=0, help="With --predict: does a step fit?")
+    ] = 0,
     json: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a report with every sample.")
     ] = None,
@@ -60,6 +66,8 @@ def bench(
 
     if sweep and (memory or renderer):
         raise ValueError("--sweep measures memory itself and no renderer: give neither option")
+    if within and not predict:
+        raise ValueError("--within belongs to --predict: give both")
     if precision not in ("float32", "bf16"):
         raise ValueError(f"--precision must be float32 or bf16, got {precision!r}")
     axes = [parse_axis(text) for text in sweep or ()]
@@ -72,8 +80,16 @@ def bench(
         "precision": precision,
         "device": choose_device(device, console.print),
     }
-    options: dict[str, Any] = {"overrides": overrides or [], "rounds": rounds, "warmup": warmup}
     names = [str(path) for path in recipes]
+    if predict:
+        if work["device"] != "cpu":
+            raise ValueError("--predict predicts the CPU: add --device cpu")
+        from qgs_bench.predict import predict_recipes, show_predictions
+
+        with console.status("calibrating") as status:
+            entries = predict_recipes(names, work, overrides or (), status.update)
+        return show_predictions(entries, console, within)
+    options: dict[str, Any] = {"overrides": overrides or [], "rounds": rounds, "warmup": warmup}
     files: list[Path] = []
     if json is not None:
         refuse_other_file(json)
