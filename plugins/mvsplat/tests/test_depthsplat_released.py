@@ -2,9 +2,11 @@
 
 import pytest
 import torch
+from qgs_mvsplat import sweep
 from qgs_mvsplat.adapter import band_mask, camera_quaternions, turn_of_harmonics
+from qgs_mvsplat.depthsplat import nearest_neighbours
 from qgs_mvsplat.pixels import PIXEL, in_world, pixel_fields
-from qgs_mvsplat.sweep import warp_grid, warped
+from qgs_mvsplat.sweep import feature_lenses, relative_poses, warp_grid, warped
 from recorded_depthsplat import DEGREE, DIMS, decoded, recorded
 from released import Released
 
@@ -70,3 +72,18 @@ def test_warp(cases: Released) -> None:
     torch.testing.assert_close(grid, given["grid"], rtol=1e-3, atol=5e-5)
     seen = warped(given["features"], given["grid"])
     torch.testing.assert_close(seen, given["warped"], rtol=1e-4, atol=5e-5)
+
+
+def test_both_ways_to_correlate_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few pixels for each candidate: all pairs at once; many: warped features, in chunks."""
+    released = Released("depthsplat_a")
+    cameras, features = released.views().cameras, released.tensors["features_mv.0"]
+    neighbours = nearest_neighbours(cameras.c2w, 2)
+    inverse = released.tensors["inverse_depth_candidates.0"][..., None, None]
+    lens = feature_lenses(cameras, features.shape[-2:])
+    given = (features, inverse, lens, relative_poses(cameras.c2w, neighbours), neighbours)
+    for pairs, samples in ((0, 1 << 15), (40, 1 << 10)):
+        monkeypatch.setattr(sweep, "PAIRS", pairs)
+        monkeypatch.setattr(sweep, "MAX_SAMPLES", samples)
+        found = sweep.cost_volume(*given)
+        torch.testing.assert_close(found, released.tensors["cost_volume.0"], rtol=1e-4, atol=1.5e-4)

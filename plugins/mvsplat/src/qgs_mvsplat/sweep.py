@@ -13,7 +13,9 @@ from qgs.types import Cameras
 MIN_DEPTH = 1e-3
 """Bound of z in another camera, world units: points behind it land far outside of its image."""
 MAX_SAMPLES = 1 << 24
-"""Numbers that a chunk of candidates may sample at once (64 MiB in float32)."""
+"""Numbers that are sampled at once (64 MiB in float32)."""
+PAIRS = 40
+"""Pixels for each candidate up to which all pairs of pixels are correlated."""
 
 
 def cyclic_neighbours(scenes: int, views: int) -> Tensor:
@@ -93,18 +95,40 @@ def cost_volume(
     depth_NDhw = depth_NDhw.expand(-1, -1, height, width)
     own_NChw, lens_N4 = features_BVChw.flatten(0, 1), lens_BV4.flatten(0, 1)
     batch = torch.arange(scenes, device=features_BVChw.device)[:, None]
-    count = depth_NDhw.shape[1]
-    chunk = max(1, MAX_SAMPLES // own_NChw.numel())
+    correlate = _of_all_pairs if height * width <= PAIRS * depth_NDhw.shape[1] else _of_warped
     total_NDhw = depth_NDhw.new_zeros(())
     for index in range(neighbours_BVJ.shape[-1]):
         other_NChw = features_BVChw[batch, neighbours_BVJ[..., index]].flatten(0, 1)
         pose_N44 = poses_BVJ44[:, :, index].flatten(0, 1)
-        parts = []
-        for start in range(0, count, chunk):
-            with torch.no_grad():  # the sweep moves features, it does not learn where to look
-                grid = warp_grid(depth_NDhw[:, start : start + chunk], lens_N4, pose_N44)
-            sampled_NCDhw = warped(other_NChw, grid)
-            parts.append(torch.einsum("nchw,ncdhw->ndhw", own_NChw, sampled_NCDhw))
-        total_NDhw = total_NDhw + torch.cat(parts, 1)
+        # The sweep moves features, it does not learn where to look.
+        total_NDhw = total_NDhw + correlate(
+            own_NChw, other_NChw, depth_NDhw, lens_N4.detach(), pose_N44.detach()
+        )
     mean_NDhw = total_NDhw / (math.sqrt(channels) * neighbours_BVJ.shape[-1])
     return mean_NDhw.unflatten(0, (scenes, views))
+
+
+def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
+    """Correlations (N, D, h, w) with warped features, some candidates at a time."""
+    chunk, parts = max(1, MAX_SAMPLES // own.numel()), []
+    for part_Nkhw in depth.split(chunk, 1):
+        sampled_NCkhw = warped(other, warp_grid(part_Nkhw, lens, pose))
+        parts.append(torch.einsum("nchw,nckhw->nkhw", own, sampled_NCkhw))
+    return torch.cat(parts, 1)
+
+
+def _of_all_pairs(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
+    """The same: all pairs of pixels are correlated, then a map of each pixel is sampled.
+
+    Warping is linear in the features, so that it may follow the product. A map has one channel, and
+    all of it is a matrix product, which is faster while there are few pixels for each candidate.
+    """
+    count, _, height, width = own.shape
+    grid_NPD2 = warp_grid(depth, lens, pose).permute(0, 2, 3, 1, 4).flatten(1, 2)
+    own_NPC, other_NCQ = own.flatten(2).mT, other.flatten(2)
+    chunk, parts = max(1, MAX_SAMPLES // (count * height * width)), []
+    for own_NpC, grid_NpD2 in zip(own_NPC.split(chunk, 1), grid_NPD2.split(chunk, 1), strict=True):
+        maps_X1hw = (own_NpC @ other_NCQ).reshape(-1, 1, height, width)
+        found = warped(maps_X1hw, grid_NpD2.flatten(0, 1)[:, None, None])
+        parts.append(found.view(count, -1, depth.shape[1]))
+    return torch.cat(parts, 1).mT.unflatten(2, (height, width))

@@ -106,8 +106,11 @@ class Attention(nn.Module):
             # Published weights expect this: keys are ordered by pixels, then views, but the mask is
             # repeated view by view, so that with three and more views it falls on other keys.
             mask = None if mask is None else mask.repeat(1, 1, neighbours_BVJ.shape[-1])
-        read = F.scaled_dot_product_attention(q, k, v, None if mask is None else mask.to(q))
-        message = self.norm1(self.merge(read))
+        # In four axes, the windows as heads: with five, torch takes a slower way.
+        q, k, v = (x.flatten(0, 1) for x in (q, k, v))
+        mask = None if mask is None else mask[None].to(q)
+        read = F.scaled_dot_product_attention(q, k, v, mask)
+        message = self.norm1(self.merge(read.view_as(x_BVWLC)))
         if self.mlp is not None:
             message = self.norm2(self.mlp(torch.cat([x_BVWLC, message], -1)))
         return x_BVWLC + message
