@@ -10,6 +10,7 @@ import torch
 from qgs.analysis.depth import scene_depth
 from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.data.domain import Domain
+from qgs.data.samples import evenly
 from qgs.geometry.rays import pixel_directions
 
 Window: TypeAlias = tuple[Frames, Frames]
@@ -49,19 +50,14 @@ def choose_windows(
     targets = held or (usable if len(usable) > inputs else [])
     if not targets:
         return [(tuple(usable), ())]
-    frusta, usable = _Frusta(scene, trained_on), _thinned(usable, _MOST)
-    ranked = sorted((*frusta.window(t, usable, inputs), t) for t in _thinned(targets, _MOST))
+    frusta, usable = Frusta(scene, trained_on), evenly(usable, _MOST)
+    ranked = sorted((*frusta.window(t, usable, inputs), t) for t in evenly(targets, _MOST))
     good = {target: window for cost, window, target in ranked if cost <= ranked[0][0] + _POOR}
     chosen = [next(iter(good))]
     while len(chosen) < min(count, len(good)):
         # the farthest from all chosen ones; of equal ones the best
         chosen.append(max(good.keys() - {*chosen}, key=lambda t: frusta.far[t, chosen].min()))
     return [(good[target], frusta.compared(good[target], target)) for target in chosen]
-
-
-def novel_frames(scene: Scene, inputs: Frames, trained_on: Domain) -> Frames:
-    """At most NOVEL photos that the inputs see, the nearest; held-out ones where there are."""
-    return _Frusta(scene, trained_on).compared(inputs)
 
 
 def trained_ratios(trained_on: Domain) -> tuple[tuple[float, float], float]:
@@ -76,7 +72,7 @@ def trained_ratios(trained_on: Domain) -> tuple[tuple[float, float], float]:
     return (low, high), ranges.get("turn", (0.0, TURN))[1]
 
 
-class _Frusta:
+class Frusta:
     """Cameras in units of the depth that they look at, and what each sees of the others' views."""
 
     def __init__(self, scene: Scene, trained_on: Domain) -> None:
@@ -129,7 +125,7 @@ class _Frusta:
         """_NEAR frames around a target: evenly spaced ones of a slow video, else the nearest."""
         others = sorted((f for f in usable if f != target), key=lambda f: self.far[target, f])
         inside = [f for f in others if self.apart[target, f] <= 2 * self.high]
-        return _thinned(inside, _NEAR) if len(inside) > _NEAR else others[:_NEAR]
+        return evenly(inside, _NEAR) if len(inside) > _NEAR else others[:_NEAR]
 
     def _beside(self, frame: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Distance of a camera from the lines between cameras a and b, (n,) in depths."""
@@ -147,7 +143,10 @@ class _Frusta:
         return tuple(chosen) if inputs == 1 else (*chosen, last)
 
     def compared(self, window: Frames, target: int | None = None) -> Frames:
-        """The target and the frames nearest to it, or to the inputs, that the inputs see."""
+        """The target and the frames nearest to it, or to the inputs, that the inputs see.
+
+        At most NOVEL; held-out ones where there are.
+        """
         held_out, inputs = sorted(self.scene.held_out), list(window)
         reach = max(1.0, self.far[np.ix_(inputs, inputs)].max() / 2)
         others = [f for f in held_out or range(len(self.scene)) if f not in (*inputs, target)]
@@ -160,9 +159,3 @@ class _Frusta:
 def _excess(value: np.ndarray | float, limit: np.ndarray | float) -> np.ndarray:
     """Logarithm of the factor by which a value exceeds its limit; 0 below."""
     return np.log(np.maximum(value / np.maximum(limit, 1e-9), 1))
-
-
-def _thinned(frames: Sequence[int], most: int) -> list[int]:
-    """At most `most` of `frames`, evenly spaced."""
-    places = np.linspace(0, len(frames) - 1, min(most, len(frames))).round()
-    return [frames[int(place)] for place in places]

@@ -6,16 +6,15 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from qgs.analysis.inputs import NOVEL, choose_windows, novel_frames
+from qgs.analysis.inputs import NOVEL, Frusta, choose_windows
 from qgs.analysis.scale import FoundScale
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import SEARCHED, Domain, remedies
 from qgs.data.evaluation import ViewsOf
-from qgs.data.samples import Sample, make_sample, moments, own_world, spread
+from qgs.data.samples import Sample, evenly, make_sample, moments, own_world, spread
 from qgs.geometry.poses import relative_to, scaled
 from qgs.geometry.transforms import moved
 from qgs.metrics.baselines import BASELINES, worse_than_nearest
@@ -48,11 +47,11 @@ def choose_frames(
             raise ValueError(f"there are {len(usable)} photos, too few for {inputs} input views")
         span = min(max(span, inputs), len(usable))
         first = (len(usable) - span) // 2
-        frames = _evenly(usable[first : first + span], inputs)
+        frames = evenly(usable[first : first + span], inputs)
     if compare is None:
         between = [f for f in range(min(frames), max(frames) + 1) if f not in frames]
         between = [f for f in between if f in held_out] or between
-        compare = _evenly(between, min(NOVEL, len(between)))
+        compare = evenly(between, NOVEL)
     every = [*frames, *compare]
     if missing := [frame for frame in every if not 0 <= frame < total]:
         raise ValueError(f"frames {listed(missing)} do not exist; the photos are 0..{total - 1}")
@@ -61,13 +60,6 @@ def choose_frames(
             f"frames named twice: {listed(twice)}; inputs and compared frames must differ"
         )
     return tuple(frames), tuple(compare)
-
-
-def _evenly(frames: Sequence[int], count: int) -> tuple[int, ...]:
-    """`count` of `frames`, the first and the last among them; one alone is the middle one."""
-    last = len(frames) - 1
-    places = np.linspace(0, last, count).round() if count > 1 else np.full(count, last // 2)
-    return tuple(frames[int(place)] for place in places)
 
 
 def choose_sample(
@@ -97,7 +89,7 @@ def choose_sample(
             of = views.model_copy(update={"inputs": wanted})
             frames, novel = choose_windows(scene, of, trained_on, held_out=compare)[0]
         elif compare is None and {*frames} <= {*range(len(scene))}:
-            novel = novel_frames(scene, tuple(frames), trained_on)
+            novel = Frusta(scene, trained_on).compared(tuple(frames))
         compare = novel if compare is None else compare
     picked = choose_frames(len(scene), wanted, span, frames, compare, held_out=scene.held_out)
     if scene.times is not None and compare is None and picked[1]:
@@ -219,8 +211,8 @@ def reconstruct_sample(
         kind = "seen in training" if frame in seen else "novel"
         others = {name: values[index] for name, values in baselines.items()}
         scores.append(ViewScore(frame, kind, quality[count + index], others))
-    result = Reconstruction(model, sample, prediction, gaussians, rendering, scores, world)
-    return replace(result, tuning=tuning, refinement=refinement)
+    made = model, sample, prediction, gaussians, rendering, scores, world
+    return Reconstruction(*made, tuning, refinement)
 
 
 def sample_cameras(sample: Sample) -> Cameras:

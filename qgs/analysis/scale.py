@@ -7,7 +7,7 @@ too small, surfaces close to the cameras render them well, so further photos are
 
 import math
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,7 +21,7 @@ from qgs.geometry.poses import look_at_depth, scaled
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Views, map_tensors
-from qgs.wording import counted, listed
+from qgs.wording import listed
 
 FURTHER = 2
 """Photos that are judged with the inputs, at most."""
@@ -78,20 +78,6 @@ class FoundScale:
         return {"result": self.text, "further_frames": list(self.further), "tried": tried}
 
 
-def summary(found: Collection[FoundScale], option: str = "--scale FACTOR") -> str:
-    """One line on the scales of one or several windows, and the option that sets another."""
-    first, ordered = next(iter(found)), sorted(scale.factor for scale in found)
-    text, seconds = first.text, sum(scale.seconds for scale in found)
-    if len(found) > 1:
-        poor = sum(bool(scale.poor) for scale in found)
-        mean = sum(scale.psnr for scale in found) / len(found)
-        text = (
-            f"scale {ordered[0]:.3g} to {ordered[-1]:.3g}, found on the inputs and photos beside "
-            f"them in {len(found)} windows: {mean:.1f} dB"
-        ) + f", no scale fits {counted(poor, 'window')}" * bool(poor)
-    return f"{text}, in {seconds:.1f} s" + f"; {option} sets another" * bool(option)
-
-
 class ScaleSearch:
     """The settings of views for windows of scenes, with the found factor in place of `search`.
 
@@ -145,9 +131,8 @@ def find_scale(
         middle = len(inputs) // 2
         further, given = given[middle : middle + 1], given[:middle] + given[middle + 1 :]
     sample = make_sample(scene, given, further, constant_scale(views, 1.0), mirror=False)
-    trained, depth = model.trained_on or Domain(), float(look_at_depth(scene.cameras.c2w))
     frames = given if len(given) > 1 else given + further
-    low, high, nearest = search_range(trained, scene, frames, depth)
+    low, high, nearest = search_range(model.trained_on or Domain(), scene, frames)
     count = min(math.ceil(math.log(high / low) / math.log(STEP)) + 1, MOST)
     ratio = (high / low) ** (1 / max(count - 1, 1))
     trial = _Trial(model.eval(), sample, low, ratio ** (1 / 3), 0.0 if further else nearest)
@@ -188,13 +173,12 @@ def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
     return tuple(sorted(frame for _, frame in sorted(zip(far, left, strict=True))[:FURTHER]))
 
 
-def search_range(
-    trained: Domain, scene: Scene, frames: Frames, depth: float
-) -> tuple[float, float, float]:
+def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, float, float]:
     """The smallest and largest factor of a search, and from where on depths are as in training.
 
-    depth: that the cameras look at, 0 where it is unknown; then the last is 0.
+    The last is 0 where the depth that the cameras look at is unknown.
     """
+    depth = float(look_at_depth(scene.cameras.c2w))
     centres = scene.cameras.c2w[list(frames), :3, 3].double()
     baseline, found = float(torch.cdist(centres, centres).max()), list[float]()
     low, high = trained.ranges.get("baseline", BASELINES)

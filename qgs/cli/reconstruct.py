@@ -136,7 +136,6 @@ def show(result: Reconstruction, what: str, console: Console) -> None:
     from rich.table import Table
 
     from qgs.analysis.reconstruction import KINDS
-    from qgs.analysis.scale import summary
     from qgs.metrics.baselines import BASELINES
     from qgs.metrics.images import Psnr
 
@@ -157,6 +156,8 @@ def show(result: Reconstruction, what: str, console: Console) -> None:
             table.add_row(f"{kind}, mean", str(len(rows)), *means, style="bold")
             table.add_section()
     console.print(table)
-    found = [summary([result.scale])] if result.scale else []
-    for remark in (*found, *result.remarks):
+    if scale := result.scale:
+        found = f"{scale.text}, in {scale.seconds:.1f} s; --scale FACTOR sets another"
+        console.print(found, soft_wrap=True, highlight=False, markup=False)
+    for remark in result.remarks:
         console.print(remark, soft_wrap=True, highlight=False, markup=False)

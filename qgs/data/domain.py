@@ -44,11 +44,6 @@ REMEDIES = {
 it helps. The scale comes first: it costs nothing and moves baseline and depth together."""
 OF_RECIPES = {"--scale": "views.scale", "--frames": "views.gap", "--inputs": "views.inputs"}
 """The same in recipes, for commands that evaluate one."""
-OF_SHOWN = {
-    "--scale": "--scale",
-    **{n: f"{n} of qgs reconstruct" for n in ("--frames", "--inputs")},
-}
-"""The same for commands that choose the input views of photos themselves."""
 SEARCHED = {"--scale": ""}
 """Where the best scale was searched: another one is no remedy."""
 
@@ -99,9 +94,12 @@ class Domain:
         """By name a phrase for each range of the training that the range of `found` exceeds."""
         phrases, seen = dict[str, str](), found.ranges
         for name, trained in self.ranges.items():
-            if name in seen and not _inside(seen[name], trained):
+            if name not in seen:
+                continue
+            low, high = seen[name]
+            if low * TOLERANCE < trained[0] or high > trained[1] * TOLERANCE:
                 words = WORDS[name].format(_shown(seen[name]))
-                if seen[name][0] == math.inf:
+                if low == math.inf:
                     words = "their axes meet at no point before them"
                 phrases[name] = f"{words} (trained: {_shown(trained)})"
         return phrases
@@ -215,10 +213,6 @@ def _measured(inputs: Cameras, targets: Cameras) -> Iterator[tuple[str, Tensor]]
     yield "depth", torch.where(depths > 0, depths, math.inf)
     halves = inputs.size[1] / 2 / inputs.intrinsics[..., 0].double()
     yield "fov", 2 * halves.arctan().rad2deg()
-
-
-def _inside(found: tuple[float, float], trained: tuple[float, float]) -> bool:
-    return found[0] * TOLERANCE >= trained[0] and found[1] <= trained[1] * TOLERANCE
 
 
 def _shown(values: tuple[float, float]) -> str:

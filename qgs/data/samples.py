@@ -9,7 +9,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -29,6 +29,8 @@ from qgs.geometry.poses import (
 from qgs.machine import refuse_more_than_memory
 from qgs.types import Cameras, Views, concatenated, map_tensors
 from qgs.wording import listed, numbered
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -154,11 +156,16 @@ def one_of_each(chosen: Sequence[Frames], cameras: Sequence[int]) -> Frames:
     return tuple(m[cameras[i % len(cameras)] % len(m)] for i, m in enumerate(chosen))
 
 
+def evenly(items: Sequence[_T], count: int) -> list[_T]:
+    """At most `count` of `items`, evenly spaced, the first and last among them; one: the middle."""
+    last, count = len(items) - 1, min(count, len(items))
+    places = np.linspace(0, last, count) if count > 1 else np.full(count, last // 2)
+    return [items[place] for place in places.round().astype(int)]
+
+
 def spread(span: Sequence[Frames], count: int) -> Frames:
-    """Frames of `count` moments, evenly spaced from the first to the last; one is the middle."""
-    last = len(span) - 1
-    places = np.linspace(0, last, count) if count > 1 else np.array([last // 2])
-    return one_of_each([span[place] for place in places.round().astype(int)], range(count))
+    """Frames of `count` moments, as of `evenly`."""
+    return one_of_each(evenly(span, count), range(count))
 
 
 def make_sample(

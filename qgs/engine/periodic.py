@@ -126,13 +126,8 @@ class PeriodicEvaluation:
     def _picture(self) -> Picture:
         """A row per sample: input views, the first target view, its rendering and its depth."""
         recipe, model, training = self._recipe, self._model, self._model.training
-        plan = EvaluationPlan(
-            recipe.build_data(),
-            recipe.views,
-            recipe.evaluation,
-            index_of(recipe),
-            recipe.build_view_sampler(),
-        )
+        data = recipe.build_data(), recipe.views, recipe.evaluation
+        plan = EvaluationPlan(*data, index_of(recipe), recipe.build_view_sampler())
         # A broken test scene has been reported by the scores; pictures take the next one.
         usable = (sample for sample in plan.samples() if isinstance(sample, Sample))
         model.eval()

@@ -8,6 +8,7 @@ import pytest
 from commands import run_qgs
 from PIL import Image
 from qgs_viewer.contest import checkpoints, judge
+from qgs_viewer.scales import summary
 from qgs_viewer.sources import ModelSource, Wanted, open_source
 from small import Walk, model_of
 
@@ -19,7 +20,6 @@ from qgs.analysis.scale import (
     further_photos,
     photo_settings,
     search_range,
-    summary,
 )
 from qgs.composer import resolve
 from qgs.contracts import ViewsConfig
@@ -137,10 +137,11 @@ def test_without_further_photos_an_input_is_judged_or_inputs_alone() -> None:
 
 def test_the_range_follows_the_unit_and_the_training() -> None:
     trained = Domain({"baseline": [0.1, 0.4], "depth": [0.8, 3.0]}, 4)
-    low, high, nearest = search_range(trained, Walk(), (1, 4), 5.0)
-    assert low < 0.8 / 5 < high
-    assert nearest == pytest.approx(1.0 / 5)
-    assert search_range(Domain(), Walk(), (2, 2), 0.0) == (1.0, 1.0, 0.0)
+    low, high, nearest = search_range(trained, Walk(), (1, 4))
+    assert low < 0.8 / 3 < high
+    assert nearest == pytest.approx(1.0 / 3, rel=1e-3)  # the cameras of Walk look 3 away
+    still = type("Still", (Walk,), {"cameras": Walk().cameras[[2, 2]]})()
+    assert search_range(Domain(), still, (0, 1)) == (1.0, 1.0, 0.0)
 
 
 def test_words_of_several_windows() -> None:

@@ -16,12 +16,12 @@ from rich import box
 from rich.table import Table
 
 from qgs.analysis.inputs import Window, choose_windows
-from qgs.analysis.scale import ScaleSearch, photo_settings, summary
+from qgs.analysis.scale import ScaleSearch, photo_settings
 from qgs.analysis.scenes import HOLDOUT, Size, installed_sources, size_multiple, whole_size
 from qgs.composer import Recipe, resolve
 from qgs.composer.schema import summary_of
 from qgs.contracts import Scene, ViewsConfig
-from qgs.data.domain import OF_RECIPES, OF_SHOWN, Domain
+from qgs.data.domain import OF_RECIPES, Domain
 from qgs.data.evaluation import WindowsOf, evaluation_samples, true_depth
 from qgs.data.recognition import is_training_data, open_for
 from qgs.engine.distributed import choose_device
@@ -34,6 +34,7 @@ from qgs.metrics.baselines import BASELINES
 from qgs.wording import counted, listed, short_names
 from qgs_viewer.curves import Curves, curves_of
 from qgs_viewer.report import Contender, Report
+from qgs_viewer.scales import OF_SHOWN, summary
 
 PICTURED_SCENES = 6
 WINDOWS = 6  # scenes, and windows of a scene, that are judged of a user's photos

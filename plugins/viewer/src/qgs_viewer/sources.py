@@ -13,7 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from qgs.analysis.reconstruction import choose_frames, choose_sample
-from qgs.analysis.scale import ScaleSearch, photo_settings, summary
+from qgs.analysis.scale import ScaleSearch, photo_settings
 from qgs.analysis.scenes import choice, chosen_scene, frame_list, named_scene
 from qgs.composer import Recipe, resolve
 from qgs.contracts import Scene, ViewsConfig
@@ -29,6 +29,7 @@ from qgs.types import Cameras
 from qgs.wording import listed
 from qgs_viewer.look import NEUTRAL, Look, look_inside
 from qgs_viewer.placement import Placement
+from qgs_viewer.scales import summary
 
 PLY, CAMERAS = "gaussians.ply", "cameras.json"
 """Files in the folder of a finished reconstruction."""

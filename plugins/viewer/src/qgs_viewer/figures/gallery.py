@@ -3,9 +3,9 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from qgs.analysis.scale import ScaleSearch, summary
+from qgs.analysis.scale import ScaleSearch
 from qgs.composer import resolve
-from qgs.data.domain import OF_SHOWN, SEARCHED, Domain, verdict
+from qgs.data.domain import SEARCHED, Domain, verdict
 from qgs.data.evaluation import evaluation_samples, true_depth
 from qgs.data.recognition import is_training_data
 from qgs.io.checkpoint import load
@@ -16,6 +16,7 @@ from qgs_viewer.curves import curves_figure, curves_of
 from qgs_viewer.figures import anchors, attention, dispersion, global_gaussians, novel_views
 from qgs_viewer.figures.exhibits import Exhibition, NothingToShowError, exhibit
 from qgs_viewer.figures.paper import WIDTH, Made, paper_style, write_figure
+from qgs_viewer.scales import OF_SHOWN, summary
 
 
 @paper_style()
