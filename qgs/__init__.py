@@ -43,7 +43,7 @@ DISTRIBUTIONS = {
         "scene": "query-gaussians-refine",
     }
     | dict.fromkeys(("compare", "diff", "study"), "query-gaussians-studies")
-    | dict.fromkeys(("export", "import"), "query-gaussians-published")
+    | dict.fromkeys(("convert", "export", "import"), "query-gaussians-published")
     | dict.fromkeys(("view", "demo", "report", "figures"), "query-gaussians-viewer")
     | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),
     "qgs.jobs": {"slurm": "query-gaussians-studies"},

@@ -71,12 +71,6 @@ def can_compile() -> bool:
     return find_spec("numba") is not None
 
 
-def usable_cores() -> int:
-    """CPU cores that this process may use; all of the machine where the system does not say."""
-    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ()
-    return len(allowed) or os.cpu_count() or 1
-
-
 def in_threads(unit: Callable[..., None], work: Iterable[tuple[Any, ...]]) -> None:
     """Call `unit(*item)` for every item of `work`, and wait.
 

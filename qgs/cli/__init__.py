@@ -9,7 +9,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from qgs import DISTRIBUTIONS
-from qgs.cli import convert, evaluate, inspect, reconstruct, train
+from qgs.cli import evaluate, inspect, reconstruct, train
 from qgs.extensions import installed
 
 GROUP = "qgs.commands"
@@ -30,6 +30,7 @@ HELP = {
         "Train every variant with every seed, evaluate all by one protocol, and compare the scores."
     ),
     "bench": "Size, latency and memory of models: any number of recipes in turn.",
+    "convert": "Write Gaussians as PLY, .splat or in a plugin's format.",
     "export": "Write a checkpoint as one new file, with --half at half the size.",
     "import": "Turn published weights into a checkpoint; every tensor is accounted for.",
     "new-plugin": "Write a plugin to start from: one component, its contract tests, a recipe.",
@@ -103,7 +104,6 @@ COMMANDS = {
     "train": train.train,
     "eval": evaluate.evaluate,
     "reconstruct": reconstruct.reconstruct,
-    "convert": convert.convert,
 }
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)

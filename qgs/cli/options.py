@@ -8,14 +8,6 @@ import typer
 Checkpoint: TypeAlias = Annotated[
     str, typer.Argument(help="Run folder, checkpoint, its URL, or a shipped model: PLUGIN/NAME.")
 ]
-Runs: TypeAlias = Annotated[
-    list[str],
-    typer.Argument(
-        metavar="RUN...", help="Run folders, checkpoints, their URLs, or shipped models."
-    ),
-]
-PHOTOS_HELP = "Photos and cameras; default: the recipe's data, of shipped models rooms unseen."
-Photos: TypeAlias = Annotated[str | None, typer.Option(help=PHOTOS_HELP)]
 Overrides: TypeAlias = Annotated[
     list[str] | None,
     typer.Option("--set", help="Change an option of the recipe, such as model.queries.count=128."),

@@ -116,10 +116,9 @@ def study(
         return
     stopped, failed = None, 0
     if workers and missing:
-        from qgs.machine import usable_cores
         from qgs_studies.queue import Queue
 
-        threads = threads or max(usable_cores() // workers, 1)
+        threads = threads or max(_usable_cores() // workers, 1)
         chosen = plan.runs if only is None else [plan.runs[only]]
         queue = Queue(plan, workers, threads, device, console, _gpus(device), chosen)
         stopped, failed = queue.work(), len(queue.failures)
@@ -147,3 +146,9 @@ def _gpus(device: str) -> list[str]:
     import torch
 
     return [str(number) for number in range(torch.cuda.device_count())]
+
+
+def _usable_cores() -> int:
+    """CPU cores that this process may use; all of the machine where the system does not say."""
+    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ()
+    return len(allowed) or os.cpu_count() or 1

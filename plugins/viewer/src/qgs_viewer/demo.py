@@ -14,8 +14,6 @@ from rich.console import Console
 
 from qgs.cli.options import (
     Device,
-    Photos,
-    Runs,
     Scale,
     Size,
     Threads,
@@ -23,6 +21,7 @@ from qgs.cli.options import (
     scale_settings,
     use_threads,
 )
+from qgs_viewer.options import Photos, Runs
 
 if TYPE_CHECKING:
     from qgs_viewer.contest import Entry

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from qgs.cli.options import Device, Photos, Runs
+from qgs.cli.options import Device
+from qgs_viewer.options import Photos, Runs
 
 NAMES = (
     "global_gaussians", "novel_views", "anchors", "refinement", "cross_attention",

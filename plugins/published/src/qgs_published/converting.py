@@ -5,7 +5,13 @@ from typing import Annotated
 
 import typer
 
+from qgs.io.files import refuse_existing
+from qgs.io.gaussians import load_ply, save_gaussians
 
+app = typer.Typer(help="Gaussians, written in another form.")
+
+
+@app.command()
 def convert(
     source: Annotated[
         Path, typer.Argument(metavar="IN", help="PLY of qgs or of any 3DGS program.")
@@ -20,10 +26,10 @@ def convert(
         int | None, typer.Option(min=1, help="Keep this many, the most opaque; default: all.")
     ] = None,
 ) -> None:
-    """Write Gaussians as PLY, .splat or in a plugin's format, with --count the most opaque ones."""
-    from qgs.io.files import refuse_existing
-    from qgs.io.gaussians import load_ply, save_gaussians
+    """Write Gaussians as PLY, .splat or in a plugin's format.
 
+    With --count the most opaque ones alone.
+    """
     refuse_existing(out)
     gaussians = load_ply(source)
     kept = gaussians if count is None else gaussians.most_opaque(count)
