@@ -56,8 +56,10 @@ plugin = Plugin(
             "the softmax over depths spread what a pixel shows over its image"
         },
         DepthSplatEncoder: {
+            "compiles": "instance norms take biases of the CNN away again, so that their gradients "
+            "are rounding alone",
             "parameters_learn": "zeros start behind each other, in the blocks and at the end of a "
-            "U-Net and at the end of a correction, and each takes a step to open"
+            "U-Net and at the end of a correction, and each takes a step to open",
         },
     },
 )
