@@ -12,3 +12,9 @@ def _seeded_on_one_thread() -> None:
     """The models are so small that a second thread only waits."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def few_samples_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A training measures the ranges of its views in .1 s, not in a second."""
+    monkeypatch.setattr("qgs.data.stream.MEASURED", 48)

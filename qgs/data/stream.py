@@ -33,7 +33,7 @@ from qgs.data.samples import (
 )
 from qgs.data.view_samplers import Span
 from qgs.machine import is_out_of_memory
-from qgs.types import Cameras
+from qgs.types import Cameras, concatenated
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,12 @@ def trained_domain(
     out: training itself reports it.
     """
     stream, domain = SampleStream(source, views, seed, sampler=sampler), Domain()
+    drawn = list[tuple[Cameras, Cameras]]()
     for number in range(MEASURED):
         with suppress(Exception):  # whatever a reader raises
-            domain.see(*stream.cameras(number, round(number / (MEASURED - 1) * steps)))
+            drawn.append(stream.cameras(number, round(number / (MEASURED - 1) * steps)))
+    if drawn:
+        domain.see(*concatenated(drawn, 0))
     return domain
 
 

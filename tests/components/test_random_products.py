@@ -34,6 +34,8 @@ SMALL: dict[str, Any] = {
 BLOCKS = {"qgs/multiview_vit": 0, "tokengs2026/multiscale_vit": 2, "gslrm/transformer": 1}
 NOT_DRAWN = {"lpips/vgg16", "dinov2/multiview_vit"}
 """What needs weights from elsewhere; `c3g/vggt_features`, which does too, has no example."""
+ONLY_TOGETHER = "mvsplat/"
+"""Parts that fit only each other, at a width of their own: the tests of their plugin train them."""
 
 PUBLISHED: tuple[dict[str, str], ...] = (
     {},
@@ -65,7 +67,7 @@ def _choices() -> dict[str, Choices]:
     for name, installed in registry.load_registry(PLUGINS).plugins.items():
         for case in cases_of(installed):
             kind = f"{name}/{case.component.name}"
-            if case.slot in found and kind not in NOT_DRAWN:
+            if case.slot in found and kind not in NOT_DRAWN and not kind.startswith(ONLY_TOGETHER):
                 options = case.config.model_dump(mode="json", exclude_unset=True)
                 found[case.slot].setdefault(kind, []).append((case.component, options))
     return found

@@ -21,6 +21,12 @@ from qgs.io.checkpoint import CheckpointFile, save
 from qgs.io.tensors import CheckpointError
 from qgs.types import Cameras
 
+
+@pytest.fixture(autouse=True)
+def few_samples_measured() -> None:
+    """Here all are measured."""
+
+
 RECIPE = {
     "recipe": 1,
     "model": MODEL,
