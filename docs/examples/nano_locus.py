@@ -4,11 +4,12 @@
 
 trains a tiny model on scenes of random blobs. The weights are one dictionary `p`, named as in the
 framework: the tensors of a checkpoint of recipes/tiny/locus.yaml fit as they are, and a test holds
-Gaussians, image, loss and gradients against the framework's. Comments name each part's file there.
+Gaussians, image, loss and gradients against the framework's, whose files the headings name. The
+weights start more simply than the recipe's.
 
 Axes: B scenes, V views, M image tokens (the patches of all views), N queries, K Gaussians a query,
-D width, h heads. World: the frame of the first input camera. Cameras: c2w (B, V, 4, 4) in OpenCV
-axes (x right, y down, z forward), intrinsics (B, V, 4) fx, fy, cx, cy in pixels.
+D width, h heads. World: the frame of the first input camera, which the caller gives. Cameras: c2w
+(B, V, 4, 4) in OpenCV axes, intrinsics (B, V, 4) fx, fy, cx, cy in pixels; `render` takes one.
 """
 
 import math
@@ -19,8 +20,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-# The sizes of recipes/tiny/locus.yaml; published: 1024, 16, 8, 3, 1024, 12, 64.
-WIDTH, HEADS, PATCH, ENCODER_DEPTH, QUERIES, DEPTH, PER_QUERY = 128, 4, 8, 1, 256, 4, 8
+WIDTH, HEADS, PATCH = 128, 4, 8  # published: 1024, 16, 8
+ENCODER_DEPTH, DECODER_DEPTH, QUERIES, PER_QUERY = 1, 4, 256, 8  # published: 3, 12, 1024, 64
 SCALE_CAP = 0.15  # largest standard deviation of a Gaussian, world units
 LAYER_WEIGHTS = {2: 1 / 3, 4: 2 / 3}  # decoder layers that the loss sees, and how much
 OPACITY_BIAS, NEAR, FAR, BACKGROUND = -1.0, 0.025, 125.0, 0.5
@@ -96,8 +97,7 @@ def encode(p: Weights, images: Tensor, c2w: Tensor, intrinsics: Tensor) -> Seque
     plucker = plucker_map(c2w, intrinsics, *images.shape[-2:]).flatten(0, 1)
     mean, std = torch.tensor([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]])[..., None, None]
     x = patches(p, "encoder.rgb_embedding", ((images - mean) / std).flatten(0, 1))
-    x = x + patches(p, "encoder.ray_embedding", plucker)
-    x = x.reshape(len(images), -1, WIDTH)
+    x = (x + patches(p, "encoder.ray_embedding", plucker)).reshape(len(images), -1, WIDTH)
     for i in range(ENCODER_DEPTH):
         layer = f"encoder.blocks.{i}"
         update = self_attention(p, f"{layer}.attention", norm(p, f"{layer}.norm1", x))
@@ -109,7 +109,7 @@ def encode(p: Weights, images: Tensor, c2w: Tensor, intrinsics: Tensor) -> Seque
     return norm(p, "encoder.k_norm", split(k)), split(v), rays.reshape(len(images), -1, 6)
 
 
-# ---- Decoder layer: qgs/components/decoder.py; qgs_locus/{ray_bias,cross_attention,...}.py ----
+# ---- Decoder layer: qgs/components/decoder.py, qgs_locus/{fields,ray_bias,*_attention}.py ----
 def support_radius(rho: Tensor) -> Tensor:
     # At r = 0 all Gaussians of an anchor would lie on one point and their offsets get no gradient.
     return F.softplus(rho).clamp_min(1e-3)
@@ -121,8 +121,8 @@ def ray_bias(mu: Tensor, rho: Tensor, rays: Tensor) -> Tensor:
     length = direction.norm(dim=-1, keepdim=True)  # below 1: a mean of unit vectors
     moment, direction = (x[:, None] / length[:, None] for x in (moment, direction))
     distance = (torch.linalg.cross(mu[:, :, None], direction, dim=-1) - moment).norm(dim=-1)
-    # sigma is at least .032: the anchors of this recipe start there, and a radius above .316 widens
-    # it. b is at least -20: an anchor far from all rays still attends, by content.
+    # sigma is at least .032: it follows radii above .316, and the recipe's start at .3. b is at
+    # least -20: an anchor far from all rays still attends, by content.
     sigma = (0.1 * support_radius(rho)).square().clamp_min(1e-3).sqrt()
     return (-0.5 * (distance / sigma).square()).clamp_min(-20)
 
@@ -150,13 +150,15 @@ def posact(t: Tensor) -> Tensor:
     return torch.where(t >= 0, torch.expm1(t), -torch.expm1(-t))
 
 
+# ---- Head, centres: qgs/components/{head,centers}.py, qgs_locus/decoding.py; qgs/model.py ----
 def decode(p: Weights, x: Tensor, mu: Tensor, rho: Tensor) -> Gaussians:
     """N*K Gaussians: means at offsets from the anchor that are multiples of its radius."""
-    raw = linear(p, "head.linear", x, PER_QUERY * 14).unflatten(-1, (PER_QUERY, 14))
-    offset, rgb, scale, quat, opacity = raw.split((3, 3, 3, 4, 1), -1)
+    sizes = (3, 3, 3, 4, 1)
+    raw = linear(p, "head.linear", x, PER_QUERY * sum(sizes)).unflatten(-1, (PER_QUERY, -1))
+    offset, rgb, scale, quat, opacity = raw.split(sizes, -1)
     parts = {
         "means": mu[:, :, None] + support_radius(rho)[:, :, None] * posact(offset),
-        "scales": (scale.clamp(-10, 10) - 1).exp().mul(SCALE_CAP).clamp_max(SCALE_CAP),
+        "scales": (scale.clamp(-10, 10) - 1).exp().clamp_max(1) * SCALE_CAP,  # starts below the cap
         "quats": F.normalize(quat, dim=-1, eps=1e-4),
         "opacities": torch.sigmoid(opacity[..., 0] + OPACITY_BIAS),
         "colors": (torch.tanh(rgb) + 1) / 2,
@@ -175,10 +177,10 @@ def forward(p: Weights, images: Tensor, c2w: Tensor, intrinsics: Tensor) -> dict
     raw = p.need("queries.raw_radius", (QUERIES, 1), -1.05, -1.05)  # softplus: 0.3
     x, mu, rho = (y.expand(len(images), -1, -1) for y in (features, p["queries.center"], raw))
     layers = {}
-    for i in range(DEPTH):
+    for i in range(DECODER_DEPTH):
         layer = f"decoder.{i}"
-        bias = ray_bias(mu, rho, rays)
-        update = cross_attention(p, f"{layer}.cross_attention", x, bias, k, v)
+        b = ray_bias(mu, rho, rays)
+        update = cross_attention(p, f"{layer}.cross_attention", x, b, k, v)
         x = x + scaled(p, f"{layer}.cross_scale", update)
         x = x + scaled(p, f"{layer}.self_scale", anchor_aware(p, f"{layer}.self_attention", x, mu))
         normed = norm(p, f"{layer}.feed_forward.norm", x)
@@ -190,27 +192,27 @@ def forward(p: Weights, images: Tensor, c2w: Tensor, intrinsics: Tensor) -> dict
     return layers
 
 
-# ---- Renderer: qgs/renderers/reference.py ----
+# ---- Renderer: qgs/renderers/reference.py, qgs/geometry/transforms.py ----
 def rotation(quats: Tensor) -> Tensor:  # (..., 4) w x y z -> (..., 3, 3)
     w, v = quats[..., :1, None], quats[..., None, 1:].expand(*quats.shape[:-1], 3, 3)
-    cross = torch.linalg.cross(v, torch.eye(3).expand_as(v), dim=-1).mT  # the matrix of v x .
+    cross = torch.linalg.cross(v, torch.eye(3).expand_as(v), dim=-1).mT  # cross @ y is v x y
     return torch.eye(3) + 2 * (w * cross + cross @ cross)
 
 
-def render(g: Gaussians, b: int, c2w: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
+def render(g: Gaussians, b: int, c2w: Tensor, intrinsics: Tensor, size: tuple[int, ...]) -> Tensor:
     """RGB (3, H, W) of the Gaussians of scene b from one camera: EWA splatting, front to back."""
     (fx, fy, cx, cy), (height, width) = intrinsics, size
-    w2c = c2w[:3, :3].T
-    in_camera = (g["means"][b] - c2w[:3, 3]) @ w2c.T
+    turn = c2w[:3, :3].T  # from the world's axes to the camera's
+    in_camera = (g["means"][b] - c2w[:3, 3]) @ turn.T
     seen = ((in_camera[:, 2] >= NEAR) & (in_camera[:, 2] <= FAR)).nonzero()[:, 0]
     i = seen[in_camera[seen, 2].argsort(stable=True)]  # front to back
     x, y, z = in_camera[i].unbind(-1)
     u, v = fx * x / z + cx, fy * y / z + cy
-    # The Jacobian of the projection, at most 15 % outside the image: it grows without bound there.
+    # The Jacobian of the projection grows without bound outside the image: slopes stop 15 % out.
     slope_x = (x / z).clamp((-0.15 * width - cx) / fx, (1.15 * width - cx) / fx)
     slope_y = (y / z).clamp((-0.15 * height - cy) / fy, (1.15 * height - cy) / fy)
     rows = [fx / z, 0 * z, -fx / z * slope_x, 0 * z, fy / z, -fy / z * slope_y]
-    spread = torch.stack(rows, -1).unflatten(-1, (2, 3)) @ w2c @ rotation(g["quats"][b, i])
+    spread = torch.stack(rows, -1).unflatten(-1, (2, 3)) @ turn @ rotation(g["quats"][b, i])
     spread = spread * g["scales"][b, i, None]
     inverse = (spread @ spread.mT + 0.3 * torch.eye(2)).inverse()  # low-pass of 3DGS, pixel^2
     du = (torch.arange(width) + 0.5 - u[:, None])[:, None]  # (G, 1, W)
@@ -218,10 +220,10 @@ def render(g: Gaussians, b: int, c2w: Tensor, intrinsics: Tensor, size: tuple[in
     xx, xy, yy = (inverse[:, r, c, None, None] for r, c in ((0, 0), (0, 1), (1, 1)))
     power = -0.5 * (xx * du * du + yy * dv * dv) - xy * du * dv
     alpha = g["opacities"][b, i, None, None] * power.clamp_max(0).exp()
-    alpha = torch.where(alpha >= 1 / 255, alpha.clamp_max(0.999), 0.0)
+    alpha = torch.where(alpha >= 1 / 255, alpha.clamp_max(0.999), 0.0)  # steps of 8 bits
     after = torch.cumprod(1 - alpha, 0)
     before = torch.cat([torch.ones_like(after[:1]), after])[:-1]
-    weight = torch.where(after > 1e-4, alpha * before, 0.0)
+    weight = torch.where(after > 1e-4, alpha * before, 0.0)  # 3DGS stops before 1e-4 is reached
     rgb = torch.einsum("gc,ghw->chw", g["colors"][b, i], weight)
     return rgb + BACKGROUND * (1 - weight.sum(0))
 
@@ -238,26 +240,25 @@ def ssim(x: Tensor, y: Tensor) -> Tensor:
     return (alike / ((energy + 0.01**2) * (xx + yy - energy + 0.03**2))).mean()
 
 
-def out_of_view(points: Tensor, c2w: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
-    """Mean of |u| - 1 and |v| - 1 beyond the nearest image, u and v from -1 to 1, at most 1."""
+def out_of_view(points: Tensor, c2w: Tensor, intrinsics: Tensor, size: tuple[int, ...]) -> Tensor:
+    """Mean of (|u| - 1)+ + (|v| - 1)+, least over views, at most 1; u, v in [-1, 1] in an image."""
     local = (points[:, None] - c2w[..., None, :3, 3]) @ c2w[..., :3, :3]  # (B, V, P, 3)
     z = torch.where(local[..., 2:].abs() < 1e-3, 1e-3, local[..., 2:])  # finite gradients
     pixel = intrinsics[..., None, :2] * local[..., :2] / z + intrinsics[..., None, 2:]
     outside = (2 * pixel / torch.tensor([size[1], size[0]]) - 1).abs().sub(1).relu().sum(-1)
-    outside = torch.where(local[..., 2] <= NEAR, torch.inf, outside)  # behind: not seen
+    outside = torch.where(local[..., 2] <= NEAR, torch.inf, outside)  # published: mirrored
     return outside.amin(1).clamp_max(1).mean()
 
 
 def loss(p: Weights, inputs: Sequence[Tensor], targets: Sequence[Tensor]) -> Tensor:
     """inputs and targets: images (B, V, 3, H, W), c2w, intrinsics."""
     truth, c2w, intrinsics = targets
-    size, total = (truth.shape[-2], truth.shape[-1]), torch.zeros(())
+    size, total, y = tuple(truth.shape[-2:]), torch.zeros(()), truth.flatten(0, 1)
     views = [(b, v) for b in range(truth.shape[0]) for v in range(truth.shape[1])]
     layers = forward(p, *inputs)
     for number, weight in LAYER_WEIGHTS.items():
         g = layers[number]
         rgb = torch.stack([render(g, b, c2w[b, v], intrinsics[b, v], size) for b, v in views])
-        y = truth.flatten(0, 1)
         term = F.mse_loss(rgb, y) + 0.2 * (1 - ssim(rgb, y)) / 2
         for name, factor in (("means", 0.1), ("mu", 0.01)):
             term = term + factor * out_of_view(g[name], c2w, intrinsics, size)
@@ -284,7 +285,7 @@ def main(steps: int) -> None:
     for step in range(steps):
         scene = blobs(views=4)
         value = loss(p, [x[:, :2] for x in scene], [x[:, 2:] for x in scene])
-        if optimizer is None:  # now all weights exist; biases and norms do not decay
+        if optimizer is None:  # now all weights exist; biases, norms and LayerScale do not decay
             groups = [{"params": [x for x in p.values() if x.ndim != 1], "weight_decay": 0.05}]
             groups += [{"params": [x for x in p.values() if x.ndim == 1], "weight_decay": 0.0}]
             optimizer = torch.optim.AdamW(groups, lr=1e-3, betas=(0.9, 0.95))
