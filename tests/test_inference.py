@@ -12,6 +12,7 @@ from qgs.composer import resolve
 from qgs.types import Cameras, Views
 
 ROOT = Path(__file__).parents[1]
+MODELS = ["tokengs", "locus", "ellipsoid", "gslrm", "c3g", "globalsplat", "mvsplat", "depthsplat"]
 IMPORTERS = ("import_module", "__import__")
 PUBLIC = {f"qgs.{name}" for name in qgs.__all__}
 
@@ -37,7 +38,7 @@ def somewhere(size: int = 64) -> Views:
     return Views(torch.rand(1, 2, 3, size, size), Cameras(c2w, lens, (size, size)))
 
 
-@pytest.mark.parametrize("name", ["tokengs", "locus", "ellipsoid", "gslrm", "c3g", "globalsplat"])
+@pytest.mark.parametrize("name", MODELS)
 def test_a_forward_pass_reads_no_value(name: str, tmp_path: Path) -> None:
     recipe = resolve(f"recipes/tiny/{name}.yaml")
     file = tmp_path / "model.safetensors"

@@ -69,8 +69,8 @@ def reconstruct(
     The scale is the recipe's; where that is a constant and the model was not trained on these
     photos, it is searched, see `qgs.analysis.scale`.
 
-    photos: a folder of photos and cameras, or its URL; or Views (1, V) in any world, of which all
-        are inputs unless `frames` says otherwise. OpenCV cameras, images in [0, 1].
+    photos: a folder of photos and cameras, or its URL; or Views (1, V) in any world, which all
+        become inputs unless `frames` names some. OpenCV cameras, images in [0, 1].
     inputs: how many; the recipe's number by default.
     frames: which photos, by number or file name; by default see `qgs.analysis.inputs`.
     compare: photos to compare with, "none" or no frames for none; of a folder, by default those

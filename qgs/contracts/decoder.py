@@ -61,8 +61,8 @@ class DecoderLayer(ModelComponent):
 
     sublayers: the slots inside this layer, of `cross_attention`, `self_attention` and
         `feed_forward`; a recipe that fills another one is refused.
-    reads_layer_scale: whether `decoder.layer_scale` has an effect; a recipe that sets it for layers
-        none of which reads it is refused.
+    reads_layer_scale: whether `decoder.layer_scale` has an effect; a recipe that sets it is refused
+        where no layer reads it.
     """
 
     slot: ClassVar[str] = "layer"

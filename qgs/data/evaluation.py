@@ -27,7 +27,7 @@ class IndexEntry(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     context: FrameList
-    """The input frames, the first of which sets the model's frame."""
+    """The input frames; the first sets the model's frame."""
     target: FrameList
     """The frames that are judged."""
 
@@ -94,7 +94,7 @@ class EvaluationPlan:
     windows_of: gives windows of a scene with held-out frames that does not move, instead.
 
     wanted, null, unlisted: see `qgs.engine.results.Evaluation`. framing: of the first photo, and
-    drawn: scenes of which samples were, once `samples` has run. Raises ValueError without scenes.
+    drawn: scenes that have samples, once `samples` has run. Raises ValueError without scenes.
     """
 
     def __init__(

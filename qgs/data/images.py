@@ -125,7 +125,7 @@ def orientation(image: Image.Image) -> int:
     """How EXIF would turn a decoded image; 1 for not at all."""
     try:
         return image.getexif().get(_ORIENTATION, 1)
-    except Exception:  # damaged EXIF, of which Pillow raises anything, does not matter
+    except Exception:  # Pillow raises anything for damaged EXIF, which does not matter
         return 1
 
 

@@ -179,7 +179,7 @@ def make_sample(
 ) -> Sample:
     """Decode frames, normalise poses in the scene's precision, mirror if asked; float32.
 
-    noise: of which `views.pose_noise` is drawn; None leaves poses as they are. depths: whether
+    noise: draws `views.pose_noise`; None leaves poses as they are. depths: whether
     views have depth maps where the scene has them; 0 in views whose pose is noisy, which no longer
     stand where the surface was seen from.
     """
@@ -218,7 +218,7 @@ def with_noise(
 def shaken(c2w: Tensor, angle: float, rng: np.random.Generator) -> Tensor:
     """Poses (F, 4, 4), all but the first off by `angle`, see `ViewsConfig.pose_noise`; radians."""
     turns, moves = torch.from_numpy(rng.normal(0, angle, (2, len(c2w), 3))).to(c2w)
-    cross = torch.linalg.cross(turns[:, None], torch.eye(3).to(c2w)[None]).mT
+    cross = torch.linalg.cross(turns[:, None], torch.eye(3).to(c2w)[None]).mT  # of turn x
     off, distances = c2w.clone(), (c2w[:, :3, 3] - c2w[0, :3, 3]).norm(dim=-1, keepdim=True)
     off[1:, :3, :3] = (c2w[:, :3, :3] @ torch.linalg.matrix_exp(cross))[1:]
     off[1:, :3, 3] += (moves * distances)[1:]

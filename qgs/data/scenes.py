@@ -61,7 +61,7 @@ class BoundedCache(Generic[Value]):
         """The value kept for `key`, or what `make` returns, which is kept if it fits."""
         with self._lock:
             if key in self._kept:
-                self._kept.move_to_end(key)
+                self._kept.move_to_end(key)  # the front is the least recently used
                 return self._kept[key][0]
         # made outside of the lock, so that threads decode side by side; two may make the same
         value = make()

@@ -75,7 +75,7 @@ def training_batches(
     """Batches start, start + 1, ... of an endless sequence, of `batch_size` samples each.
 
     Sample k depends on (seed, k) alone. Global batch n is the samples from n * batch_size *
-    processes on, of which every process gets its slice: `start` resumes exactly, and processes and
+    processes on; every process gets its slice. `start` resumes exactly, and processes and
     workers change nothing. workers: processes that decode; 0 decodes in a thread. Closing ends
     them. skips, sampler, depths: see `SampleStream`. accumulate: batches of an optimiser step.
     Raises ValueError without training scenes or with too few frames, SampleError and WorkerError.

@@ -101,7 +101,7 @@ def _frame(folder: UPath, place: UPath, values: Mapping[str, Any], name: str) ->
         )
     pose, matrix = numbers(values.get("c2w")), numbers(values.get("K"))
     if matrix.shape in ((3, 3), (4, 4)):
-        matrix = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+        matrix = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]  # fx, fy, cx, cy
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0, 0, 0, 1]])
     wrong = [("path", "no image is named")] if not name else []

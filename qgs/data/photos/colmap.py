@@ -161,7 +161,7 @@ def _camera(model: str, width: int, height: int, parameters: Sequence[float]) ->
     """Fields of a `PhotoFrame` that the camera took."""
     values = dict(zip(_parameters(model), parameters, strict=True))
     size, problems = listed_size(height, width)
-    focal = values.pop("f", math.nan)
+    focal = values.pop("f", math.nan)  # simple models have one for both axes
     fx, fy = values.pop("fx", focal), values.pop("fy", focal)
     intrinsics = fx, fy, values.pop("cx"), values.pop("cy")
     kind = _MODELS[model][2]

@@ -51,7 +51,7 @@ def _rows(file: UPath) -> np.ndarray:
 def _frame(path: UPath, row: np.ndarray) -> PhotoFrame:
     down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
     c2w = np.eye(4)
-    c2w[:3] = np.stack([right, down, -back, centre], 1)
+    c2w[:3] = np.stack([right, down, -back, centre], 1)  # OpenCV's axes
     size, problems = listed_size(float(height), float(width))
     return PhotoFrame(
         name=f"{path.parent.name}/{path.name}",

@@ -187,7 +187,7 @@ def _intrinsics(values: Mapping[str, Any], size: Size | None) -> Intrinsics:
         return _number(values, key) or size[axis] / 2 / math.tan(angle / 2)
 
     fx = focal("fl_x", "camera_angle_x", 1)
-    fy = focal("fl_y", "camera_angle_y", 0) or fx
+    fy = focal("fl_y", "camera_angle_y", 0) or fx  # pixels are square unless listed
     if fx is None or fy is None:
         raise _UnreadableError(
             "intrinsics",

@@ -306,7 +306,7 @@ def present_frames(
     refuse_fatal_problems(listing.file, present if len(present) > 1 else frames)
     if len(present) < 2:
         raise FileNotFoundError(
-            f"{listing.file} names {len(frames)} images, of which {len(present)} exist "
+            f"{listing.file} names {len(frames)} images, but {len(present)} exist "
             f"and 2 are needed: add {listed(missing, 3) or 'photos'}"
         )
     if missing:
@@ -317,7 +317,7 @@ def present_frames(
     absent = sorted(set(map(str, masks)) - set(map(str, existing(masks))))
     if absent:
         raise FileNotFoundError(
-            f"{listing.file} names {len(masks)} masks, of which {len(absent)} do not exist: "
+            f"{listing.file} names {len(masks)} masks, but {len(absent)} do not exist: "
             f"{listed(absent, 3)}. Add them, or remove their 'mask_path'"
         )
     return present, missing

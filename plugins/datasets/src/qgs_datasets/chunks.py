@@ -234,7 +234,7 @@ def _long_enough(
     files = list_scenes(folder)
     if not config.min_frames:
         return files
-    # in the order of the files, of which few stay open
+    # in the order of the files: few of them stay open
     by_file = sorted(files.items(), key=lambda item: str(item[1]))
     frames = {key: len(opener(key, file)) for key, file in by_file}
     short = {key: count for key, count in frames.items() if count < config.min_frames}

@@ -133,7 +133,7 @@ def _is_unfinished(path: UPath) -> bool:
 
 @dataclass
 class Packed:
-    """What a packing did: scenes by split, of which `resumed` were packed before.
+    """What a packing did: scenes by split; `resumed` of them were packed before.
 
     frames, kept: images written now, and those whose bytes stayed. left_out: scenes that could not
     be read, with the reason.

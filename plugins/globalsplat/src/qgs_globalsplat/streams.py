@@ -30,7 +30,7 @@ TEXTURE_FIELD: Fields = {TEXTURE: FieldSpec(("D",))}
 
 
 class SlotQueries(LearnedQueries):
-    """N learned tokens, of which the last `extra` decode no Gaussians: the mask leaves them out.
+    """N learned tokens; the last `extra` decode no Gaussians, the mask leaves them out.
 
     Geometry = Linear(LayerNorm(token)), texture = another Linear(LayerNorm(token)).
     """
@@ -61,13 +61,13 @@ class SlotQueries(LearnedQueries):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Tokens of which none decodes Gaussians."""
+        """No token that decodes Gaussians."""
         if config.extra >= config.count:
             reason = f"all {config.count} tokens are extra ones, which decode no Gaussians"
             yield Problem("extra", reason, f"write at most {config.count - 1}, or raise `count`")
 
     def start(self, batch_size: int) -> QueryState:
-        """The two streams of all tokens, in every scene alike."""
+        """The two streams of all tokens, the same in every scene."""
         tokens_ND = self.slots if self.extra is None else torch.cat([self.slots, self.extra])
         streams = (self.geometry(tokens_ND), at_least_float32(self.texture(tokens_ND)))
         geometry_BND, texture_BND = (x.expand(batch_size, -1, -1) for x in streams)

@@ -18,7 +18,7 @@ def group_norm(width: int) -> nn.GroupNorm:
 
 
 class OverViews(nn.Sequential):
-    """A sequence whose U-Nets and attentions are told how many views (B V, C, H, W) has."""
+    """A sequence that passes V, the views in (B V, C, H, W), on to its U-Nets and attentions."""
 
     def forward(self, x_NCHW: Tensor, views: int) -> Tensor:
         for module in self:

@@ -111,7 +111,7 @@ class FreeGaussians:
 def shared(opacities: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
     """Opacity and scale factor of N equal Gaussians that together look like one.
 
-    opacities: (n,), of the one. shares: (n,) integers N, at most _MOST_COPIES of which count.
+    opacities: (n,), of the one. shares: (n,) integers N, clamped to _MOST_COPIES.
     Equation 9 of the paper: the sum over k of C(N, k+1) (-1)^k / sqrt(k+1) a^(k+1). In float64,
     because terms of alternating sign cancel.
     """

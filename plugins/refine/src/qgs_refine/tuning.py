@@ -53,7 +53,7 @@ def tune(
     """Fit what the model holds of the scenes `views` (B, V) to these views; weights stay.
 
     what: "queries", all features and floating fields of the initial state, so LocusGS's anchors
-    too; or "latents", the features of the image memory, of which the encoder makes keys and values
+    too; or "latents", the features of the image memory; the encoder makes keys and values of them
     anew in every step. `loss` compares the last layer with the photos; the optimiser is Adam.
     TokenGS takes 50 steps, at a rate of 1e-4 of queries and 1e-2 of latents.
     Raises ValueError for less than one step, and for latents of an encoder that has none to tune.

@@ -24,7 +24,7 @@ from qgs_studies.stored import COMPACT, StoredResults
 class Difference:
     """One metric over the scenes that both results have; differences are first minus second.
 
-    trainings: pairs of them, of one of which low and high say nothing.
+    trainings: number of paired runs; with one, low and high ignore the noise of training.
     low, high: the 95 % interval of the mean difference, None for fewer than two scenes.
     wins, losses: scenes in which the first is better, or worse; the rest are equal.
     """

@@ -128,7 +128,7 @@ def run_of(folder: Path, variant: str, seed: int) -> Run:
 
 
 def recipe_file(folder: Path, variant: str) -> Path:
-    """The resolved recipe of a variant, of which its runs are trained."""
+    """The resolved recipe that the runs of a variant train."""
     return folder / "variants" / f"{variant}.yaml"
 
 

@@ -27,7 +27,7 @@ from qgs_studies.study import Hypothesis
 SEEN, CONTRADICTED, UNDECIDED = "seen", "contradicted", "undecided"
 Terms: TypeAlias = Mapping[tuple[str, str], int]
 
-_RANKED = 5  # variants of which a rank correlation says anything
+_RANKED = 5  # fewest variants for which a rank correlation means anything
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ def anchor_colors(look: Look, choice: Choice) -> tuple[np.ndarray, np.ndarray]:
 
 
 def faded(colors: np.ndarray | Color, strength: float | np.ndarray, look: Look) -> np.ndarray:
-    """uint8 colours mixed with the background of `look`, of which strength 0 is all."""
+    """uint8 colours mixed with the background of `look`; strength 0 is the background alone."""
     mixed = strength * np.array(colors) + (1 - strength) * 255 * np.array(look.background)
     return mixed.round().astype(np.uint8)
 

@@ -186,7 +186,7 @@ def _outside_graphs(function: Callable[..., T]) -> Callable[..., T]:
 
 
 class _Dense(torch.autograd.Function):
-    """The bias of all pairs, of which nothing is kept for the backward pass."""
+    """The bias of all pairs; keeps nothing of it for the backward pass."""
 
     @staticmethod
     def forward(ctx: Any, queries: Tensor, tokens: Tensor, bias: AttentionBias) -> Tensor:

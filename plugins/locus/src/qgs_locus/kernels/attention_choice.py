@@ -3,7 +3,7 @@
 On a CPU: blocks. On CUDA: the plain way, with the bias of all pairs, while one layer needs at most
 1 / SHARE of the GPU's memory for it (every layer keeps its bias for the backward pass); beyond that
 Triton kernels, or blocks where these cannot be used. No path has been timed on a GPU. The choice
-depends on sizes alone, so that layers, steps and processes of a training choose alike.
+depends on sizes alone, so that all layers, steps and processes of a training make the same choice.
 """
 
 import logging
@@ -61,7 +61,7 @@ def chosen_kernel(
 
 
 def plain_bytes(q_BhNd: Tensor, bias: "AttentionBias") -> int:
-    """What the plain way takes besides q, k and v: the bias, and its gradient for each head."""
+    """Memory of the plain way without q, k and v: the bias, and its gradient for each head."""
     (scenes, heads, queries, _), read = q_BhNd.shape, q_BhNd.element_size()
     each = bias.queries.element_size() + (read if q_BhNd.dtype != bias.queries.dtype else 0)
     if torch.is_grad_enabled() and (bias.queries.requires_grad or bias.tokens.requires_grad):
