@@ -259,12 +259,12 @@ class ImageMemory(TensorContainer):
     )
 
     def __post_init__(self) -> None:
+        shape = tuple(self.features.shape)
+        if self.grid is not None and shape[1:2] != (patches := math.prod(self.grid),):
+            raise ValueError(f"ImageMemory.grid {self.grid}: {patches} tokens, features {shape}")
         _check_shapes(
             self, features="B M C", keys="B h M D/h", values="B h M D/h", patch_rays="B M 6"
         )
-        tokens = self.features.shape[1]
-        if self.grid is not None and math.prod(self.grid) != tokens:
-            raise ValueError(f"ImageMemory.grid {self.grid} must hold the {tokens} tokens")
 
     def __getitem__(self, name: str) -> Tensor:
         """A tensor that a component `reads`, such as "keys"; KeyError where there is none."""

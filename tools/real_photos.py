@@ -1,6 +1,6 @@
 """How models do on photos of real scenes, over many windows, with the scale that search finds.
 
-    python tools/real_photos.py [PHOTOS ...] [--model rooms/locus-64] [--windows 12] [--out JSON]
+    python tools/real_photos.py PHOTOS ... [--model rooms/locus-64] [--windows 12] [--out JSON]
 
 For each window: PSNR and SSIM of novel views with the found scale, with `views.scale: auto`, and by
 the best factor of a fine grid; the nearest photo; the scale, and seconds of a core for its search.
@@ -31,8 +31,6 @@ from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.model import QueryGaussianModel
 
-ROOT = Path(__file__).resolve().parents[2] / "shared" / "photos"
-SCENES = ("mary_rose", "office_walk", "desk")
 MODELS = ("rooms/locus-64", "rooms/tokengs-64", "rooms/locus-128")
 RATIO, REACH = 1.08, 5.0
 """Of the fine grid: ratio of its factors, how far it goes beyond the range of both scales."""
@@ -44,13 +42,10 @@ Row = dict[str, Any]
 def main() -> None:
     options = parsed()
     torch.set_num_threads(options.threads)
-    places = options.photos or [ROOT / name for name in SCENES if (ROOT / name).is_dir()]
-    if not places:
-        raise SystemExit("name folders of photos with cameras")
     size = parse_size(options.size)
     rows: list[Row] = []
     for name in options.model or MODELS:
-        for place in places:
+        for place in options.photos:
             rows += scene_rows(name, Path(place), options.windows, size, options.spans)
     print(table(rows))
     if options.out:
@@ -60,7 +55,7 @@ def main() -> None:
 def parsed() -> argparse.Namespace:
     """The options."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("photos", nargs="*", help=f"folders; default: {', '.join(SCENES)}")
+    parser.add_argument("photos", nargs="+", help="folders of photos with cameras")
     parser.add_argument("--model", action="append", help=f"default: {', '.join(MODELS)}")
     parser.add_argument("--windows", type=int, default=12, help="of a scene, at most")
     parser.add_argument("--size", help="HxW of the photos; default: whole, as the models do")

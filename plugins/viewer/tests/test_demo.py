@@ -180,8 +180,8 @@ def test_the_page_has_the_remarks_and_warnings_that_were_printed(models, tmp_pat
     shutil.copy(photos / "transforms.json", photos / "transforms_train.json")
     result = run_qgs("demo", photos, *models)
     page = html.unescape((tmp_path / "demo" / "report.html").read_text())
-    notes = page.partition("How they compare</h2>")[2].partition("<div")[0]
-    for remark in re.findall("<p>(.*)</p>", notes):
+    notes = page.partition("<ul>")[2].partition("</ul>")[0]
+    for remark in re.findall("<li>(.*)</li>", notes):
         assert remark in result.output + caplog.text
     assert "2 formats" in notes
     assert "few, more: the model sees" in notes

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from commands import run_qgs
+from photo_formats import real_folder
 from PIL import Image
 from qgs_viewer.contest import checkpoints, judge
 from qgs_viewer.scales import summary
@@ -26,7 +27,6 @@ from qgs.contracts import ViewsConfig
 from qgs.data.domain import Domain
 
 MODEL, UNIT = "rooms/tokengs-64", 7.0
-REAL = Path(__file__).parents[4] / "shared" / "photos"
 
 
 @pytest.fixture(scope="module")
@@ -60,22 +60,14 @@ def test_a_room_in_another_unit_has_its_own_scale(room: Path) -> None:
     assert not found.poor
 
 
-@pytest.mark.parametrize("place", ["room", "office_walk"])
+@pytest.mark.parametrize("place", ["room", pytest.param("office_walk", marks=pytest.mark.slow)])
 def test_all_commands_find_the_same_scale(
     place: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    photos = REAL / place
-    if place == "room":
-        photos = request.getfixturevalue("room")
-    elif not photos.is_dir():
-        pytest.skip(f"needs the photos at {photos}")
+    photos = request.getfixturevalue("room") if place == "room" else real_folder(place)
     entry = judge(checkpoints([MODEL]), str(photos), "cpu")[0]
     (_, inputs, compared), found = next(iter(entry.search.found.items()))
-    frames, holdout = (",".join(map(str, part)) for part in (inputs, compared))
-    run_qgs(
-        *("reconstruct", MODEL, photos, "--out", tmp_path / "out"),
-        *("--frames", frames, "--holdout", holdout),
-    )
+    run_qgs("reconstruct", MODEL, photos, "--out", tmp_path / "out")
     record = json.loads((tmp_path / "out/cameras.json").read_text())
     assert record["to_photos"]["scale"] == pytest.approx(found.factor, rel=1e-6)
     assert record["to_photos"]["search"] == found.record

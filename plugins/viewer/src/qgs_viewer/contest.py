@@ -263,11 +263,17 @@ def remarks(entries: Sequence[Entry]) -> list[str]:
 
 
 def chosen_windows(entry: Entry) -> Iterator[str]:
-    """A sentence on each scene whose windows were chosen, by names of photos."""
+    """A line on each scene whose windows were chosen, by names of photos in their folder."""
     for score in entry.evaluation.scores if entry.windows_of else ():
-        pairs = [[listed(score.names.get(f, str(f)) for f in p) for p in w] for w in score.views]
-        text = "; ".join(f"{inputs}, judged on held-out {targets}" for inputs, targets in pairs)
-        yield f"{score.scene}, inputs {text}."
+        frames = {frame for window in score.views for part in window for frame in part}
+        names = {frame: score.names.get(frame, str(frame)) for frame in frames}
+        folder = f"{os.path.commonpath([os.path.dirname(name) for name in names.values()])}/"
+        pairs = [
+            [listed(names[frame].removeprefix(folder) for frame in part) for part in window]
+            for window in score.views
+        ]
+        text = "; ".join(f"{inputs} ({targets})" for inputs, targets in pairs)
+        yield f"{score.scene}, inputs (held-out photos that are judged): {text}"
 
 
 def scales(entries: Sequence[Entry]) -> list[str]:
@@ -328,6 +334,7 @@ def report_of(
     device = torch.cuda.get_device_name() if gpu else cores
     threads = counted(torch.get_num_threads(), "thread")
     names = listed((entry.contender.name for entry in entries), most=3)
+    judged = "beside" if entries[0].windows_of else "between"
     return Report(
         columns=evaluation.columns,
         title=f"{names}: {scenes.lower()}",
@@ -345,7 +352,7 @@ def report_of(
         depths=[true_depth(source, sample) for sample in samples],
         facts={
             "Data": f"{recipe.tree['data']['type']}, {width} × {height} pixels",
-            "Views": f"{recipe.views.inputs} inputs, judged on the views between them",
+            "Views": f"{recipe.views.inputs} inputs, judged on views {judged} them",
             **facts,
             "Machine": f"{device}, {threads}, {platform.system()}",
             "Software": ", ".join(f"{name} {version}" for name, version in software.items()),

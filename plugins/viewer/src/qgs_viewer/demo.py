@@ -131,7 +131,7 @@ def show_trained(
         entries = contest.judge(files, photos, device, parse_size(size), scale_settings(scale))
     lede = "These trained models come with qgs, and none has seen the scenes below."
     if photos is not None:
-        lede = "Trained models on your photos, judged on those between their inputs."
+        lede = "Trained models on your photos, judged on photos beside their inputs."
     elif models:
         lede = "Trained models, judged on the test split of their recipe."
     facts = {"Training": "; ".join(entry.progress for entry in entries)}

@@ -52,7 +52,7 @@ class Report:
 
     baselines: name to scores on the same views. samples: the pictured scenes, headed `scenes`.
     depths: for each the true depth (T, 1, H, W) of its targets in the model's units, where known.
-    lede: a sentence or two below the title. notes: remarks above the table. meanings: of the
+    lede: a sentence or two below the title. notes: remarks below the table. meanings: of the
     columns. commands: next commands, with what each does.
     """
 
