@@ -3,6 +3,7 @@
 from qgs_dinov2.vit import VitConfig
 
 from qgs.contracts import Plugin
+from qgs_mvsplat.depth_error import DepthError
 from qgs_mvsplat.depthsplat_encoder import DepthSplatEncoder
 from qgs_mvsplat.depthsplat_head import WorldHead
 from qgs_mvsplat.depthsplat_weights import DEPTHSPLAT
@@ -30,7 +31,7 @@ plugin = Plugin(
     contract_version=1,
     components=(
         *(MVSplatEncoder, PixelQueries, RayHead, OnRays),
-        *(DepthSplatEncoder, WorldHead, Exchange, DecayedSupervision),
+        *(DepthSplatEncoder, WorldHead, Exchange, DecayedSupervision, DepthError),
     ),
     layouts=(MVSPLAT, DEPTHSPLAT),
     examples=(
