@@ -13,6 +13,8 @@ from published.idle_options import IDLE_OPTIONS
 
 WEIGHTS = "weights."
 EXPECTED = "expected."
+LOADER = ("crop.", "patch.")
+"""Of a release's data loader: it crops photos to whole pixels, the sources here do not."""
 
 
 class GoldenFileError(ValueError):
@@ -77,15 +79,20 @@ class GoldenFile:
         return {name.removeprefix(WEIGHTS): self.input(name) for name in names}
 
     def expected(self) -> dict[str, Tensor]:
-        """The tensors to compare: all that were not read as inputs or weights."""
-        return {name: value for name, value in self.tensors.items() if name not in self.read}
+        """The tensors to compare: all but inputs, weights and those of a data loader."""
+        left_out = {*self.read, *self.of_loader()}
+        return {name: value for name, value in self.tensors.items() if name not in left_out}
+
+    def of_loader(self) -> list[str]:
+        """Names of a data loader's tensors."""
+        return [name for name in self.tensors if name.startswith(LOADER)]
 
     def promised(self) -> list[str]:
         """Names that the metadata lists as outputs."""
         outputs = self.config.get("outputs", [])
         if not isinstance(outputs, list) or not all(isinstance(name, str) for name in outputs):
             raise GoldenFileError(f"`outputs` must be a list of names, got {outputs!r}")
-        return outputs
+        return [name for name in outputs if not name.startswith(LOADER)]
 
 
 class _Noting(Mapping[str, Any]):

@@ -6,9 +6,12 @@ from typing import Any
 from qgs_published.layouts import names_of
 from torch import Tensor
 
+from published.depthsplat import depthsplat_tensors
 from published.files import GoldenFile, GoldenFileError
 from published.locus import locusgs_recipe
+from published.mvsplat import mvsplat_tensors
 from published.recording import model_tensors
+from published.splat_cases import cases_tensors
 from published.tokengs import tokengs_recipe
 from qgs.composer import resolve
 from qgs.contracts.weights import real_ratio
@@ -18,6 +21,14 @@ RECIPES: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
     "tokengs": tokengs_recipe,
     "locusgs": locusgs_recipe,
 }
+
+COMPUTED: Mapping[str, Callable[[GoldenFile], dict[str, Tensor]]] = {
+    "mvsplat": mvsplat_tensors,
+    "mvsplat_cases": cases_tensors,
+    "depthsplat": depthsplat_tensors,
+    "depthsplat_cases": cases_tensors,
+}
+"""Kinds of files whose weights and inputs are stored in another way."""
 
 TIMES = ("times", "target_time")
 TUNED = "tuned_latents"
@@ -31,6 +42,8 @@ def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     Raises GoldenFileError for a file that contradicts itself or lacks something, and ValueError
     for options that no recipe can express.
     """
+    if golden.config.get("kind") in COMPUTED:
+        return COMPUTED[golden.config["kind"]](golden)
     recipe = resolve(recipe_of(golden))
     model = recipe.build_model().eval()
     weights = golden.weights()
@@ -48,7 +61,8 @@ def recipe_of(golden: GoldenFile) -> dict[str, Any]:
     """The recipe of the model that a file was computed with; raises as `golden_tensors` does."""
     kind = golden.config.get("kind")
     if not isinstance(kind, str) or kind not in RECIPES:
-        raise GoldenFileError(f"the kind of model is {kind!r}; known are {', '.join(RECIPES)}")
+        known = ", ".join([*RECIPES, *COMPUTED])
+        raise GoldenFileError(f"the kind of model is {kind!r}; known are {known}")
     constants = {name: golden.config[name] for name in ("geo_sigma",) if name in golden.config}
     recipe = RECIPES[kind](golden.options("options", constants))
     model = recipe["model"]

@@ -1,12 +1,9 @@
-"""Files in DepthSplat's published layout: recognised, imported whole, exact; parameters counted."""
+"""DepthSplat's parameters counted, and its recipes read from names and shapes."""
 
 from pathlib import Path
 
 import pytest
-import torch
 from qgs_mvsplat.depthsplat_weights import DEPTHSPLAT
-from qgs_published.importing import import_weights
-from released import Released
 
 import qgs
 from qgs.contracts import LayoutError
@@ -124,20 +121,3 @@ def test_the_published_models(name: str) -> None:
     for missing in ("pretrained.norm.weight", "gaussian_regressor.0.weight"):
         with pytest.raises(LayoutError):
             DEPTHSPLAT.read({k: x for k, x in shapes.items() if not k.endswith(missing)})
-
-
-def test_an_imported_file_gives_the_released_numbers(tmp_path: Path) -> None:
-    released = Released("depthsplat_base_eighth_a")
-    weights = {f"encoder.{name}": x for name, x in released.weights().items()}
-    file, out = tmp_path / "depthsplat-gs-base.pth", tmp_path / "model.safetensors"
-    torch.save({"state_dict": weights, "epoch": 3}, file)
-    import_weights(file, None, out)
-    model = qgs.load(out).eval()
-    own = {DEPTHSPLAT.published_name(name): x for name, x in model.state_dict().items()}
-    assert own.keys() == weights.keys()
-    assert all(torch.equal(x, weights[str(name)]) for name, x in own.items())
-    near, far = (released.tensors[name] for name in ("near", "far"))
-    with torch.no_grad():
-        numbers = model.encoder.predict(released.views(), near, far)
-    depth = numbers[:, :, 0].exp()
-    torch.testing.assert_close(depth, released.tensors["depth"], rtol=1e-4, atol=5e-5)

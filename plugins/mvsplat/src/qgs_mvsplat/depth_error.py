@@ -15,7 +15,8 @@ class DepthError(Metric):
 
     def forward(self, given: MetricInput) -> Tensor:
         """One number for each pixel with a true depth; where nothing is rendered it is 1."""
-        assert given.depth is not None and given.true_depth is not None
+        assert given.depth is not None
+        assert given.true_depth is not None
         known = given.true_depth > 0
         true = given.true_depth[known]
         return (given.depth[known] - true).abs() / true

@@ -18,13 +18,13 @@ from qgs_mvsplat.sweep import (
 )
 from qgs_mvsplat.two_depths import Exchange
 from qgs_mvsplat.windows import shift_mask
-from recorded import Recorder
-from released import Released
 from torch import Tensor
 
+from published.files import GoldenFile
+from published.splats import Recorder, views_of, weights_of
 from qgs.contracts import LayerParts, ModelDims
 from qgs.geometry.transforms import quat_to_matrix
-from qgs.types import GaussianAttributes, ImageMemory, QueryState
+from qgs.types import GaussianAttributes, ImageMemory, QueryState, Views
 
 DIMS = {1: ModelDims(38, 1, 0), 2: ModelDims(39, 1, 2)}
 """Of models of one scale, and of two with both depths."""
@@ -32,9 +32,9 @@ DEGREE = 2
 VITS = {"vits": VitConfig(), "vitb": VitConfig(width=768, depth=12, heads=12)}
 
 
-def encoder_of(released: Released) -> DepthSplatEncoder:
+def encoder_of(golden: GoldenFile) -> DepthSplatEncoder:
     """The encoder with the options and the weights of a file."""
-    options = released.options
+    options = golden.options("options")
     config = DepthSplatEncoder.Config(
         near=0.5,
         far=100.0,
@@ -45,15 +45,15 @@ def encoder_of(released: Released) -> DepthSplatEncoder:
         coarse_depth=options["num_scales"] > 1,
     )
     encoder = DepthSplatEncoder(config, DIMS[config.scales]).eval()
-    encoder.network.load_state_dict(released.weights())
+    encoder.network.load_state_dict(weights_of(golden))
     return encoder
 
 
 @torch.no_grad()
-def recorded(released: Released) -> dict[str, Tensor]:
+def depthsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     """Every output of a golden file."""
-    encoder, views = encoder_of(released), released.views()
-    near, far = released.tensors["near"], released.tensors["far"]
+    encoder, views = encoder_of(golden), views_of(golden)
+    near, far = golden.input("near"), golden.input("far")
     kept = Recorder(near.shape[1])
     watch(kept, encoder, views.cameras.size)
     numbers = encoder.predict(views, near, far)
@@ -67,7 +67,7 @@ def recorded(released: Released) -> dict[str, Tensor]:
     found["neighbours"] = torch.cat([first, neighbours], -1)
     found["shift_mask"] = shift_mask(*(side // encoder.config.stride for side in size))
     swept(found, predictor, sweep)
-    return found | gaussians(released, numbers)
+    return found | gaussians(views, numbers, encoder.dims)
 
 
 def watch(kept: Recorder, encoder: DepthSplatEncoder, size: tuple[int, int]) -> None:
@@ -75,14 +75,8 @@ def watch(kept: Recorder, encoder: DepthSplatEncoder, size: tuple[int, int]) -> 
     network, predictor = encoder.network, encoder.network.depth_predictor
     low = (size[0] // encoder.config.stride, size[1] // encoder.config.stride)
     kept.output("features_cnn.0", predictor.backbone.conv2)
-    transformer, vit = predictor.transformer, predictor.pretrained
-    transformer.register_forward_pre_hook(
-        lambda _, given: kept.found.update({"transformer.0": given[0]})
-    )
-    for index, layer in enumerate(transformer.layers):
-        kept.windows(f"transformer_self.{index}", layer.self_attn, low, bool(index % 2))
-        kept.windows(f"transformer.{index + 1}", layer, low, bool(index % 2))
-    transformer.register_forward_hook(lambda _, __, out: kept.found.update({"features_mv.0": out}))
+    kept.transformer(predictor.transformer, low, "features_mv.0")
+    vit = predictor.pretrained
     if encoder.config.scales > 1:
         kept.output("features_mv.1", predictor.mv_pyramid.stages[1])
         kept.output("features_mono.1", predictor.mono_pyramid.stages[1])
@@ -146,14 +140,13 @@ def swept(found: dict[str, Tensor], predictor: DepthPredictor, sweep: Sweep) -> 
         found[f"coarse_inverse_depth.{scale}"] = inverse.unflatten(0, shape)
 
 
-def gaussians(released: Released, numbers_BVCHW: Tensor) -> dict[str, Tensor]:
+def gaussians(views: Views, numbers_BVCHW: Tensor, dims: ModelDims) -> dict[str, Tensor]:
     """Outputs behind the networks, by queries, layers, head and centres."""
-    cameras = released.views().cameras
-    views, size = cameras.shape[1], cameras.size
+    cameras = views.cameras
+    count, size = cameras.shape[1], cameras.size
     numbers = numbers_BVCHW.movedim(2, -1)
-    memory = ImageMemory(numbers.flatten(1, 3), grid=(views, *size))
-    dims = DIMS[released.options["num_scales"]]
-    state = PixelQueries(PixelQueries.Config(), dims)(memory, released.views())
+    memory = ImageMemory(numbers.flatten(1, 3), grid=(count, *size))
+    state = PixelQueries(PixelQueries.Config(), dims)(memory, views)
     out, means = decoded(state, dims)
     factors = quat_to_matrix(out.quats) * out.scales[..., None, :]
     turn = turn_of_harmonics(cameras.c2w[..., :3, :3], DEGREE) * band_mask(DEGREE)
@@ -166,7 +159,7 @@ def gaussians(released: Released, numbers_BVCHW: Tensor) -> dict[str, Tensor]:
         "means": means,
         "covariances": (factors @ factors.mT)[:, :, 0],
         "opacities": out.opacities[..., 0],
-        "scales": out.scales.unflatten(1, (views, *size))[..., 0, :],
+        "scales": out.scales.unflatten(1, (count, *size))[..., 0, :],
         "rotations": camera_quaternions(numbers[..., 7:11]),
         "harmonics": torch.einsum("bvkl,bvhwxl->bvhwxk", turn, sh).flatten(1, 3),
     }
