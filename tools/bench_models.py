@@ -11,7 +11,7 @@ Prints medians, and medians of the ratios to TokenGS round by round.
 
 import argparse
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from operator import truediv
 
@@ -71,7 +71,7 @@ def backward(model: QueryGaussianModel, photos: Views, bf16: bool = False) -> No
     total.backward()
 
 
-def compare(runs: dict[str, Callable[[], object]], rounds: int) -> None:
+def compare(runs: Mapping[str, Callable[[], object]], rounds: int) -> None:
     """Time every run in turn, once a round; print medians and ratios to the first run."""
     columns = in_turn([*runs.values()], rounds, warmup=1)
     for name, samples in zip(runs, columns, strict=True):

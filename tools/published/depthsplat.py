@@ -92,7 +92,8 @@ def watch(kept: Recorder, encoder: DepthSplatEncoder, size: tuple[int, int]) -> 
         lambda _, given: kept.keep("features_mono_eighth.3", given[0][-1])
     )
     for scale in range(encoder.config.scales):
-        regressor, head = predictor.regressor[scale], predictor.depth_head[scale]
+        regressor: Any = predictor.regressor[scale]
+        head = predictor.depth_head[scale]
         kept.input(f"cost_volume.{scale}", regressor, slice(predictor.candidates(scale)))
         kept.output(f"cost_unet.{scale}.stem", regressor[2])
         kept.unet(f"cost_unet.{scale}", regressor[3])

@@ -53,7 +53,11 @@ class Recorder:
 
     def output(self, name: str, module: nn.Module) -> None:
         """What a module returns."""
-        module.register_forward_hook(lambda _, __, out: self.keep(name, out))
+
+        def keep(_: Any, __: Any, out: Tensor) -> None:
+            self.keep(name, out)
+
+        module.register_forward_hook(keep)
 
     def input(self, name: str, module: nn.Module, channels: slice = slice(None)) -> None:
         """What a module is given."""
