@@ -1,0 +1,1 @@
+"""Camera poses of photos and videos, and videos of camera paths."""

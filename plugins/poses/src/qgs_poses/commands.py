@@ -1,0 +1,97 @@
+"""`qgs poses`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from qgs.cli.options import Threads
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+app = typer.Typer(help="Camera poses of photos or a video.")
+
+
+@app.command()
+def poses(
+    source: Annotated[
+        Path, typer.Argument(metavar="PHOTOS_OR_VIDEO", help="Folder of photos, or a video file.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="New folder for poses and photos; default: NAME_poses beside them."),
+    ] = None,
+    frames: Annotated[
+        int | None,
+        typer.Option(
+            min=3, help="Frames of a video; default: two for each second, 40 to 120 in all."
+        ),
+    ] = None,
+    side: Annotated[
+        int, typer.Option(min=200, help="Longer side in pixels at which points are looked for.")
+    ] = 1600,
+    matching: Annotated[
+        Literal["auto", "exhaustive", "sequential"],
+        typer.Option(
+            help="Match all pairs, or neighbours by name; auto: the latter for videos and above 80 "
+            "photos."
+        ),
+    ] = "auto",
+    features: Annotated[
+        int, typer.Option(min=100, help="Points of a photo that are matched, at most.")
+    ] = 4096,
+    seed: Annotated[
+        int, typer.Option(min=0, help="With --threads 1 the same seed gives the same file.")
+    ] = 0,
+    threads: Threads = None,
+) -> None:
+    """Camera poses of photos or a video, by COLMAP: sparse/0 and images, checked at once.
+
+    The photos stay where they are. An interrupted call goes on where it was when it is repeated.
+    """
+    from rich.console import Console
+
+    from qgs_poses.door import beside
+    from qgs_poses.making import Options, make_poses
+
+    if not source.exists():
+        raise FileNotFoundError(
+            f"{source} (from {Path.cwd()}) does not exist: give photos or a video"
+        )
+    if frames is not None and not source.is_file():
+        raise ValueError("--frames is for a video: leave it out")
+    console = Console()
+    options = Options(frames, side, matching, features, seed=seed)
+    if threads:
+        options = Options(frames, side, matching, features, threads, seed)
+    made = make_poses(source, out or beside(source), options, console)
+    for line in made.summary:
+        _line(console, line)
+    show_verdict(made.folder, console)
+    _line(console, f"wrote {made.folder}; next: qgs demo {made.folder}")
+
+
+def show_verdict(folder: Path, console: Console) -> None:
+    """What `qgs data check` finds in `folder`."""
+    from qgs_datatools.check import Options, check
+
+    from qgs.data.paths import opened_path
+
+    with console.status("checking"):
+        report = check(opened_path(folder), Options())
+    for finding in report.findings:
+        _line(console, str(finding))
+    (scene,) = report.scenes
+    warnings = len(report.findings) - report.errors
+    _line(
+        console,
+        f"checked: {report.errors} errors, {warnings} warnings; matched points lie "
+        f"{scene.epipolar} pixels from their epipolar lines",
+    )
+
+
+def _line(console: Console, text: str) -> None:
+    console.print(text, soft_wrap=True, highlight=False, markup=False)

@@ -1,0 +1,186 @@
+"""Photos of a user, made ready for COLMAP: upright, RGB with 8 bits, no larger than wanted.
+
+What no poses can be made of is refused here, before minutes are spent.
+"""
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageOps
+from upath import UPath
+
+from qgs.data.images import eight_bits, opened_image
+from qgs.data.photos.reader import image_files
+from qgs.wording import counted, listed
+
+LEAST = 3
+SMALLEST = 64  # pixels of a side
+_FOREIGN = (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".avif", ".jxl")
+_ORIENTATION, _SUB, _MAKE, _MODEL = 0x0112, 0x8769, 0x010F, 0x0110
+_LENS = (0x920A, 0xA405, 0xA434)  # focal length, its equivalent of 35 mm film, lens
+_JUDGED = 640  # pixels of the longer side at which sharpness is measured
+_THUMB = (48, 48)
+ALIKE = 1.2
+"""Mean difference of thumbnails in 1/255 up to which two photos show the same; noise gives .5."""
+BLURRED = 4.0
+"""Variance of the Laplacian, of grey in 1/255, up to which no photo of a folder has edges."""
+
+
+class PosesError(ValueError):
+    """Photos or a video of which no poses can be made; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photo that is ready. name: in both folders. size: (H, W) upright. camera: of EXIF.
+
+    sharpness: variance of the Laplacian at _JUDGED pixels. thumb: (48, 48) grey.
+    """
+
+    name: str
+    size: tuple[int, int]
+    camera: str
+    sharpness: float
+    thumb: np.ndarray
+
+
+def photo_files(folder: Path) -> list[Path]:
+    """The photos in `folder`, or in its `images`. Raises PosesError for fewer than LEAST."""
+    found = next((f for f in (folder, folder / "images") if image_files(UPath(f))), folder)
+    files = [Path(str(file)) for file in image_files(UPath(found))]
+    foreign = sorted(f.name for f in found.iterdir() if f.suffix.lower() in _FOREIGN)
+    if len(files) < LEAST:
+        text = f"{found} holds {counted(len(files), 'photo')}, and poses need {LEAST} at least"
+        if foreign:
+            text += f"; {listed(foreign, 3)} cannot be read: convert them to JPEG"
+        raise PosesError(text if foreign else f"{text}: take more, from places of your own choice")
+    return files
+
+
+def left_out_formats(files: Sequence[Path]) -> list[str]:
+    """Names of photos beside `files` in formats that are not read."""
+    names = (file.name for file in files[0].parent.iterdir())
+    return sorted(name for name in names if name.lower().endswith(_FOREIGN))
+
+
+def prepare(
+    files: Sequence[Path],
+    kept: Path,
+    working: Path,
+    side: int,
+    progress: Callable[[int], None] = lambda done: None,
+) -> tuple[list[Photo], dict[str, str]]:
+    """Put `files` upright into `kept`, and no longer than `side` into `working`.
+
+    A file that is upright already is linked, or copied across file systems. Returns those that are
+    ready, in the order of `files`, and of the others name and reason.
+    """
+    ready, faulty = list[Photo](), dict[str, str]()
+    for number, file in enumerate(files):
+        try:
+            ready.append(_prepared(file, kept, working, side))
+        except (OSError, ValueError) as error:
+            if isinstance(error, OSError) and error.errno is not None:  # the disk, not the photo
+                raise
+            faulty[file.name] = str(error)
+        progress(number + 1)
+    return ready, faulty
+
+
+def _prepared(file: Path, kept: Path, working: Path, side: int) -> Photo:
+    with file.open("rb") as opened, opened_image(opened) as image:
+        if min(image.size) < SMALLEST:
+            raise ValueError(f"it has {image.width} x {image.height} pixels")
+        turned = image.getexif().get(_ORIENTATION, 1) != 1
+        exif, kind = image.getexif(), image.format
+        camera = _camera(exif)
+        image.load()
+        plain = image.mode in ("RGB", "L") and kind in ("JPEG", "MPO", "PNG")
+        upright = ImageOps.exif_transpose(image) if turned else image
+    rgb = eight_bits(upright).convert("RGB")
+    exif.pop(_ORIENTATION, None)
+    name = file.name if kind in ("JPEG", "MPO", "PNG") else f"{file.name}.png"
+    if plain and not turned:
+        _link(file, kept / name)
+    else:
+        _save(rgb, kept / name, exif)
+    scale = side / max(rgb.size)
+    if scale < 1 or not plain:
+        width, height = (max(round(extent * min(scale, 1)), 1) for extent in rgb.size)
+        _save(rgb.resize((width, height), Image.Resampling.LANCZOS), working / name, exif)
+    else:
+        _link(kept / name, working / name)
+    grey = rgb.convert("L")
+    thumb = np.array(grey.resize(_THUMB, Image.Resampling.BOX), np.float32)
+    return Photo(name, (rgb.height, rgb.width), camera, sharpness(grey), thumb)
+
+
+def _camera(exif: Image.Exif) -> str:
+    """What tells one camera, or one focal length of it, from another."""
+    sub = exif.get_ifd(_SUB)
+    values = [exif.get(tag) for tag in (_MAKE, _MODEL)] + [sub.get(tag) for tag in _LENS]
+    return json.dumps([str(value).strip("\0 ") for value in values if value])
+
+
+def _save(image: Image.Image, path: Path, exif: Image.Exif) -> None:
+    options = {"quality": 95, "subsampling": 0} if path.suffix.lower() != ".png" else {}
+    kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
+    image.save(path, kind, exif=exif.tobytes(), **options)
+
+
+def _link(file: Path, path: Path) -> None:
+    if path.exists():
+        path.unlink()
+    try:
+        os.link(file.resolve(), path)
+    except OSError:  # another file system, or one without links
+        shutil.copyfile(file, path)
+
+
+def sharpness(grey: Image.Image) -> float:
+    """Variance of the Laplacian of a grey image, at _JUDGED pixels of its longer side."""
+    scale = _JUDGED / max(grey.size)
+    small = (max(round(grey.width * scale), 3), max(round(grey.height * scale), 3))
+    pixels = np.asarray(grey.resize(small, Image.Resampling.BOX), np.float32)
+    return laplacian_variance(pixels)
+
+
+def laplacian_variance(pixels: np.ndarray) -> float:
+    """Of grey pixels (H, W) float32, without the border."""
+    inner = pixels[1:-1, 1:-1]
+    around = pixels[:-2, 1:-1] + pixels[2:, 1:-1] + pixels[1:-1, :-2] + pixels[1:-1, 2:]
+    return float((around - 4 * inner).var())
+
+
+def refuse_hopeless(photos: Sequence[Photo], faulty: dict[str, str], what: str) -> None:
+    """Raise PosesError for fewer than LEAST photos, for blurred ones, and where nothing moves."""
+    if len(photos) < LEAST:
+        why = "; ".join(f"{name}: {reason}" for name, reason in list(faulty.items())[:3])
+        raise PosesError(
+            f"{what} has {counted(len(photos), 'photo')} that can be read, and poses need {LEAST} "
+            f"at least ({why}): replace them"
+        )
+    if max(photo.sharpness for photo in photos) < BLURRED:
+        raise PosesError(
+            f"{what} shows no edges: the photos are blurred or bare, and COLMAP finds no points in "
+            "them. Take sharp ones, in more light, of something with texture"
+        )
+    first = photos[0].thumb
+    if all(float(np.abs(photo.thumb - first).mean()) < ALIKE for photo in photos[1:]):
+        raise PosesError(
+            f"all photos of {what} show the same view: walk while you take them, a step between "
+            "two photos; turning on the spot gives no depth either"
+        )
+
+
+def camera_groups(photos: Sequence[Photo]) -> list[list[str]]:
+    """Names of the photos that share a camera: of one size, one lens, one focal length."""
+    groups: dict[object, list[str]] = {}
+    for photo in photos:
+        groups.setdefault((photo.size, photo.camera), []).append(photo.name)
+    return list(groups.values())
