@@ -14,7 +14,6 @@ from qgs.components.head import GaussianHead
 from qgs.components.optimizer import OneCycleAdamW
 from qgs.components.queries import LatentQueries
 from qgs.components.supervision import LayerSupervision, OnePass
-from qgs.components.weights import TOKENGS
 from qgs.contracts import Component
 
 COMPONENTS: tuple[type[Component], ...] = (
@@ -36,7 +35,6 @@ COMPONENTS: tuple[type[Component], ...] = (
 __all__ = [
     "COMPONENTS",
     "NORM_EPS",
-    "TOKENGS",
     "ContentCrossAttention",
     "ContentSelfAttention",
     "CrossAttentionCore",

@@ -1,4 +1,4 @@
-"""The weights of TokenGS: published names, and the recipe that fits a state dict."""
+"""Published names of TokenGS's weights, and the recipe that fits a state dict."""
 
 from typing import Any
 
@@ -6,7 +6,6 @@ from qgs.components.head import CHANNELS
 from qgs.contracts.weights import (
     Rename,
     Shapes,
-    WeightLayout,
     layer_count,
     real_ratio,
     size_at,
@@ -93,28 +92,3 @@ def read_tokengs(shapes: Shapes) -> dict[str, Any]:
     model["centers"] = {"type": "qgs/free", "z_offset": 1.0, **unlimited}
     model["supervision"] = {"type": "qgs/layers", "layers": [model["decoder"]["depth"]]}
     return {"recipe": 1, "model": model}
-
-
-TOKENGS = WeightLayout(
-    name="TokenGS",
-    source="nv-tlabs/TokenGS",
-    components={
-        "encoder": ("qgs/multiview_vit",),
-        "queries": ("qgs/latent",),
-        "cross_attention": ("qgs/content",),
-        "self_attention": ("qgs/content",),
-        "feed_forward": ("qgs/mlp",),
-        "refinement": ("qgs/none",),
-        "head": ("qgs/gaussian_head",),
-        "centers": ("qgs/free",),
-    },
-    renames=(*BACKBONE_RENAMES, CROSS_QUERY),
-    marks=(DECODER + "0.gs_cross_attn.q_proj.weight",),
-    read=read_tokengs,
-    undecided=(
-        "activations of the head and of the positions, their clamps and epsilons: TokenGS's",
-        "supervised layers: the last",
-        "scale and frame of the world, losses, renderer, training: the framework's defaults",
-    ),
-)
-"""The released TokenGS, before its version of June 2026."""

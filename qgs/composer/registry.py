@@ -33,7 +33,6 @@ BUILTIN = Plugin(
         *qgs.metrics.COMPONENTS,
         *qgs.data.COMPONENTS,
     ),
-    layouts=(qgs.components.TOKENGS,),
     examples=(
         qgs.components.LayerSupervision.Config(layers=(1, 2)),
         qgs.data.PhotosSource.Config(path="photos"),  # type: ignore[call-arg]

@@ -124,8 +124,9 @@ def _close_rows(state, live):
 
 
 @kernel
-def _blend_row(state, base, dx0, linear, quadratic, constant, opacity, r, g, b, z, options):
+def _blend_row(state, base, dx0, power_of, look, options):
     """Blend a splat into one row. power(dx) = (quadratic dx + linear) dx + constant, in base 2."""
+    (linear, quadratic, constant), (opacity, r, g, b, z) = power_of, look
     alpha_min, alpha_cap, transmittance_min = options
     for lane in range(_LANES):
         i = base + lane
@@ -146,79 +147,13 @@ def _blend_row(state, base, dx0, linear, quadratic, constant, opacity, r, g, b, 
 
 
 @kernel
-def _row_span(v, ey, top):
-    """The rows of the tile at `top` whose pixel centres lie within `ey` of `v`."""
-    first = max(0, int(np.ceil(v - ey - top - _HALF)))
-    last = min(TILE - 1, int(np.floor(v + ey - top - _HALF)))
-    return first, last
-
-
-@kernel
-def _misses_row(dx0, vertex, linear, quadratic, constant, lowest):
-    """Whether power stays below `lowest` over all 16 lanes, by its peak on their real interval."""
-    peak = min(max(vertex, dx0), dx0 + _LAST_LANE)
-    return (quadratic * peak + linear) * peak + constant < lowest
-
-
-@kernel
-def forward_unit(splats, opacities, colors, tile_rows, options, sums):
-    """Fill the tile rows [first, last) of sums (5, H, W) from one image's splats (G, 9)."""
-    height, width = sums.shape[1:]
-    top, bottom = tile_rows[0] * TILE, min(tile_rows[1] * TILE, height)
-    order = _by_depth(splats, top, bottom, width)
-    row_order = np.empty(order.shape[0] + 1, np.int32)
-    state = np.empty(TILE * _ROW, np.float32)
-    live = np.empty(TILE, np.bool_)
-    for y0 in range(top, bottom, TILE):
-        rows = min(TILE, height - y0)
-        n = _touching_rows(order, splats, y0, y0 + rows, row_order)
-        for x0 in range(0, width, TILE):
-            columns = min(TILE, width - x0)
-            _open(state, live, rows, columns)
-            since_check = 0
-            for i in range(n):
-                g = row_order[i]
-                u, v, ex = splats[g, 0], splats[g, 1], splats[g, 6]
-                if u + ex <= x0 or u - ex >= x0 + columns:
-                    continue
-                xx, xy, yy = splats[g, 2], splats[g, 3], splats[g, 4]
-                first, last = _row_span(v, splats[g, 7], np.float32(y0))
-                dx0 = np.float32(x0) + _HALF - u
-                quadratic = -_HALF * _LOG2_E * xx
-                lean, lowest = -xy / xx, splats[g, 8]  # the peak of a row moves by lean dy
-                for row in range(first, last + 1):
-                    if not live[row]:
-                        continue
-                    dy = np.float32(y0 + row) + _HALF - v
-                    linear, constant = -_LOG2_E * xy * dy, -_HALF * _LOG2_E * yy * dy * dy
-                    if _misses_row(dx0, lean * dy, linear, quadratic, constant, lowest):
-                        continue
-                    _blend_row(
-                        state, np.uint64(row) * _STATE, dx0, linear, quadratic, constant,
-                        opacities[g],
-                        colors[g, 0], colors[g, 1], colors[g, 2], splats[g, 5], options,
-                    )  # fmt: skip
-                since_check += 1
-                if since_check == _CHECK_EVERY:
-                    since_check = 0
-                    if not _close_rows(state, live):
-                        break
-            for row in range(rows):
-                for lane in range(columns):
-                    base = row * _ROW + lane
-                    for channel in range(SUMS):
-                        sums[channel, y0 + row, x0 + lane] = state[base + (2 + channel) * TILE]
-
-
-@kernel
-def _backward_row(
-    state, base, totals, dx0, dy, linear, quadratic, constant, opacity, r, g, b, z, options
-):
+def _backward_row(state, base, totals, dx0, dy, power_of, look, options):
     """Repeat `_blend_row` and add to the 10 lane blocks of `totals`.
 
     Blocks: h, h dx, h dy, h dx dx, h dx dy, h dy dy with h = dL/dpower (in base e), then the
     gradients of depth, r, g, b.
     """
+    (linear, quadratic, constant), (opacity, r, g, b, z) = power_of, look
     alpha_min, alpha_cap, transmittance_min = options
     for lane in range(_LANES):
         i = base + lane
@@ -297,11 +232,8 @@ def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
 
 
 @kernel
-def backward_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out):
-    """Add the gradients of the unit that `forward_unit` rendered to `out` (G, 10).
-
-    slopes: (5, H, W), the gradient of the loss in `sums`.
-    """
+def _unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, backward):
+    """Walk the tile rows [first, last) of one image; `backward` is a constant of either caller."""
     height, width = sums.shape[1:]
     top, bottom = tile_rows[0] * TILE, min(tile_rows[1] * TILE, height)
     order = _by_depth(splats, top, bottom, width)
@@ -315,7 +247,8 @@ def backward_unit(splats, opacities, colors, tile_rows, options, sums, slopes, o
         for x0 in range(0, width, TILE):
             columns = min(TILE, width - x0)
             _open(state, live, rows, columns)
-            _load_gradients(state, sums, slopes, y0, x0, rows, columns)
+            if backward:
+                _load_gradients(state, sums, slopes, y0, x0, rows, columns)
             since_check = 0
             for i in range(n):
                 g = row_order[i]
@@ -323,26 +256,31 @@ def backward_unit(splats, opacities, colors, tile_rows, options, sums, slopes, o
                 if u + ex <= x0 or u - ex >= x0 + columns:
                     continue
                 xx, xy, yy = splats[g, 2], splats[g, 3], splats[g, 4]
-                first, last = _row_span(v, splats[g, 7], np.float32(y0))
+                look = opacities[g], colors[g, 0], colors[g, 1], colors[g, 2], splats[g, 5]
+                above = v - np.float32(y0) - _HALF  # rows whose pixel centres lie within ey of v
+                first = max(0, int(np.ceil(above - splats[g, 7])))
+                last = min(TILE - 1, int(np.floor(above + splats[g, 7])))
                 dx0 = np.float32(x0) + _HALF - u
                 quadratic = -_HALF * _LOG2_E * xx
-                lean, lowest = -xy / xx, splats[g, 8]
+                lean, lowest = -xy / xx, splats[g, 8]  # the peak of a row moves by lean dy
                 touched = False
                 for row in range(first, last + 1):
                     if not live[row]:
                         continue
                     dy = np.float32(y0 + row) + _HALF - v
                     linear, constant = -_LOG2_E * xy * dy, -_HALF * _LOG2_E * yy * dy * dy
-                    if _misses_row(dx0, lean * dy, linear, quadratic, constant, lowest):
+                    # power is below `lowest` in all lanes if at its peak on their real interval
+                    peak = min(max(lean * dy, dx0), dx0 + _LAST_LANE)
+                    if (quadratic * peak + linear) * peak + constant < lowest:
+                        continue
+                    base, power = np.uint64(row) * _STATE, (linear, quadratic, constant)
+                    if not backward:
+                        _blend_row(state, base, dx0, power, look, options)
                         continue
                     if not touched:
                         totals[:] = _ZERO
                         touched = True
-                    _backward_row(
-                        state, np.uint64(row) * _STATE, totals, dx0, dy, linear, quadratic,
-                        constant, opacities[g],
-                        colors[g, 0], colors[g, 1], colors[g, 2], splats[g, 5], options,
-                    )  # fmt: skip
+                    _backward_row(state, base, totals, dx0, dy, power, look, options)
                 if touched:
                     _add_gradients(totals, xx, xy, yy, opacities[g], out[g])
                 since_check += 1
@@ -350,3 +288,25 @@ def backward_unit(splats, opacities, colors, tile_rows, options, sums, slopes, o
                     since_check = 0
                     if not _close_rows(state, live):
                         break
+            if backward:
+                continue
+            for row in range(rows):
+                for lane in range(columns):
+                    base = row * _ROW + lane
+                    for channel in range(SUMS):
+                        sums[channel, y0 + row, x0 + lane] = state[base + (2 + channel) * TILE]
+
+
+@kernel
+def forward_unit(splats, opacities, colors, tile_rows, options, sums):
+    """Fill the tile rows [first, last) of sums (5, H, W) from one image's splats (G, 9)."""
+    _unit(splats, opacities, colors, tile_rows, options, sums, sums, splats, False)
+
+
+@kernel
+def backward_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out):
+    """Add the gradients of the unit that `forward_unit` rendered to `out` (G, 10).
+
+    slopes: (5, H, W), the gradient of the loss in `sums`.
+    """
+    _unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, True)

@@ -1,58 +1,15 @@
 """`qgs/photometric`: MSE, L1 and SSIM of rendered against true images (TokenGS, LocusGS)."""
 
 from collections.abc import Iterable, Iterator
-from typing import Literal
 
-import torch
 import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import Loss, Problem, RecipeContext
 from qgs.geometry.precision import full_precision
+from qgs.similarity import WINDOW, Padding, mean_ssim
 from qgs.types import LayerPrediction, Rendering, Views
-
-WINDOW = 11
-SIGMA = 1.5
-C1, C2 = 0.01**2, 0.03**2
-
-Padding = Literal["same", "valid"]
-
-
-@full_precision
-def mean_ssim(images: Tensor, truth: Tensor, padding: Padding) -> Tensor:
-    """Mean structural similarity, 0-d, of images (..., H, W) in [0, 1] (Wang et al. 2004).
-
-    padding: "same" pads with zeros, as the releases do; "valid" uses windows inside the image, and
-    raises ValueError for images smaller than one.
-    """
-    height, width = images.shape[-2:]
-    if padding == "valid" and min(height, width) < WINDOW:
-        raise ValueError(
-            f'SSIM with padding "valid" needs images of at least {WINDOW} pixels a side, got '
-            f"{height} x {width}; raise data.image_size or use padding: same"
-        )
-    # Two products with band matrices: faster on a CPU than convolutions, and their gradients too.
-    moments = torch.stack([images, truth, images * images, truth * truth, images * truth])
-    along_rows = moments @ _window(width, padding).to(moments)
-    blurred = along_rows.transpose(-1, -2) @ _window(height, padding).to(moments)
-    mean_x, mean_y, square_x, square_y, product = blurred
-    luminance = 2 * mean_x * mean_y + C1
-    structure = 2 * (product - mean_x * mean_y) + C2
-    energy = mean_x.square() + mean_y.square()
-    # Variances as differences of squares lose digits, which is why this runs in float32 at least.
-    spread = square_x + square_y - energy + C2
-    return (luminance * structure / ((energy + C1) * spread)).mean()
-
-
-def _window(size: int, padding: Padding) -> Tensor:
-    """(size, outputs) matrix that blurs along one axis: column j weighs the pixels around j."""
-    position = torch.arange(size, dtype=torch.float64)
-    offset = position[:, None] - position
-    weight = torch.exp(-(offset**2) / (2 * SIGMA**2)) * (offset.abs() <= WINDOW // 2)
-    reach = torch.arange(-(WINDOW // 2), WINDOW // 2 + 1)
-    weight = weight / torch.exp(-(reach**2) / (2 * SIGMA**2)).sum()
-    return weight if padding == "same" else weight[:, WINDOW // 2 : size - WINDOW // 2]
 
 
 class Photometric(Loss):

@@ -3,18 +3,14 @@
 from collections.abc import Mapping
 from typing import Literal, TypeAlias
 
-import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.contracts import Column, ComponentConfig, Metric, MetricInput
 from qgs.geometry.precision import full_precision
+from qgs.similarity import WINDOW, similarity_map
 
 SsimCovariance: TypeAlias = Literal["population", "sample"]
 
-_WINDOW = 11
-_SIGMA = 1.5
-_STABILISERS = (0.01**2, 0.03**2)  # C1 and C2 of Wang et al. 2004 for a data range of 1
 _MSE_FLOOR = 1e-10  # identical images get 100 dB
 
 
@@ -67,33 +63,13 @@ def psnr(images: Tensor, truth: Tensor) -> Tensor:
 def ssim(images: Tensor, truth: Tensor, covariance: SsimCovariance = "population") -> Tensor:
     """Structural similarity of images (..., 3, H, W), clipped to [0, 1] -> (...).
 
-    Wang et al. 2004, eq. 13. Equals scikit-image's `structural_similarity` with gaussian_weights,
-    sigma 1.5 and data_range 1, which leaves out the 5 pixels at the border; covariance "sample" is
-    its use_sample_covariance, by which the N = 11 * 11 pixels of a window give variances times
-    N / (N - 1). In float64: the variances of flat images are small differences of squares.
+    Equals scikit-image's `structural_similarity` with gaussian_weights, sigma 1.5 and data_range 1,
+    which leaves out the 5 pixels at the border; covariance "sample" is its use_sample_covariance,
+    by which the N = 11 * 11 pixels of a window give variances times N / (N - 1). In float64: the
+    variances of flat images are small differences of squares.
     Raises ValueError when a side is shorter than the window of 11 pixels.
     """
-    if min(images.shape[-2:]) < _WINDOW:
-        raise ValueError(
-            f"SSIM needs images of at least {_WINDOW} pixels a side, got "
-            f"{images.shape[-2]}x{images.shape[-1]}"
-        )
-    x, y = (image.clamp(0, 1).double().reshape(-1, *image.shape[-3:]) for image in (images, truth))
-    samples = _WINDOW**2
+    x, y = (image.clamp(0, 1).double() for image in (images, truth))
+    samples = WINDOW**2
     correction = samples / (samples - 1) if covariance == "sample" else 1.0
-    mean_x, mean_y = _windowed(x), _windowed(y)
-    variances = correction * (_windowed(x * x + y * y) - mean_x.square() - mean_y.square())
-    shared = correction * (_windowed(x * y) - mean_x * mean_y)
-    c1, c2 = _STABILISERS
-    similarity = (2 * mean_x * mean_y + c1) * (2 * shared + c2)
-    similarity /= (mean_x.square() + mean_y.square() + c1) * (variances + c2)
-    return similarity.mean((-3, -2, -1)).reshape(images.shape[:-3]).to(images.dtype)
-
-
-def _windowed(images: Tensor) -> Tensor:
-    """Gaussian means (B, 3, H - 10, W - 10) over the windows within images (B, 3, H, W)."""
-    offset = torch.arange(_WINDOW, dtype=images.dtype, device=images.device) - _WINDOW // 2
-    weights = torch.exp(-offset.square() / (2 * _SIGMA**2))
-    kernel = (weights / weights.sum()).expand(images.shape[1], 1, 1, -1)
-    along_rows = F.conv2d(images, kernel, groups=images.shape[1])
-    return F.conv2d(along_rows, kernel.mT, groups=images.shape[1])
+    return similarity_map(x, y, "valid", correction).mean((-3, -2, -1)).to(images.dtype)

@@ -69,10 +69,8 @@ class CpuRenderer(Renderer):
         """Sums (B, V, F, H, W) of the features, three at a time as if they were colours."""
         if gaussians.features is None:
             return None
-        parts = [
-            self._sums(gaussians, F.pad(part, (0, 3 - part.shape[-1])), cameras)[:, :, :3]
-            for part in gaussians.features.split(3, -1)
-        ]
+        threes = F.pad(gaussians.features, (0, -gaussians.features.shape[-1] % 3)).split(3, -1)
+        parts = [self._sums(gaussians, three, cameras)[:, :, :3] for three in threes]
         return torch.cat(parts, 2)[:, :, : gaussians.features.shape[-1]]
 
 

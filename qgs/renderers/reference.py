@@ -44,9 +44,8 @@ def project(
     x/z and y/z are clamped to 15 % of the image beyond its borders, as gsplat does.
     """
     w2c = cameras.w2c
-    factors = (
-        quat_to_matrix(F.normalize(gaussians.quats, dim=-1)) * gaussians.scales[..., None, :]
-    )  # (B, G, 3, 3)
+    turns = quat_to_matrix(F.normalize(gaussians.quats, dim=-1))
+    factors = turns * gaussians.scales[..., None, :]  # (B, G, 3, 3)
     position = w2c[..., :3, :3] @ gaussians.means.transpose(-1, -2)[:, None] + w2c[..., :3, 3:]
     x, y, z = position.unbind(-2)  # (B, V, G) each
     in_range = (z >= near) & (z <= far)

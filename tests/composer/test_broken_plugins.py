@@ -14,8 +14,8 @@ from qgs.composer.registry import available_plugins, load_usable_plugins
 from qgs.contracts import CONTRACT_VERSION, LearnedQueries, Plugin
 
 IMPORTS = """
-from qgs.components import TOKENGS, LatentQueries
-from qgs.contracts import CONTRACT_VERSION, Plugin
+from qgs.components import LatentQueries
+from qgs.contracts import CONTRACT_VERSION, Plugin, WeightLayout
 """
 BROKEN = {
     "raises at import": ("raise RuntimeError('no luck')", "RuntimeError: no luck"),
@@ -58,7 +58,8 @@ def test_fix_of_a_plugin_that_cannot_be_imported(source, fix, write, install):
 
 
 def test_a_plugin_may_offer_layouts_alone(write, install):
-    listed = "plugin = Plugin('layouts', CONTRACT_VERSION, (), layouts=(TOKENGS,))"
+    layout = "WeightLayout('', '', {}, (), ('mark',), dict)"
+    listed = f"plugin = Plugin('layouts', CONTRACT_VERSION, (), layouts=({layout},))"
     install("qgs-layouts", "layouts", IMPORTS + listed)
     assert resolve(write("recipe: 1\nplugins: [layouts]\n")).plugin_versions["layouts"] == "1.2"
 

@@ -61,5 +61,5 @@ def test_identical_images_with_leading_dimensions() -> None:
 
 
 def test_images_smaller_than_the_window_are_refused() -> None:
-    with pytest.raises(ValueError, match="at least 11 pixels a side, got 10x20"):
+    with pytest.raises(ValueError, match="at least 11 pixels a side, got 10 x 20"):
         ssim(*pair(0.1, (10, 20)))

@@ -10,12 +10,12 @@ from commands import run_qgs
 from published.files import read_golden
 from qgs_published.importing import import_weights
 from qgs_published.layouts import PublishedError, fitting_recipe, names_of
+from qgs_published.tokengs import TOKENGS
 from qgs_tokengs2026.weights import TOKENGS_2026_6
 from safetensors.torch import load_file, save, save_file
 from torch import Tensor
 
 import qgs
-from qgs.components import TOKENGS
 from qgs.composer import resolve
 from qgs.composer.recipe import differing_predictions
 from qgs.io.checkpoint import CheckpointFile

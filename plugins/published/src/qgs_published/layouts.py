@@ -13,6 +13,7 @@ from qgs.contracts.weights import Shapes
 from qgs.io.checkpoint import unique_tensors
 from qgs.io.tensors import differing_tensors, shapes_of
 from qgs.wording import listed
+from qgs_published.tokengs import TOKENGS
 
 
 class PublishedError(ValueError):
@@ -69,7 +70,7 @@ def names_of(recipe: Recipe) -> Names:
 
 
 def _layouts(plugins: Iterable[InstalledPlugin]) -> list[WeightLayout]:
-    return [layout for installed in plugins for layout in installed.plugin.layouts]
+    return [TOKENGS, *(layout for installed in plugins for layout in installed.plugin.layouts)]
 
 
 def _unknown_components(recipe: Recipe, layout: WeightLayout) -> list[str]:

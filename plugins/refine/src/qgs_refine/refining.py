@@ -17,9 +17,10 @@ from torch import Tensor, nn
 
 from qgs.engine.distributed import StopRequest, stop_requests
 from qgs.engine.tracking import TrainingProgress
-from qgs.losses.photometric import mean_squared_error, mean_ssim
+from qgs.losses.photometric import mean_squared_error
 from qgs.metrics.images import psnr
 from qgs.renderers import AutoRenderer
+from qgs.similarity import mean_ssim
 from qgs.types import Cameras, Gaussians, Views, concatenated, map_tensors, named_tensors
 from qgs_refine.growth import FreeGaussians
 from qgs_refine.sweeping import swept

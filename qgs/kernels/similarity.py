@@ -1,0 +1,66 @@
+"""Numba kernel of `qgs.similarity`: the sum of SSIM over a plane, and its gradient.
+
+The formula is that of `similarity_map`, whose autograd this is tested against.
+"""
+
+import numpy as np
+
+from qgs.kernels import kernel
+
+_REACH = 5
+_ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
+
+
+@kernel
+def _windowed(planes, row, weights, framed, out):
+    """Means (N, W) over the windows around a row of planes (N, H, W), which are zero outside.
+
+    weights: of pixels 0 to _REACH from the centre. framed: (N, W + 2 _REACH), overwritten.
+    """
+    parts, height, width = planes.shape
+    framed[:] = _ZERO
+    for part in range(parts):
+        for other in range(max(row - _REACH, 0), min(row + _REACH + 1, height)):
+            weight = weights[abs(other - row)]
+            for column in range(width):
+                framed[part, column + _REACH] += weight * planes[part, other, column]
+        for column in range(width):
+            at = column + _REACH
+            mean = weights[0] * framed[part, at]
+            for k in range(1, _REACH + 1):
+                mean += weights[k] * (framed[part, at - k] + framed[part, at + k])
+            out[part, column] = mean
+
+
+@kernel
+def similarity_sum(moments, weights, stabilisers, slope):
+    """The sum of SSIM of x and y over all pixels; `slope` (H, W) gets its gradient by x.
+
+    moments: (4, H, W), x, y, x^2 + y^2 and x y.
+    """
+    (_, height, width), (c1, c2), total = moments.shape, stabilisers, 0.0
+    framed = np.empty((4, width + 2 * _REACH), np.float32)
+    means = np.empty((4, width), np.float32)
+    slopes = np.empty((3, height, width), np.float32)  # by the means of x, of squares, of x y
+    for row in range(height):
+        _windowed(moments, row, weights, framed, means)
+        of_row = _ZERO
+        for column in range(width):
+            a, b = means[0, column], means[1, column]
+            energy = a * a + b * b
+            luminance, structure = _TWO * a * b + c1, _TWO * (means[3, column] - a * b) + c2
+            bright, spread = energy + c1, means[2, column] - energy + c2
+            inverse = _ONE / (bright * spread)
+            value = luminance * structure * inverse
+            of_mean = b * (structure - luminance) * inverse
+            of_row += value
+            slopes[0, row, column] = _TWO * (of_mean + a * value * (_ONE / spread - _ONE / bright))
+            slopes[1, row, column] = -value / spread
+            slopes[2, row, column] = _TWO * luminance * inverse
+        total += of_row
+    for row in range(height):
+        _windowed(slopes, row, weights, framed, means)
+        for column in range(width):
+            of_squares = means[0, column] + _TWO * moments[0, row, column] * means[1, column]
+            slope[row, column] = of_squares + moments[1, row, column] * means[2, column]
+    return total
