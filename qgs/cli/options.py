@@ -1,5 +1,6 @@
 """Options that several commands share."""
 
+import os
 import re
 from typing import Annotated, TypeAlias
 
@@ -39,6 +40,14 @@ SceneName: TypeAlias = Annotated[
 ViewsSettings: TypeAlias = Annotated[
     list[str] | None,
     typer.Option("--set", help="Change an option of the recipe's `views`; repeatable."),
+]
+NoPoses: TypeAlias = Annotated[
+    bool,
+    typer.Option(
+        "--no-poses",
+        help="Refuse photos without camera poses and videos, of which poses are made otherwise.",
+        callback=lambda given: os.environ.update(QGS_NO_POSES="1") if given else None,
+    ),
 ]
 Scale: TypeAlias = Annotated[
     float | None,

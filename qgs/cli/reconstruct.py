@@ -14,6 +14,7 @@ from qgs.cli.options import (
     Device,
     Frames,
     Inputs,
+    NoPoses,
     Scale,
     SceneName,
     Size,
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 def reconstruct(
     checkpoint: Checkpoint,
     photos: Annotated[
-        str, typer.Argument(help="Folder of photos and cameras, chunks or archives, or its URL.")
+        str, typer.Argument(help="Folder of photos, chunks or archives, its URL, or a video.")
     ],
     out: Annotated[Path, typer.Option(help="Folder for the results, or .ply/.splat file.")],
     inputs: Inputs = None,
@@ -70,6 +71,7 @@ def reconstruct(
     size: Size = None,
     scene_name: SceneName = None,
     threads: options.Threads = None,
+    no_poses: NoPoses = False,
     device: Device = "auto",
 ) -> None:
     """Reconstruct a scene: PLY, renders beside photos, depth, an orbit, cameras.

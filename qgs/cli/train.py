@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 
 from qgs.cli.evaluate import evaluate_into
-from qgs.cli.options import Device, Overrides, Threads, use_threads
+from qgs.cli.options import Device, NoPoses, Overrides, Threads, use_threads
 from qgs.extensions import function
 from qgs.wording import listed
 
@@ -35,6 +35,7 @@ def train(
         ),
     ] = None,
     threads: Threads = None,
+    no_poses: NoPoses = False,
     device: Device = "auto",
 ) -> None:
     """Train a model, then evaluate it on views it never saw.

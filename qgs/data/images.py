@@ -15,7 +15,6 @@ from upath import UPath
 
 from qgs.contracts import Scene
 from qgs.data.paths import LARGEST, open_file
-from qgs.data.scenes import warn_once
 from qgs.machine import is_out_of_memory, with_unit
 from qgs.wording import name_shown
 
@@ -111,14 +110,10 @@ def encoded_size(file: IO[bytes]) -> tuple[int, int]:
 def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Image.Image:
     """The file as RGB, over `background` in [0, 1]. Raises ValueError where it is unreadable.
 
-    Pixels stay where they are stored, as COLMAP and nerfstudio read them; another EXIF orientation
-    is logged.
+    Pixels stay where they are stored; `qgs.data.photos.turning` follows EXIF.
     """
     with _readable(path, "an image") as file:
-        image = decode_rgb(file, background)
-    if orientation(image) != 1:
-        warn_once(f"photos in {path.parent} {TURNED}: {TURN}")
-    return image
+        return decode_rgb(file, background)
 
 
 def orientation(image: Image.Image) -> int:

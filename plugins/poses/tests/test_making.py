@@ -159,6 +159,7 @@ def test_hopeless_photos_are_refused(kind, shots, tmp_path):
         Image.fromarray(image).save(folder / f"{number}.png")
     with pytest.raises(PosesError):
         make_poses(folder, tmp_path / "poses", Options(), quiet())
+    assert not (tmp_path / "poses").exists()
 
 
 def test_turning_on_the_spot_gives_no_poses(from_one_place, tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from upath import UPath
 
-from qgs.data.photos.cameras import CamerasJson
 from qgs.data.photos.checks import with_equal_times
 from qgs.data.photos.colmap import Colmap
 from qgs.data.photos.llff import Llff
@@ -14,7 +13,7 @@ from qgs.data.scenes import warn_once
 from qgs.extensions import ExtensionError, installed, load
 from qgs.wording import listed
 
-READERS: tuple[type[PhotoReader], ...] = (Nerfstudio, Blender, Colmap, Llff, CamerasJson)
+READERS: tuple[type[PhotoReader], ...] = (Nerfstudio, Blender, Colmap, Llff)
 """The built-in formats. Where a folder holds several listings, the first of this order is read."""
 GROUP = "qgs.photo_readers"
 """Entry point group of further readers: format name = module:subclass of `PhotoReader`."""
@@ -70,9 +69,8 @@ def read_listing(folder: UPath, format: str = "auto", images: str | None = None)
     if not held:
         inside = listed(sorted(item.name for item in folder.iterdir()))
         raise FileNotFoundError(
-            f"{folder} lists no cameras; it holds {inside or 'nothing'}. Make poses with COLMAP or "
-            f"nerfstudio's `ns-process-data`, or give the folder that holds one of {listings}. A "
-            f"minimal transforms.json: {_SMALLEST}"
+            f"{folder} lists no cameras; it holds {inside or 'nothing'}. Make some by `qgs poses`, "
+            f"or give a folder that holds one of {listings}. A minimal transforms.json: {_SMALLEST}"
         )
     if format == "auto" and len(held) > 1:
         warn_once(

@@ -17,19 +17,24 @@ from upath import UPath
 
 from qgs.contracts import OptionError, SceneSource, SceneSourceConfig
 from qgs.data.images import (
+    TURN,
+    TURNED,
     CropResize,
     alpha_mask,
     image_size,
     open_depth,
     open_mask,
     open_rgb,
+    orientation,
     to_tensor,
 )
 from qgs.data.lenses import Mode, Size, undistorted, whole_zoom
 from qgs.data.paths import is_local, opened_path, read_file
 from qgs.data.photos import formats_of, read_listing, readers
 from qgs.data.photos.checks import refuse_fatal_problems, size_problems
+from qgs.data.photos.posing import VIDEOS, posed
 from qgs.data.photos.reader import PhotoFrame, existing
+from qgs.data.photos.turning import turned, turned_size, upright
 from qgs.data.scenes import (
     BoundedCache,
     EncodedFrame,
@@ -47,10 +52,11 @@ class PhotosConfig(SceneSource.Config):
 
     path: str
     """Folder of one scene, of folders of scenes, or with such folders in train and test: absolute,
-    relative to the working directory, or an fsspec URL."""
+    relative to the working directory, or an fsspec URL. Photos without cameras, and a video, get
+    poses first."""
     format: str = "auto"
-    """How cameras are listed: nerfstudio, blender, colmap, llff, cameras, or a format of a plug-in;
-    auto takes the first that a folder holds."""
+    """How cameras are listed: nerfstudio, blender, colmap, llff, or a format of a plug-in; auto is
+    the first that a folder holds."""
     images: str | None = None
     """Folder of photos to read instead of the listed one, such as images_4."""
     holdout: int = Field(default=8, ge=0)
@@ -84,7 +90,7 @@ class PhotoScene(EncodedScene):
     ) -> None:
         self.name, self._config, self._cache = name, config, cache
         frames, self.missing = present_frames(folder, config.format, config.images)
-        self._frames = frames = frames[: config.max_frames or None]
+        self._frames = frames = [*map(upright, frames[: config.max_frames or None])]
         times = [frame.time for frame in frames if frame.time is not None]
         self.times = torch.tensor(times, dtype=torch.float64) if len({*times}) > 1 else None
         every = config.holdout
@@ -104,7 +110,7 @@ class PhotoScene(EncodedScene):
         known: dict[object, Size] = {}
         intrinsics: list[Tensor] = []
         for frame in self._frames:
-            kind = (frame.path.parent, frame.size) if frame.size else frame.path
+            kind = (frame.path.parent, frame.size, frame.turns) if frame.size else frame.path
             if kind not in known:
                 known[kind] = _checked(image_size(frame.path), frame, frame.path)
             size = known[kind]
@@ -142,12 +148,14 @@ class PhotoScene(EncodedScene):
     def encoded(self, frame: int) -> EncodedFrame:
         """See `EncodedScene`."""
         photo, size = self._frames[frame], self.stored_size(frame)
-        buffer = io.BytesIO()
+        buffer, pixels = io.BytesIO(), io.BytesIO()
         if photo.mask is not None:
-            Image.fromarray(_whole_mask(photo)).save(buffer, "png")
+            turned(Image.fromarray(_whole_mask(photo)), photo).save(buffer, "png")
+        if photo.turns:
+            turned(open_rgb(photo.path, self._config.background), photo).save(pixels, "png")
         return EncodedFrame(
-            photo.name, read_file(photo.path), photo.c2w, photo.at_size(size), size,
-            photo.lens, buffer.getvalue() or None, self._config.background,
+            photo.name, pixels.getvalue() or read_file(photo.path), photo.c2w, photo.at_size(size),
+            size, photo.lens, buffer.getvalue() or None, self._config.background,
         )  # fmt: skip
 
     def _stacked(
@@ -167,6 +175,8 @@ class PhotoScene(EncodedScene):
 
     def _image(self, frame: PhotoFrame) -> np.ndarray:
         image = open_rgb(frame.path, self._config.background)
+        if not frame.turns and orientation(image) != 1:
+            warn_once(f"photos in {frame.path.parent} {TURNED}: {TURN}")
         return self._delivered(image, frame, frame.path)
 
     def _mask(self, frame: PhotoFrame) -> np.ndarray:
@@ -183,10 +193,11 @@ class PhotoScene(EncodedScene):
     def _delivered(
         self, image: Image.Image, frame: PhotoFrame, file: UPath, mode: Mode = "bilinear"
     ) -> np.ndarray:
-        """The content of `file` without distortion, at the delivered size."""
+        """The content of `file`, upright without distortion, at the delivered size."""
         if file != frame.path and frame.size is None:  # a mask or depth map follows the photo
             frame = replace(frame, size=image_size(frame.path))
         size = _checked((image.height, image.width), frame, file)
+        image = turned(image, frame)
         if frame.lens is not None:
             pixels = undistorted(np.array(image), frame.at_size(size), frame.lens, mode)
             image = Image.fromarray(pixels)
@@ -206,8 +217,8 @@ def _whole_mask(frame: PhotoFrame) -> np.ndarray:
 
 
 def _checked(size: tuple[int, ...], frame: PhotoFrame, file: UPath) -> Size:
-    """(H, W) of `file`, which is one of the frame, if it goes with what is listed."""
-    height, width = size
+    """(H, W) of `file`, upright, which is one of the frame, if it goes with what is listed."""
+    height, width = turned_size((size[0], size[1]), frame)
     for problem in size_problems((height, width), frame.size):
         raise ValueError(f"{file}: {problem}")
     return height, width
@@ -227,12 +238,15 @@ class PhotosSource(LazySource):
 
     def __init__(self, config: PhotosConfig) -> None:
         super().__init__(config)
-        root = opened_path(config.path)
+        root, auto = opened_path(config.path), (config.format, config.images) == ("auto", None)
         train = test = {folder_name(root): root}
         if root.is_dir() and not formats_of(root):
             train, test = (_folders(root / part, config) for part in ("train", "test"))
             if not (train and test):
-                train = test = _folders(root, config) or {folder_name(root): root}
+                place = posed(root) if auto and not _folders(root, config) else root
+                train = test = _folders(root, config) or {folder_name(root): place}
+        elif root.suffix.lower() in VIDEOS:
+            train = test = {folder_name(root): posed(root)}
         scenes = LazyScenes(train, partial(PhotoScene, config=config, cache=image_cache()))
         self.splits = {"train": scenes, "test": scenes}
         if train is not test:

@@ -10,6 +10,7 @@ from PIL import Image
 from qgs.data.images import decode_rgb
 from qgs.data.lenses import Size, undistorted
 from qgs.data.photos.reader import PhotoFrame
+from qgs.data.photos.turning import turned
 from qgs_datatools.conventions import Convention
 
 
@@ -26,7 +27,7 @@ class Photo:
     def picture(self, size: Size | None, side: int) -> tuple[np.ndarray, np.ndarray]:
         """Pinhole RGB, `side` pixels long at most, and its intrinsics (4,). Raises OSError."""
         frame = self.listed if self.listed.size else replace(self.listed, size=size)
-        image = decode_rgb(io.BytesIO(self.read()), (1.0, 1.0, 1.0))
+        image = turned(decode_rgb(io.BytesIO(self.read()), (1.0, 1.0, 1.0)), frame)
         scale = min(1.0, side / max(image.size))
         width, height = (max(1, round(extent * scale)) for extent in image.size)
         pixels = np.array(image.resize((width, height), Image.Resampling.LANCZOS))

@@ -24,6 +24,7 @@ from qgs.data.images import (
 from qgs.data.lenses import Size
 from qgs.data.photos.checks import size_problems
 from qgs.data.photos.reader import PhotoFrame
+from qgs.data.photos.turning import turned_size
 from qgs.wording import numbered
 from qgs_datatools.candidates import Photo
 from qgs_datatools.findings import Finding, Severity
@@ -90,12 +91,13 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
     try:
         data = photo.read()
         with opened_image(io.BytesIO(data)) as image:
-            size, turned = (image.height, image.width), False
+            size, turned = turned_size((image.height, image.width), photo.listed), False
             if not headers_only:
                 image.draft(None, _SMALLEST)
                 image.load()
                 eight_bits(image)
-                turned = orientation(image) != 1  # EXIF may stand behind the pixels
+                # EXIF may stand behind the pixels
+                turned = orientation(image) != 1 and not photo.listed.turns
     except Exception as error:  # whatever a reader raises; the other photos go on
         return Decoded(error=error_text(error))
     digest = hashlib.blake2b(data, digest_size=16).digest()

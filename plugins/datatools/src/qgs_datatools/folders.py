@@ -10,6 +10,7 @@ from qgs.data.paths import read_file
 from qgs.data.photos import formats_of, read_listing, readers
 from qgs.data.photos.reader import existing
 from qgs.data.photos.source import folder_name
+from qgs.data.photos.turning import upright
 from qgs_datatools.candidates import Candidate, Photo
 from qgs_datatools.conventions import LLFF, OPENCV, OPENCV_C2W, OPENGL
 from qgs_datatools.findings import Finding
@@ -67,7 +68,7 @@ def dl3dv_scenes(path: UPath, images: str | None) -> list[Candidate]:
 
 
 def _photos(folder: UPath, kind: str, images: str | None) -> list[Photo]:
-    frames = read_listing(folder, kind, images).frames
+    frames = [*map(upright, read_listing(folder, kind, images).frames)]
     there = existing(frame.path for frame in frames if frame.name)
     masks = existing(frame.mask for frame in frames if frame.mask is not None)
     return [

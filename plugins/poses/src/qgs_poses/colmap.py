@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 
 from qgs_poses.job import FEATURES, MATCHING, Job
-from qgs_poses.photos import PosesError
+from qgs_poses.photos import ColmapError
 
 REFUSALS = {
     "features": (
@@ -69,7 +69,7 @@ class Log:
 
 
 def run(job: Job, photos: int, show: Callable[[str, int, int], None]) -> None:
-    """Do `job` in a process of its own. Raises PosesError where that ends early.
+    """Do `job` in a process of its own. Raises ColmapError where that ends early.
 
     show: called with stage, what is done and what there is.
     """
@@ -98,4 +98,4 @@ def run(job: Job, photos: int, show: Callable[[str, int, int], None]) -> None:
         process.stdin.close()
         process.stdout.close()
     if process.returncode:
-        raise PosesError(log.crash(process.returncode))
+        raise ColmapError(log.crash(process.returncode))

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from qgs_poses.making import Options, fingerprint, make_poses, read_record
+from qgs_poses.making import Options, begun, fingerprint, make_locked, read_record
 from qgs_poses.photos import PosesError
 
 
@@ -14,20 +14,34 @@ def posed_folder(source: Path) -> Path:
     Raises PosesError where they belong to other photos than are there now, and as `make_poses`.
     """
     out = beside(source)
-    if record := read_record(out):
-        if record.get("source") != fingerprint(source):
-            raise PosesError(
-                f"{out} has the poses of what {source} held before: delete it, so that they are "
-                f"made anew, or run `qgs poses {source} --out FOLDER` and give that folder"
-            )
+    if is_made(source, out):
         return out
-    console = Console(stderr=True)
-    text = f"{source} has no camera poses: they are made first, once, and kept in {out}"
-    console.print(text, soft_wrap=True, highlight=False, markup=False)
-    made = make_poses(source, out, Options(), console)
-    for line in made.summary:
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+    with begun(source, out, wait=True):  # of several processes of a training one makes them
+        if not is_made(source, out):
+            _make(source, out)
     return out
+
+
+def is_made(source: Path, out: Path) -> bool:
+    """Whether `out` has the poses of `source`. Raises PosesError where they are of other photos."""
+    record = read_record(out)
+    if record and record.get("source") != fingerprint(source):
+        raise PosesError(
+            f"{out} has the poses of what {source} held before: delete it, so that they are made "
+            f"anew, or run `qgs poses {source} --out FOLDER` and give that folder"
+        )
+    return record is not None
+
+
+def _make(source: Path, out: Path) -> None:
+    console = Console(stderr=True)
+
+    def say(text: str) -> None:
+        console.print(text, soft_wrap=True, highlight=False, markup=False)
+
+    say(f"{source} has no camera poses: they are made first, once, and kept in {out}")
+    for line in make_locked(source, out, Options(), console).summary:
+        say(line)
 
 
 def beside(source: Path) -> Path:

@@ -18,6 +18,7 @@ from qgs.wording import counted, listed
 from qgs_poses.colmap import REFUSALS, Job, run
 from qgs_poses.frames import extract
 from qgs_poses.photos import (
+    ColmapError,
     Photo,
     PosesError,
     camera_groups,
@@ -113,10 +114,14 @@ def make_poses(source: Path, out: Path, options: Options, console: Console) -> M
     that an interrupted call with the same options left is finished. Raises PosesError for photos
     without poses, FileExistsError for a folder of something else, and OSError.
     """
-    refuse_foreign(out)
+    with begun(source, out, wait=False):
+        return make_locked(source, out, options, console)
+
+
+def make_locked(source: Path, out: Path, options: Options, console: Console) -> Made:
+    """As `make_poses`, for a caller that holds the lock of `out`."""
     of = {"source": fingerprint(source), "options": asdict(options)}
-    out.mkdir(parents=True, exist_ok=True)
-    with locked(out), naming_full_disk(out / WORKING), Bars(console, out) as bars:
+    with naming_full_disk(out / WORKING), Bars(console, out) as bars:
         working = out / WORKING
         if _begun(working) != of:
             shutil.rmtree(working, ignore_errors=True)
@@ -162,8 +167,33 @@ def _begun(working: Path) -> Any:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from making poses in `folder`, where the system knows such locks."""
+def begun(source: Path, out: Path, wait: bool) -> Iterator[None]:
+    """The folder `out`, for this process alone; what is left of photos without poses is deleted.
+
+    Raises as `refuse_foreign`, `fingerprint` and `locked`.
+    """
+    refuse_foreign(out)
+    fingerprint(source)  # too few photos raise before anything is written
+    out.mkdir(parents=True, exist_ok=True)
+    with locked(out, wait):
+        try:
+            yield
+        except ColmapError:
+            raise
+        except PosesError:
+            for part in (WORKING, IMAGES, SPARSE):
+                shutil.rmtree(out / part, ignore_errors=True)
+            if not any(out.iterdir()):
+                out.rmdir()
+            raise
+
+
+@contextmanager
+def locked(folder: Path, wait: bool) -> Iterator[None]:
+    """Keep other processes from making poses in `folder`, where the system knows such locks.
+
+    wait: until another process has made them; else FileExistsError.
+    """
     try:
         import fcntl
     except ImportError:  # Windows
@@ -171,7 +201,7 @@ def locked(folder: Path) -> Iterator[None]:
         return
     number = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(number, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except BlockingIOError:
         os.close(number)
         raise FileExistsError(

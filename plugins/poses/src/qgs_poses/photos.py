@@ -35,6 +35,10 @@ class PosesError(ValueError):
     """Photos or a video of which no poses can be made; the message says what to do."""
 
 
+class ColmapError(PosesError):
+    """COLMAP ended early, so that the same call may go on from there."""
+
+
 @dataclass(frozen=True)
 class Photo:
     """A photo that is ready. name: in both folders. size: (H, W) upright. camera: of EXIF.

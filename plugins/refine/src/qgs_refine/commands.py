@@ -8,14 +8,14 @@ from typing import Annotated
 
 import typer
 
-from qgs.cli.options import Device, Frames, Scale, SceneName, parse_size
+from qgs.cli.options import Device, Frames, NoPoses, Scale, SceneName, parse_size
 
 app = typer.Typer(help="The best scene of photos in a given time.")
 
 
 @app.command()
 def scene(
-    photos: Annotated[str, typer.Argument(help="Folder of photos and cameras, or its URL.")],
+    photos: Annotated[str, typer.Argument(help="Folder of photos, its URL, or a video.")],
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("scene"),
     minutes: Annotated[
         float, typer.Option(help="Time for everything, from the start to the last file.")
@@ -44,6 +44,7 @@ def scene(
         str, typer.Option(help="Judge every n-th photo and optimise on the others, or none.")
     ] = "8",
     scene_name: SceneName = None,
+    no_poses: NoPoses = False,
     device: Device = "auto",
 ) -> None:
     """The best scene of photos in a given time: scene.ply, scene.splat, a page, held-out scores.

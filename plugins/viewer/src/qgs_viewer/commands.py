@@ -15,6 +15,7 @@ from qgs.cli.options import (
     Device,
     Frames,
     Inputs,
+    NoPoses,
     Scale,
     SceneName,
     Size,
@@ -43,7 +44,7 @@ def view(
     photos: Annotated[
         str | None,
         typer.Argument(
-            help="Photos and cameras for a model; default: its recipe's data, of shipped models an "
+            help="Photos or a video for a model; default: its recipe's data, of shipped models an "
             "unseen room."
         ),
     ] = None,
@@ -73,6 +74,7 @@ def view(
         bool, typer.Option("--open/--no-open", help="Open it in the browser of this machine.")
     ] = True,
     threads: Threads = None,
+    no_poses: NoPoses = False,
     device: Device = "auto",
 ) -> None:
     """Turn a reconstruction in the browser, pick a query, see its anchor and what it reads.

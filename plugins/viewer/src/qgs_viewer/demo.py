@@ -14,6 +14,7 @@ from rich.console import Console
 
 from qgs.cli.options import (
     Device,
+    NoPoses,
     Scale,
     Size,
     Threads,
@@ -40,7 +41,7 @@ def demo(
         list[str] | None,
         typer.Argument(
             metavar="[PHOTOS]",
-            help="Folder of your own photos and cameras; with --train, recipe files to compare.",
+            help="Folder of your own photos, or a video; with --train, recipe files to compare.",
         ),
     ] = None,
     models: Annotated[
@@ -62,11 +63,12 @@ def demo(
     size: Size = None,
     scale: Scale = None,
     threads: Threads = None,
+    no_poses: NoPoses = False,
     device: Device = "auto",
 ) -> None:
     """Trained models on rooms unseen in training, or on your photos; writes report.html.
 
-    Photos need camera poses, as Nerfstudio, COLMAP, Blender or LLFF write them. With --train the
+    Photos without camera poses, and videos, get them first (qgs poses). With --train the
     tiny TokenGS and LocusGS, or the named recipes, are trained on the same rooms and compared.
     """
     if train and models:
@@ -97,6 +99,7 @@ def report(
     size: Size = None,
     scale: Scale = None,
     threads: Threads = None,
+    no_poses: NoPoses = False,
     device: Device = "auto",
 ) -> None:
     """Evaluate trained models and show their scenes side by side; writes report.html."""

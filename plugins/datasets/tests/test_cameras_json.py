@@ -1,4 +1,4 @@
-"""`cameras.json` with c2w, K and photos beside it."""
+"""`cameras.json` with c2w and K, or other names of them, and photos beside it."""
 
 import json
 
@@ -52,6 +52,53 @@ FORMS = {
 }  # fmt: skip
 
 
+def renamed(photos, old: str, new: str, change=lambda value: value):
+    others = [{key: value for key, value in c.items() if key != old} for c in named(photos)]
+    return [{**o, new: change(c[old])} for o, c in zip(others, named(photos), strict=True)]
+
+
+def parts(photos, value):
+    """Intrinsics in parts of the width and height."""
+    (height, width), matrix = photos.size, np.array(value)
+    matrix[0] /= width
+    matrix[1] /= height
+    return matrix.tolist()
+
+
+DIALECTS = {
+    "views, intrinsic": lambda p: {"views": renamed(p, "K", "intrinsic")},
+    "w2c": lambda p: renamed(p, "c2w", "w2c", lambda pose: np.linalg.inv(pose).tolist()),
+    "w2c of each": lambda p: {
+        "world_to_camera": np.linalg.inv(p.c2w)[:, :3].tolist(), "intrinsics": list(p.intrinsics),
+    },
+    "OpenGL": lambda p: renamed(
+        p, "c2w", "transform_matrix", lambda pose: (np.array(pose) * [1, -1, -1, 1]).tolist()
+    ),
+    "parts": lambda p: renamed(p, "K", "K", lambda value: parts(p, value)),
+    "numbers by name": lambda p: [
+        {"image": f.name, "c2w": c.tolist(), "fl_x": 50.0, "fl_y": 52.0, "cx": 19.0, "cy": 16.0}
+        for f, c in zip(p.files, p.c2w, strict=True)
+    ],
+    "3DGS": lambda p: [
+        {"id": 0, "img_name": f.stem, "width": 40, "height": 30, "fx": 50.0, "fy": 52.0,
+         "position": c[:3, 3].tolist(), "rotation": c[:3, :3].tolist(), "cx": 19.0, "cy": 16.0}
+        for f, c in zip(p.files, p.c2w, strict=True)
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_other_names_are_read_and_the_meaning_is_logged(tmp_path, photos, dialect, caplog):
+    copied(photos, tmp_path / "scene")
+    (tmp_path / "scene" / "cameras.json").write_text(json.dumps(DIALECTS[dialect](photos)))
+    read = scene(tmp_path / "scene")
+    torch.testing.assert_close(read.cameras.c2w, torch.from_numpy(photos.c2w))
+    expected = torch.tensor(photos.intrinsics).double().expand(6, 4)
+    torch.testing.assert_close(read.cameras.intrinsics, expected)
+    plain = dialect in ("views, intrinsic", "numbers by name")
+    assert plain != ("is read as" in caplog.text)
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_what_is_read(tmp_path, photos, form):
     folder = tmp_path / "scene"
@@ -73,7 +120,9 @@ def test_what_is_read(tmp_path, photos, form):
         lambda p: [{"c2w": p.c2w[0].tolist(), "K": "x", "image": "a"}],
         lambda p: {"K": [matrix(p)] * 5, "c2w": p.c2w.tolist()},
         lambda p: [*named(p), 7],
-        lambda p: [{**c, "K": [1.2, 1.2, 0.5, 0.5]} for c in named(p)],
+        lambda p: [{**c, "K": None} for c in named(p)],
+        lambda p: renamed(p, "c2w", "extrinsics"),
+        lambda p: renamed(p, "c2w", "location"),
     ],
 )
 def test_what_is_refused_names_the_file(tmp_path, photos, content):
@@ -108,8 +157,12 @@ def test_no_more_of_a_listing_is_read_than_tells_what_it_is(tmp_path, photos):
     assert formats_of(file.parent) == ["cameras"]
 
 
-def test_files_of_that_name_from_other_programs_are_no_photos(tmp_path, photos):
+def test_a_file_of_that_name_without_poses_is_named_where_photos_lie_beside_it(tmp_path, photos):
     copied(photos, tmp_path / "scene")
-    (tmp_path / "scene" / "cameras.json").write_text('[{"id": 0, "position": [0, 0, 0]}]')
-    with pytest.raises(FileNotFoundError, match="lists no cameras"):
-        scene(tmp_path / "scene")
+    file = tmp_path / "scene" / "cameras.json"
+    file.write_text(json.dumps([{"id": 0, "position": [0, 0, 0]}] * 6))
+    with pytest.raises(ValueError, match=r"cameras\.json"):
+        scene(file.parent)
+    for photo in file.parent.glob("*.png"):
+        photo.unlink()
+    assert formats_of(file.parent) == []

@@ -1,0 +1,85 @@
+"""Photos without cameras and videos, wherever qgs takes photos."""
+
+import shutil
+
+import pytest
+from commands import run_qgs
+from qgs_poses import door, making
+from qgs_poses.photos import PosesError
+from walked import PHOTOS, write_video
+
+import qgs
+from qgs.data import PhotosSource
+
+
+@pytest.fixture
+def photos(walk, made, tmp_path, monkeypatch):
+    """A copy of the walk; what COLMAP finds of it is there already, and asked for at most once."""
+    calls = []
+
+    def found(source, out, options, console):
+        calls.append(source)
+        shutil.copytree(made.folder, out, dirs_exist_ok=True)
+        record = (out / "poses.json").read_text().replace("{", '{"again": 1,', 1)
+        (out / "poses.json").write_text(record)
+        return made
+
+    monkeypatch.setattr(door, "make_locked", found)
+    folder = shutil.copytree(walk, tmp_path / "holiday")
+    return folder, calls
+
+
+def test_poses_are_made_once_and_kept_beside_the_photos(photos):
+    folder, calls = photos
+    for _ in range(2):
+        views = qgs.read_photos(folder, size=(36, 54))
+        assert views.images.shape == (1, PHOTOS, 3, 36, 54)
+    assert len(calls) == 1
+    assert (folder.parent / "holiday_poses" / "sparse" / "0").is_dir()
+    source = PhotosSource(PhotosSource.Config(path=str(folder)))
+    assert source.names("train") == ["holiday"]
+
+
+def test_no_poses_refuses_and_other_photos_are_not_mixed_up(photos, monkeypatch):
+    folder, calls = photos
+    with monkeypatch.context() as patch:
+        patch.setenv("QGS_NO_POSES", "1")
+        with pytest.raises(ValueError, match="--no-poses"):
+            qgs.read_photos(folder)
+    assert not calls
+    qgs.read_photos(folder)
+    (folder / "0.jpg").unlink()
+    with pytest.raises(PosesError, match="holiday_poses"):
+        qgs.read_photos(folder)
+
+
+def test_no_poses_of_the_command_line(photos, monkeypatch, tmp_path):
+    folder, calls = photos
+    monkeypatch.setenv("QGS_NO_POSES", "")  # and what the command sets ends with the test
+    out = str(tmp_path / "out")
+    result = run_qgs("scene", str(folder), "--out", out, "--no-poses")
+    assert "--no-poses" in str(result.exception)
+    assert not calls
+
+
+def test_the_poses_of_a_video_are_those_of_its_frames(shots, tmp_path):
+    video = write_video(tmp_path / "phone.mp4", [shot.image for shot in shots])
+    views = qgs.read_photos(video, size=(36, 54))
+    assert views.images.shape == (1, PHOTOS, 3, 36, 54)
+    assert making.read_record(tmp_path / "phone_poses") is not None
+
+
+def test_a_folder_of_something_else_is_not_written_into(photos):
+    folder, _ = photos
+    beside = folder.parent / "holiday_poses"
+    beside.mkdir()
+    (beside / "mine.txt").write_text("keep")
+    with pytest.raises(FileExistsError):
+        qgs.read_photos(folder)
+    assert [*beside.iterdir()] == [beside / "mine.txt"]
+
+
+def test_a_folder_whose_photos_are_elsewhere_is_none(tmp_path):
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    with pytest.raises(FileNotFoundError, match="lists no cameras"):
+        qgs.read_photos(tmp_path / "a")

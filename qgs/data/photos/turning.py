@@ -1,0 +1,77 @@
+"""Photos whose EXIF says that they are to be turned, and their cameras with them."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from PIL import Image
+
+from qgs.data.images import opened_image, orientation
+from qgs.data.lenses import RadialTangential, Size
+from qgs.data.paths import is_local
+from qgs.data.photos.checks import size_problems
+from qgs.data.photos.reader import PhotoFrame
+
+_TURNS = {3: 2, 6: 1, 8: 3}
+"""EXIF orientation to quarter turns clockwise; the others mirror, which no camera does."""
+_TRANSPOSED = (Image.Transpose.ROTATE_270, Image.Transpose.ROTATE_180, Image.Transpose.ROTATE_90)
+_QUARTER = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+"""Axes of a camera turned clockwise, in those of the camera before: its x was -y, its y was x."""
+
+
+def upright(frame: PhotoFrame) -> PhotoFrame:
+    """`frame` as EXIF turns its photo, camera and lens included; of a store as it is.
+
+    Where the listed size is the upright one, so are the listed cameras; where size does not tell,
+    as of squares and half turns, they are those of the stored pixels.
+    """
+    if not is_local(frame.path) or not frame.path.is_file():  # each header would be a request
+        return frame
+    size, turns = _header(str(frame.path), frame.path.stat().st_mtime_ns)
+    if not turns:
+        return frame
+    if turns % 2 and _fits(size[::-1], frame.size) and not _fits(size, frame.size):
+        return replace(frame, turns=turns)
+    frame = replace(frame, turns=turns, size=frame.size or size)
+    for _ in range(turns):
+        frame = _quarter(frame)
+    return frame
+
+
+def turned_size(size: Size, frame: PhotoFrame) -> Size:
+    """(H, W) of a stored photo of `frame`, or of its mask or depth map, when it is upright."""
+    already = frame.turns % 2 and _fits(size, frame.size) and not _fits(size[::-1], frame.size)
+    return size if already or frame.turns % 2 == 0 else size[::-1]
+
+
+def turned(image: Image.Image, frame: PhotoFrame) -> Image.Image:
+    """The stored photo, mask or depth map, upright; one that was drawn upright stays."""
+    size = image.height, image.width
+    stays = frame.turns % 2 and turned_size(size, frame) == size and size[0] != size[1]
+    return image.transpose(_TRANSPOSED[frame.turns - 1]) if frame.turns and not stays else image
+
+
+@lru_cache(maxsize=2**16)
+def _header(path: str, changed: int) -> tuple[Size, int]:
+    """(H, W) as stored and quarter turns; none of a file that is no image."""
+    try:
+        with open(path, "rb") as file, opened_image(file) as image:
+            return (image.height, image.width), _TURNS.get(orientation(image), 0)
+    except OSError:
+        return (1, 1), 0
+
+
+def _fits(size: Size, listed: Size | None) -> bool:
+    return not any(size_problems(size, listed))
+
+
+def _quarter(frame: PhotoFrame) -> PhotoFrame:
+    """Camera, size and lens of `frame`, a quarter turn clockwise."""
+    assert frame.size is not None
+    (height, width), (fx, fy, cx, cy), lens = frame.size, frame.intrinsics, frame.lens
+    if isinstance(lens, RadialTangential):  # (p2, p1) is a vector in the image
+        lens = replace(lens, p1=lens.p2, p2=-lens.p1)
+    return replace(
+        frame, size=(width, height), c2w=frame.c2w @ _QUARTER,
+        intrinsics=(fy, fx, height - cy, cx), lens=lens,
+    )  # fmt: skip
