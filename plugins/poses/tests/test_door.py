@@ -4,12 +4,12 @@ import shutil
 
 import pytest
 from commands import run_qgs
+from photo_formats import opened
 from qgs_poses import door, making
 from qgs_poses.photos import PosesError
 from walked import PHOTOS, write_video
 
 import qgs
-from qgs.data import PhotosSource
 
 
 @pytest.fixture
@@ -32,12 +32,11 @@ def photos(walk, made, tmp_path, monkeypatch):
 def test_poses_are_made_once_and_kept_beside_the_photos(photos):
     folder, calls = photos
     for _ in range(2):
-        views = qgs.read_photos(folder, size=(36, 54))
-        assert views.images.shape == (1, PHOTOS, 3, 36, 54)
+        source = opened(folder)
+        assert source.names("train") == ["holiday"]
+        assert len(source.scenes("train")[0]) == PHOTOS
     assert len(calls) == 1
     assert (folder.parent / "holiday_poses" / "sparse" / "0").is_dir()
-    source = PhotosSource(PhotosSource.Config(path=str(folder)))
-    assert source.names("train") == ["holiday"]
 
 
 def test_no_poses_refuses_and_other_photos_are_not_mixed_up(photos, monkeypatch):
@@ -45,12 +44,12 @@ def test_no_poses_refuses_and_other_photos_are_not_mixed_up(photos, monkeypatch)
     with monkeypatch.context() as patch:
         patch.setenv("QGS_NO_POSES", "1")
         with pytest.raises(ValueError, match="--no-poses"):
-            qgs.read_photos(folder)
+            opened(folder)
     assert not calls
-    qgs.read_photos(folder)
+    opened(folder)
     (folder / "0.jpg").unlink()
     with pytest.raises(PosesError, match="holiday_poses"):
-        qgs.read_photos(folder)
+        opened(folder)
 
 
 def test_no_poses_of_the_command_line(photos, monkeypatch, tmp_path):
@@ -75,11 +74,11 @@ def test_a_folder_of_something_else_is_not_written_into(photos):
     beside.mkdir()
     (beside / "mine.txt").write_text("keep")
     with pytest.raises(FileExistsError):
-        qgs.read_photos(folder)
+        opened(folder)
     assert [*beside.iterdir()] == [beside / "mine.txt"]
 
 
 def test_a_folder_whose_photos_are_elsewhere_is_none(tmp_path):
     (tmp_path / "a" / "b").mkdir(parents=True)
     with pytest.raises(FileNotFoundError, match="lists no cameras"):
-        qgs.read_photos(tmp_path / "a")
+        opened(tmp_path / "a")

@@ -29,7 +29,6 @@ _REDUCED = ("images_2", "images_4", "images_8")
 _PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 _FISHEYE = "OPENCV_FISHEYE"
 _OTHER = ("k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "sx1", "sy1", "b1", "b2")
-_BLENDER_SPLITS = {"train": "train", "val": "test", "test": "test"}
 _NO_POSE = np.full((4, 4), np.nan)
 _NO_INTRINSICS: Intrinsics = (math.nan, math.nan, math.nan, math.nan)
 _OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0, 1.0])  # of a pose's columns
@@ -58,38 +57,6 @@ class Nerfstudio(PhotoReader):
                     if existing(frame.path for frame in moved):
                         return Listing(file, moved)
         return Listing(file, frames)
-
-
-class Blender(PhotoReader):
-    """NeRF's synthetic scenes: a transforms file for each split; the alpha channel is the mask."""
-
-    name = "blender"
-    listing = "transforms_train.json"
-    poses = "opengl"
-
-    @classmethod
-    def recognises(cls, folder: UPath) -> bool:
-        """See `PhotoReader`: any of the files is enough."""
-        return any((folder / f"transforms_{part}.json").is_file() for part in _BLENDER_SPLITS)
-
-    @classmethod
-    def read(cls, folder: UPath, images: str | None) -> Listing:
-        """See `PhotoReader`: training frames first, others held out. `images`: ValueError."""
-        if images is not None:
-            raise ValueError(
-                f"`images` is {images!r}, but the transforms files of {folder} name a folder for "
-                "each split: leave `images` out"
-            )
-        frames: list[PhotoFrame] = []
-        for part, split in _BLENDER_SPLITS.items():
-            file = folder / f"transforms_{part}.json"
-            if file.is_file():
-                # these scenes have no masks but their alpha channel
-                frames += [
-                    replace(frame, split=split, mask=frame.mask or frame.path)
-                    for frame in read_transforms(file)
-                ]
-        return Listing(folder, frames)
 
 
 def read_transforms(file: UPath) -> list[PhotoFrame]:
