@@ -41,13 +41,14 @@ DISTRIBUTIONS = {
         "data": "query-gaussians-datatools",
         "bench": "query-gaussians-bench",
         "scene": "query-gaussians-refine",
-        "poses": "query-gaussians-poses",
     }
+    | dict.fromkeys(("poses", "video"), "query-gaussians-poses")
     | dict.fromkeys(("compare", "diff", "study"), "query-gaussians-studies")
     | dict.fromkeys(("convert", "export", "import"), "query-gaussians-published")
     | dict.fromkeys(("view", "demo", "report", "figures"), "query-gaussians-viewer")
     | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),
     "qgs.poses": {"folder": "query-gaussians-poses"},
+    "qgs.videos": {"reconstruction": "query-gaussians-poses"},
     "qgs.jobs": {"slurm": "query-gaussians-studies"},
     "qgs.pages": {"gaussians": "query-gaussians-viewer"},
     "qgs.traces": {"queries": "query-gaussians-viewer"},

@@ -22,6 +22,7 @@ HELP = {
         "The best scene of photos in a given time: scene.ply, scene.splat, a page, held-out scores."
     ),
     "poses": "Camera poses of photos or a video, by COLMAP: sparse/0 and images, checked at once.",
+    "video": "A camera path through Gaussians, as mp4 or webp.",
     "demo": "Trained models on rooms unseen in training, or on your photos; writes report.html.",
     "report": "Evaluate trained models and show their scenes side by side; writes report.html.",
     "figures": "Figures of trained models for a paper, as PDF and PNG.",

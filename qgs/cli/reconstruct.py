@@ -63,6 +63,12 @@ def reconstruct(
         int | None,
         typer.Option(min=1, help="Gaussians after --refine; default: as many as predicted."),
     ] = None,
+    video: Annotated[
+        Path | None, typer.Option(help="Video to write too, .mp4 or .webp, along --path.")
+    ] = None,
+    path: Annotated[
+        str, typer.Option(help="Cameras of --video: orbit, spiral, walk, or a file; see qgs video.")
+    ] = "orbit",
     scale: Scale = None,
     overrides: ViewsSettings = None,
     overwrite: Annotated[
@@ -88,6 +94,7 @@ def reconstruct(
     if refine is not None and not 0 < refine < float("inf"):
         raise ValueError(f"--refine must be a number of seconds above 0, got {refine:g}")
     refiner = function("qgs.refiners", "reconstruction") if refine else None
+    filmed = function("qgs.videos", "reconstruction") if video else None
 
     from rich.console import Console
 
@@ -118,16 +125,18 @@ def reconstruct(
         tune=partial(tuned, model, recipe, console) if tuned else None,
     )
     show(result, "feed-forward" if refine else "", console)
-    paths = result.save(out)
+    paths, shown = result.save(out), result
     if refiner:
         scene, seen = chosen_scene(recipe, photos, fine or pixels, scene_name, holdout is None)
         more = {"count": gaussians, "inputs_only": refine_inputs, "seen": seen}
-        better = refiner(result, scene, refine, **more, console=console)
-        show(better, "refined", console)
+        shown = refiner(result, scene, refine, **more, console=console)
+        show(shown, "refined", console)
         single = out.with_stem(f"{out.stem}_refined")
-        paths += better.save(single if paths == [out] else out / "refined")
-    for path in paths:
-        console.print(f"wrote {path}", soft_wrap=True)
+        paths += shown.save(single if paths == [out] else out / "refined")
+    if filmed:
+        paths.append(filmed(shown, path, video, console))
+    for file in paths:
+        console.print(f"wrote {file}", soft_wrap=True)
 
 
 def show(result: Reconstruction, what: str, console: Console) -> None:

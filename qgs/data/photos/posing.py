@@ -25,4 +25,4 @@ def posed(path: UPath) -> UPath:
         return path
     if os.environ.get(REFUSE):
         raise ValueError(f"{path} has no camera poses, and --no-poses ({REFUSE}) wants none")
-    return UPath(function("qgs.poses", "folder")(Path(path)))
+    return UPath(function("qgs.poses", "folder")(Path(str(path))))

@@ -30,7 +30,7 @@ def upright(frame: PhotoFrame) -> PhotoFrame:
     size, turns = _header(str(frame.path), frame.path.stat().st_mtime_ns)
     if not turns:
         return frame
-    if turns % 2 and _fits(size[::-1], frame.size) and not _fits(size, frame.size):
+    if turns % 2 and _fits(_swapped(size), frame.size) and not _fits(size, frame.size):
         return replace(frame, turns=turns)
     frame = replace(frame, turns=turns, size=frame.size or size)
     for _ in range(turns):
@@ -40,8 +40,8 @@ def upright(frame: PhotoFrame) -> PhotoFrame:
 
 def turned_size(size: Size, frame: PhotoFrame) -> Size:
     """(H, W) of a stored photo of `frame`, or of its mask or depth map, when it is upright."""
-    already = frame.turns % 2 and _fits(size, frame.size) and not _fits(size[::-1], frame.size)
-    return size if already or frame.turns % 2 == 0 else size[::-1]
+    already = frame.turns % 2 and _fits(size, frame.size) and not _fits(_swapped(size), frame.size)
+    return size if already or frame.turns % 2 == 0 else _swapped(size)
 
 
 def turned(image: Image.Image, frame: PhotoFrame) -> Image.Image:
@@ -59,6 +59,10 @@ def _header(path: str, changed: int) -> tuple[Size, int]:
             return (image.height, image.width), _TURNS.get(orientation(image), 0)
     except OSError:
         return (1, 1), 0
+
+
+def _swapped(size: Size) -> Size:
+    return size[1], size[0]
 
 
 def _fits(size: Size, listed: Size | None) -> bool:

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from qgs.cli.options import Threads
+from qgs.cli.options import NoPoses, SceneName, Threads, parse_size, use_threads
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 app = typer.Typer(help="Camera poses of photos or a video.")
+video_app = typer.Typer(help="A camera path through Gaussians, as a video.")
 
 
 @app.command()
@@ -95,3 +96,50 @@ def show_verdict(folder: Path, console: Console) -> None:
 
 def _line(console: Console, text: str) -> None:
     console.print(text, soft_wrap=True, highlight=False, markup=False)
+
+
+@video_app.command()
+def video(
+    source: Annotated[
+        Path, typer.Argument(help="What qgs reconstruct or qgs scene wrote, or a PLY file.")
+    ],
+    photos: Annotated[
+        str | None,
+        typer.Argument(help="Photos of the scene, for qgs scene and PLY: the path follows them."),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="New .mp4 (H.264) or .webp file.")] = Path("video.mp4"),
+    path: Annotated[
+        str,
+        typer.Option(
+            help="orbit, spiral, walk, or a file: a camera path of nerfstudio's viewer or a "
+            "transforms file, in the world of the photos."
+        ),
+    ] = "orbit",
+    size: Annotated[
+        str | None,
+        typer.Option(metavar="HxW", help="Of the video; default: the photos', from 480 pixels on."),
+    ] = None,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Of orbit, spiral and walk.")] = 8.0,
+    rate: Annotated[int, typer.Option(min=1, max=120, help="Frames a second.")] = 24,
+    fov: Annotated[
+        float | None,
+        typer.Option(min=1, max=170, help="Vertical angle of view, degrees; default: the photos'."),
+    ] = None,
+    scene: SceneName = None,
+    no_poses: NoPoses = False,
+    threads: Threads = None,
+) -> None:
+    """A camera path through Gaussians, as mp4 or webp."""
+    from rich.console import Console
+
+    from qgs.io.files import refuse_existing
+    from qgs_poses.film import refuse_suffix
+    from qgs_poses.filming import Shot, film, open_stage
+
+    refuse_existing(out)
+    refuse_suffix(out)
+    use_threads(threads)
+    console = Console()
+    shot = Shot(path, parse_size(size), seconds, rate, fov)
+    film(open_stage(source, photos, scene), shot, out, console)
+    _line(console, f"wrote {out}")
