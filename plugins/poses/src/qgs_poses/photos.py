@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image, ImageOps
 from upath import UPath
 
-from qgs.data.images import eight_bits, opened_image
+from qgs.data.images import eight_bits, opened_image, orientation
 from qgs.data.photos.reader import image_files
 from qgs.wording import counted, listed
 
@@ -56,7 +56,7 @@ class Photo:
 def photo_files(folder: Path) -> list[Path]:
     """The photos in `folder`, or in its `images`. Raises PosesError for fewer than LEAST."""
     found = next((f for f in (folder, folder / "images") if image_files(UPath(f))), folder)
-    files = [Path(str(file)) for file in image_files(UPath(found))]
+    files = [file for file in map(Path, map(str, image_files(UPath(found)))) if file.is_file()]
     foreign = sorted(f.name for f in found.iterdir() if f.suffix.lower() in _FOREIGN)
     if len(files) < LEAST:
         text = f"{found} holds {counted(len(files), 'photo')}, and poses need {LEAST} at least"
@@ -100,14 +100,12 @@ def _prepared(file: Path, kept: Path, working: Path, side: int) -> Photo:
     with file.open("rb") as opened, opened_image(opened) as image:
         if min(image.size) < SMALLEST:
             raise ValueError(f"it has {image.width} x {image.height} pixels")
-        turned = image.getexif().get(_ORIENTATION, 1) != 1
-        exif, kind = image.getexif(), image.format
-        camera = _camera(exif)
         image.load()
+        turned, kind = orientation(image) != 1, image.format
+        exif, camera = _exif(image)
         plain = image.mode in ("RGB", "L") and kind in ("JPEG", "MPO", "PNG")
         upright = ImageOps.exif_transpose(image) if turned else image
     rgb = eight_bits(upright).convert("RGB")
-    exif.pop(_ORIENTATION, None)
     name = file.name if kind in ("JPEG", "MPO", "PNG") else f"{file.name}.png"
     if plain and not turned:
         _link(file, kept / name)
@@ -124,17 +122,25 @@ def _prepared(file: Path, kept: Path, working: Path, side: int) -> Photo:
     return Photo(name, (rgb.height, rgb.width), camera, sharpness(grey), thumb)
 
 
-def _camera(exif: Image.Exif) -> str:
-    """What tells one camera, or one focal length of it, from another."""
-    sub = exif.get_ifd(_SUB)
-    values = [exif.get(tag) for tag in (_MAKE, _MODEL)] + [sub.get(tag) for tag in _LENS]
-    return json.dumps([str(value).strip("\0 ") for value in values if value])
+def _exif(image: Image.Image) -> tuple[bytes, str]:
+    """EXIF without the orientation, and what tells one camera, or focal length of it, from another.
+
+    Both are empty where EXIF is damaged.
+    """
+    try:
+        exif = image.getexif()
+        sub = exif.get_ifd(_SUB)
+        values = [exif.get(tag) for tag in (_MAKE, _MODEL)] + [sub.get(tag) for tag in _LENS]
+        exif.pop(_ORIENTATION, None)
+        return exif.tobytes(), json.dumps([str(value).strip("\0 ") for value in values if value])
+    except Exception:  # Pillow raises anything of it
+        return b"", ""
 
 
-def _save(image: Image.Image, path: Path, exif: Image.Exif) -> None:
+def _save(image: Image.Image, path: Path, exif: bytes) -> None:
     options = {"quality": 95, "subsampling": 0} if path.suffix.lower() != ".png" else {}
     kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
-    image.save(path, kind, exif=exif.tobytes(), **options)
+    image.save(path, kind, exif=exif, **options)
 
 
 def _link(file: Path, path: Path) -> None:
