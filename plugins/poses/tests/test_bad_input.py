@@ -1,4 +1,4 @@
-"""What people give: each kind ends with poses or with one sentence, and nothing of theirs changes."""
+"""What people give: each kind ends with poses or with one sentence, and theirs stays as it was."""
 
 import os
 import shutil
