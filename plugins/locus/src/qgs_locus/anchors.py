@@ -23,6 +23,7 @@ from qgs_locus.fields import (
     CENTER_FIELD,
     RAW_RADIUS,
     RadiusOptions,
+    ball_support,
     radius_field,
     raw_radius_of,
     support_radius,
@@ -127,5 +128,4 @@ class AnchoredQueries(LearnedQueries):
         r_BN1 = torch.zeros_like(center_BN3[..., :1])
         if self.config.radius:
             r_BN1 = support_radius(state[RAW_RADIUS], self.config)
-        axes_BN33 = r_BN1[..., None] * torch.eye(3).to(center_BN3)
-        return SpatialSupport(centers=center_BN3, axes=axes_BN33)
+        return ball_support(center_BN3, r_BN1)

@@ -3,18 +3,23 @@
 import math
 from typing import Literal
 
+import torch
 import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Fields, FieldSpec
 from qgs.geometry.precision import full_precision
+from qgs.types import SpatialSupport
 
 CENTER = "anchor.center"
 RAW_RADIUS = "anchor.raw_radius"
 
 CENTER_FIELD: Fields = {CENTER: FieldSpec((3,), frame="world")}
 """Unbounded anchor centre mu (B, N, 3)."""
+
+RAW_LEAST = 1e-6
+"""Least softplus of a raw radius that is made from a radius, so that the raw one is finite."""
 
 
 class RadiusOptions(ComponentConfig):
@@ -48,3 +53,16 @@ def support_radius(raw_radius: Tensor, options: RadiusOptions) -> Tensor:
 def raw_radius_of(radius: float) -> float:
     """softplus^-1: the rho whose softplus is `radius` > 0."""
     return radius + math.log(-math.expm1(-radius))
+
+
+@full_precision
+def raw_radii(radii: Tensor, options: RadiusOptions) -> Tensor:
+    """The raw radii of which `support_radius` makes `radii`, which are raised to the least one."""
+    least = options.radius_min if options.radius_bound == "offset" else 0.0
+    softplus = (radii - least).clamp_min(RAW_LEAST)
+    return softplus + (-torch.expm1(-softplus)).log()
+
+
+def ball_support(centers: Tensor, radii: Tensor) -> SpatialSupport:
+    """Balls around centres (B, N, 3), of radii (B, N, 1)."""
+    return SpatialSupport(centers=centers, axes=radii[..., None] * torch.eye(3).to(centers))
