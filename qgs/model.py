@@ -3,12 +3,14 @@
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, cast
 
+import torch
 from torch import Tensor, nn
 
 from qgs.contracts import (
     Centers,
     DecoderLayer,
     Encoder,
+    Feedback,
     Head,
     Queries,
     Refinement,
@@ -49,6 +51,7 @@ class QueryGaussianModel(nn.Module):
         queries: Queries,
         decoder: Sequence[DecoderLayer],
         refinements: Sequence[Refinement],
+        feedback: Feedback,
         head: Head,
         centers: Centers,
         supervision: Supervision,
@@ -62,6 +65,7 @@ class QueryGaussianModel(nn.Module):
         self.refinements = nn.ModuleList(dict.fromkeys(refinements))
         shared = {id(module): index for index, module in enumerate(self.refinements)}
         self.refinement_of = [shared[id(module)] for module in refinements]
+        self.feedback = feedback
         self.head = head
         self.centers = centers
         self.supervision = supervision
@@ -72,8 +76,8 @@ class QueryGaussianModel(nn.Module):
 
     @property
     def depth(self) -> int:
-        """Number of decoder layers."""
-        return len(self.decoder)
+        """Number of decoder layers that an evaluation runs, those of rounds of feedback too."""
+        return len(self.decoder) + self.feedback.rounds * self.feedback.layers
 
     def forward(
         self,
@@ -90,11 +94,12 @@ class QueryGaussianModel(nn.Module):
             views = self._without_cameras(views)
         memory = self.encoder(views)
         initial = self.queries(memory, views) if state is None else state
-        return self.predict(memory, initial, layers)
+        return self.predict(views, memory, initial, layers)
 
     def _without_cameras(self, photos: Photos) -> Views:
-        """`photos` for encoders and queries that read no cameras; ValueError if one does."""
-        readers = [type(x).__name__ for x in (self.encoder, self.queries) if x.reads_cameras]
+        """`photos` for parts that read no cameras; ValueError if one does."""
+        parts = (self.encoder, self.queries, self.feedback)
+        readers = [type(part).__name__ for part in parts if part.reads_cameras]
         if readers:
             raise ValueError(
                 f"{' and '.join(readers)} of this model read cameras, and these photos have none; "
@@ -103,37 +108,59 @@ class QueryGaussianModel(nn.Module):
         return cast(Views, photos)  # it has the same images and masks
 
     def predict(
-        self, memory: ImageMemory, state: QueryState, layers: Collection[int] | None = None
+        self,
+        views: Views,
+        memory: ImageMemory,
+        state: QueryState,
+        layers: Collection[int] | None = None,
     ) -> Prediction:
         """Run all decoder layers and decode Gaussians after the chosen ones.
 
-        memory: the encoder's output. state: the queries before the first layer, of as many scenes.
-        layers: numbers of the layers to decode; the last always is (1 is the first; a decoder
-            of depth 0 has 0, the state before any layer); None for the supervised ones in
-            training, and for the last alone in evaluation.
+        views, memory: the encoder's input and output. state: the queries before the first layer, of
+            as many scenes.
+        layers: numbers of the layers to decode; the last always is, and that of every round (1 is
+            the first, rounds count on; a decoder of depth 0 has 0, the state before any layer);
+            None for the supervised ones in training, and for the last alone in evaluation.
         Raises ValueError for a layer that does not exist and for another number of scenes.
         """
         if layers is None:
             layers = self.supervision.weights().keys() if self.training else ()
-        known = range(min(1, self.depth), self.depth + 1)
+        last, again = len(self.decoder), len(self.decoder) - self.feedback.layers
+        rounds = self.feedback.drawn() if self.training else self.feedback.rounds
+        order = [*range(last), *(rounds * [*range(again, last)])]
+        known = range(min(1, last), len(order) + 1)
         unknown = sorted(n for n in layers if n not in known)
         if unknown:
             raise ValueError(
-                f"layers {unknown} do not exist; this model has layers {known[0]}..{self.depth}"
+                f"layers {unknown} do not exist; this model has layers {known[0]}..{len(order)}"
             )
         scenes, given = memory.features.shape[0], state.features.shape[0]
         if scenes != given:
             raise ValueError(f"the memory is of {scenes} scenes, the initial state of {given}")
         decoded: dict[int, LayerPrediction] = {}
-        if not self.depth:
+        if not last:
             decoded[0] = LayerPrediction(gaussians=self.decode(state), state=state)
-        for number, layer in enumerate(self.decoder, start=1):
-            refine = self.refinements[self.refinement_of[number - 1]]
-            state, memory = layer(state, memory)
+        first = memory
+        for number, index in enumerate(order, start=1):
+            if index == again and number > last:
+                state, memory = self._corrected(decoded[number - 1], first, views)
+            elif index == again:
+                first = memory
+            refine = self.refinements[self.refinement_of[index]]
+            state, memory = self.decoder[index](state, memory)
             state = refine(state)
-            if number in layers or number == self.depth:
+            if number in layers or index == last - 1:
                 decoded[number] = LayerPrediction(gaussians=self.decode(state), state=state)
-        return Prediction(decoded[self.depth].gaussians, state, decoded)
+        return Prediction(decoded[len(order)].gaussians, state, decoded)
+
+    def _corrected(
+        self, before: LayerPrediction, memory: ImageMemory, views: Views
+    ) -> tuple[QueryState, ImageMemory]:
+        """What a round of feedback starts with."""
+        photos = self.feedback.compared(views)
+        with torch.no_grad():  # what looks wrong is an input of the round, no loss
+            rendering = self.render(before.gaussians, photos.cameras)
+        return self.feedback(before.state, memory, rendering, photos)
 
     def decode(self, state: QueryState) -> Gaussians:
         """The Gaussians of a state, ordered query by query."""

@@ -13,6 +13,7 @@ from qgs.components import (
     LayerSupervision,
     MlpFeedForward,
     MultiViewViT,
+    NoFeedback,
     NoRefinement,
 )
 from qgs.contracts import LayerParts, ModelDims
@@ -46,6 +47,7 @@ def build_model() -> QueryGaussianModel:
         queries=make(LatentQueries, count=QUERIES, std=1.0),
         decoder=layers,
         refinements=[refinement] * DEPTH,
+        feedback=make(NoFeedback),
         head=head,
         centers=make(FreeCenters),
         supervision=LayerSupervision(LayerSupervision.Config(layers=(DEPTH,))),

@@ -22,6 +22,7 @@ def parameter_counts(model: QueryGaussianModel) -> dict[str, int]:
         "decoder.layer": _count(model.decoder) - sum(sublayers.values()),
         **sublayers,
         "decoder.refinement": _count(model.refinements),
+        "feedback": _count(model.feedback),
         "head": _count(model.head),
         "centers": _count(model.centers),
     }
@@ -43,7 +44,7 @@ def heading(model: QueryGaussianModel) -> str:
     """Class, parameters, decoder layers, queries and device."""
     tree = (model.recipe or {}).get("model", {})
     options = {**tree.get("queries", {}), **tree.get("head", {})}
-    parts = [f"{_count(model):,} parameters", f"{model.depth} decoder layers"]
+    parts = [f"{_count(model):,} parameters", f"{len(model.decoder)} decoder layers"]
     if {"count", "gaussians_per_query"} <= options.keys():
         parts.append(f"{options['count']:,} queries of {options['gaussians_per_query']} Gaussians")
     device = next((parameter.device for parameter in model.parameters()), "cpu")
@@ -69,6 +70,6 @@ def _types(model: QueryGaussianModel, slot: str) -> list[str]:
             modules = [getattr(layer, slot) for layer in model.decoder if hasattr(layer, slot)]
         return [type(module).__name__ for module in modules]
     own = tree["decoder"].get("layers", {})
-    layers = [own.get(str(index), {}) for index in range(model.depth)]
+    layers = [own.get(str(index), {}) for index in range(len(model.decoder))]
     chosen = [layer.get(slot, tree["decoder"].get(slot)) for layer in layers]
     return [one["type"] for one in chosen if one]

@@ -7,6 +7,7 @@ from qgs.components.decoder import (
     ContentSelfAttention,
     CrossSelfMlp,
     MlpFeedForward,
+    NoFeedback,
     NoRefinement,
 )
 from qgs.components.encoder import MultiViewViT
@@ -24,6 +25,7 @@ COMPONENTS: tuple[type[Component], ...] = (
     ContentSelfAttention,
     MlpFeedForward,
     NoRefinement,
+    NoFeedback,
     GaussianHead,
     FreeCenters,
     OffsetCenters,
@@ -47,6 +49,7 @@ __all__ = [
     "Mlp",
     "MlpFeedForward",
     "MultiViewViT",
+    "NoFeedback",
     "NoRefinement",
     "OffsetCenters",
     "OneCycleAdamW",

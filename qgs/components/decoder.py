@@ -15,6 +15,7 @@ from qgs.contracts import (
     ComponentConfig,
     CrossAttention,
     DecoderLayer,
+    Feedback,
     FeedForward,
     LayerParts,
     ModelDims,
@@ -22,7 +23,7 @@ from qgs.contracts import (
     SelfAttention,
     memory_fields,
 )
-from qgs.types import ImageMemory, QueryState
+from qgs.types import ImageMemory, QueryState, Rendering, Views
 
 
 class CrossSelfMlp(DecoderLayer):
@@ -124,3 +125,15 @@ class NoRefinement(Refinement):
 
     def forward(self, state: QueryState) -> QueryState:
         return state
+
+
+class NoFeedback(Feedback):
+    """No rounds: every layer runs once."""
+
+    name = "none"
+    reads_cameras = False
+
+    def forward(
+        self, state: QueryState, memory: ImageMemory, rendering: Rendering, photos: Views
+    ) -> tuple[QueryState, ImageMemory]:
+        return state, memory

@@ -1,6 +1,6 @@
 """`qgs/layers`: a set of supervised layers, later ones weighing more (LocusGS)."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from pydantic import Field, field_validator
 
@@ -18,7 +18,7 @@ from qgs.types import Views
 
 
 class LayerSupervision(Supervision):
-    """The m-th of S supervised layers weighs m / (1 + ... + S)."""
+    """The m-th of S supervised layers, ends of rounds among them, weighs m / (1 + ... + S)."""
 
     name = "layers"
 
@@ -56,11 +56,11 @@ class LayerSupervision(Supervision):
                 f"choose layers from 1 to {context.dims.depth}, or raise model.decoder.depth",
             )
 
-    def weights(self) -> Mapping[int, float]:
-        count = len(self.config.layers)
+    def weights(self, rounds: Sequence[int] = ()) -> Mapping[int, float]:
+        layers = (*self.config.layers, *rounds)
         # They sum to 1, so that the learning rate does not depend on how many there are.
-        total = count * (count + 1) / 2
-        return {number: rank / total for rank, number in enumerate(self.config.layers, start=1)}
+        total = len(layers) * (len(layers) + 1) / 2
+        return {number: rank / total for rank, number in enumerate(layers, start=1)}
 
 
 class OnePass(Objective):

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 from qgs.composer.decode import Chosen
 from qgs.composer.errors import Problems
 from qgs.composer.registry import Registry, component_failure, default_config
-from qgs.composer.slots import LAYER_SLOTS, SUBLAYER_SLOTS
+from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SUBLAYER_SLOTS
 from qgs.composer.yaml_text import KeyPath, MapNode, find
 from qgs.contracts import Refinement, Supervision
 from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpec, RecipeContext
@@ -15,7 +15,7 @@ from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpe
 Parts: TypeAlias = Mapping[KeyPath, Chosen | None]
 """What stands at each place; None for a component that could not be decoded."""
 
-_FLOW = ("encoder", "queries", *LAYER_SLOTS, "head", "centers", "renderer", "losses", "objective")
+_FLOW = ("encoder", "queries", *LAYER_SLOTS, *MODEL_SLOTS[2:], "losses", "objective")
 """Slots that read or write fields, in the order in which a layer's prediction is made."""
 
 
@@ -177,6 +177,7 @@ def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[Chosen | None, 
                 yield parts["model", name], layer
             judges = ("losses", "objective")
             yield from ((part, layer) for path, part in parts.items() if path[0] in judges)
+    yield parts["model", "feedback"], None
 
 
 def _unmet(

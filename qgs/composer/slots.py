@@ -42,6 +42,7 @@ SLOTS = {
         Slot(contracts.SelfAttention, "qgs/content"),
         Slot(contracts.FeedForward, "qgs/mlp"),
         Slot(contracts.Refinement, "qgs/none"),
+        Slot(contracts.Feedback, "qgs/none"),
         Slot(contracts.Head, "qgs/gaussian_head"),
         Slot(contracts.Centers, "qgs/free"),
         Slot(contracts.Supervision, "qgs/layers"),
@@ -54,7 +55,7 @@ SLOTS = {
         Slot(contracts.ViewSampler, "qgs/span"),
     )
 }
-MODEL_SLOTS = ("encoder", "queries", "head", "centers", "supervision", "renderer")
+MODEL_SLOTS = ("encoder", "queries", "feedback", "head", "centers", "supervision", "renderer")
 SUBLAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward")
 LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
 _SECTIONS = ("losses", "objective", "data", "view_sampler", "metrics", "optimizer")

@@ -1,4 +1,4 @@
-"""Slots of the decoder: `layer`, what stands inside one, and `refinement` after each.
+"""Slots of the decoder: `layer`, what stands inside one, `refinement` after each, `feedback`.
 
 An attention or feed-forward component holds its norms and its output projection; the decoder layer
 adds LayerScale and the residual sum.
@@ -12,7 +12,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from qgs.contracts.component import ComponentConfig, ModelComponent, ModelDims
-from qgs.types import ImageMemory, QueryState
+from qgs.types import ImageMemory, QueryState, Rendering, Views
 
 
 @dataclass(frozen=True)
@@ -143,3 +143,33 @@ class Refinement(ModelComponent):
     @abstractmethod
     def forward(self, state: QueryState) -> QueryState:
         """The refined state."""
+
+
+class Feedback(ModelComponent):
+    """(QueryState, ImageMemory, Rendering, Views) -> state and memory of the next round.
+
+    A round begins with what the last layer's Gaussians look like from the cameras of the photos,
+    rendered without gradients; then the last `layers` decoder layers run again, and update the
+    state once more. The memory is the one that the first of them read in the first pass.
+
+    rounds: how many an evaluation makes; it may be changed on a built model.
+    """
+
+    slot: ClassVar[str] = "feedback"
+    reads_cameras: ClassVar[bool] = True
+    layers: int = 0
+    rounds: int = 0
+
+    def drawn(self) -> int:
+        """How many rounds a forward pass in training makes; they may be random."""
+        return self.rounds
+
+    def compared(self, views: Views) -> Views:
+        """The input photos as they are rendered and compared; smaller ones take less time."""
+        return views
+
+    @abstractmethod
+    def forward(
+        self, state: QueryState, memory: ImageMemory, rendering: Rendering, photos: Views
+    ) -> tuple[QueryState, ImageMemory]:
+        """What the first repeated layer reads. photos: `compared` views, (B, V) as `rendering`."""

@@ -1,7 +1,7 @@
 """Slots `losses` and `supervision`: what training minimises, and after which layers."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal
 
 import torch
@@ -67,8 +67,9 @@ class Supervision(Component):
     slot: ClassVar[str] = "supervision"
 
     @abstractmethod
-    def weights(self) -> Mapping[int, float]:
+    def weights(self, rounds: Sequence[int] = ()) -> Mapping[int, float]:
         """Layer number to weight, ascending; the weights sum to 1.
 
-        1 is the first layer; 0, the start, is the only one of a decoder of depth 0.
+        1 is the first layer; 0, the start, is the only one of a decoder of depth 0. rounds: numbers
+        of the last layers of rounds of feedback, which are supervised too.
         """

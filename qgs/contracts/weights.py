@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -59,11 +59,6 @@ class WeightLayout:
     def published_name(self, ours: str) -> str | None:
         """The published name of our parameter `ours`; None where the codebase has none."""
         return next((name for r in self.renames if (name := r.renamed(ours)) is not None), None)
-
-    def unused_names(self, theirs: Iterable[str]) -> list[str]:
-        """Published parameters that are stored beside `theirs` and never used."""
-        found = (rule.renamed(name) for name in theirs for rule in self.unused)
-        return [name for name in found if name is not None]
 
 
 def layer_count(shapes: Shapes, prefix: str) -> int:

@@ -111,7 +111,8 @@ class TrainingPass(nn.Module):
         total, count = targets.images.new_zeros(()), targets.images.shape[1]
         terms: dict[str, Tensor] = {}
         signs: list[tuple[float, dict[str, Tensor]]] = []
-        for number, weight in self.model.supervision.weights().items():
+        rounds = [number for number in prediction.layers if number > len(self.model.decoder)]
+        for number, weight in self.model.supervision.weights(rounds).items():
             self.hook(f"prediction of layer {number}{judgement}", prediction.layers[number])
             layer = DetachedLayer(prediction.layers[number], parameters)
             signs = []  # of this layer: those of the last one remain

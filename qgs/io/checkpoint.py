@@ -16,7 +16,6 @@ from qgs.composer import Recipe, RecipeError
 from qgs.composer.registry import available_plugins, load_registry
 from qgs.contracts.schedule import END, follow, steps_followed
 from qgs.data.domain import KEY, Domain, FirstViews
-from qgs.io.files import refuse_existing
 from qgs.io.models import checkpoint_path
 from qgs.io.tensors import (
     CheckpointError,
@@ -194,15 +193,6 @@ def write_checkpoint(
         **{_EXTRA + key: value for key, value in extra.items()},
     }
     write_tensors(path, tensors, metadata)
-
-
-def new_checkpoint_path(path: str | Path) -> Path:
-    """`path`; raises ValueError for another suffix, FileExistsError where something lies."""
-    path = Path(path)
-    if path.suffix.lower() != ".safetensors":
-        raise ValueError(f"{path}: weights are written as safetensors; name it .safetensors")
-    refuse_existing(path)
-    return path
 
 
 def digest(tensors: Mapping[str, Tensor]) -> str:

@@ -53,7 +53,8 @@ def model_tensors(
     if tuned_latents is not None:
         memory = model.encoder(views)
         state = model.queries(memory, views)
-        tuned = model.predict(model.encoder.project(tuned_latents, memory), state)
+        memory = model.encoder.project(tuned_latents, memory)
+        tuned = model.predict(views, memory, state)
         found["gaussians_of_tuned_latents"] = _packed(tuned.gaussians)
     return found
 

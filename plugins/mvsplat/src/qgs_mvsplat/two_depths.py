@@ -4,7 +4,7 @@
 layer 2 the final depth; `mvsplat/decayed` weighs them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from pydantic import Field
@@ -44,7 +44,7 @@ class DecayedSupervision(LayerSupervision):
 
     config: Config
 
-    def weights(self) -> Mapping[int, float]:
-        layers = self.config.layers
+    def weights(self, rounds: Sequence[int] = ()) -> Mapping[int, float]:
+        layers = (*self.config.layers, *rounds)
         each = [self.config.decay**n for n in range(len(layers) - 1, -1, -1)]
         return {layer: weight / sum(each) for layer, weight in zip(layers, each, strict=True)}

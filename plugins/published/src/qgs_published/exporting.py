@@ -7,12 +7,8 @@ from typing import Annotated
 import typer
 
 from qgs.cli.options import Checkpoint
-from qgs.io.checkpoint import (
-    CheckpointFile,
-    new_checkpoint_path,
-    refuse_nonfinite,
-    write_checkpoint,
-)
+from qgs.io.checkpoint import CheckpointFile, refuse_nonfinite, write_checkpoint
+from qgs.io.files import refuse_existing
 from qgs.io.tensors import CheckpointError, nonfinite
 from qgs.wording import listed
 
@@ -49,3 +45,12 @@ def export_checkpoint(name: str | os.PathLike[str], out: str | Path, half: bool 
                 f"{listed(broken)}; ship it as it is"
             )
         write_checkpoint(out, tensors, file.recipe.tree, file.extra)
+
+
+def new_checkpoint_path(path: str | Path) -> Path:
+    """`path`; raises ValueError for another suffix, FileExistsError where something lies."""
+    path = Path(path)
+    if path.suffix.lower() != ".safetensors":
+        raise ValueError(f"{path}: weights are written as safetensors; name it .safetensors")
+    refuse_existing(path)
+    return path

@@ -12,10 +12,11 @@ from qgs.composer import Recipe, resolve
 from qgs.composer.recipe import differing_predictions
 from qgs.composer.yaml_text import dump
 from qgs.contracts import WeightLayout
-from qgs.io.checkpoint import new_checkpoint_path, refuse_nonfinite, write_checkpoint
+from qgs.io.checkpoint import refuse_nonfinite, write_checkpoint
 from qgs.io.files import refuse_existing, write_text
 from qgs.io.tensors import shapes_of
 from qgs.wording import listed
+from qgs_published.exporting import new_checkpoint_path
 from qgs_published.layouts import Names, PublishedError, fitting_recipe, names_of, recognise
 from qgs_published.weight_files import WeightFile, read_weight_file
 

@@ -101,7 +101,9 @@ def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
     # Two of our parameters under one published name would be an error in the layout's renames.
     assert len(set(published.values())) == len(published)
     unnamed = tuple(name for name in shapes if name not in published)
-    unused = tuple(layout.unused_names(published.values()))
+    # Stored beside the used ones, and never read by the published code.
+    beside = (rule.renamed(name) for name in published.values() for rule in layout.unused)
+    unused = tuple(name for name in beside if name is not None)
     return Names(layout, shapes, published, unnamed, unused)
 
 

@@ -79,9 +79,9 @@ def tune(
     def predicted() -> tuple[Prediction, Tensor]:
         # The part that is fixed was computed once, outside.
         if what == "queries":
-            prediction = model.predict(memory, tuned, ())
+            prediction = model.predict(views, memory, tuned, ())
         else:
-            prediction = model.predict(model.encoder.project(tuned, memory), start, ())
+            prediction = model.predict(views, model.encoder.project(tuned, memory), start, ())
         rendering = model.render(prediction.gaussians, views.cameras)
         terms = loss(prediction.layers[model.depth], rendering, views, views)
         return prediction, torch.stack(list(terms.values())).sum()

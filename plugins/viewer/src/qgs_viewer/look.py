@@ -114,8 +114,9 @@ class Look:
         missing = [query for query in dict.fromkeys(queries) if query not in self._traces]
         if missing and self.inside is not None:
             model, memory = self.inside.model, self.inside.memory
+            state = self.inside.states[0]
             with torch.no_grad(), trace(model, queries=missing) as record:
-                model.predict(memory, self.inside.states[0])
+                model.predict(self.views, memory, state)
             self._traces.update({query: (record, at) for at, query in enumerate(missing)})
 
     def hub(self, query: int, layer: int) -> Tensor:
@@ -163,7 +164,7 @@ def look_inside(
     """What `model` makes of views (1, V), with all that can be asked of it."""
     memory = model.encoder(views)
     start = model.queries(memory, views)
-    prediction = model.predict(memory, start, range(1, model.depth + 1))
+    prediction = model.predict(views, memory, start, range(1, model.depth + 1))
     states = [start, *(layer.state for layer in prediction.layers.values())]
     inside = Inside(model, memory, states)
     placement = placement or Placement.identity()

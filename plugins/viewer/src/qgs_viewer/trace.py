@@ -49,6 +49,8 @@ def trace(
 ) -> Iterator[Trace]:
     """Record states and attention weights of `queries` in `layers` (numbers; None: all of them).
 
+    Rounds of feedback count on: a decoder of 4 layers that repeats two has 5 and 6 in the first.
+
     It uses forward hooks, removed at the end, and the contracts' `explain`; without gradients.
     Raises ValueError for layers or queries that do not exist.
     """
@@ -62,13 +64,15 @@ def trace(
         return map_tensors(lambda tensor: tensor.detach()[:, index], state)
 
     def start(module: nn.Module, args: Any) -> None:
+        nonlocal current
         record.layers.clear()
-        record.grid = None
+        record.grid, current = None, 0
 
-    def enter(number: int, module: nn.Module, args: tuple[QueryState, ImageMemory]) -> None:
-        nonlocal current  # layers run in order, so refinements may share a module
+    def enter(module: nn.Module, args: tuple[QueryState, ImageMemory]) -> None:
+        nonlocal current  # layers run in order, though rounds and refinements share modules
         state, memory = args
-        current, record.grid = number, memory.grid
+        number = current = current + 1
+        record.grid = memory.grid
         if number == 1:
             found = _checked(queries, range(state.features.shape[1]), "queries")
             record.queries = torch.tensor(found, dtype=torch.long)
@@ -79,6 +83,8 @@ def trace(
 
     @torch.no_grad()
     def explain(part: str, module: Any, args: tuple[Any, ...]) -> None:
+        if current not in numbers:
+            return
         weights = module.explain(*args, record.queries.to(args[0].features.device))
         setattr(record.layers[current], part, weights)
         if weights is None:
@@ -89,10 +95,10 @@ def trace(
             record.layers[current].after = chosen(state)
 
     handles = [model.register_forward_pre_hook(start)]
-    for number, layer in enumerate(model.decoder, start=1):
-        handles.append(layer.register_forward_pre_hook(partial(enter, number)))
+    for layer in model.decoder:
+        handles.append(layer.register_forward_pre_hook(enter))
         for part in ATTENTIONS:
-            if number in numbers and hasattr(layer, part):
+            if hasattr(layer, part):
                 hook = partial(explain, part)
                 handles.append(getattr(layer, part).register_forward_pre_hook(hook))
     handles += [part.register_forward_hook(leave) for part in model.refinements]

@@ -1,0 +1,93 @@
+"""Places in photos: where they are, what is seen there, and the rays through them.
+
+A place is x and y as shares of a photo's width and height; `view_N` says of which photo it is.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from qgs.geometry.precision import full_precision
+from qgs.types import Cameras
+
+PLASTIC = 1.32471795724474602596
+"""The real root of x^3 = x + 1; its powers step through the unit square most evenly (M. Roberts,
+"The Unreasonable Effectiveness of Quasirandom Sequences", 2018: the sequence R2)."""
+
+
+def patch_centres(rows: int, columns: int, device: torch.device) -> Tensor:
+    """Places (rows * columns, 2) in one photo, row by row."""
+    y, x = ((torch.arange(n, device=device) + 0.5) / n for n in (rows, columns))
+    return torch.cartesian_prod(y, x).flip(-1)
+
+
+def spread(count: int, shift_BV2: Tensor) -> tuple[Tensor, Tensor]:
+    """Views (N,) of N = `count` points, in turn, and their places (B, N, 2).
+
+    The points of a view follow the sequence R2, moved by the shift of its scene and view.
+    """
+    index_N = torch.arange(count, device=shift_BV2.device)
+    views = shift_BV2.shape[1]
+    view_N, turn_N1 = index_N % views, (index_N // views + 1)[:, None]
+    # In float64: the index times a step loses the digits that float32 has after the point.
+    step_2 = torch.tensor([1 / PLASTIC, 1 / PLASTIC**2], dtype=torch.float64, device=view_N.device)
+    place_BN2 = (0.5 + shift_BV2.double()[:, view_N] + turn_N1 * step_2) % 1
+    return view_N, place_BN2.to(shift_BV2)
+
+
+def cells(count: int) -> Tensor:
+    """Middles (K, 2), x and y, of K = `count` equal cells of a square of side 1 about 0.
+
+    They lie row by row in a grid as nearly square as K allows.
+    """
+    rows = next(n for n in range(math.isqrt(count), 0, -1) if count % n == 0)
+    y, x = ((torch.arange(n) + 0.5) / n - 0.5 for n in (rows, count // rows))
+    return torch.cartesian_prod(y, x).flip(-1)
+
+
+def sampled(
+    maps_BMC: Tensor, grid: tuple[int, int, int], view_N: Tensor, place_BN2: Tensor
+) -> Tensor:
+    """Values (B, N, C), bilinear between the middles of patches; beyond them those of the edge.
+
+    maps_BMC: values of the patches of a grid (V, rows, columns), by view, row and column.
+    """
+    _, rows, columns = grid
+    sizes_2 = place_BN2.new_tensor([columns, rows])
+    at_BN2 = (place_BN2 * sizes_2 - 0.5).clamp_min(0).minimum(sizes_2 - 1)
+    first_BN2 = at_BN2.floor()
+    far_BN2 = at_BN2 - first_BN2
+    total_BNC = torch.zeros_like(maps_BMC[:, :1])
+    for x, y in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        step_2 = place_BN2.new_tensor([x, y])
+        column_BN, row_BN = (first_BN2 + step_2).minimum(sizes_2 - 1).long().unbind(-1)
+        index_BN = (view_N * rows + row_BN) * columns + column_BN
+        share_BN1 = (1 - step_2 + (2 * step_2 - 1) * far_BN2).prod(-1, keepdim=True)
+        found_BNC = maps_BMC.take_along_dim(index_BN[..., None], 1)
+        total_BNC = total_BNC + share_BN1.to(maps_BMC) * found_BNC
+    return total_BNC
+
+
+@full_precision
+def colors_at(images_BV3HW: Tensor, side: float, view_N: Tensor, place_BN2: Tensor) -> Tensor:
+    """RGB (B, N, 3): means over squares of about `side` pixels around places."""
+    scenes, views, _, height, width = images_BV3HW.shape
+    size = [max(1, round(length / max(side, 1.0))) for length in (height, width)]
+    small = F.adaptive_avg_pool2d(images_BV3HW.flatten(0, 1), size)
+    pixels = small.flatten(2).mT.reshape(scenes, -1, 3)
+    return sampled(pixels, (views, *size), view_N, place_BN2)
+
+
+def rays_at(cameras: Cameras, view_N: Tensor, place_BN2: Tensor) -> tuple[Tensor, Tensor]:
+    """World-frame origins and directions (B, N, 3) through places of photos.
+
+    Directions have length 1 along the axis of their camera.
+    """
+    height, width = cameras.size
+    c2w_BN44, lens_BN4 = cameras.c2w[:, view_N], cameras.intrinsics[:, view_N]
+    pixel_BN2 = place_BN2.to(lens_BN4) * lens_BN4.new_tensor([width, height])
+    slope_BN2 = (pixel_BN2 - lens_BN4[..., 2:]) / lens_BN4[..., :2]
+    local_BN3 = F.pad(slope_BN2, (0, 1), value=1.0)
+    return c2w_BN44[..., :3, 3], torch.einsum("bnij,bnj->bni", c2w_BN44[..., :3, :3], local_BN3)
