@@ -80,8 +80,9 @@ class ObservedQueries(Queries):
         super().__init__(config, dims)
         self.slots = nn.Parameter(torch.randn(config.per_token, dims.width) * config.std)
         self.depth_mlp = Mlp(dims.width, dims.width, 1)
-        nn.init.zeros_(self.depth_mlp.fc2.weight)  # all anchors start in the middle of parallax
-        nn.init.zeros_(self.depth_mlp.fc2.bias)
+        # All anchors start at one depth, the geometric mean of near and far.
+        nn.init.zeros_(self.depth_mlp.fc2.weight)
+        nn.init.constant_(self.depth_mlp.fc2.bias, -math.log(config.far / config.near) / 2)
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
