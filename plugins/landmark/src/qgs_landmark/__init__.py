@@ -2,17 +2,25 @@
 
 from qgs.contracts import Plugin
 from qgs_landmark.footprint import ColoredHead, FootprintCenters
+from qgs_landmark.neighbours import NeighbourAttention
 from qgs_landmark.observed import ObservedQueries
 from qgs_landmark.rendered import RenderedFeedback
 
 plugin = Plugin(
     name="landmark",
     contract_version=1,
-    components=(ObservedQueries, RenderedFeedback, FootprintCenters, ColoredHead),
+    components=(
+        ObservedQueries,
+        NeighbourAttention,
+        RenderedFeedback,
+        FootprintCenters,
+        ColoredHead,
+    ),
     examples=(
         ObservedQueries.Config(count=None),
         ObservedQueries.Config(count=None, per_token=2, radius_bound="offset"),
         ObservedQueries.Config(count=7, cells=4),
+        NeighbourAttention.Config(count=3, hidden=8),
         ColoredHead.Config(gaussians_per_query=6),
         FootprintCenters.Config(cells=2),
         RenderedFeedback.Config(rounds=1, layers=1, shrink=1, cells=1),

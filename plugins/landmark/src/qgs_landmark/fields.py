@@ -7,7 +7,7 @@ PLANE = "landmark.plane"
 
 
 def footprint_fields(count: int) -> Fields:
-    """The colours of K = `count` cells (B, N, K, 3), and the directions of the photo (B, N, 2, 3)."""
+    """Colours of K = `count` cells (B, N, K, 3), and directions of the photo (B, N, 2, 3)."""
     colors = FieldSpec((count, 3), encoding=f"mean RGB of {count} cells of the footprint")
     axes = "unit vectors to the right and down in the photo"
     return {COLORS: colors, PLANE: FieldSpec((2, 3), frame="world", encoding=axes)}

@@ -38,6 +38,7 @@ ARGUMENTS: Mapping[str, tuple[str, ...]] = {
     "self_attention": ("state",),
     "feed_forward": ("features",),
     "refinement": ("state",),
+    "feedback": ("state", "memory", "rendering", "photos"),
     "head": ("state",),
     "centers": ("offsets", "state"),
     "renderer": ("gaussians", "cameras"),
@@ -162,6 +163,10 @@ class Maker:
             times = self.uniform(0, 1, *cameras.shape)
         return Views(images, cameras, None, times, None if times is None else times[:, :1])
 
+    def photos(self) -> Views:
+        """What a rendering is compared with."""
+        return self.views()
+
     def memory(self) -> ImageMemory:
         """An image memory with the rays of the cameras, in patches of PATCH pixels."""
         (height, width), views, dims = self.image, self.sizes.views, self.case.dims
@@ -204,10 +209,10 @@ class Maker:
 
     def rendering(self, views: int | None = None) -> Rendering:
         """Noise pictures; by default of no views for a loss that needs none."""
-        loss = self.case.component
-        assert issubclass(loss, Loss)
+        given = self.case.component
         if views is None:
-            views = 0 if loss.renderings == "none" else self.sizes.views
+            unseen = issubclass(given, Loss) and given.renderings == "none"
+            views = 0 if unseen else self.sizes.views
         shape = (self.sizes.batch, views)
         rgb, alpha = (self.uniform(0, 1, *shape, c, *self.image) for c in (3, 1))
         depth = self.uniform(1, 2, *shape, 1, *self.image)

@@ -27,10 +27,13 @@ PARAMETRIC = frozenset(n for n in MODULES if issubclass(SLOTS[n].contract, Model
 """Slots whose components are built with the sizes of the model."""
 STATEFUL = frozenset(
     {"layer", "cross_attention", "self_attention", "refinement", "head", "centers", "losses"}
+    | {"feedback"}
 )
 """Slots whose components read the state of the queries."""
 READERS = STATEFUL | {"queries"}
 """Slots whose components read the state of the queries or the image memory."""
+WITH_MEMORY = frozenset({"layer", "feedback"})
+"""Slots whose components give a state and an image memory."""
 PER_QUERY = STATEFUL - {"losses"} | {"feed_forward"}
 """Slots whose components give something for every query."""
 

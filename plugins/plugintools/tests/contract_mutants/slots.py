@@ -15,6 +15,7 @@ from qgs.components import (
     LatentQueries,
     LayerSupervision,
     MultiViewViT,
+    NoFeedback,
     OneCycleAdamW,
     OnePass,
 )
@@ -72,8 +73,22 @@ class NeverResizes(LatentQueries):
 
 @mutant("supervision_weights", "weights sum to 2", options={"layers": (1, 2)})
 class WeighsTwice(LayerSupervision):
-    def weights(self):
-        return {layer: 2 * weight for layer, weight in super().weights().items()}
+    def weights(self, rounds=()):
+        factor = 1 if rounds else 2
+        return {layer: factor * weight for layer, weight in super().weights(rounds).items()}
+
+
+@mutant("supervision_weights", "with rounds that end at [3, 4]", options={"layers": (1, 2)})
+class IgnoresRounds(LayerSupervision):
+    def weights(self, rounds=()):
+        return super().weights()
+
+
+@mutant("feedback_compares_the_photos", "rays through the corners")
+class HalvesTheLensAlone(NoFeedback):
+    def compared(self, views):
+        cameras = replace(views.cameras, intrinsics=views.cameras.intrinsics / 2)
+        return replace(views, cameras=cameras)
 
 
 class NoiseScene(Scene):

@@ -12,7 +12,7 @@ from qgs_plugintools.case import Case, ContractError, expect
 from qgs_plugintools.inputs import Inputs, Maker, Sizes, inputs_of, sizes_of, tracked_inputs
 from qgs_plugintools.modules import each_mode, seeded
 from qgs_plugintools.places import file_of
-from qgs_plugintools.registry import ALL_SLOTS, MODULES, PARAMETRIC, check
+from qgs_plugintools.registry import ALL_SLOTS, MODULES, PARAMETRIC, WITH_MEMORY, check
 from qgs_plugintools.running import with_place
 from qgs_plugintools.trees import difference, floating, gradients, leaves, scalar
 
@@ -23,6 +23,7 @@ OUTPUTS: Mapping[str, type] = {
     "encoder": ImageMemory,
     "queries": QueryState,
     "layer": tuple,
+    "feedback": tuple,
     "refinement": QueryState,
     "head": GaussianAttributes,
     "renderer": Rendering,
@@ -62,7 +63,7 @@ def check_runs(case: Case) -> None:
     output = case.lively()(*inputs_of(case).values())
     kind = OUTPUTS.get(case.slot, Tensor)
     expect(isinstance(output, kind), f"it gives a {type(output).__name__}, not a {kind.__name__}")
-    if case.slot == "layer":
+    if case.slot in WITH_MEMORY:
         kinds = [type(part).__name__ for part in output]
         expect(kinds == ["QueryState", "ImageMemory"], f"it gives {kinds}, not state and memory")
     if isinstance(output, Mapping):
@@ -124,11 +125,11 @@ def _expected_shapes(case: Case, module: Any, sizes: Sizes) -> dict[str, Shape]:
                 for name, spec in case.component.fields_written(case.config).items()
                 if name != "memory.grid"  # no tensor
             }
-        case "queries" | "refinement" | "layer":
+        case "queries" | "refinement" | "layer" | "feedback":
             count = module.count if case.slot == "queries" else count
             maker = Maker(case, replace(sizes, queries=count or 1), torch.Generator())
             provided = case.component.fields_written(case.config).items()
-            where = "0." if case.slot == "layer" else ""
+            where = "0." if case.slot in WITH_MEMORY else ""
             fields = {n: (batch, count, *maker.field(n, s).shape[2:]) for n, s in provided}
             fields = {f"{where}fields.{name}": shape for name, shape in fields.items()}
             return {f"{where}features": (batch, count, width), **fields}

@@ -34,7 +34,7 @@ from qgs.types import (
 from qgs_plugintools.case import Case, expect
 from qgs_plugintools.inputs import Inputs, Maker, Sizes, inputs_of, memory_width, required_fields
 from qgs_plugintools.modules import each_mode, seeded
-from qgs_plugintools.registry import ALL_SLOTS, MODULES, READERS, check
+from qgs_plugintools.registry import ALL_SLOTS, MODULES, READERS, WITH_MEMORY, check
 from qgs_plugintools.trees import (
     described,
     difference,
@@ -87,7 +87,7 @@ def check_reads_within_requires(case: Case) -> None:
 def _read_off(case: Case, module: Any, inputs: Inputs) -> Any:
     """The output; of a layer the state, since it passes on a memory that it does not read."""
     output = module(*inputs.values())
-    return output[0] if case.slot == "layer" else output
+    return output[0] if case.slot in WITH_MEMORY else output
 
 
 class AskedFields(dict[str, Tensor]):
@@ -151,11 +151,11 @@ def _with_others(case: Case, inputs: Inputs, field: str) -> Iterator[Inputs]:
         yield mapped(inputs, lambda n, x, o=other: o[n] if n in full else x)
 
 
-@check({"layer", "refinement", "queries"})
+@check({"layer", "refinement", "feedback", "queries"})
 def check_writes_equal_provides(case: Case) -> None:
     """The fields that are written are those in `provides`, in the shape and dtype given there.
 
-    A layer and a refinement pass on all other fields as they are, a refinement the features too.
+    The others pass on all other fields as they are, a refinement the features too.
     """
     module = case.lively()
     for mode in each_mode(module):
@@ -166,7 +166,7 @@ def check_writes_equal_provides(case: Case) -> None:
             inputs = {**inputs, "state": QueryState(state.features, before)}
         with seeded(0):
             output = module(*inputs.values())
-        output = output[0] if case.slot == "layer" else output
+        output = output[0] if case.slot in WITH_MEMORY else output
         provided = case.component.fields_written(case.config)
         kept = {n for n, x in output.fields.items() if n in before and _same(x, before[n])}
         written = set(output.fields) - kept

@@ -28,6 +28,7 @@ READ = {
     "self_attention": ("state.features",),
     "feed_forward": ("features",),
     "refinement": (),
+    "feedback": (),
     "queries": (),
     "layer": ("state.features",),
     "head": ("state.features",),
@@ -194,7 +195,7 @@ def check_points_behind_cameras_stay_finite(case: Case) -> None:
         _expect_finite(case, f"points {where}", _changed(case, moved))
 
 
-@check({"encoder", "layer", "cross_attention", "renderer", "losses"})
+@check({"encoder", "layer", "cross_attention", "feedback", "renderer", "losses"})
 def check_duplicated_view_stays_finite(case: Case) -> None:
     """A view that is given twice gives finite outputs and finite gradients."""
 

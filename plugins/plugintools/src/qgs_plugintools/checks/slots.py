@@ -109,7 +109,14 @@ def check_queries_resize(case: Case) -> None:
 
 @check({"supervision"})
 def check_supervision_weights(case: Case) -> None:
-    """Weights are of existing layers, ascending, none negative, and sum to 1."""
+    """Weights are of existing layers, ascending, none negative, and sum to 1.
+
+    So they do with ends of rounds of feedback, all of which are supervised.
+    """
+    ends = [case.dims.depth + 1, case.dims.depth + 2]
+    longer = dict(case.build().weights(ends))
+    expect(list(longer)[-2:] == ends, f"with rounds that end at {ends} it weighs {list(longer)}")
+    expect(abs(sum(longer.values()) - 1) < 1e-6, f"with rounds weights sum to {longer}")
     weights = dict(case.build().weights())
     layers = list(weights)
     expect(layers == sorted(set(layers)), f"layers are {layers}")
@@ -117,6 +124,33 @@ def check_supervision_weights(case: Case) -> None:
     expect(known and bool(layers), f"of {case.dims.depth} layers it supervises {layers}")
     expect(min(weights.values()) >= 0, f"weights are {weights}")
     expect(abs(sum(weights.values()) - 1) < 1e-6, f"weights sum to {sum(weights.values()):g}")
+
+
+@check({"feedback"})
+def check_feedback_compares_the_photos(case: Case) -> None:
+    """`compared` views have the poses and rays of the photos, and their mean colours.
+
+    `rounds` and what `drawn` gives are not negative, and a round repeats an existing layer.
+    """
+    module, photos = case.build(), inputs_of(case)["photos"]
+    seen = module.compared(photos)
+    found = difference(photos.cameras.c2w, seen.cameras.c2w)
+    expect(not found, f"`compared` views have other poses: {found}")
+    corners = [
+        torch.stack([-c / f, (s - c) / f])
+        for x in (photos.cameras, seen.cameras)
+        for f, c, s in (
+            (x.intrinsics[..., i], x.intrinsics[..., 2 + i], x.size[1 - i]) for i in (0, 1)
+        )
+    ]
+    found = difference(corners[:2], corners[2:], 1e-5, 1e-6)
+    expect(not found, f"rays through the corners of `compared` views are others: {found}")
+    found = difference(photos.images.mean((-1, -2)), seen.images.mean((-1, -2)), 1e-4, 1e-5)
+    expect(not found, f"mean colours of `compared` views are others: {found}")
+    counts = [module.rounds, *(module.drawn() for _ in range(4))]
+    expect(min(counts) >= 0, f"it makes {min(counts)} rounds")
+    layers = range(0 if max(counts) == 0 else 1, case.dims.depth + 1)
+    expect(module.layers in layers, f"of {case.dims.depth} layers a round repeats {module.layers}")
 
 
 @check({"data"})

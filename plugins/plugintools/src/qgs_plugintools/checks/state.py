@@ -32,15 +32,16 @@ def check_inputs_are_not_changed(case: Case) -> None:
 def check_outputs_share_no_memory(case: Case) -> None:
     """What a component computes lies in memory of its own: not in that of its inputs or weights.
 
-    Buffers are weights here. A refinement and a layer may hand on the fields that they do not
-    provide, a layer the memory too.
+    Buffers are weights here. A refinement, a layer and a feedback may hand on the fields that they
+    do not provide, the latter two the memory too, and a feedback the features.
     """
     module, inputs = case.lively(), inputs_of(case)
     outputs = leaves(module(*inputs.values()))
     tensors = [*leaves(inputs).items(), *tensors_of(module).items()]
     owners = {x.untyped_storage().data_ptr(): name for name, x in tensors if x.numel()}
     provided = [f"fields.{name}" for name in case.component.fields_written(case.config)]
-    own = {"refinement": provided, "layer": ["0.features", *(f"0.{name}" for name in provided)]}
+    of_state = [f"0.{name}" for name in provided]
+    own = {"refinement": provided, "feedback": of_state, "layer": ["0.features", *of_state]}
     for name, tensor in outputs.items():
         if name not in own.get(case.slot, outputs):
             continue

@@ -20,12 +20,12 @@ from qgs_plugintools.inputs import (
     tracked_inputs,
 )
 from qgs_plugintools.modules import each_mode, seeded
-from qgs_plugintools.registry import MODULES, PER_QUERY, check
+from qgs_plugintools.registry import MODULES, PER_QUERY, WITH_MEMORY, check
 from qgs_plugintools.trees import difference, floating, gradients, leaves, mapped, scalar
 
 RTOL, ATOL = 1e-4, 1e-5
 
-VIEW_INPUTS = ("views", "memory", "cameras", "rendering", "target", "inputs")
+VIEW_INPUTS = ("views", "memory", "cameras", "rendering", "photos", "target", "inputs")
 """Arguments that hold something of every view."""
 
 TURN = (0.8, 0.4, -0.2, 0.4)
@@ -77,7 +77,7 @@ def check_query_permutation(case: Case) -> None:
     moved = {n: _reordered(x, order) if n in counted else x for n, x in inputs.items()}
     one, other = (module(*given.values()) for given in (inputs, moved))
     expected = one
-    if case.slot == "layer":
+    if case.slot in WITH_MEMORY:
         expected = _reordered(one[0], order), one[1]
     elif case.slot in PER_QUERY:
         expected = _reordered(one, order)
@@ -85,7 +85,7 @@ def check_query_permutation(case: Case) -> None:
     expect(not found, f"with {sizes.queries} permuted queries, {found}")
 
 
-@check({"encoder", "layer", "cross_attention", "renderer", "losses"})
+@check({"encoder", "layer", "cross_attention", "feedback", "renderer", "losses"})
 def check_view_permutation(case: Case) -> None:
     """Views have no order, unless an encoder or a cross-attention declares `ordered_views`.
 
@@ -100,7 +100,7 @@ def check_view_permutation(case: Case) -> None:
     moved = {n: _permuted(x, order) if n in VIEW_INPUTS else x for n, x in inputs.items()}
     one, other = (module(*given.values()) for given in (inputs, moved))
     expected = one
-    if case.slot == "layer":
+    if case.slot in WITH_MEMORY:
         expected = one[0], _permuted(one[1], order)
     elif case.slot in ("encoder", "renderer"):
         expected = _permuted(one, order)
