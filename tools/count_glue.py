@@ -1,6 +1,6 @@
 """How much of a plugin is glue: imports, options, declarations, as a share of its lines.
 
-python tools/count_glue.py locus ellipsoid c3g gslrm globalsplat mvsplat
+python tools/count_glue.py locus ellipsoid c3g gslrm globalsplat mvsplat landmark
 """
 
 import ast

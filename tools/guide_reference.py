@@ -15,8 +15,8 @@ from qgs.composer.slots import SLOTS
 from qgs.composer.yaml_text import dump
 from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
 
-PLUGINS = ("locus", "ellipsoid", "c3g", "gslrm", "globalsplat", "mvsplat", "tokengs2026")
-PLUGINS += ("dinov2", "lpips", "rooms", "datasets")
+PLUGINS = ("locus", "ellipsoid", "landmark", "c3g", "gslrm", "globalsplat", "mvsplat")
+PLUGINS += ("tokengs2026", "dinov2", "lpips", "rooms", "datasets")
 
 SECTIONS: Mapping[str, type[ComponentConfig]] = {
     "Top level": RecipeSettings,

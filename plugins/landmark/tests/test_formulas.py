@@ -5,12 +5,14 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from qgs_landmark.fields import COLORS, PLANE
+from qgs_landmark.fields import COLORS, FRAME
 from qgs_landmark.footprint import ColoredHead, FootprintCenters
 from qgs_landmark.neighbours import NeighbourAttention, nearest
 from qgs_landmark.observed import ObservedQueries
+from qgs_landmark.refinement import FramedRefinement
 from qgs_landmark.rendered import RenderedFeedback
 from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
+from qgs_locus.refinement import AnchorRefinement
 from torch import Tensor
 
 from qgs.components.blocks import split_heads
@@ -141,9 +143,25 @@ def test_centres_add_offsets_in_radii() -> None:
     offsets = torch.randn(2, TOKENS, 4, 3).double()
     moved = centers(offsets, state) - centers(torch.zeros_like(offsets), state)
     radii = support_radius(state[RAW_RADIUS], centers.config)
-    torch.testing.assert_close(moved, radii[..., None] * offsets)
-    assert state[PLANE].shape == (2, TOKENS, 2, 3)
+    axes = views().cameras.c2w[..., :3, :3].repeat_interleave(TOKENS // 2, 1)
+    expected = torch.einsum("bnij,bnkj->bnki", axes, radii[..., None] * offsets)
+    torch.testing.assert_close(moved, expected)
+    assert state[FRAME].shape == (2, TOKENS, 3, 3)
     assert state[COLORS].shape == (2, TOKENS, 4, 3)
+
+
+def test_refinement_steps_in_radii_along_the_axes_of_the_photo() -> None:
+    _, state = started(count=None)
+    ours, theirs = (
+        kind(kind.Config(), DIMS).double() for kind in (FramedRefinement, AnchorRefinement)
+    )
+    ours.load_state_dict(theirs.state_dict())
+    steps = theirs(state)[CENTER] - state[CENTER]
+    axes = views().cameras.c2w[..., :3, :3].repeat_interleave(TOKENS // 2, 1)
+    radii = support_radius(state[RAW_RADIUS], ours.config)
+    expected = torch.einsum("bnij,bnj->bni", axes, radii * steps)
+    torch.testing.assert_close(ours(state)[CENTER] - state[CENTER], expected)
+    assert torch.equal(ours(state)[RAW_RADIUS], theirs(state)[RAW_RADIUS])
 
 
 def cloud(count: int = 40) -> QueryState:

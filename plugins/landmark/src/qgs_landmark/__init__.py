@@ -4,6 +4,7 @@ from qgs.contracts import Plugin
 from qgs_landmark.footprint import ColoredHead, FootprintCenters
 from qgs_landmark.neighbours import NeighbourAttention
 from qgs_landmark.observed import ObservedQueries
+from qgs_landmark.refinement import FramedRefinement
 from qgs_landmark.rendered import RenderedFeedback
 
 plugin = Plugin(
@@ -12,6 +13,7 @@ plugin = Plugin(
     components=(
         ObservedQueries,
         NeighbourAttention,
+        FramedRefinement,
         RenderedFeedback,
         FootprintCenters,
         ColoredHead,
@@ -22,7 +24,8 @@ plugin = Plugin(
         ObservedQueries.Config(count=7, cells=4),
         NeighbourAttention.Config(count=3, hidden=8),
         ColoredHead.Config(gaussians_per_query=6),
-        FootprintCenters.Config(cells=2),
+        FootprintCenters.Config(offset="linear"),
+        FramedRefinement.Config(center=False),
         RenderedFeedback.Config(rounds=1, layers=1, shrink=1, cells=1),
     ),
 )

@@ -1,13 +1,27 @@
 """What a query knows of the square of a photo that it starts from, its footprint."""
 
+from torch import Tensor
+
 from qgs.contracts import Fields, FieldSpec
+from qgs.geometry.precision import full_precision
 
 COLORS = "landmark.colors"
-PLANE = "landmark.plane"
+FRAME = "landmark.frame"
+
+FRAME_FIELD: Fields = {
+    FRAME: FieldSpec((3, 3), frame="world", encoding="rows: right, down, ahead in the photo")
+}
+"""The axes of a query's photo (B, N, 3, 3), unit vectors."""
 
 
-def footprint_fields(count: int) -> Fields:
-    """Colours of K = `count` cells (B, N, K, 3), and directions of the photo (B, N, 2, 3)."""
-    colors = FieldSpec((count, 3), encoding=f"mean RGB of {count} cells of the footprint")
-    axes = "unit vectors to the right and down in the photo"
-    return {COLORS: colors, PLANE: FieldSpec((2, 3), frame="world", encoding=axes)}
+def color_field(count: int) -> Fields:
+    """The colours of the K = `count` cells of a footprint (B, N, K, 3)."""
+    return {COLORS: FieldSpec((count, 3), encoding=f"mean RGB of {count} cells of the footprint")}
+
+
+@full_precision
+def in_world(steps_BNx3: Tensor, frame_BN33: Tensor) -> Tensor:
+    """Steps to the right, down and ahead, (B, N, 3) or (B, N, K, 3), as world vectors."""
+    if steps_BNx3.ndim == frame_BN33.ndim:
+        return steps_BNx3 @ frame_BN33
+    return (steps_BNx3[:, :, None] @ frame_BN33)[:, :, 0]

@@ -1,17 +1,18 @@
 """`landmark/footprint`, `landmark/colored`: Gaussians that start as the photo's square they see."""
 
 import torch
+import torch.nn.functional as F
 from pydantic import Field
 from qgs_locus.decoding import RadiusScaledCenters
-from qgs_locus.fields import RAW_RADIUS, RadiusOptions, radius_field, support_radius
+from qgs_locus.fields import CENTER, RAW_RADIUS, RadiusOptions, radius_field, support_radius
 from torch import Tensor
 
 from qgs.components import GaussianHead
 from qgs.components.head import CHANNELS
 from qgs.contracts import Fields
-from qgs.geometry.precision import at_least_float32, full_precision
+from qgs.geometry.precision import at_least_float32
 from qgs.types import GaussianAttributes, QueryState
-from qgs_landmark.fields import COLORS, PLANE, footprint_fields
+from qgs_landmark.fields import COLORS, FRAME, FRAME_FIELD, color_field, in_world
 from qgs_landmark.places import cells
 
 COLOR_MARGIN = 0.02
@@ -19,37 +20,31 @@ COLOR_MARGIN = 0.02
 
 
 class FootprintCenters(RadiusScaledCenters):
-    """mean = mu + r (u e_x + v e_y + posact(offset)), (u, v) the middle of the Gaussian's cell.
+    """mean = mu + r (u, v, 0) + r posact(offset), in the frame of the anchor's photo.
 
-    e_x and e_y are the photo's directions to the right and down. Where the radius is the side of
-    the footprint, offsets of 0 put each Gaussian onto the ray of its cell.
+    (u, v) is the middle of the Gaussian's cell in a square of side 1 about 0. Where the radius is
+    the side of the footprint, offsets of 0 put each Gaussian onto the ray of its cell.
     """
 
     name = "footprint"
 
     class Config(RadiusScaledCenters.Config):
-        cells: int = Field(default=4, ge=1)
-        """K, the Gaussians of a query, as its head makes them."""
+        """See `locus/radius_scaled`."""
 
     config: Config
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Anchors, and the directions of their photos."""
-        plane = {PLANE: footprint_fields(config.cells)[PLANE]}
-        return {**super().fields_read(config), **plane}
+        """Anchors, and the axes of their photos."""
+        return {**super().fields_read(config), **FRAME_FIELD}
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """(B, N, K, 3) -> (B, N, K, 3)."""
-        means_BNK3 = super().forward(offsets, state)
+        cell_K3 = F.pad(cells(offsets.shape[2]).to(state[FRAME]), (0, 1))
+        steps_BNK3 = cell_K3 + self.config.displacement(offsets)
         r_BN1 = support_radius(state[RAW_RADIUS], self.config)
-        return means_BNK3 + on_plane(state[PLANE], offsets.shape[2], r_BN1)
-
-
-@full_precision
-def on_plane(plane_BN23: Tensor, count: int, side_BN1: Tensor) -> Tensor:
-    """Middles of `count` cells of squares about 0 of some sides: (B, N, K, 3)."""
-    return side_BN1[:, :, None] * (cells(count).to(plane_BN23) @ plane_BN23)
+        steps_BNK3 = in_world(r_BN1[:, :, None] * steps_BNK3, state[FRAME])
+        return state[CENTER][:, :, None] + steps_BNK3
 
 
 class ColoredHead(GaussianHead):
@@ -71,8 +66,7 @@ class ColoredHead(GaussianHead):
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
         """Colours and radii."""
-        colors = {COLORS: footprint_fields(config.gaussians_per_query)[COLORS]}
-        return {**colors, **radius_field(config)}
+        return {**color_field(config.gaussians_per_query), **radius_field(config)}
 
     def forward(self, state: QueryState) -> GaussianAttributes:
         raw_BNC = at_least_float32(self.linear(self.norm(state.features)))

@@ -30,7 +30,7 @@ from qgs.contracts import (
 )
 from qgs.geometry.precision import full_precision
 from qgs.types import ImageMemory, QueryState, SpatialSupport, Views
-from qgs_landmark.fields import COLORS, PLANE, footprint_fields
+from qgs_landmark.fields import COLORS, FRAME, FRAME_FIELD, color_field
 from qgs_landmark.places import cells, colors_at, patch_centres, rays_at, sampled, spread
 
 
@@ -60,8 +60,8 @@ class ObservedQueries(Queries):
         std: float = Field(default=0.3, ge=0)
         """Standard deviation that the learned vectors start from, which are added to tokens."""
         cells: int | None = Field(default=None, ge=1)
-        """K, parts of its footprint whose colours a query knows, for `landmark/footprint` and
-        `landmark/colored`, whose Gaussians they are; null where nothing reads them."""
+        """K, parts of its footprint whose colours a query knows, for the Gaussians of
+        `landmark/colored`; null where nothing reads them."""
 
         @field_validator("far")
         @classmethod
@@ -86,9 +86,9 @@ class ObservedQueries(Queries):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Centre and raw radius, and what is known of the footprint."""
-        known = footprint_fields(config.cells) if config.cells else {}
-        return {**CENTER_FIELD, **radius_field(config), **known}
+        """Centre, raw radius, the axes of the photo, and colours."""
+        colors = color_field(config.cells) if config.cells else {}
+        return {**CENTER_FIELD, **radius_field(config), **FRAME_FIELD, **colors}
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
@@ -129,6 +129,7 @@ class ObservedQueries(Queries):
         anchors = {
             CENTER: origin_BN3 + z_BN1 * direction_BN3,
             RAW_RADIUS: raw_radii(radii_BN1, config),
+            FRAME: cameras.c2w[:, view_N, :3, :3].mT,
         }
         if config.cells is None:
             return anchors
@@ -136,8 +137,7 @@ class ObservedQueries(Queries):
         place_BX2 = (place_BN2[:, :, None] + step_K2).flatten(1, 2)
         view_X = view_N.repeat_interleave(config.cells)
         colors = colors_at(views.images, side / math.sqrt(config.cells), view_X, place_BX2)
-        plane = cameras.c2w[:, view_N, :3, :2].mT
-        return anchors | {COLORS: colors.unflatten(1, (-1, config.cells)), PLANE: plane}
+        return anchors | {COLORS: colors.unflatten(1, (-1, config.cells))}
 
     def support(self, state: QueryState) -> SpatialSupport:
         """Balls of the support radius."""

@@ -87,12 +87,16 @@ class AnchorRefinement(Refinement):
         """A state with moved centres and changed raw radii."""
         refined: dict[str, Tensor] = {}
         if self.config.center:
-            step_BN3 = self.center_mlp(state.features)
-            if self.config.center_step == "posact":
-                step_BN3 = posact(step_BN3, self.config.input_limit, self.config.output_limit)
-            # Autocast gives the step in half precision, which has no digits for a place.
-            refined[CENTER] = state[CENTER] + at_least_float32(step_BN3)
+            refined[CENTER] = state[CENTER] + self.center_step(state)
         if self.config.radius:
             step = at_least_float32(self.radius_mlp(state.features))
             refined[self.raw_radius] = state[self.raw_radius] + step
         return state.replace(fields=refined)
+
+    def center_step(self, state: QueryState) -> Tensor:
+        """What is added to the centres (B, N, 3), float32, world frame."""
+        step_BN3 = self.center_mlp(state.features)
+        if self.config.center_step == "posact":
+            step_BN3 = posact(step_BN3, self.config.input_limit, self.config.output_limit)
+        # Autocast gives the step in half precision, which has no digits for a place.
+        return at_least_float32(step_BN3)
