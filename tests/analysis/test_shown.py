@@ -33,11 +33,11 @@ def test_a_model_says_its_slots_in_a_few_lines(model):
     total = sum(parameter.numel() for parameter in model.parameters())
     assert f"{total:,} parameters" in heading
     assert "8 queries of 4 Gaussians" in heading
-    assert len(lines) == 11
+    assert len(lines) == 12
     assert re.search(
         r"^  decoder\.cross_attention +qgs/content, locus/ray_biased +[\d,]+$", repr(model), re.M
     )
-    counts = [int(line.split()[-1].replace(",", "")) for line in lines[:9]]
+    counts = [int(line.split()[-1].replace(",", "")) for line in lines[:10]]
     assert sum(counts) == total
     for word in ("locus/anchored", "qgs/gaussian_head", "qgs/auto"):
         assert word in repr(model)

@@ -11,8 +11,8 @@ from qgs.composer.registry import available_plugins, load_registry
 from qgs.composer.schema import recipe_schema
 
 RECIPES = Path(__file__).parents[2] / "recipes"
-SHIPPED = ["c3g", "datasets", "dinov2", "ellipsoid", "globalsplat", "gslrm", "locus", "lpips"]
-SHIPPED += ["mvsplat", "rooms", "tokengs2026"]
+SHIPPED = ["c3g", "datasets", "dinov2", "ellipsoid", "globalsplat", "gslrm", "landmark", "locus"]
+SHIPPED += ["lpips", "mvsplat", "rooms", "tokengs2026"]
 
 
 @pytest.fixture(scope="module")

@@ -70,7 +70,7 @@ class NeighbourAttention(SelfAttention):
     def _near(self, state: QueryState) -> tuple[Tensor, Tensor, Tensor]:
         """Neighbours (B, N, k), their relative places, and the logits (B, h, N, k) of these."""
         index_BNk, seen_BNk = nearest(state[CENTER], self.config.count, state.mask)
-        place_BNkP = relative_places(state[CENTER], index_BNk)
+        place_BNkP = relative_places(state[CENTER], index_BNk, seen_BNk)
         bias_BNkh = at_least_float32(self.place_mlp(place_BNkP))
         bias_BhNk = bias_BNkh.permute(0, 3, 1, 2)
         if seen_BNk is not None:
@@ -105,10 +105,12 @@ def nearest(center_BN3: Tensor, count: int, mask_BN: Tensor | None) -> tuple[Ten
 
 
 @full_precision
-def relative_places(center_BN3: Tensor, index_BNk: Tensor) -> Tensor:
-    """p (B, N, k, 5) of neighbours."""
+def relative_places(center_BN3: Tensor, index_BNk: Tensor, seen_BNk: Tensor | None) -> Tensor:
+    """p (B, N, k, 5) of neighbours; those that are not `seen` are no queries, and have no place."""
     around_BNk3 = _taken(center_BN3[:, None], index_BNk)[:, 0]
     step_BNk3 = around_BNk3 - center_BN3[:, :, None]
+    if seen_BNk is not None:
+        step_BNk3 = torch.where(seen_BNk[..., None], step_BNk3, 0.0)
     reach_BN1 = (step_BNk3.square().sum(-1).amax(-1) + EPS**2).sqrt()[..., None, None]
     step_BNk3 = step_BNk3 / reach_BN1
     length_BNk1 = (step_BNk3.square().sum(-1, keepdim=True) + EPS).sqrt()

@@ -74,10 +74,10 @@ def sampled(
 def colors_at(images_BV3HW: Tensor, side: float, view_N: Tensor, place_BN2: Tensor) -> Tensor:
     """RGB (B, N, 3): means over squares of about `side` pixels around places."""
     scenes, views, _, height, width = images_BV3HW.shape
-    size = [max(1, round(length / max(side, 1.0))) for length in (height, width)]
-    small = F.adaptive_avg_pool2d(images_BV3HW.flatten(0, 1), size)
+    rows, columns = (max(1, round(length / max(side, 1.0))) for length in (height, width))
+    small = F.adaptive_avg_pool2d(images_BV3HW.flatten(0, 1), (rows, columns))
     pixels = small.flatten(2).mT.reshape(scenes, -1, 3)
-    return sampled(pixels, (views, *size), view_N, place_BN2)
+    return sampled(pixels, (views, rows, columns), view_N, place_BN2)
 
 
 def rays_at(cameras: Cameras, view_N: Tensor, place_BN2: Tensor) -> tuple[Tensor, Tensor]:

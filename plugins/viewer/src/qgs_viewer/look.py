@@ -112,7 +112,7 @@ class Look:
     def trace(self, queries: Sequence[int]) -> None:
         """Have the attention of `queries` at hand, by one pass through the decoder for all."""
         missing = [query for query in dict.fromkeys(queries) if query not in self._traces]
-        if missing and self.inside is not None:
+        if missing and self.inside is not None and self.views is not None:
             model, memory = self.inside.model, self.inside.memory
             state = self.inside.states[0]
             with torch.no_grad(), trace(model, queries=missing) as record:
