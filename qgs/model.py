@@ -118,9 +118,9 @@ class QueryGaussianModel(nn.Module):
 
         views, memory: the encoder's input and output. state: the queries before the first layer, of
             as many scenes.
-        layers: numbers of the layers to decode; the last always is, and that of every round (1 is
-            the first, rounds count on; a decoder of depth 0 has 0, the state before any layer);
-            None for the supervised ones in training, and for the last alone in evaluation.
+        layers: numbers of the layers to decode, beside the last and that of each round (1 is the
+            first, rounds count on; 0 is the start, of a decoder of depth 0); None for the
+            supervised ones in training, and for no others in evaluation.
         Raises ValueError for a layer that does not exist and for another number of scenes.
         """
         if layers is None:
@@ -137,9 +137,7 @@ class QueryGaussianModel(nn.Module):
         scenes, given = memory.features.shape[0], state.features.shape[0]
         if scenes != given:
             raise ValueError(f"the memory is of {scenes} scenes, the initial state of {given}")
-        decoded: dict[int, LayerPrediction] = {}
-        if not last:
-            decoded[0] = LayerPrediction(gaussians=self.decode(state), state=state)
+        decoded = {} if last else {0: LayerPrediction(self.decode(state), state)}
         first = memory
         for number, index in enumerate(order, start=1):
             if index == again and number > last:
@@ -150,13 +148,13 @@ class QueryGaussianModel(nn.Module):
             state, memory = self.decoder[index](state, memory)
             state = refine(state)
             if number in layers or index == last - 1:
-                decoded[number] = LayerPrediction(gaussians=self.decode(state), state=state)
+                decoded[number] = LayerPrediction(self.decode(state), state)
         return Prediction(decoded[len(order)].gaussians, state, decoded)
 
     def _corrected(
         self, before: LayerPrediction, memory: ImageMemory, views: Views
     ) -> tuple[QueryState, ImageMemory]:
-        """What a round of feedback starts with."""
+        """What a round starts with."""
         photos = self.feedback.compared(views)
         with torch.no_grad():  # what looks wrong is an input of the round, no loss
             rendering = self.render(before.gaussians, photos.cameras)

@@ -128,7 +128,7 @@ class NoRefinement(Refinement):
 
 
 class NoFeedback(Feedback):
-    """No rounds: every layer runs once."""
+    """Every layer runs once."""
 
     name = "none"
     reads_cameras = False
