@@ -26,6 +26,8 @@ _SMALL = DepthSplatEncoder.Config(
     regressor=8,
 )
 
+_BIASES = "instance norms take biases of the CNN away again: they are stored and learn nothing"
+
 plugin = Plugin(
     name="mvsplat",
     contract_version=1,
@@ -53,14 +55,13 @@ plugin = Plugin(
     ),
     exemptions={
         MVSplatEncoder: {
+            "parameters_learn": _BIASES,
             "tokens_are_those_of_the_grid": "before training, instance norms over whole maps and "
-            "the softmax over depths spread what a pixel shows over its image"
+            "the softmax over depths spread what a pixel shows over its image",
         },
         DepthSplatEncoder: {
-            "compiles": "instance norms take biases of the CNN away again, so that their gradients "
-            "are rounding alone",
-            "parameters_learn": "zeros start behind each other, in the blocks and at the end of a "
-            "U-Net and at the end of a correction, and each takes a step to open",
+            "parameters_learn": f"{_BIASES}; and zeros start behind each other, in the blocks and "
+            "at the end of a U-Net and of a correction, and each takes a step to open",
         },
     },
 )

@@ -25,16 +25,20 @@ class ResidualBlock(nn.Module):
         super().__init__()
         self.conv1 = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
         self.conv2 = nn.Conv2d(outputs, outputs, 3, padding=1, bias=False)
-        # The norm behind it takes the bias away again; published files have one nevertheless.
-        self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride))
-        if stride == 1 and inputs == outputs:
-            self.downsample = None
+        self.stride = stride
+        same = stride == 1 and inputs == outputs
+        self.downsample = None if same else nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride))
 
     def forward(self, x_NCHW: Tensor) -> Tensor:
-        skip = x_NCHW if self.downsample is None else F.instance_norm(self.downsample(x_NCHW))
+        skip_NCHW = x_NCHW
+        if self.downsample is not None:
+            weight, bias = self.downsample.parameters()
+            # Published files have this bias, but the norm takes it away again: times zero it learns
+            # nothing, where it would learn from rounding alone.
+            skip_NCHW = F.instance_norm(F.conv2d(x_NCHW, weight, 0 * bias, self.stride))
         x_NCHW = F.relu(F.instance_norm(self.conv1(x_NCHW)))
         # The branch is rectified before the sum as well (released code).
-        return F.relu(skip + F.relu(F.instance_norm(self.conv2(x_NCHW))))
+        return F.relu(skip_NCHW + F.relu(F.instance_norm(self.conv2(x_NCHW))))
 
 
 class CNN(nn.Module):

@@ -47,7 +47,7 @@ WIDTHS = {sum(CHANNELS) + 3 * coefficients(degree): degree for degree in (1, 2, 
 
 def degree_of(width: int) -> int:
     """Degree of the harmonics in the numbers of a pixel, D = `width`; those beyond are not read."""
-    return max((degree for least, degree in WIDTHS.items() if least <= width), default=1)
+    return max([1, *(degree for least, degree in WIDTHS.items() if least <= width)])
 
 
 def numbers_of(features_BND: Tensor) -> Tensor:
