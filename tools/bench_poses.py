@@ -3,8 +3,9 @@
     python tools/bench_poses.py FOLDER ... --out NEW_FOLDER [--video FPS] [--every N]
 
 FOLDER: photos with cameras in any format; the photos alone are given to `qgs poses`, or with
---video an mp4 (H.264) of them. Errors are after the similarity that aligns the centres best
-(Umeyama, 1991), positions in parts of the extent: the largest distance of two cameras.
+--video an mp4 (H.264) of them. Errors are after a similarity, whose rotation aligns the
+orientations best and whose scale and translation the centres; positions in parts of the extent:
+the largest distance of two cameras.
 """
 
 import argparse
@@ -25,17 +26,15 @@ from qgs.data.photos import read_listing
 
 def aligned(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Degrees and distances, (N,) each, of poses (N, 4, 4) to true ones; see above."""
-    a, b = found[:, :3, 3], true[:, :3, 3]
+    u, _, v = np.linalg.svd(np.einsum("nij,nkj->ik", true[:, :3, :3], found[:, :3, :3]))
+    turn = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
+    a, b = found[:, :3, 3] @ turn.T, true[:, :3, 3]
     a0, b0 = a - a.mean(0), b - b.mean(0)
-    u, s, v = np.linalg.svd(b0.T @ a0)
-    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ v))])
-    turn = u @ sign @ v
-    scale = np.trace(np.diag(s) @ sign) / (a0**2).sum()
-    centres = scale * a0 @ turn.T + b.mean(0)
+    distances = np.linalg.norm((a0 * b0).sum() / (a0**2).sum() * a0 - b0, axis=-1)
     extent = np.linalg.norm(b[:, None] - b[None], axis=-1).max()
     between = np.einsum("ij,njk,nlk->nil", turn, found[:, :3, :3], true[:, :3, :3])
     cosine = ((np.trace(between, axis1=1, axis2=2) - 1) / 2).clip(-1, 1)
-    return np.degrees(np.arccos(cosine)), np.linalg.norm(centres - b, axis=-1) / extent
+    return np.degrees(np.arccos(cosine)), distances / extent
 
 
 def write_video(files: Sequence[Path], path: Path, rate: int) -> None:

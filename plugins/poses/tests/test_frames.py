@@ -6,7 +6,7 @@ import av
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
-from qgs_poses.frames import FEWEST, MOST, extract, taken
+from qgs_poses.frames import FEWEST, extract, shift
 from qgs_poses.photos import PosesError
 from walked import write_video
 
@@ -43,7 +43,27 @@ def test_a_long_video_gives_even_intervals(tmp_path):
     extract(video, tmp_path, 10)
     levels = [level(path) for path in sorted(tmp_path.glob("*.jpg"))]
     assert [n // 5 for n in levels] == [*range(10)]
-    assert (taken(1), taken(30), taken(1000)) == (FEWEST, 60, MOST)
+
+
+def test_a_picture_that_moves_fast_gives_more_frames(tmp_path):
+    rng = np.random.default_rng(0)
+    wide = rng.integers(0, 255, (12, 200, 3), np.uint8).repeat(8, 0).repeat(8, 1)
+    counts = []
+    for step in (0, 6):  # pixels of 128
+        images = [np.ascontiguousarray(wide[:, step * n : step * n + 128]) for n in range(120)]
+        video = write_video(tmp_path / f"{step}.mp4", images, rate=30)
+        (tmp_path / str(step)).mkdir()
+        extract(video, tmp_path / str(step))
+        counts.append(len([*(tmp_path / str(step)).glob("*.jpg")]))
+    assert counts[0] == FEWEST
+    assert 60 <= counts[1] <= 120
+
+
+def test_the_shift_of_a_picture():
+    rng = np.random.default_rng(0)
+    wide = np.kron(rng.random((12, 40)), np.ones((4, 4))).astype(np.float32)
+    assert shift(wide[:, :64], wide[:, 8:72]) == pytest.approx(8 / 64)
+    assert shift(wide[:, :64], wide[:, :64]) == 0
 
 
 def test_a_varying_rate_counts_by_time(tmp_path):

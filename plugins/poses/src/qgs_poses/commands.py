@@ -28,7 +28,7 @@ def poses(
     frames: Annotated[
         int | None,
         typer.Option(
-            min=3, help="Frames of a video; default: two for each second, 40 to 120 in all."
+            min=3, help="Frames of a video; default: two a second, more of fast motion, 40 to 240."
         ),
     ] = None,
     side: Annotated[

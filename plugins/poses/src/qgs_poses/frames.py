@@ -1,4 +1,4 @@
-"""Frames of a video: even intervals, of each the sharpest."""
+"""Frames of a video: of each interval of time and of motion the sharpest."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -14,15 +14,13 @@ from PIL import Image
 from qgs.wording import counted
 from qgs_poses.photos import LEAST, PosesError, laplacian_variance
 
-FEWEST, MOST, PER_SECOND = 40, 120, 2.0
-"""How many frames are taken of a video."""
+FEWEST, MOST, PER_SECOND = 40, 240, 2.0
+"""How many frames are taken of a video, and the least rate of them."""
+STEP = 0.06
+"""Shift of the picture, in parts of its width, after which another frame is taken."""
 _JUDGED = 8  # frames of an interval that are compared
-_SIDE = 640
-
-
-def taken(seconds: float) -> int:
-    """How many frames are taken of a video."""
-    return int(min(max(seconds * PER_SECOND, FEWEST), MOST))
+_SIDE, _THUMB = 640, (48, 64)
+_WINDOW = np.outer(np.hanning(_THUMB[0]), np.hanning(_THUMB[1]))
 
 
 def extract(
@@ -31,10 +29,11 @@ def extract(
     count: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[str]:
-    """Write the sharpest frame of each of `count` even intervals of time as JPEG, upright.
+    """Write the sharpest frame of each interval as JPEG, upright, numbered from 0 on.
 
-    Returns remarks. What cannot be decoded is left out. Raises PosesError for no video, and for
-    fewer than LEAST frames.
+    count: of even intervals of time; by default as `Intervals` has them, MOST at most. progress:
+    seconds done and in all. Returns remarks. What cannot be decoded is left out. Raises PosesError
+    for no video, and for fewer than LEAST frames.
     """
     times, broken = _times(video)
     if len(times) < LEAST:
@@ -42,23 +41,22 @@ def extract(
             f"{video} has {counted(len(times), 'frame')} that can be read, and poses need {LEAST} "
             "at least: take a longer video, or copy it again"
         )
-    start, end = times[0], times[-1]
-    wanted = min(count or taken(float(end - start)), len(times))
+    start = times[0]
     # the last frame is shown as long as the others in the mean
-    length = (end - start) * Fraction(len(times), len(times) - 1) / wanted or Fraction(1)
-    every = max(len(times) // (wanted * _JUDGED), 1)
-    written, faults, last = 0, 0, start
-    place, best, sharpest = 0, None, -1.0
+    length = float(times[-1] - start) * len(times) / (len(times) - 1) or 1.0
+    intervals = Intervals(float(start), length, count)
+    every = max(int(len(times) / (length * intervals.rate) / _JUDGED), 1)
+    place, best, sharpest, faults, last = 0, None, -1.0, 0, start
     for number, (time, frame) in enumerate(_decoded(video)):
         if frame is None:
             faults += 1
             continue
-        here = min(max(int((time - start) / length), 0), wanted - 1)
+        here, last = intervals.place(float(time), frame), max(last, time)
         if here != place and best is not None:
             _write(best, folder / f"{place:05d}.jpg")
-            written, best, sharpest = written + 1, None, -1.0
-            progress(here, wanted)
-        place, last = here, max(last, time)
+            best, sharpest = None, -1.0
+        place = here
+        progress(int(time - start), int(length))
         if best is not None and number % every:
             continue
         score = _sharpness(frame)
@@ -66,19 +64,55 @@ def extract(
             best, sharpest = frame, score
     if best is not None:
         _write(best, folder / f"{place:05d}.jpg")
-        written += 1
-    if written < LEAST:
+    written = sorted(folder.glob("*.jpg"))
+    if len(written) < LEAST:
         raise PosesError(
-            f"{video} has {counted(written, 'frame')} that can be decoded, and poses need "
+            f"{video} has {counted(len(written), 'frame')} that can be decoded, and poses need "
             f"{LEAST} at least: convert it to H.264, or copy it again"
         )
-    remarks = []
-    if broken or faults:
-        remarks.append(
-            f"{video} is damaged: {written} of {wanted} intervals have a frame, the last one at "
-            f"{float(last - start):.1f} s"
-        )
-    return remarks
+    if count is None and len(written) > MOST:
+        kept = {round(number) for number in np.linspace(0, len(written) - 1, MOST)}
+        for number in set(range(len(written))) - kept:
+            written[number].unlink()
+    if not (broken or faults):
+        return []
+    at = f"{float(last - start):.1f} s"
+    return [f"{video} is damaged: frames are taken up to {at}, where they could be decoded"]
+
+
+class Intervals:
+    """Intervals of time, 1 / `rate` s long, or shorter ones in which the picture moves by STEP.
+
+    count: of intervals of time alone. start, length: of the video, in seconds.
+    """
+
+    def __init__(self, start: float, length: float, count: int | None) -> None:
+        self.start, self.count = start, count
+        self.rate = count / length if count else max(PER_SECOND, FEWEST / length)
+        self._place, self._opened, self._moved = 0, start, 0.0
+        self._thumb: np.ndarray | None = None
+
+    def place(self, time: float, frame: Any) -> int:
+        """The number of the interval of the next frame."""
+        if self.count:
+            return min(max(int((time - self.start) * self.rate + 1e-6), 0), self.count - 1)
+        thumb = _grey(frame, _THUMB)
+        if self._thumb is not None:
+            self._moved += shift(self._thumb, thumb)
+        self._thumb = thumb
+        if max((time - self._opened) * self.rate + 1e-6, self._moved / STEP) >= 1:
+            self._place, self._opened, self._moved = self._place + 1, time, 0.0
+        return self._place
+
+
+def shift(before: np.ndarray, after: np.ndarray) -> float:
+    """How far a small picture moved, in parts of its sides: the peak of the phase correlation."""
+    one, other = (np.fft.rfft2((x - x.mean()) * _WINDOW) for x in (before, after))
+    product = one * other.conj()
+    found = np.fft.irfft2(product / (np.abs(product) + 1e-9), s=_THUMB)
+    peak = np.array(np.unravel_index(found.argmax(), _THUMB))
+    sides = np.array(_THUMB)
+    return float(np.linalg.norm(((peak + sides // 2) % sides - sides // 2) / sides))
 
 
 def _opened(video: Path) -> Any:
@@ -131,9 +165,13 @@ def _decoded(video: Path) -> Iterator[tuple[Fraction, Any]]:
 
 def _sharpness(frame: Any) -> float:
     scale = _SIDE / max(frame.width, frame.height)
-    width, height = (max(round(side * scale) // 2 * 2, 4) for side in (frame.width, frame.height))
-    grey = frame.reformat(width=width, height=height, format="gray").to_ndarray()
-    return laplacian_variance(grey.astype(np.float32))
+    height, width = (max(round(side * scale) // 2 * 2, 4) for side in (frame.height, frame.width))
+    return laplacian_variance(_grey(frame, (height, width)))
+
+
+def _grey(frame: Any, size: tuple[int, int]) -> np.ndarray:
+    grey = frame.reformat(width=size[1], height=size[0], format="gray").to_ndarray()
+    return grey.astype(np.float32)
 
 
 def _write(frame: Any, path: Path) -> None:

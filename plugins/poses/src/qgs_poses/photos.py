@@ -102,9 +102,9 @@ def _prepared(file: Path, kept: Path, working: Path, side: int) -> Photo:
             raise ValueError(f"it has {image.width} x {image.height} pixels")
         image.load()
         turned, kind = orientation(image) != 1, image.format
-        exif, camera = _exif(image)
         plain = image.mode in ("RGB", "L") and kind in ("JPEG", "MPO", "PNG")
         upright = ImageOps.exif_transpose(image) if turned else image
+        exif, camera = _exif(image)  # last, because it takes the orientation out
     rgb = eight_bits(upright).convert("RGB")
     name = file.name if kind in ("JPEG", "MPO", "PNG") else f"{file.name}.png"
     if plain and not turned:
