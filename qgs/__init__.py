@@ -33,8 +33,8 @@ DISTRIBUTIONS = {
     "qgs.plugins": {
         name: f"query-gaussians-{name}"
         for name in (
-            *("locus", "ellipsoid", "c3g", "gslrm", "globalsplat", "mvsplat", "tokengs2026"),
-            *("dinov2", "lpips", "rooms", "datasets"),
+            *("locus", "ellipsoid", "landmark", "c3g", "gslrm", "globalsplat", "mvsplat"),
+            *("tokengs2026", "dinov2", "lpips", "rooms", "datasets"),
         )
     },
     "qgs.commands": {

@@ -63,9 +63,9 @@ def test_every_floating_field_is_tuned_and_no_other(
     seen: list[QueryState] = []
     predict = model.predict
 
-    def recorded(memory, state, layers=None):
+    def recorded(views, memory, state, layers=None):
         seen.append(map_tensors(torch.clone, state))
-        return predict(memory, state, layers)
+        return predict(views, memory, state, layers)
 
     monkeypatch.setattr(model, "predict", recorded)
     tune(model, inputs, tuning_loss(recipe), steps=1, rate=1e-3)

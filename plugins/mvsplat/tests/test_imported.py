@@ -42,7 +42,7 @@ def outputs(model: qgs.QueryGaussianModel, golden: GoldenFile) -> dict[str, Tens
     numbers = model.encoder.predict(views, golden.input("near"), golden.input("far"))
     grid = (numbers.shape[1], *views.cameras.size)
     memory = ImageMemory(numbers.permute(0, 1, 3, 4, 2).flatten(1, 3), grid=grid)
-    found = model.predict(memory, model.queries(memory, views)).gaussians
+    found = model.predict(views, memory, model.queries(memory, views)).gaussians
     factors = quat_to_matrix(found.quats) * found.scales[..., None, :]
     return {
         "means": found.means,
