@@ -65,7 +65,7 @@ def test_anchors_of_all_tokens_stand_on_the_rays_of_their_patches(each: int) -> 
     x = (memory().features[:, :, None] + queries.slots).flatten(1, 2)
     torch.testing.assert_close(state.features, x)
     w = torch.sigmoid(queries.depth_mlp(x))
-    z = 1 / (w / 0.5 + (1 - w) / 4.0)
+    z = 0.5**w * 4.0 ** (1 - w)
     given = views().cameras
     local = torch.einsum(
         "bvij,bvnj->bvni", given.w2c[..., :3, :3], state[CENTER].unflatten(1, (2, -1))

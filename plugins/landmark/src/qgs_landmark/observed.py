@@ -28,18 +28,28 @@ from qgs.contracts import (
     memory_fields,
     without_effect,
 )
-from qgs.geometry.precision import full_precision
+from qgs.geometry.precision import at_least_float32, full_precision
 from qgs.types import ImageMemory, QueryState, SpatialSupport, Views
 from qgs_landmark.fields import COLORS, FRAME, FRAME_FIELD, color_field
 from qgs_landmark.places import cells, colors_at, patch_centres, rays_at, sampled, spread
+from qgs_landmark.sweep import mismatch
+
+SHARPNESS = 300.0
+"""1 / t at first: a difference of .01 in RGB makes a depth e times less likely."""
+UNSEEN = 0.2
+"""Difference in RGB at first that a depth which no other photo sees is taken to have."""
+SAMPLES = 4
+"""Samples along each side of a window."""
 
 
 class ObservedQueries(Queries):
     """A query at a place of a photo: the token there, and an anchor on the ray through it.
 
-    The anchor's depth z, along the camera's axis, is 1 / z = (1 - w) / far + w / near with w the
-    sigmoid of an MLP of the token. Its radius is `radius` sides of its footprint at that depth: the
-    square of the photo that is its share of all photos.
+    The anchor's depth z, along the camera's axis, is near^w far^(1 - w), with w the sigmoid of an
+    MLP of the token. With a sweep w is the mean of D values from 0 to 1, with weights softmax(
+    MLP(token) - c / t): c is how much the photo differs from the others where it shows that depth.
+    The radius is `radius` sides of the anchor's footprint at its depth: the square of the photo
+    that is its share of all photos.
     """
 
     name = "observed"
@@ -55,6 +65,10 @@ class ObservedQueries(Queries):
         """Least depth, world units."""
         far: float = Field(default=3.0, gt=0, validate_default=True)
         """Largest depth, world units."""
+        sweep: int | None = Field(default=None, ge=2)
+        """D, the depths at which photos are compared; null for a depth by the token alone."""
+        window: float = Field(default=1.5, gt=0)
+        """Side of the squares that are compared, in sides of the footprint."""
         radius: float = Field(default=1.0, gt=0)
         """Radius that an anchor starts with, in sides of its footprint at its depth."""
         std: float = Field(default=0.3, ge=0)
@@ -79,10 +93,13 @@ class ObservedQueries(Queries):
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         self.slots = nn.Parameter(torch.randn(config.per_token, dims.width) * config.std)
-        self.depth_mlp = Mlp(dims.width, dims.width, 1)
-        # All anchors start at one depth, the geometric mean of near and far.
+        self.depth_mlp = Mlp(dims.width, dims.width, config.sweep or 1)
         nn.init.zeros_(self.depth_mlp.fc2.weight)
-        nn.init.constant_(self.depth_mlp.fc2.bias, -math.log(config.far / config.near) / 2)
+        nn.init.zeros_(self.depth_mlp.fc2.bias)
+        if config.sweep is not None:
+            self.sharpness = nn.Parameter(torch.tensor(math.log(SHARPNESS)))
+            self.unseen = nn.Parameter(torch.tensor(UNSEEN))
+            self.match_proj = nn.Linear(config.sweep, dims.width)
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
@@ -112,18 +129,42 @@ class ObservedQueries(Queries):
                 self.config.count, drawn(scenes, count, 2, device=device, dtype=torch.float32)
             )
             x_BND = sampled(memory.features, memory.grid, view_N, place_BN2) + self.slots
-        nearness_BN1 = self.depth_mlp(x_BND)
+        if self.config.sweep is None:
+            nearness_BN1 = at_least_float32(self.depth_mlp(x_BND)).sigmoid()
+        else:
+            match_BND = self._match(views, view_N, place_BN2)
+            x_BND = x_BND + self.match_proj(match_BND.softmax(-1))
+            share_BND = (at_least_float32(self.depth_mlp(x_BND)) + match_BND).softmax(-1)
+            # Not as a matrix product, which autocast makes in half precision.
+            nearness_BN1 = (share_BND * _nearness(self.config.sweep, device)).sum(-1, keepdim=True)
         return QueryState(x_BND, self._fields(nearness_BN1, views, view_N, place_BN2))
+
+    def _match(self, views: Views, view_N: Tensor, place_BN2: Tensor) -> Tensor:
+        """Logits (B, N, D) of depths, by how well photos agree there."""
+        assert self.config.sweep is not None
+        depth_D = self._depth(_nearness(self.config.sweep, place_BN2.device))
+        side = self.config.window * self._side(views, len(view_N))
+        error_BND, seen_BND = mismatch(views, view_N, place_BN2, depth_D, side, SAMPLES)
+        return -self.sharpness.exp() * torch.where(seen_BND, error_BND, self.unseen)
+
+    def _depth(self, nearness: Tensor) -> Tensor:
+        """World units."""
+        return self.config.far * (self.config.near / self.config.far) ** nearness
+
+    @staticmethod
+    def _side(views: Views, count: int) -> float:
+        """Side of a footprint in pixels: `count` of them have the area of all photos."""
+        _, photos = views.cameras.shape
+        return math.sqrt(photos * math.prod(views.cameras.size) / count)
 
     @full_precision
     def _fields(
         self, nearness_BN1: Tensor, views: Views, view_N: Tensor, place_BN2: Tensor
     ) -> dict[str, Tensor]:
-        config, cameras, w_BN1 = self.config, views.cameras, nearness_BN1.sigmoid()
-        z_BN1 = 1 / ((1 - w_BN1) / config.far + w_BN1 / config.near)
+        config, cameras, z_BN1 = self.config, views.cameras, self._depth(nearness_BN1)
         origin_BN3, direction_BN3 = rays_at(cameras, view_N, place_BN2)
         height, width = cameras.size
-        side = math.sqrt(cameras.shape[1] * height * width / len(view_N))
+        side = self._side(views, len(view_N))
         focal_BN1 = cameras.intrinsics[:, view_N, :2].mean(-1, keepdim=True)
         radii_BN1 = config.radius * side * z_BN1 / focal_BN1
         anchors = {
@@ -142,3 +183,8 @@ class ObservedQueries(Queries):
     def support(self, state: QueryState) -> SpatialSupport:
         """Balls of the support radius."""
         return ball_support(state[CENTER], support_radius(state[RAW_RADIUS], self.config))
+
+
+def _nearness(count: int, device: torch.device) -> Tensor:
+    """From 0, which is `far`, to 1, which is `near`: (count,)."""
+    return torch.linspace(0, 1, count, device=device)

@@ -1,0 +1,81 @@
+"""A sweep over depths: how well the photos agree about what a place of one of them shows."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from qgs.geometry.precision import full_precision
+from qgs.types import Cameras, Views
+from qgs_landmark.places import cells, rays_at
+
+LEAST_SEEN = 0.5
+"""Share of a window that another photo must see for its colours to count."""
+LEAST_DEPTH = 1e-3
+"""World units in front of a camera, of what it sees."""
+
+
+@torch.no_grad()  # colours have no gradient to send; a network learns what to make of them
+@full_precision
+def mismatch(
+    views: Views, view_N: Tensor, place_BN2: Tensor, depth_D: Tensor, side: float, points: int
+) -> tuple[Tensor, Tensor]:
+    """How much windows around places differ from other photos, at depths: (B, N, D), and where.
+
+    It is the mean difference of RGB over a square of `side` pixels, of points x points samples,
+    and over the photos that see at least half of it at that depth. The second tensor says whether
+    any does; where none does, the difference is 0.
+    """
+    height, width = views.cameras.size
+    place_BN2 = place_BN2.to(views.images)
+    step_P2 = side * cells(points**2).to(place_BN2) / place_BN2.new_tensor([width, height])
+    place_BNP2 = place_BN2[:, :, None] + step_P2
+    color_B3NP = bilinear(views.images, view_N, place_BNP2)
+    shape = (*place_BN2.shape[:2], len(depth_D))
+    total_BND, count_BND = place_BN2.new_zeros(shape), place_BN2.new_zeros(shape)
+    photos = views.cameras.shape[1]
+    for ahead in range(1, photos):
+        other_N = (view_N + ahead) % photos
+        at_BNDP2, seen_BNDP = reprojected(views.cameras, view_N, other_N, place_BNP2, depth_D)
+        found_B3NDP = bilinear(views.images, other_N, at_BNDP2.flatten(2, 3))
+        found_B3NDP = found_B3NDP.unflatten(3, (-1, points**2))
+        error_BNDP = (found_B3NDP - color_B3NP[:, :, :, None]).abs().mean(1)
+        error_BND = (error_BNDP * seen_BNDP).sum(-1) / seen_BNDP.sum(-1).clamp_min(1)
+        counts_BND = seen_BNDP.to(error_BND).mean(-1) >= LEAST_SEEN
+        total_BND, count_BND = total_BND + error_BND * counts_BND, count_BND + counts_BND
+    return total_BND / count_BND.clamp_min(1), count_BND > 0
+
+
+def bilinear(images_BV3HW: Tensor, view_N: Tensor, place_BNX2: Tensor) -> Tensor:
+    """RGB (B, 3, N, X) at places of the photos `view_N`; outside of one those of its edge."""
+    _, photos, _, height, width = images_BV3HW.shape
+    # All photos as one, one below another: places keep half a pixel from the edges of theirs.
+    edge_2 = place_BNX2.new_tensor([0.5 / width, 0.5 / height])
+    x_BNX, y_BNX = place_BNX2.maximum(edge_2).minimum(1 - edge_2).unbind(-1)
+    y_BNX = (y_BNX + view_N[:, None]) / photos
+    column = images_BV3HW.transpose(1, 2).flatten(2, 3)
+    grid = 2 * torch.stack([x_BNX, y_BNX], -1) - 1
+    return F.grid_sample(column, grid, align_corners=False)
+
+
+def reprojected(
+    cameras: Cameras, view_N: Tensor, other_N: Tensor, place_BNP2: Tensor, depth_D: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Places (B, N, D, P, 2) in other photos of places at depths, and which lie in these photos."""
+    height, width = cameras.size
+    points = place_BNP2.shape[2]
+    view_X = view_N.repeat_interleave(points)
+    origin_BX3, direction_BX3 = rays_at(cameras, view_X, place_BNP2.flatten(1, 2))
+    origin_BN3, direction_BNP3 = origin_BX3[:, ::points], direction_BX3.unflatten(1, (-1, points))
+    c2w_BN44, lens_BN4 = cameras.c2w[:, other_N], cameras.intrinsics[:, other_N]
+    turn_BN33 = c2w_BN44[..., :3, :3]
+    # Of a point at depth z, divided by z: the ray's direction + the step between cameras / z.
+    ray_BNP3 = direction_BNP3 @ turn_BN33
+    step_BN13 = (origin_BN3 - c2w_BN44[..., :3, 3])[:, :, None] @ turn_BN33
+    local = ray_BNP3[:, :, None] + step_BN13[:, :, None] / depth_D[:, None, None]
+    ahead_BNDP = local[..., 2] * depth_D[:, None] > LEAST_DEPTH
+    slope = local[..., :2] / local[..., 2:].clamp_min(LEAST_DEPTH / depth_D.max())
+    focal_BN2, middle_BN2 = lens_BN4[:, :, None, None].split(2, -1)
+    place_BNDP2 = (slope * focal_BN2 + middle_BN2) / slope.new_tensor([width, height])
+    # Beyond the edges, colours would be those of the edge.
+    inside_BNDP = ((place_BNDP2 > 0) & (place_BNDP2 < 1)).all(-1)
+    return place_BNDP2, ahead_BNDP & inside_BNDP
