@@ -43,6 +43,18 @@ def scene(
     holdout: Annotated[
         str, typer.Option(help="Judge every n-th photo and optimise on the others, or none.")
     ] = "8",
+    degree: Annotated[
+        int, typer.Option(min=0, max=3, help="Harmonics of the colours, which grow with time.")
+    ] = 1,
+    exposure: Annotated[
+        bool, typer.Option("--exposure", help="Optimise an affine map of each photo's colours.")
+    ] = False,
+    refine_poses: Annotated[
+        bool, typer.Option("--refine-poses", help="Optimise the cameras of the photos too.")
+    ] = False,
+    masks: Annotated[
+        bool, typer.Option("--masks", help="What the photos' masks leave out is background.")
+    ] = False,
     scene_name: SceneName = None,
     no_poses: NoPoses = False,
     device: Device = "auto",
@@ -64,9 +76,11 @@ def scene(
     from rich.console import Console
 
     from qgs.engine.distributed import choose_device
+    from qgs_refine.refining import Extras
     from qgs_refine.scene import Wanted, make_scene
 
     wanted = Wanted(
-        model, frames, scale, pixels, gaussians, seconds, holdout, scene_name, choose_device(device)
-    )
+        model, frames, scale, pixels, gaussians, seconds, holdout, scene_name,
+        choose_device(device), Extras(degree, exposure, refine_poses), masks,
+    )  # fmt: skip
     make_scene(photos, out, wanted, began, 60 * minutes, Console())

@@ -25,7 +25,8 @@ class FreeGaussians:
     """Gaussians (1, G) as unbounded parameters (G, ...), with Adam.
 
     values: by name, means, log_scales, quats, opacity_logits, color_logits, and sh and features if
-    given. With sh, which allow any colour, `colors` takes the place of color_logits.
+    given. With sh, which allow any colour, `colors` takes the place of color_logits. active: how
+    many of the coefficients are used; the others wait as they are.
     """
 
     def __init__(self, gaussians: Gaussians, rates: Mapping[str, float]) -> None:
@@ -46,6 +47,7 @@ class FreeGaussians:
             {"params": [self.values[name]], "name": name, "lr": rates[name]} for name in given
         ]
         self.optimizer = torch.optim.Adam(groups, eps=1e-15)
+        self.active = None if gaussians.sh is None else gaussians.sh.shape[-2]
 
     @property
     def count(self) -> int:
@@ -58,7 +60,8 @@ class FreeGaussians:
         shape = v["log_scales"].exp(), F.normalize(v["quats"], dim=-1)
         colors = v["colors"] if "colors" in v else v["color_logits"].sigmoid()
         look = v["opacity_logits"].sigmoid(), colors
-        return Gaussians(v["means"], *shape, *look, v.get("sh"), v.get("features"))
+        sh = v["sh"][:, :, : self.active] if self.active else None
+        return Gaussians(v["means"], *shape, *look, sh, v.get("features"))
 
     @torch.no_grad()
     def grow(self, count: int, generator: torch.Generator) -> None:

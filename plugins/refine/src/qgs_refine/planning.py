@@ -22,13 +22,15 @@ from qgs.data.domain import Domain
 from qgs.data.recognition import open_for
 from qgs.data.samples import views_in
 from qgs.io.checkpoint import load
+from qgs.machine import available_bytes
 from qgs.metrics.images import psnr
 from qgs.types import Gaussians
 from qgs.wording import listed
+from qgs_refine.refining import NO_EXTRAS, Extras
 
 NONE = "none"
 """As a model: the start is made of the photos alone; as a holdout: all are optimised on."""
-SIZES = range(96, 1025, 16)
+SIZES = range(96, 2161, 16)
 """Shorter sides that are considered, pixels."""
 LEAST_STEPS, STEPS_OF_PHOTO = 4000, 25
 """Steps that a refinement takes at least, and of each photo; then photos may be larger.
@@ -37,7 +39,8 @@ LEAST_STEPS, STEPS_OF_PHOTO = 4000, 25
 the time."""
 DENSITY = 0.6
 """Gaussians over pixels of a photo: twice as many gained less than their time."""
-MOST_GAUSSIANS = 500_000
+MOST_GAUSSIANS = 262_144
+_BYTES = 16  # of memory for each value of a photo, at all its sizes: half of it is kept free
 _OF_PIXELS, _OF_GAUSSIANS = 0.77, 0.3  # exponents of the time of a step, measured on CPUs
 _COARSE = 0.9  # time of a step in the mean over coarse levels, over that of a start at full size
 _PROBE = 128  # shorter side with which a step is timed
@@ -56,6 +59,8 @@ class Plan:
     gaussians: int
     seconds: float
     holdout: str
+    extras: Extras = NO_EXTRAS
+    masks: bool = False
 
     def command(self, photos: str, out: str, scene: str | None = None) -> str:
         """A command line that makes the scene again."""
@@ -72,6 +77,9 @@ class Plan:
             "--holdout": self.holdout,
         }
         words = [photos, *(word for option in options.items() for word in option)]
+        words += ["--degree", str(self.extras.degree)]
+        flags = {"exposure": self.extras.exposure, "refine-poses": self.extras.poses}
+        words += [f"--{flag}" for flag, given in {**flags, "masks": self.masks}.items() if given]
         return " ".join(["qgs scene", *map(shlex.quote, words)])
 
 
@@ -201,18 +209,20 @@ def affordable(
     seconds: float,
     wanted: tuple[Size | None, int | None],
 ) -> tuple[Size, int]:
-    """Photo size and number of Gaussians with which `seconds` are enough steps.
+    """Photo size and number of Gaussians with which `seconds` are enough steps, and memory is.
 
     step: seconds of a step at the size `timed` with `timed_count` Gaussians; the time of others
     follows by powers. wanted: what the user set, None where it is free.
     """
     steps = max(LEAST_STEPS, STEPS_OF_PHOTO * len(scenes.frames))
     best: tuple[Size, int] | None = None
+    available = available_bytes()
     for size in _sizes(scenes.probe, wanted[0]):
         count = wanted[1] or min(round(DENSITY * math.prod(size)), MOST_GAUSSIANS)
         of_pixels = (math.prod(size) / math.prod(timed)) ** _OF_PIXELS
         time = _COARSE * step * of_pixels * (count / timed_count) ** _OF_GAUSSIANS
-        if best is not None and steps * time > seconds:
+        memory = 3 * math.prod(size) * len(scenes.frames) * _BYTES
+        if best is not None and (steps * time > seconds or memory > available):
             break
         best = size, count
     assert best is not None

@@ -21,7 +21,16 @@ from qgs.losses.photometric import mean_squared_error
 from qgs.metrics.images import psnr
 from qgs.renderers import AutoRenderer
 from qgs.similarity import mean_ssim
-from qgs.types import Cameras, Gaussians, Views, concatenated, map_tensors, named_tensors
+from qgs.types import (
+    SH_COUNTS,
+    Cameras,
+    Gaussians,
+    Views,
+    concatenated,
+    map_tensors,
+    named_tensors,
+)
+from qgs_refine.adjusting import Adjustments
 from qgs_refine.growth import FreeGaussians
 from qgs_refine.sweeping import swept
 
@@ -39,6 +48,7 @@ _STEPS_BETWEEN_GROWTHS = 40
 _LEVELS = ((4, 0.2), (2, 0.5), (1, 1.0))  # part of the resolution, up to this part of the budget
 _LEAST_SIDE = 64  # pixels: no level is smaller
 _POINTS = 12  # of the curve
+_DEGREES_FROM = (0.1, 0.35, 0.6)  # part of the budget from which on a degree of harmonics is used
 
 
 @dataclass(frozen=True)
@@ -55,14 +65,32 @@ class CurvePoint:
 class RefinedScene:
     """Refined Gaussians (1, G). curve: from the start on; empty without photos to compare with.
 
-    seconds: of optimisation, without evaluations. stopped_by: the signal that ended it early.
+    seconds: of optimisation, without evaluations. cameras: (1, V) of the photos, corrected where
+    that was wanted. stopped_by: the signal that ended it early.
     """
 
     gaussians: Gaussians
     curve: Sequence[CurvePoint]
     steps: int
     seconds: float
+    cameras: Cameras
     stopped_by: str | None = None
+
+
+@dataclass(frozen=True)
+class Extras:
+    """What is optimised beside means, shapes, opacities and colours.
+
+    degree: spherical harmonics up to this degree, 0 to 3, grow with time where the start has none.
+    exposure: an affine map of the colours of each photo. poses: the camera of each photo.
+    """
+
+    degree: int = 0
+    exposure: bool = False
+    poses: bool = False
+
+
+NO_EXTRAS = Extras()
 
 
 def refine(
@@ -75,6 +103,7 @@ def refine(
     compared: Views | None = None,
     renderer: nn.Module | None = None,
     console: Console | None = None,
+    extras: Extras = NO_EXTRAS,
 ) -> RefinedScene:
     """Optimise `gaussians` (1, G) on the photos `views` (1, V) of their scene.
 
@@ -82,9 +111,10 @@ def refine(
     Gaussians at the end, by default as many as given; they grow in the first part of the time.
     The optimisation starts from the most opaque of the given Gaussians and, as the part `swept` of
     all, from others at pixels, where the photos agree on a depth. compared: photos (1, W) for the
-    curve, never optimised on. renderer: `qgs/auto` by default. console: where progress is shown;
-    nowhere by default. The first Ctrl-C finishes the step and returns the result so far. Works in
-    any world: its size is measured by the distance of the Gaussians from the cameras.
+    curve, never optimised on, whose cameras stay. renderer: `qgs/auto` by default. console: where
+    progress is shown; nowhere by default. extras: what else is optimised. The first Ctrl-C finishes
+    the step and returns the result so far. Works in any world: its size is measured by the distance
+    of the Gaussians from the cameras.
 
     Raises ValueError for more than one scene, no photo, no time, and Gaussians that are not finite.
     """
@@ -93,11 +123,12 @@ def refine(
     quiet, stopping = console or Console(quiet=True), stop_requests(console is None)
     with TrainingProgress(quiet) as progress, stopping as stop, torch.enable_grad():
         renderer = renderer or AutoRenderer(AutoRenderer.Config())
-        run = _Run(gaussians, views, seconds, wanted, renderer, swept)
+        run = _Run(gaussians, views, seconds, wanted, renderer, swept, extras)
         curve = list(run.curve(compared, progress, stop))
         name = stop.signal.name if stop.signal else None
         refined = map_tensors(Tensor.detach, run.free.gaussians())
-        return RefinedScene(refined, curve, run.step, run.spent, name)
+        cameras = run.adjustments.every_camera(views.cameras)
+        return RefinedScene(refined, curve, run.step, run.spent, cameras, name)
 
 
 def seconds_of_step(gaussians: Gaussians, views: Views, renderer: nn.Module | None = None) -> float:
@@ -127,17 +158,24 @@ class _Run:
         wanted: int,
         renderer: nn.Module,
         swept: float,
+        extras: Extras = NO_EXTRAS,
     ) -> None:
-        self.renderer, self.wanted, self.given = renderer, wanted, gaussians
+        self.renderer, self.wanted, self.given, self.grows = renderer, wanted, gaussians, False
         self.generator, began = torch.Generator().manual_seed(0), perf_counter()
         side = min(views.cameras.size)
         levels = [level for level in _LEVELS if level[0] == 1 or side // level[0] >= _LEAST_SIDE]
         self.levels = [(resized(views, part), end) for part, end in levels]
         self.start = min(wanted, gaussians.count)
         gaussians = partly_swept(gaussians, self.levels[0][0], self.start, swept, self.generator)
-        self.size = distance(gaussians, views)
+        self.size, photos = distance(gaussians, views), views.images.shape[1]
+        if extras.degree and gaussians.sh is None:
+            zeros = gaussians.means.new_zeros(1, gaussians.count, SH_COUNTS[extras.degree - 1], 3)
+            gaussians, self.grows = replace(gaussians, sh=zeros), True
         self.rates = {**_RATES, "means": _RATES["means"] * self.size}
         self.free = FreeGaussians(gaussians, self.rates)
+        self.adjustments = Adjustments(
+            photos, extras.poses, extras.exposure, self.size, gaussians.means
+        )
         self.seconds, self.step, self.grown = seconds, 0, 0
         # half of the time is for steps, however long a slow machine matches photos
         self.spent = min(perf_counter() - began, seconds / 2)
@@ -179,16 +217,23 @@ class _Run:
         views = next(views for views, end in self.levels if used < end or end == 1)
         if not self.order:
             self.order = torch.randperm(views.images.shape[1], generator=self.generator).tolist()
-        photo = views.select([self.order.pop()])
+        place = self.order.pop()
+        photo = views.select([place])
+        if self.grows:
+            degrees = sum(used >= start for start in _DEGREES_FROM)
+            self.free.active = (0, *SH_COUNTS)[degrees]
         gaussians = self.free.gaussians()
-        rgb = self.renderer(replace(gaussians, features=None), photo.cameras).rgb
+        cameras = self.adjustments.cameras(place, photo.cameras)
+        rgb = self.renderer(replace(gaussians, features=None), cameras).rgb
+        rgb, held = self.adjustments.seen(place, rgb)
         error = mean_squared_error(rgb, photo.images)
         loss = error + _SSIM * (1 - mean_ssim(rgb, photo.images, "same"))
         spread = gaussians.opacities.mean() + gaussians.scales.mean() / self.size
-        loss = loss + max(_SMALL, _SMALL_OF_FEW / views.images.shape[1]) * spread
+        loss = loss + max(_SMALL, _SMALL_OF_FEW / views.images.shape[1]) * spread + held
         self.free.optimizer.zero_grad()
         loss.backward()
         self.free.optimizer.step()
+        self.adjustments.step(used)
         self.step += 1
         self._grow(used)
         return float(loss.detach()), -10 * math.log10(max(float(error.detach()), 1e-10))

@@ -25,9 +25,10 @@ from qgs.io.gaussians import save_ply, save_splat
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.renderers import AutoRenderer
-from qgs.types import Gaussians, Views
+from qgs.types import Gaussians, Views, concatenated
 from qgs_refine.planning import NONE, Plan, Scenes, Start, affordable, best_start, shipped_models
-from qgs_refine.refining import RefinedScene, refine, seconds_of_step
+from qgs_refine.points import from_points, sparse_points
+from qgs_refine.refining import NO_EXTRAS, Extras, RefinedScene, refine, seconds_of_step
 from qgs_refine.sweeping import swept
 
 END, PART_OF_END = 4.0, 0.03
@@ -53,6 +54,8 @@ class Wanted:
     holdout: str = "8"
     scene: str | None = None
     device: str = "cpu"
+    extras: Extras = NO_EXTRAS
+    masks: bool = False
 
 
 def make_scene(
@@ -74,20 +77,23 @@ def make_scene(
     size, count = affordable(*timed, scenes, left(), (wanted.size, wanted.gaussians))
     both = views_in(start.world, scenes.at(size), (*scenes.frames, *scenes.held))
     both, photos_count = both.to(wanted.device), len(scenes.frames)
+    if wanted.masks:
+        both = masked(both, renderer.config.background)
     views, judged = both.select(slice(photos_count)), both.select(slice(photos_count, None))
     budget, scale = left(), float(start.world[1])
     plan = Plan(start.model, start.frames, scale, size, count, budget, wanted.holdout)
+    plan = replace(plan, extras=wanted.extras, masks=wanted.masks)
     command = plan.command(photos, str(out), wanted.scene)
     console.print(command, soft_wrap=True, highlight=False, markup=False)
     gaussians, part = start.gaussians, 0.5
     if gaussians is None:
         sweeping, part = perf_counter(), 0.0
-        many = max(min(count, int(SWEEP * budget / of_pixel)), few.count)
-        gaussians = swept(probe, many, 1.0, torch.Generator().manual_seed(0))
+        gaussians = photos_start(photos, start.world, probe, count, int(SWEEP * budget / of_pixel))
         budget = max(budget - (perf_counter() - sweeping), _LEAST_PART * budget)
     refined = refine(
-        gaussians, views, budget, count=count, swept=part, renderer=renderer, console=console
-    )
+        gaussians, views, budget, count=count, swept=part, renderer=renderer, console=console,
+        extras=wanted.extras,
+    )  # fmt: skip
     made = Made(start, refined, renderer, scenes, views, judged, command)
     write_scene(made, out, page, began, console)
 
@@ -112,6 +118,33 @@ def photos_world(scenes: Scenes) -> tuple[Tensor, Tensor]:
     scale = 1 / scene_depth(scenes.probe)
     views = ViewsConfig(scale="constant", scale_factor=scale)
     return own_world(scenes.probe, scenes.frames[:1], views)
+
+
+def photos_start(
+    photos: str, world: tuple[Tensor, Tensor], views: Views, count: int, most: int
+) -> Gaussians:
+    """Gaussians (1, G): COLMAP's points where the folder has some, the others at pixels.
+
+    count: of all at the end. most: at pixels, of the photos `views` (1, V), at least TIMED.
+    """
+    parts, points = list[Gaussians](), sparse_points(photos)
+    if points is not None:
+        parts.append(from_points(points, world, count).to(views.images.device))
+    many = max(min(count - sum(part.count for part in parts), most), 0 if parts else TIMED)
+    if many:
+        parts.append(swept(views, many, 1.0, torch.Generator().manual_seed(0)))
+    return concatenated(parts, 1)
+
+
+def masked(views: Views, background: Sequence[float]) -> Views:
+    """The photos with the background in place of what their masks leave out.
+
+    What is empty is thereby seen to be empty. Raises ValueError for photos without masks.
+    """
+    if views.masks is None:
+        raise ValueError("--masks: these photos have no masks: leave it out, or add masks")
+    color = views.images.new_tensor(background)[:, None, None]
+    return replace(views, images=views.masks * views.images + (1 - views.masks) * color)
 
 
 def timed_sweep(views: Views) -> tuple[Gaussians, float]:

@@ -1,0 +1,68 @@
+"""What is optimised of each photo beside the Gaussians: its pose, and its exposure."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from qgs.geometry.transforms import quat_to_matrix
+from qgs.types import Cameras
+
+_RATES = {"poses": 3e-4, "colours": 2e-3}
+_LAST = 0.1  # final learning rates over the first
+_HELD = 0.1  # weight of the squares of a photo's colour map: their mean stays near that of all
+
+
+class Adjustments:
+    """Corrections of V photos, each optimised in the steps of its own photo.
+
+    poses: (6,) of each photo, half the axis of a turn and a shift over `size`, both in the
+    camera's frame. colours: (3, 4), what is added to an affine map of rendered RGB. Empty for
+    neither.
+    """
+
+    def __init__(self, photos: int, poses: bool, exposure: bool, size: float, like: Tensor) -> None:
+        self.size, self._poses, self._colours = size, list[Tensor](), list[Tensor]()
+        if poses:
+            self._poses = [like.new_zeros(6).requires_grad_() for _ in range(photos)]
+        if exposure:
+            self._colours = [like.new_zeros(3, 4).requires_grad_() for _ in range(photos)]
+        parts = {"poses": self._poses, "colours": self._colours}
+        groups = [{"params": p, "lr": _RATES[k], "name": k} for k, p in parts.items() if p]
+        # one tensor a photo: Adam leaves those without a gradient where they are
+        self._optimizer = torch.optim.Adam(groups, eps=1e-15) if groups else None
+
+    def cameras(self, photo: int, cameras: Cameras) -> Cameras:
+        """Cameras (1, 1) of a photo, as corrected."""
+        if not self._poses:
+            return cameras
+        turn, shift = self._poses[photo].split(3)
+        quat = F.normalize(torch.cat([turn.new_ones(1), turn]), dim=0)
+        move = torch.eye(4).to(turn)
+        move = torch.cat(
+            [torch.cat([quat_to_matrix(quat), self.size * shift[:, None]], 1), move[3:]]
+        )
+        return Cameras(cameras.c2w @ move, cameras.intrinsics, cameras.size)
+
+    def every_camera(self, cameras: Cameras) -> Cameras:
+        """Cameras (1, V) of all photos, as corrected, without gradients."""
+        if not self._poses:
+            return cameras
+        with torch.no_grad():
+            each = [self.cameras(v, cameras[:, v : v + 1]).c2w for v in range(len(self._poses))]
+        return Cameras(torch.cat(each, 1), cameras.intrinsics, cameras.size)
+
+    def seen(self, photo: int, rgb: Tensor) -> tuple[Tensor, Tensor | float]:
+        """Rendered rgb (1, 1, 3, H, W) in the exposure of a photo, and what that costs."""
+        if not self._colours:
+            return rgb, 0.0
+        change = self._colours[photo]
+        turned = torch.einsum("ij,bvjhw->bvihw", change[:, :3], rgb) + change[:, 3, None, None]
+        return rgb + turned, _HELD * change.square().sum()
+
+    def step(self, used: float) -> None:
+        """Follow the gradients of a step. used: part of the budget spent so far."""
+        if self._optimizer is not None:
+            for group in self._optimizer.param_groups:
+                group["lr"] = _RATES[group["name"]] * _LAST**used
+            self._optimizer.step()
+            self._optimizer.zero_grad()
