@@ -25,31 +25,37 @@ def photos(number: int = 5) -> Views:
     return Views(RENDERER(cloud(60), cameras).rgb.clamp(0, 1), cameras)
 
 
-def test_a_wrong_pose_is_found() -> None:
-    """Of the middle photo, with the true Gaussians: its shift by a twentieth of the distance."""
-    true, wrong = photos(), photos().cameras.c2w.clone()
-    wrong[0, 2, :3, 3] += 0.04 * wrong[0, 2, :3, 0]
+def test_a_photo_with_a_wrong_pose_is_met_and_the_others_stay() -> None:
+    """A small shift looks like a turn, so what the corrected camera sees is compared."""
+    true = photos()
+    wrong = true.cameras.c2w.clone()
+    wrong[0, 2, :3, 3] += 0.04 * wrong[0, 2, :3, 0]  # a fiftieth of the distance
     given = replace(true, cameras=replace(true.cameras, c2w=wrong))
+
+    def quality(c2w: torch.Tensor) -> float:
+        cameras = replace(true.cameras, c2w=c2w)
+        return mean_psnr(cloud(60), replace(true, cameras=cameras).select([2]), RENDERER)
+
     found = qgs.refine(cloud(60), given, 600, swept=0.0, extras=Extras(poses=True)).cameras.c2w
     plain = qgs.refine(cloud(60), given, 3, swept=0.0).cameras.c2w
     assert torch.equal(plain, wrong)
-    before, after = ((c2w - true.cameras.c2w)[0, 2, :3, 3].norm() for c2w in (wrong, found))
-    assert after < 0.6 * before
+    assert quality(found) > quality(wrong) + 3
+    moved = (found - wrong)[0, [0, 1, 3, 4], :3, 3].norm(dim=-1)
+    assert 0 < moved.max() < 0.01
     turns = found[0, :, :3, :3]
     torch.testing.assert_close(turns @ turns.mT, torch.eye(3).expand(5, 3, 3), atol=1e-5, rtol=0)
 
 
-def test_another_exposure_of_a_photo_leaves_the_gaussians_alone() -> None:
+def test_a_darker_photo_leaves_the_gaussians_alone() -> None:
     true = photos()
     images = true.images.clone()
-    images[:, 2] = 0.7 * images[:, 2] + 0.1
-    given = replace(true, images=images)
-    scores = list[float]()
+    images[:, 2] *= 0.6
+    given, scores = replace(true, images=images), list[float]()
     for exposure in (False, True):
         extras = Extras(exposure=exposure)
         found = qgs.refine(cloud(60), given, 300, swept=0.0, extras=extras).gaussians
         scores.append(mean_psnr(found, true, RENDERER))
-    assert scores[1] > scores[0] + 1
+    assert scores[1] > scores[0] + 0.5
 
 
 def test_harmonics_grow_with_time() -> None:

@@ -16,6 +16,8 @@ def model(folder: Path) -> Path:
     """A COLMAP model of one camera and one image, without points."""
     place = folder / "sparse/0"
     place.mkdir(parents=True)
+    (folder / "images").mkdir()
+    (folder / "images/a.png").touch()
     (place / "cameras.txt").write_text("1 PINHOLE 8 8 8 8 4 4\n")
     (place / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
     return place

@@ -3,6 +3,8 @@
 import io
 import json
 import shlex
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock as Mock
@@ -22,11 +24,15 @@ from qgs_refine.planning import (
     held_out_frames,
     sized,
 )
+from qgs_refine.refining import Extras
+from qgs_refine.scene import photos_start, photos_world
 from rich.console import Console
 from test_refining import RENDERER, cloud, ring
 
 import qgs
+from qgs.data.samples import views_in
 from qgs.drawing.images import rgb_picture
+from qgs.geometry.transforms import matrix_to_quat, moved
 
 FEW = ("--size", "32x48", "--gaussians", "300")
 
@@ -169,5 +175,33 @@ def test_a_plan_is_a_command_line() -> None:
     assert words[5:] == [
         *("--scene", "walk", "--model", "rooms/locus-64", "--frames", "a b.jpg,c.jpg"),
         *("--scale", "0.38197", "--size", "64x112", "--gaussians", "900", "--seconds", "30"),
-        *("--holdout", "8"),
+        *("--holdout", "8", "--degree", "0"),
     ]
+    extras = Extras(degree=2, exposure=True, poses=True)
+    words = shlex.split(replace(plan, extras=extras, masks=True).command("photos", "out"))
+    assert words[-5:] == ["--degree", "2", "--exposure", "--refine-poses", "--masks"]
+
+
+def test_points_of_colmap_are_part_of_the_start(photos: Path, tmp_path: Path) -> None:
+    """The folder with its cameras as a COLMAP model, whose one point is far to the side."""
+    place = tmp_path / "sparse/0"
+    place.mkdir(parents=True)
+    (tmp_path / "images").mkdir()
+    lines = list[str]()
+    for number, camera in enumerate(json.loads((photos / "cameras.json").read_text())):
+        w2c = torch.tensor(camera["c2w"]).inverse()
+        values = [*matrix_to_quat(w2c[:3, :3]).tolist(), *w2c[:3, 3].tolist()]
+        lines.append(f"{number + 1} {' '.join(map(str, values))} 1 {number}.png\n\n")
+        shutil.copy(photos / f"{number}.png", tmp_path / "images")
+    (place / "images.txt").write_text("".join(lines))
+    (place / "cameras.txt").write_text("1 PINHOLE 48 32 48 48 24 16\n")
+    (place / "points3D.txt").write_text("1 5 6 7 255 0 0 0.5 1 1\n")
+    scenes = Scenes(str(tmp_path), None, "8", None, None)
+    world = photos_world(scenes)
+    views = views_in(world, scenes.probe, scenes.frames)
+    found = photos_start(str(tmp_path), world, views, 100, 40)
+    assert found.count == 41
+    point = moved(found, world[0], 1 / float(world[1])).means[0, 0]
+    torch.testing.assert_close(point, torch.tensor([5.0, 6, 7]), atol=1e-4, rtol=0)
+    plain = photos_world(Scenes(str(photos), None, "8", None, None))
+    assert photos_start(str(photos), plain, views, 100, 40).count == making.TIMED

@@ -7,9 +7,10 @@ from torch import Tensor
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Cameras
 
-_RATES = {"poses": 3e-4, "colours": 2e-3}
+_RATES = {"poses": 3e-4, "colours": 5e-3}
 _LAST = 0.1  # final learning rates over the first
-_HELD = 0.1  # weight of the squares of a photo's colour map: their mean stays near that of all
+# Weights of squares, so that the world and its colours stay where they are in the mean.
+_HELD = {"poses": 10.0, "colours": 0.1}
 
 
 class Adjustments:
@@ -51,13 +52,18 @@ class Adjustments:
             each = [self.cameras(v, cameras[:, v : v + 1]).c2w for v in range(len(self._poses))]
         return Cameras(torch.cat(each, 1), cameras.intrinsics, cameras.size)
 
-    def seen(self, photo: int, rgb: Tensor) -> tuple[Tensor, Tensor | float]:
-        """Rendered rgb (1, 1, 3, H, W) in the exposure of a photo, and what that costs."""
+    def seen(self, photo: int, rgb: Tensor) -> Tensor:
+        """Rendered rgb (1, 1, 3, H, W) in the exposure of a photo."""
         if not self._colours:
-            return rgb, 0.0
+            return rgb
         change = self._colours[photo]
-        turned = torch.einsum("ij,bvjhw->bvihw", change[:, :3], rgb) + change[:, 3, None, None]
-        return rgb + turned, _HELD * change.square().sum()
+        turned = torch.einsum("ij,bvjhw->bvihw", change[:, :3], rgb)
+        return rgb + turned + change[:, 3, None, None]
+
+    def cost(self, photo: int) -> Tensor | float:
+        """What the corrections of a photo add to the loss."""
+        parts = {"poses": self._poses, "colours": self._colours}
+        return sum(_HELD[k] * p[photo].square().sum() for k, p in parts.items() if p)
 
     def step(self, used: float) -> None:
         """Follow the gradients of a step. used: part of the budget spent so far."""

@@ -225,11 +225,12 @@ class _Run:
         gaussians = self.free.gaussians()
         cameras = self.adjustments.cameras(place, photo.cameras)
         rgb = self.renderer(replace(gaussians, features=None), cameras).rgb
-        rgb, held = self.adjustments.seen(place, rgb)
+        rgb = self.adjustments.seen(place, rgb)
         error = mean_squared_error(rgb, photo.images)
         loss = error + _SSIM * (1 - mean_ssim(rgb, photo.images, "same"))
         spread = gaussians.opacities.mean() + gaussians.scales.mean() / self.size
-        loss = loss + max(_SMALL, _SMALL_OF_FEW / views.images.shape[1]) * spread + held
+        loss = loss + max(_SMALL, _SMALL_OF_FEW / views.images.shape[1]) * spread
+        loss = loss + self.adjustments.cost(place)
         self.free.optimizer.zero_grad()
         loss.backward()
         self.free.optimizer.step()
