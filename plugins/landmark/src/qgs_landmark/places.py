@@ -54,20 +54,22 @@ def sampled(
 
     maps_BMC: values of the patches of a grid (V, rows, columns), by view, row and column.
     """
-    _, rows, columns = grid
-    sizes_2 = place_BN2.new_tensor([columns, rows])
-    at_BN2 = (place_BN2 * sizes_2 - 0.5).clamp_min(0).minimum(sizes_2 - 1)
-    first_BN2 = at_BN2.floor()
-    far_BN2 = at_BN2 - first_BN2
-    total_BNC = torch.zeros_like(maps_BMC[:, :1])
-    for x, y in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        step_2 = place_BN2.new_tensor([x, y])
-        column_BN, row_BN = (first_BN2 + step_2).minimum(sizes_2 - 1).long().unbind(-1)
-        index_BN = (view_N * rows + row_BN) * columns + column_BN
-        share_BN1 = (1 - step_2 + (2 * step_2 - 1) * far_BN2).prod(-1, keepdim=True)
-        found_BNC = maps_BMC.take_along_dim(index_BN[..., None], 1)
-        total_BNC = total_BNC + share_BN1.to(maps_BMC) * found_BNC
-    return total_BNC
+    maps_BVChw = maps_BMC.unflatten(1, grid).movedim(-1, 2)
+    return bilinear(maps_BVChw, view_N, place_BN2[:, :, None])[..., 0].mT
+
+
+def bilinear(maps_BVCHW: Tensor, view_N: Tensor, place_BNX2: Tensor) -> Tensor:
+    """Values (B, C, N, X) at places of the maps `view_N`; outside of one those of its edge."""
+    photos, height, width = maps_BVCHW.shape[1], *maps_BVCHW.shape[-2:]
+    # All maps as one, one below another: places keep half a pixel from the edges of theirs.
+    edge_2 = place_BNX2.new_tensor([0.5 / width, 0.5 / height])
+    x_BNX, y_BNX = place_BNX2.maximum(edge_2).minimum(1 - edge_2).unbind(-1)
+    y_BNX = (y_BNX + view_N[:, None]) / photos
+    column, grid = maps_BVCHW.transpose(1, 2).flatten(2, 3), torch.stack([x_BNX, y_BNX], -1)
+    # Places have no digits in half precision, and features of float64 keep theirs.
+    kind = torch.promote_types(column.dtype, grid.dtype)
+    found = F.grid_sample(column.to(kind), 2 * grid.to(kind) - 1, align_corners=False)
+    return found.to(column.dtype)
 
 
 @full_precision

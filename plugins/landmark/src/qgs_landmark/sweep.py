@@ -1,12 +1,11 @@
 """A sweep over depths: how well the photos agree about what a place of one of them shows."""
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.geometry.precision import full_precision
 from qgs.types import Cameras, Views
-from qgs_landmark.places import cells, rays_at
+from qgs_landmark.places import bilinear, cells, rays_at
 
 LEAST_SEEN = 0.5
 """Share of a window that another photo must see for its colours to count."""
@@ -43,18 +42,6 @@ def mismatch(
         counts_BND = seen_BNDP.to(error_BND).mean(-1) >= LEAST_SEEN
         total_BND, count_BND = total_BND + error_BND * counts_BND, count_BND + counts_BND
     return total_BND / count_BND.clamp_min(1), count_BND > 0
-
-
-def bilinear(images_BV3HW: Tensor, view_N: Tensor, place_BNX2: Tensor) -> Tensor:
-    """RGB (B, 3, N, X) at places of the photos `view_N`; outside of one those of its edge."""
-    _, photos, _, height, width = images_BV3HW.shape
-    # All photos as one, one below another: places keep half a pixel from the edges of theirs.
-    edge_2 = place_BNX2.new_tensor([0.5 / width, 0.5 / height])
-    x_BNX, y_BNX = place_BNX2.maximum(edge_2).minimum(1 - edge_2).unbind(-1)
-    y_BNX = (y_BNX + view_N[:, None]) / photos
-    column = images_BV3HW.transpose(1, 2).flatten(2, 3)
-    grid = 2 * torch.stack([x_BNX, y_BNX], -1) - 1
-    return F.grid_sample(column, grid, align_corners=False)
 
 
 def reprojected(
