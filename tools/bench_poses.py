@@ -11,12 +11,11 @@ the largest distance of two cameras.
 import argparse
 import json
 from collections.abc import Sequence
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import numpy as np
 from PIL import Image
+from qgs_poses.film import write_film
 from qgs_poses.making import Options, make_poses
 from rich.console import Console
 
@@ -37,20 +36,6 @@ def aligned(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return np.degrees(np.arccos(cosine)), distances / extent
 
 
-def write_video(files: Sequence[Path], path: Path, rate: int) -> None:
-    """An mp4 of images of one size, the shorter time of each 1 / rate s."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=rate, options={"crf": "18"})
-        with Image.open(files[0]) as first:
-            stream.width, stream.height = (side // 2 * 2 for side in first.size)
-        stream.pix_fmt, stream.time_base = "yuv420p", Fraction(1, rate)
-        for file in files:
-            with Image.open(file) as image:
-                frame = av.VideoFrame.from_image(image.convert("RGB"))
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", nargs="+", type=Path)
@@ -67,7 +52,8 @@ def main() -> None:
         source = photos
         if arguments.video:
             source = photos / "video.mp4"
-            write_video(files, source, arguments.video)
+            pictures = (np.array(Image.open(file).convert("RGB")) for file in files)
+            write_film(pictures, source, arguments.video)
         else:
             for file in files:
                 (photos / file.name).symlink_to(file.resolve())

@@ -76,7 +76,7 @@ def test_a_killed_call_is_finished_and_finished_ones_stay(walk, tmp_path, monkey
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(making, "_finished", killed)
+        patch.setattr(making, "_moved", killed)
         with pytest.raises(KeyboardInterrupt):
             make_poses(walk, out, Options(), quiet())
     assert read_record(out) is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -67,7 +68,7 @@ def poses(
     console = Console()
     options = Options(frames, side, matching, features, seed=seed)
     if threads:
-        options = Options(frames, side, matching, features, threads, seed)
+        options = replace(options, threads=threads)
     made = make_poses(source, out or beside(source), options, console)
     for line in made.summary:
         _line(console, line)

@@ -24,10 +24,7 @@ def pictures(
 ) -> Iterator[np.ndarray]:
     """The scene (1, G) from each camera (1, T) of a path, uint8 (H, W, 3)."""
     for frame in range(path.shape[1]):
-        camera = Cameras(
-            path.c2w[:, frame : frame + 1], path.intrinsics[:, frame : frame + 1], path.size
-        )
-        yield rgb_picture(renderer(gaussians, camera).rgb[0, 0])
+        yield rgb_picture(renderer(gaussians, path[:, frame : frame + 1]).rgb[0, 0])
         progress(frame + 1)
 
 

@@ -104,9 +104,7 @@ def lenses(path: Cameras, size: tuple[int, int], fov: float | None) -> torch.Ten
 def seen_depth(stage: Stage) -> float:
     """The median depth of what the first, the middle and the last camera see."""
     count = stage.cameras.shape[1]
-    some = [0, count // 2, count - 1]
-    few = Cameras(stage.cameras.c2w[:, some], stage.cameras.intrinsics[:, some], stage.cameras.size)
-    rendered = stage.renderer(stage.gaussians, few)
+    rendered = stage.renderer(stage.gaussians, stage.cameras[:, [0, count // 2, count - 1]])
     seen = rendered.depth[rendered.alpha > 0.5]
     return float(seen.median()) if seen.numel() else 1.0
 

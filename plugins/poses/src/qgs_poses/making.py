@@ -5,7 +5,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -128,7 +128,7 @@ def make_locked(source: Path, out: Path, options: Options, console: Console) -> 
             shutil.rmtree(out / IMAGES, ignore_errors=True)
             working.mkdir()
             write_text(working / "begun.json", json.dumps(of))
-        remarks, names = list[str](), None
+        remarks = list[str]()
         if source.is_file():
             files, remarks = _frames(source, working / "frames", options, bars)
         else:
@@ -138,8 +138,19 @@ def make_locked(source: Path, out: Path, options: Options, console: Console) -> 
         photos, faulty = _ready(files, out, options, bars)
         refuse_hopeless(photos, faulty, str(source))
         result = _mapped(photos, out, options, source.is_file(), bars)
-        made = _finished(photos, out, result, bars)
-        made = replace(made, faulty=faulty, remarks=remarks)
+        posed, *others = _moved(result, out)
+        without = [photo.name for photo in photos if photo.name not in {*posed}]
+        made = Made(
+            folder=out,
+            posed=posed,
+            without=without,
+            others=others,
+            faulty=faulty,
+            remarks=remarks,
+            seconds=dict(bars.ended()),
+            error=result["error"],
+            points=result["points"],
+        )
         record = {**of, "made_by": "qgs poses", "seconds": made.seconds}
         record |= {"posed": made.posed, "without": made.without, "error": made.error}
         write_text(out / RECORD, json.dumps(record, indent=1))
@@ -315,13 +326,9 @@ def _mapped(
     return result
 
 
-def _finished(photos: Sequence[Photo], out: Path, result: Mapping[str, Any], bars: Bars) -> Made:
-    """Move the largest model to `out`/sparse/0, and count its photos."""
-    posed, *others = result["models"]
-    names = [photo.name for photo in photos]
+def _moved(result: Mapping[str, Any], out: Path) -> Sequence[Sequence[str]]:
+    """The photos of each model, the largest first, which now is `out`/sparse/0."""
     (out / SPARSE).mkdir(exist_ok=True)
     shutil.rmtree(out / SPARSE / "0", ignore_errors=True)
     (out / WORKING / "models" / "best").rename(out / SPARSE / "0")
-    without = [name for name in names if name not in {*posed}]
-    numbers = dict(bars.ended()), result["error"], result["points"]
-    return Made(out, posed, without, others, {}, (), *numbers)
+    return result["models"]
