@@ -22,21 +22,21 @@ class Adjustments:
     """
 
     def __init__(self, photos: int, poses: bool, exposure: bool, size: float, like: Tensor) -> None:
-        self.size, self._poses, self._colours = size, list[Tensor](), list[Tensor]()
-        if poses:
-            self._poses = [like.new_zeros(6).requires_grad_() for _ in range(photos)]
-        if exposure:
-            self._colours = [like.new_zeros(3, 4).requires_grad_() for _ in range(photos)]
-        parts = {"poses": self._poses, "colours": self._colours}
-        groups = [{"params": p, "lr": _RATES[k], "name": k} for k, p in parts.items() if p]
+        self.size = size
+        shapes = ({"poses": (6,)} if poses else {}) | ({"colours": (3, 4)} if exposure else {})
+        self._parts = {
+            name: [like.new_zeros(shape).requires_grad_() for _ in range(photos)]
+            for name, shape in shapes.items()
+        }
+        groups = [{"params": p, "lr": _RATES[k], "name": k} for k, p in self._parts.items()]
         # one tensor a photo: Adam leaves those without a gradient where they are
         self._optimizer = torch.optim.Adam(groups, eps=1e-15) if groups else None
 
     def cameras(self, photo: int, cameras: Cameras) -> Cameras:
         """Cameras (1, 1) of a photo, as corrected."""
-        if not self._poses:
+        if "poses" not in self._parts:
             return cameras
-        turn, shift = self._poses[photo].split(3)
+        turn, shift = self._parts["poses"][photo].split(3)
         quat = F.normalize(torch.cat([turn.new_ones(1), turn]), dim=0)
         move = torch.eye(4).to(turn)
         move = torch.cat(
@@ -46,24 +46,23 @@ class Adjustments:
 
     def every_camera(self, cameras: Cameras) -> Cameras:
         """Cameras (1, V) of all photos, as corrected, without gradients."""
-        if not self._poses:
+        if "poses" not in self._parts:
             return cameras
         with torch.no_grad():
-            each = [self.cameras(v, cameras[:, v : v + 1]).c2w for v in range(len(self._poses))]
+            each = [self.cameras(v, cameras[:, v : v + 1]).c2w for v in range(cameras.shape[1])]
         return Cameras(torch.cat(each, 1), cameras.intrinsics, cameras.size)
 
     def seen(self, photo: int, rgb: Tensor) -> Tensor:
         """Rendered rgb (1, 1, 3, H, W) in the exposure of a photo."""
-        if not self._colours:
+        if "colours" not in self._parts:
             return rgb
-        change = self._colours[photo]
+        change = self._parts["colours"][photo]
         turned = torch.einsum("ij,bvjhw->bvihw", change[:, :3], rgb)
         return rgb + turned + change[:, 3, None, None]
 
     def cost(self, photo: int) -> Tensor | float:
         """What the corrections of a photo add to the loss."""
-        parts = {"poses": self._poses, "colours": self._colours}
-        return sum(_HELD[k] * p[photo].square().sum() for k, p in parts.items() if p)
+        return sum(_HELD[k] * p[photo].square().sum() for k, p in self._parts.items())
 
     def step(self, used: float) -> None:
         """Follow the gradients of a step. used: part of the budget spent so far."""
