@@ -14,7 +14,7 @@ from qgs.composer.decode import Chosen
 from qgs.composer.errors import Problems, RecipeError, RecipeProblem
 from qgs.composer.places import near_pattern
 from qgs.composer.registry import BUILTIN, component_failure
-from qgs.composer.slots import MODEL_SLOTS, SUBLAYER_SLOTS
+from qgs.composer.slots import AFTER_LAYERS, SUBLAYER_SLOTS
 from qgs.composer.yaml_text import KeyPath, MapNode, find
 from qgs.contracts import (
     Component,
@@ -78,7 +78,7 @@ def build_model(
             decoder=decoder,
             refinements=refinements,
             recipe=tree,
-            **{name: at(name) for name in MODEL_SLOTS if name not in ("encoder", "queries")},
+            **{name: at(name) for name in AFTER_LAYERS},
         )
     return model if on_meta or device is None else model.to(device)
 

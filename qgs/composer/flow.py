@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 from qgs.composer.decode import Chosen
 from qgs.composer.errors import Problems
 from qgs.composer.registry import Registry, component_failure, default_config
-from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SUBLAYER_SLOTS
+from qgs.composer.slots import AFTER_LAYERS, LAYER_SLOTS, SUBLAYER_SLOTS
 from qgs.composer.yaml_text import KeyPath, MapNode, find
 from qgs.contracts import Refinement, Supervision
 from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpec, RecipeContext
@@ -15,7 +15,7 @@ from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpe
 Parts: TypeAlias = Mapping[KeyPath, Chosen | None]
 """What stands at each place; None for a component that could not be decoded."""
 
-_FLOW = ("encoder", "queries", *LAYER_SLOTS, *MODEL_SLOTS[2:], "losses", "objective")
+_FLOW = ("encoder", "queries", *LAYER_SLOTS, *AFTER_LAYERS, "losses", "objective")
 """Slots that read or write fields, in the order in which a layer's prediction is made."""
 
 

@@ -55,7 +55,8 @@ SLOTS = {
         Slot(contracts.ViewSampler, "qgs/span"),
     )
 }
-MODEL_SLOTS = ("encoder", "queries", "feedback", "head", "centers", "supervision", "renderer")
+AFTER_LAYERS = ("feedback", "head", "centers", "supervision", "renderer")
+MODEL_SLOTS = ("encoder", "queries", *AFTER_LAYERS)
 SUBLAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward")
 LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
 _SECTIONS = ("losses", "objective", "data", "view_sampler", "metrics", "optimizer")
