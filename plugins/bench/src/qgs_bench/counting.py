@@ -4,6 +4,7 @@ The pass runs on tensors without numbers (torch's FakeTensorMode) while a dispat
 storage and every operator. Compiled kernels are not called; of them the renderer is counted.
 """
 
+import gc
 import math
 import weakref
 from collections import Counter
@@ -72,8 +73,10 @@ def count(recipe: Recipe, operation: Operation, workload: Workload) -> Count:
             found.append(error)
 
     thread = Thread(target=run)  # components keep buffers by thread: no fake one may stay in ours
+    gc.freeze()  # a pass makes many objects: each collection would search all of torch again
     thread.start()
     thread.join()
+    gc.unfreeze()
     if isinstance(found[0], Count):
         return found[0]
     reason = str(found[0]).partition("\n")[0]

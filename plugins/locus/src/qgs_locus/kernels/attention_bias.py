@@ -301,22 +301,25 @@ def _attention_gradients(
     scale = q.shape[-1] ** -0.5
     dq, dk, dv = (torch.zeros_like(x) if needs[n] else None for n, x in enumerate(saved[:3]))
     of_bias = _BiasGradients(queries, tokens, bias)
-    q, rowsum = q * scale, (gradient * out).sum(-1)  # rowsum is that of P * dP, without either
+    q = q * scale
+    rowsum = (gradient * out).sum(-1, keepdim=True)  # that of P * dP, without either
     for scene, rows, (b, total, p, ds) in bias.blocks(4, lse.dtype):
         bias.write(queries[scene, rows], tokens[scene], b)
-        for head in range(q.shape[1]):
-            of_queries, of_tokens = (scene, head, rows), (scene, head)
+        of_queries = (x[scene, :, rows] for x in (q, gradient, lse[..., None], rowsum))
+        of_tokens = k[scene], v[scene]
+        each_head = enumerate(zip(*of_queries, *of_tokens, strict=True))
+        for head, (q_nd, do_nd, lse_n1, rowsum_n1, k_Md, v_Md) in each_head:
             # p = exp(q k + b - lse), each step into memory that is there already
-            torch.sub(b, lse[of_queries][:, None], out=p)
-            p.addmm_(q[of_queries], k[of_tokens].mT).exp_()
+            torch.sub(b, lse_n1, out=p)
+            p.addmm_(q_nd, k_Md.mT).exp_()
             if dv is not None:
-                dv[of_tokens].addmm_(p.mT, gradient[of_queries])
-            torch.mm(gradient[of_queries], v[of_tokens].mT, out=ds)
-            ds.sub_(rowsum[of_queries][:, None]).mul_(p)
+                dv[scene, head].addmm_(p.mT, do_nd)
+            torch.mm(do_nd, v_Md.mT, out=ds)
+            ds.sub_(rowsum_n1).mul_(p)
             if dq is not None:
-                dq[of_queries] = ds @ k[of_tokens]
+                dq[scene, head, rows] = ds @ k_Md
             if dk is not None:
-                dk[of_tokens].addmm_(ds.mT, q[of_queries])
+                dk[scene, head].addmm_(ds.mT, q_nd)
             if of_bias.wanted:
                 total.copy_(ds) if head == 0 else total.add_(ds)
         if of_bias.wanted:
