@@ -7,6 +7,7 @@ from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import Centers, ComponentConfig
+from qgs.geometry.constants import constant
 from qgs.geometry.precision import at_least_float32, full_precision
 from qgs.types import QueryState
 
@@ -68,4 +69,4 @@ class OffsetCenters(Centers):
 
 
 def _further(means: Tensor, z: float) -> Tensor:
-    return means + torch.tensor([0.0, 0.0, z]).to(means)
+    return means + constant([0.0, 0.0, z], means)

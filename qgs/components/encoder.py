@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 
-import torch
 from einops import rearrange, repeat
 from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components.blocks import NORM_EPS, LayerScale, Mlp, SelfAttentionCore, split_heads
 from qgs.contracts import ModelDims, PatchEncoder
+from qgs.geometry.constants import constant
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.types import ImageMemory, Views
 
@@ -146,7 +146,5 @@ def _larger(kernel: Tensor, side: int) -> Tensor:
 def imagenet_normalised(images: Tensor) -> Tensor:
     """(RGB - mean) / std of ImageNet, for images (..., 3, H, W) in [0, 1]."""
     # ImageNet's statistics, as in the release: for other photos they centre well enough.
-    options = {"dtype": images.dtype, "device": images.device}
-    mean = torch.tensor(IMAGENET_MEAN, **options).view(3, 1, 1)
-    std = torch.tensor(IMAGENET_STD, **options).view(3, 1, 1)
+    mean, std = (constant(x, images)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
     return (images - mean) / std

@@ -8,6 +8,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from torch import Tensor
 
 from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpec, OptionError
+from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import seen_colors
 from qgs.types import Cameras, Gaussians, Rendering
 
@@ -127,7 +128,7 @@ def background_of(
 ) -> Tensor:
     """The background RGB (3,) in the dtype and on the device of `like`."""
     if background is None:
-        return torch.tensor(configured, dtype=like.dtype, device=like.device)
+        return constant(configured, like)
     if background.shape != (3,):
         raise ValueError(f"background must be one RGB of shape (3,), got {tuple(background.shape)}")
     return background.to(like)

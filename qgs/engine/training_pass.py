@@ -12,6 +12,7 @@ from qgs.composer import Recipe
 from qgs.contracts import Loss, Objective, Outcome
 from qgs.contracts.schedule import follow
 from qgs.engine.precision import no_autocast
+from qgs.geometry.constants import constant
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import (
@@ -182,7 +183,7 @@ class TrainingPass(nn.Module):
 
     @torch.no_grad()
     def _signs(self, rendering: Rendering, target: Views) -> dict[str, Tensor]:
-        background = rendering.rgb.new_tensor(self.model.renderer.config.background)
+        background = constant(self.model.renderer.config.background, rendering.rgb)
         alpha, deviation = measure(rendering.rgb, rendering.alpha, background)
         likeness = psnr(rendering.rgb, target.images).mean()
         return {"psnr": likeness, "alpha": alpha, "deviation": deviation}

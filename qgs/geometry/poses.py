@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from qgs.geometry.constants import constant
 from qgs.geometry.precision import full_precision
 
 _PARALLEL = 3e-4  # mean squared sine of the axes' angles to their mean; 1 degree
@@ -34,7 +35,7 @@ def look_at(eye: Tensor, forward: Tensor, down: Tensor) -> Tensor:
     down = F.normalize(down - (down * forward).sum(-1, keepdim=True) * forward, dim=-1)
     right = torch.linalg.cross(down, forward)
     top = torch.stack([right, down, forward, eye], -1)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    bottom = constant([0.0, 0.0, 0.0, 1.0], top).expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, bottom], -2)
 
 

@@ -8,6 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import Loss, Problem, RecipeContext, without_effect
+from qgs.geometry.constants import constant
 from qgs.geometry.precision import full_precision
 from qgs.losses.opacity import mean_of_gaussians
 from qgs.types import Cameras, LayerPrediction, Rendering, Views
@@ -137,7 +138,7 @@ def _image_excess(
     pixels = focal * xy / torch.where(at_zero, 1.0, z) + principal
     pixels = torch.where(at_zero, torch.where(xy == 0, 0.0, infinite_pixel * xy.sign()), pixels)
     height, width = cameras.size
-    normalised = 2 * pixels / pixels.new_tensor([width, height]) - 1
+    normalised = 2 * pixels / constant([width, height], pixels) - 1
     excess = (normalised.abs() - 1).relu().sum(-1)
     if behind is None:
         return excess

@@ -65,7 +65,9 @@ def depthsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     found["dino_positions"] = predictor.pretrained.positions(*grid)
     first = torch.arange(near.shape[1]).expand(len(near), -1)[..., None]
     found["neighbours"] = torch.cat([first, neighbours], -1)
-    found["shift_mask"] = shift_mask(*(side // encoder.config.stride for side in size))
+    found["shift_mask"] = shift_mask(
+        *(side // encoder.config.stride for side in size), device=near.device
+    )
     swept(found, predictor, sweep)
     return found | gaussians(views, numbers, encoder.dims)
 
@@ -150,7 +152,7 @@ def gaussians(views: Views, numbers_BVCHW: Tensor, dims: ModelDims) -> dict[str,
     state = PixelQueries(PixelQueries.Config(), dims)(memory, views)
     out, means = decoded(state, dims)
     factors = quat_to_matrix(out.quats) * out.scales[..., None, :]
-    turn = turn_of_harmonics(cameras.c2w[..., :3, :3], DEGREE) * band_mask(DEGREE)
+    turn = turn_of_harmonics(cameras.c2w[..., :3, :3], DEGREE) * band_mask(DEGREE, cameras.c2w)
     sh = numbers[..., 11:38].unflatten(-1, (3, -1))
     row, column = torch.meshgrid(*(torch.arange(n) for n in size), indexing="ij")
     place = torch.stack([column, row], -1) + numbers[..., 2:4].sigmoid()

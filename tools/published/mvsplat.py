@@ -53,7 +53,7 @@ def mvsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     found, count = kept.found, encoder.config.candidates
     found["disparity_candidates"] = disparity = inverse_depth_candidates(near, far, count)
     found["match_pdf"] = found["match_logits"].softmax(2)
-    neighbours = cyclic_neighbours(*near.shape)
+    neighbours = cyclic_neighbours(*near.shape, device=near.device)
     sweep = Sweep(views.cameras, neighbours, near, far)
     coarse = encoder.depth_predictor.match(found["features"], sweep)[0]
     found["coarse_disparity"] = coarse.unflatten(0, near.shape)
@@ -62,7 +62,7 @@ def mvsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     depth = (1 / disparity)[:, :, None, :, None, None].expand(*poses.shape[:3], -1, *low)
     grid = warp_grid(*(x.flatten(0, 2) for x in (depth, lens, poses)))
     found["warp_grid"] = grid.unflatten(0, poses.shape[:3])
-    found["shift_mask"] = shift_mask(*low)
+    found["shift_mask"] = shift_mask(*low, device=near.device)
     return found | gaussians(views, raw, encoder.dims)
 
 
@@ -98,7 +98,7 @@ def gaussians(views: Views, raw_BVCHW: Tensor, dims: ModelDims) -> dict[str, Ten
     factors = quat_to_matrix(out.quats) * out.scales[..., None, :]
     sh = raw[..., 11:].unflatten(-1, (3, -1))
     degree = round(sh.shape[-1] ** 0.5) - 1
-    turn = turn_of_harmonics(cameras.c2w[..., :3, :3], degree) * band_mask(degree)
+    turn = turn_of_harmonics(cameras.c2w[..., :3, :3], degree) * band_mask(degree, cameras.c2w)
     row, column = torch.meshgrid(*(torch.arange(n) for n in size), indexing="ij")
     place = torch.stack([column, row], -1) + raw[..., 2:4].sigmoid()
     return {

@@ -53,7 +53,7 @@ def single_gaussians(golden: GoldenFile) -> dict[str, Tensor]:
     )
     centers = OnRays(OnRays.Config(measure="distance" if of_rays else "depth"), dims)
     factors = quat_to_matrix(head.quats) * head.scales[..., None, :]
-    turn = turn_of_harmonics(c2w[:, :3, :3], degree) * band_mask(degree)
+    turn = turn_of_harmonics(c2w[:, :3, :3], degree) * band_mask(degree, c2w)
     directions = ray_directions(numbers[:, :, None, 2:4], fields[PIXEL], unit=of_rays)
     return {
         "origins": fields[PIXEL][:, 0, 0],

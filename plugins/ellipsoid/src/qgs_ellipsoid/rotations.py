@@ -4,6 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from qgs.geometry.constants import constant
 from qgs.geometry.precision import full_precision
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
@@ -12,7 +13,7 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 def unit(v: Tensor, otherwise: tuple[float, ...]) -> Tensor:
     """Vectors (..., C) of length 1; `otherwise` for those of length 0."""
     length = v.norm(dim=-1, keepdim=True)
-    return torch.where(length > 0, v / torch.where(length > 0, length, 1), v.new_tensor(otherwise))
+    return torch.where(length > 0, v / torch.where(length > 0, length, 1), constant(otherwise, v))
 
 
 @full_precision

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from qgs.components import Mlp
 from qgs.contracts import Fields, FieldSpec, ModelDims, PatchEncoder, memory_fields
+from qgs.geometry.constants import constant
 from qgs.geometry.precision import full_precision
 from qgs.geometry.rays import plucker_rays
 from qgs.types import Cameras, ImageMemory, Views
@@ -86,7 +87,7 @@ def _tokens(embedding: nn.Conv2d, images: Tensor) -> Tensor:
 def lens(cameras: Cameras) -> Tensor:
     """(..., 4): log of the focal lengths, then the principal point, in sides of the image."""
     height, width = cameras.size
-    sides = cameras.intrinsics.new_tensor([width, height])
+    sides = constant([width, height], cameras.intrinsics)
     focal, principal = (cameras.intrinsics / sides.repeat(2)).chunk(2, -1)
     return torch.cat([focal.log(), principal], -1)
 

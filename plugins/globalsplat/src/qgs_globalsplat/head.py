@@ -20,6 +20,7 @@ from qgs.contracts import (
     Problem,
     RecipeContext,
 )
+from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.precision import full_precision
 from qgs.types import GaussianAttributes, QueryState
@@ -133,7 +134,7 @@ class MergingHead(Head):
         low, high = math.log(config.scale_min) - 1, math.log(config.scale_max) + 2
         log_scale = (log_scale + config.scale_bias).clamp(low, high)
         # Zeros would be no rotation; this starts every candidate at the identity.
-        rotation = rotation + rotation.new_tensor([1, 0, 0, 0, 1, 0])
+        rotation = rotation + constant([1, 0, 0, 0, 1, 0], rotation)
         # Logs of transmittance add up where Gaussians overlap; opacities do not.
         clear = -F.softplus(opacity + config.opacity_bias)
         return torch.cat([place, log_scale, rotation, clear], -1)

@@ -23,6 +23,7 @@ from qgs.contracts import (
     RecipeContext,
     memory_fields,
 )
+from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.precision import at_least_float32, full_precision
 from qgs.types import Cameras, GaussianAttributes, ImageMemory, QueryState, Views
@@ -197,5 +198,5 @@ class PixelHead(Head):
 def _unit(quats: Tensor) -> Tensor:
     """Quaternions (..., 4) of length 1; the identity for those of length 0."""
     length = quats.norm(dim=-1, keepdim=True)
-    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+    identity = constant([1.0, 0.0, 0.0, 0.0], quats)
     return torch.where(length > 0, quats / torch.where(length > 0, length, 1), identity)

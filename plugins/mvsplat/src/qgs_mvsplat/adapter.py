@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import rotated
 from qgs.geometry.precision import full_precision
 
@@ -47,14 +48,11 @@ def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
 
 
 @cache
-def _samples() -> Tensor:
+def _samples(degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Directions all around (64, 3), and the pseudo-inverse of the harmonics there."""
     generator = torch.Generator().manual_seed(0)
-    return F.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=-1)
-
-
-@cache
-def _inverse_at_samples(degree: int) -> Tensor:
-    return torch.linalg.pinv(e3nn_harmonics(_samples(), degree))
+    around = F.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=-1)
+    return around.to(device), torch.linalg.pinv(e3nn_harmonics(around, degree)).to(device)
 
 
 @full_precision
@@ -64,23 +62,26 @@ def turn_of_harmonics(rotation: Tensor, degree: int) -> Tensor:
     By least squares in float64 from values at directions all around, which is exact, and keeps the
     digits that Euler angles of small tilts lose in the released code.
     """
-    directions, inverse = (x.to(rotation.device) for x in (_samples(), _inverse_at_samples(degree)))
+    directions, inverse = _samples(degree, rotation.device)
     turned = torch.einsum("...ij,sj->...si", rotation.double(), directions)
     # Y(R d) = D Y(d) for every direction d.
     return (inverse @ e3nn_harmonics(turned, degree)).mT.to(rotation.dtype)
 
 
 @cache
-def _basis_change(count: int) -> Tensor:
+def _basis_change(degree: int, device: torch.device) -> Tensor:
     # The family's rasteriser evaluates the functions of 3DGS at (z, x, y) of a direction.
     cycle = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=torch.float64)
-    return rotated(torch.eye(count, dtype=torch.float64), cycle)
+    count = coefficients(min(degree, SH_DEGREE))
+    change = torch.eye(coefficients(degree), dtype=torch.float64)
+    change[1:count, 1:count] = rotated(torch.eye(count - 1, dtype=torch.float64), cycle)
+    return change.to(device)
 
 
-def band_mask(degree: int) -> Tensor:
+def band_mask(degree: int, like: Tensor) -> Tensor:
     """What the family multiplies raw coefficients (K) with: 1, then .1 / 4^l in degree l."""
     each = [1.0, *(0.1 * 0.25**n for n in range(1, degree + 1))]
-    return torch.tensor([x for n, x in enumerate(each) for _ in range(2 * n + 1)])
+    return constant([x for n, x in enumerate(each) for _ in range(2 * n + 1)], like)
 
 
 @full_precision
@@ -92,11 +93,8 @@ def world_harmonics(rotation: Tensor, degree: int) -> Tensor:
     change of basis, and they do not commute: the family turns in e3nn's basis, but its rasteriser
     has other signs there; published weights expect that order.
     """
-    turn = turn_of_harmonics(rotation, degree) * band_mask(degree).to(rotation)
-    change = torch.eye(coefficients(degree), dtype=torch.float64)
-    count = coefficients(min(degree, SH_DEGREE))
-    change[1:count, 1:count] = _basis_change(count - 1)
-    return change.to(rotation) @ turn
+    turn = turn_of_harmonics(rotation, degree) * band_mask(degree, rotation)
+    return _basis_change(degree, rotation.device).to(rotation) @ turn
 
 
 def quaternions(rotation: Tensor) -> Tensor:
@@ -132,7 +130,7 @@ def world_quaternions(camera_xyzw: Tensor, turn_wxyz: Tensor) -> Tensor:
     """Unit quaternions (..., 4), w x y z, in the world; a zero one is no rotation at all."""
     own = camera_xyzw.roll(1, -1)
     length = own.norm(dim=-1, keepdim=True)
-    identity = own.new_tensor([1.0, 0.0, 0.0, 0.0])
+    identity = constant([1.0, 0.0, 0.0, 0.0], own)
     # The smallest number keeps the division of unused zeros finite, and its gradient too.
     own = torch.where(length > 0, own / length.clamp_min(torch.finfo(own.dtype).tiny), identity)
     return F.normalize(quat_product(turn_wxyz, own), dim=-1)

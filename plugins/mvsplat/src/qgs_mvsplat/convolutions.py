@@ -6,16 +6,7 @@ from typing import Literal, TypeAlias
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
-
 Padding: TypeAlias = Literal["zeros", "replicate"]
-
-
-def imagenet_normalized(images_BV3HW: Tensor) -> Tensor:
-    """Images in [0, 1] with the mean and the deviation of ImageNet's taken off."""
-    mean, std = (images_BV3HW.new_tensor(x)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
-    return (images_BV3HW - mean) / std
 
 
 def conv3(inputs: int, outputs: int, padding: Padding = "zeros") -> nn.Conv2d:

@@ -12,13 +12,13 @@ from pydantic import Field, ValidationInfo, field_validator
 from qgs_dinov2.vit import PATCH, DinoV2, VitConfig
 from torch import Tensor, nn
 
+from qgs.components.encoder import imagenet_normalised
 from qgs.contracts import ComponentConfig, OptionError
 from qgs.geometry.precision import at_least_float32, full_precision
 from qgs.types import Cameras
 from qgs_mvsplat.cnn import CNN, WIDTHS, Stages
 from qgs_mvsplat.convolutions import (
     conv3,
-    imagenet_normalized,
     resized,
     two_convolutions,
 )
@@ -133,7 +133,7 @@ def nearest_neighbours(c2w_BV44: Tensor, count: int) -> Tensor:
     """
     scenes, views = c2w_BV44.shape[:2]
     if views <= 3:
-        return cyclic_neighbours(scenes, views).sort(-1).values.to(c2w_BV44.device)
+        return cyclic_neighbours(scenes, views, c2w_BV44.device).sort(-1).values
     centre_BV3 = at_least_float32(c2w_BV44[..., :3, 3])
     order_BVV = torch.cdist(centre_BV3, centre_BV3).argsort(-1)
     # The first is taken for the view itself without a look (released code): of two cameras at one
@@ -158,7 +158,7 @@ def finer_candidates(coarse_N1hw: Tensor, sweep: Sweep, first: int, count: int) 
     low_N1hw = (centre_N1hw - count // 2 * step).clamp(least, most)
     high_N1hw = (centre_N1hw + (count // 2 - 1) * step).clamp(least, most)
     # Linear between clamped ends: near a bound the steps shrink, and the centre is none of them.
-    part_D11 = torch.linspace(0, 1, count).to(centre_N1hw)[:, None, None]
+    part_D11 = torch.linspace(0, 1, count, device=centre_N1hw.device).to(centre_N1hw)[:, None, None]
     return low_N1hw + part_D11 * (high_N1hw - low_N1hw)
 
 
@@ -197,7 +197,7 @@ class DepthPredictor(nn.Module):
     ) -> Depths:
         """near, far: camera-frame z in world units."""
         size, shape = images_BV3HW.shape[-2:], images_BV3HW.shape[:2]
-        normalized_N3HW = imagenet_normalized(images_BV3HW).flatten(0, 1)
+        normalized_N3HW = imagenet_normalised(images_BV3HW).flatten(0, 1)
         neighbours_BVJ = nearest_neighbours(cameras.c2w, self.sizes.neighbours)
         sweep = Sweep(cameras, neighbours_BVJ, near_BV, far_BV)
         cnn = self.backbone(normalized_N3HW)

@@ -9,6 +9,7 @@ from einops import rearrange
 from pydantic import Field
 from torch import Tensor, nn
 
+from qgs.components.encoder import imagenet_normalised
 from qgs.contracts import (
     ComponentConfig,
     Encoder,
@@ -20,7 +21,7 @@ from qgs.contracts import (
 from qgs.geometry.precision import full_precision
 from qgs.types import Cameras, ImageMemory, Views
 from qgs_mvsplat.cnn import CNN, WIDTHS
-from qgs_mvsplat.convolutions import conv3, imagenet_normalized, resized, two_convolutions
+from qgs_mvsplat.convolutions import conv3, resized, two_convolutions
 from qgs_mvsplat.pixels import width_problems
 from qgs_mvsplat.sweep import (
     cost_volume,
@@ -46,7 +47,7 @@ class Backbone(nn.Module):
 
     def forward(self, images_BV3HW: Tensor, neighbours_BVJ: Tensor) -> tuple[Tensor, Tensor]:
         """Both (B, V, D, H/4, W/4)."""
-        normalized = imagenet_normalized(images_BV3HW).flatten(0, 1)
+        normalized = imagenet_normalised(images_BV3HW).flatten(0, 1)
         cnn = self.backbone(normalized).features.unflatten(0, images_BV3HW.shape[:2])
         return cnn, self.transformer(with_positions(cnn), neighbours_BVJ)
 
@@ -115,7 +116,7 @@ class MVSplatEncoder(Encoder):
 
     def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
         """Numbers of every pixel (B, V, C, H, W), for depths between `near` and `far`."""
-        neighbours = cyclic_neighbours(*views.cameras.shape).to(near_BV.device)
+        neighbours = cyclic_neighbours(*views.cameras.shape, device=near_BV.device)
         # The transformer reads other views in ascending order, the sweep in cyclic order.
         cnn, features = self.backbone(views.images, neighbours.sort(-1).values)
         sweep = Sweep(views.cameras, neighbours, near_BV, far_BV)

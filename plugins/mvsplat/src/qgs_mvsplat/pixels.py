@@ -102,8 +102,8 @@ def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
 def pixel_fields(cameras: Cameras, rows: int, columns: int) -> dict[str, Tensor]:
     """PIXEL_FIELDS of images (B, V) seen as rows x columns pixels: (B, V*rows*columns, ...)."""
     (height, width), c2w = cameras.size, cameras.c2w
-    left = torch.arange(columns).to(c2w) * (width / columns)
-    upper = torch.arange(rows).to(c2w) * (height / rows)
+    left = torch.arange(columns, device=c2w.device).to(c2w) * (width / columns)
+    upper = torch.arange(rows, device=c2w.device).to(c2w) * (height / rows)
     fx, fy, cx, cy = (x_BV[..., None] for x_BV in cameras.intrinsics.unbind(-1))
     x_BVRC = repeat((left - cx) / fx, "b v c -> b v r c", r=rows)
     y_BVRC = repeat((upper - cy) / fy, "b v r -> b v r c", c=columns)

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from qgs.geometry.constants import constant
 from qgs.geometry.precision import full_precision
 from qgs.types import Cameras
 
@@ -18,17 +19,17 @@ PAIRS = 40
 """Pixels for each candidate up to which all pairs of pixels are correlated."""
 
 
-def cyclic_neighbours(scenes: int, views: int) -> Tensor:
+def cyclic_neighbours(scenes: int, views: int, device: torch.device) -> Tensor:
     """The views (B, V, V - 1) that follow each view, around; a single view is its own neighbour."""
-    view = torch.arange(views)
-    step = torch.arange(1, max(views, 2))
+    view = torch.arange(views, device=device)
+    step = torch.arange(1, max(views, 2), device=device)
     return ((view[:, None] + step) % views).expand(scenes, -1, -1)
 
 
 @full_precision
 def inverse_depth_candidates(near_BV: Tensor, far_BV: Tensor, count: int) -> Tensor:
     """(B, V, D), linear from 1/far to 1/near, both included."""
-    step_D = torch.linspace(0, 1, count).to(near_BV)
+    step_D = torch.linspace(0, 1, count, device=near_BV.device).to(near_BV)
     least = 1 / far_BV[..., None]
     return least + step_D * (1 / near_BV[..., None] - least)
 
@@ -44,7 +45,7 @@ def relative_poses(c2w_BV44: Tensor, neighbours_BVJ: Tensor) -> Tensor:
 def feature_lenses(cameras: Cameras, size: Sequence[int]) -> Tensor:
     """Intrinsics (B, V, 4) of cameras whose images are of `size`, (H, W)."""
     scale = (size[1] / cameras.size[1], size[0] / cameras.size[0])
-    return cameras.intrinsics * cameras.intrinsics.new_tensor([*scale, *scale])
+    return cameras.intrinsics * constant([*scale, *scale], cameras.intrinsics)
 
 
 @full_precision
@@ -56,8 +57,8 @@ def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
     height, width = depth_NDhw.shape[-2:]
     fx, fy, cx, cy = (x[:, None, None] for x in lens_N4.unbind(-1))
     # Pixels count from 0 without the half that rays have; published weights expect the difference.
-    x_w = torch.arange(width).to(depth_NDhw)
-    y_h1 = torch.arange(height).to(depth_NDhw)[:, None]
+    x_w = torch.arange(width, device=depth_NDhw.device).to(depth_NDhw)
+    y_h1 = torch.arange(height, device=depth_NDhw.device).to(depth_NDhw)[:, None]
     ray = ((x_w - cx) / fx).expand(-1, height, -1), ((y_h1 - cy) / fy).expand(-1, -1, width)
     ray_Nhw3 = torch.stack([*ray, torch.ones_like(ray[0])], -1)
     turned_Nhw3 = torch.einsum("nij,nhwj->nhwi", pose_N44[:, :3, :3], ray_Nhw3)

@@ -16,16 +16,17 @@ MASKED = -100.0
 """Added to logits between parts of a shifted window that are no neighbours (Swin)."""
 
 
-def positions(width: int, rows: int, columns: int) -> Tensor:
+def positions(width: int, rows: int, columns: int, device: torch.device) -> Tensor:
     """Sine embedding (D, rows, columns) of the places in one window (DETR), y before x."""
     half = width // 2
-    frequency_C = TEMPERATURE ** (-2 * (torch.arange(half) // 2) / half)
+    index_C = torch.arange(half, device=device)
+    frequency_C = TEMPERATURE ** (-2 * (index_C // 2) / half)
 
     def embedded(count: int) -> Tensor:
         # Places count from 1, and the small number keeps them just below 2 pi (DETR).
-        places = torch.arange(1, count + 1) / (count + 1e-6) * 2 * math.pi
+        places = torch.arange(1, count + 1, device=device) / (count + 1e-6) * 2 * math.pi
         angle_NC = places[:, None] * frequency_C
-        return torch.where(torch.arange(half) % 2 == 0, angle_NC.sin(), angle_NC.cos())
+        return torch.where(index_C % 2 == 0, angle_NC.sin(), angle_NC.cos())
 
     y = embedded(rows)[:, None].expand(rows, columns, half)
     x = embedded(columns)[None].expand(rows, columns, half)
@@ -35,11 +36,11 @@ def positions(width: int, rows: int, columns: int) -> Tensor:
 def with_positions(x_BVCHW: Tensor) -> Tensor:
     """Features plus `positions`, which count inside each of the windows."""
     width, height, columns = x_BVCHW.shape[2:]
-    window = positions(width, height // SPLIT, columns // SPLIT).to(x_BVCHW)
+    window = positions(width, height // SPLIT, columns // SPLIT, x_BVCHW.device).to(x_BVCHW)
     return x_BVCHW + window.repeat(1, SPLIT, SPLIT)
 
 
-def shift_mask(height: int, width: int) -> Tensor:
+def shift_mask(height: int, width: int, device: torch.device) -> Tensor:
     """(4, L, L), added to the logits of windows of a map that was rolled by half a window.
 
     MASKED between pixels that the roll brought together, 0 between neighbours.
@@ -47,7 +48,7 @@ def shift_mask(height: int, width: int) -> Tensor:
 
     def pieces(size: int) -> Tensor:
         window = size // SPLIT
-        index = torch.arange(size)
+        index = torch.arange(size, device=device)
         return (index >= size - window).long() + (index >= size - window // 2).long()
 
     piece_HW = 3 * pieces(height)[:, None] + pieces(width)
@@ -147,7 +148,7 @@ class WindowTransformer(nn.Module):
         """Maps (B, V, C, H, W), with positions; `neighbours_BVJ` are the views that each reads."""
         size = (x_BVCHW.shape[-2], x_BVCHW.shape[-1])
         shifted = (size[0] // SPLIT // 2, size[1] // SPLIT // 2)
-        mask = shift_mask(*size).to(x_BVCHW.device)
+        mask = shift_mask(*size, x_BVCHW.device)
         x_BVHWC = x_BVCHW.permute(0, 1, 3, 4, 2)
         for index, layer in enumerate(self.layers):
             shift = shifted if index % 2 else (0, 0)

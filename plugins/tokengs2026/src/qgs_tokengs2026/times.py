@@ -14,7 +14,7 @@ from qgs.geometry.precision import full_precision
 def time_features(times: Tensor, channels: int) -> Tensor:
     """Times (...) -> (..., T): cos, then sin, of t exp(-ln(10000) i / (T/2)), i = 0 … T/2 - 1."""
     half = channels // 2
-    rates = torch.exp(-math.log(10_000) / half * torch.arange(half).to(times))
+    rates = torch.exp(-math.log(10_000) / half * torch.arange(half, device=times.device).to(times))
     angles = times[..., None] * rates
     return torch.cat([angles.cos(), angles.sin()], -1)
 
