@@ -40,7 +40,7 @@ class FootprintCenters(RadiusScaledCenters):
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """(B, N, K, 3) -> (B, N, K, 3)."""
-        cell_K3 = F.pad(cells(offsets.shape[2]).to(state[FRAME]), (0, 1))
+        cell_K3 = F.pad(cells(offsets.shape[2], state[FRAME]), (0, 1))
         steps_BNK3 = cell_K3 + self.config.displacement(offsets)
         r_BN1 = support_radius(state[RAW_RADIUS], self.config)
         steps_BNK3 = in_world(r_BN1[:, :, None] * steps_BNK3, state[FRAME])

@@ -86,16 +86,15 @@ def nearest(center_BN3: Tensor, count: int, mask_BN: Tensor | None) -> tuple[Ten
     Exact, some rows of distances at a time. An anchor is its own first neighbour.
     """
     scenes, anchors, _ = center_BN3.shape
-    rows = max(1, MAX_PAIRS // (scenes * anchors))
-    found = []
-    for start in range(0, anchors, rows):
-        part = center_BN3[:, start : start + rows]
+    # One part where all distances fit: torch.compile makes a graph for each number of parts.
+    rows = anchors if scenes * anchors**2 <= MAX_PAIRS else max(1, MAX_PAIRS // (scenes * anchors))
+    found, own_N = [], torch.arange(anchors, device=center_BN3.device)
+    for part_BR3, own_R in zip(center_BN3.split(rows, 1), own_N.split(rows), strict=True):
         # Not as |a|^2 + |b|^2 - 2 ab, which has no digits left between close anchors far away.
-        distance = torch.cdist(part, center_BN3, compute_mode="donot_use_mm_for_euclid_dist")
+        distance = torch.cdist(part_BR3, center_BN3, compute_mode="donot_use_mm_for_euclid_dist")
         if mask_BN is not None:
             distance = distance.masked_fill(~mask_BN[:, None], torch.inf)
-        own = torch.arange(part.shape[1], device=part.device)
-        distance[:, own, start + own] = -1
+        distance = distance.masked_fill(own_N == own_R[:, None], -1)
         found.append(distance.topk(min(count, anchors), largest=False).indices)
     index_BNk = torch.cat(found, 1)
     if mask_BN is None:
@@ -119,5 +118,6 @@ def relative_places(center_BN3: Tensor, index_BNk: Tensor, seen_BNk: Tensor | No
 
 def _taken(x_BhNd: Tensor, index_BNk: Tensor) -> Tensor:
     """(B, h, N, k, d)."""
-    flat = index_BNk.flatten(1)[:, None, :, None]
-    return x_BhNd.take_along_dim(flat, 2).unflatten(2, tuple(index_BNk.shape[1:]))
+    # `take_along_dim` would do, but torch.compile makes a graph for each size of it.
+    flat = index_BNk.flatten(1)[:, None, :, None].expand(-1, x_BhNd.shape[1], -1, x_BhNd.shape[3])
+    return x_BhNd.gather(2, flat).unflatten(2, (-1, index_BNk.shape[2]))

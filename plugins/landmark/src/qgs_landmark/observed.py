@@ -28,6 +28,7 @@ from qgs.contracts import (
     memory_fields,
     without_effect,
 )
+from qgs.geometry.constants import constant
 from qgs.geometry.precision import at_least_float32, full_precision
 from qgs.types import ImageMemory, QueryState, SpatialSupport, Views
 from qgs_landmark.fields import COLORS, FRAME, FRAME_FIELD, color_field
@@ -174,7 +175,7 @@ class ObservedQueries(Queries):
         }
         if config.cells is None:
             return anchors
-        step_K2 = side * cells(config.cells).to(place_BN2) / place_BN2.new_tensor([width, height])
+        step_K2 = side * cells(config.cells, place_BN2) / constant([width, height], place_BN2)
         place_BX2 = (place_BN2[:, :, None] + step_K2).flatten(1, 2)
         view_X = view_N.repeat_interleave(config.cells)
         colors = colors_at(views.images, side / math.sqrt(config.cells), view_X, place_BX2)

@@ -3,12 +3,11 @@
 A place is x and y as shares of a photo's width and height; `view_N` says of which photo it is.
 """
 
-import math
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from qgs.geometry.constants import constant
 from qgs.geometry.precision import full_precision
 from qgs.types import Cameras
 
@@ -37,14 +36,19 @@ def spread(count: int, shift_BV2: Tensor) -> tuple[Tensor, Tensor]:
     return view_N, place_BN2.to(shift_BV2)
 
 
-def cells(count: int) -> Tensor:
+def cells(count: int, like: Tensor) -> Tensor:
     """Middles (K, 2), x and y, of K = `count` equal cells of a square of side 1 about 0.
 
     They lie row by row in a grid as nearly square as K allows.
     """
-    rows = next(n for n in range(math.isqrt(count), 0, -1) if count % n == 0)
-    y, x = ((torch.arange(n) + 0.5) / n - 0.5 for n in (rows, count // rows))
-    return torch.cartesian_prod(y, x).flip(-1)
+    index_K = torch.arange(count, device=like.device)
+    # The divisor next to the square root. It stays a tensor, since torch.compile would make a graph
+    # for each K that Python divides.
+    n_K = index_K + 1
+    rows = torch.where((count % n_K == 0) & (n_K * n_K <= count), n_K, 1).amax()
+    columns = count // rows
+    x_K, y_K = (index_K % columns + 0.5) / columns, (index_K // columns + 0.5) / rows
+    return torch.stack([x_K, y_K], -1).to(like) - 0.5
 
 
 def sampled(
@@ -62,7 +66,7 @@ def bilinear(maps_BVCHW: Tensor, view_N: Tensor, place_BNX2: Tensor) -> Tensor:
     """Values (B, C, N, X) at places of the maps `view_N`; outside of one those of its edge."""
     photos, height, width = maps_BVCHW.shape[1], *maps_BVCHW.shape[-2:]
     # All maps as one, one below another: places keep half a pixel from the edges of theirs.
-    edge_2 = place_BNX2.new_tensor([0.5 / width, 0.5 / height])
+    edge_2 = constant([0.5 / width, 0.5 / height], place_BNX2)
     x_BNX, y_BNX = place_BNX2.maximum(edge_2).minimum(1 - edge_2).unbind(-1)
     y_BNX = (y_BNX + view_N[:, None]) / photos
     column, grid = maps_BVCHW.transpose(1, 2).flatten(2, 3), torch.stack([x_BNX, y_BNX], -1)
@@ -89,7 +93,7 @@ def rays_at(cameras: Cameras, view_N: Tensor, place_BN2: Tensor) -> tuple[Tensor
     """
     height, width = cameras.size
     c2w_BN44, lens_BN4 = cameras.c2w[:, view_N], cameras.intrinsics[:, view_N]
-    pixel_BN2 = place_BN2.to(lens_BN4) * lens_BN4.new_tensor([width, height])
+    pixel_BN2 = place_BN2.to(lens_BN4) * constant([width, height], lens_BN4)
     slope_BN2 = (pixel_BN2 - lens_BN4[..., 2:]) / lens_BN4[..., :2]
     local_BN3 = F.pad(slope_BN2, (0, 1), value=1.0)
     return c2w_BN44[..., :3, 3], torch.einsum("bnij,bnj->bni", c2w_BN44[..., :3, :3], local_BN3)

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from qgs.geometry.constants import constant
 from qgs.geometry.precision import full_precision
 from qgs.types import Cameras, Views
 from qgs_landmark.places import bilinear, cells, rays_at
@@ -26,22 +27,22 @@ def mismatch(
     """
     height, width = views.cameras.size
     place_BN2 = place_BN2.to(views.images)
-    step_P2 = side * cells(points**2).to(place_BN2) / place_BN2.new_tensor([width, height])
+    step_P2 = side * cells(points**2, place_BN2) / constant([width, height], place_BN2)
     place_BNP2 = place_BN2[:, :, None] + step_P2
     color_B3NP = bilinear(views.images, view_N, place_BNP2)
-    shape = (*place_BN2.shape[:2], len(depth_D))
-    total_BND, count_BND = place_BN2.new_zeros(shape), place_BN2.new_zeros(shape)
-    photos = views.cameras.shape[1]
-    for ahead in range(1, photos):
-        other_N = (view_N + ahead) % photos
-        at_BNDP2, seen_BNDP = reprojected(views.cameras, view_N, other_N, place_BNP2, depth_D)
-        found_B3NDP = bilinear(views.images, other_N, at_BNDP2.flatten(2, 3))
-        found_B3NDP = found_B3NDP.unflatten(3, (-1, points**2))
-        error_BNDP = (found_B3NDP - color_B3NP[:, :, :, None]).abs().mean(1)
-        error_BND = (error_BNDP * seen_BNDP).sum(-1) / seen_BNDP.sum(-1).clamp_min(1)
-        counts_BND = seen_BNDP.to(error_BND).mean(-1) >= LEAST_SEEN
-        total_BND, count_BND = total_BND + error_BND * counts_BND, count_BND + counts_BND
-    return total_BND / count_BND.clamp_min(1), count_BND > 0
+    # All other photos at once: torch.compile would make a graph for each length of a loop.
+    photos, count = views.cameras.shape[1], len(view_N)
+    other_X = (view_N + torch.arange(1, photos, device=view_N.device)[:, None]).flatten() % photos
+    view_X, place_BXP2 = view_N.repeat(photos - 1), place_BNP2.repeat(1, photos - 1, 1, 1)
+    at_BXDP2, seen_BXDP = reprojected(views.cameras, view_X, other_X, place_BXP2, depth_D)
+    found_B3XDP = bilinear(views.images, other_X, at_BXDP2.flatten(2, 3))
+    found_B3ANDP = found_B3XDP.unflatten(3, (-1, points**2)).unflatten(2, (photos - 1, count))
+    seen_BANDP = seen_BXDP.unflatten(1, (photos - 1, count))
+    error_BANDP = (found_B3ANDP - color_B3NP[:, :, None, :, None]).abs().mean(1)
+    error_BAND = (error_BANDP * seen_BANDP).sum(-1) / seen_BANDP.sum(-1).clamp_min(1)
+    counts_BAND = seen_BANDP.to(error_BAND).mean(-1) >= LEAST_SEEN
+    count_BND = counts_BAND.sum(1)
+    return (error_BAND * counts_BAND).sum(1) / count_BND.clamp_min(1), count_BND > 0
 
 
 def reprojected(
@@ -62,7 +63,7 @@ def reprojected(
     ahead_BNDP = local[..., 2] * depth_D[:, None] > LEAST_DEPTH
     slope = local[..., :2] / local[..., 2:].clamp_min(LEAST_DEPTH / depth_D.max())
     focal_BN2, middle_BN2 = lens_BN4[:, :, None, None].split(2, -1)
-    place_BNDP2 = (slope * focal_BN2 + middle_BN2) / slope.new_tensor([width, height])
+    place_BNDP2 = (slope * focal_BN2 + middle_BN2) / constant([width, height], slope)
     # Beyond the edges, colours would be those of the edge.
     inside_BNDP = ((place_BNDP2 > 0) & (place_BNDP2 < 1)).all(-1)
     return place_BNDP2, ahead_BNDP & inside_BNDP
