@@ -54,9 +54,10 @@ def orbit(inputs: Cameras, depth: float, frames: int) -> Cameras:
 def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
     """Write gaussians.ply, overview.png, views/, depth/, orbit.gif and cameras.json into `out`.
 
-    All is in the model's world; cameras.json has the similarity to that of the photos. Earlier
-    entries of these names are replaced, all at the end. With the suffix of a scene writer (.ply,
-    .splat, ...) `out` is one file of the Gaussians, in the world of the photos.
+    All is in the model's world; cameras.json has the similarity to that of the photos. An
+    earlier result is replaced, all at the end; FileExistsError for other entries of these names.
+    With the suffix of a scene writer (.ply, .splat, ...) `out` is one file of the Gaussians, in the
+    world of the photos.
     """
     if out.suffix.lower() in scene_writers():
         save_gaussians(result.in_photos_world, out)
@@ -65,7 +66,7 @@ def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
     with torch.no_grad():
         frames = result.model.render(result.gaussians, path).rgb[0]
     rows = _pictures(result)
-    with replacing_entries(out) as fresh:
+    with replacing_entries(out, "gaussians.ply") as fresh:
         save_ply(result.gaussians, fresh / "gaussians.ply")
         for i, score in enumerate(result.scores):
             name = f"{score.frame:05d}_{score.kind.split()[0]}.png"

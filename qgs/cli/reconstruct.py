@@ -72,7 +72,8 @@ def reconstruct(
     scale: Scale = None,
     overrides: ViewsSettings = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")
+        bool,
+        typer.Option("--overwrite", help="Write over an earlier result or beside other files."),
     ] = False,
     size: Size = None,
     scene_name: SceneName = None,

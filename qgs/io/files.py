@@ -13,6 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from qgs.machine import with_unit
+from qgs.wording import listed
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -77,11 +78,12 @@ def _synchronise(path: Path) -> None:
 
 
 @contextmanager
-def replacing_entries(folder: str | os.PathLike[str]) -> Iterator[Path]:
+def replacing_entries(folder: str | os.PathLike[str], mark: str) -> Iterator[Path]:
     """A temporary folder whose entries move into `folder` when the block ends well.
 
     An entry takes the place of all that was under its name, folders included; what else `folder`
-    holds stays. When the block raises, `folder` stays as it was.
+    holds stays. When the block raises, `folder` stays as it was. mark: the entry of earlier
+    results; FileExistsError where one would replace what lies in a folder without it.
     """
     target = Path(folder)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -91,11 +93,23 @@ def replacing_entries(folder: str | os.PathLike[str]) -> Iterator[Path]:
         old.mkdir()
         yield fresh
         target.mkdir(exist_ok=True)
-        for entry in sorted(fresh.iterdir()):
-            place = target / entry.name
-            if place.exists():
-                place.rename(old / entry.name)
-            entry.rename(place)
+        names = sorted(entry.name for entry in fresh.iterdir())
+        there = [name for name in names if (target / name).exists()]
+        if there and mark not in there:
+            raise FileExistsError(
+                f"{target} holds {listed(there)}, of no earlier result: choose another folder"
+            )
+        try:
+            for name in names:
+                if name in there:
+                    (target / name).rename(old / name)
+                (fresh / name).rename(target / name)
+        except BaseException:
+            for entry in old.iterdir():
+                if (target / entry.name).exists():
+                    (target / entry.name).rename(fresh / entry.name)
+                entry.rename(target / entry.name)
+            raise
 
 
 def refuse_existing(target: Path) -> None:

@@ -64,10 +64,14 @@ def test_what_a_user_made_is_kept(checkpoint, photos, tmp_path):
     assert isinstance(refused.exception, FileExistsError)
     assert "--overwrite" in str(refused.exception)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["notes.txt", "views"]
+    foreign = run(checkpoint, photos, "--out", tmp_path, "--overwrite")
+    assert isinstance(foreign.exception, FileExistsError)
+    assert (tmp_path / "views" / "00099_novel.png").is_file()
+    (tmp_path / "gaussians.ply").touch()  # as an earlier result has it
     allowed = run(checkpoint, photos, "--out", tmp_path, "--overwrite")
     assert allowed.exception is None
     assert (tmp_path / "notes.txt").read_text() == "mine"
-    assert (tmp_path / "gaussians.ply").is_file()
+    assert (tmp_path / "gaussians.ply").stat().st_size
     assert not (tmp_path / "views" / "00099_novel.png").exists()
     assert (tmp_path / "views" / "00003_novel.png").is_file()
 

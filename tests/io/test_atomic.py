@@ -22,12 +22,52 @@ def test_entries_are_replaced_whole_and_the_rest_stays(tmp_path: Path) -> None:
     (out / "views").mkdir(parents=True)
     (out / "views" / "old.png").touch()
     (out / "notes.txt").write_text("mine")
-    with replacing_entries(out) as fresh:
+    with replacing_entries(out, "views") as fresh:
         (fresh / "views").mkdir()
         (fresh / "views" / "new.png").touch()
     assert [path.name for path in (out / "views").iterdir()] == ["new.png"]
     assert (out / "notes.txt").read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_entries_of_no_earlier_result_stay(tmp_path: Path) -> None:
+    (tmp_path / "out" / "depth").mkdir(parents=True)
+    (tmp_path / "out" / "depth" / "sensor.png").write_text("mine")
+
+    def write() -> None:
+        with replacing_entries(tmp_path / "out", "scene.ply") as fresh:
+            (fresh / "scene.ply").touch()
+            (fresh / "depth").mkdir()
+
+    with pytest.raises(FileExistsError, match="depth"):
+        write()
+    assert (tmp_path / "out" / "depth" / "sensor.png").read_text() == "mine"
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["depth"]
+
+
+def test_entries_come_back_where_moving_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("a", "b"):
+        (out / name).write_text("old")
+    rename = Path.rename
+
+    def interrupted(self: Path, target: Path) -> Path:
+        if self.parent.name == "fresh" and self.name == "b":
+            raise KeyboardInterrupt
+        return rename(self, target)
+
+    def write() -> None:
+        with replacing_entries(out, "a") as fresh:
+            for name in ("a", "b"):
+                (fresh / name).write_text("new")
+            monkeypatch.setattr(Path, "rename", interrupted)
+
+    with pytest.raises(KeyboardInterrupt):
+        write()
+    assert {path.name: path.read_text() for path in out.iterdir()} == {"a": "old", "b": "old"}
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path: Path) -> None:

@@ -191,7 +191,7 @@ def write_scene(made: Made, out: Path, page: Any, began: float, console: Console
     """Write scene.ply, scene.splat, metrics.json, held_out.png and the page into `out`."""
     gaussians, photos = made.in_photos_world, made.judged
     record = scores(made)
-    with replacing_entries(out) as fresh:
+    with replacing_entries(out, "scene.ply") as fresh:
         save_ply(gaussians, fresh / "scene.ply")
         save_splat(gaussians, fresh / "scene.splat")
         if made.scenes.held:
