@@ -37,6 +37,8 @@ class QueryGaussianModel(nn.Module):
 
     refinements: one per decoder layer, at `refinement_of`; layers may share a module.
     recipe: the resolved recipe this model was composed from, None for one built by hand.
+    releases: plugins of that recipe, as `Recipe.releases`; those that were imported, whatever is
+        installed when the model is saved.
     trained_on: statistics of the training views, as its checkpoint records them, or None.
     loaded_from: its checkpoint as `qgs.load` takes it, an absolute path; "" if it was not loaded.
     """
@@ -71,6 +73,7 @@ class QueryGaussianModel(nn.Module):
         self.supervision = supervision
         self.renderer = renderer
         self.recipe = recipe
+        self.releases: Mapping[str, tuple[str, str]] = {}
         self.trained_on: Domain | None = None
         self.loaded_from = ""
 

@@ -39,7 +39,7 @@ class Recipe:
     provenance: dotted path of each value of `tree` to `FILE:LINE`, `--set #n`, or the default that
         set it.
     parts: path of each place, decoder layers numbered, to the component that stands there.
-    plugin_versions: name to version of every plugin in use, `qgs` included.
+    releases: name to (distribution, version) of every plugin in use, `qgs` included.
     """
 
     tree: Mapping[str, Any]
@@ -52,7 +52,7 @@ class Recipe:
     views: contracts.ViewsConfig
     training: contracts.TrainingConfig
     evaluation: contracts.EvaluationConfig
-    plugin_versions: Mapping[str, str]
+    releases: Mapping[str, tuple[str, str]]
 
     @property
     def data_config(self) -> contracts.SceneSourceConfig | None:
@@ -86,6 +86,7 @@ class Recipe:
             fix = "Lower the option of the model that makes the largest of them."
             refuse_more_than_memory("the model with its weights", sizes, fix)
         model = build_model(*arguments, device)
+        model.releases = self.releases
         if pretrained:
             load_pretrained(model)
         return model
@@ -183,7 +184,10 @@ def resolve(
         views=settings["views",],
         training=settings["training",],
         evaluation=settings["evaluation",],
-        plugin_versions={n: registry.plugins[n].version for n in ("qgs", *out.values["plugins"])},
+        releases={
+            name: (registry.plugins[name].distribution, registry.plugins[name].version)
+            for name in ("qgs", *out.values["plugins"])
+        },
     )
 
 

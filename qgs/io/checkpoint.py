@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 import qgs
 from qgs.composer import Recipe, RecipeError
-from qgs.composer.registry import available_plugins, load_registry
+from qgs.composer.registry import available_plugins
 from qgs.contracts.schedule import END, follow, steps_followed
 from qgs.data.domain import KEY, Domain, FirstViews
 from qgs.io.models import checkpoint_path
@@ -169,25 +169,26 @@ def save(
     }
     step = steps_followed(model.modules())
     followed = {} if step in (None, END) else {"step": str(step)}
-    write_checkpoint(path, tensors, model.recipe, followed | dict(extra or {}))
+    write_checkpoint(path, tensors, model.recipe, model.releases, followed | dict(extra or {}))
 
 
 def write_checkpoint(
     path: str | os.PathLike[str],
     tensors: Mapping[str, Tensor],
     tree: Mapping[str, Any],
+    releases: Mapping[str, tuple[str, str]],
     extra: Mapping[str, str],
 ) -> None:
     """Write a checkpoint from its parts, without copying a tensor.
 
     tensors: on the CPU, contiguous, named as by `unique_tensors`. tree: the resolved recipe.
+    releases: as `Recipe.releases`.
     """
-    plugins = load_registry(tree["plugins"]).plugins
     metadata = {
         _RECIPE: json.dumps(tree),
         _DIGEST: digest(tensors),
-        _PLUGINS: json.dumps({name: plugin.version for name, plugin in plugins.items()}),
-        _DISTRIBUTIONS: json.dumps({name: used.distribution for name, used in plugins.items()}),
+        _PLUGINS: json.dumps({name: version for name, (_, version) in releases.items()}),
+        _DISTRIBUTIONS: json.dumps({name: origin for name, (origin, _) in releases.items()}),
         _FORMAT: str(FORMAT_VERSION),
         _VERSION: qgs.__version__,
         **{_EXTRA + key: value for key, value in extra.items()},

@@ -61,7 +61,7 @@ def test_a_plugin_may_offer_layouts_alone(write, install):
     layout = "WeightLayout('', '', {}, (), ('mark',), dict)"
     listed = f"plugin = Plugin('layouts', CONTRACT_VERSION, (), layouts=({layout},))"
     install("qgs-layouts", "layouts", IMPORTS + listed)
-    assert resolve(write("recipe: 1\nplugins: [layouts]\n")).plugin_versions["layouts"] == "1.2"
+    assert resolve(write("recipe: 1\nplugins: [layouts]\n")).releases["layouts"][1] == "1.2"
 
 
 def test_two_distributions_with_one_plugin_name(write, install):

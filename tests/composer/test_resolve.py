@@ -145,7 +145,7 @@ def test_plugins_are_united_and_each_keeps_its_line(write, spatial, install):
     overlay = write("recipe: 1\nextends: [a.yaml, b.yaml]\nplugins:\n- first\n")
     recipe = resolve(overlay, ["plugins=[second]"])
     assert recipe.tree["plugins"] == ["spatial", "first"], "nothing is of `second`"
-    assert set(recipe.plugin_versions) == {"qgs", "spatial", "first"}
+    assert set(recipe.releases) == {"qgs", "spatial", "first"}
     assert recipe.provenance["plugins"] == "a.yaml:2, b.yaml:3"
     recipe = resolve(overlay, ["plugins=[second]", "model.queries.type=second/latent"])
     assert recipe.tree["plugins"] == ["spatial", "second"]

@@ -78,7 +78,7 @@ def test_recipe_and_versions_travel_along(model: QueryGaussianModel, saved: Path
     assert recipe.tree == model.recipe
     metadata = metadata_of(saved)
     assert metadata["qgs.version"] == qgs.__version__
-    assert json.loads(metadata["qgs.plugins"]) == dict(recipe.plugin_versions)
+    assert json.loads(metadata["qgs.plugins"]) == {n: v for n, (_, v) in recipe.releases.items()}
     distributions = json.loads(metadata["qgs.distributions"])
     assert distributions["qgs"] == "query-gaussians"
     assert distributions["rooms"] == "query-gaussians-rooms"
@@ -92,7 +92,7 @@ def test_only_plugins_that_are_used_are_needed(
     without_rooms = {n: e for n, e in available_plugins().items() if n != "rooms"}
     for module in ("qgs.composer.registry", "qgs.io.checkpoint"):
         monkeypatch.setattr(f"{module}.available_plugins", lambda: without_rooms)
-    assert set(CheckpointFile(path).recipe.plugin_versions) == {"qgs", "locus"}
+    assert set(CheckpointFile(path).recipe.releases) == {"qgs", "locus"}
     assert qgs.load(path).queries.count == 8
     with pytest.raises(RecipeError, match="offers a plugin `rooms`"):
         qgs.compose(RECIPES / "photos.yaml", SMALL)
@@ -104,7 +104,7 @@ def test_a_model_without_a_step_is_saved_without_one(tmp_path: Path) -> None:
     recipe = resolve(RECIPES / "tokengs.yaml", [*SMALL, ramp])
     first, second = tmp_path / "first.safetensors", tmp_path / "second.safetensors"
     tensors = {k: x.detach() for k, x in unique_tensors(recipe.build_model()).items()}
-    write_checkpoint(first, tensors, recipe.tree, {})
+    write_checkpoint(first, tensors, recipe.tree, recipe.releases, {})
     save(qgs.load(first), second)
     assert CheckpointFile(second).step is None
     assert qgs.load(second).renderer.config.model_dump()["dilation"] == 0.5

@@ -44,7 +44,7 @@ def export_checkpoint(name: str | os.PathLike[str], out: str | Path, half: bool 
                 f"{file.path} has weights that float16 cannot hold (larger than 65504): "
                 f"{listed(broken)}; ship it as it is"
             )
-        write_checkpoint(out, tensors, file.recipe.tree, file.extra)
+        write_checkpoint(out, tensors, file.recipe.tree, file.recipe.releases, file.extra)
 
 
 def new_checkpoint_path(path: str | Path) -> Path:

@@ -82,7 +82,7 @@ def import_weights(
     tensors, converted = _as_float32(file, names, to_float32)
     settings = differing_predictions(recipe.tree, resolve(names.layout.read(shapes)).tree)
     imported = f"{names.layout.name} weights {file.path.name}"
-    write_checkpoint(out, tensors, recipe.tree, {"imported": imported})
+    write_checkpoint(out, tensors, recipe.tree, recipe.releases, {"imported": imported})
     if recipe_file:
         try:
             write_text(recipe_file, text)

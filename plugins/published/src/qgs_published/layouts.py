@@ -59,7 +59,7 @@ def names_of(recipe: Recipe) -> Names:
 
     Raises PublishedError with the components that each layout does not know.
     """
-    registry = load_registry([name for name in recipe.plugin_versions if name != "qgs"])
+    registry = load_registry([name for name in recipe.releases if name != "qgs"])
     reasons = []
     for layout in _layouts(registry.plugins.values()):
         found = _unknown_components(recipe, layout)
