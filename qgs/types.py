@@ -246,7 +246,7 @@ class ImageMemory(TensorContainer):
     grid: (V, H/P, W/P), M is its product; tokens are ordered view, row, column. None for tokens
         that are no patches, such as learned latents.
 
-    its `writes` say which of them there are.
+    The encoder's `writes` say which of these are not None.
     """
 
     features: Tensor

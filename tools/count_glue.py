@@ -9,7 +9,10 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-DECLARED = {"name", "slot", "reads", "writes", "fields_read", "fields_written", "bandwidth_fields"}
+DECLARED = {
+    *("name", "slot", "reads", "writes", "fields_read", "fields_written", "bandwidth_fields"),
+    *("problems", "scheduled", "renderings", "sublayers"),
+}
 """Attributes and methods that tell the composer what a component is."""
 
 

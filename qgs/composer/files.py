@@ -25,10 +25,9 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
     """`over` laid over `base`, both at `path`.
 
     A component of another `type`, or a mapping of another `kind` or `schedule`, keeps nothing of
-    the old one.
-    `plugins` are united, other lists replaced. `null` replaces what it lies over: in place of an
-    option it is a value, in place of a component or a section it leaves the default, in place of
-    a swap it drops the swap.
+    the old one. `plugins` are united, other lists replaced. `null` replaces what it lies over: in
+    place of an option it is a value, in place of a component or a section it leaves the default, in
+    place of a swap it drops the swap.
     """
     other_type = "type" in over and type_at(base, path) not in (None, type_at(over, path))
     kinds = [key for key in ("kind", "schedule") if key in over]

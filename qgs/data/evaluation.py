@@ -5,9 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
 import numpy as np
-import torch
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
-from torch import Tensor
 
 from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewSampler, ViewsConfig
 from qgs.contracts.schedule import END
@@ -15,7 +13,6 @@ from qgs.data.images import framing
 from qgs.data.paths import opened_path, read_json
 from qgs.data.samples import Frames, Sample, gap_range, make_sample, moments, spread
 from qgs.data.view_samplers import Span
-from qgs.geometry.poses import largest_distance
 from qgs.wording import listed
 
 FrameList: TypeAlias = Annotated[list[Annotated[int, Field(strict=True)]], Field(min_length=1)]
@@ -91,7 +88,8 @@ class EvaluationPlan:
     the others `evaluation.samples` samples, inputs drawn by `sampler` (default: `Span`) as at the
     end of training with `evaluation.seed`, targets the other frames of the span, or of one time.
     Targets of T times are T samples. views_of: makes the settings of a sample, such as its scale.
-    windows_of: gives windows of a scene with held-out frames that does not move, instead.
+    windows_of: gives windows of a scene with held-out frames that does not move, instead. depths:
+    targets have true depth where scenes do.
 
     wanted, null, unlisted: see `qgs.engine.results.Evaluation`. framing: of the first photo, and
     drawn: scenes that have samples, once `samples` has run. Raises ValueError without scenes.
@@ -106,6 +104,7 @@ class EvaluationPlan:
         sampler: ViewSampler | None = None,
         views_of: ViewsOf | None = None,
         windows_of: WindowsOf | None = None,
+        depths: bool = False,
     ) -> None:
         self.framing: str | None = None
         self.drawn = set[str]()
@@ -114,7 +113,7 @@ class EvaluationPlan:
             raise ValueError(f"the data source {type(source).name!r} has no test scenes")
         self._views, self._evaluation, self._index = views, evaluation, index
         self._views_of = views_of or (lambda *window: views)
-        self._windows_of = windows_of
+        self._windows_of, self._depths = windows_of, depths
         self._sampler = sampler or Span(Span.Config())
         names = source.names("test")
         self._places = {name: place for place, name in enumerate(names)}
@@ -138,7 +137,7 @@ class EvaluationPlan:
                         self.framing = framing(scene, inputs[0])
                     views = self._views_of(scene, inputs, targets)
                     for part in [targets] if scene.times is None else moments(scene, targets):
-                        yield make_sample(scene, inputs, part, views, False, noise)
+                        yield make_sample(scene, inputs, part, views, False, noise, self._depths)
             except Exception as error:  # whatever a reader raises; the other scenes go on
                 yield SceneFailure(name, one_line(error))
 
@@ -171,27 +170,17 @@ def evaluation_samples(
     sampler: ViewSampler | None = None,
     views_of: ViewsOf | None = None,
     windows_of: WindowsOf | None = None,
+    depths: bool = False,
 ) -> Sequence[Sample]:
     """Samples of a plan without an index; raises ValueError for the first scene that fails."""
     samples: list[Sample] = []
-    plan = EvaluationPlan(source, views, evaluation, None, sampler, views_of, windows_of)
+    choices = sampler, views_of, windows_of, depths
+    plan = EvaluationPlan(source, views, evaluation, None, *choices)
     for sample in plan.samples():
         if isinstance(sample, SceneFailure):
             raise ValueError(f"scene {sample.scene!r} cannot be judged: {sample.reason}")
         samples.append(sample)
     return samples
-
-
-def true_depth(source: SceneSource, sample: Sample) -> Tensor | None:
-    """Depth (T, 1, H, W) of the targets in the sample's units; None where the scene has none."""
-    scene = source.scenes("test")[list(source.names("test")).index(sample.scene)]
-    depth = scene.depths(sample.target_frames)
-    if depth is None:
-        return None
-    own = scene.cameras[[sample.input_frames[0], *sample.target_frames]].c2w
-    # the ratio of distances between cameras is the scale that `make_sample` chose
-    ours = torch.cat([sample.inputs.cameras.c2w[0, :1], sample.targets.cameras.c2w[0]])
-    return depth * float(largest_distance(ours) / largest_distance(own))
 
 
 def one_line(error: Exception) -> str:

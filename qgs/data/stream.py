@@ -191,6 +191,7 @@ class SampleStream:
         """Of the inputs and targets (1, V) of a sample as drawn after `step` optimiser steps."""
         rng = np.random.default_rng([self._seed, 1, number])
         scene = self._scenes[self.order.scene(number)]
+        rng.random()  # whether the sample is mirrored
         inputs, targets = self._sampler.draw(scene, self._views, rng, step)
         world, count = own_world(scene, inputs, self._views), len(inputs)
         both = cameras_in(world, scene, (*inputs, *targets))

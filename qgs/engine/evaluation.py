@@ -18,7 +18,6 @@ from qgs.data.evaluation import (
     ViewsOf,
     WindowsOf,
     one_line,
-    true_depth,
 )
 from qgs.data.samples import Sample, stack_views
 from qgs.engine.protocol import index_of, protocol_of
@@ -58,10 +57,11 @@ def evaluate(
         raise ValueError(f"batch is how many scenes pass together, at least 1, got {batch}")
     source, index = recipe.build_data(), index_of(recipe)
     sampler = recipe.build_view_sampler()
-    choices = index, sampler, views_of, windows_of
-    plan = EvaluationPlan(source, recipe.views, recipe.evaluation, *choices)
     measures = Measures(recipe)
-    scorer = _Scorer(model, recipe, source, measures)
+    # Depth maps cost as much as photos to decode.
+    choices = index, sampler, views_of, windows_of, "true_depth" in measures.needed
+    plan = EvaluationPlan(source, recipe.views, recipe.evaluation, *choices)
+    scorer = _Scorer(model, recipe, measures)
     training = model.training
     # Components draw random numbers in training mode only.
     model.eval()
@@ -181,11 +181,8 @@ class Measures:
 class _Scorer:
     """Scores samples; `seen` are their cameras, `gaussians` the most Gaussians of a scene."""
 
-    def __init__(
-        self, model: QueryGaussianModel, recipe: Recipe, source: SceneSource, measures: Measures
-    ) -> None:
+    def __init__(self, model: QueryGaussianModel, recipe: Recipe, measures: Measures) -> None:
         self._model = model
-        self._source = source
         self._device = next(model.parameters()).device
         self._measures = measures
         self.seen = Domain()
@@ -251,14 +248,10 @@ class _Scorer:
         targets = sample.targets.to(self._device)
         self.gaussians = max(self.gaussians, gaussians.count)
         rendering = self._model.render(gaussians, targets.cameras)
-        # Depth maps cost as much as photos to decode.
-        depth = true_depth(self._source, sample) if "true_depth" in self._measures.needed else None
-        if depth is not None:
-            depth = depth[None].to(self._device)
         count = self._model.head.gaussians_per_query
         given = {
             "model": MetricInput(
-                rendering.rgb, targets, gaussians, count, rendering.depth, true_depth=depth
+                rendering.rgb, targets, gaussians, count, rendering.depth, true_depth=targets.depths
             ),
             **{n: MetricInput(f(inputs, targets.cameras), targets) for n, f in BASELINES.items()},
         }

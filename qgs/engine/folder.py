@@ -20,6 +20,7 @@ from qgs.io.checkpoint import load_weights, save, unique_tensors
 from qgs.io.files import is_leftover, naming_full_disk, read_records, write_text
 from qgs.io.models import CHECKPOINT
 from qgs.io.tensors import CheckpointError, TensorFile, write_tensors
+from qgs.machine import is_out_of_memory
 from qgs.model import QueryGaussianModel
 from qgs.wording import listed
 
@@ -225,6 +226,8 @@ class Saver:
             except OtherRunError:
                 raise
             except Exception as error:  # a part of a plugin may raise anything
+                if is_out_of_memory(error):
+                    raise
                 raise CheckpointError(
                     f"{self.folder.state} is damaged: its part `{name}` cannot be restored "
                     f"({type(error).__name__}: {error})"

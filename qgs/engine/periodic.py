@@ -96,15 +96,15 @@ class PeriodicEvaluation:
             # The average is judged second: it is applied to the weights for as long as that takes.
             with self._average.applied():
                 records.append(self._record("ema", step))
-        picture = self._picture()
         place = self._folder / "evaluations.jsonl"
         # A resumed run evaluates again what lies after its last save.
         kept = [record for record in read_records(place) if record["step"] < step]
         write_text(place, "".join(json.dumps(record) + "\n" for record in (*kept, *records)))
-        write_png(picture, self._folder / "pictures" / f"step-{step}.png")
         for record in records:
             group, scores = f"evaluation/{record['weights']}", record["scores"]
             self._trackers.log({f"{group}/{name}": score for name, score in scores.items()}, step)
+        picture = self._picture()
+        write_png(picture, self._folder / "pictures" / f"step-{step}.png")
         self._trackers.picture("evaluation", picture, step)
 
     def _between_scenes(self, done: int, wanted: int) -> None:

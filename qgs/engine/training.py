@@ -234,9 +234,9 @@ class Trainer:
             "counters": self,
             "moments": OptimizerState(training_pass, self.torch_optimizer),
             "schedule": self.optimizer,
+            **({"ema": self.average} if self.average else {}),
             # Last: restoring a part may draw random numbers.
             "random": RandomStates(accelerator),
-            **({"ema": self.average} if self.average else {}),
         }
 
     def _follow_schedules(self) -> None:

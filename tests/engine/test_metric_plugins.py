@@ -23,7 +23,7 @@ from qgs.contracts import (
     Plugin,
     Scene,
 )
-from qgs.data.evaluation import evaluation_samples, true_depth
+from qgs.data.evaluation import evaluation_samples
 from qgs.engine.distributed import make_accelerator
 from qgs.engine.evaluation import Evaluation, evaluate
 from qgs.engine.periodic import PeriodicEvaluation
@@ -148,10 +148,10 @@ def test_what_a_metric_needs(mine: Tiny, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(type(source.scenes("test")[0]), "masks", masks)
     model = recipe.build_model().eval()
     evaluation = evaluate(model, recipe)
-    sample = evaluation_samples(source, recipe.views, recipe.evaluation)[0]
+    sample = evaluation_samples(source, recipe.views, recipe.evaluation, depths=True)[0]
     with torch.no_grad():
         rendering = model.render(model(sample.inputs).gaussians, sample.targets.cameras)
-    expected = float((rendering.depth[0] - true_depth(source, sample)).mean())
+    expected = float((rendering.depth - sample.targets.depths).mean())
     assert evaluation.scores[0].values["model_depth"] == pytest.approx(expected, rel=1e-5)
     assert evaluation.mean("depth", "nearest_input") is None
     assert evaluation.mean("mask_mean") == evaluation.mean("mask_mean", "mean_colour") == 1.0

@@ -9,7 +9,7 @@ from qgs_viewer.report import GROUP, Contender, Report, report_html
 
 from qgs.composer import resolve
 from qgs.contracts import Column
-from qgs.data.evaluation import evaluation_samples, true_depth
+from qgs.data.evaluation import evaluation_samples
 from qgs.data.scenes import warn_once
 from qgs.drawing.images import EXACT, data_uri
 
@@ -39,7 +39,7 @@ def _only_sections_of_the_test(monkeypatch):
 def page_of(tree: dict, name: str) -> str:
     recipe = resolve(tree)
     source = recipe.build_data()
-    samples = evaluation_samples(source, recipe.views, recipe.evaluation)
+    samples = evaluation_samples(source, recipe.views, recipe.evaluation, depths=True)
     contender = Contender(
         name=name,
         model=recipe.build_model().eval(),
@@ -60,7 +60,7 @@ def page_of(tree: dict, name: str) -> str:
         contenders=[contender],
         baselines={"Mean colour": {"psnr": 11.11, "mine": None, "none": None}},
         samples=samples,
-        depths=[true_depth(source, sample) for sample in samples],
+        depths=[sample.targets.depths[0] for sample in samples],
         facts={"Budget": "none"},
         notes=["The photos lie outside."],
         meanings=["What my metric means."],
@@ -179,8 +179,8 @@ def test_large_photos_are_compressed_and_small_ones_exact():
 def test_true_depth_is_in_the_units_of_the_sample():
     recipe = resolve(PLAIN)
     source = recipe.build_data()
-    sample = evaluation_samples(source, recipe.views, recipe.evaluation)[0]
+    sample = evaluation_samples(source, recipe.views, recipe.evaluation, depths=True)[0]
     own = source.scenes("test")[0].depths(sample.target_frames)
-    ratio = true_depth(source, sample) / own
+    ratio = sample.targets.depths[0] / own
     assert ratio.min() == pytest.approx(recipe.views.scale_factor, rel=1e-3)
     assert ratio.max() == pytest.approx(recipe.views.scale_factor, rel=1e-3)

@@ -22,7 +22,7 @@ from qgs.composer import Recipe, resolve
 from qgs.composer.schema import summary_of
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import OF_RECIPES, Domain
-from qgs.data.evaluation import WindowsOf, evaluation_samples, true_depth
+from qgs.data.evaluation import WindowsOf, evaluation_samples
 from qgs.data.recognition import is_training_data, open_for
 from qgs.engine.distributed import choose_device
 from qgs.engine.evaluation import evaluate
@@ -321,13 +321,13 @@ def report_of(
     searched = entries if recipe.views.scale == "search" else entries[:1]
     pictured = [
         evaluation_samples(
-            source, recipe.views, few, views_of=entry.search, windows_of=entry.windows_of
+            source, recipe.views, few, None, entry.search, entry.windows_of, depths=True
         )[:PICTURED_SCENES]
         for entry in searched
     ] * (len(entries) // len(searched))
     samples = pictured[0]
     height, width = recipe.tree["data"]["image_size"]
-    plugins = {name: v for entry in entries for name, v in entry.recipe.plugin_versions.items()}
+    plugins = {name: v for entry in entries for name, (_, v) in entry.recipe.releases.items()}
     software = {"torch": torch.__version__, **plugins}
     gpu = torch.cuda.is_available()
     cores = f"CPU with {os.cpu_count()} cores ({platform.machine()})"
@@ -349,7 +349,7 @@ def report_of(
         ],
         baselines={n.replace("_", " ").capitalize(): evaluation.means(n) for n in BASELINES},
         samples=samples,
-        depths=[true_depth(source, sample) for sample in samples],
+        depths=[None if (d := sample.targets.depths) is None else d[0] for sample in samples],
         facts={
             "Data": f"{recipe.tree['data']['type']}, {width} × {height} pixels",
             "Views": f"{recipe.views.inputs} inputs, judged on views {judged} them",

@@ -6,7 +6,7 @@ from pathlib import Path
 from qgs.analysis.scale import ScaleSearch
 from qgs.composer import resolve
 from qgs.data.domain import SEARCHED, Domain, verdict
-from qgs.data.evaluation import evaluation_samples, true_depth
+from qgs.data.evaluation import evaluation_samples
 from qgs.data.recognition import is_training_data
 from qgs.io.checkpoint import load
 from qgs.io.files import write_text
@@ -74,7 +74,7 @@ def open_exhibition(
     if photos is not None and not is_training_data(photos, resolve(own).data_config):
         windows_of = contest.photo_windows(recipe.views, models[first].trained_on)
     samples = evaluation_samples(
-        source, recipe.views, recipe.evaluation, views_of=search, windows_of=windows_of
+        source, recipe.views, recipe.evaluation, None, search, windows_of, depths=True
     )
     names = dict.fromkeys(sample.scene for sample in samples)
     if scene is not None and scene not in names:
@@ -94,7 +94,7 @@ def open_exhibition(
         remarks.append(f"{first}: {summary(search.found.values(), option='')}.")
     if recipe.views.scale == "auto":
         remarks.append(contest.AUTO_SCALE)
-    depths = [true_depth(source, sample) for sample in samples]
+    depths = [None if (d := sample.targets.depths) is None else d[0] for sample in samples]
     return Exhibition(exhibits, samples, depths, query, remarks)
 
 
