@@ -1,8 +1,12 @@
 """Words that messages and tables share."""
 
+import logging
 import os
 import re
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
+
+_log = logging.getLogger(__name__)
 
 
 def listed(names: Iterable[object], most: int = 8, between: str = ", ") -> str:
@@ -42,3 +46,9 @@ def name_shown(name: str, most: int = 500) -> str:
     """`name` as a message shows it, of at most some characters."""
     name = name if name.replace("\n", "").isprintable() else repr(name)
     return name if len(name) <= most else f"{name[:most]} ... ({len(name):,} characters)"
+
+
+@lru_cache(maxsize=4096)
+def warn_once(message: str) -> None:
+    """Log `message`, unless this process has logged it before."""
+    _log.warning("%s", message)

@@ -18,10 +18,9 @@ from qgs.data.domain import SEARCHED, Domain, value_range_problem, verdict
 from qgs.data.images import framing
 from qgs.data.recognition import is_training_data, open_for
 from qgs.data.samples import Sample, training_frames, views_in
-from qgs.data.scenes import warn_once
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Views
-from qgs.wording import counted, listed
+from qgs.wording import counted, listed, warn_once
 
 HOLDOUT = 8
 """Every n-th photo of a user's scene is held out, as papers on novel views do (Mip-NeRF 360)."""

@@ -14,9 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from qgs.data.scenes import warn_once
 from qgs.geometry.poses import first_camera, largest_distance, look_at_depth, mean_camera
 from qgs.types import Cameras, Views
+from qgs.wording import warn_once
 
 OUTLIERS = 0.002
 """Share of the values at either end of a range that does not count, such as parallel axes."""

@@ -7,7 +7,7 @@ from upath import UPath
 from qgs.contracts import Component, SceneSource, SceneSourceConfig, component_of
 from qgs.data.evaluation import one_line
 from qgs.data.paths import opened_path
-from qgs.data.scenes import warn_once
+from qgs.wording import warn_once
 
 
 def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:

@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import Frames, Scene, ViewsConfig
-from qgs.data.scenes import warn_once
 from qgs.geometry.poses import (
     first_camera,
     largest_distance,
@@ -28,7 +27,7 @@ from qgs.geometry.poses import (
 )
 from qgs.machine import refuse_more_than_memory
 from qgs.types import Cameras, Views, concatenated, map_tensors
-from qgs.wording import listed, numbered
+from qgs.wording import listed, numbered, warn_once
 
 _T = TypeVar("_T")
 

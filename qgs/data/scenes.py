@@ -1,11 +1,9 @@
 """What sources of scenes share: lists opened on demand, stored photos, a cache, warnings."""
 
-import logging
 from abc import abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from threading import Lock
 from typing import Any, Generic, TypeVar
 
@@ -15,7 +13,6 @@ from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.lenses import Intrinsics, Lens, Size
 
 Value = TypeVar("Value")
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -108,9 +105,3 @@ class LazySource(SceneSource):
     def names(self, split: Split) -> Sequence[str]:
         """See `SceneSource`."""
         return self.scenes(split).names
-
-
-@lru_cache(maxsize=4096)
-def warn_once(message: str) -> None:
-    """Log `message`, unless this process has logged it before."""
-    _log.warning("%s", message)

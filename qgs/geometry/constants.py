@@ -7,9 +7,5 @@ from torch import Tensor
 
 
 def constant(values: Sequence[float], like: Tensor) -> Tensor:
-    """`values` (N,) in the dtype and on the device of `like`.
-
-    Each number is filled in there, for `torch.tensor` copies from the host, and a copy from its
-    usual memory makes the host wait for a CUDA device.
-    """
+    """`values` (N,) in the dtype and on the device of `like`; the host waits for no copy."""
     return torch.stack([like.new_full((), value) for value in values])

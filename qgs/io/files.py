@@ -96,9 +96,8 @@ def replacing_entries(folder: str | os.PathLike[str], mark: str) -> Iterator[Pat
         names = sorted(entry.name for entry in fresh.iterdir())
         there = [name for name in names if (target / name).exists()]
         if there and mark not in there:
-            raise FileExistsError(
-                f"{target} holds {listed(there)}, of no earlier result: choose another folder"
-            )
+            what = f"{target} holds {listed(there)}, of no earlier result"
+            raise FileExistsError(f"{what}: choose another folder")
         try:
             for name in names:
                 if name in there:

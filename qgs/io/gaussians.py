@@ -10,12 +10,11 @@ import torch.nn.functional as F
 from plyfile import PlyData, PlyElement, PlyElementParseError, PlyHeaderParseError
 from torch import Tensor
 
-from qgs.data.scenes import warn_once
 from qgs.extensions import imported, installed
 from qgs.geometry.harmonics import SH_C0
 from qgs.io.files import replacing
 from qgs.types import SH_COUNTS, Gaussians, map_tensors, named_tensors
-from qgs.wording import listed
+from qgs.wording import listed, warn_once
 
 WRITER_GROUP = "qgs.scene_writers"
 """Entry points of functions (gaussians, path): the name is the suffix that they write, undotted."""

@@ -1,8 +1,5 @@
 """`qgs/depth_surface`: Gaussians on the surface that depth maps show."""
 
-import logging
-from functools import cache
-
 import torch
 import torch.nn.functional as F
 from pydantic import Field
@@ -11,8 +8,7 @@ from torch import Tensor
 from qgs.contracts import Loss
 from qgs.geometry.precision import full_precision
 from qgs.types import LayerPrediction, Rendering, Views
-
-_log = logging.getLogger(__name__)
+from qgs.wording import warn_once
 
 
 class DepthSurface(Loss):
@@ -47,7 +43,10 @@ class DepthSurface(Loss):
         measured = [view for view in views if view.depths is not None]
         means, mask = prediction.gaussians.means, prediction.state.mask
         if not measured:
-            _warn_once()
+            warn_once(
+                "a batch has no depth maps, so the loss qgs/depth_surface is 0 for it: where no "
+                "scene has any, give `depth_file_path` in transforms.json, or take the loss out"
+            )
             return 0 * means.sum()
         found = [
             surface_errors(means, view, self.config.beta, self.config.near) for view in measured
@@ -59,14 +58,6 @@ class DepthSurface(Loss):
         # a scene in which no centre meets a measured pixel has the loss 0, with a gradient of 0
         total = nearest.masked_fill(nearest.isinf(), 0).sum(1)
         return (total / seen.any(1).sum(1).clamp_min(1)).mean()
-
-
-@cache
-def _warn_once() -> None:
-    _log.warning(
-        "a batch has no depth maps, so the loss qgs/depth_surface is 0 for it: where no scene has "
-        "any, give `depth_file_path` in transforms.json, or take the loss out"
-    )
 
 
 @full_precision

@@ -153,8 +153,8 @@ def test_inputs_alone_are_refined_on_and_photos_held_out_of_training_never(photo
 @pytest.mark.parametrize(
     ("options", "frames", "compared"),
     [
-        ((), [0, 1, 2, 4, 5, 6], [3]),
-        (("--holdout", "none"), [*range(7)], []),
+        pytest.param((), [0, 1, 2, 4, 5, 6], [3], marks=pytest.mark.slow),
+        pytest.param(("--holdout", "none"), [*range(7)], [], marks=pytest.mark.slow),
         (("--holdout", "1.png,3"), [0, 2, 4, 5, 6], [1, 3]),
     ],
 )

@@ -27,7 +27,7 @@ from upath import UPath
 from qgs.data import PhotosSource
 from qgs.data import photos as formats
 from qgs.data.photos.source import PhotoScene
-from qgs.data.scenes import warn_once
+from qgs.wording import warn_once
 
 REAL = ("mary_rose", "office_walk", "desk")
 

@@ -92,6 +92,7 @@ def mean_alpha(checkpoint: Path, recipe: Recipe) -> float:
         return float(model.render(gaussians, sample.targets.cameras).alpha.mean())
 
 
+@pytest.mark.slow
 def test_a_run_driven_to_the_background_stops_and_keeps_good_weights(
     tiny: Tiny, tmp_path: Path
 ) -> None:

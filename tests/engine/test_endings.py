@@ -52,6 +52,7 @@ def test_data_that_fails_leaves_a_run_that_goes_on(
     assert same(weights(again), weights(through))
 
 
+@pytest.mark.slow
 def test_a_killed_worker_leaves_a_run_that_goes_on(tiny: Tiny, tmp_path: Path) -> None:
     recipe = tiny("tokengs", "training.steps=100", "training.workers=1", "training.save_every=0")
 

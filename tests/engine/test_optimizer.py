@@ -170,7 +170,13 @@ def test_a_plugin_adds_an_optimiser_by_one_class(
     assert {key.rsplit("/")[-1] for key in moments} == {"keys", "momentum_buffer"}
 
 
-@pytest.mark.parametrize("made", ["Adafactor(groups, lr=0.01)", "SGD(groups, lr=0.01)"])
+@pytest.mark.parametrize(
+    "made",
+    [
+        "Adafactor(groups, lr=0.01)",
+        pytest.param("SGD(groups, lr=0.01)", marks=pytest.mark.slow),
+    ],
+)
 def test_moments_of_any_shape_and_none_are_restored(
     tiny: Tiny, tmp_path: Path, install: Callable[..., None], made: str
 ) -> None:

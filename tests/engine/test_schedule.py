@@ -91,9 +91,15 @@ def halving_cosine(step: int) -> float:
 @pytest.mark.parametrize(
     ("schedule", "rate"),
     [
-        ("{schedule: linear, values: [0, 2.0e-3], at: [0, 2]}", ramp),
+        pytest.param(
+            "{schedule: linear, values: [0, 2.0e-3], at: [0, 2]}", ramp, marks=pytest.mark.slow
+        ),
         ("{schedule: cosine, values: [1.0e-3, 0], at: [0, 4]}", halving_cosine),
-        ("{schedule: steps, values: [1.0e-3, 1.0e-4], at: [3]}", lambda s: [1e-3, 1e-4][s >= 3]),
+        pytest.param(
+            "{schedule: steps, values: [1.0e-3, 1.0e-4], at: [3]}",
+            lambda s: [1e-3, 1e-4][s >= 3],
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_any_schedule_is_a_learning_rate(

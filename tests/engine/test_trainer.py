@@ -18,7 +18,7 @@ from qgs.engine.folder import RunFolder
 from qgs.io.checkpoint import CheckpointFile
 
 
-@pytest.mark.parametrize("name", ["tokengs", "locus"])
+@pytest.mark.parametrize("name", [pytest.param("tokengs", marks=pytest.mark.slow), "locus"])
 def test_training_lowers_the_loss(tiny: Tiny, tmp_path: Path, name: str) -> None:
     options = ("training.steps=40", "optimizer.warmup=4", "data.scenes=1", "views.mirror=0.0")
     result = run_anywhere(tiny(name, *options), tmp_path / "run")

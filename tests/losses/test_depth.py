@@ -13,8 +13,9 @@ from qgs.composer import resolve
 from qgs.contracts import ViewsConfig
 from qgs.data.samples import make_sample, stack_views
 from qgs.engine.training import train
-from qgs.losses.depth import DepthSurface, _warn_once, surface_errors
+from qgs.losses.depth import DepthSurface, surface_errors
 from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering, Views
+from qgs.wording import warn_once
 
 ROOMS = {
     "recipe": 1,
@@ -92,7 +93,7 @@ def test_a_view_that_is_target_and_input_counts_once() -> None:
 def test_a_batch_without_depth_maps_adds_nothing_and_is_logged_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    _warn_once.cache_clear()
+    warn_once.cache_clear()
     means = POINTS.clone().requires_grad_()
     for _ in range(2):
         value = term(means, Views(wall().images, wall().cameras))

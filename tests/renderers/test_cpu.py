@@ -168,7 +168,8 @@ _RENDER_ONE = (
 )
 
 
-@pytest.mark.parametrize("home", [pytest.param("home", marks=pytest.mark.slow), "file"])
+@pytest.mark.slow
+@pytest.mark.parametrize("home", ["home", "file"])
 def test_an_installation_that_cannot_be_written_renders(tmp_path: Path, home: str):
     """The cache goes to the user's directory; where that cannot be written either, to none."""
     package = tmp_path / "site" / "qgs"

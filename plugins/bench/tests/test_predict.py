@@ -27,7 +27,10 @@ def test_counts_follow_shapes() -> None:
     assert twice.peak > once.peak
 
 
-@pytest.mark.parametrize(("within", "says"), [("100", "fits"), ("0.01", "does not fit")])
+@pytest.mark.parametrize(
+    ("within", "says"),
+    [pytest.param("100", "fits", marks=pytest.mark.slow), ("0.01", "does not fit")],
+)
 def test_the_command(within: str, says: str) -> None:
     words = ("--predict", "--within", within, "--size", "16x24", "--device", "cpu")
     result = run_qgs("bench", TOKENGS, *words, *sets())

@@ -69,6 +69,7 @@ def test_photos_turned_by_exif_are_upright_and_large_ones_are_seen_small(shots, 
     assert frames[0].intrinsics[0] == pytest.approx(435, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_killed_call_is_finished_and_finished_ones_stay(walk, tmp_path, monkeypatch):
     out = tmp_path / "poses"
 
@@ -102,6 +103,7 @@ def test_other_folders_are_left_alone(walk, tmp_path):
     assert (tmp_path / "mine" / "notes.txt").read_text() == "keep"
 
 
+@pytest.mark.slow
 def test_photos_of_two_places_give_the_larger_model(shots, tmp_path):
     import textured_room
 
@@ -162,6 +164,7 @@ def test_hopeless_photos_are_refused(kind, shots, tmp_path):
     assert not (tmp_path / "poses").exists()
 
 
+@pytest.mark.slow
 def test_turning_on_the_spot_gives_no_poses(from_one_place, tmp_path):
     folder = tmp_path / "photos"
     folder.mkdir()

@@ -10,8 +10,8 @@ from qgs_viewer.report import GROUP, Contender, Report, report_html
 from qgs.composer import resolve
 from qgs.contracts import Column
 from qgs.data.evaluation import evaluation_samples
-from qgs.data.scenes import warn_once
 from qgs.drawing.images import EXACT, data_uri
+from qgs.wording import warn_once
 
 PLAIN = {
     "recipe": 1,

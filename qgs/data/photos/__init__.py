@@ -8,9 +8,8 @@ from qgs.data.photos.checks import with_equal_times
 from qgs.data.photos.colmap import Colmap
 from qgs.data.photos.nerfstudio import Nerfstudio
 from qgs.data.photos.reader import Listing, PhotoReader
-from qgs.data.scenes import warn_once
 from qgs.extensions import ExtensionError, installed, load
-from qgs.wording import listed
+from qgs.wording import listed, warn_once
 
 READERS: tuple[type[PhotoReader], ...] = (Nerfstudio, Colmap)
 """The built-in formats. Where a folder holds several listings, the first of this order is read."""

@@ -8,8 +8,7 @@ import numpy as np
 
 from qgs.data.lenses import Intrinsics, Size
 from qgs.data.photos.reader import FrameProblem, Listing, PhotoFrame
-from qgs.data.scenes import warn_once
-from qgs.wording import listed, numbered
+from qgs.wording import listed, numbered, warn_once
 
 LARGEST_SIDE = 10**6  # pixels of a listed photo
 _FARTHEST = 1e12  # largest coordinate of a camera; the square of larger ones overflows float32

@@ -41,10 +41,9 @@ from qgs.data.scenes import (
     EncodedScene,
     LazyScenes,
     LazySource,
-    warn_once,
 )
 from qgs.types import Cameras
-from qgs.wording import listed
+from qgs.wording import listed, warn_once
 
 
 class PhotosConfig(SceneSource.Config):

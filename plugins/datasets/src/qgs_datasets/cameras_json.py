@@ -23,8 +23,7 @@ from qgs.data.photos.reader import (
     image_files,
     numbers,
 )
-from qgs.data.scenes import warn_once
-from qgs.wording import listed
+from qgs.wording import listed, warn_once
 
 _LISTS = ("frames", "cameras", "views")
 _NAMES = ("image", "image_path", "file_path", "filename", "file_name", "file", "name", "img_name")

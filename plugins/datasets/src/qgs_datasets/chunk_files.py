@@ -35,8 +35,7 @@ from qgs.data.photos.checks import (
     pose_problems,
     size_problems,
 )
-from qgs.data.scenes import warn_once
-from qgs.wording import listed, name_shown
+from qgs.wording import listed, name_shown, warn_once
 
 INDEX = "index.json"
 SUFFIX = ".torch"

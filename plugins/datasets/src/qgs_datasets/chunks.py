@@ -22,10 +22,9 @@ from qgs.data.scenes import (
     EncodedScene,
     LazyScenes,
     LazySource,
-    warn_once,
 )
 from qgs.types import Cameras
-from qgs.wording import listed
+from qgs.wording import listed, warn_once
 from qgs_datasets.chunk_files import (
     SUFFIX,
     Chunk,

@@ -13,8 +13,8 @@ from qgs.contracts import SceneSource
 from qgs.data.paths import opened_path, read_file, read_json
 from qgs.data.photos import formats_of
 from qgs.data.photos.source import PhotoScene, PhotosConfig, image_cache
-from qgs.data.scenes import LazyScenes, LazySource, warn_once
-from qgs.wording import listed
+from qgs.data.scenes import LazyScenes, LazySource
+from qgs.wording import listed, warn_once
 
 LISTING = "transforms.json"
 _INSIDE = ("", "gaussian_splat", "nerfstudio")  # folders of a scene that may hold the listing

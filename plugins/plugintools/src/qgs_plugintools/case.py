@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -110,7 +111,7 @@ class Case:
         """Whether it is built with the sizes of the model."""
         return issubclass(self.component, ModelComponent)
 
-    @property
+    @cached_property  # every check of the case is named by it
     def label(self) -> str:
         """Slot and name, and the options that differ from their defaults, in YAML."""
         changed = {

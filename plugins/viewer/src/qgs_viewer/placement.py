@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from qgs.data.scenes import warn_once
 from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Cameras, Gaussians
+from qgs.wording import warn_once
 
 LEAST_WEIGHT = 0.02  # blending weight on a clicked ray below which a Gaussian is not hit
 

@@ -14,7 +14,6 @@ from torch import Tensor
 from qgs.analysis.saving import orbit_path
 from qgs.contracts import Column, LearnedQueries
 from qgs.data.samples import Sample
-from qgs.data.scenes import warn_once
 from qgs.drawing import images, page_environment
 from qgs.drawing.figures import figure_picture, hex_color
 from qgs.drawing.images import Picture, depth_picture, depth_range, rgb_picture
@@ -22,6 +21,7 @@ from qgs.geometry.poses import largest_distance
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Prediction
+from qgs.wording import warn_once
 from qgs_viewer.curves import Curves, curves_figure
 from qgs_viewer.figures.exhibits import Exhibit, exhibit
 from qgs_viewer.pictures import PARTS, attention_pictures_of, color_error, error_picture

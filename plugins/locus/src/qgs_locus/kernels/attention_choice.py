@@ -53,16 +53,11 @@ def chosen_kernel(
         return kernel
     if q_BhNd.device.type != "cuda":
         return "blocks"
-    if plain_bytes(q_BhNd, bias) * SHARE <= _memory(q_BhNd.device):
+    if plain_bytes(q_BhNd, bias) * SHARE <= torch.cuda.mem_get_info(q_BhNd.device)[1]:
         return "plain"
     found = "triton" if fits_triton(q_BhNd, bias) else "blocks"
     _log_once(f"attention with a bias goes through {found}: that of all pairs is too large")
     return found
-
-
-@cache  # once, as all layers of all passes ask
-def _memory(device: torch.device) -> int:
-    return torch.cuda.mem_get_info(device)[1]
 
 
 def plain_bytes(q_BhNd: Tensor, bias: "AttentionBias") -> int:

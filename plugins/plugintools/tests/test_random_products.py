@@ -4,6 +4,7 @@ import random
 from dataclasses import replace
 from typing import Any, Literal, get_args, get_origin
 
+import pytest
 import torch
 from qgs_plugintools import Case
 from qgs_plugintools.inputs import Maker, Sizes
@@ -157,6 +158,7 @@ def _train(recipe: Recipe) -> None:
         assert model.eval()(inputs).gaussians.means.isfinite().all()
 
 
+@pytest.mark.slow
 def test_each_product_trains_or_is_refused() -> None:
     trained, refused, faults = list[Recipe](), 0, list[str]()
     for seed in range(DRAWS):
