@@ -27,10 +27,6 @@ _SMALL = DepthSplatEncoder.Config(
 )
 
 _BIASES = "instance norms take biases of the CNN away again: they are stored and learn nothing"
-_GRAPHS = (
-    "the sweep takes the neighbours of a photo one after another, for the memory that all at once "
-    "would take, so that each number of photos has a graph of its own"
-)
 
 plugin = Plugin(
     name="mvsplat",
@@ -59,13 +55,13 @@ plugin = Plugin(
     ),
     exemptions={
         MVSplatEncoder: {
-            "compiles": _GRAPHS,
+            "compiles": "the sweep takes the other photos one after another, for the memory that "
+            "all at once would take: each number of photos has a graph of its own",
             "parameters_learn": _BIASES,
             "tokens_are_those_of_the_grid": "before training, instance norms over whole maps and "
             "the softmax over depths spread what a pixel shows over its image",
         },
         DepthSplatEncoder: {
-            "compiles": _GRAPHS,
             "parameters_learn": f"{_BIASES}; and zeros start behind each other, in the blocks and "
             "at the end of a U-Net and of a correction, and each takes a step to open",
         },

@@ -224,7 +224,8 @@ class DepthPredictor(nn.Module):
         self, cnn: Stages, multi: Sequence[Tensor], mono: Sequence[Tensor], sweep: Sweep
     ) -> tuple[list[Tensor], Tensor]:
         """Inverse depth (B V, 1, h, w) of each scale, largest probability of the last."""
-        views, found, confidence = sweep.near.shape[1], list[Tensor](), multi[0]
+        found: list[Tensor] = []  # `list[Tensor]()` would break the graph of torch.compile
+        views, confidence = sweep.near.shape[1], multi[0]
         poses_BVJ44 = relative_poses(sweep.cameras.c2w, sweep.neighbours)
         for scale, (own, features) in enumerate(zip(multi, mono, strict=True)):
             count = self.candidates(scale)
