@@ -57,7 +57,7 @@ class FoundScale:
     @property
     def poor(self) -> str:
         """A remark where no factor gave a good result or the inputs alone decide, else ""."""
-        if self.psnr < POOR:
+        if not self.psnr >= POOR:  # NaN is poor too
             return (
                 f"no scale fits, at the best the photos are rendered at {self.psnr:.1f} dB: choose "
                 "inputs that overlap more (--frames), or give the scale (--scale)"
@@ -217,7 +217,8 @@ class _Trial:
 
     def score(self, place: float) -> float:
         below = self._nearest / self.factor(place)
-        return self.psnr(place) - PENALTY * math.log(max(below, 1.0))
+        found = self.psnr(place) - PENALTY * math.log(max(below, 1.0))
+        return -math.inf if math.isnan(found) else found
 
     def best(self, places: Sequence[float]) -> float:
         """Try those places; the best of all so far."""

@@ -87,13 +87,11 @@ def _photos(
 ) -> tuple[Sample, Views, list[int]]:
     """The sample of `start` at the size of `scene`, the photos to optimise on, and their frames.
 
-    Held-out photos are compared with all together, unless others were named.
+    Held-out photos are compared with all together, unless others were named; but for inputs.
     """
     inputs, targets = start.sample.input_frames, start.sample.target_frames
-    if targets and {*targets} < {
-        *scene.held_out
-    }:  # the refined scene is the whole one, not a window
-        targets = tuple(sorted(scene.held_out))
+    if targets and {*targets} < {*scene.held_out}:  # of the whole scene, not of a window
+        targets = tuple(sorted({*scene.held_out} - {*inputs}))
     usable = {*inputs} if inputs_only else {*training_frames(scene), *inputs} - {*targets}
     frames = sorted(usable)
     every = views_in(start.world, scene, (*frames, *targets)).to(start.gaussians.means.device)
