@@ -1,4 +1,4 @@
-"""What sources of scenes share: lists opened on demand, stored photos, a cache, warnings."""
+"""What sources of scenes share: lists opened on demand, stored photos, a cache."""
 
 from abc import abstractmethod
 from collections import OrderedDict

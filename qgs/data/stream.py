@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from qgs.contracts import SceneSource, ViewSampler, ViewsConfig
+from qgs.contracts import Frames, Scene, SceneSource, ViewSampler, ViewsConfig
 from qgs.data.domain import Domain
 from qgs.data.evaluation import one_line
 from qgs.data.samples import (
@@ -191,21 +191,25 @@ class SampleStream:
         """Of the inputs and targets (1, V) of a sample as drawn after `step` optimiser steps."""
         rng = np.random.default_rng([self._seed, 1, number])
         scene = self._scenes[self.order.scene(number)]
-        rng.random()  # whether the sample is mirrored
-        inputs, targets = self._sampler.draw(scene, self._views, rng, step)
+        _, inputs, targets = self._drawn(scene, rng, step)
         world, count = own_world(scene, inputs, self._views), len(inputs)
         both = cameras_in(world, scene, (*inputs, *targets))
         both = with_noise(both, count, self._views, rng) if self._views.pose_noise else both
         return both[:, :count], both[:, count:]
+
+    def _drawn(
+        self, scene: Scene, rng: np.random.Generator, step: int
+    ) -> tuple[bool, Frames, Frames]:
+        """Whether a sample is mirrored, and its input and target frames."""
+        mirror = bool(rng.random() < self._views.mirror)
+        return mirror, *self._sampler.draw(scene, self._views, rng, step)
 
     def _made(self, number: int, attempt: int) -> Sample:
         """Sample `number`, or its replacement after `attempt` failures."""
         # the first attempt draws from (seed, 1, number), whether others were replaced or not
         rng = np.random.default_rng([self._seed, 1, number, *[attempt] * bool(attempt)])
         scene = self._scenes[self.order.scene(number + attempt)]
-        mirror = bool(rng.random() < self._views.mirror)
-        step = number // self._per_step
-        inputs, targets = self._sampler.draw(scene, self._views, rng, step)
+        mirror, inputs, targets = self._drawn(scene, rng, number // self._per_step)
         try:
             return make_sample(scene, inputs, targets, self._views, mirror, rng, self._depths)
         except Exception as error:

@@ -75,4 +75,4 @@ def exhibit_of(kind: str) -> Exhibit:
 
 def exhibition_of(*kinds: str, query: int | None = None) -> Exhibition:
     samples = [sample_of(), sample_of((0, 5))]
-    return Exhibition([exhibit_of(kind) for kind in kinds], samples, [None, None], query)
+    return Exhibition([exhibit_of(kind) for kind in kinds], samples, query)

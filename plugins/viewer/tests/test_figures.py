@@ -69,7 +69,9 @@ def test_novel_views_show_the_middle_target_with_its_score_and_error() -> None:
 def test_depths_of_a_scene_have_one_scale_and_the_true_one_a_column(kinds: tuple[str, ...]) -> None:
     show = exhibition_of(*kinds)
     true = torch.linspace(1, 9, 2 * SIDE * SIDE).view(2, 1, SIDE, SIDE)
-    made = novel_views.made(replace(show, depths=[true, None]))
+    first, second = show.samples
+    known = replace(first, targets=replace(first.targets, depths=true[None]))
+    made = novel_views.made(replace(show, samples=[known, second]))
     titled = {axis.get_title(loc="left"): axis for axis in made.figure.axes}
     sample, maps = show.samples[0], [true[1]]
     for model in show.models.values():

@@ -60,7 +60,6 @@ def page_of(tree: dict, name: str) -> str:
         contenders=[contender],
         baselines={"Mean colour": {"psnr": 11.11, "mine": None, "none": None}},
         samples=samples,
-        depths=[sample.targets.depths[0] for sample in samples],
         facts={"Budget": "none"},
         notes=["The photos lie outside."],
         meanings=["What my metric means."],

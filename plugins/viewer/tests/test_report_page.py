@@ -38,7 +38,6 @@ def page_of_two_scenes() -> str:
         contenders=contenders(),
         baselines={},
         samples=[sample_of(1, 2), sample_of(3, 4)],
-        depths=[None, None],
         facts={},
     )
     return report_html(report)

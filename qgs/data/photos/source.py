@@ -35,13 +35,7 @@ from qgs.data.photos.checks import refuse_fatal_problems, size_problems
 from qgs.data.photos.posing import VIDEOS, posed
 from qgs.data.photos.reader import PhotoFrame, existing
 from qgs.data.photos.turning import turned, turned_size, upright
-from qgs.data.scenes import (
-    BoundedCache,
-    EncodedFrame,
-    EncodedScene,
-    LazyScenes,
-    LazySource,
-)
+from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, LazySource
 from qgs.types import Cameras
 from qgs.wording import listed, warn_once
 

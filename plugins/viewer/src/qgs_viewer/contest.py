@@ -321,7 +321,13 @@ def report_of(
     searched = entries if recipe.views.scale == "search" else entries[:1]
     pictured = [
         evaluation_samples(
-            source, recipe.views, few, None, entry.search, entry.windows_of, depths=True
+            source,
+            recipe.views,
+            few,
+            None,
+            entry.search,
+            entry.windows_of,
+            depths=entry is searched[0],
         )[:PICTURED_SCENES]
         for entry in searched
     ] * (len(entries) // len(searched))
@@ -349,7 +355,6 @@ def report_of(
         ],
         baselines={n.replace("_", " ").capitalize(): evaluation.means(n) for n in BASELINES},
         samples=samples,
-        depths=[None if (d := sample.targets.depths) is None else d[0] for sample in samples],
         facts={
             "Data": f"{recipe.tree['data']['type']}, {width} × {height} pixels",
             "Views": f"{recipe.views.inputs} inputs, judged on views {judged} them",

@@ -50,10 +50,9 @@ class Contender:
 class Report:
     """A comparison of `contenders`, in order, by `columns`: each score and how it is shown.
 
-    baselines: name to scores on the same views. samples: the pictured scenes, headed `scenes`.
-    depths: for each the true depth (T, 1, H, W) of its targets in the model's units, where known.
-    lede: a sentence or two below the title. notes: remarks below the table. meanings: of the
-    columns. commands: next commands, with what each does.
+    baselines: name to scores on the same views. samples: the pictured scenes, headed `scenes`, with
+    the true depth of targets where known. lede: a sentence or two below the title. notes: remarks
+    below the table. meanings: of the columns. commands: next commands, with what each does.
     """
 
     columns: Mapping[str, Column]
@@ -61,7 +60,6 @@ class Report:
     contenders: Sequence[Contender]
     baselines: Mapping[str, Mapping[str, float | None]]
     samples: Sequence[Sample]
-    depths: Sequence[Tensor | None]
     facts: Mapping[str, str]
     lede: str = ""
     scenes: str = "Unseen scenes"
@@ -129,9 +127,8 @@ def report_html(report: Report) -> str:
         pictured_scene(
             [(c, predictions[number], samples_of(c, samples)[number]) for c, predictions in shown],
             sample,
-            depth,
         )
-        for number, (sample, depth) in enumerate(zip(samples, report.depths, strict=True))
+        for number, sample in enumerate(samples)
     ]
     environment = page_environment("qgs_viewer", uri=images.data_uri, hex=hex_color)
     template = environment.get_template("report.html")
@@ -162,17 +159,17 @@ def offered_sections(shown: Shown, samples: Sequence[Sample]) -> Iterator[Report
 
 
 def pictured_scene(
-    shown: Sequence[tuple[Contender, Prediction, Sample]], sample: Sample, depth: Tensor | None
+    shown: Sequence[tuple[Contender, Prediction, Sample]], sample: Sample
 ) -> dict[str, Any]:
     """Name, inputs and pictures of a scene by kind and column; `most`: the brightest error.
 
-    shown: each with the sample in its own scale. depth: the true one (T, 1, H, W).
+    shown: each with the sample in its own scale.
     """
     views = sample.targets.select(slice(TARGETS))
     inputs, truth = sample.input_frames, views.images[0]
     frames = [f"frame {sample.label(f)}" for f in (*inputs, *sample.target_frames)]
     colors = {"Truth": _photos(truth, frames[len(inputs) :])}
-    depths = {} if depth is None else {"Truth": depth[:TARGETS]}
+    depths = {} if views.depths is None else {"Truth": views.depths[0]}
     errors = {}
     for contender, prediction, own in shown:
         cameras = own.targets.select(slice(TARGETS)).cameras

@@ -4,7 +4,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
 
 from qgs.data.samples import Sample
 from qgs.drawing.images import Picture, enlarged, rgb_picture
@@ -62,14 +61,12 @@ class Exhibit:
 class Exhibition:
     """Models on the same scenes; the exhibits look at the first of `samples`.
 
-    depths: for each sample the true depth (T, 1, H, W) of its targets in the models' units, where
-    known. query: shown in figures of single queries; None for each model's most notable ones.
-    notes: remarks on models and scenes.
+    samples: with the true depth of targets where known. query: shown in figures of single queries;
+    None for each model's most notable ones. notes: remarks on models and scenes.
     """
 
     exhibits: Sequence[Exhibit]
     samples: Sequence[Sample]
-    depths: Sequence[Tensor | None]
     query: int | None = None
     notes: Sequence[str] = ()
 

@@ -94,8 +94,7 @@ def open_exhibition(
         remarks.append(f"{first}: {summary(search.found.values(), option='')}.")
     if recipe.views.scale == "auto":
         remarks.append(contest.AUTO_SCALE)
-    depths = [None if (d := sample.targets.depths) is None else d[0] for sample in samples]
-    return Exhibition(exhibits, samples, depths, query, remarks)
+    return Exhibition(exhibits, samples, query, remarks)
 
 
 def refuse_unknown(names: Sequence[str]) -> None:

@@ -28,7 +28,7 @@ TRUE = " of the models' and the true depth, which is shown where it is known"
 
 def made(show: Exhibition) -> Made:
     """See `figure`."""
-    samples, depths, first = show.samples[:SCENES], show.depths[:SCENES], show.samples[0]
+    samples, first = show.samples[:SCENES], show.samples[0]
     target = first.label(first.target_frames[len(first.target_frames) // 2])
     more = len(first.input_frames) - INPUTS
     caption = paper.caption(
@@ -37,9 +37,9 @@ def made(show: Exhibition) -> Made:
         photos=len(first.input_frames),
         shown=f", {INPUTS} of them shown" if more > 0 else "",
         frame=target,
-        true=TRUE * _known(depths),
+        true=TRUE * _known(samples),
     )
-    return Made(figure(show.models, samples, depths), caption)
+    return Made(figure(show.models, samples), caption)
 
 
 @paper.paper_style()
@@ -47,16 +47,12 @@ def made(show: Exhibition) -> Made:
 def figure(
     models: Mapping[str, QueryGaussianModel],
     samples: Sequence[Sample],
-    depths: Sequence[Tensor | None],
 ) -> Figure:
-    """Inputs, truth, render with PSNR, depths and error of the middle target of each sample.
-
-    depths: for each sample the true depth (T, 1, H, W) of its targets, where known.
-    """
+    """Inputs, truth, render with PSNR, depths and error of the middle target of each sample."""
     scenes = [_rendered(models, sample) for sample in samples]
     errors = [color_error(r.rgb[0, 0], truth) for seen, truth in scenes for r in seen.values()]
     brightest = depth_range(torch.cat([error.flatten() for error in errors]))[1]
-    titles = [title for title in TITLES if title != "true depth" or _known(depths)]
+    titles = [title for title in TITLES if title != "true depth" or _known(samples)]
     columns = ceil(INPUTS / len(models)) + len(titles) - INPUTS
     rows = len(samples) * len(models)
     height, width = samples[0].inputs.cameras.size
@@ -64,9 +60,9 @@ def figure(
     drawn = new_figure((side * height / width + 0.04) * rows + 0.45)
     heights = [side * height / width] * rows + [0.07]
     *panels, scales = drawn.subplots(rows + 1, columns, height_ratios=heights)
-    for number, (sample, depth) in enumerate(zip(samples, depths, strict=True)):
+    for number, sample in enumerate(samples):
         block = np.array(panels[number * len(models) : (number + 1) * len(models)])
-        _scene(block, sample, depth, *scenes[number], brightest, _known(depths))
+        _scene(block, sample, *scenes[number], brightest, _known(samples))
         block[0, 0].set_ylabel(sample_name(sample, samples), labelpad=paper.PAD)
     for axis, title in zip(panels[0][::-1], titles, strict=False):
         axis.set_title(title)
@@ -74,8 +70,8 @@ def figure(
     return drawn
 
 
-def _known(depths: Sequence[Tensor | None]) -> bool:
-    return any(depth is not None for depth in depths)
+def _known(samples: Sequence[Sample]) -> bool:
+    return any(sample.targets.depths is not None for sample in samples)
 
 
 def _rendered(
@@ -95,7 +91,6 @@ def _rendered(
 def _scene(
     block: np.ndarray,
     sample: Sample,
-    depth: Tensor | None,
     seen: Mapping[str, Rendering],
     truth: Tensor,
     brightest: float,
@@ -110,7 +105,8 @@ def _scene(
     first = block.shape[1] - 4 - column
     picture_panel(block[0, first], rgb_picture(truth))
     maps = [rendering.depth[0, 0].cpu() for rendering in seen.values()]
-    true = [] if depth is None else [depth[len(sample.target_frames) // 2].cpu()]
+    depths = sample.targets.depths
+    true = [] if depths is None else [depths[0, len(sample.target_frames) // 2].cpu()]
     near, far = depth_range(torch.cat([*true, *maps]))
     for line, found in zip(block, maps, strict=True):
         picture_panel(line[-2], depth_picture(found, near, far))
