@@ -45,8 +45,10 @@ def choose_windows(
     usable = [frame for frame in range(len(scene)) if frame not in held]
     if inputs > len(usable):
         besides = f" beside {len(held)} held-out ones" if held else ""
-        few = f"there are {len(usable)} photos{besides}, too few for {inputs} input views"
-        raise ValueError(f"{few}: ask for fewer (--inputs), or hold none out (--holdout none)")
+        raise ValueError(
+            f"there are {len(usable)} photos{besides}, too few for {inputs} input views: add "
+            "photos, or let qgs reconstruct take fewer (--inputs) or hold none out (--holdout none)"
+        )
     targets = held or (usable if len(usable) > inputs else [])
     if not targets:
         return [(tuple(usable), ())]

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from qgs.analysis.inputs import NOVEL, Frusta, choose_windows
+from qgs.analysis.inputs import NOVEL, Frusta, Window, choose_windows
 from qgs.analysis.scale import FoundScale
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import SEARCHED, Domain, remedies
@@ -27,31 +27,8 @@ KINDS = ("input", "novel", "seen in training")
 """A compared view of a folder that the model was trained on is novel if it was held out."""
 
 
-def choose_frames(
-    total: int,
-    inputs: int,
-    span: int,
-    frames: Sequence[int] | None = None,
-    compare: Sequence[int] | None = None,
-    held_out: Sequence[int] = (),
-) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Input frames and novel frames, from 0 to total - 1.
-
-    frames: the inputs; None spreads `inputs` of them, ends included, over the middle `span` frames.
-    compare: the novel ones; None spreads at most NOVEL between the inputs, `held_out` ones first,
-    which are no inputs. Raises ValueError for frames that do not exist or come twice.
-    """
-    usable = [frame for frame in range(total) if frame not in held_out]
-    if frames is None:
-        if inputs > len(usable):
-            raise ValueError(f"there are {len(usable)} photos, too few for {inputs} input views")
-        span = min(max(span, inputs), len(usable))
-        first = (len(usable) - span) // 2
-        frames = evenly(usable[first : first + span], inputs)
-    if compare is None:
-        between = [f for f in range(min(frames), max(frames) + 1) if f not in frames]
-        between = [f for f in between if f in held_out] or between
-        compare = evenly(between, NOVEL)
+def checked_window(total: int, frames: Sequence[int], compare: Sequence[int] = ()) -> Window:
+    """Input frames and compared ones. Raises ValueError for one twice or not of 0 to total - 1."""
     every = [*frames, *compare]
     if missing := [frame for frame in every if not 0 <= frame < total]:
         raise ValueError(f"frames {listed(missing)} do not exist; the photos are 0..{total - 1}")
@@ -73,31 +50,41 @@ def choose_sample(
 ) -> tuple[Sample, tuple[Tensor, Tensor]]:
     """Inputs and compared views of `scene`, and their world as of `own_world`.
 
-    trained_on: of the model, where the photos are none of its training's kind: inputs are then
-    those of `choose_windows`, otherwise those of `choose_frames`. views_of: makes the settings of
-    the chosen views, such as their scale; None takes `views`. Where times are known, inputs spread
-    over them, and views compared by default are of one.
+    frames, compare: by default the best of `choose_windows`; where times are known, inputs spread
+    over them, and views of one time between. trained_on: of the model. views_of: makes the settings
+    of the chosen views, such as their scale; None takes `views`. Raises ValueError for frames that
+    do not exist or come twice, and for too few.
     """
-    wanted, span = inputs or views.inputs, views.gap[1] + 1
-    usable = moments(scene)
-    if scene.times is not None and frames is None and wanted <= len(usable):
-        first = max(len(usable) - max(span, wanted), 0) // 2
-        frames = spread(usable[first : len(usable) - first], wanted)
-    elif scene.times is None and trained_on is not None:
-        novel = compare
-        if frames is None:
-            of = views.model_copy(update={"inputs": wanted})
-            frames, novel = choose_windows(scene, of, trained_on, held_out=compare)[0]
-        elif compare is None and {*frames} <= {*range(len(scene))}:
-            novel = Frusta(scene, trained_on).compared(tuple(frames))
-        compare = novel if compare is None else compare
-    picked = choose_frames(len(scene), wanted, span, frames, compare, held_out=scene.held_out)
-    if scene.times is not None and compare is None and picked[1]:
-        moment = scene.times[picked[1][len(picked[1]) // 2]]
-        picked = picked[0], tuple(frame for frame in picked[1] if scene.times[frame] == moment)
+    views = views.model_copy(update={"inputs": inputs or views.inputs})
+    if frames is not None:
+        checked_window(len(scene), frames)
+    if scene.times is not None:
+        frames, novel = _over_time(scene, scene.times, views, frames)
+    elif frames is None:
+        window = choose_windows(scene, views, trained_on or Domain(), held_out=compare)[0]
+        frames, novel = window
+    else:
+        novel = Frusta(scene, trained_on or Domain()).compared(tuple(frames))
+    picked = checked_window(len(scene), frames, novel if compare is None else compare)
     views = views_of(scene, *picked) if views_of else views
     sample = make_sample(scene, *picked, views, mirror=False)
     return sample, own_world(scene, picked[0], views)
+
+
+def _over_time(
+    scene: Scene, times: Tensor, views: ViewsConfig, frames: Sequence[int] | None
+) -> Window:
+    """Inputs, and at most NOVEL frames of one time between them, held-out ones where there are."""
+    usable = moments(scene)
+    if frames is None:
+        if views.inputs > len(usable):
+            raise ValueError(f"there are {len(usable)} times, too few for {views.inputs} inputs")
+        first = max(len(usable) - max(views.gap[1] + 1, views.inputs), 0) // 2
+        frames = spread(usable[first : len(usable) - first], views.inputs)
+    between = [f for f in range(min(frames), max(frames) + 1) if f not in frames]
+    novel = evenly([f for f in between if f in scene.held_out] or between, NOVEL)
+    moment = times[novel[len(novel) // 2]] if novel else None
+    return tuple(frames), tuple(frame for frame in novel if times[frame] == moment)
 
 
 @dataclass(frozen=True)

@@ -102,8 +102,8 @@ def reconstruct(
     against = [] if compare == "none" else compare
     against = None if against is None else frame_list(against, "compare", found)
     search = ScaleSearch(model, photo_settings(recipe.views, own, overrides))
-    trained_on = None if seen else model.trained_on or Domain()
-    sample, world = choose_sample(found, recipe.views, inputs, wanted, against, trained_on, search)
+    domain = model.trained_on
+    sample, world = choose_sample(found, recipe.views, inputs, wanted, against, domain, search)
     training = model.training
     try:
         tuned, record = tune(sample.inputs) if tune else (None, None)
@@ -200,18 +200,16 @@ def chosen_scene(
         whole = whole_size(scene, size_multiple([recipe]))
         if whole != scene.cameras.size:
             return chosen_scene(recipe, path, whole, name, holdout)
-    if holdout and not is_training_data and not scene.held_out and len(scene) > 2:
-        options = held_out_of(source.config, len(scene))
-        scene = named_scene(type(source)(options), path, name)
+    if holdout and not is_training_data:
+        scene = named_scene(type(source)(holding_out(source.config, scene)), path, name)
     seen = is_training_data and scene.name in source.names("train")
     return scene, training_frames(scene) if seen else ()
 
 
-def held_out_of(config: SceneSourceConfig, photos: int) -> SceneSourceConfig:
-    """Options with every HOLDOUT-th of `photos` held out, or the middle one of fewer."""
-    if getattr(config, "holdout", None) != 0:
-        return config
-    return config.model_copy(update={"holdout": min(HOLDOUT, photos)})
+def holding_out(config: SceneSourceConfig, scene: Scene) -> SceneSourceConfig:
+    """Options with every HOLDOUT-th photo held out, unless `scene` or they have a split."""
+    split = scene.held_out or getattr(config, "holdout", None) != 0
+    return config if split else config.model_copy(update={"holdout": HOLDOUT})
 
 
 def whole_size(scene: Scene, multiple: int | None) -> Size:

@@ -88,8 +88,8 @@ class EvaluationPlan:
     the others `evaluation.samples` samples, inputs drawn by `sampler` (default: `Span`) as at the
     end of training with `evaluation.seed`, targets the other frames of the span, or of one time.
     Targets of T times are T samples. views_of: makes the settings of a sample, such as its scale.
-    windows_of: gives windows of a scene with held-out frames that does not move, instead. depths:
-    targets have true depth where scenes do.
+    windows_of: gives windows of a scene that does not move, instead. depths: targets have true
+    depth where scenes do.
 
     wanted, null, unlisted: see `qgs.engine.results.Evaluation`. framing: of the first photo, and
     drawn: scenes that have samples, once `samples` has run. Raises ValueError without scenes.
@@ -143,13 +143,11 @@ class EvaluationPlan:
 
     def _choices(self, scene: Scene, place: int) -> Iterator[tuple[Frames, Frames]]:
         """Input and target frames of each sample."""
+        windows_of = self._windows_of if scene.times is None else None
         if self._index is not None:
             yield _named(scene, self._index)
-        elif scene.held_out:
-            if self._windows_of is None or scene.times is not None:
-                windows = held_out_windows(scene, self._views)
-            else:
-                windows = self._windows_of(scene)
+        elif scene.held_out or windows_of:
+            windows = windows_of(scene) if windows_of else held_out_windows(scene, self._views)
             count = min(self._evaluation.scenes, len(windows))
             # evenly thinned, so that both ends of a long scene are judged
             kept = np.linspace(0, len(windows) - 1, count).round().astype(int)

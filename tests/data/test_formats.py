@@ -151,7 +151,7 @@ def test_a_folder_of_scenes(tmp_path, caplog):
     assert [s.name for s in source.scenes("train")] == ["a", "b"]
     assert [s.name for s in source.scenes("test")[1:]] == ["b"]
     assert "left out: notes, photos" in caplog.text
-    assert source.scenes("test")[0].held_out == (4,)
+    assert source.scenes("test")[0].held_out == (3,)
     assert not torch.equal(*(s.images([0]) for s in source.scenes("train")))
 
 

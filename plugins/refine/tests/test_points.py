@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from qgs_refine.points import from_points, sparse_points
+from upath import UPath
 
 from qgs.geometry.poses import look_at
 
@@ -42,7 +43,7 @@ def as_binary() -> bytes:
 @pytest.mark.parametrize(("name", "content"), [("txt", as_text()), ("bin", as_binary())])
 def test_points_of_a_model(name: str, content: bytes, tmp_path: Path) -> None:
     (model(tmp_path) / f"points3D.{name}").write_bytes(content)
-    found = sparse_points(str(tmp_path))
+    found = sparse_points(UPath(tmp_path))
     assert found is not None
     expected = torch.tensor(POINTS, dtype=torch.float64)
     torch.testing.assert_close(found[0], expected[:, :3])
@@ -50,15 +51,15 @@ def test_points_of_a_model(name: str, content: bytes, tmp_path: Path) -> None:
 
 
 def test_without_points_there_are_none(tmp_path: Path) -> None:
-    assert sparse_points(str(tmp_path)) is None
+    assert sparse_points(UPath(tmp_path)) is None
     model(tmp_path)
-    assert sparse_points(str(tmp_path)) is None
+    assert sparse_points(UPath(tmp_path)) is None
 
 
 def test_cameras_of_another_format_have_another_world(tmp_path: Path) -> None:
     (model(tmp_path) / "points3D.txt").write_bytes(as_text())
     (tmp_path / "transforms.json").write_text("{}")
-    assert sparse_points(str(tmp_path)) is None
+    assert sparse_points(UPath(tmp_path)) is None
 
 
 @pytest.mark.parametrize("cut", [4, 40, -3])
@@ -66,7 +67,7 @@ def test_points_that_are_cut_off_are_refused(cut: int, tmp_path: Path) -> None:
     file = model(tmp_path) / "points3D.bin"
     file.write_bytes(as_binary()[:cut])
     with pytest.raises(ValueError, match=r"points3D\.bin"):
-        sparse_points(str(tmp_path))
+        sparse_points(UPath(tmp_path))
 
 
 def test_gaussians_stand_at_the_points_in_the_world_of_a_scene() -> None:

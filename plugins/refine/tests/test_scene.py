@@ -21,7 +21,7 @@ from qgs_refine.planning import (
     Plan,
     Scenes,
     affordable,
-    held_out_frames,
+    judged_frames,
     sized,
 )
 from qgs_refine.refining import Extras
@@ -140,16 +140,16 @@ def test_a_folder_with_something_in_it_is_refused(photos: Path) -> None:
     ("count", "holdout", "held"),
     [(20, "8", (4, 12)), (7, "8", (3,)), (3, "8", (1,)), (2, "8", ()), (7, "3", (1, 4))],
 )
-def test_held_out_frames(count: int, holdout: str, held: tuple[int, ...]) -> None:
+def test_judged_frames(count: int, holdout: str, held: tuple[int, ...]) -> None:
     scene = Mock(held_out=(), __len__=lambda self: count)
-    assert held_out_frames(scene, holdout) == held
-    assert held_out_frames(scene, NONE) == ()
+    assert judged_frames(scene, holdout) == held
+    assert judged_frames(scene, NONE) == ()
 
 
 def test_a_split_of_the_photos_goes_first() -> None:
     scene = Mock(held_out=(0, 5), __len__=lambda self: 20)
-    assert held_out_frames(scene, "8") == (0, 5)
-    assert held_out_frames(scene, NONE) == ()
+    assert judged_frames(scene, "8") == (0, 5)
+    assert judged_frames(scene, NONE) == ()
 
 
 def test_more_time_buys_larger_photos_and_more_gaussians(photos: Path) -> None:
@@ -183,7 +183,9 @@ def test_a_plan_is_a_command_line() -> None:
 
 
 def test_points_of_colmap_are_part_of_the_start(photos: Path, tmp_path: Path) -> None:
-    """The folder with its cameras as a COLMAP model, whose one point is far to the side."""
+    """Of a folder of scenes, the cameras as a COLMAP model whose one point is far to the side."""
+    shutil.copytree(photos, tmp_path / "other")
+    tmp_path /= "mine"
     place = tmp_path / "sparse/0"
     place.mkdir(parents=True)
     (tmp_path / "images").mkdir()
@@ -196,12 +198,13 @@ def test_points_of_colmap_are_part_of_the_start(photos: Path, tmp_path: Path) ->
     (place / "images.txt").write_text("".join(lines))
     (place / "cameras.txt").write_text("1 PINHOLE 48 32 48 48 24 16\n")
     (place / "points3D.txt").write_text("1 5 6 7 255 0 0 0.5 1 1\n")
-    scenes = Scenes(str(tmp_path), None, "8", None, None)
+    scenes = Scenes(str(tmp_path.parent), tmp_path.name, "8", None, None)
     world = photos_world(scenes)
     views = views_in(world, scenes.probe, scenes.frames)
-    found = photos_start(str(tmp_path), world, views, 100, 40)
+    found = photos_start(scenes.probe, world, views, 100, 40)
     assert found.count == 41
     point = moved(found, world[0], 1 / float(world[1])).means[0, 0]
     torch.testing.assert_close(point, torch.tensor([5.0, 6, 7]), atol=1e-4, rtol=0)
-    plain = photos_world(Scenes(str(photos), None, "8", None, None))
-    assert photos_start(str(photos), plain, views, 100, 40).count == making.TIMED
+    other = Scenes(str(photos), None, "8", None, None)
+    found = photos_start(other.probe, photos_world(other), views, 100, 40)
+    assert found.count == making.TIMED

@@ -10,7 +10,7 @@ import yaml
 from commands import MODEL, run_qgs
 from photo_formats import noisy_photos
 from plyfile import PlyData
-from qgs_viewer.contest import checkpoints, judge, resolve_fairly
+from qgs_viewer.contest import checkpoints, judge, report_of, resolve_fairly
 from qgs_viewer.curves import curves_of
 from qgs_viewer.demo import new_folder
 
@@ -140,6 +140,42 @@ def test_photos_in_another_unit_are_judged_alike(models, tmp_path):
     assert figures[0] == pytest.approx(figures[1], abs=1e-3)
 
 
+def test_small_scenes_keep_their_photos_and_others_every_eighth(models, tmp_path):
+    for name, count in (("large", 20), ("small", 3), ("tiny", 2)):
+        noisy_photos(tmp_path / "scenes" / name, count, step=0.1)
+    evaluation = judge(checkpoints(models[1:2]), str(tmp_path / "scenes"), "cpu")[0].evaluation
+    judged = {
+        score.scene: {f for _, compared in score.views for f in compared}
+        for score in evaluation.scores
+    }
+    assert judged == {"large": {4, 12}, "small": {1}}
+    assert [missing.scene for missing in evaluation.missing] == ["tiny"]
+
+
+def test_two_photos_leave_nothing_to_compare_with(models, tmp_path):
+    result = run_qgs("demo", noisy_photos(tmp_path / "two", 2, step=0.1), *models)
+    assert isinstance(result.exception, ValueError)
+    assert "none is left to compare with" in str(result.exception)
+    assert not (tmp_path / "demo").exists()
+
+
+def test_a_model_tuned_on_the_photos_is_compared_on_those_it_never_saw(models, tmp_path):
+    photos = noisy_photos(tmp_path / "mine", 20, step=0.1)
+    data = {"type": "qgs/photos", "path": str(photos), "image_size": [16, 16], "holdout": 5}
+    views = {**RECIPE["views"], "gap": [1, 3], "scale": "auto"}
+    file = tmp_path / "models/tuned.safetensors"
+    qgs.save(resolve({**RECIPE, "data": data, "views": views}).build_model(), file)
+    before, after = judge(checkpoints([models[1], str(file)]), str(photos), "cpu")
+    judged = [[score.views for score in entry.evaluation.scores] for entry in (before, after)]
+    assert judged[0] == judged[1]
+    compared = {frame for views in judged[0] for _, frames in views for frame in frames}
+    assert compared <= {2, 7, 12, 17}
+    assert [entry.recipe.views.scale for entry in (before, after)] == ["search", "auto"]
+    report = report_of([before, after], "", {}, {})
+    ends = [own.samples[0].inputs.cameras.c2w[0, -1, :3, 3].norm() for own in report.contenders]
+    assert ends[0] != ends[1]
+
+
 def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert new_folder(None).name == "demo"
@@ -159,9 +195,10 @@ def next_lines(output):
 
 def test_the_next_commands_exist_and_name_the_photos_and_a_model(models, tmp_path):
     photos = noisy_photos(tmp_path / "my photos", 12, step=0.1)
-    result = run_qgs("demo", photos, *models)
+    result = run_qgs("demo", photos, *models, "--scale", "0.5")
     assert result.exit_code == 0, result.output
     commands = next_lines(result.output)
+    assert all(command[-2:] == ["--scale", "0.5"] for command in (commands[1], commands[0][:-4]))
     assert [command[1] for command in commands] == ["reconstruct", "view"]
     for _, name, *words in commands:
         assert words[0] in models

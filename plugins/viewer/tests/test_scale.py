@@ -83,6 +83,21 @@ def test_all_commands_find_the_same_scale(
         assert sum(quality) / len(quality) == pytest.approx(first.values["model_psnr"], abs=0.01)
 
 
+def test_all_commands_choose_the_same_inputs_of_photos_that_the_model_knows(
+    room: Path, tmp_path: Path
+) -> None:
+    data = {"type": "qgs/photos", "path": str(room), "holdout": 4}
+    recipe = resolve({**(qgs.load(MODEL).recipe or {}), "data": data})
+    qgs.save(recipe.build_model(), tmp_path / "own.safetensors")
+    name = str(tmp_path / "own.safetensors")
+    result = qgs.load(name).reconstruct(room)
+    opened = open_source(name, Wanted(photos=str(room)))
+    judged = judge(checkpoints([name]), str(room), "cpu")[0].evaluation.scores[0].views[0]
+    assert tuple(opened.frames) == result.sample.input_frames == judged[0]
+    assert result.sample.target_frames == judged[1]
+    assert {*judged[1]} <= {2, 6, 10}
+
+
 def test_a_scale_can_be_set(room: Path, tmp_path: Path) -> None:
     out, options = tmp_path / "out", ("--frames", "3,6")
     done = run_qgs("reconstruct", MODEL, room, "--out", out, *options, "--scale", "0.5")

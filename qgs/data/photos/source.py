@@ -35,7 +35,14 @@ from qgs.data.photos.checks import refuse_fatal_problems, size_problems
 from qgs.data.photos.posing import VIDEOS, posed
 from qgs.data.photos.reader import PhotoFrame, existing
 from qgs.data.photos.turning import turned, turned_size, upright
-from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, LazySource
+from qgs.data.scenes import (
+    BoundedCache,
+    EncodedFrame,
+    EncodedScene,
+    LazyScenes,
+    LazySource,
+    held_out_frames,
+)
 from qgs.types import Cameras
 from qgs.wording import listed, warn_once
 
@@ -53,8 +60,8 @@ class PhotosConfig(SceneSource.Config):
     images: str | None = None
     """Folder of photos to read instead of the listed one, such as images_4."""
     holdout: int = Field(default=8, ge=0)
-    """Every n-th frame is kept for evaluation, from frame n // 2 on; 0 for none. A listing's own
-    split goes first."""
+    """Every n-th frame is kept for evaluation, from frame n // 2 on, or the middle one of fewer; 0
+    for none. A listing's own split goes first."""
     max_frames: int = Field(default=0, ge=0)
     """Only the first frames of a listing; 0 for all."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -81,13 +88,12 @@ class PhotoScene(EncodedScene):
     def __init__(
         self, name: str, folder: UPath, config: PhotosConfig, cache: BoundedCache[np.ndarray]
     ) -> None:
-        self.name, self._config, self._cache = name, config, cache
+        self.name, self.folder, self._config, self._cache = name, folder, config, cache
         frames, self.missing = present_frames(folder, config.format, config.images)
         self._frames = frames = [*map(upright, frames[: config.max_frames or None])]
         times = [frame.time for frame in frames if frame.time is not None]
         self.times = torch.tensor(times, dtype=torch.float64) if len({*times}) > 1 else None
-        every = config.holdout
-        self.held_out = tuple(range(every // 2, len(frames), every)) if every else ()
+        self.held_out = held_out_frames(len(frames), config.holdout)
         if any(frame.split for frame in frames):
             self.held_out = tuple(i for i, frame in enumerate(frames) if frame.split == "test")
 

@@ -16,7 +16,14 @@ from qgs.contracts import SceneSource, Split
 from qgs.data.images import CropResize, decode_rgb, to_tensor
 from qgs.data.lenses import Size
 from qgs.data.paths import opened_path
-from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, LazySource
+from qgs.data.scenes import (
+    BoundedCache,
+    EncodedFrame,
+    EncodedScene,
+    LazyScenes,
+    LazySource,
+    held_out_frames,
+)
 from qgs.types import Cameras
 from qgs.wording import listed, warn_once
 from qgs_datasets.chunk_files import (
@@ -73,7 +80,7 @@ class ChunkScene(EncodedScene):
     def held_out(self) -> Sequence[int]:  # type: ignore[override]  # known once the chunk is open
         """See `Scene`: as the option says, else as the chunk does."""
         every = self._config.holdout
-        return tuple(range(every // 2, len(self), every)) if every else self._record.held_out
+        return held_out_frames(len(self), every) if every else self._record.held_out
 
     @cached_property
     def times(self) -> Tensor | None:  # type: ignore[override]  # known once the chunk is open

@@ -17,13 +17,15 @@ from qgs.analysis.scenes import Size, installed_sources, named_scene, reconstruc
 from qgs.cli.options import scale_settings
 from qgs.composer import resolve
 from qgs.composer.registry import load_usable_plugins
-from qgs.contracts import Scene
+from qgs.contracts import Frames, Scene
 from qgs.data.domain import Domain
 from qgs.data.recognition import open_for
 from qgs.data.samples import views_in
+from qgs.data.scenes import held_out_frames
 from qgs.io.checkpoint import load
 from qgs.machine import available_bytes
 from qgs.metrics.images import psnr
+from qgs.model import QueryGaussianModel
 from qgs.types import Gaussians
 from qgs.wording import listed
 from qgs_refine.refining import NO_EXTRAS, Extras
@@ -83,20 +85,17 @@ class Plan:
         return " ".join(["qgs scene", *map(shlex.quote, words)])
 
 
-def held_out_frames(scene: Scene, holdout: str) -> tuple[int, ...]:
-    """Frames that are judged and never optimised on, as `data.holdout` chooses them.
+def judged_frames(scene: Scene, holdout: str) -> Frames:
+    """Frames that are judged and never optimised on.
 
-    holdout: NONE, or n for every n-th photo; a split of the photos' own goes first. Of two photos
-    none. Raises ValueError for another text.
+    holdout: NONE, or n as of `held_out_frames`; a split of the photos' own goes first. Raises
+    ValueError for another text.
     """
     if holdout == NONE:
         return ()
     if not holdout.isdecimal() or int(holdout) < 2:
         raise ValueError(f"--holdout must be none or every how many, such as 8; got {holdout!r}")
-    every = min(int(holdout), len(scene))
-    if scene.held_out or len(scene) < 3:
-        return tuple(scene.held_out)
-    return tuple(range(every // 2, len(scene), every))
+    return tuple(scene.held_out) or held_out_frames(len(scene), int(holdout))
 
 
 def shipped_models() -> list[str]:
@@ -124,19 +123,25 @@ class Start:
 def best_start(
     scenes: Scenes, models: Sequence[str], seconds: float, device: str, console: Console
 ) -> Start:
-    """The start of the model that renders photos near its inputs best.
+    """The start of the model that renders photos near the inputs best.
 
-    No further model is tried once _SEARCH of `seconds` is spent. Raises ValueError for no model.
+    All take the inputs that the user named, or else those that the first one would choose. No
+    further model is tried once _SEARCH of `seconds` is spent. Raises ValueError for no model.
     """
     if not models:
         raise ValueError(
             "no trained model is installed: install query-gaussians-rooms, or name one (--model)"
         )
     began, starts = perf_counter(), list[Start]()
-    for model in models:
+    inputs: str | Frames | None = scenes.inputs
+    for name in models:
         if starts and perf_counter() - began > _SEARCH * seconds:
             break
-        starts.append(_start(scenes, model, device))
+        model = load(name, device)
+        if inputs is None:
+            views, trained_on = resolve(model.recipe or {}).views, model.trained_on or Domain()
+            inputs = choose_windows(scenes.probe, views, trained_on)[0][0]
+        starts.append(_start(scenes, name, model, inputs))
     best = max(starts, key=lambda start: start.quality)
     if len(starts) > 1:
         scores = listed(f"{start.model} {start.quality:.2f} dB" for start in starts)
@@ -144,23 +149,22 @@ def best_start(
     return best
 
 
-def _start(scenes: Scenes, name: str, device: str) -> Start:
-    """What a model makes of the inputs that the user named, or else of those that it takes."""
-    model, scene, scale = load(name, device), scenes.probe, scenes.scale
-    views = resolve(model.recipe or {}).views
+def _start(scenes: Scenes, name: str, model: QueryGaussianModel, frames: str | Frames) -> Start:
+    """What the model `name` makes of these inputs."""
+    scene = scenes.probe
     result = reconstruct(
         model,
         scenes.photos,
-        frames=scenes.inputs or choose_windows(scene, views, model.trained_on or Domain())[0][0],
+        frames=frames,
         compare=scenes.held,
         scene=scenes.name,
-        overrides=scale_settings(scale),
+        overrides=scale_settings(scenes.scale),
     )
     inputs = result.sample.input_frames
     others = [frame for frame in scenes.frames if frame not in inputs]
     middle = sum(inputs) / len(inputs)
     judged = sorted(others, key=lambda frame: abs(frame - middle))[:_JUDGED] or [*inputs]
-    photos = views_in(result.world, scene, tuple(judged)).to(device)
+    photos = views_in(result.world, scene, tuple(judged)).to(result.gaussians.means.device)
     with torch.no_grad():
         rendered = model.render(result.gaussians, photos.cameras).rgb
     quality = float(psnr(rendered, photos.images).mean())
@@ -182,7 +186,7 @@ class Scenes:
         self._sources = installed_sources()
         found = self.at(None)
         self.probe = self.at(sized(found, _PROBE))
-        self.held = held_out_frames(found, holdout)
+        self.held = judged_frames(found, holdout)
         self.frames = tuple(frame for frame in range(len(found)) if frame not in self.held)
         self.probe.held_out = self.held
 

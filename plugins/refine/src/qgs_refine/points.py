@@ -4,8 +4,9 @@ import struct
 
 import torch
 from torch import Tensor
+from upath import UPath
 
-from qgs.data.paths import opened_path, read_file
+from qgs.data.paths import read_file
 from qgs.data.photos import formats_of
 from qgs.data.photos.colmap import Colmap
 from qgs.types import Gaussians
@@ -16,17 +17,16 @@ _AT_ONCE = 1024  # points, so that memory stays within 0.1 GB
 _FIXED = struct.Struct("<Q3d3BdQ")  # number, position, colour, error, length of the track
 
 
-def sparse_points(folder: str) -> tuple[Tensor, Tensor] | None:
+def sparse_points(folder: UPath) -> tuple[Tensor, Tensor] | None:
     """Positions (N, 3), float64, and colours (N, 3) in [0, 1], in the world of the cameras.
 
-    folder: of photos, or its URL. None where COLMAP did not make the cameras, and without points.
+    folder: of a scene's photos. None where COLMAP did not make the cameras, and without points.
     Raises ValueError for points that cannot be read.
     """
-    root = opened_path(folder)
     # other formats go first, and have a world of their own
-    if not root.is_dir() or formats_of(root)[:1] != [Colmap.name]:
+    if formats_of(folder)[:1] != [Colmap.name]:
         return None
-    model = Colmap.read(root, None).file
+    model = Colmap.read(folder, None).file
     readers = {"points3D.bin": _binary, "points3D.txt": _text}
     file = next((model / name for name in readers if (model / name).is_file()), None)
     if file is None:

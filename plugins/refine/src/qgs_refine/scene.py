@@ -14,6 +14,7 @@ from torch import Tensor
 from qgs.analysis.depth import scene_depth
 from qgs.analysis.scenes import Size
 from qgs.contracts import Scene, ViewsConfig
+from qgs.data.photos.source import PhotoScene
 from qgs.data.samples import own_world, views_in
 from qgs.drawing import images
 from qgs.drawing.figures import figure_picture, grid_figure
@@ -88,7 +89,8 @@ def make_scene(
     gaussians, part = start.gaussians, 0.5
     if gaussians is None:
         sweeping, part = perf_counter(), 0.0
-        gaussians = photos_start(photos, start.world, probe, count, int(SWEEP * budget / of_pixel))
+        most = int(SWEEP * budget / of_pixel)
+        gaussians = photos_start(scenes.probe, start.world, probe, count, most)
         budget = max(budget - (perf_counter() - sweeping), _LEAST_PART * budget)
     refined = refine(
         gaussians, views, budget, count=count, swept=part, renderer=renderer, console=console,
@@ -121,13 +123,14 @@ def photos_world(scenes: Scenes) -> tuple[Tensor, Tensor]:
 
 
 def photos_start(
-    photos: str, world: tuple[Tensor, Tensor], views: Views, count: int, most: int
+    scene: Scene, world: tuple[Tensor, Tensor], views: Views, count: int, most: int
 ) -> Gaussians:
-    """Gaussians (1, G): COLMAP's points where the folder has some, the others at pixels.
+    """Gaussians (1, G): COLMAP's points where the scene has some, the others at pixels.
 
     count: of all at the end. most: at pixels, of the photos `views` (1, V), at least TIMED.
     """
-    parts, points = list[Gaussians](), sparse_points(photos)
+    points = sparse_points(scene.folder) if isinstance(scene, PhotoScene) else None
+    parts = list[Gaussians]()
     if points is not None:
         parts.append(from_points(points, world, count).to(views.images.device))
     many = max(min(count - sum(part.count for part in parts), most), 0 if parts else TIMED)

@@ -3,7 +3,7 @@
 import os
 import platform
 import signal
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -17,7 +17,7 @@ from rich.table import Table
 
 from qgs.analysis.inputs import Window, choose_windows
 from qgs.analysis.scale import ScaleSearch, photo_settings
-from qgs.analysis.scenes import HOLDOUT, Size, installed_sources, size_multiple, whole_size
+from qgs.analysis.scenes import Size, holding_out, installed_sources, size_multiple, whole_size
 from qgs.composer import Recipe, resolve
 from qgs.composer.schema import summary_of
 from qgs.contracts import Scene, ViewsConfig
@@ -42,8 +42,12 @@ AUTO_SCALE = "Each scene is scaled until what its cameras look at is 1 away (vie
 JUDGED = ("data", "views", "evaluation", "metrics")
 TRAINED = ("optimizer", "training")
 """Sections of recipes that must be equal, so that only the models differ."""
-OF_THE_METHOD = ("optimizer.parts", "training.judge_inputs", "evaluation.tuning")
-"""Options in them that may differ: how a method trains, and tuning, which nobody does here."""
+OF_THE_METHOD = (
+    "optimizer.parts", "training.judge_inputs", "evaluation.tuning", "views.scale",
+    "views.scale_factor",
+)  # fmt: skip
+"""Options in them that may differ: how a method trains, tuning, which nobody does here, and the
+unit of a model's world, which no score depends on."""
 
 
 @dataclass(frozen=True)
@@ -125,13 +129,12 @@ def judge(
                 file.step,
                 file.recipe.training,
             )
-            data = file.recipe.data_config
         of = "" if training.seconds else f" of {training.steps:,}"
         progress = "not known" if step is None else f"step {step:,}{of}"
         recipe, options = recipes[name], OF_RECIPES if photos is None else OF_SHOWN
         search, domain = ScaleSearch(model, recipe.views), model.trained_on
         # those of the first model for all, so that one protocol judges them
-        if not entries and photos is not None and not is_training_data(photos, data):
+        if not entries and photos is not None:
             windows_of = photo_windows(recipe.views, domain)
         evaluation = evaluate(
             model,
@@ -154,7 +157,13 @@ def photo_windows(views: ViewsConfig, trained_on: Domain | None) -> WindowsOf:
 
     def windows_of(scene: Scene) -> list[Window]:
         if scene.name not in known:
-            known[scene.name] = choose_windows(scene, views, trained_on or Domain(), WINDOWS)
+            windows = choose_windows(scene, views, trained_on or Domain(), WINDOWS)
+            if not any(compared for _, compared in windows):
+                raise ValueError(
+                    f"all {len(scene)} photos are inputs, none is left to compare with: add one "
+                    "between them, or see what a model makes of them by qgs view MODEL PHOTOS"
+                )
+            known[scene.name] = windows
         return known[scene.name]
 
     return windows_of
@@ -178,38 +187,53 @@ def recipes_alike(
         with CheckpointFile(path) as file:
             recipes[name] = file.recipe
     if photos is not None:
-        multiple = size_multiple(recipes.values())
+        data = _data_of(photos, recipes.values(), size)
+        first = next(iter(recipes.values())).tree["views"]
         recipes = {
-            name: resolve(_on_photos(recipe, photos, size, multiple).tree, overrides)
+            name: resolve(_on_photos(recipe, photos, data, first).tree, overrides)
             for name, recipe in recipes.items()
         }
     refuse_unequal(recipes, JUDGED)
     return recipes
 
 
-def _on_photos(recipe: Recipe, photos: str, size: Size | None, multiple: int | None) -> Recipe:
-    """`recipe` with the data at `photos`, some of them held out, in place of its own.
+def _data_of(photos: str, recipes: Collection[Recipe], size: Size | None) -> dict[str, Any]:
+    """The section `data` of the photos for all `recipes`, some photos held out.
 
-    Data that it was not trained on has a unit of its own, see `photo_settings`.
+    As a recipe that was trained on them opens them, where there is one, so that none of its
+    training is judged; else at a size at which they are whole.
     """
-    sources = installed_sources()
-    source, own = open_for(photos, size, recipe.data_config, sources)
-    first = next(chain(source.scenes("test"), source.scenes("train")), None)
-    if size is None and not own and first is not None:
-        size = whole_size(first, multiple)
-    scale = photo_settings(recipe.views, own).scale
+    sources, trained = installed_sources(), [recipe.data_config for recipe in recipes]
+    config = next((data for data in trained if is_training_data(photos, data)), trained[0])
+    source, own = open_for(photos, size, config, sources)
+    scene = next(chain(source.scenes("test"), source.scenes("train")), None)
+    config = source.config
+    if not own and scene is not None:
+        size, config = size or whole_size(scene, size_multiple(recipes)), holding_out(config, scene)
     kind = next(name for name, component in sources.items() if component is type(source))
-    options = source.config.model_dump(mode="json")
-    options["image_size"] = [*(size or source.config.image_size)]
-    if options.get("holdout") == 0:
-        fewest = min((len(scene) for scene in source.scenes("test")), default=HOLDOUT)
-        options["holdout"] = min(HOLDOUT, fewest)
+    options = config.model_dump(mode="json")
+    return {"type": kind, **options, "image_size": [*(size or config.image_size)]}
+
+
+def _on_photos(
+    recipe: Recipe, photos: str, data: Mapping[str, Any], first: Mapping[str, Any]
+) -> Recipe:
+    """`recipe` on the photos of `data`, with the choice of views of `first`.
+
+    Photos that it was not trained on have a unit of their own, see `photo_settings`.
+    """
+    own, plugin = is_training_data(photos, recipe.data_config), data["type"].split("/")[0]
+    views = {
+        **recipe.tree["views"],
+        **{name: first[name] for name in ("gap", "targets")},
+        "scale": photo_settings(recipe.views, own).scale,
+    }
     tree = {
         **recipe.tree,
-        "data": {"type": kind, **options},
-        "plugins": [*dict.fromkeys([*recipe.tree["plugins"], *{kind.split("/")[0]} - {"qgs"}])],
+        "data": data,
+        "plugins": [*dict.fromkeys([*recipe.tree["plugins"], *{plugin} - {"qgs"}])],
         "evaluation": {**recipe.tree["evaluation"], "scenes": WINDOWS, "index": None},
-        "views": {**recipe.tree["views"], "scale": scale},
+        "views": views,
     }
     return resolve(tree)
 
@@ -318,19 +342,20 @@ def report_of(
     recipe, evaluation = entries[0].recipe, entries[0].evaluation
     few = recipe.evaluation.model_copy(update={"scenes": PICTURED_SCENES, "samples": 1})
     source = recipe.build_data()
-    searched = entries if recipe.views.scale == "search" else entries[:1]
+    units = {(entry.recipe.views.scale, entry.recipe.views.scale_factor) for entry in entries}
+    unlike = entries if len(units) > 1 or recipe.views.scale == "search" else entries[:1]
     pictured = [
         evaluation_samples(
             source,
-            recipe.views,
+            entry.recipe.views,
             few,
             None,
             entry.search,
             entry.windows_of,
-            depths=entry is searched[0],
+            depths=entry is unlike[0],
         )[:PICTURED_SCENES]
-        for entry in searched
-    ] * (len(entries) // len(searched))
+        for entry in unlike
+    ] * (len(entries) // len(unlike))
     samples = pictured[0]
     height, width = recipe.tree["data"]["image_size"]
     plugins = {name: v for entry in entries for name, (_, v) in entry.recipe.releases.items()}

@@ -138,7 +138,7 @@ def show_trained(
     elif models:
         lede = "Trained models, judged on the test split of their recipe."
     facts = {"Training": "; ".join(entry.progress for entry in entries)}
-    commands = next_commands(models or MODELS, entries, target, photos, size)
+    commands = next_commands(models or MODELS, entries, target, photos, size, scale)
     notes += show_remarks(entries, console)
     write(contest.report_of(entries, lede, facts, commands, scenes, notes), target, console)
 

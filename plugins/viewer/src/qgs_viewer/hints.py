@@ -17,11 +17,12 @@ def next_commands(
     target: Path,
     photos: str | None = None,
     size: str | None = None,
+    scale: float | None = None,
 ) -> Mapping[str, str]:
     """Commands, as a shell takes them, and what each does.
 
     models: `entries` as a command line names them. target: the folder of the report; what the
-    commands write goes there, since it is new. photos, size: those of the report.
+    commands write goes there, since it is new. photos, size, scale: those of the report.
     """
     best = shlex.quote(models[_best(entries)])
     scene = shlex.quote(f"{target / 'scene'}")
@@ -40,6 +41,7 @@ def next_commands(
     names = [*dict.fromkeys(score.scene for score in entries[0].evaluation.scores)]
     chosen = f" --scene {shlex.quote(names[0])}" if len(names) > 1 else ""
     chosen += f" --size {shlex.quote(size)}" if size else ""
+    chosen += f" --scale {scale:g}" if scale else ""
     return {
         f"qgs reconstruct {given}{chosen} --out {scene} --refine 30": REFINED,
         f"qgs view {given}{chosen}": SCENE,

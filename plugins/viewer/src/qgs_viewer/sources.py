@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from qgs.analysis.reconstruction import choose_frames, choose_sample
+from qgs.analysis.reconstruction import checked_window, choose_sample
 from qgs.analysis.scale import ScaleSearch, photo_settings
 from qgs.analysis.scenes import choice, chosen_scene, frame_list, named_scene
 from qgs.composer import Recipe, resolve
@@ -86,7 +86,7 @@ class ModelSource(Source):
         """What the model makes of these frames, placed in the shown world."""
         if not frames:
             raise ValueError("a reconstruction needs an input photo: choose one at least")
-        picked, _ = choose_frames(len(self.scene), len(frames), 1, frames, compare=())
+        picked, _ = checked_window(len(self.scene), frames)
         world = own_world(self.scene, picked, self.views)
         device = next(self.model.parameters()).device
         inputs = make_sample(self.scene, picked, (), self.views, mirror=False).inputs.to(device)
@@ -264,14 +264,13 @@ def _of_model(name: str, wanted: Wanted) -> Source:
     trained = model.trained_on or Domain()
     own = wanted.photos is None or is_training_data(wanted.photos, recipe.data_config)
     search = ScaleSearch(model, photo_settings(recipe.views, own, wanted.overrides))
-    unlike = None if wanted.photos is None else trained
-    sample, _ = choose_sample(scene, recipe.views, wanted.inputs, chosen, None, unlike, search)
+    sample, _ = choose_sample(scene, recipe.views, wanted.inputs, chosen, None, trained, search)
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
     frames, scales = sample.input_frames, [*search.found.values()]
     notes = [
         *([summary(scales)] if scales else []),
-        *([choice(sample, scene, compares=False)] if unlike else []),
+        *([choice(sample, scene, compares=False)] if wanted.photos else []),
         verdict(trained, found, SEARCHED if scales else {}),
         *(scale.poor for scale in scales),
         framing(scene, frames[0]),
