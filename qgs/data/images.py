@@ -66,11 +66,10 @@ class CropResize:
 
 def framing(scene: Scene, frame: int) -> str:
     """A sentence on crop and scale of a photo; "" for one that is delivered as stored."""
-    stored, size = scene.stored_size(frame), scene.cameras.size
-    if stored is None or stored == size:
+    stored, size, zoom = scene.stored_size(frame), scene.cameras.size, scene.zoom(frame)
+    if stored is None or (stored == size and zoom == 1):
         return ""
-    crop = CropResize(stored, size)
-    left, top, right, bottom = crop.box
+    left, top, right, bottom = CropResize(stored, size, zoom).box
     cut = 1 - (right - left) * (bottom - top) / (stored[0] * stored[1])
     part = f"the middle {right - left:.0f} x {bottom - top:.0f} ({cut:.0%} is cut off)"
     return (

@@ -64,6 +64,15 @@ class Batch:
     """What was to be in it and could not be made: scene, frame and reason."""
 
 
+def held_out_frames(total: int, every: int) -> Frames:
+    """Every n-th of `total` frames, from n // 2 on, or the middle one of fewer; of two none.
+
+    0 holds none out.
+    """
+    every = min(every, total)
+    return tuple(range(every // 2, total, every)) if every and total > 2 else ()
+
+
 def training_frames(scene: Scene) -> list[int]:
     """The frames that training may see: all but the held-out ones."""
     return sorted({*range(len(scene))} - {*scene.held_out})

@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from qgs.contracts import Frames, Scene, SceneSource, Split
+from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.lenses import Intrinsics, Lens, Size
 
 Value = TypeVar("Value")
@@ -32,15 +32,6 @@ class EncodedFrame:
     lens: Lens | None = None
     mask: bytes | None = None
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
-
-
-def held_out_frames(total: int, every: int) -> Frames:
-    """Every n-th of `total` frames, from n // 2 on, or the middle one of fewer; of two none.
-
-    0 holds none out.
-    """
-    every = min(every, total)
-    return tuple(range(every // 2, total, every)) if every and total > 2 else ()
 
 
 class EncodedScene(Scene):

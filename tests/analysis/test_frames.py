@@ -7,7 +7,7 @@ from photo_formats import noisy_photos, opened
 from qgs.analysis.reconstruction import checked_window, choose_sample
 from qgs.analysis.scenes import GivenScene, read_photos
 from qgs.contracts import ViewsConfig
-from qgs.data.scenes import held_out_frames
+from qgs.data.samples import held_out_frames
 
 VIEWS = ViewsConfig(inputs=4, gap=(3, 20))
 

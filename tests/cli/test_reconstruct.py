@@ -156,6 +156,7 @@ def test_inputs_alone_are_refined_on_and_photos_held_out_of_training_never(photo
         pytest.param((), [0, 1, 2, 4, 5, 6], [3], marks=pytest.mark.slow),
         pytest.param(("--holdout", "none"), [*range(7)], [], marks=pytest.mark.slow),
         (("--holdout", "1.png,3"), [0, 2, 4, 5, 6], [1, 3]),
+        (("--frames", "2,3"), [*range(7)], []),  # 3 is the held-out one
     ],
 )
 def test_photos_held_out_are_compared_with_and_not_refined_on(

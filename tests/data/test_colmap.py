@@ -10,6 +10,7 @@ from photo_formats import scene as read
 from photo_formats import synthetic, world_to_camera, write_colmap
 from PIL import Image
 
+from qgs.data.images import framing
 from qgs.data.paths import opened_path
 from qgs.data.photos import read_listing
 from qgs.data.photos.checks import frame_problems
@@ -62,6 +63,8 @@ def test_photos_of_every_camera_become_pinhole_photos(tmp_path, camera, kind):
     middle = np.array(SIZE[::-1]) / 2
     assert 1 <= zoom <= (1.1 if name == "OPENCV" else 1)
     assert fy == pytest.approx(zoom * lens.focal_length_y)
+    assert scene.zoom(1) == pytest.approx(zoom)
+    assert bool(framing(scene, 1)) == (zoom > 1)
     assert [cx, cy] == pytest.approx((middle + zoom * ([41, 29] - middle)).tolist())
     pixels = scene.images([1])[0].mul(255).permute(1, 2, 0).numpy()
     expected = colours((pixel_centres() - [cx, cy]) / [fx, fy])

@@ -35,14 +35,8 @@ from qgs.data.photos.checks import refuse_fatal_problems, size_problems
 from qgs.data.photos.posing import VIDEOS, posed
 from qgs.data.photos.reader import PhotoFrame, existing
 from qgs.data.photos.turning import turned, turned_size, upright
-from qgs.data.scenes import (
-    BoundedCache,
-    EncodedFrame,
-    EncodedScene,
-    LazyScenes,
-    LazySource,
-    held_out_frames,
-)
+from qgs.data.samples import held_out_frames
+from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, LazySource
 from qgs.types import Cameras
 from qgs.wording import listed, warn_once
 
@@ -143,6 +137,10 @@ class PhotoScene(EncodedScene):
         """See `Scene`."""
         photo = self._frames[frame]
         return _checked(image_size(photo.path), photo, photo.path)
+
+    def zoom(self, frame: int) -> float:
+        """See `Scene`."""
+        return self._crop(self._frames[frame], self.stored_size(frame)).zoom
 
     def encoded(self, frame: int) -> EncodedFrame:
         """See `EncodedScene`."""

@@ -16,14 +16,8 @@ from qgs.contracts import SceneSource, Split
 from qgs.data.images import CropResize, decode_rgb, to_tensor
 from qgs.data.lenses import Size
 from qgs.data.paths import opened_path
-from qgs.data.scenes import (
-    BoundedCache,
-    EncodedFrame,
-    EncodedScene,
-    LazyScenes,
-    LazySource,
-    held_out_frames,
-)
+from qgs.data.samples import held_out_frames
+from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, LazySource
 from qgs.types import Cameras
 from qgs.wording import listed, warn_once
 from qgs_datasets.chunk_files import (

@@ -20,8 +20,7 @@ from qgs.composer.registry import load_usable_plugins
 from qgs.contracts import Frames, Scene
 from qgs.data.domain import Domain
 from qgs.data.recognition import open_for
-from qgs.data.samples import views_in
-from qgs.data.scenes import held_out_frames
+from qgs.data.samples import held_out_frames, views_in
 from qgs.io.checkpoint import load
 from qgs.machine import available_bytes
 from qgs.metrics.images import psnr
