@@ -13,7 +13,6 @@ from rich.markup import escape
 from qgs.engine.results import as_json, print_lines, print_table
 from qgs.io.files import replacing, write_text
 from qgs.wording import counted, short_names
-from qgs_bench.figure import sweep_figure
 from qgs_bench.run import KIND
 from qgs_bench.sweep import series_of
 
@@ -131,6 +130,8 @@ def write(report: Mapping[str, Any], path: Path) -> Path:
 
 def write_sweep(report: Mapping[str, Any], path: Path) -> list[Path]:
     """The report as JSON at `path`, and beside it as CSV, PNG and PDF."""
+    from qgs_bench.figure import sweep_figure  # Matplotlib is slow to import
+
     files = [write(report, path), *(path.with_suffix(suffix) for suffix in SUFFIXES)]
     text = io.StringIO()
     names = ("recipe", "axis", "value", "operation")
