@@ -73,6 +73,6 @@ def read_listing(folder: UPath, format: str = "auto", images: str | None = None)
     if format == "auto" and len(held) > 1:
         warn_once(
             f"{folder} holds photos in {len(held)} formats ({', '.join(held)}) and is read as "
-            f"{held[0]}; `format: {held[1]}` reads the other"
+            f"{held[0]}; in a recipe, data.format: {held[1]} reads the other"
         )
     return with_equal_times(known[held[0] if format == "auto" else format].read(folder, images))

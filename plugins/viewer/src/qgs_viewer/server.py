@@ -1,13 +1,23 @@
 """A viser server that prints nothing, and where its viewers first stand in a scene."""
 
+import http
 import io
+import ipaddress
+import logging
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
+from functools import partial
+from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 import viser
+import websockets.asyncio.server as sockets
+from websockets.datastructures import Headers
+from websockets.http11 import Response
 
 from qgs_viewer.look import Look
 from qgs_viewer.stage import distance_to
@@ -20,14 +30,58 @@ SHORT = 0.3  # length of the mean of unit vectors below which they have no direc
 def quiet_server(
     host: str = "127.0.0.1", port: int = 0, label: str | None = None
 ) -> Iterator[viser.ViserServer]:
-    """A running server, at the next free port from `port` on; 0 takes any."""
-    with redirect_stdout(io.StringIO()):  # viser prints a box of addresses, whatever it is asked
-        server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+    """A running server, at the next free port from `port` on; 0 takes any.
+
+    Only its own page may connect to it, see `foreign`.
+    """
+    # a message that is none ends its connection, which is no news
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+    serve = sockets.serve
+    sockets.serve = partial(_guarded, serve, host)  # viser has no option for this
+    try:
+        with redirect_stdout(
+            io.StringIO()
+        ):  # viser prints a box of addresses, whatever it is asked
+            server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+    finally:
+        sockets.serve = serve
     try:
         yield server
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()
+
+
+def foreign(headers: Headers, host: str) -> bool:
+    """Whether a request comes from another page, or by a name that is not the server's.
+
+    Another page that is open in the browser could read the scene; under a name of its own that
+    resolves to this machine (DNS rebinding) it would look like this one. Addresses in digits, the
+    names of this machine and `host` are the server's.
+    """
+    named, origin = headers.get("Host", ""), headers.get("Origin")
+    if origin is not None and urlsplit(origin).netloc != named:
+        return True
+    name = urlsplit(f"//{named}").hostname or ""
+    if name in {"localhost", host, socket.gethostname().lower()}:
+        return False
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return True
+    return False
+
+
+def _guarded(serve: Any, host: str, *where: Any, process_request: Any, **options: Any) -> Any:
+    """`websockets.asyncio.server.serve` that refuses `foreign` requests."""
+
+    def checked(connection: Any, request: Any) -> Response | None:
+        if foreign(request.headers, host):
+            status = http.HTTPStatus.FORBIDDEN
+            return Response(status, status.phrase, Headers({"Content-Length": "0"}), b"")
+        return process_request(connection, request)
+
+    return serve(*where, process_request=checked, **options)
 
 
 def stand(server: viser.ViserServer, look: Look) -> None:
