@@ -11,7 +11,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from qgs.composer import Recipe
+from qgs.composer import Recipe, resolve
 from qgs.data.samples import Batch
 from qgs.data.stream import SampleStream, training_batches
 from qgs.engine.distributed import StopRequest
@@ -19,11 +19,30 @@ from qgs.engine.folder import RunFolder
 from qgs.engine.tracking import TrainingProgress
 from qgs.engine.training import Trainer, TrainingResult, train
 
+RECIPES = Path(__file__).parents[1] / "recipes" / "tiny"
+
+SMALL = (
+    "model.width=32",
+    "model.heads=2",
+    "model.queries.count=24",
+    "model.head.gaussians_per_query=4",
+    "data.image_size=[16, 16]",
+    "views.targets=2",
+    "evaluation.scenes=2",
+    "training.steps=4",
+    "training.seconds=null",
+    "optimizer.warmup=2",
+)
 QUIET = Console(quiet=True)
 Tiny: TypeAlias = Callable[..., Recipe]
 """The fixture `tiny`."""
 TWO = ("plugins=[rooms, locus, two]", "objective={type: two/two_passes}", "views.inputs=5")
 """With the fixture `two`: train on two passes of the model."""
+
+
+def tiny_recipe(name: str, *overrides: str) -> Recipe:
+    """A recipe of recipes/tiny, smaller yet, with overrides."""
+    return resolve(RECIPES / f"{name}.yaml", [*SMALL, *overrides])
 
 
 def run(recipe: Recipe, folder: Path, resume: bool = False, device: str = "cpu") -> TrainingResult:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -91,8 +91,8 @@ class EvaluationPlan:
     windows_of: gives windows of a scene that does not move, instead. depths: targets have true
     depth where scenes do.
 
-    wanted, null, unlisted: see `qgs.engine.results.Evaluation`. framing: of the first photo, and
-    drawn: scenes that have samples, once `samples` has run. Raises ValueError without scenes.
+    wanted, null, unlisted: see `qgs.engine.results.Evaluation`. framing: of the first photo,
+    once `samples` has run. Raises ValueError without scenes.
     """
 
     def __init__(
@@ -107,7 +107,6 @@ class EvaluationPlan:
         depths: bool = False,
     ) -> None:
         self.framing: str | None = None
-        self.drawn = set[str]()
         self._scenes = source.scenes("test")
         if not len(self._scenes):
             raise ValueError(f"the data source {type(source).name!r} has no test scenes")
@@ -153,7 +152,6 @@ class EvaluationPlan:
             kept = np.linspace(0, len(windows) - 1, count).round().astype(int)
             yield from (windows[i] for i in kept)
         else:
-            self.drawn.add(scene.name)
             for k in range(self._evaluation.samples):
                 rng = np.random.default_rng([self._evaluation.seed, place, k])
                 inputs, drawn = self._sampler.draw(scene, self._views, rng, END)
@@ -166,15 +164,11 @@ def evaluation_samples(
     views: ViewsConfig,
     evaluation: EvaluationConfig,
     sampler: ViewSampler | None = None,
-    views_of: ViewsOf | None = None,
-    windows_of: WindowsOf | None = None,
-    depths: bool = False,
+    **options: Any,
 ) -> Sequence[Sample]:
     """Samples of a plan without an index; raises ValueError for the first scene that fails."""
     samples: list[Sample] = []
-    choices = sampler, views_of, windows_of, depths
-    plan = EvaluationPlan(source, views, evaluation, None, *choices)
-    for sample in plan.samples():
+    for sample in EvaluationPlan(source, views, evaluation, None, sampler, **options).samples():
         if isinstance(sample, SceneFailure):
             raise ValueError(f"scene {sample.scene!r} cannot be judged: {sample.reason}")
         samples.append(sample)

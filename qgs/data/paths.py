@@ -25,7 +25,7 @@ def opened_path(path: str | Path | UPath) -> UPath:
     try:
         url = UPath(path)
         url.fs  # noqa: B018  asks for the file system, whose package may be missing
-    except (ImportError, ValueError) as error:  # fsspec names the package to install
+    except Exception as error:  # whatever a file system's constructor raises
         raise ValueError(f"{path} cannot be opened as a path or URL: {error}") from error
     if url.protocol in {"file", "local"}:
         return UPath(url.path)

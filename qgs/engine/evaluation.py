@@ -90,27 +90,17 @@ def evaluate(
     likeness = "" if trained_on is None else verdict(trained_on, scorer.seen, options)
     own = recipe.tree["data"] == (model.recipe or {}).get("data")
     remedy = "train for longer" if own else remedies(("baseline", "depth"), options)
-    remarks = (likeness, plan.framing, *_remarks(evaluation, plan, recipe, remedy))
+    remarks = likeness, plan.framing, _worse(evaluation, remedy)
     return replace(evaluation, remarks=[*filter(None, remarks)])
 
 
-def _remarks(
-    evaluation: Evaluation, plan: EvaluationPlan, recipe: Recipe, remedy: str
-) -> Iterator[str]:
-    """Remarks on the scores; "" for those that do not apply. remedy: see `worse_than_nearest`."""
-    scores, samples = evaluation.scores, recipe.evaluation.samples
-    fixed = [score for score in scores if score.scene not in plan.drawn]
-    if samples > 1 and fixed:
-        where = f" for {len(fixed)} of {len(scores)} scenes" if len(fixed) < len(scores) else ""
-        why = "the index names the views"
-        if evaluation.held_out:
-            why = "{} of {} held-out frames are judged, each once".format(*evaluation.held_out)
-        unused = f"evaluation.samples={samples} changed nothing{where}"
-        yield f"{unused}, since no views were drawn: {why}"
-    if evaluation.columns and not any(score.given for score in scores):
-        name, column = next(iter(evaluation.columns.items()))
-        nearest = evaluation.mean(name, "nearest_input")
-        yield worse_than_nearest(column, evaluation.mean(name), nearest, remedy)
+def _worse(evaluation: Evaluation, remedy: str) -> str:
+    """See `worse_than_nearest`; on the first value, where no inputs were judged."""
+    if not evaluation.columns or any(score.given for score in evaluation.scores):
+        return ""
+    name, column = next(iter(evaluation.columns.items()))
+    means = evaluation.mean(name), evaluation.mean(name, "nearest_input")
+    return worse_than_nearest(column, *means, remedy)
 
 
 class Measures:

@@ -48,14 +48,3 @@ def patch_rays(plucker: Tensor, patch_size: int) -> Tensor:
     """
     pooled = F.avg_pool2d(plucker.flatten(0, 1), patch_size)
     return pooled.flatten(2).transpose(1, 2).reshape(plucker.shape[0], -1, 6)
-
-
-@full_precision
-def normalised_rays(rays: Tensor, eps: float = 1e-6) -> tuple[Tensor, Tensor]:
-    """Unit-direction Plücker rays (m', d') = (m, d) / |d|, |d| floored at `eps`.
-
-    rays (..., 6), moment first -> moments (..., 3), directions (..., 3).
-    """
-    moments, directions = rays.split(3, dim=-1)
-    length = directions.norm(dim=-1, keepdim=True).clamp_min(eps)
-    return moments / length, directions / length

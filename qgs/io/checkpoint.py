@@ -18,6 +18,7 @@ from qgs.contracts.schedule import END, follow, steps_followed
 from qgs.data.domain import KEY, Domain, FirstViews
 from qgs.io.models import checkpoint_path
 from qgs.io.tensors import (
+    SEAL,
     CheckpointError,
     TensorFile,
     differing_tensors,
@@ -30,7 +31,7 @@ from qgs.machine import TooLargeError
 from qgs.model import QueryGaussianModel
 from qgs.wording import listed
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Raised when the metadata of checkpoints change."""
 
 _RECIPE, _DIGEST, _FORMAT, _EXTRA = "qgs.recipe", "qgs.digest", "qgs.format_version", "qgs.extra."
@@ -58,7 +59,8 @@ class CheckpointFile(TensorFile):
                 "qgs.save or `qgs train` can be loaded. Published weights become a checkpoint by "
                 f"`qgs import {self.path} --recipe auto --out CHECKPOINT.safetensors`"
             )
-        self.refuse_newer(_FORMAT, FORMAT_VERSION)
+        if self.refuse_newer(_FORMAT, FORMAT_VERSION) > 2 and SEAL not in self.metadata:
+            raise self.damaged(f"its metadata lack {SEAL}")
         self.extra = {
             key.removeprefix(_EXTRA): value
             for key, value in self.metadata.items()

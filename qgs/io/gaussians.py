@@ -1,4 +1,4 @@
-"""Gaussians as files: PLY of the 3DGS release, .splat, and formats that distributions add."""
+"""Gaussians as files: PLY of the 3DGS release, and formats that distributions add."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -36,8 +36,7 @@ REST = tuple(f"f_rest_{index}" for index in range(3 * SH_COUNTS[-1]))
 as zeros too: the viewer of the 3DGS release and plugins of game engines need all of them."""
 PROPERTIES = (*_MEANS, "nx", "ny", "nz", *_COLORS, *REST, "opacity", *_SCALES, *_QUATS)
 
-SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
-"""A Gaussian of a .splat file, 32 bytes. Source: github.com/antimatter15/splat, convert.py."""
+_HEADER = 2**16  # bytes of a header, at most: that of the 3DGS release has 1,500
 
 
 def save_gaussians(gaussians: Gaussians, path: str | Path) -> None:
@@ -56,13 +55,12 @@ def save_gaussians(gaussians: Gaussians, path: str | Path) -> None:
 
 
 def scene_writers() -> Mapping[str, Callable[[], Callable[[Gaussians, str | Path], None]]]:
-    """Suffix to what finds the function that writes such files, own ones and of WRITER_GROUP.
+    """Suffix to what finds the function that writes such files, of WRITER_GROUP and `save_ply`.
 
     Finding one raises ExtensionError where its distribution cannot be imported.
     """
-    own = {".ply": lambda: save_ply, ".splat": lambda: save_splat}
     added = {f".{e.name.lower()}": partial(imported, e) for e in installed(WRITER_GROUP)}
-    return {**added, **own}
+    return {**added, ".ply": lambda: save_ply}
 
 
 def save_ply(gaussians: Gaussians, path: str | Path) -> None:
@@ -72,7 +70,7 @@ def save_ply(gaussians: Gaussians, path: str | Path) -> None:
     quaternions stay w x y z; normals are zero. Warns that `features` are left out.
     Raises ValueError for several scenes or for numbers that are not finite.
     """
-    scene = _one_scene(gaussians, "PLY", "features")
+    scene = one_scene(gaussians, "PLY", "features")
     sh = scene.means.new_zeros(scene.count, SH_COUNTS[-1], 3) if scene.sh is None else scene.sh
     rest = F.pad(sh, (0, 0, 0, SH_COUNTS[-1] - sh.shape[1]))
     columns = {
@@ -91,28 +89,6 @@ def save_ply(gaussians: Gaussians, path: str | Path) -> None:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(file)
 
 
-def save_splat(gaussians: Gaussians, path: str | Path) -> None:
-    """Write one scene, (G, ...) or (1, G, ...), the largest and most opaque Gaussians first.
-
-    Colours, opacities and quaternions, w x y z, get 8 bits. Warns that spherical harmonics and
-    `features` are left out. Raises as `save_ply`.
-    """
-    scene = _one_scene(gaussians, ".splat", "sh", "features")
-    # Viewers draw a file while it loads, so what covers most comes first.
-    first = (scene.scales.prod(-1) * scene.opacities).argsort(descending=True, stable=True)
-    scene = scene[first]
-
-    def as_bytes(values: Tensor) -> Tensor:
-        return values.round().clamp(0, 255).byte()
-
-    records = np.empty(scene.count, SPLAT)
-    records["mean"], records["scale"] = scene.means, scene.scales
-    records["rgba"] = as_bytes(torch.cat([scene.colors, scene.opacities[:, None]], -1) * 255)
-    records["quat"] = as_bytes(F.normalize(scene.quats, dim=-1) * 128 + 128)
-    with replacing(path) as temporary:
-        temporary.write_bytes(records.tobytes())
-
-
 def load_ply(path: str | Path) -> Gaussians:
     """The Gaussians (1, G) of a PLY file in the layout of the 3DGS release, whatever wrote it.
 
@@ -120,9 +96,14 @@ def load_ply(path: str | Path) -> Gaussians:
     FileNotFoundError, and ValueError for another kind of file or of PLY, such as a compressed one,
     and for numbers that are not finite.
     """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no file at {path}")
     try:
+        with open(path, "rb") as start:
+            if b"end_header" not in start.read(_HEADER):
+                raise ValueError(f"its header has no end within {_HEADER:,} bytes")
         file = PlyData.read(str(path))
-    except (PlyHeaderParseError, PlyElementParseError, UnicodeDecodeError) as error:
+    except (PlyHeaderParseError, PlyElementParseError, ValueError, MemoryError) as error:
         raise ValueError(
             f"{path} is no whole PLY file ({error}); give one as `qgs reconstruct` writes it"
         ) from error
@@ -149,18 +130,18 @@ def load_ply(path: str | Path) -> Gaussians:
     scene = Gaussians(
         means=columns(*_MEANS),
         scales=columns(*_SCALES).exp(),
-        quats=F.normalize(columns(*_QUATS), dim=-1),
+        quats=(quats := columns(*_QUATS)) / quats.norm(dim=-1, keepdim=True),  # NaN for 0
         opacities=columns("opacity")[:, 0].sigmoid(),
         colors=columns(*_COLORS) * SH_C0 + 0.5,
         sh=_used_degrees(columns(*rest).unflatten(-1, (3, -1)).mT) if rest else None,
     )
     try:
-        return _one_scene(scene, "PLY")[None]
+        return one_scene(scene, "PLY")[None]
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _one_scene(gaussians: Gaussians, kind: str, *lost: str) -> Gaussians:
+def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> Gaussians:
     """The Gaussians (G, ...) of (G, ...) or (1, G, ...), float32 on the CPU, for a file.
 
     Warns about the parts in `lost`. Raises ValueError for several scenes or for numbers that are

@@ -5,6 +5,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,6 +20,8 @@ from qgs.contracts.weights import Shapes
 from qgs.io.files import replacing
 from qgs.wording import name_shown
 
+SEAL = "qgs.seal"
+"""Metadata entry with the checksum of all others."""
 _PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}
 
 
@@ -42,6 +45,8 @@ class TensorFile:
         with self._whole():
             self._file: Any = safe_open(self.path, "pt")
         self.metadata: Mapping[str, str] = self._file.metadata() or {}
+        if SEAL in self.metadata and self.metadata[SEAL] != seal(self.metadata):
+            raise self.damaged("its metadata are not those that were written")
 
     def __enter__(self) -> Self:
         return self
@@ -110,8 +115,8 @@ class TensorFile:
         with self.entry(key):
             return resolve(tree)
 
-    def refuse_newer(self, key: str, ours: int) -> None:
-        """Raise CheckpointError where the format version in the entry `key` is above `ours`."""
+    def refuse_newer(self, key: str, ours: int) -> int:
+        """The format version in the entry `key`; CheckpointError where it is above `ours`."""
         with self.entry(key) as text:
             written = int(text[:20])
         if written > ours:
@@ -119,6 +124,7 @@ class TensorFile:
                 f"{self.path} has {key} {written}, and qgs {qgs.__version__} reads {ours}: "
                 "install the newer qgs that wrote it"
             )
+        return written
 
 
 def write_tensors(
@@ -127,11 +133,17 @@ def write_tensors(
     """Write `tensors`, contiguous and on the CPU, to `path`; see `replacing`. Raises OSError."""
     with replacing(path) as temporary:
         try:
-            save_file(dict(tensors), temporary, dict(metadata))
+            save_file(dict(tensors), temporary, {**metadata, SEAL: seal(metadata)})
         except SafetensorError as error:  # it gives the number of an OSError as text only
             if number := re.search(r"os error (\d+)", str(error)):
                 raise OSError(int(number[1]), str(error), os.fspath(path)) from error
             raise
+
+
+def seal(metadata: Mapping[str, str]) -> str:
+    """A checksum of all metadata entries but SEAL."""
+    entries = sorted((key, text) for key, text in metadata.items() if key != SEAL)
+    return blake2b(json.dumps(entries).encode(), digest_size=16).hexdigest()
 
 
 def pickle_kind(path: str | os.PathLike[str]) -> str:

@@ -113,7 +113,7 @@ def test_what_a_folder_holds_most_is_read_in_a_told_order(tmp_path, caplog):
     first = scene(tmp_path)
     write_colmap(tmp_path, photos, "text")
     assert_same(scene(tmp_path), photos)
-    assert "`format: llff` reads the other" in caplog.text
+    assert "data.format: llff reads the other" in caplog.text
     assert first.cameras.shape == (6,)
     with pytest.raises(FileNotFoundError, match=r"transforms\.json"):
         scene(tmp_path, format="nerfstudio")

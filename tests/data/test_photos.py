@@ -108,6 +108,20 @@ def test_folders_and_files_that_are_not_there(tmp_path, monkeypatch):
         opened(tmp_path)
 
 
+@pytest.mark.parametrize("of", ["file_path", "mask_path", "depth_file_path"])
+@pytest.mark.parametrize("place", ["../other/images/1.png", "{}/other/images/1.png"])
+def test_files_outside_of_the_folder_are_read_only_if_allowed(tmp_path, of, place):
+    for name in ("mine", "other"):
+        (tmp_path / name).mkdir()
+    folder(tmp_path / "other")
+    mine = folder(tmp_path / "mine", frame={of: place.format(tmp_path)})
+    with pytest.raises(ValueError, match=r"other/images/1\.png"):
+        opened(mine)
+    assert of != "file_path" or opened(mine, outside=True).scenes("train")
+    (mine / "linked").symlink_to(tmp_path / "other")  # a link in the folder is the user's own
+    assert opened(folder(mine, frame={of: "linked/images/1.png"})).scenes("train")
+
+
 def test_transparent_pixels_show_the_background(tmp_path):
     folder(tmp_path)
     Image.new("RGBA", (64, 48), (0, 0, 0, 0)).save(tmp_path / "images" / "0.png")

@@ -5,33 +5,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-from qgs.composer import Recipe, resolve
-
-RECIPES = Path(__file__).parents[2] / "recipes" / "tiny"
-
-SMALL = (
-    "model.width=32",
-    "model.heads=2",
-    "model.queries.count=24",
-    "model.head.gaussians_per_query=4",
-    "data.image_size=[16, 16]",
-    "views.targets=2",
-    "evaluation.scenes=2",
-    "training.steps=4",
-    "training.seconds=null",
-    "optimizer.warmup=2",
-)
+from training_runs import Tiny, tiny_recipe
 
 
 @pytest.fixture(scope="session")
-def tiny() -> Callable[..., Recipe]:
-    """`tiny("tokengs", "a.b=c")`: a recipe of recipes/tiny, smaller yet, with overrides."""
-
-    def make(name: str, *overrides: str) -> Recipe:
-        return resolve(RECIPES / f"{name}.yaml", [*SMALL, *overrides])
-
-    return make
+def tiny() -> Tiny:
+    """See `tiny_recipe`."""
+    return tiny_recipe
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
@@ -15,6 +16,7 @@ from safetensors.torch import load_file, save_file
 import qgs
 from qgs.composer import RecipeError, resolve
 from qgs.composer.registry import available_plugins
+from qgs.data.domain import KEY, Domain
 from qgs.io import tensors as tensors_module
 from qgs.io.checkpoint import (
     CheckpointFile,
@@ -23,7 +25,7 @@ from qgs.io.checkpoint import (
     unique_tensors,
     write_checkpoint,
 )
-from qgs.io.tensors import CheckpointError
+from qgs.io.tensors import SEAL, CheckpointError, seal
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Views
 
@@ -57,7 +59,7 @@ def rewrite(path: Path, tensors: dict[str, torch.Tensor] | None = None, **change
     """Write the file again with other tensors or metadata; None removes an entry."""
     metadata = {k: v for k, v in (metadata_of(path) | changed).items() if v is not None}
     own = {name: tensor.clone() for name, tensor in load_file(path).items()}
-    save_file(own if tensors is None else tensors, path, metadata)
+    save_file(own if tensors is None else tensors, path, metadata | {SEAL: seal(metadata)})
 
 
 def test_a_loaded_model_predicts_the_same(model: QueryGaussianModel, saved: Path) -> None:
@@ -220,6 +222,55 @@ PLAIN = {
     "qgs.distributions": "{}",
     "qgs.format_version": "2",
 }
+
+
+def test_a_changed_digit_in_any_metadata_is_refused(saved: Path) -> None:
+    """Of the recipe, the step, the ranges, the seal itself and its name."""
+    qgs.save(qgs.load(saved), saved, extra={"step": "7000", KEY: Domain({"depth": [1.0]}, 1).text})
+    whole = saved.read_bytes()
+    size = int.from_bytes(whole[:8], "little")
+    header, metadata, refused = whole[8 : 8 + size], metadata_of(saved), 0
+    rng = np.random.default_rng(0)
+    for text in (json.dumps(text)[1:-1].encode() for entry in metadata.items() for text in entry):
+        start = header.index(b'"' + text + b'"') + 1
+        for at in start + rng.integers(0, len(text), 8):
+            if not chr(header[at]).isalnum() or header[at - 1 : at] == b"\\":
+                continue
+            changed = bytearray(whole)
+            changed[8 + at] = ord("4") if header[at] == ord("3") else ord("3")
+            saved.write_bytes(changed)
+            with pytest.raises(CheckpointError):
+                CheckpointFile(saved)
+            refused += 1
+    assert refused > 60
+
+
+def test_a_second_entry_of_one_name_changes_nothing_unseen(saved: Path) -> None:
+    """The last one of a name is what a reader gets, and what the seal is compared with."""
+    whole, tree = saved.read_bytes(), CheckpointFile(saved).recipe.tree
+    size = int.from_bytes(whole[:8], "little")
+    old = b'"qgs.format_version":"3"'
+    assert whole.count(old) == 1
+    for first, second in ((b"2", b"3"), (b"3", b"2")):
+        pair = old.replace(b"3", first) + b"," + old.replace(b"3", second)
+        header = whole[8 : 8 + size].rstrip().replace(old, pair)
+        header += b" " * (-len(header) % 8)
+        saved.write_bytes(len(header).to_bytes(8, "little") + header + whole[8 + size :])
+        if second == b"3":
+            assert CheckpointFile(saved).recipe.tree == tree
+            continue
+        with pytest.raises(CheckpointError, match="metadata"):
+            CheckpointFile(saved)
+
+
+def test_files_of_the_format_without_a_seal_are_read(saved: Path) -> None:
+    own, metadata = load_file(saved), metadata_of(saved)
+    del metadata[SEAL]
+    save_file(own, saved, metadata)
+    with pytest.raises(CheckpointError, match="lack"):
+        CheckpointFile(saved)
+    save_file(own, saved, metadata | {"qgs.format_version": "2"})
+    assert CheckpointFile(saved).recipe.tree
 
 
 def recipe_with(**changed: Any) -> dict[str, str]:

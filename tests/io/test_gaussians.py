@@ -1,5 +1,6 @@
 """Files of Gaussians: PLY as other programs write and read it, .splat, a format of a plug-in."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,11 +17,9 @@ from qgs.io.gaussians import (
     OPACITY_EPS,
     PROPERTIES,
     SH_C0,
-    SPLAT,
     load_ply,
     save_gaussians,
     save_ply,
-    save_splat,
 )
 from qgs.types import Gaussians, map_tensors
 
@@ -170,26 +169,32 @@ def test_other_files_are_refused_by_name(tmp_path: Path) -> None:
     PlyData(elements).write(tmp_path / "compressed.ply")
     save_ply(random_gaussians(3), tmp_path / "whole.ply")
     (tmp_path / "cut.ply").write_bytes((tmp_path / "whole.ply").read_bytes()[:-5])
+    whole = (tmp_path / "whole.ply").read_bytes()
     (tmp_path / "noise.ply").write_bytes(b"\x89PNG\r\n\xff")
-    for name in ("points", "compressed", "cut", "noise"):
+    (tmp_path / "empty.ply").touch()
+    (tmp_path / "negative.ply").write_bytes(whole.replace(b"vertex 3", b"vertex -3"))
+    (tmp_path / "promise.ply").write_bytes(whole.replace(b"vertex 3", b"vertex 3000000000"))
+    text = whole.replace(b"binary_little_endian", b"ascii").replace(
+        b"vertex 3", b"vertex 9" + b"9" * 18
+    )
+    (tmp_path / "text.ply").write_bytes(text)
+    (tmp_path / "twice.ply").write_bytes(whole.replace(b"float nx", b"float x"))
+    comments = whole.replace(b"element", b"comment x\n" * 10_000 + b"element")
+    (tmp_path / "long.ply").write_bytes(comments)
+    zeros = random_gaussians(3)
+    save_ply(replace(zeros, quats=zeros.quats * 0), tmp_path / "no_rotation.ply")
+    save_ply(replace(zeros, scales=zeros.scales * 0 + 3e38), tmp_path / "large.ply")
+    large = bytearray((tmp_path / "large.ply").read_bytes())
+    large[-28:-24] = np.float32(200).tobytes()  # a logarithm whose exponential overflows
+    (tmp_path / "large.ply").write_bytes(large)
+    names = ("points", "compressed", "cut", "noise", "empty", "negative", "promise", "text")
+    for name in (*names, "twice", "long", "no_rotation", "large"):
         with pytest.raises(ValueError, match=rf"{name}\.ply"):
             load_ply(tmp_path / f"{name}.ply")
-    with pytest.raises(FileNotFoundError):
-        load_ply(tmp_path / "none.ply")
-
-
-def test_the_bytes_of_a_splat_file(tmp_path: Path) -> None:
-    given = random_gaussians(1, 300)
-    save_splat(given, tmp_path / "scene.splat")
-    read = np.frombuffer((tmp_path / "scene.splat").read_bytes(), SPLAT)
-    assert SPLAT.itemsize == 32
-    order = (given.scales[0].prod(-1) * given.opacities[0]).argsort(descending=True)
-    means, scales, quats, opacities, colors = (getattr(given, n)[0][order].numpy() for n in PARTS)
-    np.testing.assert_array_equal(read["mean"], means)
-    np.testing.assert_array_equal(read["scale"], scales)
-    np.testing.assert_allclose(read["rgba"][:, :3] / 255, colors, atol=0.002)
-    np.testing.assert_allclose(read["rgba"][:, 3] / 255, opacities, atol=0.002)
-    np.testing.assert_allclose((read["quat"].astype(float) - 128) / 128, quats, atol=0.008)
+    os.mkfifo(tmp_path / "pipe.ply")  # reading it would wait for a writer
+    for name in ("none", "pipe"):
+        with pytest.raises(FileNotFoundError, match=rf"{name}\.ply"):
+            load_ply(tmp_path / f"{name}.ply")
 
 
 def test_convert_keeps_the_most_opaque(tmp_path: Path) -> None:

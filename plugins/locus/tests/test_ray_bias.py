@@ -3,10 +3,8 @@
 import pytest
 import torch
 from qgs_locus.kernels.attention_bias import BLOCK
-from qgs_locus.ray_bias import RayBias, dense_bias, ray_tokens
+from qgs_locus.ray_bias import RayBias, dense_bias, normalised_rays, ray_tokens
 from torch import Tensor
-
-from qgs.geometry.rays import normalised_rays
 
 
 def _rays(count: int, dtype: torch.dtype = torch.float32) -> Tensor:

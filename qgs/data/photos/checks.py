@@ -1,14 +1,16 @@
 """Problems of a listed photo: its pose, its intrinsics, its size."""
 
 import math
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from upath import UPath
 
 from qgs.data.lenses import Intrinsics, Size
 from qgs.data.photos.reader import FrameProblem, Listing, PhotoFrame
-from qgs.wording import listed, numbered, warn_once
+from qgs.wording import listed, name_shown, numbered, warn_once
 
 LARGEST_SIDE = 10**6  # pixels of a listed photo
 _FARTHEST = 1e12  # largest coordinate of a camera; the square of larger ones overflows float32
@@ -17,6 +19,17 @@ _SAME_ASPECT = 0.01  # relative difference between the file's and the listing's 
 _SQUARE = 0.1  # relative difference of sides, or of fx and fy, that counts as equal
 _NORMALISED = 5.0  # a focal length below is in units of the image, not of its pixels
 _FOCAL = (0.1, 30.0)  # of the longer side: angles of view of 157 and 2 degrees
+
+
+def refuse_outside(folder: UPath, found: Listing) -> None:
+    """Raise ValueError for a listed file that is not in `folder`; a link there is."""
+    for frame in found.frames:
+        for file in filter(None, (frame.path, frame.mask, frame.depth)):
+            if os.path.relpath(file.path, folder.path or ".").startswith(".."):
+                raise ValueError(
+                    f"{found.file} names {name_shown(str(file))}, which is outside of {folder}: "
+                    "move it into the folder, or allow this by data.outside=true"
+                )
 
 
 def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:

@@ -35,6 +35,7 @@ _MODELS: dict[str, tuple[int, str, type[Lens] | None]] = {
 }
 """Number in binary files, parameters in their order, and lens of every camera model."""
 _NAMES = {number: name for name, (number, _, _) in _MODELS.items()}
+_LONGER = "a file goes on after as many records as it promises"
 _BYTES_OF_A_POINT = 24  # x, y and the point's number
 
 
@@ -57,7 +58,7 @@ class Colmap(PhotoReader):
         read_cameras, read_images = _READ[suffix]
         try:
             cameras = {number: _camera(*camera) for number, camera in read_cameras(model)}
-            posed = list(read_images(model))
+            posed = [(name, _c2w(*pose), camera) for name, pose, camera in read_images(model)]
             unknown = {camera for *_, camera in posed} - cameras.keys()
             if unknown:
                 raise ValueError(f"images are of cameras {sorted(unknown)}, which are not in it")
@@ -68,10 +69,8 @@ class Colmap(PhotoReader):
             ) from error
         photos = image_folder(folder, images)
         frames = [
-            PhotoFrame(
-                str(PurePosixPath(photos.name, name)), photos / name, _c2w(*pose), **cameras[camera]
-            )
-            for name, pose, camera in posed
+            PhotoFrame(str(PurePosixPath(photos.name, name)), photos / name, c2w, **cameras[camera])
+            for name, c2w, camera in posed
         ]
         return Listing(model, sorted(frames, key=lambda frame: frame.name))
 
@@ -95,13 +94,15 @@ Image: TypeAlias = tuple[str, list[float], int]
 def _text_cameras(model: UPath) -> Iterator[Camera]:
     for line in _lines(model / "cameras.txt"):
         number, name, width, height, *parameters = line.split()
+        if "_" in "".join([number, width, height, *parameters]):  # Python reads 1_000 as a number
+            raise ValueError(f"cameras.txt has the line {line[:60]!r}, whose numbers are none")
         yield int(number), (name, int(width), int(height), [*map(float, parameters)])
 
 
 def _text_images(model: UPath) -> Iterator[Image]:
     for line in _lines(model / "images.txt", after=1):  # a line of points follows each image
         number, *fields = line.split(maxsplit=9)
-        if len(fields) != 9 or not number.isdecimal():
+        if len(fields) != 9 or not number.isdecimal() or "_" in "".join(fields[:8]):
             raise ValueError(
                 f"images.txt has the line {line[:60]!r} where an image was expected: 9 numbers "
                 "and a name, then a line of points, which may be empty"
@@ -126,6 +127,8 @@ def _binary_cameras(model: UPath) -> Iterator[Camera]:
             name = _NAMES.get(kind, f"number {kind}")
             parameters = _unpacked(f"<{len(_parameters(name))}d", file)
             yield number, (name, width, height, parameters)
+        if file.read(1):
+            raise ValueError(_LONGER)
 
 
 def _binary_images(model: UPath) -> Iterator[Image]:
@@ -136,6 +139,8 @@ def _binary_images(model: UPath) -> Iterator[Image]:
             # skipped unread: points are most of the file
             file.seek(_BYTES_OF_A_POINT * _unpacked("<Q", file)[0], 1)
             yield name, pose, camera
+        if file.read(1):
+            raise ValueError(_LONGER)
 
 
 _READ = {"txt": (_text_cameras, _text_images), "bin": (_binary_cameras, _binary_images)}
@@ -170,9 +175,11 @@ def _camera(model: str, width: int, height: int, parameters: Sequence[float]) ->
 
 
 def _c2w(*cam_from_world: float) -> np.ndarray:
-    """OpenCV camera-to-world; COLMAP gives world-to-camera, with a quaternion of any length."""
+    """OpenCV camera-to-world; COLMAP gives world-to-camera."""
     quaternion, translation = torch.tensor(cam_from_world, dtype=torch.float64).split([4, 3])
-    rotation = quat_to_matrix(quaternion / quaternion.norm()).T  # NaN for no rotation at all
+    if abs(float(quaternion.norm()) - 1) > 0.1:
+        raise ValueError(f"the quaternion {[*cam_from_world[:4]]} of an image has not length 1")
+    rotation = quat_to_matrix(quaternion / quaternion.norm()).T
     c2w = torch.eye(4, dtype=torch.float64)
     c2w[:3, :3], c2w[:3, 3] = rotation, -rotation @ translation
     return c2w.numpy()

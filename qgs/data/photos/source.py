@@ -31,7 +31,7 @@ from qgs.data.images import (
 from qgs.data.lenses import Mode, Size, undistorted, whole_zoom
 from qgs.data.paths import is_local, opened_path, read_file
 from qgs.data.photos import formats_of, read_listing, readers
-from qgs.data.photos.checks import refuse_fatal_problems, size_problems
+from qgs.data.photos.checks import refuse_fatal_problems, refuse_outside, size_problems
 from qgs.data.photos.posing import VIDEOS, posed
 from qgs.data.photos.reader import PhotoFrame, existing
 from qgs.data.photos.turning import turned, turned_size, upright
@@ -53,6 +53,8 @@ class PhotosConfig(SceneSource.Config):
     a folder holds."""
     images: str | None = None
     """Folder of photos to read instead of the listed one, such as images_4."""
+    outside: bool = False
+    """Read photos outside of the folder too, which a listing names by absolute paths or `..`."""
     holdout: int = Field(default=8, ge=0)
     """Every n-th frame is kept for evaluation, from frame n // 2 on, or the middle one of fewer; 0
     for none. A listing's own split goes first."""
@@ -83,7 +85,8 @@ class PhotoScene(EncodedScene):
         self, name: str, folder: UPath, config: PhotosConfig, cache: BoundedCache[np.ndarray]
     ) -> None:
         self.name, self.folder, self._config, self._cache = name, folder, config, cache
-        frames, self.missing = present_frames(folder, config.format, config.images)
+        options = config.format, config.images, config.outside
+        frames, self.missing = present_frames(folder, *options)
         self._frames = frames = [*map(upright, frames[: config.max_frames or None])]
         times = [frame.time for frame in frames if frame.time is not None]
         self.times = torch.tensor(times, dtype=torch.float64) if len({*times}) > 1 else None
@@ -231,6 +234,7 @@ class PhotosSource(LazySource):
     name = "photos"
     Config = PhotosConfig
     tells_times: ClassVar[bool] = True
+    not_in_protocol: ClassVar[frozenset[str]] = frozenset({"path", "outside"})
     split_options: ClassVar[frozenset[str]] = frozenset({"holdout", "max_frames"})
 
     def __init__(self, config: PhotosConfig) -> None:
@@ -296,7 +300,7 @@ def folder_name(folder: UPath) -> str:
 
 
 def present_frames(
-    folder: UPath, format: str = "auto", images: str | None = None
+    folder: UPath, format: str = "auto", images: str | None = None, outside: bool = False
 ) -> tuple[list[PhotoFrame], list[str]]:
     """The frames of the listing's splits whose image files exist, and the paths of the others.
 
@@ -304,6 +308,8 @@ def present_frames(
     exist, ValueError for poses and intrinsics that cannot be right.
     """
     listing = read_listing(folder, format, images)
+    if not outside:
+        refuse_outside(folder, listing)
     frames = [frame for frame in listing.frames if frame.split != "unused"]
     if len(frames) < len(listing.frames):
         warn_once(

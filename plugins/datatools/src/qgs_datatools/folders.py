@@ -8,6 +8,7 @@ from upath import UPath
 
 from qgs.data.paths import read_file
 from qgs.data.photos import formats_of, read_listing, readers
+from qgs.data.photos.checks import refuse_outside
 from qgs.data.photos.reader import existing
 from qgs.data.photos.source import folder_name
 from qgs.data.photos.turning import upright
@@ -68,7 +69,9 @@ def dl3dv_scenes(path: UPath, images: str | None) -> list[Candidate]:
 
 
 def _photos(folder: UPath, kind: str, images: str | None) -> list[Photo]:
-    frames = [*map(upright, read_listing(folder, kind, images).frames)]
+    listing = read_listing(folder, kind, images)
+    refuse_outside(folder, listing)
+    frames = [*map(upright, listing.frames)]
     there = existing(frame.path for frame in frames if frame.name)
     masks = existing(frame.mask for frame in frames if frame.mask is not None)
     return [

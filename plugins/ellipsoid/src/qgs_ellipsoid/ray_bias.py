@@ -11,11 +11,10 @@ from typing import Any, Self
 
 import torch
 from qgs_locus.kernels.attention_bias import AttentionBias, Kernel
-from qgs_locus.ray_bias import clamped
+from qgs_locus.ray_bias import clamped, normalised_rays
 from torch import Tensor
 
 from qgs.geometry.precision import full_precision
-from qgs.geometry.rays import normalised_rays
 from qgs_ellipsoid.rotations import unit
 
 UPWARD = (0.0, 0.0, 1.0)

@@ -10,8 +10,18 @@ import torch
 from torch import Tensor
 
 from qgs.geometry.precision import full_precision
-from qgs.geometry.rays import normalised_rays
 from qgs_locus.kernels.attention_bias import AttentionBias, Kernel
+
+
+@full_precision
+def normalised_rays(rays: Tensor, eps: float = 1e-6) -> tuple[Tensor, Tensor]:
+    """Unit-direction Plücker rays (m', d') = (m, d) / |d|, |d| floored at `eps`.
+
+    rays (..., 6), moment first -> moments (..., 3), directions (..., 3).
+    """
+    moments, directions = rays.split(3, dim=-1)
+    length = directions.norm(dim=-1, keepdim=True).clamp_min(eps)
+    return moments / length, directions / length
 
 
 @full_precision

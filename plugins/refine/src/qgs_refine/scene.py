@@ -22,7 +22,7 @@ from qgs.drawing.images import rgb_picture
 from qgs.extensions import ExtensionError, function
 from qgs.geometry.transforms import moved
 from qgs.io.files import replacing_entries, write_text
-from qgs.io.gaussians import save_ply, save_splat
+from qgs.io.gaussians import save_ply
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.renderers import AutoRenderer
@@ -30,6 +30,7 @@ from qgs.types import Gaussians, Views, concatenated
 from qgs_refine.planning import NONE, Plan, Scenes, Start, affordable, best_start, shipped_models
 from qgs_refine.points import from_points, sparse_points
 from qgs_refine.refining import NO_EXTRAS, Extras, RefinedScene, refine, seconds_of_step
+from qgs_refine.splat import save_splat
 from qgs_refine.sweeping import swept
 
 END, PART_OF_END = 4.0, 0.03

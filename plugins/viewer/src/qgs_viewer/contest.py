@@ -349,9 +349,8 @@ def report_of(
             source,
             entry.recipe.views,
             few,
-            None,
-            entry.search,
-            entry.windows_of,
+            views_of=entry.search,
+            windows_of=entry.windows_of,
             depths=entry is unlike[0],
         )[:PICTURED_SCENES]
         for entry in unlike

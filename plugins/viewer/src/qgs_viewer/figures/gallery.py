@@ -4,10 +4,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from qgs.analysis.scale import ScaleSearch
-from qgs.composer import resolve
 from qgs.data.domain import SEARCHED, Domain, verdict
 from qgs.data.evaluation import evaluation_samples
-from qgs.data.recognition import is_training_data
 from qgs.io.checkpoint import load
 from qgs.io.files import write_text
 from qgs.wording import listed
@@ -69,13 +67,11 @@ def open_exhibition(
     source = recipe.build_data()
     models = {name: load(file, device) for name, file in files.items()}
     first = next(iter(models))
-    search, own = ScaleSearch(models[first], recipe.views), models[first].recipe or {}
-    windows_of = None
-    if photos is not None and not is_training_data(photos, resolve(own).data_config):
+    search, windows_of = ScaleSearch(models[first], recipe.views), None
+    if photos is not None:
         windows_of = contest.photo_windows(recipe.views, models[first].trained_on)
-    samples = evaluation_samples(
-        source, recipe.views, recipe.evaluation, None, search, windows_of, depths=True
-    )
+    choices = {"views_of": search, "windows_of": windows_of}
+    samples = evaluation_samples(source, recipe.views, recipe.evaluation, **choices, depths=True)
     names = dict.fromkeys(sample.scene for sample in samples)
     if scene is not None and scene not in names:
         raise ValueError(f"--scene: {scene!r} is not judged; scenes are {listed(names)}")

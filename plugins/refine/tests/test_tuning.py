@@ -3,12 +3,17 @@
 import pytest
 import torch
 from qgs_refine.tuning import tune, tuning_loss
-from training_runs import Tiny
+from training_runs import Tiny, tiny_recipe
 
 from qgs.composer import Recipe
 from qgs.data.evaluation import evaluation_samples
 from qgs.model import QueryGaussianModel
 from qgs.types import QueryState, Views, map_tensors
+
+
+@pytest.fixture
+def tiny() -> Tiny:
+    return tiny_recipe
 
 
 def model_and_inputs(recipe: Recipe) -> tuple[QueryGaussianModel, Views]:
