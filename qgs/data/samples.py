@@ -17,11 +17,10 @@ from torch import Tensor
 
 from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.geometry.poses import (
-    first_camera,
     largest_distance,
     look_at_depth,
-    mean_camera,
     mirrored,
+    reference_pose,
     relative_to,
     scaled,
 )
@@ -282,12 +281,11 @@ def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[T
             "it is for qgs reconstruct, view, demo and report --photos alone; write auto, distance "
             "or constant"
         )
-    every = scene.cameras.c2w
-    c2w = every[list(input_frames)]
-    reference = (first_camera if views.frame == "first_cam" else mean_camera)(c2w)
+    c2w = scene.cameras.c2w[list(input_frames)]
+    reference = reference_pose(views.frame, c2w)
     # of all cameras: the scale of a scene does not depend on which inputs are drawn
     if views.scale == "auto":
-        return reference, auto_scale(every, scene.name)
+        return reference, auto_scale(scene.cameras.c2w, scene.name)
     factor = torch.tensor(views.scale_factor, dtype=c2w.dtype)
     if views.scale == "distance":
         distance = largest_distance(relative_to(reference, c2w))

@@ -69,6 +69,17 @@ def test_normalised_poses():
         make_sample(Line(5, step=0.0), (0, 3), (1,), config, False)
 
 
+def test_given_poses_stay_and_scale_about_their_origin():
+    scene = Line(9)
+    config = ViewsConfig(inputs=2, frame="given", scale="constant", scale_factor=1.0)
+    sample = make_sample(scene, (2, 6), (4,), config, False)
+    assert torch.equal(sample.inputs.cameras.c2w[0], scene.cameras.c2w[[2, 6]])
+    assert torch.equal(sample.targets.cameras.c2w[0], scene.cameras.c2w[[4]])
+    apart = config.model_copy(update={"scale": "distance"})
+    places = make_sample(scene, (2, 6), (4,), apart, False).inputs.cameras.c2w[0, :, 0, 3]
+    assert places.tolist() == pytest.approx([(3 + 1) / 2, (3 + 3) / 2])
+
+
 def test_mirroring_flips_images_poses_and_principal_point():
     plain = make_sample(Line(5), (0, 3), (1,), ViewsConfig(inputs=2), False).inputs
     flipped = mirrored_views(plain)

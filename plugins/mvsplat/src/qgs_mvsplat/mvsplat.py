@@ -86,6 +86,9 @@ class MVSplatEncoder(Encoder):
         """Channels of the U-Net that refines depths at full size."""
         depth_levels: int = Field(default=5, ge=1, le=8)
         """Levels of that U-Net; the lowest has attention over all views."""
+        cost_volume: bool = True
+        """Whether views are compared; false has zeros in place of correlations, so that depths
+        come from features alone, with as many parameters (the paper's ablation)."""
 
     config: Config
 
@@ -144,6 +147,7 @@ class DepthPredictor(nn.Module):
             *(conv3(matched, cost), group_norm(cost), nn.GELU()),
             *(UNet(cost, config.cost_levels, pre_norm=False), conv3(cost, count)),
         )
+        self.compares = config.cost_volume
         self.regressor_residual = nn.Conv2d(matched, count, 1)
         self.depth_head_lowres = two_convolutions(count, 2 * count, count)
         self.stride, scale = config.stride, FACTOR // config.stride
@@ -185,13 +189,16 @@ class DepthPredictor(nn.Module):
         """Inverse depth and largest probability (B V, 1, h, w) of the candidates at 1/4."""
         count = self.regressor_residual.out_channels
         candidates_BVD = inverse_depth_candidates(sweep.near, sweep.far, count)
-        volume_BVDhw = cost_volume(
-            features_BVDhw,
-            candidates_BVD[..., None, None],
-            feature_lenses(sweep.cameras, features_BVDhw.shape[3:]),
-            relative_poses(sweep.cameras.c2w, sweep.neighbours),
-            sweep.neighbours,
-        )
+        size = features_BVDhw.shape[3:]
+        volume_BVDhw = features_BVDhw.new_zeros(*candidates_BVD.shape, *size)
+        if self.compares:
+            volume_BVDhw = cost_volume(
+                features_BVDhw,
+                candidates_BVD[..., None, None],
+                feature_lenses(sweep.cameras, size),
+                relative_poses(sweep.cameras.c2w, sweep.neighbours),
+                sweep.neighbours,
+            )
         matched = torch.cat([volume_BVDhw, features_BVDhw], 2).flatten(0, 1)
         refined = self.corr_refine_net(matched, features_BVDhw.shape[1])
         refined = refined + self.regressor_residual(matched)
