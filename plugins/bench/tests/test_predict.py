@@ -45,7 +45,7 @@ def test_mistakes() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["tokengs", "locus"])
+@pytest.mark.parametrize("name", ["tokengs", "locus", "mvsplat", "depthsplat"])
 def test_near_the_measured(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of processor time, which other processes disturb less."""
     monkeypatch.setattr(predict, "timer", time.process_time)
