@@ -238,9 +238,8 @@ def views_in(
     """Views (1, F) of these frames in a world as of `own_world`, float32; times are 0 to 1."""
     refuse_too_many(len(frames), scene)
     wanted = sorted(set(frames))
-    place = {frame: i for i, frame in enumerate(wanted)}
     # a frame that is input and target, or target twice, is decoded once
-    order = [place[frame] for frame in frames]
+    order = [wanted.index(frame) for frame in frames]
     images, masks = scene.images(wanted), scene.masks(wanted)
     surface = scene.depths(wanted) if depths else None
     if surface is not None:  # z of cameras scales with their translations
@@ -328,8 +327,7 @@ def mirrored_views(views: Views) -> Views:
     fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
     intrinsics = torch.stack([fx, fy, cameras.size[1] - cx, cy], -1)
     flipped = Cameras(mirrored(cameras.c2w), intrinsics, cameras.size)
-    masks, depths = map_tensors(_flipped, (views.masks, views.depths))
-    images = _flipped(views.images)
+    images, masks, depths = map_tensors(_flipped, (views.images, views.masks, views.depths))
     return replace(views, images=images, cameras=flipped, masks=masks, depths=depths)
 
 
