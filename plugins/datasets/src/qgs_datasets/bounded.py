@@ -84,7 +84,7 @@ class Bounded(ViewSampler):
         margin = self.options(step).margin
         inside = span[margin : len(span) - margin]
         if scene.times is not None:  # all targets of a sample are of one moment
-            inside = [inside[rng.integers(len(inside))]]
+            inside = [inside[int(rng.integers(len(inside)))]]
         return [frame for moment in inside for frame in moment]
 
     def gaps(self, step: int) -> tuple[int, int]:
