@@ -162,7 +162,7 @@ class ViewSampler(Component):
     def draw(
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
     ) -> tuple[Frames, Frames]:
-        """`views.inputs` input frames, ascending, and `views.targets` target frames.
+        """Up to `views.inputs` frames, ascending, as many in each sample of a step, and targets.
 
         Held-out frames are never drawn. step: optimiser steps before the one that the sample is
         for; `qgs.contracts.schedule.END` in evaluation. Raises ValueError for too few frames.

@@ -20,8 +20,8 @@ class ViewsConfig(ComponentConfig):
     gap: tuple[int, int] = (10, 40)
     """[min, max] frames, or times where they are known, from the first input to the last, which
     count too; it shrinks to what a scene has, with a warning where that is below min."""
-    frame: Literal["first_cam", "mean_cam"] = "first_cam"
-    """The camera that becomes the identity: the first input, or the mean of the inputs."""
+    frame: Literal["first_cam", "mean_cam", "given"] = "first_cam"
+    """The camera that becomes the identity: the first input, the mean of inputs; "given": none."""
     scale: Literal["constant", "distance", "auto", "search"] = "constant"
     """Translations are multiplied by `scale_factor`; with "distance", they are divided by the
     largest distance from the first input camera to another one before. "auto" takes one factor per

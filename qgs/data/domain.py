@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from qgs.geometry.poses import first_camera, largest_distance, look_at_depth, mean_camera
+from qgs.geometry.poses import largest_distance, look_at_depth, reference_pose
 from qgs.types import Cameras, Views
 from qgs.wording import warn_once
 
@@ -181,13 +181,13 @@ class FirstViews:
         c2w = views.cameras.c2w
         yield value_range_problem(views.images)
         if self.settings is not None:
-            first = self.settings["frame"] == "first_cam"
-            place = (first_camera if first else mean_camera)(c2w)
+            frame = self.settings["frame"]
+            place = reference_pose(frame, c2w)
             # exact up to the rounding of poses; worlds of other conventions differ by far more
             if float((place - torch.eye(4).to(place)).abs().max()) > 0.05:
                 distance = float(place[..., :3, 3].norm(dim=-1).max())
                 yield (
-                    f"the {'first' if first else 'mean'} camera is not at the origin of the "
+                    f"the {frame.removesuffix('_cam')} camera is not at the origin of the "
                     f"model's world, looking along +z, but {distance:.3g} away or turned; cameras "
                     "are OpenCV camera-to-world (x right, y down, z forward; of OpenGL axes negate "
                     "columns 1, 2)"

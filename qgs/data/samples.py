@@ -17,11 +17,10 @@ from torch import Tensor
 
 from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.geometry.poses import (
-    first_camera,
     largest_distance,
     look_at_depth,
-    mean_camera,
     mirrored,
+    reference_pose,
     relative_to,
     scaled,
 )
@@ -239,9 +238,8 @@ def views_in(
     """Views (1, F) of these frames in a world as of `own_world`, float32; times are 0 to 1."""
     refuse_too_many(len(frames), scene)
     wanted = sorted(set(frames))
-    place = {frame: i for i, frame in enumerate(wanted)}
     # a frame that is input and target, or target twice, is decoded once
-    order = [place[frame] for frame in frames]
+    order = [wanted.index(frame) for frame in frames]
     images, masks = scene.images(wanted), scene.masks(wanted)
     surface = scene.depths(wanted) if depths else None
     if surface is not None:  # z of cameras scales with their translations
@@ -282,12 +280,11 @@ def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[T
             "it is for qgs reconstruct, view, demo and report --photos alone; write auto, distance "
             "or constant"
         )
-    every = scene.cameras.c2w
-    c2w = every[list(input_frames)]
-    reference = (first_camera if views.frame == "first_cam" else mean_camera)(c2w)
+    c2w = scene.cameras.c2w[list(input_frames)]
+    reference = reference_pose(views.frame, c2w)
     # of all cameras: the scale of a scene does not depend on which inputs are drawn
     if views.scale == "auto":
-        return reference, auto_scale(every, scene.name)
+        return reference, auto_scale(scene.cameras.c2w, scene.name)
     factor = torch.tensor(views.scale_factor, dtype=c2w.dtype)
     if views.scale == "distance":
         distance = largest_distance(relative_to(reference, c2w))
@@ -330,8 +327,7 @@ def mirrored_views(views: Views) -> Views:
     fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
     intrinsics = torch.stack([fx, fy, cameras.size[1] - cx, cy], -1)
     flipped = Cameras(mirrored(cameras.c2w), intrinsics, cameras.size)
-    masks, depths = map_tensors(_flipped, (views.masks, views.depths))
-    images = _flipped(views.images)
+    images, masks, depths = map_tensors(_flipped, (views.images, views.masks, views.depths))
     return replace(views, images=images, cameras=flipped, masks=masks, depths=depths)
 
 

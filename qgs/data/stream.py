@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 import traceback
+from collections import defaultdict
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -100,12 +101,13 @@ def trained_domain(
     out: training itself reports it.
     """
     stream, domain = SampleStream(source, views, seed, sampler=sampler), Domain()
-    drawn = list[tuple[Cameras, Cameras]]()
+    drawn = defaultdict[int, list[tuple[Cameras, Cameras]]](list)
     for number in range(MEASURED):
         with suppress(Exception):  # whatever a reader raises
-            drawn.append(stream.cameras(number, round(number / (MEASURED - 1) * steps)))
-    if drawn:
-        domain.see(*concatenated(drawn, 0))
+            inputs, targets = stream.cameras(number, round(number / (MEASURED - 1) * steps))
+            drawn[inputs.shape[1]].append((inputs, targets))
+    for alike in drawn.values():
+        domain.see(*concatenated(alike, 0))
     return domain
 
 

@@ -13,9 +13,11 @@ _PARALLEL = 3e-4  # mean squared sine of the axes' angles to their mean; 1 degre
 
 
 @full_precision
-def first_camera(c2w: Tensor) -> Tensor:
-    """Reference frame of "first_cam": the first camera. c2w (..., V, 4, 4) -> (..., 4, 4)."""
-    return c2w[..., 0, :, :]
+def reference_pose(frame: str, c2w: Tensor) -> Tensor:
+    """Pose (..., 4, 4) that `views.frame` makes the identity, of inputs c2w (..., V, 4, 4)."""
+    if frame == "given":
+        return torch.eye(4).to(c2w).expand_as(c2w[..., 0, :, :])
+    return mean_camera(c2w) if frame == "mean_cam" else c2w[..., 0, :, :]
 
 
 @full_precision

@@ -67,6 +67,10 @@ def test_normalised_poses():
     assert centres.tolist() == pytest.approx([-0.5, 0.5])
     with pytest.raises(ValueError, match="one point"):
         make_sample(Line(5, step=0.0), (0, 3), (1,), config, False)
+    stay = ViewsConfig(inputs=2, scale_factor=1.0, frame="given")
+    given = make_sample(scene, (2, 6), (4,), stay, False)
+    assert torch.equal(given.inputs.cameras.c2w[0], scene.cameras.c2w[[2, 6]])
+    assert torch.equal(given.targets.cameras.c2w[0], scene.cameras.c2w[[4]])
 
 
 def test_mirroring_flips_images_poses_and_principal_point():

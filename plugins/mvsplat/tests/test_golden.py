@@ -1,5 +1,6 @@
 """MVSplat and DepthSplat against tensors that the released code computed."""
 
+from importlib.util import find_spec, module_from_spec
 from pathlib import Path
 
 import parity
@@ -11,6 +12,7 @@ from qgs_mvsplat import sweep
 from qgs_mvsplat.adapter import e3nn_harmonics, world_harmonics
 from qgs_mvsplat.depthsplat import nearest_neighbours
 from qgs_mvsplat.sweep import feature_lenses, relative_poses
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from qgs.geometry.harmonics import harmonics
 
@@ -77,10 +79,35 @@ def test_both_ways_to_correlate_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     neighbours = nearest_neighbours(cameras.c2w, 2)
     inverse = golden.tensors["inverse_depth_candidates.0"][..., None, None]
     lens = feature_lenses(cameras, features.shape[-2:])
-    given = (features, inverse, lens, relative_poses(cameras.c2w, neighbours), neighbours)
+    rest = (inverse, lens, relative_poses(cameras.c2w, neighbours), neighbours)
+
+    def found() -> tuple[torch.Tensor, torch.Tensor]:
+        learned = features.clone().requires_grad_()
+        volume = sweep.cost_volume(learned, *rest)
+        return volume, torch.autograd.grad(volume.square().sum(), learned)[0]
+
+    gradient = found()[1]  # of all at once
     for pairs, samples in ((0, 1 << 15), (40, 1 << 10)):
         monkeypatch.setattr(sweep, "PAIRS", pairs)
         monkeypatch.setattr(sweep, "MAX_SAMPLES", samples)
-        found = sweep.cost_volume(*given)
+        volume, own = found()
         # Sums cancel: twice the rounding of the released code's own.
-        torch.testing.assert_close(found, golden.tensors["cost_volume.0"], rtol=1e-4, atol=1.5e-4)
+        torch.testing.assert_close(volume, golden.tensors["cost_volume.0"], rtol=1e-4, atol=1.5e-4)
+        torch.testing.assert_close(own, gradient, rtol=1e-4, atol=1.5e-4 * gradient.abs().max())
+
+
+def test_a_pass_on_shapes_or_in_inference_leaves_nothing_for_others() -> None:
+    """In a module of its own, which no other test has used before."""
+    spec = find_spec("qgs_mvsplat.adapter")
+    assert spec is not None
+    assert spec.loader is not None
+    with torch.inference_mode():
+        fresh = module_from_spec(spec)
+        spec.loader.exec_module(fresh)
+        fresh.world_harmonics(torch.eye(3), 2)
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        fresh.world_harmonics(torch.eye(3), 2)
+    rotation = torch.linalg.matrix_exp(torch.tensor([[0.0, 1, 2], [-1, 0, 3], [-2, -3, 0]]))
+    rotation.requires_grad_()
+    fresh.world_harmonics(rotation, 2).sum().backward()
+    assert torch.equal(fresh.world_harmonics(rotation, 2), world_harmonics(rotation, 2))

@@ -170,6 +170,8 @@ def _work(func: Any, args: Any, given: list[Tensor], made: list[Tensor], compute
         left, right = args[_MATMULS[packet] : _MATMULS[packet] + 2]
         shape = math.prod(left.shape[:-2]), *left.shape[-2:], right.shape[-1]
         return Work("matmul", dtype, shape, (left.stride(-1) > 1, right.stride(-1) > 1))
+    if "conv" in func.name():
+        return _convolution(func.name(), dtype, args, made)
     if "scaled_dot_product" in func.name():
         backward = "backward" in func.name()
         query, key = args[int(backward) : int(backward) + 2]
@@ -178,6 +180,19 @@ def _work(func: Any, args: Any, given: list[Tensor], made: list[Tensor], compute
     if not computes or func.name().startswith(("aten::empty", "aten::new_empty")):
         return Work("view", dtype)
     return Work("pointwise", dtype, (sum(tensor.nbytes for tensor in (*given, *made)),))
+
+
+def _convolution(name: str, dtype: torch.dtype, args: Any, made: list[Tensor]) -> Work:
+    """The matrix products of a convolution, or of its gradients."""
+    if "backward" in name:  # of gradient, input, weight, ..., which of input and weight need one
+        (out, given, weight), times = args[:3], sum(args[-1][:2])
+        transposed = args[7]
+    else:  # in inference mode conv_transpose2d has another name, and no flag
+        (given, weight), out, times = args[:2], made[0], 1
+        transposed = "transpose" in name or (name == "aten::convolution" and args[6])
+    rows = (given if transposed else out).numel() // len(weight)
+    shape = times, rows, weight.numel() // len(weight), len(weight)
+    return Work("matmul", dtype, shape, (False, True))
 
 
 @contextmanager

@@ -135,22 +135,26 @@ def _seconds(work: Work) -> float:
     sides = list(work.shape[1:])
     while math.prod(sides) > LARGEST:  # still a product of three long sides
         sides[sides.index(max(sides))] //= 2
-    part = work._replace(shape=(1, *sides))
-    return _measured(part) * math.prod(work.shape) / max(math.prod(sides), 1)
+    # small products take their batch along: a call takes longer than one of them
+    batch = max(min(work.shape[0], LARGEST // max(math.prod(sides), 1)), 1)
+    part = work._replace(shape=(batch, *sides))
+    return _measured(part) * math.prod(work.shape) / max(math.prod(part.shape), 1)
 
 
 @cache
 def _measured(work: Work) -> float:
-    (_, rows, second, third), dtype = work.shape, work.dtype
+    (batch, rows, second, third), dtype = work.shape, work.dtype
     if work.kind == "matmul":
         left, right = (
-            torch.rand(n, m, dtype=dtype).mT if turned else torch.rand(m, n, dtype=dtype)
+            torch.rand(batch, n, m, dtype=dtype).mT
+            if turned
+            else torch.rand(batch, m, n, dtype=dtype)
             for (m, n), turned in zip(((rows, second), (second, third)), work.flags, strict=True)
         )
         return _median(lambda: left @ right)
     (backward,) = work.flags
-    q = torch.rand(1, 1, rows, third, dtype=dtype, requires_grad=backward)
-    k = torch.rand(1, 1, second, third, dtype=dtype, requires_grad=backward)
+    q = torch.rand(1, batch, rows, third, dtype=dtype, requires_grad=backward)
+    k = torch.rand(1, batch, second, third, dtype=dtype, requires_grad=backward)
     with torch.inference_mode(not backward):
         if not backward:
             return _median(lambda: F.scaled_dot_product_attention(q, k, k))

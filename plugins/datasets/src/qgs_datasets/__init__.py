@@ -4,11 +4,12 @@ from qgs.contracts import Plugin
 from qgs_datasets.bounded import Bounded
 from qgs_datasets.chunks import ChunksSource
 from qgs_datasets.dl3dv import Dl3dvSource
+from qgs_datasets.farthest import Farthest
 
 plugin = Plugin(
     name="datasets",
     contract_version=1,
-    components=(ChunksSource, Dl3dvSource, Bounded),
+    components=(ChunksSource, Dl3dvSource, Bounded, Farthest),
     examples=(
         ChunksSource.Config(path="chunks"),  # type: ignore[call-arg]
         Dl3dvSource.Config(path="dl3dv"),  # type: ignore[call-arg]

@@ -1,6 +1,6 @@
 """`datasets/bounded`: pixelSplat's sampler of views."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from pydantic import Field
@@ -51,9 +51,20 @@ class Bounded(ViewSampler):
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
     ) -> tuple[Frames, Frames]:
         """See `ViewSampler`."""
+        span = self.span(scene, views, rng, step)
+        between = rng.choice(range(1, len(span) - 1), views.inputs - 2, replace=False)
+        places = [0, *sorted(map(int, between)), len(span) - 1]
+        inputs = one_of_each([span[place] for place in places], range(len(places)))
+        pool = self.seen(scene, span, rng, step)
+        return inputs, tuple(map(int, rng.choice(pool, views.targets)))
+
+    def span(
+        self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int, parts: int = 1
+    ) -> list[Frames]:
+        """Moments from the first to the last that is drawn from; gaps are divided by `parts`."""
         refuse_too_many(views.inputs + views.targets, scene)
         options, usable = self.options(step), moments(scene)
-        low, high = self.gaps(step)
+        low, high = (gap // parts for gap in self.gaps(step))
         high = min(high, len(usable) - 1)
         # a target needs a place at the margin from both ends, and each input one of its own
         low = max(min(low, high), 2 * options.margin, views.inputs - 1)
@@ -64,15 +75,17 @@ class Bounded(ViewSampler):
             )
         gap = int(rng.integers(low, high + 1))
         first = int(rng.integers(0, len(usable) - gap))
-        span = usable[first : first + gap + 1]
-        between = rng.choice(range(1, gap), views.inputs - 2, replace=False)
-        places = [0, *sorted(map(int, between)), gap]
-        inputs = one_of_each([span[place] for place in places], range(len(places)))
-        inside = span[options.margin : gap + 1 - options.margin]
+        return usable[first : first + gap + 1]
+
+    def seen(
+        self, scene: Scene, span: Sequence[Frames], rng: np.random.Generator, step: int
+    ) -> list[int]:
+        """The frames of a span that targets are drawn from."""
+        margin = self.options(step).margin
+        inside = span[margin : len(span) - margin]
         if scene.times is not None:  # all targets of a sample are of one moment
-            inside = [inside[rng.integers(len(inside))]]
-        pool = [frame for moment in inside for frame in moment]
-        return inputs, tuple(map(int, rng.choice(pool, views.targets)))
+            inside = [inside[int(rng.integers(len(inside)))]]
+        return [frame for moment in inside for frame in moment]
 
     def gaps(self, step: int) -> tuple[int, int]:
         """Least and largest gap after `step` steps: linear from the initial to the final bounds."""

@@ -47,12 +47,33 @@ def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
     return torch.stack([found[n, m] for n in range(degree + 1) for m in range(-n, n + 1)], -1)
 
 
-@cache
-def _samples(degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Directions all around (64, 3), and the pseudo-inverse of the harmonics there."""
+def _fitted(degree: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Directions all around (64, 3), the pseudo-inverse of the harmonics there, change of basis."""
     generator = torch.Generator().manual_seed(0)
-    around = F.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=-1)
-    return around.to(device), torch.linalg.pinv(e3nn_harmonics(around, degree)).to(device)
+    double = {"dtype": torch.float64, "device": "cpu"}
+    around = F.normalize(torch.randn(64, 3, generator=generator, **double), dim=-1)
+    # The family's rasteriser evaluates the functions of 3DGS at (z, x, y) of a direction.
+    cycle = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], **double)
+    count = coefficients(min(degree, SH_DEGREE))
+    change = torch.eye(coefficients(degree), **double)
+    change[1:count, 1:count] = rotated(torch.eye(count - 1, **double), cycle)
+    return around, torch.linalg.pinv(e3nn_harmonics(around, degree)), change
+
+
+# Made at import: a first pass may be one on shapes alone (`qgs bench --predict`) or in inference
+# mode, and tensors of it must not stay for others.
+with torch.inference_mode(False):
+    _FITTED = {degree: _fitted(degree) for degree in (1, 2, 3, 4)}
+
+
+@cache
+def _on_gpu(degree: int, device: torch.device) -> tuple[Tensor, ...]:
+    with torch.inference_mode(False):
+        return tuple(x.to(device) for x in _FITTED[degree])
+
+
+def _fixed(degree: int, device: torch.device) -> tuple[Tensor, ...]:
+    return _FITTED[degree] if device.type == "cpu" else _on_gpu(degree, device)
 
 
 @full_precision
@@ -62,20 +83,10 @@ def turn_of_harmonics(rotation: Tensor, degree: int) -> Tensor:
     By least squares in float64 from values at directions all around, which is exact, and keeps the
     digits that Euler angles of small tilts lose in the released code.
     """
-    directions, inverse = _samples(degree, rotation.device)
+    directions, inverse, _ = _fixed(degree, rotation.device)
     turned = torch.einsum("...ij,sj->...si", rotation.double(), directions)
     # Y(R d) = D Y(d) for every direction d.
     return (inverse @ e3nn_harmonics(turned, degree)).mT.to(rotation.dtype)
-
-
-@cache
-def _basis_change(degree: int, device: torch.device) -> Tensor:
-    # The family's rasteriser evaluates the functions of 3DGS at (z, x, y) of a direction.
-    cycle = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=torch.float64)
-    count = coefficients(min(degree, SH_DEGREE))
-    change = torch.eye(coefficients(degree), dtype=torch.float64)
-    change[1:count, 1:count] = rotated(torch.eye(count - 1, dtype=torch.float64), cycle)
-    return change.to(device)
 
 
 def band_mask(degree: int, like: Tensor) -> Tensor:
@@ -89,12 +100,12 @@ def world_harmonics(rotation: Tensor, degree: int) -> Tensor:
     """(..., K, K): from raw coefficients in a camera's frame to ours in the world.
 
     rotation: camera to world (..., 3, 3). degree: those above SH_DEGREE stay in e3nn's basis. The
-    turn comes before the
-    change of basis, and they do not commute: the family turns in e3nn's basis, but its rasteriser
-    has other signs there; published weights expect that order.
+    turn comes before the change of basis, and they do not commute: the family turns in e3nn's
+    basis, but its rasteriser has other signs there; published weights expect that order, and the
+    world that they were trained in (`views.frame: given`).
     """
     turn = turn_of_harmonics(rotation, degree) * band_mask(degree, rotation)
-    return _basis_change(degree, rotation.device).to(rotation) @ turn
+    return _fixed(degree, rotation.device)[2].to(rotation) @ turn
 
 
 def quaternions(rotation: Tensor) -> Tensor:

@@ -211,7 +211,7 @@ class DepthPredictor(nn.Module):
         multi = self.mv_pyramid(x_NChw) if several else [x_NChw]
         mono = self.mono_pyramid(mono_NChw) if several else [mono_NChw]
         coarse, confidence_N1hw = self.match(cnn, multi, mono, sweep)
-        # The coarse inverse depth joins, not the depth.
+        # Inverse depth joins here, depth itself where Gaussians are predicted (released code).
         joined = self.beside(cnn, multi, coarse[-1])
         correction_N1HW = at_least_float32(self.upsampler(maps, joined))
         full = [resized(x, size) for x in coarse]
@@ -261,13 +261,15 @@ class DepthPredictor(nn.Module):
         self, cnn: Stages, multi: Sequence[Tensor], depth: Tensor | None = None
     ) -> list[tuple[list[Tensor], list[Tensor]]]:
         """What joins the ViT's maps at 1/2, 1/4, 1/8: before and behind their own channels."""
+        # The release has the order CNN, ViT, transformer, depth. Where its CNN ends at 1/4, nothing
+        # joins at 1/8.
         found: list[tuple[list[Tensor], list[Tensor]]] = [([], []) for _ in range(LEVELS)]
         stages = (cnn.first, cnn.second, cnn.features)
         for x, level in zip(stages, self.sizes.cnn_levels, strict=True):
             found[level][0].append(x)
         levels = [*map(self.sizes.level, range(len(multi))), self.sizes.finest]
         for x, level in zip([*multi, depth], levels, strict=True):
-            if x is not None:  # at 1/2 the ViT's own map comes last (released code)
+            if x is not None:  # at 1/2 the release has the ViT's own map last instead
                 found[level][level > 0].append(x)
         return found
 

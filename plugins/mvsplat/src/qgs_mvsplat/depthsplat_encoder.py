@@ -4,22 +4,20 @@ from collections.abc import Iterable
 
 import torch
 import torch.nn.functional as F
-from einops import rearrange
-from pydantic import Field
 from qgs_dinov2.weight_file import load_weights
 from torch import Tensor, nn
 
-from qgs.contracts import Encoder, ModelDims, Problem, RecipeContext, memory_fields
+from qgs.contracts import ModelDims, Problem, RecipeContext
 from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.precision import at_least_float32
-from qgs.types import ImageMemory, Views
+from qgs.types import Views
 from qgs_mvsplat.adapter import coefficients
 from qgs_mvsplat.depthsplat import GAUSSIAN_CHANNELS, DepthSplat, DepthSplatConfig
-from qgs_mvsplat.mvsplat import check_size, size_problems
-from qgs_mvsplat.pixels import WIDTHS, degree_of, width_problems
+from qgs_mvsplat.encoder import DepthRange, SweepEncoder
+from qgs_mvsplat.pixels import WIDTHS, degree_of
 
 
-class DepthSplatEncoder(Encoder):
+class DepthSplatEncoder(SweepEncoder):
     """Every pixel's depth and raw Gaussian, from a plane sweep and a pretrained ViT.
 
     The memory has a token for each pixel. Its D numbers, the model's width, are those of
@@ -28,16 +26,8 @@ class DepthSplatEncoder(Encoder):
     """
 
     name = "depthsplat"
-    # Views at equal distances are neighbours in their order; with three or more, the mask of
-    # shifted windows falls on keys in their order (released code).
-    ordered_views = True
-    writes = memory_fields("features", "grid")
 
-    class Config(DepthSplatConfig):
-        near: float = Field(gt=0)
-        """Least depth, world units; 0.5 as published, with poses as they are."""
-        far: float = Field(gt=0)
-        """Largest depth, world units; 100 for RealEstate10K, 200 for DL3DV as published."""
+    class Config(DepthSplatConfig, DepthRange):
         coarse_depth: bool = False
         """Whether the last of the D numbers is the logarithm of the first sweep's depth, for
         `mvsplat/exchange`; of two scales, in a model wider than the other numbers (published:
@@ -47,9 +37,6 @@ class DepthSplatEncoder(Encoder):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        if config.far <= config.near:
-            reason = f"far must be beyond near, got near {config.near:g} and far {config.far:g}"
-            yield Problem("far", reason, "give the depths at which the scene begins and ends")
         if config.coarse_depth and config.scales == 1:
             reason = "with one scale there is no coarse depth"
             yield Problem("coarse_depth", reason, "write false, or set scales to 2")
@@ -60,8 +47,11 @@ class DepthSplatEncoder(Encoder):
         if config.features % (32 * config.scales):
             reason = f"{config.features} features make no heads of 32 channels in both scales"
             yield Problem("features", reason, "write a multiple of 64")
-        yield from width_problems(context)
-        yield from size_problems(_multiple(config), context)
+        yield from super().problems(config, context)
+
+    @classmethod
+    def multiple(cls, config: Config) -> int:
+        return 4 * config.stride  # the U-Nets halve the features of each sweep
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
@@ -75,19 +65,7 @@ class DepthSplatEncoder(Encoder):
         """Weight decay on everything (released code)."""
         return True
 
-    def forward(self, views: Views) -> ImageMemory:
-        """Raises ValueError for images that the U-Nets and windows do not divide."""
-        check_size(views, _multiple(self.config))
-        scenes, count = views.cameras.shape
-        near, far = (
-            views.cameras.c2w.new_full((scenes, count), x)
-            for x in (self.config.near, self.config.far)
-        )
-        features = rearrange(self.predict(views, near, far), "b v c h w -> b (v h w) c")
-        return ImageMemory(features, grid=(count, *views.cameras.size))
-
     def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
-        """Numbers of every pixel (B, V, C, H, W), for depths between `near` and `far`."""
         depths, raw_BVCHW = self.network(views.images, views.cameras, near_BV, far_BV)
         raw_BVCHW = at_least_float32(raw_BVCHW)
         first = GAUSSIAN_CHANNELS
@@ -99,8 +77,3 @@ class DepthSplatEncoder(Encoder):
         coarse = logs[:1] if self.config.coarse_depth else []
         left = self.dims.width - numbers.shape[2] - len(coarse)
         return torch.cat([F.pad(numbers, (0, 0, 0, 0, 0, left)), *coarse], 2)
-
-
-def _multiple(config: DepthSplatEncoder.Config) -> int:
-    """What sides of images are multiples of: the U-Nets halve the features of each sweep."""
-    return 4 * config.stride

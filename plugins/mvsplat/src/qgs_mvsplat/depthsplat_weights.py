@@ -74,7 +74,7 @@ def _read(shapes: Shapes) -> dict[str, Any]:
         "supervision": supervision if two else {"type": "qgs/layers", "layers": [0]},
     }
     photometric = {"type": "qgs/photometric", "mse_weight": 1.0, "ssim_weight": 0.0}
-    views = {"scale": "constant", "scale_factor": 1.0}
+    views = {"frame": "given", "scale": "constant", "scale_factor": 1.0}
     losses = {"photometric": photometric}
     plugins = ["mvsplat"]
     return {"recipe": 1, "plugins": plugins, "model": model, "views": views, "losses": losses}
@@ -98,7 +98,7 @@ DEPTHSPLAT = WeightLayout(
         "bounds of the scales: the release's",
         "losses: mean squared error of both depths where there are two, to which the release adds "
         "0.05 LPIPS (plugin `lpips`)",
-        "scale of the world: as given; renderer, training: the framework's defaults",
+        "frame and scale of the world: as given; renderer, training: the framework's defaults",
     ),
 )
 """The released DepthSplat, in files of Lightning or of a bare state dict."""

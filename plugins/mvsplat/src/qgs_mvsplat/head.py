@@ -96,6 +96,8 @@ def mapped_opacity(p: Tensor, exponent: float) -> Tensor:
     """Opacities of probabilities; those themselves for an exponent of 0."""
     if exponent == 0:
         return p
+    # The mean of two curves, which is p for an exponent of 0, that of the published weights. The
+    # released code has the map from pixelSplat, where it sharpens opacities while training.
     power, inside = 2.0**exponent, (p > 0) & (p < 1)
     # 0 and 1 stay as they are; there the slope of the map may be infinite.
     q = torch.where(inside, p, 0.5)

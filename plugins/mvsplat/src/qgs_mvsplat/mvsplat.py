@@ -1,28 +1,19 @@
 """`mvsplat/mvsplat`: CNN, window transformer, plane sweep and two U-Nets (arXiv 2403.14627)."""
 
-from collections.abc import Iterable
 from typing import Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from einops import rearrange
 from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.components.encoder import imagenet_normalised
-from qgs.contracts import (
-    ComponentConfig,
-    Encoder,
-    ModelDims,
-    Problem,
-    RecipeContext,
-    memory_fields,
-)
+from qgs.contracts import ModelDims
 from qgs.geometry.precision import full_precision
-from qgs.types import Cameras, ImageMemory, Views
+from qgs.types import Cameras, Views
 from qgs_mvsplat.cnn import CNN, WIDTHS
 from qgs_mvsplat.convolutions import conv3, resized, two_convolutions
-from qgs_mvsplat.pixels import width_problems
+from qgs_mvsplat.encoder import DepthRange, SweepEncoder
 from qgs_mvsplat.sweep import (
     cost_volume,
     cyclic_neighbours,
@@ -52,7 +43,7 @@ class Backbone(nn.Module):
         return cnn, self.transformer(with_positions(cnn), neighbours_BVJ)
 
 
-class MVSplatEncoder(Encoder):
+class MVSplatEncoder(SweepEncoder):
     """Every pixel's depth and raw Gaussian, from features of all views and a plane sweep.
 
     The memory has a token for each pixel, or square of them. Its D numbers, the model's width, are
@@ -61,10 +52,8 @@ class MVSplatEncoder(Encoder):
     """
 
     name = "mvsplat"
-    ordered_views = True
-    writes = memory_fields("features", "grid")
 
-    class Config(ComponentConfig):
+    class Config(DepthRange):
         cnn_widths: tuple[int, int, int] = WIDTHS
         """Channels of the three stages of the CNN."""
         features: int = Field(default=128, ge=4, multiple_of=4)
@@ -74,10 +63,6 @@ class MVSplatEncoder(Encoder):
         (published)."""
         candidates: int = Field(default=128, ge=2)
         """Depths that the plane sweep compares, evenly in inverse depth from `near` to `far`."""
-        near: float = Field(gt=0)
-        """Least depth, world units; 1 for RealEstate10K as published, with poses as they are."""
-        far: float = Field(gt=0)
-        """Largest depth, world units; 100 as published."""
         cost_width: int = Field(default=128, ge=32, multiple_of=32)
         """Channels of the U-Net over the cost volume."""
         cost_levels: int = Field(default=3, ge=1, le=6)
@@ -86,36 +71,23 @@ class MVSplatEncoder(Encoder):
         """Channels of the U-Net that refines depths at full size."""
         depth_levels: int = Field(default=5, ge=1, le=8)
         """Levels of that U-Net; the lowest has attention over all views."""
+        cost_volume: bool = True
+        """Whether views are compared; false has zeros in place of correlations, so that depths
+        come from features alone, with as many parameters (the paper's ablation)."""
 
     config: Config
 
     @classmethod
-    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        if config.far <= config.near:
-            reason = f"far must be beyond near, got near {config.near:g} and far {config.far:g}"
-            yield Problem("far", reason, "give the depths at which the scene begins and ends")
-        yield from width_problems(context)
-        yield from size_problems(_multiple(config), context)
+    def multiple(cls, config: Config) -> int:
+        cost, depth = (2 ** (x - 1) for x in (config.cost_levels, config.depth_levels))
+        return max(2 * FACTOR, FACTOR * cost, config.stride * depth)
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         self.backbone = Backbone(config.features, config.cnn_widths)
         self.depth_predictor = DepthPredictor(config, dims.width)
 
-    def forward(self, views: Views) -> ImageMemory:
-        """Raises ValueError for images that the U-Nets and windows do not divide."""
-        check_size(views, _multiple(self.config))
-        scenes, count = views.cameras.shape
-        near, far = (
-            views.cameras.c2w.new_full((scenes, count), x)
-            for x in (self.config.near, self.config.far)
-        )
-        raw_BVCHW = self.predict(views, near, far)
-        features = rearrange(raw_BVCHW, "b v c h w -> b (v h w) c")
-        return ImageMemory(features, grid=(count, raw_BVCHW.shape[3], raw_BVCHW.shape[4]))
-
     def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
-        """Numbers of every pixel (B, V, C, H, W), for depths between `near` and `far`."""
         neighbours = cyclic_neighbours(*views.cameras.shape, device=near_BV.device)
         # The transformer reads other views in ascending order, the sweep in cyclic order.
         cnn, features = self.backbone(views.images, neighbours.sort(-1).values)
@@ -144,6 +116,7 @@ class DepthPredictor(nn.Module):
             *(conv3(matched, cost), group_norm(cost), nn.GELU()),
             *(UNet(cost, config.cost_levels, pre_norm=False), conv3(cost, count)),
         )
+        self.compares = config.cost_volume
         self.regressor_residual = nn.Conv2d(matched, count, 1)
         self.depth_head_lowres = two_convolutions(count, 2 * count, count)
         self.stride, scale = config.stride, FACTOR // config.stride
@@ -185,13 +158,16 @@ class DepthPredictor(nn.Module):
         """Inverse depth and largest probability (B V, 1, h, w) of the candidates at 1/4."""
         count = self.regressor_residual.out_channels
         candidates_BVD = inverse_depth_candidates(sweep.near, sweep.far, count)
-        volume_BVDhw = cost_volume(
-            features_BVDhw,
-            candidates_BVD[..., None, None],
-            feature_lenses(sweep.cameras, features_BVDhw.shape[3:]),
-            relative_poses(sweep.cameras.c2w, sweep.neighbours),
-            sweep.neighbours,
-        )
+        size = features_BVDhw.shape[3:]
+        volume_BVDhw = features_BVDhw.new_zeros(*candidates_BVD.shape, *size)
+        if self.compares:
+            volume_BVDhw = cost_volume(
+                features_BVDhw,
+                candidates_BVD[..., None, None],
+                feature_lenses(sweep.cameras, size),
+                relative_poses(sweep.cameras.c2w, sweep.neighbours),
+                sweep.neighbours,
+            )
         matched = torch.cat([volume_BVDhw, features_BVDhw], 2).flatten(0, 1)
         refined = self.corr_refine_net(matched, features_BVDhw.shape[1])
         refined = refined + self.regressor_residual(matched)
@@ -215,28 +191,3 @@ def refined_log_depth(
     least, most = (1 / x.flatten()[:, None, None, None] for x in (far_BV, near_BV))
     fine = (disparity_N1HW + change_N1HW).clamp(least, most)
     return -fine.log()
-
-
-def _multiple(config: MVSplatEncoder.Config) -> int:
-    """What sides of images are multiples of, in pixels: for windows and levels of U-Nets."""
-    cost, depth = (2 ** (x - 1) for x in (config.cost_levels, config.depth_levels))
-    return max(2 * FACTOR, FACTOR * cost, config.stride * depth)
-
-
-def size_problems(multiple: int, context: RecipeContext) -> Iterable[Problem]:
-    """Images of a recipe whose sides are no multiples."""
-    size = context.image_size
-    if size and any(side % multiple for side in size):
-        nearest = [max(round(side / multiple), 1) * multiple for side in size]
-        reason = f"images of {size[0]} x {size[1]} (H x W) are no multiples of {multiple} pixels"
-        yield Problem("", reason, f"set data.image_size to {nearest}")
-
-
-def check_size(views: Views, multiple: int) -> None:
-    """Raise ValueError for images whose sides are no multiples."""
-    height, width = views.cameras.size
-    if height % multiple or width % multiple:
-        raise ValueError(
-            f"images of {height} x {width} (H x W) are no multiples of {multiple} pixels; "
-            "resize or crop the views"
-        )

@@ -1,11 +1,12 @@
 """The plane sweep: how well the features of a view agree with those of others at each depth."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from qgs.geometry.constants import constant
 from qgs.geometry.precision import full_precision
@@ -111,11 +112,13 @@ def cost_volume(
 
 def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
     """Correlations (N, D, h, w) with warped features, some candidates at a time."""
-    chunk, parts = max(1, MAX_SAMPLES // own.numel()), []
-    for part_Nkhw in depth.split(chunk, 1):
-        sampled_NCkhw = warped(other, warp_grid(part_Nkhw, lens, pose))
-        parts.append(torch.einsum("nchw,nckhw->nkhw", own, sampled_NCkhw))
-    return torch.cat(parts, 1)
+
+    def part(own: Tensor, other: Tensor, depth_Nkhw: Tensor) -> Tensor:
+        sampled_NCkhw = warped(other, warp_grid(depth_Nkhw, lens, pose))
+        return torch.einsum("nchw,nckhw->nkhw", own, sampled_NCkhw)
+
+    parts = depth.split(max(1, MAX_SAMPLES // own.numel()), 1)
+    return torch.cat(_each(part, [(own, other, depth_Nkhw) for depth_Nkhw in parts]), 1)
 
 
 def _of_all_pairs(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
@@ -127,9 +130,23 @@ def _of_all_pairs(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose:
     count, _, height, width = own.shape
     grid_NPD2 = warp_grid(depth, lens, pose).permute(0, 2, 3, 1, 4).flatten(1, 2)
     own_NPC, other_NCQ = own.flatten(2).mT, other.flatten(2)
-    chunk, parts = max(1, MAX_SAMPLES // (count * height * width)), []
-    for own_NpC, grid_NpD2 in zip(own_NPC.split(chunk, 1), grid_NPD2.split(chunk, 1), strict=True):
+
+    def part(own_NpC: Tensor, other_NCQ: Tensor, grid_NpD2: Tensor) -> Tensor:
         maps_X1hw = (own_NpC @ other_NCQ).reshape(-1, 1, height, width)
         found = warped(maps_X1hw, grid_NpD2.flatten(0, 1)[:, None, None])
-        parts.append(found.view(count, -1, depth.shape[1]))
+        return found.view(count, -1, depth.shape[1])
+
+    chunk = max(1, MAX_SAMPLES // (count * height * width))
+    pairs = zip(own_NPC.split(chunk, 1), grid_NPD2.split(chunk, 1), strict=True)
+    parts = _each(part, [(own_NpC, other_NCQ, grid_NpD2) for own_NpC, grid_NpD2 in pairs])
     return torch.cat(parts, 1).mT.unflatten(2, (height, width))
+
+
+def _each(part: Callable[..., Tensor], given: Sequence[tuple[Tensor, ...]]) -> list[Tensor]:
+    """`part` of each; of several the samples are made again backward, so that one's take memory."""
+    if len(given) == 1:
+        return [part(*given[0])]
+    return [
+        checkpoint(part, *tensors, use_reentrant=False, preserve_rng_state=False)
+        for tensors in given
+    ]

@@ -46,7 +46,7 @@ def _read(shapes: Shapes) -> dict[str, Any]:
     mse = {"type": "qgs/photometric", "mse_weight": 1.0, "ssim_weight": 0.0}
     # The memory has depth and opacity in front of what the release calls a raw Gaussian.
     model = {"width": raw + 2, "heads": 1, "encoder": encoder, **_PARTS}
-    views = {"scale": "constant", "scale_factor": 1.0}
+    views = {"frame": "given", "scale": "constant", "scale_factor": 1.0}
     parts = {"model": model, "views": views, "losses": {"photometric": mse}}
     return {"recipe": 1, "plugins": ["mvsplat"], **parts}
 
@@ -67,7 +67,7 @@ MVSPLAT = WeightLayout(
         "near and far: 1 and 100, of RealEstate10K and ACID (DTU: 2.125 and 4.525)",
         "bounds of the scales, opacity map: the release's",
         "losses: mean squared error, to which the release adds 0.05 LPIPS (plugin `lpips`)",
-        "scale of the world: as given; renderer, training: the framework's defaults",
+        "frame and scale of the world: as given; renderer, training: the framework's defaults",
     ),
 )
 """The released MVSplat, in files of Lightning or of a bare state dict."""

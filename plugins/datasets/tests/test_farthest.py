@@ -1,0 +1,92 @@
+"""DepthSplat's sampler of views: how many inputs, how far apart, and targets."""
+
+from itertools import islice
+
+import numpy as np
+import pytest
+import torch
+from line_scenes import Line
+from qgs_datasets.farthest import Farthest, farthest_points
+
+from qgs.composer import RecipeError, resolve
+from qgs.contracts import ViewsConfig
+from qgs.contracts.schedule import END
+from qgs.data.stream import trained_domain, training_batches
+from qgs.types import Cameras
+
+VIEWS = ViewsConfig(inputs=6, targets=8)
+
+
+def farthest(**options) -> Farthest:
+    plain = {"min_gap": 20, "max_gap": 50, "initial_min_gap": 15, "initial_max_gap": 30}
+    return Farthest(Farthest.Config(**(plain | {"warm_up_steps": 100} | options)))
+
+
+@pytest.mark.parametrize(
+    ("step", "count", "gaps"),
+    [
+        (0, 2, (5, 10)),  # 6 // 2 times shorter
+        (100, 2, (6, 16)),
+        (101, 3, (10, 25)),
+        (102, 4, (20, 50)),
+        (104, 6, (20, 50)),
+        (END, 6, (20, 50)),
+    ],
+)
+def test_numbers_of_inputs_and_gaps(step: int, count: int, gaps: tuple[int, int]) -> None:
+    found = set[int]()
+    for seed in range(400):
+        inputs, targets = farthest().draw(Line(80), VIEWS, np.random.default_rng(seed), step)
+        assert len({*inputs}) == count
+        assert list(inputs) == sorted(inputs)
+        found.add(inputs[-1] - inputs[0])
+        # on a line the ends are the farthest points, so inputs are the ends of the gap
+        assert len(targets) == 8
+        assert min(targets) >= inputs[0]
+        assert max(targets) <= inputs[-1]
+        assert len({*targets}) == min(8, inputs[-1] - inputs[0] + 1)
+    assert (min(found), max(found)) == gaps
+
+
+class Bend(Line):
+    """Cameras that wait at the origin and go away at the end."""
+
+    @property
+    def cameras(self) -> Cameras:
+        cameras = super().cameras
+        cameras.c2w[:, 0, 3] = torch.arange(self.count).clamp_min(self.count - 4).float()
+        return cameras
+
+
+def test_inputs_stand_where_cameras_move() -> None:
+    sampler = farthest(min_gap=20, max_gap=20)
+    inputs, _ = sampler.draw(Bend(21), VIEWS.model_copy(update={"inputs": 4}), seeded(), END)
+    assert inputs[1:] == (18, 19, 20)
+
+
+def seeded() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def test_points_farthest_from_each_other() -> None:
+    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0], [5, 0, 0], [2, 0, 0], [9, 0, 0]])
+    # the mean is at 3.7: 9 is farthest, then 0, then 5, then 2; 5 again only after 1
+    assert farthest_points(points, 6) == [5, 0, 2, 4, 1, 3]
+
+
+def test_more_inputs_than_views() -> None:
+    options = ["view_sampler={type: datasets/farthest, fewest: 3}", "views.inputs=2"]
+    with pytest.raises(RecipeError, match="fewest"):
+        resolve("tiny/tokengs_bounded.yaml", options)
+
+
+def test_batches_have_as_many_inputs_in_a_step_and_their_ranges_are_measured() -> None:
+    sampler = {"type": "datasets/farthest", "min_gap": 3, "max_gap": 7, "initial_min_gap": 3}
+    options = [f"view_sampler={sampler | {'initial_max_gap': 7}}", "views.inputs=4"]
+    recipe = resolve("tiny/tokengs_bounded.yaml", [*options, "data.image_size=[16, 16]"])
+    source, drawn = recipe.build_data(), recipe.build_view_sampler()
+    batches = training_batches(source, recipe.views, 2, 0, 0, sampler=drawn, accumulate=2)
+    counts = [batch.inputs.images.shape[:2] for batch in islice(batches, 8)]
+    assert counts == [(2, 2), (2, 2), (2, 3), (2, 3), (2, 4), (2, 4), (2, 2), (2, 2)]
+    ranges = trained_domain(source, recipe.views, 0, drawn, steps=600).ranges
+    assert ranges["views"] == (2, 4)
