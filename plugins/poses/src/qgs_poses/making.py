@@ -141,7 +141,7 @@ def make_locked(
         photos, faulty = _ready(files, out, options, bars)
         refuse_hopeless(photos, faulty, str(source))
         result = _mapped(photos, out, options, source.is_file(), bars)
-        posed, *others = _moved(result, out)
+        posed, *others = apart(_moved(result, out))
         without = [photo.name for photo in photos if photo.name not in {*posed}]
         made = Made(
             folder=out,
@@ -326,6 +326,16 @@ def _mapped(
     if word := result.get("refused"):
         raise PosesError(REFUSALS[word].format(photos=counted(len(photos), "photo"), **result))
     return result
+
+
+def apart(models: Sequence[Sequence[str]]) -> list[list[str]]:
+    """The photos of each model, the largest first, that no model before has, where two are left."""
+    taken, kept = set[str](), list[list[str]]()
+    for names in models:
+        left = [name for name in names if name not in taken]
+        kept += [left] if len(left) > 1 else []
+        taken |= {*names}
+    return kept
 
 
 def _moved(result: Mapping[str, Any], out: Path) -> Sequence[Sequence[str]]:
