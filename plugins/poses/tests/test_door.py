@@ -17,7 +17,7 @@ def photos(walk, made, tmp_path, monkeypatch):
     """A copy of the walk; what COLMAP finds of it is there already, and asked for at most once."""
     calls = []
 
-    def found(source, out, options, console):
+    def found(source, held, out, options, console):
         calls.append(source)
         shutil.copytree(made.folder, out, dirs_exist_ok=True)
         record = (out / "poses.json").read_text().replace("{", '{"again": 1,', 1)

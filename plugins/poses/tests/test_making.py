@@ -123,6 +123,11 @@ def test_photos_of_two_places_give_the_larger_model(shots, tmp_path):
     assert textured_room.SIZE == (120, 180)
 
 
+def test_a_photo_of_several_models_is_in_the_largest_alone():
+    models = [["a", "b", "c", "d"], ["b", "c"], ["d", "e", "f"], ["e", "g"]]
+    assert making.apart(models) == [["a", "b", "c", "d"], ["e", "f"]]
+
+
 def test_the_summary_says_what_to_do_where_many_have_none(made):
     few = replace(made, posed=made.posed[:3], without=made.posed[3:])
     assert any("between" in line for line in few.summary)

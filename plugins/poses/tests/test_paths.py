@@ -81,7 +81,14 @@ def test_a_camera_path_of_nerfstudio_is_read(tmp_path):
     torch.testing.assert_close(c2w, expected.expand(2, 4, 4))
     torch.testing.assert_close(lens, torch.tensor([50.0, 50, 75, 50]).double().expand(2, 4))
     (tmp_path / "transforms.json").write_text(
-        json.dumps({"fl_x": 80, "h": 50, "frames": [{"transform_matrix": pose.tolist()}]})
+        json.dumps(
+            {
+                "fl_x": 80,
+                "w": 75,
+                "h": 50,
+                "frames": [{"file_path": "a.png", "transform_matrix": pose.tolist()}],
+            }
+        )
     )
     c2w, lens = read_path(tmp_path / "transforms.json", (100, 150), None)
     torch.testing.assert_close(c2w, expected[None])
@@ -89,7 +96,17 @@ def test_a_camera_path_of_nerfstudio_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "content", ["{", "{}", '{"frames": []}', '{"frames": [{"transform_matrix": [1, 2]}]}', "[1]"]
+    "content",
+    [
+        "{",
+        "{}",
+        "[1]",
+        '{"frames": []}',
+        '{"camera_path": [{"camera_to_world": [1, 2]}]}',
+        '{"fl_x": 9, "w": 9, "h": 9, "frames": [{"file_path": "a", "transform_matrix": [1, 2]}]}',
+        '{"fl_x": 9, "frames": [{"file_path": "a", "transform_matrix": '
+        "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}]}",
+    ],
 )
 def test_a_file_that_is_no_path_is_refused(content, tmp_path):
     (tmp_path / "path.json").write_text(content)

@@ -114,13 +114,16 @@ def make_poses(source: Path, out: Path, options: Options, console: Console) -> M
     that an interrupted call with the same options left is finished. Raises PosesError for photos
     without poses, FileExistsError for a folder of something else, and OSError.
     """
-    with begun(source, out, wait=False):
-        return make_locked(source, out, options, console)
+    held = fingerprint(source)  # too few photos raise before anything is written
+    with begun(out, wait=False):
+        return make_locked(source, held, out, options, console)
 
 
-def make_locked(source: Path, out: Path, options: Options, console: Console) -> Made:
-    """As `make_poses`, for a caller that holds the lock of `out`."""
-    of = {"source": fingerprint(source), "options": asdict(options)}
+def make_locked(
+    source: Path, held: Mapping[str, Any], out: Path, options: Options, console: Console
+) -> Made:
+    """As `make_poses`, for a caller that holds the lock of `out`. held: fingerprint of `source`."""
+    of = {"source": held, "options": asdict(options)}
     with naming_full_disk(out / WORKING), Bars(console, out) as bars:
         working = out / WORKING
         if _begun(working) != of:
@@ -138,7 +141,7 @@ def make_locked(source: Path, out: Path, options: Options, console: Console) -> 
         photos, faulty = _ready(files, out, options, bars)
         refuse_hopeless(photos, faulty, str(source))
         result = _mapped(photos, out, options, source.is_file(), bars)
-        posed, *others = _moved(result, out)
+        posed, *others = apart(_moved(result, out))
         without = [photo.name for photo in photos if photo.name not in {*posed}]
         made = Made(
             folder=out,
@@ -178,13 +181,12 @@ def _begun(working: Path) -> Any:
 
 
 @contextmanager
-def begun(source: Path, out: Path, wait: bool) -> Iterator[None]:
+def begun(out: Path, wait: bool) -> Iterator[None]:
     """The folder `out`, for this process alone; what is left of photos without poses is deleted.
 
-    Raises as `refuse_foreign`, `fingerprint` and `locked`.
+    Raises as `refuse_foreign` and `locked`.
     """
     refuse_foreign(out)
-    fingerprint(source)  # too few photos raise before anything is written
     out.mkdir(parents=True, exist_ok=True)
     with locked(out, wait):
         try:
@@ -324,6 +326,16 @@ def _mapped(
     if word := result.get("refused"):
         raise PosesError(REFUSALS[word].format(photos=counted(len(photos), "photo"), **result))
     return result
+
+
+def apart(models: Sequence[Sequence[str]]) -> list[list[str]]:
+    """The photos of each model, the largest first, that no model before has, where two are left."""
+    taken, kept = set[str](), list[list[str]]()
+    for names in models:
+        left = [name for name in names if name not in taken]
+        kept += [left] if len(left) > 1 else []
+        taken |= {*names}
+    return kept
 
 
 def _moved(result: Mapping[str, Any], out: Path) -> Sequence[Sequence[str]]:

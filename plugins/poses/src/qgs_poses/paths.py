@@ -3,19 +3,24 @@
 import json
 import math
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from upath import UPath
 
 from qgs.analysis.saving import SWAY, orbit
+from qgs.data.photos.checks import pose_problems
+from qgs.data.photos.nerfstudio import read_transforms
+from qgs.data.photos.reader import PhotoFrame
 from qgs.geometry.poses import look_at, mean_camera
 from qgs.types import Cameras
 
 KINDS = ("orbit", "spiral", "walk")
-_OPENGL = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)  # of a pose's columns
+_OPENGL = np.array([1.0, -1.0, -1.0, 1.0])  # of a pose's columns
 _SMOOTH = 1.5  # photos over which a walk is smoothed
 _TURNS = 2.0  # of a spiral
 
@@ -64,30 +69,37 @@ def read_path(file: Path, size: tuple[int, int], fov: float | None) -> tuple[Ten
     """
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
-        entries = data.get("camera_path") or data["frames"]
-        read = [_entry({**data, **entry}, size, fov) for entry in entries]
-        poses = torch.tensor(np.stack([pose for pose, _ in read]), dtype=torch.float64)
+        if entries := data.get("camera_path"):
+            read = [_keyframe(entry, size) for entry in entries]
+        else:
+            read = [_photo(frame, size) for frame in read_transforms(UPath(file))]
+        poses = np.stack([pose for pose, _ in read])
+        for problem in chain(*map(pose_problems, poses)):
+            raise ValueError(problem)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{file} is no camera path ({type(error).__name__}: {error}): give one that "
             "nerfstudio's viewer saved, a transforms.json, or one of " + ", ".join(KINDS)
         ) from error
-    return poses * _OPENGL, torch.tensor([lens for _, lens in read], dtype=torch.float64)
+    height, width = size
+    given = fov and _focal(fov, height)
+    lenses = [(given or focal,) * 2 + (width / 2, height / 2) for _, focal in read]
+    return torch.from_numpy(poses), torch.tensor(lenses, dtype=torch.float64)
 
 
-def _entry(
-    values: Mapping[str, Any], size: tuple[int, int], fov: float | None
-) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """The pose of an entry, in OpenGL axes, and fx, fy, cx, cy."""
-    given = values.get("camera_to_world", values.get("transform_matrix"))
-    pose = np.array(given, np.float64).reshape(-1, 4)
-    pose = np.vstack([pose[:3], [0, 0, 0, 1]])
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise ValueError("a pose is no 4 x 4 matrix of numbers")
-    height = size[0]
-    if fov is None and values.get("fl_y", values.get("fl_x")):
-        focal = values.get("fl_y", values.get("fl_x")) * height / (values.get("h") or 0)
-    else:
-        angle = fov or values.get("fov") or 50.0
-        focal = height / 2 / math.tan(math.radians(float(angle)) / 2)
-    return pose, (focal, focal, size[1] / 2, height / 2)
+def _keyframe(entry: Mapping[str, Any], size: tuple[int, int]) -> tuple[np.ndarray, float]:
+    """The pose of an entry of a path of nerfstudio's viewer, in OpenCV axes, and fy."""
+    pose = np.array(entry["camera_to_world"], np.float64).reshape(4, 4)
+    return pose * _OPENGL, _focal(float(entry.get("fov") or 50.0), size[0])
+
+
+def _photo(frame: PhotoFrame, size: tuple[int, int]) -> tuple[np.ndarray, float]:
+    """The pose of a photo of a transforms file and fy at another size."""
+    if frame.problems or frame.size is None:
+        raise ValueError(f"{frame.name}: {next(iter(frame.problems), 'add its h and w')}")
+    return frame.c2w, frame.intrinsics[1] * size[0] / frame.size[0]
+
+
+def _focal(angle: float, height: int) -> float:
+    """In pixels, of a vertical angle of view in degrees."""
+    return height / 2 / math.tan(math.radians(angle) / 2)
