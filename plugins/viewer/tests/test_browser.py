@@ -90,6 +90,11 @@ def test_the_viewer(model: str, tmp_path: Path) -> None:
         assert all(address in request for request in network(page, "http://none"))
 
 
+def turned(page: Page, x: float) -> None:
+    for kind, place in (("mousePressed", x), ("mouseMoved", x + 30), ("mouseReleased", x + 30)):
+        page.call("Input.dispatchMouseEvent", type=kind, x=place, y=300, button="left", buttons=1)
+
+
 def waited(page: Page, happened: Callable[[], bool]) -> bool:
     try:
         return bool(page.until("it", happened, 10))
@@ -110,5 +115,13 @@ def test_a_page_draws_and_asks_for_nothing(tmp_path: Path) -> None:
         grey = (np.abs(shot - 127.5).max(-1) < 1).mean()
         assert grey > 0.02, "the background of the model, not that of the page"
         assert network(page, file.as_uri()) == []
+        page.evaluate(
+            "URL.createObjectURL = data => { window.film = data; return 'data:,'; };"
+            "document.querySelector('#record').click()"
+        )
+        for place in range(400, 600, 10):
+            turned(page, place)  # what stands still has no frames
+        page.evaluate("document.querySelector('#record').click()")
+        page.until("a film", "window.film?.type.startsWith('video/webm') && film.size > 10000")
         assert page.targets == ["worker"], "it sorts the Gaussians as the page is turned"
         assert page.errors == []

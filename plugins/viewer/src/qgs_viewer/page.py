@@ -22,11 +22,38 @@ if (origin === "null") window.Worker = class extends Worker {
 };
 </script>"""
 
+_RECORD = """<script>
+addEventListener("DOMContentLoaded", () => {
+  const button = document.createElement("button");
+  button.id = "record";
+  button.textContent = "record";
+  button.style = "position: fixed; left: 1em; bottom: 1em; z-index: 99";
+  let film = null;
+  button.onclick = () => {
+    if (film) return film.stop();
+    const drawn = document.querySelector("canvas[data-engine]");  // the other is an overlay
+    const stream = drawn.captureStream();
+    film = new MediaRecorder(stream, {mimeType: "video/webm", videoBitsPerSecond: 2e7});
+    film.ondataavailable = ({data}) => {
+      const link = document.createElement("a");
+      link.href = URL.createObjectURL(data);
+      link.download = "scene.webm";
+      link.click();
+      film = null;
+      button.textContent = "record";
+    };
+    film.start();
+    button.textContent = "stop, and save scene.webm";
+  };
+  document.body.append(button);
+});
+</script>"""
+
 
 def scene_html(
     look: Look, choice: Choice | None = None, *, dark: bool = False, start: Look | None = None
 ) -> str:
-    """A page on which `look` can be turned: 0.8 MB of viser's code and 40 bytes a Gaussian.
+    """A page on which `look` can be turned, and that records it: 0.8 MB, and 40 bytes a Gaussian.
 
     choice: by default the scene with the anchors of the last layer. start: look that gives the
     first view and the size of photos, by default its own.
@@ -37,7 +64,7 @@ def scene_html(
         choice = choice or Choice(layer=look.depth)
         Stage(server.scene).put(look, choice, unit=distance_to(start))
         page = server.get_scene_serializer().as_html(dark)
-    return page.replace("<head>", f"<head>{_WORKERS}", 1)
+    return page.replace("<head>", f"<head>{_WORKERS}{_RECORD}", 1)
 
 
 def scenes_html(looks: Mapping[str, Look], choices: Mapping[str, Choice] | None = None) -> str:
