@@ -127,6 +127,21 @@ def test_cameras_around_something_are_seen_from_outside() -> None:
     assert eye[2] > 0.5  # above them
 
 
+def test_a_walk_is_seen_from_a_camera_in_its_middle() -> None:
+    look = around(1.0)
+    assert look.views is not None
+    c2w, angles = torch.eye(4).repeat(9, 1, 1), torch.linspace(-2.0, 2.0, 9)
+    c2w[:, 0, 3] = 5 * torch.arange(9.0)
+    c2w[:, 0, 0], c2w[:, 0, 2] = angles.cos(), angles.sin()
+    c2w[:, 2, 0], c2w[:, 2, 2] = -angles.sin(), angles.cos()
+    lenses = torch.tensor([64.0, 64, 32, 32]).expand(1, 9, 4)
+    cameras = Cameras(c2w[None], lenses, (64, 64))
+    look = Look(look.gaussians, Views(torch.rand(1, 9, 3, 64, 64), cameras))
+    eye, target = first_eye(look)
+    assert eye.tolist() == [20, 0, 0]
+    assert (target - eye)[2] > 0.99 * ((target - eye) ** 2).sum() ** 0.5
+
+
 def test_up_is_that_of_the_cameras() -> None:
     for turn in (0.2, 1.0):
         up = up_of(around(turn))

@@ -19,6 +19,7 @@ import websockets.asyncio.server as sockets
 from websockets.datastructures import Headers
 from websockets.http11 import Response
 
+from qgs.geometry.poses import look_at_depth
 from qgs_viewer.look import Look
 from qgs_viewer.stage import distance_to
 
@@ -106,7 +107,8 @@ def up_of(look: Look) -> torch.Tensor:
 def first_eye(look: Look) -> tuple[np.ndarray, np.ndarray]:
     """Where the viewer stands at first and what it looks at, both (3,), shown world.
 
-    Behind cameras that look the same way; outside of those that surround something.
+    Behind cameras that look the same way; outside of those that surround something; of a walk at
+    the camera in its middle, since walls may stand behind it.
     """
     middle = look.placement.points(look.gaussians.means[0]).median(0).values
     unit = distance_to(look)
@@ -115,6 +117,11 @@ def first_eye(look: Look) -> tuple[np.ndarray, np.ndarray]:
     c2w, up = look.views.cameras.c2w[0].cpu().double(), up_of(look)
     eyes = look.placement.points(c2w[:, :3, 3])
     eye, forward = eyes.mean(0), look.placement.rotation @ c2w[:, :3, 2].mean(0)
+    apart = (eyes - eye).norm(dim=-1)
+    if apart.max() > unit and not look_at_depth(c2w):
+        eye = eyes[apart.argmin()]
+        ahead = look.placement.rotation @ c2w[apart.argmin(), :3, 2]
+        return eye.numpy(), (eye + unit * ahead).numpy()
     if forward.norm() < SHORT:
         away = 1.5 * max(float((eyes - middle).norm(dim=-1).max()), unit)
         ahead = look.placement.rotation @ c2w[0, :3, 2]
