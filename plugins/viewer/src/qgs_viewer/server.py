@@ -21,7 +21,7 @@ from websockets.http11 import Response
 
 from qgs.geometry.poses import look_at_depth
 from qgs_viewer.look import Look
-from qgs_viewer.stage import distance_to
+from qgs_viewer.stage import FRUSTUM, distance_to
 
 FIELD_OF_VIEW = 0.95  # of the viewer's window, vertical, radians
 SHORT = 0.3  # length of the mean of unit vectors below which they have no direction in common
@@ -108,7 +108,7 @@ def first_eye(look: Look) -> tuple[np.ndarray, np.ndarray]:
     """Where the viewer stands at first and what it looks at, both (3,), shown world.
 
     Behind cameras that look the same way; outside of those that surround something; of a walk at
-    the camera in its middle, since walls may stand behind it.
+    the camera in its middle, before its photo, since walls may stand behind it.
     """
     middle = look.placement.points(look.gaussians.means[0]).median(0).values
     unit = distance_to(look)
@@ -119,9 +119,9 @@ def first_eye(look: Look) -> tuple[np.ndarray, np.ndarray]:
     eye, forward = eyes.mean(0), look.placement.rotation @ c2w[:, :3, 2].mean(0)
     apart = (eyes - eye).norm(dim=-1)
     if apart.max() > unit and not look_at_depth(c2w):
-        eye = eyes[apart.argmin()]
-        ahead = look.placement.rotation @ c2w[apart.argmin(), :3, 2]
-        return eye.numpy(), (eye + unit * ahead).numpy()
+        ahead = unit * look.placement.rotation @ c2w[apart.argmin(), :3, 2]
+        eye = eyes[apart.argmin()] + 2 * FRUSTUM * ahead
+        return eye.numpy(), (eye + ahead).numpy()
     if forward.norm() < SHORT:
         away = 1.5 * max(float((eyes - middle).norm(dim=-1).max()), unit)
         ahead = look.placement.rotation @ c2w[0, :3, 2]
