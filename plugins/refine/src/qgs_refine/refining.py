@@ -131,14 +131,15 @@ def refine(
         return RefinedScene(refined, curve, run.step, run.spent, cameras, name)
 
 
-def seconds_of_step(gaussians: Gaussians, views: Views, renderer: nn.Module | None = None) -> float:
+def seconds_of_step(
+    gaussians: Gaussians, views: Views, renderer: nn.Module, extras: Extras = NO_EXTRAS
+) -> float:
     """Time of a step of `refine` with these Gaussians at the size of the photos `views` (1, V).
 
-    The least of three, after one in which kernels compile.
+    The least of three, after one in which kernels compile, with all harmonics in use.
     """
-    renderer = renderer or AutoRenderer(AutoRenderer.Config())
-    run, times = _Run(gaussians, views, math.inf, gaussians.count, renderer, 0.0), list[float]()
-    run.levels = run.levels[-1:]
+    run = _Run(gaussians, views, math.inf, gaussians.count, renderer, 0.0, extras)
+    run.levels, run.grows, times = run.levels[-1:], False, list[float]()
     with torch.enable_grad():
         for _ in range(4):
             began = perf_counter()

@@ -27,6 +27,7 @@ from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.renderers import AutoRenderer
 from qgs.types import Gaussians, Views, concatenated
+from qgs_refine.plain import plain
 from qgs_refine.planning import NONE, Plan, Scenes, Start, affordable, best_start, shipped_models
 from qgs_refine.points import from_points, sparse_points
 from qgs_refine.refining import NO_EXTRAS, Extras, RefinedScene, refine, seconds_of_step
@@ -75,7 +76,8 @@ def make_scene(
     renderer = AutoRenderer(AutoRenderer.Config(background=backdrop(scenes.probe, scenes.frames)))
     probe = views_in(start.world, scenes.probe, scenes.frames).to(wanted.device)
     few, of_pixel = timed_sweep(probe)
-    timed = seconds_of_step(few, probe, renderer), probe.cameras.size, few.count
+    seconds_of_one = seconds_of_step(few, probe, renderer, wanted.extras)
+    timed = seconds_of_one, probe.cameras.size, few.count
     size, count = affordable(*timed, scenes, left(), (wanted.size, wanted.gaussians))
     both = views_in(start.world, scenes.at(size), (*scenes.frames, *scenes.held))
     both, photos_count = both.to(wanted.device), len(scenes.frames)
@@ -170,11 +172,10 @@ class Made:
     judged: Views
     command: str
 
-    @property
-    def in_photos_world(self) -> Gaussians:
-        """Gaussians (1, G) in the frame and unit of the photos' cameras."""
+    def of_photos(self, gaussians: Gaussians) -> Gaussians:
+        """Gaussians (1, G) of its world in the frame and unit of the photos' cameras."""
         reference, scale = self.start.world
-        return moved(self.refined.gaussians, reference, 1 / float(scale))
+        return moved(gaussians, reference, 1 / float(scale))
 
     def label(self, frame: int) -> str:
         """The file of a photo."""
@@ -193,18 +194,20 @@ def backdrop(scene: Scene, frames: Sequence[int]) -> tuple[float, float, float]:
 @torch.no_grad()
 def write_scene(made: Made, out: Path, page: Any, began: float, console: Console) -> None:
     """Write scene.ply, scene.splat, metrics.json, held_out.png and the page into `out`."""
-    gaussians, photos = made.in_photos_world, made.judged
+    gaussians, photos = made.of_photos(made.refined.gaussians), made.judged
+    shown = plain(made.refined.gaussians, made.refined.cameras)
     record = scores(made)
     with replacing_entries(out, "scene.ply") as fresh:
         save_ply(gaussians, fresh / "scene.ply")
-        save_splat(gaussians, fresh / "scene.splat")
+        save_splat(made.of_photos(shown), fresh / "scene.splat")
         if made.scenes.held:
             pictures = held_out_picture(made, record["held_out"])
             images.write_png(pictures, fresh / "held_out.png")
         if page:
-            few = made.views.select(slice(None, None, max(len(made.scenes.frames) // 12, 1)))
+            views = replace(made.views, cameras=made.refined.cameras)
+            few = views.select(slice(None, None, max(len(made.scenes.frames) // 12, 1)))
             background = made.renderer.config.background
-            write_text(fresh / "index.html", page(made.refined.gaussians, few, background))
+            write_text(fresh / "index.html", page(shown, few, background))
         record["total_seconds"] = round(perf_counter() - began, 1)
         write_text(fresh / "metrics.json", json.dumps(record, indent=1))
         names = sorted(entry.name for entry in fresh.iterdir())
