@@ -95,7 +95,7 @@ def reconstruct(
     if refine is not None and not 0 < refine < float("inf"):
         raise ValueError(f"--refine must be a number of seconds above 0, got {refine:g}")
     refiner = function("qgs.refiners", "reconstruction") if refine else None
-    filmed = function("qgs.videos", "reconstruction") if video else None
+    filmed = function("qgs.videos", "reconstruction")(video, path) if video else None
 
     from rich.console import Console
 
@@ -135,7 +135,7 @@ def reconstruct(
         single = out.with_stem(f"{out.stem}_refined")
         paths += shown.save(single if paths == [out] else out / "refined")
     if filmed:
-        paths.append(filmed(shown, path, video, console))
+        paths.append(filmed(shown, console))
     for file in paths:
         console.print(f"wrote {file}", soft_wrap=True)
 

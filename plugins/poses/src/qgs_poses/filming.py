@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,11 @@ from qgs.contracts import Renderer
 from qgs.data.recognition import open_for
 from qgs.geometry.poses import relative_to, scaled
 from qgs.geometry.transforms import moved
+from qgs.io.files import refuse_existing
 from qgs.io.gaussians import load_ply
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians
-from qgs_poses.film import pictures, write_film
+from qgs_poses.film import pictures, refuse_suffix, write_film
 from qgs_poses.paths import KINDS, path_of, read_path
 
 _HEIGHT = 480  # pixels of the shorter side by default
@@ -49,17 +51,28 @@ class Stage:
     photos: tuple[torch.Tensor, float]
 
 
-def film_reconstruction(result: Reconstruction, path: str, file: Path, console: Console) -> Path:
-    """Film what `qgs reconstruct` made, as --video and --path ask; see `film`."""
-    reference, scale = result.world
-    cameras, world = result.sample.inputs.cameras, (reference.double(), float(scale))
-    film(Stage(result.gaussians, cameras, result.model.renderer, world), Shot(path), file, console)
-    return file
+def film_reconstruction(file: Path, path: str) -> Callable[[Reconstruction, Console], Path]:
+    """What films the result of `qgs reconstruct`, as --video and --path ask; see `film`.
+
+    Raises FileExistsError and ValueError at once, before anything is reconstructed.
+    """
+    refuse_existing(file)
+    refuse_suffix(file)
+    if path not in KINDS:
+        read_path(Path(path), (_HEIGHT, _HEIGHT), None)
+
+    def filmed(result: Reconstruction, console: Console) -> Path:
+        (reference, scale), renderer = result.world, result.model.renderer
+        cameras, world = result.sample.inputs.cameras, (reference.double(), float(scale))
+        film(Stage(result.gaussians, cameras, renderer, world), Shot(path), file, console)
+        return file
+
+    return filmed
 
 
 def film(stage: Stage, shot: Shot, file: Path, console: Console) -> None:
     """Render the path and write `file`. Raises ValueError for a path that is none."""
-    path = cameras_of(stage, shot)
+    path = cameras_of(stage, shot).to(stage.gaussians.means.device)
     count = path.shape[1]
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("rendering", total=count)
