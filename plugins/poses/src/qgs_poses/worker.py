@@ -9,7 +9,7 @@ import json
 import os
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +66,10 @@ def mapped(job: Job) -> Mapping[str, Any]:
             job.images,
             image_names=group,
             camera_mode=COLMAP.CameraMode.SINGLE,
-            reader_options={"camera_model": "SIMPLE_RADIAL"},
+            reader_options={
+                "camera_model": "SIMPLE_RADIAL",
+                "existing_camera_id": _camera(job.database, group),
+            },
             extraction_options=extraction,
             device=COLMAP.Device.cpu,
         )
@@ -89,6 +92,13 @@ def mapped(job: Job) -> Mapping[str, Any]:
     if pairs < 2:
         return {"refused": "overlap", "pairs": pairs}
     return _models(job, len(names))
+
+
+def _camera(database: str, group: Sequence[str]) -> int:
+    """The camera of those of `group` that an interrupted process left; -1 for a new one."""
+    with COLMAP.Database.open(database) as opened:
+        images = opened.read_all_images()
+    return next((image.camera_id for image in images if image.name in group), -1)
 
 
 def _features(database: str) -> dict[str, int]:
@@ -140,13 +150,13 @@ def _models(job: Job, total: int) -> Mapping[str, Any]:
     ordered = sorted(solid, key=lambda model: -model.num_reg_images())
     best = Path(job.models, "best")
     best.mkdir()
-    _scaled(_centred(ordered[0]), job.sizes).write(best)
+    _scaled(_centred(ordered[0], job.threads), job.sizes).write(best)
     names = [sorted(image.name for image in model.images.values()) for model in ordered]
     error = ordered[0].compute_mean_reprojection_error()
     return {"models": names, "error": error, "points": ordered[0].num_points3D()}
 
 
-def _centred(model: Any) -> Any:
+def _centred(model: Any, threads: int) -> Any:
     """`model` with principal points refined, where enough photos share a camera and it fits better.
 
     COLMAP keeps them in the middle of the image; photos that are cut out of larger ones then turn.
@@ -161,6 +171,7 @@ def _centred(model: Any) -> Any:
     options = COLMAP.BundleAdjustmentOptions()
     options.refine_principal_point = True
     options.print_summary = False
+    options.ceres.solver_options.num_threads = threads
     moved = COLMAP.Reconstruction(model)
     COLMAP.bundle_adjustment(moved, options)
     errors = [each.compute_mean_reprojection_error() for each in (model, moved)]
