@@ -1,11 +1,17 @@
 """Photos without cameras and videos, wherever qgs takes photos."""
 
+import json
+import re
 import shutil
+import threading
+import time
+from contextlib import contextmanager
 
 import pytest
 from commands import run_qgs
 from photo_formats import opened
 from qgs_poses import door, making
+from qgs_poses.making import locked
 from qgs_poses.photos import PosesError
 from walked import PHOTOS, write_video
 
@@ -82,3 +88,70 @@ def test_a_folder_whose_photos_are_elsewhere_is_none(tmp_path):
     (tmp_path / "a" / "b").mkdir(parents=True)
     with pytest.raises(FileNotFoundError, match="lists no cameras"):
         opened(tmp_path / "a")
+
+
+def waiting(folder, monkeypatch) -> tuple[threading.Thread, list]:
+    """A thread that has seen no poses of `folder`, and waits for the lock that the caller holds."""
+    came, results = threading.Event(), []
+
+    @contextmanager
+    def late(*words, **options):
+        came.set()
+        with locked(*words, **options):
+            yield
+
+    def ask() -> None:
+        try:
+            results.append(door.posed_folder(folder))
+        except Exception as error:
+            results.append(error)
+
+    monkeypatch.setattr(door, "locked", late)
+    thread = threading.Thread(target=ask)
+    thread.start()
+    assert came.wait(20)
+    return thread, results
+
+
+def test_one_that_waits_takes_what_the_other_made(photos, made, monkeypatch):
+    folder, calls = photos
+    out = door.beside(folder)
+    with locked(folder, out, wait=False):
+        thread, results = waiting(folder, monkeypatch)
+        record = making.read_record(made.folder)
+        shutil.copytree(made.folder, out, dirs_exist_ok=True)
+        assert record
+        held = {**record, "source": making.fingerprint(folder)}
+        (out / "poses.json").write_text(json.dumps(held))
+    thread.join(20)
+    assert results == [out]
+    assert not calls
+
+
+def test_one_that_waits_for_photos_without_poses_locks_a_new_folder(photos, made, monkeypatch):
+    folder, _ = photos
+    out = door.beside(folder)
+
+    def checked(*rest):
+        with pytest.raises(FileExistsError), locked(folder, out, wait=False):
+            pass
+        return made
+
+    monkeypatch.setattr(door, "make_locked", checked)
+    with locked(folder, out, wait=False):
+        thread, results = waiting(folder, monkeypatch)
+        time.sleep(0.2)  # it waits for the lock of the folder that now is deleted
+        out.rmdir()
+    thread.join(20)
+    assert results == [out]
+
+
+def test_a_read_only_place_names_the_command_for_another(photos, monkeypatch):
+    folder, _ = photos
+
+    def refused(*rest: object, **options: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(making.Path, "mkdir", refused)
+    with pytest.raises(OSError, match=re.escape(f"qgs poses {folder} --out")):
+        door.posed_folder(folder)

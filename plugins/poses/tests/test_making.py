@@ -83,7 +83,7 @@ def test_a_killed_call_is_finished_and_finished_ones_stay(walk, tmp_path, monkey
     assert read_record(out) is None
     database = (out / "working" / "database.db").stat().st_ino
     monkeypatch.setattr(making.shutil, "rmtree", _all_but(out / "working", making.shutil.rmtree))
-    made = make_poses(walk, out, Options(), quiet())
+    made = make_poses(walk, out, Options(threads=1), quiet())  # another number wipes nothing
     assert len(made.posed) == PHOTOS
     assert (out / "working" / "database.db").stat().st_ino == database
     with pytest.raises(FileExistsError):
@@ -128,10 +128,13 @@ def test_a_photo_of_several_models_is_in_the_largest_alone():
     assert making.apart(models) == [["a", "b", "c", "d"], ["e", "f"]]
 
 
-def test_the_summary_says_what_to_do_where_many_have_none(made):
-    few = replace(made, posed=made.posed[:3], without=made.posed[3:])
+def test_the_summary_says_what_to_do_where_some_have_none_and_what_differs(made):
+    few = replace(made, posed=made.posed[1:], without=made.posed[:1])
     assert any("between" in line for line in few.summary)
     assert not any("between" in line for line in made.summary)
+    for threads in (1, 2):
+        again = replace(made, threads=threads).summary
+        assert any("another run" in line for line in again) == (threads > 1)
 
 
 def test_a_video_gets_poses(shots, tmp_path):

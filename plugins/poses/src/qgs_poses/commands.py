@@ -81,6 +81,7 @@ def show_verdict(folder: Path, console: Console) -> None:
     from qgs_datatools.check import Options, check
 
     from qgs.data.paths import opened_path
+    from qgs.wording import counted
 
     with console.status("checking"):
         report = check(opened_path(folder), Options())
@@ -90,8 +91,8 @@ def show_verdict(folder: Path, console: Console) -> None:
     warnings = len(report.findings) - report.errors
     _line(
         console,
-        f"checked: {report.errors} errors, {warnings} warnings; matched points lie "
-        f"{scene.epipolar} pixels from their epipolar lines",
+        f"checked: {counted(report.errors, 'error')}, {counted(warnings, 'warning')}; matched "
+        f"points lie {scene.epipolar} pixels from their epipolar lines",
     )
 
 

@@ -6,7 +6,14 @@ from typing import Any
 
 from rich.console import Console
 
-from qgs_poses.making import Options, begun, fingerprint, make_locked, read_record
+from qgs_poses.making import (
+    Options,
+    fingerprint,
+    locked,
+    make_locked,
+    read_record,
+    refuse_foreign,
+)
 from qgs_poses.photos import PosesError
 
 
@@ -18,8 +25,9 @@ def posed_folder(source: Path) -> Path:
     held, out = fingerprint(source), beside(source)
     if is_made(source, held, out):
         return out
-    with begun(out, wait=True):  # of several processes of a training one makes them
+    with locked(source, out, wait=True):  # of several processes of a training one makes them
         if not is_made(source, held, out):
+            refuse_foreign(out)
             _make(source, held, out)
     return out
 

@@ -31,8 +31,6 @@ from qgs_poses.photos import (
 RECORD, WORKING, IMAGES, SPARSE = "poses.json", "working", "images", "sparse"
 EXHAUSTIVE = 80
 """Photos up to which every pair is matched; of more, and of videos, neighbours in time."""
-ENOUGH = 0.8
-"""Part of the photos with poses below which the summary says what to do."""
 _READING, _FRAMES = "photos", "frames of the video"
 
 
@@ -56,7 +54,7 @@ class Made:
     """Poses of the photos of `folder`. others: photos of further models, each apart from the rest.
 
     without: names of photos that have none. faulty: those that could not be read, and why. seconds:
-    of each stage. error: mean reprojection error in pixels.
+    of each stage. error: mean reprojection error in pixels. threads: that made them.
     """
 
     folder: Path
@@ -68,6 +66,7 @@ class Made:
     seconds: Mapping[str, float]
     error: float
     points: int
+    threads: int
 
     @property
     def summary(self) -> Iterator[str]:
@@ -84,11 +83,13 @@ class Made:
                 f"{counted(len(names), 'photo')} fit each other and none of the rest, so they are "
                 f"left out: {listed(list(names), 4)}"
             )
-        if len(self.posed) < ENOUGH * total:
+        if self.without:
             yield (
                 "to get more: take photos between those with and those without poses, so that "
                 "neighbours share half of what they show; or name another --matching"
             )
+        if self.threads > 1:
+            yield f"made with {self.threads} threads: another run differs a little"
 
 
 def fingerprint(source: Path) -> dict[str, Any]:
@@ -115,15 +116,36 @@ def make_poses(source: Path, out: Path, options: Options, console: Console) -> M
     without poses, FileExistsError for a folder of something else, and OSError.
     """
     held = fingerprint(source)  # too few photos raise before anything is written
-    with begun(out, wait=False):
+    with locked(source, out, wait=False):
+        refuse_foreign(out)
         return make_locked(source, held, out, options, console)
 
 
 def make_locked(
     source: Path, held: Mapping[str, Any], out: Path, options: Options, console: Console
 ) -> Made:
-    """As `make_poses`, for a caller that holds the lock of `out`. held: fingerprint of `source`."""
-    of = {"source": held, "options": asdict(options)}
+    """As `make_poses`, for a caller that holds the lock of `out` and knows that it is its own.
+
+    held: fingerprint of `source`.
+    """
+    try:
+        return _made(source, held, out, options, console)
+    except ColmapError:
+        raise
+    except PosesError:  # the same call would end there again
+        for part in (WORKING, IMAGES, SPARSE):
+            shutil.rmtree(out / part, ignore_errors=True)
+        if not any(out.iterdir()):
+            out.rmdir()
+        raise
+
+
+def _made(
+    source: Path, held: Mapping[str, Any], out: Path, options: Options, console: Console
+) -> Made:
+    asked = asdict(options)
+    del asked["threads"]  # another number may go on with what is there
+    of = {"source": held, "options": asked}
     with naming_full_disk(out / WORKING), Bars(console, out) as bars:
         working = out / WORKING
         if _begun(working) != of:
@@ -153,6 +175,7 @@ def make_locked(
             seconds=dict(bars.ended()),
             error=result["error"],
             points=result["points"],
+            threads=options.threads,
         )
         record = {**of, "made_by": "qgs poses", "seconds": made.seconds}
         record |= {"posed": made.posed, "without": made.without, "error": made.error}
@@ -163,10 +186,6 @@ def make_locked(
 
 def refuse_foreign(out: Path) -> None:
     """Raise FileExistsError for a folder that this program did not begin."""
-    if not out.exists():
-        return
-    if not out.is_dir():
-        raise FileExistsError(f"{out} is a file: choose another --out")
     if (out / RECORD).is_file():
         raise FileExistsError(f"{out} has poses already: choose another --out, or delete it")
     if any(out.iterdir()) and not (out / WORKING / "begun.json").is_file():
@@ -181,37 +200,48 @@ def _begun(working: Path) -> Any:
 
 
 @contextmanager
-def begun(out: Path, wait: bool) -> Iterator[None]:
-    """The folder `out`, for this process alone; what is left of photos without poses is deleted.
+def locked(source: Path, out: Path, wait: bool) -> Iterator[None]:
+    """The folder `out`, made if need be, for this process alone, where the system knows such locks.
 
-    Raises as `refuse_foreign` and `locked`.
+    wait: until another process has made the poses of `source` in it; else FileExistsError. Raises
+    OSError where it cannot be made or locked.
     """
-    refuse_foreign(out)
-    out.mkdir(parents=True, exist_ok=True)
-    with locked(out, wait):
+    while True:
         try:
-            yield
-        except ColmapError:
-            raise
-        except PosesError:
-            for part in (WORKING, IMAGES, SPARSE):
-                shutil.rmtree(out / part, ignore_errors=True)
-            if not any(out.iterdir()):
-                out.rmdir()
-            raise
+            out.mkdir(parents=True, exist_ok=True)
+        except FileExistsError:
+            raise FileExistsError(f"{out} is a file: choose another --out") from None
+        except OSError as error:
+            raise OSError(
+                f"{out} cannot be made ({error.strerror}): name another place, as "
+                f"`qgs poses {source} --out FOLDER`"
+            ) from error
+        lock = _lock(out, wait)
+        # whoever had the lock deletes the folder where there are no poses
+        if lock is None or _is(out, lock):
+            break
+        os.close(lock)
+    try:
+        yield
+    finally:
+        if lock is not None:
+            os.close(lock)
 
 
-@contextmanager
-def locked(folder: Path, wait: bool) -> Iterator[None]:
-    """Keep other processes from making poses in `folder`, where the system knows such locks.
+def _is(folder: Path, number: int) -> bool:
+    """Whether a file descriptor is that of `folder`, and not of a deleted one of its name."""
+    try:
+        return os.path.samestat(os.fstat(number), folder.stat())
+    except FileNotFoundError:
+        return False
 
-    wait: until another process has made them; else FileExistsError.
-    """
+
+def _lock(folder: Path, wait: bool) -> int | None:
+    """A file descriptor that holds the lock until it is closed; None without such locks."""
     try:
         import fcntl
     except ImportError:  # Windows
-        yield
-        return
+        return None
     number = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(number, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
@@ -222,10 +252,7 @@ def locked(folder: Path, wait: bool) -> Iterator[None]:
         ) from None
     except OSError:
         pass  # this file system knows no locks
-    try:
-        yield
-    finally:
-        os.close(number)
+    return number
 
 
 class Bars:

@@ -140,6 +140,7 @@ def _exif(image: Image.Image) -> tuple[bytes, str]:
 def _save(image: Image.Image, path: Path, exif: bytes) -> None:
     options = {"quality": 95, "subsampling": 0} if path.suffix.lower() != ".png" else {}
     kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
+    path.unlink(missing_ok=True)  # an earlier call may have linked the user's own file there
     image.save(path, kind, exif=exif, **options)
 
 
