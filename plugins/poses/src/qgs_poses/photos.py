@@ -5,6 +5,7 @@ What no poses can be made of is refused here, before minutes are spent.
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -54,7 +55,7 @@ class Photo:
 
 
 def photo_files(folder: Path) -> list[Path]:
-    """The photos in `folder`, or in its `images`. Raises PosesError for fewer than LEAST."""
+    """The photos in `folder`, or in its `images`, 2 before 10. Raises PosesError below LEAST."""
     found = next((f for f in (folder, folder / "images") if image_files(UPath(f))), folder)
     files = [file for file in map(Path, map(str, image_files(UPath(found)))) if file.is_file()]
     foreign = sorted(f.name for f in found.iterdir() if f.suffix.lower() in _FOREIGN)
@@ -63,7 +64,12 @@ def photo_files(folder: Path) -> list[Path]:
         if foreign:
             text += f"; {listed(foreign, 3)} cannot be read: convert them to JPEG"
         raise PosesError(text if foreign else f"{text}: take more, from places of your own choice")
-    return files
+    return sorted(files, key=lambda file: _by_number(file.name))
+
+
+def _by_number(name: str) -> tuple[str, str]:
+    """Sorts 2 before 10."""
+    return re.sub(r"\d+", lambda found: found[0].zfill(20), name), name
 
 
 def left_out_formats(files: Sequence[Path]) -> list[str]:
@@ -82,12 +88,17 @@ def prepare(
     """Put `files` upright into `kept`, and no longer than `side` into `working`.
 
     A file that is upright already is linked, or copied across file systems. Returns those that are
-    ready, in the order of `files`, and of the others name and reason.
+    ready, in the order of `files`, and of the others name and reason. Names get a number before
+    them where they sort differently as text, which COLMAP and readers of its models go by.
     """
     ready, faulty = list[Photo](), dict[str, str]()
-    for number, file in enumerate(files):
+    names = [file.name for file in files]
+    if names != sorted(names):
+        digits = len(str(len(names)))
+        names = [f"{number:0{digits}}_{name}" for number, name in enumerate(names)]
+    for number, (file, name) in enumerate(zip(files, names, strict=True)):
         try:
-            ready.append(_prepared(file, kept, working, side))
+            ready.append(_prepared(file, name, kept, working, side))
         except (OSError, ValueError) as error:
             if isinstance(error, OSError) and error.errno is not None:  # the disk, not the photo
                 raise
@@ -96,7 +107,7 @@ def prepare(
     return ready, faulty
 
 
-def _prepared(file: Path, kept: Path, working: Path, side: int) -> Photo:
+def _prepared(file: Path, name: str, kept: Path, working: Path, side: int) -> Photo:
     with file.open("rb") as opened, opened_image(opened) as image:
         if min(image.size) < SMALLEST:
             raise ValueError(f"it has {image.width} x {image.height} pixels")
@@ -106,7 +117,7 @@ def _prepared(file: Path, kept: Path, working: Path, side: int) -> Photo:
         upright = ImageOps.exif_transpose(image) if turned else image
         exif, camera = _exif(image)  # last, because it takes the orientation out
     rgb = eight_bits(upright).convert("RGB")
-    name = file.name if kind in ("JPEG", "MPO", "PNG") else f"{file.name}.png"
+    name = name if kind in ("JPEG", "MPO", "PNG") else f"{name}.png"
     if plain and not turned:
         _link(file, kept / name)
     else:
