@@ -1,12 +1,13 @@
 """Frames of videos: which are taken, that they are upright, and what a damaged file costs."""
 
 from fractions import Fraction
+from pathlib import Path
 
 import av
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
-from qgs_poses.frames import FEWEST, extract, shift
+from qgs_poses.frames import FEWEST, extract, shift, thinned
 from qgs_poses.photos import PosesError
 from walked import write_video
 
@@ -57,6 +58,13 @@ def test_a_picture_that_moves_fast_gives_more_frames(tmp_path):
         counts.append(len([*(tmp_path / str(step)).glob("*.jpg")]))
     assert counts[0] == FEWEST
     assert 60 <= counts[1] <= 120
+
+
+def test_of_more_frames_than_wanted_the_sharpest_of_neighbours_are_kept():
+    scores = {Path(f"{n:05d}.jpg"): float(n % 5 == 2) for n in range(50)}
+    assert [int(path.stem) for path in thinned(scores, 10)] == [*range(2, 50, 5)]
+    assert thinned(scores, 50) == [*scores]
+    assert len(thinned(scores, 33)) == 33
 
 
 def test_the_shift_of_a_picture():

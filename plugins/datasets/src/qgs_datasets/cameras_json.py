@@ -178,7 +178,7 @@ class _Camera:
             pose = np.full((4, 4), np.nan) if singular else np.linalg.inv(pose)
         if key in _OPENGL:
             meaning, pose = f"{key} (OpenGL camera-to-world)", pose * [1, -1, -1, 1]
-        return pose, "c2w" if key in _C2W else meaning
+        return pose, f"{key} (camera-to-world)" if key in _C2W[1:] else meaning
 
     def _intrinsics(self) -> tuple[np.ndarray, str]:
         """fx, fy, cx, cy in pixels, and what was read as that."""
@@ -202,7 +202,7 @@ class _Camera:
             height, width = size
             scaled = matrix * [width, height, width, height]
             return scaled, f"{key or 'fx'} in parts of width and height"
-        return matrix, "K in pixels"
+        return matrix, f"{key or names[0]} in pixels"
 
     def _photo_size(self) -> Size | None:
         """As listed, else that of the file; None of one that cannot be read."""

@@ -1,6 +1,6 @@
 """Frames of a video: of each interval of time and of motion the sharpest."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
@@ -31,9 +31,10 @@ def extract(
 ) -> list[str]:
     """Write the sharpest frame of each interval as JPEG, upright, numbered from 0 on.
 
-    count: of even intervals of time; by default as `Intervals` has them, MOST at most. progress:
-    seconds done and in all. Returns remarks. What cannot be decoded is left out. Raises PosesError
-    for no video, and for fewer than LEAST frames.
+    count: of even intervals of time; by default as `Intervals` has them, and where these are more
+    than MOST, the sharpest of each few neighbours. progress: seconds done and in all. Returns
+    remarks. What cannot be decoded is left out. Raises PosesError for no video, and for fewer than
+    LEAST frames.
     """
     times, broken = _times(video)
     if len(times) < LEAST:
@@ -47,13 +48,19 @@ def extract(
     intervals = Intervals(float(start), length, count)
     every = max(int(len(times) / (length * intervals.rate) / _JUDGED), 1)
     place, best, sharpest, faults, last = 0, None, -1.0, 0, start
+    scores = dict[Path, float]()
+
+    def keep() -> None:
+        if best is not None:
+            scores[_write(best, folder / f"{place:05d}.jpg")] = sharpest
+
     for number, (time, frame) in enumerate(_decoded(video)):
         if frame is None:
             faults += 1
             continue
         here, last = intervals.place(float(time), frame), max(last, time)
-        if here != place and best is not None:
-            _write(best, folder / f"{place:05d}.jpg")
+        if here != place:
+            keep()
             best, sharpest = None, -1.0
         place = here
         progress(int(time - start), int(length))
@@ -62,22 +69,28 @@ def extract(
         score = _sharpness(frame)
         if score > sharpest:
             best, sharpest = frame, score
-    if best is not None:
-        _write(best, folder / f"{place:05d}.jpg")
-    written = sorted(folder.glob("*.jpg"))
-    if len(written) < LEAST:
+    keep()
+    if len(scores) < LEAST:
         raise PosesError(
-            f"{video} has {counted(len(written), 'frame')} that can be decoded, and poses need "
+            f"{video} has {counted(len(scores), 'frame')} that can be decoded, and poses need "
             f"{LEAST} at least: convert it to H.264, or copy it again"
         )
-    if count is None and len(written) > MOST:
-        kept = {round(number) for number in np.linspace(0, len(written) - 1, MOST)}
-        for number in set(range(len(written))) - kept:
-            written[number].unlink()
+    if count is None:
+        for path in {*scores} - {*thinned(scores, MOST)}:
+            path.unlink()
     if not (broken or faults):
         return []
     at = f"{float(last - start):.1f} s"
     return [f"{video} is damaged: frames are taken up to {at}, where they could be decoded"]
+
+
+def thinned(scores: Mapping[Path, float], most: int) -> list[Path]:
+    """At most `most` of the frames: of each even number of neighbours the one of highest score."""
+    best = dict[int, Path]()
+    for number, path in enumerate(sorted(scores)):
+        part = number * most // len(scores)
+        best[part] = max(best.get(part, path), path, key=scores.__getitem__)
+    return list(best.values())
 
 
 class Intervals:
@@ -174,7 +187,7 @@ def _grey(frame: Any, size: tuple[int, int]) -> np.ndarray:
     return grey.astype(np.float32)
 
 
-def _write(frame: Any, path: Path) -> None:
+def _write(frame: Any, path: Path) -> Path:
     """As JPEG, turned as the video says."""
     image = Image.fromarray(frame.to_ndarray(format="rgb24"))
     turns = round(frame.rotation / 90) % 4  # counterclockwise, in degrees
@@ -182,3 +195,4 @@ def _write(frame: Any, path: Path) -> None:
         kinds = (Image.Transpose.ROTATE_90, Image.Transpose.ROTATE_180, Image.Transpose.ROTATE_270)
         image = image.transpose(kinds[turns - 1])
     image.save(path, quality=95, subsampling=0)
+    return path
