@@ -32,18 +32,20 @@ addEventListener("DOMContentLoaded", () => {
   button.onclick = () => {
     if (film) return film.stop();
     const drawn = document.querySelector("canvas[data-engine]");  // the other is an overlay
-    const stream = drawn.captureStream();
-    film = new MediaRecorder(stream, {mimeType: "video/webm", videoBitsPerSecond: 2e7});
+    const mimeType = ["video/mp4", "video/webm"].find(kind => MediaRecorder.isTypeSupported(kind));
+    if (!drawn || !mimeType) return;  // the scene is still being read
+    const file = `scene.${mimeType.slice(6)}`;
+    film = new MediaRecorder(drawn.captureStream(), {mimeType, videoBitsPerSecond: 2e7});
     film.ondataavailable = ({data}) => {
       const link = document.createElement("a");
       link.href = URL.createObjectURL(data);
-      link.download = "scene.webm";
+      link.download = file;
       link.click();
       film = null;
       button.textContent = "record";
     };
     film.start();
-    button.textContent = "stop, and save scene.webm";
+    button.textContent = `stop, and save ${file}`;
   };
   document.body.append(button);
 });
