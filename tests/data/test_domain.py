@@ -132,6 +132,7 @@ def test_what_helps_is_named_and_the_scale_comes_first(first, second, focal, opt
     assert re.findall(r"--\w+", verdict(trained, found, SEARCHED)) == options[1:]
 
 
+@pytest.mark.slow
 def test_checkpoints_tell_what_they_were_trained_on_also_when_a_run_is_continued(tmp_path) -> None:
     recipe = resolve(RECIPE)
     expected = trained_domain(recipe.build_data(), recipe.views, recipe.seed, steps=6)

@@ -71,15 +71,12 @@ def change_counters(folder: Path, **values: Any) -> None:
 
 CASES = [
     ("locus", ("training.ema=0.9", "training.render_views=1")),
-    pytest.param(
-        "tokengs",
-        ("training.accumulate=2", "views.mirror=0.5"),
-        marks=pytest.mark.slow,
-    ),
-    pytest.param("locus", ("training.precision=bf16",), marks=pytest.mark.slow),
+    ("tokengs", ("training.accumulate=2", "views.mirror=0.5")),
+    ("locus", ("training.precision=bf16",)),
 ]
 
 
+@pytest.mark.slow  # test_scheduled_options.py and test_objectives.py resume in the fast tests
 @pytest.mark.parametrize(("name", "overrides"), CASES)
 def test_13_and_7_steps_are_20(
     tiny: Tiny, tmp_path: Path, name: str, overrides: Sequence[str]

@@ -40,6 +40,7 @@ def recipes(tmp_path):
     return [tmp_path / "few.yaml", tmp_path / "more.yaml"]
 
 
+@pytest.mark.slow
 def test_recipes_are_trained_compared_and_reported(recipes, tmp_path):
     out = tmp_path / "demo"
     result = run_qgs("demo", "--train", *recipes, "--seconds", 1, "--out", out)
