@@ -56,14 +56,14 @@ def choose_sample(
     do not exist or come twice, and for too few.
     """
     views = views.model_copy(update={"inputs": inputs or views.inputs})
-    domain = trained_on or Domain()
+    domain, novel = trained_on or Domain(), tuple(compare or ())
     if frames is not None:
         checked_window(len(scene), frames)
     if scene.times is not None:
         frames, novel = _over_time(scene, scene.times, views, frames)
     elif frames is None:
         frames, novel = choose_windows(scene, views, domain, held_out=compare)[0]
-    else:
+    elif compare is None:
         novel = Frusta(scene, domain).compared(tuple(frames))
     picked = checked_window(len(scene), frames, novel if compare is None else compare)
     views = views_of(scene, *picked) if views_of else views

@@ -200,8 +200,9 @@ def chosen_scene(
         whole = whole_size(scene, size_multiple([recipe]))
         if whole != scene.cameras.size:
             return chosen_scene(recipe, path, whole, name, holdout)
-    if holdout and not is_training_data:
-        scene = named_scene(type(source)(holding_out(source.config, scene)), path, name)
+    options = holding_out(source.config, scene)
+    if holdout and not is_training_data and options is not source.config:
+        scene = named_scene(type(source)(options), path, name)
     seen = is_training_data and scene.name in source.names("train")
     return scene, training_frames(scene) if seen else ()
 

@@ -127,10 +127,11 @@ def load_ply(path: str | Path) -> Gaussians:
     def columns(*names: str) -> Tensor:
         return torch.from_numpy(np.stack([vertices[name] for name in names], -1, dtype=np.float32))
 
+    quats = columns(*_QUATS)
     scene = Gaussians(
         means=columns(*_MEANS),
         scales=columns(*_SCALES).exp(),
-        quats=(quats := columns(*_QUATS)) / quats.norm(dim=-1, keepdim=True),  # NaN for 0
+        quats=quats / quats.norm(dim=-1, keepdim=True),  # NaN for 0
         opacities=columns("opacity")[:, 0].sigmoid(),
         colors=columns(*_COLORS) * SH_C0 + 0.5,
         sh=_used_degrees(columns(*rest).unflatten(-1, (3, -1)).mT) if rest else None,

@@ -25,7 +25,7 @@ def refuse_outside(folder: UPath, found: Listing) -> None:
     """Raise ValueError for a listed file that is not in `folder`; a link there is."""
     for frame in found.frames:
         for file in filter(None, (frame.path, frame.mask, frame.depth)):
-            if os.path.relpath(file.path, folder.path or ".").startswith(".."):
+            if os.path.relpath(file.path, folder.path or ".").split(os.sep)[0] == "..":
                 raise ValueError(
                     f"{found.file} names {name_shown(str(file))}, which is outside of {folder}: "
                     "move it into the folder, or allow this by data.outside=true"

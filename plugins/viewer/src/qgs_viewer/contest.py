@@ -124,11 +124,8 @@ def judge(
     windows_of: WindowsOf | None = None
     for name, path in files.items():
         with CheckpointFile(path) as file:
-            model, step, training = (
-                file.model(choose_device(device)),
-                file.step,
-                file.recipe.training,
-            )
+            model, step = file.model(choose_device(device)), file.step
+            training = file.recipe.training
         of = "" if training.seconds else f" of {training.steps:,}"
         progress = "not known" if step is None else f"step {step:,}{of}"
         recipe, options = recipes[name], OF_RECIPES if photos is None else OF_SHOWN

@@ -40,9 +40,8 @@ def quiet_server(
     serve = sockets.serve
     sockets.serve = partial(_guarded, serve, host)  # viser has no option for this
     try:
-        with redirect_stdout(
-            io.StringIO()
-        ):  # viser prints a box of addresses, whatever it is asked
+        # viser prints a box of addresses, whatever it is asked
+        with redirect_stdout(io.StringIO()):
             server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     finally:
         sockets.serve = serve
