@@ -6,10 +6,10 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar, get_args, get_origin
+from typing import Any, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError
-from pydantic_core import ErrorDetails, to_jsonable_python
+from pydantic_core import ErrorDetails, PydanticUndefinedType, to_jsonable_python
 
 from qgs.components.schedules import SCHEDULES
 from qgs.composer.errors import Problems, did_you_mean, nearest
@@ -52,7 +52,7 @@ class DecoderSettings(ComponentConfig):
 class RecipeSettings(ComponentConfig):
     """Settings at the top of a recipe."""
 
-    recipe: Literal[1]
+    recipe: int = Field(ge=1, le=1)
     """Version of the recipe format."""
     seed: int = Field(default=0, ge=0, lt=2**63)
     """Of the model's initial parameters and of training."""
@@ -246,7 +246,7 @@ def decode_config(
             reason, fix = _explain(detail, given, config)
         name = ".".join([*path, *map(str, steps)])
         field = config.model_fields.get(str(loc[0])) if loc else None
-        if field and not field.is_required() and not isinstance(field.default, BaseModel):
+        if field and not isinstance(field.default, BaseModel | PydanticUndefinedType):
             fix += f" (default: {inline(to_jsonable_python(field.get_default()))})"
         problems.add(origin, name, reason, fix)
     return None

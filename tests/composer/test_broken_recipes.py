@@ -60,6 +60,7 @@ BROKEN = (
      "model:\n  decoder:\n    layers:\n      12: {feed_forward: {ratio: 2}}\n"),
     ("missing recipe version", 1, "recipe", "missing", "seed: 1\n"),
     ("newer recipe version", 1, "recipe", "1", "recipe: 2\n"),
+    ("a truth value as version", 1, "recipe", "true", "recipe: true\n"),
     ("data without a type", 2, "data.type", "qgs/photos", "data: {image_size: [64, 64]}\n"),
     ("loss without a type", 3, "losses.mine.type", "type", "losses:\n  mine: {weight: 0.1}\n"),
     ("too few items", 2, "views.gap", "2 items", "views: {gap: [5]}\n"),
@@ -88,7 +89,13 @@ BROKEN = (
     ("nested too deep", 3, "", "levels", "seed:\n  " + "[" * 70 + "]" * 70 + "\n"),
     ("nested deeper than Python's stack", 1, "", "deep", "seed: " + "[" * 5000),
 )  # fmt: skip
-WITHOUT_HEAD = ("missing recipe version", "newer recipe version", "empty file", "a list at the top")
+WITHOUT_HEAD = (
+    "missing recipe version",
+    "newer recipe version",
+    "a truth value as version",
+    "empty file",
+    "a list at the top",
+)
 
 
 @pytest.mark.parametrize("row", BROKEN, ids=lambda row: row[0])

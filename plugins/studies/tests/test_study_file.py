@@ -82,6 +82,14 @@ WRONG = {
     "budget: {steps: 200}": ("budget: {steps: 200, seconds: 3}", ":8: budget", "got 2"),
     "[flat < full]": ("[flat < fulll]", ":10: hypotheses.0", "`full`"),
     "study: 1\n": ("study: 1\nsead: [0]\n", ":2: sead", "`seeds`"),
+    "study: 1\nbase": ("study: true\nbase", ":1: study", "true"),
+    "  flat: ": ("  FULL: ", ":3: variants", "`FULL`"),
+    "variants:\n": (
+        "variants:\n" + "".join(f"  v{n}:\n" for n in range(198)),
+        ":3: variants",
+        "200",
+    ),
+    "reference": ("published: {full: good}\nreference", ":7: published.full", "number"),
     "{type: qgs/content}": (
         "{type: qgs/contents}",
         ":5: variants.flat: model.decoder.cross_attention.type",

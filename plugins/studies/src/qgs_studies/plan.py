@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import combinations, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,9 @@ EQUAL = (
 
 All but the model and its optimiser.
 """
+
+BESIDE = ("seed", "plugins")
+"""What does not make a recipe another model."""
 
 INDEX = "evaluation.index"
 """Compared by what the file holds, because it may have moved."""
@@ -170,11 +173,14 @@ def composed(study: Study) -> dict[str, Recipe]:
             report(error, f"variants.{name}", study.origins[name])
     if len(recipes) == len(study.variants):
         _check_equal(study, recipes, problems)
-        for (a, one), (b, other) in combinations(recipes.items(), 2):
-            if not differences(one, other):
+        models = dict[str, str]()
+        for name, recipe in recipes.items():
+            tree = {key: part for key, part in recipe.tree.items() if key not in BESIDE}
+            other = models.setdefault(json.dumps(tree, sort_keys=True), name)
+            if other != name:
                 fix = "change an option of it, or leave one of them out"
-                reason = f"`{b}` is the same model as `{a}`"
-                problems.add(study.origins[b], f"variants.{b}", reason, fix)
+                reason = f"`{name}` is the same model as `{other}`"
+                problems.add(study.origins[name], f"variants.{name}", reason, fix)
         for label, node in study.evaluations.items():
             for name, recipe in recipes.items():
                 try:
@@ -221,7 +227,7 @@ def read_evaluation(file: Path) -> MapNode:
 def differences(ours: Recipe, theirs: Recipe) -> dict[str, tuple[Any, Any]]:
     """Options in which two recipes differ, seeds and names of plugins aside."""
     a, b = flat(ours.tree), flat(theirs.tree)
-    paths = [p for p in {**a, **b} if p not in ("seed", "plugins") and a.get(p) != b.get(p)]
+    paths = [p for p in {**a, **b} if p not in BESIDE and a.get(p) != b.get(p)]
     return {path: (a.get(path), b.get(path)) for path in paths}
 
 

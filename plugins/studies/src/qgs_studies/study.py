@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
@@ -68,7 +68,7 @@ class Hypothesis(ComponentConfig):
 class StudySettings(ComponentConfig):
     """A study as its file has it, with the files that it extends."""
 
-    study: Literal[1]
+    study: int = Field(ge=1, le=1)
     """Version of the format."""
     title: str = ""
     """Heading of the page; empty takes the file's name."""
@@ -90,12 +90,24 @@ class StudySettings(ComponentConfig):
     """Recipe, or several laid over each other, that variants are laid over."""
     overlay: dict[str, Any] = Field(default_factory=dict)
     """Part of a recipe that is laid over every variant."""
-    variants: dict[Name, Any] = Field(min_length=1)
-    """A recipe file, or the part of a recipe, by name."""
+    variants: dict[Name, Any] = Field(min_length=1, max_length=200)
+    """A recipe file, or the part of a recipe, by name. Each takes a tenth of a second to check."""
     evaluations: dict[Name, dict[str, Any]] = Field(default_factory=dict)
     """What is changed before every trained model is judged once more, by name."""
     published: dict[str, float] = Field(default_factory=dict)
     """The metric as published, by variant: shown beside ours, with the rank correlation."""
+
+    @field_validator("variants", "evaluations")
+    @classmethod
+    def _folders_differ(cls, named: dict[str, Any]) -> dict[str, Any]:
+        names = {name.lower(): name for name in named}
+        if same := [name for name in named if names[name.lower()] != name]:
+            raise OptionError(
+                f"`{same[0]}` and `{names[same[0].lower()]}` are one folder where file names have "
+                "no case",
+                "give them other names",
+            )
+        return named
 
     @field_validator("seeds")
     @classmethod
