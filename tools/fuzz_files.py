@@ -4,7 +4,8 @@
 
     python tools/fuzz_files.py --seed 0 --only 17
 
-A checkpoint is loaded and made into Gaussians, or starts a training; see fuzzing.py.
+A checkpoint is loaded and made into Gaussians, or starts a training; what is made of a damaged one
+that is not refused must be what the whole one gives. See fuzzing.py.
 """
 
 import json
@@ -15,8 +16,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import safetensors.torch
 import torch
-from fuzzing import JUNK, Use, fuzz, other_bytes, other_leaf, refused
+from fuzzing import JUNK, FaultError, Use, fuzz, other_bytes, other_leaf, refused
 
 import qgs
 from qgs.composer import resolve
@@ -122,24 +124,33 @@ def damage_ply(file: Path, dice: random.Random) -> str:
     return "ply"
 
 
-def decode(file: Path) -> None:
+def decode(file: Path) -> bytes:
     with CheckpointFile(file) as checkpoint:
         model, _ = checkpoint.model(), checkpoint.extra
     assert isinstance(model.queries, LearnedQueries)
     with torch.no_grad():
-        qgs.save_ply(model.decode(model.queries.start(1)), file.with_suffix(".ply"))
+        qgs.save_ply(model.decode(model.queries.start(1)), ply := file.with_suffix(".ply"))
+    return ply.read_bytes()
 
 
-def start_from(file: Path) -> None:
+def start_from(file: Path) -> bytes:
     recipe = resolve(RECIPE, [*SMALL, "model.queries.count=9", f"init_from={file}"])
-    initialise(recipe.build_model(), recipe)
+    initialise(model := recipe.build_model(), recipe)
+    return safetensors.torch.save(model.state_dict())
 
 
-def judged(use: Callable[[Path], object], path: Path) -> str:
+def load_ply(file: Path) -> None:
+    qgs.load_ply(file)
+
+
+def judged(use: Callable[[Path], bytes | None], path: Path, whole: bytes | None) -> str:
+    """whole: what the undamaged file gives; None where a change may go unseen."""
     try:
-        use(path)
+        made = use(path)
     except (ValueError, OSError) as error:
         return f"{use.__name__} {refused(error, str(path))}"
+    if made != whole:
+        raise FaultError("another result than that of the undamaged file")
     return f"{use.__name__} success"
 
 
@@ -147,19 +158,18 @@ def prepared(scratch: Path) -> Callable[[random.Random, Path], tuple[str, Use]]:
     qgs.save(
         qgs.compose(RECIPE, SMALL), checkpoint := scratch / "a.safetensors", extra={"step": "3"}
     )
-    decode(checkpoint)
     kinds = (
-        (decode, damage_checkpoint),
-        (start_from, damage_checkpoint),
-        (qgs.load_ply, damage_ply),
+        (decode, damage_checkpoint, decode(checkpoint)),
+        (start_from, damage_checkpoint, start_from(checkpoint)),
+        (load_ply, damage_ply, None),
     )
 
     def case_in(dice: random.Random, folder: Path) -> tuple[str, Use]:
-        use, damage = dice.choice(kinds)
+        use, damage, whole = dice.choice(kinds)
         path = folder / ("a.ply" if damage is damage_ply else "a.safetensors")
         path.write_bytes((scratch / path.name).read_bytes())
         what = (other_bytes if dice.random() < 0.15 else damage)(path, dice)
-        return f"{use.__name__}, {what}", partial(judged, use, path)
+        return f"{use.__name__}, {what}", partial(judged, use, path, whole)
 
     return case_in
 
