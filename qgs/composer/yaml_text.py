@@ -3,6 +3,7 @@
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache, partial
 from typing import Any, TypeAlias, cast
 
 import yaml
@@ -168,7 +169,7 @@ def load_text(
     """
     number = 1
     try:
-        root = yaml.compose(text, Loader=Yaml12Loader)
+        root = _composed(text)
         return None if root is None else _Reader(file, problems, line).read(root, path)
     except yaml.reader.ReaderError as error:
         number += text.count("\n", 0, error.position)
@@ -186,6 +187,10 @@ def load_text(
         reason, fix = "mappings or lists are nested too deep", "write the recipe flatter"
     problems.stop(Origin(file, number if line is None else line), ".".join(path), reason, fix)
     return MapNode(Origin(file, number))
+
+
+# Files that many recipes extend are parsed once.
+_composed = lru_cache(maxsize=32)(partial(yaml.compose, Loader=Yaml12Loader))
 
 
 class _Reader:
