@@ -43,7 +43,7 @@ def show_safely() -> None:
     """From here on, whatever this process prints is `shown`; Rich still colours and draws."""
     import rich.text
 
-    vars(rich.text)["strip_control_codes"] = shown  # of all texts that it draws
+    rich.text.__dict__["strip_control_codes"] = shown  # of all texts that it draws
     for name in ("stdout", "stderr"):
         if stream := getattr(sys, name):  # None where the system gave none
             setattr(sys, name, _Shown(stream))

@@ -163,5 +163,5 @@ def _opened(url: str) -> Iterator[tuple[Callable[[int], bytes], int]]:
     if place.username:
         user = f"{unquote(place.username)}:{unquote(place.password or '')}".encode()
         request.add_unredirected_header("Authorization", f"Basic {b64encode(user).decode()}")
-    with urlopen(request, timeout=PATIENCE) as answer:
+    with urlopen(request, timeout=2 * PATIENCE) as answer:  # long after `_arriving` gave up
         yield answer.read1, answer.length or 0
