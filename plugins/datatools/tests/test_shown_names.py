@@ -18,13 +18,12 @@ NAME = "a\x1b[2J\u202eb\x9bc\rd\x07"
 RAW = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 RECIPE = {
     "recipe": 1,
-    "model": MODEL,
+    "model": {**MODEL, "renderer": {"type": "qgs/torch"}},
     "plugins": ["rooms"],
     "data": {"type": "rooms/procedural", "image_size": [16, 16], "test_scenes": 1},
     "views": {"inputs": 2, "targets": 2, "gap": [2, 4]},
     "evaluation": {"scenes": 1},
     "training": {"steps": 1},
-    "renderer": {"type": "qgs/torch"},
     "optimizer": {"type": "qgs/adamw", "warmup": 0},
 }
 FAULTY = f"""
@@ -64,7 +63,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("compose", f"{NAME}.yaml"),
         ("compose", f"{NAME}.yaml", "--set", f"model.{NAME}=1"),
         ("compose", NAME),
-        ("train", f"{NAME}.yaml", "--out", f"{NAME}-run"),
+        pytest.param(
+            ("train", f"{NAME}.yaml", "--out", f"{NAME}-run"), marks=pytest.mark.slow, id="trains"
+        ),
         ("train", f"{NAME}.yaml", "--out", NAME),
         ("eval", f"{NAME}.safetensors"),
         ("reconstruct", "rooms/locus-64", NAME, "--out", "out"),
@@ -91,3 +92,4 @@ def test_no_command_prints_control_characters(
             sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]
     assert RAW.findall(out.getvalue()) == []
     assert r"\u202e" in out.getvalue()
+    assert Path(f"{NAME}-run", "checkpoint.safetensors").is_file() == (f"{NAME}-run" in words)

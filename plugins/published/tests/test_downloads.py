@@ -117,6 +117,11 @@ def test_failures(kind: str, cause: str, server: str, cache: Path, capsys) -> No
     assert printed.count("the download ends in") == (4 if cause.endswith("0.2 s") else 0)
 
 
+def test_no_server() -> None:
+    with pytest.raises(OSError, match=r"nothing was kept: .*refused"):
+        checkpoint_path("http://127.0.0.1:9/a.safetensors")
+
+
 def test_passwords_are_sent_and_never_printed(server: str, model: bytes, capsys) -> None:
     url = f"http://me:p%40ss@{server}/login/a.safetensors"
     assert checkpoint_path(url).read_bytes() == model

@@ -83,7 +83,7 @@ def _download(url: str, file: Path) -> None:
             with safe_open(temporary, "pt"):
                 pass
     except Exception as error:  # whatever the file system of the URL raises
-        cause = without_secrets(str(error)) or type(error).__name__
+        cause = without_secrets(str(getattr(error, "reason", error))) or type(error).__name__
         if isinstance(error, HTTPError):
             fix = _FIXES.get(error.code, "try again later")
             cause = f"the server answers {error.code} ({error.reason}), {fix}"
