@@ -50,6 +50,7 @@ DISTRIBUTIONS = {
     "qgs.poses": {"folder": "query-gaussians-poses"},
     "qgs.videos": {"reconstruction": "query-gaussians-poses"},
     "qgs.jobs": {"slurm": "query-gaussians-studies"},
+    "qgs.downloads": {"checkpoint": "query-gaussians-published"},
     "qgs.pages": {"gaussians": "query-gaussians-viewer"},
     "qgs.traces": {"queries": "query-gaussians-viewer"},
     "qgs.refiners": dict.fromkeys(

@@ -11,6 +11,7 @@ from typer.core import TyperCommand, TyperGroup
 from qgs import DISTRIBUTIONS
 from qgs.cli import evaluate, inspect, reconstruct, train
 from qgs.extensions import installed
+from qgs.terminal import show_safely
 
 GROUP = "qgs.commands"
 """Group of entry points NAME = "module:app", where `app` is a `typer.Typer`."""
@@ -116,6 +117,7 @@ def main() -> None:
 
     The environment variable QGS_DEBUG=1 shows the traceback.
     """
+    show_safely()
     try:
         app()
     except (ValueError, OSError, RuntimeError, MemoryError) as error:

@@ -21,11 +21,15 @@ def list_components(
         ),
     ] = None,
 ) -> None:
-    """Installed components by slot, and trained models; with NAME all options and meanings."""
-    from qgs.cli.tables import details, overview
-    from qgs.composer.registry import load_usable_plugins
+    """Installed components by slot, and trained models; with NAME all options and meanings.
 
-    registry, broken = load_usable_plugins()
+    Imports every installed plugin; for a NAME such as rooms/locus-64 that of the name alone.
+    """
+    from qgs.cli.tables import details, overview
+    from qgs.composer.registry import load_registry, load_usable_plugins
+
+    plugin, slash, _ = (name or "").partition("/")
+    registry, broken = (load_registry([plugin]), []) if slash else load_usable_plugins()
     for part in details(name, registry) if name else overview(registry):
         Console().print(part, highlight=False)
     for message in broken:
@@ -55,7 +59,7 @@ def schema(
         Path | None, typer.Option(help="File to write; standard output if none.")
     ] = None,
 ) -> None:
-    """JSON Schema of a recipe with everything that is installed."""
+    """JSON Schema of a recipe with everything that is installed; imports every plugin."""
     from qgs.composer.registry import load_usable_plugins
     from qgs.composer.schema import recipe_schema
     from qgs.io.files import write_text

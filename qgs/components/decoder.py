@@ -3,13 +3,7 @@
 from pydantic import Field
 from torch import Tensor, nn
 
-from qgs.components.blocks import (
-    NORM_EPS,
-    CrossAttentionCore,
-    LayerScale,
-    Mlp,
-    SelfAttentionCore,
-)
+from qgs.components.blocks import NORM_EPS, CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
 from qgs.contracts import (
     AttentionWeights,
     ComponentConfig,

@@ -3,14 +3,7 @@
 from typing import Any
 
 from qgs.components.head import CHANNELS
-from qgs.contracts.weights import (
-    Rename,
-    Shapes,
-    layer_count,
-    real_ratio,
-    size_at,
-    whole_ratio,
-)
+from qgs.contracts.weights import Rename, Shapes, layer_count, real_ratio, size_at, whole_ratio
 
 ENCODER = "enc_dec_backbone.encoder."
 DECODER = "enc_dec_backbone.decoder_blocks."

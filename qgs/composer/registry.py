@@ -16,11 +16,7 @@ from qgs import extensions
 from qgs.composer.errors import Origin, Problems
 from qgs.composer.slots import SLOTS
 from qgs.composer.yaml_text import ListNode, MapNode, kind_of
-from qgs.contracts import (
-    Component,
-    ComponentConfig,
-    OptionError,
-)
+from qgs.contracts import Component, ComponentConfig, OptionError
 from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
 
 BUILTIN = Plugin(

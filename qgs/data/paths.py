@@ -12,6 +12,7 @@ from typing import IO, Any
 from upath import UPath
 
 from qgs.machine import with_unit
+from qgs.terminal import without_secrets
 
 LARGEST = 500_000_000
 """Bytes of a file that is read as a whole, such as an uncompressed photo of 120 million pixels."""
@@ -26,7 +27,8 @@ def opened_path(path: str | Path | UPath) -> UPath:
         url = UPath(path)
         url.fs  # noqa: B018  asks for the file system, whose package may be missing
     except Exception as error:  # whatever a file system's constructor raises
-        raise ValueError(f"{path} cannot be opened as a path or URL: {error}") from error
+        what = without_secrets(f"{path} cannot be opened as a path or URL: {error}")
+        raise ValueError(what) from error
     if url.protocol in {"file", "local"}:
         return UPath(url.path)
     return url.expanduser() if is_local(url) else url

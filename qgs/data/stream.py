@@ -23,17 +23,10 @@ from torch.utils.data import DataLoader, Dataset
 from qgs.contracts import Frames, Scene, SceneSource, ViewSampler, ViewsConfig
 from qgs.data.domain import Domain
 from qgs.data.evaluation import one_line
-from qgs.data.samples import (
-    Batch,
-    Sample,
-    cameras_in,
-    collate,
-    make_sample,
-    own_world,
-    with_noise,
-)
+from qgs.data.samples import Batch, Sample, cameras_in, collate, make_sample, own_world, with_noise
 from qgs.data.view_samplers import Span
 from qgs.machine import is_out_of_memory
+from qgs.terminal import show_safely
 from qgs.types import Cameras, concatenated
 
 
@@ -308,6 +301,7 @@ def _from_workers(batches: _Batches, start: int, workers: int) -> Generator[Batc
 
 def _prepare_worker(number: int) -> None:
     """Ignore signals, which go to all processes of a job; the training process ends workers."""
+    show_safely()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     logging.getLogger("qgs.data.scenes").setLevel(logging.ERROR)  # reported when data was opened

@@ -1,6 +1,5 @@
-"""Models by name: those that plugins ship, and those at URLs."""
+"""Models by name: those that plugins ship."""
 
-import hashlib
 import os
 import re
 import sys
@@ -10,7 +9,6 @@ import pytest
 import torch
 from commands import MODEL, run_qgs
 from safetensors.torch import load_file
-from upath import UPath
 
 import qgs
 from qgs.composer import resolve
@@ -78,36 +76,6 @@ def test_models_are_listed_and_checked(shipped: Path) -> None:
     assert checked.exit_code == 1
     assert "ok     model box/small" in checked.output
     assert "FAILED model box/gone: no checkpoint at" in checked.output
-
-
-@pytest.fixture
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("QGS_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
-
-
-def test_a_url_is_downloaded_once_and_its_hash_told(
-    shipped: Path, cache: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    remote = UPath("memory://models/a.safetensors")
-    remote.write_bytes(shipped.read_bytes())
-    digest = hashlib.sha256(shipped.read_bytes()).hexdigest()
-    assert qgs.load(str(remote)).recipe == qgs.load(shipped).recipe
-    assert f"memory://models/a.safetensors: sha256 {digest}, kept as" in capsys.readouterr().err
-    remote.unlink()
-    assert qgs.load(str(remote)).recipe == qgs.load(shipped).recipe
-    told = capsys.readouterr().err
-    assert f"{digest}, not downloaded again (delete the file to do so); it was kept as" in told
-    assert [file.name for file in cache.rglob("*") if file.is_file()] == ["a.safetensors"]
-
-
-def test_a_part_of_a_file_is_never_kept(shipped: Path, cache: Path) -> None:
-    remote = UPath("memory://models/b.safetensors")
-    remote.write_bytes(shipped.read_bytes()[:-9])
-    with pytest.raises(OSError, match=r"as a whole safetensors file .*nothing of it was kept"):
-        qgs.load(str(remote))
-    remote.write_bytes(shipped.read_bytes())
-    assert qgs.load(str(remote)).depth == 1
 
 
 def test_half_precision_halves_the_file_and_loads_as_float32(shipped: Path) -> None:

@@ -3,8 +3,11 @@
 import shutil
 
 import pytest
+from installing import install
 from planted import FRAMES, Copy, good_sets
 from textured_room import walk
+
+__all__ = ["install"]
 
 
 @pytest.fixture(scope="session")

@@ -19,11 +19,11 @@ run = partial(run_qgs, "data")
 @pytest.fixture
 def tapes(tmp_path, monkeypatch):
     tape_source.install(tmp_path / "site", monkeypatch)
-    sources._installed.cache_clear()
+    sources._imported.cache_clear()
     for name in "ab":
         tape_source.write_tape(tmp_path / "tapes" / f"{name}.tape")
     yield tmp_path / "tapes"
-    sources._installed.cache_clear()
+    sources._imported.cache_clear()
 
 
 @pytest.mark.parametrize("format", ["auto", "tapes/tape"])
@@ -41,7 +41,6 @@ def test_check(tapes, format):
     assert "error: b, frame 3 (3): the pose has NaN" in bad.output
     refused = str(run("check", tapes, "--format", "rooms/procedural").exception)
     assert refused.startswith("there is no format 'rooms/procedural': use one of auto, nerfstudio")
-    assert "tapes/tape" in refused
 
 
 def test_missing_images_are_told_and_counted(tapes, monkeypatch):

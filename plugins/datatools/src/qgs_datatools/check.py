@@ -134,10 +134,10 @@ def check(
         *readers(),
         "dl3dv",
         "chunks",
-        *(kind for kind in sources() if kind.partition("/")[0] not in OF_FILES),
+        *(kind for kind in sources(options.format) if kind.partition("/")[0] not in OF_FILES),
     )
     if options.format not in formats:
-        usable = "; ".join([", ".join(formats), *left_out()])
+        usable = f"{', '.join(formats)}, or PLUGIN/NAME of a source that reads a path"
         raise ValueError(f"there is no format {options.format!r}: use one of {usable}")
     if path.is_file() and path.suffix in (".json", ".npy"):
         path = path.parent
@@ -158,7 +158,7 @@ def check(
         findings, summary = index_findings(file, held, reported)
         general += findings
         summaries += [summary] if summary else []
-    notes = [*left_out(), *notes]
+    notes = [*left_out(options.format), *notes]
     return CheckReport(str(path), scenes, general, summaries, len(judged), notes)
 
 

@@ -48,7 +48,8 @@ def check(
     """Find what is wrong with a data set: one line for each fault, with scene, frame and remedy.
 
     Every image is decoded, and poses are compared with what neighbouring photos share. Exit code 1
-    when there are errors, 0 when there are none or only warnings.
+    when there are errors, 0 when there are none or only warnings. Imports every installed plugin to
+    ask which reads PATH; with --format PLUGIN/NAME that one, with another format none.
     """
     from qgs.data.paths import opened_path
     from qgs_datatools.check import Options, check
@@ -139,16 +140,14 @@ def pack(
     """Turn any data set into chunks, the format that training reads fastest.
 
     JPEG and PNG photos of pinhole cameras stay as they are; others are undistorted, resized if
-    asked to, and written as PNG. Called again, it finishes what was interrupted.
+    asked to, and written as PNG. Called again, it finishes what was interrupted. Imports every
+    installed plugin to ask which reads a data set; for a recipe only its own.
     """
     from qgs.data.paths import opened_path
     from qgs_datatools import packing
     from qgs_datatools.entries import Encoding
-    from qgs_datatools.sources import left_out
 
     console = Console()
-    for note in left_out():
-        _line(console, note)
     source, settings = _opened(path, options or [], image_size)
     splits = _splits(source, test_scenes, test_every)
     settings |= {"test_scenes": test_scenes, "test_every": test_every}
@@ -177,10 +176,12 @@ def _opened(
     from qgs.composer import resolve
     from qgs.data.paths import opened_path
     from qgs.data.recognition import recognised
-    from qgs_datatools.sources import sources
+    from qgs_datatools.sources import left_out, sources
 
     recipe: Any = path
     if Path(path).suffix not in {".yaml", ".yml"}:
+        for note in left_out():
+            _line(Console(), note)
         kind = recognised(opened_path(path), sources())
         plugin = kind.partition("/")[0]
         recipe = {"recipe": 1, "data": {"type": kind, "path": path}}

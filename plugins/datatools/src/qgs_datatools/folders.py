@@ -33,7 +33,7 @@ def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Cand
         if folder in scenes or folder.name.startswith("."):
             continue
         if scenes:
-            yield _no_scene(folder)
+            yield _no_scene(folder, wanted)
         elif folder.name in ("train", "test"):
             yield from photo_folders(folder, wanted, images)
 
@@ -47,8 +47,8 @@ def _listings(folder: UPath, name: str, wanted: str, images: str | None) -> Iter
         yield Candidate(label, name, kind, _POSES[readers()[kind].poses], photos)
 
 
-def _no_scene(folder: UPath) -> Finding:
-    kind = kind_of(folder)
+def _no_scene(folder: UPath, wanted: str) -> Finding:
+    kind = kind_of(folder, wanted)
     reason = "the folder lists no cameras and is no scene"
     fix = "make poses for it, or move it away"
     if kind != "photos":

@@ -7,7 +7,7 @@ from typing import get_args
 import numpy as np
 from upath import UPath
 
-from qgs.composer.registry import Registry, load_usable_plugins
+from qgs.composer.registry import Registry, load_registry, load_usable_plugins
 from qgs.contracts import Component, Scene, SceneSource, Split
 from qgs.data.photos.reader import PhotoFrame
 from qgs.data.recognition import recognised
@@ -22,24 +22,31 @@ _SIZE = (256, 256)  # of the images that a source is asked for
 
 
 @cache
-def _installed() -> tuple[Registry, list[str]]:
-    return load_usable_plugins()
+def _imported(format: str) -> tuple[Registry, list[str]]:
+    """All plugins for "auto"; else OF_FILES, and that of a `format` PLUGIN/NAME."""
+    if format == "auto":
+        return load_usable_plugins()
+    plugin, slash, _ = format.partition("/")
+    return load_registry([*OF_FILES, *([plugin] if slash else [])]), []
 
 
-def sources() -> dict[str, type[Component]]:
-    """The sources of qgs and of every usable plugin that read a path, by PLUGIN/NAME."""
-    found = _installed()[0].components("data")
+def sources(format: str = "auto") -> dict[str, type[Component]]:
+    """The sources that read a path, by PLUGIN/NAME: of OF_FILES, and of the plugins for `format`.
+
+    Raises PluginError where the one that `format` names cannot be used.
+    """
+    found = _imported(format)[0].components("data")
     return {kind: source for kind, source in found.items() if "path" in source.Config.model_fields}
 
 
-def left_out() -> list[str]:
+def left_out(format: str = "auto") -> list[str]:
     """A note on each plugin that cannot be used."""
-    return [f"left out: {problem}" for problem in _installed()[1]]
+    return [f"left out: {problem}" for problem in _imported(format)[1]]
 
 
-def kind_of(path: UPath) -> str:
+def kind_of(path: UPath, format: str = "auto") -> str:
     """PLUGIN/NAME of the source that reads `path`, or NAME for those whose files are checked."""
-    kind = recognised(path, sources())
+    kind = recognised(path, sources(format))
     plugin, _, name = kind.partition("/")
     return name if plugin in OF_FILES else kind
 
@@ -49,7 +56,7 @@ def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candid
 
     images: for its option of that name. Raises ValueError where it has none.
     """
-    source = sources()[kind]
+    source = sources(kind)[kind]
     assert issubclass(source, SceneSource)
     if images is not None and "images" not in source.Config.model_fields:
         raise ValueError(f"{kind} has no option `images`: leave --images out")

@@ -1,0 +1,49 @@
+"""What standard output and error show: no control characters, no passwords."""
+
+import re
+import sys
+from collections.abc import Iterable
+from typing import Any, TextIO
+
+_RAW = "[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+_USER = r"(?<=://)[^\s/?#]*@"
+_TOKEN = r"(?i)([?&][^\s=&]*(?:token|key|sig|secret|pass|auth|cred)[^\s=&]*=)[^\s&#]+"
+
+
+def without_secrets(text: str) -> str:
+    """`text` whose URLs have *** for users with their passwords, and for tokens and signatures."""
+    return re.sub(_TOKEN, r"\1***", re.sub(_USER, "***@", text))
+
+
+def shown(text: str) -> str:
+    r"""`text` `without_secrets`; control and bidirectional characters as \x1b, \u202e."""
+    return re.sub(_RAW, lambda found: ascii(found[0])[1:-1], without_secrets(text))
+
+
+class _Shown:
+    """A text stream that writes what is `shown`. rich_proxied_file: for Rich, which adds codes."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.rich_proxied_file = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.rich_proxied_file, name)
+
+    def write(self, text: str) -> int:
+        # While Rich draws, a proxy of its own stands in for us, and Rich alone writes here.
+        raw = self not in (sys.stdout, sys.stderr)
+        self.rich_proxied_file.write(text if raw else shown(text))
+        return len(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        self.write("".join(lines))
+
+
+def show_safely() -> None:
+    """From here on, whatever this process prints is `shown`; Rich still colours and draws."""
+    import rich.text
+
+    rich.text.__dict__["strip_control_codes"] = shown  # of all texts that it draws
+    for name in ("stdout", "stderr"):
+        if stream := getattr(sys, name):  # None where the system gave none
+            setattr(sys, name, _Shown(stream))
