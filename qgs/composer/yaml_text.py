@@ -190,7 +190,7 @@ def load_text(
 
 
 # Files that many recipes extend are parsed once.
-_composed = lru_cache(maxsize=32)(partial(yaml.compose, Loader=Yaml12Loader))
+_composed = lru_cache(maxsize=128)(partial(yaml.compose, Loader=Yaml12Loader))
 
 
 class _Reader:
