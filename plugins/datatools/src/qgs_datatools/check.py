@@ -22,6 +22,7 @@ from qgs_datatools.findings import Finding, errors_of, merged
 from qgs_datatools.folders import dl3dv_scenes, photo_folders
 from qgs_datatools.geometry import TOO_FEW, Geometry, geometry_findings, judge_scene
 from qgs_datatools.indices import Held, found_indices, index_findings
+from qgs_datatools.masks import matched_findings, picture_findings
 from qgs_datatools.sources import OF_FILES, kind_of, left_out, source_scenes, sources
 
 PHOTOS, FEWEST = 400, 20
@@ -255,7 +256,8 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
         if frame not in _frames(poses) and np.isfinite(photo.listed.c2w).all()
     ]
     sharing = list(sharing_findings(scene, placed, float32=candidate.kind == "chunks"))
-    findings = merged([*absent, *files, *sizes, *poses, *others, *sharing])
+    pictures = list(picture_findings(scene))
+    findings = merged([*absent, *files, *sizes, *poses, *others, *sharing, *pictures])
     geometry = None
     if most_photos:
         faulty = _frames([*sizes, *others, *sharing])
@@ -264,6 +266,7 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
         explained = errors_of(findings) and geometry.unjudged != TOO_FEW
         if geometry.distances or not explained:
             findings += geometry_findings(scene, geometry, candidate.convention)
+        findings += matched_findings(scene, geometry.pairs)
     return replace(
         report,
         listed=len(photos) + len(missing),

@@ -176,10 +176,10 @@ def geometry_findings(
         after = geometry.distances[geometry.better] * geometry.diagonal
         reason = f"{misreading.reason} ({off}; {after:.1f} when read so)"
         yield scene.finding(frames, reason, misreading.fix)
-    elif both := exchanged_poses(geometry.pairs):
+    elif both := exchanged_poses(geometry.pairs, TOLERANCE):
         reason = "their poses look exchanged: with each other's they fit those of the other frames"
         yield scene.finding(both, reason, "exchange the two poses, or the two photos")
-    elif lens := other_lens(geometry.pairs):
+    elif lens := other_lens(geometry.pairs, TOLERANCE):
         yield _of_lens(scene, geometry, lens)
     elif not geometry.agrees:
         reason = f"the poses do not explain the photos ({off}), nor in another convention"

@@ -15,6 +15,7 @@ _MOST_SUSPECTS = 24  # frames of poor pairs whose exchange is tried
 _CURED = 4  # poor pairs before an exchange for each one after it; photographed poses are not exact
 _FAR = 4.0  # times the better pairs: a frame is off that is so far from all its partners
 _LENS_PAIRS = 30  # are enough for three numbers, of those far apart, which say most
+_LENS_MATCHES = 80  # of a pair: more change its median little
 _CLEARLY = 1.3  # times smaller with other intrinsics; three free numbers gain sound scenes 1.2
 _AS_GOOD = 1.25  # times the best fit's distance: a simpler explanation that explains it too
 _LEAST_CHANGE = 0.04  # of the focal length, or of the longer side: less is no mistake
@@ -27,9 +28,12 @@ def better_quarter(pairs: Sequence[Pair]) -> float:
     return max(float(np.quantile([pair.distance() for pair in pairs], 0.25)), _NOISE)
 
 
-def exchanged_poses(pairs: Sequence[Pair]) -> tuple[int, int] | None:
-    """Two frames with which nearly all pairs that are off fit, once their poses are exchanged."""
-    limit = _POOR * better_quarter(pairs)
+def exchanged_poses(pairs: Sequence[Pair], most: float) -> tuple[int, int] | None:
+    """Two frames with which nearly all pairs that are off fit, once their poses are exchanged.
+
+    most: distance of sound pairs at most, of the diagonal, for two of few frames touch most pairs.
+    """
+    limit = min(_POOR * better_quarter(pairs), most)
     poor = Counter(f for pair in pairs if pair.distance() > limit for f in pair.frames)
     poses = {f: pose for pair in pairs for f, pose in zip(pair.frames, pair.poses, strict=True)}
     found: tuple[float, tuple[int, int]] | None = None
@@ -81,9 +85,9 @@ def frames_of_other_channels(pairs: Sequence[Pair]) -> list[int]:
 
 
 def _channels_differ(pair: Pair) -> bool:
-    one, two = pair.colors
-    same, swapped = (float(np.median(np.abs(one - x).sum(-1))) for x in (two, two[:, ::-1]))
-    return same > _SWAPPED * swapped and same > _COLORED
+    one, two = pair.colors[..., 0] - pair.colors[..., 2]  # exposure moves all channels together
+    same, swapped = (float(np.median(np.abs(one - other))) for other in (two, -two))
+    return same > max(_SWAPPED * swapped, _COLORED)
 
 
 @dataclass(frozen=True)
@@ -100,10 +104,13 @@ class OtherLens:
     exchanged: bool = False
 
 
-def other_lens(pairs: Sequence[Pair]) -> OtherLens | None:
-    """Other intrinsics, of all frames alike, with which pairs are clearly nearer; else None."""
+def other_lens(pairs: Sequence[Pair], most: float) -> OtherLens | None:
+    """Other intrinsics, of all frames alike, with which pairs are clearly nearer; else None.
+
+    most: distance up to which they are an explanation, of the diagonal.
+    """
     wide = sorted(pairs, key=lambda pair: pair.baseline)[len(pairs) // 2 :]
-    pairs = wide[:: -(-len(wide) // _LENS_PAIRS)]
+    pairs = [_thinned(pair) for pair in wide[:: -(-len(wide) // _LENS_PAIRS)]]
 
     def off(change: np.ndarray) -> float:
         return _median([_changed(pair, *change) for pair in pairs])
@@ -112,8 +119,9 @@ def other_lens(pairs: Sequence[Pair]) -> OtherLens | None:
     grid = [np.array([zoom, 0.0, 0.0]) for zoom in np.linspace(-0.6, 0.6, 9)]
     start = min(grid, key=off)
     zoomed, of_zoom = _descended(off, start, 1)
-    best, after = min((_descended(off, x, 3) for x in (start, zoomed, np.zeros(3))), key=_value)
-    if before < _CLEARLY * after or np.abs(best).max() < _LEAST_CHANGE:
+    starts = [zoomed, np.zeros(3)] if zoomed.any() else [zoomed]
+    best, after = min((_descended(off, start, 3) for start in starts), key=_value)
+    if after > most or before < _CLEARLY * after or np.abs(best).max() < _LEAST_CHANGE:
         return None
     swapped = [replace(p, intrinsics=p.intrinsics[:, [0, 1, 3, 2]]) for p in pairs]
     if (distance := _median(swapped)) * _CLEARLY <= before and distance <= _AS_GOOD * after:
@@ -121,6 +129,10 @@ def other_lens(pairs: Sequence[Pair]) -> OtherLens | None:
     if of_zoom <= _AS_GOOD * after and of_zoom * _CLEARLY <= before:
         best, after = zoomed, of_zoom
     return OtherLens(before, after, float(np.exp(best[0])), (float(best[1]), float(best[2])))
+
+
+def _thinned(pair: Pair) -> Pair:
+    return replace(pair, matches=pair.matches[:, :: -(-pair.matches.shape[1] // _LENS_MATCHES)])
 
 
 def _value(found: tuple[np.ndarray, float]) -> float:
