@@ -7,6 +7,7 @@ import numpy as np
 from qgs_datatools.decoding import DecodedScene
 from qgs_datatools.epipolar import Pair
 from qgs_datatools.findings import Finding
+from qgs_datatools.suspects import above_in_all
 
 _OBJECTS = 0.5  # masks that are whiter, as those of what moves, may be all white in some frames
 _OPPOSITE = 0.5  # of matches with another frame contradict an inverted mask; of a sound one 0.1
@@ -29,14 +30,11 @@ def matched_findings(scene: DecodedScene, pairs: Sequence[Pair]) -> Iterator[Fin
     """Masks that matches contradict: inverted ones, and those of a neighbouring frame."""
     masks = {f: r.mask for f, r in enumerate(scene.decoded) if r.mask is not None}
     masks = {frame: mask for frame, mask in masks.items() if np.ptp(mask)}
-    least: dict[int, float] = {}
-    for pair in pairs:
-        if (on := _on(masks, pair)) is not None:
-            share = float((on[0] != on[1]).mean())
-            least |= {frame: min(share, least.get(frame, 1.0)) for frame in pair.frames}
-    if inverted := [frame for frame, share in least.items() if share > _OPPOSITE]:
+    on = [(p.frames, values) for p in pairs if (values := _on(masks, p)) is not None]
+    against = [(frames, float((one != two).mean())) for frames, (one, two) in on]
+    if inverted := above_in_all(against, _OPPOSITE):
         reason = "the mask looks inverted: it is white where those of the other frames are black"
-        yield scene.finding(sorted(inverted), reason, _FIX, "warning")
+        yield scene.finding(inverted, reason, _FIX, "warning")
         masks = {frame: mask for frame, mask in masks.items() if frame not in inverted}
     for step, which in ((-1, "next"), (1, "previous")):
         both = [(_on(masks, p), _on(masks, p, step), p.frames) for p in pairs]

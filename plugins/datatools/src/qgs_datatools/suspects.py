@@ -50,22 +50,27 @@ def exchanged_poses(pairs: Sequence[Pair], most: float) -> tuple[int, int] | Non
 
 
 def frames_off(pairs: Sequence[Pair], least: float) -> list[int]:
-    """Frames far from all their partners, two at least; the worst first is left out of the rest.
+    """Frames whose pose fits none of their partners'; least: a distance up to which it does."""
+    limit = max(_FAR * better_quarter(pairs), least)
+    return above_in_all([(pair.frames, pair.distance()) for pair in pairs], limit)
 
-    least: distance up to which no pair is off, of the diagonal.
+
+def above_in_all(values: Sequence[tuple[tuple[int, int], float]], limit: float) -> list[int]:
+    """Frames of two pairs or more whose values are all above `limit`.
+
+    The worst goes first with its pairs, so that its partners are not blamed.
     """
-    limit, off = max(_FAR * better_quarter(pairs), least), list[int]()
-    left = [(pair.frames, pair.distance()) for pair in pairs]
+    off = list[int]()
     while True:
         of_frame = defaultdict[int, list[float]](list)
-        for frames, distance in left:
+        for frames, value in values:
             for frame in frames:
-                of_frame[frame].append(distance)
-        far = {f: d for f, d in of_frame.items() if len(d) > 1 and min(d) > limit}
-        if not far:
+                of_frame[frame].append(value)
+        above = {f: v for f, v in of_frame.items() if len(v) > 1 and min(v) > limit}
+        if not above:
             return sorted(off)
-        off.append(max(far, key=lambda frame: (len(far[frame]), sum(far[frame]))))
-        left = [item for item in left if off[-1] not in item[0]]
+        off.append(max(above, key=lambda frame: (len(above[frame]), sum(above[frame]))))
+        values = [item for item in values if off[-1] not in item[0]]
 
 
 def frames_of_other_channels(pairs: Sequence[Pair]) -> list[int]:
