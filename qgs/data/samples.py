@@ -64,10 +64,7 @@ class Batch:
 
 
 def held_out_frames(total: int, every: int) -> Frames:
-    """Every n-th of `total` frames, from n // 2 on, or the middle one of fewer; of two none.
-
-    0 holds none out.
-    """
+    """Every n-th of `total` frames, from n // 2 on, or the middle one of fewer; none of 2, by 0."""
     every = min(every, total)
     return tuple(range(every // 2, total, every)) if every and total > 2 else ()
 
@@ -151,7 +148,6 @@ def draw_frames(
     if scene.times is not None:
         novel = [moment for moment in span if {*moment} - {*inputs}] or span
         pool = novel[rng.integers(len(novel))]
-    # new views first, then inputs, then repetitions, so that short scenes can be used too
     targets = [*rng.permutation([frame for frame in pool if frame not in inputs])]
     targets += [*rng.permutation([frame for frame in inputs if frame in pool])]
     targets += list(rng.choice(pool, max(views.targets - len(targets), 0)))
@@ -186,9 +182,8 @@ def make_sample(
 ) -> Sample:
     """Decode frames, normalise poses in the scene's precision, mirror if asked; float32.
 
-    noise: draws `views.pose_noise`; None leaves poses as they are. depths: whether
-    views have depth maps where the scene has them; 0 in views whose pose is noisy, which no longer
-    stand where the surface was seen from.
+    noise: draws `views.pose_noise`, if given. depths: whether views have depth maps where the scene
+    has them; 0 in views whose pose is noisy, which the surface was not seen from.
     """
     world = own_world(scene, input_frames, views)
     both = views_in(world, scene, (*input_frames, *target_frames), depths)
@@ -235,12 +230,20 @@ def shaken(c2w: Tensor, angle: float, rng: np.random.Generator) -> Tensor:
 def views_in(
     world: tuple[Tensor, Tensor], scene: Scene, frames: Frames, depths: bool = False
 ) -> Views:
-    """Views (1, F) of these frames in a world as of `own_world`, float32; times are 0 to 1."""
+    """Views (1, F) of these frames in a world as of `own_world`, float32; times are 0 to 1.
+
+    Raises ValueError where all masks of `scene` are black.
+    """
     refuse_too_many(len(frames), scene)
     wanted = sorted(set(frames))
     # a frame that is input and target, or target twice, is decoded once
     order = [wanted.index(frame) for frame in frames]
     images, masks = scene.images(wanted), scene.masks(wanted)
+    black = masks is not None and not masks.numpy().any()
+    # these views alone may not show what is modelled
+    if black and not any(m.any() for i in range(len(scene)) if (m := scene.masks([i])) is not None):
+        fix = "make them white on what is modelled, or list none"
+        raise ValueError(f"all masks of scene {scene.name!r} are black: {fix}")
     surface = scene.depths(wanted) if depths else None
     if surface is not None:  # z of cameras scales with their translations
         surface = torch.from_numpy(surface.numpy()[order] * np.float32(world[1].item()))[None]
@@ -300,9 +303,8 @@ def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[T
 def auto_scale(c2w: Tensor, scene: str) -> Tensor:
     """The factor that brings what all cameras c2w (F, 4, 4) of `scene` look at to a depth of 1.
 
-    Where they look at nothing in common (see `look_at_depth`), a warning says so, and the largest
-    distance from the first camera to another one becomes 1. 0-d. Raises ValueError when all stand
-    on one point.
+    Where they look at nothing in common (see `look_at_depth`), it warns, and the largest distance
+    from the first camera becomes 1. 0-d. Raises ValueError when all stand on one point.
     """
     depth = look_at_depth(c2w)
     if depth > 0:
@@ -351,11 +353,9 @@ def collate(samples: Sequence[Sample]) -> Batch:
 
 
 def stack_views(views: Sequence[Views]) -> Views:
-    """Views (B, V) of several (b, V), on the CPU.
+    """Views (B, V) of several (b, V), on the CPU. Raises ValueError where only some have times.
 
     Masks of 1 and depths of 0 (unknown) where only others have some.
-
-    Raises ValueError where only some have times.
     """
     others: list[dict[str, Any]] = [
         {"cameras": v.cameras, "times": v.times, "target_time": v.target_time} for v in views

@@ -81,7 +81,10 @@ def test_rows_and_images_must_agree(tmp_path, photos):
         read(tmp_path)
 
 
-@pytest.mark.parametrize("content", [np.zeros((3, 15)), np.array([[None] * 17]), b"hello"])
+@pytest.mark.parametrize(
+    "content",
+    [np.zeros((3, 15)), np.array([[None] * 17]), b"hello", np.tile([1.0] * 16 + [0.5], (6, 1))],
+)
 def test_files_that_are_no_rows_are_told(tmp_path, photos, content):
     write_llff(tmp_path, photos)
     file = tmp_path / "poses_bounds.npy"

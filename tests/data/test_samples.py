@@ -55,6 +55,12 @@ def test_targets_are_novel_while_there_are_enough():
         assert len({*inputs, *targets}) == 5
 
 
+def test_only_a_scene_whose_masks_are_all_black_is_refused():
+    assert make_sample(MaskedLine(2), (0,), (0,), ViewsConfig(inputs=1), False).targets is not None
+    with pytest.raises(ValueError, match="line1"):
+        make_sample(MaskedLine(1), (0,), (0,), ViewsConfig(inputs=1), False)
+
+
 def test_normalised_poses():
     scene = Line(9)
     first = make_sample(scene, (2, 6), (4,), ViewsConfig(inputs=2, scale_factor=0.4), False)

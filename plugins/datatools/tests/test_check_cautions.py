@@ -80,7 +80,7 @@ def test_plain_photos_are_not_judged_and_that_is_told(room):
 def test_masks_that_are_missing_or_damaged(room):
     (room.path / "masks").mkdir()
     (room.path / "masks" / "1.png").write_bytes(b"no image")
-    Image.new("L", SIZE[::-1], 255).save(room.path / "masks" / "2.png")
+    Image.linear_gradient("L").resize(SIZE[::-1]).save(room.path / "masks" / "2.png")
     masks = enumerate(f"masks/{number}.png" for number in range(3))
     room.listing(lambda data: [data["frames"][i].update(mask_path=mask) for i, mask in masks])
     first, second = told(room.path, geometry=0)

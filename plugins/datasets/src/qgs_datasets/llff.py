@@ -13,7 +13,7 @@ class Llff(PhotoReader):
     """The photos by name, each with its row: 15 numbers of a (3, 5) matrix, near and far.
 
     The matrix is a camera-to-world whose axes are (down, right, back), then height, width and focal
-    length; the principal point is the middle. Near and far are not used.
+    length; the principal point is the middle. Near and far are checked, not used.
     """
 
     name = "llff"
@@ -35,7 +35,7 @@ class Llff(PhotoReader):
 
 
 def _rows(file: UPath) -> np.ndarray:
-    """(N, 17) float64. Raises ValueError for a file of something else."""
+    """(N, 17) float64. Raises ValueError for a file of something else, and for near > far."""
     try:
         with open_file(file) as opened:
             rows = load_array(opened)
@@ -45,6 +45,12 @@ def _rows(file: UPath) -> np.ndarray:
         ) from error
     if rows.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
         raise ValueError(f"{file} must have shape (N, 17), got {rows.shape}: export it again")
+    if (wrong := np.flatnonzero(~(rows[:, 15] <= rows[:, 16]))).size:
+        near, far = rows[wrong[0], 15:]
+        raise ValueError(
+            f"{file}, row {wrong[0]}: near {near:g} must be at most far {far:g}: "
+            "export it again with near and far at the end of each row"
+        )
     return rows.astype(np.float64)
 
 

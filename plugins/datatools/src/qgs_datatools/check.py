@@ -22,7 +22,11 @@ from qgs_datatools.findings import Finding, errors_of, merged
 from qgs_datatools.folders import dl3dv_scenes, photo_folders
 from qgs_datatools.geometry import TOO_FEW, Geometry, geometry_findings, judge_scene
 from qgs_datatools.indices import Held, found_indices, index_findings
+from qgs_datatools.masks import matched_findings, picture_findings
 from qgs_datatools.sources import OF_FILES, kind_of, left_out, source_scenes, sources
+
+PHOTOS, FEWEST = 400, 20
+"""Photos that are matched in all, half a second each, and in a scene at least."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,11 @@ class SceneReport:
     def errors(self) -> int:
         """Number of findings that are errors."""
         return len(errors_of(self.findings))
+
+    @property
+    def partly_judged(self) -> bool:
+        """Whether photos were left out when the cameras were judged."""
+        return self.geometry is not None and self.geometry.left_out > 0
 
     @property
     def look_at_depth(self) -> float:
@@ -150,7 +159,8 @@ def check(
     held: dict[str, list[Held]] = defaultdict(list)
     for number, candidate in enumerate(candidates):
         progress(number, len(candidates), candidate.name)
-        report = check_scene(candidate, options, with_geometry=number in judged)
+        most = max(PHOTOS // len(judged), FEWEST) if number in judged else 0
+        report = check_scene(candidate, options, most)
         scenes.append(report)
         held[report.scene].append(Held(report.split, report.numbered or None))
     summaries: list[str] = []
@@ -158,6 +168,11 @@ def check(
         findings, summary = index_findings(file, held, reported)
         general += findings
         summaries += [summary] if summary else []
+    if partly := sum(scene.partly_judged for scene in scenes):
+        notes.append(
+            f"in {partly} scene{'s' if partly > 1 else ''} only some of the photos were matched "
+            "with others; a lower --geometry judges fewer scenes by more of theirs"
+        )
     notes = [*left_out(options.format), *notes]
     return CheckReport(str(path), scenes, general, summaries, len(judged), notes)
 
@@ -204,8 +219,11 @@ def _scenes_to_judge(count: int, options: Options) -> tuple[set[int], list[str]]
     return set(places.tolist()), [f"{left} judges all"] if len({*places}) < count else []
 
 
-def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) -> SceneReport:
-    """Check one scene; every fault becomes a finding. Raises as `check`."""
+def check_scene(candidate: Candidate, options: Options, most_photos: int) -> SceneReport:
+    """Check one scene; every fault becomes a finding. Raises as `check`.
+
+    most_photos: that are matched with each other, to judge its cameras.
+    """
     name = candidate.name
     report = SceneReport(name, candidate.scene, candidate.kind, candidate.split)
     try:
@@ -238,15 +256,17 @@ def check_scene(candidate: Candidate, options: Options, *, with_geometry: bool) 
         if frame not in _frames(poses) and np.isfinite(photo.listed.c2w).all()
     ]
     sharing = list(sharing_findings(scene, placed, float32=candidate.kind == "chunks"))
-    findings = merged([*absent, *files, *sizes, *poses, *others, *sharing])
+    pictures = list(picture_findings(scene))
+    findings = merged([*absent, *files, *sizes, *poses, *others, *sharing, *pictures])
     geometry = None
-    if with_geometry:
+    if most_photos:
         faulty = _frames([*sizes, *others, *sharing])
         usable = [f for f in placed if f not in faulty and scene.decoded[f].size is not None]
-        geometry = judge_scene(scene, usable, candidate.convention)
+        geometry = judge_scene(scene, usable, candidate.convention, most_photos)
         explained = errors_of(findings) and geometry.unjudged != TOO_FEW
         if geometry.distances or not explained:
             findings += geometry_findings(scene, geometry, candidate.convention)
+        findings += matched_findings(scene, geometry.pairs)
     return replace(
         report,
         listed=len(photos) + len(missing),

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from statistics import median, median_low
 
+import numpy as np
 from PIL import Image
 
 from qgs.data.evaluation import one_line
@@ -24,13 +25,15 @@ from qgs.data.images import (
 from qgs.data.lenses import Size
 from qgs.data.photos.checks import size_problems
 from qgs.data.photos.reader import PhotoFrame
-from qgs.data.photos.turning import turned_size
+from qgs.data.photos.turning import turned, turned_size
 from qgs.wording import numbered
 from qgs_datatools.candidates import Photo
 from qgs_datatools.findings import Finding, Severity
 
 _ERRORS = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 _SMALLEST = (8, 8)  # asks JPEG for its coarsest picture: all bytes are read, few pixels are made
+_SMALL = 96  # pixels of the longer side: shows the outline of a mask
+_BLACK = 4  # of 255: a covered lens has noise
 _ROUNDING = 1.5  # pixels by which a scaled copy's sides may be off
 _CENTRED = 0.1  # of a side: how far from the middle a principal point usually lies at most
 _COPY = re.compile(r"images_\d+")
@@ -41,6 +44,7 @@ class Decoded:
     """size: (H, W), None where it cannot be decoded. digest: of the bytes. turned: by EXIF.
 
     error: text on the photo; other_errors: texts on its mask and depth map, each with a remedy.
+    black: whether nothing is to be seen. mask: scaled down to _SMALL pixels, (H, W) in [0, 1].
     """
 
     size: Size | None = None
@@ -48,6 +52,8 @@ class Decoded:
     turned: bool = False
     error: str | None = None
     other_errors: tuple[tuple[str, str], ...] = ()
+    black: bool = False
+    mask: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -91,18 +97,27 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
     try:
         data = photo.read()
         with opened_image(io.BytesIO(data)) as image:
-            size, turned = turned_size((image.height, image.width), photo.listed), False
+            size, by_exif = turned_size((image.height, image.width), photo.listed), False
+            black = False
             if not headers_only:
                 image.draft(None, _SMALLEST)
                 image.load()
-                eight_bits(image)
+                black = _is_black(eight_bits(image))
                 # EXIF may stand behind the pixels
-                turned = orientation(image) != 1 and not photo.listed.turns
+                by_exif = orientation(image) != 1 and not photo.listed.turns
     except Exception as error:  # whatever a reader raises; the other photos go on
         return Decoded(error=error_text(error))
     digest = hashlib.blake2b(data, digest_size=16).digest()
-    others = () if headers_only else tuple(_other_errors(photo, size))
-    return Decoded(size, digest, turned, other_errors=others)
+    if headers_only:
+        return Decoded(size, digest, by_exif)
+    errors, mask = _others(photo, size)
+    return Decoded(size, digest, by_exif, None, errors, black, mask)
+
+
+def _is_black(image: Image.Image) -> bool:
+    """Whether nothing of it is brighter than _BLACK, or transparent."""
+    rgba = np.array(image.resize((_SMALL, _SMALL)).convert("RGBA"))
+    return bool(rgba[..., :3].max() <= _BLACK and rgba[..., 3].min() == 255)
 
 
 def error_text(error: Exception) -> str:
@@ -110,21 +125,34 @@ def error_text(error: Exception) -> str:
     return str(error) if isinstance(error, _ERRORS) and str(error) else one_line(error)
 
 
-def _other_errors(photo: Photo, size: Size) -> Iterator[tuple[str, str]]:
-    """Faults of the mask and the depth map of a photo of `size`, and remedies."""
+def _others(photo: Photo, size: Size) -> tuple[tuple[tuple[str, str], ...], np.ndarray | None]:
+    """Faults of mask and depth map of a photo of `size`, with remedies; a sound mask, small."""
     mask, depth = photo.listed.mask, photo.listed.depth
     read_mask = photo.read_mask
     if mask is not None and photo.mask_exists and mask != photo.listed.path:
         read_mask = partial(open_mask, mask)
     read_depth = partial(open_depth, depth, 1.0) if depth is not None else None
+    errors, sound = list[tuple[str, str]](), dict[str, np.ndarray]()
     for kind, file, read in (("mask", mask, read_mask), ("depth map", depth, read_depth)):
         try:
             found = read() if read else None
             problems = () if found is None else size_problems(found.shape[:2], size)
             reasons = [f"{file or 'its mask'}: {problem.reason}" for problem in problems]
+            if found is not None and not reasons:
+                sound[kind] = found
         except Exception as error:
             reasons = [error_text(error)]
-        yield from ((reason, f"replace the {kind}") for reason in reasons)
+        errors += [(reason, f"replace the {kind}") for reason in reasons]
+    return tuple(errors), _small(sound["mask"], photo.listed) if "mask" in sound else None
+
+
+def _small(mask: np.ndarray, frame: PhotoFrame) -> np.ndarray:
+    """As `Decoded.mask`, upright; of uint8, or of a source's numbers in [0, 1]."""
+    pixels = mask if mask.dtype == np.uint8 else (255 * mask).astype(np.uint8)
+    image = turned(Image.fromarray(pixels), frame)
+    scale = min(1.0, _SMALL / max(image.size))
+    width, height = (max(1, round(side * scale)) for side in image.size)
+    return np.array(image.resize((width, height), Image.Resampling.BOX)) / 255
 
 
 def file_findings(scene: DecodedScene, listing: str) -> Iterator[Finding]:

@@ -1,8 +1,7 @@
-"""Whether a scene's poses agree with its photos, judged on a few pairs of neighbours."""
+"""Whether a scene's cameras agree with its photos, judged on pairs of neighbours."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
 
 import numpy as np
 
@@ -10,17 +9,22 @@ from qgs_datatools.conventions import Convention
 from qgs_datatools.decoding import DecodedScene
 from qgs_datatools.epipolar import MIN_MATCHES, Features, Pair, detect, match
 from qgs_datatools.findings import Finding
+from qgs_datatools.suspects import (
+    OtherLens,
+    exchanged_poses,
+    frames_of_other_channels,
+    frames_off,
+    other_lens,
+)
 
 AS_READ = "as read"  # the reading of poses that changes nothing
 SIDE = 400  # pixels on the longer side of the photos that are matched
 TOLERANCE = 0.005  # largest median distance that good poses leave, of the image's diagonal
 CLEARLY_BETTER = 3.0  # a reading whose distance is this many times smaller replaces the present one
 TOO_FEW = f"too few matches, below {MIN_MATCHES} in every pair that was tried"
-_RGB_TO_GREY = np.array([0.299, 0.587, 0.114]) / 255
-_STARTS = 5
+_RUNS = 5  # of consecutive frames, where not all are matched
 _GAPS = (8, 4, 2, 1)
 _NO_BASELINE = 1e-4  # of the cameras' extent: poses so close say nothing about their lines
-_ONE_PAIR = 3 * TOLERANCE  # a pair off by more is reported though the others agree
 _NONSENSE = 0.02  # of the diagonal: no lens or rounding explains more
 
 
@@ -31,7 +35,7 @@ class Geometry:
     distances: median over pairs of the distance of matches to epipolar lines by reading of the
     poses, fractions of the diagonal; empty where `unjudged` says why. pairs: the worst first;
     photos: both of the worst one, (H, W, 3) uint8. diagonal: of the files, in pixels. labels: what
-    messages call the photos.
+    messages call the photos. left_out: frames that were not matched.
     """
 
     distances: Mapping[str, float] = field(default_factory=dict)
@@ -40,6 +44,7 @@ class Geometry:
     photos: tuple[np.ndarray, ...] = ()
     diagonal: float = 0.0
     labels: tuple[str, ...] = ()
+    left_out: int = 0
 
     @property
     def fraction(self) -> float:
@@ -64,15 +69,16 @@ class Geometry:
         return self.fraction <= TOLERANCE and self.better is None
 
 
-def judge_scene(scene: DecodedScene, usable: Sequence[int], convention: Convention) -> Geometry:
-    """Match up to five pairs, spread over the frames that are `usable`."""
+def judge_scene(
+    scene: DecodedScene, usable: Sequence[int], convention: Convention, most: int
+) -> Geometry:
+    """Match each frame that is `usable`, of runs of at most `most`, with the next and another."""
     if len(usable) < 2:
         return Geometry(unjudged="fewer than 2 usable frames")
-    matcher = _Matcher(scene, usable)
+    matcher = _Matcher(scene, [frame for run in _runs(usable, most) for frame in run])
     if not np.ptp(matcher.centres, axis=0).any():
         return Geometry(unjudged="all cameras on one point")
-    starts = np.linspace(0, len(usable) - 2, _STARTS).round().astype(int).tolist()
-    pairs = [pair for start in dict.fromkeys(starts) for pair in islice(matcher.pairs(start), 1)]
+    pairs = matcher.pairs()
     if not pairs:
         return Geometry(unjudged=TOO_FEW)
     pairs.sort(key=lambda pair: -pair.distance())
@@ -85,7 +91,17 @@ def judge_scene(scene: DecodedScene, usable: Sequence[int], convention: Conventi
     size = scene.decoded[pairs[0].frames[0]].size
     assert size is not None
     labels = tuple(map(scene.label, pairs[0].frames))
-    return Geometry(distances, "", pairs, photos, float(np.hypot(*size)), labels)
+    left_out = len(usable) - len(matcher.frames)
+    return Geometry(distances, "", pairs, photos, float(np.hypot(*size)), labels, left_out)
+
+
+def _runs(frames: Sequence[int], most: int) -> list[Sequence[int]]:
+    """All frames, or runs of neighbours, spread over them, that together have `most`."""
+    if len(frames) <= most:
+        return [frames]
+    length = max(most // _RUNS, 2)
+    starts = np.linspace(0, len(frames) - length, most // length).astype(int)
+    return [frames[start : start + length] for start in starts]
 
 
 class _Matcher:
@@ -101,22 +117,32 @@ class _Matcher:
         """The photo as it is matched, and its intrinsics; by its number in the scene."""
         return self.scene.photos[frame].picture(self.scene.decoded[frame].size, SIDE)
 
-    def pairs(self, start: int) -> Iterator[Pair]:
-        """The frame at `start` with each of its partners that shares enough with it."""
-        return filter(None, (self.pair(start, place) for place in self.partners(start)))
+    def pairs(self) -> list[Pair]:
+        """Each frame with the next one, and with the first of its partners that shares enough."""
+        found: dict[frozenset[int], Pair | None] = {}
+        for start in range(len(self.frames)):
+            partners = list(self.partners(start))
+            for group in ([p for p in partners if p == start + 1], partners):
+                for place in group:
+                    both = frozenset((start, place))
+                    if both not in found:
+                        found[both] = self.pair(min(both), max(both))
+                    if found[both]:
+                        break
+        return [*filter(None, found.values())]
 
     def pair(self, first: int, second: int) -> Pair | None:
         """None where too little is shared."""
         for place in {first, second} - self._features.keys():
             picture, intrinsics = self.picture(self.frames[place])
             height, width, _ = picture.shape
-            self._features[place] = detect(picture @ _RGB_TO_GREY), intrinsics, (height, width)
+            self._features[place] = detect(picture), intrinsics, (height, width)
         (one, k1, size), (two, k2, _) = self._features[first], self._features[second]
         matches = match(one, two)
         if matches is None:
             return None
         frames, poses = (self.frames[first], self.frames[second]), self.poses[[first, second]]
-        return Pair(frames, matches, poses, np.stack([k1, k2]), size)
+        return Pair(frames, *matches, poses, np.stack([k1, k2]), size)
 
     def partners(self, start: int) -> Iterator[int]:
         """Places of frames that may see the same: along the listing, then near in space."""
@@ -150,18 +176,48 @@ def geometry_findings(
         after = geometry.distances[geometry.better] * geometry.diagonal
         reason = f"{misreading.reason} ({off}; {after:.1f} when read so)"
         yield scene.finding(frames, reason, misreading.fix)
+    elif both := exchanged_poses(geometry.pairs, TOLERANCE):
+        reason = "their poses look exchanged: with each other's they fit those of the other frames"
+        yield scene.finding(both, reason, "exchange the two poses, or the two photos")
+    elif lens := other_lens(geometry.pairs, TOLERANCE):
+        yield _of_lens(scene, geometry, lens)
     elif not geometry.agrees:
         reason = f"the poses do not explain the photos ({off}), nor in another convention"
         fix = "check that poses and photos are in the same order, and the intrinsics"
         moves = len({photo.listed.time for photo in scene.photos}) > 1  # and what moves lies off
         severity = "error" if geometry.fraction > _NONSENSE and not moves else "warning"
         yield scene.finding(frames, reason, fix, severity)
+    elif off_frames := frames_off(geometry.pairs, TOLERANCE):
+        reason = "the pose does not fit those of the other frames"
+        fix = "check that it belongs to the photo, correct it, or remove the frame"
+        yield scene.finding(off_frames, reason, fix, "warning")
+    if channels := frames_of_other_channels(geometry.pairs):
+        reason = "red and blue look exchanged: what other photos show too has their colours so"
+        yield scene.finding(channels, reason, "write the photo as RGB, not as BGR", "warning")
+
+
+def _of_lens(scene: DecodedScene, geometry: Geometry, lens: OtherLens) -> Finding:
+    """A finding on intrinsics that do not fit the photos, and on those that do."""
+    pair, scale = geometry.pairs[0], geometry.diagonal / np.hypot(*geometry.pairs[0].size)
+    fx, _, cx, cy = scale * pair.intrinsics[0]
+    change = scale * max(pair.size) * np.array(lens.shift)
+    off = (
+        f"matches lie {lens.before * geometry.diagonal:.1f} pixels from their epipolar lines, "
+        f"and {lens.after * geometry.diagonal:.1f}"
+    )
+    if lens.exchanged:
+        reason = f"cx and cy look exchanged ({off} with cx {cy:.0f}, cy {cx:.0f})"
+        fix = "exchange them"
+    elif not change.any():
+        reason = f"the focal lengths do not fit the photos ({off} with {lens.zoom:.2f} times them)"
+        fix = "correct them, or the size that goes with them; photos that were cut have other ones"
     else:
-        for pair in geometry.pairs:
-            if (distance := pair.distance()) > _ONE_PAIR:
-                reason = (
-                    "the two poses do not fit each other: matches lie "
-                    f"{distance * geometry.diagonal:.1f} pixels from their epipolar lines"
-                )
-                fix = "correct the pose of one of them, or remove it"
-                yield scene.finding(pair.frames, reason, fix, "warning")
+        x, y = np.array([cx, cy]) + change
+        reason = (
+            f"the intrinsics do not fit the photos ({off} with a focal length of "
+            f"{fx * lens.zoom:.0f} instead of {fx:.0f} and a principal point ({x:.0f}, {y:.0f}) "
+            f"instead of ({cx:.0f}, {cy:.0f}))"
+        )
+        fix = "give those of the photos as they are; cutting moves cx and cy, scaling changes all"
+    severity = "error" if geometry.fraction > TOLERANCE else "warning"
+    return scene.finding(range(len(scene.photos)), reason, fix, severity)
