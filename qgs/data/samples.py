@@ -148,6 +148,7 @@ def draw_frames(
     if scene.times is not None:
         novel = [moment for moment in span if {*moment} - {*inputs}] or span
         pool = novel[rng.integers(len(novel))]
+    # new views first, then inputs, then repetitions, so that short scenes can be used too
     targets = [*rng.permutation([frame for frame in pool if frame not in inputs])]
     targets += [*rng.permutation([frame for frame in inputs if frame in pool])]
     targets += list(rng.choice(pool, max(views.targets - len(targets), 0)))
