@@ -189,8 +189,7 @@ def load_text(
     return MapNode(Origin(file, number))
 
 
-# Files that many recipes extend are parsed once.
-_composed = lru_cache(maxsize=128)(partial(yaml.compose, Loader=Yaml12Loader))
+_composed = lru_cache(maxsize=128)(partial(yaml.compose, Loader=Yaml12Loader))  # bases of many
 
 
 class _Reader:

@@ -1,5 +1,6 @@
 """Gaussians as files: PLY of the 3DGS release, and formats that distributions add."""
 
+import re
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -100,15 +101,18 @@ def load_ply(path: str | Path) -> Gaussians:
         raise FileNotFoundError(f"no file at {path}")
     try:
         with open(path, "rb") as start:
-            if b"end_header" not in start.read(_HEADER):
-                raise ValueError(f"its header has no end within {_HEADER:,} bytes")
+            header, end, _ = start.read(_HEADER).partition(b"end_header")
+        counts = map(int, re.findall(rb"element\s+\S+\s+(\d{1,99})", header))
+        if not end or max(counts, default=0) > Path(path).stat().st_size:  # else memory goes first
+            raise ValueError(f"its header is not whole in {_HEADER:,} bytes, or promises too much")
         file = PlyData.read(str(path))
     except (PlyHeaderParseError, PlyElementParseError, ValueError, MemoryError) as error:
         raise ValueError(
             f"{path} is no whole PLY file ({error}); give one as `qgs reconstruct` writes it"
         ) from error
     found = {element.name: element for element in file.elements}
-    names = found["vertex"].data.dtype.names if "vertex" in found else ()
+    kinds = (found["vertex"].data.dtype.fields if "vertex" in found else None) or {}
+    names = [name for name, kind in kinds.items() if not kind[0].hasobject]  # no lists
     if missing := [name for name in NEEDED if name not in names]:
         kind = "a compressed PLY" if "chunk" in found else "no PLY of Gaussians"
         raise ValueError(

@@ -140,6 +140,7 @@ BROKEN = {
     "a pose cut off": ("images.bin", 60),
     "points cut off": ("images.bin", 110),
     "an image cut off": ("images.bin", 200),
+    "the last point cut off": ("images.bin", -1),
     "a camera cut off": ("cameras.bin", 40),
     "an unknown camera": ("cameras.bin", struct.pack("<QIiQQ3d", 1, 7, 99, 40, 30, 1, 1, 1)),
     "no image in text": ("images.txt", b"1 1 0 0 0 0 0 1 a.png\n\n"),

@@ -181,6 +181,8 @@ def test_other_files_are_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "twice.ply").write_bytes(whole.replace(b"float nx", b"float x"))
     comments = whole.replace(b"element", b"comment x\n" * 10_000 + b"element")
     (tmp_path / "long.ply").write_bytes(comments)
+    faces = b"element face 100000000\nproperty list uint float v\nend_header"
+    (tmp_path / "faces.ply").write_bytes(whole.replace(b"end_header", faces))
     zeros = random_gaussians(3)
     save_ply(replace(zeros, quats=zeros.quats * 0), tmp_path / "no_rotation.ply")
     save_ply(replace(zeros, scales=zeros.scales * 0 + 3e38), tmp_path / "large.ply")
@@ -188,7 +190,7 @@ def test_other_files_are_refused_by_name(tmp_path: Path) -> None:
     large[-28:-24] = np.float32(200).tobytes()  # a logarithm whose exponential overflows
     (tmp_path / "large.ply").write_bytes(large)
     names = ("points", "compressed", "cut", "noise", "empty", "negative", "promise", "text")
-    for name in (*names, "twice", "long", "no_rotation", "large"):
+    for name in (*names, "twice", "long", "faces", "no_rotation", "large"):
         with pytest.raises(ValueError, match=rf"{name}\.ply"):
             load_ply(tmp_path / f"{name}.ply")
     os.mkfifo(tmp_path / "pipe.ply")  # reading it would wait for a writer

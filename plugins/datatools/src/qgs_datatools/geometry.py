@@ -188,11 +188,15 @@ def geometry_findings(
         severity = "error" if geometry.fraction > _NONSENSE and not moves else "warning"
         yield scene.finding(frames, reason, fix, severity)
     elif off_frames := frames_off(geometry.pairs, TOLERANCE):
-        reason = "the pose does not fit those of the other frames"
+        reason = "the pose or the intrinsics do not fit those of the other frames"
         fix = "check that it belongs to the photo, correct it, or remove the frame"
         yield scene.finding(off_frames, reason, fix, "warning")
     if channels := frames_of_other_channels(geometry.pairs):
-        reason = "red and blue look exchanged: what other photos show too has their colours so"
+        every = {frame for pair in geometry.pairs for frame in pair.frames}
+        which = ", or in all others" if 2 * len(channels) == len(every) else ""
+        reason = (
+            f"red and blue look exchanged{which}: what other photos show too has their colours so"
+        )
         yield scene.finding(channels, reason, "write the photo as RGB, not as BGR", "warning")
 
 

@@ -105,7 +105,7 @@ def _copy(url: str, file: Path) -> None:
                 raise OSError(errno.ENOSPC, f"of {with_unit(announced)}")
             if len(start) == 9 and start[8:] != b"{":  # where the header of safetensors begins
                 is_page = start.lstrip().startswith(b"<")
-                what = "a web page: use the URL of the file, or log in" if is_page else "another"
+                what = "a web page: use the URL of the file, or log in" if is_page else "other data"
                 raise OSError(f"what the server sends is no safetensors file but {what}")
             local.write(part)
     if done < announced:

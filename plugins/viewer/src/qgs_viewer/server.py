@@ -63,7 +63,7 @@ def foreign(headers: Headers, host: str) -> bool:
     if origin is not None and urlsplit(origin).netloc != named:
         return True
     name = urlsplit(f"//{named}").hostname or ""
-    if name in {"localhost", host, socket.gethostname().lower()}:
+    if name in {"localhost", host.lower(), socket.gethostname().lower()}:
         return False
     try:
         ipaddress.ip_address(name)
@@ -77,8 +77,9 @@ def _guarded(serve: Any, host: str, *where: Any, process_request: Any, **options
 
     def checked(connection: Any, request: Any) -> Response | None:
         if foreign(request.headers, host):
-            status = http.HTTPStatus.FORBIDDEN
-            return Response(status, status.phrase, Headers({"Content-Length": "0"}), b"")
+            status, text = http.HTTPStatus.FORBIDDEN, b"Open the address that qgs view printed.\n"
+            length = Headers({"Content-Length": str(len(text))})
+            return Response(status, status.phrase, length, text)
         return process_request(connection, request)
 
     return serve(*where, process_request=checked, **options)
