@@ -189,7 +189,7 @@ def load_text(
     return MapNode(Origin(file, number))
 
 
-_composed = lru_cache(maxsize=128)(partial(yaml.compose, Loader=Yaml12Loader))  # bases of many
+_composed = lru_cache(maxsize=128)(partial(yaml.compose, Loader=Yaml12Loader))  # parses bases once
 
 
 class _Reader:

@@ -13,7 +13,7 @@ from upath import UPath
 
 from qgs.data.photos import read_listing, readers
 from qgs.geometry.poses import look_at_depth
-from qgs.wording import listed
+from qgs.wording import counted, listed
 from qgs_datatools.cameras import camera_findings, sharing_findings
 from qgs_datatools.candidates import Candidate
 from qgs_datatools.chunks import chunk_folders
@@ -170,7 +170,7 @@ def check(
         summaries += [summary] if summary else []
     if partly := sum(scene.partly_judged for scene in scenes):
         notes.append(
-            f"in {partly} scene{'s' if partly > 1 else ''} only some of the photos were matched "
+            f"in {counted(partly, 'scene')} only some of the photos were matched "
             "with others; a lower --geometry judges fewer scenes by more of theirs"
         )
     notes = [*left_out(options.format), *notes]

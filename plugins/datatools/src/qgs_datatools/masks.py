@@ -21,24 +21,22 @@ def picture_findings(scene: DecodedScene) -> Iterator[Finding]:
     """Black photos, and masks that are all black or all white."""
     if black := [frame for frame, result in enumerate(scene.decoded) if result.black]:
         yield scene.finding(black, "the image is black", "replace it, or remove the frame")
-    masks = {f: r.mask for f, r in enumerate(scene.decoded) if r.mask is not None}
-    white = {frame: float(mask.mean()) for frame, mask in masks.items()}
-    yield from _blank(scene, white)
+    yield from _blank(scene, {frame: float(mask.mean()) for frame, mask in _masks(scene).items()})
 
 
 def matched_findings(scene: DecodedScene, pairs: Sequence[Pair]) -> Iterator[Finding]:
     """Masks that matches contradict: inverted ones, and those of a neighbouring frame."""
-    masks = {f: r.mask for f, r in enumerate(scene.decoded) if r.mask is not None}
-    masks = {frame: mask for frame, mask in masks.items() if np.ptp(mask)}
+    masks = {frame: mask for frame, mask in _masks(scene).items() if np.ptp(mask)}
     on = [(p.frames, values) for p in pairs if (values := _on(masks, p)) is not None]
     against = [(frames, float((one != two).mean())) for frames, (one, two) in on]
     if inverted := above_in_all(against, _OPPOSITE):
         reason = "the mask looks inverted: it is white where those of the other frames are black"
         yield scene.finding(inverted, reason, _FIX, "warning")
         masks = {frame: mask for frame, mask in masks.items() if frame not in inverted}
+    own_on = [(p, values) for p in pairs if (values := _on(masks, p)) is not None]
     for step, which in ((-1, "next"), (1, "previous")):
-        both = [(_on(masks, p), _on(masks, p, step), p.frames) for p in pairs]
-        known = [(own, other, f) for own, other, f in both if own is not None and other is not None]
+        shifted = [(own, _on(masks, p, step), p.frames) for p, own in own_on]
+        known = [(own, other, f) for own, other, f in shifted if other is not None]
         wrong, fewer = (
             sum(int((values[0] != values[1]).sum()) for values in group)
             for group in ([own for own, _, _ in known], [other for _, other, _ in known])
@@ -48,13 +46,21 @@ def matched_findings(scene: DecodedScene, pairs: Sequence[Pair]) -> Iterator[Fin
             reason = f"the mask fits the {which} photo better than its own"
             fix = "check that masks and photos are in the same order"
             yield scene.finding(frames, reason, fix, "warning")
-    on = [(float(masks[p.frames[0]].mean()), x) for p in pairs if (x := _on(masks, p)) is not None]
     ring = [np.concatenate([m[0], m[-1], m[:, 0], m[:, -1]]).mean() for m in masks.values()]
-    if on and np.median(ring) > _BORDER:
-        static = [(~x).mean() / (1 - white) / max(x.mean() / white, 1e-6) for white, x in on]
+    if own_on and np.median(ring) > _BORDER:
+        white = [float(masks[pair.frames[0]].mean()) for pair, _ in own_on]
+        static = [
+            (~values).mean() / (1 - share) / max(values.mean() / share, 1e-6)
+            for share, (_, values) in zip(white, own_on, strict=True)
+        ]
         if np.median(static) > _STATIC:
             reason = "the masks look inverted: they are black inside, on what stands still"
             yield scene.finding([*masks], reason, _FIX, "warning")
+
+
+def _masks(scene: DecodedScene) -> dict[int, np.ndarray]:
+    """Sound masks by frame, as `Decoded.mask`."""
+    return {f: r.mask for f, r in enumerate(scene.decoded) if r.mask is not None}
 
 
 def _on(masks: Mapping[int, np.ndarray], pair: Pair, step: int = 0) -> np.ndarray | None:

@@ -50,22 +50,24 @@ def checkpoint(url: str) -> Path:
         if time.time() - leftover.stat().st_mtime > PATIENCE:  # else it may go on
             leftover.unlink(missing_ok=True)
     kept = "not downloaded again (delete the file to do so); it was kept as"
-    if file.is_file() and not _is_whole(file, written):
+    digest = _digest(file) if file.is_file() else ""
+    if digest and not _is_whole(file, digest, written):
         print(f"{file} is damaged and is downloaded again", file=sys.stderr)
         file.unlink()
-    if not file.is_file():
+        digest = ""
+    if not digest:
         _download(url, file)
-        written.write_text(_digest(file), encoding="utf-8")
+        written.write_text(digest := _digest(file), encoding="utf-8")
         kept = "kept as"
-    print(f"{name}: sha256 {_digest(file)}, {kept} {file}", file=sys.stderr)
+    print(f"{name}: sha256 {digest}, {kept} {file}", file=sys.stderr)
     return file
 
 
-def _is_whole(file: Path, written: Path) -> bool:
-    """Whether `file` is safetensors, and that of the digest in `written`, if there is one."""
+def _is_whole(file: Path, digest: str, written: Path) -> bool:
+    """Whether `file` is safetensors, and its digest the one in `written`, if there is one."""
     try:
         with safe_open(file, "pt"):  # its header holds the size
-            return not written.is_file() or written.read_bytes() == _digest(file).encode()
+            return not written.is_file() or written.read_bytes() == digest.encode()
     except SafetensorError:
         return False
 
