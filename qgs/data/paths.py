@@ -48,7 +48,9 @@ def listing(folder: UPath) -> list[UPath]:
 
 
 def open_file(path: Path | UPath) -> IO[bytes]:
-    """`path`, open for reading bytes. Raises as `read_file`, which reads what is not local."""
+    """`path`, open for reading bytes. Raises OSError, and as `read_file` what is not local."""
+    if is_local(path) and path.is_fifo():  # opening it would wait for somebody who writes
+        raise OSError(f"{path} is a pipe")
     # decoders seek to and fro, and each seek would be a request to a store
     return path.open("rb") if is_local(path) else io.BytesIO(read_file(path))
 
@@ -56,7 +58,7 @@ def open_file(path: Path | UPath) -> IO[bytes]:
 def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
     """The bytes of `path`. Raises OSError for more than `most`, and for a damaged archive."""
     try:
-        with path.open("rb") as file:
+        with open_file(path) if is_local(path) else path.open("rb") as file:
             content: bytes = file.read(most + 1)  # of an archive, whose header may promise less
     except _DAMAGED as error:
         raise OSError(f"{path} is damaged: {error}") from error

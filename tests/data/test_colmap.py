@@ -128,45 +128,46 @@ def test_models_that_pycolmap_writes(tmp_path):
 def test_quaternions_are_normalised(tmp_path):
     photos = synthetic(tmp_path / "photos", 2)
     folder = write_colmap(tmp_path, photos, "text")
-    file = folder / "sparse" / "0" / "images.txt"
-    pose = world_to_camera(photos.c2w[0])
-    longer = [1.05 * q for q in pose[:4]] + list(pose[4:])
-    file.write_text(f"1 {' '.join(map(str, longer))} 7 view_000.png\n\n")
+    longer = np.multiply(world_to_camera(photos.c2w[0]), [1.05] * 4 + [1] * 3)
+    line = f"1 {' '.join(map(str, longer))} 7 view_000.png\n\n"
+    (folder / "sparse" / "0" / "images.txt").write_text(line)
     np.testing.assert_allclose(frames(folder)[0].c2w, photos.c2w[0], atol=1e-9)
 
 
 BROKEN = {
-    "no count": ("images.bin", 4),
-    "a pose cut off": ("images.bin", 60),
-    "points cut off": ("images.bin", 110),
-    "an image cut off": ("images.bin", 200),
-    "the last point cut off": ("images.bin", -1),
-    "a camera cut off": ("cameras.bin", 40),
-    "an unknown camera": ("cameras.bin", struct.pack("<QIiQQ3d", 1, 7, 99, 40, 30, 1, 1, 1)),
-    "no image in text": ("images.txt", b"1 1 0 0 0 0 0 1 a.png\n\n"),
-    "no number": ("images.txt", b"1 1 0 0 0 zero 0 1 7 a.png\n\n"),
-    "a quaternion of length 3": ("images.txt", b"1 3 0 0 0 0 0 1 7 a.png\n\n"),
-    "no rotation": ("images.txt", b"1 0 0 0 0 0 0 1 7 a.png\n\n"),
-    "digits of Python": ("images.txt", b"1 1 0 0 0 1_000 0 1 7 a.png\n\n"),
-    "a camera of Python": ("cameras.txt", b"7 PINHOLE 4_0 30 50 52 19 16\n"),
-    "fewer images than there are": ("images.bin", {0: 1}),
-    "fewer cameras than there are": ("cameras.bin", {0: 0}),
-    "no such camera": ("images.txt", b"1 1 0 0 0 0 0 1 8 a.png\n\n"),
+    "no count": ("images.bin", lambda whole: whole[:4]),
+    "a pose cut off": ("images.bin", lambda whole: whole[:60]),
+    "points cut off": ("images.bin", lambda whole: whole[:110]),
+    "an image cut off": ("images.bin", lambda whole: whole[:200]),
+    "the last point cut off": ("images.bin", lambda whole: whole[:-1]),
+    "a camera cut off": ("cameras.bin", lambda whole: whole[:40]),
+    "an unknown camera": (
+        "cameras.bin",
+        lambda _: struct.pack("<QIiQQ3d", 1, 7, 99, 40, 30, 1, 1, 1),
+    ),
+    "no image in text": ("images.txt", lambda _: b"1 1 0 0 0 0 0 1 a.png\n\n"),
+    "an image twice": ("images.txt", lambda _: b"1 1 0 0 0 0 0 1 7 a.png\n\n" * 2),
+    "no points": ("images.txt", lambda _: b"1 1 0 0 0 0 0 1 7 a.png\n2 1 0 0 0 0 0 1 7 b.png\n"),
+    "no number": ("images.txt", lambda _: b"1 1 0 0 0 zero 0 1 7 a.png\n\n"),
+    "a quaternion of length 3": ("images.txt", lambda _: b"1 3 0 0 0 0 0 1 7 a.png\n\n"),
+    "no rotation": ("images.txt", lambda _: b"1 0 0 0 0 0 0 1 7 a.png\n\n"),
+    "digits of Python": ("images.txt", lambda _: b"1 1 0 0 0 1_000 0 1 7 a.png\n\n"),
+    "a camera of Python": ("cameras.txt", lambda _: b"7 PINHOLE 4_0 30 50 52 19 16\n"),
+    "a camera twice": ("cameras.txt", lambda _: b"7 PINHOLE 40 30 50 52 19 16\n" * 2),
+    "fewer images than there are": ("images.bin", lambda whole: b"\1" + whole[1:]),
+    "fewer cameras than there are": ("cameras.bin", lambda whole: b"\0" + whole[1:]),
+    "no such camera": ("images.txt", lambda _: b"1 1 0 0 0 0 0 1 8 a.png\n\n"),
 }
-"""A file of the model, and its size, its content or bytes of it."""
+"""A file of the model, and its content by that of a whole one."""
 
 
 @pytest.mark.parametrize("what", BROKEN)
 def test_broken_models_are_told(tmp_path, what):
-    name, content = BROKEN[what]
+    name, change = BROKEN[what]
     kind = "text" if name.endswith("txt") else "binary"
     folder = write_colmap(tmp_path, synthetic(tmp_path / "photos", 2), kind)
     file = folder / "sparse" / "0" / name
-    changed = bytearray(file.read_bytes())
-    for place, byte in content.items() if isinstance(content, dict) else ():
-        changed[place] = byte
-    changed = changed[:content] if isinstance(content, int) else changed
-    file.write_bytes(content if isinstance(content, bytes) else changed)
+    file.write_bytes(change(file.read_bytes()))
     with pytest.raises(ValueError, match=r"sparse/0"):
         read(folder)
 

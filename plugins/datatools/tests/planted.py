@@ -7,6 +7,7 @@ import numpy as np
 import photo_formats
 import torch
 from qgs_datatools.check import Options, check
+from qgs_datatools.findings import Finding
 from textured_room import INTRINSICS, SIZE
 from upath import UPath
 
@@ -57,10 +58,13 @@ def save(root, content) -> None:
         torch.save(content, file)
 
 
-def told(path, index=(), geometry: int = 1) -> list[str]:
+def findings(path, index=(), geometry: int = 1) -> list[Finding]:
     options = Options(geometry=geometry, threads=2)
-    report = check(UPath(path), options, [UPath(file) for file in index])
-    return [str(finding) for finding in report.findings]
+    return check(UPath(path), options, [UPath(file) for file in index]).findings
+
+
+def told(path, index=(), geometry: int = 1) -> list[str]:
+    return [str(finding) for finding in findings(path, index, geometry)]
 
 
 class Copy:

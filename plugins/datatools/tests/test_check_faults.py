@@ -1,6 +1,7 @@
 """Each planted fault is found as exactly one line; the untouched sets pass without any."""
 
 import json
+import os
 from fnmatch import fnmatchcase
 
 import numpy as np
@@ -40,6 +41,11 @@ def resized(size):
 def truncated_file(room, shots):
     file = room.path / "images" / "2.jpg"
     file.write_bytes(file.read_bytes()[:-400])
+
+
+def pipe(room, shots):
+    (room.path / "images" / "2.jpg").unlink()
+    os.mkfifo(room.path / "images" / "2.jpg")
 
 
 def pose(frame, changed):
@@ -94,6 +100,7 @@ IN_A_FOLDER = {
         pose(4, lambda c2w, shots: c2w * np.nan),
         "frame 4 (images/4.jpg): the pose has NaN*",
     ),
+    "a pipe": (pipe, "frame 2 (images/2.jpg): *is a pipe*"),
     "duplicate pose": (
         pose(5, lambda c2w, shots: shots[2].c2w @ FLIP),
         "frame 5 (images/5.jpg): the pose repeats that of frame 2 (images/2.jpg)*",

@@ -113,13 +113,25 @@ def test_failures(kind: str, cause: str, server: str, cache: Path, capsys) -> No
     assert "p%40ss" not in printed
     assert "hidden" not in printed
     assert caught.value.__suppress_context__
-    assert files(cache) == []
+    assert [*cache.iterdir()] == []
     assert printed.count("the download ends in") == (4 if cause.endswith("0.2 s") else 0)
 
 
 def test_no_server() -> None:
     with pytest.raises(OSError, match=r"nothing was kept: .*refused"):
         checkpoint_path("http://127.0.0.1:9/a.safetensors")
+
+
+@pytest.mark.parametrize("name", ["", "..", "a" * 300, "%2e%2e"])
+def test_any_name_is_kept_in_a_folder_of_the_cache(name, server, model, cache) -> None:
+    file = checkpoint_path(f"http://{server}/whole/{name}")
+    assert file.read_bytes() == model
+    assert file.parent.parent == cache
+
+
+def test_no_url() -> None:
+    with pytest.raises(OSError, match="no URL"):
+        checkpoint_path("https://[::1/a.safetensors")
 
 
 def test_passwords_are_sent_and_never_printed(server: str, model: bytes, capsys) -> None:
@@ -165,6 +177,8 @@ def test_leftovers_of_killed_downloads_are_removed(server: str, cache: Path) -> 
     [
         ("https://me:pass@host:80/a?b=1", "https://***@host:80/a?b=1"),
         ("sftp://me:p@ss@host/a", "sftp://***@host/a"),
+        ("sftp://me:p/s?s#w@host/a", "sftp://***@host/a"),
+        ("https://host/a#access_token=b", "https://host/a#access_token=***"),
         ("at https://host/a?x=1&X-Amz-Signature=b&y=2", "at https://host/a?x=1&X-Amz-Signature=***&y=2"),
         ("simplecache::https://me:pass@host/a?token=b", "simplecache::https://***@host/a?token=***"),
         ("s3://bucket/a@b", "s3://bucket/a@b"),

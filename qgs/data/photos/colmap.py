@@ -57,10 +57,12 @@ class Colmap(PhotoReader):
         model, suffix = next(_models(folder))
         read_cameras, read_images = _READ[suffix]
         try:
-            cameras = {number: _camera(*camera) for number, camera in read_cameras(model)}
+            listed = [*read_cameras(model)]
+            cameras = {number: _camera(*camera) for number, camera in listed}
             posed = [(name, _c2w(*pose), camera) for name, pose, camera in read_images(model)]
-            unknown = {camera for *_, camera in posed} - cameras.keys()
-            if unknown:
+            if len(cameras) + len({name for name, *_ in posed}) < len(listed) + len(posed):
+                raise ValueError("a camera or an image is listed twice")
+            if unknown := {camera for *_, camera in posed} - cameras.keys():
                 raise ValueError(f"images are of cameras {sorted(unknown)}, which are not in it")
         except ValueError as error:
             raise ValueError(
@@ -100,24 +102,21 @@ def _text_cameras(model: UPath) -> Iterator[Camera]:
 
 
 def _text_images(model: UPath) -> Iterator[Image]:
-    for line in _lines(model / "images.txt", after=1):  # a line of points follows each image
+    for line in _lines(model / "images.txt", points=True):
         number, *fields = line.split(maxsplit=9)
         if len(fields) != 9 or not number.isdecimal() or "_" in "".join(fields[:8]):
-            raise ValueError(
-                f"images.txt has the line {line[:60]!r} where an image was expected: 9 numbers "
-                "and a name, then a line of points, which may be empty"
-            )
+            raise ValueError(f"images.txt has {line[:60]!r} in place of 9 numbers and a name")
         yield fields[8], [*map(float, fields[:7])], int(fields[7])
 
 
-def _lines(file: UPath, after: int = 0) -> Iterator[str]:
-    """Content lines of a file without comments; skips `after` lines following each."""
+def _lines(file: UPath, points: bool = False) -> Iterator[str]:
+    """Content lines of a file without comments; after each a line of `points` is skipped."""
     with io.TextIOWrapper(open_file(file), encoding="utf-8") as lines:
         for line in lines:
             if (line := line.strip()) and not line.startswith("#"):
                 yield line
-                for _ in range(after):
-                    next(lines, None)
+                if points and len(next(lines, "").split()) % 3:  # x, y, number of each point
+                    raise ValueError(f"{file.name} has no line of points after {line[:60]!r}")
 
 
 def _binary_cameras(model: UPath) -> Iterator[Camera]:

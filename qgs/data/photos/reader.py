@@ -113,7 +113,6 @@ def existing(paths: Iterable[UPath]) -> set[UPath]:
         by_folder.setdefault(str(path.parent), []).append(path)
     held: set[UPath] = set()
     for inside in by_folder.values():
-        # one request for a folder; asking a store for each photo takes minutes
         names = {item.name for item in listing(inside[0].parent)}
         held.update(path for path in inside if path.name in names)
     return held

@@ -54,7 +54,7 @@ class PhotosConfig(SceneSource.Config):
     images: str | None = None
     """Folder of photos to read instead of the listed one, such as images_4."""
     outside: bool = False
-    """Read photos outside of the folder too, which a listing names by absolute paths or `..`."""
+    """Read photos outside of the folder too, by absolute paths or `..`; links are followed."""
     holdout: int = Field(default=8, ge=0)
     """Every n-th frame is kept for evaluation, from frame n // 2 on, or the middle one of fewer; 0
     for none. A listing's own split goes first."""

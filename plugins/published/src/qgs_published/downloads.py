@@ -44,8 +44,13 @@ def checkpoint(url: str) -> Path:
     """
     cache = Path(os.environ.get("QGS_CACHE") or "~/.cache/qgs").expanduser()
     key = hashlib.sha256(url.encode()).hexdigest()[:16]
-    file = cache / key / (PurePosixPath(urlsplit(url).path).name or "checkpoint")
-    written, name = file.with_name(f"{file.name}.sha256"), without_secrets(url)
+    name = without_secrets(url)
+    try:
+        last = PurePosixPath(urlsplit(url).path).name
+    except ValueError as error:
+        raise OSError(f"{name} is no URL: {error}") from None
+    file = cache / key / (last.strip(".")[-50:] or "checkpoint")  # a name may have 255 bytes
+    written = file.with_name(f"{file.name}.sha256")
     for leftover in filter(is_leftover, cache.glob("*/.*.tmp")):
         if time.time() - leftover.stat().st_mtime > PATIENCE:  # else it may go on
             leftover.unlink(missing_ok=True)
@@ -85,6 +90,8 @@ def _download(url: str, file: Path) -> None:
             with safe_open(temporary, "pt"):
                 pass
     except Exception as error:  # whatever the file system of the URL raises
+        with suppress(OSError):  # it holds something
+            file.parent.rmdir()
         cause = without_secrets(str(getattr(error, "reason", error))) or type(error).__name__
         if isinstance(error, HTTPError):
             fix = _FIXES.get(error.code, "try again later")
