@@ -43,8 +43,8 @@ JUDGED = ("data", "views", "evaluation", "metrics")
 TRAINED = ("optimizer", "training")
 """Sections of recipes that must be equal, so that only the models differ."""
 OF_THE_METHOD = (
-    "optimizer.parts", "training.judge_inputs", "evaluation.tuning", "views.scale",
-    "views.scale_factor",
+    "optimizer.parts", "training.judge_inputs", "evaluation.tuning", "evaluation.tuning_rate",
+    "views.scale", "views.scale_factor",
 )  # fmt: skip
 """Options in them that may differ: how a method trains, tuning, which nobody does here, and the
 unit of a model's world, which no score depends on."""

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from qgs_viewer.contest import Entry
     from qgs_viewer.report import Report
 
-MODELS = ("rooms/tokengs-64", "rooms/locus-64")
+MODELS = ("rooms/tokengs-64", "rooms/locus-64", "rooms/landmark-64")
 RECIPES = ("recipes/tiny/tokengs.yaml", "recipes/tiny/locus.yaml")
 
 app = typer.Typer(help="Trained models on unseen rooms, or on your photos.")
@@ -46,7 +46,7 @@ def demo(
     ] = None,
     models: Annotated[
         list[str] | None,
-        typer.Option("--model", help="Trained model, as in qgs eval; repeatable; default: two."),
+        typer.Option("--model", help="Trained model, as in qgs eval; repeatable; default: three."),
     ] = None,
     train: Annotated[
         bool, typer.Option("--train", help="Train and compare recipes instead, the tiny two.")

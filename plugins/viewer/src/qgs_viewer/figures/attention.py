@@ -191,9 +191,9 @@ def nodes_of(shown: Exhibit, layer: int) -> Tensor:
 
 
 def _parts(shown: Exhibit) -> list[str]:
-    found = shown.look.self_attention(0, shown.look.depth)
-    assert found is not None
-    return ["weights"] if found.geometry is None else list(PARTS)
+    layers = chosen_layers(shown.look.depth, SELF_LAYERS)
+    found = [shown.look.self_attention(0, layer) for layer in layers]
+    return list(PARTS) if all(one and one.geometry is not None for one in found) else ["weights"]
 
 
 def _graph(
