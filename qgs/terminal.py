@@ -6,8 +6,10 @@ from collections.abc import Iterable
 from typing import Any, TextIO
 
 _RAW = "[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
-_USER = r"(?<=://)(?:[^\s/?#@:]*:\S*|[^\s/?#]*)@"  # a password may hold / ? #
-_TOKEN = r"(?i)([?&#][^\s=&]*(?:token|key|sig|secret|pass|auth|cred)[^\s=&]*=)[^\s&#]+"
+_USER = r"(?<=://)(?:[^\s/?#@:]{0,99}:\S{0,300}|[^\s/?#]{0,300})@"  # a password may hold / ? #
+_TOKEN = (
+    r"(?i)([?&#][^\s=&?#]{0,40}(?:token|key|sig|secret|pass|auth|cred)[^\s=&?#]{0,40}=)[^\s&#]+"
+)
 
 
 def without_secrets(text: str) -> str:

@@ -5,27 +5,36 @@
     python tools/fuzz_files.py --seed 0 --only 17
 
 A checkpoint is loaded and made into Gaussians, or starts a training; what is made of a damaged one
-that is not refused must be what the whole one gives. See fuzzing.py.
+that is not refused must be what the whole one gives. Half of them are sealed anew, as by somebody
+who means harm: these may give other numbers. PLY files are shown. See fuzzing.py.
 """
 
 import json
+import math
 import random
+import struct
 import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import safetensors.torch
 import torch
 from fuzzing import JUNK, FaultError, Use, fuzz, other_bytes, other_leaf, refused
+from qgs_viewer.choice import Choice, painted
+from qgs_viewer.look import Look
+from qgs_viewer.server import first_eye
 
 import qgs
 from qgs.composer import resolve
 from qgs.contracts import LearnedQueries
 from qgs.engine.initial import initialise
 from qgs.io.checkpoint import CheckpointFile
+from qgs.io.tensors import SEAL, seal
 
+SEALED = "forged"
 RECIPE = Path(__file__).parents[1] / "recipes" / "tiny" / "locus.yaml"
 SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8", "data.image_size=[16, 16]",
          "model.decoder.depth=2", "model.supervision.layers=[2]")  # fmt: skip
@@ -103,9 +112,12 @@ def damage_checkpoint(file: Path, dice: random.Random) -> str:
         del header["__metadata__"]["qgs.digest"]
     change = dice.choice((other_tensor, other_tensor, other_metadata, other_metadata, other_recipe))
     change(header, data, dice)
+    metadata, sealed = header["__metadata__"], dice.random() < 0.5
+    if sealed and isinstance(metadata, dict) and all(isinstance(x, str) for x in metadata.values()):
+        metadata[SEAL] = seal(metadata)  # else hardly anything behind it would be tried
     text = json.dumps(header).encode()
     file.write_bytes(len(text).to_bytes(8, "little") + text + data)
-    return change.__name__
+    return f"{SEALED} {change.__name__}" if sealed else change.__name__
 
 
 def damage_ply(file: Path, dice: random.Random) -> str:
@@ -115,7 +127,8 @@ def damage_ply(file: Path, dice: random.Random) -> str:
     if dice.random() < 0.3:
         values = bytearray(data)
         place = 4 * dice.randrange(len(values) // 4)
-        values[place : place + 4] = b"\xff" * 4
+        number = dice.choice((math.nan, 0.0, 88.0, -120.0, 3e38, -3e38))
+        values[place : place + 4] = struct.pack("<f", number)
         data = bytes(values)
     else:
         news = (b"list", b"uchar int", b"double", b"ascii", b"-1", b"10000000000000", b"x", b"\xff")
@@ -139,8 +152,14 @@ def start_from(file: Path) -> bytes:
     return safetensors.torch.save(model.state_dict())
 
 
-def load_ply(file: Path) -> None:
-    qgs.load_ply(file)
+def show_ply(file: Path) -> None:
+    """As the viewer does."""
+    look = Look(qgs.load_ply(file))
+    eye, _ = first_eye(look)
+    shown = painted(look, Choice())
+    parts = eye, shown.centers, shown.covariances
+    if not all(np.isfinite(part).all() for part in parts) or not shown.magnification > 0:
+        raise FaultError("the viewer gets numbers that are not finite")
 
 
 def judged(use: Callable[[Path], bytes | None], path: Path, whole: bytes | None) -> str:
@@ -149,7 +168,7 @@ def judged(use: Callable[[Path], bytes | None], path: Path, whole: bytes | None)
         made = use(path)
     except (ValueError, OSError) as error:
         return f"{use.__name__} {refused(error, str(path))}"
-    if made != whole:
+    if whole is not None and made != whole:
         raise FaultError("another result than that of the undamaged file")
     return f"{use.__name__} success"
 
@@ -161,7 +180,7 @@ def prepared(scratch: Path) -> Callable[[random.Random, Path], tuple[str, Use]]:
     kinds = (
         (decode, damage_checkpoint, decode(checkpoint)),
         (start_from, damage_checkpoint, start_from(checkpoint)),
-        (load_ply, damage_ply, None),
+        (show_ply, damage_ply, None),
     )
 
     def case_in(dice: random.Random, folder: Path) -> tuple[str, Use]:
@@ -169,7 +188,8 @@ def prepared(scratch: Path) -> Callable[[random.Random, Path], tuple[str, Use]]:
         path = folder / ("a.ply" if damage is damage_ply else "a.safetensors")
         path.write_bytes((scratch / path.name).read_bytes())
         what = (other_bytes if dice.random() < 0.15 else damage)(path, dice)
-        return f"{use.__name__}, {what}", partial(judged, use, path, whole)
+        forged = what.startswith(SEALED)  # whoever writes a seal may write other weights
+        return f"{use.__name__}, {what}", partial(judged, use, path, None if forged else whole)
 
     return case_in
 

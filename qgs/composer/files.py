@@ -110,6 +110,8 @@ class _Files:
         if place in self.trees:
             return self.trees[place]
         try:
+            if file.exists() and not file.is_file():  # /dev/zero has no end
+                raise OSError("it is no regular file")
             text = file.read_text(encoding="utf-8")
         except UnicodeDecodeError:
             self._problems.stop(Origin(str(file)), "", "this is no UTF-8 text", "save it as UTF-8")

@@ -107,9 +107,7 @@ def load_ply(path: str | Path) -> Gaussians:
             raise ValueError(f"its header is not whole in {_HEADER:,} bytes, or promises too much")
         file = PlyData.read(str(path))
     except (PlyHeaderParseError, PlyElementParseError, ValueError, MemoryError) as error:
-        raise ValueError(
-            f"{path} is no whole PLY file ({error}); give one as `qgs reconstruct` writes it"
-        ) from error
+        raise ValueError(f"{path} is no whole PLY file ({error}): copy it again") from error
     found = {element.name: element for element in file.elements}
     kinds = (found["vertex"].data.dtype.fields if "vertex" in found else None) or {}
     names = [name for name, kind in kinds.items() if not kind[0].hasobject]  # no lists
@@ -120,6 +118,8 @@ def load_ply(path: str | Path) -> Gaussians:
             "3DGS release, as SuperSplat's uncompressed export writes it"
         )
     vertices = found["vertex"].data
+    if not len(vertices):
+        raise ValueError(f"{path} holds no Gaussians")
     rest = [name for name in REST if name in names]
     count = sum(name.startswith("f_rest_") for name in names)
     if count not in (0, *(3 * n for n in SH_COUNTS)) or rest != list(REST[:count]):
@@ -131,11 +131,11 @@ def load_ply(path: str | Path) -> Gaussians:
     def columns(*names: str) -> Tensor:
         return torch.from_numpy(np.stack([vertices[name] for name in names], -1, dtype=np.float32))
 
-    quats = columns(*_QUATS)
+    quats = columns(*_QUATS).double()  # in which norms are finite
     scene = Gaussians(
         means=columns(*_MEANS),
         scales=columns(*_SCALES).exp(),
-        quats=quats / quats.norm(dim=-1, keepdim=True),  # NaN for 0
+        quats=(quats / quats.norm(dim=-1, keepdim=True)).float(),  # NaN for 0
         opacities=columns("opacity")[:, 0].sigmoid(),
         colors=columns(*_COLORS) * SH_C0 + 0.5,
         sh=_used_degrees(columns(*rest).unflatten(-1, (3, -1)).mT) if rest else None,
@@ -149,8 +149,8 @@ def load_ply(path: str | Path) -> Gaussians:
 def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> Gaussians:
     """The Gaussians (G, ...) of (G, ...) or (1, G, ...), float32 on the CPU, for a file.
 
-    Warns about the parts in `lost`. Raises ValueError for several scenes or for numbers that are
-    not finite. kind: of the file.
+    Warns about the parts in `lost`. Raises ValueError for several scenes or for numbers whose
+    squares are not finite. kind: of the file.
     """
     batch = gaussians.means.shape[:-2]
     if batch not in ((), (1,)):
@@ -162,9 +162,9 @@ def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> Gaussians:
         warn_once(f"{kind} files have no place for {listed(names)}: left out")
     scene = gaussians[0] if batch else gaussians
     scene = map_tensors(Tensor.detach, scene).to("cpu", torch.float32)
-    finite = [part.isfinite()[..., None].flatten(1).all(-1) for _, part in named_tensors(scene)]
-    if broken := int((~torch.stack(finite).all(0)).sum()):
-        raise ValueError(f"{broken} of {scene.count} Gaussians have numbers that are not finite")
+    squares = [part.square()[..., None].flatten(1) for _, part in named_tensors(scene)]
+    if broken := int((~torch.cat(squares, -1).isfinite().all(-1)).sum()):
+        raise ValueError(f"{broken} of {scene.count} Gaussians are not finite, or too large")
     return scene
 
 

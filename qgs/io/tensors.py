@@ -20,8 +20,8 @@ from qgs.contracts.weights import Shapes
 from qgs.io.files import replacing
 from qgs.wording import name_shown
 
-SEAL = "qgs.seal"
-"""Metadata entry with the checksum of all others."""
+SEAL, _DIGEST = "qgs.seal", "qgs.digest"
+"""Metadata entries with the checksums of all others, and of the tensors."""
 _PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}
 
 
@@ -34,8 +34,7 @@ class TensorFile:
 
     path: of the file. metadata: its text entries.
     Before it maps anything, safetensors compares the sizes in the header with the size of the file.
-    Raises OSError and MemoryError of the system, and CheckpointError for anything but a whole
-    safetensors file.
+    Raises OSError and MemoryError of the system, and CheckpointError for any but a whole file.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -57,7 +56,10 @@ class TensorFile:
     def read(self) -> dict[str, Tensor]:
         """All tensors, memory-mapped; they outlive the open file."""
         with self._whole():
-            return {name: self._file.get_tensor(name) for name in self._file.keys()}  # noqa: SIM118
+            tensors = {name: self._file.get_tensor(name) for name in self._file.keys()}  # noqa: SIM118
+        if self.metadata.get(_DIGEST, "") not in ("", digest(tensors)):
+            raise self.damaged("its tensors are not those that were written")
+        return tensors
 
     @contextmanager
     def _whole(self) -> Iterator[None]:
@@ -133,11 +135,21 @@ def write_tensors(
     """Write `tensors`, contiguous and on the CPU, to `path`; see `replacing`. Raises OSError."""
     with replacing(path) as temporary:
         try:
+            metadata = {**metadata, _DIGEST: digest(tensors)}
             save_file(dict(tensors), temporary, {**metadata, SEAL: seal(metadata)})
         except SafetensorError as error:  # it gives the number of an OSError as text only
             if number := re.search(r"os error (\d+)", str(error)):
                 raise OSError(int(number[1]), str(error), os.fspath(path)) from error
             raise
+
+
+def digest(tensors: Mapping[str, Tensor]) -> str:
+    """A checksum of the names, dtypes, shapes and bytes of contiguous tensors on the CPU."""
+    total = blake2b(digest_size=16)
+    for name, tensor in sorted(tensors.items()):
+        total.update(f"{name} {tensor.dtype} {list(tensor.shape)}\n".encode())
+        total.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return total.hexdigest()
 
 
 def seal(metadata: Mapping[str, str]) -> str:

@@ -8,14 +8,13 @@ from typing import Any
 import pytest
 import torch
 from safetensors import safe_open
-from safetensors.torch import save_file
 from training_runs import Tiny, run
 
 from qgs.data.stream import MAX_REPLACED, SampleError, SampleStream
 from qgs.engine import training
 from qgs.engine.folder import read_state
 from qgs.engine.guard import OutOfMemoryError
-from qgs.io.tensors import CheckpointError
+from qgs.io.tensors import CheckpointError, write_tensors
 
 WEIGHT = "queries.features"
 EMA = "training.ema=0.9"
@@ -25,9 +24,9 @@ def rewrite(path: Path, change: Callable[[dict[str, torch.Tensor]], Any], **meta
     """Write a safetensors file again with changed tensors, and metadata but for `metadata`."""
     with safe_open(path, "pt") as file:
         tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-        known = {k: v for k, v in file.metadata().items() if k != "qgs.digest"}
+        known = file.metadata()
     change(tensors)
-    save_file(tensors, path, known | metadata)
+    write_tensors(path, tensors, known | metadata)
 
 
 @pytest.fixture(scope="module")

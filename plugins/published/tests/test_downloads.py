@@ -187,3 +187,8 @@ def test_leftovers_of_killed_downloads_are_removed(server: str, cache: Path) -> 
 )  # fmt: skip
 def test_secrets_in_urls(url: str, expected: str) -> None:
     assert without_secrets(url) == shown(url) == expected
+
+
+def test_long_text_is_shown_at_once() -> None:
+    text = "?token" * 20_000 + "#token" * 20_000 + "://me:" * 20_000
+    assert shown(text) == text

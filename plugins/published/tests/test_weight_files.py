@@ -86,3 +86,12 @@ def test_what_cannot_be_read_is_named(tmp_path: Path, name: str, content: bytes)
         read_weight_file(path)
     with pytest.raises(FileNotFoundError):
         read_weight_file(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["model", "state_dict"])
+def test_a_dict_that_holds_itself(tmp_path: Path, key: str) -> None:
+    content: dict[str, Any] = {"w": torch.zeros(2)}
+    content[key] = content
+    torch.save(content, tmp_path / "w.pt")
+    with pytest.raises(CheckpointError, match="too deep"):
+        read_weight_file(tmp_path / "w.pt")

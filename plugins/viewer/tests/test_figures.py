@@ -145,7 +145,7 @@ def test_attention_is_that_of_a_trace_and_its_anchor_lies_where_it_was() -> None
         assert there.sum() == len(attention.PARTS)
 
 
-@pytest.mark.parametrize("kind", (*PAIR, "landmark"))  # its layers differ
+@pytest.mark.parametrize("kind", [*PAIR, "landmark"])  # its layers differ
 def test_edges_lead_to_the_queries_that_are_read_most(kind: str) -> None:
     shown, (query, layer) = exhibit_of(kind), (5, exhibit_of(kind).look.depth)
     with torch.no_grad(), qgs.trace(shown.model, [layer], [query]) as record:

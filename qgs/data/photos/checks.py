@@ -28,7 +28,7 @@ def refuse_outside(folder: UPath, found: Listing) -> None:
             if os.path.relpath(file.path, folder.path or ".").split(os.sep)[0] == "..":
                 raise ValueError(
                     f"{found.file} names {name_shown(str(file))}, which is outside of {folder}: "
-                    "move it into the folder, or allow this by data.outside=true"
+                    "move it into the folder, or train with data.outside=true"
                 )
 
 

@@ -60,7 +60,7 @@ class Colmap(PhotoReader):
             listed = [*read_cameras(model)]
             cameras = {number: _camera(*camera) for number, camera in listed}
             posed = [(name, _c2w(*pose), camera) for name, pose, camera in read_images(model)]
-            if len(cameras) + len({name for name, *_ in posed}) < len(listed) + len(posed):
+            if len(cameras) + len({PurePosixPath(p[0]) for p in posed}) < len(listed) + len(posed):
                 raise ValueError("a camera or an image is listed twice")
             if unknown := {camera for *_, camera in posed} - cameras.keys():
                 raise ValueError(f"images are of cameras {sorted(unknown)}, which are not in it")

@@ -86,9 +86,8 @@ class _UnreadableError(Exception):
 def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None) -> PhotoFrame:
     """size: (H, W) of the image where neither the frame nor the top of `data` gives 'h' and 'w'."""
     path = entry.get("file_path") if isinstance(entry, Mapping) else None
-    if not isinstance(path, str) or not PurePosixPath(path).name:
-        fix = "add the image's name, or remove the frame"
-        problem = FrameProblem("path", "it has no 'file_path'", fix)
+    if not isinstance(path, str) or not PurePosixPath(path).name or "://" in path:
+        problem = FrameProblem("path", "its 'file_path' names no file", "correct or remove it")
         return PhotoFrame("", folder, _NO_POSE, _NO_INTRINSICS, problems=(problem,))
     values = {**data, **entry}
     name = image_name(path)

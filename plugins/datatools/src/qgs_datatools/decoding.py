@@ -16,6 +16,7 @@ from qgs.data.evaluation import one_line
 from qgs.data.images import (
     TURN,
     TURNED,
+    alpha_mask,
     eight_bits,
     open_depth,
     open_mask,
@@ -129,8 +130,8 @@ def _others(photo: Photo, size: Size) -> tuple[tuple[tuple[str, str], ...], np.n
     """Faults of mask and depth map of a photo of `size`, with remedies; a sound mask, small."""
     mask, depth = photo.listed.mask, photo.listed.depth
     read_mask = photo.read_mask
-    if mask is not None and photo.mask_exists and mask != photo.listed.path:
-        read_mask = partial(open_mask, mask)
+    if mask is not None and photo.mask_exists:
+        read_mask = partial(alpha_mask if mask == photo.listed.path else open_mask, mask)
     read_depth = partial(open_depth, depth, 1.0) if depth is not None else None
     errors, sound = list[tuple[str, str]](), dict[str, np.ndarray]()
     for kind, file, read in (("mask", mask, read_mask), ("depth map", depth, read_depth)):

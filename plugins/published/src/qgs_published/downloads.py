@@ -4,6 +4,7 @@ import errno
 import hashlib
 import os
 import shutil
+import string
 import sys
 import time
 from base64 import b64encode
@@ -14,7 +15,7 @@ from queue import Empty, Queue
 from threading import Thread
 from typing import Any, TypeAlias
 from urllib.error import HTTPError
-from urllib.parse import unquote, urlsplit
+from urllib.parse import quote, unquote, urlsplit
 from urllib.request import Request, urlopen
 
 from safetensors import SafetensorError, safe_open
@@ -92,13 +93,16 @@ def _download(url: str, file: Path) -> None:
     except Exception as error:  # whatever the file system of the URL raises
         with suppress(OSError):  # it holds something
             file.parent.rmdir()
-        cause = without_secrets(str(getattr(error, "reason", error))) or type(error).__name__
+        cause = str(getattr(error, "reason", error)) or type(error).__name__
         if isinstance(error, HTTPError):
             fix = _FIXES.get(error.code, "try again later")
             cause = f"the server answers {error.code} ({error.reason}), {fix}"
+        elif isinstance(error, FileNotFoundError):
+            cause = "there is no such file"
         elif isinstance(error, SafetensorError):
             cause = f"this is not a whole safetensors file ({error})"
         # the error that it comes from may hold a password
+        cause = without_secrets(cause)
         raise OSError(f"{name} could not be downloaded, nothing was kept: {cause}") from None
 
 
@@ -168,7 +172,8 @@ def _opened(url: str) -> Iterator[tuple[Callable[[int], bytes], int]]:
         with store.open(path.path, "rb", block_size=2**20) as stream:
             yield stream.read, getattr(stream, "size", None) or 0
         return
-    request = Request(place._replace(netloc=place.netloc.rpartition("@")[2]).geturl())
+    whole = place._replace(netloc=place.netloc.rpartition("@")[2]).geturl()
+    request = Request(quote(whole, safe=string.punctuation))  # such as é
     if place.username:
         user = f"{unquote(place.username)}:{unquote(place.password or '')}".encode()
         request.add_unredirected_header("Authorization", f"Basic {b64encode(user).decode()}")

@@ -61,7 +61,12 @@ def _read_torch(path: Path, notes: list[str]) -> dict[str, Tensor]:
             "cut off, or holds Python objects, which could run code: copy it again, or save "
             "`model.state_dict()` alone"
         ) from error
-    return _state_dict(content, path, notes)
+    try:
+        return _state_dict(content, path, notes)
+    except RecursionError:  # a dict may hold itself
+        raise CheckpointError(
+            f"{path}: the weights lie too deep; save `model.state_dict()` alone"
+        ) from None
 
 
 def _state_dict(content: Any, path: Path, notes: list[str]) -> dict[str, Tensor]:

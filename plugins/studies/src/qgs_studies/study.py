@@ -165,6 +165,8 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
     """The tree of `file` laid over the study that it extends, names of files made absolute."""
     origin = Origin(str(file))
     try:
+        if file.exists() and not file.is_file():  # /dev/zero has no end
+            raise OSError("it is no regular file")
         text = file.read_text(encoding="utf-8")
     except (OSError, ValueError) as error:
         fix = "check the path, or take one such as studies/tiny/structural.yaml"
