@@ -62,7 +62,9 @@ def shown_scores() -> dict[str, tuple[str, ...]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("models", [("rooms/locus-64", "rooms/tokengs-64"), ("rooms/locus-128",)])
+@pytest.mark.parametrize(
+    "models", [("rooms/landmark-64", "rooms/locus-64", "rooms/tokengs-64"), ("rooms/locus-128",)]
+)
 def test_the_models_score_what_the_readme_says(models: tuple[str, ...]) -> None:
     """By the code of `qgs demo`: crop, renderer and metrics included."""
     shown = shown_scores()
