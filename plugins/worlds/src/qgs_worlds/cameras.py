@@ -19,11 +19,17 @@ _PROBE = (6, 6)  # pixels of the depth maps by which views are judged
 
 @dataclass(frozen=True)
 class Rig:
-    """c2w: OpenCV (F, 4, 4). fov: horizontal, degrees. motion: how the cameras move."""
+    """c2w: OpenCV (F, 4, 4). fov: horizontal, degrees. distance: to what they look at. motion: name."""
 
     c2w: np.ndarray
     fov: float
+    distance: float
     motion: str
+
+    def sight(self) -> tuple[np.ndarray, float]:
+        """Middle and radius of a ball that holds most of what they see."""
+        middle = (self.c2w[:, :3, 3] + self.distance * self.c2w[:, :3, 2]).mean(0)
+        return middle, 1.3 * self.distance + 1
 
 
 def draw_cameras(
@@ -39,10 +45,10 @@ def draw_cameras(
     """
     best, least = None, math.inf
     for attempt in range(_TRIES):
-        rig, distance = _draw(rng, place, count, varied, 0.7**attempt)
+        rig = _draw(rng, place, count, varied, 0.7**attempt)
         fault = _outside(rig.c2w[:, :3, 3], place, world[0])
         if fault == 0:
-            fault = _view_fault(rig, world, distance)
+            fault = _view_fault(rig, world)
         if fault < least or best is None:
             best, least = rig, fault
         if least <= 0.3:
@@ -57,7 +63,7 @@ def _outside(eyes: np.ndarray, place: Place, shapes: np.ndarray) -> float:
     return 0.0 if inside and clearances(shapes[: place.fixed], eyes).min() > CLEARANCE else 100.0
 
 
-def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray], distance: float) -> float:
+def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
     """The worst view's share of sky and of things right before the camera."""
     focal = _PROBE[1] / 2 / math.tan(math.radians(rig.fov) / 2)
     intrinsics = np.array([focal, focal, _PROBE[1] / 2, _PROBE[0] / 2])
@@ -65,7 +71,7 @@ def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray], distance: float)
     fault = 2.0 if near < CLEARANCE else 0.0
     for c2w in rig.c2w:
         t, _, _ = trace(*_PROBE, 0, 1, *world, c2w, intrinsics)
-        close = (t < max(0.25, 0.25 * distance)).mean()
+        close = (t < max(0.25, 0.25 * rig.distance)).mean()
         sky = max(np.isinf(t).mean() - 0.3, 0.0)
         fault = max(fault, float(close), float(sky))
     return fault
@@ -79,13 +85,13 @@ def _still(
     base = points[clearances(shapes[: place.fixed], points).min(1).argmax()]
     eyes = base + 0.01 * rng.uniform(-1, 1, (count, 3))
     target = np.array(place.targets[0])
-    return Rig(_look_at(eyes, np.tile(target, (count, 1)), np.zeros(count)), rig.fov, "still")
+    return Rig(_look_at(eyes, np.tile(target, (count, 1)), np.zeros(count)), rig.fov, rig.distance, "still")
 
 
 def _draw(
     rng: np.random.Generator, place: Place, count: int, varied: bool, shrink: float
-) -> tuple[Rig, float]:
-    """Cameras, and the distance of the first to its target. shrink: of the path's length."""
+) -> Rig:
+    """Cameras anywhere in the place. shrink: factor of the path's length."""
     target = np.array(place.targets[rng.integers(len(place.targets))])
     base, distance = _stand(rng, place, target, varied)
     s = np.linspace(-0.5, 0.5, count)
@@ -94,7 +100,7 @@ def _draw(
         step = across / np.linalg.norm(across) * max(rng.uniform(*PLAIN_TRAVEL) * shrink, 0.05)
         target = np.array([*target[:2], base[2] - rng.uniform(0.1, 0.4)])
         c2w = _look_at(base + s[:, None] * step, target + 0.1 * s[:, None] * step, np.zeros(count))
-        return Rig(c2w, float(rng.uniform(*PLAIN_FOV)), "walk"), distance
+        return Rig(c2w, float(rng.uniform(*PLAIN_FOV)), distance, "walk")
     low, high = np.log(BASELINE)
     length = distance * math.exp(rng.uniform(low, high)) * shrink
     motion = ("walk", "orbit", "round", "gather")[rng.choice(4, p=(0.35, 0.3, 0.1, 0.25))]
@@ -105,7 +111,7 @@ def _draw(
     targets = targets + 0.02 * distance * rng.normal(size=eyes.shape)
     roll = np.clip(rng.normal(0, 5) + rng.normal(0, 1, count), -15, 15)
     c2w = _look_at(eyes, targets, np.radians(roll))
-    return Rig(c2w[::-1] if rng.random() < 0.5 else c2w, fov, motion), distance
+    return Rig(c2w[::-1] if rng.random() < 0.5 else c2w, fov, distance, motion)
 
 
 def _stand(

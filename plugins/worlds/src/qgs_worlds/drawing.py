@@ -15,6 +15,7 @@ from qgs_worlds.intervals import clearances
 from qgs_worlds.lights import draw_effects, draw_lights
 from qgs_worlds.places import KINDS, SHARES, Place, draw_place
 from qgs_worlds.rows import World
+from qgs_worlds.shadows import shadow_maps
 from qgs_worlds.shapes import packed
 from qgs_worlds.source import lens
 from qgs_worlds.things import PLAIN, VARIED, Things, spread
@@ -36,12 +37,16 @@ class Drawn:
     effects: np.ndarray
     quality: int
 
-    def photo(self, frame: int, size: tuple[int, int], samples: int) -> np.ndarray:
-        """Image (H, W, 3) uint8."""
-        image = np.empty((*size, 3), np.uint8)
-        light = cast_light(self.world, self.rig.c2w[[frame]], lens(self.rig.fov, size), size, samples)
-        develop(image, light[0], self.effects, frame)
-        return through_jpeg(image, self.quality) if self.quality else image
+    def photos(self, frames: Sequence[int], size: tuple[int, int], samples: int) -> list[np.ndarray]:
+        """Images (H, W, 3) uint8."""
+        c2w, images = self.rig.c2w[list(frames)], []
+        for frame, light in zip(
+            frames, cast_light(self.world, c2w, lens(self.rig.fov, size), size, samples), strict=True
+        ):
+            image = np.empty((*size, 3), np.uint8)
+            develop(image, light, self.effects, frame)
+            images.append(through_jpeg(image, self.quality) if self.quality else image)
+        return images
 
     def depths(self, frames: Sequence[int], size: tuple[int, int]) -> np.ndarray:
         """Depths (F, H, W) float32, 0 in the sky."""
@@ -52,7 +57,7 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
     """The scene of a key (seed, split, index). What an option changes is drawn on its own."""
     numbers = np.random.default_rng(key)
     plan, skin, shine, camera = (Random(int(numbers.integers(1 << 62))) for _ in range(4))
-    maps = materials.height_maps(numbers, _MAPS)
+    maps = materials.height_maps(int(numbers.integers(1 << 31)), _MAPS)
     varied = config.shapes == "varied"
     kind = plan.choices(KINDS, SHARES)[0] if varied else "indoors"
     things = Things(plan, VARIED if varied else PLAIN, materials.COUNT, _MAPS)
@@ -65,7 +70,9 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
     lit = config.light == "varied"
     skins = materials.textures(skin, config.textures == "varied", lit)
     lights, air = draw_lights(shine, place, lit)
-    world = World(np.ascontiguousarray(shapes[kept]), maps, skins, lights, air)
+    shapes = np.ascontiguousarray(shapes[kept])
+    shades = shadow_maps(shapes, maps, lights, *rig.sight())
+    world = World(shapes, maps, skins, shades[0], air, *shades[1:])
     light = cast_light(world, rig.c2w, lens(rig.fov, _THUMB), _THUMB, 1)
     effects, quality = draw_effects(camera, light, config.effects)
     return Drawn(place, world, rig, effects, quality)

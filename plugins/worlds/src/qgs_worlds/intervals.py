@@ -176,22 +176,15 @@ def relief(o, d, heights, start):
 
 
 @njit(**INNER)
-def inside(kind, extra, o, d, heights):
-    """Entry, exit and their faces for a primitive of any kind and a ray from any point."""
-    p, t = nearest(o, d)
+def convex(kind, extra, p, d):
+    """Entry, exit and their faces for a convex primitive of any kind."""
     if kind == r.ELLIPSOID:
-        near, far, entry, leave = ellipsoid(p, d)
-    elif kind == r.BOX:
-        near, far, entry, leave = box(p, d)
-    elif kind == r.FRUSTUM:
-        near, far, entry, leave = frustum(p, d, extra)
-    elif kind == r.CAPSULE:
-        near, far, entry, leave = capsule(p, d, extra)
-    elif kind == r.TORUS:
-        near, far, entry, leave = torus(p, d, extra, -t)
-    else:
-        near, far, entry, leave = relief(p, d, heights[int(extra)], -t)
-    return near + t, far + t, entry, leave
+        return ellipsoid(p, d)
+    if kind == r.BOX:
+        return box(p, d)
+    if kind == r.FRUSTUM:
+        return frustum(p, d, extra)
+    return capsule(p, d, extra)
 
 
 @njit(**INNER)
@@ -224,14 +217,21 @@ def local_point(shapes, i, p, x, y, z):
 @njit(**INNER)
 def shape_hit(shapes, heights, i, o, d):
     """t at which a ray enters shape i, or inf, and the face: 0 to 2, on the cut 3 to 5."""
-    lo = local_point(shapes, i, 0, o[0], o[1], o[2])
-    ld = local(shapes, i, 0, d[0], d[1], d[2])
-    near, far, entry, _ = inside(shapes[i, 0], shapes[i, 1], lo, ld, heights)
-    cut_near, cut_far, leave, p = NONE, -NONE, ZERO, r.PRIMITIVE_FIELDS
-    if shapes[i, p] >= ZERO and near <= far:
-        lo = local_point(shapes, i, p, o[0], o[1], o[2])
-        ld = local(shapes, i, p, d[0], d[1], d[2])
-        cut_near, cut_far, _, leave = inside(shapes[i, p], shapes[i, p + 1], lo, ld, heights)
+    kind, extra, way = shapes[i, 0], shapes[i, 1], local(shapes, i, 0, *d)
+    p, start = nearest(local_point(shapes, i, 0, o[0], o[1], o[2]), way)
+    if kind == r.TORUS:
+        near, far, entry, _ = torus(p, way, extra, -start)
+    elif kind == r.HEIGHT:
+        near, far, entry, _ = relief(p, way, heights[int(extra)], -start)
+    else:
+        near, far, entry, _ = convex(kind, extra, p, way)
+    near, far = near + start, far + start
+    cut_near, cut_far, leave, c = NONE, -NONE, ZERO, r.PRIMITIVE_FIELDS
+    if shapes[i, c] >= ZERO and near <= far:
+        way = local(shapes, i, c, *d)
+        p, start = nearest(local_point(shapes, i, c, o[0], o[1], o[2]), way)
+        cut_near, cut_far, _, leave = convex(shapes[i, c], shapes[i, c + 1], p, way)
+        cut_near, cut_far = cut_near + start, cut_far + start
     return less(near, far, entry, cut_near, cut_far, leave)
 
 

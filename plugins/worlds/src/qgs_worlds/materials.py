@@ -5,11 +5,15 @@ import math
 from random import Random
 
 import numpy as np
+from numba import njit
+from qgs_rooms.textures import OPTIONS
 
 from qgs_worlds import rows as r
+from qgs_worlds.textures import chance, noise
 from qgs_worlds.things import spread
 
-COUNT = 24  # textures of a world
+COUNT = 20  # textures of a world
+_SIDE = 33  # points of a height map along each axis
 _PLAIN_PATTERNS = (r.STRIPES, r.CHECKER, r.TILES, r.DOTS)
 _PATTERNS = (*_PLAIN_PATTERNS, r.TILES, r.GLYPHS, r.GLYPHS, r.RINGS)
 
@@ -23,13 +27,13 @@ class Palette:
         self.rng = rng
         base = rng.random()
         self._hues = [(base + step + 0.05 * rng.gauss(0, 1)) % 1 for step in (0, 0.06, 0.1, 0.5, 0.33)]
-        self._grey = rng.uniform(0.6, 3.5)
+        self._grey = rng.uniform(1, 5)
 
     def color(self) -> Color:
         """A colour: most are dull, few are bright or dark."""
         rng = self.rng
         hue = rng.choice(self._hues) if rng.random() < 0.8 else rng.random()
-        saturation, value = rng.betavariate(1, self._grey), rng.betavariate(1.6, 1.5)
+        saturation, value = rng.random() ** self._grey, 0.5 * (rng.random() + rng.random())
         red, green, blue = colorsys.hsv_to_rgb(hue, saturation, 0.12 + 0.83 * value)
         return red**2.2, green**2.2, blue**2.2
 
@@ -110,20 +114,20 @@ def _varied(rng: Random, palette: Palette, highlights: bool) -> list[float]:
     return _row(rng, ramp, palette.color(), **fields)
 
 
-def height_maps(rng: np.random.Generator, count: int, side: int = 33) -> np.ndarray:
-    """(count, side, side) float32 in [-1, 1]: smooth noise in octaves, each map of its own grain."""
-    maps = np.zeros((count, side, side))
-    places = np.linspace(0, 1, side)
-    for field in maps:
-        cells, gain = int(rng.integers(2, 7)), rng.uniform(0.3, 0.6)
-        for octave in range(3):
-            grid = rng.uniform(-1, 1, (cells + 2, cells + 2))
-            x = places * cells
-            i = np.minimum(x.astype(int), cells - 1)
-            w = x - i
-            w = w * w * (3 - 2 * w)
-            rows = grid[i] * (1 - w)[:, None] + grid[i + 1] * w[:, None]
-            field += gain**octave * (rows[:, i] * (1 - w) + rows[:, i + 1] * w)
-            cells *= 2
-        field /= np.abs(field).max()
-    return maps.astype(np.float32)
+@njit(**OPTIONS)
+def height_maps(seed, count):
+    """(count, 33, 33) float32 in [-1, 1]: smooth noise in octaves, each map of its own grain."""
+    maps = np.empty((count, _SIDE, _SIDE), np.float32)
+    for k in range(count):
+        cells, gain = 2.0 + 5.0 * chance(k, 0, seed), 0.3 + 0.3 * chance(k, 1, seed)
+        largest = 0.0
+        for i in range(_SIDE):
+            for j in range(_SIDE):
+                x, y, weight, height = cells * i / (_SIDE - 1), cells * j / (_SIDE - 1), 1.0, 0.0
+                for octave in range(3):
+                    height += weight * noise(r.VALUE, x, y, seed + 10 * k + octave)
+                    x, y, weight = 2 * x, 2 * y, gain * weight
+                maps[k, i, j] = height
+                largest = max(largest, abs(height))
+        maps[k] /= largest
+    return maps

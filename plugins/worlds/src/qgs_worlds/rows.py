@@ -27,7 +27,7 @@ NO_PATTERN, STRIPES, CHECKER, TILES, DOTS, GLYPHS, RINGS = range(7)
 TEXTURE_FIELDS = COLORS + 12  # RGB of four colours: three of the ramp, one of the pattern
 
 # Fields of a light: whether it is a lamp, its position or the direction to the sun, RGB, whether it
-# throws shadows.
+# throws shadows: 0, or the number of its first map plus 1.
 LAMP, PLACE, COLOR, SHADOWS, LIGHT_FIELDS = 0, 1, 4, 7, 8
 # Fields of the air: ambient RGB from above and from below, RGB of the sky overhead and at the
 # horizon, fog per metre, clouds, seed, strength and reach of the ambient occlusion.
@@ -44,7 +44,8 @@ class World:
     """A scene, ready to be cast.
 
     shapes: (S, SHAPE_FIELDS) float32. heights: (K, G, G) float32 in [-1, 1]. textures:
-    (T, TEXTURE_FIELDS), lights: (L, LIGHT_FIELDS), air: (AIR_FIELDS,), all float64.
+    (T, TEXTURE_FIELDS), lights: (L, LIGHT_FIELDS), air: (AIR_FIELDS,), all float64. maps, depths,
+    codes: the shadow maps (`shadow_maps`), to which lights point.
     """
 
     shapes: np.ndarray
@@ -52,7 +53,11 @@ class World:
     textures: np.ndarray
     lights: np.ndarray
     air: np.ndarray
+    maps: np.ndarray
+    depths: np.ndarray
+    codes: np.ndarray
 
-    def packed(self) -> tuple[np.ndarray, ...]:
+    def packed(self) -> tuple[object, ...]:
         """The arrays as kernels take them."""
-        return self.shapes, self.heights, self.textures, self.lights, self.air
+        shades = (self.maps, self.depths, self.codes)
+        return self.shapes, self.heights, self.textures, self.lights, self.air, shades

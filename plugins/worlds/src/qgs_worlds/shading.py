@@ -8,13 +8,13 @@ from qgs_rooms.intersections import ONE, ZERO
 from qgs_rooms.textures import INNER
 
 from qgs_worlds import rows as r
-from qgs_worlds.intervals import height_at, local, local_point, shape_hit
+from qgs_worlds.intervals import height_at, local, local_point
 from qgs_worlds.raycast import SKY
+from qgs_worlds.shadows import lit
 from qgs_worlds.textures import color, noise
 
 _TAKEN = np.float32(-2)
-_LIFT = 2e-3  # metres by which rays to lights start above a surface
-_SHADES, _NEAR = np.float32(1), np.float32(2)
+_LIFT = 2e-3  # metres above a surface where its light is looked up
 
 
 @njit(**INNER)
@@ -69,12 +69,13 @@ def _on_primitive(kind, extra, heights, face, x, y, z, h):
 
 
 @njit(**INNER)
-def _surface(shapes, heights, code, x, y, z):
+def _surface(shapes, heights, code, place):
     """Index of the texture, world normal and texture coordinates of a point of a surface."""
     i, part = code >> 3, code & 7
     cut = part >= 3
     p, face = (r.PRIMITIVE_FIELDS, part - 3) if cut else (0, part)
-    lx, ly, lz = local_point(shapes, i, p, np.float32(x), np.float32(y), np.float32(z))
+    x, y, z = np.float32(place[0]), np.float32(place[1]), np.float32(place[2])
+    lx, ly, lz = local_point(shapes, i, p, x, y, z)
     h = (shapes[i, p + r.HALF], shapes[i, p + r.HALF + 1], shapes[i, p + r.HALF + 2])
     kind, extra = int(shapes[i, p]), shapes[i, p + 1]
     n, u, v, side = _on_primitive(kind, extra, heights, face, lx, ly, lz, h)
@@ -90,87 +91,51 @@ def _surface(shapes, heights, code, x, y, z):
 
 
 @njit(**INNER)
-def _candidates(spheres, near, o, d, limit, reach, pad):
-    """Write into `near` which shapes' bounding spheres a ray to a light meets, or are in reach."""
-    ox, oy, oz = np.float32(o[0]), np.float32(o[1]), np.float32(o[2])
-    dx, dy, dz = np.float32(d[0]), np.float32(d[1]), np.float32(d[2])
-    limit, reach, pad = np.float32(limit), np.float32(reach), np.float32(pad)
-    for i in range(near.shape[0]):
-        x, y, z = spheres[0, i] - ox, spheres[1, i] - oy, spheres[2, i] - oz
-        square, along, size = x * x + y * y + z * z, x * dx + y * dy + z * dz, spheres[3, i]
-        met = (square - along * along < (size + pad) * (size + pad)) & (along > -size)
-        met = met & (along - size < limit)
-        close = square < (size + reach) * (size + reach)
-        near[i] = (_SHADES if met else ZERO) + (_NEAR if close else ZERO)
-
-
-@njit(**INNER)
-def _lit(shapes, heights, near, points, n, normal, light, lamp):
-    """The share of n points from which a light is seen."""
-    blocked, count = 0, near.shape[0]
-    for i in range(count):
-        if near[i] != _SHADES and near[i] != _SHADES + _NEAR:
-            continue
-        for k in range(1, n + 1):
-            bit = 1 << k
-            if blocked & bit:
-                continue
-            x = points[k, 0] + _LIFT * normal[0]
-            y = points[k, 1] + _LIFT * normal[1]
-            z = points[k, 2] + _LIFT * normal[2]
-            o = (np.float32(x), np.float32(y), np.float32(z))
-            dx, dy, dz = light[0] - lamp * x, light[1] - lamp * y, light[2] - lamp * z
-            d = (np.float32(dx), np.float32(dy), np.float32(dz))
-            t, _ = shape_hit(shapes, heights, i, o, d)
-            if t < (0.98 if lamp else np.inf):
-                blocked |= bit
-        if blocked == (2 << n) - 2:
-            return 0.0
-    count = 0
-    for k in range(1, n + 1):
-        count += blocked >> k & 1
-    return 1.0 - count / n
-
-
-@njit(**INNER)
-def _open(shapes, near, own, x, y, z, normal, strength, reach):
+def _open(shapes, spheres, near, own, place, normal, strength, reach):
     """How much of the ambient light reaches a point, by distances to boxes around near shapes."""
-    first = second = reach
+    x, y, z = np.float32(place[0]), np.float32(place[1]), np.float32(place[2])
+    reach = np.float32(reach)
     for i in range(near.shape[0]):
-        if near[i] < _NEAR or i == own:
+        a, b, c = spheres[0, i] - x, spheres[1, i] - y, spheres[2, i] - z
+        size = spheres[3, i] + reach
+        near[i] = ONE if a * a + b * b + c * c < size * size else ZERO
+    up, far = (np.float32(0.25) * reach, np.float32(0.8) * reach), reach * reach
+    first = second = far
+    for i in range(near.shape[0]):
+        if near[i] == ZERO or i == own:
             continue
-        h = (shapes[i, r.HALF], shapes[i, r.HALF + 1], shapes[i, r.HALF + 2])
-        a = local_point(shapes, i, 0, np.float32(x), np.float32(y), np.float32(z))
-        b = local(shapes, i, 0, np.float32(normal[0]), np.float32(normal[1]), np.float32(normal[2]))
-        for step in range(2):
-            up = np.float32((0.25 if step == 0 else 0.8) * reach)
-            square = ZERO
-            for axis in range(3):
-                away = abs(a[axis] + up * b[axis]) - shapes[i, r.EXTENT + axis]
-                square += (max(away, ZERO) * h[axis]) ** 2
-            distance = math.sqrt(square)
-            first = min(first, distance) if step == 0 else first
-            second = min(second, distance) if step == 1 else second
-    hidden = 0.5 * max(1 - first / (0.25 * reach), 0.0) + 0.5 * max(1 - second / (0.8 * reach), 0.0)
-    return 1.0 - strength * hidden
+        a = local_point(shapes, i, 0, x, y, z)
+        b = local(shapes, i, 0, normal[0], normal[1], normal[2])
+        low = high = ZERO
+        for axis in range(3):
+            extent, h = shapes[i, r.EXTENT + axis], shapes[i, r.HALF + axis]
+            low += (max(abs(a[axis] + up[0] * b[axis]) - extent, ZERO) * h) ** 2
+            high += (max(abs(a[axis] + up[1] * b[axis]) - extent, ZERO) * h) ** 2
+        first, second = min(first, low), min(second, high)
+    hidden = max(1 - math.sqrt(first) / up[0], 0.0) + max(1 - math.sqrt(second) / up[1], 0.0)
+    return 1.0 - 0.5 * strength * hidden
 
 
 @njit(**INNER)
-def _sky(air, lights, x, y, z):
+def _sky(air, lights, view):
     """RGB of the sky in a direction: a gradient, clouds and a glow about the sun."""
-    x, y, z = _unit(x, y, z)
+    x, y, z = view
     up = math.sqrt(max(z, 0.0))
     cloud = 0.0
     if air[r.CLOUDS] > 0 and z > 0.02:
         a, b, seed = 1.2 * x / (z + 0.15), 1.2 * y / (z + 0.15), int(air[r.AIR_SEED])
-        for octave in range(4):
-            cloud += 0.55**octave * noise(r.VALUE, a, b, seed + octave)
-            a, b = 2.03 * a + 5.1, 2.03 * b
+        weight = 1.0
+        for octave in range(3):
+            cloud += weight * noise(r.VALUE, a, b, seed + octave)
+            a, b, weight = 2.03 * a + 5.1, 2.03 * b, 0.55 * weight
         cloud = min(max(2.0 * cloud + air[r.CLOUDS] - 0.5, 0.0), 1.0) * min(8 * z, 1.0)
     glow = 0.0
     if lights.shape[0] > 0 and lights[0, r.LAMP] == 0:
         near = x * lights[0, r.PLACE] + y * lights[0, r.PLACE + 1] + z * lights[0, r.PLACE + 2]
-        glow = 0.5 * max(near, 0.0) ** 32
+        near = max(near, 0.0) ** 2
+        near *= near
+        near *= near
+        glow = 0.5 * near * near
     white = 1.3 * max(air[r.HORIZON], air[r.HORIZON + 1], air[r.HORIZON + 2])
     red = air[r.HORIZON] + up * (air[r.ZENITH] - air[r.HORIZON])
     green = air[r.HORIZON + 1] + up * (air[r.ZENITH + 1] - air[r.HORIZON + 1])
@@ -183,57 +148,58 @@ def _sky(air, lights, x, y, z):
 
 
 @njit(**INNER)
-def _shade(world, spheres, near, code, points, n, view, footprint, distance):
-    """RGB of a surface seen at rows 1 to n of `points`, their mean in row 0, from `view`."""
-    shapes, heights, textures, lights, air = world
-    x, y, z = points[0, 0], points[0, 1], points[0, 2]
-    row, normal, u, v = _surface(shapes, heights, code, x, y, z)
+def _light(lights, shadows, k, own, place, normal, view, open_, shine):
+    """How much of light k comes from a point by reflection: evenly, and as a highlight."""
+    lamp = lights[k, r.LAMP]
+    dx = lights[k, r.PLACE] - lamp * place[0]
+    dy = lights[k, r.PLACE + 1] - lamp * place[1]
+    dz = lights[k, r.PLACE + 2] - lamp * place[2]
+    square = dx * dx + dy * dy + dz * dz
+    near = 1.0 / math.sqrt(square)
+    cosine = (normal[0] * dx + normal[1] * dy + normal[2] * dz) * near
+    if cosine <= 0:
+        return 0.0, 0.0
+    strength = 1.0 / (1.0 + lamp * 0.25 * square)
+    if lights[k, r.SHADOWS] > 0:
+        x, y, z = place
+        x, y, z = x + _LIFT * normal[0], y + _LIFT * normal[1], z + _LIFT * normal[2]
+        strength *= lit(shadows, lights, k, own, x, y, z)
+    else:
+        strength *= open_
+    if shine <= 0:
+        return strength * cosine, 0.0
+    hx, hy, hz = _unit(dx * near - view[0], dy * near - view[1], dz * near - view[2])
+    half = max(hx * normal[0] + hy * normal[1] + hz * normal[2], 0.0)
+    return strength * cosine, strength * half**shine
+
+
+@njit(**INNER)
+def _shade(world, spheres, near, code, place, view, footprint, distance):
+    """RGB of a surface seen at a point from direction `view`."""
+    shapes, heights, textures, lights, air, shadows = world
+    shape = code >> 3
+    row, normal, u, v = _surface(shapes, heights, code, place)
+    # only what is hollow or bent throws shadows on itself
+    hollow = shapes[shape, r.PRIMITIVE_FIELDS] >= ZERO or shapes[shape, 0] >= r.TORUS
+    own = -1 if hollow else shape
     facing = -(normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2])
     slant = footprint / math.sqrt(max(facing, 0.06))
-    albedo = color(textures, row, u, v, slant / shapes[code >> 3, r.SCALE])
-    above = 0.5 + 0.5 * normal[2]
-    red = green = blue = shine = 0.0
-    hidden = 1.0
+    albedo = color(textures, row, u, v, slant / shapes[shape, r.SCALE])
+    way = (np.float32(normal[0]), np.float32(normal[1]), np.float32(normal[2]))
+    open_ = _open(shapes, spheres, near, shape, place, way, air[r.OCCLUSION], air[r.REACH])
+    glow, shine, up = textures[row, r.EMISSION], 0.0, 0.5 + 0.5 * normal[2]
+    red = glow + open_ * (air[r.BELOW] + up * (air[r.ABOVE] - air[r.BELOW]))
+    green = glow + open_ * (air[r.BELOW + 1] + up * (air[r.ABOVE + 1] - air[r.BELOW + 1]))
+    blue = glow + open_ * (air[r.BELOW + 2] + up * (air[r.ABOVE + 2] - air[r.BELOW + 2]))
+    sharp = textures[row, r.SHINE] if textures[row, r.SPECULAR] > 0 else 0.0
     for k in range(lights.shape[0]):
-        lamp = lights[k, r.LAMP]
-        dx = lights[k, r.PLACE] - lamp * x
-        dy = lights[k, r.PLACE + 1] - lamp * y
-        dz = lights[k, r.PLACE + 2] - lamp * z
-        far = math.sqrt(dx * dx + dy * dy + dz * dz)
-        dx, dy, dz = dx / far, dy / far, dz / far
-        cosine = normal[0] * dx + normal[1] * dy + normal[2] * dz
-        if k == 0:  # the ambient occlusion shares the search for shapes
-            start = (x, y, z)
-            limit = far if lamp else 1e9
-            _candidates(spheres, near, start, (dx, dy, dz), limit, air[r.REACH], 2 * footprint)
-            hidden = _open(
-                shapes, near, code >> 3, x, y, z, normal, air[r.OCCLUSION], air[r.REACH]
-            )
-        if cosine <= 0:
-            continue
-        strength = cosine / (1 + lamp * 0.25 * far * far)
-        if lights[k, r.SHADOWS] > 0:
-            if k > 0:
-                limit = far if lamp else 1e9
-                _candidates(spheres, near, (x, y, z), (dx, dy, dz), limit, 0.0, 2 * footprint)
-            place = (lights[k, r.PLACE], lights[k, r.PLACE + 1], lights[k, r.PLACE + 2])
-            strength *= _lit(shapes, heights, near, points, n, normal, place, lamp)
-        else:
-            strength *= hidden
-        red += strength * lights[k, r.COLOR]
-        green += strength * lights[k, r.COLOR + 1]
-        blue += strength * lights[k, r.COLOR + 2]
-        if textures[row, r.SPECULAR] > 0:
-            hx, hy, hz = _unit(dx - view[0], dy - view[1], dz - view[2])
-            half = max(hx * normal[0] + hy * normal[1] + hz * normal[2], 0.0)
-            shine += strength / cosine * half ** textures[row, r.SHINE]
-    shine *= textures[row, r.SPECULAR]
-    glow, mist = textures[row, r.EMISSION], 1.0 - math.exp(-air[r.FOG] * distance)
-    low = air[r.BELOW], air[r.BELOW + 1], air[r.BELOW + 2]
-    red += hidden * (low[0] + above * (air[r.ABOVE] - low[0])) + glow
-    green += hidden * (low[1] + above * (air[r.ABOVE + 1] - low[1])) + glow
-    blue += hidden * (low[2] + above * (air[r.ABOVE + 2] - low[2])) + glow
+        even, high = _light(lights, shadows, k, own, place, normal, view, open_, sharp)
+        red += even * lights[k, r.COLOR]
+        green += even * lights[k, r.COLOR + 1]
+        blue += even * lights[k, r.COLOR + 2]
+        shine += textures[row, r.SPECULAR] * high * lights[k, r.COLOR + 1]
     red, green, blue = red * albedo[0] + shine, green * albedo[1] + shine, blue * albedo[2] + shine
+    mist = 1.0 - 1.0 / (1.0 + air[r.FOG] * distance)
     return (
         red + mist * (air[r.HORIZON] - red),
         green + mist * (air[r.HORIZON + 1] - green),
@@ -242,38 +208,36 @@ def _shade(world, spheres, near, code, points, n, view, footprint, distance):
 
 
 @njit(**INNER)
-def _gather(t, code, i, j, own, samples, top, o, rays, points):
-    """Write where rays of the pixel at (i, j) hit surface `own`, the mean in row 0; count them."""
-    n, step = 0, 1.0 / samples
-    x = y = z = 0.0
+def _gather(t, code, i, j, own, samples):
+    """Take the rays of the pixel at (i, j) that hit surface `own`: their number and means.
+
+    Of their t, and of their columns and rows within the pixel, which t weighs.
+    """
+    n = 0
+    t_sum = u_sum = v_sum = ZERO
     for a in range(samples):
         for b in range(samples):
             if code[i + a, j + b] == own:
                 code[i + a, j + b] = _TAKEN
                 n += 1
-                u, v = (j + b + 0.5) * step, top + (i + a + 0.5) * step
-                distance = t[i + a, j + b] if own != SKY else 1.0
-                points[n, 0] = o[0] + distance * (rays[0, 0] + u * rays[0, 1] + v * rays[0, 2])
-                points[n, 1] = o[1] + distance * (rays[1, 0] + u * rays[1, 1] + v * rays[1, 2])
-                points[n, 2] = o[2] + distance * (rays[2, 0] + u * rays[2, 1] + v * rays[2, 2])
-                x, y, z = x + points[n, 0], y + points[n, 1], z + points[n, 2]
-    points[0, 0], points[0, 1], points[0, 2] = x / n, y / n, z / n
-    return n
+                distance = t[i + a, j + b] if own != SKY else ONE
+                t_sum += distance
+                u_sum += distance * b
+                v_sum += distance * a
+    return n, t_sum / n, u_sum / t_sum, v_sum / t_sum
 
 
 @njit(**INNER)
 def paint(image, t, code, top, samples, world, c2w, rays):
     """Write image (rows, W, 3) float32, a band that begins at row `top`, and use `code` up.
 
-    Values are linear in light. Rays of a pixel that meet one surface share its texture and light,
-    but for shadows, which are sharp.
+    Values are linear in light. Rays of a pixel that meet one surface are shaded at their mean.
     """
-    o = (c2w[0, 3], c2w[1, 3], c2w[2, 3])
-    shapes, _, _, lights, air = world
+    ox, oy, oz = c2w[0, 3], c2w[1, 3], c2w[2, 3]
+    shapes, lights, air = world[0], world[3], world[4]
     spheres = np.ascontiguousarray(shapes[:, r.SPHERE : r.SPHERE + 4].T)
     near = np.empty(shapes.shape[0], np.float32)
-    points = np.empty((samples * samples + 1, 3))
-    part = 1.0 / (samples * samples)
+    step = 1.0 / samples
     spread = math.sqrt(rays[0, 1] ** 2 + rays[1, 1] ** 2 + rays[2, 1] ** 2)
     for row in range(image.shape[0]):
         for column in range(image.shape[1]):
@@ -284,19 +248,21 @@ def paint(image, t, code, top, samples, world, c2w, rays):
                     own = code[i + a, j + b]
                     if own == _TAKEN:
                         continue
-                    depth = t[i + a, j + b]
-                    n = _gather(t, code, i, j, own, samples, top, o, rays, points)
-                    dx, dy, dz = points[0, 0] - o[0], points[0, 1] - o[1], points[0, 2] - o[2]
+                    n, depth, u, v = _gather(t, code, i, j, own, samples)
+                    u, v = column + (u + 0.5) * step, top + row + (v + 0.5) * step
+                    dx = rays[0, 0] + u * rays[0, 1] + v * rays[0, 2]
+                    dy = rays[1, 0] + u * rays[1, 1] + v * rays[1, 2]
+                    dz = rays[2, 0] + u * rays[2, 1] + v * rays[2, 2]
+                    long = math.sqrt(dx * dx + dy * dy + dz * dz)
+                    view = (dx / long, dy / long, dz / long)
                     if own == SKY:
-                        seen = _sky(air, lights, dx, dy, dz)
+                        seen = _sky(air, lights, view)
                     else:
-                        distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-                        view = (dx / distance, dy / distance, dz / distance)
+                        place = (ox + depth * dx, oy + depth * dy, oz + depth * dz)
                         seen = _shade(
-                            world, spheres, near, int(own), points, n, view, spread * depth, distance
+                            world, spheres, near, int(own), place, view, spread * depth, depth * long
                         )
-                    red += n * part * seen[0]
-                    green += n * part * seen[1]
-                    blue += n * part * seen[2]
-            image[row, column, 0], image[row, column, 1] = red, green
-            image[row, column, 2] = blue
+                    red, green, blue = red + n * seen[0], green + n * seen[1], blue + n * seen[2]
+            part = step * step
+            image[row, column, 0], image[row, column, 1] = part * red, part * green
+            image[row, column, 2] = part * blue

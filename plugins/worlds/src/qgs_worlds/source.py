@@ -95,11 +95,13 @@ class WorldScene(Scene):
         """See `Scene`."""
         config, cache = self._config, self._cache
         images = {frame: cache[self.name, frame] for frame in frames if (self.name, frame) in cache}
-        for frame in dict.fromkeys(frames):
-            if frame not in images:
-                images[frame] = self._drawn.photo(frame, config.image_size, config.samples)
-                if (len(cache) + 1) * images[frame].nbytes <= config.cache_mb * 2**20:
-                    cache[self.name, frame] = images[frame]
+        if missing := [frame for frame in dict.fromkeys(frames) if frame not in images]:
+            photos = self._drawn.photos(missing, config.image_size, config.samples)
+            images.update(zip(missing, photos, strict=True))
+            fitting = config.cache_mb * 2**20 // photos[0].nbytes - len(cache)
+            cache.update(
+                {(self.name, frame): images[frame] for frame in missing[: max(fitting, 0)]}
+            )
         out = np.empty((len(frames), 3, *config.image_size), np.float32)
         for place, frame in enumerate(frames):
             np.multiply(images[frame].transpose(2, 0, 1), np.float32(1 / 255), out=out[place])
