@@ -68,13 +68,11 @@ def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
     focal = _PROBE[1] / 2 / math.tan(math.radians(rig.fov) / 2)
     intrinsics = np.array([focal, focal, _PROBE[1] / 2, _PROBE[0] / 2])
     near = clearances(world[0], rig.c2w[:, :3, 3]).min()
-    fault = 2.0 if near < CLEARANCE else 0.0
-    for c2w in rig.c2w:
-        t, _, _ = trace(*_PROBE, 0, 1, *world, c2w, intrinsics)
-        close = (t < max(0.25, 0.25 * rig.distance)).mean()
-        sky = max(np.isinf(t).mean() - 0.3, 0.0)
-        fault = max(fault, float(close), float(sky))
-    return fault
+    views = [trace(*_PROBE, 0, 1, *world, c2w, intrinsics)[0].ravel() for c2w in rig.c2w]
+    t = np.stack(views)
+    close = float((t < max(0.25, 0.25 * rig.distance)).mean(1).max())
+    sky = float((t == np.inf).mean(1).max())
+    return max(close, sky - 0.3, 2.0 if near < CLEARANCE else 0.0)
 
 
 def _still(

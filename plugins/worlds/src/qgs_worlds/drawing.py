@@ -61,7 +61,7 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
     varied = config.shapes == "varied"
     kind = plan.choices(KINDS, SHARES)[0] if varied else "indoors"
     things = Things(plan, VARIED if varied else PLAIN, materials.COUNT, _MAPS)
-    count = round(spread(plan, 3, config.complexity))
+    count = round(spread(plan, 4, config.complexity))
     place = draw_place(kind, plan, things, count, maps)
     shapes = packed(place.shapes)
     rig = draw_cameras(numbers, place, (shapes, maps), config.views_per_scene, config.cameras == "varied")

@@ -9,10 +9,18 @@ from PIL import Image
 from qgs_rooms.textures import INNER, OPTIONS
 
 from qgs_worlds import rows as r
-from qgs_worlds.textures import scrambled
 
 _SHOULDER = 0.6  # of full brightness, from where on highlights are compressed
 _STEP, _ENTRIES = 1 / 512, 2048  # of the table of the tone curve
+
+
+@njit(**INNER)
+def _scrambled(i, j, seed):
+    """32 random bits for each pixel i of frame j."""
+    h = (i * 374761393 + j * 668265263 + seed * 974634777) & 0xFFFFFFFF
+    h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
+    h = ((h ^ (h >> 15)) * 739982445) & 0xFFFFFFFF
+    return h ^ (h >> 16)
 
 
 @njit(**INNER)
@@ -38,7 +46,7 @@ def develop(image, light, effects, frame):
         for j in range(width):
             y, x = 2 * i + 1 - height, 2 * j + 1 - width
             edge = 1.0 - effects[r.VIGNETTE] * (x * x + y * y) * reach
-            h = scrambled(i * width + j, frame, seed)
+            h = _scrambled(i * width + j, frame, seed)
             for c in range(3):
                 value = math.sqrt(max(light[i, j, c] * effects[r.GAINS + c] * edge, 0.0))
                 value = 255 * curve[min(int(value * (1 / _STEP) + 0.5), _ENTRIES - 1)]

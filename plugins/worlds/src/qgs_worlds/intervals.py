@@ -10,23 +10,24 @@ import math
 import numpy as np
 from numba import njit
 from qgs_rooms.intersections import NONE, ONE, TINY, ZERO, reciprocal, slab
-from qgs_rooms.textures import INNER, OPTIONS
+from qgs_rooms.textures import OPTIONS
 
 from qgs_worlds import rows as r
+from qgs_worlds.kernels import BORROWING
 
 NEAR = np.float32(0.01)
 _HALF, _TWO = np.float32(0.5), np.float32(2)
 _STEPS, _TOUCH = 48, np.float32(2e-4)  # of the search for a torus
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def nearest(o, d):
     """The point of a ray that is nearest to the origin, and its t."""
     t = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
     return (o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]), t
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def ellipsoid(o, d):
     """The unit sphere."""
     inside = ONE - (o[0] * o[0] + o[1] * o[1] + o[2] * o[2])
@@ -35,7 +36,7 @@ def ellipsoid(o, d):
     return (-root if met else NONE), (root if met else -NONE), ZERO, ZERO
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def box(o, d):
     """The cube; faces are numbered by axis."""
     near_x, far_x = slab(o[0], reciprocal(d[0]), ONE)
@@ -47,7 +48,7 @@ def box(o, d):
     return near, far, entry, leave
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def frustum(o, d, top):
     """Radius 1 at z = -1, `top` <= 1 at z = 1. Face 0 is the side, 1 a cap."""
     low, high = slab(o[2], reciprocal(d[2]), ONE)
@@ -77,7 +78,7 @@ def frustum(o, d, top):
     )
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def capsule(o, d, half):
     """Points up to 1 from the segment between z = -half and half."""
     low, high = slab(o[2], reciprocal(d[2]), half)
@@ -96,7 +97,7 @@ def capsule(o, d, half):
     return near, far, ZERO, ZERO
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def torus(o, d, thickness, start):
     """Outer radius 1, thin radius `thickness`, about z, from `start` on; the exit is the entry."""
     length = math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
@@ -116,7 +117,7 @@ def torus(o, d, thickness, start):
     return NONE, -NONE, ZERO, ZERO
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def height_at(heights, x, y):
     """Bilinear height at x, y in [-1, 1]."""
     last = heights.shape[0] - 1
@@ -129,12 +130,12 @@ def height_at(heights, x, y):
     return low + a * (high - low)
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _above(heights, o, d, t):
     return o[2] + t * d[2] - height_at(heights, o[0] + t * d[0], o[1] + t * d[1])
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _next_line(o, d, t, cells):
     """The t at which a ray crosses the next line between cells along one axis."""
     if abs(d) < TINY:
@@ -146,7 +147,7 @@ def _next_line(o, d, t, cells):
     return (np.float32(line) / cells * _TWO - ONE - o) / d
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def relief(o, d, heights, start):
     """What is below the height map, in the cube, as `torus`. Face 0 is its top, 1 a side."""
     t, end, _, _ = box(o, d)
@@ -175,7 +176,7 @@ def relief(o, d, heights, start):
     return NONE, -NONE, ZERO, ZERO
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def convex(kind, extra, p, d):
     """Entry, exit and their faces for a convex primitive of any kind."""
     if kind == r.ELLIPSOID:
@@ -187,7 +188,7 @@ def convex(kind, extra, p, d):
     return capsule(p, d, extra)
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def less(near, far, entry, cut_near, cut_far, cut_leave):
     """Entry into the first interval without the second one, and its face, 3 more on the cut."""
     outer = (near > NEAR) & (near <= far) & ((near < cut_near) | (near > cut_far))
@@ -196,7 +197,7 @@ def less(near, far, entry, cut_near, cut_far, cut_leave):
     return t, (entry if outer else cut_leave + np.float32(3))
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def local(shapes, i, p, x, y, z):
     """A direction in the frame of the primitive whose fields begin at p, of shape i."""
     m = p + r.MATRIX
@@ -207,14 +208,14 @@ def local(shapes, i, p, x, y, z):
     )
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def local_point(shapes, i, p, x, y, z):
     """A point in the frame of the primitive whose fields begin at p, of shape i."""
     c = p + r.CENTER
     return local(shapes, i, p, x - shapes[i, c], y - shapes[i, c + 1], z - shapes[i, c + 2])
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def shape_hit(shapes, heights, i, o, d):
     """t at which a ray enters shape i, or inf, and the face: 0 to 2, on the cut 3 to 5."""
     kind, extra, way = shapes[i, 0], shapes[i, 1], local(shapes, i, 0, *d)

@@ -9,7 +9,7 @@ from qgs_worlds import rows as r
 from qgs_worlds.places import Place
 from qgs_worlds.things import spread
 
-_LAMPS = {"indoors": (1, 3), "outdoors": (0, 1), "objects": (0, 3)}
+_LAMPS = {"indoors": (1, 2), "outdoors": (0, 1), "objects": (0, 2)}
 _SUNNY = {"indoors": 0.5, "outdoors": 0.75, "objects": 0.45}
 
 
@@ -60,7 +60,7 @@ def _air(rng: Random, above: np.ndarray, below: np.ndarray, occlusion: float) ->
     air[r.FOG] = rng.choice((0.0005, spread(rng, 0.0005, 0.02)))
     air[r.CLOUDS] = rng.choice((0.0, rng.uniform(0.2, 1.0), rng.uniform(0.2, 1.0)))
     air[r.AIR_SEED] = rng.randrange(1 << 16)
-    air[r.OCCLUSION], air[r.REACH] = occlusion, rng.uniform(0.25, 0.8)
+    air[r.OCCLUSION], air[r.REACH] = occlusion, rng.uniform(0.12, 0.4)
     return air
 
 
@@ -80,4 +80,4 @@ def draw_effects(rng: Random, light: np.ndarray, varied: bool) -> tuple[np.ndarr
     effects[r.VIGNETTE] = rng.choice((0.0, rng.uniform(0, 0.5)))
     effects[r.NOISE] = rng.choice((0.0, spread(rng, 0.003, 0.03)))
     effects[r.NOISE_SEED] = rng.randrange(1 << 16)
-    return effects, rng.choice((0, rng.randint(60, 98)))
+    return effects, rng.choice((0, 0, rng.randint(60, 98)))

@@ -12,7 +12,7 @@ from qgs_worlds import rows as r
 from qgs_worlds.textures import chance, noise
 from qgs_worlds.things import spread
 
-COUNT = 20  # textures of a world
+COUNT = 14  # textures of a world
 _SIDE = 33  # points of a height map along each axis
 _PLAIN_PATTERNS = (r.STRIPES, r.CHECKER, r.TILES, r.DOTS)
 _PATTERNS = (*_PLAIN_PATTERNS, r.TILES, r.GLYPHS, r.GLYPHS, r.RINGS)
@@ -27,7 +27,7 @@ class Palette:
         self.rng = rng
         base = rng.random()
         self._hues = [(base + step + 0.05 * rng.gauss(0, 1)) % 1 for step in (0, 0.06, 0.1, 0.5, 0.33)]
-        self._grey = rng.uniform(1, 5)
+        self._grey = rng.uniform(1.5, 7)
 
     def color(self) -> Color:
         """A colour: most are dull, few are bright or dark."""
@@ -129,5 +129,5 @@ def height_maps(seed, count):
                     x, y, weight = 2 * x, 2 * y, gain * weight
                 maps[k, i, j] = height
                 largest = max(largest, abs(height))
-        maps[k] /= largest
+        maps[k] /= max(largest, 1e-6)
     return maps

@@ -72,7 +72,7 @@ def _indoors(rng: Random, things: Things, count: int) -> Place:
     fixed = len(shapes)
     x, y, z = size[0] / 2, size[1] / 2, size[2]
     for _ in range(count):
-        extent = min(spread(rng, 0.12, 0.9), 0.3 * min(size))
+        extent = min(spread(rng, 0.15, 1.0), 0.3 * min(size))
         at = (rng.uniform(-x, x) * 0.85, rng.uniform(-y, y) * 0.85, 0.0)
         shapes += _put(rng, things, at, extent, z)
     if not plain:
@@ -152,10 +152,10 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
         shapes += _far(rng, things)
     near: list[Shape] = []
     for _ in range(count):
-        away, angle = 9 * math.sqrt(rng.random()), rng.uniform(0, math.tau)
+        away, angle = 9 * rng.random() ** 0.7, rng.uniform(0, math.tau)
         at = (away * math.cos(angle), away * math.sin(angle), 0.0)
         at = at if rng.random() < 0.85 else (at[0], at[1], rng.uniform(0.3, 3))
-        near += placed(things.draw(), at, rng.uniform(0, math.tau), spread(rng, 0.15, 1.6), ground)
+        near += placed(things.draw(), at, rng.uniform(0, math.tau), spread(rng, 0.25, 2), ground)
     shapes += near
     level = max((ground(0.5 * x, 0.5 * y) for x in range(-24, 25, 2) for y in range(-24, 25, 2)))
     low, high = (-12.0, -12.0, level + 0.3), (12.0, 12.0, level + 7)
@@ -213,9 +213,9 @@ def _objects(rng: Random, things: Things, count: int) -> Place:
         table = Primitive(kind, (0.0, 0.0, level / 2), (wide, wide, level / 2), extra=1.0)
         shapes.append(things.skinned(table, 0.7))
     fixed = len(shapes)
-    for _ in range(max(count // 3, 1)):
-        at = (rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), level)
-        size = spread(rng, 0.08, 0.45)
+    for _ in range(max(count // 2, 1)):
+        at = (rng.gauss(0, 0.4), rng.gauss(0, 0.4), level)
+        size = spread(rng, 0.1, 0.5)
         shapes += placed(things.draw(), at, rng.uniform(0, math.tau), size, _level)
     low, high = (-3.5, -3.5, level + 0.2), (3.5, 3.5, level + 3)
     eyes = (level + 0.25, level + 1.6)

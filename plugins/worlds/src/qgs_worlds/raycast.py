@@ -19,6 +19,7 @@ from qgs_worlds.intervals import (
     relief,
     torus,
 )
+from qgs_worlds.kernels import BORROWING
 
 SKY = -1  # part p of shape i has code 8 i + p
 _PLANE = 0.02  # shapes are clipped where they come nearer to the camera's plane than this
@@ -47,7 +48,7 @@ def _corners(shapes, i, c2w, corners):
                 corners[corner, a] += axes[j, a] if corner >> j & 1 else -axes[j, a]
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _clipped(corners, points):
     """Write the corners in front of the camera, and where edges cross its plane; their number."""
     n = 0
@@ -78,7 +79,7 @@ def _bounds(shapes, i, c2w, intrinsics, corners, points):
     return u0, u1, v0, v1
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _ray(o, base, step, along):
     """The ray at column `along` of a row: its point nearest to the origin, direction, t there."""
     x, y = base[0] + along * step[0], base[1] + along * step[1]
@@ -87,13 +88,13 @@ def _ray(o, base, step, along):
     return p, d, t
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _store(spans, k, found, t):
     near, far, entry, leave = found
     spans[0, k], spans[1, k], spans[2, k], spans[3, k] = near + t, far + t, entry, leave
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _inside_row(kind, extra, heights, steps, o, base, step, spans):
     """Write `spans` (4, R): entries, exits and their faces, for the rays of a row.
 
@@ -124,7 +125,7 @@ def _inside_row(kind, extra, heights, steps, o, base, step, spans):
                 _store(spans, k, relief(p, d, heights, -t), t)
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _closest(t, code, own, first, second):
     """Keep what is nearer: a shape by the intervals of its primitives (4, R), or what was there."""
     for k in range(t.shape[0]):
@@ -136,14 +137,14 @@ def _closest(t, code, own, first, second):
         code[k] = own + face if closer else code[k]
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _span(low, high, samples, first, count):
     """Indices of the samples between two screen coordinates, among `count` from pixel `first`."""
     low, high = (low - first) * samples - 0.5, (high - first) * samples + 0.5
     return int(min(max(low, 0.0), count)), int(min(max(high + 1, 0.0), count))
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _base(rays, v):
     """Direction of the ray at u = 0 of row v."""
     return (

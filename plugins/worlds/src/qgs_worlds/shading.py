@@ -8,7 +8,9 @@ from qgs_rooms.intersections import ONE, ZERO
 from qgs_rooms.textures import INNER
 
 from qgs_worlds import rows as r
-from qgs_worlds.intervals import height_at, local, local_point
+from qgs_worlds.intervals import height_at, local_point
+from qgs_worlds.kernels import BORROWING
+from qgs_worlds.occlusion import surroundings, visible
 from qgs_worlds.raycast import SKY
 from qgs_worlds.shadows import lit
 from qgs_worlds.textures import color, noise
@@ -17,13 +19,13 @@ _TAKEN = np.float32(-2)
 _LIFT = 2e-3  # metres above a surface where its light is looked up
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _unit(x, y, z):
     scale = 1.0 / math.sqrt(x * x + y * y + z * z + 1e-20)
     return x * scale, y * scale, z * scale
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _largest(x, y, z):
     """The axis along which a vector is longest."""
     if abs(x) >= abs(y) and abs(x) >= abs(z):
@@ -31,7 +33,7 @@ def _largest(x, y, z):
     return 1 if abs(y) >= abs(z) else 2
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _on_axis(axis, x, y, z, h):
     """Normal of the cube's face across an axis, position on it in metres, and its number."""
     if axis == 0:
@@ -41,7 +43,7 @@ def _on_axis(axis, x, y, z, h):
     return (0.0, 0.0, math.copysign(1.0, z)), x * h[0], y * h[1], (5 if z > 0 else 4)
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _on_primitive(kind, extra, heights, face, x, y, z, h):
     """As `_on_axis` for a primitive of any kind, at a point and a face of it."""
     if kind == r.BOX:
@@ -68,7 +70,7 @@ def _on_primitive(kind, extra, heights, face, x, y, z, h):
     return (x, y, 0.5 * (1 - extra) * across), angle * h[0], z * h[2], 0
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _surface(shapes, heights, code, place):
     """Index of the texture, world normal and texture coordinates of a point of a surface."""
     i, part = code >> 3, code & 7
@@ -90,33 +92,7 @@ def _surface(shapes, heights, code, place):
     return (int(shapes[i, r.CUT_TEXTURE]) if cut else row), normal, u * scale, v * scale
 
 
-@njit(**INNER)
-def _open(shapes, spheres, near, own, place, normal, strength, reach):
-    """How much of the ambient light reaches a point, by distances to boxes around near shapes."""
-    x, y, z = np.float32(place[0]), np.float32(place[1]), np.float32(place[2])
-    reach = np.float32(reach)
-    for i in range(near.shape[0]):
-        a, b, c = spheres[0, i] - x, spheres[1, i] - y, spheres[2, i] - z
-        size = spheres[3, i] + reach
-        near[i] = ONE if a * a + b * b + c * c < size * size else ZERO
-    up, far = (np.float32(0.25) * reach, np.float32(0.8) * reach), reach * reach
-    first = second = far
-    for i in range(near.shape[0]):
-        if near[i] == ZERO or i == own:
-            continue
-        a = local_point(shapes, i, 0, x, y, z)
-        b = local(shapes, i, 0, normal[0], normal[1], normal[2])
-        low = high = ZERO
-        for axis in range(3):
-            extent, h = shapes[i, r.EXTENT + axis], shapes[i, r.HALF + axis]
-            low += (max(abs(a[axis] + up[0] * b[axis]) - extent, ZERO) * h) ** 2
-            high += (max(abs(a[axis] + up[1] * b[axis]) - extent, ZERO) * h) ** 2
-        first, second = min(first, low), min(second, high)
-    hidden = max(1 - math.sqrt(first) / up[0], 0.0) + max(1 - math.sqrt(second) / up[1], 0.0)
-    return 1.0 - 0.5 * strength * hidden
-
-
-@njit(**INNER)
+@njit(**BORROWING)
 def _sky(air, lights, view):
     """RGB of the sky in a direction: a gradient, clouds and a glow about the sun."""
     x, y, z = view
@@ -147,7 +123,7 @@ def _sky(air, lights, view):
     )
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _light(lights, shadows, k, own, place, normal, view, open_, shine):
     """How much of light k comes from a point by reflection: evenly, and as a highlight."""
     lamp = lights[k, r.LAMP]
@@ -173,8 +149,8 @@ def _light(lights, shadows, k, own, place, normal, view, open_, shine):
     return strength * cosine, strength * half**shine
 
 
-@njit(**INNER)
-def _shade(world, spheres, near, code, place, view, footprint, distance):
+@njit(**BORROWING)
+def _shade(world, around, code, place, view, footprint, distance):
     """RGB of a surface seen at a point from direction `view`."""
     shapes, heights, textures, lights, air, shadows = world
     shape = code >> 3
@@ -185,8 +161,7 @@ def _shade(world, spheres, near, code, place, view, footprint, distance):
     facing = -(normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2])
     slant = footprint / math.sqrt(max(facing, 0.06))
     albedo = color(textures, row, u, v, slant / shapes[shape, r.SCALE])
-    way = (np.float32(normal[0]), np.float32(normal[1]), np.float32(normal[2]))
-    open_ = _open(shapes, spheres, near, shape, place, way, air[r.OCCLUSION], air[r.REACH])
+    open_ = visible(shapes, around, shape, place, normal, air[r.OCCLUSION], air[r.REACH])
     glow, shine, up = textures[row, r.EMISSION], 0.0, 0.5 + 0.5 * normal[2]
     red = glow + open_ * (air[r.BELOW] + up * (air[r.ABOVE] - air[r.BELOW]))
     green = glow + open_ * (air[r.BELOW + 1] + up * (air[r.ABOVE + 1] - air[r.BELOW + 1]))
@@ -207,7 +182,7 @@ def _shade(world, spheres, near, code, place, view, footprint, distance):
     )
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _gather(t, code, i, j, own, samples):
     """Take the rays of the pixel at (i, j) that hit surface `own`: their number and means.
 
@@ -233,10 +208,13 @@ def paint(image, t, code, top, samples, world, c2w, rays):
 
     Values are linear in light. Rays of a pixel that meet one surface are shaded at their mean.
     """
+    _paint(image, t, code, top, samples, world, surroundings(world[0]), c2w, rays)
+
+
+@njit(**BORROWING)
+def _paint(image, t, code, top, samples, world, around, c2w, rays):
     ox, oy, oz = c2w[0, 3], c2w[1, 3], c2w[2, 3]
-    shapes, lights, air = world[0], world[3], world[4]
-    spheres = np.ascontiguousarray(shapes[:, r.SPHERE : r.SPHERE + 4].T)
-    near = np.empty(shapes.shape[0], np.float32)
+    lights, air = world[3], world[4]
     step = 1.0 / samples
     spread = math.sqrt(rays[0, 1] ** 2 + rays[1, 1] ** 2 + rays[2, 1] ** 2)
     for row in range(image.shape[0]):
@@ -260,7 +238,7 @@ def paint(image, t, code, top, samples, world, c2w, rays):
                     else:
                         place = (ox + depth * dx, oy + depth * dy, oz + depth * dz)
                         seen = _shade(
-                            world, spheres, near, int(own), place, view, spread * depth, depth * long
+                            world, around, int(own), place, view, spread * depth, depth * long
                         )
                     red, green, blue = red + n * seen[0], green + n * seen[1], blue + n * seen[2]
             part = step * step

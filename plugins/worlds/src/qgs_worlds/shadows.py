@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 from numba import njit
-from qgs_rooms.textures import INNER
 
 from qgs_worlds import rows as r
+from qgs_worlds.kernels import BORROWING
 from qgs_worlds.raycast import trace
 
 _SUN_SIDE, _LAMP_SIDE = 224, 72  # pixels of the map of the sun, and of each of a lamp's six
@@ -67,7 +67,7 @@ def _views(
     return [(c2w[0], _SUN_SIDE, _SUN_SIDE / 2 * _SUN / radius)]
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _seen(maps, depths, codes, k, own, x, y, z):
     """The share of a light that a point gets by map k; all of it outside of the map."""
     x, y, z = x - maps[k, _POSE + 3], y - maps[k, _POSE + 7], z - maps[k, _POSE + 11]
@@ -91,7 +91,7 @@ def _seen(maps, depths, codes, k, own, x, y, z):
     return light
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def lit(shadows, lights, light, own, x, y, z):
     """The share of a light that reaches a point. own: its shape, if it throws none on itself."""
     maps, depths, codes = shadows

@@ -6,7 +6,6 @@ Kernels are imported when the first scene is drawn: numba takes longer to load t
 import math
 from collections.abc import Sequence
 from functools import cached_property, partial
-from random import Random
 from typing import ClassVar, Literal, TypeAlias
 
 import numpy as np

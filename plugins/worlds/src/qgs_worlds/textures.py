@@ -2,53 +2,46 @@
 
 import math
 
+import numpy as np
 from numba import njit
-from qgs_rooms.textures import INNER
 
 from qgs_worlds import rows as r
+from qgs_worlds.kernels import BORROWING
+
+_SIDE = 64  # of the table of random numbers, which noise repeats
+_TABLE = np.random.default_rng(7).random((_SIDE, _SIDE)).astype(np.float32)
 
 
-@njit(**INNER)
-def scrambled(i, j, seed):
-    """An integer in [0, 2^32) for each lattice point."""
-    h = (i * 374761393 + j * 668265263 + seed * 974634777) & 0xFFFFFFFF
-    h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
-    h = ((h ^ (h >> 15)) * 739982445) & 0xFFFFFFFF
-    return h ^ (h >> 16)
-
-
-@njit(**INNER)
+@njit(**BORROWING)
 def chance(i, j, seed):
     """A number in [0, 1) for each lattice point."""
-    return scrambled(i, j, seed) / 4294967296.0
+    return float(_TABLE[(i + seed) & (_SIDE - 1), (j + (seed >> 6)) & (_SIDE - 1)])
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _slope(i, j, seed, x, y):
     """Height at (x, y) of a plane through the lattice point with a random slope."""
-    h = scrambled(i, j, seed)
-    return ((h & 0xFFFF) / 32768.0 - 1.0) * x + ((h >> 16) / 32768.0 - 1.0) * y
+    return (2 * chance(i, j, seed) - 1.0) * x + (2 * chance(j, i, seed + 1371) - 1.0) * y
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _corner(basis, i, j, seed, x, y):
     return chance(i, j, seed) - 0.5 if basis == r.VALUE else _slope(i, j, seed, x, y)
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _cells(x, y, i, j, seed):
     """Distance to the nearest of points scattered one to a cell, less its mean."""
     least = 4.0
     for a in range(-1, 2):
         for b in range(-1, 2):
-            h = scrambled(i + a, j + b, seed)
-            u = i + a + (h & 0xFFFF) / 65536.0 - x
-            v = j + b + (h >> 16) / 65536.0 - y
+            u = i + a + chance(i + a, j + b, seed) - x
+            v = j + b + chance(j + b, i + a, seed + 1371) - y
             least = min(least, u * u + v * v)
     return 1.4 * (math.sqrt(least) - 0.45)
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def noise(basis, x, y, seed):
     """Noise of unit period and a mean of about 0, mostly within -0.5 and 0.5."""
     i, j = math.floor(x), math.floor(y)
@@ -62,13 +55,13 @@ def noise(basis, x, y, seed):
     return low + b * (high - low)
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _seen(footprint, period):
     """How much is seen of what has a period: 0 where it is finer than two footprints."""
     return min(max(2.0 - 4.0 * footprint / period, 0.0), 1.0)
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _octaves(textures, row, x, y, footprint):
     """Noise in octaves, about 0.5; x, y: in periods, as is the footprint."""
     basis, seed = int(textures[row, r.BASIS]), int(textures[row, r.SEED])
@@ -77,24 +70,24 @@ def _octaves(textures, row, x, y, footprint):
         seen = _seen(footprint, 1.0)
         if seen <= 0:
             break
-        total += seen * weight * noise(basis, x, y, seed + octave)
+        total += seen * weight * noise(basis, x, y, seed + 389 * octave)
         x, y, footprint, weight = 1.97 * x + 7.3, 1.97 * y, 1.97 * footprint, weight * textures[row, r.GAIN]
     return 0.5 + total
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _step(x, blur):
     """A step at 0, blurred."""
     return min(max(0.5 + x / blur, 0.0), 1.0)
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _bar(x, width, blur):
     """1 within `width` around an integer, 0 elsewhere."""
     return _step(0.5 * width - abs(x - math.floor(x + 0.5)), blur)
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _glyphs(x, y, seed, blur):
     """Lines of marks: random dots of 4 x 6 in a cell, words apart, lines of several lengths."""
     line, place = math.floor(y), math.floor(x)
@@ -107,7 +100,7 @@ def _glyphs(x, y, seed, blur):
     return _seen(blur, 0.4) + 0.4 * (1 - _seen(blur, 0.4))
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def _pattern(kind, x, y, width, seed, blur):
     """How much of the fourth colour is seen, and the tone of the cell in [0, 1]."""
     i, j = math.floor(x), math.floor(y)
@@ -129,7 +122,7 @@ def _pattern(kind, x, y, width, seed, blur):
     return _glyphs(x, y, seed, blur), 0.5
 
 
-@njit(**INNER)
+@njit(**BORROWING)
 def color(textures, row, u, v, footprint):
     """RGB of a texture at u, v; footprint: distance of neighbouring pixels there, same unit."""
     seed, period = int(textures[row, r.SEED]), textures[row, r.PERIOD]
