@@ -19,7 +19,7 @@ _PROBE = (6, 6)  # pixels of the depth maps by which views are judged
 
 @dataclass(frozen=True)
 class Rig:
-    """c2w: OpenCV (F, 4, 4). fov: horizontal, degrees. distance: to what they look at. motion: name."""
+    """c2w: OpenCV (F, 4, 4). fov: horizontal, degrees. distance: to what they look at."""
 
     c2w: np.ndarray
     fov: float
@@ -75,20 +75,18 @@ def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
     return max(close, sky - 0.3, 2.0 if near < CLEARANCE else 0.0)
 
 
-def _still(
-    rng: np.random.Generator, place: Place, shapes: np.ndarray, count: int, rig: Rig
-) -> Rig:
+def _still(rng: np.random.Generator, place: Place, shapes: np.ndarray, count: int, rig: Rig) -> Rig:
     """Cameras a few millimetres apart at the freest of some points, if nothing else was found."""
     points = rng.uniform(place.low, place.high, (64, 3))
     base = points[clearances(shapes[: place.fixed], points).min(1).argmax()]
     eyes = base + 0.01 * rng.uniform(-1, 1, (count, 3))
     target = np.array(place.targets[0])
-    return Rig(_look_at(eyes, np.tile(target, (count, 1)), np.zeros(count)), rig.fov, rig.distance, "still")
+    return Rig(
+        _look_at(eyes, np.tile(target, (count, 1)), np.zeros(count)), rig.fov, rig.distance, "still"
+    )
 
 
-def _draw(
-    rng: np.random.Generator, place: Place, count: int, varied: bool, shrink: float
-) -> Rig:
+def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shrink: float) -> Rig:
     """Cameras anywhere in the place. shrink: factor of the path's length."""
     target = np.array(place.targets[rng.integers(len(place.targets))])
     base, distance = _stand(rng, place, target, varied)
@@ -109,7 +107,8 @@ def _draw(
     targets = targets + 0.02 * distance * rng.normal(size=eyes.shape)
     roll = np.clip(rng.normal(0, 5) + rng.normal(0, 1, count), -15, 15)
     c2w = _look_at(eyes, targets, np.radians(roll))
-    return Rig(c2w[::-1] if rng.random() < 0.5 else c2w, fov, distance, motion)
+    order = -1 if rng.random() < 0.5 else 1
+    return Rig(np.ascontiguousarray(c2w[::order]), fov, distance, motion)
 
 
 def _stand(
@@ -133,7 +132,14 @@ def _stand(
     return base, max(float(np.linalg.norm(base - target)), 0.3)
 
 
-def _walk(rng, base, target, length, s, fov):  # type: ignore[no-untyped-def]
+def _walk(
+    rng: np.random.Generator,
+    base: np.ndarray,
+    target: np.ndarray,
+    length: float,
+    s: np.ndarray,
+    fov: float,
+) -> tuple[np.ndarray, np.ndarray]:
     """Along a bent line; looking ahead, or at what is passed."""
     way = rng.normal(size=3) * (1, 1, 0.3)
     way /= np.linalg.norm(way)
@@ -142,7 +148,14 @@ def _walk(rng, base, target, length, s, fov):  # type: ignore[no-untyped-def]
     return eyes, target + rng.uniform(0, 1) * (eyes - base)
 
 
-def _orbit(rng, base, target, length, s, fov):  # type: ignore[no-untyped-def]
+def _orbit(
+    rng: np.random.Generator,
+    base: np.ndarray,
+    target: np.ndarray,
+    length: float,
+    s: np.ndarray,
+    fov: float,
+) -> tuple[np.ndarray, np.ndarray]:
     """Around the target, rising and coming nearer a little."""
     offset = base - target
     flat = max(math.hypot(offset[0], offset[1]), 0.2)
@@ -154,7 +167,14 @@ def _orbit(rng, base, target, length, s, fov):  # type: ignore[no-untyped-def]
     return eyes, np.tile(target, (len(s), 1))
 
 
-def _round(rng, base, target, length, s, fov):  # type: ignore[no-untyped-def]
+def _round(
+    rng: np.random.Generator,
+    base: np.ndarray,
+    target: np.ndarray,
+    length: float,
+    s: np.ndarray,
+    fov: float,
+) -> tuple[np.ndarray, np.ndarray]:
     """From one place in directions that overlap."""
     angles = s * math.radians(fov) * rng.uniform(0.3, 1.2)
     cos, sin = np.cos(angles), np.sin(angles)
@@ -164,7 +184,14 @@ def _round(rng, base, target, length, s, fov):  # type: ignore[no-untyped-def]
     return eyes, eyes + way
 
 
-def _gather(rng, base, target, length, s, fov):  # type: ignore[no-untyped-def]
+def _gather(
+    rng: np.random.Generator,
+    base: np.ndarray,
+    target: np.ndarray,
+    length: float,
+    s: np.ndarray,
+    fov: float,
+) -> tuple[np.ndarray, np.ndarray]:
     """From places scattered around one point, all at the target."""
     offsets = rng.normal(size=(len(s), 3)) * (1, 1, 0.5)
     offsets *= rng.random((len(s), 1)) ** 0.5 / np.linalg.norm(offsets, axis=1, keepdims=True)

@@ -37,11 +37,15 @@ class Drawn:
     effects: np.ndarray
     quality: int
 
-    def photos(self, frames: Sequence[int], size: tuple[int, int], samples: int) -> list[np.ndarray]:
+    def photos(
+        self, frames: Sequence[int], size: tuple[int, int], samples: int
+    ) -> list[np.ndarray]:
         """Images (H, W, 3) uint8."""
         c2w, images = self.rig.c2w[list(frames)], []
         for frame, light in zip(
-            frames, cast_light(self.world, c2w, lens(self.rig.fov, size), size, samples), strict=True
+            frames,
+            cast_light(self.world, c2w, lens(self.rig.fov, size), size, samples),
+            strict=True,
         ):
             image = np.empty((*size, 3), np.uint8)
             develop(image, light, self.effects, frame)
@@ -64,7 +68,9 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
     count = round(spread(plan, 4, config.complexity))
     place = draw_place(kind, plan, things, count, maps)
     shapes = packed(place.shapes)
-    rig = draw_cameras(numbers, place, (shapes, maps), config.views_per_scene, config.cameras == "varied")
+    rig = draw_cameras(
+        numbers, place, (shapes, maps), config.views_per_scene, config.cameras == "varied"
+    )
     kept = clearances(shapes, rig.c2w[:, :3, 3]).min(0) > CLEARANCE
     kept[: place.fixed] = True
     lit = config.light == "varied"
@@ -76,5 +82,3 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
     light = cast_light(world, rig.c2w, lens(rig.fov, _THUMB), _THUMB, 1)
     effects, quality = draw_effects(camera, light, config.effects)
     return Drawn(place, world, rig, effects, quality)
-
-

@@ -1,8 +1,8 @@
 """Where a ray o + t d is inside a primitive: entry, exit, and by which face of each.
 
-Numbers are float32, in the primitive's own frame. o is the point of the ray nearest to the frame's
-origin (`nearest`), as small differences of large numbers would lose thin things far away. A ray that
-misses enters at inf and leaves at -inf.
+Numbers are float32, in the primitive's own frame. o is the point of the ray nearest to the
+frame's origin (`nearest`), as small differences of large numbers would lose thin things far away.
+A ray that misses enters at inf and leaves at -inf.
 """
 
 import math
@@ -141,9 +141,11 @@ def _next_line(o, d, t, cells):
     if abs(d) < TINY:
         return NONE
     place = (o + t * d + ONE) * _HALF * cells
-    line = math.floor(place + np.float32(1e-3)) + 1 if d > ZERO else math.ceil(
-        place - np.float32(1e-3)
-    ) - 1
+    line = (
+        math.floor(place + np.float32(1e-3)) + 1
+        if d > ZERO
+        else math.ceil(place - np.float32(1e-3)) - 1
+    )
     return (np.float32(line) / cells * _TWO - ONE - o) / d
 
 

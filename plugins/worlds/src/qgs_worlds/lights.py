@@ -1,4 +1,4 @@
-"""Light of a world: sun, lamps, the sky and what comes from all sides; and the camera's settings."""
+"""Light of a world: sun, lamps, the sky, what comes from all sides; settings of the camera."""
 
 import math
 from random import Random
@@ -43,7 +43,9 @@ def draw_lights(rng: Random, place: Place, varied: bool) -> tuple[np.ndarray, np
     indoors = place.kind == "indoors"
     above = spread(rng, 0.15, 0.6) * (1 if indoors else 1.5) * tint
     below = rng.uniform(0.3, 0.9) * above * _tinted(rng, 0.15)
-    return np.array(lights).reshape(-1, r.LIGHT_FIELDS), _air(rng, above, below, rng.uniform(0.4, 0.9))
+    return np.array(lights).reshape(-1, r.LIGHT_FIELDS), _air(
+        rng, above, below, rng.uniform(0.4, 0.9)
+    )
 
 
 def _lamp(at: object, color: np.ndarray, shadows: bool) -> list[float]:

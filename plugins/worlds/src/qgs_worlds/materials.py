@@ -26,7 +26,9 @@ class Palette:
     def __init__(self, rng: Random) -> None:
         self.rng = rng
         base = rng.random()
-        self._hues = [(base + step + 0.05 * rng.gauss(0, 1)) % 1 for step in (0, 0.06, 0.1, 0.5, 0.33)]
+        self._hues = [
+            (base + step + 0.05 * rng.gauss(0, 1)) % 1 for step in (0, 0.06, 0.1, 0.5, 0.33)
+        ]
         self._grey = rng.uniform(1.5, 7)
 
     def color(self) -> Color:

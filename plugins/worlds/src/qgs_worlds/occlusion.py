@@ -16,8 +16,8 @@ from qgs_worlds.kernels import BORROWING
 def surroundings(shapes):
     """What `visible` keeps for points that follow each other: all boxes; those near to a place.
 
-    Boxes (19, S): matrices, centres in their frames, extents and half sizes, shapes. Then the place
-    and the number of boxes near it.
+    Boxes (19, S): matrices, centres in their frames, extents, half sizes and shapes. Then the
+    place, the number of boxes near it, and the square of the distance up to which they are enough.
     """
     boxes = np.empty((19, shapes.shape[0]), np.float32)
     for i in range(shapes.shape[0]):
@@ -30,14 +30,15 @@ def surroundings(shapes):
             boxes[12 + k, i] = shapes[i, r.EXTENT + k]
             boxes[15 + k, i] = shapes[i, r.HALF + k]
         boxes[18, i] = i
-    return boxes, np.empty_like(boxes), np.full(4, np.inf)
+    return boxes, np.empty_like(boxes), np.full(5, np.inf)
 
 
 @njit(**BORROWING)
-def _find(shapes, around, x, y, z, reach):
+def _find(shapes, around, x, y, z, reach, slack):
     """Keep the boxes that are near to a place."""
     boxes, near, place = around
-    count = 0
+    place[0], place[1], place[2], place[4] = x, y, z, slack * slack
+    count, reach = 0, np.float32(1.6 * reach + slack)
     for i in range(shapes.shape[0]):
         a, b, c = shapes[i, r.SPHERE] - x, shapes[i, r.SPHERE + 1] - y, shapes[i, r.SPHERE + 2] - z
         size = shapes[i, r.SPHERE + 3] + reach
@@ -45,22 +46,23 @@ def _find(shapes, around, x, y, z, reach):
             for k in range(19):
                 near[k, count] = boxes[k, i]
             count += 1
-    place[0], place[1], place[2], place[3] = x, y, z, count
+    place[3] = count
 
 
 @njit(**{**BORROWING, "fastmath": {"contract", "reassoc", "arcp", "nsz", "nnan"}})
-def visible(shapes, around, own, point, normal, strength, reach):
-    """How much of the ambient light reaches a point: its distances at two heights above its surface.
+def visible(shapes, around, own, point, normal, strength, reach, footprint):
+    """How much of the ambient light reaches a point: a distance field at two heights above it.
 
-    As Evans 2006 with a distance field. own: the shape that the point is on.
+    As Evans 2006, "Fast approximations for global illumination on dynamic scenes". own: the shape
+    that the point is on. footprint: metres between pixels there.
     """
     x, y, z = np.float32(point[0]), np.float32(point[1]), np.float32(point[2])
     nx, ny, nz = np.float32(normal[0]), np.float32(normal[1]), np.float32(normal[2])
     low, high = np.float32(0.25 * reach), np.float32(0.8 * reach)
     _, near, place = around
     a, b, c = place[0] - point[0], place[1] - point[1], place[2] - point[2]
-    if not a * a + b * b + c * c < 0.36 * reach * reach:
-        _find(shapes, around, x, y, z, np.float32(2.2 * reach))
+    if place[4] == np.inf or a * a + b * b + c * c > place[4]:
+        _find(shapes, around, x, y, z, reach, 0.3 * reach + 4 * footprint)
     me, first, second = np.float32(own), low * low, high * high
     # no branches and no stores, so that LLVM vectorises it
     for i in range(int(place[3])):

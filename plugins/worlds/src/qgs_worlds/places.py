@@ -45,7 +45,9 @@ def draw_place(kind: Kind, rng: Random, things: Things, count: int, maps: np.nda
     """A scene of a kind with `count` things. maps: height maps, which terrains may take."""
     if kind == "indoors":
         return _indoors(rng, things, count)
-    return _outdoors(rng, things, count, maps) if kind == "outdoors" else _objects(rng, things, count)
+    return (
+        _outdoors(rng, things, count, maps) if kind == "outdoors" else _objects(rng, things, count)
+    )
 
 
 def _level(x: float, y: float) -> float:
@@ -79,7 +81,9 @@ def _indoors(rng: Random, things: Things, count: int) -> Place:
         for _ in range(rng.choice((0, 0, 1, 2))):
             shapes.append(_beam(rng, things, x, y, z))
     targets = _middles(shapes[fixed:])
-    targets += [(rng.uniform(-x, x), rng.uniform(-y, y), rng.uniform(0.4, z - 0.4)) for _ in range(6)]
+    targets += [
+        (rng.uniform(-x, x), rng.uniform(-y, y), rng.uniform(0.4, z - 0.4)) for _ in range(6)
+    ]
     low, high = (0.3 - x, 0.3 - y, 0.35), (x - 0.3, y - 0.3, z - 0.35)
     eyes = (0.9, min(1.7, z - 0.4))
     return Place("indoors", shapes, fixed, low, high, eyes, targets, (0.6, 6.0), z)
@@ -116,7 +120,9 @@ def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
             wide, low = rng.uniform(0.25, 0.8) * along, rng.choice((-0.1, rng.uniform(0.5, 1.1)))
             top = rng.uniform(max(low + 0.6, 1.7), height - 0.1)
             middle = rng.uniform(wide - along, along - wide) * 0.8
-            hole = _box((across + _WALL, middle, (low + top) / 2), (4 * _WALL, wide, (top - low) / 2))
+            hole = _box(
+                (across + _WALL, middle, (low + top) / 2), (4 * _WALL, wide, (top - low) / 2)
+            )
         texture = common if rng.random() < 0.6 else things.texture()[0]
         wall = [Shape(body, hole, texture, 1, common, scale)]
         if hole and rng.random() < 0.6:
@@ -157,7 +163,7 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
         at = at if rng.random() < 0.85 else (at[0], at[1], rng.uniform(0.3, 3))
         near += placed(things.draw(), at, rng.uniform(0, math.tau), spread(rng, 0.25, 2), ground)
     shapes += near
-    level = max((ground(0.5 * x, 0.5 * y) for x in range(-24, 25, 2) for y in range(-24, 25, 2)))
+    level = max(ground(0.5 * x, 0.5 * y) for x in range(-24, 25, 2) for y in range(-24, 25, 2))
     low, high = (-12.0, -12.0, level + 0.3), (12.0, 12.0, level + 7)
     eyes = (level + 0.6, level + 2.2)
     return Place("outdoors", shapes, fixed, low, high, eyes, _middles(near), (1.2, 11.0), level + 4)
@@ -187,7 +193,9 @@ def _far(rng: Random, things: Things) -> Thing:
     at = (away * math.cos(angle), away * math.sin(angle), 0.0)
     if pick < 0.65:
         wide, deep, high = rng.uniform(2, 7), rng.uniform(2, 7), spread(rng, 2, 14)
-        body = Primitive(r.BOX, (*at[:2], high), (wide, deep, high), about_z(rng.uniform(0, math.tau)))
+        body = Primitive(
+            r.BOX, (*at[:2], high), (wide, deep, high), about_z(rng.uniform(0, math.tau))
+        )
         return [things.skinned(body, spread(rng, 2, 9))]
     high, crown = rng.uniform(1, 3), things.texture()[0]
     trunk = Primitive(r.FRUSTUM, (*at[:2], high), (0.12 * high, 0.12 * high, high), extra=0.6)

@@ -62,7 +62,12 @@ def _on_primitive(kind, extra, heights, face, x, y, z, h):
     if kind == r.TORUS:
         ring = 1.0 - extra
         w = (across - ring) / max(across, 1e-6)
-        return (w * x, w * y, z), angle * ring * h[0], math.atan2(z, across - ring) * extra * h[0], 0
+        return (
+            (w * x, w * y, z),
+            angle * ring * h[0],
+            math.atan2(z, across - ring) * extra * h[0],
+            0,
+        )
     if kind == r.CAPSULE:
         return (x, y, z - min(max(z, -extra), extra)), angle * h[0], z * h[2], 0
     if face == 1:
@@ -161,7 +166,7 @@ def _shade(world, around, code, place, view, footprint, distance):
     facing = -(normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2])
     slant = footprint / math.sqrt(max(facing, 0.06))
     albedo = color(textures, row, u, v, slant / shapes[shape, r.SCALE])
-    open_ = visible(shapes, around, shape, place, normal, air[r.OCCLUSION], air[r.REACH])
+    open_ = visible(shapes, around, shape, place, normal, air[r.OCCLUSION], air[r.REACH], footprint)
     glow, shine, up = textures[row, r.EMISSION], 0.0, 0.5 + 0.5 * normal[2]
     red = glow + open_ * (air[r.BELOW] + up * (air[r.ABOVE] - air[r.BELOW]))
     green = glow + open_ * (air[r.BELOW + 1] + up * (air[r.ABOVE + 1] - air[r.BELOW + 1]))

@@ -97,7 +97,11 @@ def lit(shadows, lights, light, own, x, y, z):
     maps, depths, codes = shadows
     k = int(lights[light, r.SHADOWS]) - 1
     if lights[light, r.LAMP] > 0:
-        dx, dy, dz = x - lights[light, r.PLACE], y - lights[light, r.PLACE + 1], z - lights[light, r.PLACE + 2]
+        dx, dy, dz = (
+            x - lights[light, r.PLACE],
+            y - lights[light, r.PLACE + 1],
+            z - lights[light, r.PLACE + 2],
+        )
         if abs(dx) >= abs(dy) and abs(dx) >= abs(dz):
             k += 0 if dx > 0 else 1
         elif abs(dy) >= abs(dz):

@@ -40,7 +40,11 @@ class Primitive(NamedTuple):
         if self.kind == r.TORUS:
             c *= self.extra
         a, b, c = self.turn[6] * a, self.turn[7] * b, self.turn[8] * c
-        return math.sqrt(a * a + b * b + c * c) if self.kind == r.ELLIPSOID else abs(a) + abs(b) + abs(c)
+        return (
+            math.sqrt(a * a + b * b + c * c)
+            if self.kind == r.ELLIPSOID
+            else abs(a) + abs(b) + abs(c)
+        )
 
 
 class Shape(NamedTuple):

@@ -6,7 +6,7 @@ Kernels are imported when the first scene is drawn: numba takes longer to load t
 import math
 from collections.abc import Sequence
 from functools import cached_property, partial
-from typing import ClassVar, Literal, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -17,7 +17,9 @@ from torch import Tensor
 from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.scenes import LazyScenes, LazySource
 from qgs.types import Cameras
-from qgs_worlds.places import Kind
+
+if TYPE_CHECKING:
+    from qgs_worlds.drawing import Drawn
 
 Variety: TypeAlias = Literal["plain", "varied"]
 
@@ -35,8 +37,8 @@ class WorldsConfig(SceneSource.Config):
     """The most things in a scene, which have a few shapes each; how many is drawn log-uniformly."""
     cameras: Variety = "varied"
     """Plain: a walk along a line, level, with a field of view of 60 to 75 degrees. Varied: walks,
-    orbits, looks round and sets that look at one point, over baselines from tiny to wide, with pitch
-    and roll and 40 to 90 degrees."""
+    orbits, looks round and sets that look at one point, over baselines from tiny to wide, with
+    pitch and roll and 40 to 90 degrees."""
     shapes: Variety = "varied"
     """Plain: upright boxes, balls and cylinders in closed rooms. Varied: composites of all
     primitives turned freely, with cuts, bars, wires and height fields, in rooms with openings, in
@@ -69,25 +71,21 @@ class WorldScene(Scene):
         return self._config.views_per_scene
 
     @cached_property
-    def _drawn(self):  # type: ignore[no-untyped-def]
+    def drawn(self) -> "Drawn":
+        """What is there, and how it is seen."""
         from qgs_worlds.drawing import draw
 
         return draw(self._key, self._config)
 
-    @property
-    def kind(self) -> Kind:
-        """What kind of scene it is."""
-        return self._drawn.place.kind
-
     @cached_property
     def _intrinsics(self) -> np.ndarray:
-        return lens(self._drawn.rig.fov, self._config.image_size)
+        return lens(self.drawn.rig.fov, self._config.image_size)
 
     @cached_property
     def cameras(self) -> Cameras:
         """See `Scene`."""
         intrinsics = torch.from_numpy(self._intrinsics).float().expand(len(self), 4)
-        c2w = torch.from_numpy(self._drawn.rig.c2w).float()
+        c2w = torch.from_numpy(self.drawn.rig.c2w).float()
         return Cameras(c2w, intrinsics, self._config.image_size)
 
     def images(self, frames: Sequence[int]) -> Tensor:
@@ -95,7 +93,7 @@ class WorldScene(Scene):
         config, cache = self._config, self._cache
         images = {frame: cache[self.name, frame] for frame in frames if (self.name, frame) in cache}
         if missing := [frame for frame in dict.fromkeys(frames) if frame not in images]:
-            photos = self._drawn.photos(missing, config.image_size, config.samples)
+            photos = self.drawn.photos(missing, config.image_size, config.samples)
             images.update(zip(missing, photos, strict=True))
             fitting = config.cache_mb * 2**20 // photos[0].nbytes - len(cache)
             cache.update(
@@ -108,7 +106,7 @@ class WorldScene(Scene):
 
     def depths(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`: z along the ray through the pixel's centre; the sky is unknown."""
-        depths = self._drawn.depths(frames, self._config.image_size)
+        depths = self.drawn.depths(frames, self._config.image_size)
         return torch.from_numpy(depths)[:, None]
 
 

@@ -49,7 +49,10 @@ def noise(basis, x, y, seed):
         return _cells(x, y, i, j, seed)
     a, b = x - i, y - j
     c00, c10 = _corner(basis, i, j, seed, a, b), _corner(basis, i + 1, j, seed, a - 1, b)
-    c01, c11 = _corner(basis, i, j + 1, seed, a, b - 1), _corner(basis, i + 1, j + 1, seed, a - 1, b - 1)
+    c01, c11 = (
+        _corner(basis, i, j + 1, seed, a, b - 1),
+        _corner(basis, i + 1, j + 1, seed, a - 1, b - 1),
+    )
     a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
     low, high = c00 + a * (c10 - c00), c01 + a * (c11 - c01)
     return low + b * (high - low)
@@ -71,7 +74,12 @@ def _octaves(textures, row, x, y, footprint):
         if seen <= 0:
             break
         total += seen * weight * noise(basis, x, y, seed + 389 * octave)
-        x, y, footprint, weight = 1.97 * x + 7.3, 1.97 * y, 1.97 * footprint, weight * textures[row, r.GAIN]
+        x, y, footprint, weight = (
+            1.97 * x + 7.3,
+            1.97 * y,
+            1.97 * footprint,
+            weight * textures[row, r.GAIN],
+        )
     return 0.5 + total
 
 

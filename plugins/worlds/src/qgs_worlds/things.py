@@ -46,7 +46,8 @@ class Style:
 
 PLAIN = Style((r.BOX, r.BOX, r.ELLIPSOID, r.FRUSTUM), 0.0, 0.0, 0.0, 0.0, True, 5)
 VARIED = Style(
-    (r.BOX, r.BOX, r.BOX, r.ELLIPSOID, r.ELLIPSOID, r.FRUSTUM, r.FRUSTUM, r.CAPSULE, r.TORUS, r.HEIGHT),
+    (r.BOX, r.BOX, r.BOX, r.ELLIPSOID, r.ELLIPSOID, r.FRUSTUM, r.FRUSTUM, r.CAPSULE, r.TORUS,
+     r.HEIGHT),
     0.45, 0.35, 0.15, 0.12, False, 8,
 )  # fmt: skip
 
@@ -124,7 +125,11 @@ class Things:
         thing, skin = [], self.texture()
         for _ in range(count):
             reach = 0.6 if count > 1 else 0.0
-            center = (rng.uniform(-reach, reach), rng.uniform(-reach, reach), rng.uniform(-reach, reach))
+            center = (
+                rng.uniform(-reach, reach),
+                rng.uniform(-reach, reach),
+                rng.uniform(-reach, reach),
+            )
             body = self._primitive(center, 1.0 if count == 1 else rng.uniform(0.4, 0.9))
             skin = skin if rng.random() < 0.4 else self.texture()
             hole = self._cut(body) if cut else None
@@ -178,7 +183,9 @@ class Things:
         """Parallel bars between two rails, like a fence or a ladder."""
         rng = self.rng
         count, high = rng.randint(3, 9), rng.uniform(0.4, 1)
-        ends = [(-1.0, 0.0, s * high) for s in (-0.8, 0.8)] + [(1.0, 0.0, s * high) for s in (-0.8, 0.8)]
+        ends = [(-1.0, 0.0, s * high) for s in (-0.8, 0.8)] + [
+            (1.0, 0.0, s * high) for s in (-0.8, 0.8)
+        ]
         places = [2 * (k + 0.5) / count - 1 for k in range(count)]
         points = ends + [(x, 0.0, s * high) for x in places for s in (-1, 1)]
         pairs = [(0, 2), (1, 3)] + [(4 + 2 * k, 5 + 2 * k) for k in range(count)]
@@ -190,7 +197,9 @@ def lowest(thing: Thing) -> float:
     return min(shape.body.center[2] - shape.body.reach() for shape in thing)
 
 
-def placed(thing: Thing, to: Point, turn: float, size: float, on: Callable[[float, float], float]) -> Thing:
+def placed(
+    thing: Thing, to: Point, turn: float, size: float, on: Callable[[float, float], float]
+) -> Thing:
     """The thing scaled and turned, to[2] metres above the ground `on` (x, y)."""
     low = lowest(thing) * size
     place = (to[0], to[1], to[2] + on(to[0], to[1]) - low)
