@@ -1,12 +1,10 @@
-"""Images and depth maps of a world, in bands of rows, each one compiled call."""
+"""Images and depth maps of a world, in bands of rows."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
-from numba import njit
-from qgs_rooms.textures import OPTIONS
 
 from qgs_worlds.raycast import trace
 from qgs_worlds.rows import World
@@ -22,7 +20,9 @@ def cast_light(
     light, packed = np.empty((len(c2w), *size, 3), np.float32), world.packed()
 
     def cast(frame: int, top: int, bottom: int) -> None:
-        _light(light[frame][top:bottom], top, samples, packed, c2w[frame], intrinsics)
+        rows = (bottom - top, size[1], top, samples)
+        t, code, rays = trace(*rows, world.shapes, world.heights, c2w[frame], intrinsics)
+        paint(light[frame, top:bottom], t, code, top, samples, packed, c2w[frame], rays)
 
     _in_bands(cast, len(c2w), size[0])
     return light
@@ -53,10 +53,3 @@ def _in_bands(cast: Callable[[int, int, int], None], frames: int, height: int) -
         return
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         list(pool.map(lambda band: cast(*band), bands))  # raises what a thread raised
-
-
-@njit(**OPTIONS)
-def _light(light, top, samples, world, c2w, intrinsics):
-    rows, columns, _ = light.shape
-    t, code, rays = trace(rows, columns, top, samples, world[0], world[1], c2w, intrinsics)
-    paint(light, t, code, top, samples, world, c2w, rays)

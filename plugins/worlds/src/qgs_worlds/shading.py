@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 from qgs_rooms.intersections import ONE, ZERO
-from qgs_rooms.textures import INNER
+from qgs_rooms.textures import OPTIONS
 
 from qgs_worlds import rows as r
 from qgs_worlds.intervals import height_at, local_point
@@ -207,7 +207,7 @@ def _gather(t, code, i, j, own, samples):
     return n, t_sum / n, u_sum / t_sum, v_sum / t_sum
 
 
-@njit(**INNER)
+@njit(**OPTIONS)
 def paint(image, t, code, top, samples, world, c2w, rays):
     """Write image (rows, W, 3) float32, a band that begins at row `top`, and use `code` up.
 
