@@ -10,8 +10,8 @@ import time
 
 import numpy as np
 import torch
-from qgs_rooms.source import RoomsSource
-from qgs_worlds.source import WorldsSource
+from qgs_rooms.source import RoomsConfig, RoomsSource
+from qgs_worlds.source import WorldsConfig, WorldsSource
 
 from qgs.contracts import Scene
 
@@ -29,8 +29,8 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     size = (options.side, options.side)
-    rooms = RoomsSource(RoomsSource.Config(image_size=size, cache_mb=0)).scenes("train")
-    worlds = WorldsSource(WorldsSource.Config(image_size=size, cache_mb=0)).scenes("train")
+    rooms = RoomsSource(RoomsConfig(image_size=size, cache_mb=0)).scenes("train")
+    worlds = WorldsSource(WorldsConfig(image_size=size, cache_mb=0)).scenes("train")
     warm = 3
     pairs = [[seconds(rooms[i]), seconds(worlds[i])] for i in range(options.scenes + warm)][warm:]
     room, world = np.median(pairs, 0)

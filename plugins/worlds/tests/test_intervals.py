@@ -47,7 +47,7 @@ def first(shape: Shape, origin: np.ndarray, way: np.ndarray) -> float:
     if shape.cut:
         f = np.maximum(f, -inside(shape.cut, points))
     within = np.flatnonzero(f < 0)
-    return t[within[0]] if len(within) else np.inf
+    return float(t[within[0]]) if len(within) else np.inf
 
 
 def drawn(kind: int, rng: Random, middle: tuple[float, float, float]) -> Primitive:

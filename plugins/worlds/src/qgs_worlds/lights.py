@@ -33,15 +33,15 @@ def draw_lights(rng: Random, place: Place, varied: bool) -> tuple[np.ndarray, np
     if sunny:
         up, angle = math.radians(rng.uniform(12, 70)), rng.uniform(0, math.tau)
         way = (math.cos(up) * math.cos(angle), math.cos(up) * math.sin(angle), math.sin(up))
-        lights.append([0.0, *way, *(spread(rng, 1, 4) * _tinted(rng, 0.2)), 1.0])
+        lights.append([0.0, *way, *(spread(rng, 1.2, 5) * _tinted(rng, 0.2)), 1.0])
     low, high = _LAMPS[place.kind]
     for number in range(rng.randint(max(low, 0 if sunny or place.kind == "outdoors" else 1), high)):
         at = [rng.uniform(a, b) for a, b in zip(place.low, place.high, strict=True)]
         at[2] = min(rng.uniform(0.6, 1.0) * place.top, place.top - 0.15)
-        color = spread(rng, 0.4, 2.5) * _tinted(rng, 0.4)
+        color = spread(rng, 0.6, 4) * _tinted(rng, 0.4)
         lights.append(_lamp(at, color, number == 0 and place.kind != "outdoors"))
     indoors = place.kind == "indoors"
-    above = spread(rng, 0.15, 0.6) * (1 if indoors else 1.5) * tint
+    above = spread(rng, 0.07, 0.5) * (1 if indoors else 1.5) * tint
     below = rng.uniform(0.3, 0.9) * above * _tinted(rng, 0.15)
     return np.array(lights).reshape(-1, r.LIGHT_FIELDS), _air(
         rng, above, below, rng.uniform(0.4, 0.9)
@@ -74,11 +74,12 @@ def draw_effects(rng: Random, light: np.ndarray, varied: bool) -> tuple[np.ndarr
     luminance = light.reshape(-1, 3) @ (0.3, 0.6, 0.1)
     grey = math.exp(float(np.log(luminance + 0.02).mean()))
     effects = np.zeros(r.EFFECT_FIELDS)
-    effects[: r.GAMMA], effects[r.GAMMA] = 0.2 / grey, 2.2
+    # the exponent of middle tones, which cameras' curves make steeper than that of displays
+    gamma = rng.uniform(1.15, 2.0) if varied else 1.6
+    effects[: r.GAMMA], effects[r.GAMMA] = 0.43**gamma / grey, gamma
     if not varied:
         return effects, 0
-    effects[: r.GAMMA] *= 2 ** rng.uniform(-1, 0.8) * _tinted(rng, 0.12)
-    effects[r.GAMMA] = rng.uniform(1.8, 2.5)
+    effects[: r.GAMMA] *= 2 ** rng.uniform(-0.8, 0.8) * _tinted(rng, 0.12)
     effects[r.VIGNETTE] = rng.choice((0.0, rng.uniform(0, 0.5)))
     effects[r.NOISE] = rng.choice((0.0, spread(rng, 0.003, 0.03)))
     effects[r.NOISE_SEED] = rng.randrange(1 << 16)

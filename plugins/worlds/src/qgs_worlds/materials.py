@@ -35,7 +35,7 @@ class Palette:
         """A colour: most are dull, few are bright or dark."""
         rng = self.rng
         hue = rng.choice(self._hues) if rng.random() < 0.8 else rng.random()
-        saturation, value = rng.random() ** self._grey, 0.5 * (rng.random() + rng.random())
+        saturation, value = rng.random() ** self._grey, rng.random()
         red, green, blue = colorsys.hsv_to_rgb(hue, saturation, 0.12 + 0.83 * value)
         return red**2.2, green**2.2, blue**2.2
 
@@ -93,7 +93,7 @@ def _varied(rng: Random, palette: Palette, highlights: bool) -> list[float]:
     """Noise with a spectrum near 1/f, half of it with a pattern; some surfaces are even."""
     base = palette.color()
     flat = rng.random() < 0.2
-    by = 0.15 if flat else rng.uniform(0.4, 1.3)
+    by = 0.15 if flat else rng.uniform(0.5, 1.6)
     ramp = [palette.near(base, by), base, palette.near(base, by)]
     if not flat and rng.random() < 0.3:
         ramp[rng.randrange(3)] = palette.color()

@@ -9,7 +9,7 @@ from qgs_rooms.textures import INNER
 
 from qgs_worlds import rows as r
 from qgs_worlds.intervals import local
-from qgs_worlds.kernels import BORROWING
+from qgs_worlds.kernels import BORROWING, REDUCING
 
 
 @njit(**INNER)
@@ -49,7 +49,7 @@ def _find(shapes, around, x, y, z, reach, slack):
     place[3] = count
 
 
-@njit(**{**BORROWING, "fastmath": {"contract", "reassoc", "arcp", "nsz", "nnan"}})
+@njit(**REDUCING)
 def visible(shapes, around, own, point, normal, strength, reach, footprint):
     """How much of the ambient light reaches a point: a distance field at two heights above it.
 

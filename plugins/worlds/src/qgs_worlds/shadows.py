@@ -35,7 +35,8 @@ def shadow_maps(
     Depths and codes of all maps lie behind each other. middle, radius: where the sun's shadows are
     seen; lamps throw theirs everywhere.
     """
-    lights, maps, depths, codes = lights.copy(), [], [np.zeros(0)], [np.zeros(0)]
+    nothing = np.zeros(0, np.float32)
+    lights, maps, depths, codes = lights.copy(), [], [nothing], [nothing]
     begin = 0
     for light in lights:
         if light[r.SHADOWS] == 0:
@@ -49,8 +50,7 @@ def shadow_maps(
             codes.append(code.ravel())
             begin += side * side
     table = np.array(maps).reshape(-1, _FIELDS)
-    both = [np.concatenate(parts).astype(np.float32) for parts in (depths, codes)]
-    return lights, table, both[0], both[1]
+    return lights, table, np.concatenate(depths), np.concatenate(codes)
 
 
 def _views(
