@@ -16,7 +16,7 @@ from qgs.composer.yaml_text import dump
 from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
 
 PLUGINS = ("locus", "ellipsoid", "landmark", "c3g", "gslrm", "globalsplat", "mvsplat")
-PLUGINS += ("tokengs2026", "dinov2", "lpips", "rooms", "datasets")
+PLUGINS += ("tokengs2026", "dinov2", "lpips", "rooms", "worlds", "datasets")
 
 SECTIONS: Mapping[str, type[ComponentConfig]] = {
     "Top level": RecipeSettings,

@@ -12,7 +12,7 @@ from qgs.composer.schema import recipe_schema
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 SHIPPED = ["c3g", "datasets", "dinov2", "ellipsoid", "globalsplat", "gslrm", "landmark", "locus"]
-SHIPPED += ["lpips", "mvsplat", "rooms", "tokengs2026"]
+SHIPPED += ["lpips", "mvsplat", "rooms", "tokengs2026", "worlds"]
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,6 @@
+"""Procedural worlds for qgs: scenes without meaning, textures, light, cameras, ray casting."""
+
+from qgs.contracts import Plugin
+from qgs_worlds.source import WorldsSource
+
+plugin = Plugin(name="worlds", contract_version=1, components=(WorldsSource,))

@@ -1,0 +1,217 @@
+"""Cameras of a scene: walks, orbits, looks round and sets that look at one point."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from qgs_worlds.intervals import clearances
+from qgs_worlds.places import Place
+from qgs_worlds.raycast import trace
+
+CLEARANCE = 0.2  # metres from a camera to the box around any shape, at least
+FOV = (40.0, 90.0)  # horizontal, degrees
+BASELINE = (0.012, 1.2)  # length of a path by the distance to what is looked at
+PLAIN_FOV, PLAIN_TRAVEL = (60.0, 75.0), (0.65, 1.2)
+_TRIES = 12
+_PROBE = (6, 6)  # pixels of the depth maps by which views are judged
+
+
+@dataclass(frozen=True)
+class Rig:
+    """c2w: OpenCV (F, 4, 4). fov: horizontal, degrees. distance: to what they look at."""
+
+    c2w: np.ndarray
+    fov: float
+    distance: float
+    motion: str
+
+    def sight(self) -> tuple[np.ndarray, float]:
+        """Middle and radius of a ball that holds most of what they see."""
+        middle = (self.c2w[:, :3, 3] + self.distance * self.c2w[:, :3, 2]).mean(0)
+        return middle, 1.3 * self.distance + 1
+
+
+def draw_cameras(
+    rng: np.random.Generator,
+    place: Place,
+    world: tuple[np.ndarray, np.ndarray],
+    count: int,
+    varied: bool,
+) -> Rig:
+    """Cameras in `place` that see something; the best of a few draws. world: shapes and heights.
+
+    They keep `CLEARANCE` from fixed shapes; others that are nearer are to be taken out.
+    """
+    best, least = None, math.inf
+    for attempt in range(_TRIES):
+        rig = _draw(rng, place, count, varied, 0.7**attempt)
+        fault = _outside(rig.c2w[:, :3, 3], place, world[0])
+        if fault == 0:
+            fault = _view_fault(rig, world)
+        if fault < least or best is None:
+            best, least = rig, fault
+        if least <= 0.3:
+            break
+    assert best is not None
+    return best if least < 100 else _still(rng, place, world[0], count, best)
+
+
+def _outside(eyes: np.ndarray, place: Place, shapes: np.ndarray) -> float:
+    """0 if all eyes are where they may be, 100 or more if not."""
+    inside = (eyes >= place.low).all() and (eyes <= place.high).all()
+    return 0.0 if inside and clearances(shapes[: place.fixed], eyes).min() > CLEARANCE else 100.0
+
+
+def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
+    """The worst view's share of sky and of things right before the camera."""
+    focal = _PROBE[1] / 2 / math.tan(math.radians(rig.fov) / 2)
+    intrinsics = np.array([focal, focal, _PROBE[1] / 2, _PROBE[0] / 2])
+    near = clearances(world[0], rig.c2w[:, :3, 3]).min()
+    views = [trace(*_PROBE, 0, 1, *world, c2w, intrinsics)[0].ravel() for c2w in rig.c2w]
+    t = np.stack(views)
+    close = float((t < max(0.25, 0.25 * rig.distance)).mean(1).max())
+    sky = float((t == np.inf).mean(1).max())
+    return max(close, sky - 0.3, 2.0 if near < CLEARANCE else 0.0)
+
+
+def _still(rng: np.random.Generator, place: Place, shapes: np.ndarray, count: int, rig: Rig) -> Rig:
+    """Cameras a few millimetres apart at the freest of some points, if nothing else was found."""
+    points = rng.uniform(place.low, place.high, (64, 3))
+    base = points[clearances(shapes[: place.fixed], points).min(1).argmax()]
+    eyes = base + 0.01 * rng.uniform(-1, 1, (count, 3))
+    target = np.array(place.targets[0])
+    return Rig(
+        _look_at(eyes, np.tile(target, (count, 1)), np.zeros(count)), rig.fov, rig.distance, "still"
+    )
+
+
+def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shrink: float) -> Rig:
+    """Cameras anywhere in the place. shrink: factor of the path's length."""
+    target = np.array(place.targets[rng.integers(len(place.targets))])
+    base, distance = _stand(rng, place, target, varied)
+    s = np.linspace(-0.5, 0.5, count)
+    if not varied:
+        across = np.array([target[1] - base[1], base[0] - target[0], 0.0])
+        step = across / np.linalg.norm(across) * max(rng.uniform(*PLAIN_TRAVEL) * shrink, 0.05)
+        target = np.array([*target[:2], base[2] - rng.uniform(0.1, 0.4)])
+        c2w = _look_at(base + s[:, None] * step, target + 0.1 * s[:, None] * step, np.zeros(count))
+        return Rig(c2w, float(rng.uniform(*PLAIN_FOV)), distance, "walk")
+    low, high = np.log(BASELINE)
+    length = distance * math.exp(rng.uniform(low, high)) * shrink
+    motion = ("walk", "orbit", "round", "gather")[rng.choice(4, p=(0.35, 0.3, 0.1, 0.25))]
+    fov = float(rng.uniform(*FOV))
+    eyes, targets = _MOTIONS[motion](rng, base, target, length, s, fov)
+    eyes = eyes + 0.03 * length * rng.normal(size=eyes.shape)
+    targets = targets + 0.05 * distance * rng.normal(size=3)
+    targets = targets + 0.02 * distance * rng.normal(size=eyes.shape)
+    roll = np.clip(rng.normal(0, 5) + rng.normal(0, 1, count), -15, 15)
+    c2w = _look_at(eyes, targets, np.radians(roll))
+    order = -1 if rng.random() < 0.5 else 1
+    return Rig(np.ascontiguousarray(c2w[::order]), fov, distance, motion)
+
+
+def _stand(
+    rng: np.random.Generator, place: Place, target: np.ndarray, varied: bool
+) -> tuple[np.ndarray, float]:
+    """A point to look at the target from, and its distance."""
+    low, high = np.log(place.distance)
+    for _ in range(20):
+        distance = math.exp(rng.uniform(low, high))
+        angle = rng.uniform(0, math.tau)
+        height = rng.uniform(*place.eyes)
+        if varied and rng.random() < 0.3:
+            height = rng.uniform(place.low[2], min(place.high[2], target[2] + 0.8 * distance))
+        flat = math.sqrt(max(distance**2 - (height - target[2]) ** 2, (0.5 * distance) ** 2))
+        base = np.array(
+            [target[0] + flat * math.cos(angle), target[1] + flat * math.sin(angle), height]
+        )
+        if (base > place.low).all() and (base < place.high).all():
+            break
+    base = np.clip(base, place.low, place.high)
+    return base, max(float(np.linalg.norm(base - target)), 0.3)
+
+
+def _walk(
+    rng: np.random.Generator,
+    base: np.ndarray,
+    target: np.ndarray,
+    length: float,
+    s: np.ndarray,
+    fov: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Along a bent line; looking ahead, or at what is passed."""
+    way = rng.normal(size=3) * (1, 1, 0.3)
+    way /= np.linalg.norm(way)
+    bend = rng.normal(size=3) * (0.3, 0.3, 0.1)
+    eyes = base + length * (s[:, None] * way + (s**2)[:, None] * bend)
+    return eyes, target + rng.uniform(0, 1) * (eyes - base)
+
+
+def _orbit(
+    rng: np.random.Generator,
+    base: np.ndarray,
+    target: np.ndarray,
+    length: float,
+    s: np.ndarray,
+    fov: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Around the target, rising and coming nearer a little."""
+    offset = base - target
+    flat = max(math.hypot(offset[0], offset[1]), 0.2)
+    angles = s * min(length / flat, 2.4)
+    cos, sin = np.cos(angles), np.sin(angles)
+    nearer, rise = 1 + 0.2 * rng.normal() * s, 0.2 * length * rng.normal() * s
+    x, y = cos * offset[0] - sin * offset[1], sin * offset[0] + cos * offset[1]
+    eyes = target + np.stack([nearer * x, nearer * y, offset[2] + rise], 1)
+    return eyes, np.tile(target, (len(s), 1))
+
+
+def _round(
+    rng: np.random.Generator,
+    base: np.ndarray,
+    target: np.ndarray,
+    length: float,
+    s: np.ndarray,
+    fov: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """From one place in directions that overlap."""
+    angles = s * math.radians(fov) * rng.uniform(0.3, 1.2)
+    cos, sin = np.cos(angles), np.sin(angles)
+    x, y, z = target - base
+    way = np.stack([cos * x - sin * y, sin * x + cos * y, np.full(len(s), z)], 1)
+    eyes = base + 0.3 * length * rng.normal(size=3) * s[:, None]
+    return eyes, eyes + way
+
+
+def _gather(
+    rng: np.random.Generator,
+    base: np.ndarray,
+    target: np.ndarray,
+    length: float,
+    s: np.ndarray,
+    fov: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """From places scattered around one point, all at the target."""
+    offsets = rng.normal(size=(len(s), 3)) * (1, 1, 0.5)
+    offsets *= rng.random((len(s), 1)) ** 0.5 / np.linalg.norm(offsets, axis=1, keepdims=True)
+    return base + 0.5 * length * offsets, np.tile(target, (len(s), 1))
+
+
+_MOTIONS = {"walk": _walk, "orbit": _orbit, "round": _round, "gather": _gather}
+
+
+def _look_at(eyes: np.ndarray, targets: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    forward = targets - eyes
+    flat = np.linalg.norm(forward[:, :2], axis=1)
+    # never straight up or down, where nothing says which way is right
+    forward[:, 2] = np.clip(forward[:, 2], -4 * flat, 4 * flat)
+    forward[flat < 1e-6] = (1.0, 0.0, 0.0)
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    down = np.cross(forward, right)
+    cos, sin = np.cos(roll)[:, None], np.sin(roll)[:, None]
+    c2w = np.tile(np.eye(4), (len(eyes), 1, 1))
+    c2w[:, :3] = np.stack([cos * right + sin * down, cos * down - sin * right, forward, eyes], -1)
+    return c2w

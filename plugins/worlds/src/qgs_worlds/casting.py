@@ -1,0 +1,55 @@
+"""Images and depth maps of a world, in bands of rows."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+
+from qgs_worlds.raycast import trace
+from qgs_worlds.rows import World
+from qgs_worlds.shading import paint
+
+_BAND = 64  # rows of an image that one thread casts at a time
+
+
+def cast_light(
+    world: World, c2w: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int], samples: int
+) -> np.ndarray:
+    """Light (F, H, W, 3) float32, means of samples^2 rays. c2w: OpenCV. intrinsics: in pixels."""
+    light, packed = np.empty((len(c2w), *size, 3), np.float32), world.packed()
+
+    def cast(frame: int, top: int, bottom: int) -> None:
+        rows = (bottom - top, size[1], top, samples)
+        t, code, rays = trace(*rows, world.shapes, world.heights, c2w[frame], intrinsics)
+        paint(light[frame, top:bottom], t, code, top, samples, packed, c2w[frame], rays)
+
+    _in_bands(cast, len(c2w), size[0])
+    return light
+
+
+def cast_depths(
+    world: World, c2w: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]
+) -> np.ndarray:
+    """Depths (F, H, W) float32: z of the ray through each pixel's centre, 0 where it meets none."""
+    depths = np.empty((len(c2w), *size), np.float32)
+
+    def cast(frame: int, top: int, bottom: int) -> None:
+        rows = (bottom - top, size[1], top, 1)
+        t, _, _ = trace(*rows, world.shapes, world.heights, c2w[frame], intrinsics)
+        depths[frame, top:bottom] = np.where(np.isfinite(t), t, 0)
+
+    _in_bands(cast, len(c2w), size[0])
+    return depths
+
+
+def _in_bands(cast: Callable[[int, int, int], None], frames: int, height: int) -> None:
+    """Call `cast(frame, top, bottom)` for all rows of all frames, on torch's number of threads."""
+    tops = range(0, height, _BAND)
+    bands = [(frame, top, min(top + _BAND, height)) for frame in range(frames) for top in tops]
+    if torch.get_num_threads() == 1:
+        for band in bands:
+            cast(*band)
+        return
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        list(pool.map(lambda band: cast(*band), bands))  # raises what a thread raised

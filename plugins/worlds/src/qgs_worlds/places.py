@@ -1,0 +1,231 @@
+"""Kinds of scenes: a room with openings, the open with far things, objects on plain ground."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from random import Random
+from typing import Literal
+
+import numpy as np
+
+from qgs_worlds import rows as r
+from qgs_worlds.shapes import Point, Primitive, Shape, about_z, rod
+from qgs_worlds.things import Thing, Things, placed, spread
+
+Kind = Literal["indoors", "outdoors", "objects"]
+KINDS: tuple[Kind, ...] = ("indoors", "outdoors", "objects")
+SHARES = (0.45, 0.3, 0.25)
+
+_WALL = 0.1  # half of a wall's thickness, metres
+_FAR = 600.0  # half of the ground's width
+_TERRAIN = 24.0  # half of a terrain's width
+
+
+@dataclass
+class Place:
+    """Shapes, and where cameras may stand and what they look at.
+
+    fixed: the number of shapes, from the first, that stay where cameras come near. low, high:
+    corners of the box for eyes. eyes: usual heights of eyes. targets: points to look at.
+    distance: least and largest one from an eye to its target. top: where lamps hang.
+    """
+
+    kind: Kind
+    shapes: list[Shape]
+    fixed: int
+    low: Point
+    high: Point
+    eyes: tuple[float, float]
+    targets: list[Point]
+    distance: tuple[float, float]
+    top: float
+
+
+def draw_place(kind: Kind, rng: Random, things: Things, count: int, maps: np.ndarray) -> Place:
+    """A scene of a kind with `count` things. maps: height maps, which terrains may take."""
+    if kind == "indoors":
+        return _indoors(rng, things, count)
+    return (
+        _outdoors(rng, things, count, maps) if kind == "outdoors" else _objects(rng, things, count)
+    )
+
+
+def _level(x: float, y: float) -> float:
+    return 0.0
+
+
+def _box(center: Point, half: Point) -> Primitive:
+    return Primitive(r.BOX, center, half)
+
+
+def _ground(things: Things, scale: float, height: float = 0.0) -> Shape:
+    ground = things.skinned(_box((0.0, 0.0, height - 1.0), (_FAR, _FAR, 1.0)), scale)
+    return ground._replace(faces=1)
+
+
+def _middles(shapes: list[Shape]) -> list[Point]:
+    return [shape.body.center for shape in shapes]
+
+
+def _indoors(rng: Random, things: Things, count: int) -> Place:
+    size = (rng.uniform(2.6, 7.5), rng.uniform(2.6, 7.5), rng.uniform(2.2, 3.8))
+    plain = things.style.tilted == 0
+    shapes = [_ground(things, spread(rng, 0.4, 1.5)), *_walls(rng, things, size, 1 if plain else 3)]
+    fixed = len(shapes)
+    x, y, z = size[0] / 2, size[1] / 2, size[2]
+    for _ in range(count):
+        extent = min(spread(rng, 0.15, 1.0), 0.3 * min(size))
+        at = (rng.uniform(-x, x) * 0.85, rng.uniform(-y, y) * 0.85, 0.0)
+        shapes += _put(rng, things, at, extent, z)
+    if not plain:
+        for _ in range(rng.choice((0, 0, 1, 2))):
+            shapes.append(_beam(rng, things, x, y, z))
+    targets = _middles(shapes[fixed:])
+    targets += [
+        (rng.uniform(-x, x), rng.uniform(-y, y), rng.uniform(0.4, z - 0.4)) for _ in range(6)
+    ]
+    low, high = (0.3 - x, 0.3 - y, 0.35), (x - 0.3, y - 0.3, z - 0.35)
+    eyes = (0.9, min(1.7, z - 0.4))
+    return Place("indoors", shapes, fixed, low, high, eyes, targets, (0.6, 6.0), z)
+
+
+def _put(rng: Random, things: Things, at: Point, size: float, ceiling: float) -> Thing:
+    """A thing on the floor, at some height, or under the ceiling."""
+    thing, pick = things.draw(), rng.random()
+    lift = 0.0
+    if things.style.tilted and pick < 0.3:
+        lift = rng.uniform(0.2, max(ceiling - 2.2 * size, 0.3))
+    return placed(thing, (at[0], at[1], lift), rng.uniform(0, math.tau), size, _level)
+
+
+def _beam(rng: Random, things: Things, x: float, y: float, z: float) -> Shape:
+    """A thin bar, column or cable through the room."""
+    a, b = (rng.uniform(-x, x), rng.uniform(-y, y)), (rng.uniform(-x, x), rng.uniform(-y, y))
+    ends = rng.choice((((*a, 0.0), (*a, z)), ((-x, a[1], z * 0.9), (x, b[1], z * 0.9))))
+    return things.skinned(rod(*ends, spread(rng, 0.006, 0.12), rng.random() < 0.5))
+
+
+def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
+    """Four walls and a ceiling, and windows or doors in up to `most` of them."""
+    half_x, half_y, height = size[0] / 2, size[1] / 2, size[2]
+    scale = spread(rng, 0.5, 2)
+    common = things.texture()[0]
+    open_sides = set(rng.sample(range(4), rng.randint(1, most)))
+    shapes = []
+    for side in range(4):
+        across, along = (half_x, half_y) if side % 2 == 0 else (half_y, half_x)
+        body = _box((across + _WALL, 0.0, height / 2), (_WALL, along + 2 * _WALL, height / 2))
+        hole = None
+        if side in open_sides:
+            wide, low = rng.uniform(0.25, 0.8) * along, rng.choice((-0.1, rng.uniform(0.5, 1.1)))
+            top = rng.uniform(max(low + 0.6, 1.7), height - 0.1)
+            middle = rng.uniform(wide - along, along - wide) * 0.8
+            hole = _box(
+                (across + _WALL, middle, (low + top) / 2), (4 * _WALL, wide, (top - low) / 2)
+            )
+        texture = common if rng.random() < 0.6 else things.texture()[0]
+        wall = [Shape(body, hole, texture, 1, common, scale)]
+        if hole and rng.random() < 0.6:
+            wall += _panes(rng, things, hole)
+        shapes += [part.moved((0.0, 0.0, 0.0), about_z(side * math.pi / 2)) for part in wall]
+    ceiling = _box((0.0, 0.0, height + _WALL), (half_x + 2 * _WALL, half_y + 2 * _WALL, _WALL))
+    return [*shapes, things.skinned(ceiling, scale)._replace(faces=1)]
+
+
+def _panes(rng: Random, things: Things, hole: Primitive) -> list[Shape]:
+    """Bars in an opening."""
+    (x, y, z), (_, wide, high) = hole.center, hole.half
+    radius, texture = rng.uniform(0.015, 0.05), things.texture()[0]
+    bars = [rod((x, y, z - high), (x, y, z + high), radius, True)]
+    if rng.random() < 0.6:
+        level = z + rng.uniform(-0.3, 0.4) * high
+        bars.append(rod((x, y - wide, level), (x, y + wide, level), radius, True))
+    return [Shape(bar, None, texture, 1, 0, 0.3) for bar in bars]
+
+
+def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place:
+    ground: Callable[[float, float], float] = _level
+    shapes = [_ground(things, spread(rng, 1, 4))]
+    if rng.random() < 0.6:
+        amplitude, index = spread(rng, 0.15, 1.5), rng.randrange(len(maps))
+        shapes[0] = _ground(things, spread(rng, 1, 4), -0.7 * amplitude)
+        half = (_TERRAIN, _TERRAIN, amplitude)
+        body = Primitive(r.HEIGHT, (0.0, 0.0, 0.0), half, extra=float(index))
+        shapes.append(things.skinned(body, spread(rng, 1, 4))._replace(faces=1))
+        ground = _on(maps[index], amplitude)
+    fixed = len(shapes)
+    for _ in range(2 + count // 4):
+        shapes += _far(rng, things)
+    near: list[Shape] = []
+    for _ in range(count):
+        away, angle = 9 * rng.random() ** 0.7, rng.uniform(0, math.tau)
+        at = (away * math.cos(angle), away * math.sin(angle), 0.0)
+        at = at if rng.random() < 0.85 else (at[0], at[1], rng.uniform(0.3, 3))
+        near += placed(things.draw(), at, rng.uniform(0, math.tau), spread(rng, 0.25, 2), ground)
+    shapes += near
+    level = max(ground(0.5 * x, 0.5 * y) for x in range(-24, 25, 2) for y in range(-24, 25, 2))
+    low, high = (-12.0, -12.0, level + 0.3), (12.0, 12.0, level + 7)
+    eyes = (level + 0.6, level + 2.2)
+    return Place("outdoors", shapes, fixed, low, high, eyes, _middles(near), (1.2, 11.0), level + 4)
+
+
+def _on(field: np.ndarray, amplitude: float) -> Callable[[float, float], float]:
+    """Height of a terrain at x, y."""
+    last = len(field) - 1
+
+    def height(x: float, y: float) -> float:
+        i, j = (min(max(round((p / _TERRAIN + 1) / 2 * last), 0), last) for p in (x, y))
+        return amplitude * float(field[i, j])
+
+    return height
+
+
+def _far(rng: Random, things: Things) -> Thing:
+    """A hill, a building or a tree."""
+    pick, angle = rng.random(), rng.uniform(0, math.tau)
+    if pick < 0.3:
+        away, size = rng.uniform(60, 220), rng.uniform(15, 60)
+        at = (away * math.cos(angle), away * math.sin(angle), 0.0)
+        half = (size, size * rng.uniform(0.6, 1.8), size * rng.uniform(0.2, 0.6))
+        body = Primitive(r.ELLIPSOID, at, half, about_z(rng.uniform(0, math.tau)))
+        return [things.skinned(body, size / 2)]
+    away = spread(rng, 11, 70)
+    at = (away * math.cos(angle), away * math.sin(angle), 0.0)
+    if pick < 0.65:
+        wide, deep, high = rng.uniform(2, 7), rng.uniform(2, 7), spread(rng, 2, 14)
+        body = Primitive(
+            r.BOX, (*at[:2], high), (wide, deep, high), about_z(rng.uniform(0, math.tau))
+        )
+        return [things.skinned(body, spread(rng, 2, 9))]
+    high, crown = rng.uniform(1, 3), things.texture()[0]
+    trunk = Primitive(r.FRUSTUM, (*at[:2], high), (0.12 * high, 0.12 * high, high), extra=0.6)
+    tree = [things.skinned(trunk)]
+    for _ in range(rng.randint(1, 4)):
+        x, y = (rng.uniform(-0.5, 0.5) * high for _ in range(2))
+        half = tuple(rng.uniform(0.35, 0.9) * high for _ in range(3))
+        leaves = Primitive(r.ELLIPSOID, (at[0] + x, at[1] + y, rng.uniform(1.7, 2.6) * high), half)  # type: ignore[arg-type]
+        tree.append(Shape(leaves, None, crown, 1, 0, rng.uniform(0.5, 2)))
+    return tree
+
+
+def _objects(rng: Random, things: Things, count: int) -> Place:
+    shapes = [_ground(things, spread(rng, 0.3, 1.5))]
+    if rng.random() < 0.3:
+        wall = _box((rng.uniform(1.5, 3), 0.0, 3.0), (0.1, 30.0, 4.0))
+        wall = things.skinned(wall, spread(rng, 0.3, 1.5))
+        shapes.append(wall.moved((0.0, 0.0, 0.0), about_z(rng.uniform(0, math.tau))))
+    level = 0.0
+    if rng.random() < 0.4:
+        level, wide = rng.uniform(0.02, 0.8), rng.uniform(0.5, 1.1)
+        kind = rng.choice((r.BOX, r.FRUSTUM))
+        table = Primitive(kind, (0.0, 0.0, level / 2), (wide, wide, level / 2), extra=1.0)
+        shapes.append(things.skinned(table, 0.7))
+    fixed = len(shapes)
+    for _ in range(max(count // 2, 1)):
+        at = (rng.gauss(0, 0.4), rng.gauss(0, 0.4), level)
+        size = spread(rng, 0.1, 0.5)
+        shapes += placed(things.draw(), at, rng.uniform(0, math.tau), size, _level)
+    low, high = (-3.5, -3.5, level + 0.2), (3.5, 3.5, level + 3)
+    eyes = (level + 0.25, level + 1.6)
+    targets = _middles(shapes[fixed:])
+    return Place("objects", shapes, fixed, low, high, eyes, targets, (0.6, 2.5), level + 2.5)

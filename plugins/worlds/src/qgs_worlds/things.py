@@ -1,0 +1,206 @@
+"""Things without meaning: composites of primitives, with cuts, bars and wires, repeated in rows."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from random import Random
+
+from qgs_worlds import rows as r
+from qgs_worlds.shapes import (
+    UPRIGHT,
+    Point,
+    Primitive,
+    Shape,
+    Turn,
+    about_z,
+    any_turn,
+    rod,
+    rotated,
+)
+
+Thing = list[Shape]
+
+
+def spread(rng: Random, low: float, high: float) -> float:
+    """A number drawn log-uniformly."""
+    return low * (high / low) ** rng.random()
+
+
+@dataclass(frozen=True)
+class Style:
+    """What things are made of.
+
+    kinds: of primitives. tilted: share of primitives turned freely. cut, wired, repeated: shares of
+    things from which something is taken away, which are bars or wires, which stand in rows.
+    even: whether primitives are as wide as deep.
+    """
+
+    kinds: tuple[int, ...]
+    tilted: float
+    cut: float
+    wired: float
+    repeated: float
+    even: bool
+    most: int
+
+
+PLAIN = Style((r.BOX, r.BOX, r.ELLIPSOID, r.FRUSTUM), 0.0, 0.0, 0.0, 0.0, True, 5)
+VARIED = Style(
+    (r.BOX, r.BOX, r.BOX, r.ELLIPSOID, r.ELLIPSOID, r.FRUSTUM, r.FRUSTUM, r.CAPSULE, r.TORUS,
+     r.HEIGHT),
+    0.45, 0.35, 0.15, 0.12, False, 8,
+)  # fmt: skip
+
+
+class Things:
+    """Draws things about 2 units large around the origin.
+
+    textures: there are this many, of which a shape takes one, or six in a row for its faces.
+    maps: number of height maps.
+    """
+
+    def __init__(self, rng: Random, style: Style, textures: int, maps: int) -> None:
+        self.rng, self.style, self.maps = rng, style, maps
+        self._textures = textures
+
+    def texture(self) -> tuple[int, int]:
+        """First texture of a shape and the number of them."""
+        faces = 6 if self.rng.random() < 0.3 else 1
+        return self.rng.randrange(self._textures - 5), faces
+
+    def skinned(self, body: Primitive, scale: float = 1.0, cut: Primitive | None = None) -> Shape:
+        """A shape with textures of its own."""
+        first, faces = self.texture()
+        return Shape(body, cut, first, faces, self.rng.randrange(self._textures), scale)
+
+    def draw(self) -> Thing:
+        """A thing."""
+        pick = self.rng.random() - self.style.wired
+        if pick < 0:
+            return self.rng.choice((self._frame, self._wire, self._bars))()
+        pick -= self.style.repeated
+        return self._row() if pick < 0 else self._composite()
+
+    def _turn(self) -> Turn:
+        if self.rng.random() < self.style.tilted:
+            return any_turn(self.rng)
+        return about_z(self.rng.uniform(0, math.tau)) if self.rng.random() < 0.5 else UPRIGHT
+
+    def _primitive(self, center: Point, size: float) -> Primitive:
+        rng = self.rng
+        kind = rng.choice(self.style.kinds)
+        a, b, c = (size * spread(rng, 0.25, 1.0) for _ in range(3))
+        if self.style.even and kind != r.BOX:
+            a = b = min(a, b)
+            c = a if kind == r.ELLIPSOID else c
+        extra = 1.0
+        if kind == r.FRUSTUM and not self.style.even:
+            extra = rng.choice((0.001, 1.0, rng.random()))
+        if kind == r.CAPSULE:
+            a = b = c = 0.6 * min(a, b)
+            extra = rng.uniform(0.3, 3)
+        if kind == r.TORUS:
+            b = c = a
+            extra = rng.uniform(0.1, 0.4)
+        if kind == r.HEIGHT:
+            extra = rng.randrange(self.maps)
+        return Primitive(kind, center, (a, b, c), self._turn(), extra)
+
+    def _cut(self, body: Primitive) -> Primitive | None:
+        """What is taken away from a primitive, at its surface or through it."""
+        if body.kind in (r.TORUS, r.HEIGHT):
+            return None
+        rng = self.rng
+        way = rotated(body.turn, tuple(rng.uniform(-0.8, 0.8) * h for h in body.half))  # type: ignore[arg-type]
+        center = tuple(a + b for a, b in zip(body.center, way, strict=True))
+        kind = rng.choice((r.BOX, r.ELLIPSOID, r.FRUSTUM))
+        half = tuple(h * rng.uniform(0.35, 0.9) for h in body.half)
+        turn = body.turn if rng.random() < 0.5 else any_turn(rng)
+        return Primitive(kind, center, half, turn, rng.uniform(0.2, 1))  # type: ignore[arg-type]
+
+    def _composite(self) -> Thing:
+        rng = self.rng
+        count = min(int(spread(rng, 1, self.style.most + 1)), self.style.most)
+        cut = rng.random() < self.style.cut
+        thing, skin = [], self.texture()
+        for _ in range(count):
+            reach = 0.6 if count > 1 else 0.0
+            center = (
+                rng.uniform(-reach, reach),
+                rng.uniform(-reach, reach),
+                rng.uniform(-reach, reach),
+            )
+            body = self._primitive(center, 1.0 if count == 1 else rng.uniform(0.4, 0.9))
+            skin = skin if rng.random() < 0.4 else self.texture()
+            hole = self._cut(body) if cut else None
+            inner = skin[0] if rng.random() < 0.5 else rng.randrange(self._textures)
+            thing.append(Shape(body, hole, *skin, inner))
+        return thing
+
+    def _row(self) -> Thing:
+        """One shape, repeated along a line, growing or turning from one to the next."""
+        rng = self.rng
+        count = rng.randint(3, 7)
+        first = self.skinned(self._primitive((0.0, 0.0, 0.0), 1.2 / count))
+        way = rotated(self._turn(), (2.0 / count, 0.0, rng.choice((0.0, 0.0, 1.2 / count))))
+        angle = rng.choice((0.0, 0.0, rng.uniform(-0.5, 0.5)))
+        grow = rng.choice((1.0, 1.0, rng.uniform(0.8, 1.2)))
+        places = [k - (count - 1) / 2 for k in range(count)]
+        return [
+            first.moved((s * way[0], s * way[1], s * way[2]), about_z(s * angle), grow**s)
+            for s in places
+        ]
+
+    def _rods(self, points: list[Point], pairs: list[tuple[int, int]], radius: float) -> Thing:
+        square, skin = self.rng.random() < 0.5, self.texture()
+        return [
+            Shape(rod(points[a], points[b], radius, square), None, skin[0], 1, 0, 1.0)
+            for a, b in pairs
+        ]
+
+    def _frame(self) -> Thing:
+        """The edges of a box."""
+        rng = self.rng
+        a, b, c = (rng.uniform(0.4, 1) for _ in range(3))
+        points = [(x, y, z) for x in (-a, a) for y in (-b, b) for z in (-c, c)]
+        pairs = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
+        return self._rods(points, pairs, spread(rng, 0.012, 0.08))
+
+    def _wire(self) -> Thing:
+        """A line of rods through a few points, or an arc of them."""
+        rng = self.rng
+        count = rng.randint(3, 8)
+        if rng.random() < 0.5:
+            bend, lift = rng.uniform(1, 6), rng.uniform(-0.3, 0.3)
+            angles = [bend * k / (count - 1) for k in range(count)]
+            points = [(math.cos(t), math.sin(t), lift * t) for t in angles]
+        else:
+            points = [tuple(rng.uniform(-1, 1) for _ in range(3)) for _ in range(count)]
+        pairs = [(k, k + 1) for k in range(count - 1)]
+        return self._rods(points, pairs, spread(rng, 0.008, 0.05))  # type: ignore[arg-type]
+
+    def _bars(self) -> Thing:
+        """Parallel bars between two rails, like a fence or a ladder."""
+        rng = self.rng
+        count, high = rng.randint(3, 9), rng.uniform(0.4, 1)
+        ends = [(-1.0, 0.0, s * high) for s in (-0.8, 0.8)] + [
+            (1.0, 0.0, s * high) for s in (-0.8, 0.8)
+        ]
+        places = [2 * (k + 0.5) / count - 1 for k in range(count)]
+        points = ends + [(x, 0.0, s * high) for x in places for s in (-1, 1)]
+        pairs = [(0, 2), (1, 3)] + [(4 + 2 * k, 5 + 2 * k) for k in range(count)]
+        return self._rods(points, pairs, spread(rng, 0.012, 0.06))
+
+
+def lowest(thing: Thing) -> float:
+    """The least height of a thing, or a little below."""
+    return min(shape.body.center[2] - shape.body.reach() for shape in thing)
+
+
+def placed(
+    thing: Thing, to: Point, turn: float, size: float, on: Callable[[float, float], float]
+) -> Thing:
+    """The thing scaled and turned, to[2] metres above the ground `on` (x, y)."""
+    low = lowest(thing) * size
+    place = (to[0], to[1], to[2] + on(to[0], to[1]) - low)
+    return [shape.moved(place, about_z(turn), size) for shape in thing]

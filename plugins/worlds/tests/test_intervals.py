@@ -1,0 +1,111 @@
+"""Where rays enter shapes, against the signs of implicit functions sampled along them."""
+
+from random import Random
+
+import numpy as np
+import pytest
+from qgs_worlds import rows as r
+from qgs_worlds.intervals import clearances, hit
+from qgs_worlds.materials import height_maps
+from qgs_worlds.shapes import Primitive, Shape, any_turn, packed, rod
+
+MAPS = height_maps(3, 2)
+FAR, SAMPLES = 6.0, 6000
+
+
+def relief(x, y, field):
+    """Bilinear heights at x, y in [-1, 1]."""
+    last = len(field) - 1
+    a, b = ((np.clip(p, -1, 1) + 1) / 2 * last for p in (x, y))
+    i, j = (np.minimum(p.astype(int), last - 1) for p in (a, b))
+    a, b = a - i, b - j
+    low = field[i, j] * (1 - b) + field[i, j + 1] * b
+    return low * (1 - a) + (field[i + 1, j] * (1 - b) + field[i + 1, j + 1] * b) * a
+
+
+def inside(primitive: Primitive, points: np.ndarray) -> np.ndarray:
+    """Negative inside of a primitive, positive outside."""
+    turn = np.array(primitive.turn).reshape(3, 3)
+    x, y, z = ((points - primitive.center) @ turn / primitive.half).T
+    extra, flat = primitive.extra, np.hypot(x, y)
+    cube = np.maximum(np.maximum(abs(x), abs(y)), abs(z)) - 1
+    return {
+        r.ELLIPSOID: lambda: x * x + y * y + z * z - 1,
+        r.BOX: lambda: cube,
+        r.FRUSTUM: lambda: np.maximum(abs(z) - 1, flat - (1 + extra + (extra - 1) * z) / 2),
+        r.CAPSULE: lambda: np.hypot(flat, z - np.clip(z, -extra, extra)) - 1,
+        r.TORUS: lambda: np.hypot(flat - 1 + extra, z) - extra,
+        r.HEIGHT: lambda: np.maximum(cube, z - relief(x, y, MAPS[int(extra)])),
+    }[primitive.kind]()
+
+
+def first(shape: Shape, origin: np.ndarray, way: np.ndarray) -> float:
+    """t at which a ray enters a shape, by sampling, or inf."""
+    t = np.linspace(0, FAR, SAMPLES)
+    points = origin + t[:, None] * way
+    f = inside(shape.body, points)
+    if shape.cut:
+        f = np.maximum(f, -inside(shape.cut, points))
+    within = np.flatnonzero(f < 0)
+    return float(t[within[0]]) if len(within) else np.inf
+
+
+def drawn(kind: int, rng: Random, middle: tuple[float, float, float]) -> Primitive:
+    a, b, c = (rng.uniform(0.3, 1) for _ in range(3))
+    extra = {
+        r.FRUSTUM: rng.choice((0.001, 0.4, 1.0)),
+        r.CAPSULE: rng.uniform(0.3, 1),
+        r.TORUS: rng.uniform(0.1, 0.4),
+        r.HEIGHT: float(rng.randrange(2)),
+    }.get(kind, 0.0)
+    if kind in (r.CAPSULE, r.TORUS):
+        b = c = a
+    return Primitive(kind, middle, (a, b, c), any_turn(rng), extra)
+
+
+KINDS = {"ellipsoid": 0, "box": 1, "frustum": 2, "capsule": 3, "torus": 4, "height": 5}
+
+
+PAIRS = [(kind, None) for kind in KINDS]
+PAIRS += [(kind, cut) for kind in list(KINDS)[:4] for cut in ("ellipsoid", "box", "frustum")]
+
+
+@pytest.mark.parametrize(("kind", "cut"), PAIRS)
+def test_rays_enter_where_implicit_functions_say(kind, cut):
+    rng, draws = Random(7), np.random.default_rng(7)
+    found, expected = [], []
+    for _ in range(60):
+        hole = drawn(KINDS[cut], rng, (0.3, -0.2, 0.4)) if cut else None
+        shape = Shape(drawn(KINDS[kind], rng, (0.1, 0.2, 0.3)), hole)
+        rows = packed([shape])
+        for _ in range(4):
+            origin = draws.normal(size=3)
+            origin *= 3 / np.linalg.norm(origin)
+            way = draws.normal(size=3) * 0.5 - origin
+            way /= np.linalg.norm(way)
+            single = (tuple(map(np.float32, p)) for p in (origin, way))
+            found.append(hit(rows, MAPS, 0, *single)[0])
+            expected.append(first(shape, origin, way))
+    found, expected = np.array(found), np.array(expected)
+    both = np.isfinite(found) & np.isfinite(expected)
+    assert both.mean() > 0.2
+    assert (np.isfinite(found) != np.isfinite(expected)).mean() < 0.015, "rays that graze"
+    # samples are 1 mm apart
+    assert (abs(found[both] - expected[both]) < 3e-3).mean() > 0.98
+
+
+def test_thin_rods_far_away_are_met():
+    rows = packed(
+        [Shape(rod((30.0, -1.0, 0.0), (30.0, 1.0, 0.5), 0.004, square)) for square in (0, 1)]
+    )
+    origin = (np.float32(0), np.float32(0), np.float32(0))
+    way = (np.float32(30), np.float32(0), np.float32(0.25))
+    for i in range(2):
+        assert hit(rows, MAPS, i, origin, way)[0] == pytest.approx(1, abs=3e-4)
+
+
+def test_clearances_are_distances_to_boxes():
+    body = Primitive(r.CAPSULE, (1.0, 0.0, 0.0), (0.5, 0.5, 0.5), extra=1.0)
+    points = np.array([[1.0, 0.0, 2.0], [3.0, 0.0, 0.5], [1.2, 0.1, 0.9], [2.5, 0.0, 2.0]])
+    expected = [1.0, 1.5, 0.0, np.hypot(1, 1)]
+    assert clearances(packed([Shape(body)]), points)[:, 0] == pytest.approx(expected, abs=1e-6)
