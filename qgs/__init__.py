@@ -34,7 +34,7 @@ DISTRIBUTIONS = {
         name: f"query-gaussians-{name}"
         for name in (
             *("locus", "ellipsoid", "landmark", "c3g", "gslrm", "globalsplat", "mvsplat"),
-            *("tokengs2026", "dinov2", "lpips", "rooms", "datasets"),
+            *("tokengs2026", "dinov2", "lpips", "rooms", "datasets", "worlds"),
         )
     },
     "qgs.commands": {

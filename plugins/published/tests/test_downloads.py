@@ -41,7 +41,7 @@ class Server(BaseHTTPRequestHandler):
             self.send_header("Content-Length", str(sizes.get(kind, len(content))))
         self.end_headers()
         sent = content if status == 200 else b""
-        for place in range(0, len(sent), 1 if kind == "drip" else len(sent)):
+        for place in range(0, len(sent), 1 if kind == "drip" else len(sent) or 1):
             if kind == "drip":
                 self.ended.wait(0.1)
             self.wfile.write(sent[place : place + (1 if kind == "drip" else len(sent))])

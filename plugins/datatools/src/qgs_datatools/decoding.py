@@ -11,6 +11,7 @@ from statistics import median, median_low
 
 import numpy as np
 from PIL import Image
+from upath import UPath
 
 from qgs.data.evaluation import one_line
 from qgs.data.images import (
@@ -131,7 +132,7 @@ def _others(photo: Photo, size: Size) -> tuple[tuple[tuple[str, str], ...], np.n
     mask, depth = photo.listed.mask, photo.listed.depth
     read_mask = photo.read_mask
     if mask is not None and photo.mask_exists:
-        read_mask = partial(alpha_mask if mask == photo.listed.path else open_mask, mask)
+        read_mask = partial(_alpha if mask == photo.listed.path else open_mask, mask)
     read_depth = partial(open_depth, depth, 1.0) if depth is not None else None
     errors, sound = list[tuple[str, str]](), dict[str, np.ndarray]()
     for kind, file, read in (("mask", mask, read_mask), ("depth map", depth, read_depth)):
@@ -145,6 +146,12 @@ def _others(photo: Photo, size: Size) -> tuple[tuple[tuple[str, str], ...], np.n
             reasons = [error_text(error)]
         errors += [(reason, f"replace the {kind}") for reason in reasons]
     return tuple(errors), _small(sound["mask"], photo.listed) if "mask" in sound else None
+
+
+def _alpha(path: UPath) -> np.ndarray | None:
+    """The alpha channel of a photo, as a mask; None for an opaque one."""
+    mask = alpha_mask(path)
+    return None if mask.min() == 255 else mask
 
 
 def _small(mask: np.ndarray, frame: PhotoFrame) -> np.ndarray:
