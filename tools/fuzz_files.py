@@ -112,8 +112,9 @@ def damage_checkpoint(file: Path, dice: random.Random) -> str:
         del header["__metadata__"]["qgs.digest"]
     change = dice.choice((other_tensor, other_tensor, other_metadata, other_metadata, other_recipe))
     change(header, data, dice)
-    metadata, sealed = header["__metadata__"], dice.random() < 0.5
-    if sealed and isinstance(metadata, dict) and all(isinstance(x, str) for x in metadata.values()):
+    metadata = header["__metadata__"]
+    is_whole = isinstance(metadata, dict) and all(isinstance(x, str) for x in metadata.values())
+    if sealed := is_whole and dice.random() < 0.5:
         metadata[SEAL] = seal(metadata)  # else hardly anything behind it would be tried
     text = json.dumps(header).encode()
     file.write_bytes(len(text).to_bytes(8, "little") + text + data)

@@ -57,7 +57,7 @@ class TensorFile:
         """All tensors, memory-mapped; they outlive the open file."""
         with self._whole():
             tensors = {name: self._file.get_tensor(name) for name in self._file.keys()}  # noqa: SIM118
-        if self.metadata.get(_DIGEST, "") not in ("", digest(tensors)):
+        if (written := self.metadata.get(_DIGEST)) and written != digest(tensors):
             raise self.damaged("its tensors are not those that were written")
         return tensors
 
