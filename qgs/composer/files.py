@@ -19,6 +19,7 @@ from qgs.composer.yaml_text import (
     load_mapping,
     load_text,
 )
+from qgs.data.paths import open_file
 
 
 def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
@@ -110,9 +111,8 @@ class _Files:
         if place in self.trees:
             return self.trees[place]
         try:
-            if file.exists() and not file.is_file():  # /dev/zero has no end
-                raise OSError("it is no regular file")
-            text = file.read_text(encoding="utf-8")
+            with open_file(file) as opened:
+                text = opened.read().decode("utf-8")
         except UnicodeDecodeError:
             self._problems.stop(Origin(str(file)), "", "this is no UTF-8 text", "save it as UTF-8")
             return MapNode(Origin(str(file)))

@@ -49,8 +49,8 @@ def listing(folder: UPath) -> list[UPath]:
 
 def open_file(path: Path | UPath) -> IO[bytes]:
     """`path`, open for reading bytes. Raises OSError, and as `read_file` what is not local."""
-    if is_local(path) and path.is_fifo():  # opening it would wait for somebody who writes
-        raise OSError(f"{path} is a pipe")
+    if is_local(path) and (path.is_fifo() or path.is_char_device()):  # which may never end
+        raise OSError(f"{path} is a pipe or a device")
     # decoders seek to and fro, and each seek would be a request to a store
     return path.open("rb") if is_local(path) else io.BytesIO(read_file(path))
 

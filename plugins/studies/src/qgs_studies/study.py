@@ -13,6 +13,7 @@ from qgs.composer.errors import Origin, Problems, did_you_mean
 from qgs.composer.files import found_recipe, merge
 from qgs.composer.yaml_text import ListNode, MapNode, kind_of, load_mapping
 from qgs.contracts import ComponentConfig, OptionError
+from qgs.data.paths import open_file
 from qgs.engine.evaluation import SECTIONS
 from qgs_studies.hypotheses import NAME, Contrast, parsed
 
@@ -165,9 +166,8 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
     """The tree of `file` laid over the study that it extends, names of files made absolute."""
     origin = Origin(str(file))
     try:
-        if file.exists() and not file.is_file():  # /dev/zero has no end
-            raise OSError("it is no regular file")
-        text = file.read_text(encoding="utf-8")
+        with open_file(file) as opened:
+            text = opened.read().decode("utf-8")
     except (OSError, ValueError) as error:
         fix = "check the path, or take one such as studies/tiny/structural.yaml"
         problems.stop(origin, "study", f"{file} cannot be read: {error}", fix)
