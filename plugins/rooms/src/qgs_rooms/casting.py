@@ -1,18 +1,13 @@
 """Images and depth maps of a room, in bands of rows, each one compiled call."""
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
-import torch
 from numba import njit
 
+from qgs_rooms.bands import in_bands
 from qgs_rooms.raycast import ray_basis, screen_bounds, trace
 from qgs_rooms.shading import paint
 from qgs_rooms.shapes import Room
 from qgs_rooms.textures import OPTIONS
-
-_BAND = 64  # rows of an image that one thread casts at a time
 
 
 def cast_images(
@@ -31,7 +26,7 @@ def cast_images(
         band = images[frame][top:bottom]
         _colors(band, top, samples, packed, floor, c2w[frame], intrinsics)
 
-    _in_bands(cast, len(c2w), size[0])
+    in_bands(cast, len(c2w), size[0])
     return images
 
 
@@ -45,16 +40,8 @@ def cast_depths(
         view = (room.shapes, room.size, c2w[frame], intrinsics)
         depths[frame, top:bottom] = _traced(bottom - top, size[1], top, 1, *view)[0]
 
-    _in_bands(cast, len(c2w), size[0])
+    in_bands(cast, len(c2w), size[0])
     return depths
-
-
-def _in_bands(cast: Callable[[int, int, int], None], frames: int, height: int) -> None:
-    """Call `cast(frame, top, bottom)` for all rows of all frames, on torch's number of threads."""
-    tops = range(0, height, _BAND)
-    bands = [(frame, top, min(top + _BAND, height)) for frame in range(frames) for top in tops]
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        list(pool.map(lambda band: cast(*band), bands))  # raises what a thread raised
 
 
 @njit(**OPTIONS)

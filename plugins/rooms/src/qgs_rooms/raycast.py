@@ -45,17 +45,27 @@ def _clipped(corners, points):
 
 
 @njit(**INNER)
+def covered(corners, points, intrinsics):
+    """u0, u1, v0, v1 in pixels of a box by its corners (8, 3); u0 > u1 behind the camera.
+
+    points: (20, 3), memory to work in.
+    """
+    u0, u1, v0, v1 = np.inf, -np.inf, np.inf, -np.inf
+    for k in range(_clipped(corners, points)):
+        u = intrinsics[0] * points[k, 0] / points[k, 2] + intrinsics[2]
+        v = intrinsics[1] * points[k, 1] / points[k, 2] + intrinsics[3]
+        u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
+    return u0, u1, v0, v1
+
+
+@njit(**INNER)
 def screen_bounds(shapes, c2w, intrinsics):
     """(S, 4) u0, u1, v0, v1 in pixels of every shape; u0 > u1 for one behind the camera."""
     bounds = np.empty((shapes.shape[0], 4))
     corners, points = np.empty((8, 3)), np.empty((20, 3))
     for i in range(shapes.shape[0]):
         _corners(shapes, i, c2w, corners)
-        u0, u1, v0, v1 = np.inf, -np.inf, np.inf, -np.inf
-        for k in range(_clipped(corners, points)):
-            u = intrinsics[0] * points[k, 0] / points[k, 2] + intrinsics[2]
-            v = intrinsics[1] * points[k, 1] / points[k, 2] + intrinsics[3]
-            u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
+        u0, u1, v0, v1 = covered(corners, points, intrinsics)
         bounds[i, 0], bounds[i, 1], bounds[i, 2], bounds[i, 3] = u0, u1, v0, v1
     return bounds
 
@@ -114,14 +124,14 @@ def _cylinder_row(t, code, steps, o, base, step, radius, half, own):
 
 
 @njit(**INNER)
-def _span(low, high, samples, first, count):
+def span(low, high, samples, first, count):
     """Indices of the samples between two screen coordinates, among `count` from pixel `first`."""
     low, high = (low - first) * samples - 0.5, (high - first) * samples + 0.5
     return int(min(max(low, 0.0), count)), int(min(max(high + 1, 0.0), count))
 
 
 @njit(**INNER)
-def _row_base(rays, v):
+def row_base(rays, v):
     """Direction of the ray at u = 0 of row v."""
     return (
         np.float32(rays[0, 0] + v * rays[0, 2]),
@@ -151,10 +161,10 @@ def trace(t, code, top, samples, shapes, size, bounds, c2w, rays):
     o = (np.float32(c2w[0, 3]), np.float32(c2w[1, 3]), np.float32(c2w[2, 3]))
     extent = (np.float32(size[0]), np.float32(size[1]), np.float32(size[2]))
     for i in range(rows):
-        _walls(t[i], code[i], steps, o, _row_base(rays, top + (i + 0.5) / samples), step, extent)
+        _walls(t[i], code[i], steps, o, row_base(rays, top + (i + 0.5) / samples), step, extent)
     for k in range(shapes.shape[0]):
-        first, last = _span(bounds[k, 0], bounds[k, 1], samples, 0.0, columns)
-        above, below = _span(bounds[k, 2], bounds[k, 3], samples, top, rows)
+        first, last = span(bounds[k, 0], bounds[k, 1], samples, 0.0, columns)
+        above, below = span(bounds[k, 2], bounds[k, 3], samples, top, rows)
         if first >= last:
             continue
         lo = local_point(shapes, k, o[0], o[1], o[2])
@@ -163,7 +173,7 @@ def trace(t, code, top, samples, shapes, size, bounds, c2w, rays):
         own = np.float32(WALLS + 4 * k)
         along = steps[first:last]
         for i in range(above, below):
-            base = _row_base(rays, top + (i + 0.5) / samples)
+            base = row_base(rays, top + (i + 0.5) / samples)
             lb = local(shapes, k, base[0], base[1], base[2])
             near, codes = t[i, first:last], code[i, first:last]
             if shapes[k, 0] == s.BOX:

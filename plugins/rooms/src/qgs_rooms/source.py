@@ -3,28 +3,23 @@
 Kernels are imported when the first room is drawn: numba takes longer to load than a recipe does.
 """
 
-import math
 from collections.abc import Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from random import Random
-from typing import ClassVar
 
 import numpy as np
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from qgs.contracts import Scene, SceneSource, Split
-from qgs.data.scenes import LazyScenes, LazySource
+from qgs.contracts import SceneSource, Split
 from qgs.types import Cameras
 from qgs_rooms.path import camera_path
 from qgs_rooms.plan import furnish
+from qgs_rooms.procedural import DrawnScene, DrawnSource, ImageCache, lens
 from qgs_rooms.shapes import Room
 
 _SHADOW_CELLS = 80
-
-ImageCache = dict[tuple[str, int], np.ndarray]
-"""Images (H, W, 3) uint8 by scene and frame; once it is full, what it holds stays."""
 
 
 class RoomsConfig(SceneSource.Config):
@@ -55,25 +50,19 @@ class RoomsConfig(SceneSource.Config):
         return self
 
 
-class RoomScene(Scene):
+class RoomScene(DrawnScene):
     """One room and the cameras on its path. World: metres, z up, the floor at 0."""
 
     def __init__(
         self, name: str, index: int, config: RoomsConfig, split: Split, cache: ImageCache
     ) -> None:
-        self.name = name
-        self._config, self._cache = config, cache
-        rng = np.random.default_rng([config.seed, 0 if split == "train" else 1, index])
+        super().__init__(name, index, config, split, cache)
+        rng = np.random.default_rng(self.key)
         self._plan_seed = int(rng.integers(1 << 62))
         sizes = rng.uniform((4.2, 4.2, 2.45), (5.8, 5.8, 2.9))
         self.size: tuple[float, float, float] = tuple(map(float, sizes))  # type: ignore[assignment]
         self._c2w = camera_path(rng, self.size, config.views_per_scene)
-        height, width = config.image_size
-        focal = width / 2 / math.tan(math.radians(float(rng.uniform(*config.fov))) / 2)
-        self._intrinsics = np.array([focal, focal, width / 2, height / 2])
-
-    def __len__(self) -> int:
-        return self._config.views_per_scene
+        self._intrinsics = lens(float(rng.uniform(*config.fov)), config.image_size)
 
     @cached_property
     def cameras(self) -> Cameras:
@@ -92,24 +81,12 @@ class RoomScene(Scene):
 
         return floor_shadows(self.room.shapes, self.size, self.room.lights[0], _SHADOW_CELLS)
 
-    def images(self, frames: Sequence[int]) -> Tensor:
-        """See `Scene`."""
-        config, cache = self._config, self._cache
-        images = {frame: cache[self.name, frame] for frame in frames if (self.name, frame) in cache}
-        if missing := [frame for frame in dict.fromkeys(frames) if frame not in images]:
-            from qgs_rooms.casting import cast_images
+    def cast(self, frames: list[int]) -> np.ndarray:
+        """See `DrawnScene`."""
+        from qgs_rooms.casting import cast_images
 
-            size, cameras = config.image_size, (self._c2w[missing], self._intrinsics)
-            cast = cast_images(self.room, self._floor, *cameras, size, config.samples)
-            images.update(zip(missing, cast, strict=True))
-            fitting = config.cache_mb * 2**20 // cast[0].nbytes - len(cache)
-            cache.update(
-                {(self.name, frame): images[frame] for frame in missing[: max(fitting, 0)]}
-            )
-        out = np.empty((len(frames), 3, *config.image_size), np.float32)
-        for place, frame in enumerate(frames):
-            np.multiply(images[frame].transpose(2, 0, 1), np.float32(1 / 255), out=out[place])
-        return torch.from_numpy(out)
+        config, cameras = self._config, (self._c2w[frames], self._intrinsics)
+        return cast_images(self.room, self._floor, *cameras, config.image_size, config.samples)
 
     def depths(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`: z along the ray through the pixel's centre."""
@@ -119,22 +96,9 @@ class RoomScene(Scene):
         return torch.from_numpy(cast_depths(self.room, *cameras, self._config.image_size))[:, None]
 
 
-class RoomsSource(LazySource):
+class RoomsSource(DrawnSource):
     """Endless procedural rooms; room i of a split is a function of (seed, split, i) alone."""
 
     name = "procedural"
     Config = RoomsConfig
-    not_in_protocol: ClassVar[frozenset[str]] = SceneSource.not_in_protocol | {"cache_mb"}
-    split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
-
-    def __init__(self, config: RoomsConfig) -> None:
-        super().__init__(config)
-        cache: ImageCache = {}
-        counts: dict[Split, int] = {"train": config.scenes, "test": config.test_scenes}
-        self.splits = {
-            split: LazyScenes(
-                {f"{split}/{index:06d}": index for index in range(count)},
-                partial(RoomScene, config=config, split=split, cache=cache),
-            )
-            for split, count in counts.items()
-        }
+    scene = RoomScene

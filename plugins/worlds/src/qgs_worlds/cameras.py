@@ -2,8 +2,10 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from qgs_rooms.procedural import lens
 
 from qgs_worlds.intervals import clearances
 from qgs_worlds.places import Place
@@ -30,6 +32,23 @@ class Rig:
         """Middle and radius of a ball that holds most of what they see."""
         middle = (self.c2w[:, :3, 3] + self.distance * self.c2w[:, :3, 2]).mean(0)
         return middle, 1.3 * self.distance + 1
+
+
+class Path(NamedTuple):
+    """Where cameras may go: from `base`, for `length` metres, towards or around `target`.
+
+    s: from -.5 to .5, one number for each camera. fov: horizontal, degrees.
+    """
+
+    base: np.ndarray
+    target: np.ndarray
+    length: float
+    s: np.ndarray
+    fov: float
+
+
+Motion: TypeAlias = tuple[np.ndarray, np.ndarray]
+"""Eyes and what they look at, both (F, 3)."""
 
 
 def draw_cameras(
@@ -65,8 +84,7 @@ def _outside(eyes: np.ndarray, place: Place, shapes: np.ndarray) -> float:
 
 def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
     """The worst view's share of sky and of things right before the camera."""
-    focal = _PROBE[1] / 2 / math.tan(math.radians(rig.fov) / 2)
-    intrinsics = np.array([focal, focal, _PROBE[1] / 2, _PROBE[0] / 2])
+    intrinsics = lens(rig.fov, _PROBE)
     near = clearances(world[0], rig.c2w[:, :3, 3]).min()
     views = [trace(*_PROBE, 0, 1, *world, c2w, intrinsics)[0].ravel() for c2w in rig.c2w]
     t = np.stack(views)
@@ -101,7 +119,7 @@ def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shri
     length = distance * math.exp(rng.uniform(low, high)) * shrink
     motion = ("walk", "orbit", "round", "gather")[rng.choice(4, p=(0.35, 0.3, 0.1, 0.25))]
     fov = float(rng.uniform(*FOV))
-    eyes, targets = _MOTIONS[motion](rng, base, target, length, s, fov)
+    eyes, targets = _MOTIONS[motion](rng, Path(base, target, length, s, fov))
     eyes = eyes + 0.03 * length * rng.normal(size=eyes.shape)
     targets = targets + 0.05 * distance * rng.normal(size=3)
     targets = targets + 0.02 * distance * rng.normal(size=eyes.shape)
@@ -132,15 +150,9 @@ def _stand(
     return base, max(float(np.linalg.norm(base - target)), 0.3)
 
 
-def _walk(
-    rng: np.random.Generator,
-    base: np.ndarray,
-    target: np.ndarray,
-    length: float,
-    s: np.ndarray,
-    fov: float,
-) -> tuple[np.ndarray, np.ndarray]:
+def _walk(rng: np.random.Generator, path: Path) -> Motion:
     """Along a bent line; looking ahead, or at what is passed."""
+    base, target, length, s = path.base, path.target, path.length, path.s
     way = rng.normal(size=3) * (1, 1, 0.3)
     way /= np.linalg.norm(way)
     bend = rng.normal(size=3) * (0.3, 0.3, 0.1)
@@ -148,15 +160,9 @@ def _walk(
     return eyes, target + rng.uniform(0, 1) * (eyes - base)
 
 
-def _orbit(
-    rng: np.random.Generator,
-    base: np.ndarray,
-    target: np.ndarray,
-    length: float,
-    s: np.ndarray,
-    fov: float,
-) -> tuple[np.ndarray, np.ndarray]:
+def _orbit(rng: np.random.Generator, path: Path) -> Motion:
     """Around the target, rising and coming nearer a little."""
+    base, target, length, s = path.base, path.target, path.length, path.s
     offset = base - target
     flat = max(math.hypot(offset[0], offset[1]), 0.2)
     angles = s * min(length / flat, 2.4)
@@ -167,16 +173,10 @@ def _orbit(
     return eyes, np.tile(target, (len(s), 1))
 
 
-def _round(
-    rng: np.random.Generator,
-    base: np.ndarray,
-    target: np.ndarray,
-    length: float,
-    s: np.ndarray,
-    fov: float,
-) -> tuple[np.ndarray, np.ndarray]:
+def _round(rng: np.random.Generator, path: Path) -> Motion:
     """From one place in directions that overlap."""
-    angles = s * math.radians(fov) * rng.uniform(0.3, 1.2)
+    base, target, length, s = path.base, path.target, path.length, path.s
+    angles = s * math.radians(path.fov) * rng.uniform(0.3, 1.2)
     cos, sin = np.cos(angles), np.sin(angles)
     x, y, z = target - base
     way = np.stack([cos * x - sin * y, sin * x + cos * y, np.full(len(s), z)], 1)
@@ -184,15 +184,9 @@ def _round(
     return eyes, eyes + way
 
 
-def _gather(
-    rng: np.random.Generator,
-    base: np.ndarray,
-    target: np.ndarray,
-    length: float,
-    s: np.ndarray,
-    fov: float,
-) -> tuple[np.ndarray, np.ndarray]:
+def _gather(rng: np.random.Generator, path: Path) -> Motion:
     """From places scattered around one point, all at the target."""
+    base, target, length, s = path.base, path.target, path.length, path.s
     offsets = rng.normal(size=(len(s), 3)) * (1, 1, 0.5)
     offsets *= rng.random((len(s), 1)) ** 0.5 / np.linalg.norm(offsets, axis=1, keepdims=True)
     return base + 0.5 * length * offsets, np.tile(target, (len(s), 1))

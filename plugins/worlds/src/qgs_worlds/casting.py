@@ -1,16 +1,11 @@
 """Images and depth maps of a world, in bands of rows."""
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
-import torch
+from qgs_rooms.bands import in_bands
 
 from qgs_worlds.raycast import trace
 from qgs_worlds.rows import World
 from qgs_worlds.shading import paint
-
-_BAND = 64  # rows of an image that one thread casts at a time
 
 
 def cast_light(
@@ -24,7 +19,7 @@ def cast_light(
         t, code, rays = trace(*rows, world.shapes, world.heights, c2w[frame], intrinsics)
         paint(light[frame, top:bottom], t, code, top, samples, packed, c2w[frame], rays)
 
-    _in_bands(cast, len(c2w), size[0])
+    in_bands(cast, len(c2w), size[0])
     return light
 
 
@@ -39,17 +34,5 @@ def cast_depths(
         t, _, _ = trace(*rows, world.shapes, world.heights, c2w[frame], intrinsics)
         depths[frame, top:bottom] = np.where(np.isfinite(t), t, 0)
 
-    _in_bands(cast, len(c2w), size[0])
+    in_bands(cast, len(c2w), size[0])
     return depths
-
-
-def _in_bands(cast: Callable[[int, int, int], None], frames: int, height: int) -> None:
-    """Call `cast(frame, top, bottom)` for all rows of all frames, on torch's number of threads."""
-    tops = range(0, height, _BAND)
-    bands = [(frame, top, min(top + _BAND, height)) for frame in range(frames) for top in tops]
-    if torch.get_num_threads() == 1:
-        for band in bands:
-            cast(*band)
-        return
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        list(pool.map(lambda band: cast(*band), bands))  # raises what a thread raised

@@ -6,6 +6,7 @@ from random import Random
 from typing import TYPE_CHECKING
 
 import numpy as np
+from qgs_rooms.procedural import lens
 
 from qgs_worlds import materials
 from qgs_worlds.cameras import CLEARANCE, Rig, draw_cameras
@@ -17,7 +18,6 @@ from qgs_worlds.places import KINDS, SHARES, Place, draw_place
 from qgs_worlds.rows import World
 from qgs_worlds.shadows import shadow_maps
 from qgs_worlds.shapes import packed
-from qgs_worlds.source import lens
 from qgs_worlds.things import PLAIN, VARIED, Things, spread
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 from qgs_rooms.intersections import NONE, ZERO
-from qgs_rooms.raycast import ray_basis
+from qgs_rooms.raycast import covered, ray_basis, row_base, span
 from qgs_rooms.textures import INNER, OPTIONS
 
 from qgs_worlds import rows as r
@@ -22,7 +22,6 @@ from qgs_worlds.intervals import (
 from qgs_worlds.kernels import BORROWING
 
 SKY = -1  # part p of shape i has code 8 i + p
-_PLANE = 0.02  # shapes are clipped where they come nearer to the camera's plane than this
 
 
 @njit(**INNER)
@@ -46,37 +45,6 @@ def _corners(shapes, i, c2w, corners):
             corners[corner, a] = middle[a]
             for j in range(3):
                 corners[corner, a] += axes[j, a] if corner >> j & 1 else -axes[j, a]
-
-
-@njit(**BORROWING)
-def _clipped(corners, points):
-    """Write the corners in front of the camera, and where edges cross its plane; their number."""
-    n = 0
-    for k in range(8):
-        z = corners[k, 2]
-        if z > _PLANE:
-            points[n, 0], points[n, 1], points[n, 2] = corners[k, 0], corners[k, 1], z
-            n += 1
-        for axis in range(3):
-            other = k | (1 << axis)
-            if other != k and (z > _PLANE) != (corners[other, 2] > _PLANE):
-                w = (_PLANE - z) / (corners[other, 2] - z)
-                for a in range(3):
-                    points[n, a] = corners[k, a] + w * (corners[other, a] - corners[k, a])
-                n += 1
-    return n
-
-
-@njit(**INNER)
-def _bounds(shapes, i, c2w, intrinsics, corners, points):
-    """u0, u1, v0, v1 in pixels of shape i; u0 > u1 for one behind the camera."""
-    _corners(shapes, i, c2w, corners)
-    u0, u1, v0, v1 = np.inf, -np.inf, np.inf, -np.inf
-    for k in range(_clipped(corners, points)):
-        u = intrinsics[0] * points[k, 0] / points[k, 2] + intrinsics[2]
-        v = intrinsics[1] * points[k, 1] / points[k, 2] + intrinsics[3]
-        u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
-    return u0, u1, v0, v1
 
 
 @njit(**BORROWING)
@@ -137,23 +105,6 @@ def _closest(t, code, own, first, second):
         code[k] = own + face if closer else code[k]
 
 
-@njit(**BORROWING)
-def _span(low, high, samples, first, count):
-    """Indices of the samples between two screen coordinates, among `count` from pixel `first`."""
-    low, high = (low - first) * samples - 0.5, (high - first) * samples + 0.5
-    return int(min(max(low, 0.0), count)), int(min(max(high + 1, 0.0), count))
-
-
-@njit(**BORROWING)
-def _base(rays, v):
-    """Direction of the ray at u = 0 of row v."""
-    return (
-        np.float32(rays[0, 0] + v * rays[0, 2]),
-        np.float32(rays[1, 0] + v * rays[1, 2]),
-        np.float32(rays[2, 0] + v * rays[2, 2]),
-    )
-
-
 @njit(**INNER)
 def _trace_shape(t, code, top, samples, shapes, heights, i, o, rays, steps, area, scratch):
     """Let shape i cover what lies behind it in an area of the samples."""
@@ -164,7 +115,7 @@ def _trace_shape(t, code, top, samples, shapes, heights, i, o, rays, steps, area
     spans = scratch[:, :, : last - first]
     spans[1, 0], spans[1, 1], spans[1, 3] = NONE, -NONE, ZERO
     for row in range(above, below):
-        base = _base(rays, top + (row + 0.5) / samples)
+        base = row_base(rays, top + (row + 0.5) / samples)
         for part in range(parts):
             p = part * r.PRIMITIVE_FIELDS
             lo = local_point(shapes, i, p, o[0], o[1], o[2])
@@ -189,9 +140,10 @@ def trace(rows, columns, top, samples, shapes, heights, c2w, intrinsics):
     corners, points = np.empty((8, 3)), np.empty((20, 3))
     scratch = np.empty((2, 4, columns * samples), np.float32)
     for i in range(shapes.shape[0]):
-        u0, u1, v0, v1 = _bounds(shapes, i, c2w, intrinsics, corners, points)
-        first, last = _span(u0, u1, samples, 0.0, columns * samples)
-        above, below = _span(v0, v1, samples, top, rows * samples)
+        _corners(shapes, i, c2w, corners)
+        u0, u1, v0, v1 = covered(corners, points, intrinsics)
+        first, last = span(u0, u1, samples, 0.0, columns * samples)
+        above, below = span(v0, v1, samples, top, rows * samples)
         if first < last and above < below:
             area = (above, below, first, last)
             _trace_shape(t, code, top, samples, shapes, heights, i, o, rays, steps, area, scratch)

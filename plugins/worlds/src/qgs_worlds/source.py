@@ -3,19 +3,17 @@
 Kernels are imported when the first scene is drawn: numba takes longer to load than a recipe does.
 """
 
-import math
 from collections.abc import Sequence
-from functools import cached_property, partial
-from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 import torch
 from pydantic import Field
-from qgs_rooms.source import ImageCache
+from qgs_rooms.procedural import DrawnScene, DrawnSource, lens
 from torch import Tensor
 
-from qgs.contracts import Scene, SceneSource, Split
-from qgs.data.scenes import LazyScenes, LazySource
+from qgs.contracts import SceneSource
 from qgs.types import Cameras
 
 if TYPE_CHECKING:
@@ -57,25 +55,15 @@ class WorldsConfig(SceneSource.Config):
     """Megabytes of images kept in memory; 0 keeps none."""
 
 
-class WorldScene(Scene):
+class WorldScene(DrawnScene):
     """One scene and its cameras. World: metres, z up."""
-
-    def __init__(
-        self, name: str, index: int, config: WorldsConfig, split: Split, cache: ImageCache
-    ) -> None:
-        self.name = name
-        self._config, self._cache = config, cache
-        self._key = [config.seed, 0 if split == "train" else 1, index]
-
-    def __len__(self) -> int:
-        return self._config.views_per_scene
 
     @cached_property
     def drawn(self) -> "Drawn":
         """What is there, and how it is seen."""
         from qgs_worlds.drawing import draw
 
-        return draw(self._key, self._config)
+        return draw(self.key, self._config)
 
     @cached_property
     def _intrinsics(self) -> np.ndarray:
@@ -88,21 +76,9 @@ class WorldScene(Scene):
         c2w = torch.from_numpy(self.drawn.rig.c2w).float()
         return Cameras(c2w, intrinsics, self._config.image_size)
 
-    def images(self, frames: Sequence[int]) -> Tensor:
-        """See `Scene`."""
-        config, cache = self._config, self._cache
-        images = {frame: cache[self.name, frame] for frame in frames if (self.name, frame) in cache}
-        if missing := [frame for frame in dict.fromkeys(frames) if frame not in images]:
-            photos = self.drawn.photos(missing, config.image_size, config.samples)
-            images.update(zip(missing, photos, strict=True))
-            fitting = config.cache_mb * 2**20 // photos[0].nbytes - len(cache)
-            cache.update(
-                {(self.name, frame): images[frame] for frame in missing[: max(fitting, 0)]}
-            )
-        out = np.empty((len(frames), 3, *config.image_size), np.float32)
-        for place, frame in enumerate(frames):
-            np.multiply(images[frame].transpose(2, 0, 1), np.float32(1 / 255), out=out[place])
-        return torch.from_numpy(out)
+    def cast(self, frames: list[int]) -> Sequence[np.ndarray]:
+        """See `DrawnScene`."""
+        return self.drawn.photos(frames, self._config.image_size, self._config.samples)
 
     def depths(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`: z along the ray through the pixel's centre; the sky is unknown."""
@@ -110,28 +86,9 @@ class WorldScene(Scene):
         return torch.from_numpy(depths)[:, None]
 
 
-def lens(fov: float, size: tuple[int, int]) -> np.ndarray:
-    """fx, fy, cx, cy in pixels of a horizontal field of view in degrees, for (H, W)."""
-    focal = size[1] / 2 / math.tan(math.radians(fov) / 2)
-    return np.array([focal, focal, size[1] / 2, size[0] / 2])
-
-
-class WorldsSource(LazySource):
+class WorldsSource(DrawnSource):
     """Endless procedural scenes; scene i of a split is a function of (seed, split, i) alone."""
 
     name = "procedural"
     Config = WorldsConfig
-    not_in_protocol: ClassVar[frozenset[str]] = SceneSource.not_in_protocol | {"cache_mb"}
-    split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
-
-    def __init__(self, config: WorldsConfig) -> None:
-        super().__init__(config)
-        cache: ImageCache = {}
-        counts: dict[Split, int] = {"train": config.scenes, "test": config.test_scenes}
-        self.splits = {
-            split: LazyScenes(
-                {f"{split}/{index:06d}": index for index in range(count)},
-                partial(WorldScene, config=config, split=split, cache=cache),
-            )
-            for split, count in counts.items()
-        }
+    scene = WorldScene

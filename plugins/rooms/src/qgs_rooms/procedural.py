@@ -1,0 +1,79 @@
+"""Scenes that are drawn from a seed, and whose images are cast on demand and kept."""
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from qgs.contracts import Scene, SceneSource, Split
+from qgs.data.scenes import LazyScenes, LazySource
+
+ImageCache = dict[tuple[str, int], np.ndarray]
+"""Images (H, W, 3) uint8 by scene and frame; once it is full, what it holds stays."""
+
+
+class DrawnScene(Scene):
+    """Scene `index` of a split. config: of its source; `views_per_scene` cameras see it.
+
+    key: seed, split and index, of which all that is drawn is a function.
+    """
+
+    def __init__(self, name: str, index: int, config: Any, split: Split, cache: ImageCache) -> None:
+        self.name = name
+        self._config, self._cache = config, cache
+        self.key = [config.seed, 0 if split == "train" else 1, index]
+
+    def __len__(self) -> int:
+        return self._config.views_per_scene
+
+    @abstractmethod
+    def cast(self, frames: list[int]) -> Sequence[np.ndarray]:
+        """Images (H, W, 3) uint8, one for each frame."""
+
+    def images(self, frames: Sequence[int]) -> Tensor:
+        """See `Scene`."""
+        config, cache = self._config, self._cache
+        images = {frame: cache[self.name, frame] for frame in frames if (self.name, frame) in cache}
+        if missing := [frame for frame in dict.fromkeys(frames) if frame not in images]:
+            cast = self.cast(missing)
+            images.update(zip(missing, cast, strict=True))
+            fitting = config.cache_mb * 2**20 // cast[0].nbytes - len(cache)
+            cache.update(
+                {(self.name, frame): images[frame] for frame in missing[: max(fitting, 0)]}
+            )
+        out = np.empty((len(frames), 3, *config.image_size), np.float32)
+        for place, frame in enumerate(frames):
+            np.multiply(images[frame].transpose(2, 0, 1), np.float32(1 / 255), out=out[place])
+        return torch.from_numpy(out)
+
+
+class DrawnSource(LazySource):
+    """Endless scenes; scene i of a split is a function of (seed, split, i) alone."""
+
+    scene: ClassVar[type[DrawnScene]]
+    not_in_protocol: ClassVar[frozenset[str]] = SceneSource.not_in_protocol | {"cache_mb"}
+    split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
+
+    def __init__(self, config: Any) -> None:
+        super().__init__(config)
+        cache: ImageCache = {}
+        counts: dict[Split, int] = {"train": config.scenes, "test": config.test_scenes}
+        self.splits = {
+            split: LazyScenes(
+                {f"{split}/{index:06d}": index for index in range(count)},
+                partial(self.scene, config=config, split=split, cache=cache),
+            )
+            for split, count in counts.items()
+        }
+
+
+def lens(fov: float, size: tuple[int, int]) -> np.ndarray:
+    """fx, fy, cx, cy in pixels of a horizontal field of view in degrees, for (H, W)."""
+    height, width = size
+    focal = width / 2 / math.tan(math.radians(fov) / 2)
+    return np.array([focal, focal, width / 2, height / 2])
