@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 from pydantic import ValidationError
+from qgs_rooms.source import RoomScene, RoomsConfig, RoomsSource
 from qgs_worlds import rows as r
 from qgs_worlds.effects import develop
 from qgs_worlds.intervals import hit
@@ -51,7 +52,7 @@ def test_any_size(size):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"scenes": 0}, {"complexity": 2}, {"light": "dark"}, {"views_per_scene": 1}]
+    "wrong", [{"scenes": 0}, {"complexity": 2}, {"light": "dark"}, {"depth": (2, 1)}, {"rooms": 2}]
 )
 def test_wrong_options_are_refused(wrong):
     with pytest.raises(ValidationError):
@@ -81,7 +82,29 @@ def test_depth_is_that_of_the_nearest_shape():
                 for k in range(len(world.shapes))
             ]
             nearest = min(hits)
-            assert depth[i, j] == pytest.approx(nearest if np.isfinite(nearest) else 0, rel=2e-3)
+            true = nearest * scene.drawn.scale if np.isfinite(nearest) else 0
+            assert depth[i, j] == pytest.approx(true, rel=2e-3)
+
+
+def test_scenes_are_scaled_to_their_depth():
+    scaled, drawn = (source(depth=depth).scenes("train") for depth in ((2.0, 2.0), None))
+    for index in range(8):
+        depths = scaled[index].depths(range(8))
+        assert depths[depths > 0].median() == pytest.approx(2, rel=0.1)
+        factor = scaled[index].drawn.scale
+        torch.testing.assert_close(depths, drawn[index].depths(range(8)) * factor)
+        moved = scaled[index].cameras.c2w[:, :3, 3], drawn[index].cameras.c2w[:, :3, 3]
+        torch.testing.assert_close(moved[0], moved[1] * factor)
+        assert torch.equal(scaled[index].images([1]), drawn[index].images([1]))
+
+
+def test_a_share_of_scenes_are_rooms():
+    mixed = source(rooms=0.25).scenes("train")
+    rooms = RoomsSource(RoomsConfig(image_size=mixed[0].cameras.size)).scenes("train")
+    drawn = [index for index in range(400) if isinstance(mixed[index], RoomScene)]
+    assert 70 < len(drawn) < 130
+    assert torch.equal(mixed[drawn[0]].images([3]), rooms[drawn[0]].images([3]))
+    assert not any(isinstance(scene, RoomScene) for scene in source().scenes("train")[:50])
 
 
 def test_depths_of_two_views_agree():

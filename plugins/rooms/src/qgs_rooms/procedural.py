@@ -2,7 +2,7 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, ClassVar
 
@@ -55,7 +55,8 @@ class DrawnScene(Scene):
 class DrawnSource(LazySource):
     """Endless scenes; scene i of a split is a function of (seed, split, i) alone."""
 
-    scene: ClassVar[type[DrawnScene]]
+    scene: ClassVar[Callable[..., DrawnScene]]
+    """Called with name and index of the scene, its config, split and cache."""
     not_in_protocol: ClassVar[frozenset[str]] = SceneSource.not_in_protocol | {"cache_mb"}
     split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
 

@@ -13,7 +13,7 @@ from qgs_worlds.raycast import trace
 
 CLEARANCE = 0.2  # metres from a camera to the box around any shape, at least
 FOV = (40.0, 90.0)  # horizontal, degrees
-BASELINE = (0.012, 1.2)  # length of a path by the distance to what is looked at
+BASELINE = (0.04, 1.3)  # length of a path by the distance to what is looked at
 PLAIN_FOV, PLAIN_TRAVEL = (60.0, 75.0), (0.65, 1.2)
 _TRIES = 12
 _PROBE = (6, 6)  # pixels of the depth maps by which views are judged

@@ -1,7 +1,7 @@
 """Scenes drawn from a seed, and photos of them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from random import Random
 from typing import TYPE_CHECKING
 
@@ -29,13 +29,17 @@ _THUMB = (10, 10)  # pixels of the pictures by which a scene is exposed
 
 @dataclass(frozen=True)
 class Drawn:
-    """A scene: its place, world and cameras; how its photos are developed."""
+    """A scene: its place, world and cameras; how its photos are developed.
+
+    scale: factor of all lengths, which brings the median depth of what is seen into its range.
+    """
 
     place: Place
     world: World
     rig: Rig
     effects: np.ndarray
     quality: int
+    scale: float
 
     def photos(
         self, frames: Sequence[int], size: tuple[int, int], samples: int
@@ -81,4 +85,13 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
     world = World(shapes, maps, skins, shades[0], air, *shades[1:])
     light = cast_light(world, rig.c2w, lens(rig.fov, _THUMB), _THUMB, 1)
     effects, quality = draw_effects(camera, light, config.effects)
-    return Drawn(place, world, rig, effects, quality)
+    drawn = Drawn(place, world, rig, effects, quality, 1.0)
+    if config.depth is None:
+        return drawn
+    return replace(drawn, scale=spread(Random(str(key)), *config.depth) / _median_depth(drawn))
+
+
+def _median_depth(drawn: Drawn) -> float:
+    """Of what all cameras see, the sky left out."""
+    depths = drawn.depths(range(len(drawn.rig.c2w)), _THUMB)
+    return float(np.median(depths[depths > 0])) if depths.any() else drawn.rig.distance

@@ -3,17 +3,20 @@
 Kernels are imported when the first scene is drawn: numba takes longer to load than a recipe does.
 """
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
+from random import Random
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 import torch
-from pydantic import Field
-from qgs_rooms.procedural import DrawnScene, DrawnSource, lens
+from pydantic import Field, field_validator
+from qgs_rooms.procedural import DrawnScene, DrawnSource, ImageCache, lens
+from qgs_rooms.source import RoomScene, RoomsConfig
 from torch import Tensor
 
-from qgs.contracts import SceneSource
+from qgs.contracts import SceneSource, Split
 from qgs.types import Cameras
 
 if TYPE_CHECKING:
@@ -45,6 +48,11 @@ class WorldsConfig(SceneSource.Config):
     """Plain: even surfaces and simple patterns. Varied: noise near 1/f, warped, and patterns."""
     light: Variety = "varied"
     """Plain: one lamp and soft shading. Varied: sun and lamps with shadows, highlights, fog."""
+    depth: tuple[float, float] | None = (1.2, 4.0)
+    """Least and largest median depth of what cameras see, metres; each scene is scaled to a depth
+    drawn from it log-uniformly. null: scenes are as large as they are drawn."""
+    rooms: float = Field(default=0.0, ge=0, le=1)
+    """Share of scenes that are those of `rooms/procedural` instead, with the same numbers."""
     effects: bool = True
     """Whether cameras differ in exposure, white balance, tone, vignette, noise and JPEG quality."""
     samples: int = Field(default=2, ge=1, le=8)
@@ -54,9 +62,18 @@ class WorldsConfig(SceneSource.Config):
     cache_mb: int = Field(default=512, ge=0)
     """Megabytes of images kept in memory; 0 keeps none."""
 
+    @field_validator("depth")
+    @classmethod
+    def _depth_is_a_range(cls, depth: tuple[float, float] | None) -> tuple[float, float] | None:
+        if depth is not None and not 0 < depth[0] <= depth[1] < math.inf:
+            raise ValueError(
+                f"depth must be [min, max] metres with 0 < min <= max, got {list(depth)}"
+            )
+        return depth
+
 
 class WorldScene(DrawnScene):
-    """One scene and its cameras. World: metres, z up."""
+    """One scene and its cameras. World: metres, scaled by `drawn.scale`; z up."""
 
     @cached_property
     def drawn(self) -> "Drawn":
@@ -74,6 +91,7 @@ class WorldScene(DrawnScene):
         """See `Scene`."""
         intrinsics = torch.from_numpy(self._intrinsics).float().expand(len(self), 4)
         c2w = torch.from_numpy(self.drawn.rig.c2w).float()
+        c2w[:, :3, 3] *= self.drawn.scale
         return Cameras(c2w, intrinsics, self._config.image_size)
 
     def cast(self, frames: list[int]) -> Sequence[np.ndarray]:
@@ -83,7 +101,17 @@ class WorldScene(DrawnScene):
     def depths(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`: z along the ray through the pixel's centre; the sky is unknown."""
         depths = self.drawn.depths(frames, self._config.image_size)
-        return torch.from_numpy(depths)[:, None]
+        return torch.from_numpy(depths)[:, None] * self.drawn.scale
+
+
+def world_or_room(
+    name: str, index: int, config: WorldsConfig, split: Split, cache: ImageCache
+) -> DrawnScene:
+    """Scene `index` of a split: a world, or a room by the share of `rooms`."""
+    if Random(f"{config.seed} {split} {index}").random() >= config.rooms:
+        return WorldScene(name, index, config, split, cache)
+    alike = config.model_dump(include={"image_size", *RoomsConfig.model_fields} - {"type"})
+    return RoomScene(name, index, RoomsConfig(**alike), split, cache)
 
 
 class WorldsSource(DrawnSource):
@@ -91,4 +119,4 @@ class WorldsSource(DrawnSource):
 
     name = "procedural"
     Config = WorldsConfig
-    scene = WorldScene
+    scene = staticmethod(world_or_room)
