@@ -139,7 +139,9 @@ def _stand(
         angle = rng.uniform(0, math.tau)
         height = rng.uniform(*place.eyes)
         if varied and rng.random() < 0.3:
-            height = rng.uniform(place.low[2], min(place.high[2], target[2] + 0.8 * distance))
+            height = rng.uniform(
+                place.low[2], max(min(place.high[2], target[2] + 0.8 * distance), place.low[2])
+            )
         flat = math.sqrt(max(distance**2 - (height - target[2]) ** 2, (0.5 * distance) ** 2))
         base = np.array(
             [target[0] + flat * math.cos(angle), target[1] + flat * math.sin(angle), height]
