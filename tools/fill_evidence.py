@@ -1,8 +1,8 @@
-"""Write the tables of finished studies into docs/evidence.md, between its markers.
+"""Write the tables of finished studies into the pages of docs/, between their markers.
 
     python tools/fill_evidence.py FOLDER
 
-FOLDER holds a folder of each study, as `qgs study ... --out FOLDER/NAME` left it. A region of the
+FOLDER holds a folder of each study, as `qgs study ... --out FOLDER/NAME` left it. A region of a
 page from `<!-- study: NAME -->` to `<!-- end -->` becomes the answer and the tables of table.md
 there; where a study has several evaluations, their tables become one, of mean PSNR. Figures go to
 docs/images/evidence_NAME.webp: the study's, or lines over evaluations that are called WHAT_NUMBER.
@@ -21,7 +21,7 @@ from PIL import Image
 from qgs.drawing.figures import categorical, figure_style, hex_color
 from qgs.io.files import replacing, write_text
 
-PAGE = Path(__file__).parents[1] / "docs" / "evidence.md"
+DOCS = Path(__file__).parents[1] / "docs"
 UNITS = {"noise": "degrees of noise", "views": "input views"}
 REGION = re.compile(r"(<!-- study: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -125,12 +125,15 @@ def main() -> None:
         if not (study / "table.md").exists():
             print(f"{study} has no table.md: the page keeps what it has of {region[2]}")
             return region[0]
-        image = PAGE.parent / "images" / f"evidence_{region[2]}.webp"
+        image = DOCS / "images" / f"evidence_{region[2]}.webp"
         write_figure(study, image)
         shown = f"![{region[2]}: the figures of the table below](images/{image.name})"
         return f"{region[1]}\n{shown}\n\n{page_of(study)}\n{region[3]}"
 
-    write_text(PAGE, REGION.sub(filled, PAGE.read_text(encoding="utf-8")))
+    for page in DOCS.glob("*.md"):
+        text = page.read_text(encoding="utf-8")
+        if REGION.search(text):
+            write_text(page, REGION.sub(filled, text))
 
 
 if __name__ == "__main__":

@@ -113,7 +113,7 @@ def test_anchors_are_shown_layer_by_layer_of_models_that_have_them() -> None:
     axes = made.figure.axes
     layers = chosen_layers(exhibit_of("locus").look.depth, anchors.LAYERS, 0)
     titles = [axis.get_title(loc="left") for axis in axes]
-    assert titles == ["learned start", *(f"after layer {n}" for n in layers[1:]), titles[-1]]
+    assert titles == ["start", *(f"after layer {n}" for n in layers[1:]), titles[-1]]
     assert "Not shown: tokengs" in made.caption
     assert len(pictures(axes)) == len(axes) == len(layers) + 1
     with pytest.raises(NothingToShowError, match="tokengs: the queries have no anchors"):

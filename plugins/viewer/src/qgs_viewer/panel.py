@@ -81,7 +81,7 @@ class Panel:
             escape.on_trigger(lambda _: self.pick(None))
             self.others = gui.add_dropdown("other queries", get_args(Others), initial_value="faint")
             self._on(self.others, lambda: {"others": self.others.value})
-            hint = "Supports are those after this layer; 0 is the learned start."
+            hint = "Supports are those after this layer; 0 is the start."
             self.layer = gui.add_slider("layer", 0, depth, 1, depth, hint=hint)
             self._on(self.layer, lambda: {"layer": int(self.layer.value)})
             hint = "Lines to the patches that the query attends to most; broad and strong is much."

@@ -17,7 +17,7 @@ from qgs_viewer.figures.paper import Made, chosen_layers, new_figure, paper_styl
 from qgs_viewer.queries import DrawnQuery, query_picture
 
 QUERIES = 6
-LAYERS = 4  # states that are shown, the learned start among them
+LAYERS = 4  # states that are shown, the start among them
 BANDS = ((5, 95, 0.18), (25, 75, 0.35))  # percentiles between which a band lies, and its opacity
 
 
@@ -46,7 +46,7 @@ def anchors_figure(exhibits: Sequence[Exhibit], chosen: dict[str, list[DrawnQuer
         layers = chosen_layers(shown.look.depth, LAYERS, 0)
         pictures = shown.anchors(layers, chosen[shown.name], paper.SIDE)
         for axis, layer, picture in zip(line, layers, pictures, strict=False):
-            title = f"after layer {layer}" if layer else "learned start"
+            title = f"after layer {layer}" if layer else "start"
             paper.picture_panel(axis, picture, title)
         fine = finer(camera, paper.SIDE)
         picture = query_picture(shown.model, shown.gaussians, chosen[shown.name], fine)
