@@ -25,7 +25,7 @@ from qgs_refine import refine
 from qgs_viewer.contest import checkpoints, recipes_alike
 
 from qgs.analysis.depth import scene_depth
-from qgs.analysis.inputs import choose_windows
+from qgs.analysis.inputs import choose_windows, trained_ratios
 from qgs.analysis.scale import ScaleSearch, at_factors, constant_scale
 from qgs.cli.options import parse_size
 from qgs.contracts import Frames, Scene, ViewsConfig
@@ -147,10 +147,10 @@ def chosen(
 
 
 def apart(domain: Domain, factor: float) -> Domain:
-    """`domain` with inputs `factor` times as far apart and turned."""
-    moved = {"baseline", "turn"}
-    values = {k: [factor * x if k in moved else x for x in v] for k, v in domain.values.items()}
-    return Domain(values, domain.samples)
+    """As `domain`, with inputs `factor` times as far apart and turned as it has the best ones."""
+    (low, high), turn = trained_ratios(domain)
+    ends = {"baseline": [factor * low, factor * high], "turn": [0.0, factor * turn]}
+    return Domain({**ends, "depth": [1.0, 1.0]}, domain.samples)
 
 
 def warped_by_plane(inputs: Views, targets: Cameras, depth: float) -> torch.Tensor:

@@ -17,8 +17,8 @@ Window: TypeAlias = tuple[Frames, Frames]
 """Input frames, and novel frames that are compared with."""
 NOVEL = 6
 """Views that are compared with by default, at most."""
-BASELINE, TURN = (0.06, 0.25), 20.0
-"""Distance of inputs per depth, and degrees between their axes, where no training is known."""
+BASELINE, TURN, VARIED = (0.06, 0.25), 20.0, 20.0
+"""Distance of inputs per depth, and turn in degrees, where a training is unknown, or VARIED."""
 _MOST = 300  # frames that are considered: time grows with the square of their number
 _NEAR = 48  # frames around a target that its inputs are chosen from
 _POINTS = 6  # of a frustum, per side of the image
@@ -65,13 +65,13 @@ def choose_windows(
 def trained_ratios(trained_on: Domain) -> tuple[tuple[float, float], float]:
     """Range of baseline per depth, and largest turn in degrees, of the training's inputs."""
     ranges = trained_on.ranges
-    if "baseline" not in ranges:
+    least, most = ranges.get("baseline", (0.0, math.inf))
+    if most > VARIED * least:
         return BASELINE, TURN
     near, far = ranges.get("depth", (1.0, 1.0))
     # parallel axes meet at infinity; what they show has a depth of the order of the nearest
     depth = math.sqrt(near * min(far, 3 * near)) if math.isfinite(near) else 1.0
-    low, high = (end / depth for end in ranges["baseline"])
-    return (low, high), ranges.get("turn", (0.0, TURN))[1]
+    return (least / depth, most / depth), ranges.get("turn", (0.0, TURN))[1]
 
 
 class Frusta:

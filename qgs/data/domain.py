@@ -18,7 +18,7 @@ from qgs.geometry.poses import largest_distance, look_at_depth, reference_pose
 from qgs.types import Cameras, Views
 from qgs.wording import warn_once
 
-OUTLIERS = 0.002
+OUTLIERS = 0.05
 """Share of the values at either end of a range that does not count, such as parallel axes."""
 TOLERANCE = 1.25
 """Views are outside where they leave the trained range by more than this factor."""

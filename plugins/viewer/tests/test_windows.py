@@ -88,6 +88,11 @@ def test_inputs_are_as_far_apart_as_in_training_whatever_the_unit(unit):
     assert 2 * abs(chosen[0] - chosen[1]) <= turn
 
 
+def test_a_training_with_all_distances_says_nothing_about_the_best():
+    varied = Domain({"baseline": [0.002, 0.9], "turn": [0.4, 43.0], "depth": [0.002, 4.0]}, 512)
+    assert trained_ratios(varied) == trained_ratios(Domain())
+
+
 def test_photos_that_look_elsewhere_are_no_inputs():
     away = orbit(12, 5.0)
     away[::2, :3, :3] = away[::2, :3, :3] @ torch.diag(torch.tensor([-1.0, 1, -1]))
