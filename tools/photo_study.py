@@ -1,6 +1,6 @@
 """The models of a study on photos that none was trained on: a row for each variant, with intervals.
 
-    python tools/photo_study.py STUDY PHOTOS ... [--like rooms/landmark-64] [--distances .5 1 2]
+    python tools/photo_study.py STUDY PHOTOS ... [--like worlds/landmark-64] [--distances .5 1 2]
 
 STUDY: what `qgs study` wrote. Windows are those that `qgs demo` chooses for the model --like, and
 inputs as far apart as tools/real_photos.py says; the same for all. Every model's scale is searched.
@@ -18,11 +18,10 @@ import numpy as np
 import torch
 from qgs_studies.intervals import interval
 from qgs_viewer.contest import checkpoints, recipes_alike
-from real_photos import apart, chosen, judged
+from real_photos import apart, chosen, judged, trained_on
 
 from qgs.analysis.scale import ScaleSearch, constant_scale
 from qgs.contracts import Frames, Scene, ViewsConfig
-from qgs.data.domain import Domain
 from qgs.data.samples import make_sample
 from qgs.io.checkpoint import load
 from qgs.io.files import write_text
@@ -63,7 +62,7 @@ def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("study", type=Path)
     parser.add_argument("photos", nargs="+", help="folders of photos with cameras")
-    parser.add_argument("--like", default="rooms/landmark-64", help="model that has the windows")
+    parser.add_argument("--like", default="worlds/landmark-64", help="model that has the windows")
     parser.add_argument("--distances", type=float, nargs="+", default=[0.5, 1.0, 2.0])
     parser.add_argument("--windows", type=int, default=6, help="of a scene, at most")
     parser.add_argument("--threads", type=int, default=1)
@@ -73,8 +72,7 @@ def parsed() -> argparse.Namespace:
 
 def windows(options: argparse.Namespace) -> Iterator[Case]:
     """Windows of all scenes, at all distances."""
-    files = checkpoints([options.like])
-    domain = load(next(iter(files.values())), "cpu").trained_on or Domain()
+    files, domain = checkpoints([options.like]), trained_on(options.like)
     for place in options.photos:
         recipe = next(iter(recipes_alike(files, place).values()))
         scene = recipe.build_data().scenes("test")[0]

@@ -1,14 +1,15 @@
 """How models do on photos of real scenes, over many windows, with the scale that search finds.
 
-    python tools/real_photos.py PHOTOS ... [--model rooms/locus-64] [--distances .5 1 2]
-        [--refine 10] [--windows 12] [--out JSON]
+    python tools/real_photos.py PHOTOS ... [--model rooms/locus-64] [--like MODEL]
+        [--distances .5 1 2] [--refine 10] [--windows 12] [--out JSON]
 
 For each window: PSNR and SSIM of novel views with the found scale, with `views.scale: auto`, and by
 the best factor of a fine grid; the nearest photo, as it is and as a plane at the depth at which the
 inputs agree best; after a refinement on the inputs; the scale, and seconds of a core for its
-search. Prints Markdown. Windows are those of `choose_windows`, or with --spans those of `qgs eval`,
-which have held-out photos in order of the files. Every eighth photo is held out. --distances: how
-far inputs are apart, in distances of the training.
+search. Prints Markdown. Windows are those that `qgs demo` chooses for the model --like, the first
+one by default, or with --spans those of `qgs eval`, which have held-out photos in order of the
+files. Every eighth photo is held out. --distances: how far inputs are apart, in distances of the
+training of --like.
 """
 
 import argparse
@@ -16,6 +17,7 @@ import json
 import math
 import time
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +42,7 @@ from qgs.metrics.images import psnr, ssim
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Views
 
-MODELS = ("rooms/landmark-64", "rooms/locus-64", "rooms/tokengs-64", "rooms/locus-128")
+MODELS = ("worlds/landmark-64", "rooms/landmark-64", "rooms/locus-64", "rooms/tokengs-64")
 RATIO, REACH = 1.08, 5.0
 """Of the fine grid: ratio of its factors, how far it goes beyond the range of both scales."""
 CHUNK = 12  # factors in one forward pass
@@ -68,6 +70,7 @@ def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("photos", nargs="+", help="folders of photos with cameras")
     parser.add_argument("--model", action="append", help=f"default: {', '.join(MODELS)}")
+    parser.add_argument("--like", metavar="MODEL", help="that has the windows; default: the first")
     parser.add_argument("--distances", type=float, nargs="+", default=[1.0], metavar="FACTOR")
     parser.add_argument("--refine", type=float, default=0.0, metavar="SECONDS", help="on inputs")
     parser.add_argument("--windows", type=int, default=12, help="of a scene, at most")
@@ -90,8 +93,8 @@ def scene_rows(
     recipe = next(iter(recipes_alike(files, str(photos), size).values()))
     model = load(next(iter(files.values())), "cpu").eval()
     scene, views = recipe.build_data().scenes("test")[0], recipe.views
-    domain = apart(model.trained_on or Domain(), distance)
-    windows = chosen(scene, views, domain, options.windows, options.spans)
+    domain = trained_on(options.like or (options.model or MODELS)[0])
+    windows = chosen(scene, views, apart(domain, distance), options.windows, options.spans)
     search, rows = ScaleSearch(model, views.model_copy(update={"scale": "search"})), list[Row]()
     for inputs, targets in windows:
         began = time.process_time()
@@ -133,6 +136,12 @@ def scene_rows(
             }
         )
     return rows
+
+
+@cache
+def trained_on(name: str) -> Domain:
+    """The cameras that a model was trained on."""
+    return load(next(iter(checkpoints([name]).values())), "cpu").trained_on or Domain()
 
 
 def chosen(

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from qgs_viewer.report import Report
 
 MODELS = ("rooms/tokengs-64", "rooms/locus-64", "rooms/landmark-64")
+ON_PHOTOS = ("worlds/landmark-64", "rooms/landmark-64", "rooms/locus-64")
+"""On a user's photos; the first one's training decides which of them are inputs."""
 RECIPES = ("recipes/tiny/tokengs.yaml", "recipes/tiny/locus.yaml")
 
 app = typer.Typer(help="Trained models on unseen rooms, or on your photos.")
@@ -121,9 +123,9 @@ def show_trained(
     from qgs_viewer import contest
     from qgs_viewer.hints import next_commands
 
-    console = Console()
+    console, shown = Console(), models or (MODELS if photos is None else ON_PHOTOS)
     try:
-        files = contest.checkpoints(models or MODELS)
+        files = contest.checkpoints(shown)
     except FileNotFoundError as error:
         if not models:
             error.add_note("without trained models: qgs demo --train, which takes some minutes")
@@ -138,7 +140,7 @@ def show_trained(
     elif models:
         lede = "Trained models, judged on the test split of their recipe."
     facts = {"Training": "; ".join(entry.progress for entry in entries)}
-    commands = next_commands(models or MODELS, entries, target, photos, size, scale)
+    commands = next_commands(shown, entries, target, photos, size, scale)
     notes += show_remarks(entries, console)
     write(contest.report_of(entries, lede, facts, commands, scenes, notes), target, console)
 

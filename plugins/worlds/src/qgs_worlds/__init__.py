@@ -3,4 +3,9 @@
 from qgs.contracts import Plugin
 from qgs_worlds.source import WorldsSource
 
-plugin = Plugin(name="worlds", contract_version=1, components=(WorldsSource,))
+plugin = Plugin(
+    name="worlds",
+    contract_version=1,
+    components=(WorldsSource,),
+    models={"landmark-64": "models/landmark-64.safetensors"},
+)
