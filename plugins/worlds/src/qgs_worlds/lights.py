@@ -1,6 +1,7 @@
 """Light of a world: sun, lamps, the sky, what comes from all sides; settings of the camera."""
 
 import math
+from collections.abc import Sequence
 from random import Random
 
 import numpy as np
@@ -48,8 +49,8 @@ def draw_lights(rng: Random, place: Place, varied: bool) -> tuple[np.ndarray, np
     )
 
 
-def _lamp(at: object, color: np.ndarray, shadows: bool) -> list[float]:
-    return [1.0, *at, *color, float(shadows)]  # type: ignore[misc]
+def _lamp(at: Sequence[float], color: np.ndarray, shadows: bool) -> list[float]:
+    return [1.0, *at, *color, float(shadows)]
 
 
 def _air(rng: Random, above: np.ndarray, below: np.ndarray, occlusion: float) -> np.ndarray:
@@ -75,7 +76,7 @@ def draw_effects(rng: Random, light: np.ndarray, varied: bool) -> tuple[np.ndarr
     grey = math.exp(float(np.log(luminance + 0.02).mean()))
     effects = np.zeros(r.EFFECT_FIELDS)
     # the exponent of middle tones, which cameras' curves make steeper than that of displays
-    gamma = rng.uniform(1.15, 2.0) if varied else 1.6
+    gamma = rng.uniform(1.6, 2.1) if varied else 1.9
     effects[: r.GAMMA], effects[r.GAMMA] = 0.43**gamma / grey, gamma
     if not varied:
         return effects, 0
