@@ -76,7 +76,7 @@ def draw_effects(rng: Random, light: np.ndarray, varied: bool) -> tuple[np.ndarr
     grey = math.exp(float(np.log(luminance + 0.02).mean()))
     effects = np.zeros(r.EFFECT_FIELDS)
     # the exponent of middle tones, which cameras' curves make steeper than that of displays
-    gamma = rng.uniform(1.6, 2.1) if varied else 1.9
+    gamma = rng.uniform(1.15, 2.0) if varied else 1.6
     effects[: r.GAMMA], effects[r.GAMMA] = 0.43**gamma / grey, gamma
     if not varied:
         return effects, 0
