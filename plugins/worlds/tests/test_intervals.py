@@ -5,12 +5,22 @@ from random import Random
 import numpy as np
 import pytest
 from qgs_worlds import rows as r
-from qgs_worlds.intervals import clearances, hit
+from qgs_worlds.intervals import clearances
 from qgs_worlds.materials import height_maps
+from qgs_worlds.raycast import trace
 from qgs_worlds.shapes import Primitive, Shape, any_turn, packed, rod
 
 MAPS = height_maps(3, 2)
 FAR, SAMPLES = 6.0, 6000
+
+
+def met(rows, maps, origin, way) -> float:
+    """t at which a ray o + t d meets a shape, by the one pixel of an image, or inf."""
+    length = np.linalg.norm(way)
+    c2w = np.eye(4)
+    right = np.linalg.svd(np.array([way]))[2][1]
+    c2w[:3] = np.stack([right, np.cross(way, right) / length, way / length, origin], 1)
+    return trace(1, 1, 0, 1, rows, maps, c2w, np.array([100.0, 100.0, 0.5, 0.5]))[0][0, 0] / length
 
 
 def relief(x, y, field):
@@ -83,8 +93,7 @@ def test_rays_enter_where_implicit_functions_say(kind, cut):
             origin *= 3 / np.linalg.norm(origin)
             way = draws.normal(size=3) * 0.5 - origin
             way /= np.linalg.norm(way)
-            single = (tuple(map(np.float32, p)) for p in (origin, way))
-            found.append(hit(rows, MAPS, 0, *single)[0])
+            found.append(met(rows, MAPS, origin, way))
             expected.append(first(shape, origin, way))
     found, expected = np.array(found), np.array(expected)
     both = np.isfinite(found) & np.isfinite(expected)
@@ -96,12 +105,24 @@ def test_rays_enter_where_implicit_functions_say(kind, cut):
 
 def test_thin_rods_far_away_are_met():
     rows = packed(
-        [Shape(rod((30.0, -1.0, 0.0), (30.0, 1.0, 0.5), 0.004, square)) for square in (0, 1)]
+        [Shape(rod((30.0, -1.0, 0.0), (30.0, 1.0, 0.5), 0.004, square)) for square in (False, True)]
     )
-    origin = (np.float32(0), np.float32(0), np.float32(0))
-    way = (np.float32(30), np.float32(0), np.float32(0.25))
+    way = np.array([30, 0, 0.25])
     for i in range(2):
-        assert hit(rows, MAPS, i, origin, way)[0] == pytest.approx(1, abs=3e-4)
+        assert met(rows[i : i + 1], MAPS, np.zeros(3), way) == pytest.approx(1, abs=3e-4)
+
+
+REACHES = [(r.CAPSULE, 1.4), (r.TORUS, 0.3), (r.FRUSTUM, 1.0), (r.ELLIPSOID, 0), (r.BOX, 0)]
+
+
+@pytest.mark.parametrize(("kind", "extra"), REACHES)
+def test_reach_is_that_of_the_lowest_point(kind, extra):
+    rng, points = Random(3), np.random.default_rng(3).uniform(-2, 2, (200_000, 3))
+    for _ in range(4):
+        half = (0.7, 0.7, 0.7) if kind in (r.CAPSULE, r.TORUS) else (0.5, 0.8, 0.6)
+        tilted = Primitive(kind, (0.0, 0.0, 0.0), half, any_turn(rng), extra)
+        lowest = -points[inside(tilted, points) < 0, 2].min()
+        assert lowest <= tilted.reach() < lowest + 0.2
 
 
 def test_clearances_are_distances_to_boxes():

@@ -5,9 +5,10 @@ from pydantic import ValidationError
 from qgs_rooms.source import RoomScene, RoomsConfig, RoomsSource
 from qgs_worlds import rows as r
 from qgs_worlds.effects import develop
-from qgs_worlds.intervals import hit
 from qgs_worlds.places import KINDS
+from qgs_worlds.shapes import packed
 from qgs_worlds.source import WorldsSource
+from test_intervals import met
 
 from qgs.geometry.rays import pixel_directions
 
@@ -74,14 +75,9 @@ def test_depth_is_that_of_the_nearest_shape():
         depth = scene.depths([2])[0, 0].numpy()
         ways = pixel_directions(camera.intrinsics, camera.size).double().numpy()
         turn = scene.drawn.rig.c2w[2]
-        for i, j in random.integers((32, 48), size=(40, 2)):
-            way = tuple(map(np.float32, turn[:3, :3] @ ways[i, j]))
-            origin = tuple(map(np.float32, turn[:3, 3]))
-            hits = [
-                hit(world.shapes, world.heights, k, origin, way)[0]
-                for k in range(len(world.shapes))
-            ]
-            nearest = min(hits)
+        for i, j in random.integers((32, 48), size=(15, 2)):
+            ray = turn[:3, 3], turn[:3, :3] @ ways[i, j]
+            nearest = min(met(shape[None], world.heights, *ray) for shape in world.shapes)
             true = nearest * scene.drawn.scale if np.isfinite(nearest) else 0
             assert depth[i, j] == pytest.approx(true, rel=2e-3)
 
@@ -201,7 +197,7 @@ def test_plain_parts():
         assert drawn.place.kind == "indoors"
         inner = drawn.world.shapes[drawn.place.fixed :]
         assert {*inner[:, r.KIND].astype(int)} <= {r.BOX, r.ELLIPSOID, r.FRUSTUM}
-        assert (inner[:, r.PRIMITIVE_FIELDS] == r.NOTHING).all()
+        assert (drawn.world.shapes[:, r.PRIMITIVE_FIELDS] == r.NOTHING).all(), "closed"
         assert np.abs(inner[:, [r.MATRIX + k for k in (2, 5, 6, 7)]]).max() == 0, "upright"
     for drawn in plain(textures="plain"):
         assert drawn.world.textures[:, r.OCTAVES].max() <= 1
@@ -214,10 +210,32 @@ def test_plain_parts():
         assert np.ptp(drawn.effects[:3]) == 0
 
 
-def test_an_option_changes_its_own_part_alone():
-    one, other = source().scenes("train")[4].drawn, source(cameras="plain").scenes("train")[4].drawn
-    assert np.array_equal(one.world.textures, other.world.textures)
-    assert one.place.shapes == other.place.shapes
+def parts(**options) -> dict[str, np.ndarray]:
+    """What is drawn for a scene; its cameras decide which shapes stay."""
+    drawn = source(**options).scenes("train")[4].drawn
+    return {
+        "shapes": packed(drawn.place.shapes),
+        "c2w": drawn.rig.c2w,
+        "colours": np.delete(drawn.world.textures, [r.SPECULAR, r.SHINE], 1),
+        "gloss": drawn.world.textures[:, [r.SPECULAR, r.SHINE]],
+        "lights": drawn.world.lights,
+        "air": drawn.world.air,
+        "grain": drawn.effects[r.GAMMA :],
+    }
+
+
+@pytest.mark.parametrize(
+    ("option", "changed"),
+    [
+        ({"cameras": "plain"}, {"c2w"}),
+        ({"textures": "plain"}, {"colours", "gloss"}),
+        ({"light": "plain"}, {"gloss", "lights", "air"}),
+        ({"effects": False}, {"grain"}),
+    ],
+)
+def test_an_option_changes_its_own_part_alone(option, changed):
+    one, other = parts(), parts(**option)
+    assert {name for name in one if not np.array_equal(one[name], other[name])} == changed
 
 
 def test_all_views_of_a_scene_are_developed_alike():

@@ -4,10 +4,11 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import Scene, SceneSource, Split
@@ -17,13 +18,32 @@ ImageCache = dict[tuple[str, int], np.ndarray]
 """Images (H, W, 3) uint8 by scene and frame; once it is full, what it holds stays."""
 
 
+class DrawnConfig(SceneSource.Config):
+    """Options of all sources of drawn scenes."""
+
+    scenes: int = Field(default=2000, ge=1)
+    """Scenes of the training split."""
+    test_scenes: int = Field(default=32, ge=1)
+    """Scenes of the test split; none of them is in the training split."""
+    views_per_scene: int = Field(default=8, ge=2)
+    """Cameras in each scene."""
+    samples: int = Field(default=2, ge=1, le=8)
+    """Rays per pixel along each axis."""
+    seed: int = Field(default=0, ge=0)
+    """All scenes follow from it."""
+    cache_mb: int = Field(default=512, ge=0)
+    """Megabytes of images kept in memory; 0 keeps none."""
+
+
 class DrawnScene(Scene):
     """Scene `index` of a split. config: of its source; `views_per_scene` cameras see it.
 
     key: seed, split and index, of which all that is drawn is a function.
     """
 
-    def __init__(self, name: str, index: int, config: Any, split: Split, cache: ImageCache) -> None:
+    def __init__(
+        self, name: str, index: int, config: DrawnConfig, split: Split, cache: ImageCache
+    ) -> None:
         self.name = name
         self._config, self._cache = config, cache
         self.key = [config.seed, 0 if split == "train" else 1, index]
@@ -55,12 +75,13 @@ class DrawnScene(Scene):
 class DrawnSource(LazySource):
     """Endless scenes; scene i of a split is a function of (seed, split, i) alone."""
 
+    Config = DrawnConfig
     scene: ClassVar[Callable[..., DrawnScene]]
     """Called with name and index of the scene, its config, split and cache."""
     not_in_protocol: ClassVar[frozenset[str]] = SceneSource.not_in_protocol | {"cache_mb"}
     split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
 
-    def __init__(self, config: Any) -> None:
+    def __init__(self, config: DrawnConfig) -> None:
         super().__init__(config)
         cache: ImageCache = {}
         counts: dict[Split, int] = {"train": config.scenes, "test": config.test_scenes}

@@ -9,36 +9,24 @@ from random import Random
 
 import numpy as np
 import torch
-from pydantic import Field, model_validator
+from pydantic import model_validator
 from torch import Tensor
 
-from qgs.contracts import SceneSource, Split
+from qgs.contracts import Split
 from qgs.types import Cameras
 from qgs_rooms.path import camera_path
 from qgs_rooms.plan import furnish
-from qgs_rooms.procedural import DrawnScene, DrawnSource, ImageCache, lens
+from qgs_rooms.procedural import DrawnConfig, DrawnScene, DrawnSource, ImageCache, lens
 from qgs_rooms.shapes import Room
 
 _SHADOW_CELLS = 80
 
 
-class RoomsConfig(SceneSource.Config):
+class RoomsConfig(DrawnConfig):
     """Options of `rooms/procedural`."""
 
-    scenes: int = Field(default=2000, ge=1)
-    """Rooms of the training split."""
-    test_scenes: int = Field(default=32, ge=1)
-    """Rooms of the test split; none of them is in the training split."""
-    views_per_scene: int = Field(default=8, ge=2)
-    """Cameras on the path through each room."""
-    samples: int = Field(default=2, ge=1, le=8)
-    """Rays per pixel along each axis."""
     fov: tuple[float, float] = (60.0, 75.0)
     """Least and largest horizontal field of view, degrees."""
-    seed: int = Field(default=0, ge=0)
-    """All rooms follow from it."""
-    cache_mb: int = Field(default=512, ge=0)
-    """Megabytes of images kept in memory; 0 keeps none."""
 
     @model_validator(mode="after")
     def _fov_is_a_range(self) -> "RoomsConfig":

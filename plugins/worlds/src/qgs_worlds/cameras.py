@@ -11,8 +11,8 @@ from qgs_worlds.intervals import clearances
 from qgs_worlds.places import Place
 from qgs_worlds.raycast import trace
 
-CLEARANCE = 0.2  # metres from a camera to the box around any shape, at least
-FOV = (40.0, 90.0)  # horizontal, degrees
+CLEARANCE = 0.2  # metres from a camera to the box around any shape, at least, before scaling
+FOV = (40.0, 90.0)  # across the longer side of an image, degrees
 BASELINE = (0.04, 1.3)  # length of a path by the distance to what is looked at
 PLAIN_FOV, PLAIN_TRAVEL = (60.0, 75.0), (0.65, 1.2)
 _TRIES = 12
@@ -21,15 +21,24 @@ _PROBE = (6, 6)  # pixels of the depth maps by which views are judged
 
 @dataclass(frozen=True)
 class Rig:
-    """c2w: OpenCV (F, 4, 4). fov: horizontal, degrees. distance: to what they look at."""
+    """c2w: OpenCV (F, 4, 4). fov: across the longer side of an image, degrees. distance: to what
+    they look at."""
 
     c2w: np.ndarray
     fov: float
     distance: float
     motion: str
 
-    def sight(self) -> tuple[np.ndarray, float]:
-        """Middle and radius of a ball that holds most of what they see."""
+    def lens(self, size: tuple[int, int]) -> np.ndarray:
+        """fx, fy, cx, cy in pixels of images (H, W)."""
+        focal = lens(self.fov, (max(size), max(size)))[0]
+        return np.array([focal, focal, size[1] / 2, size[0] / 2])
+
+    def sight(self, place: Place) -> tuple[np.ndarray, float]:
+        """Middle and radius of a ball that holds most of what they see; indoors, the room."""
+        if place.kind == "indoors":
+            half = 0.5 * place.top
+            return np.array([0.0, 0.0, half]), math.hypot(*place.high[:2], half) + 0.5
         middle = (self.c2w[:, :3, 3] + self.distance * self.c2w[:, :3, 2]).mean(0)
         return middle, 1.3 * self.distance + 1
 
@@ -37,7 +46,7 @@ class Rig:
 class Path(NamedTuple):
     """Where cameras may go: from `base`, for `length` metres, towards or around `target`.
 
-    s: from -.5 to .5, one number for each camera. fov: horizontal, degrees.
+    s: from -.5 to .5, one number for each camera. fov: see `Rig`.
     """
 
     base: np.ndarray
@@ -84,7 +93,7 @@ def _outside(eyes: np.ndarray, place: Place, shapes: np.ndarray) -> float:
 
 def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
     """The worst view's share of sky and of things right before the camera."""
-    intrinsics = lens(rig.fov, _PROBE)
+    intrinsics = rig.lens(_PROBE)
     near = clearances(world[0], rig.c2w[:, :3, 3]).min()
     views = [trace(*_PROBE, 0, 1, *world, c2w, intrinsics)[0].ravel() for c2w in rig.c2w]
     t = np.stack(views)

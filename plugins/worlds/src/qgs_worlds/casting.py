@@ -9,14 +9,24 @@ from qgs_worlds.shading import paint
 
 
 def cast_light(
-    world: World, c2w: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int], samples: int
+    world: World,
+    c2w: np.ndarray,
+    intrinsics: np.ndarray,
+    size: tuple[int, int],
+    samples: int,
+    depths: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Light (F, H, W, 3) float32, means of samples^2 rays. c2w: OpenCV. intrinsics: in pixels."""
+    """Light (F, H, W, 3) float32, means of samples^2 rays. c2w: OpenCV. intrinsics: in pixels.
+
+    depths: (F, samples H, samples W), to write z of the rays, inf in the sky.
+    """
     light, packed = np.empty((len(c2w), *size, 3), np.float32), world.packed()
 
     def cast(frame: int, top: int, bottom: int) -> None:
         rows = (bottom - top, size[1], top, samples)
         t, code, rays = trace(*rows, world.shapes, world.heights, c2w[frame], intrinsics)
+        if depths is not None:
+            depths[frame, samples * top : samples * bottom] = t
         paint(light[frame, top:bottom], t, code, top, samples, packed, c2w[frame], rays)
 
     in_bands(cast, len(c2w), size[0])

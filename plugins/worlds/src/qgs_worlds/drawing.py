@@ -1,12 +1,11 @@
 """Scenes drawn from a seed, and photos of them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from random import Random
 from typing import TYPE_CHECKING
 
 import numpy as np
-from qgs_rooms.procedural import lens
 
 from qgs_worlds import materials
 from qgs_worlds.cameras import CLEARANCE, Rig, draw_cameras
@@ -48,7 +47,7 @@ class Drawn:
         c2w, images = self.rig.c2w[list(frames)], []
         for frame, light in zip(
             frames,
-            cast_light(self.world, c2w, lens(self.rig.fov, size), size, samples),
+            cast_light(self.world, c2w, self.rig.lens(size), size, samples),
             strict=True,
         ):
             image = np.empty((*size, 3), np.uint8)
@@ -58,7 +57,7 @@ class Drawn:
 
     def depths(self, frames: Sequence[int], size: tuple[int, int]) -> np.ndarray:
         """Depths (F, H, W) float32, 0 in the sky."""
-        return cast_depths(self.world, self.rig.c2w[list(frames)], lens(self.rig.fov, size), size)
+        return cast_depths(self.world, self.rig.c2w[list(frames)], self.rig.lens(size), size)
 
 
 def draw(key: list[int], config: "WorldsConfig") -> Drawn:
@@ -81,17 +80,13 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
     skins = materials.textures(skin, config.textures == "varied", lit)
     lights, air = draw_lights(shine, place, lit)
     shapes = np.ascontiguousarray(shapes[kept])
-    shades = shadow_maps(shapes, maps, lights, *rig.sight())
+    shades = shadow_maps(shapes, maps, lights, *rig.sight(place))
     world = World(shapes, maps, skins, shades[0], air, *shades[1:])
-    light = cast_light(world, rig.c2w, lens(rig.fov, _THUMB), _THUMB, 1)
+    depths = np.empty((len(rig.c2w), *_THUMB), np.float32)
+    light = cast_light(world, rig.c2w, rig.lens(_THUMB), _THUMB, 1, depths)
     effects, quality = draw_effects(camera, light, config.effects)
-    drawn = Drawn(place, world, rig, effects, quality, 1.0)
-    if config.depth is None:
-        return drawn
-    return replace(drawn, scale=spread(Random(str(key)), *config.depth) / _median_depth(drawn))
-
-
-def _median_depth(drawn: Drawn) -> float:
-    """Of what all cameras see, the sky left out."""
-    depths = drawn.depths(range(len(drawn.rig.c2w)), _THUMB)
-    return float(np.median(depths[depths > 0])) if depths.any() else drawn.rig.distance
+    scale, seen = 1.0, depths[np.isfinite(depths)]
+    if config.depth is not None:
+        median = float(np.median(seen)) if len(seen) else rig.distance
+        scale = spread(Random(str(key)), *config.depth) / median
+    return Drawn(place, world, rig, effects, quality, scale)

@@ -179,18 +179,6 @@ def relief(o, d, heights, start):
 
 
 @njit(**BORROWING)
-def convex(kind, extra, p, d):
-    """Entry, exit and their faces for a convex primitive of any kind."""
-    if kind == r.ELLIPSOID:
-        return ellipsoid(p, d)
-    if kind == r.BOX:
-        return box(p, d)
-    if kind == r.FRUSTUM:
-        return frustum(p, d, extra)
-    return capsule(p, d, extra)
-
-
-@njit(**BORROWING)
 def less(near, far, entry, cut_near, cut_far, cut_leave):
     """Entry into the first interval without the second one, and its face, 3 more on the cut."""
     outer = (near > NEAR) & (near <= far) & ((near < cut_near) | (near > cut_far))
@@ -218,30 +206,15 @@ def local_point(shapes, i, p, x, y, z):
 
 
 @njit(**BORROWING)
-def shape_hit(shapes, heights, i, o, d):
-    """t at which a ray enters shape i, or inf, and the face: 0 to 2, on the cut 3 to 5."""
-    kind, extra, way = shapes[i, 0], shapes[i, 1], local(shapes, i, 0, *d)
-    p, start = nearest(local_point(shapes, i, 0, o[0], o[1], o[2]), way)
-    if kind == r.TORUS:
-        near, far, entry, _ = torus(p, way, extra, -start)
-    elif kind == r.HEIGHT:
-        near, far, entry, _ = relief(p, way, heights[int(extra)], -start)
-    else:
-        near, far, entry, _ = convex(kind, extra, p, way)
-    near, far = near + start, far + start
-    cut_near, cut_far, leave, c = NONE, -NONE, ZERO, r.PRIMITIVE_FIELDS
-    if shapes[i, c] >= ZERO and near <= far:
-        way = local(shapes, i, c, *d)
-        p, start = nearest(local_point(shapes, i, c, o[0], o[1], o[2]), way)
-        cut_near, cut_far, _, leave = convex(shapes[i, c], shapes[i, c + 1], p, way)
-        cut_near, cut_far = cut_near + start, cut_far + start
-    return less(near, far, entry, cut_near, cut_far, leave)
+def hollow(shapes, i):
+    """Whether shape i is bent or cut: it may shade itself, and fills little of its box."""
+    return shapes[i, r.KIND] >= r.TORUS or shapes[i, r.PRIMITIVE_FIELDS] >= ZERO
 
 
 @njit(**OPTIONS)
-def hit(shapes, heights, i, o, d):
-    """As `shape_hit`, to be called from Python."""
-    return shape_hit(shapes, heights, i, o, d)
+def height_of(heights, x, y):
+    """As `height_at`, to be called from Python."""
+    return height_at(heights, x, y)
 
 
 @njit(**OPTIONS)

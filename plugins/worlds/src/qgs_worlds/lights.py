@@ -1,6 +1,7 @@
 """Light of a world: sun, lamps, the sky, what comes from all sides; settings of the camera."""
 
 import math
+from collections.abc import Sequence
 from random import Random
 
 import numpy as np
@@ -48,8 +49,8 @@ def draw_lights(rng: Random, place: Place, varied: bool) -> tuple[np.ndarray, np
     )
 
 
-def _lamp(at: object, color: np.ndarray, shadows: bool) -> list[float]:
-    return [1.0, *at, *color, float(shadows)]  # type: ignore[misc]
+def _lamp(at: Sequence[float], color: np.ndarray, shadows: bool) -> list[float]:
+    return [1.0, *at, *color, float(shadows)]
 
 
 def _air(rng: Random, above: np.ndarray, below: np.ndarray, occlusion: float) -> np.ndarray:

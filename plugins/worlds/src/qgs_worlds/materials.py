@@ -47,14 +47,11 @@ class Palette:
 
 
 def textures(rng: Random, varied: bool, highlights: bool) -> np.ndarray:
-    """(COUNT + 1, TEXTURE_FIELDS); the last one glows."""
+    """(COUNT, TEXTURE_FIELDS). Without highlights all else is drawn alike."""
     palette = Palette(rng)
-    draw = _varied if varied else _plain
-    rows = [draw(rng, palette, highlights) for _ in range(COUNT)]
-    glowing = np.array(rows[-1])
-    glowing[r.OCTAVES], glowing[r.PATTERN], glowing[r.EMISSION] = 0, r.NO_PATTERN, rng.uniform(1, 6)
-    glowing[r.COLORS : r.COLORS + 9] = 0.8
-    return np.array([*rows, glowing])
+    if not varied:
+        return np.array([_plain(rng, palette) for _ in range(COUNT)])
+    return np.array([_varied(rng, palette, highlights) for _ in range(COUNT)])
 
 
 def _row(rng: Random, ramp: list[Color], mark: Color, **fields: float) -> list[float]:
@@ -66,14 +63,14 @@ def _row(rng: Random, ramp: list[Color], mark: Color, **fields: float) -> list[f
     return row + [channel for color in (*ramp, mark) for channel in color]
 
 
-def _plain(rng: Random, palette: Palette, highlights: bool) -> list[float]:
+def _plain(rng: Random, palette: Palette) -> list[float]:
     """An even surface, or two colours in a simple pattern."""
     base = palette.color()
     ramp = [palette.near(base, 0.1), base, palette.near(base, 0.1)]
-    noise = {"OCTAVES": 1, "PERIOD": rng.uniform(0.3, 1), "CONTRAST": 0.6}
+    fields = {"OCTAVES": 1, "PERIOD": rng.uniform(0.3, 1), "CONTRAST": 0.6}
     if rng.random() < 0.5:
-        return _row(rng, ramp, base, **noise)
-    return _row(rng, ramp, palette.color(), **noise, **_pattern(rng, _PLAIN_PATTERNS))
+        return _row(rng, ramp, base, **fields)
+    return _row(rng, ramp, palette.color(), **fields, **_pattern(rng, _PLAIN_PATTERNS))
 
 
 def _pattern(rng: Random, kinds: tuple[int, ...]) -> dict[str, float]:
@@ -111,8 +108,10 @@ def _varied(rng: Random, palette: Palette, highlights: bool) -> list[float]:
     }
     if rng.random() < 0.4:
         fields |= _pattern(rng, _PATTERNS)
-    if highlights and rng.random() < 0.25:
-        fields |= {"SPECULAR": spread(rng, 0.05, 0.8), "SHINE": spread(rng, 5, 150)}
+    shiny = rng.random() < 0.25
+    gloss = {"SPECULAR": spread(rng, 0.05, 0.8), "SHINE": spread(rng, 5, 150)}
+    if highlights and shiny:
+        fields |= gloss
     return _row(rng, ramp, palette.color(), **fields)
 
 

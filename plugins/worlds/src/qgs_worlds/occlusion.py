@@ -1,4 +1,4 @@
-"""Ambient occlusion: how much of the sky or the walls a point sees, by the boxes around shapes."""
+"""Ambient occlusion: how much of the sky or the walls a point sees, by boxes around shapes."""
 
 import math
 
@@ -8,7 +8,7 @@ from qgs_rooms.intersections import ZERO
 from qgs_rooms.textures import INNER
 
 from qgs_worlds import rows as r
-from qgs_worlds.intervals import local
+from qgs_worlds.intervals import hollow, local
 from qgs_worlds.kernels import BORROWING, REDUCING
 
 
@@ -35,14 +35,14 @@ def surroundings(shapes):
 
 @njit(**BORROWING)
 def _find(shapes, around, x, y, z, reach, slack):
-    """Keep the boxes that are near to a place."""
+    """Keep the boxes near to a place, without those of hollow shapes, which do not fill them."""
     boxes, near, place = around
     place[0], place[1], place[2], place[4] = x, y, z, slack * slack
     count, reach = 0, np.float32(1.6 * reach + slack)
     for i in range(shapes.shape[0]):
         a, b, c = shapes[i, r.SPHERE] - x, shapes[i, r.SPHERE + 1] - y, shapes[i, r.SPHERE + 2] - z
         size = shapes[i, r.SPHERE + 3] + reach
-        if a * a + b * b + c * c < size * size:
+        if a * a + b * b + c * c < size * size and not hollow(shapes, i):
             for k in range(19):
                 near[k, count] = boxes[k, i]
             count += 1

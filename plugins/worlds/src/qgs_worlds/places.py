@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from qgs_worlds import rows as r
+from qgs_worlds.intervals import height_of
 from qgs_worlds.shapes import Point, Primitive, Shape, about_z, rod
 from qgs_worlds.things import Thing, Things, placed, spread
 
@@ -70,7 +71,11 @@ def _middles(shapes: list[Shape]) -> list[Point]:
 def _indoors(rng: Random, things: Things, count: int) -> Place:
     size = (rng.uniform(2.6, 7.5), rng.uniform(2.6, 7.5), rng.uniform(2.2, 3.8))
     plain = things.style.tilted == 0
-    shapes = [_ground(things, spread(rng, 0.4, 1.5)), *_walls(rng, things, size, 1 if plain else 3)]
+    shapes = [_ground(things, spread(rng, 0.4, 1.5)), *_walls(rng, things, size, 0 if plain else 3)]
+    for wall in [shape for shape in shapes if shape.cut]:
+        toward = math.atan2(wall.body.center[1], wall.body.center[0])
+        for _ in range(2):
+            shapes += _far(rng, things, toward + rng.uniform(-0.6, 0.6))
     fixed = len(shapes)
     x, y, z = size[0] / 2, size[1] / 2, size[2]
     for _ in range(count):
@@ -110,7 +115,7 @@ def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
     half_x, half_y, height = size[0] / 2, size[1] / 2, size[2]
     scale = spread(rng, 0.5, 2)
     common = things.texture()[0]
-    open_sides = set(rng.sample(range(4), rng.randint(1, most)))
+    open_sides = set(rng.sample(range(4), rng.randint(0, most)))
     shapes = []
     for side in range(4):
         across, along = (half_x, half_y) if side % 2 == 0 else (half_y, half_x)
@@ -144,7 +149,7 @@ def _panes(rng: Random, things: Things, hole: Primitive) -> list[Shape]:
 
 
 def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place:
-    ground: Callable[[float, float], float] = _level
+    ground, level = _level, 0.0
     shapes = [_ground(things, spread(rng, 1, 4))]
     if rng.random() < 0.6:
         amplitude, index = spread(rng, 0.15, 1.5), rng.randrange(len(maps))
@@ -153,9 +158,11 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
         body = Primitive(r.HEIGHT, (0.0, 0.0, 0.0), half, extra=float(index))
         shapes.append(things.skinned(body, spread(rng, 1, 4))._replace(faces=1))
         ground = _on(maps[index], amplitude)
+        middle = len(maps[index]) // 4  # cameras stay on the middle half
+        level = amplitude * float(maps[index][middle:-middle, middle:-middle].max())
     fixed = len(shapes)
     for _ in range(2 + count // 4):
-        shapes += _far(rng, things)
+        shapes += _far(rng, things, rng.uniform(0, math.tau))
     near: list[Shape] = []
     for _ in range(count):
         away, angle = 9 * rng.random() ** 0.7, rng.uniform(0, math.tau)
@@ -163,7 +170,6 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
         at = at if rng.random() < 0.85 else (at[0], at[1], rng.uniform(0.3, 3))
         near += placed(things.draw(), at, rng.uniform(0, math.tau), spread(rng, 0.25, 2), ground)
     shapes += near
-    level = max(ground(0.5 * x, 0.5 * y) for x in range(-24, 25, 2) for y in range(-24, 25, 2))
     low, high = (-12.0, -12.0, level + 0.3), (12.0, 12.0, level + 7)
     eyes = (level + 0.6, level + 2.2)
     return Place("outdoors", shapes, fixed, low, high, eyes, _middles(near), (1.2, 11.0), level + 4)
@@ -171,18 +177,14 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
 
 def _on(field: np.ndarray, amplitude: float) -> Callable[[float, float], float]:
     """Height of a terrain at x, y."""
-    last = len(field) - 1
-
-    def height(x: float, y: float) -> float:
-        i, j = (min(max(round((p / _TERRAIN + 1) / 2 * last), 0), last) for p in (x, y))
-        return amplitude * float(field[i, j])
-
-    return height
+    return lambda x, y: (
+        amplitude * height_of(field, np.float32(x / _TERRAIN), np.float32(y / _TERRAIN))
+    )
 
 
-def _far(rng: Random, things: Things) -> Thing:
-    """A hill, a building or a tree."""
-    pick, angle = rng.random(), rng.uniform(0, math.tau)
+def _far(rng: Random, things: Things, angle: float) -> Thing:
+    """A hill, a building or a tree in a direction; it begins below any ground."""
+    pick = rng.random()
     if pick < 0.3:
         away, size = rng.uniform(60, 220), rng.uniform(15, 60)
         at = (away * math.cos(angle), away * math.sin(angle), 0.0)
@@ -194,11 +196,12 @@ def _far(rng: Random, things: Things) -> Thing:
     if pick < 0.65:
         wide, deep, high = rng.uniform(2, 7), rng.uniform(2, 7), spread(rng, 2, 14)
         body = Primitive(
-            r.BOX, (*at[:2], high), (wide, deep, high), about_z(rng.uniform(0, math.tau))
+            r.BOX, (*at[:2], high - 1), (wide, deep, high + 1), about_z(rng.uniform(0, math.tau))
         )
         return [things.skinned(body, spread(rng, 2, 9))]
     high, crown = rng.uniform(1, 3), things.texture()[0]
-    trunk = Primitive(r.FRUSTUM, (*at[:2], high), (0.12 * high, 0.12 * high, high), extra=0.6)
+    half = (0.12 * high, 0.12 * high, high + 1)
+    trunk = Primitive(r.FRUSTUM, (*at[:2], high - 1), half, extra=0.6)
     tree = [things.skinned(trunk)]
     for _ in range(rng.randint(1, 4)):
         x, y = (rng.uniform(-0.5, 0.5) * high for _ in range(2))
@@ -214,15 +217,21 @@ def _objects(rng: Random, things: Things, count: int) -> Place:
         wall = _box((rng.uniform(1.5, 3), 0.0, 3.0), (0.1, 30.0, 4.0))
         wall = things.skinned(wall, spread(rng, 0.3, 1.5))
         shapes.append(wall.moved((0.0, 0.0, 0.0), about_z(rng.uniform(0, math.tau))))
-    level = 0.0
+    level = wide = 0.0
     if rng.random() < 0.4:
         level, wide = rng.uniform(0.02, 0.8), rng.uniform(0.5, 1.1)
         kind = rng.choice((r.BOX, r.FRUSTUM))
         table = Primitive(kind, (0.0, 0.0, level / 2), (wide, wide, level / 2), extra=1.0)
         shapes.append(things.skinned(table, 0.7))
     fixed = len(shapes)
-    for _ in range(max(count // 2, 1)):
-        at = (rng.gauss(0, 0.4), rng.gauss(0, 0.4), level)
+    spot = (rng.gauss(0, 0.2), rng.gauss(0, 0.2))
+    for number in range(count):
+        if number % 2:
+            x, y = rng.gauss(0, 0.7), rng.gauss(0, 0.7)
+        else:
+            away, angle = 0.5 * math.sqrt(rng.random()), rng.uniform(0, math.tau)
+            x, y = spot[0] + away * math.cos(angle), spot[1] + away * math.sin(angle)
+        at = (x, y, level if math.hypot(x, y) < wide else 0.0)
         size = spread(rng, 0.1, 0.5)
         shapes += placed(things.draw(), at, rng.uniform(0, math.tau), size, _level)
     low, high = (-3.5, -3.5, level + 0.2), (3.5, 3.5, level + 3)

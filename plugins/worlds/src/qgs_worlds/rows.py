@@ -23,7 +23,7 @@ VALUE, GRADIENT, CELLS = range(3)  # kinds of noise
 NO_PATTERN, STRIPES, CHECKER, TILES, DOTS, GLYPHS, RINGS = range(7)
 # Fields of a texture. Periods are in units of the texture.
 (SEED, BASIS, PERIOD, OCTAVES, GAIN, CONTRAST, WARP, STRETCH, PATTERN, PATTERN_PERIOD, ASPECT,
- WIDTH, STRENGTH, TONE, SPECULAR, SHINE, EMISSION, COLORS) = range(18)  # fmt: skip
+ WIDTH, STRENGTH, TONE, SPECULAR, SHINE, COLORS) = range(17)  # fmt: skip
 TEXTURE_FIELDS = COLORS + 12  # RGB of four colours: three of the ramp, one of the pattern
 
 # Fields of a light: whether it is a lamp, its position or the direction to the sun, RGB, whether it

@@ -8,7 +8,7 @@ from qgs_rooms.intersections import ONE, ZERO
 from qgs_rooms.textures import OPTIONS
 
 from qgs_worlds import rows as r
-from qgs_worlds.intervals import height_at, local_point
+from qgs_worlds.intervals import height_at, hollow, local_point
 from qgs_worlds.kernels import BORROWING
 from qgs_worlds.occlusion import surroundings, visible
 from qgs_worlds.raycast import SKY
@@ -54,7 +54,7 @@ def _on_primitive(kind, extra, heights, face, x, y, z, h):
     if kind == r.HEIGHT:
         if face == 1:
             return _on_axis(_largest(x, y, z), x, y, z, h)
-        s, field = np.float32(0.6 / heights.shape[1]), heights[int(extra)]
+        s, field = np.float32(2.0 / (heights.shape[1] - 1)), heights[int(extra)]
         slope_x = height_at(field, x + s, y) - height_at(field, x - s, y)
         slope_y = height_at(field, x, y + s) - height_at(field, x, y - s)
         return (-slope_x / (2 * s), -slope_y / (2 * s), 1.0), x * h[0], y * h[1], 0
@@ -160,25 +160,21 @@ def _shade(world, around, code, place, view, footprint, distance):
     shapes, heights, textures, lights, air, shadows = world
     shape = code >> 3
     row, normal, u, v = _surface(shapes, heights, code, place)
-    # only what is hollow or bent throws shadows on itself
-    hollow = shapes[shape, r.PRIMITIVE_FIELDS] >= ZERO or shapes[shape, 0] >= r.TORUS
-    own = -1 if hollow else shape
+    own = -1 if hollow(shapes, shape) else shape
     facing = -(normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2])
     slant = footprint / math.sqrt(max(facing, 0.06))
     albedo = color(textures, row, u, v, slant / shapes[shape, r.SCALE])
     open_ = visible(shapes, around, shape, place, normal, air[r.OCCLUSION], air[r.REACH], footprint)
-    glow, shine, up = textures[row, r.EMISSION], 0.0, 0.5 + 0.5 * normal[2]
-    red = glow + open_ * (air[r.BELOW] + up * (air[r.ABOVE] - air[r.BELOW]))
-    green = glow + open_ * (air[r.BELOW + 1] + up * (air[r.ABOVE + 1] - air[r.BELOW + 1]))
-    blue = glow + open_ * (air[r.BELOW + 2] + up * (air[r.ABOVE + 2] - air[r.BELOW + 2]))
-    sharp = textures[row, r.SHINE] if textures[row, r.SPECULAR] > 0 else 0.0
+    up, gloss = 0.5 + 0.5 * normal[2], textures[row, r.SPECULAR]
+    red = albedo[0] * open_ * (air[r.BELOW] + up * (air[r.ABOVE] - air[r.BELOW]))
+    green = albedo[1] * open_ * (air[r.BELOW + 1] + up * (air[r.ABOVE + 1] - air[r.BELOW + 1]))
+    blue = albedo[2] * open_ * (air[r.BELOW + 2] + up * (air[r.ABOVE + 2] - air[r.BELOW + 2]))
+    sharp = textures[row, r.SHINE] if gloss > 0 else 0.0
     for k in range(lights.shape[0]):
         even, high = _light(lights, shadows, k, own, place, normal, view, open_, sharp)
-        red += even * lights[k, r.COLOR]
-        green += even * lights[k, r.COLOR + 1]
-        blue += even * lights[k, r.COLOR + 2]
-        shine += textures[row, r.SPECULAR] * high * lights[k, r.COLOR + 1]
-    red, green, blue = red * albedo[0] + shine, green * albedo[1] + shine, blue * albedo[2] + shine
+        red += (albedo[0] * even + gloss * high) * lights[k, r.COLOR]
+        green += (albedo[1] * even + gloss * high) * lights[k, r.COLOR + 1]
+        blue += (albedo[2] * even + gloss * high) * lights[k, r.COLOR + 2]
     mist = 1.0 - 1.0 / (1.0 + air[r.FOG] * distance)
     return (
         red + mist * (air[r.HORIZON] - red),

@@ -81,7 +81,9 @@ def _seen(maps, depths, codes, k, own, x, y, z):
     a, b = min(max(a, 0.0), side - 1.001), min(max(b, 0.0), side - 1.001)
     i, j = int(b), int(a)
     a, b = a - j, b - i
-    bias, place = np.float32(depth - 0.01 - 1.5 / scale), int(maps[k, _BEGIN]) + i * side + j
+    # within a pixel of the map the depth of what shades itself varies
+    bias = np.float32(depth - 0.01 - (1.5 / scale if own < 0 else 0.0))
+    place = int(maps[k, _BEGIN]) + i * side + j
     light = 0.0
     for row in range(2):
         for column in range(2):

@@ -34,17 +34,15 @@ class Primitive(NamedTuple):
 
     def reach(self) -> float:
         """How far it extends up and down from its centre, metres, at most."""
-        a, b, c = self.half
+        size, up = self.half[2], abs(self.turn[8])
         if self.kind == r.CAPSULE:
-            c *= 1 + self.extra
+            return size * (1 + up * self.extra)
         if self.kind == r.TORUS:
-            c *= self.extra
-        a, b, c = self.turn[6] * a, self.turn[7] * b, self.turn[8] * c
-        return (
-            math.sqrt(a * a + b * b + c * c)
-            if self.kind == r.ELLIPSOID
-            else abs(a) + abs(b) + abs(c)
-        )
+            return size * ((1 - self.extra) * math.sqrt(max(1 - up * up, 0.0)) + self.extra)
+        a, b, c = (t * half for t, half in zip(self.turn[6:], self.half, strict=True))
+        if self.kind == r.ELLIPSOID:
+            return math.hypot(a, b, c)
+        return abs(c) + (math.hypot(a, b) if self.kind == r.FRUSTUM else abs(a) + abs(b))
 
 
 class Shape(NamedTuple):

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 import torch
 from pydantic import Field, field_validator
-from qgs_rooms.procedural import DrawnScene, DrawnSource, ImageCache, lens
+from qgs_rooms.procedural import DrawnConfig, DrawnScene, DrawnSource, ImageCache
 from qgs_rooms.source import RoomScene, RoomsConfig
 from torch import Tensor
 
-from qgs.contracts import SceneSource, Split
+from qgs.contracts import Split
 from qgs.types import Cameras
 
 if TYPE_CHECKING:
@@ -25,21 +25,17 @@ if TYPE_CHECKING:
 Variety: TypeAlias = Literal["plain", "varied"]
 
 
-class WorldsConfig(SceneSource.Config):
+class WorldsConfig(DrawnConfig):
     """Options of `worlds/procedural`."""
 
     scenes: int = Field(default=100_000, ge=1)
     """Scenes of the training split."""
-    test_scenes: int = Field(default=32, ge=1)
-    """Scenes of the test split; none of them is in the training split."""
-    views_per_scene: int = Field(default=8, ge=2)
-    """Cameras in each scene."""
     complexity: int = Field(default=32, ge=4)
-    """The most things in a scene, which have a few shapes each; how many is drawn log-uniformly."""
+    """The most things near the cameras, of a few shapes each; how many is drawn log-uniformly."""
     cameras: Variety = "varied"
     """Plain: a walk along a line, level, with a field of view of 60 to 75 degrees. Varied: walks,
     orbits, looks round and sets that look at one point, over baselines from tiny to wide, with
-    pitch and roll and 40 to 90 degrees."""
+    pitch and roll and 40 to 90 degrees. Fields of view are across an image's longer side."""
     shapes: Variety = "varied"
     """Plain: upright boxes, balls and cylinders in closed rooms. Varied: composites of all
     primitives turned freely, with cuts, bars, wires and height fields, in rooms with openings, in
@@ -55,12 +51,6 @@ class WorldsConfig(SceneSource.Config):
     """Share of scenes that are those of `rooms/procedural` instead, with the same numbers."""
     effects: bool = True
     """Whether cameras differ in exposure, white balance, tone, vignette, noise and JPEG quality."""
-    samples: int = Field(default=2, ge=1, le=8)
-    """Rays per pixel along each axis."""
-    seed: int = Field(default=0, ge=0)
-    """All scenes follow from it."""
-    cache_mb: int = Field(default=512, ge=0)
-    """Megabytes of images kept in memory; 0 keeps none."""
 
     @field_validator("depth")
     @classmethod
@@ -71,9 +61,17 @@ class WorldsConfig(SceneSource.Config):
             )
         return depth
 
+    @cached_property
+    def of_rooms(self) -> RoomsConfig:
+        """Options of the rooms among the scenes."""
+        alike = self.model_dump(include={"image_size", *DrawnConfig.model_fields})
+        return RoomsConfig(**alike)
+
 
 class WorldScene(DrawnScene):
     """One scene and its cameras. World: metres, scaled by `drawn.scale`; z up."""
+
+    _config: WorldsConfig
 
     @cached_property
     def drawn(self) -> "Drawn":
@@ -84,7 +82,7 @@ class WorldScene(DrawnScene):
 
     @cached_property
     def _intrinsics(self) -> np.ndarray:
-        return lens(self.drawn.rig.fov, self._config.image_size)
+        return self.drawn.rig.lens(self._config.image_size)
 
     @cached_property
     def cameras(self) -> Cameras:
@@ -110,8 +108,7 @@ def world_or_room(
     """Scene `index` of a split: a world, or a room by the share of `rooms`."""
     if Random(f"{config.seed} {split} {index}").random() >= config.rooms:
         return WorldScene(name, index, config, split, cache)
-    alike = config.model_dump(include={"image_size", *RoomsConfig.model_fields} - {"type"})
-    return RoomScene(name, index, RoomsConfig(**alike), split, cache)
+    return RoomScene(name, index, config.of_rooms, split, cache)
 
 
 class WorldsSource(DrawnSource):

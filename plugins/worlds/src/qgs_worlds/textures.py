@@ -9,6 +9,7 @@ from qgs_worlds import rows as r
 from qgs_worlds.kernels import BORROWING
 
 _SIDE = 64  # of the table of random numbers, which noise repeats
+_INK = 0.24  # mean of glyphs: words, letters, part of a cell and dots in it
 _TABLE = np.random.default_rng(7).random((_SIDE, _SIDE)).astype(np.float32)
 
 
@@ -96,7 +97,7 @@ def _bar(x, width, blur):
 
 
 @njit(**BORROWING)
-def _glyphs(x, y, seed, blur):
+def _glyphs(x, y, seed):
     """Lines of marks: random dots of 4 x 6 in a cell, words apart, lines of several lengths."""
     line, place = math.floor(y), math.floor(x)
     if chance(place // 3, line, seed + 5) < 0.25 or chance(place, line, seed) < 0.15:
@@ -105,7 +106,19 @@ def _glyphs(x, y, seed, blur):
     i, j = math.floor(a), math.floor(b)
     if i > 3 or j > 5 or chance(4 * place + i, 6 * line + j, seed + 1) < 0.45:
         return 0.0
-    return _seen(blur, 0.4) + 0.4 * (1 - _seen(blur, 0.4))
+    return 1.0
+
+
+@njit(**BORROWING)
+def _mean(kind, width):
+    """How much of the fourth colour a pattern has."""
+    if kind == r.CHECKER:
+        return 0.5
+    if kind == r.TILES:
+        return 1.0 - (1.0 - 0.25 * width) ** 2
+    if kind == r.DOTS:
+        return math.pi * (0.55 * width) ** 2
+    return _INK if kind == r.GLYPHS else width
 
 
 @njit(**BORROWING)
@@ -127,7 +140,7 @@ def _pattern(kind, x, y, width, seed, blur):
     if kind == r.DOTS:
         a, b = x - i - 0.5, y - j - 0.5
         return _step(0.55 * width - math.sqrt(a * a + b * b), blur), chance(i, j, seed)
-    return _glyphs(x, y, seed, blur), 0.5
+    return _INK + _seen(blur, 0.4) * (_glyphs(x, y, seed) - _INK), 0.5
 
 
 @njit(**BORROWING)
@@ -152,7 +165,7 @@ def color(textures, row, u, v, footprint):
         x, y = u / period * aspect + 0.2 * (x - u / textures[row, r.PERIOD]), v / period
         w, tone = _pattern(kind, x, y, textures[row, r.WIDTH], seed, blur + 1e-6)
         seen = _seen(blur, 1.6)
-        mean = 0.5 if kind == r.CHECKER else 0.35
+        mean = _mean(kind, textures[row, r.WIDTH])
         w = textures[row, r.STRENGTH] * (mean + seen * (w - mean))
         shade = 1 + textures[row, r.TONE] * seen * (tone - 0.5)
         last = r.COLORS + 9

@@ -1,0 +1,89 @@
+"""Light at known points: shadows, what is open to the sky, means of patterns."""
+
+import numpy as np
+import pytest
+from numba import njit
+from qgs_worlds import rows as r
+from qgs_worlds.cameras import Rig
+from qgs_worlds.casting import cast_light
+from qgs_worlds.rows import World
+from qgs_worlds.shadows import shadow_maps
+from qgs_worlds.shapes import Primitive, Shape, packed
+from qgs_worlds.textures import color
+
+GROUND = Shape(Primitive(r.BOX, (0.0, 0.0, -1.0), (50.0, 50.0, 1.0)))
+WALL = Primitive(r.BOX, (1.0, 0.0, 1.0), (0.1, 5.0, 2.0))
+DOOR = Primitive(r.BOX, (1.0, 0.0, 1.0), (0.4, 0.8, 2.5))
+RING = Primitive(r.TORUS, (0.0, 0.0, 0.1), (1.0, 1.0, 1.0), extra=0.1)
+TERRAIN = Primitive(r.HEIGHT, (0.0, 0.0, 0.0), (5.0, 5.0, 0.5))
+THING = Shape(Primitive(r.BOX, (0.0, 0.0, 0.1), (0.2, 0.2, 0.1)))
+LIGHT = 1.5
+
+
+def seen_from_above(shapes, points, sun=(), ambient=0.0) -> list[float]:
+    """Light that comes from white shapes below points, to a camera 1 m high."""
+    heights = np.zeros((1, 9, 9), np.float32)
+    heights[0, 0, 0] = 1.0  # a peak far away
+    textures = np.zeros((1, r.TEXTURE_FIELDS))
+    textures[0, [r.PERIOD, r.STRETCH]] = textures[0, r.COLORS :] = 1.0
+    air = np.zeros(r.AIR_FIELDS)
+    air[: r.ZENITH], air[r.OCCLUSION], air[r.REACH] = ambient, 1.0, 0.3
+    lights = np.array([[0.0, *sun, LIGHT, LIGHT, LIGHT, 1.0]] if sun else []).reshape(-1, 8)
+    table = packed(shapes)
+    lights, *maps = shadow_maps(table, heights, lights, np.zeros(3), 6.0)
+    world = World(table, heights, textures, lights, air, *maps)
+    c2w = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (len(points), 1, 1))
+    c2w[:, :3, 3] = [(x, y, 1.0) for x, y in points]
+    lens = np.array([100.0, 100.0, 0.5, 0.5])
+    return cast_light(world, c2w, lens, (1, 1), 1)[:, 0, 0, 0].tolist()
+
+
+@pytest.mark.parametrize("height", [0.8, 0.03])
+def test_a_box_throws_its_shadow_away_from_the_sun(height):
+    box = Shape(Primitive(r.BOX, (0.0, 0.0, height / 2), (0.5, 0.5, height / 2)))
+    sun = (0.5**0.5, 0.0, 0.5**0.5)  # the shadow is as long as the box is high
+    points = [(-0.5 - 0.1 * height, 0.0), (-0.6 - height, 0.0), (0.6, 0.0), (-0.53, 0.6)]
+    shaded, *others = seen_from_above([GROUND, box], points, sun)
+    assert shaded < 0.7 * LIGHT * sun[2], "a pixel of the shadow map is 5 cm wide"
+    assert others == pytest.approx([LIGHT * sun[2]] * 3, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "point", "open_"),
+    [
+        ([GROUND, Shape(WALL)], (-3.0, 0.0), True),
+        ([GROUND, Shape(WALL)], (0.85, 0.0), False),
+        ([GROUND, Shape(WALL, DOOR)], (1.0, 0.0), True),
+        ([GROUND, Shape(RING)], (0.0, 0.0), True),
+        ([Shape(TERRAIN), THING], (0.0, 0.0), True),
+    ],
+    ids=["far from a wall", "beside a wall", "in a door", "in a ring", "on a terrain"],
+)
+def test_what_is_near_hides_the_sky(shapes, point, open_):
+    (light,) = seen_from_above(shapes, [point], ambient=1.0)
+    assert (light > 0.999) if open_ else (light < 0.8)
+
+
+@njit
+def mean(textures, footprint):
+    """Of the red of a texture over 60 periods."""
+    total = 0.0
+    for i in range(500):
+        for j in range(500):
+            total += color(textures, 0, 0.1217 * i, 0.1171 * j, footprint)[0]
+    return total / 250_000
+
+
+@pytest.mark.parametrize("kind", range(r.STRIPES, r.RINGS + 1))
+def test_patterns_keep_their_mean_from_afar(kind):
+    for width in (0.15, 0.4, 0.7):
+        texture = np.zeros((1, r.TEXTURE_FIELDS))
+        texture[0, [r.PERIOD, r.STRETCH, r.PATTERN_PERIOD, r.ASPECT, r.STRENGTH]] = 1.0
+        texture[0, r.PATTERN], texture[0, r.WIDTH], texture[0, r.COLORS + 9] = kind, width, 1.0
+        assert mean(texture, 1e-3) == pytest.approx(mean(texture, 10.0), abs=0.05)
+
+
+@pytest.mark.parametrize("size", [(40, 130), (130, 40)])
+def test_the_field_of_view_is_across_the_longer_side(size):
+    fx, fy, cx, cy = Rig(np.eye(4)[None], 90.0, 1.0, "walk").lens(size)
+    assert (fx, fy, cx, cy) == pytest.approx((65, 65, size[1] / 2, size[0] / 2))
