@@ -43,14 +43,14 @@ def main() -> None:
     options = parsed()
     torch.set_num_threads(options.threads)
     cases = list(windows(options))
-    trained = sorted(options.study.glob("runs/*/seed-*/checkpoint.safetensors"))
+    trained = sorted(options.study.glob("runs/*/seed-*/evaluation/protocol.json"))
     if not trained:
         raise SystemExit(f"{options.study} has no trained runs: qgs study makes them")
     scores: dict[str, list[list[float]]] = {}  # by "VARIANT/seed-N", of each case PSNR and SSIM
     scores["nearest/"] = [copied(case) for case in cases]
-    for file in trained:
-        model = load(file, "cpu").eval()
-        scores["/".join(file.parts[-3:-1])] = [score(model, case) for case in cases]
+    for run in (file.parents[1] for file in trained):
+        model = load(run, "cpu").eval()
+        scores["/".join(run.parts[-2:])] = [score(model, case) for case in cases]
     if options.out:
         names = [[case.scene.name, case.inputs, case.targets] for case in cases]
         write_text(options.out, json.dumps({"windows": names, "scores": scores}, indent=1))
@@ -102,34 +102,38 @@ def copied(case: Case) -> list[float]:
 def order(study: Path) -> list[str]:
     """The variants, as the study has them."""
     results = study / "results.json"
-    known = json.loads(results.read_text("utf-8"))["variants"] if results.is_file() else {}
-    return [*known]
+    rows = json.loads(results.read_text("utf-8"))["table"] if results.is_file() else []
+    return [*dict.fromkeys(row["variant"] for row in rows)]
 
 
-def table(scores: dict[str, list[list[float]]], scenes: list[str], order: list[str]) -> str:
+def table(scores: dict[str, list[list[float]]], scenes: list[str], variants: list[str]) -> str:
     """A row for each variant: PSNR of each scene, PSNR and SSIM of all, the last difference."""
-    runs = dict[str, list[list[list[float]]]]()
+    runs = dict[str, dict[str, list[list[float]]]]()
     for run, values in scores.items():
-        runs.setdefault(run.split("/")[0], []).append(values)
-    names = ["nearest", *(name for name in order if name in runs)]
+        variant, seed = run.split("/")
+        runs.setdefault(variant, {})[seed] = values
+    names = ["nearest", *(name for name in variants if name in runs)]
     names += [name for name in runs if name not in names]
     places = [*dict.fromkeys(scenes)]
     lines = [f"| | {' | '.join(places)} | all | SSIM | to the row above |"]
     lines.append("|---|" + "--:|" * (len(places) + 3))
-    before = None
+    before = dict[str, list[list[float]]]()
     for name in names:
-        values = np.array(runs[name])  # (seeds, windows, 2)
+        values = np.array([*runs[name].values()])  # (seeds, windows, 2)
         of = [values[:, np.array(scenes) == place, 0].mean() for place in places]
         cells = [f"{value:.2f}" for value in (*of, values[..., 0].mean())]
         cells.append(f"{values[..., 1].mean():.3f}")
-        gain = "" if before is None or name == names[1] else gained(values[..., 0] - before)
+        pairs = [(runs[name][seed], before[seed]) for seed in runs[name].keys() & before.keys()]
+        gain = gained(np.array([np.subtract(own, old)[:, 0] for own, old in pairs]))
         lines.append(f"| {name} | {' | '.join([*cells, gain])} |")
-        before = values[..., 0]
+        before = runs[name]
     return "\n".join(lines)
 
 
 def gained(differences: np.ndarray) -> str:
-    """Mean of differences (seeds, windows) and its interval."""
+    """Mean of differences (seeds, windows) and its interval; "" without a common seed."""
+    if not differences.size:
+        return ""
     low, high = interval(differences)
     mean = f"{differences.mean():+.2f}"
     return mean if low is None else f"{mean} [{low:+.2f}, {high:+.2f}]"

@@ -18,7 +18,7 @@ Window: TypeAlias = tuple[Frames, Frames]
 NOVEL = 6
 """Views that are compared with by default, at most."""
 BASELINE, TURN, VARIED = (0.06, 0.25), 20.0, 20.0
-"""Distance of inputs per depth, and turn in degrees, where a training is unknown, or VARIED."""
+"""Baseline per depth, turn in degrees: of unknown trainings, and baselines VARIED-fold apart."""
 _MOST = 300  # frames that are considered: time grows with the square of their number
 _NEAR = 48  # frames around a target that its inputs are chosen from
 _POINTS = 6  # of a frustum, per side of the image

@@ -98,10 +98,14 @@ def judged_frames(scene: Scene, holdout: str) -> Frames:
 
 
 def shipped_models() -> list[str]:
-    """Names of the models that installed plugins ship and whose files are there."""
+    """Names of the models that installed plugins ship and whose files are there.
+
+    Those of worlds, which were trained for photos, come first.
+    """
     registry, _ = load_usable_plugins()
     models = [pair for plugin in registry.plugins.values() for pair in plugin.models.items()]
-    return sorted(name for name, file in models if file.is_file())
+    names = (name for name, file in models if file.is_file())
+    return sorted(names, key=lambda name: (not name.startswith("worlds/"), name))
 
 
 @dataclass(frozen=True)
@@ -129,7 +133,7 @@ def best_start(
     """
     if not models:
         raise ValueError(
-            "no trained model is installed: install query-gaussians-rooms, or name one (--model)"
+            "no trained model is installed: install query-gaussians-worlds, or name one (--model)"
         )
     began, starts = perf_counter(), list[Start]()
     inputs: str | Frames | None = scenes.inputs
