@@ -22,7 +22,7 @@ from real_photos import apart, chosen, judged, trained_on
 
 from qgs.analysis.scale import ScaleSearch, constant_scale
 from qgs.contracts import Frames, Scene, ViewsConfig
-from qgs.data.samples import make_sample
+from qgs.data.samples import Sample, make_sample
 from qgs.io.checkpoint import load
 from qgs.io.files import write_text
 from qgs.metrics.baselines import nearest_input
@@ -31,12 +31,13 @@ from qgs.model import QueryGaussianModel
 
 
 class Case(NamedTuple):
-    """A window of a scene."""
+    """A window of a scene. sample: its photos, with the scene's own lengths."""
 
     scene: Scene
     views: ViewsConfig
     inputs: Frames
     targets: Frames
+    sample: Sample
 
 
 def main() -> None:
@@ -79,24 +80,23 @@ def windows(options: argparse.Namespace) -> Iterator[Case]:
         for distance in options.distances:
             far = apart(domain, distance)
             for window in chosen(scene, recipe.views, far, options.windows, False):
-                yield Case(scene, recipe.views, *window)
+                unscaled = constant_scale(recipe.views, 1.0)
+                sample = make_sample(scene, *window, unscaled, mirror=False)
+                yield Case(scene, recipe.views, *window, sample)
 
 
 def score(model: QueryGaussianModel, case: Case) -> list[float]:
     """PSNR and SSIM of the novel views of a window, at the scale that is found."""
     search = ScaleSearch(model, case.views.model_copy(update={"scale": "search"}))
     factor = search(case.scene, case.inputs, case.targets).scale_factor
-    unscaled = constant_scale(case.views, 1.0)
-    sample = make_sample(case.scene, case.inputs, case.targets, unscaled, mirror=False)
-    return [*judged(model, sample, [factor])[factor]]
+    return [*judged(model, case.sample, [factor])[factor]]
 
 
 def copied(case: Case) -> list[float]:
     """PSNR and SSIM of the nearest photo."""
-    unscaled = constant_scale(case.views, 1.0)
-    sample = make_sample(case.scene, case.inputs, case.targets, unscaled, mirror=False)
-    seen = nearest_input(sample.inputs, sample.targets.cameras)
-    return [float(metric(seen, sample.targets.images).mean()) for metric in (psnr, ssim)]
+    targets = case.sample.targets
+    seen = nearest_input(case.sample.inputs, targets.cameras)
+    return [float(metric(seen, targets.images).mean()) for metric in (psnr, ssim)]
 
 
 def order(study: Path) -> list[str]:

@@ -36,7 +36,7 @@ from qgs.data.evaluation import held_out_windows
 from qgs.data.samples import Sample, make_sample, own_world
 from qgs.geometry.rays import pixel_directions
 from qgs.geometry.transforms import to_camera, to_pixels
-from qgs.io.checkpoint import load
+from qgs.io.checkpoint import CheckpointFile, load
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.model import QueryGaussianModel
@@ -140,8 +140,9 @@ def scene_rows(
 
 @cache
 def trained_on(name: str) -> Domain:
-    """The cameras that a model was trained on."""
-    return load(next(iter(checkpoints([name]).values())), "cpu").trained_on or Domain()
+    """The cameras that a model was trained on; its weights are not read."""
+    with CheckpointFile(name) as file:
+        return file.domain
 
 
 def chosen(
