@@ -152,7 +152,7 @@ def test_cameras_are_rigid_and_keep_clear_of_every_surface(scenes):
 def test_what_is_drawn_is_spread(scenes):
     rigs = [scene.drawn.rig for scene in scenes]
     fov = np.array([rig.fov for rig in rigs])
-    assert 40 <= fov.min() < 45 < 85 < fov.max() <= 90
+    assert 18 <= fov.min() < 23 < 85 < fov.max() <= 90
     eyes = np.stack([rig.c2w[:, :3, 3] for rig in rigs])
     widest = np.linalg.norm(eyes[:, :, None] - eyes[:, None], axis=-1).max((1, 2))
     low, middle, high = np.quantile(widest, (0.02, 0.5, 0.98))

@@ -35,7 +35,7 @@ class WorldsConfig(DrawnConfig):
     cameras: Variety = "varied"
     """Plain: a walk along a line, level, with a field of view of 60 to 75 degrees. Varied: walks,
     orbits, looks round and sets that look at one point, over baselines from tiny to wide, with
-    pitch and roll and 40 to 90 degrees. Fields of view are across an image's longer side."""
+    pitch and roll and 18 to 90 degrees. Fields of view are across an image's longer side."""
     shapes: Variety = "varied"
     """Plain: upright boxes, balls and cylinders in closed rooms. Varied: composites of all
     primitives turned freely, with cuts, bars, wires and height fields, in rooms with openings, in
