@@ -1,21 +1,24 @@
-"""The models of a study on photos that none was trained on: a row for each variant, with intervals.
+"""The models of a study on photos that none was trained on.
 
     python tools/photo_study.py STUDY PHOTOS ... [--like worlds/landmark-64] [--distances .5 1 2]
+        [--figure PICTURE]
 
 STUDY: what `qgs study` wrote. Windows are those that `qgs demo` chooses for the model --like, and
 inputs as far apart as tools/real_photos.py says; the same for all. Every model's scale is searched.
-Prints Markdown: novel views of each scene, and over all windows the difference to the variant
-before, with its 95 % interval over trainings and windows.
+Prints Markdown: novel views of each scene by variant, then for each claim of the study the
+difference on photos over all windows, with its 95 % interval over trainings and windows.
 """
 
 import argparse
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
+from PIL import Image
 from qgs_studies.intervals import interval
 from qgs_viewer.contest import checkpoints, recipes_alike
 from real_photos import apart, chosen, judged, trained_on
@@ -23,11 +26,15 @@ from real_photos import apart, chosen, judged, trained_on
 from qgs.analysis.scale import ScaleSearch, constant_scale
 from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.data.samples import Sample, make_sample
+from qgs.drawing.figures import INK, MUTED, categorical, figure_picture, figure_style, hex_color
 from qgs.io.checkpoint import load
-from qgs.io.files import write_text
+from qgs.io.files import replacing, write_text
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.model import QueryGaussianModel
+
+Scores: TypeAlias = dict[str, list[list[float]]]
+"""By "VARIANT/seed-N", or "nearest/": PSNR and SSIM of each window."""
 
 
 class Case(NamedTuple):
@@ -47,15 +54,21 @@ def main() -> None:
     trained = sorted(options.study.glob("runs/*/seed-*/evaluation/protocol.json"))
     if not trained:
         raise SystemExit(f"{options.study} has no trained runs: qgs study makes them")
-    scores: dict[str, list[list[float]]] = {}  # by "VARIANT/seed-N", of each case PSNR and SSIM
+    scores: Scores = {}
     scores["nearest/"] = [copied(case) for case in cases]
     for run in (file.parents[1] for file in trained):
         model = load(run, "cpu").eval()
         scores["/".join(run.parts[-2:])] = [score(model, case) for case in cases]
+    names = ["nearest", *(name for name in order(options.study) if name in runs_of(scores))]
+    if options.figure:
+        with replacing(options.figure) as file:
+            picture = Image.fromarray(figure_picture(figure(scores, names[1:])))
+            picture.save(file, format=options.figure.suffix[1:])
     if options.out:
-        names = [[case.scene.name, case.inputs, case.targets] for case in cases]
-        write_text(options.out, json.dumps({"windows": names, "scores": scores}, indent=1))
-    print(table(scores, [case.scene.name for case in cases], order(options.study)))
+        windows_of = [[case.scene.name, case.inputs, case.targets] for case in cases]
+        write_text(options.out, json.dumps({"windows": windows_of, "scores": scores}, indent=1))
+    print(table(scores, [case.scene.name for case in cases], names))
+    print(claims(scores, results(options.study)["hypotheses"]))
 
 
 def parsed() -> argparse.Namespace:
@@ -68,6 +81,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--windows", type=int, default=6, help="of a scene, at most")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, help="JSON file of all windows")
+    parser.add_argument("--figure", type=Path, help="picture of PSNR by variant, PNG or WebP")
     return parser.parse_args()
 
 
@@ -99,41 +113,72 @@ def copied(case: Case) -> list[float]:
     return [float(metric(seen, targets.images).mean()) for metric in (psnr, ssim)]
 
 
+def results(study: Path) -> dict[str, Any]:
+    """What `qgs study` reported."""
+    return json.loads((study / "results.json").read_text("utf-8"))
+
+
 def order(study: Path) -> list[str]:
     """The variants, as the study has them."""
-    results = study / "results.json"
-    rows = json.loads(results.read_text("utf-8"))["table"] if results.is_file() else []
-    return [*dict.fromkeys(row["variant"] for row in rows)]
+    return [*dict.fromkeys(row["variant"] for row in results(study)["table"])]
 
 
-def table(scores: dict[str, list[list[float]]], scenes: list[str], variants: list[str]) -> str:
-    """A row for each variant: PSNR of each scene, PSNR and SSIM of all, the last difference."""
-    runs = dict[str, dict[str, list[list[float]]]]()
+def runs_of(scores: Scores) -> dict[str, dict[str, np.ndarray]]:
+    """By variant and seed: PSNR and SSIM of windows (W, 2)."""
+    runs = dict[str, dict[str, np.ndarray]]()
     for run, values in scores.items():
         variant, seed = run.split("/")
-        runs.setdefault(variant, {})[seed] = values
-    names = ["nearest", *(name for name in variants if name in runs)]
-    names += [name for name in runs if name not in names]
-    places = [*dict.fromkeys(scenes)]
-    lines = [f"| | {' | '.join(places)} | all | SSIM | to the row above |"]
-    lines.append("|---|" + "--:|" * (len(places) + 3))
-    before = dict[str, list[list[float]]]()
-    for name in names:
-        values = np.array([*runs[name].values()])  # (seeds, windows, 2)
+        runs.setdefault(variant, {})[seed] = np.array(values)
+    return runs
+
+
+def table(scores: Scores, scenes: list[str], variants: list[str]) -> str:
+    """A row for each variant: PSNR of each scene, PSNR and SSIM of all."""
+    runs, places = runs_of(scores), [*dict.fromkeys(scenes)]
+    lines = [f"| | {' | '.join(places)} | all | SSIM |", "|---|" + "--:|" * (len(places) + 2)]
+    for name in variants:
+        values = np.stack([*runs[name].values()])  # (seeds, windows, 2)
         of = [values[:, np.array(scenes) == place, 0].mean() for place in places]
         cells = [f"{value:.2f}" for value in (*of, values[..., 0].mean())]
-        cells.append(f"{values[..., 1].mean():.3f}")
-        pairs = [(runs[name][seed], before[seed]) for seed in runs[name].keys() & before.keys()]
-        gain = gained(np.array([np.subtract(own, old)[:, 0] for own, old in pairs]))
-        lines.append(f"| {name} | {' | '.join([*cells, gain])} |")
-        before = runs[name]
+        lines.append(f"| {name} | {' | '.join(cells)} | {values[..., 1].mean():.3f} |")
     return "\n".join(lines)
 
 
+def claims(scores: Scores, hypotheses: list[dict[str, Any]]) -> str:
+    """A row for each pair of variants that the study compares: PSNR of the first minus the other's.
+
+    Seeds are paired.
+    """
+    runs, lines = runs_of(scores), ["", "| on photos | dB |", "|---|--:|"]
+    for hypothesis in hypotheses:
+        left, sign, right = (part.split("@")[0] for part in hypothesis["claim"].split())
+        own, other = runs.get(left, {}), runs.get(right, {})
+        pairs = [own[seed] - other[seed] for seed in own if seed in other]
+        if pairs:
+            lines.append(f"| {left} {sign} {right} | {gained(np.stack(pairs)[..., 0])} |")
+    return "\n".join(lines)
+
+
+def figure(scores: Scores, variants: list[str]) -> Figure:
+    """PSNR over all windows: a point for each training, a line for the mean, one for copying."""
+    runs = runs_of(scores)
+    with figure_style():
+        drawn = Figure(figsize=(6.4, 0.8 + 0.28 * len(variants)), layout="constrained")
+        axes = drawn.subplots()
+        for place, name in enumerate(variants):
+            means = [values[:, 0].mean() for values in runs[name].values()]
+            axes.plot(means, [place] * len(means), "o", color=hex_color(categorical(0)))
+            axes.plot(np.mean(means), place, "|", color=hex_color(INK), markersize=14)
+        at, muted = runs["nearest"][""][:, 0].mean(), hex_color(MUTED)
+        axes.axvline(at, color=muted, linestyle="--", label="nearest photo")
+        axes.set(yticks=range(len(variants)), yticklabels=variants, xlabel="PSNR on photos, dB")
+        axes.invert_yaxis()
+        axes.legend(loc="lower right")
+    return drawn
+
+
 def gained(differences: np.ndarray) -> str:
-    """Mean of differences (seeds, windows) and its interval; "" without a common seed."""
-    if not differences.size:
-        return ""
+    """Mean of differences (seeds, windows), and its interval where there are several seeds."""
     low, high = interval(differences)
     mean = f"{differences.mean():+.2f}"
     return mean if low is None else f"{mean} [{low:+.2f}, {high:+.2f}]"

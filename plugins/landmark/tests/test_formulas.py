@@ -94,10 +94,6 @@ def test_a_number_of_anchors_is_spread_over_the_photos() -> None:
     assert torch.equal(state[CENTER], again[CENTER])
     assert state.features.shape == (2, 10, DIMS.width)
     assert queries.count == 10
-    queries.train()
-    torch.manual_seed(0)
-    moved = queries(memory(), views())
-    assert not torch.allclose(moved[CENTER], state[CENTER])
     side = math.sqrt(2 * SIZE[0] * SIZE[1] / 10)
     depth = support_radius(state[RAW_RADIUS], queries.config) * 20.0 / side
     for view in range(2):

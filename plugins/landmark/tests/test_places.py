@@ -70,30 +70,32 @@ def test_rays_are_those_of_pixels() -> None:
 @pytest.mark.parametrize("views", [1, 2, 5])
 @pytest.mark.parametrize("count", [1, 256, 300])
 def test_points_are_spread_evenly_over_all_photos(views: int, count: int) -> None:
-    generator = torch.Generator().manual_seed(0)
-    view_N, place = spread(count, torch.rand(1, views, 2, generator=generator))
+    view_N, place = spread(count, views, (48, 64), torch.device("cpu"))
     assert view_N.bincount(minlength=views).max() - view_N.bincount(minlength=views).min() <= 1
-    assert place.min() >= 0
-    assert place.max() < 1
+    pixels = (patch_centres(48, 64, place.device) * torch.tensor([64.0, 48.0])).double()
     for view in range(views) if count >= 16 * views else ():
-        own = place[0, view_N == view]
-        in_quarters = (own * 4).long().clamp(0, 3)  # of 4 x 4 parts none has too few or too many
-        held = (in_quarters[:, 1] * 4 + in_quarters[:, 0]).bincount(minlength=16)
-        assert (held - len(own) / 16).abs().max() <= 4  # of random points 9
+        own = place[view_N == view].double() * torch.tensor([64.0, 48.0])
+        area = 48 * 64 / len(own)
+        nearest, owner = torch.cdist(pixels, own).min(1)
+        assert nearest.max() < 0.9 * area**0.5  # half a diagonal of a part is .71 of its side
+        held = owner.bincount(minlength=len(own))
+        assert held.min() > 0.5 * area
+        assert held.max() < 1.6 * area
 
 
-def test_points_of_the_first_views_do_not_depend_on_the_numbers_of_scenes() -> None:
-    one, several = (spread(20, torch.zeros(scenes, 2, 2))[1] for scenes in (1, 3))
-    assert torch.equal(one.expand(3, -1, -1), several)
+def test_as_many_points_as_tokens_are_their_patches() -> None:
+    view_N, place = spread(48, 1, (24, 32), torch.device("cpu"))
+    torch.testing.assert_close(place, patch_centres(6, 8, torch.device("cpu")))
+    assert not view_N.any()
 
 
 @pytest.mark.parametrize(
-    ("count", "rows", "columns"), [(1, 1, 1), (4, 2, 2), (6, 2, 3), (5, 1, 5), (8, 2, 4)]
+    ("count", "rows"), [(1, [1]), (2, [2]), (4, [2, 2]), (6, [3, 3]), (5, [2, 3]), (8, [2, 3, 3])]
 )
-def test_cells_divide_a_square(count: int, rows: int, columns: int) -> None:
+def test_cells_divide_a_square(count: int, rows: list[int]) -> None:
     middles = [
-        ((column + 0.5) / columns - 0.5, (row + 0.5) / rows - 0.5)
-        for row in range(rows)
+        ((column + 0.5) / columns - 0.5, (row + 0.5) / len(rows) - 0.5)
+        for row, columns in enumerate(rows)
         for column in range(columns)
     ]
     torch.testing.assert_close(cells(count, torch.empty(0)), torch.tensor(middles))
@@ -107,4 +109,20 @@ def test_colours_are_means_of_squares() -> None:
         for row in range(8):
             for column in range(12):
                 square = images[:, view, :, 2 * row : 2 * row + 2, 2 * column : 2 * column + 2]
-                torch.testing.assert_close(found[:, row, column], square.mean((-1, -2)))
+                torch.testing.assert_close(
+                    found[:, row, column], square.mean((-1, -2)), rtol=0, atol=1e-6
+                )
+
+
+def test_colours_are_means_of_squares_that_lie_across_pixels() -> None:
+    image = torch.rand(1, 1, 3, *SIZE, generator=torch.Generator().manual_seed(0)).double()
+    place = torch.tensor([[[0.35, 0.5], [0.613, 0.4]]], dtype=torch.float64)
+    found = colors_at(image, 3.0, torch.zeros(2, dtype=torch.long), place)
+    for index, (x, y) in enumerate((place[0] * torch.tensor([SIZE[1], SIZE[0]])).tolist()):
+        shares = [  # of each column and row, how much of it lies within
+            (torch.arange(n) + 1).clamp(max=at + 1.5) - torch.arange(n).clamp(min=at - 1.5)
+            for n, at in ((SIZE[1], x), (SIZE[0], y))
+        ]
+        column, row = (share.clamp(min=0).double() / 3 for share in shares)
+        expected = torch.einsum("chw,h,w->c", image[0, 0], row, column)
+        torch.testing.assert_close(found[0, index], expected, rtol=0, atol=1e-6)

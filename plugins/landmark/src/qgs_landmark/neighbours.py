@@ -118,6 +118,9 @@ def relative_places(center_BN3: Tensor, index_BNk: Tensor, seen_BNk: Tensor | No
 
 def _taken(x_BhNd: Tensor, index_BNk: Tensor) -> Tensor:
     """(B, h, N, k, d)."""
-    # `take_along_dim` would do, but torch.compile makes a graph for each size of it.
-    flat = index_BNk.flatten(1)[:, None, :, None].expand(-1, x_BhNd.shape[1], -1, x_BhNd.shape[3])
-    return x_BhNd.gather(2, flat).unflatten(2, (-1, index_BNk.shape[2]))
+    # Whole rows: `gather` takes number by number (10 ms instead of 3 for 512 anchors on a CPU).
+    scenes, heads, anchors, _ = x_BhNd.shape
+    first = torch.arange(scenes * heads, device=index_BNk.device).view(scenes, heads, 1, 1)
+    rows = (first * anchors + index_BNk[:, None]).flatten()
+    taken = x_BhNd.flatten(0, 2).index_select(0, rows)
+    return taken.unflatten(0, (scenes, heads, *index_BNk.shape[1:]))

@@ -58,8 +58,8 @@ class ObservedQueries(Queries):
 
     class Config(RadiusOptions):
         count: int | None = Field(default=256, ge=1)
-        """N, the number of queries, at points spread evenly over all input photos, whatever their
-        number and size; null for `per_token` at the centre of each token's patch."""
+        """N, the number of queries, spread evenly over all input photos, whatever their number and
+        size, in rows; null for `per_token` at the centre of each token's patch."""
         per_token: int = Field(default=1, ge=1)
         """Queries of each token where `count` is null; each has a learned vector of its own."""
         near: float = Field(default=0.2, gt=0)
@@ -125,10 +125,8 @@ class ObservedQueries(Queries):
             view_N = torch.arange(count, device=device).repeat_interleave(rows * columns * each)
             x_BND = (memory.features[:, :, None] + self.slots).flatten(1, 2)
         else:
-            drawn = torch.rand if self.training else torch.zeros
-            view_N, place_BN2 = spread(
-                self.config.count, drawn(scenes, count, 2, device=device, dtype=torch.float32)
-            )
+            view_N, place_N2 = spread(self.config.count, count, views.cameras.size, device)
+            place_BN2 = place_N2.expand(scenes, -1, -1)
             x_BND = sampled(memory.features, memory.grid, view_N, place_BN2) + self.slots
         if self.config.sweep is None:
             nearness_BN1 = at_least_float32(self.depth_mlp(x_BND)).sigmoid()

@@ -3,6 +3,8 @@
 A place is x and y as shares of a photo's width and height; `view_N` says of which photo it is.
 """
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -11,9 +13,8 @@ from qgs.geometry.constants import constant
 from qgs.geometry.precision import full_precision
 from qgs.types import Cameras
 
-PLASTIC = 1.32471795724474602596
-"""The real root of x^3 = x + 1; its powers step through the unit square most evenly (M. Roberts,
-"The Unreasonable Effectiveness of Quasirandom Sequences", 2018: the sequence R2)."""
+EPS = 1e-4
+"""Pixels by which a side may exceed a whole number that it stands for."""
 
 
 def patch_centres(rows: int, columns: int, device: torch.device) -> Tensor:
@@ -22,33 +23,38 @@ def patch_centres(rows: int, columns: int, device: torch.device) -> Tensor:
     return torch.cartesian_prod(y, x).flip(-1)
 
 
-def spread(count: int, shift_BV2: Tensor) -> tuple[Tensor, Tensor]:
-    """Views (N,) of N = `count` points, in turn, and their places (B, N, 2).
+def spread(
+    count: int, views: int, size: tuple[int, int], device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Views (N,) of N = `count` points, in turn, and their places (N, 2) in photos (H, W).
 
-    The points of a view follow the sequence R2, moved by the shift of its scene and view.
+    They are middles of parts, which leave nothing out, as points of a low-discrepancy sequence do.
     """
-    index_N = torch.arange(count, device=shift_BV2.device)
-    views = shift_BV2.shape[1]
-    view_N, turn_N1 = index_N % views, (index_N // views + 1)[:, None]
-    # In float64: the index times a step loses the digits that float32 has after the point.
-    step_2 = torch.tensor([1 / PLASTIC, 1 / PLASTIC**2], dtype=torch.float64, device=view_N.device)
-    place_BN2 = (0.5 + shift_BV2.double()[:, view_N] + turn_N1 * step_2) % 1
-    return view_N, place_BN2.to(shift_BV2)
+    index_N = torch.arange(count, device=device)
+    view_N = index_N % views
+    return view_N, parts(index_N // views, (count - 1 - view_N) // views + 1, size[0] / size[1])
 
 
 def cells(count: int, like: Tensor) -> Tensor:
-    """Middles (K, 2), x and y, of K = `count` equal cells of a square of side 1 about 0.
-
-    They lie row by row in a grid as nearly square as K allows.
-    """
+    """Middles (K, 2), x and y, of K = `count` cells of a square of side 1 about 0."""
     index_K = torch.arange(count, device=like.device)
-    # The divisor next to the square root. It stays a tensor, since torch.compile would make a graph
-    # for each K that Python divides.
-    n_K = index_K + 1
-    rows = torch.where((count % n_K == 0) & (n_K * n_K <= count), n_K, 1).amax()
-    columns = count // rows
-    x_K, y_K = (index_K % columns + 0.5) / columns, (index_K // columns + 0.5) / rows
-    return torch.stack([x_K, y_K], -1).to(like) - 0.5
+    # A tensor, since torch.compile would make a graph for each number that Python divides.
+    return parts(index_K, (index_K + 1).amax(), 1.0).to(like) - 0.5
+
+
+def parts(index_N: Tensor, count: Tensor, aspect: float) -> Tensor:
+    """Middles (N, 2), x and y, of the parts `index_N` of `count` of a unit square, row by row.
+
+    Rows are of equal height, about that of a part's width in a photo `aspect` times as high as
+    wide; they have as many parts each, or one more.
+    """
+    rows = (count * aspect).sqrt().round().clamp_min(1).long()
+    rows = torch.minimum(rows, count)
+    row_N = ((index_N + 1) * rows - 1) // count
+    first_N = row_N * count // rows
+    held_N = (row_N + 1) * count // rows - first_N
+    x_N, y_N = (index_N - first_N + 0.5) / held_N, (row_N + 0.5) / rows
+    return torch.stack([x_N, y_N], -1)
 
 
 def sampled(
@@ -78,12 +84,14 @@ def bilinear(maps_BVCHW: Tensor, view_N: Tensor, place_BNX2: Tensor) -> Tensor:
 
 @full_precision
 def colors_at(images_BV3HW: Tensor, side: float, view_N: Tensor, place_BN2: Tensor) -> Tensor:
-    """RGB (B, N, 3): means over squares of about `side` pixels around places."""
-    scenes, views, _, height, width = images_BV3HW.shape
-    rows, columns = (max(1, round(length / max(side, 1.0))) for length in (height, width))
-    small = F.adaptive_avg_pool2d(images_BV3HW.flatten(0, 1), (rows, columns))
-    pixels = small.flatten(2).mT.reshape(scenes, -1, 3)
-    return sampled(pixels, (views, rows, columns), view_N, place_BN2)
+    """RGB (B, N, 3): means over squares of `side` pixels around places, by a sample a pixel.
+
+    Those of whole sides are exact. Beyond an edge, its pixels repeat.
+    """
+    height, width = images_BV3HW.shape[-2:]
+    place_BN2, samples = place_BN2.to(images_BV3HW), max(1, math.ceil(side - EPS))
+    step_P2 = side * cells(samples**2, place_BN2) / constant([width, height], place_BN2)
+    return bilinear(images_BV3HW, view_N, place_BN2[:, :, None] + step_P2).mean(-1).mT
 
 
 def rays_at(cameras: Cameras, view_N: Tensor, place_BN2: Tensor) -> tuple[Tensor, Tensor]:

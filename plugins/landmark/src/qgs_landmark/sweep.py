@@ -14,7 +14,6 @@ LEAST_DEPTH = 1e-3
 """World units in front of a camera, of what it sees."""
 
 
-@torch.no_grad()  # colours have no gradient to send; a network learns what to make of them
 @full_precision
 def mismatch(
     views: Views, view_N: Tensor, place_BN2: Tensor, depth_D: Tensor, side: float, points: int
@@ -23,7 +22,7 @@ def mismatch(
 
     It is the mean difference of RGB over a square of `side` pixels, of points x points samples,
     and over the photos that see at least half of it at that depth. The second tensor says whether
-    any does; where none does, the difference is 0.
+    any does; where none does, the difference is 0. Cameras get gradients, as photos do.
     """
     height, width = views.cameras.size
     place_BN2 = place_BN2.to(views.images)

@@ -13,6 +13,7 @@ from qgs_worlds.raycast import trace
 
 CLEARANCE = 0.2  # metres from a camera to the box around any shape, at least, before scaling
 FOV = (18.0, 90.0)  # across the longer side of an image, degrees: from a long lens to a wide one
+AHEAD_FOV = 60.0  # degrees from which on cameras of a walk may look ahead alone
 BASELINE = (0.04, 1.3)  # length of a path by the distance to what is looked at
 PLAIN_FOV, PLAIN_TRAVEL = (60.0, 75.0), (0.65, 1.2)
 _TRIES = 12
@@ -162,13 +163,13 @@ def _stand(
 
 
 def _walk(rng: np.random.Generator, path: Path) -> Motion:
-    """Along a bent line; looking ahead, or at what is passed, which a long lens must turn to."""
+    """Along a bent line; looking ahead or at what is passed, the longer the lens the more."""
     base, target, length, s = path.base, path.target, path.length, path.s
     way = rng.normal(size=3) * (1, 1, 0.3)
     way /= np.linalg.norm(way)
     bend = rng.normal(size=3) * (0.3, 0.3, 0.1)
     eyes = base + length * (s[:, None] * way + (s**2)[:, None] * bend)
-    ahead = rng.uniform(0, min(path.fov / 60, 1))
+    ahead = rng.uniform(0, min(path.fov / AHEAD_FOV, 1))
     return eyes, target + ahead * (eyes - base)
 
 
