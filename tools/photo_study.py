@@ -36,6 +36,9 @@ from qgs.model import QueryGaussianModel
 Scores: TypeAlias = dict[str, list[list[float]]]
 """By "VARIANT/seed-N", or "nearest/": PSNR and SSIM of each window."""
 
+Runs: TypeAlias = dict[str, dict[str, np.ndarray]]
+"""By variant and seed: PSNR and SSIM of windows (W, 2)."""
+
 
 class Case(NamedTuple):
     """A window of a scene. sample: its photos, with the scene's own lengths."""
@@ -59,16 +62,18 @@ def main() -> None:
     for run in (file.parents[1] for file in trained):
         model = load(run, "cpu").eval()
         scores["/".join(run.parts[-2:])] = [score(model, case) for case in cases]
-    names = ["nearest", *(name for name in order(options.study) if name in runs_of(scores))]
+    reported, runs = results(options.study), runs_of(scores)
+    order = dict.fromkeys(row["variant"] for row in reported["table"])
+    names = ["nearest", *(name for name in order if name in runs)]
     if options.figure:
         with replacing(options.figure) as file:
-            picture = Image.fromarray(figure_picture(figure(scores, names[1:])))
+            picture = Image.fromarray(figure_picture(figure(runs, names[1:])))
             picture.save(file, format=options.figure.suffix[1:])
     if options.out:
         windows_of = [[case.scene.name, case.inputs, case.targets] for case in cases]
         write_text(options.out, json.dumps({"windows": windows_of, "scores": scores}, indent=1))
-    print(table(scores, [case.scene.name for case in cases], names))
-    print(claims(scores, results(options.study)["hypotheses"]))
+    print(table(runs, [case.scene.name for case in cases], names))
+    print(claims(runs, reported["hypotheses"]))
 
 
 def parsed() -> argparse.Namespace:
@@ -118,23 +123,18 @@ def results(study: Path) -> dict[str, Any]:
     return json.loads((study / "results.json").read_text("utf-8"))
 
 
-def order(study: Path) -> list[str]:
-    """The variants, as the study has them."""
-    return [*dict.fromkeys(row["variant"] for row in results(study)["table"])]
-
-
-def runs_of(scores: Scores) -> dict[str, dict[str, np.ndarray]]:
-    """By variant and seed: PSNR and SSIM of windows (W, 2)."""
-    runs = dict[str, dict[str, np.ndarray]]()
+def runs_of(scores: Scores) -> Runs:
+    """The scores by variant and seed."""
+    runs: Runs = {}
     for run, values in scores.items():
         variant, seed = run.split("/")
         runs.setdefault(variant, {})[seed] = np.array(values)
     return runs
 
 
-def table(scores: Scores, scenes: list[str], variants: list[str]) -> str:
+def table(runs: Runs, scenes: list[str], variants: list[str]) -> str:
     """A row for each variant: PSNR of each scene, PSNR and SSIM of all."""
-    runs, places = runs_of(scores), [*dict.fromkeys(scenes)]
+    places = [*dict.fromkeys(scenes)]
     lines = [f"| | {' | '.join(places)} | all | SSIM |", "|---|" + "--:|" * (len(places) + 2)]
     for name in variants:
         values = np.stack([*runs[name].values()])  # (seeds, windows, 2)
@@ -144,12 +144,12 @@ def table(scores: Scores, scenes: list[str], variants: list[str]) -> str:
     return "\n".join(lines)
 
 
-def claims(scores: Scores, hypotheses: list[dict[str, Any]]) -> str:
+def claims(runs: Runs, hypotheses: list[dict[str, Any]]) -> str:
     """A row for each pair of variants that the study compares: PSNR of the first minus the other's.
 
     Seeds are paired.
     """
-    runs, lines = runs_of(scores), ["", "| on photos | dB |", "|---|--:|"]
+    lines = ["", "| on photos | dB |", "|---|--:|"]
     for hypothesis in hypotheses:
         left, sign, right = (part.split("@")[0] for part in hypothesis["claim"].split())
         own, other = runs.get(left, {}), runs.get(right, {})
@@ -159,9 +159,8 @@ def claims(scores: Scores, hypotheses: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def figure(scores: Scores, variants: list[str]) -> Figure:
+def figure(runs: Runs, variants: list[str]) -> Figure:
     """PSNR over all windows: a point for each training, a line for the mean, one for copying."""
-    runs = runs_of(scores)
     with figure_style():
         drawn = Figure(figsize=(6.4, 0.8 + 0.28 * len(variants)), layout="constrained")
         axes = drawn.subplots()
@@ -173,7 +172,7 @@ def figure(scores: Scores, variants: list[str]) -> Figure:
         axes.axvline(at, color=muted, linestyle="--", label="nearest photo")
         axes.set(yticks=range(len(variants)), yticklabels=variants, xlabel="PSNR on photos, dB")
         axes.invert_yaxis()
-        axes.legend(loc="lower right")
+        drawn.legend(loc="outside upper right")
     return drawn
 
 
