@@ -209,6 +209,10 @@ class ModelComponent(Component, torch.nn.Module):
         """
         return parameter.ndim != 1
 
+    def adapted(self, learned: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """A state dict made of one with other sizes; what it leaves as it is must fit as it is."""
+        return dict(learned)
+
 
 class MissingExtraError(RuntimeError):
     """An optional package is missing; the message names the command that installs it."""

@@ -1,7 +1,7 @@
 """Slot `encoder`: posed photos to image memory."""
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import ClassVar
 
 import torch
@@ -52,13 +52,6 @@ class Encoder(ModelComponent):
     writes = MEMORY_FIELDS
     """The parts of the ImageMemory that it fills, all by default; its features may have a width of
     their own."""
-
-    def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """A state dict for this encoder, made of one `learned` with patches of another size.
-
-        Weights that it cannot bring to its own shapes stay as they are, and are then refused.
-        """
-        return dict(learned)
 
     @classmethod
     def size_multiple(cls, config: ComponentConfig) -> int | None:

@@ -11,15 +11,15 @@ from qgs.io.checkpoint import CheckpointFile, load_weights, unique_tensors
 from qgs.io.tensors import CheckpointError, differing_tensors, shapes_of
 from qgs.model import QueryGaussianModel
 
-_QUERIES, _ENCODER = "queries.", "encoder."
+_QUERIES = "queries."
 
 
 def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     """Give `model`, freshly built from `recipe`, the weights of `recipe.init_from`, if any.
 
     `init_from` is a name as `CheckpointFile` takes it. Queries grow or shrink by their own rule
-    (`Queries.resized`) with random numbers of the recipe's seed, the encoder adapts weights to its
-    patches (`Encoder.adapted`); everything else must have the same names and shapes.
+    (`Queries.resized`) with random numbers of the recipe's seed, encoder and head adapt weights to
+    their sizes (`ModelComponent.adapted`); everything else must have the same names and shapes.
 
     Returns lines about weights of another size, and about options that make the same weights
     predict other Gaussians. Raises FileNotFoundError, CheckpointError with every difference.
@@ -35,13 +35,15 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
         for option, (their, ours) in differing_predictions(theirs.tree, recipe.tree).items()
         if option != "model.queries.count"
     ]
-    adapted = model.encoder.adapted(_part(_ENCODER, learned))
-    weights = learned | {_ENCODER + name: values for name, values in adapted.items()}
+    weights = dict(learned)
+    for part, component in ("encoder.", model.encoder), ("head.", model.head):
+        adapted = component.adapted(_part(part, learned))
+        weights |= {part + name: values for name, values in adapted.items()}
     found = _differences(weights, model, count)
     if found:
         first = (
-            f"init_from: {path} does not fit this recipe; only the number of queries and, to a "
-            "multiple, the size of patches may differ:"
+            f"init_from: {path} does not fit this recipe; only the number of queries and what its "
+            "encoder and head adapt, such as the size of patches, to a multiple, may differ:"
         )
         trained = "options of the model that the checkpoint was trained with:"
         raise CheckpointError("\n  ".join([first, *found, trained, *(f"  {o}" for o in options)]))

@@ -133,6 +133,20 @@ def test_gaussians_start_as_the_photo_that_they_stand_for() -> None:
     )
 
 
+def test_a_head_of_more_gaussians_starts_from_those_of_the_nearest_cells() -> None:
+    """`init_from`: each of 2 x 2 cells has its channels in the four of 4 x 4 that divide it."""
+    small, large = (
+        ColoredHead(ColoredHead.Config(gaussians_per_query=count), DIMS) for count in (4, 16)
+    )
+    large.load_state_dict(large.adapted(small.state_dict()))
+    features = torch.randn(2, TOKENS, DIMS.width, generator=torch.Generator().manual_seed(2))
+    four, sixteen = (
+        head.linear(features).unflatten(-1, (side, side, -1))
+        for head, side in ((small, 2), (large, 4))
+    )
+    torch.testing.assert_close(sixteen, four.repeat_interleave(2, 2).repeat_interleave(2, 3))
+
+
 def test_centres_add_offsets_in_radii() -> None:
     _, state = started(count=None, cells=4)
     centers = FootprintCenters(FootprintCenters.Config(offset="linear"), DIMS)

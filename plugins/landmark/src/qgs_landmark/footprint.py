@@ -1,5 +1,7 @@
 """`landmark/footprint`, `landmark/colored`: Gaussians that start as the photo's square they see."""
 
+from collections.abc import Mapping
+
 import torch
 import torch.nn.functional as F
 from pydantic import Field
@@ -67,6 +69,21 @@ class ColoredHead(GaussianHead):
     def fields_read(cls, config: Config) -> Fields:
         """Colours and radii."""
         return {**color_field(config.gaussians_per_query), **radius_field(config)}
+
+    def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """A Gaussian takes the weights of the nearest of other cells, which are more or fewer."""
+        return {
+            name: values if name.startswith("norm.") else self._of_cells(values)
+            for name, values in learned.items()
+        }
+
+    def _of_cells(self, rows: Tensor) -> Tensor:
+        """Rows of channels, for this head's cells."""
+        rows_KC = rows.unflatten(0, (-1, sum(CHANNELS)))
+        own, theirs = (
+            cells(k, rows.new_empty(0).float()) for k in (self.gaussians_per_query, len(rows_KC))
+        )
+        return rows_KC[torch.cdist(own, theirs).argmin(-1)].flatten(0, 1)
 
     def forward(self, state: QueryState) -> GaussianAttributes:
         raw_BNC = at_least_float32(self.linear(self.norm(state.features)))
