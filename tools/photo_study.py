@@ -1,12 +1,13 @@
 """The models of a study on photos that none was trained on.
 
     python tools/photo_study.py STUDY PHOTOS ... [--like worlds/landmark-64] [--distances .5 1 2]
-        [--figure PICTURE]
+        [--figure PICTURE] [--out JSON]
 
 STUDY: what `qgs study` wrote. Windows are those that `qgs demo` chooses for the model --like, and
 inputs as far apart as tools/real_photos.py says; the same for all. Every model's scale is searched.
 Prints Markdown: novel views of each scene by variant, then for each claim of the study the
-difference on photos over all windows, with its 95 % interval over trainings and windows.
+difference on photos over all windows, with its 95 % interval over trainings and windows. With --out
+a second call measures new trainings alone.
 """
 
 import argparse
@@ -57,11 +58,7 @@ def main() -> None:
     trained = sorted(options.study.glob("runs/*/seed-*/evaluation/protocol.json"))
     if not trained:
         raise SystemExit(f"{options.study} has no trained runs: qgs study makes them")
-    scores: Scores = {}
-    scores["nearest/"] = [copied(case) for case in cases]
-    for run in (file.parents[1] for file in trained):
-        model = load(run, "cpu").eval()
-        scores["/".join(run.parts[-2:])] = [score(model, case) for case in cases]
+    scores = measured(options.out, cases, [file.parents[1] for file in trained])
     reported, runs = results(options.study), runs_of(scores)
     order = dict.fromkeys(row["variant"] for row in reported["table"])
     names = ["nearest", *(name for name in order if name in runs)]
@@ -69,9 +66,6 @@ def main() -> None:
         with replacing(options.figure) as file:
             picture = Image.fromarray(figure_picture(figure(runs, names[1:])))
             picture.save(file, format=options.figure.suffix[1:])
-    if options.out:
-        windows_of = [[case.scene.name, case.inputs, case.targets] for case in cases]
-        write_text(options.out, json.dumps({"windows": windows_of, "scores": scores}, indent=1))
     print(table(runs, [case.scene.name for case in cases], names))
     print(claims(runs, reported["hypotheses"]))
 
@@ -85,7 +79,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--distances", type=float, nargs="+", default=[0.5, 1.0, 2.0])
     parser.add_argument("--windows", type=int, default=6, help="of a scene, at most")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="JSON file of all windows")
+    parser.add_argument("--out", type=Path, help="JSON file of all scores; those in it are kept")
     parser.add_argument("--figure", type=Path, help="picture of PSNR by variant, PNG or WebP")
     return parser.parse_args()
 
@@ -102,6 +96,23 @@ def windows(options: argparse.Namespace) -> Iterator[Case]:
                 unscaled = constant_scale(recipe.views, 1.0)
                 sample = make_sample(scene, *window, unscaled, mirror=False)
                 yield Case(scene, recipe.views, *window, sample)
+
+
+def measured(file: Path | None, cases: list[Case], trained: list[Path]) -> Scores:
+    """Scores of the nearest photo and of all trained runs; those that the file has are kept."""
+    windows_of = [[case.scene.name, [*case.inputs], [*case.targets]] for case in cases]
+    known = json.loads(file.read_text("utf-8")) if file and file.exists() else None
+    if known and known["windows"] != windows_of:
+        raise SystemExit(f"{file} has scores of other windows: name another file")
+    scores: Scores = known["scores"] if known else {"nearest/": [copied(case) for case in cases]}
+    for run in trained:
+        name = "/".join(run.parts[-2:])
+        if name not in scores:
+            model = load(run, "cpu").eval()
+            scores[name] = [score(model, case) for case in cases]
+            if file:
+                write_text(file, json.dumps({"windows": windows_of, "scores": scores}, indent=1))
+    return scores
 
 
 def score(model: QueryGaussianModel, case: Case) -> list[float]:

@@ -77,10 +77,10 @@ def trained_ratios(trained_on: Domain) -> tuple[tuple[float, float], float]:
 class Frusta:
     """Cameras in units of the depth that they look at, and what each sees of the others' views."""
 
-    def __init__(self, scene: Scene, trained_on: Domain) -> None:
+    def __init__(self, scene: Scene, trained_on: Domain, depth: float | None = None) -> None:
         self.scene, self.cameras = scene, scene.cameras
         c2w = self.cameras.c2w.double().numpy()
-        self.centres, self.rotations = c2w[:, :3, 3] / scene_depth(scene), c2w[:, :3, :3]
+        self.centres, self.rotations = c2w[:, :3, 3] / (depth or scene_depth(scene)), c2w[:, :3, :3]
         (self.low, self.high), self.most_turn = trained_ratios(trained_on)
         self.apart = np.linalg.norm(self.centres[:, None] - self.centres, axis=-1)
         self.turns = np.degrees(np.arccos((c2w[:, :3, 2] @ c2w[:, :3, 2].T).clip(-1, 1)))

@@ -168,6 +168,10 @@ class ViewSampler(Component):
         for; `qgs.contracts.schedule.END` in evaluation. Raises ValueError for too few frames.
         """
 
+    def windows(self, scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
+        """Inputs and targets that judge a scene by held-out photos; none for `views.gap`'s."""
+        return []
+
     def options(self, step: int) -> Any:
         """`config` with the numbers of scheduled options after `step` steps."""
         return at_step(self.config, self.schedules, step)

@@ -11,7 +11,7 @@ from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewSampler, Vie
 from qgs.contracts.schedule import END
 from qgs.data.images import framing
 from qgs.data.paths import opened_path, read_json
-from qgs.data.samples import Frames, Sample, gap_range, make_sample, moments, spread
+from qgs.data.samples import Frames, Sample, evenly, gap_range, make_sample, moments, spread
 from qgs.data.view_samplers import Span
 from qgs.wording import listed
 
@@ -84,12 +84,11 @@ class EvaluationPlan:
     """The scenes of a test split that are judged, and on which views; never mirrored.
 
     With an index, its scenes and frames. Without one, of the first `evaluation.scenes` scenes:
-    of a scene with held-out frames `held_out_windows`, evenly thinned to `evaluation.scenes`; of
-    the others `evaluation.samples` samples, inputs drawn by `sampler` (default: `Span`) as at the
-    end of training with `evaluation.seed`, targets the other frames of the span, or of one time.
-    Targets of T times are T samples. views_of: makes the settings of a sample, such as its scale.
-    windows_of: gives windows of a scene that does not move, instead. depths: targets have true
-    depth where scenes do.
+    of a scene with held-out frames `sampler.windows`, else `held_out_windows`, evenly thinned to
+    `evaluation.scenes`; of the others `evaluation.samples` samples, inputs drawn by `sampler`
+    (default: `Span`) as at the end of training with `evaluation.seed`, targets the other frames of
+    the span, or of one time. Targets of T times are T samples. views_of: settings of a sample, such
+    as its scale. windows_of: windows of a scene that does not move. depths: targets have true ones.
 
     wanted, null, unlisted: see `qgs.engine.results.Evaluation`. framing: of the first photo,
     once `samples` has run. Raises ValueError without scenes.
@@ -146,11 +145,9 @@ class EvaluationPlan:
         if self._index is not None:
             yield _named(scene, self._index)
         elif scene.held_out or windows_of:
-            windows = windows_of(scene) if windows_of else held_out_windows(scene, self._views)
-            count = min(self._evaluation.scenes, len(windows))
-            # evenly thinned, so that both ends of a long scene are judged
-            kept = np.linspace(0, len(windows) - 1, count).round().astype(int)
-            yield from (windows[i] for i in kept)
+            windows = windows_of(scene) if windows_of else self._sampler.windows(scene, self._views)
+            windows = windows or held_out_windows(scene, self._views)
+            yield from evenly(windows, self._evaluation.scenes)
         else:
             for k in range(self._evaluation.samples):
                 rng = np.random.default_rng([self._evaluation.seed, place, k])

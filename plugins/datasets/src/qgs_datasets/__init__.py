@@ -5,11 +5,12 @@ from qgs_datasets.bounded import Bounded
 from qgs_datasets.chunks import ChunksSource
 from qgs_datasets.dl3dv import Dl3dvSource
 from qgs_datasets.farthest import Farthest
+from qgs_datasets.overlapping import Overlapping
 
 plugin = Plugin(
     name="datasets",
     contract_version=1,
-    components=(ChunksSource, Dl3dvSource, Bounded, Farthest),
+    components=(ChunksSource, Dl3dvSource, Bounded, Farthest, Overlapping),
     examples=(
         ChunksSource.Config(path="chunks"),  # type: ignore[call-arg]
         Dl3dvSource.Config(path="dl3dv"),  # type: ignore[call-arg]

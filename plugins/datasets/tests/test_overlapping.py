@@ -1,0 +1,97 @@
+"""Views of photos in any order: which are inputs, how far apart, and what they are judged on."""
+
+import numpy as np
+import pytest
+import torch
+from line_scenes import Line, Lines
+from qgs_datasets.overlapping import Overlapping
+
+from qgs.composer import RecipeError, resolve
+from qgs.contracts import EvaluationConfig, ViewsConfig
+from qgs.data.evaluation import EvaluationPlan
+from qgs.types import Cameras
+
+DEPTH = 10.0
+VIEWS = ViewsConfig(inputs=2, targets=3)
+SHUFFLED = torch.randperm(40, generator=torch.Generator().manual_seed(0))
+
+
+class Arc(Line):
+    """40 cameras .5 apart around what they look at, DEPTH away; files in an order of chance."""
+
+    @property
+    def cameras(self) -> Cameras:
+        angle = 0.5 / DEPTH * (SHUFFLED - 20).double()
+        c2w = torch.eye(4).double().repeat(40, 1, 1)
+        c2w[:, 0, 0] = c2w[:, 2, 2] = angle.cos()
+        c2w[:, 0, 2], c2w[:, 2, 0] = -angle.sin(), angle.sin()
+        c2w[:, :3, 3] = -DEPTH * c2w[:, :3, 2]
+        return Cameras(c2w, torch.tensor([8.0, 8, 4, 4]).expand(40, 4), (8, 8))
+
+
+def draws(count: int, **options: object) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    sampler = Overlapping(Overlapping.Config.model_validate(options))
+    scene = Arc(40, held_out=(0, 8, 16))
+    return [sampler.draw(scene, VIEWS, np.random.default_rng(k), 0) for k in range(count)]
+
+
+def steps(frames: tuple[int, ...]) -> list[int]:
+    """Places of frames on the arc."""
+    return sorted(int(SHUFFLED[frame]) for frame in frames)
+
+
+def test_inputs_stand_beside_the_target_wherever_their_files_are() -> None:
+    found = draws(200)
+    for inputs, targets in found:
+        assert list(inputs) == sorted({*inputs})
+        assert len(targets) == 3
+        assert not {0, 8, 16} & {*inputs, *targets}
+        assert not {*inputs} & {*targets}
+        (target,) = steps(targets[:1])
+        assert min(abs(target - place) for place in steps(inputs)) <= 10  # .5 depths
+    apart = [steps(inputs)[1] - steps(inputs)[0] for inputs, _ in found]
+    assert min(apart) <= 2
+    assert max(apart) >= 6
+    assert len({inputs for inputs, _ in found}) > 100
+
+
+def test_apart_moves_inputs_apart() -> None:
+    near, far = (
+        np.mean([np.ptp(steps(inputs)) for inputs, _ in draws(100, apart=(factor, factor))])
+        for factor in (0.5, 2.0)
+    )
+    assert far > 2 * near
+
+
+def test_a_sample_is_a_function_of_its_seed() -> None:
+    assert draws(20) == draws(20)
+
+
+def test_every_held_out_photo_is_judged_with_inputs_beside_it() -> None:
+    scene = Arc(40, held_out=(0, 8, 16))
+    sampler = Overlapping(Overlapping.Config())
+    plan = EvaluationPlan(Lines(scene), VIEWS, EvaluationConfig(), sampler=sampler)
+    samples = [*plan.samples()]
+    assert [sample.target_frames for sample in samples] == [(0,), (8,), (16,)]
+    for sample in samples:
+        first, last = steps(sample.input_frames)
+        assert first < int(SHUFFLED[sample.target_frames[0]]) < last
+
+
+def test_photos_of_many_times_are_judged_in_their_order_and_not_drawn() -> None:
+    scene, sampler = Arc(40, held_out=(3,)), Overlapping(Overlapping.Config())
+    scene.times = torch.arange(40).double()
+    assert sampler.windows(scene, VIEWS) == []
+    with pytest.raises(ValueError, match="qgs/span"):
+        sampler.draw(scene, VIEWS, np.random.default_rng(0), 0)
+
+
+def test_a_scene_of_as_many_photos_as_inputs_is_refused() -> None:
+    with pytest.raises(ValueError, match="'line2' has 2 photos"):
+        Overlapping(Overlapping.Config()).draw(Line(2), VIEWS, np.random.default_rng(0), 0)
+
+
+@pytest.mark.parametrize("apart", ["[2, 1]", "[0, 1]"])
+def test_bounds_are_ordered(apart: str) -> None:
+    with pytest.raises(RecipeError, match="least"):
+        resolve("finetune/photos.yaml", [f"view_sampler.apart={apart}"])
