@@ -58,7 +58,7 @@ def main() -> None:
     trained = sorted(options.study.glob("runs/*/seed-*/evaluation/protocol.json"))
     if not trained:
         raise SystemExit(f"{options.study} has no trained runs: qgs study makes them")
-    scores = measured(options.out, cases, [file.parents[1] for file in trained])
+    scores = measured(options, cases, [file.parents[1] for file in trained])
     reported, runs = results(options.study), runs_of(scores)
     order = dict.fromkeys(row["variant"] for row in reported["table"])
     names = ["nearest", *(name for name in order if name in runs)]
@@ -98,12 +98,17 @@ def windows(options: argparse.Namespace) -> Iterator[Case]:
                 yield Case(scene, recipe.views, *window, sample)
 
 
-def measured(file: Path | None, cases: list[Case], trained: list[Path]) -> Scores:
+def measured(options: argparse.Namespace, cases: list[Case], trained: list[Path]) -> Scores:
     """Scores of the nearest photo and of all trained runs; those that the file has are kept."""
-    windows_of = [[case.scene.name, [*case.inputs], [*case.targets]] for case in cases]
+    file: Path | None = options.out
+    of = {
+        "study": str(options.study.resolve()),
+        "like": options.like,
+        "windows": [[case.scene.name, [*case.inputs], [*case.targets]] for case in cases],
+    }
     known = json.loads(file.read_text("utf-8")) if file and file.exists() else None
-    if known and known["windows"] != windows_of:
-        raise SystemExit(f"{file} has scores of other windows: name another file")
+    if known and any(known[key] != value for key, value in of.items()):
+        raise SystemExit(f"{file} has scores of another study, or windows: name another file")
     scores: Scores = known["scores"] if known else {"nearest/": [copied(case) for case in cases]}
     for run in trained:
         name = "/".join(run.parts[-2:])
@@ -111,7 +116,7 @@ def measured(file: Path | None, cases: list[Case], trained: list[Path]) -> Score
             model = load(run, "cpu").eval()
             scores[name] = [score(model, case) for case in cases]
             if file:
-                write_text(file, json.dumps({"windows": windows_of, "scores": scores}, indent=1))
+                write_text(file, json.dumps(of | {"scores": scores}, indent=1))
     return scores
 
 

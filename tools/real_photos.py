@@ -23,16 +23,17 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+from qgs_datasets.overlapping import apart
 from qgs_refine import refine
 from qgs_viewer.contest import checkpoints, recipes_alike
 
-from qgs.analysis.depth import scene_depth
-from qgs.analysis.inputs import choose_windows, trained_ratios
 from qgs.analysis.scale import ScaleSearch, at_factors, constant_scale
 from qgs.cli.options import parse_size
 from qgs.contracts import Frames, Scene, ViewsConfig
+from qgs.data.depth import scene_depth
 from qgs.data.domain import Domain
 from qgs.data.evaluation import held_out_windows
+from qgs.data.inputs import choose_windows
 from qgs.data.samples import Sample, make_sample, own_world
 from qgs.geometry.rays import pixel_directions
 from qgs.geometry.transforms import to_camera, to_pixels
@@ -154,13 +155,6 @@ def chosen(
     windows = held_out_windows(scene, views)
     step = math.ceil(len(windows) / count)
     return windows[::step]
-
-
-def apart(domain: Domain, factor: float) -> Domain:
-    """As `domain`, with inputs `factor` times as far apart and turned as it has the best ones."""
-    (low, high), turn = trained_ratios(domain)
-    ends = {"baseline": [factor * low, factor * high], "turn": [0.0, factor * turn]}
-    return Domain({**ends, "depth": [1.0, 1.0]}, domain.samples)
 
 
 def warped_by_plane(inputs: Views, targets: Cameras, depth: float) -> torch.Tensor:

@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from qgs.analysis.inputs import NOVEL, Frusta, Window, choose_windows
 from qgs.analysis.scale import FoundScale
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import SEARCHED, Domain, remedies
 from qgs.data.evaluation import ViewsOf
+from qgs.data.inputs import NOVEL, Frusta, Window, choose_windows
 from qgs.data.samples import Sample, evenly, make_sample, moments, own_world, spread
 from qgs.geometry.poses import relative_to, scaled
 from qgs.geometry.transforms import moved

@@ -71,7 +71,7 @@ def reconstruct(
     photos: a folder of photos and cameras, or its URL; or Views (1, V) in any world, which all
         become inputs unless `frames` names some. OpenCV cameras, images in [0, 1].
     inputs: how many; the recipe's number by default.
-    frames: which photos, by number or file name; by default see `qgs.analysis.inputs`.
+    frames: which photos, by number or file name; by default see `qgs.data.inputs`.
     compare: photos to compare with, "none" or no frames for none; of a folder, by default those
         near the inputs of every eighth photo, which is held out.
     size: (H, W) of the photos of a folder; by default see `chosen_scene`.

@@ -169,7 +169,10 @@ class ViewSampler(Component):
         """
 
     def windows(self, scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
-        """Inputs and targets that judge a scene by held-out photos; none for `views.gap`'s."""
+        """Input and target frames of each window that a scene is judged on.
+
+        Empty by default: then `EvaluationPlan` has windows in the order of frames.
+        """
         return []
 
     def options(self, step: int) -> Any:

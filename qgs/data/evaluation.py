@@ -32,7 +32,6 @@ class IndexEntry(BaseModel):
 EvaluationIndex: TypeAlias = Mapping[str, IndexEntry | None]
 """Scene name to its frames; None for a scene that is listed but not judged."""
 
-WindowsOf: TypeAlias = Callable[[Scene], Sequence[tuple[Frames, Frames]]]
 """From a scene to input and target frames of its samples."""
 ViewsOf: TypeAlias = Callable[[Scene, Frames, Frames], ViewsConfig]
 """From a scene, input and target frames to the settings with which their sample is made."""
@@ -84,11 +83,11 @@ class EvaluationPlan:
     """The scenes of a test split that are judged, and on which views; never mirrored.
 
     With an index, its scenes and frames. Without one, of the first `evaluation.scenes` scenes:
-    of a scene with held-out frames `sampler.windows`, else `held_out_windows`, evenly thinned to
-    `evaluation.scenes`; of the others `evaluation.samples` samples, inputs drawn by `sampler`
-    (default: `Span`) as at the end of training with `evaluation.seed`, targets the other frames of
-    the span, or of one time. Targets of T times are T samples. views_of: settings of a sample, such
-    as its scale. windows_of: windows of a scene that does not move. depths: targets have true ones.
+    the windows of `sampler` (default: `Span`), else of a scene with held-out frames
+    `held_out_windows`, evenly thinned to `evaluation.scenes`; else `evaluation.samples` samples,
+    inputs drawn by `sampler` as at the end of training with `evaluation.seed`, targets the other
+    frames of the span, or of one time. Targets of T times are T samples. views_of: makes the
+    settings of a sample, such as its scale. depths: targets have true depth where scenes do.
 
     wanted, null, unlisted: see `qgs.engine.results.Evaluation`. framing: of the first photo,
     once `samples` has run. Raises ValueError without scenes.
@@ -102,7 +101,6 @@ class EvaluationPlan:
         index: EvaluationIndex | None = None,
         sampler: ViewSampler | None = None,
         views_of: ViewsOf | None = None,
-        windows_of: WindowsOf | None = None,
         depths: bool = False,
     ) -> None:
         self.framing: str | None = None
@@ -111,7 +109,7 @@ class EvaluationPlan:
             raise ValueError(f"the data source {type(source).name!r} has no test scenes")
         self._views, self._evaluation, self._index = views, evaluation, index
         self._views_of = views_of or (lambda *window: views)
-        self._windows_of, self._depths = windows_of, depths
+        self._depths = depths
         self._sampler = sampler or Span(Span.Config())
         names = source.names("test")
         self._places = {name: place for place, name in enumerate(names)}
@@ -141,13 +139,12 @@ class EvaluationPlan:
 
     def _choices(self, scene: Scene, place: int) -> Iterator[tuple[Frames, Frames]]:
         """Input and target frames of each sample."""
-        windows_of = self._windows_of if scene.times is None else None
         if self._index is not None:
             yield _named(scene, self._index)
-        elif scene.held_out or windows_of:
-            windows = windows_of(scene) if windows_of else self._sampler.windows(scene, self._views)
-            windows = windows or held_out_windows(scene, self._views)
+        elif windows := self._sampler.windows(scene, self._views):
             yield from evenly(windows, self._evaluation.scenes)
+        elif scene.held_out:
+            yield from evenly(held_out_windows(scene, self._views), self._evaluation.scenes)
         else:
             for k in range(self._evaluation.samples):
                 rng = np.random.default_rng([self._evaluation.seed, place, k])

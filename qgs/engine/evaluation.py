@@ -10,15 +10,9 @@ import torch
 
 from qgs.composer import Recipe
 from qgs.composer.registry import BUILTIN, component_failure
-from qgs.contracts import Column, Metric, MetricInput, SceneSource
+from qgs.contracts import Column, Metric, MetricInput, SceneSource, ViewSampler
 from qgs.data.domain import OF_RECIPES, SEARCHED, Domain, remedies, verdict
-from qgs.data.evaluation import (
-    EvaluationPlan,
-    SceneFailure,
-    ViewsOf,
-    WindowsOf,
-    one_line,
-)
+from qgs.data.evaluation import EvaluationPlan, SceneFailure, ViewsOf, one_line
 from qgs.data.samples import Sample, stack_views
 from qgs.engine.protocol import index_of, protocol_of
 from qgs.engine.results import TUNING, Evaluation, SceneScore
@@ -41,7 +35,7 @@ def evaluate(
     trained_on: Domain | None = None,
     options: Mapping[str, str] = OF_RECIPES,
     views_of: ViewsOf | None = None,
-    windows_of: WindowsOf | None = None,
+    sampler: ViewSampler | None = None,
 ) -> Evaluation:
     """Evaluate `model` by the metrics of `recipe` on its test views, where the model is.
 
@@ -49,17 +43,19 @@ def evaluate(
     model's mode. step: optimiser steps behind the weights. batch: scenes in one forward pass; with
     tuning each passes alone. observe: called with (scenes done, all scenes). trained_on: the domain
     of the model, empty where it is unknown; None leaves out the remark on it. options: what remarks
-    call those of `qgs.data.domain.REMEDIES`. views_of, windows_of: see `EvaluationPlan`.
+    call those of `qgs.data.domain.REMEDIES`. views_of: see `EvaluationPlan`.
+    sampler: by default the recipe's.
+
     Raises what opening the data source or the index and `Measures` raise, and ValueError when no
     scene could be scored or `batch` is less than 1.
     """
     if batch < 1:
         raise ValueError(f"batch is how many scenes pass together, at least 1, got {batch}")
     source, index = recipe.build_data(), index_of(recipe)
-    sampler = recipe.build_view_sampler()
+    sampler = sampler or recipe.build_view_sampler()
     measures = Measures(recipe)
     # Depth maps cost as much as photos to decode.
-    choices = index, sampler, views_of, windows_of, "true_depth" in measures.needed
+    choices = index, sampler, views_of, "true_depth" in measures.needed
     plan = EvaluationPlan(source, recipe.views, recipe.evaluation, *choices)
     scorer = _Scorer(model, recipe, measures)
     training = model.training

@@ -42,8 +42,8 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     found = _differences(weights, model, count)
     if found:
         first = (
-            f"init_from: {path} does not fit this recipe; only the number of queries and what its "
-            "encoder and head adapt, such as the size of patches, to a multiple, may differ:"
+            f"init_from: {path} does not fit this recipe; only the number of queries and sizes "
+            "that encoder and head adapt (of patches, to a multiple) may differ:"
         )
         trained = "options of the model that the checkpoint was trained with:"
         raise CheckpointError("\n  ".join([first, *found, trained, *(f"  {o}" for o in options)]))

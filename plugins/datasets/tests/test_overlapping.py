@@ -29,10 +29,12 @@ class Arc(Line):
         return Cameras(c2w, torch.tensor([8.0, 8, 4, 4]).expand(40, 4), (8, 8))
 
 
-def draws(count: int, **options: object) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+def draws(
+    count: int, views: ViewsConfig = VIEWS, **options: object
+) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
     sampler = Overlapping(Overlapping.Config.model_validate(options))
     scene = Arc(40, held_out=(0, 8, 16))
-    return [sampler.draw(scene, VIEWS, np.random.default_rng(k), 0) for k in range(count)]
+    return [sampler.draw(scene, views, np.random.default_rng(k), 0) for k in range(count)]
 
 
 def steps(frames: tuple[int, ...]) -> list[int]:
@@ -78,17 +80,49 @@ def test_every_held_out_photo_is_judged_with_inputs_beside_it() -> None:
         assert first < int(SHUFFLED[sample.target_frames[0]]) < last
 
 
-def test_photos_of_many_times_are_judged_in_their_order_and_not_drawn() -> None:
+def test_without_held_out_photos_four_of_all_are_judged() -> None:
+    sampler = Overlapping(Overlapping.Config())
+    found = sampler.windows(Arc(40), VIEWS)
+    assert [targets for _, targets in found] == [(0,), (13,), (26,), (39,)]
+    for inputs, (target,) in found:
+        assert target not in inputs
+        assert min(abs(int(SHUFFLED[target]) - place) for place in steps(inputs)) <= 5
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_any_number_of_inputs(count: int) -> None:
+    for inputs, targets in draws(20, VIEWS.model_copy(update={"inputs": count})):
+        assert len({*inputs}) == count
+        assert min(abs(int(SHUFFLED[targets[0]]) - place) for place in steps(inputs)) <= 10
+
+
+def test_cameras_without_a_common_point_and_few_photos() -> None:
+    """Their depth is swept; two photos are inputs, and the third is every target."""
+    scene = Line(3, step=0.1)
+    inputs, targets = Overlapping(Overlapping.Config()).draw(scene, VIEWS, seeded(), 0)
+    assert len({*inputs}) == 2
+    assert {*targets} == {0, 1, 2} - {*inputs}
+    assert len(targets) == 3
+
+
+def seeded() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def test_a_scene_that_moves_is_judged_in_its_order_and_not_drawn() -> None:
     scene, sampler = Arc(40, held_out=(3,)), Overlapping(Overlapping.Config())
     scene.times = torch.arange(40).double()
     assert sampler.windows(scene, VIEWS) == []
-    with pytest.raises(ValueError, match="qgs/span"):
-        sampler.draw(scene, VIEWS, np.random.default_rng(0), 0)
+    with pytest.raises(ValueError, match=r"moves: .* qgs/span"):
+        sampler.draw(scene, VIEWS, seeded(), 0)
 
 
-def test_a_scene_of_as_many_photos_as_inputs_is_refused() -> None:
-    with pytest.raises(ValueError, match="'line2' has 2 photos"):
-        Overlapping(Overlapping.Config()).draw(Line(2), VIEWS, np.random.default_rng(0), 0)
+def test_too_few_photos_are_refused() -> None:
+    sampler = Overlapping(Overlapping.Config())
+    with pytest.raises(ValueError, match="'line2' has 2 photos, and needs 3"):
+        sampler.draw(Line(2), VIEWS, seeded(), 0)
+    with pytest.raises(ValueError, match="has 1 photos beside 1 held-out ones, and needs 2"):
+        sampler.windows(Line(2, held_out=(1,)), VIEWS)
 
 
 @pytest.mark.parametrize("apart", ["[2, 1]", "[0, 1]"])

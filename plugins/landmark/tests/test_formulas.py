@@ -16,7 +16,9 @@ from qgs_locus.refinement import AnchorRefinement
 from torch import Tensor
 
 from qgs.components.blocks import split_heads
+from qgs.composer import resolve
 from qgs.contracts import ModelDims
+from qgs.engine.initial import initialise
 from qgs.geometry.rays import camera_rays
 from qgs.types import Cameras, ImageMemory, QueryState, Rendering, Views
 
@@ -145,6 +147,21 @@ def test_a_head_of_more_gaussians_starts_from_those_of_the_nearest_cells() -> No
         for head, side in ((small, 2), (large, 4))
     )
     torch.testing.assert_close(sixteen, four.repeat_interleave(2, 2).repeat_interleave(2, 3))
+
+
+def test_a_head_leaves_weights_that_are_not_its_own() -> None:
+    """They are then refused by their names and shapes."""
+    theirs = {"linear.weight": torch.zeros(13, 8), "fc.weight": torch.zeros(28, 8)}
+    found = ColoredHead(ColoredHead.Config(), DIMS).adapted(theirs)
+    assert {name: values.shape for name, values in found.items()} == {
+        name: values.shape for name, values in theirs.items()
+    }
+
+
+def test_the_recipe_of_larger_photos_starts_from_the_shipped_model() -> None:
+    recipe = resolve("rooms/landmark_128.yaml")
+    changes = initialise(recipe.build_model(), recipe)
+    assert "head.linear.weight: (112, 128) -> (224, 128)" in changes
 
 
 def test_centres_add_offsets_in_radii() -> None:

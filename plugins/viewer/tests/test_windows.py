@@ -6,11 +6,11 @@ import pytest
 import textured_room
 import torch
 
-from qgs.analysis.depth import scene_depth
-from qgs.analysis.inputs import choose_windows, trained_ratios
 from qgs.analysis.scenes import GivenScene
 from qgs.contracts import ViewsConfig
+from qgs.data.depth import scene_depth
 from qgs.data.domain import Domain
+from qgs.data.inputs import choose_windows, trained_ratios
 from qgs.geometry.poses import look_at
 from qgs.types import Cameras, Views
 

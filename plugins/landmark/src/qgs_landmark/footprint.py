@@ -20,6 +20,8 @@ from qgs_landmark.places import cells
 COLOR_MARGIN = 0.02
 """Colours of photos keep this far from 0 and 1, where no step would change them."""
 
+_OF_CHANNELS = ("linear.weight", "linear.bias")
+
 
 class FootprintCenters(RadiusScaledCenters):
     """mean = mu + r (u, v, 0) + r posact(offset), in the frame of the anchor's photo.
@@ -73,16 +75,16 @@ class ColoredHead(GaussianHead):
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """A Gaussian takes the weights of the nearest of other cells, which are more or fewer."""
         return {
-            name: values if name.startswith("norm.") else self._of_cells(values)
+            name: self._of_cells(values) if name in _OF_CHANNELS else values
             for name, values in learned.items()
         }
 
     def _of_cells(self, rows: Tensor) -> Tensor:
-        """Rows of channels, for this head's cells."""
+        """Rows of channels of other cells, for this head's; as they are where they are others."""
+        if len(rows) % sum(CHANNELS):
+            return rows
         rows_KC = rows.unflatten(0, (-1, sum(CHANNELS)))
-        own, theirs = (
-            cells(k, rows.new_empty(0).float()) for k in (self.gaussians_per_query, len(rows_KC))
-        )
+        own, theirs = (cells(k, rows) for k in (self.gaussians_per_query, len(rows_KC)))
         return rows_KC[torch.cdist(own, theirs).argmin(-1)].flatten(0, 1)
 
     def forward(self, state: QueryState) -> GaussianAttributes:

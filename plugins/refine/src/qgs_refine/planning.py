@@ -12,13 +12,13 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from qgs.analysis.inputs import choose_windows
 from qgs.analysis.scenes import Size, installed_sources, named_scene, reconstruct
 from qgs.cli.options import scale_settings
 from qgs.composer import resolve
 from qgs.composer.registry import load_usable_plugins
 from qgs.contracts import Frames, Scene
 from qgs.data.domain import Domain
+from qgs.data.inputs import choose_windows
 from qgs.data.recognition import open_for
 from qgs.data.samples import held_out_frames, views_in
 from qgs.io.checkpoint import load

@@ -11,9 +11,9 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from qgs.analysis.depth import scene_depth
 from qgs.analysis.scenes import Size
 from qgs.contracts import Scene, ViewsConfig
+from qgs.data.depth import scene_depth
 from qgs.data.photos.source import PhotoScene
 from qgs.data.samples import own_world, views_in
 from qgs.drawing import images

@@ -15,15 +15,16 @@ import yaml
 from rich import box
 from rich.table import Table
 
-from qgs.analysis.inputs import Window, choose_windows
 from qgs.analysis.scale import ScaleSearch, photo_settings
 from qgs.analysis.scenes import Size, holding_out, installed_sources, size_multiple, whole_size
 from qgs.composer import Recipe, resolve
 from qgs.composer.schema import summary_of
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.domain import OF_RECIPES, Domain
-from qgs.data.evaluation import WindowsOf, evaluation_samples
+from qgs.data.evaluation import evaluation_samples
+from qgs.data.inputs import Window, choose_windows
 from qgs.data.recognition import is_training_data, open_for
+from qgs.data.view_samplers import Span
 from qgs.engine.distributed import choose_device
 from qgs.engine.evaluation import evaluate
 from qgs.engine.results import Evaluation
@@ -50,11 +51,34 @@ OF_THE_METHOD = (
 unit of a model's world, which no score depends on."""
 
 
+class PhotoWindows(Span):
+    """WINDOWS windows of each scene by `choose_windows`, chosen once."""
+
+    def __init__(self, trained_on: Domain) -> None:
+        super().__init__(Span.Config())
+        self._trained_on, self._known = trained_on, dict[str, list[Window]]()
+
+    def windows(self, scene: Scene, views: ViewsConfig) -> list[Window]:
+        """See `ViewSampler`; scenes that move have none."""
+        if scene.times is not None:
+            return []
+        if scene.name not in self._known:
+            windows = choose_windows(scene, views, self._trained_on, WINDOWS)
+            if not any(compared for _, compared in windows):
+                raise ValueError(
+                    f"all {len(scene)} photos are inputs, none is left to compare with: add one "
+                    "between them, or see what a model makes of them by qgs view MODEL PHOTOS"
+                )
+            self._known[scene.name] = windows
+        return self._known[scene.name]
+
+
 @dataclass(frozen=True)
 class Entry:
     """A judged model with its recipe. progress: how far its training has come.
 
-    search: the scales that were found for it. windows_of: see `EvaluationPlan`.
+    search: the scales that were found for it. windows: of a user's
+    photos.
     """
 
     recipe: Recipe
@@ -62,7 +86,7 @@ class Entry:
     evaluation: Evaluation
     search: ScaleSearch
     progress: str = ""
-    windows_of: WindowsOf | None = None
+    windows: PhotoWindows | None = None
 
 
 def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:
@@ -121,7 +145,7 @@ def judge(
 ) -> list[Entry]:
     """The models in `files` on unseen scenes, or on held-out photos; raises as `recipes_alike`."""
     recipes, entries = recipes_alike(files, photos, size, overrides), list[Entry]()
-    windows_of: WindowsOf | None = None
+    windows: PhotoWindows | None = None
     for name, path in files.items():
         with CheckpointFile(path) as file:
             model, step = file.model(choose_device(device)), file.step
@@ -132,38 +156,20 @@ def judge(
         search, domain = ScaleSearch(model, recipe.views), model.trained_on
         # those of the first model for all, so that one protocol judges them
         if not entries and photos is not None:
-            windows_of = photo_windows(recipe.views, domain)
+            windows = PhotoWindows(domain or Domain())
         evaluation = evaluate(
             model,
             recipe,
             trained_on=domain,
             options=options,
             views_of=search,
-            windows_of=windows_of,
+            sampler=windows,
         )
         text = about(path) or describe(recipe)
         entry = entry_of(name, recipe, evaluation, search, text, curves_of(path))
         progress = f"{name}: {progress}"
-        entries.append(replace(entry, progress=progress, windows_of=windows_of))
+        entries.append(replace(entry, progress=progress, windows=windows))
     return entries
-
-
-def photo_windows(views: ViewsConfig, trained_on: Domain | None) -> WindowsOf:
-    """WINDOWS windows of each scene by `choose_windows`, chosen once."""
-    known = dict[str, list[Window]]()
-
-    def windows_of(scene: Scene) -> list[Window]:
-        if scene.name not in known:
-            windows = choose_windows(scene, views, trained_on or Domain(), WINDOWS)
-            if not any(compared for _, compared in windows):
-                raise ValueError(
-                    f"all {len(scene)} photos are inputs, none is left to compare with: add one "
-                    "between them, or see what a model makes of them by qgs view MODEL PHOTOS"
-                )
-            known[scene.name] = windows
-        return known[scene.name]
-
-    return windows_of
 
 
 def recipes_alike(
@@ -285,7 +291,7 @@ def remarks(entries: Sequence[Entry]) -> list[str]:
 
 def chosen_windows(entry: Entry) -> Iterator[str]:
     """A line on each scene whose windows were chosen, by names of photos in their folder."""
-    for score in entry.evaluation.scores if entry.windows_of else ():
+    for score in entry.evaluation.scores if entry.windows else ():
         frames = {frame for window in score.views for part in window for frame in part}
         names = {frame: score.names.get(frame, str(frame)) for frame in frames}
         folder = f"{os.path.commonpath([os.path.dirname(name) for name in names.values()])}/"
@@ -347,7 +353,7 @@ def report_of(
             entry.recipe.views,
             few,
             views_of=entry.search,
-            windows_of=entry.windows_of,
+            sampler=entry.windows or entry.recipe.build_view_sampler(),
             depths=entry is unlike[0],
         )[:PICTURED_SCENES]
         for entry in unlike
@@ -361,7 +367,7 @@ def report_of(
     device = torch.cuda.get_device_name() if gpu else cores
     threads = counted(torch.get_num_threads(), "thread")
     names = listed((entry.contender.name for entry in entries), most=3)
-    judged = "beside" if entries[0].windows_of else "between"
+    judged = "beside" if entries[0].windows else "between"
     return Report(
         columns=evaluation.columns,
         title=f"{names}: {scenes.lower()}",

@@ -67,11 +67,11 @@ def open_exhibition(
     source = recipe.build_data()
     models = {name: load(file, device) for name, file in files.items()}
     first = next(iter(models))
-    search, windows_of = ScaleSearch(models[first], recipe.views), None
+    search, sampler = ScaleSearch(models[first], recipe.views), recipe.build_view_sampler()
     if photos is not None:
-        windows_of = contest.photo_windows(recipe.views, models[first].trained_on)
-    choices = {"views_of": search, "windows_of": windows_of}
-    samples = evaluation_samples(source, recipe.views, recipe.evaluation, **choices, depths=True)
+        sampler = contest.PhotoWindows(models[first].trained_on or Domain())
+    choices = {"views_of": search, "depths": True}
+    samples = evaluation_samples(source, recipe.views, recipe.evaluation, sampler, **choices)
     names = dict.fromkeys(sample.scene for sample in samples)
     if scene is not None and scene not in names:
         raise ValueError(f"--scene: {scene!r} is not judged; scenes are {listed(names)}")

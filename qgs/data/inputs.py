@@ -7,8 +7,8 @@ from typing import TypeAlias
 import numpy as np
 import torch
 
-from qgs.analysis.depth import scene_depth
 from qgs.contracts import Frames, Scene, ViewsConfig
+from qgs.data.depth import scene_depth
 from qgs.data.domain import Domain
 from qgs.data.samples import evenly
 from qgs.geometry.rays import pixel_directions
@@ -75,7 +75,7 @@ def trained_ratios(trained_on: Domain) -> tuple[tuple[float, float], float]:
 
 
 class Frusta:
-    """Cameras in units of the depth that they look at, and what each sees of the others' views."""
+    """Cameras in units of a depth, by default `scene_depth`; what each sees of others' views."""
 
     def __init__(self, scene: Scene, trained_on: Domain, depth: float | None = None) -> None:
         self.scene, self.cameras = scene, scene.cameras
@@ -108,7 +108,7 @@ class Frusta:
         """
         near = self._near(target, usable)
         seen, frames = self.seen(target, near), np.array(near)
-        first, second = np.triu_indices(len(near), k=min(inputs - 1, 1))
+        first, second = np.triu_indices(len(near), 1) if inputs > 1 else (np.arange(len(near)),) * 2
         a, b = frames[first], frames[second]
         # a photo that is almost one of the inputs compares little
         close = np.minimum(self.apart[target, a], self.apart[target, b])
