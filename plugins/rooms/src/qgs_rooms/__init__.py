@@ -8,6 +8,7 @@ plugin = Plugin(
     contract_version=1,
     components=(RoomsSource,),
     models={
+        "landmark-128": "models/landmark-128.safetensors",
         "landmark-64": "models/landmark-64.safetensors",
         "locus-128": "models/locus-128.safetensors",
         "locus-64": "models/locus-64.safetensors",
