@@ -94,7 +94,7 @@ def test_only_plugins_that_are_used_are_needed(
     without_rooms = {n: e for n, e in available_plugins().items() if n != "rooms"}
     for module in ("qgs.composer.registry", "qgs.io.checkpoint"):
         monkeypatch.setattr(f"{module}.available_plugins", lambda: without_rooms)
-    assert set(CheckpointFile(path).recipe.releases) == {"qgs", "locus"}
+    assert set(CheckpointFile(path).recipe.releases) == {"qgs", "locus", "datasets"}
     assert qgs.load(path).queries.count == 8
     with pytest.raises(RecipeError, match="offers a plugin `rooms`"):
         qgs.compose(RECIPES / "photos.yaml", SMALL)
