@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 SOURCES = ("qgs", "plugins", "tests", "tools", "docs/examples")
 TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_LINES = 600
-MAX_CORE_LINES, MAX_CORE_FILES, MAX_LINES_OF_CORE_TESTS = 17_700, 130, 14_600
+MAX_CORE_LINES, MAX_CORE_FILES, MAX_LINES_OF_CORE_TESTS = 17_698, 130, 14_600
 MACHINE_PATH = re.compile(r"(?<![\w.$}])/(?:home|root|work|Users|opt|mnt|tmp)/\w")
 
 

@@ -32,7 +32,6 @@ class IndexEntry(BaseModel):
 EvaluationIndex: TypeAlias = Mapping[str, IndexEntry | None]
 """Scene name to its frames; None for a scene that is listed but not judged."""
 
-"""From a scene to input and target frames of its samples."""
 ViewsOf: TypeAlias = Callable[[Scene, Frames, Frames], ViewsConfig]
 """From a scene, input and target frames to the settings with which their sample is made."""
 

@@ -44,7 +44,7 @@ def evaluate(
     tuning each passes alone. observe: called with (scenes done, all scenes). trained_on: the domain
     of the model, empty where it is unknown; None leaves out the remark on it. options: what remarks
     call those of `qgs.data.domain.REMEDIES`. views_of: see `EvaluationPlan`.
-    sampler: by default the recipe's.
+    sampler: of views, by default the recipe's.
 
     Raises what opening the data source or the index and `Measures` raise, and ValueError when no
     scene could be scored or `batch` is less than 1.

@@ -71,11 +71,13 @@ class Overlapping(ViewSampler):
         """See `ViewSampler`; none where a scene moves."""
         if scene.times is not None:
             return []
-        usable = _enough(scene, views.inputs + (not scene.held_out))
-        frusta = self._frusta(scene)
-        judged = sorted(scene.held_out) or evenly(usable, _JUDGED)
-        found = [(frusta.window(target, usable, views.inputs)[1], target) for target in judged]
-        return [(_ascending(inputs), (target,)) for inputs, target in found]
+        # without held-out photos the target is one of those that inputs are chosen from
+        usable = _enough(scene, views.inputs if scene.held_out else views.inputs + 1)
+        frusta, found = self._frusta(scene), []
+        for target in sorted(scene.held_out) or evenly(usable, _JUDGED):
+            _, inputs = frusta.window(target, usable, views.inputs)
+            found.append((_ascending(inputs), (target,)))
+        return found
 
     def _frusta(self, scene: Scene, factor: float = 1.0) -> Frusta:
         """Of cameras that may stand, and turn, `factor` times as far apart as usual."""

@@ -80,7 +80,10 @@ class ColoredHead(GaussianHead):
         }
 
     def _of_cells(self, rows: Tensor) -> Tensor:
-        """Rows of channels of other cells, for this head's; as they are where they are others."""
+        """Rows (K' * 14, ...) of other cells as those (K * 14, ...) of this head's.
+
+        Rows that do not divide into channels are of another kind of head, and stay.
+        """
         if len(rows) % sum(CHANNELS):
             return rows
         rows_KC = rows.unflatten(0, (-1, sum(CHANNELS)))

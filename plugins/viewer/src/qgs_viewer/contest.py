@@ -77,8 +77,7 @@ class PhotoWindows(Span):
 class Entry:
     """A judged model with its recipe. progress: how far its training has come.
 
-    search: the scales that were found for it. windows: of a user's
-    photos.
+    search: the scales that were found for it. windows: of a user's photos.
     """
 
     recipe: Recipe
