@@ -3,7 +3,8 @@
     python tools/gpu_check.py OUT
 
 Each step is a command of its own with a time limit; a step that fails does not stop the others.
-OUT/report.md has commands, results and times, OUT/logs all output.
+Those that measure no time run side by side, the others alone. OUT/report.md has commands, results
+and times, OUT/logs all output.
 """
 
 import json
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,8 +32,9 @@ from qgs_locus.ray_bias import ray_tokens as locus_tokens
 from torch import Tensor
 
 ROOT = Path(__file__).parents[1]
-TINY = ("tokengs", "locus", "ellipsoid", "c3g", "gslrm", "globalsplat")
+TINY = ("tokengs", "locus", "landmark", "ellipsoid", "c3g", "gslrm", "mvsplat", "globalsplat")
 PAIR = ("tokengs/dl3dv_4096_4views.yaml", "locus/dl3dv_4096_4views.yaml")
+SMALLER = ("locus/dl3dv.yaml", "landmark/dl3dv.yaml")
 KERNELS: Any = ("plain", "blocks", "triton")
 TOLERANCES = {torch.float32: 1e-5, torch.bfloat16: 4 * 2**-7, torch.float16: 4 * 2**-10}
 """Half precision rounds the output once, and the kernels the weights and their derivative; the
@@ -47,37 +50,57 @@ class Step:
     limit: float = 900
 
 
-def steps(out: Path) -> Iterator[Step]:
-    """All checks; those that others depend on come first."""
+def checks(out: Path) -> Iterator[list[Step]]:
+    """Lists of steps that may run side by side; those that others depend on come first."""
     python = sys.executable
     tests = (python, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-rs", "-m", "")
     compiled = "import gsplat.cuda._backend as b; assert b._C"
-    yield Step("gsplat compiles", [python, "-c", compiled], 1800)
-    contract = ("tests/renderers", "tests/engine/test_objective.py", "-k", "gsplat")
-    yield Step("renderer contract on gsplat", [*tests, *contract], 1800)
-    for name in TINY:
+    yield [
+        Step("gsplat compiles", [python, "-c", compiled], 1800),
+        Step("Triton kernels", [*tests, "plugins/ellipsoid/tests/test_attention_triton.py"]),
+    ]
+    contract = ("tests/renderers", "tests/engine/test_training_pass.py", "-k", "gsplat")
+    yield [
+        Step("renderer contract on gsplat", [*tests, *contract], 1800),
+        *(
+            training(out, name, precision)
+            for name in TINY
+            for precision in ("float32", "bf16")
+        ),
+        two_processes(out),
+    ]  # fmt: skip
+    yield [Step("attention against float64, timed", [python, __file__, "--attention"])]
+    narrow = ("--set", "model.width=384", "--set", "model.heads=6")
+    for name, pair, changes in (
+        ("at 1,024 anchors", SMALLER, (*narrow, "--views", "4", "--size", "256x256")),
+        ("at published size", PAIR, ("--memory", "--step")),
+    ):
         for precision in ("float32", "bf16"):
-            run = ("--out", str(out / "runs" / f"{name}-{precision}"), "--device", "cuda")
-            changes = ("--set", "training.steps=200", "--set", f"training.precision={precision}")
-            command = ["qgs", "train", f"tiny/{name}.yaml", *run, *changes]
-            yield Step(f"training of {name}, {precision}", command, 600)
-    # NCCL refuses two processes on one GPU; gloo is for CPUs.
-    device = "cuda" if torch.cuda.device_count() > 1 else "cpu"
-    launch = (python, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
-    run = ("--out", str(out / "runs/two"), "--set", "training.steps=50", "--device", device)
-    program = str(Path(python).with_name("qgs"))
-    command = [*launch, program, "train", "tiny/locus.yaml", *run]
-    yield Step(f"DDP of two processes, {device}", command, 600)
-    for precision in ("float32", "bf16"):
-        options = ("--memory", "--step", "--precision", precision, "--device", "cuda")
-        file = ("--json", f"bench-{precision}.json", "--rounds", "30", "--warmup", "5")
-        command = ["qgs", "bench", *PAIR, *options, *file]
-        yield Step(f"latency and memory at published size, {precision}", command)
-    yield Step("Triton kernels", [*tests, "plugins/ellipsoid/tests/test_attention_triton.py"])
-    yield Step("attention against float64, timed", [python, __file__, "--attention"])
+            options = ("--precision", precision, "--device", "cuda", "--rounds", "30")
+            file = ("--warmup", "5", "--json", f"{name.replace(' ', '-')}-{precision}.json")
+            command = ["qgs", "bench", *pair, *changes, *options, *file]
+            yield [Step(f"latency {name}, {precision}", command)]
     sweep = ("--sweep", "views=2..32", "--sweep", "queries=256..16384", "--json", "sweep.json")
     options = ("--device", "cuda", "--rounds", "5")
-    yield Step("growth with views and queries", ["qgs", "bench", *PAIR, *sweep, *options], 1800)
+    yield [Step("growth with views and queries", ["qgs", "bench", *PAIR, *sweep, *options], 1800)]
+
+
+def training(out: Path, name: str, precision: str) -> Step:
+    """A short training of a tiny recipe on the GPU."""
+    run = ("--out", str(out / "runs" / f"{name}-{precision}"), "--device", "cuda", "--threads", "1")
+    changes = ("--set", "training.steps=200", "--set", f"training.precision={precision}")
+    command = ["qgs", "train", f"tiny/{name}.yaml", *run, *changes]
+    return Step(f"training of {name}, {precision}", command, 600)
+
+
+def two_processes(out: Path) -> Step:
+    """DDP. NCCL refuses two processes on one GPU; gloo is for CPUs."""
+    device = "cuda" if torch.cuda.device_count() > 1 else "cpu"
+    launch = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
+    run = ("--out", str(out / "runs/two"), "--set", "training.steps=50", "--device", device)
+    program = str(Path(sys.executable).with_name("qgs"))
+    command = [*launch, program, "train", "tiny/locus.yaml", *run]
+    return Step(f"DDP of two processes, {device}", command, 600)
 
 
 def run_step(step: Step, out: Path) -> tuple[bool, float, str]:
@@ -108,16 +131,17 @@ def report(out: Path) -> bool:
     lines += ["| step | | seconds |", "|---|---|--:|"]
     outputs: list[str] = []
     good = True
-    for step in steps(out):
-        print(f"{step.name} ...", end=" ", flush=True)
-        passed, seconds, tail = run_step(step, out)
-        verdict = "passed" if passed else "FAILED"
-        print(verdict, f"{seconds:.0f} s", flush=True)
-        lines.append(f"| {step.name} | {verdict} | {seconds:.0f} |")
-        outputs += ["", f"## {step.name}", "", f"`{shlex.join(step.command)}`", "", "```", tail]
-        outputs.append("```")
-        good &= passed
-        (out / "report.md").write_text("\n".join([*lines, *outputs]) + "\n")
+    for steps in checks(out):
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            results = pool.map(lambda step: (step, *run_step(step, out)), steps)
+            for step, passed, seconds, tail in results:
+                verdict = "passed" if passed else "FAILED"
+                print(step.name, verdict, f"{seconds:.0f} s", flush=True)
+                lines.append(f"| {step.name} | {verdict} | {seconds:.0f} |")
+                outputs += ["", f"## {step.name}", "", f"`{shlex.join(step.command)}`", ""]
+                outputs += ["```", tail, "```"]
+                good &= passed
+                (out / "report.md").write_text("\n".join([*lines, *outputs]) + "\n")
     return good
 
 

@@ -7,7 +7,7 @@
 #     pip download --only-binary=:all: --python-version 3.12 --implementation cp \
 #         --platform manylinux_2_28_x86_64 --platform manylinux_2_17_x86_64 --platform manylinux2014_x86_64 \
 #         --no-deps -d WHEELS -r <(pip freeze --exclude-editable | grep -v ^torch) \
-#         gsplat==1.5.3 jaxtyping wadler-lindig ninja hatchling
+#         gsplat==1.5.3 jaxtyping wadler-lindig ninja hatchling editables trove-classifiers
 # Exit code: 0 all steps passed, 1 some failed (the report says which), 2 there is no GPU.
 set -uo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
@@ -29,14 +29,18 @@ fi
 mkdir -p "$out"
 out=$(cd "$out" && pwd)
 environment=$out/environment
-"$python" -m venv --system-site-packages "$environment" || exit 1
+# It sees the packages of $python, which may itself be of an environment.
+"$python" -m venv --without-pip "$environment" || exit 1
+"$python" -c 'import site; print(*site.getsitepackages(), sep="\n")' \
+    >"$("$environment/bin/python" -c 'import site; print(site.getsitepackages()[0])')/outer.pth"
 plugins=()
 for plugin in "$root"/plugins/[a-z]*/; do
     plugins+=(--editable "$plugin")
 done
 # torch stays the machine's: wheels of it in WHEELS are not looked at.
 mapfile -t files < <(find "$wheels" -name '*.whl' ! -name 'torch-*' ! -name 'nvidia_*' ! -name 'triton-*')
-install=("$environment/bin/python" -m pip install -q --no-index --disable-pip-version-check --no-deps)
+install=("$python" -m pip --python "$environment/bin/python" install -q --no-index)
+install+=(--disable-pip-version-check --no-deps)
 "${install[@]}" "${files[@]}" || echo "gpu_check: some wheels could not be installed (see above)" >&2
 "${install[@]}" --no-build-isolation --editable "$root" "${plugins[@]}" || {
     echo "gpu_check: qgs could not be installed (see above); WHEELS must have hatchling" >&2
