@@ -38,7 +38,7 @@ for plugin in "$root"/plugins/[a-z]*/; do
     plugins+=(--editable "$plugin")
 done
 # torch stays the machine's: wheels of it in WHEELS are not looked at.
-mapfile -t files < <(find "$wheels" -name '*.whl' ! -name 'torch-*' ! -name 'nvidia_*' ! -name 'triton-*')
+mapfile -t files < <(find "$wheels" -type f -name '*.whl' ! -name 'torch-*' ! -name 'nvidia_*' ! -name 'triton-*')
 install=("$python" -m pip --python "$environment/bin/python" install -q --no-index)
 install+=(--disable-pip-version-check --no-deps)
 "${install[@]}" "${files[@]}" || echo "gpu_check: some wheels could not be installed (see above)" >&2

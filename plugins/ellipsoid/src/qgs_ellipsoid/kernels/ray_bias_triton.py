@@ -23,7 +23,10 @@ def gradients(queries, tokens, step, gradient, sums):
     a, b, e, u = _parts(queries, tokens, step)
     below, factor, lower = _squared(b), tl.load(queries + 21), tl.load(queries + 22)
     ratio = _squared(a) / below
-    inside = tl.where(-factor * ratio <= lower, 0.0, gradient)
+    at_bound = -factor * ratio <= lower
+    inside = tl.where(at_bound, 0.0, gradient)
+    # gradient - inside would be fused with a product in `gradient`, and leave what rounding lost.
+    to_bound = tl.where(at_bound, gradient, 0.0)
     up = -2 * factor * inside / below
     down = -up * ratio
     a0, a1, a2 = up * a[0], up * a[1], up * a[2]
@@ -58,7 +61,7 @@ def gradients(queries, tokens, step, gradient, sums):
         sums[19] + tl.sum(b2 * u[1], 1),
         sums[20] + tl.sum(b2 * u[2], 1),
         sums[21] - tl.sum(inside * ratio, 1),
-        sums[22] + tl.sum(gradient - inside, 1),
+        sums[22] + tl.sum(to_bound, 1),
     )
 
 

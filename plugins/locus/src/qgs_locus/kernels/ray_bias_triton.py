@@ -24,14 +24,17 @@ def gradients(queries, tokens, step, gradient, sums):
     d0, d1, d2 = tl.load(tokens + 3 * step), tl.load(tokens + 4 * step), tl.load(tokens + 5 * step)
     factor, lower = tl.load(queries + 3), tl.load(queries + 4)
     distance_sq = e0 * e0 + e1 * e1 + e2 * e2
-    inside = tl.where(-factor * distance_sq <= lower, 0.0, gradient)
+    at_bound = -factor * distance_sq <= lower
+    inside = tl.where(at_bound, 0.0, gradient)
+    # gradient - inside would be fused with a product in `gradient`, and leave what rounding lost.
+    to_bound = tl.where(at_bound, gradient, 0.0)
     to_center = -2 * factor * inside
     return (
         sums[0] + tl.sum(to_center * (d1 * e2 - d2 * e1), 1),
         sums[1] + tl.sum(to_center * (d2 * e0 - d0 * e2), 1),
         sums[2] + tl.sum(to_center * (d0 * e1 - d1 * e0), 1),
         sums[3] - tl.sum(inside * distance_sq, 1),
-        sums[4] + tl.sum(gradient - inside, 1),
+        sums[4] + tl.sum(to_bound, 1),
     )
 
 
