@@ -38,8 +38,7 @@ def choose_windows(
     Each has `views.inputs` inputs, none of them held out. A window is made for each photo to
     compare with, a held-out one where there are: of the photos near it those that together see most
     of it, overlap, and stand as far apart as in training. Deterministic; the order of the frames
-    does not matter. held_out: by default the scene's. Raises ValueError for fewer photos than
-    inputs.
+    does not matter. held_out: by default the scene's. ValueError for fewer photos than inputs.
     """
     held, inputs = sorted(scene.held_out if held_out is None else held_out), views.inputs
     usable = [frame for frame in range(len(scene)) if frame not in held]

@@ -11,6 +11,7 @@ from torch import Tensor
 from qgs.contracts import ComponentConfig, Problem, RecipeContext, Renderer, RendererConfig
 from qgs.contracts.component import MissingExtraError
 from qgs.contracts.renderer import background_of, check_inputs, colors_of
+from qgs.renderers.reference import TorchRenderer
 from qgs.types import Cameras, Gaussians, Rendering
 
 
@@ -41,12 +42,13 @@ class GsplatRenderer(Renderer):
         """See `Renderer`; ValueError for tensors not on CUDA, RuntimeError without gsplat."""
         check_inputs(gaussians, cameras)
         _check_supported(gaussians, cameras)
+        if not gaussians.means.shape[1]:  # by their number gsplat's kernels divide
+            return TorchRenderer(self.config)(gaussians, cameras, background)
         rasterization = import_module("gsplat").rasterization  # imported late: it needs CUDA
 
-        config = self.config
         with torch.autocast("cuda", enabled=False):
             gaussians, cameras = gaussians.to(torch.float32), cameras.to(torch.float32)
-            backdrop = background_of(background, config.background, gaussians.means)
+            backdrop = background_of(background, self.config.background, gaussians.means)
             colors, features = colors_of(gaussians, cameras), gaussians.features
             if features is not None:  # further channels, over 0
                 backdrop = F.pad(backdrop, (0, features.shape[-1]))
@@ -67,9 +69,9 @@ class GsplatRenderer(Renderer):
                 Ks=calibration.unflatten(-1, (3, 3)),
                 width=width,
                 height=height,
-                near_plane=config.near,
-                far_plane=config.far,
-                eps2d=config.dilation,
+                near_plane=self.config.near,
+                far_plane=self.config.far,
+                eps2d=self.config.dilation,
                 packed=False,
                 backgrounds=backdrop.expand(*cameras.shape, -1).contiguous(),
                 render_mode="RGB+ED",

@@ -1,5 +1,6 @@
 """`qgs/gsplat` and `qgs/auto` as far as a machine without a GPU can tell."""
 
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -28,9 +29,7 @@ def calls(monkeypatch):
         rgbd = torch.arange(float(channels)).expand(*images, channels)
         return rgbd, torch.full((*images, 1), 0.25), {}
 
-    monkeypatch.setitem(__import__("sys").modules, "gsplat", SimpleNamespace(
-        rasterization=rasterization
-    ))  # fmt: skip
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
     monkeypatch.setattr(gsplat_module, "_check_supported", lambda *_: None)
     return seen
 
@@ -56,6 +55,8 @@ def test_arguments_are_what_gsplat_expects(calls, make_scene):
     assert rendering.depth.shape == (2, 3, 1, 12, 20)
     assert rendering.depth.eq(3).all()
     assert rendering.alpha.shape == (2, 3, 1, 12, 20)
+    GsplatRenderer(config)(gaussians[:, :0], cameras)
+    assert len(calls) == 1, "kernels divide by the number of Gaussians"
 
 
 def test_harmonics_and_features_reach_gsplat(calls, make_scene):
