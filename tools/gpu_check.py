@@ -57,7 +57,11 @@ def checks(out: Path) -> Iterator[list[Step]]:
     compiled = "import gsplat.cuda._backend as b; assert b._C"
     yield [
         Step("gsplat compiles", [python, "-c", compiled], 1800),
-        Step("Triton kernels", [*tests, "plugins/ellipsoid/tests/test_attention_triton.py"]),
+        # Triton compiles each case of these tests for some 15 s, on one core.
+        Step(
+            "Triton kernels",
+            [*tests, "-n", "8", "plugins/ellipsoid/tests/test_attention_triton.py"],
+        ),
     ]
     contract = ("tests/renderers", "tests/engine/test_training_pass.py", "-k", "gsplat")
     yield [

@@ -2,8 +2,8 @@
 
 On a CPU: blocks. On CUDA: the plain way, with the bias of all pairs, while one layer needs at most
 1 / SHARE of the GPU's memory for it (every layer keeps its bias for the backward pass); beyond that
-Triton kernels, or blocks where these cannot be used. No path has been timed on a GPU. The choice
-depends on sizes alone, so that all layers, steps and processes of a training make the same choice.
+Triton kernels, or blocks where these cannot be used. The paths have not been compared on a GPU. The
+choice depends on sizes alone, so that all layers, steps and processes of a training make the same.
 """
 
 import logging
