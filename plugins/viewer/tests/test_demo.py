@@ -12,7 +12,7 @@ from photo_formats import noisy_photos
 from plyfile import PlyData
 from qgs_viewer.contest import checkpoints, judge, report_of, resolve_fairly
 from qgs_viewer.curves import curves_of
-from qgs_viewer.demo import new_folder
+from qgs_viewer.demo import new_folder, show_trained
 
 import qgs
 from qgs.composer import resolve
@@ -175,6 +175,16 @@ def test_a_model_tuned_on_the_photos_is_compared_on_those_it_never_saw(models, t
     report = report_of([before, after], "", {}, {})
     ends = [own.samples[0].inputs.cameras.c2w[0, -1, :3, 3].norm() for own in report.contenders]
     assert ends[0] != ends[1]
+
+
+@pytest.mark.parametrize(("size", "side"), [(None, 128), ("128x192", 128), ("64x64", 64)])
+def test_photos_meet_models_of_their_size(tmp_path, monkeypatch, size, side):
+    def none_of(models):
+        raise FileNotFoundError(" ".join(models))
+
+    monkeypatch.setattr("qgs_viewer.contest.checkpoints", none_of)
+    with pytest.raises(FileNotFoundError, match=f"^worlds/landmark-{side} rooms/landmark-{side} "):
+        show_trained(None, str(tmp_path), tmp_path, "cpu", size)
 
 
 def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from qgs_viewer.report import Report
 
 MODELS = ("rooms/tokengs-64", "rooms/locus-64", "rooms/landmark-64")
-ON_PHOTOS = ("worlds/landmark-64", "rooms/landmark-64", "rooms/locus-64")
-"""On a user's photos; the first one's training decides which of them are inputs."""
+ON_PHOTOS = ("worlds/landmark", "rooms/landmark", "rooms/locus")
+"""On a user's photos, with -64 or -128; the first one's training decides which are inputs."""
 RECIPES = ("recipes/tiny/tokengs.yaml", "recipes/tiny/locus.yaml")
 
 app = typer.Typer(help="Trained models on unseen rooms, or on your photos.")
@@ -123,7 +123,9 @@ def show_trained(
     from qgs_viewer import contest
     from qgs_viewer.hints import next_commands
 
-    console, shown = Console(), models or (MODELS if photos is None else ON_PHOTOS)
+    console, wanted = Console(), parse_size(size)
+    side = 64 if wanted and min(wanted) < 128 else 128
+    shown = models or (MODELS if photos is None else [f"{name}-{side}" for name in ON_PHOTOS])
     try:
         files = contest.checkpoints(shown)
     except FileNotFoundError as error:
@@ -133,7 +135,7 @@ def show_trained(
     scenes = "Unseen scenes" if photos is None else "Your photos"
     console.print(f"Reconstructing: {scenes.lower()}", style="dim")
     with kept_warnings() as notes:
-        entries = contest.judge(files, photos, device, parse_size(size), scale_settings(scale))
+        entries = contest.judge(files, photos, device, wanted, scale_settings(scale))
     lede = "These trained models come with qgs, and none has seen the scenes below."
     if photos is not None:
         lede = "Trained models on your photos, judged on photos beside their inputs."

@@ -7,5 +7,8 @@ plugin = Plugin(
     name="worlds",
     contract_version=1,
     components=(WorldsSource,),
-    models={"landmark-64": "models/landmark-64.safetensors"},
+    models={
+        "landmark-64": "models/landmark-64.safetensors",
+        "landmark-128": "models/landmark-128.safetensors",
+    },
 )
