@@ -1,21 +1,22 @@
-"""Every check that needs a GPU, one after the other, in one report: see gpu_check.sh.
+"""Every check that needs a GPU, in one report: see gpu_check.sh.
 
-    python tools/gpu_check.py OUT
+    python tools/gpu_check.py OUT [WORD ...]
 
 Each step is a command of its own with a time limit; a step that fails does not stop the others.
-Those that measure no time run side by side, the others alone. OUT/report.md has commands, results
-and times, OUT/logs all output.
+Those that measure no time run side by side, the others alone; with WORDs, only steps that have one
+of them in their name. OUT/report.md has commands, results and times, OUT/logs all output.
 """
 
 import json
 import math
 import os
 import shlex
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,7 +77,7 @@ def checks(out: Path) -> Iterator[list[Step]]:
     yield [Step("attention against float64, timed", [python, __file__, "--attention"])]
     narrow = ("--set", "model.width=384", "--set", "model.heads=6")
     for name, pair, changes in (
-        ("at 1,024 anchors", SMALLER, (*narrow, "--views", "4", "--size", "256x256")),
+        ("at 1024 anchors", SMALLER, (*narrow, "--views", "4", "--size", "256x256")),
         ("at published size", PAIR, ("--memory", "--step")),
     ):
         for precision in ("float32", "bf16"):
@@ -107,46 +108,47 @@ def two_processes(out: Path) -> Step:
     return Step(f"DDP of two processes, {device}", command, 600)
 
 
-def run_step(step: Step, out: Path) -> tuple[bool, float, str]:
-    """Run it in OUT; whether it passed, seconds, and the end of its output."""
+def run_step(step: Step, out: Path) -> tuple[bool, str, str]:
+    """Run it in OUT; whether it passed, its row of the table, and the end of its output."""
     log = out / "logs" / f"{step.name.replace(' ', '-').replace(',', '')}.txt"
     log.parent.mkdir(parents=True, exist_ok=True)
     paths = os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
     where, started = ROOT if "pytest" in step.command else out, time.perf_counter()
     with log.open("w") as file:
+        process = subprocess.Popen(
+            step.command, cwd=where, env={**os.environ, "PYTHONPATH": paths}, stdout=file,
+            stderr=subprocess.STDOUT, start_new_session=True,
+        )  # fmt: skip
         try:
-            code = subprocess.run(
-                step.command, cwd=where, env={**os.environ, "PYTHONPATH": paths}, stdout=file,
-                stderr=subprocess.STDOUT, timeout=step.limit,
-            ).returncode  # fmt: skip
-        except (subprocess.TimeoutExpired, OSError) as error:
+            code = process.wait(step.limit)
+        except subprocess.TimeoutExpired as error:
+            os.killpg(process.pid, signal.SIGKILL)  # its own processes too
             code = str(error)
             file.write(f"\n{error}\n")
-    tail = log.read_text(errors="replace").splitlines()[-40:]
-    return code == 0, time.perf_counter() - started, "\n".join(tail)
+    verdict = "passed" if code == 0 else "FAILED"
+    row = f"| {step.name} | {verdict} | {time.perf_counter() - started:.0f} |"
+    print(row, flush=True)
+    end = "\n".join(log.read_text(errors="replace").splitlines()[-40:])
+    command = f"## {step.name}\n\n`{shlex.join(step.command)}`"
+    return code == 0, row, f"{command}\n\n```\n{end}\n```"
 
 
-def report(out: Path) -> bool:
-    """Run all, and write OUT/report.md anew after each; whether all passed."""
+def report(out: Path, words: Sequence[str]) -> bool:
+    """Run the steps, and write OUT/report.md anew after each; whether all passed."""
     names = ", ".join(
         torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())
     )
-    lines = [f"# Checks on {names}, torch {torch.__version__}, CUDA {torch.version.cuda}", ""]
-    lines += ["| step | | seconds |", "|---|---|--:|"]
-    outputs: list[str] = []
-    good = True
+    head = f"# Checks on {names}, torch {torch.__version__}, CUDA {torch.version.cuda}"
+    results: list[tuple[bool, str, str]] = []
     for steps in checks(out):
+        wanted = [s for s in steps if not words or any(word in s.name for word in words)]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            results = pool.map(lambda step: (step, *run_step(step, out)), steps)
-            for step, passed, seconds, tail in results:
-                verdict = "passed" if passed else "FAILED"
-                print(step.name, verdict, f"{seconds:.0f} s", flush=True)
-                lines.append(f"| {step.name} | {verdict} | {seconds:.0f} |")
-                outputs += ["", f"## {step.name}", "", f"`{shlex.join(step.command)}`", ""]
-                outputs += ["```", tail, "```"]
-                good &= passed
-                (out / "report.md").write_text("\n".join([*lines, *outputs]) + "\n")
-    return good
+            for done in as_completed([pool.submit(run_step, step, out) for step in wanted]):
+                results.append(done.result())
+                rows = ["| step | | seconds |", "|---|---|--:|", *(row for _, row, _ in results)]
+                parts = [head, "\n".join(rows), *(end for _, _, end in results)]
+                (out / "report.md").write_text("\n\n".join(parts) + "\n")
+    return all(passed for passed, _, _ in results)
 
 
 def drawn(kind: str, queries: int, tokens: int, heads: int, lowest: float = -5.0) -> Any:
@@ -219,8 +221,8 @@ def attention() -> bool:
 
 
 def main() -> int:
-    if len(sys.argv) != 2:
-        sys.exit("usage: python tools/gpu_check.py OUT")
+    if len(sys.argv) < 2:
+        sys.exit("usage: python tools/gpu_check.py OUT [WORD ...]")
     if not torch.cuda.is_available():
         print("gpu_check: torch finds no GPU, so there is nothing to check", file=sys.stderr)
         return 2
@@ -228,7 +230,7 @@ def main() -> int:
         return int(not attention())
     out = Path(sys.argv[1]).resolve()
     out.mkdir(parents=True, exist_ok=True)
-    return int(not report(out))
+    return int(not report(out, sys.argv[2:]))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Runs on a machine with a GPU everything that a CPU cannot hold, and writes one report:
-#     tools/gpu_check.sh WHEELS [OUT]      (OUT: a new folder, gpu-report if not given)
+#     tools/gpu_check.sh WHEELS [OUT [WORD ...]]      (OUT: a new folder, gpu-report if not given;
+#                                                     WORDs: of the steps' names, all if not given)
 # The machine needs Python 3.11 or newer with pip, torch with CUDA, and nvcc (gsplat compiles), and no
 # network. WHEELS is a folder with the wheels of all else, filled where there is a network, for the
 # Python of that machine (here 3.12), by
@@ -31,7 +32,7 @@ out=$(cd "$out" && pwd)
 environment=$out/environment
 # It sees the packages of $python, which may itself be of an environment.
 "$python" -m venv --without-pip "$environment" || exit 1
-"$python" -c 'import site; print(*site.getsitepackages(), sep="\n")' \
+"$python" -c 'import site; print(*site.getsitepackages(), site.getusersitepackages(), sep="\n")' \
     >"$("$environment/bin/python" -c 'import site; print(site.getsitepackages()[0])')/outer.pth"
 plugins=()
 for plugin in "$root"/plugins/[a-z]*/; do
@@ -47,4 +48,4 @@ install+=(--disable-pip-version-check --no-deps)
     exit 1
 }
 export PATH="$environment/bin:$PATH"
-cd "$root" && exec "$environment/bin/python" tools/gpu_check.py "$out"
+cd "$root" && exec "$environment/bin/python" tools/gpu_check.py "$out" "${@:3}"

@@ -85,17 +85,21 @@ def parsed() -> argparse.Namespace:
 
 
 def windows(options: argparse.Namespace) -> Iterator[Case]:
-    """Windows of all scenes, at all distances."""
+    """Windows of all scenes, at all distances; one that is the best at several comes once."""
     files, domain = checkpoints([options.like]), trained_on(options.like)
     for place in options.photos:
         recipe = next(iter(recipes_alike(files, place).values()))
-        scene = recipe.build_data().scenes("test")[0]
-        for distance in options.distances:
-            far = apart(domain, distance)
-            for window in chosen(scene, recipe.views, far, options.windows, False):
-                unscaled = constant_scale(recipe.views, 1.0)
-                sample = make_sample(scene, *window, unscaled, mirror=False)
-                yield Case(scene, recipe.views, *window, sample)
+        scene, unscaled = recipe.build_data().scenes("test")[0], constant_scale(recipe.views, 1.0)
+        found = dict.fromkeys(
+            window
+            for distance in options.distances
+            for window in chosen(
+                scene, recipe.views, apart(domain, distance), options.windows, False
+            )
+        )
+        for window in found:
+            sample = make_sample(scene, *window, unscaled, mirror=False)
+            yield Case(scene, recipe.views, *window, sample)
 
 
 def measured(options: argparse.Namespace, cases: list[Case], trained: list[Path]) -> Scores:

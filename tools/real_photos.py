@@ -244,7 +244,11 @@ def table(rows: Sequence[Row]) -> str:
             of.setdefault((row["distance"], row["scene"]), []).append(row)
         lines += [line(model, scene, part) for (_, scene), part in of.items()]
         if len(of) > 1:
-            lines.append(line(model, "**all**", own))
+            # A window may be the best at several distances.
+            found = {
+                (row["scene"], *map(tuple, (row["inputs"], row["targets"]))): row for row in own
+            }
+            lines.append(line(model, "**all**", [*found.values()]))
     return "\n".join(lines)
 
 

@@ -42,7 +42,7 @@ class GsplatRenderer(Renderer):
         """See `Renderer`; ValueError for tensors not on CUDA, RuntimeError without gsplat."""
         check_inputs(gaussians, cameras)
         _check_supported(gaussians, cameras)
-        if not gaussians.means.shape[1]:  # by their number gsplat's kernels divide
+        if not gaussians.means.shape[1]:  # gsplat's kernels divide by their number
             return TorchRenderer(self.config)(gaussians, cameras, background)
         rasterization = import_module("gsplat").rasterization  # imported late: it needs CUDA
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 MODELS = ("rooms/tokengs-64", "rooms/locus-64", "rooms/landmark-64")
 ON_PHOTOS = ("worlds/landmark", "rooms/landmark", "rooms/locus")
-"""On a user's photos, with -64 or -128; the first one's training decides which are inputs."""
+"""On a user's photos, with -64 or -128; the first's training decides which photos are inputs."""
 RECIPES = ("recipes/tiny/tokengs.yaml", "recipes/tiny/locus.yaml")
 
 app = typer.Typer(help="Trained models on unseen rooms, or on your photos.")

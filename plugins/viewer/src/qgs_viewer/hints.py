@@ -32,7 +32,7 @@ def next_commands(
         if tuple(models) == MODELS:
             compare = "qgs demo PHOTOS"
         return {
-            compare: "compares these models on a folder PHOTOS of your own, with camera poses",
+            compare: "compares models on a folder PHOTOS of your own, with camera poses",
             f"qgs reconstruct {best} PHOTOS --out {scene} --refine 30": REFINED,
             f"qgs view {best}": SCENE,
             "qgs recipes": "lists recipes, each a model to train or to change",

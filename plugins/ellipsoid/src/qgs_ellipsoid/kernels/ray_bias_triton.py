@@ -25,7 +25,7 @@ def gradients(queries, tokens, step, gradient, sums):
     ratio = _squared(a) / below
     at_bound = -factor * ratio <= lower
     inside = tl.where(at_bound, 0.0, gradient)
-    # gradient - inside would be fused with a product in `gradient`, and leave what rounding lost.
+    # gradient - inside would be fused with the product in `gradient`, and leave its rounding error.
     to_bound = tl.where(at_bound, gradient, 0.0)
     up = -2 * factor * inside / below
     down = -up * ratio

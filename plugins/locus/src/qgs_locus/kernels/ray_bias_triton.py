@@ -26,7 +26,7 @@ def gradients(queries, tokens, step, gradient, sums):
     distance_sq = e0 * e0 + e1 * e1 + e2 * e2
     at_bound = -factor * distance_sq <= lower
     inside = tl.where(at_bound, 0.0, gradient)
-    # gradient - inside would be fused with a product in `gradient`, and leave what rounding lost.
+    # gradient - inside would be fused with the product in `gradient`, and leave its rounding error.
     to_bound = tl.where(at_bound, gradient, 0.0)
     to_center = -2 * factor * inside
     return (
