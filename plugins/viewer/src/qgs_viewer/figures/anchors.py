@@ -89,8 +89,8 @@ def refinement_figure(exhibits: Sequence[Exhibit]) -> Figure:
         layers, color = np.arange(shown.look.depth + 1), hex_color(categorical(number))
         _bands(radius, layers, radii(shown), color, shown.name)
         _bands(step, layers[1:], steps, color, shown.name)
-    for axis, title in ((radius, "support radius"), (step, "step of the anchor")):
-        axis.set_title(f"{title}, world units")
+    for axis, title in ((radius, "support radius"), (step, "anchor's step")):
+        axis.set_title(f"{title},\nworld units")
         axis.set(xlabel="layer", ylim=(0, None))
         axis.xaxis.get_major_locator().set_params(integer=True)
     if len(exhibits) > 1:
@@ -120,4 +120,4 @@ def _ways(axis: Axes, shown: Exhibit) -> None:
     start = {"facecolors": "none", "edgecolors": hex_color(MUTED), "linewidths": 0.4}
     axis.scatter(*places[0].T, s=4, zorder=3, **start)
     axis.scatter(*places[-1].T, s=3, color=paper.INK_HEX, linewidths=0, zorder=3)
-    axis.set_title(f"{shown.name}: ways of the anchors")
+    axis.set_title(f"{shown.name}:\nways of the anchors")
