@@ -4,7 +4,8 @@
 
 Each step is a command of its own with a time limit; a step that fails does not stop the others.
 Those that measure no time run side by side, the others alone; with WORDs, only steps that have one
-of them in their name. OUT/report.md has commands, results and times, OUT/logs all output.
+of them in their name, after gsplat's build, which others would repeat. OUT/report.md has commands,
+results and times, OUT/logs all output.
 """
 
 import json
@@ -36,6 +37,7 @@ ROOT = Path(__file__).parents[1]
 TINY = ("tokengs", "locus", "landmark", "ellipsoid", "c3g", "gslrm", "mvsplat", "globalsplat")
 PAIR = ("tokengs/dl3dv_4096_4views.yaml", "locus/dl3dv_4096_4views.yaml")
 SMALLER = ("locus/dl3dv.yaml", "landmark/dl3dv.yaml")
+BUILD = "gsplat compiles"
 KERNELS: Any = ("plain", "blocks", "triton")
 TOLERANCES = {torch.float32: 1e-5, torch.bfloat16: 4 * 2**-7, torch.float16: 4 * 2**-10}
 """Half precision rounds the output once, and the kernels the weights and their derivative; the
@@ -57,7 +59,7 @@ def checks(out: Path) -> Iterator[list[Step]]:
     tests = (python, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-rs", "-m", "")
     compiled = "import gsplat.cuda._backend as b; assert b._C"
     yield [
-        Step("gsplat compiles", [python, "-c", compiled], 1800),
+        Step(BUILD, [python, "-c", compiled], 1800),
         # Triton compiles each case of these tests for some 15 s, on one core.
         Step(
             "Triton kernels",
@@ -141,7 +143,8 @@ def report(out: Path, words: Sequence[str]) -> bool:
     head = f"# Checks on {names}, torch {torch.__version__}, CUDA {torch.version.cuda}"
     results: list[tuple[bool, str, str]] = []
     for steps in checks(out):
-        wanted = [s for s in steps if not words or any(word in s.name for word in words)]
+        named = (BUILD, *words)
+        wanted = [s for s in steps if not words or any(name in s.name for name in named)]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             for done in as_completed([pool.submit(run_step, step, out) for step in wanted]):
                 results.append(done.result())

@@ -245,9 +245,7 @@ def table(rows: Sequence[Row]) -> str:
         lines += [line(model, scene, part) for (_, scene), part in of.items()]
         if len(of) > 1:
             # A window may be the best at several distances.
-            found = {
-                (row["scene"], *map(tuple, (row["inputs"], row["targets"]))): row for row in own
-            }
+            found = {(row["scene"], f"{row['inputs']} {row['targets']}"): row for row in own}
             lines.append(line(model, "**all**", [*found.values()]))
     return "\n".join(lines)
 

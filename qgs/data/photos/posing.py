@@ -17,7 +17,7 @@ REFUSE = "QGS_NO_POSES"
 def posed(path: UPath) -> UPath:
     """A folder with the poses of `path`, a video or photos without cameras; else `path`.
 
-    Raises ValueError where poses are refused, ExtensionError without query-gaussians-poses.
+    Raises ValueError where poses are refused, ExtensionError without the plug-in, and as it does.
     """
     video = path.suffix.lower() in VIDEOS and path.is_file()
     if not is_local(path) or not (video or any(map(image_files, (path, path / "images")))):
