@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -57,14 +56,15 @@ def evaluate(
     from qgs.io.checkpoint import CheckpointFile
 
     options.use_threads(threads)
-    if foreign := [text for text in settings if re.split("[.=]", text)[0] not in SECTIONS]:
-        allowed = ", ".join(SECTIONS)
-        raise ValueError(f"--set {foreign[0]} would change the trained model; only {allowed} can")
+    free = (*SECTIONS, "model.feedback.rounds")
+    if foreign := [text for text in settings if not text.startswith(free)]:
+        raise ValueError(f"{foreign[0]} would change the trained model; set only {', '.join(free)}")
     with CheckpointFile(run) as file:
         checkpoint, recipe, step = file.path, file.recipe, file.step
-        if settings:
-            recipe = resolve(recipe.tree, settings)
         model = file.model(choose_device(device))
+    if settings:
+        recipe = resolve(recipe.tree, settings)
+        model.feedback.rounds = recipe.build_model("meta", pretrained=False).feedback.rounds
     own = Path(run).expanduser().exists()  # so that results may be written beside it
     folder = out or evaluation_folder(checkpoint, bool(settings), own)
     evaluation = evaluate_into(model, recipe, step, folder, console, batch, model.trained_on)

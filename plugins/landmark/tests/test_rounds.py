@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from commands import run_qgs
 from refusals import refused
 
 import qgs
@@ -84,6 +85,24 @@ def test_a_built_model_makes_other_numbers_of_rounds(rounds: int) -> None:
         assert list(model(given).layers) == [3 + 2 * n for n in range(rounds + 1)]
         with pytest.raises(ValueError, match=f"layers 1..{3 + 2 * rounds}"):
             model(given, layers=[4 + 2 * rounds])
+
+
+def test_an_evaluation_sets_the_number_of_rounds(tmp_path: Path) -> None:
+    """The scores of N rounds are those of a model whose recipe has N."""
+    words = ("plugins=[landmark, locus, rooms]", "data.type=rooms/procedural")
+    fewer = ("data.image_size=[32, 32]", "views.targets=2", "evaluation.scenes=2")
+    scores: dict[tuple[int, int], str] = {}
+    for made, asked in ((2, 2), (2, 1), (1, 1)):
+        feedback = {"type": "landmark/rendered", "rounds": made, "layers": 2}
+        torch.manual_seed(0)
+        model = resolve(recipe(feedback=feedback), (*words, *fewer)).build_model()
+        file, out = tmp_path / f"{made}.safetensors", tmp_path / f"{made}{asked}"
+        if not file.exists():
+            qgs.save(model, file)
+        result = run_qgs("eval", file, "--set", f"model.feedback.rounds={asked}", "--out", out)
+        assert result.exit_code == 0, result.output
+        scores[made, asked] = (out / "scenes.csv").read_text()
+    assert scores[2, 1] == scores[1, 1] != scores[2, 2]
 
 
 def test_training_supervises_every_round_it_draws() -> None:
