@@ -1,9 +1,11 @@
 """The pictures of README.md and docs/, drawn from trained models.
 
     python tools/make_pictures.py [--tokengs CHECKPOINT] [--locus CHECKPOINT] [--scene 0]
+    python tools/make_pictures.py --rounds CHECKPOINT
 
 Writes docs/images/first_sight.webp (a room that no model has seen: the photos, a walk through each
-model's Gaussians, LocusGS's anchors) and docs/images/anchors.png (the anchors layer by layer).
+model's Gaussians, LocusGS's anchors) and docs/images/anchors.png (the anchors layer by layer); of a
+model with feedback docs/images/landmark_round.webp (a view without and with its rounds).
 """
 
 import argparse
@@ -19,8 +21,9 @@ import qgs
 from qgs.analysis.saving import orbit_path
 from qgs.composer import resolve
 from qgs.data.evaluation import evaluation_samples
+from qgs.data.samples import Sample
 from qgs.drawing.figures import INK
-from qgs.drawing.images import Picture, enlarged, rgb_picture, write_png
+from qgs.drawing.images import Picture, enlarged, rgb_picture, shaded, write_png
 from qgs.io.files import replacing
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Prediction, Views
@@ -77,7 +80,7 @@ def anchors_on(
 
 
 def write_webp(frames: Sequence[Picture], path: Path) -> None:
-    """Write an endless animation."""
+    """Write an endless animation, or one picture."""
     first, *rest = map(Image.fromarray, frames)
     options = {"duration": MILLISECONDS, "loop": 0, "quality": 72, "method": 6}
     with replacing(path) as temporary:
@@ -89,14 +92,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="The pictures of README.md and docs/.")
     parser.add_argument("--tokengs", default="rooms/tokengs-64")
     parser.add_argument("--locus", default="rooms/locus-64")
+    parser.add_argument("--rounds", metavar="CHECKPOINT", help="Draw this model's rounds alone.")
     parser.add_argument("--scene", type=int, default=0, help="Number of the test room.")
     arguments = parser.parse_args()
+    if arguments.rounds:
+        return draw_rounds(qgs.load(arguments.rounds), arguments.scene)
     models = [qgs.load(arguments.tokengs), qgs.load(arguments.locus)]
-    assert models[1].recipe is not None
-    recipe = resolve(models[1].recipe)
-    sample = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[
-        arguments.scene
-    ]
+    sample = test_sample(models[1], arguments.scene)
     predictions: list[Prediction] = [model(sample.inputs) for model in models]
     rendering = models[1].render(predictions[1].gaussians, sample.inputs.cameras)
     path = orbit_path(sample.inputs.cameras, rendering.depth, FRAMES, SIDE)
@@ -109,6 +111,33 @@ def main() -> None:
     write_png(layers_picture(models[1], sample.inputs), IMAGES / "anchors.png")
     for path_ in (IMAGES / "first_sight.webp", IMAGES / "anchors.png"):
         print(f"{path_.relative_to(ROOT)}: {path_.stat().st_size / 1000:.0f} kB")
+
+
+def test_sample(model: QueryGaussianModel, scene: int) -> Sample:
+    """The photos of a test scene of the model's recipe, and its novel views."""
+    assert model.recipe is not None
+    recipe = resolve(model.recipe)
+    return evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[scene]
+
+
+def draw_rounds(model: QueryGaussianModel, scene: int) -> None:
+    """Write what the rounds change: the first novel view without and with them, and its errors."""
+    sample, rounds = test_sample(model, scene), model.feedback.rounds
+    photo, views = sample.targets.images[0, 0], []
+    for count in (0, rounds):
+        model.feedback.rounds = count
+        prediction = model(sample.inputs)
+        views.append(model.render(prediction.gaussians, sample.targets.cameras).rgb[0, 0])
+    errors = [(view - photo).abs().mean(0, keepdim=True) for view in views]
+    scores = [-10 * float((view - photo).square().mean().log10()) for view in views]
+    pictures = [rgb_picture(image) for image in (photo, *views)]
+    pictures += [shaded(error, 0, 0.3, "magma") for error in errors]
+    pictures.append(shaded(errors[1] - errors[0], -0.1, 0.1, "RdBu_r"))
+    names = [f"rounds: {n}, {score:.2f} dB" for n, score in zip((0, rounds), scores, strict=True)]
+    titles = ("novel view", *names, "error, rounds: 0", f"rounds: {rounds}", "change of the error")
+    path = IMAGES / "landmark_round.webp"
+    write_webp([titled([enlarged(picture, SIDE) for picture in pictures], titles)], path)
+    print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1000:.0f} kB")
 
 
 def layers_picture(model: QueryGaussianModel, views: Views) -> Picture:
