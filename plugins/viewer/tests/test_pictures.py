@@ -100,6 +100,20 @@ def test_notable_queries_are_heavy_well_inside_the_picture_and_apart(model, gaus
     assert len({query.index for query in notable_queries(model, placed, cameras, 12)}) == 12
 
 
+def test_queries_that_reach_beyond_the_view_come_last(model, gaussians, cameras):
+    queries = model.queries.count
+    places = torch.full((queries, 2), 3.0)
+    places[:4] = torch.tensor([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.5, 0.5]])
+    means = torch.cat([(places - 0.5) * 1.5, torch.full((queries, 1), 1.5)], -1)
+    scales = torch.full((1, queries * 4, 3), 0.02)
+    scales[:, 12:16] = 1.0  # query 3 covers the view
+    placed = replace(gaussians, means=means.repeat_interleave(4, 0)[None], scales=scales)
+    weights = rendered_weights(model, placed, cameras[:, :1]).view(queries, -1).sum(1)
+    assert int(weights.argmax()) == 3
+    drawn = [query.index for query in notable_queries(model, placed, cameras[:, :1], 4)]
+    assert (sorted(drawn[:3]), drawn[3]) == ([0, 1, 2], 3)
+
+
 def test_a_query_picture_is_grey_but_for_its_queries(model, gaussians, cameras):
     camera = finer(cameras[:, :1], 64)
     chosen = notable_queries(model, gaussians, camera, 1)

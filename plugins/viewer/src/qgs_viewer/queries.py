@@ -169,22 +169,37 @@ def _painted(gaussians: Gaussians, colors: Tensor) -> Gaussians:
 def notable_queries(
     model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras, count: int
 ) -> list[DrawnQuery]:
-    """`count` queries to show in cameras (1, V): heavy, well inside the first view, and spread."""
+    """`count` queries to show in cameras (1, V): heavy, well inside the first view, and spread.
+
+    Those of which all is inside come before those of which the middle is.
+    """
     per_query = model.head.gaussians_per_query
     weights_NK = rendered_weights(model, gaussians, cameras)[0].cpu().unflatten(0, (-1, per_query))
     means_NK3 = gaussians.means[0].cpu().view(*weights_NK.shape, 3)
     weights_N = weights_NK.sum(1)
     seen_N3 = (means_NK3 * weights_NK[..., None]).sum(1) / weights_N[:, None].clamp_min(1e-12)
-    places_N2 = _pixels(seen_N3.to(gaussians.means), cameras) / torch.tensor(cameras.size[::-1])
-    chosen = _spread(weights_N.argsort(descending=True).tolist(), places_N2, count)
+    size = torch.tensor(cameras.size[::-1])
+    places_N2 = _pixels(seen_N3.to(gaussians.means), cameras) / size
+    ends_N2 = _reach(gaussians, cameras).view(*weights_NK.shape, 2).amax(1) / size
+    chosen = _spread(weights_N.argsort(descending=True).tolist(), places_N2, ends_N2, count)
     return colored_queries(gaussians, len(weights_N), chosen)
 
 
-def _spread(order: Sequence[int], places_N2: Tensor, count: int) -> list[int]:
+def _reach(gaussians: Gaussians, cameras: Cameras) -> Tensor:
+    """Pixels (G, 2) from the middle of the first view to where each Gaussian has 2 sigma."""
+    depths = to_camera(gaussians.means[:1], cameras)[0, 0, :, 2:].clamp_min(1e-3).cpu()
+    wide = 2 * gaussians.scales[0].amax(-1, keepdim=True).cpu() * cameras.intrinsics[0, 0, :2].cpu()
+    middle = torch.tensor(cameras.size[::-1]) / 2
+    return (_pixels(gaussians.means[0], cameras) - middle).abs() + wide / depths
+
+
+def _spread(order: Sequence[int], places_N2: Tensor, ends_N2: Tensor, count: int) -> list[int]:
     """The first `count` of `order` inside [0, 1]^2 at a distance; others where they are few."""
     inside = [i for i in order if ((places_N2[i] - 0.5).abs() < 0.5 - MARGIN).all()]
+    whole = [i for i in inside if (ends_N2[i] < 0.5).all()]
     distance, chosen = 0.6 / count**0.5, list[int]()
-    for candidates, least in ((inside, distance), (inside, distance / 2), (order, 0.0)):
+    tries = ((whole, distance), (inside, distance), (inside, distance / 2), (order, 0.0))
+    for candidates, least in tries:
         for i in candidates:
             far = all((places_N2[i] - places_N2[j]).norm() >= least for j in chosen)
             if far and i not in chosen and len(chosen) < count:

@@ -21,7 +21,7 @@ from qgs.geometry.poses import largest_distance
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Prediction
-from qgs.wording import warn_once
+from qgs.wording import listed, warn_once
 from qgs_viewer.curves import Curves, curves_figure
 from qgs_viewer.figures.exhibits import Exhibit, exhibit
 from qgs_viewer.pictures import PARTS, attention_pictures_of, color_error, error_picture
@@ -186,10 +186,10 @@ def pictured_scene(
         "Error": {n: [Tile(error_picture(e, most)) for e in maps] for n, maps in errors.items()},
         "Depth": {n: [Tile(depth_picture(d, near, far)) for d in m] for n, m in depths.items()},
     }
-    span = f"frames {min(inputs)} to {max(inputs)}" if len(inputs) > 1 else f"frame {min(inputs)}"
+    numbers = listed(sorted(inputs))
     return {
         "name": sample.scene,
-        "frames": span,
+        "frames": f"input frame{'s' if len(inputs) > 1 else ''} {numbers}",
         "inputs": _photos(sample.inputs.images[0], frames[: len(inputs)]),
         "kinds": kinds,
         "most": most,

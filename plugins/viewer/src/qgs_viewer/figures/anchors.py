@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from qgs.drawing.figures import MUTED, categorical, hex_color
 from qgs.drawing.images import finer
 from qgs_viewer.figures import paper
+from qgs_viewer.figures.dispersion import FAR_APART
 from qgs_viewer.figures.exhibits import Exhibit, Exhibition, support_of
 from qgs_viewer.figures.outside import draw_ground, plan_of
 from qgs_viewer.figures.paper import Made, chosen_layers, new_figure, paper_style
@@ -81,7 +82,7 @@ def ways(shown: Exhibit) -> torch.Tensor:
 def refinement_figure(exhibits: Sequence[Exhibit]) -> Figure:
     """A plan of the ways for each model with anchors; radii and steps of all by layer."""
     wide = [1.25] * len(exhibits) + [1.0, 1.0]
-    drawn = new_figure(max(2.1, paper.WIDTH / sum(wide) * 1.05), gap=0.05)
+    drawn = new_figure(max(2.3, paper.WIDTH / sum(wide) * 1.05), gap=0.05)
     *plans, radius, step = drawn.subplots(1, len(wide), width_ratios=wide)
     for number, (axis, shown) in enumerate(zip(plans, exhibits, strict=True)):
         _ways(axis, shown)
@@ -91,10 +92,16 @@ def refinement_figure(exhibits: Sequence[Exhibit]) -> Figure:
         _bands(step, layers[1:], steps, color, shown.name)
     for axis, title in ((radius, "support radius"), (step, "anchor's step")):
         axis.set_title(f"{title},\nworld units")
-        axis.set(xlabel="layer", ylim=(0, None))
+        medians = np.concatenate([line.get_ydata() for line in axis.lines])
+        if medians.max() > FAR_APART * medians.min() > 0:
+            axis.set_yscale("log")
+            axis.tick_params(axis="y", which="minor", length=0)
+        else:
+            axis.set_ylim(0, None)
+        axis.set_xlabel("layer")
         axis.xaxis.get_major_locator().set_params(integer=True)
     if len(exhibits) > 1:
-        radius.legend()
+        drawn.legend(*radius.get_legend_handles_labels(), loc="outside lower right", ncols=3)
     return drawn
 
 
