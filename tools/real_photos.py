@@ -43,7 +43,8 @@ from qgs.metrics.images import psnr, ssim
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Views
 
-MODELS = ("worlds/landmark-64", "rooms/landmark-64", "rooms/locus-64", "rooms/tokengs-64")
+SYSTEMS = ("landmark", "locus", "tokengs")
+MODELS = [f"{data}/{system}-64" for data in ("worlds", "rooms") for system in SYSTEMS]
 RATIO, REACH = 1.08, 5.0
 """Of the fine grid: ratio of its factors, how far it goes beyond the range of both scales."""
 CHUNK = 12  # factors in one forward pass

@@ -10,5 +10,7 @@ plugin = Plugin(
     models={
         "landmark-64": "models/landmark-64.safetensors",
         "landmark-128": "models/landmark-128.safetensors",
+        "locus-64": "models/locus-64.safetensors",
+        "tokengs-64": "models/tokengs-64.safetensors",
     },
 )
