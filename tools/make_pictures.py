@@ -2,10 +2,12 @@
 
     python tools/make_pictures.py [--tokengs CHECKPOINT] [--locus CHECKPOINT] [--scene 0]
     python tools/make_pictures.py --rounds CHECKPOINT
+    python tools/make_pictures.py --worlds
 
 Writes docs/images/first_sight.webp (a room that no model has seen: the photos, a walk through each
 model's Gaussians, LocusGS's anchors) and docs/images/anchors.png (the anchors layer by layer); of a
-model with feedback docs/images/landmark_round.webp (a view without and with its rounds).
+model with feedback docs/images/landmark_round.webp (a view without and with its rounds); of worlds
+docs/images/worlds_scenes.webp (three views of the first ones).
 """
 
 import argparse
@@ -16,6 +18,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 from qgs_viewer.queries import notable_queries, support_picture
+from qgs_worlds.source import WorldsConfig, WorldsSource
 
 import qgs
 from qgs.analysis.saving import orbit_path
@@ -23,7 +26,14 @@ from qgs.composer import resolve
 from qgs.data.evaluation import evaluation_samples
 from qgs.data.samples import Sample
 from qgs.drawing.figures import INK
-from qgs.drawing.images import Picture, enlarged, rgb_picture, shaded, write_png
+from qgs.drawing.images import (
+    Picture,
+    enlarged,
+    rgb_picture,
+    shaded,
+    side_by_side,
+    write_png,
+)
 from qgs.io.files import replacing
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Prediction, Views
@@ -93,8 +103,11 @@ def main() -> None:
     parser.add_argument("--tokengs", default="rooms/tokengs-64")
     parser.add_argument("--locus", default="rooms/locus-64")
     parser.add_argument("--rounds", metavar="CHECKPOINT", help="Draw this model's rounds alone.")
+    parser.add_argument("--worlds", action="store_true", help="Draw worlds alone.")
     parser.add_argument("--scene", type=int, default=0, help="Number of the test room.")
     arguments = parser.parse_args()
+    if arguments.worlds:
+        return draw_worlds()
     if arguments.rounds:
         return draw_rounds(qgs.load(arguments.rounds), arguments.scene)
     models = [qgs.load(arguments.tokengs), qgs.load(arguments.locus)]
@@ -118,6 +131,17 @@ def test_sample(model: QueryGaussianModel, scene: int) -> Sample:
     assert model.recipe is not None
     recipe = resolve(model.recipe)
     return evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[scene]
+
+
+def draw_worlds() -> None:
+    """Write three views of each of the first 15 worlds, those of a scene side by side."""
+    scenes = WorldsSource(WorldsConfig(image_size=(96, 96))).scenes("train")
+    views = [[rgb_picture(image) for image in scene.images((0, 3, 7))] for scene in scenes[:15]]
+    shown = [side_by_side(pictures, gap=1) for pictures in views]
+    rows = [side_by_side(shown[start : start + 5], gap=GAP) for start in range(0, len(shown), 5)]
+    path = IMAGES / "worlds_scenes.webp"
+    write_webp([np.concatenate(rows)], path)
+    print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1000:.0f} kB")
 
 
 def draw_rounds(model: QueryGaussianModel, scene: int) -> None:

@@ -165,8 +165,9 @@ def _start(scenes: Scenes, name: str, model: QueryGaussianModel, frames: str | F
     )
     inputs = result.sample.input_frames
     others = [frame for frame in scenes.frames if frame not in inputs]
-    middle = sum(inputs) / len(inputs)
-    judged = sorted(others, key=lambda frame: abs(frame - middle))[:_JUDGED] or [*inputs]
+    places = scene.cameras.c2w[:, :3, 3]
+    far = (places - places[[*inputs]].mean(0)).norm(dim=-1)
+    judged = sorted(others, key=lambda frame: float(far[frame]))[:_JUDGED] or [*inputs]
     photos = views_in(result.world, scene, tuple(judged)).to(result.gaussians.means.device)
     with torch.no_grad():
         rendered = model.render(result.gaussians, photos.cameras).rgb

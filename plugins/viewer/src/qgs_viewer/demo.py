@@ -29,8 +29,11 @@ if TYPE_CHECKING:
     from qgs_viewer.report import Report
 
 MODELS = ("rooms/tokengs-64", "rooms/locus-64", "rooms/landmark-64")
-ON_PHOTOS = ("worlds/landmark", "rooms/landmark", "rooms/locus")
-"""On a user's photos, with -64 or -128; the first's training decides which photos are inputs."""
+ON_PHOTOS = {
+    64: ("worlds/landmark-64", "worlds/locus-64", "worlds/tokengs-64"),
+    128: ("worlds/landmark-128", "rooms/landmark-128", "rooms/locus-128"),
+}
+"""By pixels, on a user's photos; the first's training decides which photos are inputs."""
 RECIPES = ("recipes/tiny/tokengs.yaml", "recipes/tiny/locus.yaml")
 
 app = typer.Typer(help="Trained models on unseen rooms, or on your photos.")
@@ -125,7 +128,7 @@ def show_trained(
 
     console, wanted = Console(), parse_size(size)
     side = 64 if wanted and min(wanted) < 128 else 128
-    shown = models or (MODELS if photos is None else [f"{name}-{side}" for name in ON_PHOTOS])
+    shown = models or (MODELS if photos is None else ON_PHOTOS[side])
     try:
         files = contest.checkpoints(shown)
     except FileNotFoundError as error:
