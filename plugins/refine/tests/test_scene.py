@@ -21,6 +21,7 @@ from qgs_refine.planning import (
     Plan,
     Scenes,
     affordable,
+    by_distance,
     judged_frames,
     sized,
 )
@@ -208,3 +209,9 @@ def test_points_of_colmap_are_part_of_the_start(photos: Path, tmp_path: Path) ->
     other = Scenes(str(photos), None, "8", None, None)
     found = photos_start(other.probe, photos_world(other), views, 100, 40)
     assert found.count == making.TIMED
+
+
+def test_a_start_is_judged_on_photos_taken_nearby_whatever_their_order() -> None:
+    places = torch.tensor([[0.0], [5.0], [1.0], [0.4], [3.0], [0.6]]) * torch.tensor([1.0, 0, 0])
+    assert by_distance(places, (0, 2), [1, 3, 4, 5])[2:] == [4, 1]
+    assert by_distance(places, (4,), [0, 1, 2, 3, 5])[:2] == [1, 2]

@@ -100,7 +100,7 @@ def test_notable_queries_are_heavy_well_inside_the_picture_and_apart(model, gaus
     assert len({query.index for query in notable_queries(model, placed, cameras, 12)}) == 12
 
 
-def test_queries_that_reach_beyond_the_view_come_last(model, gaussians, cameras):
+def test_queries_that_cover_the_view_come_last(model, gaussians, cameras):
     queries = model.queries.count
     places = torch.full((queries, 2), 3.0)
     places[:4] = torch.tensor([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.5, 0.5]])

@@ -165,15 +165,19 @@ def _start(scenes: Scenes, name: str, model: QueryGaussianModel, frames: str | F
     )
     inputs = result.sample.input_frames
     others = [frame for frame in scenes.frames if frame not in inputs]
-    places = scene.cameras.c2w[:, :3, 3]
-    far = (places - places[[*inputs]].mean(0)).norm(dim=-1)
-    judged = sorted(others, key=lambda frame: float(far[frame]))[:_JUDGED] or [*inputs]
+    judged = by_distance(scene.cameras.c2w[:, :3, 3], inputs, others)[:_JUDGED] or [*inputs]
     photos = views_in(result.world, scene, tuple(judged)).to(result.gaussians.means.device)
     with torch.no_grad():
         rendered = model.render(result.gaussians, photos.cameras).rgb
     quality = float(psnr(rendered, photos.images).mean())
     names = [scene.frame_name(frame) for frame in inputs]
     return Start(name, result.world, result.gaussians, names, quality)
+
+
+def by_distance(places: Tensor, inputs: Frames, others: Sequence[int]) -> list[int]:
+    """`others`, those nearest to the middle of the inputs first. places: of all cameras (F, 3)."""
+    far = (places - places[[*inputs]].mean(0)).norm(dim=-1)
+    return sorted(others, key=lambda frame: float(far[frame]))
 
 
 class Scenes:

@@ -171,34 +171,33 @@ def notable_queries(
 ) -> list[DrawnQuery]:
     """`count` queries to show in cameras (1, V): heavy, well inside the first view, and spread.
 
-    Those of which all is inside come before those of which the middle is.
+    Queries with a Gaussian wider than half the view (2 sigma about its middle) come after others.
     """
     per_query = model.head.gaussians_per_query
     weights_NK = rendered_weights(model, gaussians, cameras)[0].cpu().unflatten(0, (-1, per_query))
     means_NK3 = gaussians.means[0].cpu().view(*weights_NK.shape, 3)
     weights_N = weights_NK.sum(1)
     seen_N3 = (means_NK3 * weights_NK[..., None]).sum(1) / weights_N[:, None].clamp_min(1e-12)
-    size = torch.tensor(cameras.size[::-1])
-    places_N2 = _pixels(seen_N3.to(gaussians.means), cameras) / size
-    ends_N2 = _reach(gaussians, cameras).view(*weights_NK.shape, 2).amax(1) / size
-    chosen = _spread(weights_N.argsort(descending=True).tolist(), places_N2, ends_N2, count)
+    places_N2 = _pixels(seen_N3.to(gaussians.means), cameras) / torch.tensor(cameras.size[::-1])
+    small_N = (_widths(gaussians, cameras).view_as(weights_NK) < 0.5).all(1) & (weights_N > 0)
+    chosen = _spread(weights_N.argsort(descending=True).tolist(), places_N2, small_N, count)
     return colored_queries(gaussians, len(weights_N), chosen)
 
 
-def _reach(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Pixels (G, 2) from the middle of the first view to where each Gaussian has 2 sigma."""
-    depths = to_camera(gaussians.means[:1], cameras)[0, 0, :, 2:].clamp_min(1e-3).cpu()
-    wide = 2 * gaussians.scales[0].amax(-1, keepdim=True).cpu() * cameras.intrinsics[0, 0, :2].cpu()
-    middle = torch.tensor(cameras.size[::-1]) / 2
-    return (_pixels(gaussians.means[0], cameras) - middle).abs() + wide / depths
+def _widths(gaussians: Gaussians, cameras: Cameras) -> Tensor:
+    """4 sigma of each Gaussian (G,) as a share of the first view's longer side; 0 behind it."""
+    depths = to_camera(gaussians.means[:1], cameras)[0, 0, :, 2]
+    focal, side = cameras.intrinsics[0, 0, :2].mean(), max(cameras.size)
+    widths = 4 * gaussians.scales[0].amax(-1) * focal / depths.clamp_min(1e-3) / side
+    return torch.where(depths > 0, widths, 0).cpu()
 
 
-def _spread(order: Sequence[int], places_N2: Tensor, ends_N2: Tensor, count: int) -> list[int]:
+def _spread(order: Sequence[int], places_N2: Tensor, small_N: Tensor, count: int) -> list[int]:
     """The first `count` of `order` inside [0, 1]^2 at a distance; others where they are few."""
     inside = [i for i in order if ((places_N2[i] - 0.5).abs() < 0.5 - MARGIN).all()]
-    whole = [i for i in inside if (ends_N2[i] < 0.5).all()]
+    small = [i for i in inside if small_N[i]]
     distance, chosen = 0.6 / count**0.5, list[int]()
-    tries = ((whole, distance), (inside, distance), (inside, distance / 2), (order, 0.0))
+    tries = ((small, distance), (inside, distance), (inside, distance / 2), (order, 0.0))
     for candidates, least in tries:
         for i in candidates:
             far = all((places_N2[i] - places_N2[j]).norm() >= least for j in chosen)
