@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
+from qgs_viewer.pictures import color_error, error_picture
 from qgs_viewer.queries import notable_queries, support_picture
 from qgs_worlds.source import WorldsConfig, WorldsSource
 
@@ -35,6 +36,7 @@ from qgs.drawing.images import (
     write_png,
 )
 from qgs.io.files import replacing
+from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, Prediction, Views
 
@@ -122,8 +124,13 @@ def main() -> None:
     frames = [titled([photos, *row], titles) for row in zip(*walks, anchors, strict=True)]
     write_webp(frames, IMAGES / "first_sight.webp")
     write_png(layers_picture(models[1], sample.inputs), IMAGES / "anchors.png")
-    for path_ in (IMAGES / "first_sight.webp", IMAGES / "anchors.png"):
-        print(f"{path_.relative_to(ROOT)}: {path_.stat().st_size / 1000:.0f} kB")
+    for written in (IMAGES / "first_sight.webp", IMAGES / "anchors.png"):
+        announce(written)
+
+
+def announce(path: Path) -> None:
+    """Print where a picture is, and how large."""
+    print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1000:.0f} kB")
 
 
 def test_sample(model: QueryGaussianModel, scene: int) -> Sample:
@@ -141,7 +148,7 @@ def draw_worlds() -> None:
     rows = [side_by_side(shown[start : start + 5], gap=GAP) for start in range(0, len(shown), 5)]
     path = IMAGES / "worlds_scenes.webp"
     write_webp([np.concatenate(rows)], path)
-    print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1000:.0f} kB")
+    announce(path)
 
 
 def draw_rounds(model: QueryGaussianModel, scene: int) -> None:
@@ -152,16 +159,16 @@ def draw_rounds(model: QueryGaussianModel, scene: int) -> None:
         model.feedback.rounds = count
         prediction = model(sample.inputs)
         views.append(model.render(prediction.gaussians, sample.targets.cameras).rgb[0, 0])
-    errors = [(view - photo).abs().mean(0, keepdim=True) for view in views]
-    scores = [-10 * float((view - photo).square().mean().log10()) for view in views]
+    errors = [color_error(view, photo) for view in views]
+    scores = [float(psnr(view, photo)) for view in views]
     pictures = [rgb_picture(image) for image in (photo, *views)]
-    pictures += [shaded(error, 0, 0.3, "magma") for error in errors]
+    pictures += [error_picture(error, 0.3) for error in errors]
     pictures.append(shaded(errors[1] - errors[0], -0.1, 0.1, "RdBu_r"))
     names = [f"rounds: {n}, {score:.2f} dB" for n, score in zip((0, rounds), scores, strict=True)]
     titles = ("novel view", *names, "error, rounds: 0", f"rounds: {rounds}", "change of the error")
     path = IMAGES / "landmark_round.webp"
     write_webp([titled([enlarged(picture, SIDE) for picture in pictures], titles)], path)
-    print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1000:.0f} kB")
+    announce(path)
 
 
 def layers_picture(model: QueryGaussianModel, views: Views) -> Picture:

@@ -57,7 +57,7 @@ def evaluate(
 
     options.use_threads(threads)
     free = (*SECTIONS, "model.feedback.rounds")
-    if foreign := [text for text in settings if not text.startswith(free)]:
+    if foreign := [s for s in settings if not {k := s.split("=")[0], k.split(".")[0]} & {*free}]:
         raise ValueError(f"{foreign[0]} would change the trained model; set only {', '.join(free)}")
     with CheckpointFile(run) as file:
         checkpoint, recipe, step = file.path, file.recipe, file.step

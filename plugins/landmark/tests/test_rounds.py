@@ -103,6 +103,8 @@ def test_an_evaluation_sets_the_number_of_rounds(tmp_path: Path) -> None:
         assert result.exit_code == 0, result.output
         scores[made, asked] = (out / "scenes.csv").read_text()
     assert scores[2, 1] == scores[1, 1] != scores[2, 2]
+    refusal = run_qgs("eval", file, "--set", "model.feedback.rounds_more=1").exception
+    assert "would change the trained model" in str(refusal)
 
 
 def test_training_supervises_every_round_it_draws() -> None:

@@ -21,7 +21,6 @@ from qgs_refine.planning import (
     Plan,
     Scenes,
     affordable,
-    by_distance,
     judged_frames,
     sized,
 )
@@ -31,6 +30,7 @@ from rich.console import Console
 from test_refining import RENDERER, cloud, ring
 
 import qgs
+from qgs.analysis.scale import further_photos
 from qgs.data.samples import views_in
 from qgs.drawing.images import rgb_picture
 from qgs.geometry.transforms import matrix_to_quat, moved
@@ -212,6 +212,10 @@ def test_points_of_colmap_are_part_of_the_start(photos: Path, tmp_path: Path) ->
 
 
 def test_a_start_is_judged_on_photos_taken_nearby_whatever_their_order() -> None:
-    places = torch.tensor([[0.0], [5.0], [1.0], [0.4], [3.0], [0.6]]) * torch.tensor([1.0, 0, 0])
-    assert by_distance(places, (0, 2), [1, 3, 4, 5])[2:] == [4, 1]
-    assert by_distance(places, (4,), [0, 1, 2, 3, 5])[:2] == [1, 2]
+    c2w = torch.eye(4).repeat(6, 1, 1)
+    c2w[:, 0, 3] = torch.tensor([0.0, 5.0, 1.0, 0.4, 3.0, 0.6])
+    scene = Mock(held_out=(), times=None, cameras=Mock(c2w=c2w))
+    scene.__len__.return_value = 6
+    assert further_photos(scene, (0, 2), (), 2) == (3, 5)
+    assert further_photos(scene, (0, 2), (), 3) == (3, 4, 5)
+    assert further_photos(scene, (4,), (), 2) == (1, 2)

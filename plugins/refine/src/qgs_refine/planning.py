@@ -12,6 +12,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
+from qgs.analysis.scale import further_photos
 from qgs.analysis.scenes import Size, installed_sources, named_scene, reconstruct
 from qgs.cli.options import scale_settings
 from qgs.composer import resolve
@@ -164,20 +165,13 @@ def _start(scenes: Scenes, name: str, model: QueryGaussianModel, frames: str | F
         overrides=scale_settings(scenes.scale),
     )
     inputs = result.sample.input_frames
-    others = [frame for frame in scenes.frames if frame not in inputs]
-    judged = by_distance(scene.cameras.c2w[:, :3, 3], inputs, others)[:_JUDGED] or [*inputs]
-    photos = views_in(result.world, scene, tuple(judged)).to(result.gaussians.means.device)
+    judged = further_photos(scene, inputs, (), _JUDGED) or inputs
+    photos = views_in(result.world, scene, judged).to(result.gaussians.means.device)
     with torch.no_grad():
         rendered = model.render(result.gaussians, photos.cameras).rgb
     quality = float(psnr(rendered, photos.images).mean())
     names = [scene.frame_name(frame) for frame in inputs]
     return Start(name, result.world, result.gaussians, names, quality)
-
-
-def by_distance(places: Tensor, inputs: Frames, others: Sequence[int]) -> list[int]:
-    """`others`, those nearest to the middle of the inputs first. places: of all cameras (F, 3)."""
-    far = (places - places[[*inputs]].mean(0)).norm(dim=-1)
-    return sorted(others, key=lambda frame: float(far[frame]))
 
 
 class Scenes:

@@ -11,10 +11,9 @@ from matplotlib.figure import Figure
 from qgs.drawing.figures import MUTED, categorical, hex_color
 from qgs.drawing.images import finer
 from qgs_viewer.figures import paper
-from qgs_viewer.figures.dispersion import FAR_APART
 from qgs_viewer.figures.exhibits import Exhibit, Exhibition, support_of
 from qgs_viewer.figures.outside import draw_ground, plan_of
-from qgs_viewer.figures.paper import Made, chosen_layers, new_figure, paper_style
+from qgs_viewer.figures.paper import Made, chosen_layers, logarithmic, new_figure, paper_style
 from qgs_viewer.queries import DrawnQuery, query_picture
 
 QUERIES = 6
@@ -93,10 +92,7 @@ def refinement_figure(exhibits: Sequence[Exhibit]) -> Figure:
     for axis, title in ((radius, "support radius"), (step, "anchor's step")):
         axis.set_title(f"{title},\nworld units")
         medians = np.concatenate([line.get_ydata() for line in axis.lines])
-        if medians.max() > FAR_APART * medians.min() > 0:
-            axis.set_yscale("log")
-            axis.tick_params(axis="y", which="minor", length=0)
-        else:
+        if not logarithmic(axis, medians.tolist()):
             axis.set_ylim(0, None)
         axis.set_xlabel("layer")
         axis.xaxis.get_major_locator().set_params(integer=True)

@@ -14,9 +14,8 @@ from qgs.metrics.dispersion import token_dispersion
 from qgs.types import Gaussians
 from qgs_viewer.figures import paper
 from qgs_viewer.figures.exhibits import Exhibition, sample_name
-from qgs_viewer.figures.paper import Made, new_figure, paper_style
+from qgs_viewer.figures.paper import Made, logarithmic, new_figure, paper_style
 
-FAR_APART = 20  # ratio of the greatest value to the least from which the scale is logarithmic
 LONGEST = 40  # scenes that are named each under its bars; of more every n-th
 FEWEST = 8  # scenes that there is room for, so that the bars of few are not broad
 IN_A_LINE = 3  # names of models in the legend
@@ -81,10 +80,9 @@ def _bars(axis: Axes, values: Mapping[str, Sequence[float]]) -> None:
         axis.bar(places, found, 0.92 * wide, color=color, label=f"{name}, mean {mean:.3g}")
         axis.axhline(mean, color=color, linestyle=(0, (4, 2)), linewidth=0.9)
     every = [value for found in values.values() for value in found]
-    if max(every) > FAR_APART * min(every) > 0:
-        axis.set(yscale="log", ylim=(min(every) / 3, max(every) * 1.5))
+    if logarithmic(axis, every):
+        axis.set_ylim(min(every) / 3, max(every) * 1.5)
     axis.tick_params(axis="x", length=0)
-    axis.tick_params(axis="y", which="minor", length=0)
     axis.grid(visible=False, axis="x")
     axis.legend(
         loc="lower right", bbox_to_anchor=(1, 1), ncols=min(len(values), IN_A_LINE), borderaxespad=0

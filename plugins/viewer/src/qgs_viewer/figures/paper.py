@@ -1,7 +1,7 @@
 """The look of figures in papers: sizes, type, pictures as panels, and how they are written."""
 
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
@@ -23,6 +23,7 @@ DPI = 220
 PAD = 2.5  # points between a panel and its label
 SIDE = 512  # pixels on the longer side of pictures that models render for a panel
 INK_HEX = hex_color(INK)
+FAR_APART = 20  # ratio of the greatest value to the least from which a scale is logarithmic
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,15 @@ def caption(name: str, **values: object) -> str:
     file = files("qgs_viewer") / "template" / "captions.toml"
     found: str = tomllib.loads(file.read_text(encoding="utf-8"))[name]["caption"]
     return found.format(**values)
+
+
+def logarithmic(axis: Axes, values: Sequence[float]) -> bool:
+    """Whether y of `axis` is logarithmic now: positive `values` FAR_APART make it so."""
+    far = max(values) > FAR_APART * min(values) > 0
+    if far:
+        axis.set_yscale("log")
+        axis.tick_params(axis="y", which="minor", length=0)
+    return far
 
 
 def new_figure(height: float, gap: float = 0.02, width: float = WIDTH) -> Figure:
