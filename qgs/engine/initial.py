@@ -18,8 +18,8 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     """Give `model`, freshly built from `recipe`, the weights of `recipe.init_from`, if any.
 
     `init_from` is a name as `CheckpointFile` takes it. Queries grow or shrink by their own rule
-    (`Queries.resized`) with random numbers of the recipe's seed, encoder and head adapt weights to
-    their sizes (`ModelComponent.adapted`); everything else must have the same names and shapes.
+    (`Queries.resized`) with random numbers of the recipe's seed, encoder, feedback and head adapt
+    weights (`ModelComponent.adapted`); everything else must have the same names and shapes.
 
     Returns lines about weights of another size, and about options that make the same weights
     predict other Gaussians. Raises FileNotFoundError, CheckpointError with every difference.
@@ -36,14 +36,14 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
         if option != "model.queries.count"
     ]
     weights = dict(learned)
-    for part, component in ("encoder.", model.encoder), ("head.", model.head):
-        adapted = component.adapted(_part(part, learned))
-        weights |= {part + name: values for name, values in adapted.items()}
+    for part in ("encoder", "feedback", "head"):
+        adapted = getattr(model, part).adapted(_part(f"{part}.", learned))
+        weights |= {f"{part}.{name}": values.cpu() for name, values in adapted.items()}
     found = _differences(weights, model, count)
     if found:
         first = (
-            f"init_from: {path} does not fit this recipe; only the number of queries and sizes "
-            "that encoder and head adapt (of patches, to a multiple) may differ:"
+            f"init_from: {path} does not fit this recipe; only the number of queries and what "
+            "encoder, feedback and head adapt (patches, to a multiple) may differ:"
         )
         trained = "options of the model that the checkpoint was trained with:"
         raise CheckpointError("\n  ".join([first, *found, trained, *(f"  {o}" for o in options)]))
@@ -54,7 +54,7 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     changes = [
         _change(name, learned[name], values)
         for name, values in weights.items()
-        if values.shape != learned[name].shape
+        if values.shape != learned.get(name, values).shape
     ]
     return [f"weights start from {path}", *changes, *(f"learned with {o}" for o in options)]
 

@@ -200,7 +200,8 @@ def test_what_is_frozen_gets_no_gradient_and_the_others_get_the_same(
 
     expected, found = gradients(" ".join(names)), gradients(learnt)
     assert set(found) == {name for name in names if name in learnt}
-    assert all(torch.equal(found[name], expected[name]) for name in found)
+    for name, gradient in found.items():  # on a GPU other products and sums are fused
+        torch.testing.assert_close(gradient, expected[name], rtol=1e-5, atol=1e-6)
 
 
 @runs

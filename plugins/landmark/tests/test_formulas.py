@@ -105,33 +105,61 @@ def test_a_number_of_anchors_is_spread_over_the_photos() -> None:
         torch.testing.assert_close(own, depth[:, view::2, 0])
 
 
+def test_parts_of_a_footprint_make_a_query() -> None:
+    """Tiles of 6 x 8 pixels of two parts each: their tokens, and the mean of their depths."""
+    queries, state = started(count=16, parts=2)
+    halves, of_halves = started(count=32)
+    own = {n: w for n, w in queries.state_dict().items() if not n.startswith("part_proj.")}
+    halves.load_state_dict(own)
+    with torch.no_grad():
+        of_halves = halves(memory(), views())
+    # 2 rows of 4 tiles in a photo, each an upper and a lower half: 4 rows of 4.
+    upper, lower = of_halves.features.unflatten(1, (2, 2, 4, 2)).unbind(2)
+    expected = (upper + lower) / 2
+    expected = expected + queries.part_proj((lower - upper) / 2)
+    torch.testing.assert_close(state.features, expected.flatten(1, 3))
+    axis = views().cameras.c2w[:, torch.arange(32) % 2, :3, 2]
+    start = views().cameras.c2w[:, torch.arange(32) % 2, :3, 3]
+    depth = ((of_halves[CENTER] - start) * axis).sum(-1)
+    mean = depth.log().unflatten(1, (2, 2, 4, 2)).mean(2).flatten(1).exp()
+    found = ((state[CENTER] - start[:, :16]) * axis[:, :16]).sum(-1)
+    torch.testing.assert_close(found, mean)
+
+
 def test_far_is_behind_near() -> None:
     with pytest.raises(ValueError, match="far must be more than near"):
         ObservedQueries.Config(near=2.0, far=1.0)
 
 
-def test_gaussians_start_as_the_photo_that_they_stand_for() -> None:
+@pytest.mark.parametrize(
+    ("count", "tile"),  # rows and columns of 2 x 2 pixels in a footprint
+    [(None, (2, 2)), (16, (4, 3)), (8, (4, 6))],
+)
+def test_gaussians_start_as_the_photo_that_they_stand_for(
+    count: int | None, tile: tuple[int, int]
+) -> None:
     """With a head of zeros, each lies on the ray of its 2 x 2 pixels and has their colour."""
-    queries, state = started(count=None, cells=4)
-    head = ColoredHead(ColoredHead.Config(), DIMS).double()
+    each = math.prod(tile)
+    queries, state = started(count=count, cells=each)
+    head = ColoredHead(ColoredHead.Config(gaussians_per_query=each), DIMS).double()
     torch.nn.init.zeros_(head.linear.weight)
     attributes = head(state)
     means = FootprintCenters(FootprintCenters.Config(), DIMS)(attributes.offsets, state)
+
+    def of_queries(maps_BVHWC: Tensor) -> Tensor:
+        parts = maps_BVHWC.unflatten(3, (-1, tile[1])).unflatten(2, (-1, tile[0]))
+        found = parts.transpose(3, 4).flatten(4, 5).flatten(2, 3)
+        return (found if count is None else found.transpose(1, 2)).flatten(1, 2)
+
     small = F.avg_pool2d(views().images.flatten(0, 1), 2).unflatten(0, (2, 2)).movedim(2, -1)
-    parts = (
-        small.unflatten(2, (4, 2)).unflatten(4, (6, 2)).transpose(3, 4).flatten(1, 3).flatten(2, 3)
-    )
-    torch.testing.assert_close(attributes.colors, parts.clamp(0.02, 0.98), rtol=0, atol=1e-6)
+    expected = of_queries(small).clamp(0.02, 0.98)
+    torch.testing.assert_close(attributes.colors, expected, rtol=0, atol=1e-6)
     halved = Cameras(views().cameras.c2w, views().cameras.intrinsics / 2, (8, 12))
-    origin, direction = camera_rays(halved)
-    rays, origins = (
-        x.unflatten(2, (4, 2)).unflatten(4, (6, 2)).transpose(3, 4).flatten(1, 3).flatten(2, 3)
-        for x in (direction, origin)
-    )
+    origins, rays = map(of_queries, camera_rays(halved))
     torch.testing.assert_close(F.normalize(means - origins, dim=-1), rays)
     radii = support_radius(state[RAW_RADIUS], queries.config)
     torch.testing.assert_close(
-        attributes.scales, (0.8 / math.e * radii[..., None]).expand(2, TOKENS, 4, 3)
+        attributes.scales, (0.8 / math.e * radii[..., None]).expand(attributes.scales.shape)
     )
 
 

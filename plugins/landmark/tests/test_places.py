@@ -5,7 +5,15 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from qgs_landmark.places import cells, colors_at, patch_centres, rays_at, sampled, spread
+from qgs_landmark.places import (
+    cells,
+    colors_at,
+    footprint,
+    patch_centres,
+    rays_at,
+    sampled,
+    spread,
+)
 from torch import Tensor
 
 from qgs.geometry.rays import camera_rays
@@ -87,6 +95,31 @@ def test_as_many_points_as_tokens_are_their_patches() -> None:
     view_N, place = spread(48, 1, (24, 32), torch.device("cpu"))
     torch.testing.assert_close(place, patch_centres(6, 8, torch.device("cpu")))
     assert not view_N.any()
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "tile"),  # width and height of a tile, or of a square where none fit
+    [
+        (256, (64, 64), (8, 4)),
+        (512, (64, 64), (4, 4)),
+        (24, (64, 64), (64 / 3, 16)),
+        (26, (64, 64), (17.75, 17.75)),
+        (255, (64, 64), (5.67, 5.67)),
+        (24, (64, 128), (32, 64 / 3)),
+        (1, (64, 64), (90.5, 90.5)),
+    ],
+)
+def test_footprints_are_tiles_where_these_divide_the_photos(
+    count: int, size: tuple[int, int], tile: tuple[float, float]
+) -> None:
+    found = footprint(count, 2, size)
+    assert found == pytest.approx(tile, rel=1e-3)
+    assert math.prod(found) * count == pytest.approx(2 * math.prod(size))
+    if size[1] % found[0] or size[0] % found[1]:
+        return
+    _, place = spread(count, 2, size, torch.device("cpu"))
+    columns, rows = (round(side / part) for side, part in zip(size[::-1], found, strict=True))
+    torch.testing.assert_close(place[::2], patch_centres(rows, columns, place.device))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,9 @@ from refusals import refused
 
 import qgs
 from qgs.composer import resolve
+from qgs.engine.initial import initialise
 from qgs.engine.training_pass import TrainingPass
+from qgs.io.checkpoint import save
 from qgs.types import Cameras, Photos, Views
 
 RECIPES = Path(__file__).parents[3] / "recipes"
@@ -196,3 +198,36 @@ def test_the_shipped_recipe_has_as_many_gaussians_as_the_others() -> None:
         model = qgs.compose(RECIPES / "tiny" / f"{name}.yaml", device="meta")
         counts[name] = sum(parameter.numel() for parameter in model.parameters())
     assert abs(counts["landmark"] / counts["locus"] - 1) < 0.1
+
+
+def test_a_model_without_rounds_starts_one_with_rounds(tmp_path: Path) -> None:
+    """They repeat its layers: what they add to keys, values and features is 0 at first."""
+    plain = resolve(recipe(feedback={"type": "qgs/none"})).build_model()
+    save(plain, tmp_path / "plain.safetensors")
+    grown = resolve(recipe() | {"init_from": str(tmp_path / "plain.safetensors")})
+    model = grown.build_model().eval()
+    said = initialise(model, grown)
+    assert "learned with model.feedback.type: qgs/none (here landmark/rendered)" in said
+    weights = model.state_dict()
+    assert all(torch.equal(weights[name], values) for name, values in plain.state_dict().items())
+    given = views()
+    with torch.no_grad():
+        memory = model.encoder(given)
+        state = model.queries(memory, given)
+        for index in (0, 1, 2, 1, 2, 1, 2):
+            state, _ = model.decoder[index](state, memory)
+            state = model.refinements[model.refinement_of[index]](state)
+        torch.testing.assert_close(model(given).state.features, state.features)
+
+
+def test_rounds_go_on_from_rounds(tmp_path: Path) -> None:
+    first = resolve(recipe())
+    learned = first.build_model()
+    save(learned, tmp_path / "rounds.safetensors")
+    more = resolve(
+        recipe(feedback={"type": "landmark/rendered", "rounds": 3})
+        | {"init_from": str(tmp_path / "rounds.safetensors")}
+    )
+    model = more.build_model()
+    initialise(model, more)
+    assert all(map(torch.equal, model.state_dict().values(), learned.state_dict().values()))

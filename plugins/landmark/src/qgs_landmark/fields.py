@@ -11,7 +11,8 @@ FRAME = "landmark.frame"
 FRAME_FIELD: Fields = {
     FRAME: FieldSpec((3, 3), frame="world", encoding="rows: right, down, ahead in the photo")
 }
-"""The axes of a query's photo (B, N, 3, 3), unit vectors."""
+"""Axes (B, N, 3, 3) of a query's photo. The first two are as long as its footprint is wide and
+high, in sides of a square of that area; the last is 1 long."""
 
 
 def color_field(count: int) -> Fields:

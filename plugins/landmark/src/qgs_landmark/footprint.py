@@ -26,8 +26,9 @@ _OF_CHANNELS = ("linear.weight", "linear.bias")
 class FootprintCenters(RadiusScaledCenters):
     """mean = mu + r (u, v, 0) + r posact(offset), in the frame of the anchor's photo.
 
-    (u, v) is the middle of the Gaussian's cell in a square of side 1 about 0. Where the radius is
-    the side of the footprint, offsets of 0 put each Gaussian onto the ray of its cell.
+    (u, v) is the middle of the Gaussian's cell in a unit square about 0, and the frame's first two
+    axes are the footprint's: where the radius is its side, offsets of 0 put each Gaussian onto the
+    ray of its cell.
     """
 
     name = "footprint"
@@ -44,7 +45,9 @@ class FootprintCenters(RadiusScaledCenters):
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """(B, N, K, 3) -> (B, N, K, 3)."""
-        cell_K3 = F.pad(cells(offsets.shape[2], state[FRAME]), (0, 1))
+        right, down = state[FRAME][0, 0, :2].norm(dim=-1)  # all footprints have one shape
+        aspect = down / right.clamp_min(torch.finfo(right.dtype).tiny)
+        cell_K3 = F.pad(cells(offsets.shape[2], offsets, aspect), (0, 1))
         steps_BNK3 = cell_K3 + self.config.displacement(offsets)
         r_BN1 = support_radius(state[RAW_RADIUS], self.config)
         steps_BNK3 = in_world(r_BN1[:, :, None] * steps_BNK3, state[FRAME])

@@ -14,7 +14,7 @@ from qgs.geometry.precision import full_precision
 from qgs.types import Cameras
 
 EPS = 1e-4
-"""Pixels by which a side may exceed a whole number that it stands for."""
+"""By how much a number may exceed a whole one, or a half, that it stands for."""
 
 
 def patch_centres(rows: int, columns: int, device: torch.device) -> Tensor:
@@ -28,28 +28,60 @@ def spread(
 ) -> tuple[Tensor, Tensor]:
     """Views (N,) of N = `count` points, in turn, and their places (N, 2) in photos (H, W).
 
-    They are middles of parts, which leave nothing out, as points of a low-discrepancy sequence do.
+    They are the middles of parts, which leave nothing out: of tiles, see `footprint`, or of rows
+    that differ in the number of their parts.
     """
     index_N = torch.arange(count, device=device)
     view_N = index_N % views
-    return view_N, parts(index_N // views, (count - 1 - view_N) // views + 1, size[0] / size[1])
+    own_N, held_N = index_N // views, (count - 1 - view_N) // views + 1
+    rows = _rows_of_tiles(count, views, size)
+    return view_N, parts(own_N, held_N, rows or _rows(held_N, size[0] / size[1]))
 
 
-def cells(count: int, like: Tensor) -> Tensor:
-    """Middles (K, 2), x and y, of K = `count` cells of a square of side 1 about 0."""
+def footprint(count: int, views: int, size: tuple[int, int]) -> tuple[float, float]:
+    """Width and height in pixels of the part of a photo (H, W) that is each of `count` points' own.
+
+    A tile, where equal tiles at most twice as wide as high, or high as wide, divide all photos;
+    otherwise a square of that area.
+    """
+    rows, area = _rows_of_tiles(count, views, size), views * math.prod(size) / count
+    height = size[0] / rows if rows else math.sqrt(area)
+    return area / height, height
+
+
+def _rows_of_tiles(count: int, views: int, size: tuple[int, int]) -> int | None:
+    """Rows of the tiles nearest to squares, rather wide than high; None where none fit."""
+    each, rest = divmod(count, views)
+    if rest:
+        return None
+    squared = each * size[0] / size[1]  # that of the rows of squares
+    few = range(1, math.isqrt(int(2 * squared)) + 1)
+    fit = [rows for rows in few if each % rows == 0 and 2 * rows**2 >= squared]
+    return max(fit, key=lambda rows: (min(rows, squared / rows), rows), default=None)
+
+
+def cells(count: int, like: Tensor, aspect: Tensor | float = 1.0) -> Tensor:
+    """Middles (K, 2), x and y, of K = `count` cells of a unit square about 0.
+
+    They are about squares once its height is stretched to `aspect` times its width.
+    """
     index_K = torch.arange(count, device=like.device)
     # A tensor, since torch.compile would make a graph for each number that Python divides.
-    return parts(index_K, (index_K + 1).amax(), 1.0).to(like) - 0.5
+    held = (index_K + 1).amax()
+    return parts(index_K, held, _rows(held, aspect)).to(like) - 0.5
 
 
-def parts(index_N: Tensor, count: Tensor, aspect: float) -> Tensor:
+def _rows(count: Tensor, aspect: Tensor | float) -> Tensor:
+    """Rows of about square parts of a photo `aspect` times as high as wide."""
+    rows = ((count * aspect).sqrt() - EPS).round().clamp_min(1).long()
+    return torch.minimum(rows, count)
+
+
+def parts(index_N: Tensor, count: Tensor, rows: Tensor | int) -> Tensor:
     """Middles (N, 2), x and y, of the parts `index_N` of `count` of a unit square, row by row.
 
-    Rows are of equal height, about that of a part's width in a photo `aspect` times as high as
-    wide; they have as many parts each, or one more.
+    Rows are of equal height and have as many parts each, or one more.
     """
-    rows = (count * aspect).sqrt().round().clamp_min(1).long()
-    rows = torch.minimum(rows, count)
     row_N = ((index_N + 1) * rows - 1) // count
     first_N = row_N * count // rows
     held_N = (row_N + 1) * count // rows - first_N

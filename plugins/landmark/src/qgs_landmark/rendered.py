@@ -1,12 +1,12 @@
 """`landmark/rendered`: rounds in which tokens know how the rendering of their photo is wrong."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
 from pydantic import Field
-from torch import nn
+from torch import Tensor, nn
 
 from qgs.components.blocks import split_heads
 from qgs.contracts import (
@@ -71,6 +71,13 @@ class RenderedFeedback(Feedback):
         if size and any(side % config.shrink for side in size):
             reason = f"images of {size[0]} x {size[1]} (H x W) cannot be {config.shrink} times less"
             yield Problem("shrink", reason, "choose a number that divides both sides")
+
+    def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """As learned; without any, from a model without rounds, errors change nothing at first."""
+        if learned:
+            return dict(learned)
+        own = self.state_dict()
+        return own | {k: torch.zeros_like(own[k]) for k in own if k.startswith("kv_proj.")}
 
     def drawn(self) -> int:
         """Uniformly from `least` to `rounds`."""
