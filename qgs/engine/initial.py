@@ -42,8 +42,8 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     found = _differences(weights, model, count)
     if found:
         first = (
-            f"init_from: {path} does not fit this recipe; only the number of queries and what "
-            "encoder, feedback and head adapt (patches, to a multiple) may differ:"
+            f"init_from: {path} does not fit this recipe; only the number of queries, sizes that "
+            "encoder and head adapt (of patches, to a multiple) and new feedback may differ:"
         )
         trained = "options of the model that the checkpoint was trained with:"
         raise CheckpointError("\n  ".join([first, *found, trained, *(f"  {o}" for o in options)]))
@@ -52,9 +52,9 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     weights |= {_QUERIES + name: values for name, values in resized.items()}
     load_weights(model, weights, str(path))
     changes = [
-        _change(name, learned[name], values)
+        _change(name, learned.get(name), values)
         for name, values in weights.items()
-        if values.shape != learned.get(name, values).shape
+        if name not in learned or values.shape != learned[name].shape
     ]
     return [f"weights start from {path}", *changes, *(f"learned with {o}" for o in options)]
 
@@ -64,9 +64,9 @@ def _part(prefix: str, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
 
 
-def _change(name: str, old: Tensor, new: Tensor) -> str:
-    if not name.startswith(_QUERIES):
-        return f"{name}: {tuple(old.shape)} -> {tuple(new.shape)}"
+def _change(name: str, old: Tensor | None, new: Tensor) -> str:
+    if old is None or not name.startswith(_QUERIES):
+        return f"{name}: {'none' if old is None else tuple(old.shape)} -> {tuple(new.shape)}"
     before, after = len(old), len(new)
     kept = f"{before} kept, {after - before} noisy copies of them"
     return f"{name}: {before} -> {after}, {'the first are kept' if after < before else kept}"

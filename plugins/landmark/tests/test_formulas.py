@@ -105,25 +105,31 @@ def test_a_number_of_anchors_is_spread_over_the_photos() -> None:
         torch.testing.assert_close(own, depth[:, view::2, 0])
 
 
-def test_parts_of_a_footprint_make_a_query() -> None:
-    """Tiles of 6 x 8 pixels of two parts each: their tokens, and the mean of their depths."""
-    queries, state = started(count=16, parts=2)
-    halves, of_halves = started(count=32)
-    own = {n: w for n, w in queries.state_dict().items() if not n.startswith("part_proj.")}
-    halves.load_state_dict(own)
+def test_tokens_of_a_footprint_make_a_query() -> None:
+    """Two side by side in each of 4 x 3 tiles: their features, and the mean of their depths."""
+    queries, state = started(count=24, tokens=2, cells=8)
+    alone, of_tokens = started(count=None)
+    weights = {n: w for n, w in queries.state_dict().items() if not n.startswith("apart_proj.")}
+    alone.load_state_dict(weights)
     with torch.no_grad():
-        of_halves = halves(memory(), views())
-    # 2 rows of 4 tiles in a photo, each an upper and a lower half: 4 rows of 4.
-    upper, lower = of_halves.features.unflatten(1, (2, 2, 4, 2)).unbind(2)
-    expected = (upper + lower) / 2
-    expected = expected + queries.part_proj((lower - upper) / 2)
-    torch.testing.assert_close(state.features, expected.flatten(1, 3))
-    axis = views().cameras.c2w[:, torch.arange(32) % 2, :3, 2]
-    start = views().cameras.c2w[:, torch.arange(32) % 2, :3, 3]
-    depth = ((of_halves[CENTER] - start) * axis).sum(-1)
-    mean = depth.log().unflatten(1, (2, 2, 4, 2)).mean(2).flatten(1).exp()
-    found = ((state[CENTER] - start[:, :16]) * axis[:, :16]).sum(-1)
-    torch.testing.assert_close(found, mean)
+        of_tokens = alone(memory(), views())
+
+    def by_tile(values_BMX: Tensor) -> tuple[Tensor, ...]:
+        """The left and the right one, (B, N, ...); a query's view changes first."""
+        found = values_BMX.unflatten(1, (2, 4, 3, 2)).flatten(2, 3).transpose(1, 2).flatten(1, 2)
+        return found.unbind(2)
+
+    left, right = by_tile(of_tokens.features)
+    expected = (left + right) / 2 + queries.apart_proj((right - left) / 2)
+    torch.testing.assert_close(state.features, expected, rtol=1e-5, atol=1e-6)
+    cameras = views().cameras
+    view = torch.arange(TOKENS) // (TOKENS // 2)
+    local = of_tokens[CENTER] - cameras.c2w[:, view, :3, 3]
+    depth = (local * cameras.c2w[:, view, :3, 2]).sum(-1, keepdim=True)
+    left, right = by_tile(depth)
+    own = state[CENTER] - cameras.c2w[:, torch.arange(24) % 2, :3, 3]
+    found = (own * cameras.c2w[:, torch.arange(24) % 2, :3, 2]).sum(-1, keepdim=True)
+    torch.testing.assert_close(found, (left * right).sqrt())
 
 
 def test_far_is_behind_near() -> None:
@@ -133,7 +139,7 @@ def test_far_is_behind_near() -> None:
 
 @pytest.mark.parametrize(
     ("count", "tile"),  # rows and columns of 2 x 2 pixels in a footprint
-    [(None, (2, 2)), (16, (4, 3)), (8, (4, 6))],
+    [(None, (2, 2)), (12, (4, 4)), (24, (2, 4))],
 )
 def test_gaussians_start_as_the_photo_that_they_stand_for(
     count: int | None, tile: tuple[int, int]

@@ -6,11 +6,13 @@ import pytest
 import torch
 import torch.nn.functional as F
 from qgs_landmark.places import (
+    aspect_of,
     cells,
     colors_at,
-    footprint,
     patch_centres,
     rays_at,
+    rows_in_square,
+    rows_in_tile,
     sampled,
     spread,
 )
@@ -78,7 +80,7 @@ def test_rays_are_those_of_pixels() -> None:
 @pytest.mark.parametrize("views", [1, 2, 5])
 @pytest.mark.parametrize("count", [1, 256, 300])
 def test_points_are_spread_evenly_over_all_photos(views: int, count: int) -> None:
-    view_N, place = spread(count, views, (48, 64), torch.device("cpu"))
+    view_N, place, _ = spread(count, views, (48, 64), 1.0, torch.device("cpu"))
     assert view_N.bincount(minlength=views).max() - view_N.bincount(minlength=views).min() <= 1
     pixels = (patch_centres(48, 64, place.device) * torch.tensor([64.0, 48.0])).double()
     for view in range(views) if count >= 16 * views else ():
@@ -92,34 +94,56 @@ def test_points_are_spread_evenly_over_all_photos(views: int, count: int) -> Non
 
 
 def test_as_many_points_as_tokens_are_their_patches() -> None:
-    view_N, place = spread(48, 1, (24, 32), torch.device("cpu"))
-    torch.testing.assert_close(place, patch_centres(6, 8, torch.device("cpu")))
+    view_N, place, share = spread(48, 1, (24, 32), 1.0, torch.device("cpu"))
+    torch.testing.assert_close(place, patch_centres(6, 8, place.device))
+    torch.testing.assert_close(share, torch.tensor([1 / 8, 1 / 6]))
     assert not view_N.any()
 
 
 @pytest.mark.parametrize(
-    ("count", "size", "tile"),  # width and height of a tile, or of a square where none fit
+    ("count", "views", "size", "aspect", "grid"),  # rows and columns; none where points are in rows
     [
-        (256, (64, 64), (8, 4)),
-        (512, (64, 64), (4, 4)),
-        (24, (64, 64), (64 / 3, 16)),
-        (26, (64, 64), (17.75, 17.75)),
-        (255, (64, 64), (5.67, 5.67)),
-        (24, (64, 128), (32, 64 / 3)),
-        (1, (64, 64), (90.5, 90.5)),
+        (256, 2, (64, 64), 0.5, (16, 8)),
+        (256, 8, (64, 64), 0.5, (8, 4)),
+        (512, 2, (64, 64), 1.0, (16, 16)),
+        (64, 1, (128, 64), 0.5, (16, 4)),
+        (64, 1, (64, 128), 0.5, (8, 8)),
+        (128, 2, (128, 64), 1.0, None),
+        (24, 2, (64, 64), 1.0, (4, 3)),
+        (24, 2, (64, 128), 1.0, None),
+        (512, 4, (64, 64), 1.0, None),
+        (26, 2, (64, 64), 1.0, None),
+        (255, 2, (64, 64), 1.0, None),
+        (2, 5, (64, 64), 1.0, None),
     ],
 )
-def test_footprints_are_tiles_where_these_divide_the_photos(
-    count: int, size: tuple[int, int], tile: tuple[float, float]
+def test_points_are_in_tiles_where_these_divide_the_photos(
+    count: int,
+    views: int,
+    size: tuple[int, int],
+    aspect: float,
+    grid: tuple[int, int] | None,
 ) -> None:
-    found = footprint(count, 2, size)
-    assert found == pytest.approx(tile, rel=1e-3)
-    assert math.prod(found) * count == pytest.approx(2 * math.prod(size))
-    if size[1] % found[0] or size[0] % found[1]:
+    view, place, share = spread(count, views, size, aspect, torch.device("cpu"))
+    wide, high = (share * torch.tensor(size[::-1])).tolist()
+    assert wide * high * count == pytest.approx(views * math.prod(size), rel=1e-5)
+    if grid is None:
+        assert wide == pytest.approx(high, rel=1e-5)
         return
-    _, place = spread(count, 2, size, torch.device("cpu"))
-    columns, rows = (round(side / part) for side, part in zip(size[::-1], found, strict=True))
-    torch.testing.assert_close(place[::2], patch_centres(rows, columns, place.device))
+    assert (size[0] / high, size[1] / wide) == pytest.approx(grid, rel=1e-5)
+    for of in range(views):
+        torch.testing.assert_close(place[view == of], patch_centres(*grid, place.device))
+
+
+@pytest.mark.parametrize(
+    ("count", "in_square", "in_tile", "aspect"),
+    [(1, 1, 1, 1), (2, 1, 1, 0.5), (3, 2, 2, 1), (4, 2, 2, 1), (6, 2, 2, 2 / 3), (8, 3, 2, 0.5)],
+)
+def test_cells_of_tiles_are_squares(
+    count: int, in_square: int, in_tile: int, aspect: float
+) -> None:
+    assert (rows_in_square(count), rows_in_tile(count)) == (in_square, in_tile)
+    assert aspect_of(count) == pytest.approx(aspect)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +155,8 @@ def test_cells_divide_a_square(count: int, rows: list[int]) -> None:
         for row, columns in enumerate(rows)
         for column in range(columns)
     ]
-    torch.testing.assert_close(cells(count, torch.empty(0)), torch.tensor(middles))
+    found = cells(count, rows_in_square(count), torch.empty(0))
+    torch.testing.assert_close(found, torch.tensor(middles))
 
 
 def test_colours_are_means_of_squares() -> None:

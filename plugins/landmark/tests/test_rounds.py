@@ -13,6 +13,7 @@ from qgs.composer import resolve
 from qgs.engine.initial import initialise
 from qgs.engine.training_pass import TrainingPass
 from qgs.io.checkpoint import save
+from qgs.io.tensors import CheckpointError
 from qgs.types import Cameras, Photos, Views
 
 RECIPES = Path(__file__).parents[3] / "recipes"
@@ -207,6 +208,7 @@ def test_a_model_without_rounds_starts_one_with_rounds(tmp_path: Path) -> None:
     grown = resolve(recipe() | {"init_from": str(tmp_path / "plain.safetensors")})
     model = grown.build_model().eval()
     said = initialise(model, grown)
+    assert "feedback.marker: none -> (32,)" in said
     assert "learned with model.feedback.type: qgs/none (here landmark/rendered)" in said
     weights = model.state_dict()
     assert all(torch.equal(weights[name], values) for name, values in plain.state_dict().items())
@@ -231,3 +233,12 @@ def test_rounds_go_on_from_rounds(tmp_path: Path) -> None:
     model = more.build_model()
     initialise(model, more)
     assert all(map(torch.equal, model.state_dict().values(), learned.state_dict().values()))
+
+
+def test_rounds_of_another_kind_are_refused(tmp_path: Path) -> None:
+    save(resolve(recipe()).build_model(), tmp_path / "rounds.safetensors")
+    start = {"init_from": str(tmp_path / "rounds.safetensors")}
+    for feedback in ({"type": "qgs/none"}, {"type": "landmark/rendered", "cells": 1}):
+        other = resolve(recipe(feedback=feedback) | start)
+        with pytest.raises(CheckpointError, match="feedback"):
+            initialise(other.build_model(), other)

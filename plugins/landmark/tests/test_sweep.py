@@ -56,7 +56,9 @@ def test_differences_are_those_of_each_sample_alone() -> None:
     cameras, side, points = given.cameras, 5.0, 3
     error, _ = mismatch(given, torch.tensor([0, 1]), place, DEPTHS, side, points)
     for anchor, (view, other) in enumerate([(0, 1), (1, 0)]):
-        pixels = place[0, anchor] * torch.tensor([32.0, 24.0]) + side * cells(points**2, place)
+        pixels = place[0, anchor] * torch.tensor([32.0, 24.0]) + side * cells(
+            points**2, points, place
+        )
         slope = (pixels - torch.tensor([16.0, 12.0])) / 30
         for index, depth in enumerate(DEPTHS):
             local = depth * torch.cat([slope, torch.ones(len(slope), 1)], -1)

@@ -22,7 +22,7 @@ plugin = Plugin(
         ObservedQueries.Config(count=None),
         ObservedQueries.Config(count=None, per_token=2, radius_bound="offset"),
         ObservedQueries.Config(count=7, cells=4, sweep=6),
-        ObservedQueries.Config(count=8, parts=3, sweep=6),
+        ObservedQueries.Config(count=8, tokens=3, sweep=6),
         NeighbourAttention.Config(count=3, hidden=8),
         ColoredHead.Config(gaussians_per_query=6),
         FootprintCenters.Config(offset="linear"),

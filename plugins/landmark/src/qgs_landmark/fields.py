@@ -1,4 +1,4 @@
-"""What a query knows of the square of a photo that it starts from, its footprint."""
+"""What a query knows of the part of a photo that it starts from, its footprint."""
 
 from torch import Tensor
 
@@ -6,13 +6,18 @@ from qgs.contracts import Fields, FieldSpec
 from qgs.geometry.precision import full_precision
 
 COLORS = "landmark.colors"
+FOOTPRINT = "landmark.footprint"
 FRAME = "landmark.frame"
 
 FRAME_FIELD: Fields = {
     FRAME: FieldSpec((3, 3), frame="world", encoding="rows: right, down, ahead in the photo")
 }
-"""Axes (B, N, 3, 3) of a query's photo. The first two are as long as its footprint is wide and
-high, in sides of a square of that area; the last is 1 long."""
+"""The axes of a query's photo (B, N, 3, 3), unit vectors."""
+FOOTPRINT_FIELD: Fields = {
+    FOOTPRINT: FieldSpec((3,), encoding="width and height in sides, rows of cells")
+}
+"""Width and height (B, N, 3) of a query's footprint, in sides of a square of its area, and how many
+rows its cells have, the same for all queries; 0 where they have no cells."""
 
 
 def color_field(count: int) -> Fields:

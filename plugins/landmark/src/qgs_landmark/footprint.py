@@ -1,4 +1,4 @@
-"""`landmark/footprint`, `landmark/colored`: Gaussians that start as the photo's square they see."""
+"""`landmark/footprint`, `landmark/colored`: Gaussians that start as the photo that they see."""
 
 from collections.abc import Mapping
 
@@ -14,8 +14,16 @@ from qgs.components.head import CHANNELS
 from qgs.contracts import Fields
 from qgs.geometry.precision import at_least_float32
 from qgs.types import GaussianAttributes, QueryState
-from qgs_landmark.fields import COLORS, FRAME, FRAME_FIELD, color_field, in_world
-from qgs_landmark.places import cells
+from qgs_landmark.fields import (
+    COLORS,
+    FOOTPRINT,
+    FOOTPRINT_FIELD,
+    FRAME,
+    FRAME_FIELD,
+    color_field,
+    in_world,
+)
+from qgs_landmark.places import cells, rows_in_square
 
 COLOR_MARGIN = 0.02
 """Colours of photos keep this far from 0 and 1, where no step would change them."""
@@ -26,9 +34,8 @@ _OF_CHANNELS = ("linear.weight", "linear.bias")
 class FootprintCenters(RadiusScaledCenters):
     """mean = mu + r (u, v, 0) + r posact(offset), in the frame of the anchor's photo.
 
-    (u, v) is the middle of the Gaussian's cell in a unit square about 0, and the frame's first two
-    axes are the footprint's: where the radius is its side, offsets of 0 put each Gaussian onto the
-    ray of its cell.
+    (u, v) is the middle of the Gaussian's cell of the footprint about its own, in sides of a square
+    of that area. Where the radius is the side, offsets of 0 put each Gaussian onto its cell's ray.
     """
 
     name = "footprint"
@@ -40,15 +47,16 @@ class FootprintCenters(RadiusScaledCenters):
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Anchors, and the axes of their photos."""
-        return {**super().fields_read(config), **FRAME_FIELD}
+        """Anchors, the axes of their photos, and their footprints."""
+        return {**super().fields_read(config), **FRAME_FIELD, **FOOTPRINT_FIELD}
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """(B, N, K, 3) -> (B, N, K, 3)."""
-        right, down = state[FRAME][0, 0, :2].norm(dim=-1)  # all footprints have one shape
-        aspect = down / right.clamp_min(torch.finfo(right.dtype).tiny)
-        cell_K3 = F.pad(cells(offsets.shape[2], offsets, aspect), (0, 1))
-        steps_BNK3 = cell_K3 + self.config.displacement(offsets)
+        count, (size_BN2, rows_BN1) = offsets.shape[2], state[FOOTPRINT].tensor_split([2], -1)
+        rows = rows_BN1[0, 0, 0].round().long().clamp_max(count)
+        rows = torch.where(rows > 0, rows, rows_in_square(count))
+        cell_BNK2 = size_BN2[:, :, None] * cells(count, rows, offsets)
+        steps_BNK3 = F.pad(cell_BNK2, (0, 1)) + self.config.displacement(offsets)
         r_BN1 = support_radius(state[RAW_RADIUS], self.config)
         steps_BNK3 = in_world(r_BN1[:, :, None] * steps_BNK3, state[FRAME])
         return state[CENTER][:, :, None] + steps_BNK3
@@ -76,7 +84,7 @@ class ColoredHead(GaussianHead):
         return {**color_field(config.gaussians_per_query), **radius_field(config)}
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """A Gaussian takes the weights of the nearest of other cells, which are more or fewer."""
+        """A Gaussian takes the weights of the nearest of more or fewer cells of a square."""
         return {
             name: self._of_cells(values) if name in _OF_CHANNELS else values
             for name, values in learned.items()
@@ -90,7 +98,8 @@ class ColoredHead(GaussianHead):
         if len(rows) % sum(CHANNELS):
             return rows
         rows_KC = rows.unflatten(0, (-1, sum(CHANNELS)))
-        own, theirs = (cells(k, rows) for k in (self.gaussians_per_query, len(rows_KC)))
+        counts = self.gaussians_per_query, len(rows_KC)
+        own, theirs = (cells(k, rows_in_square(k), rows) for k in counts)
         return rows_KC[torch.cdist(own, theirs).argmin(-1)].flatten(0, 1)
 
     def forward(self, state: QueryState) -> GaussianAttributes:

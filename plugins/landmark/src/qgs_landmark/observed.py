@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable
 
 import torch
+import torch.nn.functional as F
 from pydantic import Field, ValidationInfo, field_validator
 from qgs_locus.fields import (
     CENTER,
@@ -31,14 +32,24 @@ from qgs.contracts import (
 from qgs.geometry.constants import constant
 from qgs.geometry.precision import at_least_float32, full_precision
 from qgs.types import ImageMemory, QueryState, SpatialSupport, Views
-from qgs_landmark.fields import COLORS, FRAME, FRAME_FIELD, color_field
+from qgs_landmark.fields import (
+    COLORS,
+    FOOTPRINT,
+    FOOTPRINT_FIELD,
+    FRAME,
+    FRAME_FIELD,
+    color_field,
+)
 from qgs_landmark.places import (
+    aspect_of,
     cells,
     colors_at,
-    footprint,
     patch_centres,
     rays_at,
+    rows_in_square,
+    rows_in_tile,
     sampled,
+    side_of,
     spread,
 )
 from qgs_landmark.sweep import mismatch
@@ -67,10 +78,10 @@ class ObservedQueries(Queries):
     class Config(RadiusOptions):
         count: int | None = Field(default=256, ge=1)
         """N, the number of queries, spread evenly over all input photos, whatever their number and
-        size: in tiles where they can be, in rows otherwise (`places.footprint`); null for
-        `per_token` at the centre of each token's patch."""
-        parts: int = Field(default=1, ge=1)
-        """S, parts of its footprint whose tokens and depths make a query of `count`."""
+        size: in tiles where some of about the shape for `cells` divide them, in rows otherwise;
+        null for `per_token` at the centre of each token's patch."""
+        tokens: int = Field(default=1, ge=1)
+        """S, places in a grid on its footprint whose tokens and depths make a query of `count`."""
         per_token: int = Field(default=1, ge=1)
         """Queries of each token where `count` is null; each has a learned vector of its own."""
         near: float = Field(default=0.2, gt=0)
@@ -80,7 +91,7 @@ class ObservedQueries(Queries):
         sweep: int | None = Field(default=None, ge=2)
         """D, the depths at which photos are compared; null for a depth by the token alone."""
         window: float = Field(default=1.5, gt=0)
-        """Side of the squares that are compared, in sides of the footprint."""
+        """Side of the squares that are compared, in sides of the footprint, or of its 1/S."""
         radius: float = Field(default=1.0, gt=0)
         """Radius that an anchor starts with, in sides of its footprint at its depth."""
         std: float = Field(default=0.3, ge=0)
@@ -112,59 +123,55 @@ class ObservedQueries(Queries):
             self.sharpness = nn.Parameter(torch.tensor(math.log(SHARPNESS)))
             self.unseen = nn.Parameter(torch.tensor(UNSEEN))
             self.match_proj = nn.Linear(config.sweep, dims.width)
-        if config.parts > 1:
-            self.part_proj = nn.Linear((config.parts - 1) * dims.width, dims.width, bias=False)
+        if config.tokens > 1:
+            self.apart_proj = nn.Linear((config.tokens - 1) * dims.width, dims.width, bias=False)
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Centre, raw radius, the axes of the photo, and colours."""
+        """Centre, raw radius, the axes of the photo, footprint, and colours."""
         colors = color_field(config.cells) if config.cells else {}
-        return {**CENTER_FIELD, **radius_field(config), **FRAME_FIELD, **colors}
+        anchor = {**CENTER_FIELD, **radius_field(config), **FRAME_FIELD}
+        return {**anchor, **FOOTPRINT_FIELD, **colors}
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """`per_token` where points are chosen without regard to tokens, `parts` where by them."""
+        """`per_token` where points are chosen without regard to tokens, `tokens` where by them."""
         if config.count is None:
-            yield from without_effect(config, ("parts",), "`count` is null")
+            yield from without_effect(config, ("tokens",), "`count` is null")
         else:
             yield from without_effect(config, ("per_token",), "`count` is a number")
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         """Features (B, N, D), fields of anchors (B, N, ...), those of footprints with `cells`."""
         assert memory.grid is not None
-        (count, rows, columns), device = memory.grid, memory.features.device
-        each, scenes = self.config.per_token, len(memory.features)
-        if self.config.count is None:
-            place_BN2 = patch_centres(rows, columns, device).repeat(count, 1)
-            place_BN2 = place_BN2.repeat_interleave(each, 0).expand(scenes, -1, -1)
-            view_N = torch.arange(count, device=device).repeat_interleave(rows * columns * each)
+        (photos, rows, columns), device = memory.grid, memory.features.device
+        config, scenes, size = self.config, len(memory.features), views.cameras.size
+        if config.count is None:
+            each = config.per_token
+            place_N2 = patch_centres(rows, columns, device).repeat(photos, 1)
+            place_N2 = place_N2.repeat_interleave(each, 0)
+            view_N = torch.arange(photos, device=device).repeat_interleave(rows * columns * each)
+            side = side_of(len(view_N), photos, size)
+            share_2 = side / constant([size[1], size[0]], place_N2)
             x_BND = (memory.features[:, :, None] + self.slots).flatten(1, 2)
-            x_BND, nearness_BN1 = self._seen(x_BND, views, view_N, place_BN2)
+            x_BND, nearness_BN1 = self._swept(x_BND, views, view_N, place_N2)
         else:
-            view_N, place_N2 = spread(self.config.count, count, views.cameras.size, device)
-            place_BN2 = place_N2.expand(scenes, -1, -1)
-            view_X, place_BX2 = self._divided(self.config.parts, views, view_N, place_BN2)
+            aspect = aspect_of(config.cells or 1)
+            view_N, place_N2, share_2 = spread(config.count, photos, size, aspect, device)
+            middle_S2 = cells(config.tokens, rows_in_tile(config.tokens), place_N2)
+            view_X, place_X2 = _divided(view_N, place_N2, share_2 * middle_S2)
+            place_BX2 = place_X2.expand(scenes, -1, -1)
             x_BXD = sampled(memory.features, memory.grid, view_X, place_BX2) + self.slots
-            x_BND, nearness_BN1 = self._joined(*self._seen(x_BXD, views, view_X, place_BX2))
-        return QueryState(x_BND, self._fields(nearness_BN1, views, view_N, place_BN2))
+            x_BND, nearness_BN1 = self._joined(*self._swept(x_BXD, views, view_X, place_X2))
+        return QueryState(x_BND, self._fields(nearness_BN1, views, view_N, place_N2, share_2))
 
-    def _divided(
-        self, count: int, views: Views, view_N: Tensor, place_BN2: Tensor
+    def _swept(
+        self, x_BND: Tensor, views: Views, view_N: Tensor, place_N2: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Views (X,) and places (B, X, 2) of the middles of `count` parts of each footprint."""
-        (height, width), (wide, high) = views.cameras.size, self._footprint(views, len(view_N))
-        share_2 = constant([wide / width, high / height], place_BN2)
-        step_K2 = share_2 * cells(count, place_BN2, high / wide)
-        place_BX2 = (place_BN2[:, :, None] + step_K2).flatten(1, 2)
-        return view_N.repeat_interleave(count), place_BX2
-
-    def _seen(
-        self, x_BND: Tensor, views: Views, view_N: Tensor, place_BN2: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Features, with what a sweep shows in them, and how near places are (B, N, 1): w."""
+        """Features, with what a sweep shows in them, and w, how near places are (B, N, 1)."""
         if self.config.sweep is None:
             return x_BND, at_least_float32(self.depth_mlp(x_BND)).sigmoid()
-        match_BND = self._match(views, view_N, place_BN2)
+        match_BND = self._match(views, view_N, place_N2.expand(len(x_BND), -1, -1))
         x_BND = x_BND + self.match_proj(match_BND.softmax(-1))
         share_BND = (at_least_float32(self.depth_mlp(x_BND)) + match_BND).softmax(-1)
         # Not as a matrix product, which autocast makes in half precision.
@@ -172,21 +179,20 @@ class ObservedQueries(Queries):
         return x_BND, (share_BND * nearness_D).sum(-1, keepdim=True)
 
     def _joined(self, x_BXD: Tensor, nearness_BX1: Tensor) -> tuple[Tensor, Tensor]:
-        """Features and nearness of queries, from those of their parts."""
-        x_BNSD, nearness_BNS1 = (
-            x.unflatten(1, (-1, self.config.parts)) for x in (x_BXD, nearness_BX1)
-        )
+        """Features and nearness of queries, from those of their tokens."""
+        tokens = self.config.tokens
+        x_BNSD, nearness_BNS1 = (x.unflatten(1, (-1, tokens)) for x in (x_BXD, nearness_BX1))
         mean_BND = x_BNSD.mean(2)
-        if self.config.parts > 1:
+        if tokens > 1:
             apart_BNSD = x_BNSD[:, :, 1:] - mean_BND[:, :, None]  # the first is minus the others
-            mean_BND = mean_BND + self.part_proj(apart_BNSD.flatten(2))
+            mean_BND = mean_BND + self.apart_proj(apart_BNSD.flatten(2))
         return mean_BND, nearness_BNS1.mean(2)
 
     def _match(self, views: Views, view_N: Tensor, place_BN2: Tensor) -> Tensor:
         """Logits (B, N, D) of depths, by how well photos agree there."""
         assert self.config.sweep is not None
         depth_D = self._depth(_nearness(self.config.sweep, place_BN2.device))
-        side = self.config.window * _side(views, len(view_N))
+        side = self.config.window * side_of(len(view_N), views.cameras.shape[1], views.cameras.size)
         error_BND, seen_BND = mismatch(views, view_N, place_BN2, depth_D, side, SAMPLES)
         return -self.sharpness.exp() * torch.where(seen_BND, error_BND, self.unseen)
 
@@ -194,42 +200,53 @@ class ObservedQueries(Queries):
         """World units."""
         return self.config.far * (self.config.near / self.config.far) ** nearness
 
-    def _footprint(self, views: Views, count: int) -> tuple[float, float]:
-        """Width and height in pixels of what each of `count` queries stands for."""
-        if self.config.count is None:
-            return _side(views, count), _side(views, count)
-        return footprint(count, views.cameras.shape[1], views.cameras.size)
-
     @full_precision
     def _fields(
-        self, nearness_BN1: Tensor, views: Views, view_N: Tensor, place_BN2: Tensor
+        self,
+        nearness_BN1: Tensor,
+        views: Views,
+        view_N: Tensor,
+        place_N2: Tensor,
+        share_2: Tensor,
     ) -> dict[str, Tensor]:
+        """share_2: width and height of footprints, as shares of the photo's."""
         config, cameras, z_BN1 = self.config, views.cameras, self._depth(nearness_BN1)
+        place_BN2 = place_N2.expand(len(z_BN1), -1, -1)
         origin_BN3, direction_BN3 = rays_at(cameras, view_N, place_BN2)
-        wide, high = self._footprint(views, len(view_N))
-        side = math.sqrt(wide * high)
+        (height, width), (_, photos) = cameras.size, cameras.shape
+        side = side_of(len(view_N), photos, cameras.size)
         focal_BN1 = cameras.intrinsics[:, view_N, :2].mean(-1, keepdim=True)
         radii_BN1 = config.radius * side * z_BN1 / focal_BN1
-        axes_31 = constant([wide / side, high / side, 1.0], z_BN1)[:, None]
+        rows = 0 if config.cells is None else self._rows_of_cells(config.cells)
+        shape_3 = F.pad(
+            share_2.to(z_BN1) * constant([width, height], z_BN1) / side, (0, 1), value=rows
+        )
         anchors = {
             CENTER: origin_BN3 + z_BN1 * direction_BN3,
             RAW_RADIUS: raw_radii(radii_BN1, config),
-            FRAME: cameras.c2w[:, view_N, :3, :3].mT * axes_31,
+            FRAME: cameras.c2w[:, view_N, :3, :3].mT,
+            FOOTPRINT: shape_3.expand(*z_BN1.shape[:2], -1),
         }
         if config.cells is None:
             return anchors
-        view_X, place_BX2 = self._divided(config.cells, views, view_N, place_BN2)
+        cell_K2 = share_2 * cells(config.cells, rows, share_2)
+        view_X, place_X2 = _divided(view_N, place_N2, cell_K2)
+        place_BX2 = place_X2.expand(len(z_BN1), -1, -1)
         colors = colors_at(views.images, side / math.sqrt(config.cells), view_X, place_BX2)
         return anchors | {COLORS: colors.unflatten(1, (-1, config.cells))}
+
+    def _rows_of_cells(self, count: int) -> int:
+        return rows_in_square(count) if self.config.count is None else rows_in_tile(count)
 
     def support(self, state: QueryState) -> SpatialSupport:
         """Balls of the support radius."""
         return ball_support(state[CENTER], support_radius(state[RAW_RADIUS], self.config))
 
 
-def _side(views: Views, count: int) -> float:
-    """Side in pixels of squares of which `count` have the area of all photos."""
-    return math.sqrt(views.cameras.shape[1] * math.prod(views.cameras.size) / count)
+def _divided(view_N: Tensor, place_N2: Tensor, step_K2: Tensor) -> tuple[Tensor, Tensor]:
+    """Views (N * K,) of, and places (N * K, 2) at, K steps from each place."""
+    place_X2 = (place_N2[:, None] + step_K2).flatten(0, 1)
+    return view_N.repeat_interleave(len(step_K2)), place_X2
 
 
 def _nearness(count: int, device: torch.device) -> Tensor:

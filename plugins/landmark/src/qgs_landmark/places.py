@@ -14,7 +14,10 @@ from qgs.geometry.precision import full_precision
 from qgs.types import Cameras
 
 EPS = 1e-4
-"""By how much a number may exceed a whole one, or a half, that it stands for."""
+"""Less than any difference that counts, of pixels or of logarithms of shapes."""
+MOST_OFF = 0.35
+"""Logarithm of the factor, 1.4, by which tiles may be higher or lower than asked for. Twice as high
+or low they start worse than rows (20.1 instead of 20.3 dB, 512 points in 4 photos of 64 x 64)."""
 
 
 def patch_centres(rows: int, columns: int, device: torch.device) -> Tensor:
@@ -24,57 +27,60 @@ def patch_centres(rows: int, columns: int, device: torch.device) -> Tensor:
 
 
 def spread(
-    count: int, views: int, size: tuple[int, int], device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """Views (N,) of N = `count` points, in turn, and their places (N, 2) in photos (H, W).
+    count: int, views: int, size: tuple[int, int], aspect: float, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Views (N,) of N = `count` points, in turn, their places (N, 2) in photos (H, W), and the
+    width and height (2,) of the part of its photo that is each one's own, as shares of the photo.
 
-    They are the middles of parts, which leave nothing out: of tiles, see `footprint`, or of rows
-    that differ in the number of their parts.
+    The parts are equal tiles, where some of about `aspect`, height over width in pixels, divide all
+    photos. Otherwise the points are in rows, some of one more, and their parts count as squares.
+    Either way points leave nothing out, as those of a low-discrepancy sequence do.
     """
-    index_N = torch.arange(count, device=device)
+    index_N, of_photo = torch.arange(count, device=device), size[0] / size[1]
     view_N = index_N % views
-    own_N, held_N = index_N // views, (count - 1 - view_N) // views + 1
-    rows = _rows_of_tiles(count, views, size)
-    return view_N, parts(own_N, held_N, rows or _rows(held_N, size[0] / size[1]))
+    held_N = (count - 1 - view_N) // views + 1
+    # Tensors, since torch.compile would make a graph for each number that Python compares.
+    each, rows_R = held_N.amin(), index_N + 1
+    off_R = (each * of_photo / rows_R**2 / aspect).log().abs()
+    fit_R = (each % rows_R == 0) & (off_R < MOST_OFF) & (each * views == count)
+    wider_R = off_R - EPS * rows_R.log()  # of two that are as far off, the wider one
+    rows, tiled = torch.where(fit_R, wider_R, torch.inf).argmin() + 1, fit_R.any()
+    in_rows_N = torch.minimum((held_N * of_photo).sqrt().round().clamp_min(1).long(), held_N)
+    place_N2 = parts(index_N // views, held_N, torch.where(tiled, rows, in_rows_N))
+    tile_2 = torch.stack([rows / each, 1 / rows])
+    square_2 = side_of(count, views, size) / constant([size[1], size[0]], place_N2)
+    return view_N, place_N2, torch.where(tiled, tile_2, square_2)
 
 
-def footprint(count: int, views: int, size: tuple[int, int]) -> tuple[float, float]:
-    """Width and height in pixels of the part of a photo (H, W) that is each of `count` points' own.
-
-    A tile, where equal tiles at most twice as wide as high, or high as wide, divide all photos;
-    otherwise a square of that area.
-    """
-    rows, area = _rows_of_tiles(count, views, size), views * math.prod(size) / count
-    height = size[0] / rows if rows else math.sqrt(area)
-    return area / height, height
+def side_of(count: int, views: int, size: tuple[int, int]) -> float:
+    """Side in pixels of squares of which `count` have the area of all photos (H, W)."""
+    return math.sqrt(views * math.prod(size) / count)
 
 
-def _rows_of_tiles(count: int, views: int, size: tuple[int, int]) -> int | None:
-    """Rows of the tiles nearest to squares, rather wide than high; None where none fit."""
-    each, rest = divmod(count, views)
-    if rest:
-        return None
-    squared = each * size[0] / size[1]  # that of the rows of squares
-    few = range(1, math.isqrt(int(2 * squared)) + 1)
-    fit = [rows for rows in few if each % rows == 0 and 2 * rows**2 >= squared]
-    return max(fit, key=lambda rows: (min(rows, squared / rows), rows), default=None)
+def rows_in_square(count: int) -> int:
+    """Rows of `count` cells that divide a square into about squares."""
+    return max(1, round(math.sqrt(count)))
 
 
-def cells(count: int, like: Tensor, aspect: Tensor | float = 1.0) -> Tensor:
-    """Middles (K, 2), x and y, of K = `count` cells of a unit square about 0.
+def rows_in_tile(count: int) -> int:
+    """Rows of a grid of `count` cells with one to two times as many columns; where there is none,
+    those of a square."""
+    few = range(math.isqrt(count), 0, -1)
+    grids = (rows for rows in few if count % rows == 0 and count <= 2 * rows**2)
+    return next(grids, rows_in_square(count))
 
-    They are about squares once its height is stretched to `aspect` times its width.
-    """
+
+def aspect_of(count: int) -> float:
+    """Height over width of a tile whose `count` cells are squares."""
+    rows = rows_in_tile(count)
+    return rows**2 / count if count % rows == 0 else 1.0
+
+
+def cells(count: int, rows: int | Tensor, like: Tensor) -> Tensor:
+    """Middles (K, 2), x and y, of K = `count` cells, in rows, of a unit square about 0."""
     index_K = torch.arange(count, device=like.device)
     # A tensor, since torch.compile would make a graph for each number that Python divides.
-    held = (index_K + 1).amax()
-    return parts(index_K, held, _rows(held, aspect)).to(like) - 0.5
-
-
-def _rows(count: Tensor, aspect: Tensor | float) -> Tensor:
-    """Rows of about square parts of a photo `aspect` times as high as wide."""
-    rows = ((count * aspect).sqrt() - EPS).round().clamp_min(1).long()
-    return torch.minimum(rows, count)
+    return parts(index_K, (index_K + 1).amax(), rows).to(like) - 0.5
 
 
 def parts(index_N: Tensor, count: Tensor, rows: Tensor | int) -> Tensor:
@@ -122,7 +128,7 @@ def colors_at(images_BV3HW: Tensor, side: float, view_N: Tensor, place_BN2: Tens
     """
     height, width = images_BV3HW.shape[-2:]
     place_BN2, samples = place_BN2.to(images_BV3HW), max(1, math.ceil(side - EPS))
-    step_P2 = side * cells(samples**2, place_BN2) / constant([width, height], place_BN2)
+    step_P2 = side * cells(samples**2, samples, place_BN2) / constant([width, height], place_BN2)
     return bilinear(images_BV3HW, view_N, place_BN2[:, :, None] + step_P2).mean(-1).mT
 
 

@@ -26,7 +26,7 @@ def mismatch(
     """
     height, width = views.cameras.size
     place_BN2 = place_BN2.to(views.images)
-    step_P2 = side * cells(points**2, place_BN2) / constant([width, height], place_BN2)
+    step_P2 = side * cells(points**2, points, place_BN2) / constant([width, height], place_BN2)
     place_BNP2 = place_BN2[:, :, None] + step_P2
     color_B3NP = bilinear(views.images, view_N, place_BNP2)
     # All other photos at once: torch.compile would make a graph for each length of a loop.
