@@ -210,7 +210,7 @@ class ModelComponent(Component, torch.nn.Module):
         return parameter.ndim != 1
 
     def adapted(self, learned: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """A state dict made of one of other sizes: `init_from` asks encoder, feedback and head.
+        """A state dict made of another, or of none: `init_from` asks encoder, feedback and head.
 
         Weights that cannot be brought to this component's shapes stay, and are then refused.
         """

@@ -21,7 +21,7 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     (`Queries.resized`) with random numbers of the recipe's seed, encoder, feedback and head adapt
     weights (`ModelComponent.adapted`); everything else must have the same names and shapes.
 
-    Returns lines about weights of another size, and about options that make the same weights
+    Returns lines about weights of another size, new ones, and options that make the same weights
     predict other Gaussians. Raises FileNotFoundError, CheckpointError with every difference.
     """
     if recipe.init_from is None:

@@ -16,8 +16,8 @@ FRAME_FIELD: Fields = {
 FOOTPRINT_FIELD: Fields = {
     FOOTPRINT: FieldSpec((3,), encoding="width and height in sides, rows of cells")
 }
-"""Width and height (B, N, 3) of a query's footprint, in sides of a square of its area, and how many
-rows its cells have, the same for all queries; 0 where they have no cells."""
+"""Of a query's footprint (B, N, 3): width and height, in sides of a square of its area, and how
+many rows its cells have, 0 where it has none. It is the same for all queries of some photos."""
 
 
 def color_field(count: int) -> Fields:

@@ -34,8 +34,9 @@ _OF_CHANNELS = ("linear.weight", "linear.bias")
 class FootprintCenters(RadiusScaledCenters):
     """mean = mu + r (u, v, 0) + r posact(offset), in the frame of the anchor's photo.
 
-    (u, v) is the middle of the Gaussian's cell of the footprint about its own, in sides of a square
-    of that area. Where the radius is the side, offsets of 0 put each Gaussian onto its cell's ray.
+    (u, v) is the middle of the Gaussian's cell relative to that of the footprint, in sides of a
+    square of its area. Where the radius is the side, offsets of 0 put each Gaussian onto the ray of
+    its cell.
     """
 
     name = "footprint"
@@ -84,7 +85,10 @@ class ColoredHead(GaussianHead):
         return {**color_field(config.gaussians_per_query), **radius_field(config)}
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """A Gaussian takes the weights of the nearest of more or fewer cells of a square."""
+        """A Gaussian takes the weights of the nearest of more or fewer cells.
+
+        Both are those of a square, as with `count: null`; a grid of a tile may have other places.
+        """
         return {
             name: self._of_cells(values) if name in _OF_CHANNELS else values
             for name, values in learned.items()

@@ -78,10 +78,10 @@ class ObservedQueries(Queries):
     class Config(RadiusOptions):
         count: int | None = Field(default=256, ge=1)
         """N, the number of queries, spread evenly over all input photos, whatever their number and
-        size: in tiles where some of about the shape for `cells` divide them, in rows otherwise;
-        null for `per_token` at the centre of each token's patch."""
+        size: in equal tiles if tiles with nearly square cells fit every photo, else in rows; null
+        for `per_token` at the centre of each token's patch."""
         tokens: int = Field(default=1, ge=1)
-        """S, places in a grid on its footprint whose tokens and depths make a query of `count`."""
+        """S, places of its footprint whose tokens and depths make a query of `count`."""
         per_token: int = Field(default=1, ge=1)
         """Queries of each token where `count` is null; each has a learned vector of its own."""
         near: float = Field(default=0.2, gt=0)
@@ -91,14 +91,15 @@ class ObservedQueries(Queries):
         sweep: int | None = Field(default=None, ge=2)
         """D, the depths at which photos are compared; null for a depth by the token alone."""
         window: float = Field(default=1.5, gt=0)
-        """Side of the squares that are compared, in sides of the footprint, or of its 1/S."""
+        """Side of the squares that are compared, in sides of a square of 1/S of the footprint."""
         radius: float = Field(default=1.0, gt=0)
         """Radius that an anchor starts with, in sides of its footprint at its depth."""
         std: float = Field(default=0.3, ge=0)
         """Standard deviation that the learned vectors start from, which are added to tokens."""
         cells: int | None = Field(default=None, ge=1)
         """K, parts of its footprint whose colours a query knows, for the Gaussians of
-        `landmark/colored`; null where nothing reads them."""
+        `landmark/colored`; null where nothing reads them. 8 are rows of 2, 3 and 3 where `count` is
+        null, and 2 rows of 4 where it is a number, whatever the number of photos."""
 
         @field_validator("far")
         @classmethod
