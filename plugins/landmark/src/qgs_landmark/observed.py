@@ -44,7 +44,7 @@ from qgs_landmark.places import (
     aspect_of,
     cells,
     colors_at,
-    patch_centres,
+    patches,
     rays_at,
     rows_in_square,
     rows_in_tile,
@@ -69,7 +69,9 @@ class ObservedQueries(Queries):
     MLP of the token. With a sweep w is the mean of D values from 0 to 1, with weights softmax(
     MLP(token) - c / t): c is how much the photo differs from the others where it shows that depth.
     The radius is `radius` sides of the anchor's footprint at its depth: the part of the photo that
-    is its share of all photos, a square, or a tile with the side of a square of its area.
+    is its share of all photos, a tile or a square; its side is the root of its area. A query of S
+    tokens starts with the mean of theirs + a matrix times how all but the first differ from it; w
+    is the mean of theirs.
     """
 
     name = "observed"
@@ -145,23 +147,17 @@ class ObservedQueries(Queries):
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         """Features (B, N, D), fields of anchors (B, N, ...), those of footprints with `cells`."""
         assert memory.grid is not None
-        (photos, rows, columns), device = memory.grid, memory.features.device
-        config, scenes, size = self.config, len(memory.features), views.cameras.size
+        config, device, size = self.config, memory.features.device, views.cameras.size
         if config.count is None:
-            each = config.per_token
-            place_N2 = patch_centres(rows, columns, device).repeat(photos, 1)
-            place_N2 = place_N2.repeat_interleave(each, 0)
-            view_N = torch.arange(photos, device=device).repeat_interleave(rows * columns * each)
-            side = side_of(len(view_N), photos, size)
-            share_2 = side / constant([size[1], size[0]], place_N2)
+            view_N, place_N2, share_2 = patches(memory.grid, config.per_token, size, device)
             x_BND = (memory.features[:, :, None] + self.slots).flatten(1, 2)
             x_BND, nearness_BN1 = self._swept(x_BND, views, view_N, place_N2)
         else:
-            aspect = aspect_of(config.cells or 1)
+            photos, aspect = memory.grid[0], aspect_of(config.cells or 1)
             view_N, place_N2, share_2 = spread(config.count, photos, size, aspect, device)
             middle_S2 = cells(config.tokens, rows_in_tile(config.tokens), place_N2)
             view_X, place_X2 = _divided(view_N, place_N2, share_2 * middle_S2)
-            place_BX2 = place_X2.expand(scenes, -1, -1)
+            place_BX2 = place_X2.expand(len(memory.features), -1, -1)
             x_BXD = sampled(memory.features, memory.grid, view_X, place_BX2) + self.slots
             x_BND, nearness_BN1 = self._joined(*self._swept(x_BXD, views, view_X, place_X2))
         return QueryState(x_BND, self._fields(nearness_BN1, views, view_N, place_N2, share_2))
@@ -182,12 +178,12 @@ class ObservedQueries(Queries):
     def _joined(self, x_BXD: Tensor, nearness_BX1: Tensor) -> tuple[Tensor, Tensor]:
         """Features and nearness of queries, from those of their tokens."""
         tokens = self.config.tokens
+        if tokens == 1:
+            return x_BXD, nearness_BX1
         x_BNSD, nearness_BNS1 = (x.unflatten(1, (-1, tokens)) for x in (x_BXD, nearness_BX1))
         mean_BND = x_BNSD.mean(2)
-        if tokens > 1:
-            apart_BNSD = x_BNSD[:, :, 1:] - mean_BND[:, :, None]  # the first is minus the others
-            mean_BND = mean_BND + self.apart_proj(apart_BNSD.flatten(2))
-        return mean_BND, nearness_BNS1.mean(2)
+        apart_BNSD = x_BNSD[:, :, 1:] - mean_BND[:, :, None]  # the first is minus the others
+        return mean_BND + self.apart_proj(apart_BNSD.flatten(2)), nearness_BNS1.mean(2)
 
     def _match(self, views: Views, view_N: Tensor, place_BN2: Tensor) -> Tensor:
         """Logits (B, N, D) of depths, by how well photos agree there."""

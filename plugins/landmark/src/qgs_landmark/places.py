@@ -26,6 +26,16 @@ def patch_centres(rows: int, columns: int, device: torch.device) -> Tensor:
     return torch.cartesian_prod(y, x).flip(-1)
 
 
+def patches(
+    grid: tuple[int, int, int], each: int, size: tuple[int, int], device: torch.device
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As `spread`, `each` points in the middle of every patch of a grid (V, rows, columns)."""
+    photos, rows, columns = grid
+    place_N2 = patch_centres(rows, columns, device).repeat(photos, 1).repeat_interleave(each, 0)
+    view_N = torch.arange(photos, device=device).repeat_interleave(rows * columns * each)
+    return view_N, place_N2, _square(len(view_N), photos, size, place_N2)
+
+
 def spread(
     count: int, views: int, size: tuple[int, int], aspect: float, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -49,8 +59,13 @@ def spread(
     in_rows_N = torch.minimum((held_N * of_photo).sqrt().round().clamp_min(1).long(), held_N)
     place_N2 = parts(index_N // views, held_N, torch.where(tiled, rows, in_rows_N))
     tile_2 = torch.stack([rows / each, 1 / rows])
-    square_2 = side_of(count, views, size) / constant([size[1], size[0]], place_N2)
+    square_2 = _square(count, views, size, place_N2)
     return view_N, place_N2, torch.where(tiled, tile_2, square_2)
+
+
+def _square(count: int, views: int, size: tuple[int, int], like: Tensor) -> Tensor:
+    """Width and height (2,) of a square of `side_of`, as shares of a photo's."""
+    return side_of(count, views, size) / constant([size[1], size[0]], like)
 
 
 def side_of(count: int, views: int, size: tuple[int, int]) -> float:
@@ -60,7 +75,7 @@ def side_of(count: int, views: int, size: tuple[int, int]) -> float:
 
 def rows_in_square(count: int) -> int:
     """Rows of `count` cells that divide a square into about squares."""
-    return max(1, round(math.sqrt(count)))
+    return round(math.sqrt(count))
 
 
 def rows_in_tile(count: int) -> int:
