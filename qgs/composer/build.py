@@ -67,11 +67,10 @@ def build_model(
         decoder, refinements = [], []
         for index in map(str, range(dims.depth)):
             path = ("decoder", "layers", index)
-            has = [slot for slot in SUBLAYER_SLOTS if ("model", *path, slot) in parts]
-            sublayers = {slot: at(*path, slot) for slot in has}
+            sublayers = {s: at(*path, s) for s in SUBLAYER_SLOTS if ("model", *path, s) in parts}
             layer = parts["model", *path, "layer"]
             decoder.append(build(layer, LayerParts(dims, sublayers, layer_scale)))
-            refinements.append(at("decoder", "layers", index, "refinement"))
+            refinements.append(at(*path, "refinement"))
         model = QueryGaussianModel(
             encoder=encoder,
             queries=queries,
@@ -86,16 +85,19 @@ def build_model(
 class OnMeta(TorchFunctionMode):
     """The meta device as constructors need it.
 
-    `linspace` has numbers, which DINO's constructor reads. `randn` and arithmetic give float32
-    tensors by shape alone: torch's own way imports its compiler, for a second.
+    Weights are not drawn. `linspace` has numbers, which DINO's constructor reads. `randn` and
+    arithmetic give float32 tensors by shape alone: torch imports its compiler, for a second.
     """
 
     names = ("add", "sub", "mul", "div", "pow", "__pow__", "__rsub__", "__rdiv__", "__rpow__")
     arithmetic = frozenset(getattr(Tensor, name) for name in names)
+    draws = (nn.init.kaiming_uniform_, nn.init.uniform_, nn.init.normal_, Tensor.uniform_)
 
     def __torch_function__(
         self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
     ) -> Any:
+        if func in self.draws:
+            return args[0] if args else kwargs["tensor"]
         if func is torch.linspace:
             kwargs = {"device": "cpu", **(kwargs or {})}
         elif func is torch.randn and not kwargs:

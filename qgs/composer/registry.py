@@ -127,8 +127,7 @@ def load_usable_plugins() -> tuple[Registry, list[str]]:
     plugins, broken = {"qgs": builtin()}, []
     available = available_plugins()
     for release in map(_release, available.pop("qgs", [])):
-        reason = f"{release} offers a plugin `qgs`, the framework's own name"
-        broken.append(f"{reason}; uninstall {release}")
+        broken.append(f"{release} offers a plugin `qgs`, the framework's name; uninstall {release}")
     for name in sorted(available):
         try:
             plugins[name] = load_plugin(name)
@@ -167,8 +166,7 @@ def load_plugin(name: str) -> InstalledPlugin:
         raise PluginError(f"{named} {message}", f"{fix}, or do without the plugin") from error
     if fault := _plugin_fault(plugin, name):
         raise PluginError(f"{named} {fault}", f"update or correct {release}, or do without it")
-    file = sys.modules[entry.module].__file__
-    folder = Path(file).parent if file else Path()
+    folder = Path(sys.modules[entry.module].__file__ or "").parent
     return InstalledPlugin(plugin, entry.dist.name, entry.dist.version, folder)
 
 
