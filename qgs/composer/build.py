@@ -85,19 +85,20 @@ def build_model(
 class OnMeta(TorchFunctionMode):
     """The meta device as constructors need it.
 
-    Weights are not drawn. `linspace` has numbers, which DINO's constructor reads. `randn` and
-    arithmetic give float32 tensors by shape alone: torch imports its compiler, for a second.
+    `linspace` has numbers, which DINO's constructor reads. Weights are not drawn, and `randn` and
+    arithmetic give float32 tensors by shape alone: for these torch imports its compiler, 1 to 3 s.
     """
 
     names = ("add", "sub", "mul", "div", "pow", "__pow__", "__rsub__", "__rdiv__", "__rpow__")
     arithmetic = frozenset(getattr(Tensor, name) for name in names)
-    draws = (nn.init.kaiming_uniform_, nn.init.uniform_, nn.init.normal_, Tensor.uniform_)
+    hooked = (nn.init.kaiming_uniform_, nn.init.uniform_, nn.init.normal_)
+    draws = (*hooked, Tensor.uniform_, Tensor.normal_)
 
     def __torch_function__(
         self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
     ) -> Any:
-        if func in self.draws:
-            return args[0] if args else kwargs["tensor"]
+        if func in self.draws and (tensor := args[0] if args else kwargs["tensor"]).is_meta:
+            return tensor
         if func is torch.linspace:
             kwargs = {"device": "cpu", **(kwargs or {})}
         elif func is torch.randn and not kwargs:
@@ -142,8 +143,7 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
 def load_pretrained(*parts: nn.Module) -> None:
     """Call `load_pretrained` of every component; its MissingExtraError then names the component."""
     for component in (module for part in parts for module in part.modules()):
-        on_meta = any(x.is_meta for x in component.parameters())
-        if isinstance(component, Component) and not on_meta:
+        if isinstance(component, Component) and not any(x.is_meta for x in component.parameters()):
             try:
                 component.load_pretrained()
             except MissingExtraError as error:
