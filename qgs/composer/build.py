@@ -91,8 +91,8 @@ class OnMeta(TorchFunctionMode):
 
     names = ("add", "sub", "mul", "div", "pow", "__pow__", "__rsub__", "__rdiv__", "__rpow__")
     arithmetic = frozenset(getattr(Tensor, name) for name in names)
-    hooked = (nn.init.kaiming_uniform_, nn.init.uniform_, nn.init.normal_)
-    draws = (*hooked, Tensor.uniform_, Tensor.normal_)
+    hooked = (nn.init.kaiming_uniform_, nn.init.uniform_, nn.init.normal_)  # mode off inside
+    draws = frozenset({*hooked, Tensor.uniform_, Tensor.normal_})
 
     def __torch_function__(
         self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
