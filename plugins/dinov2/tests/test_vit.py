@@ -4,10 +4,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from qgs_dinov2 import DinoMultiViewViT, plugin
+from qgs_dinov2 import DinoMultiViewViT
 from qgs_dinov2.vit import GRID, DinoV2, VitConfig
 from qgs_dinov2.weight_file import load_weights
-from qgs_plugintools import Case, parametrize_with_checks
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -16,11 +15,6 @@ from qgs.contracts import MissingExtraError, ModelDims
 SIZES = {"S": (384, 12, 6), "B": (768, 12, 12), "L": (1024, 24, 16)}
 PUBLISHED = {"S": 22_056_192, "B": 86_579_712, "L": 304_367_616}
 """Parameters of the release, less its mask token."""
-
-
-@parametrize_with_checks([Case(example) for example in plugin.examples], tiers=["core"])
-def test_contract(check) -> None:
-    check()
 
 
 def small() -> DinoV2:

@@ -3,8 +3,7 @@
 import pytest
 from commands import run_qgs
 from contract_mutants.modules import CachesByShape, RaisesWhenBuilt
-from qgs_plugintools import cases_of
-from qgs_plugintools.plugins import exemptions_of
+from qgs_plugintools import runs_of
 
 from qgs.components import (
     FreeCenters,
@@ -18,6 +17,7 @@ from qgs.renderers import TorchRenderer
 
 UNBOUNDED = FreeCenters.Config(output_limit=None)
 LARGE = "large_numbers_stay_finite"
+GRADIENTS, INPUTS = "gradients_match_differences", "gradients_reach_inputs"
 
 
 class CannotDefault(MlpFeedForward):
@@ -71,28 +71,28 @@ def test_the_report_names_what_is_exempt(monkeypatch) -> None:
 
 
 def test_exemptions_are_of_a_class_or_of_options() -> None:
-    exempt = {FreeCenters: {"config_round_trip": "all"}, UNBOUNDED: {LARGE: "these"}}
+    exempt = {FreeCenters: {GRADIENTS: "all"}, UNBOUNDED: {INPUTS: "these"}}
     installed = _installed(FreeCenters, examples=(UNBOUNDED,), exemptions=exempt)
-    cases = cases_of(installed)
-    assert [case.config for case in cases] == [FreeCenters.Config(), UNBOUNDED]
-    known = exemptions_of(installed, cases)
-    assert known == [{"config_round_trip": "all"}, {"config_round_trip": "all", LARGE: "these"}]
+    known = [(run.case.config, run.variant, run.expected) for run in runs_of(installed)]
+    first = (FreeCenters.Config(), False, {GRADIENTS: "all"})
+    assert known == [first, (UNBOUNDED, True, {GRADIENTS: "all", INPUTS: "these"})]
 
 
 @pytest.mark.parametrize(
-    "exemptions",
+    ("exemptions", "examples"),
     [
-        {FreeCenters: {"large_number_stay_finite": "why"}},
-        {FreeCenters: {"supervision_weights": "why"}},
-        {FreeCenters: {LARGE: ""}},
-        {GaussianHead: {LARGE: "why"}},
-        {UNBOUNDED: {LARGE: "why"}},
+        ({FreeCenters: {"large_number_stay_finite": "why"}}, ()),
+        ({FreeCenters: {"supervision_weights": "why"}}, ()),
+        ({FreeCenters: {LARGE: ""}}, ()),
+        ({GaussianHead: {LARGE: "why"}}, ()),
+        ({UNBOUNDED: {INPUTS: "why"}}, ()),
+        ({UNBOUNDED: {LARGE: "why"}}, (UNBOUNDED,)),  # made of the first case of a class alone
     ],
 )
-def test_unsound_exemptions_are_refused(exemptions) -> None:
-    installed = _installed(FreeCenters, exemptions=exemptions)
+def test_unsound_exemptions_are_refused(exemptions, examples) -> None:
+    installed = _installed(FreeCenters, examples=examples, exemptions=exemptions)
     with pytest.raises(PluginError, match="exemptions"):
-        exemptions_of(installed, cases_of(installed))
+        runs_of(installed)
 
 
 @pytest.mark.parametrize(

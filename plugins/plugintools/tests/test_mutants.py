@@ -15,21 +15,14 @@ from qgs.renderers import TorchRenderer
 for file in sorted(Path(sound.__file__).parent.glob("*.py")):
     import_module(f"contract_mutants.{file.stem}")
 
-SLOW = {"loops_over_queries"}
-
-
-def _parameters() -> list:
-    return [
-        pytest.param(m, marks=[pytest.mark.slow] if m.component.name in SLOW else [], id=str(m))
-        for m in MUTANTS
-    ]
+pytestmark = pytest.mark.slow
 
 
 def test_every_check_has_a_mutant() -> None:
     assert {mutant.check for mutant in MUTANTS} == set(CHECKS)
 
 
-@pytest.mark.parametrize("mutant", _parameters())
+@pytest.mark.parametrize("mutant", MUTANTS, ids=str)
 def test_the_mutant_is_caught_by_the_check_that_is_meant(mutant: Mutant) -> None:
     case, meant = mutant.to_case(), CHECKS[mutant.check]
     result = run_check(meant, case)

@@ -35,7 +35,7 @@ def test_it_writes_a_complete_distribution(tmp_path: Path) -> None:
         "src/qgs_far_sighted/__init__.py",
         "src/qgs_far_sighted/abstaining.py",
         "src/qgs_far_sighted/py.typed",
-        "tests/test_components.py",
+        "tests/test_contract.py",
     }
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     assert project["name"] == "qgs-far-sighted"

@@ -1,5 +1,6 @@
 """How checks are run and reported: causes, places of errors, expected failures, arguments."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -10,21 +11,15 @@ from qgs_plugintools import (
     Case,
     CaseRun,
     checks_for,
-    parametrize_with_checks,
     run_check,
 )
 
-from qgs.components import FreeCenters, MlpFeedForward
+from qgs.components import MlpFeedForward
+from qgs.renderers import GsplatRenderer
 
 CASE = Case(MlpFeedForward.Config())
 CACHES = Case(CachesByShape.Config())
 STATE, FROZEN = "forward_keeps_no_state", "config_round_trip"
-
-
-def bound(cases: list[Case], **options) -> dict:
-    """The checks as pytest calls them, by the ids of their tests."""
-    mark = parametrize_with_checks(cases, **options).mark
-    return {parameter.id: parameter.values[0] for parameter in mark.args[1]}
 
 
 def test_an_error_is_reported_with_its_place_in_the_component() -> None:
@@ -36,10 +31,27 @@ def test_an_error_is_reported_with_its_place_in_the_component() -> None:
 
 
 def test_one_cause_is_one_failure() -> None:
-    run = CaseRun(Case(RaisesWhenBuilt.Config()))
-    results = [run.make(check) for check in checks_for(run.case, ["core"])]
+    results = list(CaseRun(Case(RaisesWhenBuilt.Config())).results(["core"]))
     assert [r.check.name for r in results if not r.ok] == ["builds"]
     assert {r.verdict for r in results[1:]} == {"skipped"}
+
+
+def test_a_test_of_a_case_names_all_that_fails_and_skips_what_cannot_run(monkeypatch) -> None:
+    run = CaseRun(CACHES, expected={FROZEN: "it might"})
+    with pytest.raises(pytest.fail.Exception) as failure:
+        run.check(["core"])
+    titles = [line for line in str(failure.value).splitlines() if line.startswith(CACHES.label)]
+    assert titles[0] == f"{CACHES.label}: {STATE}"
+    assert titles[1].startswith(f"{CACHES.label}: {FROZEN} passes, although")
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(pytest.skip.Exception, match="runs on cuda alone"):
+        CaseRun(Case(GsplatRenderer.Config())).check(["core"])
+
+
+def test_further_options_of_a_class_have_the_checks_that_see_options() -> None:
+    variant = {check.name for check in checks_for(CASE, variant=True)}
+    assert {"builds", "runs", "gradients_match_differences"} <= variant
+    assert variant < {check.name for check in checks_for(CASE)}
 
 
 def test_tiers_divide_the_checks_and_likely_causes_come_first() -> None:
@@ -50,21 +62,8 @@ def test_tiers_divide_the_checks_and_likely_causes_come_first() -> None:
 
 
 def test_expected_failures_are_strict() -> None:
-    checks = bound([CACHES], expected_failures={STATE: "a cache", FROZEN: "it might"})
-    with pytest.raises(pytest.xfail.Exception, match=r"a cache \(seen: .* changes _cache"):
-        checks[f"{CACHES.label}-{STATE}"]()
-    with pytest.raises(pytest.fail.Exception, match="passes"):
-        checks[f"{CACHES.label}-{FROZEN}"]()
-
-
-def test_expected_failures_may_depend_on_the_case() -> None:
-    unbounded, bounded = FreeCenters.Config(output_limit=None), FreeCenters.Config()
-    name = "large_numbers_stay_finite"
-    given = {unbounded: {name: "it has no limit"}, bounded: {}}
-    checks = bound(
-        [Case(config) for config in given], expected_failures=lambda case: given[case.config]
-    )
-    first, second = (check for label, check in checks.items() if label.endswith(name))
-    with pytest.raises(pytest.xfail.Exception, match="it has no limit"):
-        first()
-    second()
+    run = CaseRun(CACHES, expected={STATE: "a cache", FROZEN: "it might"})
+    verdicts = {result.check.name: result for result in run.results(["core"])}
+    assert re.search(r"a cache \(seen: .* changes _cache", verdicts[STATE].message)
+    assert verdicts[STATE].ok
+    assert verdicts[FROZEN].verdict == "unexpected pass"

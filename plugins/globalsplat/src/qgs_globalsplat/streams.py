@@ -134,6 +134,8 @@ class Round(DecoderLayer):
 class Stream(nn.Module):
     """(x (B, N, D), memory (B, M, C)) -> x: pre-norm, each update scaled and added."""
 
+    unlearned = ("k_norm.bias",)  # adds the same to all logits of a query
+
     def __init__(self, config: Round.Config, dims: ModelDims, layer_scale: float) -> None:
         super().__init__()
         width, memory_width = dims.width, config.memory_width or dims.width

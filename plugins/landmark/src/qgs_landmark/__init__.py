@@ -29,4 +29,9 @@ plugin = Plugin(
         FramedRefinement.Config(center=False),
         RenderedFeedback.Config(rounds=1, layers=1, shrink=1, cells=1),
     ),
+    exemptions={
+        NeighbourAttention: {
+            "updates_are_explained": "beside values it reads places, which are relative to the query"
+        },
+    },
 )

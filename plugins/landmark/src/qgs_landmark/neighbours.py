@@ -27,6 +27,7 @@ class NeighbourAttention(SelfAttention):
 
     name = "neighbours"
     reads = CENTER_FIELD
+    unlearned = ("place_mlp.fc2.bias",)  # adds the same to all logits of an anchor
 
     class Config(ComponentConfig):
         count: int = Field(default=16, ge=1)

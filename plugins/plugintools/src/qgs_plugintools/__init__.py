@@ -1,19 +1,20 @@
 """The contract suite: checks that every component of a slot must pass.
 
-    from qgs_plugintools import Case, parametrize_with_checks
+    import pytest
+    from qgs_plugintools import runs_of
 
-    @parametrize_with_checks([Case(MyAttention.Config())])
-    def test_contract(check):
-        check()
+    @pytest.mark.parametrize("run", runs_of("sightline"), ids=str)
+    def test_contract(run):
+        run.check()
 
-`qgs check-plugin NAME` runs the same checks on every component of an installed plugin.
+`qgs check-plugin sightline` makes the same checks and prints a report.
 """
 
 import qgs_plugintools.checks  # noqa: F401  (registers the checks)
 from qgs_plugintools.case import CannotCheck, Case, ContractError
-from qgs_plugintools.plugins import cases_of, check_plugin
+from qgs_plugintools.plugins import cases_of, check_plugin, runs_of
 from qgs_plugintools.registry import CHECKS, checks_for
-from qgs_plugintools.running import CaseRun, CheckResult, parametrize_with_checks, run_check
+from qgs_plugintools.running import CaseRun, CheckResult, run_check
 
 __all__ = [
     "CHECKS",
@@ -25,6 +26,6 @@ __all__ = [
     "cases_of",
     "check_plugin",
     "checks_for",
-    "parametrize_with_checks",
     "run_check",
+    "runs_of",
 ]

@@ -1,5 +1,6 @@
 """A component with options and sizes, as the checks see it, and what a check raises."""
 
+import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -79,6 +80,7 @@ class Case:
     image_size: tuple[int, int] | None = None
     fields: Mapping[str, Callable[[Tensor], Tensor]] = field(default_factory=dict)
     state_dict: Mapping[str, tuple[int, ...]] | None = None
+    _kept: dict[int, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not isinstance(self.config, ComponentConfig):
@@ -168,7 +170,18 @@ class Case:
         return built
 
     def lively(self, seed: int = 0) -> Any:
-        """An instance in evaluation mode in which no parameter is zero by initialisation."""
+        """An instance in evaluation mode in which no parameter is zero by initialisation.
+
+        It is built once for each `seed`; every call gets a copy of its own.
+        """
+        if seed not in self._kept:
+            self._kept[seed] = self._build_lively(seed)
+        try:
+            return copy.deepcopy(self._kept[seed])
+        except (TypeError, RuntimeError):  # it keeps what cannot be copied, such as an iterator
+            return self._build_lively(seed)
+
+    def _build_lively(self, seed: int) -> Any:
         module = self.build(seed).eval()
         generator = torch.Generator().manual_seed(seed + 1)
         with torch.no_grad():

@@ -12,7 +12,7 @@ from qgs.composer.registry import (
 from qgs.contracts import Component, ComponentConfig, ModelDims
 from qgs_plugintools.case import Case
 from qgs_plugintools.places import file_of
-from qgs_plugintools.registry import TIERS, Tier, checked_tiers, checks_for
+from qgs_plugintools.registry import TIERS, Tier, checked_tiers
 from qgs_plugintools.running import CaseRun, CheckResult, refuse_unexpectable, with_place
 
 DEPTHS = (2, 12)
@@ -42,14 +42,31 @@ def without_case(installed: InstalledPlugin) -> dict[type[Component], str]:
     return {c: _why_no_default(c) for c in installed.plugin.components if c not in checked}
 
 
-def exemptions_of(installed: InstalledPlugin, cases: list[Case]) -> list[Mapping[str, str]]:
-    """The known failures of each of the `cases`: those of its class and those of its options.
+def runs_of(plugin: str | InstalledPlugin) -> list[CaseRun]:
+    """Return a run for each case of a plugin, for pytest to make a test of each.
 
-    Raises PluginError for exemptions that no check of the cases can have.
+        @pytest.mark.parametrize("run", runs_of("sightline"), ids=str)
+        def test_contract(run):
+            run.check()
+
+    The first case of a class has all checks, the others those of `variants`. Raises PluginError for
+    a plugin that is unusable, and for examples or exemptions that no check can have.
     """
+    installed = load_plugin(plugin) if isinstance(plugin, str) else plugin
+    runs: list[CaseRun] = []
+    for case in cases_of(installed):
+        variant = any(run.case.component is case.component for run in runs)
+        runs.append(CaseRun(case, variant=variant))
+    for run, expected in zip(runs, _exemptions(installed, runs), strict=True):
+        run.expected = expected
+    return runs
+
+
+def _exemptions(installed: InstalledPlugin, runs: list[CaseRun]) -> list[Mapping[str, str]]:
+    """The known failures of each of the `runs`: those of its class and those of its options."""
     exemptions = installed.plugin.exemptions
     for owner, exempted in exemptions.items():
-        concerned = [case for case in cases if _concerns(owner, case)]
+        concerned = [run for run in runs if _concerns(owner, run.case)]
         if not concerned:
             fault = f"{owner!r} is neither a component of the plugin nor the options of a case"
             raise _unsound(installed, "exemptions", fault)
@@ -61,10 +78,10 @@ def exemptions_of(installed: InstalledPlugin, cases: list[Case]) -> list[Mapping
         {
             name: expected
             for owner, exempted in exemptions.items()
-            if _concerns(owner, case)
+            if _concerns(owner, run.case)
             for name, expected in exempted.items()
         }
-        for case in cases
+        for run in runs
     ]
 
 
@@ -74,10 +91,9 @@ def check_plugin(name: str, tiers: Iterable[Tier] = TIERS) -> Iterator[CheckResu
     Raises PluginError for a plugin that is unusable or has invalid examples or exemptions, and
     ValueError for no tiers and for unknown ones.
     """
-    wanted, installed = checked_tiers(tiers), load_plugin(name)
-    cases = cases_of(installed)
-    runs = map(CaseRun, cases, exemptions_of(installed, cases))
-    return (run.make(check) for run in runs for check in checks_for(run.case, wanted))
+    wanted = checked_tiers(tiers)
+    runs = runs_of(name)
+    return (result for run in runs for result in run.results(wanted))
 
 
 def _case(config: ComponentConfig) -> Case:

@@ -40,20 +40,25 @@ PER_QUERY = STATEFUL - {"losses"} | {"feed_forward"}
 
 @dataclass(frozen=True)
 class Check:
-    """One promise of the contract. contract: what it says, in one sentence."""
+    """One promise of the contract.
+
+    contract: what it says, in one sentence. variants: whether it is checked of every case of a
+    class; the others are checked of the first case alone.
+    """
 
     name: str
     function: Callable[[Case], None]
     slots: Collection[str]
     tier: Tier
     contract: str
+    variants: bool
 
 
 CHECKS: dict[str, Check] = {}
 
 
 def check(
-    slots: Collection[str], tier: Tier = "core"
+    slots: Collection[str], tier: Tier = "core", variants: bool = False
 ) -> Callable[[Callable[[Case], None]], Callable[[Case], None]]:
     """Register `check_NAME(case)` as the check NAME of components of `slots`.
 
@@ -63,19 +68,21 @@ def check(
     def register(function: Callable[[Case], None]) -> Callable[[Case], None]:
         name = function.__name__.removeprefix("check_")
         contract = " ".join(cleandoc(function.__doc__ or "").split("\n\n")[0].split())
-        CHECKS[name] = Check(name, function, frozenset(slots), tier, contract)
+        CHECKS[name] = Check(name, function, frozenset(slots), tier, contract, variants)
         return function
 
     return register
 
 
-def checks_for(case: Case, tiers: Iterable[Tier] = TIERS) -> list[Check]:
+def checks_for(case: Case, tiers: Iterable[Tier] = TIERS, variant: bool = False) -> list[Check]:
     """The checks that apply to the slot of `case`, causes before what they cause.
 
+    variant: whether another case of its class comes before it; then only those of `variants`.
     Raises ValueError for no tiers and for unknown ones.
     """
     wanted = checked_tiers(tiers)
     found = [c for c in CHECKS.values() if case.slot in c.slots and c.tier in wanted]
+    found = [c for c in found if c.variants or not variant]
     return sorted(found, key=lambda c: FIRST.index(c.name) if c.name in FIRST else len(FIRST))
 
 

@@ -1,6 +1,6 @@
-"""Run the checks of a case and report how they went, alone or as pytest tests."""
+"""Run the checks of a case and report how they went, alone or as a pytest test."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -14,14 +14,10 @@ from qgs_plugintools.registry import (
     TIERS,
     Check,
     Tier,
-    checked_tiers,
     checks_for,
 )
 
 Verdict: TypeAlias = Literal["passed", "failed", "skipped", "expected failure", "unexpected pass"]
-
-ExpectedFailures: TypeAlias = Mapping[str, str] | Callable[[Case], Mapping[str, str]]
-"""Check -> why it fails, for all cases, or as a function of the case."""
 
 
 @dataclass(frozen=True)
@@ -45,21 +41,49 @@ class CheckResult:
 
 
 class CaseRun:
-    """The checks of one case, one after the other. After `builds` or `runs` the rest is skipped."""
+    """All checks of one case. After `builds` or `runs` fails, the rest is skipped.
 
-    def __init__(self, case: Case, expected: Mapping[str, str] | None = None) -> None:
+    expected: check -> why it fails; such a check that passes is a failure.
+    variant: whether another case of its class comes before it; see `Check.variants`.
+    """
+
+    def __init__(
+        self, case: Case, expected: Mapping[str, str] | None = None, variant: bool = False
+    ) -> None:
         self.case = case
         self.expected = expected or {}
-        self.cause = ""
+        self.variant = variant
 
-    def make(self, check: Check) -> CheckResult:
-        """Run the next check."""
-        if self.cause not in ("", check.name):
-            return CheckResult(self.case, check, "skipped", f"`{self.cause}` fails: see that check")
-        result = run_check(check, self.case, self.expected.get(check.name, ""))
-        if check.name in BASICS:
-            self.cause = "" if result.ok else check.name
-        return result
+    def __str__(self) -> str:
+        return self.case.label
+
+    def results(self, tiers: Iterable[Tier] = TIERS) -> Iterator[CheckResult]:
+        """How each check went, in their order. Raises ValueError for unknown tiers."""
+        cause = ""
+        for check in checks_for(self.case, tiers, self.variant):
+            if cause:
+                message = f"`{cause}` fails: see that check"
+                yield CheckResult(self.case, check, "skipped", message)
+                continue
+            result = run_check(check, self.case, self.expected.get(check.name, ""))
+            if check.name in BASICS and not result.ok:
+                cause = check.name
+            yield result
+
+    def check(self, tiers: Iterable[Tier] = TIERS) -> None:
+        """Make all checks inside of a pytest test, which fails with the messages of all that fail.
+
+        It is skipped where the component cannot be built or called. tiers: "core", "extended".
+        """
+        import pytest
+
+        results = list(self.results(tiers))
+        failures = [result.message for result in results if not result.ok]
+        if failures:
+            pytest.fail("\n\n".join(failures), pytrace=False)
+        for result in results:
+            if result.leaves_unchecked:
+                pytest.skip(result.message)
 
 
 def run_check(check: Check, case: Case, expected: str = "") -> CheckResult:
@@ -88,19 +112,20 @@ def run_check(check: Check, case: Case, expected: str = "") -> CheckResult:
     return CheckResult(case, check, "unexpected pass", why)
 
 
-def refuse_unexpectable(expected: Mapping[str, Any], cases: Iterable[Case]) -> None:
-    """Raise ValueError for an expected failure of no check, of no case, or without a reason.
+def refuse_unexpectable(expected: Mapping[str, Any], runs: Iterable[CaseRun]) -> None:
+    """Raise ValueError for an expected failure of no check, of no run, or without a reason.
 
     expected: name of a check -> why it fails.
     """
-    slots = {case.slot for case in cases}
+    made = {check.name for run in runs for check in checks_for(run.case, variant=run.variant)}
     for name, why in expected.items():
         if name not in CHECKS:
             fix = did_you_mean(str(name), CHECKS, "checks")
             raise ValueError(f"there is no check `{name}`; {fix}")
-        if not slots & set(CHECKS[name].slots) or name in BASICS:
-            others = ", ".join(sorted(CHECKS[name].slots))
-            raise ValueError(f"`{name}` cannot be expected to fail here; it is for {others}")
+        if name in BASICS or name not in made:
+            slots = ", ".join(sorted(CHECKS[name].slots))
+            kept = "" if CHECKS[name].variants else " and the first case of a class"
+            raise ValueError(f"`{name}` cannot be expected to fail here; it is for {slots}{kept}")
         if not (isinstance(why, str) and why.strip()):
             raise ValueError(f"the expected failure of `{name}` needs a reason, as a text")
 
@@ -115,58 +140,3 @@ def with_place(error: BaseException, file: str | None) -> str:
     what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
     place = place_in(error, [package_of(file)]) if file else ""
     return f"{what} (raised under {place})" if place else what
-
-
-@dataclass(frozen=True)
-class BoundCheck:
-    """A check of a case, to be called inside a pytest test."""
-
-    check: Check
-    run: CaseRun
-
-    def __call__(self) -> None:
-        """Pass, or end the pytest test as failed, skipped or expected to fail."""
-        import pytest
-
-        result = self.run.make(self.check)
-        if result.verdict == "skipped":
-            pytest.skip(result.message)
-        if result.verdict == "expected failure":
-            pytest.xfail(result.message)
-        if not result.ok:
-            pytest.fail(result.message, pytrace=False)
-
-
-def parametrize_with_checks(
-    cases: Iterable[Case],
-    *,
-    expected_failures: ExpectedFailures | None = None,
-    tiers: Iterable[Tier] = TIERS,
-) -> Callable[[Callable[..., Any]], Any]:
-    """Parametrise a pytest test with every check that applies to each case.
-
-        @parametrize_with_checks([Case(MyAttention.Config())])
-        def test_contract(check):
-            check()
-
-    expected_failures: check -> why the cases fail it, or a function that gives that for a case.
-        A check that passes nevertheless is a failure.
-    tiers: "core", "extended".
-    Raises TypeError if `cases` is not a list of cases, at least one; ValueError for unknown tiers
-    and expected failures that no check can have.
-    """
-    import pytest
-
-    chosen, wanted = list(cases), checked_tiers(tiers)
-    if not chosen or not all(isinstance(case, Case) for case in chosen):
-        raise TypeError(f"{cases!r} is no list of cases; give [Case(MyComponent.Config())]")
-    parameters = []
-    for case in chosen:
-        expected = expected_failures(case) if callable(expected_failures) else expected_failures
-        refuse_unexpectable(expected or {}, [case] if callable(expected_failures) else chosen)
-        run = CaseRun(case, expected)
-        parameters += [
-            pytest.param(BoundCheck(check, run), id=f"{case.label}-{check.name}")
-            for check in checks_for(case, wanted)
-        ]
-    return pytest.mark.parametrize("check", parameters)

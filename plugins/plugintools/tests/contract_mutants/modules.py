@@ -179,6 +179,19 @@ class HasAnUnusedLayer(MlpFeedForward):
         self.unused = nn.Linear(dims.width, dims.width)
 
 
+@mutant("parameters_learn", "no gradient reaches shift")
+class ShiftsAllLogits(ContentCrossAttention):
+    """What is added to all logits alike changes no weight: its gradient is a rounding error."""
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.shift = nn.Parameter(torch.zeros(1, 1, 1))
+
+    def forward(self, state, memory):
+        shift = self.shift.float().expand(1, 1, memory.keys.shape[2])
+        return self.core(state.features, memory.keys, memory.values, shift)
+
+
 @mutant("inputs_are_not_changed", "the inputs differ: offsets")
 class ClampsItsInputInPlace(FreeCenters):
     def forward(self, offsets, state):

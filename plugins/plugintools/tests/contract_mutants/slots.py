@@ -10,6 +10,7 @@ from qgs_tokengs2026.latents import LatentBottleneck
 from torch import Tensor, nn
 
 from qgs.components import (
+    ContentCrossAttention,
     ContentSelfAttention,
     GaussianHead,
     LatentQueries,
@@ -248,6 +249,24 @@ class ExplainsBySigmoid(ContentSelfAttention):
     def explain(self, state, queries):
         content = super().explain(state, queries).content
         return AttentionWeights(content, None, torch.sigmoid(content))
+
+
+def explained_twice_as_sharply(given: AttentionWeights) -> AttentionWeights:
+    content = 2 * given.content
+    logits = content if given.geometry is None else content + given.geometry
+    return AttentionWeights(content, given.geometry, logits.softmax(-1))
+
+
+@mutant("explanation_is_of_the_forward_pass", "the weights change otherwise")
+class ExplainsCrossAttentionTooSharply(ContentCrossAttention):
+    def explain(self, state, memory, queries):
+        return explained_twice_as_sharply(super().explain(state, memory, queries))
+
+
+@mutant("updates_are_explained", "of them is left")
+class ExplainsSelfAttentionTooSharply(ContentSelfAttention):
+    def explain(self, state, queries):
+        return explained_twice_as_sharply(super().explain(state, queries))
 
 
 @mutant("explanation_is_a_softmax", "content is not finite: a mask is geometry")

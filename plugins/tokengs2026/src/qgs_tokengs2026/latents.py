@@ -72,6 +72,8 @@ class LatentBottleneck(MultiscaleReadout):
         self.latent_kv_proj = nn.Linear(width, 2 * width)
         self.k_norm = nn.LayerNorm(width // dims.heads, eps)
 
+    unlearned = ("feature_k_norm.bias",)  # adds the same to all logits of a latent
+
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
         """No weight decay on the latents (TokenGS release)."""
         return name != "latents" and super().decays(name, parameter)

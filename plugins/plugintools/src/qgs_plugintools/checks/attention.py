@@ -16,11 +16,15 @@ from qgs_plugintools.case import Case, expect
 from qgs_plugintools.inputs import Inputs, Sizes, inputs_of
 from qgs_plugintools.registry import check
 from qgs_plugintools.trees import (
+    cast,
     difference,
     floating,
     leaves,
     mapped,
 )
+
+QUERIES = 6
+"""Queries of a state in which each is masked in turn."""
 
 
 @check({"cross_attention"})
@@ -103,12 +107,15 @@ def check_explanation_is_of_the_forward_pass(case: Case) -> None:
     given = _explanation(module, inputs)
     if given is None or "memory.values" not in case.component.fields_read(case.config):
         return
+    _expect_read_by_weights(module, inputs, given)
     if given.geometry is None:
         state = inputs["state"]
-        inputs["state"] = state.replace(
-            features=state.features[:, :1].expand_as(state.features).clone()
-        )
-        given = _explanation(module, inputs) or given
+        equal = state.features[:, :1].expand_as(state.features).clone()
+        inputs["state"] = state.replace(features=equal)
+        _expect_read_by_weights(module, inputs, _explanation(module, inputs) or given)
+
+
+def _expect_read_by_weights(module: Any, inputs: Inputs, given: AttentionWeights) -> None:
     inputs = mapped(inputs, lambda n, x: x.requires_grad_() if n == "memory.values" else x)
     update, values = module(*inputs.values()), inputs["memory"].values
     lengths = torch.stack([_lengths(update[:, n], values) for n in range(update.shape[1])], 2)
@@ -122,6 +129,35 @@ def check_explanation_is_of_the_forward_pass(case: Case) -> None:
     worst = (high - low).where(visible.any(-1), 0.0).max().item()
     seen = "the weights change otherwise than the forward pass from one query to the next"
     expect(worst < 1e-3, f"{seen}, in their logarithms by up to {worst:.3g}")
+
+
+@check({"self_attention"})
+def check_updates_are_explained(case: Case) -> None:
+    """Updates are what the weights that `explain` gives make of one value for each query and head.
+
+    Whichever queries are masked, the values stay. So the updates under several masks are linear in
+    unknown values, of which there are fewer: they are solved for, and must leave no rest.
+    """
+    module = case.lively().double()
+    inputs = cast(inputs_of(case, Sizes(batch=1, queries=QUERIES)), torch.float64)
+    masks = torch.ones(1 + QUERIES, QUERIES, dtype=torch.bool)
+    masks[1:] ^= torch.eye(QUERIES, dtype=torch.bool)
+    factors, updates = [], []
+    for mask in masks:
+        state = replace(inputs["state"], mask=mask[None])
+        given = _explanation(module, {"state": state})
+        if given is None:
+            return
+        weights = given.weights[0, :, mask].double()  # (h, Q, N)
+        bias = torch.ones(weights.shape[1], 1, dtype=torch.float64)
+        factors.append(torch.cat([*weights, bias], 1))
+        with torch.no_grad():
+            updates.append(module(state)[0, mask])
+    factor, update = torch.cat(factors), torch.cat(updates)
+    rest = update - factor @ torch.linalg.pinv(factor) @ update
+    share = (rest.norm() / update.norm().clamp_min(1e-30)).item()
+    seen = "no values, read by the weights that `explain` gives, make the updates"
+    expect(share < 1e-3, f"{seen}: {share:.1%} of them is left")
 
 
 def _lengths(update: Tensor, values: Tensor) -> Tensor:

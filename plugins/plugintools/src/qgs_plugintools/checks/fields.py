@@ -50,7 +50,7 @@ GIVEN = "given_fields"
 """Names of the plugin that offers the component, and of the queries that give it its fields."""
 
 
-@check(READERS)
+@check(READERS, variants=True)
 def check_reads_within_requires(case: Case) -> None:
     """Only fields in `requires` are asked for, of the state and of the image memory.
 
@@ -122,7 +122,7 @@ def _with_asked_fields(inputs: Inputs, asked: set[str]) -> Inputs:
     return {name: changed(value) for name, value in inputs.items()}
 
 
-@check(READERS)
+@check(READERS, variants=True)
 def check_requires_are_read(case: Case) -> None:
     """Every field in `requires` is read: else recipes that lack it are refused for nothing.
 
@@ -151,7 +151,7 @@ def _with_others(case: Case, inputs: Inputs, field: str) -> Iterator[Inputs]:
         yield mapped(inputs, lambda n, x, o=other: o[n] if n in full else x)
 
 
-@check({"layer", "refinement", "feedback", "queries"})
+@check({"layer", "refinement", "feedback", "queries"}, variants=True)
 def check_writes_equal_provides(case: Case) -> None:
     """The fields that are written are those in `provides`, in the shape and dtype given there.
 

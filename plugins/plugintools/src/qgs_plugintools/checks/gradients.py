@@ -21,7 +21,15 @@ from qgs_plugintools.inputs import (
 )
 from qgs_plugintools.modules import each_mode, seeded
 from qgs_plugintools.registry import MODULES, check
-from qgs_plugintools.trees import cast, floating, gradients, mapped, not_finite, scalar
+from qgs_plugintools.trees import (
+    cast,
+    difference,
+    floating,
+    gradients,
+    mapped,
+    not_finite,
+    scalar,
+)
 
 READ = {
     "cross_attention": ("state.features",),
@@ -45,7 +53,7 @@ SEPARATE = 200
 """Parameters whose gradients are compared one by one; of modules with more, all together."""
 
 
-@check(READ)
+@check(READ, variants=True)
 def check_gradients_reach_inputs(case: Case) -> None:
     """What a component reads gets a gradient: the inputs of its slot and the fields it requires.
     One stopped on purpose, as of reference points, is an expected failure of this check and
@@ -106,7 +114,7 @@ def check_terms_have_gradients(case: Case) -> None:
     expect(zeros or not idle, f"no gradient comes from the term {', '.join(sorted(idle or ()))}")
 
 
-@check(MODULES - {"renderer"})
+@check(MODULES - {"renderer"}, variants=True)
 def check_gradients_match_differences(case: Case) -> None:
     """In float64, gradients agree with finite differences (torch.autograd.gradcheck).
 
@@ -134,9 +142,15 @@ def check_gradients_match_differences(case: Case) -> None:
         with seeded(0):
             return scalar(functional_call(module, own, tuple(changed.values())))
 
+    checked: dict[str, Tensor] = {}
     for mode in each_mode(module):
-        if not value(*points.values()).requires_grad:
+        total = value(*points.values())
+        if not total.requires_grad:
             continue  # what it should have gradients in is the subject of other checks
+        found = {"value": total, **gradients(total, points)}
+        if checked and not difference(found, checked):
+            continue  # it is the same in both modes
+        checked = found
         try:
             gradcheck(value, [*points.values()], eps=1e-6, atol=1e-5, rtol=1e-3, fast_mode=True)
         except GradcheckError as error:

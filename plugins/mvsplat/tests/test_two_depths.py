@@ -1,48 +1,40 @@
-"""Components of DepthSplat keep their contracts; both depths of two scales are supervised."""
+"""DepthSplat's two depths: both are supervised, layers exchange them, errors count where known."""
 
 from dataclasses import replace
 
 import pytest
 import torch
-from qgs_mvsplat import DecayedSupervision, DepthError, DepthSplatEncoder, Exchange, WorldHead
-from qgs_plugintools import Case, cases_of, checks_for, parametrize_with_checks, run_check
+from qgs_mvsplat import DecayedSupervision, DepthError, DepthSplatEncoder, Exchange
+from qgs_plugintools import CHECKS, Case, cases_of, run_check
 from qgs_plugintools.inputs import inputs_of
-from qgs_plugintools.plugins import exemptions_of
 
 from qgs.composer.registry import load_plugin
 from qgs.contracts import LayerParts, MetricInput, ModelDims
 from qgs.types import ImageMemory, QueryState
 
-OWN = (DepthSplatEncoder, WorldHead, Exchange, DecayedSupervision, DepthError)
-PLUGIN = load_plugin("mvsplat")
-ALL = cases_of(PLUGIN)
-KNOWN = dict(zip([case.label for case in ALL], exemptions_of(PLUGIN, ALL), strict=True))
-CASES = [case for case in ALL if issubclass(case.component, OWN)]
-
-ONE = next(case for case in CASES if case.component is DepthSplatEncoder)
-SEVERAL = {"features": 64, "scales": 2, "coarse_depth": True}
-TWO: Case = replace(ONE, config=ONE.config.model_copy(update=SEVERAL))
-STOPPED = ("gradients_match_differences", "tokens_are_those_of_the_grid", *KNOWN[ONE.label])
-"""Of two scales no check can follow the gradients: the second sweep takes none of the first. Tokens
-are placed by the code of one scale."""
+CHECKED = ("builds", "runs", "sizes_vary", "inputs_are_not_changed", "batch_independence")
+CHECKED += ("eval_repeats_bitwise", "zeros_stay_finite", "geometry_is_float32_under_autocast")
 
 
-@parametrize_with_checks(CASES, expected_failures=lambda case: KNOWN[case.label], tiers=["core"])
-def test_contract(check) -> None:
-    check()
+def depthsplat(scales: int) -> Case:
+    """The example of the plugin with so many scales; of two, each has a depth."""
+    cases = cases_of(load_plugin("mvsplat"))
+    example = next(case for case in cases if case.component is DepthSplatEncoder)
+    sizes = {"features": 32 * scales, "scales": scales, "coarse_depth": scales > 1}
+    return replace(example, config=example.config.model_copy(update=sizes))
 
 
-@pytest.mark.parametrize(
-    "check", [x for x in checks_for(TWO, ["core"]) if x.name not in STOPPED], ids=lambda x: x.name
-)
-def test_contract_of_two_scales(check) -> None:
-    outcome = run_check(check, TWO)
-    assert outcome.verdict != "failed", outcome.message
+def test_two_scales_keep_the_contract() -> None:
+    """No check can follow the gradients: the second sweep takes none of the first."""
+    case = depthsplat(scales=2)
+    results = [run_check(CHECKS[name], case) for name in CHECKED]
+    assert [result.message for result in results if result.verdict != "passed"] == []
 
 
 def test_the_first_sweep_learns_from_its_own_depth_alone() -> None:
-    encoder = TWO.lively()
-    numbers = encoder(*inputs_of(TWO).values()).features
+    case = depthsplat(scales=2)
+    encoder = case.lively()
+    numbers = encoder(*inputs_of(case).values()).features
     heads = [head[2].weight for head in encoder.network.depth_predictor.depth_head]
     coarse = torch.autograd.grad(numbers[..., -1].sum(), heads, retain_graph=True)
     final = torch.autograd.grad(numbers[..., 0].sum(), heads)
@@ -65,7 +57,7 @@ def test_later_depths_weigh_more() -> None:
 
 
 def test_errors_of_depth_count_where_the_truth_is_known() -> None:
-    views = inputs_of(ONE)["views"]
+    views = inputs_of(depthsplat(scales=1))["views"]
     true = torch.tensor([2.0, 4, 0, 1]).view(1, 1, 1, 2, 2)
     rendered = torch.tensor([3.0, 3, 7, 0]).view(1, 1, 1, 2, 2)
     metric = DepthError(DepthError.Config())

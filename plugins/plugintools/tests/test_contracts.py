@@ -1,0 +1,60 @@
+"""Every component of this repository keeps its contract, and its weights keep their names."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+from qgs_plugintools import CaseRun, runs_of
+from qgs_plugintools.plugins import without_case
+
+from qgs.composer.registry import load_plugin
+
+PINNED = json.loads((Path(__file__).parent / "state_dicts.json").read_text())
+"""Plugin -> label of a case -> name -> shape of a weight, so that saved weights stay loadable."""
+
+WITHOUT_CASE = {"vggt_features"}
+"""Components that need weights of their own, which the tests of their plugin make."""
+
+
+def all_runs() -> Iterator[CaseRun]:
+    for plugin, pinned in PINNED.items():
+        for run in runs_of(plugin):
+            run.case = replace(run.case, state_dict=pinned.get(run.case.label))
+            yield run
+
+
+RUNS = list(all_runs())
+
+
+@pytest.mark.parametrize("run", [run for run in RUNS if run.case.slot != "data"], ids=str)
+def test_contract(run: CaseRun) -> None:
+    run.check(["core"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", [run for run in RUNS if run.case.slot == "data"], ids=str)
+def test_contract_of_data(run: CaseRun) -> None:
+    run.check(["core"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", [run for run in RUNS if not run.variant], ids=str)
+def test_extended_contract(run: CaseRun) -> None:
+    run.check(["extended"])
+
+
+def test_every_component_is_checked_and_its_weights_are_pinned() -> None:
+    unchecked = set()
+    for plugin, pinned in PINNED.items():
+        with_weights = [run for run in runs_of(plugin) if run.case.has_parameters]
+        assert pinned.keys() <= {run.case.label for run in with_weights}, plugin
+        assert pinned.keys() >= {run.case.label for run in with_weights if not run.variant}, plugin
+        unchecked |= {component.name for component in without_case(load_plugin(plugin))}
+    assert unchecked == WITHOUT_CASE
+
+
+def test_every_plugin_of_this_environment_is_checked() -> None:
+    assert PINNED.keys() == {"qgs", *(entry.name for entry in entry_points(group="qgs.plugins"))}
