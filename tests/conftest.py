@@ -1,15 +1,22 @@
 """Every test draws the same numbers on one thread; plugins for tests are installed in a folder."""
 
 import pytest
-import torch
 from installing import install
+from suite_watch import SuiteWatch
 
 __all__ = ["install"]
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Have the whole suite, tests of plugins too, say what it costs."""
+    config.pluginmanager.register(SuiteWatch(config), "suite-watch")
 
 
 @pytest.fixture(autouse=True)
 def _seeded_on_one_thread() -> None:
     """The models are so small that a second thread only waits."""
+    import torch  # the controller of several processes needs none
+
     torch.set_num_threads(1)
     torch.manual_seed(0)
 

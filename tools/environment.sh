@@ -1,4 +1,4 @@
-# Sourced by tools/demo and tools/test: `use_environment EXTRAS` makes sure that a virtual
+# Sourced by tools/demo, tools/test and tools/lint: `use_environment EXTRAS` makes sure that a virtual
 # environment holds qgs, its EXTRAS and the plugins, and puts it first on PATH.
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
@@ -57,20 +57,25 @@ fingerprint() {
 }
 
 install() {
-    local environment=$1 extras=$2 started=$SECONDS
+    local environment=$1 extras=$2 wanted=$3 started=$SECONDS extra
     "$environment/bin/python" -m pip --version >/dev/null 2>&1 ||
         die "the virtual environment $environment has no pip." \
             "Add it with: $environment/bin/python -m ensurepip"
-    echo "qgs: installing query-gaussians[$extras] and the plugins into $environment" >&2
-    local plugin plugins=()
-    for plugin in "$root"/plugins/[a-z]*/; do
-        plugins+=(--editable "$plugin")
-    done
+    local plugin packages=(--editable "$root[$extras]")
+    if ! is_installed "$environment" "$wanted" plugins; then
+        for plugin in "$root"/plugins/[a-z]*/; do
+            packages+=(--editable "$plugin")
+        done
+    fi
+    echo "qgs: installing query-gaussians[$extras] into $environment, with $((${#packages[@]} / 2 - 1))" \
+        "plugins; the first time takes some minutes" >&2
     # Modules are compiled when first imported: most of them never are.
-    "$environment/bin/python" -m pip install -qq --disable-pip-version-check --no-compile \
-        --constraint "$root/constraints.txt" \
-        --editable "$root[$extras]" "${plugins[@]}" ||
+    "$environment/bin/python" -m pip install --disable-pip-version-check --no-compile \
+        --constraint "$root/constraints.txt" "${packages[@]}" >&2 ||
         die "the installation failed (see above); run the command again to retry."
+    for extra in ${extras//,/ } plugins; do
+        echo "$wanted" >"$environment/.qgs-$extra"
+    done
     echo "qgs: installed in $((SECONDS - started)) s" >&2
 }
 
@@ -82,7 +87,7 @@ is_installed() {
 }
 
 use_environment() {
-    local extras=$1 environment=${VIRTUAL_ENV:-$root/.venv} wanted extra
+    local extras=$1 environment=${VIRTUAL_ENV:-$root/.venv} wanted
     if [[ -n ${VIRTUAL_ENV:-} ]]; then
         is_new_enough "$environment/bin/python" ||
             die "the active virtual environment $environment has no Python 3.11 or newer." \
@@ -92,10 +97,7 @@ use_environment() {
     fi
     wanted=$(fingerprint "$environment")
     if ! is_installed "$environment" "$wanted" "$extras"; then
-        install "$environment" "$extras"
-        for extra in ${extras//,/ }; do
-            echo "$wanted" >"$environment/.qgs-$extra"
-        done
+        install "$environment" "$extras" "$wanted"
     fi
     export VIRTUAL_ENV=$environment PATH="$environment/bin:$PATH"
 }

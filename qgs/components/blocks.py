@@ -60,7 +60,7 @@ def attention_weights(q_BhQd: Tensor, k_BhTd: Tensor, bias_BhQT: Tensor | None) 
 class SelfAttentionCore(nn.Module):
     """Multi-head self-attention with fused qkv and per-head LayerNorm on queries and keys."""
 
-    unlearned = ("k_norm.bias",)  # adds the same to all logits of a query; TokenGS's weights have it
+    unlearned = ("k_norm.bias",)  # the same for all logits of a query; TokenGS has it
 
     def __init__(self, width: int, heads: int, norm_eps: float = NORM_EPS) -> None:
         super().__init__()

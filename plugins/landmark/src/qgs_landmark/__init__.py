@@ -31,7 +31,7 @@ plugin = Plugin(
     ),
     exemptions={
         NeighbourAttention: {
-            "updates_are_explained": "beside values it reads places, which are relative to the query"
+            "updates_are_explained": "beside values it reads places, relative to the query"
         },
     },
 )

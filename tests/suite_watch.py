@@ -1,0 +1,128 @@
+"""What the fast suite costs: CPU time by test, and the limits that a whole run must keep.
+
+Every process counts its own tests; under pytest-xdist the controller sums them up. The time that
+numba takes to compile a kernel for the first time belongs to no test.
+"""
+
+import os
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+MAX_ITEMS = 2_400
+MAX_SHARE = 1 / 20
+"""Of the CPU time of the whole suite, for one test."""
+DEAREST = 10
+
+
+def cpu_seconds() -> float:
+    """Of this process and of the children that it has waited for."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+class SuiteWatch:
+    """Hooks of pytest that print what a whole run cost, and fail it beyond the limits."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self.config = config
+        self.seconds: dict[str, float] = {}
+        self.workers = 0.0
+        controls = config.getoption("dist", "no") != "no" and not hasattr(config, "workerinput")
+        self.compiling = (lambda: 0.0) if controls else compilation_clock()
+
+    @pytest.hookimpl(wrapper=True, tryfirst=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
+        """Count the CPU time of a test with its fixtures."""
+        before = cpu_seconds() - self.compiling()
+        result = yield
+        self.seconds[item.nodeid] = cpu_seconds() - self.compiling() - before
+        return result
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_testnodedown(self, node: Any) -> None:
+        """Take over what a worker has counted."""
+        seconds, whole = node.workeroutput.get("cost", ({}, 0.0))
+        self.seconds |= seconds
+        self.workers += whole
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        """Hand over what this worker has counted, or judge the whole run."""
+        if hasattr(self.config, "workeroutput"):
+            self.config.workeroutput["cost"] = (self.seconds, cpu_seconds() - self.compiling())
+        elif self.faults() and session.exitstatus == pytest.ExitCode.OK:
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        """Print the cost, the dearest tests and the faults."""
+        if hasattr(self.config, "workeroutput") or not self.seconds:
+            return
+        terminalreporter.section(f"cost: {self.whole() / 60:.1f} CPU minutes, {self.count()} items")
+        for seconds, name in self.dearest()[:DEAREST]:
+            terminalreporter.write_line(f"{seconds:6.2f} s  {name}")
+        for fault in self.faults():
+            terminalreporter.write_line(f"FAILED: {fault}", red=True)
+
+    def whole(self) -> float:
+        """CPU seconds of all processes, collection included."""
+        return cpu_seconds() - self.compiling() + self.workers
+
+    def count(self) -> int:
+        """How many tests ran."""
+        return len(self.seconds)
+
+    def dearest(self) -> list[tuple[float, str]]:
+        """Seconds and names of the tests, the dearest first."""
+        return sorted(((seconds, name) for name, seconds in self.seconds.items()), reverse=True)
+
+    def faults(self) -> list[str]:
+        """What the whole fast suite does not keep; a run of some tests may cost what it will."""
+        if not is_whole(self.config):
+            return []
+        limit = MAX_SHARE * self.whole()
+        found = [
+            f"{name} takes {seconds:.1f} of {self.whole():.0f} CPU seconds, more than a twentieth: "
+            "make it smaller, share what it makes, or mark it slow"
+            for seconds, name in self.dearest()
+            if seconds > limit
+        ]
+        if self.count() > MAX_ITEMS:
+            found.append(
+                f"{self.count()} items are more than {MAX_ITEMS}: make tables of what repeats "
+                "(CONTRIBUTING.md, Tests)"
+            )
+        return found
+
+
+def is_whole(config: pytest.Config) -> bool:
+    """Whether all fast tests of the repository were asked for."""
+    chosen = config.option.keyword or config.getoption("lf", False)
+    fast = config.option.markexpr == "not slow"
+    return fast and not chosen and config.args_source == pytest.Config.ArgsSource.TESTPATHS
+
+
+def compilation_clock() -> Any:
+    """A function that gives the seconds that numba has compiled for in this process."""
+    try:
+        from numba.core import event
+    except ImportError:
+        return lambda: 0.0
+    spent = [0.0]
+    started: list[float] = []
+
+    class Compilation(event.Listener):
+        """Counts the outermost of compilations that wait for each other."""
+
+        def on_start(self, event: Any) -> None:
+            started.append(time.process_time())
+
+        def on_end(self, event: Any) -> None:
+            began = started.pop()
+            if not started:
+                spent[0] += time.process_time() - began
+
+    event.register("numba:compile", Compilation())
+    return lambda: spent[0]

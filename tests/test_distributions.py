@@ -1,0 +1,17 @@
+"""Messages name the distributions of this repository, whose entry points are as told."""
+
+import tomllib
+from pathlib import Path
+
+import qgs
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_messages_name_the_distributions_of_this_repository() -> None:
+    offered: dict[str, dict[str, str]] = {}
+    for file in ROOT.glob("plugins/*/pyproject.toml"):
+        project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
+        for group, entries in project["entry-points"].items():
+            offered.setdefault(group, {}).update(dict.fromkeys(entries, project["name"]))
+    assert {group: offered[group] for group in qgs.DISTRIBUTIONS} == qgs.DISTRIBUTIONS
