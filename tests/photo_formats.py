@@ -176,7 +176,7 @@ def write_colmap(
 ) -> Path:
     """kind: text or binary. Images are listed backwards, with two observations each."""
     names = copied(photos, folder / images, names)
-    (folder / model).mkdir(parents=True)
+    (folder / model).mkdir(parents=True, exist_ok=True)
     poses = map(world_to_camera, photos.c2w)
     entries = list(zip(range(1, len(names) + 1), poses, names, strict=True))[::-1]
     write = {"text": _write_text, "binary": _write_binary}[kind]

@@ -8,6 +8,7 @@ import pytest
 import torch
 from line_scenes import Line, Lines
 from photo_formats import opened, synthetic, write_nerfstudio
+from tables import fault
 from torch import Tensor
 
 from qgs.contracts import EvaluationConfig, Scene, ViewsConfig
@@ -52,23 +53,23 @@ def test_a_published_index_is_read(tmp_path: Path) -> None:
     assert read_index(str(file)) == {"a": entry([0, 12], [3, 6]), "b": None}
 
 
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        ('{"a": {"context": [0]}}', "a.target: Field required"),
-        ('{"a": {"context": [], "target": [1]}}', "a.context: List should have at least 1 item"),
-        ('{"a": {"context": ["0"], "target": [1]}}', "a.context.0: Input should be a valid int"),
-        ('{"a": {"context": [0.5], "target": [1]}}', "a.context.0: Input should be a valid int"),
-        ('["a"]', "file: Input should be a valid dictionary"),
-        ('{"a": null}', "names no scene to judge"),
-        ('{"a": ', "Expecting value"),
-    ],
-)
-def test_other_files_are_refused_with_the_reason(tmp_path: Path, text: str, reason: str) -> None:
-    file = tmp_path / "index.json"
-    file.write_text(text)
-    with pytest.raises(ValueError, match=reason):
-        read_index(str(file))
+REFUSED = [
+    ('{"a": {"context": [0]}}', "a.target: Field required"),
+    ('{"a": {"context": [], "target": [1]}}', "a.context: List should have at least 1 item"),
+    ('{"a": {"context": ["0"], "target": [1]}}', "a.context.0: Input should be a valid int"),
+    ('{"a": {"context": [0.5], "target": [1]}}', "a.context.0: Input should be a valid int"),
+    ('["a"]', "file: Input should be a valid dictionary"),
+    ('{"a": null}', "names no scene to judge"),
+    ('{"a": ', "Expecting value"),
+]
+
+
+def test_other_files_are_refused_with_the_reason(tmp_path: Path) -> None:
+    file, faults = tmp_path / "index.json", []
+    for text, reason in REFUSED:
+        file.write_text(text)
+        faults.append(fault(reason, read_index, str(file)))
+    assert not any(faults), faults
 
 
 def test_a_missing_index_is_told_with_its_path() -> None:

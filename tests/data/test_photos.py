@@ -9,6 +9,7 @@ import pytest
 import torch
 from photo_formats import row_of_frames
 from PIL import Image
+from tables import fault
 
 from qgs.data.images import CropResize
 from qgs.data.lenses import Fisheye, RadialTangential, undistorted
@@ -72,28 +73,29 @@ def test_missing_images_are_counted_and_named(tmp_path, caplog):
         opened(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("frame", "top", "word"),
-    [
-        ({"transform_matrix": [[math.nan] * 4] * 4}, {}, r"frame 1 \(images/1.png\).*NaN"),
-        ({"transform_matrix": np.diag([2, 1, 1, 1]).tolist()}, {}, "frame 1 .*rigid"),
-        ({"transform_matrix": np.diag([-1, 1, 1, 1]).tolist()}, {}, "frame 1 .*rigid"),
-        ({"transform_matrix": [1, 2]}, {}, "frame 1 .*4 x 4"),
-        ({"file_path": None}, {}, "frame 1.*'file_path'"),
-        ({}, {"fl_x": None}, "focal"),
-        ({}, {"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
-        ({}, {"camera_model": "OPENCV_FISHEYE", "k5": 0.1}, "k5"),
-        ({}, {"fl_x": 1.2, "fl_y": 1.3, "cx": 0.5, "cy": 0.5}, "frame 0 .*pixels"),
-        ({}, {"w": 48, "h": 64}, "swapped"),
-        ({"k6": 1e-3}, {}, "frame 1 .*k6"),
-        ({}, {"s1": 1e-3}, "s1"),
-        ({}, {"k1": math.nan}, "k1"),
-        ({}, {"w": 48}, "aspect"),
-    ],
-)
-def test_what_cannot_be_meant_is_refused(tmp_path, frame, top, word):
-    with pytest.raises(ValueError, match=word):
-        opened(folder(tmp_path, frame=frame, **top))
+REFUSED: list[tuple[dict, dict, str]] = [
+    ({"transform_matrix": [[math.nan] * 4] * 4}, {}, r"frame 1 \(images/1.png\).*NaN"),
+    ({"transform_matrix": np.diag([2, 1, 1, 1]).tolist()}, {}, "frame 1 .*rigid"),
+    ({"transform_matrix": np.diag([-1, 1, 1, 1]).tolist()}, {}, "frame 1 .*rigid"),
+    ({"transform_matrix": [1, 2]}, {}, "frame 1 .*4 x 4"),
+    ({"file_path": None}, {}, "frame 1.*'file_path'"),
+    ({}, {"fl_x": None}, "focal"),
+    ({}, {"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
+    ({}, {"camera_model": "OPENCV_FISHEYE", "k5": 0.1}, "k5"),
+    ({}, {"fl_x": 1.2, "fl_y": 1.3, "cx": 0.5, "cy": 0.5}, "frame 0 .*pixels"),
+    ({}, {"w": 48, "h": 64}, "swapped"),
+    ({"k6": 1e-3}, {}, "frame 1 .*k6"),
+    ({}, {"s1": 1e-3}, "s1"),
+    ({}, {"k1": math.nan}, "k1"),
+    ({}, {"w": 48}, "aspect"),
+]
+
+
+def test_what_cannot_be_meant_is_refused(tmp_path):
+    faults = [
+        fault(word, opened, folder(tmp_path, frame=frame, **top)) for frame, top, word in REFUSED
+    ]
+    assert not any(faults), faults
 
 
 def test_folders_and_files_that_are_not_there(tmp_path, monkeypatch):
@@ -108,18 +110,18 @@ def test_folders_and_files_that_are_not_there(tmp_path, monkeypatch):
         opened(tmp_path)
 
 
-@pytest.mark.parametrize("of", ["file_path", "mask_path", "depth_file_path"])
-@pytest.mark.parametrize("place", ["../other/images/1.png", "{}/other/images/1.png"])
-def test_files_outside_of_the_folder_are_read_only_if_allowed(tmp_path, of, place):
+def test_files_outside_of_the_folder_are_read_only_if_allowed(tmp_path):
     for name in ("mine", "other"):
         (tmp_path / name).mkdir()
     folder(tmp_path / "other")
-    mine = folder(tmp_path / "mine", frame={of: place.format(tmp_path)})
-    with pytest.raises(ValueError, match=r"other/images/1\.png"):
-        opened(mine)
-    assert of != "file_path" or opened(mine, outside=True).scenes("train")
+    mine = tmp_path / "mine"
     (mine / "linked").symlink_to(tmp_path / "other")  # a link in the folder is the user's own
-    assert opened(folder(mine, frame={of: "linked/images/1.png"})).scenes("train")
+    for of in ("depth_file_path", "mask_path", "file_path"):
+        assert opened(folder(mine, frame={of: "linked/images/1.png"})).scenes("train")
+        for place in ("../other/images/1.png", f"{tmp_path}/other/images/1.png"):
+            folder(mine, frame={of: place})
+            assert not fault(r"other/images/1\.png", opened, mine), of
+            assert of != "file_path" or opened(mine, outside=True).scenes("train")
 
 
 def test_transparent_pixels_show_the_background(tmp_path):
@@ -170,18 +172,15 @@ def test_black_edges_of_undistorted_photos_are_cut_off(tmp_path, size):
     assert image[0, row, column].item() == pytest.approx(3 * expected + 9, abs=3)
 
 
-@pytest.mark.parametrize("place", range(5))
-def test_each_coefficient_bends_rays_as_opencv_writes_it(place):
-    coefficients = [0.0] * 5
-    coefficients[place] = 0.15
-    k1, k2, p1, p2, k3 = coefficients
-    for x, y in ((0.3, -0.4), (-0.7, 0.2), (0.0, 0.5)):
-        r = math.hypot(x, y)
-        radial = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6
-        expected = (
-            x * radial + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2),
-            y * radial + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y,
-        )
-        bent = RadialTangential(*coefficients).distorted(torch.tensor([x, y]).double())
-        assert bent.tolist() == pytest.approx(expected)
-        assert bent.tolist() != pytest.approx((x, y))
+def test_each_coefficient_bends_rays_as_opencv_writes_it():
+    for coefficients in (0.15 * np.eye(5)).tolist():
+        k1, k2, p1, p2, k3 = coefficients
+        for x, y in ((0.3, -0.4), (-0.7, 0.2), (0.0, 0.5)):
+            r = math.hypot(x, y)
+            radial = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6
+            expected = (
+                x * radial + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2),
+                y * radial + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y,
+            )
+            bent = RadialTangential(*coefficients).distorted(torch.tensor([x, y]).double())
+            assert bent.tolist() == pytest.approx(expected)

@@ -1,0 +1,14 @@
+"""Tables of what must be refused: what is not, or for another reason, is told."""
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+
+def fault(match: str, function: Callable[..., Any], *given: Any, kind: Any = ValueError) -> str:
+    """What is wrong unless `function` raises `kind` with `match`; an empty text if nothing is."""
+    try:
+        function(*given)
+    except kind as error:
+        return "" if re.search(match, str(error)) else f"{match} is not in: {error}"
+    return f"{match}: nothing is raised"
