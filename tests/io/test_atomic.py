@@ -2,6 +2,7 @@
 
 import errno
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -17,41 +18,37 @@ from qgs.io.files import (
 from qgs.io.tensors import write_tensors
 
 
-def test_entries_are_replaced_whole_and_the_rest_stays(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    (out / "views").mkdir(parents=True)
-    (out / "views" / "old.png").touch()
-    (out / "notes.txt").write_text("mine")
-    with replacing_entries(out, "views") as fresh:
-        (fresh / "views").mkdir()
-        (fresh / "views" / "new.png").touch()
-    assert [path.name for path in (out / "views").iterdir()] == ["new.png"]
-    assert (out / "notes.txt").read_text() == "mine"
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+def put(folder: Path, text: str, *names: str) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
 
 
-def test_entries_of_no_earlier_result_stay(tmp_path: Path) -> None:
-    (tmp_path / "out" / "depth").mkdir(parents=True)
-    (tmp_path / "out" / "depth" / "sensor.png").write_text("mine")
+def texts(folder: Path) -> dict[str, str]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_text() for path in files}
 
-    def write() -> None:
-        with replacing_entries(tmp_path / "out", "scene.ply") as fresh:
-            (fresh / "scene.ply").touch()
-            (fresh / "depth").mkdir()
 
+def replace(folder: Path, mark: str, *names: str) -> None:
+    with replacing_entries(folder, mark) as fresh:
+        put(fresh, "new", *names)
+
+
+def test_entries_are_replaced_whole_and_the_rest_stays(tmp_path):
+    put(tmp_path / "out", "old", "views/old.png", "notes.txt")
+    replace(tmp_path / "out", "views", "views/new.png")
+    assert texts(tmp_path) == {"out/views/new.png": "new", "out/notes.txt": "old"}
+
+
+def test_entries_of_no_earlier_result_stay(tmp_path):
+    put(tmp_path / "out", "old", "depth/sensor.png")
     with pytest.raises(FileExistsError, match="depth"):
-        write()
-    assert (tmp_path / "out" / "depth" / "sensor.png").read_text() == "mine"
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["depth"]
+        replace(tmp_path / "out", "scene.ply", "scene.ply", "depth/0.png")
+    assert texts(tmp_path) == {"out/depth/sensor.png": "old"}
 
 
-def test_entries_come_back_where_moving_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    for name in ("a", "b"):
-        (out / name).write_text("old")
+def test_entries_come_back_where_moving_fails(tmp_path, monkeypatch):
+    put(tmp_path / "out", "old", "a/x", "b/x")
     rename = Path.rename
 
     def interrupted(self: Path, target: Path) -> Path:
@@ -59,18 +56,13 @@ def test_entries_come_back_where_moving_fails(
             raise KeyboardInterrupt
         return rename(self, target)
 
-    def write() -> None:
-        with replacing_entries(out, "a") as fresh:
-            for name in ("a", "b"):
-                (fresh / name).write_text("new")
-            monkeypatch.setattr(Path, "rename", interrupted)
-
+    monkeypatch.setattr(Path, "rename", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        write()
-    assert {path.name: path.read_text() for path in out.iterdir()} == {"a": "old", "b": "old"}
+        replace(tmp_path / "out", "a", "a/x", "b/x")
+    assert texts(tmp_path) == {"out/a/x": "old", "out/b/x": "old"}
 
 
-def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path: Path) -> None:
+def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path):
     path = tmp_path / "a.txt"
     write_text(path, "old")
 
@@ -81,35 +73,27 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path: Path) -> None
 
     with pytest.raises(KeyboardInterrupt):
         fail()
-    assert path.read_text() == "old"
-    assert [file.name for file in tmp_path.iterdir()] == ["a.txt"]
+    assert texts(tmp_path) == {"a.txt": "old"}
 
 
-@pytest.mark.parametrize(
-    ("words", "number", "full"),
-    [
+def test_a_disk_is_called_full_only_where_it_is(tmp_path, monkeypatch):
+    for words, number, full in (
         ("I/O error: No space left on device (os error 28)", errno.ENOSPC, True),
         ("I/O error: Disk quota exceeded (os error 122)", errno.EDQUOT, True),
         ("I/O error: File too large (os error 27)", errno.EFBIG, False),
         ("I/O error: Permission denied (os error 13)", errno.EACCES, False),
-    ],
-)
-def test_a_disk_is_called_full_only_where_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, number: int, full: bool
-) -> None:
-    def fail(*_: object) -> None:
-        raise SafetensorError(words)
-
-    monkeypatch.setattr("qgs.io.tensors.save_file", fail)
-    with pytest.raises(OSError, match=r"a\.safetensors") as caught:
-        write_tensors(tmp_path / "a.safetensors", {"a": torch.ones(1)}, {})
-    assert isinstance(caught.value, DiskFullError) == full
-    assert full or caught.value.errno == number
-    assert words in str(caught.value)
-    assert not list(tmp_path.iterdir())
+    ):
+        failure = SafetensorError(words)
+        monkeypatch.setattr("qgs.io.tensors.save_file", Mock(side_effect=failure))
+        with pytest.raises(OSError, match=r"a\.safetensors") as caught:
+            write_tensors(tmp_path / "a.safetensors", {"a": torch.ones(1)}, {})
+        assert isinstance(caught.value, DiskFullError) == full
+        assert full or caught.value.errno == number
+        assert words in str(caught.value)
+        assert not list(tmp_path.iterdir())
 
 
-def test_leftovers_of_killed_processes_are_told_from_what_users_made(tmp_path: Path) -> None:
+def test_leftovers_of_killed_processes_are_told_from_what_users_made(tmp_path):
     for name in (".state.safetensors.tmp", "notes.12.tmp", ".git", "state.safetensors"):
         (tmp_path / name).touch()
         assert not is_leftover(tmp_path / name)

@@ -1,6 +1,5 @@
 """Models by name: those that plugins ship."""
 
-import os
 import re
 import sys
 from pathlib import Path
@@ -44,7 +43,7 @@ def shipped(install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return file
 
 
-def test_a_name_stands_for_the_path_wherever_one_is_taken(shipped: Path) -> None:
+def test_a_name_stands_for_the_path_wherever_one_is_taken(shipped):
     assert checkpoint_path("box/small") == checkpoint_path("box/small-1.5") == shipped
     assert qgs.load("box/small").recipe == qgs.load(shipped).recipe
     result = run_qgs("eval", "box/small")
@@ -58,13 +57,13 @@ def test_a_name_stands_for_the_path_wherever_one_is_taken(shipped: Path) -> None
     assert "weights start from" in initialise(started.build_model(), started)[0]
 
 
-def test_an_existing_file_of_that_name_wins(shipped: Path) -> None:
+def test_an_existing_file_of_that_name_wins(shipped):
     Path("box").mkdir()
     Path("box/small").write_bytes(shipped.read_bytes())
     assert checkpoint_path("box/small") == Path("box/small")
 
 
-def test_models_are_listed_and_checked(shipped: Path) -> None:
+def test_models_are_listed_and_checked(shipped):
     result = run_qgs("list")
     assert "box/small" in result.stdout
     assert "Tiny [rooms], in a box." in " ".join(result.stdout.split())
@@ -78,21 +77,18 @@ def test_models_are_listed_and_checked(shipped: Path) -> None:
     assert "FAILED model box/gone: no checkpoint at" in checked.output
 
 
-def test_half_precision_halves_the_file_and_loads_as_float32(shipped: Path) -> None:
+def test_half_precision_is_stored_and_loads_as_float32(shipped):
     result = run_qgs("export", "box/small", "--half", "--out", "half.safetensors")
     assert result.exit_code == 0, result.output
     half, whole = load_file("half.safetensors"), load_file(shipped)
     floats = {name for name, tensor in whole.items() if tensor.is_floating_point()}
     assert {name for name, tensor in half.items() if tensor.dtype == torch.float16} == floats
-    model = qgs.load("half.safetensors")
-    assert {tensor.dtype for tensor in model.parameters()} == {torch.float32}
-    for name, tensor in model.named_parameters():
-        torch.testing.assert_close(tensor, whole[name].half().float(), rtol=0, atol=0)
+    for name, tensor in qgs.load("half.safetensors").named_parameters():
+        assert torch.equal(tensor, whole[name].half().float()), name
     assert CheckpointFile("half.safetensors").step == 7
-    assert os.path.getsize("half.safetensors") < os.path.getsize(shipped)
 
 
-def test_weights_beyond_half_precision_are_refused(shipped: Path) -> None:
+def test_weights_beyond_half_precision_are_refused(shipped):
     model = qgs.load(shipped)
     with torch.no_grad():
         model.queries.features.fill_(1e6)

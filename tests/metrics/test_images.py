@@ -4,7 +4,7 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from qgs.metrics.images import SsimCovariance, psnr, ssim
+from qgs.metrics.images import psnr, ssim
 
 
 def pair(noise: float, size: tuple[int, int] = (24, 37)) -> tuple[torch.Tensor, torch.Tensor]:
@@ -14,52 +14,40 @@ def pair(noise: float, size: tuple[int, int] = (24, 37)) -> tuple[torch.Tensor, 
     return truth + noise * torch.randn(truth.shape, generator=generator), truth
 
 
+CASES = [
+    *[((24, 37), noise, 1e-5) for noise in (0.02, 0.2, 1.0)],
+    *[(size, 0.1, 1e-6) for size in ((11, 11), (11, 40), (13, 17), (64, 33))],
+]
+
+
 @pytest.mark.parametrize("covariance", ["population", "sample"])
-@pytest.mark.parametrize(
-    ("size", "noise", "atol"),
-    [
-        *[((24, 37), noise, 1e-5) for noise in (0.02, 0.2, 1.0)],
-        *[(size, 0.1, 1e-6) for size in ((11, 11), (11, 40), (13, 17), (64, 33))],
-    ],
-)
-def test_ssim_equals_scikit_image(
-    size: tuple[int, int], noise: float, atol: float, covariance: SsimCovariance
-) -> None:
-    images, truth = pair(noise, size)
-    expected = [
-        structural_similarity(
-            a.clamp(0, 1).double().numpy(),
-            b.double().numpy(),
-            channel_axis=0,
-            data_range=1.0,
-            gaussian_weights=True,
-            sigma=1.5,
-            use_sample_covariance=covariance == "sample",
-        )
-        for a, b in zip(images, truth, strict=True)
-    ]
-    found = ssim(images, truth, covariance).double()
-    torch.testing.assert_close(found, torch.tensor(expected), rtol=0, atol=atol)
+def test_ssim_equals_scikit_image(covariance):
+    options = {"channel_axis": 0, "data_range": 1.0, "gaussian_weights": True, "sigma": 1.5}
+    options["use_sample_covariance"] = covariance == "sample"
+    for size, noise, atol in CASES:
+        images, truth = pair(noise, size)
+        expected = [
+            structural_similarity(a.clamp(0, 1).double().numpy(), b.double().numpy(), **options)
+            for a, b in zip(images, truth, strict=True)
+        ]
+        found = ssim(images, truth, covariance).double()
+        torch.testing.assert_close(found, torch.tensor(expected), rtol=0, atol=atol)
+    with pytest.raises(ValueError, match="at least 11 pixels a side, got 10 x 20"):
+        ssim(*pair(0.1, (10, 20)), covariance)
 
 
-@pytest.mark.parametrize("noise", [0.02, 1.0])
-def test_psnr_equals_scikit_image_on_clipped_images(noise: float) -> None:
-    images, truth = pair(noise)
-    expected = [
-        peak_signal_noise_ratio(b.numpy(), a.clamp(0, 1).numpy(), data_range=1.0)
-        for a, b in zip(images, truth, strict=True)
-    ]
-    torch.testing.assert_close(
-        psnr(images, truth), torch.tensor(expected, dtype=torch.float32), rtol=1e-5, atol=1e-4
-    )
+def test_psnr_equals_scikit_image_on_clipped_images():
+    for noise in (0.02, 1.0):
+        images, truth = pair(noise)
+        expected = [
+            peak_signal_noise_ratio(b.numpy(), a.clamp(0, 1).numpy(), data_range=1.0)
+            for a, b in zip(images, truth, strict=True)
+        ]
+        found = psnr(images, truth).double()
+        torch.testing.assert_close(found, torch.tensor(expected), rtol=1e-5, atol=1e-4)
 
 
-def test_identical_images_with_leading_dimensions() -> None:
+def test_identical_images_with_leading_dimensions():
     truth = pair(0.0)[1][:, None].expand(-1, 4, -1, -1, -1)
     torch.testing.assert_close(ssim(truth, truth), torch.ones(2, 4))
     torch.testing.assert_close(psnr(truth, truth), torch.full((2, 4), 100.0))
-
-
-def test_images_smaller_than_the_window_are_refused() -> None:
-    with pytest.raises(ValueError, match="at least 11 pixels a side, got 10 x 20"):
-        ssim(*pair(0.1, (10, 20)))

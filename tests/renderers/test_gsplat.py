@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from renderers.scenes import make_scene
 
 import qgs.renderers as auto_module
 import qgs.renderers.gsplat as gsplat_module
@@ -13,8 +14,6 @@ from qgs.contracts import ModelDims, RecipeContext, RendererConfig
 from qgs.geometry.harmonics import seen_colors
 from qgs.renderers import AutoRenderer, CpuRenderer, GsplatRenderer
 from qgs.types import Rendering
-
-CONTEXT = RecipeContext(ModelDims(16, 2, 1))
 
 
 @pytest.fixture
@@ -34,61 +33,59 @@ def calls(monkeypatch):
     return seen
 
 
-def test_arguments_are_what_gsplat_expects(calls, make_scene):
-    gaussians, cameras = make_scene(batch=2, views=3, count=7, size=(12, 20))
+def test_arguments_are_what_gsplat_expects(calls):
     config = RendererConfig(near=0.1, far=50.0, dilation=0.5, background=(0.1, 0.2, 0.3))
-    rendering = GsplatRenderer(config)(gaussians, cameras)
-    (found,) = calls
-    assert (found["width"], found["height"]) == (20, 12)
-    assert (found["near_plane"], found["far_plane"], found["eps2d"]) == (0.1, 50.0, 0.5)
-    assert found["packed"] is False
-    assert found["render_mode"] == "RGB+ED"
-    for name in ("means", "scales", "quats", "opacities", "colors"):
-        assert torch.equal(found[name], getattr(gaussians, name))
-    torch.testing.assert_close(found["viewmats"] @ cameras.c2w, torch.eye(4).expand(2, 3, 4, 4))
+    render = GsplatRenderer(config)
+    gaussians, cameras = make_scene(2, 3, 7, size=(12, 20), harmonics=8, features=2)
+    rendering = render(gaussians, cameras)
+    unharmonic = replace(gaussians, sh=None)
+    render(unharmonic, cameras)
+    bare = render(replace(unharmonic, features=None), cameras)
+    found, of_unharmonic, of_bare = calls
     fx, fy, cx, cy = cameras.intrinsics[1, 2]
-    expected = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    assert torch.equal(found["Ks"][1, 2], expected)
-    assert torch.equal(found["backgrounds"], torch.tensor([0.1, 0.2, 0.3]).expand(2, 3, 3))
-    assert rendering.rgb.shape == (2, 3, 3, 12, 20)
-    assert rendering.rgb[0, 0, :, 0, 0].tolist() == [0, 1, 2]
-    assert rendering.depth.shape == (2, 3, 1, 12, 20)
-    assert rendering.depth.eq(3).all()
-    assert rendering.alpha.shape == (2, 3, 1, 12, 20)
-    GsplatRenderer(config)(gaussians[:, :0], cameras)
-    assert len(calls) == 1, "kernels divide by the number of Gaussians"
-
-
-def test_harmonics_and_features_reach_gsplat(calls, make_scene):
-    gaussians, cameras = make_scene(batch=2, views=3, count=7, harmonics=8, features=2)
-    rendering = GsplatRenderer(RendererConfig())(gaussians, cameras)
-    GsplatRenderer(RendererConfig())(replace(gaussians, sh=None), cameras)
-    seen, plain = (found["colors"] for found in calls)
-    assert torch.equal(seen[..., :3], seen_colors(gaussians, cameras))
-    assert torch.equal(seen[..., 3:], gaussians.features[:, None].expand(2, 3, 7, 2))
-    assert torch.equal(plain, torch.cat([gaussians.colors, gaussians.features], -1))
-    assert calls[0]["backgrounds"][1, 2].tolist() == [0.5, 0.5, 0.5, 0, 0]
-    assert rendering.rgb[0, 0, :, 0, 0].tolist() == [0, 1, 2]
-    assert rendering.features[0, 0, :, 0, 0].tolist() == [3, 4]
-    assert rendering.depth.eq(5).all()
+    lens = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    assert torch.equal(found.pop("Ks")[1, 2], lens)
+    features = gaussians.features[:, None].expand(2, 3, 7, 2)
+    backdrop = torch.tensor([0.1, 0.2, 0.3, 0, 0]).expand(2, 3, 5)
+    assert found.pop("render_mode") == "RGB+ED"
+    expected = {
+        **{name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities")},
+        "colors": torch.cat([seen_colors(gaussians, cameras), features], -1),
+        "viewmats": torch.linalg.inv(cameras.c2w),
+        "width": 20,
+        "height": 12,
+        "near_plane": 0.1,
+        "far_plane": 50.0,
+        "eps2d": 0.5,
+        "packed": False,
+        "backgrounds": backdrop,
+    }
+    torch.testing.assert_close(found, expected)
+    plain = torch.cat([gaussians.colors, gaussians.features], -1)
+    assert torch.equal(of_unharmonic["colors"], plain)
+    assert torch.equal(of_bare["colors"], gaussians.colors)
+    assert torch.equal(of_bare["backgrounds"], backdrop[..., :3])
+    channels = torch.arange(6.0)[:, None, None].expand(2, 3, 6, 12, 20)
+    images = [rendering.rgb, rendering.features, rendering.depth]
+    assert torch.equal(torch.cat(images, 2), channels)
+    assert torch.equal(rendering.alpha, torch.full((2, 3, 1, 12, 20), 0.25))
+    assert torch.equal(bare.depth, channels[:, :, 3:4])
+    render(gaussians[:, :0], cameras)
+    assert len(calls) == 3, "kernels divide by the number of Gaussians"
 
 
 @pytest.mark.parametrize(
-    "changed", [{"alpha_cap": 0.99}, {"alpha_min": 0.01}, {"transmittance_min": 1e-3}]
+    ("option", "value"), [("alpha_cap", 0.99), ("alpha_min", 0.01), ("transmittance_min", 1e-3)]
 )
-@pytest.mark.parametrize("cls", [GsplatRenderer, AutoRenderer])
-def test_options_that_the_kernels_fix_are_refused(cls, changed):
-    (problem,) = cls.problems(RendererConfig(**changed), CONTEXT)
-    assert problem.option == next(iter(changed))
-    assert "qgs/cpu" in problem.fix
-    assert list(cls.problems(RendererConfig(near=1.0, dilation=1.0), CONTEXT)) == []
-    with pytest.raises(ValueError, match=next(iter(changed))):
-        GsplatRenderer(RendererConfig(**changed))
-
-
-def test_cpu_tensors_are_refused(make_scene):
-    with pytest.raises(ValueError, match="CUDA tensors, got Gaussians on cpu"):
-        GsplatRenderer(RendererConfig())(*make_scene())
+def test_options_that_the_kernels_fix_are_refused(option, value):
+    config, context = RendererConfig(**{option: value}), RecipeContext(ModelDims(16, 2, 1))
+    for cls in (GsplatRenderer, AutoRenderer):
+        (problem,) = cls.problems(config, context)
+        assert problem.option == option
+        assert "qgs/cpu" in problem.fix
+        assert list(cls.problems(RendererConfig(near=1.0, dilation=1.0), context)) == []
+    with pytest.raises(ValueError, match=option):
+        GsplatRenderer(config)
 
 
 class _OnCuda:
@@ -98,28 +95,30 @@ class _OnCuda:
     dtype = torch.float32
 
 
-def test_intrinsics_that_want_a_gradient_are_refused(make_scene):
-    _, cameras = make_scene()
+ON_CUDA = SimpleNamespace(means=_OnCuda())
+
+
+def test_tensors_elsewhere_and_intrinsics_that_want_a_gradient_are_refused():
+    gaussians, cameras = make_scene()
+    with pytest.raises(ValueError, match="CUDA tensors, got Gaussians on cpu"):
+        GsplatRenderer(RendererConfig())(gaussians, cameras)
     cameras.intrinsics.requires_grad_()
     with pytest.raises(ValueError, match="no gradient for intrinsics"):
-        gsplat_module._check_supported(SimpleNamespace(means=_OnCuda()), cameras)
+        gsplat_module._check_supported(ON_CUDA, cameras)
 
 
-def test_auto_goes_by_where_the_gaussians_are(make_scene, monkeypatch):
-    gaussians, cameras = make_scene()
+def test_auto_goes_by_where_the_gaussians_are(monkeypatch):
+    scene = make_scene()
     built = []
     monkeypatch.setattr(
         auto_module, "CpuRenderer", lambda config: built.append(CpuRenderer(config)) or built[-1]
     )
     auto = AutoRenderer(RendererConfig())
-    found = [auto(gaussians, cameras) for _ in range(2)][-1]
-    assert torch.equal(found.rgb, CpuRenderer(RendererConfig())(gaussians, cameras).rgb)
+    found = [auto(*scene) for _ in range(2)][-1]
+    assert torch.equal(found.rgb, CpuRenderer(RendererConfig())(*scene).rgb)
     assert len(built) == 1, "built once, not at every call"
 
     flat = torch.zeros(1, 1, 1, 2, 2)
     answer = Rendering(flat.expand(-1, -1, 3, -1, -1), flat, flat)
-    monkeypatch.setattr(
-        auto_module, "GsplatRenderer", lambda config: lambda *inputs: (answer, inputs)
-    )
-    scene = SimpleNamespace(means=_OnCuda())
-    assert AutoRenderer(RendererConfig())(scene, cameras)[0] is answer
+    monkeypatch.setattr(auto_module, "GsplatRenderer", lambda config: lambda *inputs: answer)
+    assert AutoRenderer(RendererConfig())(ON_CUDA, scene[1]) is answer

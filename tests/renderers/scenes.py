@@ -1,0 +1,70 @@
+"""Scenes with well separated depths, and gradients of everything a renderer differentiates."""
+
+from functools import partial
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from qgs.contracts import Renderer
+from qgs.geometry.transforms import quat_to_matrix
+from qgs.types import Cameras, Gaussians, Rendering, named_tensors
+
+
+def make_scene(
+    batch: int = 1,
+    views: int = 1,
+    count: int = 40,
+    size: tuple[int, int] = (24, 40),
+    scale: float | Tensor = 0.08,
+    harmonics: int = 0,
+    features: int = 0,
+    dtype: torch.dtype = torch.float32,
+) -> tuple[Gaussians, Cameras]:
+    """Gaussians in front of turned cameras, many beyond the borders; quaternions of any length.
+
+    scale: of all, or of each scene (B, 1, 1). harmonics, features: how many coefficients and
+    further channels the Gaussians have.
+    """
+    generator = torch.Generator().manual_seed(0)
+    rand = partial(torch.rand, generator=generator, dtype=torch.float64)
+    randn = partial(torch.randn, generator=generator, dtype=torch.float64)
+    depth = torch.linspace(1.5, 4.0, count)[torch.randperm(count, generator=generator)]
+    depth = depth.expand(batch, count)[..., None]
+    gaussians = Gaussians(
+        means=torch.cat([rand(batch, count, 2) * 2.4 - 1.2, depth], -1),
+        scales=scale * (0.7 * randn(batch, count, 3)).exp(),
+        quats=randn(batch, count, 4),
+        opacities=0.05 + 0.9 * rand(batch, count),
+        colors=rand(batch, count, 3),
+        sh=0.1 * randn(batch, count, harmonics, 3) if harmonics else None,
+        features=randn(batch, count, features) if features else None,
+    )
+    turn = torch.cat([torch.ones(batch, views, 1), 0.03 * randn(batch, views, 3)], -1)
+    c2w = torch.eye(4).repeat(batch, views, 1, 1)
+    c2w[..., :3, :3] = quat_to_matrix(normalize(turn, dim=-1))
+    c2w[..., :3, 3] = 0.1 * randn(batch, views, 3)
+    focal = max(size) * (0.9 + 0.2 * rand(batch, views, 2))
+    centre = torch.tensor([size[1] / 2, size[0] / 2]) + 0.5 * randn(batch, views, 2)
+    cameras = Cameras(c2w, torch.cat([focal, centre], -1), size)
+    return gaussians.to(dtype), cameras.to(dtype)
+
+
+def differentiate(
+    renderer: Renderer, gaussians: Gaussians, cameras: Cameras
+) -> tuple[Rendering, dict[str, Tensor]]:
+    """The rendering, and gradients by name of a fixed random projection of all its images."""
+    names = dict(named_tensors(gaussians))
+    leaves = {**names, "c2w": cameras.c2w, "intrinsics": cameras.intrinsics}
+    leaves = {name: value.detach().clone().requires_grad_() for name, value in leaves.items()}
+    if getattr(renderer, "kind", "") == "gsplat":
+        leaves["intrinsics"].requires_grad_(False)
+    lenses = Cameras(leaves["c2w"], leaves["intrinsics"], cameras.size)
+    rendering = renderer(Gaussians(**{name: leaves[name] for name in names}), lenses)
+    leaves = {name: leaf for name, leaf in leaves.items() if leaf.requires_grad}
+    generator = torch.Generator().manual_seed(1)
+    images = [image for _, image in named_tensors(rendering)]
+    weights = [torch.rand(x.shape, generator=generator, dtype=torch.float64) for x in images]
+    slopes = [weight.to(image) for weight, image in zip(weights, images, strict=True)]
+    grads = torch.autograd.grad(images, list(leaves.values()), slopes)
+    return rendering, dict(zip(leaves, grads, strict=True))
