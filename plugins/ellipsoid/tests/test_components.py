@@ -1,4 +1,4 @@
-"""Anchors, refinement, decoding and head, each on its own."""
+"""Anchors, attention, refinement, decoding and head, each on its own, by formulas."""
 
 import math
 
@@ -9,178 +9,186 @@ from qgs_ellipsoid.anchors import EllipsoidQueries
 from qgs_ellipsoid.cross_attention import EllipsoidCrossAttention
 from qgs_ellipsoid.fields import RAW_RADII, ROTATION, anchor_rotation
 from qgs_ellipsoid.head import AxisScaledCenters, EllipsoidHead, radii_along
+from qgs_ellipsoid.ray_bias import EllipsoidBias, ray_tokens
 from qgs_ellipsoid.refinement import EllipsoidRefinement
 from qgs_ellipsoid.rotations import quat_product, turned
-from qgs_locus.fields import CENTER, RadiusOptions, support_radius
+from qgs_locus.anchors import FrustumCenters
+from qgs_locus.fields import CENTER
 from refusals import refused
+from torch import Tensor
+from torch.testing import assert_close
 
-from qgs import QueryState
 from qgs.components import GaussianHead, posact
-from qgs.composer import RecipeError, resolve
 from qgs.contracts import ModelDims
+from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.geometry.transforms import quat_to_matrix
+from qgs.types import Cameras, ImageMemory, QueryState
 
 DIMS = ModelDims(width=16, heads=2, depth=2)
 HALF = math.sqrt(0.5)
+OFFSET = {"radius_bound": "offset", "radius_min": 0.05}
 
 
-def _state(batch: int = 2, count: int = 5) -> QueryState:
+def _radii(raw: Tensor) -> Tensor:
+    """As `OFFSET` says."""
+    return F.softplus(raw) + 0.05
+
+
+def _state() -> QueryState:
+    """Turned anchors of unequal radii in front of the cameras."""
     fields = {
-        CENTER: torch.randn(batch, count, 3),
-        ROTATION: F.normalize(torch.randn(batch, count, 4), dim=-1),
-        RAW_RADII: torch.randn(batch, count, 3),
+        CENTER: torch.randn(2, 6, 3) * 0.4 + torch.tensor([0.0, 0.0, 1.5]),
+        ROTATION: F.normalize(torch.randn(2, 6, 4), dim=-1),
+        RAW_RADII: torch.randn(2, 6, 3) - 1,
     }
-    return QueryState(torch.randn(batch, count, DIMS.width), fields)
+    return QueryState(torch.randn(2, 6, DIMS.width), fields)
 
 
-def test_products_of_quaternions_are_those_of_their_matrices() -> None:
-    left, right = (F.normalize(torch.randn(7, 4), dim=-1) for _ in range(2))
+def _made(kind, **options):
+    return kind(kind.Config(**options), DIMS)
+
+
+def test_products_of_quaternions_are_those_of_their_matrices():
+    left, right = F.normalize(torch.randn(2, 7, 4), dim=-1)
     product = quat_to_matrix(quat_product(left, right))
-    torch.testing.assert_close(product, quat_to_matrix(left) @ quat_to_matrix(right))
+    assert_close(product, quat_to_matrix(left) @ quat_to_matrix(right))
 
 
-def test_a_turn_is_about_an_axis_of_the_world() -> None:
-    about_z = torch.tensor([[HALF, 0.0, 0.0, HALF]])
-    angle = 0.01
-    seen = quat_to_matrix(turned(about_z, torch.tensor([[angle, 0.0, 0.0]])))
-    c, s = math.cos(angle), math.sin(angle)
-    about_x = torch.tensor([[1.0, 0, 0], [0, c, -s], [0, s, c]])
-    torch.testing.assert_close(seen[0], about_x @ quat_to_matrix(about_z)[0], atol=1e-6, rtol=0)
+def test_a_turn_is_about_an_axis_of_the_world_and_never_half_a_turn():
+    about_z = torch.tensor([HALF, 0.0, 0.0, HALF]).double()
+    for length in (0.0, 0.01, 1.0, 1e4):
+        angle = 2 * math.atan(length / 2)
+        quat = turned(about_z, torch.tensor([length, 0.0, 0.0]).double())
+        assert_close(quat.norm().item(), 1.0)
+        c, s = math.cos(angle), math.sin(angle)
+        about_x = torch.tensor([[1.0, 0, 0], [0, c, -s], [0, s, c]]).double()
+        assert_close(quat_to_matrix(quat), about_x @ quat_to_matrix(about_z))
 
 
-@pytest.mark.parametrize("length", [0.0, 1.0, 1e4])
-def test_a_turn_is_never_half_a_turn(length: float) -> None:
-    identity = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64)
-    quat = turned(identity, torch.tensor([[0.0, length, 0.0]], dtype=torch.float64))
-    torch.testing.assert_close(quat.norm(), torch.ones((), dtype=torch.float64))
-    assert 2 * torch.acos(quat[0, 0]) == pytest.approx(2 * math.atan(length / 2))
-    assert 2 * math.atan(length / 2) < math.pi
-
-
-def test_queries_start_as_configured() -> None:
-    config = EllipsoidQueries.Config(count=30, init_radii=(0.1, 0.2, 0.4))
-    queries = EllipsoidQueries(config, DIMS)
-    support = queries.support(queries.start(3))
-    expected = torch.diag(torch.tensor([0.1, 0.2, 0.4])).expand(3, 30, 3, 3)
-    torch.testing.assert_close(support.axes, expected)
+def test_queries_give_what_they_learned_in_the_form_that_they_promise():
+    options = {**OFFSET, "count": 500, "std": 2.0, "init_radii": (0.1, 0.2, 0.4)}
+    queries = _made(EllipsoidQueries, **options, center_init=FrustumCenters(kind="frustum"))
+    assert queries.features.std().item() == pytest.approx(2.0, rel=0.1)
+    assert (queries.center[:, 2] >= 0.3).all()
+    at_first = queries.support(queries.start(2))
+    expected = torch.diag(torch.tensor([0.15, 0.25, 0.45]))
+    assert_close(at_first.axes, expected.expand(2, 500, 3, 3))
     decaying = [name for name, p in queries.named_parameters() if queries.decays(name, p)]
     assert decaying == ["features", "center", "raw_radii"]
+    with torch.no_grad():
+        for parameter in queries.parameters():
+            parameter += torch.randn_like(parameter)
+    state = queries.start(2)
+    assert_close(state[ROTATION][1], F.normalize(queries.rotation, dim=-1))
+    assert torch.equal(state[CENTER][1], queries.center)
+    axes = quat_to_matrix(state[ROTATION]) * _radii(state[RAW_RADII])[:, :, None]
+    assert_close(queries.support(state).axes, axes)
 
 
-def test_support_shows_the_ellipsoid_of_a_turned_anchor() -> None:
-    queries = EllipsoidQueries(EllipsoidQueries.Config(count=1, init_radii=(1, 2, 3)), DIMS)
-    about_z = torch.tensor([[[HALF, 0.0, 0.0, HALF]]])
-    axes = queries.support(queries.start(1).replace(fields={ROTATION: about_z})).axes[0, 0]
-    expected = torch.tensor([[0.0, -2.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 3.0]])
-    torch.testing.assert_close(axes, expected, atol=1e-5, rtol=0)
+def _memory() -> ImageMemory:
+    """Tokens of 2 x 3 x 4 patches."""
+    c2w = torch.eye(4).repeat(2, 2, 1, 1)
+    c2w[:, 1, :3, 3] = torch.tensor([0.5, 0.1, 0.0])
+    lens = torch.tensor([20.0, 20.0, 8.0, 6.0]).expand(2, 2, 4)
+    rays = patch_rays(plucker_rays(Cameras(c2w, lens, (12, 16))), 4)
+    heads = torch.randn(2, 2, 24, 8)
+    return ImageMemory(torch.randn(2, 24, 16), heads, heads.flip(0), rays, (2, 3, 4))
 
 
-def test_refinement_moves_only_what_it_is_told_to() -> None:
+def test_attention_and_pictures_speak_of_one_ellipsoid():
+    state, memory = _state(), _memory()
+    chosen = {"sigma0": 0.3, "sigma_sq_min": 1e-5, "bias_min": -7.0, "gamma_init": 0.4}
+    bias = _made(EllipsoidCrossAttention, **chosen, **OFFSET).bias(state, memory).dense()
+    axes = _made(EllipsoidQueries, **OFFSET).support(state).axes
+    radii = axes.norm(dim=-2)
+    ellipsoids = state[CENTER], axes / radii[..., None, :], (0.3 * radii).square()
+    tokens, gamma = ray_tokens(memory["patch_rays"]), F.softplus(torch.tensor(0.4))
+    assert_close(bias, EllipsoidBias.of(*ellipsoids, tokens, -7.0, gamma).dense())
+    assert bias.min() == -7.0 * gamma
+    assert bias.max() > -1.0
+
+
+def test_the_step_of_a_centre_follows_its_options():
     state = _state()
-    for chosen in ((True, False, False), (False, True, False), (False, False, True)):
-        told = dict(zip(("center", "rotation", "radius"), chosen, strict=True))
-        refined = EllipsoidRefinement(EllipsoidRefinement.Config(**told), DIMS)(state)
-        fields = {"center": CENTER, "rotation": ROTATION, "radius": RAW_RADII}
-        moved = {key: not torch.equal(refined[f], state[f]) for key, f in fields.items()}
-        assert moved == told
-        assert refined.features is state.features
+    for options, step in (
+        ({"center_step": "linear"}, lambda t: t),
+        ({"input_limit": 0.1, "output_limit": None}, lambda t: posact(t, 0.1, None)),
+        ({"output_limit": 0.05}, lambda t: posact(t, 100.0, 0.05)),
+    ):
+        refinement = _made(EllipsoidRefinement, **options)
+        expected = state[CENTER] + step(refinement.center_mlp(state.features))
+        assert_close(refinement(state)[CENTER], expected)
 
 
-def test_refined_rotations_stay_unit_over_many_layers() -> None:
-    refinement, state = EllipsoidRefinement(EllipsoidRefinement.Config(), DIMS), _state()
-    for _ in range(50):
-        state = refinement(state)
-    torch.testing.assert_close(state[ROTATION].norm(dim=-1), torch.ones(2, 5))
-
-
-def test_a_refinement_that_starts_at_zero_can_learn() -> None:
-    refinement = EllipsoidRefinement(EllipsoidRefinement.Config(zero_init=True), DIMS)
-    state = _state()
+def test_a_refinement_that_starts_at_zero_can_learn():
+    refinement, state = _made(EllipsoidRefinement, zero_init=True), _state()
     refined = refinement(state)
-    for name, field in state.fields.items():
-        torch.testing.assert_close(refined[name], field)
-    sum((refined[name] * torch.randn_like(refined[name])).sum() for name in state.fields).backward()
-    heads = (refinement.center_mlp, refinement.rotation_mlp, refinement.radius_mlp)
-    assert all(head.fc2.weight.grad.abs().sum() > 0 for head in heads)
+    assert_close(refined.fields, state.fields)
+    sum((field * torch.randn_like(field)).sum() for field in refined.fields.values()).backward()
+    for mlp in (refinement.center_mlp, refinement.rotation_mlp, refinement.radius_mlp):
+        assert mlp.fc2.weight.grad.abs().sum() > 0
 
 
-def test_centers_follow_their_formula() -> None:
-    state, offsets = _state(), torch.randn(2, 5, 3, 3)
-    means = AxisScaledCenters(AxisScaledCenters.Config(), DIMS)(offsets, state)
-    radii = support_radius(state[RAW_RADII], RadiusOptions())
-    for scene, query, gaussian in ((0, 0, 0), (1, 4, 2)):
-        local = radii[scene, query] * posact(offsets[scene, query, gaussian])
-        rotation = quat_to_matrix(state[ROTATION][scene, query])
-        expected = state[CENTER][scene, query] + rotation @ local
-        torch.testing.assert_close(means[scene, query, gaussian], expected)
+def test_centers_follow_their_formula():
+    state, offsets = _state(), torch.randn(2, 6, 3, 3)
+    local = F.softplus(state[RAW_RADII])[:, :, None] * posact(offsets)
+    steps = torch.einsum("bnij,bnkj->bnki", quat_to_matrix(state[ROTATION]), local)
+    means = _made(AxisScaledCenters)(offsets, state)
+    assert_close(means, state[CENTER][:, :, None] + steps)
 
 
-def test_bandwidths_have_their_floor_along_each_axis() -> None:
-    attention = EllipsoidCrossAttention(EllipsoidCrossAttention.Config(), DIMS)
-    raw = torch.tensor([[[-20.0, 20.0, 20.0]]])
-    sigma_sq = attention.sigma_sq(_state(1, 1).replace(fields={RAW_RADII: raw}))
-    torch.testing.assert_close(sigma_sq, torch.tensor([[[1e-3, 4.0, 4.0]]]))
-
-
-def test_a_radius_along_a_direction_reaches_the_surface() -> None:
+def test_a_radius_along_a_direction_reaches_the_surface():
     radii, quats = 0.1 + torch.rand(2, 5, 3), F.normalize(torch.randn(2, 5, 4, 4), dim=-1)
-    along = radii_along(radii, quats)
-    surface = quat_to_matrix(quats) * along[..., None, :]
+    surface = quat_to_matrix(quats) * radii_along(radii, quats)[..., None, :]
     in_ball = surface / radii[:, :, None, :, None]
-    torch.testing.assert_close(in_ball.norm(dim=-2), torch.ones(2, 5, 4, 3))
+    assert_close(in_ball.norm(dim=-2), torch.ones(2, 5, 4, 3))
 
 
-def test_gaussians_turn_and_grow_with_their_anchor() -> None:
-    head = EllipsoidHead(EllipsoidHead.Config(gaussians_per_query=3, init_std=0.5), DIMS)
-    plain = GaussianHead(GaussianHead.Config(gaussians_per_query=3), DIMS)
+def test_gaussians_turn_and_grow_with_their_anchor():
+    head = _made(EllipsoidHead, gaussians_per_query=3, init_std=0.5)
+    plain = _made(GaussianHead, gaussians_per_query=3)
     plain.load_state_dict(head.state_dict())
     state = _state()
     local, placed = plain(state), head(state)
-    axes = quat_to_matrix(local.quats)
-    expected = anchor_rotation(state[ROTATION])[:, :, None] @ axes
-    torch.testing.assert_close(quat_to_matrix(placed.quats), expected, atol=1e-5, rtol=0)
-    radii = support_radius(state[RAW_RADII], RadiusOptions())
-    torch.testing.assert_close(placed.scales, local.scales * radii_along(radii, local.quats))
+    expected = anchor_rotation(state[ROTATION])[:, :, None] @ quat_to_matrix(local.quats)
+    assert_close(quat_to_matrix(placed.quats), expected, atol=1e-5, rtol=0)
+    radii = F.softplus(state[RAW_RADII])
+    assert_close(placed.scales, local.scales * radii_along(radii, local.quats))
     for name in ("offsets", "opacities", "colors"):
         assert torch.equal(getattr(placed, name), getattr(local, name))
 
 
-def test_gaussians_along_the_axes_of_the_anchor_scale_with_its_radii() -> None:
-    head, state = EllipsoidHead(EllipsoidHead.Config(gaussians_per_query=2), DIMS), _state()
+def test_quaternions_of_no_use_become_the_identity():
+    head, state = _made(EllipsoidHead, gaussians_per_query=2), _state()
     with torch.no_grad():
         head.linear.weight.zero_()
-        head.linear.bias.view(2, 14)[:, 9] = 1.0
-    scales = head(state).scales
-    radii = support_radius(state[RAW_RADII], RadiusOptions())
-    torch.testing.assert_close(scales, (0.075 / math.e * radii)[:, :, None].expand_as(scales))
+        head.linear.bias.view(2, 14)[1, 9:13] = 1e-6
+    out = head(state)
+    assert_close(out.quats[..., 0, :], state[ROTATION])
+    assert_close(out.quats.norm(dim=-1), torch.ones(2, 6, 2))
+    quats = torch.tensor([[1.0, 0, 0, 0], [0.5, 0.5, 0.5, 0.5]]).expand(2, 6, 2, 4)
+    along = radii_along(F.softplus(state[RAW_RADII]), quats)
+    assert_close(out.scales, 0.075 / math.e * along)
 
 
-ELLIPSOID = {"recipe": 1, "plugins": ["locus", "ellipsoid"]}
-ANCHORED = {"queries": {"type": "ellipsoid/anchored"}}
+RECIPE = {
+    "recipe": 1,
+    "plugins": ["locus", "ellipsoid"],
+    "model": {"queries": {"type": "ellipsoid/anchored"}},
+}
+STILL = "{type: ellipsoid/refine, center: false, rotation: false, radius: false}"
 
 
 @pytest.mark.parametrize(
-    ("options", "path", "why"),
+    ("override", "option", "why"),
     [
-        ({"refinement": {"center": False, "rotation": False, "radius": False}}, "", "nothing is"),
-        ({"refinement": {"center_step": "linear", "input_limit": 7.0}}, ".input_limit",
-         "no effect"),
-        ({"refinement": {"center": False, "center_step": "linear"}}, ".center_step", "no effect"),
-        ({"refinement": {"radius": False, "radius_min": 0.5}}, ".radius_min", "no effect"),
-        ({"cross_attention": {"bandwidth": "fixed", "radius_min": 0.5}}, ".radius_min",
-         "no effect"),
+        (f"decoder.refinement={STILL}", "decoder.refinement", "nothing is"),
+        ("decoder.cross_attention={type: ellipsoid/ray_biased, bandwidth: fixed, radius_min: 0.5}",
+         "decoder.cross_attention.radius_min", "no effect"),
+        ("centers={type: ellipsoid/axis_scaled, radius_bound: offset}", "centers", "softplus"),
     ],
 )  # fmt: skip
-def test_options_without_effect_are_refused(options: dict, path: str, why: str) -> None:
-    ((slot, given),) = options.items()
-    kinds = {"refinement": "refine", "cross_attention": "ray_biased"}
-    decoder = {slot: {"type": f"ellipsoid/{kinds[slot]}", **given}}
-    problem = refused({**ELLIPSOID, "model": {**ANCHORED, "decoder": decoder}})
-    assert problem.option.endswith(path)
+def test_options_without_effect_or_sense_are_refused(override, option, why):
+    problem = refused(RECIPE, (f"model.{override}",))
+    assert problem.option == f"model.{option}"
     assert why in problem.reason
-
-
-def test_radii_that_are_read_in_two_ways_are_refused() -> None:
-    centers = {"type": "ellipsoid/axis_scaled", "radius_bound": "offset"}
-    with pytest.raises(RecipeError, match="softplus"):
-        resolve({**ELLIPSOID, "model": {**ANCHORED, "centers": centers}})

@@ -1,139 +1,106 @@
 """Which kernel computes attention with a bias that is a function, with made-up memory."""
 
 from types import SimpleNamespace
-from typing import Any, cast
 
 import pytest
 import torch
-import torch.nn.functional as F
 from qgs_locus.kernels import attention_choice
-from qgs_locus.kernels.attention_bias import AttentionBias, biased_attention
-from qgs_locus.kernels.attention_choice import SHARE, attention_kernel, chosen_kernel, plain_bytes
-from torch import Tensor
+from qgs_locus.kernels.attention_bias import biased_attention
+from qgs_locus.kernels.attention_choice import SHARE, attention_kernel, chosen_kernel
+from qgs_locus.ray_bias import RayBias
 
 
-class Nearness(AttentionBias):
-    """-|x - y|^2 of positions x of queries and y of tokens."""
+class InTriton(RayBias):
+    """With functions that nothing calls here."""
 
-    def value(self, queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
-        return -(queries_nF[:, :, None] - tokens_GM).square().sum(1)
-
-
-class InTriton(Nearness):
-    """The same, with functions that nothing calls here."""
-
-    def triton_functions(self) -> tuple[Any, Any]:
+    def triton_functions(self):
         return object(), object()
 
 
-def _case(
-    kind: type[AttentionBias] = InTriton, dtype: torch.dtype = torch.float32, width: int = 8
-) -> tuple[Tensor, Tensor, Tensor, AttentionBias]:
-    q, k, v = (torch.randn(2, 3, count, width, dtype=dtype) for count in (5, 7, 7))
-    return q, k, v, kind(torch.randn(2, 5, 3, requires_grad=True), torch.randn(2, 3, 7))
+class NotInTriton(RayBias):
+    def triton_functions(self):
+        return None
 
 
-class OnCuda:
+def case(kind=InTriton, dtype=torch.float32, width=8):
+    """q and a bias that learns."""
+    center = torch.randn(2, 5, 3, requires_grad=True)
+    bias = kind.of(center, 1.0, torch.randn(2, 6, 7), -20.0, torch.ones(()))
+    return torch.randn(2, 3, 5, width, dtype=dtype), bias
+
+
+def on_cuda(q):
     """A tensor, as far as the choice looks, that says it is on CUDA."""
-
-    def __init__(self, x: Tensor) -> None:
-        self.shape, self.dtype, self.element_size = x.shape, x.dtype, x.element_size
-        self.device = SimpleNamespace(type="cuda")
+    known = {name: getattr(q, name) for name in ("shape", "dtype", "element_size")}
+    return SimpleNamespace(**known, device=SimpleNamespace(type="cuda"))
 
 
-def _chosen(kernel: Any = "auto", **options: Any) -> str:
-    q, _, _, bias = _case(**options)
-    return chosen_kernel(cast(Tensor, OnCuda(q)), bias, kernel)
+@pytest.fixture
+def chosen(monkeypatch):
+    """What a GPU chooses of which a layer may take `memory` bytes, with this version of Triton."""
 
+    def of(kernel="auto", memory=0, version=(3, 5), learnt=False, **options) -> str:
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (0, memory * SHARE))
+        monkeypatch.setattr(attention_choice, "triton_version", lambda: version)
+        q, bias = case(**options)
+        bias.tokens.requires_grad_(learnt)
+        return chosen_kernel(on_cuda(q), bias, kernel)
 
-@pytest.fixture(autouse=True)
-def _small_gpu_with_triton(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attention_choice, "triton_version", lambda: (3, 5))
-    _give(monkeypatch, 0)
-
-
-def _give(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
-    """A GPU of which a layer may take `size` bytes."""
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (0, size * SHARE))
+    return of
 
 
 PAIRS = 2 * 5 * 7
 
 
 @pytest.mark.parametrize(
-    ("dtype", "trains", "needed"),
+    ("dtype", "trains", "each"),
     [
-        (torch.float32, True, PAIRS * (4 + 3 * 4)),
-        (torch.bfloat16, True, PAIRS * (4 + 2 + 3 * 2)),
-        (torch.float32, False, PAIRS * 4),
+        (torch.float32, True, 4 + 3 * 4),
+        (torch.bfloat16, True, 4 + 2 + 3 * 2),
+        (torch.float32, False, 4),
     ],
 )
-def test_the_plain_path_is_taken_while_it_fits(
-    dtype: torch.dtype, trains: bool, needed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_plain_path_is_taken_while_it_fits(dtype, trains, each, chosen):
     with torch.set_grad_enabled(trains):
-        q, *_, bias = _case(dtype=dtype)
-        assert plain_bytes(q, bias) == needed
-        _give(monkeypatch, needed)
-        assert _chosen(dtype=dtype) == "plain"
-        _give(monkeypatch, needed - 1)
-        assert _chosen(dtype=dtype) == "triton"
+        assert chosen(memory=PAIRS * each, dtype=dtype) == "plain"
+        assert chosen(memory=PAIRS * each - 1, dtype=dtype) == "triton"
 
 
 @pytest.mark.parametrize(
-    ("version", "options"),
+    "options",
     [
-        ((), {}),
-        ((3, 2), {}),
-        ((3, 10), {"kind": Nearness}),
-        ((3, 5), {"width": 300}),
-        ((3, 5), {"dtype": torch.float64}),
+        {"version": ()},
+        {"version": (3, 2)},
+        {"version": (3, 10), "kind": NotInTriton},
+        {"width": 300},
+        {"dtype": torch.float64},
+        {"learnt": True},
     ],
 )
-def test_what_triton_cannot_compute_goes_through_blocks(
-    version: tuple[int, ...], options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(attention_choice, "triton_version", lambda: version)
-    assert _chosen(**options) == "blocks"
+def test_what_triton_cannot_compute_goes_through_blocks(options, chosen):
+    assert chosen(**options) == "blocks"
     with pytest.raises(ValueError, match="triton"):
-        _chosen("triton", **options)
+        chosen("triton", **options)
 
 
-def test_tokens_that_learn_go_through_blocks() -> None:
-    q, _, _, bias = _case()
-    bias.tokens.requires_grad_()
-    on_cuda = cast(Tensor, OnCuda(q))
-    assert chosen_kernel(on_cuda, bias, "auto") == "blocks"
-    with torch.no_grad():
-        assert chosen_kernel(on_cuda, bias, "auto") == "triton"
+@torch.no_grad()
+def test_tokens_that_could_learn_go_through_triton_where_nothing_does(chosen):
+    assert chosen(learnt=True) == "triton"
 
 
-def test_on_a_cpu_blocks_are_taken_and_triton_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_cpu_blocks_are_taken_and_triton_is_refused(monkeypatch):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
-    q, _, _, bias = _case()
+    q, bias = case()
     assert chosen_kernel(q, bias, "auto") == "blocks"
     with pytest.raises(ValueError, match="a GPU"):
-        biased_attention(*_case(), "triton")
+        biased_attention(q, q, q, bias, "triton")
 
 
-def test_a_kernel_is_forced_through_the_whole_model() -> None:
+def test_a_kernel_is_forced_through_the_whole_model(chosen):
     with attention_kernel("plain"):
-        assert _chosen() == "plain"
-        assert _chosen("blocks") == "blocks"
+        assert chosen() == "plain"
+        assert chosen("blocks") == "blocks"
         with attention_kernel("blocks"):
-            assert _chosen() == "blocks"
-        assert _chosen() == "plain"
-    assert _chosen() == "triton"
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_the_plain_path_computes_the_same(dtype: torch.dtype) -> None:
-    q, k, v, bias = _case(dtype=dtype)
-    plain = biased_attention(q, k, v, bias, "plain")
-    assert plain.dtype == dtype
-    mask = bias.dense()[:, None].to(dtype)
-    assert torch.equal(plain, F.scaled_dot_product_attention(q, k, v, attn_mask=mask))
-    tolerance = 1e-6 if dtype == torch.float32 else 3e-2
-    torch.testing.assert_close(
-        plain, biased_attention(q, k, v, bias), rtol=tolerance, atol=tolerance
-    )
+            assert chosen() == "blocks"
+        assert chosen() == "plain"
+    assert chosen() == "triton"

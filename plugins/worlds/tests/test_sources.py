@@ -1,0 +1,70 @@
+"""What rooms and worlds have in common, as both are drawn from a seed."""
+
+import pytest
+import torch
+from pydantic import ValidationError
+from qgs_rooms.source import RoomsSource
+from qgs_worlds.source import WorldsSource
+
+SIZE = 16, 24
+
+
+@pytest.fixture(params=[RoomsSource, WorldsSource])
+def source(request):
+    """Makes one with these options."""
+    kind = request.param
+    return lambda **options: kind(kind.Config(**{"image_size": SIZE, **options}))
+
+
+def test_a_scene_is_a_function_of_seed_split_and_index(source):
+    first, again = source().scenes("train")[7], source(scenes=9, cache_mb=0).scenes("train")[7]
+    assert torch.equal(first.images([3, 1]), again.images([3, 1]))
+    assert torch.equal(first.images([1]), first.images([3, 1])[1:])
+    for other in (source().scenes("test")[7], source(seed=1).scenes("train")[7]):
+        assert not torch.equal(first.images([1]), other.images([1]))
+
+
+@pytest.mark.parametrize("size", [(17, 33), (130, 5)])
+def test_images_have_any_size_and_do_not_depend_on_threads(source, size, monkeypatch):
+    def drawn(threads: int) -> tuple[torch.Tensor, torch.Tensor]:
+        monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+        scene = source(image_size=size).scenes("test")[0]
+        return scene.images([0, 5]), scene.depths([0, 5])
+
+    images, depths = drawn(1)
+    assert images.shape == (2, 3, *size)
+    assert depths.shape == (2, 1, *size)
+    assert torch.isfinite(depths).all()
+    assert 0 <= depths.min() < depths.max()
+    assert 0 <= images.min() < images.max() <= 1
+    torch.testing.assert_close(drawn(3), (images, depths), rtol=0, atol=0)
+
+
+def test_more_samples_change_edges_only(source):
+    coarse, fine = (source(samples=n).scenes("train")[0].images([0]) for n in (1, 4))
+    assert 0 < (coarse - fine).abs().mean() < 0.08
+
+
+def test_slices_and_range(source):
+    scenes = source(scenes=5).scenes("train")
+    assert [scene.name for scene in scenes[3:]] == ["train/000003", "train/000004"]
+    with pytest.raises(IndexError):
+        scenes[5]
+
+
+@pytest.mark.parametrize(
+    ("kind", "option", "wrong"),
+    [
+        (RoomsSource, "fov", (80.0, 60.0)),
+        (RoomsSource, "scenes", 0),
+        (RoomsSource, "rooms", 3),
+        (WorldsSource, "scenes", 0),
+        (WorldsSource, "complexity", 2),
+        (WorldsSource, "light", "dark"),
+        (WorldsSource, "depth", (2, 1)),
+        (WorldsSource, "rooms", 2),
+    ],
+)
+def test_wrong_options_are_refused(kind, option, wrong):
+    with pytest.raises(ValidationError, match=option):
+        kind.Config(image_size=SIZE, **{option: wrong})

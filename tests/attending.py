@@ -1,0 +1,58 @@
+"""Attention with a bias that is a function, in drawn cases, and what is wrong with its kernels."""
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+Leaves = dict[str, Tensor]
+
+
+def case(sizes: Iterable[int], middle=(), factor=1.0, lower=-6.0) -> Leaves:
+    """sizes: scenes, heads, queries, tokens, numbers of a head. Biases by rays read of a query its
+    place, `middle`, here with noise, a factor of the squared distance, and the least bias."""
+    scenes, heads, queries, tokens, each = sizes
+    noise = torch.randn(scenes, queries, 3 + len(middle))
+    place, matrices = noise.tensor_split([3], -1)
+    factor = factor * (0.1 + torch.rand(scenes, queries, 1))
+    read = [place, torch.tensor(middle) + 0.3 * matrices, factor, torch.ones_like(factor) * lower]
+    return {
+        "q": torch.randn(scenes, queries, heads, each).transpose(1, 2),
+        "k": torch.randn(scenes, heads, tokens, each),
+        "v": torch.randn(scenes, tokens, heads, each).transpose(1, 2),
+        "queries": torch.cat(read, -1),
+        "tokens": torch.randn(scenes, 9 if middle else 6, tokens),
+        "gradient": torch.randn(scenes, heads, queries, each),
+    }
+
+
+def direct(q, k, v, bias) -> Tensor:
+    """The formula, with all pairs at once."""
+    scenes = zip(bias.queries, bias.tokens, strict=True)
+    mask = torch.stack([bias.value(*read) for read in scenes])
+    return (q @ k.mT * q.shape[-1] ** -0.5 + mask[:, None]).softmax(-1) @ v
+
+
+def found(attention, kind, given: Leaves, learnt: Iterable[str]) -> Leaves:
+    """The result, and the gradients that there are."""
+    x = {name: leaf.detach().requires_grad_(name in learnt) for name, leaf in given.items()}
+    read = attention(x["q"], x["k"], x["v"], kind(x["queries"], x["tokens"]))
+    read.backward(x["gradient"])
+    gradients = {name: leaf.grad for name, leaf in x.items() if leaf.grad is not None}
+    return {"read": read.detach(), **gradients}
+
+
+def exact(kind, given: Leaves, learnt: Iterable[str]) -> Leaves:
+    return found(direct, kind, {name: x.double() for name, x in given.items()}, learnt)
+
+
+def wrong(seen: Leaves, best: Leaves, tolerance: float = 1e-5) -> dict[str, float]:
+    """Errors, relative to what is of order 1 or more: where most pairs reach the least bias,
+    gradients are sums of numbers of order 1 that nearly cancel. What is 0 but for rounding is
+    compared with ones."""
+    errors = {}
+    for name, x in seen.items():
+        size = float(best[name].norm())
+        size = max(size, 1.0) if size > 1e-10 else x.numel() ** 0.5
+        errors[name] = float((x.cpu() - best[name]).norm()) / size
+    return {name: error for name, error in errors.items() if not error < tolerance}
