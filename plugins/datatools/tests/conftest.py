@@ -2,36 +2,39 @@
 
 import shutil
 
-import numpy as np
 import pytest
 from installing import install
-from planted import FRAMES, Copy, good_sets
+from planted import Planted, good_sets
 from qgs_datatools import geometry
-from qgs_datatools.epipolar import Features, detect
 from textured_room import walk
 
 __all__ = ["install"]
 
 
+def once(make, key):
+    known = {}
+
+    def made(*given):
+        which = key(*given)
+        if which not in known:
+            known[which] = make(*given)
+        return known[which]
+
+    return made
+
+
 @pytest.fixture(scope="session", autouse=True)
-def features_are_detected_once():
-    """Most tests have the same photos; features of one take half a second."""
-    known: dict[bytes, Features] = {}
-
-    def detected(picture: np.ndarray) -> Features:
-        key = picture.tobytes()
-        if key not in known:
-            known[key] = detect(picture)
-        return known[key]
-
+def photos_are_matched_once():
+    """Most tests have the same photos; features of one take a tenth of a second."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(geometry, "detect", detected)
+        patch.setattr(geometry, "detect", once(geometry.detect, lambda photo: photo.tobytes()))
+        patch.setattr(geometry, "match", once(geometry.match, lambda *both: (*map(id, both),)))
         yield
 
 
 @pytest.fixture(scope="session")
 def shots():
-    return walk(FRAMES)
+    return walk(6)
 
 
 @pytest.fixture(scope="session")
@@ -41,12 +44,16 @@ def good(tmp_path_factory, shots):
     return root
 
 
-def copy_of(name: str):
-    @pytest.fixture
-    def copied(good, tmp_path) -> Copy:
-        return Copy(shutil.copytree(good / name, tmp_path / name))
-
-    return copied
+@pytest.fixture
+def planted(shots, tmp_path):
+    return Planted(shots, tmp_path / "planted")
 
 
-room, chunks, archives = map(copy_of, ("room", "chunks", "archives"))
+@pytest.fixture
+def room(good, tmp_path):
+    return shutil.copytree(good / "room", tmp_path / "room")
+
+
+@pytest.fixture
+def chunks(good, tmp_path):
+    return shutil.copytree(good / "chunks", tmp_path / "chunks")

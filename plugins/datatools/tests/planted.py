@@ -1,95 +1,102 @@
-"""Sound data sets of several formats, and copies of them to plant faults in."""
+"""Sound data sets of several formats, and scenes to plant faults in."""
 
 import json
 import shutil
+from fnmatch import fnmatchcase
 
 import numpy as np
-import photo_formats
 import torch
+from photo_formats import encoded
 from qgs_datatools.check import Options, check
-from qgs_datatools.findings import Finding
 from textured_room import INTRINSICS, SIZE
 from upath import UPath
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 HASH = "0123456789abcdef" * 4
-FRAMES = 6
+ALL = "frames 0-5 (images/0.jpg to images/5.jpg): "
+CAMERA = dict(zip(("fl_x", "fl_y", "cx", "cy", "h", "w"), INTRINSICS + SIZE, strict=True))
 
 
-def photo_set(folder, shots, poses=None) -> photo_formats.PhotoSet:
-    """JPEG files of `shots`, and their poses or the given ones."""
-    folder.mkdir(parents=True)
-    files = tuple(folder / f"{number}.jpg" for number in range(len(shots)))
-    for file, shot in zip(files, shots, strict=True):
-        file.write_bytes(shot.encoded())
-    c2w = np.stack([shot.c2w for shot in shots] if poses is None else poses)
-    return photo_formats.PhotoSet(files, c2w, INTRINSICS, SIZE)
+class Room:
+    """What is written of a nerfstudio folder. poses: OpenCV. files: bytes by name."""
+
+    def __init__(self, shots):
+        self.files = {f"images/{n}.jpg": shot.encoded() for n, shot in enumerate(shots)}
+        self.frames = [{"file_path": name} for name in self.files]
+        self.poses = np.stack([shot.c2w for shot in shots])
+        self.camera = dict(CAMERA)
+
+    def mask(self, masks):
+        for number, mask in enumerate(masks):
+            self.files[f"masks/{number}.png"] = encoded(mask)
+            self.frames[number]["mask_path"] = f"masks/{number}.png"
+
+    def write(self, folder):
+        for frame, pose in zip(self.frames, self.poses @ FLIP, strict=True):
+            frame["transform_matrix"] = pose.tolist()
+        listing = json.dumps({**self.camera, "frames": self.frames})
+        for name, data in {**self.files, "transforms.json": listing.encode()}.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(data)
 
 
-def good_sets(root, shots) -> None:
+class Planted:
+    """Rooms, each with a fault, and the lines that are told of it, without the room's name."""
+
+    def __init__(self, shots, root):
+        self.shots = shots
+        self.root = root
+        self.rooms = {}
+
+    def __call__(self, *lines):
+        room = Room(self.shots)
+        self.rooms[room] = lines
+        return room
+
+    def check(self, geometry=99):
+        """All rooms at once."""
+        for number, room in enumerate(self.rooms):
+            room.write(self.root / f"room {number:02}")
+        report = check(UPath(self.root), Options(geometry))
+        assert not report.general
+        wrong = []
+        for scene, lines in zip(report.scenes, self.rooms.values(), strict=True):
+            found = [str(f).replace(f"{scene.name}, ", "") for f in scene.findings]
+            if not alike(found, lines):
+                wrong.append((lines, found))
+        assert not wrong, wrong
+
+
+def alike(lines, patterns):
+    """Whether these are the lines of the patterns, and no others."""
+    return len(lines) == len(patterns) and all(map(fnmatchcase, lines, patterns))
+
+
+def told(path, index=(), geometry=1):
+    return [*map(str, check(UPath(path), Options(geometry), index).findings)]
+
+
+def good_sets(root, shots):
     """A nerfstudio folder, chunks with two scenes and an index, and an archive, all sound."""
-    photo_formats.write_nerfstudio(root / "room", photo_set(root / "shots", shots))
+    Room(shots).write(root / "room")
     shutil.make_archive(str(root / "archives" / HASH), "zip", root / "room")
-    (root / "chunks" / "test").mkdir(parents=True)
-    save(root / "chunks", [record("a", shots), record("b", shots[:3])])
-    (root / "chunks" / "test" / "index.json").write_text('{"a": "0.torch", "b": "0.torch"}')
-    index = {"a": {"context": [0, 5], "target": [2]}, "b": {"context": [0, 2], "target": [1]}}
-    (root / "chunks" / "evaluation.json").write_text(json.dumps(index))
+    save(root / "chunks/test/0.torch", [record("a", shots), record("b", shots[:3])])
+    (root / "chunks/test/index.json").write_text('{"a": "0.torch", "b": "0.torch"}')
+    (root / "chunks/evaluation.json").write_text(
+        '{"a": {"context": [0, 5], "target": [2]}, "b": {"context": [0, 2], "target": [1]}}'
+    )
 
 
-def record(key: str, shots) -> dict:
-    fx, fy, cx, cy = INTRINSICS
-    height, width = SIZE
-    rows = [
-        [fx / width, fy / height, cx / width, cy / height, 0, 0,
-         *np.linalg.inv(shot.c2w)[:3].flatten()]
-        for shot in shots
-    ]  # fmt: skip
-    images = [torch.frombuffer(bytearray(shot.encoded()), dtype=torch.uint8) for shot in shots]
+def record(key, shots):
+    """A scene of a chunk."""
+    lens = np.array(INTRINSICS) / (SIZE[::-1] * 2)
+    cameras = [[*lens, 0, 0, *np.linalg.inv(shot.c2w)[:3].flatten()] for shot in shots]
+    images = [torch.frombuffer(bytearray(s.encoded()), dtype=torch.uint8) for s in shots]
     stamps = torch.arange(len(shots))
-    return {
-        "key": key, "url": "", "timestamps": stamps,
-        "cameras": torch.tensor(rows, dtype=torch.float32), "images": images,
-    }  # fmt: skip
+    cameras = torch.tensor(cameras, dtype=torch.float32)
+    return {"key": key, "url": "", "timestamps": stamps, "cameras": cameras, "images": images}
 
 
-def save(root, content) -> None:
-    with (root / "test" / "0.torch").open("wb") as file:
-        torch.save(content, file)
-
-
-def findings(path, index=(), geometry: int = 1) -> list[Finding]:
-    options = Options(geometry=geometry, threads=2)
-    return check(UPath(path), options, [UPath(file) for file in index]).findings
-
-
-def told(path, index=(), geometry: int = 1) -> list[str]:
-    return [str(finding) for finding in findings(path, index, geometry)]
-
-
-class Copy:
-    """A copy of one of the good sets, to plant faults in."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def listing(self, change) -> None:
-        file = self.path / "transforms.json"
-        data = json.loads(file.read_text())
-        change(data)
-        file.write_text(json.dumps(data))
-
-    def poses(self, change) -> None:
-        """Replace every pose (4, 4), given its number."""
-
-        def changed(data):
-            for number, frame in enumerate(data["frames"]):
-                pose = change(number, np.array(frame["transform_matrix"]))
-                frame["transform_matrix"] = pose.tolist()
-
-        self.listing(changed)
-
-    def chunk(self, change) -> None:
-        content = torch.load(self.path / "test" / "0.torch", weights_only=True)
-        changed = change(content)
-        save(self.path, content if changed is None else changed)
+def save(chunk, content):
+    chunk.parent.mkdir(parents=True, exist_ok=True)
+    torch.save(content, chunk)

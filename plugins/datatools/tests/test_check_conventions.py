@@ -4,94 +4,58 @@ import json
 
 import numpy as np
 import photo_formats
-import pytest
-from planted import FLIP, photo_set
-from qgs_datatools.check import Options, check
+from planted import FLIP, INTRINSICS, SIZE, alike, told
 from qgs_datatools.conventions import LLFF, OPENCV, OPENCV_C2W, OPENGL
-from textured_room import walk
-from upath import UPath
-
-WRITTEN_AND_READ = [
-    (OPENGL, "flipped", lambda c2w: c2w),
-    (OPENGL, "inverted", np.linalg.inv),
-    (OPENGL, "inverted and flipped", lambda c2w: np.linalg.inv(c2w @ FLIP)),
-    (OPENCV, "flipped", lambda c2w: np.linalg.inv(c2w @ FLIP)),
-    (OPENCV, "inverted", lambda c2w: c2w),
-    (OPENCV, "inverted and flipped", lambda c2w: c2w @ FLIP),
-    (OPENCV_C2W, "flipped", lambda c2w: c2w @ FLIP),
-    (OPENCV_C2W, "inverted", np.linalg.inv),
-    (OPENCV_C2W, "inverted and flipped", lambda c2w: np.linalg.inv(c2w @ FLIP)),
-    (LLFF, "OpenGL axes", lambda c2w: c2w @ FLIP),
-    (LLFF, "OpenCV axes", lambda c2w: c2w),
-    (LLFF, "flipped", lambda c2w: c2w[:, [1, 0, 2, 3]] * [-1, 1, 1, 1]),
-    (LLFF, "turned", lambda c2w: c2w[:, [1, 0, 2, 3]] * [1, -1, 1, 1]),
-]
-"""How true OpenCV poses are written by mistake."""
 
 
-def read(convention, stored: np.ndarray) -> np.ndarray:
-    """What a reader of the format makes of a stored matrix."""
-    if convention is OPENGL:
-        return stored @ FLIP
-    if convention is OPENCV:
-        return np.linalg.inv(stored)
-    if convention is OPENCV_C2W:
-        return stored
-    down, right, back, centre = stored.T
-    return np.stack([right, down, -back, centre], 1)
-
-
-@pytest.mark.parametrize(("convention", "name", "write"), WRITTEN_AND_READ)
-def test_a_misreading_gives_the_true_poses_back(convention, name, write):
-    first, second = (shot.c2w for shot in walk(2))
-    meant = convention[name].meant
-    as_meant = [meant(read(convention, write(pose))) for pose in (first, second)]
-    relative = np.linalg.inv(as_meant[1]) @ as_meant[0]
-    assert relative == pytest.approx(np.linalg.inv(second) @ first)
-
-
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory) -> photo_formats.PhotoSet:
-    """Three photos, and their poses with OpenGL's axes where OpenCV's are expected."""
-    shots = walk(6)[:3]
-    poses = [shot.c2w @ FLIP for shot in shots]
-    return photo_set(tmp_path_factory.mktemp("photos") / "files", shots, poses)
-
-
-def write_blender(folder, photos):
-    return photo_formats.write_blender(folder, photo_formats.centred(photos), 3)
-
-
-def write_llff(folder, photos):
-    return photo_formats.write_llff(folder, photo_formats.centred(photos))
-
-
-def write_colmap(folder, photos):
-    return photo_formats.write_colmap(folder, photos, "binary")
-
-
-def write_cameras(folder, photos):
-    photo_formats.copied(photos, folder)
-    listed = [
-        {"image": file.name, "c2w": pose.tolist(), "K": list(photos.intrinsics)}
-        for file, pose in zip(photos.files, photos.c2w, strict=True)
+def test_a_misreading_gives_the_true_poses_back(shots):
+    """Of what is read where the files hold true OpenCV poses, or OpenGL's, as they should not."""
+    true = np.stack([shot.c2w for shot in shots[:2]])
+    opengl = true @ FLIP
+    w2c, opengl_w2c = np.linalg.inv([true, opengl])
+    mixed = np.eye(4)[[1, 0, 2, 3]] * [1, 1, -1, 1]  # what LLFF's reader makes of other axes
+    read = [
+        (OPENGL["flipped"], opengl),
+        (OPENGL["inverted"], w2c @ FLIP),
+        (OPENGL["inverted and flipped"], opengl_w2c @ FLIP),
+        (LLFF["flipped"], opengl),
+        (LLFF["turned"], true * [-1, 1, -1, 1]),
+        (LLFF["inverted"], w2c),
+        (LLFF["OpenGL axes"], opengl @ mixed),
+        (LLFF["OpenCV axes"], true @ mixed),
     ]
-    (folder / "cameras.json").write_text(json.dumps(listed))
-    return folder
+    for convention in (OPENCV, OPENCV_C2W):
+        names = ("flipped", "inverted", "inverted and flipped")
+        read += zip(map(convention.get, names), (opengl, w2c, opengl_w2c), strict=True)
+    wrong = []
+    for misreading, poses in read:
+        first, second = map(misreading.meant, poses)
+        if not np.allclose(np.linalg.inv(second) @ first, w2c[1] @ true[0], 1e-6, 1e-12):
+            wrong.append(misreading.reason)
+    assert not wrong, wrong
 
 
-@pytest.mark.parametrize(
-    ("write", "reason"),
-    [
-        (write_cameras, "these look like OpenGL poses read as OpenCV"),
-        (write_blender, "these look like OpenCV poses read as OpenGL"),
-        (write_colmap, "these look like OpenGL poses read as OpenCV"),
-        (write_llff, "the axes look like (up, right, forward), OpenGL and OpenCV mixed"),
-    ],
-)
-def test_the_convention_is_named(photos, tmp_path, write, reason):
-    path = write(tmp_path / "set", photos)
-    (finding,) = check(UPath(path), Options(threads=2)).findings
-    assert finding.frames == (0, 1, 2)
-    assert reason in finding.reason
-    assert write != write_cameras or finding.fix.endswith("of every camera-to-world matrix")
+def test_the_convention_is_named(good, shots, tmp_path):
+    """Three photos, and their poses with OpenGL's axes where OpenCV's are expected."""
+    files = tuple(good / f"room/images/{number}.jpg" for number in range(3))
+    poses = np.stack([shot.c2w for shot in shots[:3]]) @ FLIP
+    photos = photo_formats.PhotoSet(files, poses, INTRINSICS, SIZE)
+    centred = photo_formats.centred(photos)
+    photo_formats.write_blender(tmp_path / "blender", centred, 3)
+    photo_formats.write_llff(tmp_path / "llff", centred)
+    photo_formats.write_colmap(tmp_path / "by colmap", photos, "binary")
+    listed = [
+        {"image": name, "c2w": pose.tolist(), "K": INTRINSICS}
+        for name, pose in zip(photo_formats.copied(photos, tmp_path / "plain"), poses, strict=True)
+    ]
+    (tmp_path / "plain/cameras.json").write_text(json.dumps(listed))
+    expected = (
+        "error: blender, frames 0-2 (*these look like OpenCV poses read as OpenGL (*",
+        "error: by colmap, frames 0-2 (*these look like OpenGL poses read as OpenCV (*",
+        "error: llff, frames 0-2 (*the axes look like (up, right, forward), OpenGL and OpenCV *",
+        "error: plain, frames 0-2 (*these look like OpenGL poses read as OpenCV (*of every "
+        "camera-to-world matrix",
+    )
+    found = told(tmp_path, geometry=4)
+
+    assert alike(found, expected), found

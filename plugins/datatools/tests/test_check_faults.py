@@ -1,230 +1,193 @@
 """Each planted fault is found as exactly one line; the untouched sets pass without any."""
 
-import json
 import os
-from fnmatch import fnmatchcase
 
 import numpy as np
 import pytest
 import torch
+from photo_formats import encoded
 from PIL import Image
-from planted import FLIP, told
+from planted import ALL, FLIP, HASH, alike, record, save, told
 from qgs_datatools.check import Options, check
-from textured_room import SIZE
 from upath import UPath
 
 from qgs.data.photos.source import present_frames
 
 
-@pytest.mark.parametrize("name", ["room", "chunks", "archives"])
-def test_untouched_sets_pass(good, name):
-    report = check(UPath(good / name), Options(threads=2))
-    assert report.findings == []
-    assert report.notes == []
-    for scene in report.scenes:
-        assert scene.geometry.agrees
-        assert scene.geometry.pixels < 0.6
-        assert scene.listed == scene.decodable > 0
+def test_untouched_sets_pass(good):
+    for name in ("room", "chunks", "archives"):
+        report = check(UPath(good / name), Options())
+        assert [*report.findings, *report.notes] == []
+        for scene in report.scenes:
+            assert scene.geometry.agrees
+            assert scene.geometry.pixels < 0.6
+            assert scene.listed == scene.decodable > 0
 
 
-ALL = "frames 0-5 (images/0.jpg to images/5.jpg): "
+def test_faults_of_files(planted, shots):
+    missing = planted("error: images/2.jpg: *does not exist*")
+    del missing.files["images/2.jpg"]
+    cut = planted("error: frame 2 (images/2.jpg): *cannot be decoded*")
+    cut.files["images/2.jpg"] = cut.files["images/2.jpg"][:-400]
+    pipe = planted("error: frame 2 (images/2.jpg): *is a pipe*")
+    del pipe.files["images/2.jpg"]
+    (planted.root / "room 02/images").mkdir(parents=True)
+    os.mkfifo(planted.root / "room 02/images/2.jpg")
+
+    size = "error: frame 3 (images/3.jpg): *{} x {} pixels, but listed as 180 x 120, another {}*"
+    for width, height, what in ((160, 120, "aspect"), (90, 60, "scale")):
+        small = Image.fromarray(shots[3].image).resize((width, height))
+        other = planted(size.format(width, height, what))
+        other.files["images/3.jpg"] = encoded(small, "JPEG")
+    listed = f"error: {ALL}*180 x 120 pixels, but listed as "
+    planted(f"{listed}120 x 180*swapped*").camera.update(w=120, h=180)
+    planted(f"{listed}360 x 240: correct the listed*").camera.update(w=360, h=240)
+
+    scaled_copy = planted()
+    for key in scaled_copy.camera:
+        scaled_copy.camera[key] *= 4
+    for name in [*scaled_copy.files]:
+        scaled_copy.files[name.replace("images", "images_4")] = scaled_copy.files.pop(name)
+    planted.check()
 
 
-def resized(size):
-    def change(room, shots):
-        file = room.path / "images" / "3.jpg"
-        Image.open(file).resize(size).save(file)
+def test_faults_of_cameras(planted):
+    opencv = planted(f"error: {ALL}*OpenCV poses read as OpenGL*negate columns 1 and 2*")
+    opencv.poses @= FLIP
+    planted("error: frame 1 (images/1.jpg): the pose mirrors*").poses[1, :, 0] *= -1
+    planted("error: frame 4 (images/4.jpg): the pose has NaN*").poses[4] = np.nan
+    off = planted("error: frame 1 (images/1.jpg): the principal point lies off the image*")
+    off.frames[1]["cx"] = 200.0
+    normalised = {"fl_x": 0.8, "fl_y": 1.2, "cx": 0.5, "cy": 0.5}
+    planted(f"error: {ALL}*look normalised*").camera |= normalised
 
-    return change
+    repeats = "frame 5 (images/5.jpg): the {}pose repeat* frame 2 (images/2.jpg)*"
+    same_pose = planted(f"error: {repeats.format('')}")
+    same_photo = planted(f"warning: {repeats.format('photo and its ')}")
+    same_photo.files["images/5.jpg"] = same_photo.files["images/2.jpg"]
+    for room in (same_pose, same_photo):
+        room.poses[5] = room.poses[2]
 
-
-def truncated_file(room, shots):
-    file = room.path / "images" / "2.jpg"
-    file.write_bytes(file.read_bytes()[:-400])
-
-
-def pipe(room, shots):
-    (room.path / "images" / "2.jpg").unlink()
-    os.mkfifo(room.path / "images" / "2.jpg")
-
-
-def pose(frame, changed):
-    """Replace the pose of a frame by what `changed` makes of it and of the shots."""
-
-    def change(room, shots):
-        room.poses(lambda number, c2w: changed(c2w, shots) if number == frame else c2w)
-
-    return change
-
-
-def moved(c2w, shots):
-    c2w[:3, 3] = shots[2].c2w[:3, 3]
-    return c2w
+    same_point = (
+        "error: frame 3 (images/3.jpg): the camera stands on the same point as that of frame 2 "
+        "(images/2.jpg), a zero baseline*"
+    )
+    far, far_too, here = planted(), planted(same_point), planted(same_point)
+    for room in (here, far_too):
+        room.poses[3, :3, 3] = room.poses[2, :3, 3]
+    for room in (far, far_too):
+        room.poses[:, :3, 3] += [2e5, 3e5, 100]  # metres of a map's grid
+    planted.check()
 
 
-def listed(**values):
-    return lambda room, shots: room.listing(lambda data: data.update(values))
+def test_a_camera_that_stands_still_may_film_what_moves(planted):
+    """Two frames have one pose; times tell them apart, but are wrong in the last room."""
+    repeats = "error: frame 5 (images/5.jpg): the pose repeats *"
+    wrong = (
+        "error: frame 2 (images/2.jpg): 'time' must be a finite number, got '2': correct it",
+        "error: frames 4-5 (images/4.jpg to images/5.jpg): it has no 'time', like 3 of 6 frames, "
+        "and the others have: write it for each, or for none where nothing moves",
+        repeats,
+    )
+    cases = (([], [repeats]), ([0.5] * 6, [repeats]), (range(6), []), ([0, 1, "2", 3], wrong))
+    for times, lines in cases:
+        room = planted(*lines)
+        room.poses[5] = room.poses[2]
+        for frame, time in zip(room.frames, times, strict=False):
+            frame["time"] = time
+    planted.check(geometry=0)
 
 
-IN_A_FOLDER = {
-    "missing image": (
-        lambda room, shots: (room.path / "images" / "2.jpg").unlink(),
-        "images/2.jpg: *does not exist*",
-    ),
-    "truncated JPEG": (truncated_file, "frame 2 (images/2.jpg): *cannot be decoded*"),
-    "OpenCV poses": (
-        lambda room, shots: room.poses(lambda number, c2w: c2w @ FLIP),
-        f"{ALL}*OpenCV poses read as OpenGL*negate columns 1 and 2*",
-    ),
-    "image of another shape": (
-        resized((160, 120)),
-        "frame 3 (images/3.jpg): *160 x 120 pixels, but listed as 180 x 120, another aspect*",
-    ),
-    "image of another scale than the rest": (
-        resized((90, 60)),
-        "frame 3 (images/3.jpg): *90 x 60 pixels, but listed as 180 x 120, another scale*",
-    ),
-    "width and height swapped": (
-        listed(w=SIZE[0], h=SIZE[1]),
-        f"{ALL}*180 x 120 pixels, but listed as 120 x 180*swapped*",
-    ),
-    "a listed size that intrinsics do not go with": (
-        listed(w=360, h=240),
-        f"{ALL}*180 x 120 pixels, but listed as 360 x 240: correct the listed*",
-    ),
-    "mirrored pose": (
-        pose(1, lambda c2w, shots: c2w @ np.diag([-1, 1, 1, 1])),
-        "frame 1 (images/1.jpg): the pose mirrors*",
-    ),
-    "NaN pose": (
-        pose(4, lambda c2w, shots: c2w * np.nan),
-        "frame 4 (images/4.jpg): the pose has NaN*",
-    ),
-    "a pipe": (pipe, "frame 2 (images/2.jpg): *is a pipe*"),
-    "duplicate pose": (
-        pose(5, lambda c2w, shots: shots[2].c2w @ FLIP),
-        "frame 5 (images/5.jpg): the pose repeats that of frame 2 (images/2.jpg)*",
-    ),
-    "zero baseline": (pose(3, moved), "frame 3 (images/3.jpg): *frame 2 (images/2.jpg)*baseline*"),
-    "principal point off the image": (
-        lambda room, shots: room.listing(lambda data: data["frames"][1].update(cx=200.0)),
-        "frame 1 (images/1.jpg): the principal point lies off the image*",
-    ),
-    "normalised intrinsics read as pixels": (
-        listed(fl_x=0.8, fl_y=1.2, cx=0.5, cy=0.5),
-        f"{ALL}*look normalised*",
-    ),
-}
-
-
-@pytest.mark.parametrize("fault", IN_A_FOLDER)
-def test_fault_in_a_folder(room, shots, fault):
-    change, line = IN_A_FOLDER[fault]
-    change(room, shots)
-    (found,) = told(room.path)
-    assert fnmatchcase(found, f"error: room, {line}")
-
-
-def truncated(content):
-    content[0]["images"][4] = content[0]["images"][4][:-400].clone()
-
-
-def scaled(factors):
-    def change(content):
-        content[0]["cameras"][:, :4] *= torch.tensor(factors)
-
-    return change
-
-
-def opengl(content):
-    content[0]["cameras"][:, 6:].reshape(-1, 3, 4)[:, 1:] *= -1
-
-
-def broken_pose(content):
-    content[1]["cameras"][2, 9:] = np.nan
-
-
-def on_one_point(content):
-    content[0]["cameras"][:, [9, 13, 17]] = 0
-
-
-OF_A = "error: a, frames 0-5 (0 to 5): "
-IN_A_CHUNK = {
-    "NaN pose": (broken_pose, "error: b, frame 2 (2): the pose has NaN*"),
-    "all cameras on one point": (on_one_point, f"{OF_A}*on one point*"),
-    "truncated JPEG": (truncated, "error: a, frame 4 (4): the image cannot be decoded*"),
-    "sides swapped in the intrinsics": (
-        scaled([1.5, 1 / 1.5, 1.5, 1 / 1.5]),
-        f"{OF_A}*width and height are swapped*",
-    ),
-    "OpenGL poses": (opengl, f"{OF_A}*OpenGL poses read as OpenCV*negate rows 1 and 2*"),
-    "pixels": (scaled([180, 120, 180, 120]), f"{OF_A}*look like pixels*"),
-}
-
-
-@pytest.mark.parametrize("fault", IN_A_CHUNK)
-def test_fault_in_a_chunk(chunks, fault):
-    change, line = IN_A_CHUNK[fault]
-    chunks.chunk(change)
-    (found,) = told(chunks.path)
-    assert fnmatchcase(found, line)
-
-
-def far_away(number, pose):
-    """In metres of a map's grid."""
-    pose[:3, 3] += [2e5, 3e5, 100]
-    return pose
-
-
-def test_sound_poses_far_from_the_origin_pass(room):
-    room.poses(far_away)
-    assert told(room.path) == []
-
-
-def test_zero_baseline_far_from_the_origin(room, shots):
-    pose(3, moved)(room, shots)
-    room.poses(far_away)
-    (line,) = told(room.path)
-    assert "room, frame 3 (images/3.jpg): the camera stands on the same point as that of" in line
-
-
-@pytest.mark.parametrize(
-    ("index", "fault"),
-    [
-        (
-            {"nowhere": {"context": [0], "target": [1]}, "b": None},
-            "nowhere: the index wanted.json *not there*",
-        ),
-        (
-            {"b": {"context": [0, 2], "target": [3]}},
-            "b, frame 3: the index wanted.json *3 frames are 0 to 2*",
-        ),
-    ],
-)
-@pytest.mark.parametrize("beside", [False, True])
-def test_fault_in_an_index(chunks, tmp_path, index, fault, beside):
-    """An index is checked where it is given, and where it lies with the chunks."""
-    file = tmp_path / "wanted.json"
-    if beside:
-        fault, file = fault.replace("wanted", "evaluation"), chunks.path / "evaluation.json"
-    file.write_text(json.dumps(index))
-    (found,) = told(chunks.path, [] if beside else [file], geometry=0)
-    assert fnmatchcase(found, f"error: {fault}")
-
-
-@pytest.mark.parametrize("content", [{"key": "a"}, [torch.zeros(2), torch.zeros(2)]])
-def test_chunk_that_is_no_list_of_mappings(chunks, content):
-    chunks.chunk(lambda _: content)
-    (found,) = told(chunks.path)
-    assert fnmatchcase(found, "error: test/0.torch: *places there 2 scenes: a, b*")
-
-
-def test_photos_have_one_number_in_reading_and_in_checking(room, shots):
+def test_photos_have_one_number_in_reading_and_in_checking(planted):
     """Behind a photo that is missing, the number in a message is the one that `--frames` takes."""
-    (room.path / "images/1.jpg").unlink()
-    pose(3, lambda c2w, shots: c2w * np.nan)(room, shots)
-    lines = told(room.path)
-    assert any("room, images/1.jpg: the image does not exist" in line for line in lines)
-    assert any("room, frame 2 (images/3.jpg): the pose has NaN" in line for line in lines)
+    nan = "error: frame 2 (images/3.jpg): the pose has NaN*"
+    room = planted("error: images/1.jpg: the image does not exist*", nan)
+    del room.files["images/1.jpg"]
+    room.poses[3] = np.nan
+    planted.check()
     with pytest.raises(ValueError, match=r"frame 2 \(images/3\.jpg\): the pose has NaN"):
-        present_frames(UPath(room.path))
+        present_frames(UPath(planted.root / "room 00"))
+
+
+def test_faults_of_a_scene_in_a_chunk(shots, tmp_path):
+    nan, point, cut, opengl, swapped, pixels = records = [record(key, shots) for key in "abcdef"]
+    nan["cameras"][2, 9:] = np.nan
+    point["cameras"][:, [9, 13, 17]] = 0
+    cut["images"][4] = cut["images"][4][:-400].clone()
+    opengl["cameras"][:, 10:] *= -1
+    swapped["cameras"][:, :4] *= torch.tensor([1.5, 1 / 1.5] * 2)
+    pixels["cameras"][:, :4] *= torch.tensor([180, 120] * 2)
+    save(tmp_path / "test/0.torch", records)
+    found = told(tmp_path, geometry=6)
+    expected = (
+        "error: a, frame 2 (2): the pose has NaN*",
+        "error: b, frames 0-5 (0 to 5): *on one point*",
+        "error: c, frame 4 (4): the image cannot be decoded*",
+        "error: d, frames 0-5 (0 to 5): *OpenGL poses read as OpenCV*negate rows 1 and 2*",
+        "error: e, frames 0-5 (0 to 5): *width and height are swapped*",
+        "error: f, frames 0-5 (0 to 5): *look like pixels*",
+    )
+    assert alike(found, expected), found
+
+
+def test_faults_of_chunks_and_their_index(chunks):
+    """0 is sound but for its index, 1 is missing, and 2 to 4 hold no scenes."""
+    index = '{"a": "0.torch", "c": "1.torch", "d": "0.torch", "e": "2.torch", "f": "3.torch"}'
+    (chunks / "test/index.json").write_text(index)
+    for number, content in ((2, {"key": "e"}), (3, [torch.zeros(2)] * 2), (4, [])):
+        save(chunks / f"test/{number}.torch", content)
+    found = told(chunks, geometry=0)
+    expected = (
+        "error: test/2.torch: *places there 1 scene: e*",
+        "error: test/3.torch: *places there 1 scene: f*",
+        "error: test/4.torch: the chunk holds no scene: pack the data set again*",
+        "error: test/1.torch: the chunk does not exist; index.json places there 1 scene: c: "
+        "download the chunk, or take its scenes out of index.json",
+        "error: d: test/index.json places the scene in 0.torch, which does not hold it: take the "
+        "scene out of index.json, or get the chunk that holds it",
+        "warning: b: test/0.torch holds the scene, but test/index.json does not name it, so that "
+        "it is never read: add it to index.json",
+    )
+    assert alike(found, expected), found
+
+
+def test_an_index_is_checked_where_it_is_given_and_where_it_lies_with_the_chunks(chunks):
+    given = UPath(chunks.with_name("given.json"))
+    for file in (given, chunks / "evaluation.json"):
+        file.write_text(
+            '{"nowhere": {"context": [0], "target": [1]}, "a": null, '
+            '"b": {"context": [0, 2], "target": [3]}}'
+        )
+    found = told(chunks, [given], geometry=0)
+    expected = (
+        "error: nowhere: the index given.json *not there*",
+        "error: b, frame 3: the index given.json *3 frames are 0 to 2*",
+        "error: nowhere: the index evaluation.json *not there*",
+        "error: b, frame 3: the index evaluation.json *3 frames are 0 to 2*",
+    )
+    assert alike(found, expected), found
+
+
+def test_other_data_sets_beside_scenes_are_named(room, chunks):
+    assert told(room.parent) == [
+        "warning: chunks: the folder is another data set (chunks) and is not checked with the "
+        f"photos beside it: run `qgs data check {chunks}`"
+    ]
+
+
+def test_single_files_are_data_sets_too(good):
+    options = Options(headers_only=True)
+    for file, held in (
+        (f"archives/{HASH}.zip", [HASH]),
+        ("chunks/test/0.torch", ["a", "b"]),
+        ("room/transforms.json", ["room"]),
+    ):
+        assert [scene.name for scene in check(UPath(good / file), options).scenes] == held
+
+
+def test_nothing_passes_in_silence(good):
+    room = UPath(good / "room")
+    with pytest.raises(FileNotFoundError, match="holds no chunks: leave --format out"):
+        check(room, Options(format="chunks"))
+    with pytest.raises(FileNotFoundError, match="no evaluation index at"):
+        check(room, Options(geometry=0), [room / "none.json"])

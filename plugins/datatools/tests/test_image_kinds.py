@@ -2,243 +2,164 @@
 
 import io
 import json
-import struct
-import zlib
+import re
 
+import av
 import numpy as np
 import pytest
-import torch
 from photo_formats import encoded, row_of_frames, scene
 from PIL import Image
 from qgs_datatools.check import Options, check
 from upath import UPath
 
 SIZE = (4, 6)
-GREY = np.array([[0, 1, 127, 128, 254, 255]] * 4)
-RGB = np.stack([GREY, GREY[:, ::-1], GREY.T[:4].repeat(2, 1)[:, :6]], -1).astype(np.uint8)
-ORIENTATION = 0x0112
+GREY = np.uint8([[0, 1, 127, 128, 254, 255]] * 4)
+RGB = np.stack([GREY, GREY[:, ::-1], GREY.T[:4].repeat(2, 1)[:, :6]], -1)
+MASK = np.uint8([[0, 0, 0, 1, 1, 1]] * 4)
+WHITE = Image.fromarray(255 * MASK)  # where the mask is 1
+METRES = np.arange(24, dtype=np.float32).reshape(SIZE)
+MILLIMETRES = 1000 * METRES
 
 
-def photo_set(folder, data: bytes, suffix="png", **frame):
-    """A folder of two photos with the same bytes; frame: keys of every frame."""
+def photos(folder, files, key="file_path"):
+    """Photos as they are read, and what is found of them. files: bytes by name, of each frame."""
+    listing = row_of_frames(len(files), fl_x=5.0, w=6, h=4)
     (folder / "images").mkdir()
-    listing = row_of_frames(2, fl_x=5.0, w=SIZE[1], h=SIZE[0])
-    for i, entry in enumerate(listing["frames"]):
-        entry.update(file_path=f"images/{i}.{suffix}", **frame)
-        (folder / entry["file_path"]).write_bytes(data)
+    for frame, (name, data) in zip(listing["frames"], files.items(), strict=True):
+        (folder / frame["file_path"]).write_bytes(encoded(RGB))
+        (folder / name).write_bytes(data)
+        frame[key] = name
     (folder / "transforms.json").write_text(json.dumps(listing))
-    return folder
+    return scene(folder, SIZE), check(UPath(folder), Options(geometry=0)).findings
 
 
-def told(folder) -> list[str]:
-    report = check(UPath(folder), Options(geometry=0, threads=1))
-    return [str(f) for f in report.findings if f.severity == "error" and "point" not in str(f)]
+def wide(values, factor):
+    """Numbers of 16 bits."""
+    return np.uint16(values) * np.uint16(factor)
 
 
-def pixels(folder) -> np.ndarray:
-    """(4, 6, 3) of the first photo."""
-    read = scene(folder, SIZE).images([0])[0]
-    return read.permute(1, 2, 0).mul(255).round().numpy()
-
-
-def palette() -> Image.Image:
-    return Image.fromarray(RGB).convert("P", palette=Image.Palette.ADAPTIVE, colors=256)
-
-
-def colours_of_16_bits() -> bytes:
+def colours_of_16_bits():
     """A PNG, which Pillow cannot write."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        )
-
-    rows = b"".join(b"\0" + row.tobytes() for row in (RGB.astype(np.uint32) * 257).astype(">u2"))
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", SIZE[1], SIZE[0], 16, 2, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    codec = av.CodecContext.create("png", "w")
+    codec.height, codec.width = SIZE
+    codec.pix_fmt = "rgb48be"
+    codec.framerate = 1
+    frame = av.VideoFrame.from_ndarray(wide(RGB, 257), "rgb48be")
+    return b"".join(map(bytes, codec.encode(frame)))
 
 
-def with_alpha(colors: np.ndarray) -> np.ndarray:
-    return np.dstack([colors, np.full(SIZE, 255)]).astype(np.uint8)
+def with_alpha(alpha):
+    return encoded(np.dstack([RGB, 0 * GREY + np.uint8(alpha)]))
 
 
-BELOW = np.where(GREY[..., None] >= 128, 255, 0).repeat(3, -1)
-READ = {
-    "grey": (encoded(Image.fromarray(GREY.astype(np.uint8))), GREY),
-    "grey of 16 bits": (encoded(Image.fromarray((GREY * 257).astype(np.uint16))), GREY),
-    "grey TIFF of 16 bits": (
-        encoded(Image.fromarray((GREY * 257).astype(np.uint16)), "TIFF"),
-        GREY,
-    ),
-    "colours of 16 bits": (colours_of_16_bits(), RGB),
-    "1 bit": (encoded(Image.fromarray(GREY >= 128)), BELOW),
-    "colours": (encoded(RGB), RGB),
-    "opaque alpha": (encoded(with_alpha(RGB)), RGB),
-    "no alpha": (encoded(np.dstack([RGB, np.zeros(SIZE)]).astype(np.uint8)), RGB * 0 + 255),
-    "grey and alpha": (
-        encoded(Image.merge("LA", [Image.new("L", SIZE[::-1], 0), Image.new("L", SIZE[::-1], 51)])),
-        np.full(SIZE, 204),
-    ),
-    "palette": (encoded(palette()), RGB),
-    "CMYK": (
-        encoded(Image.new("CMYK", SIZE[::-1], (255, 0, 51, 0)), "TIFF"),
-        np.broadcast_to([0, 255, 204], (*SIZE, 3)),
-    ),
+def palette(pixels):
+    return encoded(Image.fromarray(pixels).convert("P", palette=Image.Palette.ADAPTIVE))
+
+
+def plain(mode, color, kind="PNG"):
+    return encoded(Image.new(mode, SIZE[::-1], color), kind)
+
+
+def array(values):
+    file = io.BytesIO()
+    np.save(file, values)
+    return file.getvalue()
+
+
+IMAGES = {
+    "grey.png": (encoded(GREY), GREY),
+    "grey of 16 bits.png": (encoded(wide(GREY, 257)), GREY),
+    "grey of 16 bits.tif": (encoded(wide(GREY, 257), "TIFF"), GREY),
+    "colours of 16 bits.png": (colours_of_16_bits(), RGB),
+    "1 bit.png": (encoded(GREY >= 128), 255 * (GREY >= 128)),
+    "colours.png": (encoded(RGB), RGB),
+    "opaque alpha.png": (with_alpha(255), RGB),
+    "no alpha.png": (with_alpha(0), 0 * GREY + 255),
+    "grey and alpha.png": (plain("LA", (0, 51)), 0 * GREY + 204),
+    "palette.png": (palette(RGB), RGB),
+    "CMYK.tif": (plain("CMYK", (255, 0, 51, 0), "TIFF"), 0 * RGB + np.uint8([0, 255, 204])),
 }
-
-
-@pytest.mark.parametrize("kind", READ)
-def test_what_is_read_has_the_pixels_of_the_file(tmp_path, kind):
-    data, expected = READ[kind]
-    expected = expected if np.ndim(expected) == 3 else np.stack([expected] * 3, -1)
-    folder = photo_set(tmp_path, data)
-    np.testing.assert_array_equal(pixels(folder), expected)
-    assert told(folder) == []
-
-
-REFUSED = {
-    "float TIFF": encoded(Image.fromarray(GREY.astype(np.float32)), "TIFF"),
-    "32 bits": encoded(Image.fromarray(GREY.astype(np.int32)), "TIFF"),
-    "LAB": encoded(Image.new("LAB", SIZE[::-1]), "TIFF"),
-    "PostScript": encoded(RGB, "EPS"),
-    "text": b"no image",
-    "cut off": encoded(RGB)[:60],
+MASKS = {
+    "255.png": encoded(WHITE),
+    "1.png": encoded(MASK),
+    "1 bit.png": encoded(MASK > 0),
+    "16 bits.png": encoded(wide(MASK, 65535)),
+    "255 of 16 bits.png": encoded(wide(MASK, 255)),
+    "grey colours.png": encoded(WHITE.convert("RGB")),
+    "grey palette.png": encoded(WHITE.convert("P")),
 }
+DEPTHS = {
+    "16 bits.png": encoded(np.uint16(MILLIMETRES)),
+    "16 bits.tif": encoded(MILLIMETRES.astype(">u2"), "TIFF"),
+    "float.tif": encoded(MILLIMETRES, "TIFF"),
+    "32 bits.tif": encoded(np.int32(MILLIMETRES), "TIFF"),
+    "array.npy": array(MILLIMETRES[..., None]),
+}
+NO_IMAGES = {
+    "float.tif": encoded(METRES, "TIFF"),
+    "32 bits.tif": encoded(np.int32(GREY), "TIFF"),
+    "LAB.tif": plain("LAB", 0, "TIFF"),
+    "PostScript.png": encoded(RGB, "EPS"),
+    "text.png": b"no image",
+    "cut off.png": encoded(RGB)[:60],
+}
+NO_MASKS = {
+    "colours.png": encoded(MASK[..., None] * np.uint8([255, 0, 0])),
+    "palette.png": palette(MASK[..., None] * np.uint8([200, 10, 10])),
+    "alpha.png": plain("LA", (255, 128)),
+    "float.tif": encoded(np.float32(MASK), "TIFF"),
+    "another aspect ratio.png": encoded(WHITE.resize(SIZE)),
+    "text.png": b"no image",
+}
+NO_DEPTHS = {
+    "colours.png": encoded(RGB),
+    "1 bit.png": encoded(MASK > 0),
+    "objects.npy": array(np.array([[{}] * 6] * 4, object)),
+    "false header.npy": array(METRES).replace(b"(4, 6), }", b"(2000000, 1000000), }"),
+    "cut off.npy": array(METRES)[:-4],
+    "another aspect ratio.npy": array(METRES.T),
+    "text.npy": b"no array",
+}
+KINDS = {
+    "images": ("file_path", 255, IMAGES, NO_IMAGES),
+    "masks": ("mask_path", 1, {name: (data, MASK) for name, data in MASKS.items()}, NO_MASKS),
+    "depths": (
+        "depth_file_path", 1, {name: (data, METRES) for name, data in DEPTHS.items()}, NO_DEPTHS
+    ),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", REFUSED)
-def test_what_is_refused_is_told_alike(tmp_path, kind):
-    folder = photo_set(tmp_path, REFUSED[kind])
-    with pytest.raises(ValueError, match=r"images/0\.png cannot be read as an image \((.*)\): "):
-        pixels(folder)
-    (line,) = told(folder)
-    assert line.startswith(f"error: {folder.name}, frames 0-1 (images/0.png to images/1.png): the")
+@pytest.mark.parametrize("method", KINDS)
+def test_what_is_read_has_the_pixels_of_the_file(method, tmp_path):
+    key, factor, files, _ = KINDS[method]
+    read, findings = photos(tmp_path, {name: data for name, (data, _) in files.items()}, key)
+    assert not findings
+    wrong = []
+    for frame, (name, (_, expected)) in enumerate(files.items()):
+        found = getattr(read, method)([frame])[0].movedim(0, -1).numpy() * factor
+        if not np.allclose(found, expected.reshape(*SIZE, -1), 1e-6, 0):
+            wrong.append(name)
+    assert not wrong, wrong
 
 
-@pytest.mark.parametrize(("orientation", "quarters"), [(6, 3), (8, 1), (3, 2)])
-def test_a_photo_turned_by_exif_is_read_upright(tmp_path, orientation, quarters):
-    exif = Image.Exif()
-    exif[ORIENTATION] = orientation
-    folder = photo_set(tmp_path, encoded(RGB, exif=exif))
-    upright = np.rot90(RGB, quarters)
-    read = scene(folder, upright.shape[:2]).images([0])[0]
-    np.testing.assert_array_equal(read.permute(1, 2, 0).mul(255).round().numpy(), upright)
-    report = check(UPath(folder), Options(geometry=0, threads=1))
-    assert not [f for f in report.findings if "EXIF" in str(f) or "listed as" in str(f)]
+@pytest.mark.parametrize("method", KINDS)
+def test_what_is_refused_is_told_alike(method, tmp_path):
+    key, _, _, files = KINDS[method]
+    read, (finding,) = photos(tmp_path, files, key)
+    for frame, name in enumerate(files):
+        with pytest.raises(ValueError, match=re.escape(name)):
+            getattr(read, method)([frame])
+    assert finding.severity == "error"
+    assert finding.frames == (*range(len(files)),)
+    assert next(iter(files)) in str(finding)
 
 
 def test_a_photo_mirrored_by_exif_keeps_its_stored_pixels_and_a_warning_names_it(tmp_path, caplog):
     exif = Image.Exif()
-    exif[ORIENTATION] = 2
-    folder = photo_set(tmp_path, encoded(RGB, exif=exif))
-    np.testing.assert_array_equal(pixels(folder), RGB)
+    exif[0x0112] = 2
+    data = encoded(RGB, exif=exif)
+    read, (finding,) = photos(tmp_path, {"a.png": data, "b.png": data})
+    np.testing.assert_allclose(read.images([0])[0].movedim(0, -1) * 255, RGB, 1e-6)
     assert "EXIF orientation, which is not followed" in caplog.text
-    report = check(UPath(folder), Options(geometry=0, threads=1))
-    (line,) = (str(f) for f in report.findings if "EXIF" in str(f))
-    assert line.startswith("warning: ")
-
-
-def marked(value: int, dtype=np.uint8) -> Image.Image:
-    """The right half is modelled, with this number."""
-    mask = np.zeros(SIZE, dtype)
-    mask[:, 3:] = value
-    return Image.fromarray(mask)
-
-
-COLORED = marked(1).convert("P")
-COLORED.putpalette([0, 0, 0, 200, 10, 10])
-MASKS = {
-    "255": encoded(marked(255)),
-    "1": encoded(marked(1)),
-    "1 bit": encoded(marked(255).convert("1")),
-    "16 bits": encoded(marked(65535, np.uint16)),
-    "255 of 16 bits": encoded(marked(255, np.uint16)),
-    "grey colours": encoded(marked(255).convert("RGB")),
-    "grey palette": encoded(marked(255).convert("P")),
-}
-NO_MASKS = {
-    "colours": encoded(Image.merge("RGB", [marked(255), marked(0), marked(0)])),
-    "palette": encoded(COLORED),
-    "alpha": encoded(Image.merge("LA", [marked(255), marked(255)])),
-    "float": encoded(Image.fromarray(np.ones(SIZE, np.float32)), "TIFF"),
-    "another aspect ratio": encoded(marked(255).resize((4, 6))),
-    "text": b"no image",
-}
-
-
-def masked(folder, data: bytes):
-    (folder / "mask.png").write_bytes(data)
-    return photo_set(folder, encoded(RGB), mask_path="mask.png")
-
-
-@pytest.mark.parametrize("kind", MASKS)
-def test_masks(tmp_path, kind):
-    folder = masked(tmp_path, MASKS[kind])
-    read = scene(folder, SIZE).masks([0])
-    assert read is not None
-    assert torch.equal(read[0, 0], torch.tensor([[0, 0, 0, 1, 1, 1]] * 4).float())
-    assert told(folder) == []
-
-
-@pytest.mark.parametrize("kind", NO_MASKS)
-def test_masks_that_are_refused(tmp_path, kind):
-    folder = masked(tmp_path, NO_MASKS[kind])
-    with pytest.raises(ValueError, match=r"mask\.png"):
-        scene(folder, SIZE).masks([0])
-    (line,) = told(folder)
-    assert "mask.png" in line
-
-
-def array(values: np.ndarray) -> bytes:
-    file = io.BytesIO()
-    np.save(file, values, allow_pickle=True)
-    return file.getvalue()
-
-
-def false_header(*shape: int) -> bytes:
-    file = io.BytesIO()
-    header = {"descr": "<f4", "fortran_order": False, "shape": shape}
-    np.lib.format.write_array_header_1_0(file, header)
-    return file.getvalue()
-
-
-METRES = np.arange(24).reshape(SIZE).astype(np.float32)
-DEPTHS = {
-    "16 bits": ("png", encoded(Image.fromarray((METRES * 1000).astype(np.uint16)))),
-    "TIFF of 16 bits": ("tif", encoded(Image.fromarray((METRES * 1000).astype(">u2")), "TIFF")),
-    "float TIFF": ("tif", encoded(Image.fromarray(METRES * 1000), "TIFF")),
-    "32 bits": ("tif", encoded(Image.fromarray((METRES * 1000).astype(np.int32)), "TIFF")),
-    "array": ("npy", array(METRES[..., None] * 1000)),
-}
-NO_DEPTHS = {
-    "colours": ("png", encoded(RGB)),
-    "1 bit": ("png", encoded(marked(255).convert("1"))),
-    "objects": ("npy", array(np.array([[{}] * 6] * 4, object))),
-    "a false header": ("npy", false_header(2000000, 1000000)),
-    "cut off": ("npy", array(METRES)[:-4]),
-    "another aspect ratio": ("npy", array(METRES.T)),
-    "text": ("npy", b"no array"),
-}
-
-
-def deep(folder, suffix: str, data: bytes):
-    (folder / f"depth.{suffix}").write_bytes(data)
-    return photo_set(folder, encoded(RGB), depth_file_path=f"depth.{suffix}")
-
-
-@pytest.mark.parametrize("kind", DEPTHS)
-def test_depth_maps(tmp_path, kind):
-    folder = deep(tmp_path, *DEPTHS[kind])
-    read = scene(folder, SIZE).depths([0])
-    assert read is not None
-    np.testing.assert_allclose(read[0, 0], METRES, rtol=1e-6)
-    assert told(folder) == []
-
-
-@pytest.mark.parametrize("kind", NO_DEPTHS)
-def test_depth_maps_that_are_refused(tmp_path, kind):
-    folder = deep(tmp_path, *NO_DEPTHS[kind])
-    with pytest.raises(ValueError, match=r"depth\.(png|npy)"):
-        scene(folder, SIZE).depths([0])
-    (line,) = told(folder)
-    assert "depth." in line
+    assert finding.severity == "warning"
+    assert "EXIF" in str(finding)

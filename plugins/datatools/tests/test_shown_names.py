@@ -1,6 +1,7 @@
 """What commands print, those of plugins too, holds no control characters of names and texts."""
 
 import io
+import json
 import re
 import sys
 from contextlib import redirect_stderr, redirect_stdout
@@ -12,20 +13,19 @@ from commands import MODEL
 from safetensors.numpy import save_file
 
 from qgs.cli import GROUP, main
-from qgs.composer.yaml_text import dump
 
 NAME = "a\x1b[2J\u202eb\x9bc\rd\x07"
 RAW = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
-RECIPE = {
-    "recipe": 1,
-    "model": {**MODEL, "renderer": {"type": "qgs/torch"}},
-    "plugins": ["rooms"],
-    "data": {"type": "rooms/procedural", "image_size": [16, 16], "test_scenes": 1},
-    "views": {"inputs": 2, "targets": 2, "gap": [2, 4]},
-    "evaluation": {"scenes": 1},
-    "training": {"steps": 1},
-    "optimizer": {"type": "qgs/adamw", "warmup": 0},
-}
+RECIPE = f"""
+recipe: 1
+model: {json.dumps(MODEL)}
+plugins: [rooms]
+data: {{type: rooms/procedural, image_size: [16, 16], test_scenes: 1}}
+views: {{inputs: 2, targets: 2, gap: [2, 4]}}
+evaluation: {{scenes: 1}}
+training: {{steps: 1}}
+optimizer: {{type: qgs/adamw, warmup: 0}}
+"""
 FAULTY = f"""
 import typer
 plugin = typer.Typer()
@@ -36,60 +36,61 @@ MODELS = f"""
 from qgs.contracts import Plugin
 plugin = Plugin("box", 1, (), models={{"m": {NAME + ".safetensors"!r}}})
 """
-
-
-@pytest.fixture(autouse=True)
-def restored(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rich as it is, after a test that had it show its texts safely."""
-    monkeypatch.setattr(rich.text, "strip_control_codes", rich.text.strip_control_codes)
+COMMANDS = (
+    f"compose {NAME}.yaml",
+    f"compose {NAME}.yaml --set model.{NAME}=1",
+    f"compose {NAME}",
+    f"train {NAME}.yaml --out {NAME}",
+    f"eval {NAME}.safetensors",
+    f"reconstruct rooms/locus-64 {NAME} --out out",
+    f"list {NAME}",
+    "list box/m",
+    f"recipes {NAME}",
+    f"data check {NAME}",
+    f"data check {NAME} --format colmap",
+    "faulty",
+    NAME,
+    f"list --{NAME}",
+)
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working directory; what is in it is called NAME."""
+def printed(install, tmp_path, monkeypatch):
+    """What a command prints where all is called NAME."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "400")
-    Path(f"{NAME}.yaml").write_text(dump(RECIPE))
+    Path(f"{NAME}.yaml").write_text(RECIPE)
     Path(NAME).mkdir()
     Path(NAME, "0.png").write_bytes(b"")
     Path(NAME, "transforms.json").write_text('{"frames": [{"file_path": "\\u202e"}]}')
     save_file({}, f"{NAME}.safetensors", {"qgs.format": NAME, "qgs.recipe": NAME})
-    return tmp_path
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("compose", f"{NAME}.yaml"),
-        ("compose", f"{NAME}.yaml", "--set", f"model.{NAME}=1"),
-        ("compose", NAME),
-        pytest.param(
-            ("train", f"{NAME}.yaml", "--out", f"{NAME}-run"), marks=pytest.mark.slow, id="trains"
-        ),
-        ("train", f"{NAME}.yaml", "--out", NAME),
-        ("eval", f"{NAME}.safetensors"),
-        ("reconstruct", "rooms/locus-64", NAME, "--out", "out"),
-        ("list", NAME),
-        ("list", "box/m"),
-        ("recipes", NAME),
-        ("data", "check", NAME),
-        ("data", "check", NAME, "--format", "colmap"),
-        ("faulty",),
-        (NAME,),
-        ("list", f"--{NAME}"),
-    ],
-)
-def test_no_command_prints_control_characters(
-    words: tuple[str, ...], folder: Path, install, monkeypatch: pytest.MonkeyPatch
-) -> None:
     install("faulty", "faulty", FAULTY, group=GROUP)
     install("box", "box", MODELS)
-    monkeypatch.setattr(sys, "argv", ["qgs", *words])
-    with redirect_stdout(io.StringIO()) as out, redirect_stderr(out):
-        try:
-            main()
-        except (Exception, SystemExit):
-            sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]
-    assert RAW.findall(out.getvalue()) == []
-    assert r"\u202e" in out.getvalue()
-    assert Path(f"{NAME}-run", "checkpoint.safetensors").is_file() == (f"{NAME}-run" in words)
+
+    def printed(command):
+        with monkeypatch.context() as patch, redirect_stdout(io.StringIO()) as out:
+            # rich is left as it is
+            patch.setattr(rich.text, "strip_control_codes", rich.text.strip_control_codes)
+            patch.setattr(sys, "argv", ["qgs", *command.split(" ")])
+            with redirect_stderr(out):
+                try:
+                    main()
+                except (Exception, SystemExit):
+                    sys.excepthook(*sys.exc_info())
+        return out.getvalue()
+
+    return printed
+
+
+def test_no_command_prints_control_characters(printed):
+    texts = {command: printed(command) for command in COMMANDS}
+    assert not [command for command, text in texts.items() if RAW.search(text)]
+    assert not [command for command, text in texts.items() if r"\u202e" not in text]
+
+
+@pytest.mark.slow
+def test_a_training_prints_none_either(printed):
+    text = printed(f"train {NAME}.yaml --out {NAME}-run")
+    assert not RAW.search(text)
+    assert r"\u202e" in text
+    assert Path(f"{NAME}-run/checkpoint.safetensors").is_file()

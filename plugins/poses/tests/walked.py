@@ -1,26 +1,49 @@
 """What tests of poses share."""
 
-from pathlib import Path
-
 import av
 import numpy as np
+from PIL import Image
 from rich.console import Console
 
-SCALE, PHOTOS = 3, 8
+SCALE, PHOTOS = 2, 6
 """Size of the photos over that of `textured_room`, and how many there are."""
 
 
-def quiet() -> Console:
+def quiet():
     return Console(quiet=True)
 
 
-def write_video(path: Path, images: list[np.ndarray], rate: int = 10, **options: str) -> Path:
-    """An H.264 video of images of one size."""
+def write_photos(folder, images, name="{}.png"):
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, image in enumerate(images):
+        Image.fromarray(image).save(folder / name.format(number))
+    return folder
+
+
+def write_video(path, images, rate=10, codec="libx264", **options):
+    """A video of images of one size."""
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=rate, options={"crf": "15"} | options)
+        stream = container.add_stream(codec, rate=rate, options={"crf": "15"} | options)
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = "yuv420p"
         for image in images:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
         container.mux(stream.encode())
+    return path
+
+
+def write_turned(path, images, degrees):
+    """An mp4 whose track says that it is shown `degrees` clockwise: the matrix in `tkhd`."""
+    data = write_video(path, images).read_bytes()
+    cosine, sine = {90: (0, 1), 180: (-1, 0), 270: (0, -1)}[degrees]
+    matrix = 65536 * np.array([cosine, sine, 0, -sine, cosine, 0, 0, 0])
+    start = data.index(b"tkhd") + 4 + 40  # version 0: 40 bytes before the matrix
+    path.write_bytes(data[:start] + matrix.astype(">i4").tobytes() + data[start + 32 :])
+    return path
+
+
+def cut(path, part):
+    """Only the first part of a file."""
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * part)])
     return path

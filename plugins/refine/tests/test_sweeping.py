@@ -1,86 +1,61 @@
-"""Points on what photos show, of a painted wall whose place is known."""
+"""Points on what photos show, of the inside of a textured box."""
 
-import pytest
+from dataclasses import replace
+
+import numpy as np
 import torch
 from qgs_refine.refining import partly_swept
 from qgs_refine.sweeping import swept
-from torch import Tensor
+from test_refining import cloud, generator
+from textured_room import INTRINSICS, SIZE, walk
 
-from qgs.geometry.poses import look_at
-from qgs.types import Cameras, Gaussians, Views
-
-SIDE = 48
-
-
-def paint(x: Tensor, y: Tensor) -> Tensor:
-    """RGB (..., 3) of the wall z = 0, different everywhere that a camera sees."""
-    waves = [(1.0, 7.0, 3.0), (2.0, -4.0, 8.0), (3.0, 5.0, -6.0)]
-    return torch.stack([0.5 + 0.4 * torch.sin(a + b * x + c * y) for a, b, c in waves], -1)
+from qgs.geometry.transforms import to_camera, to_pixels
+from qgs.types import Cameras, Views
 
 
-def photos(eyes: Tensor) -> Views:
-    """Photos (1, V) of the wall from `eyes` (V, 3), towards the origin."""
-    c2w = look_at(eyes, -eyes, torch.tensor([0.0, 1, 0]).expand_as(eyes))
-    lens = torch.tensor([60.0, 60, SIDE / 2, SIDE / 2])
-    steps = (torch.arange(SIDE) + 0.5 - SIDE / 2) / 60
-    rows, columns = torch.meshgrid(steps, steps, indexing="ij")
-    rays = torch.stack([columns, rows, torch.ones_like(rows)], -1)
-    images = []
-    for pose in c2w:
-        turned = rays @ pose[:3, :3].T
-        hit = pose[:3, 3] - turned * (pose[2, 3] / turned[..., 2:])
-        images.append(paint(hit[..., 0], hit[..., 1]).permute(2, 0, 1))
-    cameras = Cameras(c2w[None], lens.expand(1, len(eyes), 4), (SIDE, SIDE))
-    return Views(torch.stack(images)[None], cameras)
+def photos(count):
+    """The first photos (1, V) of a walk."""
+    shots = walk(20)[:count]
+    images = torch.tensor(np.stack([shot.image for shot in shots])).movedim(-1, 1) / 255
+    c2w = torch.tensor(np.stack([shot.c2w for shot in shots])).float()
+    lens = torch.tensor(INTRINSICS).expand(1, count, 4)
+    return Views(images[None], Cameras(c2w[None], lens, SIZE))
 
 
-def row_of_eyes(count: int, apart: float = 0.2) -> Tensor:
-    x = apart * (torch.arange(count) - (count - 1) / 2)
-    return torch.stack([x, torch.zeros(count), torch.full((count,), -2.0)], -1)
+def test_points_lie_on_the_walls_in_their_colours():
+    """Of two photos and of more; with sizes far from the truth, and more than one batch."""
+    cases = ((2, 1.0, 400), (2, 2.0, 2400), (2, 4.0, 400), (9, 1.0, 400), (9, 4.0, 400))
+    for count, size, number in cases:
+        views = photos(count)
+        found = swept(views, number, size, generator())
+        assert found.count == number
+        off = (found.means.abs() / torch.tensor([1.2, 1.0, 1.5])).amax(-1) - 1
+        assert (off.abs() < 0.075).float().mean() > 0.85  # depths are tried in steps of 7 %
+        seen = to_camera(found.means, views.cameras)
+        pixels = to_pixels(seen, views.cameras.intrinsics)[0]
+        # each is as large as two pixels of the photo that it is of, and has its colour
+        sizes = 2 * seen[0, ..., 2] / INTRINSICS[0]
+        difference, photo = (sizes - found.scales[0, :, 0]).abs().min(0)
+        assert difference.max() < 1e-5
+        x, y = pixels[photo, torch.arange(number)].long().T
+        alike = (views.images[0, photo, :, y, x] == found.colors[0]).all(-1)
+        assert alike.float().mean() > 0.95  # but for those of two photos as far away
 
 
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(0)
-
-
-@pytest.mark.parametrize("count", [2, 9])
-@pytest.mark.parametrize("size", [1.0, 2.0, 4.0])  # far from the truth, 2, too
-def test_points_lie_on_the_wall_in_its_colours(count: int, size: float) -> None:
-    views = photos(row_of_eyes(count))
-    found = swept(views, 400, size, generator())
-    off = found.means[0, :, 2].abs()
-    assert (off < 0.15).float().mean() > 0.85  # depths are tried in steps of 7 %
-    near = found.means[0, off < 0.15]
-    colors = found.colors[0, off < 0.15]
-    assert (paint(near[:, 0], near[:, 1]) - colors).abs().mean() < 0.08
-    assert found.scales.median() == pytest.approx(2 * 2 / 60, rel=0.1)  # two pixels at depth 2
-
-
-def test_without_evidence_the_depth_is_the_size() -> None:
+def test_without_evidence_the_depth_is_the_size():
     """Of photos that show nothing in common."""
-    eyes = row_of_eyes(2)
-    views = photos(eyes)
+    views = photos(2)
     c2w = views.cameras.c2w.clone()
-    c2w[0, 1, :3, 0] *= -1  # turned about
-    c2w[0, 1, :3, 2] *= -1
-    views = Views(views.images, Cameras(c2w, views.cameras.intrinsics, views.cameras.size))
+    c2w[0, 1, :3, [0, 2]] *= -1  # turned about
+    views = replace(views, cameras=replace(views.cameras, c2w=c2w))
     found = swept(views, 50, 3.0, generator())
-    axes, ways = c2w[0, :, :3, 2], found.means[0, :, None] - eyes
-    depths = (ways * axes).sum(-1).amax(-1)  # before the one that shows it
+    depths = to_camera(found.means, views.cameras)[0, ..., 2].amax(0)  # from the one that shows it
     assert (depths / 3 - 1).abs().max() < 0.04  # half of a step between the depths that are tried
 
 
-def test_more_pixels_than_are_swept_at_once() -> None:
-    found = swept(photos(row_of_eyes(3)), 4000, 2.0, generator())
-    assert found.count == 4000
-    assert (found.means[0, :, 2].abs() < 0.15).float().mean() > 0.85
-
-
-def test_half_makes_room_and_the_most_opaque_stay() -> None:
-    opacities = torch.linspace(0.1, 0.9, 11)[None]
-    quats = torch.tensor([1.0, 0, 0, 0]).expand(1, 11, 4)
-    given = Gaussians(torch.randn(1, 11, 3), torch.ones(1, 11, 3), quats, opacities, quats[..., 1:])
-    views = photos(row_of_eyes(3))
+def test_half_makes_room_and_the_most_opaque_stay():
+    given = cloud(11)
+    views = photos(3)
     mixed = partly_swept(given, views, 9, 0.5, generator())
     assert mixed.count == 9
     assert torch.equal(mixed.means[:, :5], given.most_opaque(5).means)

@@ -3,69 +3,68 @@
 import pytest
 import torch
 from qgs_refine.tuning import tune, tuning_loss
-from training_runs import Tiny, tiny_recipe
+from training_runs import tiny_recipe
 
-from qgs.composer import Recipe
 from qgs.data.evaluation import evaluation_samples
-from qgs.model import QueryGaussianModel
-from qgs.types import QueryState, Views, map_tensors
+from qgs.types import map_tensors
+
+MSE = "losses.photometric.ssim_weight=0.0"
+LATENTS = (
+    "plugins=[tokengs2026]",
+    "model.encoder={type: tokengs2026/latent_bottleneck, depth: 1, blocks: [1], latents: 12, "
+    "latent_depth: 1, patch_size: 8, layer_scale: 0.3}",
+    "evaluation.tuning=latents",
+)
 
 
-@pytest.fixture
-def tiny() -> Tiny:
-    return tiny_recipe
-
-
-def model_and_inputs(recipe: Recipe) -> tuple[QueryGaussianModel, Views]:
+def opened(*words):
+    """The recipe, its model and the input views of a scene."""
+    recipe = tiny_recipe(*words)
     samples = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)
-    return recipe.build_model().eval(), samples[0].inputs
+    return recipe, recipe.build_model().eval(), samples[0].inputs
 
 
-@pytest.mark.parametrize("name", ["tokengs", "locus"])
-def test_the_input_views_are_met_better_and_weights_are_bit_equal(tiny: Tiny, name: str) -> None:
-    recipe = tiny(name)
-    model, inputs = model_and_inputs(recipe)
+@pytest.mark.parametrize("words", [("tokengs",), ("locus",), ("tokengs", *LATENTS)])
+def test_the_input_views_are_met_better_and_weights_are_bit_equal(words):
+    """And what does not change is encoded once; the losses are the recipe's, on the inputs."""
+    recipe, model, inputs = opened(*words, MSE)
+    latents = "latents" in recipe.evaluation.tuning
     before = {key: tensor.clone() for key, tensor in model.state_dict().items()}
-    untuned = model(inputs)
-    tuning = tune(model, inputs, tuning_loss(recipe), steps=8, rate=1e-2)
-    assert len(tuning.losses) == 9
-    assert tuning.losses[-1] < 0.99 * tuning.losses[0]
-    for key, tensor in model.state_dict().items():
-        assert torch.equal(tensor, before[key])
+    untuned = model(inputs).gaussians
+    calls = []
+    part = model.encoder.latent_blocks[0] if latents else model.encoder
+    part.register_forward_hook(lambda *_: calls.append(1))
+    loss = tuning_loss(recipe)
+    tuning = tune(model, inputs, loss, 8, *((0.1, "latents") if latents else (1e-2,)))
+    assert len(calls) == 1
+    assert all(torch.equal(tensor, before[key]) for key, tensor in model.state_dict().items())
     assert all(parameter.grad is None for parameter in model.parameters())
     assert all(parameter.requires_grad for parameter in model.parameters())
-    assert torch.equal(model(inputs).gaussians.means, untuned.gaussians.means)
     assert not tuning.prediction.gaussians.means.requires_grad
 
-
-def test_the_losses_are_the_recipes_on_the_input_photos_encoded_once(tiny: Tiny) -> None:
-    recipe = tiny("tokengs", "losses.photometric.ssim_weight=0.0")
-    model, inputs = model_and_inputs(recipe)
-    calls = []
-    model.encoder.register_forward_hook(lambda *_: calls.append(1))
-    tuning = tune(model, inputs, tuning_loss(recipe), steps=2, rate=1e-3)
-    assert len(calls) == 1
-    with pytest.raises(ValueError, match="at least one step, got 0"):
-        tune(model, inputs, tuning_loss(recipe), steps=0)
-
-    def error(gaussians) -> float:
+    def error(gaussians):
         return float((model.render(gaussians, inputs.cameras).rgb - inputs.images).square().mean())
 
+    assert len(tuning.losses) == 9
+    assert tuning.losses[-1] < 0.99 * tuning.losses[0]
     with torch.no_grad():
-        assert tuning.losses[0] == pytest.approx(error(model(inputs).gaussians), rel=1e-6)
+        assert tuning.losses[0] == pytest.approx(error(untuned), rel=1e-6)
         assert tuning.losses[-1] == pytest.approx(error(tuning.prediction.gaussians), rel=1e-6)
+    with pytest.raises(ValueError, match="at least one step, got 0"):
+        tune(model, inputs, loss, steps=0)
 
 
-def test_every_floating_field_is_tuned_and_no_other(
-    tiny: Tiny, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recipe = tiny("locus")
-    model, inputs = model_and_inputs(recipe)
+def test_latents_are_tuned_at_their_own_rate():
+    assert tiny_recipe("tokengs", *LATENTS).evaluation.rate == 1e-2
+
+
+def test_every_floating_field_is_tuned_and_no_other(monkeypatch):
+    recipe, model, inputs = opened("locus")
     start = model.queries.start(1)
     numbers = torch.arange(start.features.shape[1])[None]
     labelled = start.replace(fields={"stranger.label": numbers})
     monkeypatch.setattr(model.queries, "forward", lambda memory, views: labelled)
-    seen: list[QueryState] = []
+    seen = []
     predict = model.predict
 
     def recorded(views, memory, state, layers=None):
@@ -83,35 +82,15 @@ def test_every_floating_field_is_tuned_and_no_other(
     assert torch.equal(last["stranger.label"], numbers)
 
 
-def test_a_forward_pass_starts_from_the_given_state(tiny: Tiny) -> None:
-    model, inputs = model_and_inputs(tiny("locus"))
+def test_a_forward_pass_starts_from_the_given_state():
+    _, model, inputs = opened("locus")
     start = model.queries.start(1)
     shifted = start.replace(fields={"anchor.center": start["anchor.center"] + 1})
     with torch.no_grad():
-        plain, same, moved = model(inputs), model(inputs, state=start), model(inputs, state=shifted)
-    assert torch.equal(plain.gaussians.means, same.gaussians.means)
-    assert not torch.allclose(plain.gaussians.means, moved.gaussians.means)
+        plain, same, moved = (
+            model(inputs, state=s).gaussians.means for s in (None, start, shifted)
+        )
+    assert torch.equal(plain, same)
+    assert not torch.allclose(plain, moved)
     with pytest.raises(ValueError, match="the memory is of 1 scenes, the initial state of 2"):
         model(inputs, state=model.queries.start(2))
-
-
-LATENTS = (
-    "plugins=[tokengs2026]",
-    "model.encoder={type: tokengs2026/latent_bottleneck, depth: 1, blocks: [1], latents: 12, "
-    "latent_depth: 1, patch_size: 8, layer_scale: 0.3}",
-)
-
-
-def test_latents_are_tuned_and_nothing_else(tiny: Tiny) -> None:
-    recipe = tiny("tokengs", *LATENTS, "evaluation.tuning=latents")
-    assert recipe.evaluation.rate == 1e-2
-    model, inputs = model_and_inputs(recipe)
-    before = {key: tensor.clone() for key, tensor in model.state_dict().items()}
-    calls = []
-    model.encoder.latent_blocks[0].register_forward_hook(lambda *_: calls.append(1))
-    tuning = tune(model, inputs, tuning_loss(recipe), 8, 0.1, "latents")
-    assert len(calls) == 1
-    assert tuning.losses[-1] < 0.99 * tuning.losses[0]
-    assert all(torch.equal(tensor, before[key]) for key, tensor in model.state_dict().items())
-    untuned = model(inputs).gaussians.means
-    assert not torch.equal(tuning.prediction.gaussians.means, untuned)
