@@ -1,94 +1,89 @@
 """Debian's chromium, driven through its debugging protocol."""
 
 import base64
+import io
 import json
 import shutil
 import subprocess
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 from urllib.request import urlopen
 
+import numpy as np
+from PIL import Image
 from websockets.sync.client import connect
 
 CHROMIUM = shutil.which("chromium")
 _FLAGS = (
-    "--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--remote-debugging-port=0", "--remote-allow-origins=*", "--window-size=1280,800",
-)  # fmt: skip
+    "--headless --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic "
+    "--no-first-run --disable-background-networking --remote-debugging-port=0 "
+    "--remote-allow-origins=* --window-size=1280,800 about:blank"
+)
 
 
 class Page:
     """One page of the browser. requests: URLs that it asked for. errors: of its console.
 
-    targets: kinds of what else it holds, frames and workers, once they are followed.
+    targets: kinds of what else it holds, frames and workers, whose requests and errors count too.
     """
 
-    def __init__(self, socket: Any) -> None:
+    def __init__(self, socket):
         self._socket, self._number = socket, 0
-        self.requests: list[str] = []
-        self.errors: list[str] = []
-        self.targets: list[str] = []
+        self.requests, self.errors, self.targets = [], [], []
+        self._listen()
+
+    def _listen(self, **to):
         for domain in ("Page", "Runtime", "Network", "Log"):
-            self.call(f"{domain}.enable")
+            self._send(f"{domain}.enable", {}, to)
+        follow = dict.fromkeys(("autoAttach", "waitForDebuggerOnStart", "flatten"), True)
+        self._send("Target.setAutoAttach", follow, to)
+        self._send("Runtime.runIfWaitingForDebugger", {}, to)
 
-    def call(self, method: str, **params: Any) -> dict[str, Any]:
-        number = self._send(method, params)
-        while True:
-            message = json.loads(self._socket.recv(timeout=120))
-            if message.get("id") == number:
-                assert "error" not in message, message
-                return message["result"]
-            self._note(message)
-
-    def _send(self, method: str, params: dict[str, Any], **to: str) -> int:
+    def _send(self, method, params, to):
         self._number += 1
         message = {"id": self._number, "method": method, "params": params, **to}
         self._socket.send(json.dumps(message))
         return self._number
 
-    def follow_frames(self) -> None:
-        """Note requests and errors of sandboxed frames and of workers too."""
-        self.call(
-            "Target.setAutoAttach", autoAttach=True, waitForDebuggerOnStart=True, flatten=True
-        )
+    def call(self, method, **params):
+        number = self._send(method, params, {})
+        while True:
+            message = json.loads(self._socket.recv(timeout=120))
+            if message.get("id") == number:
+                assert "error" not in message, message
+                return message["result"]
+            self._note(**message)
 
-    def _follow(self, session: str) -> None:
-        for domain in ("Runtime", "Network", "Log"):
-            self._send(f"{domain}.enable", {}, sessionId=session)
-        within = {"autoAttach": True, "waitForDebuggerOnStart": True, "flatten": True}
-        self._send("Target.setAutoAttach", within, sessionId=session)
-        self._send("Runtime.runIfWaitingForDebugger", {}, sessionId=session)
+    def _note(self, method="", params=None, **_):
+        match method:
+            case "Target.attachedToTarget":
+                self.targets.append(params["targetInfo"]["type"])
+                self._listen(sessionId=params["sessionId"])
+            case "Network.requestWillBeSent":
+                self.requests.append(params["request"]["url"])
+            case "Network.webSocketCreated":
+                self.requests.append(params["url"])
+            case "Runtime.exceptionThrown":
+                self.errors.append(str(params["exceptionDetails"]))
+            case "Log.entryAdded" if params["entry"]["level"] == "error":
+                self.errors.append(params["entry"]["text"])
 
-    def _note(self, message: dict[str, Any]) -> None:
-        method, params = message.get("method"), message.get("params", {})
-        if method == "Target.attachedToTarget":
-            self.targets.append(params["targetInfo"]["type"])
-            self._follow(params["sessionId"])
-        if method == "Network.requestWillBeSent":
-            self.requests.append(params["request"]["url"])
-        if method == "Network.webSocketCreated":
-            self.requests.append(params["url"])
-        if method == "Runtime.exceptionThrown":
-            details = params["exceptionDetails"]
-            self.errors.append(details.get("exception", {}).get("description", details["text"]))
-        if method == "Log.entryAdded" and params["entry"]["level"] == "error":
-            self.errors.append(params["entry"]["text"])
-
-    def open(self, url: str) -> None:
+    def open(self, url):
+        """Leave the page before, and forget what it noted."""
+        self.call("Page.navigate", url="about:blank")
+        time.sleep(1)
+        self.evaluate("0")  # collects events
+        self.requests, self.errors, self.targets = [], [], []
         self.call("Page.navigate", url=url)
 
-    def evaluate(self, code: str) -> Any:
+    def evaluate(self, code):
         found = self.call(
             "Runtime.evaluate", expression=code, awaitPromise=True, returnByValue=True
         )
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
-    def until(self, what: str, code: str | Callable[[], Any], seconds: float = 90) -> Any:
+    def until(self, what, code, seconds=90):
         """Wait for JavaScript or a function to give something true."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -98,32 +93,28 @@ class Page:
             self.evaluate("0")  # collects events
         raise AssertionError(f"{what} did not happen in {seconds} s; errors: {self.errors}")
 
-    def click(self, x: float, y: float) -> None:
-        where = {"x": x, "y": y, "button": "left", "clickCount": 1}
-        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
-        self.call("Input.dispatchMouseEvent", type="mousePressed", **where)
-        self.call("Input.dispatchMouseEvent", type="mouseReleased", **where)
+    def drag(self, x, y, far=0):
+        """Press the mouse, move it, let go: a click where it moves not `far`."""
+        for kind, place in (("Pressed", x), ("Moved", x + far), ("Released", x + far)):
+            where = {"x": place, "y": y, "button": "left", "buttons": 1, "clickCount": 1}
+            self.call("Input.dispatchMouseEvent", type=f"mouse{kind}", **where)
 
-    def key(self, key: str, code: int) -> None:
+    def key(self, key, code):
         for kind in ("keyDown", "keyUp"):
-            self.call(
-                "Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code
-            )
+            keys = {"key": key, "code": key, "windowsVirtualKeyCode": code}
+            self.call("Input.dispatchKeyEvent", type=kind, **keys)
 
-    def screenshot(self, path: Path) -> bytes:
+    def picture(self):
+        """What the window shows, (H, W, 3)."""
         shot = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-        path.write_bytes(shot)
-        return shot
+        return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
 
 
 @contextmanager
-def chromium(profile: Path) -> Iterator[Page]:
+def chromium(profile):
     """A page in a new browser with its profile in the folder `profile`."""
-    assert CHROMIUM is not None
-    process = subprocess.Popen(
-        [CHROMIUM, *_FLAGS, f"--user-data-dir={profile}", "about:blank"],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+    command = [CHROMIUM, f"--user-data-dir={profile}", *_FLAGS.split()]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         port_file = profile / "DevToolsActivePort"
         end = time.monotonic() + 60

@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 from hand_made_model import cameras, gaussians, model
 from installing import install
@@ -5,3 +6,15 @@ from installing import install
 pytest.importorskip("viser", reason="viser is not installed: pip install query-gaussians-viewer")
 
 __all__ = ["cameras", "gaussians", "install", "model"]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _short_loops():
+    """Files beside the point take no time: loops of reconstructions and pages, overviews."""
+    from qgs.analysis import saving
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(saving.orbit_path, "__defaults__", (2, 32))
+        patch.setattr(saving, "overview", lambda result: np.zeros((8, 8, 3), np.uint8))
+        patch.setattr("qgs_viewer.report.ORBIT_FRAMES", 2)
+        yield

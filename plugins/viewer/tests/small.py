@@ -1,78 +1,108 @@
-"""A small model of each kind, and a scene of random photos that a camera walks past."""
+"""A small model of each kind, cameras on arcs, and a scene that a camera walks past."""
 
-import math
-from collections.abc import Sequence
 from copy import deepcopy
 from functools import cache
 
 import torch
-from qgs_viewer.figures.exhibits import Exhibit, Exhibition, exhibit
+from commands import MODEL
+from qgs_viewer.figures.exhibits import Exhibition, exhibit
 from qgs_viewer.sources import ModelSource
-from torch import Tensor
 
+import qgs
 from qgs.composer import resolve
 from qgs.contracts import Scene, ViewsConfig
-from qgs.data.samples import Sample, make_sample
+from qgs.data.domain import KEY, Domain
+from qgs.data.samples import make_sample
 from qgs.geometry.poses import look_at
-from qgs.model import QueryGaussianModel
-from qgs.types import Cameras
+from qgs.types import Cameras, Gaussians
 
 QUERIES, FRAMES, SIDE = 12, 6, 64
 VIEWS = ViewsConfig(inputs=2, gap=(1, 5), scale="auto")
+BY_DISTANCE = VIEWS.model_copy(update={"scale": "distance", "scale_factor": 0.7})
 KINDS = ("tokengs", "locus", "ellipsoid")
+PAIR = KINDS[:2]
+RECIPE = {
+    "recipe": 1,
+    "model": MODEL,
+    "plugins": ["rooms"],
+    "data": {"type": "rooms/procedural", "image_size": [16, 16], "test_scenes": 3},
+    "views": {"inputs": 2, "targets": 2, "gap": [2, 4], "scale_factor": 0.4},
+    "evaluation": {"scenes": 2},
+}
+"""Of a model that takes no time, with rooms of its own."""
+
+
+def stand_in(file, queries=8):
+    """Write an untrained model of RECIPE that knows on what views it was trained; its name."""
+    domain = Domain({"baseline": [0.1, 0.3], "turn": [2.0, 20.0], "depth": [1.0, 2.0]}, 48)
+    model = resolve(RECIPE, [f"model.queries.count={queries}"]).build_model()
+    qgs.save(model, file, extra={KEY: domain.text, "step": "7000"})
+    return str(file)
+
+
+def arc(degrees, radius, rise=0.0):
+    """Poses (V, 4, 4) of cameras around the origin, which they look at, y down."""
+    angles = torch.as_tensor(degrees).double().deg2rad()
+    axes = torch.stack([angles.sin(), rise * angles, angles.cos()], -1)
+    return look_at(-radius * axes, axes, torch.tensor([0.0, 1.0, 0.0]).expand_as(axes).double())
+
+
+def pinhole(c2w, lens=(64.0, 64.0, 32.0, 32.0), size=(SIDE, SIDE)):
+    """Cameras (V,)."""
+    return Cameras(c2w, torch.tensor(lens).to(c2w).expand(len(c2w), 4), size)
+
+
+def cloud(count):
+    """Gaussians (1, G) in a cube of side 2 around the origin."""
+    make = torch.Generator().manual_seed(3)
+    means = torch.rand(1, count, 3, generator=make) * 2 - 1
+    quats = torch.nn.functional.normalize(torch.randn(1, count, 4, generator=make), dim=-1)
+    scales = 0.04 + 0.08 * torch.rand(1, count, 3, generator=make)
+    opacities = torch.rand(1, count, generator=make) * 0.7 + 0.2
+    return Gaussians(means, scales, quats, opacities, torch.rand(1, count, 3, generator=make))
 
 
 @cache
-def model_of(kind: str) -> QueryGaussianModel:
+def model_of(kind, *overrides):
     """Untrained, with QUERIES queries."""
     torch.manual_seed(0)
-    recipe = resolve(f"recipes/tiny/{kind}.yaml", [f"model.queries.count={QUERIES}"])
-    return recipe.build_model().eval()
+    settings = [f"model.queries.count={QUERIES}", *overrides]
+    return resolve(f"recipes/tiny/{kind}.yaml", settings).build_model().eval()
 
 
 class Walk(Scene):
     """Photos of noise by cameras on an arc that look at one point, principal point off centre."""
 
     name = "walk"
+    cameras = pinhole(arc(range(-30, 31, 12), 3, 0.1), (59.0, 65.0, 35.0, 30.0))
 
-    def __init__(self) -> None:
-        self._images = torch.rand(FRAMES, 3, SIDE, SIDE, generator=torch.manual_seed(1))
+    def images(self, frames):
+        every = torch.rand(FRAMES, 3, SIDE, SIDE, generator=torch.Generator().manual_seed(1))
+        return every[list(frames)]
 
-    @property
-    def cameras(self) -> Cameras:
-        angles = torch.linspace(-0.5, 0.5, FRAMES).double()
-        eye = torch.stack([3 * angles.sin(), 0.2 * angles, 5 - 3 * angles.cos()], -1)
-        target = torch.tensor([0.0, 0.0, 5.0]).double()
-        c2w = look_at(eye, target - eye, torch.tensor([0.0, 1.0, 0.0]).double().expand_as(eye))
-        focal = SIDE / (2 * math.tan(0.5))
-        lens = torch.tensor([focal, 1.1 * focal, SIDE / 2 + 3, SIDE / 2 - 2]).double()
-        return Cameras(c2w, lens.expand(FRAMES, 4), (SIDE, SIDE))
-
-    def images(self, frames: Sequence[int]) -> Tensor:
-        return self._images[list(frames)]
-
-    def frame_name(self, frame: int) -> str:
+    def frame_name(self, frame):
         return f"photos/{frame:02d}.png"
 
 
-def source_of(kind: str) -> ModelSource:
-    return ModelSource(model_of(kind), Walk(), VIEWS, (1, 4), f"{kind}: walk")
-
-
-def sample_of(inputs: Sequence[int] = (1, 4)) -> Sample:
-    """The walk as a model sees it: frames 2 and 3 from others."""
-    return make_sample(Walk(), tuple(inputs), (2, 3), VIEWS, mirror=False)
+def sample_of(inputs=(1, 4), targets=(2, 3)):
+    """The walk as a model sees it."""
+    return make_sample(Walk(), inputs, targets, VIEWS, mirror=False)
 
 
 @cache
-def exhibit_of(kind: str) -> Exhibit:
+def exhibit_of(kind):
     """Of the small model with refinements that move anchors, as trained ones do."""
-    model, random = deepcopy(model_of(kind)), torch.Generator().manual_seed(2)
+    model = deepcopy(model_of(kind))
+    random = torch.Generator().manual_seed(2)
     for parameter in model.refinements.parameters():
         parameter.data += 0.03 * torch.randn(parameter.shape, generator=random)
     return exhibit(kind, model, sample_of())
 
 
-def exhibition_of(*kinds: str, query: int | None = None) -> Exhibition:
+def source_of(kind, views=VIEWS):
+    return ModelSource(exhibit_of(kind).model, Walk(), views, (1, 4), f"{kind}: walk")
+
+
+def exhibition_of(*kinds, query=None):
     samples = [sample_of(), sample_of((0, 5))]
     return Exhibition([exhibit_of(kind) for kind in kinds], samples, query)

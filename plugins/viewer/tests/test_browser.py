@@ -1,140 +1,256 @@
-"""The viewer in a real browser: it opens, draws, picks, follows layers, takes other photos."""
+"""The viewer and its pages in a real browser: they draw, follow what is done, ask for nothing."""
 
-import io
 import time
-from collections.abc import Callable
-from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, Page, chromium
-from PIL import Image
+from browser import CHROMIUM, chromium
 from qgs_viewer.page import scene_html
 from qgs_viewer.panel import Panel
+from qgs_viewer.report import Contender, Report, report_html
 from qgs_viewer.server import quiet_server
 from qgs_viewer.sources import Wanted, open_source
+from small import PAIR, model_of, sample_of
+
+from qgs.contracts import Column
 
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium: apt install chromium"),
 ]
-MODELS = ("rooms/locus-64", "rooms/tokengs-64")
+MODEL = "rooms/locus-64"
 SCENE = (slice(160, 640), slice(330, 930))  # of the window: no panel, no notice
 
 
-def picture(page: Page, folder: Path, name: str) -> np.ndarray:
-    shot = page.screenshot(folder / f"{name}.png")
-    return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))[SCENE].astype(int)
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    with chromium(tmp_path_factory.mktemp("profile")) as page:
+        yield page
 
 
-def drawn(page: Page, folder: Path, name: str, unlike: np.ndarray | None = None) -> np.ndarray:
+def drawn(page, unlike=None):
     """The scene once it stands still, has colours, and is another than before."""
-    last, end = picture(page, folder, name), time.monotonic() + 90
-    while time.monotonic() < end:
+    pictures = [page.picture()[SCENE]]
+
+    def stands():
         time.sleep(1)
-        now = picture(page, folder, name)
-        differs = unlike is None or (np.abs(now - unlike).max(-1) > 24).mean() > 0.005
-        if now.std() > 4 and differs and np.abs(now - last).max(-1).mean() < 0.5:
-            return now
-        last = now
-    raise AssertionError(f"{name} was not drawn; see {folder}, {page.errors}")
+        pictures.append(page.picture()[SCENE])
+        last, now = pictures[-2:]
+        differs = unlike is None or (abs(now - unlike).max(-1) > 24).mean() > 0.005
+        return now.std() > 4 and differs and abs(now - last).max(-1).mean() < 0.5
+
+    page.until("a picture", stands)
+    return pictures[-1]
 
 
-def network(page: Page, own: str) -> list[str]:
-    return [r for r in page.requests if not r.startswith(("data:", "blob:", own))]
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_the_viewer(model: str, tmp_path: Path) -> None:
-    source = open_source(model, Wanted())
+def test_the_viewer(page):
+    source = open_source(MODEL, Wanted())
     source.title = "<b id=named>*name*</b> 1. [x](y)"
-    with quiet_server() as server, chromium(tmp_path / "profile") as page:
+    with quiet_server() as server:
         panel = Panel(server, source)
         address = f"127.0.0.1:{server.get_port()}"
         page.open(f"http://{address}")
         page.until("the canvas", "!!document.querySelector('canvas')")
-        opened = drawn(page, tmp_path, "opened")
+        opened = drawn(page)
         page.until("its name", f"document.body.innerText.includes({source.title!r})")
         assert page.evaluate("document.querySelector('#named')") is None
 
-        for x, y in ((620, 380), (560, 300), (700, 420), (500, 250), (600, 500)):
-            page.click(x, y)
-            if waited(page, lambda: panel.choice.query is not None):
-                break
-        assert panel.choice.query is not None
-        picked = drawn(page, tmp_path, "picked", opened)
-        told = f"query {panel.choice.query}"
-        page.until("its words", f"document.body.innerText.includes('{told}')")
+        def picks():
+            page.drag(*next(places))
+            time.sleep(2)
+            page.evaluate("0")
+            return panel.choice.query is not None
 
-        page.key("Escape", 27)
-        page.until("no query", lambda: panel.choice.query is None)
-        page.until("no words", f"!document.body.innerText.includes('{told}')")
-        panel.pick(int(told.split()[1]))
-        page.until("its words again", f"document.body.innerText.includes('{told}')")
-
+        places = iter([(620, 380), (560, 300), (700, 420), (500, 250), (600, 500)])
+        page.until("a query", picks)
+        picked = drawn(page, opened)
+        told = f"document.body.innerText.includes('query {panel.choice.query}')"
+        page.until("its words", told)
         page.evaluate("document.querySelector('[role=slider]').focus()")
         for _ in range(panel.look.depth - 1):
             page.key("ArrowLeft", 37)
             time.sleep(1)  # every step is a message of its own
         page.until("the layer", lambda: panel.choice.layer == 1)
-        if model == MODELS[0]:
-            drawn(page, tmp_path, "layer", picked)
+        drawn(page, picked)
+        page.key("Escape", 27)
+        page.until("no query", lambda: panel.choice.query is None)
+        page.until("no words", f"!{told}")
 
         before = panel.look
-        box = "[...document.querySelectorAll('input[type=checkbox]')].at(-1)"
-        page.evaluate(f"({box}).click()")
+        boxes = "[...document.querySelectorAll('input[type=checkbox]')]"
+        page.evaluate(f"{boxes}.filter(box => !box.checked).at(-1).click()")
         page.until("another look", lambda: panel.look is not before)
         assert len(panel.look.frames) == 3
-        drawn(page, tmp_path, "inputs")
+        drawn(page)
         assert page.errors == []
-        assert all(address in request for request in network(page, "http://none"))
+        outside = [urlsplit(r) for r in page.requests if not r.startswith(("data:", "blob:"))]
+        assert {place.netloc for place in outside} == {address}
 
 
-def turned(page: Page, x: float) -> None:
-    for kind, place in (("mousePressed", x), ("mouseMoved", x + 30), ("mouseReleased", x + 30)):
-        page.call("Input.dispatchMouseEvent", type=kind, x=place, y=300, button="left", buttons=1)
-
-
-def waited(page: Page, happened: Callable[[], bool]) -> bool:
-    try:
-        return bool(page.until("it", happened, 10))
-    except AssertionError:
-        return False
-
-
-def test_a_page_draws_and_asks_for_nothing(tmp_path: Path) -> None:
-    source = open_source(MODELS[0], Wanted())
+def test_a_page_draws_and_asks_for_nothing(page, tmp_path):
+    source = open_source(MODEL, Wanted())
     file = tmp_path / "scene.html"
     file.write_text(scene_html(source.look(source.frames)), encoding="utf-8")
-    with chromium(tmp_path / "profile") as page:
-        page.follow_frames()
-        page.open(file.as_uri())
-        page.until("the canvas", "!!document.querySelector('canvas')")
-        drawn(page, tmp_path, "page")
-        shot = np.asarray(Image.open(tmp_path / "page.png").convert("RGB")).astype(int)
-        grey = (np.abs(shot - 127.5).max(-1) < 1).mean()
-        assert grey > 0.02, "the background of the model, not that of the page"
-        assert network(page, file.as_uri()) == []
-        page.evaluate(
-            "window.canvas = document.querySelector('canvas[data-engine]');"
-            "window.engine = canvas.dataset.engine; delete canvas.dataset.engine;"
-            "document.querySelector('#record').click()"  # before the scene is read
-        )
-        page.until("nothing", "document.querySelector('#record').textContent === 'record'")
-        page.evaluate(
-            "canvas.dataset.engine = engine;"
-            "URL.createObjectURL = data => { window.film = data; return 'data:,'; };"
-            "document.querySelector('#record').click()"
-        )
-        for place in range(400, 600, 10):
-            turned(page, place)  # what stands still has no frames
-        page.evaluate(
-            "window.saved = document.querySelector('#record').textContent;"
-            "document.querySelector('#record').click()"
-        )
-        page.until(
-            "a film",
-            "window.film?.size > 10000 && saved.endsWith(film.type.slice(6).split(';')[0])",
-        )
-        assert page.targets == ["worker"], "it sorts the Gaussians as the page is turned"
-        assert page.errors == []
+    page.open(file.as_uri())
+    page.until("the canvas", "!!document.querySelector('canvas')")
+    drawn(page)
+    grey = (abs(page.picture() - 127.5).max(-1) < 1).mean()
+    assert grey > 0.02, "the background of the model, not that of the page"
+    assert_alone(page, file)
+    page.evaluate(
+        "window.canvas = document.querySelector('canvas[data-engine]');"
+        "window.engine = canvas.dataset.engine; delete canvas.dataset.engine;"
+        "document.querySelector('#record').click()"  # before the scene is read
+    )
+    page.until("nothing", "document.querySelector('#record').textContent === 'record'")
+    page.evaluate(
+        "canvas.dataset.engine = engine;"
+        "URL.createObjectURL = data => { window.film = data; return 'data:,'; };"
+        "document.querySelector('#record').click()"
+    )
+    for place in range(400, 600, 10):
+        page.drag(place, 300, 30)  # what stands still has no frames
+    page.evaluate(
+        "window.saved = document.querySelector('#record').textContent;"
+        "document.querySelector('#record').click()"
+    )
+    page.until(
+        "a film", "window.film?.size > 10000 && saved.endsWith(film.type.slice(6).split(';')[0])"
+    )
+    assert page.targets == ["worker"], "it sorts the Gaussians as the page is turned"
+    assert page.errors == []
+
+
+def assert_alone(page, file):
+    assert {urlsplit(request).scheme for request in page.requests} <= {"file", "data", "blob"}
+    assert [r for r in page.requests if r.startswith("file:")] == [file.as_uri()]
+
+
+def page_of_two_scenes():
+    samples = [sample_of((0, 5), targets) for targets in ((1, 2), (3, 4))]
+    contenders = [
+        Contender(kind, model_of(kind), {"psnr": 9.0}, 96, 1000, "recipe: 1") for kind in PAIR
+    ]
+    columns = {"psnr": Column("PSNR", "higher", 2, "dB")}
+    return report_html(Report(columns, "A title", contenders, {}, samples, {}))
+
+
+def test_a_report(page, tmp_path):
+    file = tmp_path / "report.html"
+    file.write_text(page_of_two_scenes(), encoding="utf-8")
+    page.open(file.as_uri())
+    page.until("the script", "document.readyState == 'complete' && !!window.theme.textContent")
+    _choose(page)
+    _name_at_length(page)
+    _slide(page)
+    _zoom(page)
+    _darken(page)
+    _turn(page)
+    assert page.targets.count("worker") == 2, "each scene sorts its Gaussians in a worker"
+    assert page.errors == []
+    assert_alone(page, file)
+
+
+def _choose(page):
+    shown = "[...document.querySelectorAll('article')].map(a => a.checkVisibility())"
+    assert page.evaluate(shown) == [True, False]
+    page.evaluate("document.querySelectorAll('.scenes > label')[1].click()")
+    assert page.evaluate(shown) == [False, True]
+    page.evaluate("document.querySelector('.scenes > input:checked').focus()")
+    page.key("ArrowLeft", 37)
+    assert page.evaluate(shown) == [True, False]
+
+
+def _name_at_length(page):
+    """File names of 60 characters without a space push no photo out of its column."""
+    page.evaluate(
+        "document.querySelectorAll('.scene figcaption').forEach("
+        "caption => caption.textContent = 'x'.repeat(60))"
+    )
+    side = "document.querySelector('.scene {}').getBoundingClientRect().{}"
+    right, left = side.format(".inputs figure", "right"), side.format(".kinds", "left")
+    assert page.evaluate(f"{right} <= {left}")
+    assert page.evaluate(
+        "[...document.querySelectorAll('.scene .rows figure')].filter(f => f.checkVisibility())"
+        ".every(f => f.scrollWidth <= f.clientWidth + 1)"
+    )
+
+
+def box_of(page, element):
+    """Its left, top and width in the window, to which it is scrolled."""
+    page.evaluate(f"document.querySelector('{element}').scrollIntoView()")
+    box = f"document.querySelector('{element}').getBoundingClientRect()"
+    return [int(page.evaluate(f"{box}.{side}")) for side in ("left", "top", "width")]
+
+
+def _slide(page):
+    left, top, width = box_of(page, ".compare > div")
+
+    def shown():
+        return page.picture()[top + 4 : top + 200, left + 4 : left + width - 4]
+
+    page.drag(left + width - 3, top + 50)
+    truth = shown()
+    page.drag(left + 3, top + 50)
+    render = shown()
+    value = "+document.querySelector('.compare input').value"
+    assert page.evaluate(value) < 5
+    for _ in range(3):
+        page.key("PageUp", 33)
+    share = page.evaluate(value)
+    assert 20 < share < 60
+    mixed, cut = shown(), int(truth.shape[1] * share / 100)
+    assert abs(truth - render).mean() > 10
+    np.testing.assert_allclose(mixed[:, : cut - 8], truth[:, : cut - 8], atol=3)
+    np.testing.assert_allclose(mixed[:, cut + 8 :], render[:, cut + 8 :], atol=3)
+
+
+def _zoom(page):
+    opened = "document.getElementById('zoom').open"
+    alt = "document.querySelector('#zoom img').alt"
+    page.evaluate("document.querySelector('.kinds img').focus()")
+    page.key("Enter", 13)
+    assert page.evaluate(opened)
+    assert page.evaluate(alt).startswith("Truth, render")
+    page.key("ArrowRight", 39)
+    assert page.evaluate(alt).startswith("tokengs, render")
+    assert page.evaluate("document.querySelector('#zoom img').clientHeight") > 400
+    page.key("Escape", 27)
+    assert not page.evaluate(opened)
+    back = "document.activeElement.alt?.startsWith('tokengs, render')"
+    page.until("the focus on the picture that was seen last", back, 10)
+    page.evaluate("document.querySelector('.inputs img').click()")
+    assert page.evaluate(opened)
+    page.evaluate("document.getElementById('zoom').click()")
+    assert not page.evaluate(opened)
+
+
+def _darken(page):
+    paper = "getComputedStyle(document.body).backgroundColor"
+    white = "rgb(255, 255, 255)"
+    press = "document.getElementById('theme').click()"
+    assert page.evaluate(paper) == white
+    page.evaluate(press)
+    dark = page.evaluate(paper)
+    assert dark != white
+    assert page.evaluate("document.getElementById('theme').textContent") == "Light"
+    page.evaluate(press)
+    system = [{"name": "prefers-color-scheme", "value": "dark"}]
+    page.call("Emulation.setEmulatedMedia", features=system)
+    assert page.evaluate(paper) == white, "the button wins"
+    page.evaluate("document.documentElement.style.colorScheme = ''")
+    assert page.evaluate(paper) == dark
+    page.call("Emulation.setEmulatedMedia", features=[])
+
+
+def _turn(page):
+    assert not page.evaluate("!!document.querySelector('iframe')")
+    page.evaluate("document.querySelector('.open').click()")
+    left, top, width = box_of(page, "iframe")
+
+    def both_drawn():
+        shot = page.picture()[top + 160 : top + 400, left : left + width]
+        return all(half.std() > 8 for half in np.array_split(shot, 2, axis=1))
+
+    page.until("both scenes", both_drawn, 180)
