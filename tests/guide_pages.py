@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 from guide_hooks import filled
+from qgs_plugintools import Case, checks_for, run_check
 
 DOCS = Path(__file__).parents[1] / "docs"
 BLOCK = re.compile(r'^```(\w+)(?: title="([^"]*)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
@@ -25,3 +26,9 @@ def blocks(page: str, kind: str) -> dict[str, str]:
     """Title, or position, to text of the blocks of one kind."""
     found = BLOCK.findall(text_of(page))
     return {t or str(i): text for i, (k, t, text) in enumerate(found) if k == kind}
+
+
+def contract_failures(*cases: Case) -> list[str]:
+    """What components of the guide do not keep of their contracts."""
+    outcomes = [run_check(check, case) for case in cases for check in checks_for(case, ["core"])]
+    return [outcome.message for outcome in outcomes if outcome.verdict == "failed"]

@@ -32,23 +32,17 @@ def build_model() -> QueryGaussianModel:
         return component(component.Config(**options), dims)
 
     def layer() -> CrossSelfMlp:
-        sublayers = {
-            "cross_attention": make(ContentCrossAttention),
-            "self_attention": make(ContentSelfAttention),
-            "feed_forward": make(MlpFeedForward),
-        }
+        kinds = (ContentCrossAttention, ContentSelfAttention, MlpFeedForward)
+        sublayers = {kind.slot: make(kind) for kind in kinds}
         return CrossSelfMlp(CrossSelfMlp.Config(), LayerParts(dims, sublayers, 0.1))
 
-    layers = [layer() for _ in range(DEPTH)]
-    refinement = make(NoRefinement)
-    head = make(GaussianHead, gaussians_per_query=PER_QUERY, init_std=0.3, scale_cap=0.2)
     return QueryGaussianModel(
+        decoder=[layer() for _ in range(DEPTH)],
+        refinements=[make(NoRefinement)] * DEPTH,
+        head=make(GaussianHead, gaussians_per_query=PER_QUERY, init_std=0.3, scale_cap=0.2),
         encoder=make(MultiViewViT, patch_size=8, depth=1),
         queries=make(LatentQueries, count=QUERIES, std=1.0),
-        decoder=layers,
-        refinements=[refinement] * DEPTH,
         feedback=make(NoFeedback),
-        head=head,
         centers=make(FreeCenters),
         supervision=LayerSupervision(LayerSupervision.Config(layers=(DEPTH,))),
         renderer=TorchRenderer(TorchRenderer.Config()),

@@ -3,14 +3,21 @@
 from collections.abc import Callable
 from typing import Any
 
-import pytest
-
 from qgs.composer import RecipeError, RecipeProblem, resolve
 
 
-def refused(recipe: Any, *arguments: Any, by: Callable = resolve, **options: Any) -> RecipeProblem:
-    """The one problem of a recipe that `by`, called with these arguments, refuses."""
-    with pytest.raises(RecipeError) as caught:
+def problems_of(
+    recipe: Any, *arguments: Any, by: Callable = resolve, **options: Any
+) -> tuple[RecipeProblem, ...]:
+    """All problems for which `by`, called with these arguments, refuses a recipe."""
+    try:
         by(recipe, *arguments, **options)
-    (problem,) = caught.value.problems
+    except RecipeError as error:
+        return error.problems
+    return ()
+
+
+def refused(recipe: Any, *arguments: Any, **options: Any) -> RecipeProblem:
+    """The one problem."""
+    (problem,) = problems_of(recipe, *arguments, **options)
     return problem

@@ -1,127 +1,269 @@
-"""What the shipped recipes promise of each other, of the papers' models and of the documents."""
+"""What shipped recipes promise: alone, beside the papers' models, each other and the pages.
+
+And the studies: each composes, at both sizes, from the same changes.
+"""
 
 import json
 import re
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
+import yaml
 from published.files import read_golden
 from published.models import recipe_of
+from qgs_studies.plan import composed, differences, planned
+from qgs_studies.study import read_study
 
-from qgs.composer import resolve
+import qgs
+from qgs.composer import Recipe, registry, resolve
 
 ROOT = Path(__file__).parents[1]
 RECIPES = ROOT / "recipes"
+SCHEMA = json.loads((RECIPES / "recipe.schema.json").read_text(encoding="utf-8"))
+IS_VALID = jsonschema.Draft202012Validator(SCHEMA).is_valid
+EVERY = sorted(path.relative_to(RECIPES).as_posix() for path in RECIPES.rglob("*.yaml"))
+STUDIES = [file for file in EVERY if file.startswith("studies/")]
+FILES = [file for file in EVERY if file not in STUDIES]
 OVERLAYS = (
     *(f"finetune/dl3dv_{views}views.yaml" for views in (2, 4, 6)),
     "rooms/budget_64.yaml",
 )
 """Laid over recipes with data; they say nothing of its type."""
 
-FILES = sorted(
-    path.relative_to(RECIPES).as_posix()
-    for path in {*RECIPES.rglob("*.yaml")} - {*RECIPES.glob("studies/**/*.yaml")}
-)
-EXPERIMENTS = ("re10k", "re10k_4096", "dl3dv", *(f"dl3dv_4096_{n}views" for n in (2, 4, 6)))
-PAIRS = ["tiny/{}.yaml", *(f"{{}}/{name}.yaml" for name in EXPERIMENTS)]
+D, N, LAYERS = 1024, 4096, 12
+"""Width, queries and decoder layers of the published models."""
+HEAD_OF_RADII = (D * D + D) + (D + 1)
+POSITION_MLPS = LAYERS * ((3 * 128 * D + D) + (D * D + D))
+GAMMAS = LAYERS
+TOKENGS, TOKENGS_2026_6, DYNAMIC = 222_016_768, 362_695_680, 360_076_288
+LOCUSGS = 241_514_780 - 52_236
+"""Without parameters that the published LocusGS carries and never uses."""
+GSLRM = 303_548_416
+"""The paper: 300 million in 24 blocks of width 1024."""
 ABLATIONS = {
-    "reference": "full",
-    "no_radius_state": "no_radius_state",
-    "static_radius": "static_radius",
-    "content_self_attention": "content_self_attn",
-    "content_cross_attention": "content_cross_attn",
-    "center_only_bias": "center_only_bias",
-    "free_centers": "free_center",
-    "anchor_offset": "anchor_offset",
+    "reference": ("full", 0),
+    "no_radius_state": ("no_radius_state", N * 1 + HEAD_OF_RADII),
+    "static_radius": ("static_radius", HEAD_OF_RADII),
+    "content_self_attention": ("content_self_attn", POSITION_MLPS),
+    "content_cross_attention": ("content_cross_attn", GAMMAS),
+    # Only read differently: sigma without r, means without mu, means without r.
+    "center_only_bias": ("center_only_bias", 0),
+    "free_centers": ("free_center", 0),
+    "anchor_offset": ("anchor_offset", 0),
 }
-"""Structural ablations and the golden files that the released code computed for them."""
+"""The golden file that the released code computed for it, parameters that the full model adds."""
+PARAMETERS = {
+    "tokengs/(re10k|dl3dv)": TOKENGS,
+    "tokengs/latent_": TOKENGS_2026_6,
+    "tokengs/dynamic": DYNAMIC,
+    "gslrm/(re10k|dl3dv)": GSLRM,
+    "locus/(re10k|dl3dv)|ablations/": LOCUSGS,
+}
+"""Of recipes whose names begin so, with N queries in place of 1024."""
+EQUALS = {
+    "tiny/c3g.yaml": "tiny/tokengs.yaml",
+    "tiny/gslrm.yaml": "tiny/locus.yaml",
+    "tiny/globalsplat.yaml": "tiny/locus.yaml",
+}
+"""Other models, and the one whose budget they have."""
 
 
 def document(name: str) -> str:
     return (ROOT / name).read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("file", sorted({*FILES} - {*OVERLAYS}))
-def test_every_recipe_resolves_to_itself_and_builds_without_memory(file: str) -> None:
-    recipe = resolve(RECIPES / file)
-    assert resolve(json.loads(json.dumps(recipe.tree))).tree == recipe.tree
-    model = recipe.build_model("meta")
-    assert {parameter.device.type for parameter in model.parameters()} == {"meta"}
-    assert model.recipe == recipe.tree
-    assert recipe.build_losses(pretrained=False).keys() == recipe.tree["losses"].keys() != set()
-    following = [part for part in recipe.schedules.values() if recipe.training.seconds]
-    assert all("schedules count steps" in text for text in recipe.warnings)
-    assert bool(recipe.warnings) == bool(following)
-
-
-@pytest.mark.parametrize("pair", PAIRS)
-def test_tokengs_and_locusgs_have_the_same_budget(pair: str) -> None:
-    ours, theirs = (resolve(RECIPES / pair.format(name)) for name in ("tokengs", "locus"))
-    for section in ("data", "views", "optimizer", "training", "evaluation", "metrics"):
-        assert ours.tree.get(section) == theirs.tree.get(section)
-    for section in ("width", "heads", "encoder", "renderer"):
-        assert ours.tree["model"][section] == theirs.tree["model"][section]
-    first, second = ours.build_model("meta"), theirs.build_model("meta")
-    assert first.queries.count == second.queries.count
-    assert first.head.gaussians_per_query == second.head.gaussians_per_query
-    assert first.depth == second.depth
-    assert type(first.centers) is not type(second.centers)
-
-
-@pytest.mark.parametrize(
-    "pair", [("c3g", "tokengs"), ("gslrm", "locus"), ("globalsplat", "locus")], ids="-".join
+PAGE = document("docs/experiments.md")
+NAMED = set(re.findall(r"[\w-]+/[\w-]+\.yaml", PAGE))
+TINY = set(
+    re.findall(r"recipes/([\w/-]+\.yaml)", document("README.md") + document("docs/photos.md"))
 )
-def test_tiny_recipes_of_other_models_have_the_same_budget(pair: tuple[str, str]) -> None:
-    ours, theirs = (resolve(RECIPES / f"tiny/{name}.yaml") for name in pair)
-    for section in ("data", "views"):
-        assert ours.tree[section] == theirs.tree[section]
-    assert ours.training.seconds == theirs.training.seconds
-    sizes = [sum(p.numel() for p in r.build_model("meta").parameters()) for r in (ours, theirs)]
-    assert sizes[0] == pytest.approx(sizes[1], rel=0.1)
+SHOWN = dict(re.findall(r"`(ablations/\w+\.yaml)`.* \| ([\d,]+) \|$", PAGE, re.MULTILINE))
 
 
-@pytest.mark.parametrize("name", ABLATIONS)
-def test_an_ablation_is_the_released_variant(name: str) -> None:
-    ours = resolve(RECIPES / "ablations" / f"{name}.yaml").tree["model"]
-    golden = read_golden(ROOT / "tests" / "golden" / f"locus_{ABLATIONS[name]}_a.safetensors")
-    released = resolve(recipe_of(golden)).tree["model"]
-    assert _structure(ours) == _structure(released)
+def once(build: Callable[..., Any], section: str) -> Callable[..., Any]:
+    """`build` for the first of all recipes with an equal section."""
+    made: dict[str, Any] = {}
+
+    def build_once(ours: Recipe, *device: str) -> Any:
+        key = json.dumps([ours.tree[section], device])
+        if key not in made:
+            made[key] = build(ours, *device)
+        return made[key]
+
+    return build_once
 
 
-SIZES = ("width", "heads", "count", "depth", "gaussians_per_query", "layers")
-STARTS = ("init_std", "layer_scale")
+@pytest.fixture(scope="module", autouse=True)
+def what_recipes_share_is_made_once() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "load_plugin", cache(registry.load_plugin))
+        patch.setattr(Recipe, "build_model", once(Recipe.build_model, "model"))
+        patch.setattr(Recipe, "build_data", once(Recipe.build_data, "data"))
+        yield
 
 
-def _structure(node: Any) -> Any:
-    """What is left of a model's recipe without sizes and initial values."""
+@cache
+def recipe(file: str) -> Recipe:
+    return resolve(RECIPES / file)
+
+
+def model(file: str) -> qgs.QueryGaussianModel:
+    return recipe(file).build_model("meta")
+
+
+def parameters(file: str) -> int:
+    return sum(parameter.numel() for parameter in model(file).parameters())
+
+
+def broken(promises: dict[str, bool]) -> list[str]:
+    return [promise for promise, kept in promises.items() if not kept]
+
+
+def changed(file: str, other: str) -> dict[str, tuple[Any, Any]]:
+    """Options of `other` that `file` changes: old value, new value."""
+    return differences(recipe(other), recipe(file))
+
+
+def keeps(file: str, other: str, *parts: str) -> dict[str, bool]:
+    paths = [path for path in changed(file, other) if path.startswith(parts)]
+    return {f"has what {other} has, not another {paths}": paths == []}
+
+
+def alone(file: str) -> dict[str, bool]:
+    ours = recipe(file)
+    following = [part for part in ours.schedules.values() if ours.training.seconds]
+    losses = ours.build_losses(pretrained=False)
+    return {
+        "resolves to itself": resolve(json.loads(json.dumps(ours.tree))).tree == ours.tree,
+        "needs no memory": all(parameter.is_meta for parameter in model(file).parameters()),
+        "has its losses": losses.keys() == ours.tree["losses"].keys() != set(),
+        "warns of schedules in a time budget alone": bool(ours.warnings) == bool(following)
+        and all("schedules count steps" in text for text in ours.warnings),
+    }
+
+
+def as_published(file: str, wanted: int) -> dict[str, bool]:
+    """The number of parameters, and the structure of ablations without sizes and initial values."""
+    golden, without = "", 0
+    if file.startswith("ablations/"):
+        golden, without = ABLATIONS.get(Path(file).stem, ("", 0))
+    count, queries = without + parameters(file), model(file).queries
+    if queries.count == 1024:
+        count += (N - 1024) * sum(x[0].numel() for x in queries.parameters())
+    shown = SHOWN.get(file, f"{wanted - without:,}")
+    kept = {
+        f"has {wanted:,} parameters, not {count:,}": count == wanted,
+        f"is shown with {shown} parameters": shown == f"{wanted - without:,}",
+    }
+    if golden:
+        released = read_golden(ROOT / f"tests/golden/locus_{golden}_a.safetensors")
+        theirs = structure(resolve(recipe_of(released)).tree["model"])
+        kept["is the released variant"] = structure(recipe(file).tree["model"]) == theirs
+    return kept
+
+
+def structure(node: Any) -> Any:
+    sizes = ("width", "heads", "count", "depth", "gaussians_per_query", "layers")
     if not isinstance(node, dict):
         return node
-    return {key: _structure(value) for key, value in node.items() if key not in SIZES + STARTS}
+    kept = node.keys() - {*sizes, "init_std", "layer_scale"}
+    return {key: structure(node[key]) for key in kept}
 
 
-def test_every_recipe_has_its_place_in_the_documents() -> None:
-    named = set(re.findall(r"[\w-]+/[\w-]+\.yaml", document("docs/experiments.md")))
-    tiny = set(
-        re.findall(r"recipes/([\w/-]+\.yaml)", document("README.md") + document("docs/photos.md"))
-    )
-    assert [file for file in FILES if file not in named | tiny] == []
-    assert sorted(named - set(FILES)) == []
+def beside_its_twin(file: str, twin: str) -> dict[str, bool]:
+    """LocusGS is compared with TokenGS at one budget."""
+    sections = ("data", "views", "optimizer", "training", "evaluation", "metrics")
+    parts = ("model.width", "model.heads", "model.encoder", "model.renderer")
+    first, second = model(file), model(twin)
+    return {
+        **keeps(file, twin, *sections, *parts),
+        "has as many queries": first.queries.count == second.queries.count,
+        "has as many Gaussians": first.head.gaussians_per_query == second.head.gaussians_per_query,
+        "has as many layers": first.depth == second.depth,
+        "has other centres": type(first.centers) is not type(second.centers),
+    }
 
 
-@pytest.mark.parametrize("model", ["tokengs", "locus"])
-@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if "4096" in name])
-def test_finetunes_change_no_more_than_they_say(model: str, name: str) -> None:
-    base = resolve(RECIPES / model / f"{name.partition('_')[0]}.yaml")
-    finetune = resolve(RECIPES / model / f"{name}.yaml")
-    assert finetune.init_from == f"runs/{model}/{name.partition('_')[0]}"
-    assert base.tree["model"]["queries"]["count"] == 1024
-    grown = {**base.tree["model"]["queries"], "count": 4096}
-    assert finetune.tree["model"] == {**base.tree["model"], "queries": grown}
-    assert finetune.tree["losses"] == base.tree["losses"]
-    assert finetune.training.steps in (20 * 500, 80 * 500)
-    rate = finetune.tree["optimizer"]
-    assert (rate["learning_rate"], rate["warmup"]) == (4e-5, 400)
-    assert base.training.steps == 300 * 500
-    rate = base.tree["optimizer"]
-    assert (rate["learning_rate"], rate["warmup"]) == (4e-4, 2000)
+def beside_its_equal(file: str) -> dict[str, bool]:
+    other = EQUALS[file]
+    near = parameters(file) == pytest.approx(parameters(other), rel=0.1)
+    return {**keeps(file, other, "data", "views", "training.seconds"), "is as large": near}
+
+
+def beside_its_base(file: str) -> dict[str, bool]:
+    """A finetune changes no more than it says, beside the data and how they are seen and judged."""
+    run = re.sub("_4096.*", "", file)
+    changes = changed(file, f"{run}.yaml").items()
+    found = {p: x for p, x in changes if not p.startswith(("data", "views", "evaluation"))}
+    wanted = {
+        "init_from": (None, f"runs/{run}"),
+        "model.queries.count": (1024, 4096),
+        "optimizer.learning_rate": (4e-4, 4e-5),
+        "optimizer.warmup": (2000, 400),
+        "training.steps": (300 * 500, (80 if "dl3dv" in file else 20) * 500),
+    }
+    return {f"changes its base by {wanted}, not by {found}": found == wanted}
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_a_recipe_keeps_its_promises(file):
+    promises = {
+        "is valid": IS_VALID(yaml.safe_load(document(f"recipes/{file}"))),
+        "has its place in the documents": file in NAMED | TINY,
+    }
+    if file not in OVERLAYS:
+        promises |= alone(file)
+    for pattern, count in PARAMETERS.items():
+        if re.match(pattern, file):
+            promises |= as_published(file, count)
+    twin = re.sub(r"^(tiny/)?locus\b", r"\1tokengs", file)
+    if twin != file and twin in FILES:
+        promises |= beside_its_twin(file, twin)
+    if file in EQUALS:
+        promises |= beside_its_equal(file)
+    if re.match("(tokengs|locus)/.*_4096", file):
+        promises |= beside_its_base(file)
+    assert broken(promises) == []
+
+
+TABLES = {"structural": "", "supervised_layers": "supervised_"}
+"""Published studies of which each variant is an ablation, and how the recipe's name begins."""
+NAMES = {"half_and_last": "6_12", "last": "12", "four": "3_6_9_12"}
+
+
+@pytest.mark.parametrize("file", STUDIES)
+def test_a_study_keeps_its_promises(file, tmp_path):
+    study = read_study(RECIPES / file)
+    claims = [hypothesis.claim for hypothesis in study.settings.hypotheses]
+    promises = {"has hypotheses": claims != []}
+    if "/tiny/" in file:
+        plan = planned(study, tmp_path / "out")
+        promises["has six runs"] = len(plan.runs) >= 6
+        recipes = plan.recipes
+    else:
+        recipes = composed(study)
+    told = [text for variant in recipes.values() for text in variant.warnings]
+    promises["warns of time budgets"] = all("schedules count steps" in text for text in told)
+    other = file.replace("/published/", "/tiny/")
+    if other != file and other in STUDIES:
+        tiny = read_study(RECIPES / other)
+        shared = [hypothesis.claim for hypothesis in tiny.settings.hypotheses][: len(claims)]
+        promises["varies as the tiny one"] = tiny.variants.keys() == study.variants.keys()
+        promises["asks what the tiny one does"] = shared == claims
+    if "/published/" in file and (prefix := TABLES.get(Path(file).stem)) is not None:
+        for name, variant in recipes.items():
+            table = recipe(f"ablations/{prefix}{NAMES.get(name, name)}.yaml")
+            sections = {path.split(".")[0] for path in differences(variant, table)}
+            promises[f"has {name} of the tables"] = sections <= {"data", "evaluation"}
+    assert broken(promises) == []
+
+
+def test_documents_and_tables_name_recipes_that_there_are():
+    named = NAMED | {*OVERLAYS, *EQUALS} | {f"ablations/{name}.yaml" for name in ABLATIONS}
+    assert sorted(named - {*FILES}) == []
+    assert len(SHOWN) == 8
+    assert [x for x in PARAMETERS if not any(re.match(x, file) for file in FILES)] == []

@@ -1,9 +1,7 @@
-from pathlib import Path
-
 from qgs.wording import short_names
 
 
-def test_short_names_tell_models_and_recipes_apart(tmp_path: Path) -> None:
+def test_short_names_tell_models_and_recipes_apart(tmp_path):
     assert short_names(["a/tiny/x.yaml", "a/tiny/y.yaml"]) == ["x", "y"]
     assert short_names(["a/tiny/x.yaml", "a/big/x.yaml"]) == ["tiny/x", "big/x"]
     assert short_names([tmp_path / "x.yaml"] * 3) == ["x", "x (2)", "x (3)"]

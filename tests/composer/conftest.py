@@ -10,7 +10,6 @@ SPATIAL = """
 from typing import Literal
 from qgs.contracts import (
     CrossAttention, ComponentConfig, FieldSpec, LearnedQueries, Plugin, Refinement, SceneSource)
-from qgs.types import QueryState
 
 PLACE = {"place.center": FieldSpec((3,), frame="world")}
 RADIUS = {"place.radius": FieldSpec((1,), frame="world")}
@@ -63,12 +62,63 @@ class Scenes(SceneSource):
 
 plugin = Plugin("spatial", 1, (Placed, Near, Measure, Local, Scenes))
 """
+MINE = """
+from qgs.components import MultiViewViT
+from qgs.contracts import MEMORY_FIELDS, DecoderLayer, FieldSpec, Loss, Plugin, Queries, Refinement
+from qgs.contracts.head import GAUSSIAN_FIELDS
+
+PLACE = {"place": FieldSpec((3,))}
+
+class Start(Queries):
+    name = "start"
+    reads = {"memory.grid": MEMORY_FIELDS["memory.grid"]}
+    writes = PLACE
+
+class Keep(Refinement):
+    name = "keep"
+    reads = writes = PLACE
+
+class Late(Refinement):
+    name = "late"
+    writes = PLACE
+
+class Joint(DecoderLayer):
+    name = "joint"
+    reads_layer_scale = False
+    reads = {"memory.features": MEMORY_FIELDS["memory.features"]}
+
+class Placed(Joint):
+    name = "placed"
+    reads = PLACE
+
+class Blind(MultiViewViT):
+    name = "blind"
+    writes = {"memory.features": FieldSpec((32,))}
+
+class FeatureLoss(Loss):
+    name = "features"
+    reads = {"gaussians.features": GAUSSIAN_FIELDS["gaussians.features"]}
+
+class Apart(Refinement):
+    name = "apart"
+    shared_by_layers = False
+    def forward(self, state):
+        return state
+
+plugin = Plugin("mine", 1, (Start, Keep, Late, Joint, Placed, Blind, FeatureLoss, Apart))
+"""
+SECOND = """
+from qgs.components import LatentQueries
+from qgs.contracts import Plugin
+plugin = Plugin("second", 1, (LatentQueries,))
+"""
 
 
 @pytest.fixture
-def spatial(install: Callable[..., None]) -> None:
-    """A sound plugin whose components depend on each other."""
-    install("qgs-spatial", "spatial", SPATIAL)
+def installed(install: Callable[..., None]) -> None:
+    """Sound plugins: `spatial` and `mine`, whose components depend on each other, and `second`."""
+    for name, source in (("spatial", SPATIAL), ("mine", MINE), ("second", SECOND)):
+        install(f"qgs-{name}", name, source)
 
 
 @pytest.fixture

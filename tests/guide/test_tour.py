@@ -17,7 +17,7 @@ def outputs(notebook: dict[str, Any]) -> list[list[str]]:
     return [[m for o in c["outputs"] for m in o.get("data", [o["output_type"]])] for c in cells]
 
 
-def test_what_the_notebook_shows_is_stored() -> None:
+def test_what_the_notebook_shows_is_stored():
     text = FILE.read_text(encoding="utf-8")
     shown = outputs(json.loads(text))
     assert all(shown)
@@ -28,7 +28,7 @@ def test_what_the_notebook_shows_is_stored() -> None:
 
 
 @pytest.mark.slow
-def test_the_notebook_runs_and_shows_what_is_stored() -> None:
+def test_the_notebook_runs_and_shows_what_is_stored():
     stored = json.loads(FILE.read_text(encoding="utf-8"))
     before = outputs(stored)
     names = run(stored)

@@ -3,63 +3,36 @@
 from pathlib import Path
 
 import pytest
-from fresh_environment import ROOT, FreshEnvironment
+from fresh_environment import ROOT
 
 pytestmark = pytest.mark.slow
 
 ORIGIN = """
 import pathlib, qgs, qgs_locus, qgs_plugintools
-for module in (qgs, qgs_locus, qgs_plugintools):
-    print(pathlib.Path(module.__file__).parents[1])
+print(*{pathlib.Path(x.__file__).parents[1] for x in (qgs, qgs_locus, qgs_plugintools)})
 """
 
 
-@pytest.fixture(scope="module")
-def plugin(fresh: FreshEnvironment, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a new plugin whose wheel is installed."""
-    workshop = tmp_path_factory.mktemp("workshop")
-    fresh.run("qgs new-plugin outside", workshop)
-    folder = workshop / "qgs-outside"
-    fresh.run("pip wheel -q --no-deps --wheel-dir dist . && pip install -q dist/*.whl", folder)
-    return folder
-
-
-def test_qgs_comes_from_its_wheel(fresh: FreshEnvironment, tmp_path: Path) -> None:
-    origins = {Path(line) for line in fresh.run(f'python -c "{ORIGIN}"', tmp_path).split()}
-    assert len(origins) == 1
-    assert origins.pop().is_relative_to(fresh.folder)
+def test_qgs_and_its_recipes_come_from_its_wheel(fresh, tmp_path):
+    (origin,) = fresh.run(f'python -c "{ORIGIN}"', tmp_path).split()
+    assert Path(origin).is_relative_to(fresh.folder)
     assert not list(fresh.folder.rglob(ROOT.name)), "nothing of the source tree"
-
-
-def test_recipes_come_with_the_wheel(fresh: FreshEnvironment, tmp_path: Path) -> None:
     assert "tiny/locus.yaml" in fresh.run("qgs recipes", tmp_path)
-    listed = fresh.run("qgs compose rooms/locus_64.yaml", tmp_path)
-    assert f"{fresh.folder}" in listed
+    assert f"{fresh.folder}" in fresh.run("qgs compose rooms/locus_64.yaml", tmp_path)
     fresh.run("qgs recipes rooms/locus_64.yaml --out mine", tmp_path)
     assert f"{fresh.folder}" not in fresh.run("qgs compose mine/rooms/locus_64.yaml", tmp_path)
 
 
-def test_its_tests_pass(fresh: FreshEnvironment, plugin: Path) -> None:
-    output = fresh.run("python -m pytest -q", plugin)
-    assert " passed" in output
-
-
-def test_it_passes_the_check_of_the_command_line(fresh: FreshEnvironment, plugin: Path) -> None:
-    report = fresh.run("qgs check-plugin outside", plugin)
-    assert "cross_attention/abstaining" in report
-    assert " 0 failed" in report
-
-
-def test_a_recipe_trains_with_it(fresh: FreshEnvironment, plugin: Path) -> None:
-    assert "outside/abstaining" in fresh.run("qgs compose recipe.yaml", plugin)
+def test_a_new_plugin_passes_its_tests_and_checks_and_trains(fresh, tmp_path):
+    fresh.run("qgs new-plugin outside", tmp_path)
+    folder = tmp_path / "qgs-outside"
+    fresh.run("pip wheel -q --no-deps --wheel-dir dist . && pip install -q dist/*.whl", folder)
+    assert " passed" in fresh.run("python -m pytest -q", folder)
+    for plugin, component in (("outside", "abstaining"), ("locus", "ray_biased")):
+        report = fresh.run(f"qgs check-plugin {plugin}", folder)
+        assert f"cross_attention/{component}" in report
+        assert " 0 failed" in report
+    assert "outside/abstaining" in fresh.run("qgs compose recipe.yaml", folder)
     small = "--set training.steps=3 --set optimizer.warmup=1 --set evaluation.scenes=1"
-    fresh.run(f"qgs train recipe.yaml --out run {small}", plugin)
-    assert (plugin / "run/checkpoint.safetensors").is_file()
-
-
-def test_locus_passes_the_check_of_the_command_line(
-    fresh: FreshEnvironment, tmp_path: Path
-) -> None:
-    report = fresh.run("qgs check-plugin locus", tmp_path, timeout=180)
-    assert "cross_attention/ray_biased" in report
-    assert " 0 failed" in report
+    fresh.run(f"qgs train recipe.yaml --out run {small}", folder)
+    assert (folder / "run/checkpoint.safetensors").is_file()
