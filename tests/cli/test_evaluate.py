@@ -1,70 +1,68 @@
-"""`qgs eval` as a user types it: indices, tuning, batches."""
+"""`qgs eval` as a user types it: indices, tuning, other weights, other settings, remarks."""
 
+import csv
 import json
 import shutil
-from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
+import numpy as np
 import pytest
-from commands import SMALL, run_qgs
-from rich.console import Console
+import torch
+from commands import MODEL, run_qgs
+from photo_formats import noisy_photos
+from PIL import Image
+from training_runs import run as train
 
 import qgs
 from qgs.cli.evaluate import evaluation_folder
 from qgs.cli.options import tuning_settings
 from qgs.composer import resolve
-from qgs.engine.training import train
-
-RECIPES = Path(__file__).parents[2] / "recipes" / "tiny"
-FEW = (*SMALL, "data.image_size=[32, 32]", "views.targets=2", "evaluation.scenes=3")
-
 
 evaluated = partial(run_qgs, "eval")
 
 
-def summary(folder: Path) -> dict:
+def summary(folder):
     return json.loads((folder / "summary.json").read_text())
 
 
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two untrained models, evaluated alike."""
-    folder = tmp_path_factory.mktemp("runs")
-    for name in ("locus", "tokengs"):
-        model = qgs.compose(RECIPES / f"{name}.yaml", overrides=FEW)
-        qgs.save(model, folder / name / "checkpoint.safetensors")
-        result = evaluated(folder / name)
-        assert result.exit_code == 0, result.output
-    return folder
-
-
 @pytest.fixture
-def index(tmp_path: Path) -> Path:
-    file = tmp_path / "two_rooms.json"
+def run(trained, tmp_path):
+    """A copy of the run."""
+    return shutil.copytree(trained[1], tmp_path / "run")
+
+
+def test_an_index_becomes_a_protocol_and_strict_evaluations_that_lack_a_scene_fail(
+    trained, tmp_path
+):
+    index = tmp_path / "two: rooms.json"
+    out = tmp_path / "out"
     entry = {"context": [0, 3], "target": [1, 2]}
-    file.write_text(json.dumps({"test/000001": entry, "test/000002": entry, "absent": entry}))
-    return file
-
-
-def test_an_index_becomes_a_protocol_of_its_name(runs: Path, index: Path, tmp_path: Path) -> None:
-    words = ("--index", index, "--out", tmp_path / "out", "--batch", 2)
-    result = evaluated(runs / "locus", *words)
+    index.write_text(json.dumps({"test/000001": entry, "test/000002": entry, "absent": entry}))
+    words = (trained[1], "--index", index, "--out", out, "--batch", 2)
+    result = evaluated(*words)
     assert result.exit_code == 0, result.output
-    told = summary(tmp_path / "out")
-    assert told["protocol"]["name"] == "two_rooms"
+    told = summary(out)
+    assert told["protocol"]["name"] == "two: rooms"
     assert told["protocol"]["settings"]["views"]["index"]["scenes"] == 3
-    assert str(tmp_path) not in (tmp_path / "out" / "summary.json").read_text()
+    assert len(told["missing"]) == 1
+    assert str(tmp_path) not in (out / "summary.json").read_text()
+    assert evaluated(*words, "--strict").exit_code == 1
+    index.write_text(json.dumps({"test/000001": entry}))
+    assert evaluated(*words, "--strict").exit_code == 0
 
 
-def test_tuning_goes_into_a_folder_of_its_own_and_is_told(runs: Path) -> None:
-    run = runs / "locus"
-    files = (run / "evaluation" / "summary.json", run / "checkpoint.safetensors")
-    before = [file.read_bytes() for file in files]
-    result = evaluated(run, "--tune", 2)
-    assert result.exit_code == 0, result.output
-    assert summary(run / "evaluation-2")["tuning"]["steps"] == 2
-    assert [file.read_bytes() for file in files] == before
+def test_other_settings_go_into_a_folder_of_their_own_and_are_told(run):
+    (run / "checkpoint_ema.safetensors").write_bytes((run / "checkpoint.safetensors").read_bytes())
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    result = evaluated(run, "--tune", 2, "--set", "evaluation.scenes=1", "--device", "cpu")
+    assert f"qgs eval {run / 'checkpoint_ema.safetensors'}" in result.output
+    told = summary(run / "evaluation-2")
+    assert told["tuning"]["steps"] == 2
+    assert (told["scenes"], told["step"]) == (1, 2)
+    assert "held_out_frames" in told
+    settings = told["protocol"]["settings"]
+    assert (settings["views"]["drawn"]["scenes"], settings["image_size"]) == (1, [32, 32])
+    assert {path: path.read_bytes() for path in before} == before
 
 
 PLUGIN = """
@@ -78,70 +76,75 @@ plugin = Plugin("mine", 1, (Mean,))
 """
 
 
-def test_a_metric_of_a_plugin_that_was_installed_later(
-    runs: Path, tmp_path: Path, install: Callable[..., None]
-) -> None:
+def test_a_metric_of_a_plugin_that_was_installed_later(run, tmp_path, install):
     install("mine", "mine", PLUGIN)
     more = ("plugins=[mine]", "metrics.level.type=mine/mean")
-    evaluated(runs / "tokengs", "--set", more[0], "--set", more[1], "--out", tmp_path / "out")
+    evaluated(
+        run / "checkpoint.safetensors",
+        "--set",
+        more[0],
+        "--set",
+        more[1],
+        "--out",
+        tmp_path / "out",
+    )
     assert "level" in summary(tmp_path / "out")["columns"]
-    recipe = resolve(RECIPES / "tokengs.yaml", (*FEW, "training.steps=1"))
-    for judged in (recipe, resolve(recipe.tree, ("training.steps=2", *more))):
-        result = train(judged, tmp_path / "run", console=Console(quiet=True), resume=True)
-    assert (result.resumed_at, (result.model.recipe or {})["plugins"]) == (1, ["rooms", "mine"])
+    judged = resolve(resolve(run / "recipe.yaml").tree, ("training.steps=3", *more))
+    result = train(judged, run, resume=True)
+    assert result.resumed_at == 2
+    assert "mine" in result.model.recipe["plugins"]
 
 
-def test_other_weights_of_a_run_keep_its_evaluation(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    assert evaluation_folder(run / "checkpoint.safetensors", False) == run / "evaluation"
-    assert evaluation_folder(run / "checkpoint_ema.safetensors", False) == run / "evaluation_ema"
-    assert evaluation_folder(run / "published.safetensors", False) == run / "evaluation_published"
-    (run / "evaluation_ema-2").mkdir(parents=True)
-    ema = run / "checkpoint_ema.safetensors"
-    assert evaluation_folder(ema, True) == run / "evaluation_ema-3"
-    assert evaluation_folder(run / "checkpoint.safetensors", True) == run / "evaluation-2"
+def test_other_weights_of_a_run_keep_its_evaluation(tmp_path):
+    (tmp_path / "evaluation_ema-2").mkdir()
+    cases = {
+        ("checkpoint", False): "evaluation",
+        ("checkpoint_ema", False): "evaluation_ema",
+        ("published", False): "evaluation_published",
+        ("checkpoint_ema", True): "evaluation_ema-3",
+        ("checkpoint", True): "evaluation-2",
+    }
+    found = {
+        (name, other): evaluation_folder(tmp_path / f"{name}.safetensors", other).name
+        for name, other in cases
+    }
+    assert found == cases
 
 
-@pytest.mark.parametrize(
-    ("words", "reason"),
-    [
-        (["RUN", "--set", "training.steps=1"], "would change the trained model"),
-        (["RUN", "--index", "it's not there.json"], "no evaluation index at it's not there.json"),
-    ],
-)
-def test_what_cannot_be_done_is_refused(runs: Path, words: list[str], reason: str) -> None:
-    result = evaluated(*(str(runs / "locus") if word == "RUN" else word for word in words))
-    assert isinstance(result.exception, ValueError | FileNotFoundError)
-    assert reason in str(result.exception)
+def test_settings_of_the_trained_model_are_refused(trained):
+    error = evaluated(trained[1], "--set", "training.steps=1").exception
+    assert isinstance(error, ValueError)
+    assert "would change the trained model" in str(error)
 
 
-def test_strict_evaluations_that_lack_a_scene_exit_with_1(
-    runs: Path, index: Path, tmp_path: Path
-) -> None:
-    words = (runs / "locus", "--index", index, "--out", tmp_path / "out")
-    assert evaluated(*words).exit_code == 0
-    strict = evaluated(*words, "--strict")
-    assert strict.exit_code == 1
-    assert len(summary(tmp_path / "out")["missing"]) == 1
-    index.write_text(json.dumps({"test/000001": {"context": [0, 3], "target": [1]}}))
-    assert evaluated(*words, "--strict").exit_code == 0
+def test_tune_says_what_and_how_often():
+    cases = {
+        "7": ["evaluation.tuning_steps=7"],
+        "0": ["evaluation.tuning_steps=0"],
+        "latents": ["evaluation.tuning_steps=50", "evaluation.tuning=latents"],
+        "queries:20": ["evaluation.tuning_steps=20", "evaluation.tuning=queries"],
+    }
+    assert {tune: tuning_settings(tune) for tune in cases} == cases
 
 
-def test_averaged_weights_of_a_run_are_named(runs: Path, tmp_path: Path) -> None:
-    for name in ("checkpoint", "checkpoint_ema"):
-        shutil.copy(runs / "locus" / "checkpoint.safetensors", tmp_path / f"{name}.safetensors")
-    result = evaluated(tmp_path, "--set", "evaluation.scenes=1")
-    assert f"qgs eval {tmp_path / 'checkpoint_ema.safetensors'}" in result.output
-
-
-@pytest.mark.parametrize(
-    ("tune", "steps", "what"),
-    [
-        ("7", 7, []),
-        ("0", 0, []),
-        ("latents", 50, ["evaluation.tuning=latents"]),
-        ("queries:20", 20, ["evaluation.tuning=queries"]),
-    ],
-)
-def test_tune_says_what_and_how_often(tune: str, steps: int, what: list[str]) -> None:
-    assert tuning_settings(tune) == [f"evaluation.tuning_steps={steps}", *what]
+def test_an_evaluation_names_its_photos_and_says_where_a_copy_is_better(tmp_path):
+    """Of photos alike but for a little noise, and Gaussians as large as they can be."""
+    rng = np.random.default_rng(0)
+    for file in sorted(noisy_photos(tmp_path, 9).glob("images/*")):
+        pixels = 90 + rng.integers(0, 9, (20, 24, 3), np.uint8)
+        Image.fromarray(pixels).save(file)
+    data = {"type": "qgs/photos", "path": str(tmp_path), "image_size": [16, 16], "holdout": 3}
+    views = {"inputs": 2, "targets": 2, "gap": [2, 4], "scale": "constant"}
+    model = qgs.compose({"recipe": 1, "model": MODEL, "data": data, "views": views})
+    with torch.no_grad():
+        model.head.linear.bias.unflatten(0, (-1, 14))[:, 6:9] = 5.0
+    domain = {"samples": 4, "ranges": {"baseline": [0, 9]}}
+    qgs.save(model, tmp_path / "checkpoint.safetensors", extra={"trained_on": json.dumps(domain)})
+    assert evaluated(tmp_path).exit_code == 0
+    folder = tmp_path / "evaluation"
+    remarks = summary(folder)["remarks"]
+    for word in ("17% is cut off", "worse than the nearest", "within"):
+        assert sum(word in remark for remark in remarks) == 1, word
+    (row,) = csv.DictReader((folder / "scenes.csv").open())
+    firsts = [row[name].split("; ")[0] for name in ("input_frames", "input_names", "target_names")]
+    assert firsts == ["0 6", "images/0.png, images/6.png", "images/1.png, images/4.png"]

@@ -2,16 +2,17 @@
 
 import io
 import json
+import multiprocessing
 import re
 import signal
 import subprocess
-import sys
+import time
 from pathlib import Path
 
 import kill
 import pytest
 from commands import run_qgs
-from qgs_studies.plan import Run, planned, run_of
+from qgs_studies.plan import planned, run_of
 from qgs_studies.queue import Queue, _end, _signal, last_record
 from qgs_studies.results import Results
 from qgs_studies.study import read_study
@@ -22,7 +23,7 @@ RECIPES = Path(__file__).parents[3] / "recipes"
 
 
 @pytest.fixture
-def study(tmp_path: Path) -> Path:
+def study(tmp_path):
     text = kill.STUDY.format(recipes=RECIPES, steps=12)
     text = text.replace("seeds: [0, 1, 2]", "seeds: [0, 1]")
     text = re.sub(r"  (free|tokengs):.*\n|differs:.*\n", "", text)
@@ -31,14 +32,19 @@ def study(tmp_path: Path) -> Path:
     return tmp_path / "study.yaml"
 
 
-def begun(out: Path) -> dict[str, int]:
+@pytest.fixture
+def plan(study):
+    return planned(read_study(study), study.parent / "out")
+
+
+def begun(out):
     """Of each run how often it was trained from the start."""
     logs = sorted(out.glob("runs/*/*.log"))
     return {f"{p.parent.name}/{p.stem}": p.read_text().count("step 1 ") for p in logs}
 
 
 @pytest.mark.slow
-def test_two_queues_share_a_folder_and_additions_run_alone(study: Path) -> None:
+def test_two_queues_share_a_folder_and_additions_run_alone(study):
     out = study.parent / "out"
     command = ["study", str(study), "--out", str(out), "--threads", "1", "--device", "cpu"]
     queues = [kill.started([*command, "--workers", "1"], study.parent / "log") for _ in range(2)]
@@ -59,39 +65,35 @@ def test_two_queues_share_a_folder_and_additions_run_alone(study: Path) -> None:
     assert "`flat`" in str(refused.exception)
 
 
-def test_what_failed_comes_last_and_a_collapse_is_final(
-    study: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    plan = planned(read_study(study), study.parent / "out")
+def test_what_failed_comes_last_and_a_collapse_is_final(study, plan, monkeypatch):
     first, second, third, fourth = plan.runs
-    first.failure.parent.mkdir(parents=True)
-    second.failure.parent.mkdir(parents=True, exist_ok=True)
-    first.failure.write_text("CollapseError: training collapsed at step 7\n")
-    second.failure.write_text("OSError: no space left\n")
-    started: list[Run] = []
+    for run, text in (
+        (first, "CollapseError: training collapsed at step 7\n"),
+        (second, "OSError: no space left\n"),
+    ):
+        run.failure.parent.mkdir(parents=True, exist_ok=True)
+        run.failure.write_text(text)
+    started = []
 
-    def start(queue: Queue, run: Run) -> None:
+    def start(queue, run):
         started.append(run)
         if len(started) == 3:
             queue._stop(signal.SIGTERM, None)
 
     monkeypatch.setattr(Queue, "_start", start)
-    queue = Queue(plan, 4, 1, "cpu", console := Console(file=io.StringIO()))
+    monkeypatch.setattr("qgs_studies.queue._POLL_SECONDS", 0.01)
+    queue = Queue(plan, 4, 1, "cpu", Console(file=(shown := io.StringIO())))
     assert queue.work() == "SIGTERM"
     assert started == [third, fourth, second]
     assert queue.failures == {}, "what failed before is no failure of this call"
-    assert str(first.failure) in console.file.getvalue()  # type: ignore[attr-defined]
+    assert str(first.failure) in shown.getvalue()
     result = run_qgs("study", study, "--out", plan.folder, "--slurm")
     assert result.exit_code == 0
     assert "#SBATCH --array=1,2,3" in (plan.folder / "slurm.sh").read_text()
 
 
-def test_a_run_that_is_killed_again_and_again_says_so_in_the_results(
-    study: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    plan = planned(read_study(study), study.parent / "out")
-
-    def start(queue: Queue, run: Run) -> None:
+def test_a_run_that_is_killed_again_and_again_says_so_in_the_results(plan, monkeypatch):
+    def start(queue, run):
         run.failure.parent.mkdir(parents=True, exist_ok=True)
         queue._processes[run] = subprocess.Popen(["sh", "-c", "kill -9 $$"]), 0
 
@@ -106,28 +108,27 @@ def test_a_run_that_is_killed_again_and_again_says_so_in_the_results(
 
 
 @pytest.mark.slow
-def test_a_killed_study_has_the_table_of_a_quiet_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_study_has_the_table_of_a_quiet_one(monkeypatch):
     monkeypatch.setattr("sys.argv", ["kill.py", "study", "--kills", "3", "--steps", "20"])
     assert kill.main() == 0
 
 
-def test_one_process_has_a_run_until_it_dies(tmp_path: Path) -> None:
+def hold(run, pipe):
+    lock = locked(run)
+    pipe.send(lock is not None)
+    time.sleep(600)
+
+
+def test_one_process_has_a_run_until_it_dies(tmp_path):
     run = run_of(tmp_path, "variant", 3)
-    code = f"""
-import time
-from pathlib import Path
-from qgs_studies.plan import run_of
-from qgs_studies.work import locked
-lock = locked(run_of(Path({str(tmp_path)!r}), "variant", 3))
-print(bool(lock), flush=True)
-time.sleep(600)
-"""
-    holder = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert holder.stdout
-    assert holder.stdout.readline() == "True\n"
+    fork = multiprocessing.get_context("fork")
+    here, there = fork.Pipe()
+    holder = fork.Process(target=hold, args=(run, there))
+    holder.start()
+    assert here.recv()
     assert locked(run) is None
     holder.kill()
-    holder.wait()
+    holder.join()
     lock = locked(run)
     assert lock
     assert not is_free(run)
@@ -135,17 +136,15 @@ time.sleep(600)
     assert is_free(run)
 
 
-def test_the_last_whole_record_tells_how_far_a_run_is(tmp_path: Path) -> None:
+def test_the_last_whole_record_tells_how_far_a_run_is(tmp_path):
     history = tmp_path / "history.jsonl"
     assert last_record(history) == (0, 0.0)
     lines = [json.dumps({"step": n, "seconds": n / 2, "loss": "x" * 100}) for n in range(1, 90)]
-    history.write_text("\n".join(lines) + '\n{"step": 90, "sec')
-    assert last_record(history) == (89, 44.5)
+    for damaged in ('{"step": 90, "sec', '{"step": 90, "sec\n'):
+        history.write_text("\n".join([*lines, damaged]))
+        assert last_record(history) == (89, 44.5)
 
 
-def test_a_damaged_last_line_and_an_exit_code_of_no_signal_end_no_study(tmp_path: Path) -> None:
-    history = tmp_path / "history.jsonl"
-    history.write_text('{"step": 3, "seconds": 1.5}\n{"step": 4, "sec\n')
-    assert last_record(history) == (3, 1.5)
+def test_an_exit_code_of_no_signal_ends_no_study():
     assert (_end(255), _end(-9)) == ("ended with exit code 255", "was ended by SIGKILL")
     assert [_signal(code) for code in (255, 137, -9, 1)] == [0, 9, 9, 0], "others go on"

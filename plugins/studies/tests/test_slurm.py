@@ -10,17 +10,9 @@ import pytest
 from commands import run_qgs, sets
 
 RECIPE = Path(__file__).parents[3] / "recipes/tiny/locus.yaml"
-QUICK = (
-    "data.image_size=[32, 32]",
-    "views.targets=2",
-    "evaluation.scenes=2",
-    "training.seconds=null",
-)
 
 
-def test_a_slurm_job_is_that_of_the_example(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slurm_job_is_that_of_the_example(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     index = tmp_path / "datasets/re10k/evaluation_2views.json"
     index.parent.mkdir(parents=True)
@@ -37,11 +29,16 @@ def test_a_slurm_job_is_that_of_the_example(
 
 
 @pytest.mark.slow
-def test_a_slurm_job_saves_at_the_signal_and_goes_on(tmp_path: Path) -> None:
+def test_a_slurm_job_saves_at_the_signal_and_goes_on(tmp_path):
     """Two processes by torchrun; the script needs of Slurm no more than `scontrol`."""
     out, asked = tmp_path / "run", tmp_path / "asked"
-    options = ("training.steps=300", "training.save_every=0", "training.batch_size=2")
-    words = sets(*QUICK, *options, "optimizer.warmup=1")
+    words = sets(
+        "data.image_size=[32, 32]",
+        "views.targets=2",
+        "evaluation.scenes=2",
+        "training={seconds: null, steps: 300, save_every: 0, batch_size: 2}",
+        "optimizer.warmup=1",
+    )
     result = run_qgs("train", RECIPE, "--out", out, "--slurm", "2", "--device", "cpu", *words)
     assert result.exit_code == 0, result.output
     stub = tmp_path / "bin/scontrol"

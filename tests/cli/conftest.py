@@ -1,0 +1,46 @@
+"""A run of `qgs train` made once, and pictures so small that a reconstruction takes no time."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import run_qgs, sets
+
+from qgs.analysis import saving
+
+RECIPE = Path(__file__).parents[2] / "recipes" / "tiny" / "locus.yaml"
+QUICK = sets(
+    "data.image_size=[32, 32]",
+    "views.targets=2",
+    "evaluation.scenes=2",
+    "training.seconds=77",
+    "training.steps=2",
+    "optimizer.warmup=1",
+)
+
+
+def train(out, *words):
+    return run_qgs("train", RECIPE, "--out", out, *QUICK, *words)
+
+
+@pytest.fixture(scope="session")
+def training():
+    """A function: train a tiny model for two steps into a folder, with these words more."""
+    return train
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory):
+    """What that printed and its folder, which no test changes."""
+    out = tmp_path_factory.mktemp("trained") / "run"
+    result = train(out)
+    assert result.exit_code == 0, result.output
+    return result.output, out
+
+
+@pytest.fixture
+def small_pictures(monkeypatch):
+    """Overview and orbit are most of the work of saving; one test looks at real ones."""
+    monkeypatch.setattr(saving, "overview", lambda result: np.zeros((4, 4, 3), np.uint8))
+    monkeypatch.setattr(saving, "orbit_path", partial(saving.orbit_path, frames=2, side=16))
