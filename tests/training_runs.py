@@ -1,9 +1,8 @@
 """Runs of tiny models, for the tests of training."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -12,10 +11,10 @@ import torch
 from rich.console import Console
 
 from qgs.composer import Recipe, resolve
-from qgs.data.samples import Batch
+from qgs.data.samples import Batch, Sample
 from qgs.data.stream import SampleStream, training_batches
 from qgs.engine.distributed import StopRequest
-from qgs.engine.folder import RunFolder
+from qgs.engine.folder import RunFolder, read_state
 from qgs.engine.tracking import TrainingProgress
 from qgs.engine.training import Trainer, TrainingResult, train
 
@@ -25,31 +24,43 @@ SMALL = (
     "model.width=32",
     "model.heads=2",
     "model.queries.count=24",
+    "model.decoder.depth=2",
+    "model.supervision.layers=[1, 2]",
     "model.head.gaussians_per_query=4",
     "data.image_size=[16, 16]",
     "views.targets=2",
     "evaluation.scenes=2",
-    "training.steps=4",
+    "training.steps=3",
     "training.seconds=null",
     "optimizer.warmup=2",
 )
 QUIET = Console(quiet=True)
+TRAINED = ("training.ema=0.5", "training.evaluate_every=2")
 Tiny: TypeAlias = Callable[..., Recipe]
-"""The fixture `tiny`."""
+"""The function `tiny`, for tests of plug-ins."""
 TWO = ("plugins=[rooms, locus, two]", "objective={type: two/two_passes}", "views.inputs=5")
 """With the fixture `two`: train on two passes of the model."""
 
 
-def tiny_recipe(name: str, *overrides: str) -> Recipe:
+def tiny(name: str, *overrides: str) -> Recipe:
     """A recipe of recipes/tiny, smaller yet, with overrides."""
     return resolve(RECIPES / f"{name}.yaml", [*SMALL, *overrides])
+
+
+tiny_recipe: Tiny = tiny
 
 
 def run(recipe: Recipe, folder: Path, resume: bool = False, device: str = "cpu") -> TrainingResult:
     return train(recipe, folder, console=QUIET, device=device, resume=resume)
 
 
-run_anywhere = partial(run, device="auto")
+@pytest.fixture(scope="session")
+def trained_run(tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
+    """A finished run of `tiny("locus", *TRAINED)`, 3 steps; a test that changes it takes a copy."""
+    torch.set_num_threads(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("qgs.data.stream.MEASURED", 8)
+        return run(tiny("locus", *TRAINED), tmp_path_factory.mktemp("trained") / "run")
 
 
 def run_calling(
@@ -74,10 +85,33 @@ def weights(result: TrainingResult) -> dict[str, torch.Tensor]:
     return result.model.state_dict()
 
 
-def same(first: Mapping[str, torch.Tensor], second: Mapping[str, torch.Tensor]) -> bool:
+def same(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
+    """Whether two mappings hold the same tensors, to the bit, and the same values."""
     return first.keys() == second.keys() and all(
-        torch.equal(t, second[n]) for n, t in first.items()
+        torch.equal(value, second[name]) if torch.is_tensor(value) else value == second[name]
+        for name, value in first.items()
     )
+
+
+def parts_of(folder: Path) -> Mapping[str, Any]:
+    """What the saved state of a run holds, by part."""
+    return read_state(RunFolder(folder).state).parts
+
+
+def saved_step(folder: Path) -> int:
+    return parts_of(folder)["counters"]["step"]
+
+
+def assert_equal_runs(first: Path, second: Path) -> None:
+    """Same weights, optimiser state and random states to the bit, same history but for time."""
+    ours, theirs = parts_of(first), parts_of(second)
+    for parts in (ours, theirs):
+        del parts["counters"]["seconds"]
+    assert ours.keys() == theirs.keys()
+    assert [name for name in ours if not same(ours[name], theirs[name])] == []
+    histories = (RunFolder(folder).history() for folder in (first, second))
+    one, other = ([{**record, "seconds": 0} for record in history] for history in histories)
+    assert one == other
 
 
 def first_batch(recipe: Recipe) -> Batch:
@@ -90,30 +124,19 @@ def losses(run: Path) -> list[float]:
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:
     """The records of a JSONL file, each strictly JSON."""
-
-    def refuse(constant: str) -> float:
-        raise ValueError(f"{constant} is no JSON")
-
-    text = path.read_text(encoding="utf-8").splitlines()
-    return [json.loads(line, parse_constant=refuse) for line in text]
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return [json.loads(line, parse_constant=pytest.fail) for line in lines]
 
 
-def change_batches(
-    monkeypatch: pytest.MonkeyPatch, change: Callable[[Batch, Sequence[int]], None]
+def change_samples(
+    monkeypatch: pytest.MonkeyPatch, change: Callable[[Sample, int, int], None]
 ) -> None:
-    """`change(batch, numbers of its samples)` alters each training batch in place."""
-    whole = SampleStream.batch
+    """`change(sample, number, attempt)` alters each training sample in place, or raises."""
+    made = SampleStream._made
 
-    def changed(stream: SampleStream, numbers: Sequence[int]) -> Batch:
-        batch = whole(stream, numbers)
-        change(batch, numbers)
-        return batch
+    def changed(stream: SampleStream, number: int, attempt: int) -> Sample:
+        sample = made(stream, number, attempt)
+        change(sample, number, attempt)
+        return sample
 
-    monkeypatch.setattr(SampleStream, "batch", changed)
-
-
-def tensorboard_events(folder: Path) -> Any:
-    """What TensorBoard reads of a run; the test is skipped without it."""
-    name = "tensorboard.backend.event_processing.event_accumulator"
-    module = pytest.importorskip(name, reason="the extra `tensorboard` is not installed")
-    return module.EventAccumulator(str(folder / "tensorboard")).Reload()
+    monkeypatch.setattr(SampleStream, "_made", changed)

@@ -1,69 +1,19 @@
-"""Two processes on one machine train the model that one would train."""
+"""Two processes on one machine train the model that one would train; which device `auto` takes."""
 
 import json
-import os
-import re
-import subprocess
-import sys
-from pathlib import Path
+import signal
 
 import pytest
 import torch
-import yaml
 from safetensors.torch import load_file
-from training_runs import TWO, Tiny, losses, read_jsonl, run, run_calling
+from training_runs import TWO, losses, parts_of, read_jsonl, run, run_calling, tiny
+from two_processes import told_by_two
 
-from qgs.composer import Recipe
-from qgs.engine.distributed import StopRequest
-from qgs.engine.folder import read_state
-from qgs.engine.training import ELSEWHERE, Trainer
+from qgs.engine import distributed
+from qgs.engine.training import ELSEWHERE
 
-WORKER = Path(__file__).with_name("distributed.py")
 PARTS = 'optimizer.parts={"decoder.0.feed_forward": 0, "head": 0.5}'
 """One sublayer stays as it is, and the head learns slower."""
-
-
-def told_by_two(recipe: Recipe, run: Path, spoil: str = "") -> str:
-    """Continue or start `run` by torchrun; what both processes print."""
-    file = run.with_suffix(".yaml")
-    file.write_text(yaml.safe_dump(dict(recipe.tree)))
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    done = subprocess.run(
-        [*command, str(WORKER), str(file), str(run), spoil],
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=240,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def train_in_two_processes(recipe: Recipe, run: Path, spoil: str = "") -> None:
-    """As `told_by_two`; both processes must say the same of the run."""
-    told = told_by_two(recipe, run, spoil)
-    # wherever they stand: what libraries print meanwhile lands in the same lines
-    said = re.findall(r"(True|False) (\d+) (\d+\.\d+)", told)
-    assert sorted(main for main, *_ in said) == ["False", "True"]
-    assert said[0][1:] == said[1][1:] == ("4", said[0][2]), "the same weights everywhere"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("accumulate", [1, 2])
-def test_two_processes_have_the_loss_curve_of_one(
-    tiny: Tiny, tmp_path: Path, accumulate: int
-) -> None:
-    options = ("training.save_every=2", f"training.accumulate={accumulate}", PARTS)
-    recipe = tiny("locus", "training.batch_size=4", *options)
-    run(recipe, tmp_path / "alone")
-    train_in_two_processes(recipe, tmp_path / "two")
-    assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
-    names = {path.name for path in (tmp_path / "two").iterdir()}
-    assert names == {
-        "recipe.yaml", "history.jsonl", "checkpoint.safetensors", "state.safetensors"
-    }  # fmt: skip
-
-
 NO_LAYERS = (
     "model.decoder={depth: 0, cross_attention: null, self_attention: null, feed_forward: null, "
     "refinement: null, layer_scale: 5.0e-5}",
@@ -71,85 +21,97 @@ NO_LAYERS = (
 )
 
 
-@pytest.mark.slow
-def test_two_processes_train_a_model_whose_keys_nothing_reads(tiny: Tiny, tmp_path: Path) -> None:
-    train_in_two_processes(tiny("tokengs", *NO_LAYERS), tmp_path / "two")
+def train_in_two_processes(*arguments):
+    """As `told_by_two`; both processes must have the same weights."""
+    (*first, total), second = told_by_two(*arguments)
+    assert first == [True, 3, {}]
+    assert second == (False, 3, {}, total)
 
 
-def test_two_processes_continue_what_one_began(tiny: Tiny, tmp_path: Path) -> None:
-    options = ("training.batch_size=2", "training.save_every=2", "training.ema=0.9", PARTS)
-    recipe = tiny("locus", *options)
-    run(recipe, tmp_path / "alone")
+def test_two_processes_continue_what_one_began(tmp_path):
+    def ask(trainer, stop):
+        stop.signal = signal.SIGINT
 
-    def kill(trainer: Trainer, stop: StopRequest) -> None:
-        if trainer.step == 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run_calling(kill, recipe, tmp_path / "two")
-    train_in_two_processes(recipe, tmp_path / "two")
-    assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
-    ours, theirs = (
-        read_state(tmp_path / name / "state.safetensors").parts for name in ("two", "alone")
-    )
+    recipe = tiny("locus", "training.ema=0.9", PARTS)
+    two, alone = tmp_path / "two", tmp_path / "alone"
+    run(recipe, alone)
+    assert run_calling(ask, recipe, two).steps == 2
+    train_in_two_processes(recipe, two)
+    assert losses(two) == pytest.approx(losses(alone), abs=1e-5)
+    ours, theirs = parts_of(two), parts_of(alone)
+    assert ours["moments"].pop("keys") == theirs["moments"].pop("keys")
     for name in ("weights", "moments", "ema", "good"):
-        assert ours[name].keys() == theirs[name].keys()
-        for key, value in ours[name].items():
-            if key != "keys":  # names, which the line above compares
-                torch.testing.assert_close(value, theirs[name][key], rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(ours[name], theirs[name], rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("name", "options", "in_two"),
+    [
+        ("locus", (PARTS, "training.batch_size=4", "training.accumulate=2"), ()),
+        ("locus", TWO, ("training.render_views=1",)),
+        ("tokengs", NO_LAYERS, ()),
+    ],
+    ids=["accumulated", "two passes", "keys that nothing reads"],
+)
 @pytest.mark.slow
-def test_two_processes_make_two_passes_as_one_does(tiny: Tiny, tmp_path: Path, two: None) -> None:
-    alone = tiny("locus", *TWO, "training.batch_size=2")
-    run(alone, tmp_path / "alone")
-    pair = tiny("locus", *TWO, "training.batch_size=2", "training.render_views=1")
-    train_in_two_processes(pair, tmp_path / "two")
+def test_two_processes_have_the_loss_curve_of_one(tmp_path, two, name, options, in_two):
+    run(tiny(name, *options), tmp_path / "alone")
+    train_in_two_processes(tiny(name, *options, *in_two), tmp_path / "two")
     assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
+    files = ({path.name for path in (tmp_path / run).iterdir()} for run in ("two", "alone"))
+    assert next(files) == next(files)
 
 
-@pytest.mark.slow
-def test_all_processes_leave_out_a_step_that_one_found_bad(tiny: Tiny, tmp_path: Path) -> None:
-    parts = ("training.batch_size=2", "training.render_views=1", "training.on_nonfinite=skip")
-    judged = ("training.ema=0.9", "training.evaluate_every=2", "evaluation.scenes=1")
-    train_in_two_processes(tiny("locus", *parts, *judged), tmp_path / "run", "spoil")
-    run = tmp_path / "run"
-    records = read_jsonl(run / "history.jsonl")
-    assert ["loss" in record for record in records] == [True, False, True, True]
-    incident = run / "incidents" / "step-2"
-    report = json.loads((incident / "report.json").read_text())
-    first = {found["process"]: found["first"] for found in report["found"]}
-    assert first[0] is None
-    assert first[1]["tensor"] == "targets.images"
+def test_all_processes_leave_out_a_step_that_one_found_bad(tmp_path):
+    options = ("on_nonfinite=skip", "render_views=1", "ema=0.9", "evaluate_every=2")
+    recipe = tiny("locus", *(f"training.{option}" for option in options))
+    train_in_two_processes(recipe, tmp_path, 3, True)
+    records = read_jsonl(tmp_path / "history.jsonl")
+    assert ["loss" in record for record in records] == [True, False, True]
+    incident = tmp_path / "incidents" / "step-2"
+    found = json.loads((incident / "report.json").read_text())["found"]
+    assert [report["process"] for report in found] == [0, 1]
+    assert [bool(report["first"]) for report in found] == [False, True]
     seen = [load_file(incident / f"batch{n}.safetensors")["targets.images"] for n in ("", "-1")]
     assert [int(images.isnan().sum()) for images in seen] == [0, 1]
-    judged = read_jsonl(run / "evaluations.jsonl")
+    judged = read_jsonl(tmp_path / "evaluations.jsonl")
     assert [(record["step"], record["weights"]) for record in judged] == [
-        (step, weights) for step in (2, 4) for weights in ("raw", "ema")
+        (step, weights) for step in (2, 3) for weights in ("raw", "ema")
     ]
 
 
+@pytest.mark.parametrize(("bad", "steps"), [(1, 0), (3, 1)], ids=["first", "later"])
 @pytest.mark.slow
-@pytest.mark.parametrize(("bad", "steps"), [(1, 0), (5, 2)], ids=["first", "later"])
-def test_two_processes_stop_together_at_a_sample_that_one_cannot_make(
-    tiny: Tiny, tmp_path: Path, bad: int, steps: int
-) -> None:
+def test_two_processes_stop_together_at_a_sample_that_one_cannot_make_or_leave_it_out(
+    tmp_path, bad, steps
+):
     """Samples with odd numbers are those of the second process."""
-    recipe = tiny("locus", "training.batch_size=2")
-    told = told_by_two(recipe, tmp_path / "run", str(bad))
-    assert told.count("refused: ") == 2
-    assert told.count(f"refused: scene 'x', frame {bad} (a.png): cannot be read") == 1
-    assert told.count(f"refused: {ELSEWHERE}") == 1
-    assert told.count(f"saved at step {steps}; continue with --resume") == 2 * bool(steps)
-    assert (tmp_path / "run").exists() == bool(steps)
+    folder = tmp_path / "run"
+    errors = told_by_two(tiny("locus"), folder, bad, False)
+    reason = f"scene 'x', frame {bad} (a.png): cannot be read"
+    for error, cause in zip(errors, (ELSEWHERE, reason), strict=True):
+        assert error.startswith(f"{cause}; ")
+        assert (f"saved at step {steps}; continue with --resume" in error) == bool(steps)
+    assert folder.exists() == bool(steps)
+    told = told_by_two(tiny("locus", "training.on_bad_sample=skip"), folder, bad, False)
+    assert [left_out for _, _, left_out, _ in told] == [{reason: 1}] * 2
+    assert len(losses(folder)) == 3
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("bad", [1, 5])
-def test_two_processes_go_on_without_a_sample_that_one_cannot_make(
-    tiny: Tiny, tmp_path: Path, bad: int
-) -> None:
-    recipe = tiny("locus", "training.batch_size=2", "training.on_bad_sample=skip")
-    told = told_by_two(recipe, tmp_path / "run", str(bad))
-    assert told.count(f"left out: 1 times scene 'x', frame {bad}") == 2
-    assert len(losses(tmp_path / "run")) == 4
+@pytest.mark.parametrize(
+    ("wanted", "cuda", "gsplat", "expected", "told"),
+    [
+        ("auto", False, False, "cpu", 0),
+        ("auto", False, True, "cpu", 0),
+        ("auto", True, False, "cpu", 1),
+        ("auto", True, True, "cuda", 0),
+        ("cpu", True, True, "cpu", 0),
+        ("cuda", True, False, "cuda", 0),
+    ],
+)
+def test_the_device_and_what_is_said(monkeypatch, wanted, cuda, gsplat, expected, told):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
+    monkeypatch.setattr(distributed, "find_spec", lambda name: gsplat or None)
+    said = []
+    assert distributed.choose_device(wanted, said.append) == expected
+    assert ["gsplat" in line for line in said] == [True] * told

@@ -1,138 +1,196 @@
-"""Errors between two steps lose nothing: the run is saved, and says how to go on."""
+"""Whatever ends a run early loses nothing: the run is saved, and says how to go on."""
 
-import json
 import multiprocessing
-from collections.abc import Sequence
-from contextlib import closing
-from pathlib import Path
-from typing import Any
+import signal
+from unittest.mock import DEFAULT, Mock
 
 import pytest
-from safetensors import SafetensorError
-from training_runs import QUIET, Tiny, change_batches, losses, run, run_calling, same, weights
+import torch
+from safetensors import SafetensorError, safe_open
+from training_runs import (
+    TRAINED,
+    assert_equal_runs,
+    change_samples,
+    losses,
+    parts_of,
+    read_jsonl,
+    run,
+    run_calling,
+    saved_step,
+    tiny,
+)
 
-from qgs.data.samples import Batch
-from qgs.data.stream import WorkerError
-from qgs.engine import periodic
-from qgs.engine.distributed import StopRequest, signal
-from qgs.engine.folder import RunFolder as Folder
-from qgs.engine.folder import read_state
+from qgs.data.stream import MAX_REPLACED, SampleError, WorkerError
+from qgs.engine import periodic, training
+from qgs.engine.folder import RunFolder
+from qgs.engine.guard import OutOfMemoryError
+from qgs.engine.periodic import PeriodicEvaluation
 from qgs.engine.tracking import TrainingProgress
-from qgs.engine.training import Trainer
+from qgs.io.checkpoint import CheckpointFile
+from qgs.io.tensors import CheckpointError, write_tensors
 
 
-def saved_step(folder: Path) -> int:
-    return read_state(Folder(folder).state).parts["counters"]["step"]
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_and_ends(tmp_path, monkeypatch, number):
+    before = signal.getsignal(number)
+    # The second one, a step later, changes nothing.
+    monkeypatch.setattr(TrainingProgress, "update", lambda *_: signal.raise_signal(number))
+    result = run(tiny("tokengs", "training.steps=100000"), tmp_path)
+    assert result.stopped_by == number.name
+    assert result.steps == len(result.folder.history()) == 2
+    assert CheckpointFile(result.folder.checkpoint).step == 2
+    assert signal.getsignal(number) is before
 
 
-def spoil(monkeypatch: pytest.MonkeyPatch, from_sample: int) -> None:
-    """From this sample on, the data cannot be read."""
-
-    def broken(batch: Batch, numbers: Sequence[int]) -> None:
-        if max(numbers) >= from_sample:
+def test_data_that_fails_leaves_a_run_that_goes_on(trained_run, tmp_path, monkeypatch):
+    def broken(sample, number, attempt):
+        if number == 4:
             raise OSError("the disk is gone")
 
-    change_batches(monkeypatch, broken)
-
-
-def test_data_that_fails_leaves_a_run_that_goes_on(
-    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recipe = tiny("tokengs", "training.save_every=0", "training.batch_size=2", "training.ema=0.9")
-    through = run(recipe, tmp_path / "through")
+    recipe = tiny("locus", *TRAINED)
     with monkeypatch.context() as patch:
-        spoil(patch, from_sample=6)
+        change_samples(patch, broken)
         with pytest.raises(OSError, match="the disk is gone") as caught:
-            run(recipe, tmp_path / "broken")
-    assert caught.value.__notes__ == ["The run is saved at step 3; continue with --resume"]
-    assert saved_step(tmp_path / "broken") == 3
-    again = run(recipe, tmp_path / "broken", resume=True)
-    assert (again.resumed_at, again.steps) == (3, 4)
-    assert losses(tmp_path / "broken") == losses(tmp_path / "through")
-    assert same(weights(again), weights(through))
+            run(tiny("locus", *TRAINED, "training.evaluate_every=0"), tmp_path)
+    assert caught.value.__notes__ == ["The run is saved at step 2; continue with --resume"]
+    assert run(recipe, tmp_path, resume=True).resumed_at == 2
+    whole = trained_run.folder.path
+    assert_equal_runs(tmp_path, whole)
+    first, second = (read_jsonl(folder / "evaluations.jsonl") for folder in (tmp_path, whole))
+    assert first == second[2:], "of step 3"
 
 
 @pytest.mark.slow
-def test_a_killed_worker_leaves_a_run_that_goes_on(tiny: Tiny, tmp_path: Path) -> None:
+def test_a_killed_worker_leaves_a_run_that_goes_on(tmp_path):
     recipe = tiny("tokengs", "training.steps=100", "training.workers=1", "training.save_every=0")
 
-    def kill(trainer: Trainer, stop: StopRequest) -> None:
+    def kill(trainer, stop):
         for child in multiprocessing.active_children():
             child.kill()
 
     with pytest.raises(WorkerError, match=r"lower training\.workers"):
-        run_calling(kill, recipe, tmp_path / "run")
-    assert saved_step(tmp_path / "run") == len(losses(tmp_path / "run")) >= 1
+        run_calling(kill, recipe, tmp_path)
+    assert saved_step(tmp_path) == len(losses(tmp_path)) >= 1
 
 
-def test_an_evaluation_that_fails_is_told_and_ends_nothing(
-    tiny: Tiny,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    steps: list[int] = []
+def test_a_step_without_memory_says_what_takes_less_and_the_run_is_saved(tmp_path, monkeypatch):
+    error = RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")
+    second_fails = Mock(wraps=training.compute_gradients, side_effect=[DEFAULT, error])
+    monkeypatch.setattr(training, "compute_gradients", second_fails)
+    with pytest.raises(OutOfMemoryError, match=r"step 2.*batch_size"):
+        run(tiny("tokengs"), tmp_path)
+    assert saved_step(tmp_path) == 1
 
-    def failing(model: Any, recipe: Any, step: int, **_: Any) -> None:
-        steps.append(saved_step(tmp_path / "run"))
+
+def test_bad_samples_are_skipped_counted_and_named_if_asked_for(tmp_path, monkeypatch, caplog):
+    bad = {1, 3}
+
+    def unreadable(sample, number, attempt):
+        if number + attempt in bad:
+            raise SampleError(f"scene 'x', frame {number + attempt} (a.png): cannot be read")
+
+    change_samples(monkeypatch, unreadable)
+    with pytest.raises(SampleError, match="frame 1"):
+        run(tiny("tokengs"), tmp_path / "stops")
+    skipping = tiny("tokengs", "training.on_bad_sample=skip")
+    result = run(skipping, tmp_path / "skips")
+    assert result.steps == 3
+    assert [reason.split(" (")[0][-7:] for reason in result.left_out] == ["frame 1", "frame 3"]
+    assert caplog.text.count("a sample is left out") == 2
+    assert parts_of(tmp_path / "skips")["counters"]["left_out"] == result.left_out
+    bad.update(range(100))
+    with pytest.raises(SampleError, match=str(MAX_REPLACED + 1)):
+        run(skipping, tmp_path / "ends")
+
+
+def test_an_evaluation_that_fails_is_told_and_ends_nothing(tmp_path, monkeypatch, caplog):
+    saved = []
+
+    def failing(*_, **options):
+        saved.append(saved_step(tmp_path))
         raise ValueError("no scene could be judged")
 
     monkeypatch.setattr(periodic, "evaluate", failing)
-    recipe = tiny("tokengs", "training.evaluate_every=2", "training.save_every=0")
-    result = run(recipe, tmp_path / "run")
-    assert result.steps == 4
-    assert steps == [2, 4], "saved before it is judged"
+    run(tiny("tokengs", "training.evaluate_every=1"), tmp_path)
+    assert saved == [1, 2, 3], "saved before it is judged"
     assert "the evaluation at step 2 failed: ValueError: no scene could be judged" in caplog.text
 
 
-def test_a_stop_is_heard_between_two_scenes(tiny: Tiny, tmp_path: Path) -> None:
-    recipe = tiny("tokengs", "training.evaluate_every=2", "evaluation.scenes=3")
-    trainer, stop = Trainer(recipe, tmp_path / "run"), StopRequest()
-    scenes: list[int] = []
-    between = trainer.evaluations._between_scenes
+def test_a_stop_is_heard_between_two_scenes(tmp_path, monkeypatch):
+    between = PeriodicEvaluation._between_scenes
 
-    def asked(done: int, wanted: int) -> None:
-        scenes.append(done)
-        stop.signal = signal.SIGTERM
-        between(done, wanted)
+    def asked(periodic, done, wanted):
+        assert done == 1
+        signal.raise_signal(signal.SIGTERM)
+        between(periodic, done, wanted)
 
-    trainer.evaluations._between_scenes = asked
-    with closing(trainer):
-        result = trainer.run(TrainingProgress(QUIET), stop)
-    assert scenes == [1]
-    assert (result.steps, result.stopped_by) == (2, "SIGTERM")
-    assert not (tmp_path / "run" / "evaluations.jsonl").exists()
+    monkeypatch.setattr(PeriodicEvaluation, "_between_scenes", asked)
+    result = run(tiny("tokengs", "training.evaluate_every=1"), tmp_path)
+    assert (result.steps, result.stopped_by) == (1, "SIGTERM")
+    assert not (tmp_path / "evaluations.jsonl").exists()
 
 
-def test_a_full_disk_is_told_with_what_to_do(
-    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(tensors: Any, path: Path, metadata: Any) -> None:
+def test_a_full_disk_is_told_with_what_to_do(copied, monkeypatch):
+    def full(tensors, path, metadata):
         path.write_bytes(bytes(40_000))
         raise SafetensorError("I/O error: No space left on device (os error 28)")
 
-    recipe, folder = tiny("tokengs", "training.save_every=1"), tmp_path / "run"
-    run(tiny("tokengs", "training.steps=3"), folder)
-    whole = Folder(folder).state.read_bytes()
-    with monkeypatch.context() as patched:
-        patched.setattr("qgs.io.tensors.save_file", full)
+    recipe = tiny("locus", *TRAINED, "training.steps=4")
+    state = RunFolder(copied).state
+    whole = state.read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr("qgs.io.tensors.save_file", full)
         with pytest.raises(OSError, match="--resume"):
-            run(recipe, folder, resume=True)
-    assert Folder(folder).state.read_bytes() == whole
-    assert run(recipe, folder, resume=True).steps == 4
+            run(recipe, copied, resume=True)
+    assert state.read_bytes() == whole
+    assert run(recipe, copied, resume=True).steps == 4
 
 
-@pytest.mark.parametrize("damage", ['{"step": 2, "lo', "[1]"])
-def test_a_damaged_line_stops_no_run(
-    tiny: Tiny, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
-) -> None:
-    folder = tmp_path / "run"
-    run(tiny("tokengs", "training.steps=3", "training.evaluate_every=3"), folder)
-    for name in ("history.jsonl", "evaluations.jsonl"):
-        lines = (folder / name).read_text().splitlines()
-        (folder / name).write_text("\n".join([damage, *lines]) + "\n")
-    run(tiny("tokengs", "training.evaluate_every=4"), folder, resume=True)
-    for name, steps in (("history.jsonl", [1, 2, 3, 4]), ("evaluations.jsonl", [3, 4])):
-        assert f"{folder / name}, line 1 is damaged" in caplog.text
-        lines = (folder / name).read_text().splitlines()
-        assert [json.loads(line)["step"] for line in lines] == steps
+def test_a_damaged_state_is_refused_and_nothing_is_replaced(copied):
+    recipe, state = tiny("locus", *TRAINED, "training.steps=4"), RunFolder(copied).state
+    with safe_open(state, "pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        metadata = file.metadata()
+    contents = [state.read_bytes()[:-100], RunFolder(copied).checkpoint.read_bytes()]
+
+    def damage(changes, text=metadata["qgs.state"]):
+        """Tensors that are None are left out."""
+        kept = {name: t for name, t in (tensors | changes).items() if t is not None}
+        write_tensors(state, kept, metadata | {"qgs.state": text})
+        contents.append(state.read_bytes())
+
+    weight = "queries.features"
+    damage({f"weights/{weight}": torch.ones(1)})
+    damage({f"ema/{weight}": None})
+    damage({f"moments/model.{weight}/exp_avg": None})
+    damage({"moments/foo/exp_avg": torch.ones(1)})
+    damage({name: None for name in tensors if name.startswith("random/")})
+    for text in ("null", '{"counters": ', '{"a":' * 5000, '{"weights": {}}'):
+        damage({}, text)
+    for content in contents:
+        state.write_bytes(content)
+        before = {path: path.read_bytes() for path in copied.glob("*.*")}
+        with pytest.raises(CheckpointError, match=str(state)):
+            run(recipe, copied, resume=True)
+        assert before == {path: path.read_bytes() for path in copied.glob("*.*")}
+
+
+def test_a_folder_in_use_is_refused_untouched(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="never overwrites"):
+        run(tiny("tokengs"), tmp_path)
+    with pytest.raises(FileExistsError, match="is a file"):
+        run(tiny("tokengs"), tmp_path / "notes.txt")
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_a_start_that_fails_leaves_no_folder(tmp_path):
+    out = tmp_path / "run"
+    nowhere = f"data={{type: qgs/photos, path: {tmp_path / 'nowhere'}, image_size: [32, 32]}}"
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        run(tiny("tokengs", nowhere), out)
+    with pytest.raises(ValueError, match=r"optimizer\.warmup"):
+        run(tiny("tokengs", "optimizer.warmup=3"), out)
+    with pytest.raises(ValueError, match=r"views\.gap"):
+        run(tiny("tokengs", "views.inputs=9", "views.gap=[2, 3]"), out)
+    assert not out.exists()

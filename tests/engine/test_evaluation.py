@@ -5,142 +5,184 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections import Counter
 from dataclasses import replace
-from itertools import chain, repeat
-from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
 from photo_formats import synthetic, write_nerfstudio
-from qgs_rooms.source import RoomsSource
 from rich.console import Console
-from training_runs import Tiny, same
+from training_runs import same, tiny
 
-from qgs.composer import Recipe
-from qgs.contracts import Scene
+from qgs.composer import Recipe, RecipeError, resolve
+from qgs.contracts import CONTRACT_VERSION, Column, ComponentConfig, Metric, Plugin
 from qgs.data.evaluation import evaluation_samples
-from qgs.data.samples import Sample
 from qgs.engine.evaluation import evaluate
-from qgs.engine.results import METHODS, Evaluation
+from qgs.engine.protocol import protocol_of
+from qgs.engine.results import METHODS
 from qgs.metrics.baselines import mean_colour, nearest_input
 from qgs.metrics.dispersion import token_dispersion
-from qgs.metrics.images import Psnr, psnr, ssim
-
-FILES = ["protocol.json", "scenes.csv", "summary.json", "table.md"]
+from qgs.metrics.images import psnr, ssim
 
 
-def write_index(folder: Path, **scenes: tuple[Sequence[int], Sequence[int]] | None) -> str:
+class MeanAbsoluteError(Metric):
+    name = "mae"
+    definition = "mean absolute error"
+    column = Column("MAE", "lower", digits=5)
+    not_in_protocol = frozenset({"log"})
+
+    class Config(ComponentConfig):
+        power: float = 1.0
+        log: str | None = None
+
+    def forward(self, given):
+        error = (given.images - given.targets.images).abs() ** self.config.power
+        return error.mean((-3, -2, -1))
+
+
+class DepthError(Metric):
+    name = "depth"
+    definition = "rendered less true depth"
+    needs = ("depth", "true_depth")
+    column = Column("depth error", "lower")
+
+    def forward(self, given):
+        return given.depth - given.true_depth
+
+
+class Masked(Metric):
+    name = "masked"
+    definition = "mean of the mask"
+    needs = ("masks",)
+
+    def columns(self):
+        return {"mean": Column("masked", "higher")}
+
+    def forward(self, given):
+        return {"mean": given.masks}
+
+
+def mine(*options):
+    """A small TokenGS with the plugin of the metrics above."""
+    plugin = Plugin("mine", CONTRACT_VERSION, (MeanAbsoluteError, DepthError, Masked))
+    options = "plugins=[rooms, mine]", *options
+    return resolve(tiny("tokengs").tree, options, plugins=[plugin])
+
+
+def write_index(folder, **scenes):
     file = folder / "some_index.json"
-    names = (name.replace("room", "test/00000") for name in scenes)
-    entries = [f and {"context": f[0], "target": f[1]} for f in scenes.values()]
-    file.write_text(json.dumps(dict(zip(names, entries, strict=True))))
+    entries = {
+        name.replace("room", "test/00000"): frames and {"context": frames[0], "target": frames[1]}
+        for name, frames in scenes.items()
+    }
+    file.write_text(json.dumps(entries))
     return f"evaluation.index={file}"
 
 
-def first_sample(recipe: Recipe) -> Sample:
-    return evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[0]
-
-
-def shown(evaluation: Evaluation) -> str:
-    console = Console(record=True, width=100, file=io.StringIO())
+def shown(evaluation):
+    console = Console(record=True, width=120, file=io.StringIO())
     evaluation.show(console)
     return console.export_text()
 
 
-def test_twice_gives_the_same_files_from_data_opened_once(
-    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recipe = tiny("locus", "evaluation.protocol=rooms-2view")
-    opened: list[RoomsSource] = []
-    scenes = RoomsSource.scenes
-    monkeypatch.setattr(
-        RoomsSource, "scenes", lambda self, split: opened.append(self) or scenes(self, split)
-    )
-    for name in ("a", "b"):
-        model = recipe.build_model().train()
-        evaluate(model, recipe).write(tmp_path / name)
-        assert model.training
-    assert len({id(source) for source in opened}) == 2
-    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == FILES
-    for file in FILES:
-        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
-    told = json.loads((tmp_path / "a" / "summary.json").read_text())["protocol"]
-    assert told["name"] == "rooms-2view"
-    content = (tmp_path / "a" / "protocol.json").read_bytes()
-    assert hashlib.sha256(content).hexdigest() == told["sha256"]
+@pytest.fixture(scope="module")
+def judged():
+    """A recipe with the metrics above, and two evaluations; only the first scene has masks."""
+    metrics = (f"metrics.{name}={{type: mine/{name}}}" for name in ("mae", "depth", "masked"))
+    recipe = mine(*metrics, "evaluation.protocol=rooms-2view")
+    source = recipe.build_data()
+
+    def masks(scene, frames):
+        return torch.ones(len(frames), 1, 16, 16) if scene.name == "test/000000" else None
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(source.scenes("test")[0]), "masks", masks)
+        patch.setattr(Recipe, "build_data", opened := Mock(return_value=source))
+        models = [recipe.build_model().train() for _ in range(2)]
+        evaluations = [evaluate(model, recipe) for model in models]
+    assert opened.call_count == 2, "once each"
+    assert models[0].training
+    return recipe, *evaluations
 
 
-def test_scores_hold_the_metrics_of_model_and_baselines(tiny: Tiny, tmp_path: Path) -> None:
-    recipe = tiny("tokengs")
+def test_scores_are_the_metrics_of_model_and_baselines(judged):
+    recipe, evaluation, _ = judged
     model = recipe.build_model().eval()
-    evaluation = evaluate(model, recipe)
-    sample = first_sample(recipe)
-    cameras, truth = sample.targets.cameras, sample.targets.images
+    data = recipe.build_data()
+    sample = evaluation_samples(data, recipe.views, recipe.evaluation, depths=True)[0]
+    inputs, targets = sample.inputs, sample.targets
     with torch.no_grad():
-        gaussians = model(sample.inputs).gaussians
-        rgb = model.render(gaussians, cameras).rgb
-    images = {
-        "model": rgb,
-        "nearest_input": nearest_input(sample.inputs, cameras),
-        "mean_colour": mean_colour(sample.inputs, cameras),
+        gaussians = model(inputs).gaussians
+        rendering = model.render(gaussians, targets.cameras)
+    baselines = (baseline(inputs, targets.cameras) for baseline in (nearest_input, mean_colour))
+    metrics = {"psnr": psnr, "ssim": ssim, "mae": lambda image, truth: (image - truth).abs()}
+    expected = {
+        f"{method}_{name}": float(metric(image, targets.images).mean())
+        for method, image in zip(METHODS, (rendering.rgb, *baselines), strict=True)
+        for name, metric in metrics.items()
     }
+    expected["model_depth"] = float((rendering.depth - targets.depths).mean())
+    expected["model_dispersion_mean"] = float(token_dispersion(gaussians.means, 4).mean())
+    expected["gaussians_used"] = int((gaussians.opacities > 1 / 255).sum())
     score = evaluation.scores[0]
+    assert {name: score.values[name] for name in expected} == pytest.approx(expected, rel=1e-6)
     assert score.views == [(sample.input_frames, sample.target_frames)]
-    for method, image in images.items():
-        for name, metric in (("psnr", psnr), ("ssim", ssim)):
-            expected = float(metric(image, truth).mean())
-            assert score.values[f"{method}_{name}"] == pytest.approx(expected, rel=1e-6)
-    dispersion = float(token_dispersion(gaussians.means, 4).mean())
-    assert score.values["model_dispersion_mean"] == pytest.approx(dispersion, rel=1e-6)
-    assert score.values["gaussians_used"] == int((gaussians.opacities > 1 / 255).sum())
-
-    evaluation.write(tmp_path)
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    rows = list(csv.DictReader((tmp_path / "scenes.csv").open()))
-    assert [row["scene"] for row in rows] == ["test/000000", "test/000001"]
-    assert summary["scenes"] == summary["samples"] == len(rows) == 2
-    assert summary["gaussians"] == gaussians.count
+    assert evaluation.gaussians == gaussians.count
+    for name in ("depth", "dispersion_mean"):
+        assert evaluation.mean(name, "nearest_input") is None
     for method in METHODS:
-        mean = sum(float(r[f"{method}_psnr"]) for r in rows) / len(rows)
-        assert summary[method]["psnr"] == pytest.approx(mean)
-        assert (summary[method]["dispersion_mean"] is None) == (method != "model")
+        assert evaluation.mean("masked_mean", method) == 1.0
+    assert set(evaluation.incomplete) == {"masked_mean"}
 
 
-def assert_batches_change_no_score(recipe: Recipe, batch: int) -> list[tuple[int, ...]]:
-    """Scenes and views of each pass of the model under `batch`."""
-    model = recipe.build_model()
-    alone = evaluate(model, recipe)
-    sizes: list[tuple[int, ...]] = []
-    model.encoder.register_forward_pre_hook(
-        lambda module, arguments: sizes.append(tuple(arguments[0].images.shape[:2]))
-    )
-    together = evaluate(model, recipe, batch=batch)
-    for ours, theirs in zip(together.scores, alone.scores, strict=True):
-        assert (ours.scene, ours.views) == (theirs.scene, theirs.views)
-        assert ours.values == pytest.approx(theirs.values, rel=0, abs=1e-6)
-    return sizes
+def test_evaluations_write_the_same_files(judged, tmp_path):
+    for name, evaluation in zip("ab", judged[1:], strict=True):
+        evaluation.write(tmp_path / name)
+    files, again = ({p.name: p.read_bytes() for p in (tmp_path / n).iterdir()} for n in "ab")
+    assert files == again
+    assert files.keys() == {"protocol.json", "scenes.csv", "summary.json", "table.md"}
+    summary = json.loads(files["summary.json"])
+    rows = list(csv.DictReader(files["scenes.csv"].decode().splitlines()))
+    assert [row["scene"] for row in rows] == ["test/000000", "test/000001"]
+    assert summary["scenes"] == summary["samples"] == 2
+    for method in METHODS:
+        for name in ("psnr", "ssim", "mae"):
+            mean = sum(float(row[f"{method}_{name}"]) for row in rows) / 2
+            assert summary[method][name] == pytest.approx(mean)
+    assert summary["columns"]["mae"]["better"] == "lower"
+    protocol = summary["protocol"]
+    assert protocol["name"] == "rooms-2view"
+    assert hashlib.sha256(files["protocol.json"]).hexdigest() == protocol["sha256"]
+    assert "   MAE ↓ |" in files["table.md"].decode()
+    told = "masked is over 1 of 2 scenes: it needs masks, not known for 1 of 2 scenes"
+    for text in ("MAE ↓", f" {summary['model']['mae']:.5f} ", told):
+        assert text in shown(evaluation)
 
 
-@pytest.mark.parametrize(("name", "batch"), [("tokengs", 4), ("locus", 16)])
-def test_batches_change_no_score(tiny: Tiny, name: str, batch: int) -> None:
-    recipe = tiny(name, "evaluation.scenes=3", "evaluation.samples=2")
-    assert_batches_change_no_score(recipe, batch)
-
-
-def test_batches_pass_through_the_model_together(tiny: Tiny, tmp_path: Path) -> None:
+def test_batches_pass_through_the_model_together_and_change_no_score(tmp_path):
     frames = {"room0": ([0, 4], [2]), "room1": ([0, 4], [1, 2, 3])}
     index = write_index(tmp_path, **frames, room2=([0, 2, 4], [1]), room3=([1], [2]))
-    sizes = assert_batches_change_no_score(tiny("tokengs", index), 4)
-    assert sizes == [(2, 2), (1, 3), (1, 1)]
+    samples = ("evaluation.scenes=3", "evaluation.samples=2")
+    for options, passes in ((index,), [(2, 2), (1, 3), (1, 1)]), (samples, [(4, 2), (2, 2)]):
+        recipe = tiny("locus", *options)
+        model = recipe.build_model()
+        alone = evaluate(model, recipe)
+        sizes = []
+        model.encoder.register_forward_pre_hook(
+            lambda module, views, sizes=sizes: sizes.append(views[0].images.shape[:2])
+        )
+        together = evaluate(model, recipe, batch=4)
+        assert sizes == passes
+        for ours, theirs in zip(together.scores, alone.scores, strict=True):
+            assert (ours.scene, ours.views) == (theirs.scene, theirs.views)
+            assert ours.values == pytest.approx(theirs.values, rel=0, abs=1e-6)
 
 
-def test_what_is_missing_is_told_in_the_same_line_as_the_score(tiny: Tiny, tmp_path: Path) -> None:
-    index = write_index(
-        tmp_path, room0=([0, 3], [1, 2]), room1=([0, 99], [1]), gone=([0, 3], [1]), nil=None
-    )
-    evaluation = evaluate((recipe := tiny("tokengs", index)).build_model(), recipe)
-    assert evaluation.wanted == ("test/000000", "test/000001", "gone")
+def test_what_is_missing_is_told_in_the_same_line_as_the_score(tmp_path):
+    named = {"room0": ([0, 3], [1, 2]), "room1": ([0, 99], [1]), "gone": ([0, 3], [1])}
+    recipe = tiny("tokengs", write_index(tmp_path, **named, nil=None))
+    evaluation = evaluate(recipe.build_model(), recipe)
     summary = evaluation.summary()
     assert summary["missing"] == {
         "test/000001": "the index names frames 99, the scene has 0 to 7",
@@ -149,82 +191,70 @@ def test_what_is_missing_is_told_in_the_same_line_as_the_score(tiny: Tiny, tmp_p
     assert (summary["scenes"], summary["scenes_in_protocol"]) == (1, 3)
     assert summary["null_entries"] == ["nil"]
     assert len(summary["not_in_index"]) == 30
-    evaluation.write(tmp_path)
     whole = replace(evaluation, wanted=evaluation.wanted[:1], missing=())
-    assert whole.summary()["statement"].endswith(" over 1 scene")
-    assert "input views of 16 x 16 pixels, poses" in shown(evaluation)
+    assert whole.statement.endswith(" over 1 scene")
+    evaluation.write(tmp_path)
+    text, table = shown(evaluation), (tmp_path / "table.md").read_text()
     line = f"PSNR {summary['model']['psnr']:.2f} over 1 of 3 scenes; missing: test/000001, gone"
-    table = (tmp_path / "table.md").read_text()
-    for text in (shown(evaluation), table, summary["statement"]):
-        assert line in text
+    assert summary["statement"] == line
+    for place in (text, table):
+        assert line in place
+        assert "input views of 16 x 16 pixels, poses" in place
+        assert "null entries of the index, not judged (1): nil" in place
     assert all("1 of 3" in row for row in table.splitlines() if row.startswith("| model"))
-    assert "null entries of the index, not judged (1): nil" in table
-    rows = {row["scene"]: row for row in csv.DictReader((tmp_path / "scenes.csv").open())}
-    assert list(rows) == ["test/000000", "test/000001", "gone"]
-    assert rows["gone"]["problem"] == "not among the test scenes of the data"
-    assert rows["test/000000"]["input_frames"] == "0 3"
-    assert rows["test/000000"]["problem"] == ""
+    rows = list(csv.DictReader((tmp_path / "scenes.csv").open()))
+    told = [(row["scene"], row["input_frames"], row["problem"]) for row in rows]
+    missing = [(name, "", problem) for name, problem in summary["missing"].items()]
+    assert told == [("test/000000", "0 3", ""), *missing]
 
 
-def test_a_failure_anywhere_ends_neither_evaluation_nor_in_silence(
-    tiny: Tiny, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recipe = tiny("tokengs", "evaluation.scenes=4")
-    model, forward = recipe.build_model(), type(recipe.build_model().encoder).forward
-    rooms = recipe.build_data().scenes("test")
-    victim, blank, broken = (rooms[number] for number in range(3))
-    photo = victim.images([0])[0]
-    images = type(victim).images
+def test_a_failure_anywhere_ends_neither_evaluation_nor_in_silence(monkeypatch):
+    """One failed sample fails its scene."""
+    recipe = tiny("tokengs", "evaluation.scenes=4", "evaluation.samples=2")
+    model, source = recipe.build_model(), recipe.build_data()
+    rooms, encoder = type(source.scenes("test")[0]), type(model.encoder)
+    images, forward = rooms.images, encoder.forward
+    decoded = Counter()
 
-    def decoded(scene: Scene, frames: Sequence[int]) -> torch.Tensor:
-        if scene.name == broken.name:
+    def images_of(scene, frames):
+        decoded[scene.name] += 1
+        place = source.names("test").index(scene.name)
+        if place == 2 and decoded[scene.name] > 1:
             raise OSError("/data/set/truncated.png is cut off")
-        found = images(scene, frames)
-        return torch.full_like(found, math.nan) if scene.name == blank.name else found
+        return images(scene, frames) * [0, math.nan, 1, 1][place]
 
-    def encoded(self, views):
-        if any(torch.equal(image, photo) for scene in views.images for image in scene):
+    def encode(self, views):
+        if (views.images == 0).all((1, 2, 3, 4)).any():
             raise RuntimeError("out of memory")
         return forward(self, views)
 
-    monkeypatch.setattr(type(victim), "images", decoded)
-    monkeypatch.setattr(type(model.encoder), "forward", encoded)
-    monkeypatch.setattr("qgs.data.view_samplers.Span.draw", lambda *_: ((0, 3), (1, 2)))
+    monkeypatch.setattr(rooms, "images", images_of)
+    monkeypatch.setattr(encoder, "forward", encode)
     evaluation = evaluate(model, recipe, batch=4)
-    assert [score.scene for score in evaluation.scores] == ["test/000003"]
+    assert [(score.scene, len(score.views)) for score in evaluation.scores] == [("test/000003", 2)]
     reasons = [failure.reason for failure in evaluation.missing]
     assert reasons[0] == "RuntimeError: out of memory"
     assert "is not finite" in reasons[1]
     assert reasons[2] == "OSError: /data/set/truncated.png is cut off"
 
 
-def test_photo_folders_are_judged_on_held_out_frames_beside_a_broken_one(
-    tiny: Tiny, tmp_path: Path
-) -> None:
+def test_photo_folders_are_judged_on_held_out_frames_beside_a_broken_one(tmp_path):
+    folder = tmp_path / "set"
     for name in ("a", "b", "c"):
-        write_nerfstudio(tmp_path / "set" / name, synthetic(tmp_path / "photos", 12, (32, 32)))
-    (tmp_path / "set" / "b" / "transforms.json").write_text("{")
-    (tmp_path / "set" / "c" / "images" / "view_006.png").write_bytes(b"no photo")
-    data = f"data={{type: qgs/photos, path: {tmp_path / 'set'}, image_size: [32, 32], holdout: 4}}"
+        write_nerfstudio(folder / name, synthetic(tmp_path / "photos", 12, (32, 32)))
+    (folder / "b" / "transforms.json").write_text("{")
+    (folder / "c" / "images" / "view_006.png").write_bytes(b"no photo")
+    data = f"data={{type: qgs/photos, path: {folder}, image_size: [32, 32], holdout: 4}}"
     recipe = tiny("tokengs", data, "evaluation.scenes=9")
     summary = (evaluation := evaluate(recipe.build_model(), recipe)).summary()
     assert [score.scene for score in evaluation.scores] == ["a"]
     assert list(summary["missing"]) == ["b", "c"]
+    assert all(summary["missing"].values())
     assert summary["held_out_frames"] == (3, 3)
     assert str(tmp_path) not in json.dumps(summary)
-    assert all(summary["missing"].values())
 
 
-def test_failed_samples_fail_their_scene(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
-    recipe = tiny("tokengs", "evaluation.samples=3")
-    score, factors = Psnr.forward, chain([1] * (2 * len(METHODS) - 1), [math.inf], repeat(1))
-    monkeypatch.setattr(Psnr, "forward", lambda self, given: score(self, given) * next(factors))
-    evaluation = evaluate(recipe.build_model(), recipe)
-    assert [failure.scene for failure in evaluation.missing] == ["test/000000"]
-    assert [len(score.views) for score in evaluation.scores] == [3]
-
-
-def test_tuned_evaluations_say_so_and_score_the_tuned_tokens(tiny: Tiny) -> None:
+def test_tuned_evaluations_say_so_and_score_the_tuned_tokens():
     plain, tuned = tiny("locus"), tiny("locus", "evaluation.tuning_steps=2")
     model = plain.build_model()
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
@@ -237,3 +267,23 @@ def test_tuned_evaluations_say_so_and_score_the_tuned_tokens(tiny: Tiny) -> None
     assert told["loss_after"] < told["loss_before"]
     assert first.scores[0].values["model_psnr"] != second.scores[0].values["model_psnr"]
     assert "queries tuned on the input views: 2 steps of Adam at 0.0001" in shown(second)
+
+
+def test_a_protocol_has_a_metrics_definition_and_options():
+    def protocol(options):
+        return protocol_of(mine(f"metrics.error={{type: mine/mae{options}}}"), None, ["x"])
+
+    plain, same, other = protocol(""), protocol(", log: there"), protocol(", power: 2.0")
+    told = {"type": "mine/mae", "definition": "mean absolute error", "power": 1.0}
+    assert plain.content["metrics"]["error"] == told
+    assert plain.sha256 == same.sha256 != other.sha256
+
+
+def test_written_metrics_lie_over_the_default_ones():
+    metrics = "metrics={lpips: {type: lpips/vgg16}, psnr: null}"
+    recipe = tiny("tokengs", metrics, "plugins=[rooms, lpips]")
+    assert list(recipe.build_metrics()) == ["ssim", "dispersion", "lpips"]
+    assert recipe.tree["metrics"]["psnr"] is None
+    assert resolve(recipe.tree).tree == recipe.tree
+    with pytest.raises(RecipeError, match=r"metrics\.psnr"):
+        tiny("tokengs", "metrics.psnr.covariance=sample")

@@ -1,255 +1,225 @@
 """A run that was interrupted or killed, and continued, is the run that was not."""
 
 import json
+import math
 import os
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 from accelerate import Accelerator
-from training_runs import Tiny, run, run_calling, same, weights
+from training_runs import (
+    TRAINED,
+    TWO,
+    assert_equal_runs,
+    parts_of,
+    read_jsonl,
+    run,
+    run_calling,
+    same,
+    tiny,
+    weights,
+)
 
-from qgs.composer import Recipe
-from qgs.engine.distributed import RandomStates, StopRequest
+import qgs
+from qgs.composer import resolve
+from qgs.engine.distributed import RandomStates
 from qgs.engine.folder import OtherRunError, RunFolder, read_state, write_state
-from qgs.engine.training import Trainer
 from qgs.io.checkpoint import CheckpointFile
-from qgs.io.tensors import CheckpointError
+
+SCHEDULED = (
+    "model.renderer.dilation={schedule: steps, values: [4, 2, 1], at: [1, 3]}",
+    "losses.photometric.ssim_weight={schedule: linear, values: [0.4, 0], at: [0, 4]}",
+    "objective.alpha_weight={schedule: steps, values: [0, 1], at: [2]}",
+    "optimizer.learning_rate={schedule: cosine, values: [1.0e-3, 0], at: [0, 4]}",
+    "optimizer.warmup=2000",
+)
 
 
 class Killed(BaseException):
     """Ends a run as a kill does, from the loop's point of view: nothing is saved any more."""
 
 
-def kill_after(steps: int, recipe: Recipe, folder: Path, resume: bool = False) -> None:
-    def kill(trainer: Trainer, stop: StopRequest) -> None:
-        if trainer.step == steps:
-            raise Killed
-
-    with pytest.raises(Killed):
-        run_calling(kill, recipe, folder, resume)
+def resumed(folder, *options):
+    """Continue a copy of `trained_run`."""
+    return run(tiny("locus", *TRAINED, *options), folder, resume=True)
 
 
-resumed = partial(run, resume=True)
-
-
-def assert_equal_runs(first: Path, second: Path) -> None:
-    """Same weights, optimiser state and random states to the bit, same history but for time."""
-    ours, theirs = (read_state(RunFolder(folder).state).parts for folder in (first, second))
-    assert ours.keys() == theirs.keys()
-    for name in ours:
-        assert ours[name].keys() == theirs[name].keys(), name
-        for key, value in ours[name].items():
-            if key == "seconds":
-                continue
-            other = theirs[name][key]
-            same = torch.equal(value, other) if torch.is_tensor(value) else value == other
-            assert same, f"{name}/{key}"
-    assert losses(first) == losses(second)
-
-
-def losses(folder: Path) -> list[tuple[float, float, float]]:
-    history = RunFolder(folder).history()
-    return [(record["step"], record["loss"], record["lr"]) for record in history]
-
-
-def change_counters(folder: Path, **values: Any) -> None:
+def change_counters(folder, **values):
     state = read_state(folder / "state.safetensors")
     parts = {**state.parts, "counters": {**state.parts["counters"], **values}}
     write_state(folder / "state.safetensors", state.recipe.tree, parts)
 
 
-CASES = [
-    ("locus", ("training.ema=0.9", "training.render_views=1")),
-    ("tokengs", ("training.accumulate=2", "views.mirror=0.5")),
-    ("locus", ("training.precision=bf16",)),
-]
+def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path, two):
+    recipe = tiny("locus", *TWO, *SCHEDULED, "training.steps=4")
+    whole, parts, again = (tmp_path / name for name in ("whole", "parts", "again.safetensors"))
+    run(recipe, whole, resume=True)
+    seen = []
 
+    def note(trainer, stop):
+        loss = trainer.training_pass.losses["photometric"]
+        seen.append((trainer.model.renderer.config.dilation, loss.config.ssim_weight))
+        if trainer.step == 1:
+            stop.signal = signal.SIGTERM  # the next step is the last
 
-@pytest.mark.slow  # test_scheduled_options.py and test_objectives.py resume in the fast tests
-@pytest.mark.parametrize(("name", "overrides"), CASES)
-def test_13_and_7_steps_are_20(
-    tiny: Tiny, tmp_path: Path, name: str, overrides: Sequence[str]
-) -> None:
-    options = ("steps=20", "save_every=5", "collapse_window=10")
-    recipe = tiny(name, *(f"training.{option}" for option in options), *overrides)
-    run(recipe, tmp_path / "through")
-    kill_after(13, recipe, tmp_path / "killed")
-    assert len(RunFolder(tmp_path / "killed").history()) == 13
-    result = resumed(recipe, tmp_path / "killed")
-    assert (result.resumed_at, result.steps) == (10, 20)
-    assert_equal_runs(tmp_path / "through", tmp_path / "killed")
+    stopped = run_calling(note, recipe, parts)
+    assert (stopped.steps, stopped.stopped_by) == (2, "SIGTERM")
+    qgs.save(qgs.load(stopped.folder.checkpoint), again)
+    assert CheckpointFile(again).step == 2
+    assert qgs.load(again).renderer.config.dilation == 2
+    for other in ("objective.depth_weight=0.5", "losses.photometric.ssim_weight.values=[0.4, 0.1]"):
+        with pytest.raises(OtherRunError, match=other.split("=")[0]):
+            run(tiny("locus", *TWO, *SCHEDULED, other), parts, resume=True)
+    assert run_calling(note, recipe, parts, resume=True).resumed_at == 2
+    assert_equal_runs(whole, parts)
+    # After a step there stand the numbers of the next one.
+    assert seen == [(2, pytest.approx(0.3)), (2, 0.2), (1, pytest.approx(0.1)), (1, 0)]
+    history = RunFolder(whole).history()
+    rates = [5e-4 * (1 + math.cos(math.pi * step / 4)) for step in range(4)]
+    assert [record["lr"] for record in history] == pytest.approx(rates)
+    assert history[3]["ssim"] == pytest.approx(history[0]["ssim"] / 4, rel=0.2), "0.1 is left"
+    assert [record["alpha_consistency"] > 0 for record in history] == [False, False, True, True]
+    terms = {"mse", "ssim", "visibility", "anchor_visibility"}
+    for record in history:
+        assert record["depth_consistency"] > 0
+        found = sum(record[n] for n in terms | {"alpha_consistency", "depth_consistency"})
+        assert found == pytest.approx(record["loss"])
 
 
 @pytest.mark.slow
-def test_workers_and_several_kills_change_nothing(tiny: Tiny, tmp_path: Path) -> None:
-    options = ("training.steps=40", "training.save_every=1")
-    recipe, with_workers = (tiny("locus", *options, f"training.workers={n}") for n in (0, 2))
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [
+        ("locus", ("training.ema=0.9", "training.render_views=1")),
+        ("tokengs", ("training.accumulate=2", "views.mirror=0.5")),
+        ("locus", ("training.precision=bf16",)),
+    ],
+)
+def test_several_kills_and_workers_change_nothing(tmp_path, name, overrides):
+    options = ("steps=40", "save_every=5", "collapse_window=10")
+    recipe = tiny(name, *(f"training.{option}" for option in options), *overrides)
+    with_workers = resolve(recipe.tree, ["training.workers=2"])
     run(recipe, tmp_path / "through")
-    kill_after(9, with_workers, tmp_path / "killed")
-    kill_after(17, with_workers, tmp_path / "killed", resume=True)
-    kill_after(18, recipe, tmp_path / "killed", resume=True)
-    resumed(with_workers, tmp_path / "killed")
+    for steps, killed in ((13, recipe), (17, with_workers), (28, with_workers)):
+
+        def kill(trainer, stop, steps=steps):
+            if trainer.step == steps:
+                raise Killed
+
+        with pytest.raises(Killed):
+            run_calling(kill, killed, tmp_path / "killed", resume=True)
+        assert len(RunFolder(tmp_path / "killed").history()) == steps
+    assert run(recipe, tmp_path / "killed", resume=True).resumed_at == 25
     assert_equal_runs(tmp_path / "through", tmp_path / "killed")
 
 
-def test_a_stopped_run_goes_on_where_it_stopped(tiny: Tiny, tmp_path: Path) -> None:
-    recipe = tiny("locus", "training.save_every=0")
-    run(recipe, tmp_path / "through")
-
-    def ask(trainer: Trainer, stop: StopRequest) -> None:
-        stop.signal = None if trainer.step < 2 else signal.SIGTERM
-
-    stopped = run_calling(ask, recipe, tmp_path / "stopped")
-    assert stopped.steps == 3, "a request is seen at the end of the step in which it comes"
-    assert resumed(recipe, tmp_path / "stopped").resumed_at == 3
-    assert_equal_runs(tmp_path / "through", tmp_path / "stopped")
-
-
-def test_resume_starts_a_run_that_is_new_and_leaves_a_finished_one(
-    tiny: Tiny, tmp_path: Path
-) -> None:
-    recipe, folder = tiny("tokengs"), tmp_path / "run"
-    first = resumed(recipe, folder)
-    assert (first.resumed_at, first.steps) == (None, 4)
-    files = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
-    again = resumed(recipe, folder)
-    assert (again.resumed_at, again.steps, again.stopped_by) == (4, 4, None)
-    assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == files
-    assert same(weights(first), weights(again))
-
-
-def test_a_kill_between_the_first_two_files_loses_nothing(
-    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recipe, folder = tiny("tokengs", "training.save_every=0"), tmp_path / "run"
-
+def test_a_kill_between_the_first_two_files_loses_nothing(tmp_path, monkeypatch):
+    recipe = tiny("tokengs", "training.steps=1", "optimizer.warmup=0")
     with monkeypatch.context() as patch:
         patch.setattr("qgs.engine.folder.save", Mock(side_effect=Killed))
         with pytest.raises(Killed):
-            run(recipe, folder)
-    assert not (folder / "checkpoint.safetensors").exists()
-    assert resumed(recipe, folder).resumed_at == 4
-    assert CheckpointFile(folder / "checkpoint.safetensors").step == 4
+            run(recipe, tmp_path)
+    assert run(recipe, tmp_path, resume=True).resumed_at == 1
+    assert CheckpointFile(tmp_path / "checkpoint.safetensors").step == 1
 
 
-def test_a_longer_budget_continues_a_finished_run(tiny: Tiny, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    resumed(tiny("tokengs"), folder)
-    longer = tiny("tokengs", "training.steps=6", "evaluation.scenes=1", "training.save_every=7")
-    assert resumed(longer, folder).steps == 6
-    assert [step for step, *_ in losses(folder)] == [1, 2, 3, 4, 5, 6]
-    assert "steps: 6" in (folder / "recipe.yaml").read_text()
-    assert CheckpointFile(folder / "checkpoint.safetensors").step == 6
+def test_a_longer_budget_goes_on_without_damaged_and_lost_records(copied, caplog):
+    files = copied / "history.jsonl", copied / "evaluations.jsonl"
+    for file in files:
+        file.write_text(f'{{"step": 2, "lo\n[1]\n{file.read_text()}{{"step": 4}}\n')
+    in_halves = Path(shutil.copytree(copied, copied.with_name("halves")))
+    longer = ("training.steps=4", "training.evaluate_every=4", "evaluation.scenes=1")
+    assert resumed(copied, *longer, "training.save_every=7").steps == 4
+    history, evaluations = (read_jsonl(file) for file in files)
+    assert [record["step"] for record in history] == [1, 2, 3, 4]
+    assert [record["step"] for record in evaluations] == [2, 2, 3, 3, 4, 4]
+    for file in files:
+        for line in (1, 2):
+            assert f"{file}, line {line} is damaged" in caplog.text
+    assert "steps: 4" in (copied / "recipe.yaml").read_text()
+    assert CheckpointFile(copied / "checkpoint.safetensors").step == 4
+    last = resumed(in_halves, *longer, "training.accumulate=2").folder.history()[-1]
+    for name in ("lr", "loss", "gradient"):
+        assert last[name] == pytest.approx(history[-1][name], rel=1e-4)
+    samples = [parts_of(folder)["counters"]["samples"] for folder in (copied, in_halves)]
+    assert samples == [8, 8]
 
 
-def test_the_clock_goes_on(tiny: Tiny, tmp_path: Path) -> None:
-    recipe = tiny("tokengs", "training.steps=100000", "training.seconds=1.5")
-    kill_after(5, tiny("tokengs", "training.steps=5", "training.save_every=4"), tmp_path / "run")
-    change_counters(tmp_path / "run", seconds=1.0)
-    result = resumed(recipe, tmp_path / "run")
-    history = result.folder.history()
-    assert [record["seconds"] for record in history[4:6]] == [1.0, history[5]["seconds"]]
-    assert 1.5 <= result.seconds < 10
+def test_the_clock_goes_on(copied):
+    change_counters(copied, seconds=1.0)
+    budget = ("training.steps=100000", "training.seconds=1.02", "training.evaluate_every=0")
+    result = resumed(copied, *budget)
+    seconds = [record["seconds"] for record in result.folder.history()]
+    assert seconds[3] == 1.0
+    assert seconds[4] > 1.0
+    assert 1.02 <= result.seconds < 10
 
 
-def test_a_run_killed_before_its_first_save_starts_again(tiny: Tiny, tmp_path: Path) -> None:
-    recipe, folder = tiny("locus"), tmp_path / "run"
-    kill_after(2, recipe, folder)
+def test_a_run_killed_before_its_first_save_starts_again(trained_run, copied):
+    for file in copied.glob("*.safetensors"):
+        file.unlink()
     for name in (".state.safetensors.4711.tmp", ".tmpA9b0zZ"):
-        (folder / name).write_text("half a state")
-    with (folder / "history.jsonl").open("a") as file:
-        file.write('{"step": 3, "lo')
+        (copied / name).write_text("half a state")
     with pytest.raises(OtherRunError, match=r"seed: 1 here, 0 in the run"):
-        resumed(tiny("locus", "seed=1"), folder)
-    assert resumed(recipe, folder).resumed_at is None
-    assert [step for step, *_ in losses(folder)] == [1, 2, 3, 4]
-    assert not list(folder.glob(".*"))
+        resumed(copied, "seed=1")
+    assert resumed(copied).resumed_at is None
+    assert_equal_runs(copied, trained_run.folder.path)
+    assert not list(copied.glob(".*"))
 
 
-def test_another_recipe_is_refused_by_its_keys(tiny: Tiny, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    kill_after(2, tiny("tokengs", "training.save_every=1"), folder)
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+def test_a_finished_run_is_left_as_it_is_and_others_are_refused(trained_run, copied):
+    def files():
+        return {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in copied.glob("*.*")}
+
+    before = files()
+    again = resumed(copied)
+    assert (again.resumed_at, again.steps, again.stopped_by) == (3, 3, None)
+    assert same(weights(trained_run), weights(again))
     other = ("optimizer.learning_rate=1e-3", "seed=4", "training.save_every=3")
     with pytest.raises(OtherRunError) as caught:
-        resumed(tiny("tokengs", *other), folder)
-    message = str(caught.value)
-    assert "optimizer.learning_rate: 0.001 here, 0.0015 in the run" in message
-    assert "seed: 4 here, 0 in the run" in message
-    assert "training.save_every:" not in message
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-
-
-def test_a_step_must_see_as_many_samples(tiny: Tiny, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    recipe = tiny("tokengs", "training.batch_size=2", "training.save_every=1")
-    run(recipe, tmp_path / "through")
-    kill_after(2, recipe, folder)
+        resumed(copied, *other)
+    assert "optimizer.learning_rate: 0.001 here, 0.0015 in the run" in str(caught.value)
+    assert "seed: 4 here, 0 in the run" in str(caught.value)
+    assert "training.save_every:" not in str(caught.value)
     with pytest.raises(OtherRunError, match=r"see 2 samples.*see 3.*batch_size=2"):
-        resumed(tiny("tokengs", "training.batch_size=3"), folder)
-    halves = tiny("tokengs", "training.batch_size=2", "training.accumulate=2")
-    assert resumed(halves, folder).steps == 4
-    for ours, theirs in zip(losses(folder), losses(tmp_path / "through"), strict=True):
-        assert ours == pytest.approx(theirs, rel=1e-4)
-
-
-def test_other_scenes_are_refused(tiny: Tiny, tmp_path: Path) -> None:
-    recipe = tiny("tokengs", "training.save_every=1")
-    kill_after(2, recipe, tmp_path / "run")
-    change_counters(tmp_path / "run", scenes="others")
-    with pytest.raises(OtherRunError, match="other training scenes"):
-        resumed(recipe, tmp_path / "run")
-
-
-def test_one_process_at_a_time_trains_in_a_folder(tiny: Tiny, tmp_path: Path) -> None:
-    recipe = tiny("tokengs")
-    kill_after(2, recipe, tmp_path / "run")
-    folder = RunFolder(tmp_path / "run")
+        resumed(copied, "training.batch_size=3")
+    folder = RunFolder(copied)
     folder.take()
     with pytest.raises(FileExistsError, match="another process is training"):
-        resumed(recipe, tmp_path / "run")
+        resumed(copied)
     folder.close()
-    assert resumed(recipe, tmp_path / "run").steps == 4
+    resumed(copied)
+    assert files() == before
+    change_counters(copied, scenes="others")
+    with pytest.raises(OtherRunError, match="other training scenes"):
+        resumed(copied)
 
 
-def test_a_state_that_is_cut_off_or_something_else_is_refused(tiny: Tiny, tmp_path: Path) -> None:
-    recipe, folder = tiny("tokengs", "training.save_every=1"), tmp_path / "run"
-    kill_after(2, recipe, folder)
-    file = folder / "state.safetensors"
-    for content in (file.read_bytes()[:-100], (folder / "checkpoint.safetensors").read_bytes()):
-        file.write_bytes(content)
-        with pytest.raises(CheckpointError, match=str(file)):
-            resumed(recipe, folder)
-
-
-def test_random_states_come_back() -> None:
+def test_random_states_come_back():
     states = RandomStates(Accelerator(cpu=True))
 
-    def draw() -> tuple[float, float, float]:
-        return random.random(), float(np.random.normal()), float(torch.rand(()))
+    def draw():
+        return random.random(), np.random.normal(), float(torch.rand(()))
 
     np.random.normal()
     saved = states.state()
-    as_json = {k: v for k, v in saved.items() if not torch.is_tensor(v)}
-    first = draw()
-    draw()
-    states.load_state({**saved, **json.loads(json.dumps(as_json))})
+    first, _ = draw(), draw()
+    values = {k: v for k, v in saved.items() if not torch.is_tensor(v)}
+    states.load_state(saved | json.loads(json.dumps(values)))
     assert draw() == first
 
 
 @pytest.mark.slow
-def test_killed_runs_go_on_from_whole_files() -> None:
+def test_killed_runs_go_on_from_whole_files():
     """Some kills must come inside a save, for this to prove anything."""
     tool = Path(__file__).parents[2] / "tools" / "kill.py"
     done = subprocess.run(

@@ -5,16 +5,16 @@ import json
 import re
 import sys
 import time
-from collections.abc import Callable
 from importlib.machinery import ModuleSpec
-from pathlib import Path
 from unittest.mock import MagicMock
 
 import pytest
 from accelerate import PartialState
 from rich.console import Console
-from training_runs import Tiny, run, tensorboard_events
+from training_runs import TRAINED, run, tiny
 
+from qgs.contracts import MissingExtraError
+from qgs.engine import tracking
 from qgs.engine.tracking import Trackers, TrainingProgress
 
 FILE_TRACKER = """
@@ -32,79 +32,77 @@ class Lines(Tracker):
 
 plugin = Lines
 """
-
-
-def test_a_distribution_offers_a_tracker_by_an_entry_point(
-    tiny: Tiny, tmp_path: Path, install: Callable[..., None]
-) -> None:
-    install("qgs-lines", "lines", FILE_TRACKER, group="qgs.trackers")
-    result = run(tiny("tokengs", "training.trackers=[lines]"), tmp_path / "run")
-    lines = [json.loads(line) for line in (tmp_path / "run" / "lines.jsonl").open()]
-    assert lines[0] == [0, {"width": 32}]
-    losses = [(step, values["loss"]) for step, values in lines[1:]]
-    assert losses == [(record["step"], record["loss"]) for record in result.folder.history()]
-    with pytest.raises(ValueError, match="lines, tensorboard, wandb"):
-        Trackers(("linez",))
-
-
 FAILING_TRACKER = """
 from qgs.engine.tracking import Tracker
 
 class Failing(Tracker):
     def __init__(self, run, options, step):
         self.closed = run / "closed"
-        if FAILS == "open":
+        if FAILS == "opens":
             raise OSError("no service")
     def log(self, values, step):
         raise OSError("no service")
     def close(self):
-        self.closed.touch()
+        self.closed.write_text(FAILS)
 
 plugin = Failing
 """
 
 
-@pytest.mark.parametrize("fails", ["open", "log"])
-def test_a_tracker_that_fails_is_left_out_and_the_training_goes_on(
-    fails: str,
-    tiny: Tiny,
-    tmp_path: Path,
-    install: Callable[..., None],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    install("qgs-lines", "lines", FILE_TRACKER, group="qgs.trackers")
-    code = f"FAILS = {fails!r}\n{FAILING_TRACKER}"
-    install(f"qgs-{fails}-fails", f"{fails}-fails", code, group="qgs.trackers")
-    result = run(tiny("tokengs", f"training.trackers=[{fails}-fails, lines]"), tmp_path / "run")
-    assert [f"{fails}-fails" in record.message for record in caplog.records].count(True) == 1
-    assert (tmp_path / "run" / "closed").exists() == (fails == "log")
-    lines = (tmp_path / "run" / "lines.jsonl").read_text().splitlines()
-    assert len(lines) == 1 + result.steps
+def test_distributions_offer_trackers_and_one_that_fails_is_left_out(tmp_path, install, caplog):
+    group = {"group": "qgs.trackers"}
+    install("qgs-lines", "lines", FILE_TRACKER, **group)
+    for name in ("opens", "logs"):
+        install(f"qgs-{name}", name, f"FAILS = {name!r}\n{FAILING_TRACKER}", **group)
+    result = run(tiny("tokengs", "training.trackers=[opens, logs, lines]"), tmp_path)
+    first, *lines = map(json.loads, (tmp_path / "lines.jsonl").open())
+    assert first == [0, {"width": 32}]
+    assert lines == [[record["step"], record] for record in result.folder.history()]
+    told = [record.message for record in caplog.records]
+    assert [" opens " in line for line in told] == [True, False]
+    assert [" logs " in line for line in told] == [False, True]
+    assert (tmp_path / "closed").read_text() == "logs"
 
 
-def test_a_resumed_run_takes_back_what_was_told_of_lost_steps(tiny: Tiny, tmp_path: Path) -> None:
-    pytest.importorskip("tensorboard", reason="the extra `tensorboard` is not installed")
-    for first, value in ((1, 1.0), (3, 2.0)):
-        tracking = Trackers(("tensorboard",))
-        tracking.open(tmp_path, tiny("locus"), step=first - 1)
-        for step in range(first, 5):
-            tracking.log({"loss": value}, step)
-        tracking.close()
-        time.sleep(1.1)  # files of one second are read in the order of a number in their names
-    events = tensorboard_events(tmp_path).Scalars("loss")
-    assert [(e.step, e.value) for e in events] == [(1, 1.0), (2, 1.0), (3, 2.0), (4, 2.0)]
+def test_a_missing_tracker_is_told_before_anything_is_made(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="tensorboard, wandb"):
+        Trackers(("linez",))
+    monkeypatch.setattr(tracking, "find_spec", lambda name: None)
+    with pytest.raises(MissingExtraError, match=r"query-gaussians\[tensorboard\]"):
+        run(tiny("tokengs", "training.trackers=[tensorboard]"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
-def test_a_resumed_run_goes_on_in_its_run_of_wandb(
-    tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tensorboard_gets_what_the_history_gets_and_drops_what_was_lost(copied):
+    """Of a resumed run: as if it had been told of steps that came after the last save."""
+    name = "tensorboard.backend.event_processing.event_accumulator"
+    module = pytest.importorskip(name, reason="the extra `tensorboard` is not installed")
+    recipe = tiny("locus", *TRAINED, "training.trackers=[tensorboard]", "training.steps=4")
+    lost = Trackers(("tensorboard",))
+    lost.open(copied, recipe)
+    for step in range(1, 6):
+        lost.log({"loss": float(step)}, step)
+    lost.close()
+    time.sleep(1.1)  # files of one second are read in the order of a number in their names
+    last = run(recipe, copied, resume=True).folder.history()[-1]
+    events = module.EventAccumulator(str(copied / "tensorboard")).Reload()
+    told = [(event.step, event.value) for event in events.Scalars("loss")]
+    assert told == [(1, 1.0), (2, 2.0), (3, 3.0), (4, pytest.approx(last["loss"]))]
+    for name in ("psnr", "lr"):
+        assert [e.value for e in events.Scalars(name)] == [pytest.approx(last[name])]
+    for name in ("evaluation/raw/psnr", "evaluation/ema/ssim"):
+        assert [event.step for event in events.Scalars(name)] == [4]
+    assert len(events.Images("evaluation")) == 1
+
+
+def test_a_resumed_run_goes_on_in_its_run_of_wandb(tmp_path, monkeypatch):
     wandb = MagicMock(__spec__=ModuleSpec("wandb", None))
     monkeypatch.setitem(sys.modules, "wandb", wandb)
     PartialState(cpu=True)  # accelerate's trackers ask it which process they are in
     for step in (0, 4):
-        tracking = Trackers(("wandb",))
-        tracking.open(tmp_path, tiny("locus"), step)
-        tracking.log({"loss": 0.5}, step + 1)
+        trackers = Trackers(("wandb",))
+        trackers.open(tmp_path, tiny("locus"), step)
+        trackers.log({"loss": 0.5}, step + 1)
     first, second = (call.kwargs for call in wandb.init.call_args_list)
     assert first == second
     assert first["id"]
@@ -112,32 +110,15 @@ def test_a_resumed_run_goes_on_in_its_run_of_wandb(
     assert logged == [1, 5]
 
 
-def shown(monkeypatch: pytest.MonkeyPatch, *steps: tuple[int, int, float, float]) -> list[str]:
-    """The lines for (step, images, seconds, used), each shown."""
-    monkeypatch.setattr("qgs.engine.tracking._LOG_SECONDS", 0.0)
-    told = io.StringIO()
-    console = Console(width=200, file=told)
-    with TrainingProgress(console) as bar:
-        for step, images, seconds, used in steps:
-            assert bar.update(step, 0.1, 20.0, images, seconds, used)
-    return [line for line in told.getvalue().splitlines() if line]
-
-
-def left(line: str) -> str:
-    found = re.search(r"(\S+) left", line)
-    assert found
-    return found[1]
-
-
-def test_time_left_is_what_the_rest_takes_at_this_speed(monkeypatch: pytest.MonkeyPatch) -> None:
-    *_, line = shown(monkeypatch, (1, 8, 0.0, 0.01), (26, 208, 100.0, 0.26))
-    assert left(line) == "0:04:56", "0.74 of the budget, 100 s for each 0.25"
-    assert "2.0 images/s" in line
-
-
-def test_a_resumed_run_counts_from_where_it_resumed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_speed_and_time_left_are_those_since_the_run_began_or_resumed(monkeypatch):
+    """0.74 of the budget, 100 s for each 0.25; and 0.399 of it, 10 s for each 0.1."""
+    monkeypatch.setattr(tracking, "_LOG_SECONDS", 0.0)
     slow_before = 10_000.0
-    first, second = (501, 4008, slow_before, 0.501), (601, 4808, slow_before + 10, 0.601)
-    *_, line = shown(monkeypatch, first, second)
-    assert left(line) == "0:00:40"
-    assert "80 images/s" in line
+    resumed = [(501, 4008, slow_before, 0.501), (601, 4808, slow_before + 10, 0.601)]
+    new = [(1, 8, 0.0, 0.01), (26, 208, 100.0, 0.26)]
+    for steps, speed, left in ((new, "2.0", "0:04:56"), (resumed, "80", "0:00:40")):
+        console = Console(width=200, file=io.StringIO())
+        with TrainingProgress(console) as bar:
+            for step, *rest in steps:
+                assert bar.update(step, 0.1, 20.0, *rest)
+        assert re.search(rf" {speed} images/s .*{left} left", console.file.getvalue())

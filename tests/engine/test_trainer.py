@@ -1,125 +1,214 @@
-"""Whole runs of tiny models on procedural rooms."""
+"""Whole runs of tiny models on procedural rooms, and what they leave."""
 
-import os
-import signal
-import threading
-import time
-from pathlib import Path
+from typing import get_args
 
+import numpy as np
 import pytest
 import torch
-from training_runs import Tiny, run_anywhere
+from PIL import Image
+from qgs_viewer.curves import curves_of
+from training_runs import (
+    TRAINED,
+    change_samples,
+    first_batch,
+    losses,
+    parts_of,
+    read_jsonl,
+    run,
+    same,
+    tiny,
+    weights,
+)
 
 import qgs
-from qgs.composer import resolve
+from qgs.composer import Recipe, resolve
 from qgs.contracts import TrainingConfig
-from qgs.data.stream import training_batches
-from qgs.engine.folder import RunFolder
+from qgs.data.evaluation import evaluation_samples
+from qgs.drawing.images import rgb_picture
+from qgs.engine import guard
+from qgs.engine.evaluation import evaluate
+from qgs.engine.guard import NonFiniteError
+from qgs.engine.precision import DTYPES
 from qgs.io.checkpoint import CheckpointFile
 
 
-@pytest.mark.parametrize("name", [pytest.param("tokengs", marks=pytest.mark.slow), "locus"])
-def test_training_lowers_the_loss(tiny: Tiny, tmp_path: Path, name: str) -> None:
-    options = ("training.steps=40", "optimizer.warmup=4", "data.scenes=1", "views.mirror=0.0")
-    result = run_anywhere(tiny(name, *options), tmp_path / "run")
-    losses = [record["loss"] for record in result.folder.history()]
-    assert result.steps == len(losses) == 40
-    assert sum(losses[-10:]) < 0.95 * sum(losses[:10])
+def test_training_lowers_the_loss(tmp_path):
+    options = ("training.steps=20", "optimizer.warmup=4", "data.scenes=1", "views.mirror=0.0")
+    rate = "optimizer.learning_rate=4e-3"
+    run(tiny("locus", *options, rate), tmp_path, device="auto")
+    falling = losses(tmp_path)
+    assert len(falling) == 20
+    assert sum(falling[-5:]) < 0.95 * sum(falling[:5])
 
 
-def test_a_run_leaves_recipe_history_and_checkpoint(tiny: Tiny, tmp_path: Path) -> None:
-    recipe = tiny("locus")
-    result = run_anywhere(recipe, tmp_path / "run")
-    assert resolve(tmp_path / "run" / "recipe.yaml").tree == recipe.tree
-    history = result.folder.history()
-    assert [record["step"] for record in history] == [1, 2, 3, 4]
+@pytest.mark.slow
+def test_locusgs_is_ahead_of_tokengs_and_of_the_baselines(tmp_path):
+    """What the demo shows, on a shorter budget: minutes of training."""
+    evaluations = []
+    for name in ("tokengs", "locus"):
+        recipe = resolve(f"tiny/{name}.yaml", ["training.seconds=60"])
+        model = run(recipe, tmp_path / name, device="auto").model
+        evaluations.append(evaluate(model, recipe))
+    token, locus = evaluations
+    baseline = token.mean("psnr", "mean_colour")
+    assert locus.mean("psnr") > token.mean("psnr") > baseline
+    assert locus.mean("dispersion_median") < token.mean("dispersion_median")
+
+
+def test_a_run_leaves_recipe_history_and_checkpoint(trained_run):
+    folder, recipe = trained_run.folder, tiny("locus", *TRAINED)
+    assert resolve(folder.recipe).tree == recipe.tree
+    history = folder.history()
+    assert [record["step"] for record in history] == [1, 2, 3]
     terms = {"mse", "ssim", "visibility", "anchor_visibility"}
     assert terms | {"loss", "psnr", "lr", "seconds", "gradient"} <= history[0].keys()
     for record in history:
         assert record["loss"] == pytest.approx(sum(record[term] for term in terms))
-    assert CheckpointFile(result.folder.checkpoint).step == 4
-    loaded = qgs.load(result.folder.checkpoint)
-    batch = next(training_batches(recipe.build_data(), recipe.views, 1, seed=1))
+    assert CheckpointFile(folder.checkpoint).step == 3
+    model, loaded = trained_run.model, qgs.load(folder.checkpoint)
+    assert same(loaded.state_dict(), model.state_dict())
+    inputs = first_batch(recipe).inputs
+    assert torch.equal(loaded(inputs).gaussians.means, model(inputs).gaussians.means)
+
+
+def test_averages_and_evaluations_leave_the_training_alone(trained_run, tmp_path):
+    plain = run(tiny("locus"), tmp_path)
+    parts, watched = parts_of(tmp_path), parts_of(trained_run.folder.path)
+    for name in ("weights", "moments", "random"):
+        assert same(parts[name], watched[name])
+    assert losses(tmp_path) == losses(trained_run.folder.path)
+    files = {"recipe.yaml", "history.jsonl", "checkpoint.safetensors", "state.safetensors"}
+    assert {path.name for path in tmp_path.iterdir()} == files
+    average, last = qgs.load(trained_run.folder.checkpoint_ema).state_dict(), weights(plain)
+    start = tiny("locus").build_model().state_dict()
+    lag, way = (
+        max(float((t - last[name]).abs().max()) for name, t in others.items())
+        for others in (average, start)
+    )
+    assert 0 < lag < way, "it follows the weights"
+
+
+def test_weights_and_their_average_are_judged_and_shown_side_by_side(trained_run):
+    folder, recipe = trained_run.folder, tiny("locus", *TRAINED)
+    records = read_jsonl(folder.path / "evaluations.jsonl")
+    assert [(r["step"], r["weights"], r["scenes"], r["scenes_in_protocol"]) for r in records] == [
+        (step, weights, 2, 2) for step in (2, 3) for weights in ("raw", "ema")
+    ]
+    raw, average = (qgs.load(file) for file in (folder.checkpoint, folder.checkpoint_ema))
+    scores = [evaluate(model, recipe).means() for model in (raw, average)]
+    assert [record["scores"] for record in records[2:]] == scores
+    assert scores[0]["psnr"] != scores[1]["psnr"]
+    pictures = {path.name: path for path in (folder.path / "pictures").iterdir()}
+    assert pictures.keys() == {"step-2.png", "step-3.png"}
+    picture = np.asarray(Image.open(pictures["step-3.png"]))
+    side, gap, columns, rows = 16, 4, 5, 2
+    assert picture.shape == (rows * (side + gap) - gap, columns * (side + gap) - gap, 3)
+    sample = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[0]
     with torch.no_grad():
-        torch.testing.assert_close(
-            loaded(batch.inputs).gaussians.means, result.model(batch.inputs).gaussians.means
-        )
+        gaussians = raw(sample.inputs).gaussians
+        rendering = raw.render(gaussians, sample.targets.cameras)
+    images = *sample.inputs.images[0], sample.targets.images[0, 0], rendering.rgb[0, 0]
+    for column, image in enumerate(images):
+        shown = picture[:side, column * (side + gap) :][:, :side]
+        np.testing.assert_array_equal(shown, rgb_picture(image))
 
 
-def test_accumulated_batches_are_one_larger_batch(tiny: Tiny, tmp_path: Path) -> None:
+def test_accumulated_batches_are_one_larger_batch(tmp_path):
     first = []
     for count in (1, 2):
-        options = ("batch_size=2", f"accumulate={count}", "steps=1")
-        recipe = tiny("tokengs", "optimizer.warmup=0", *(f"training.{o}" for o in options))
-        result = run_anywhere(recipe, tmp_path / str(count))
+        options = ("training.steps=1", f"training.accumulate={count}", "optimizer.warmup=0")
+        result = run(tiny("tokengs", *options), tmp_path / str(count))
         first.append(result.folder.history()[0])
     for key in ("loss", "mse", "visibility", "gradient"):
         assert first[0][key] == pytest.approx(first[1][key], rel=1e-4)
 
 
-@pytest.mark.parametrize(("processes", "accumulate"), [(3, 1), (1, 5), (8, 4)])
-def test_scenes_that_do_not_split_evenly_are_refused(processes: int, accumulate: int) -> None:
-    config = TrainingConfig(batch_size=16, accumulate=accumulate)
-    with pytest.raises(ValueError, match=rf"training\.batch_size: 16 .* {processes * accumulate}"):
-        config.scenes_per_batch(processes)
+def test_scenes_that_do_not_split_evenly_are_refused():
+    for processes, accumulate in ((3, 1), (1, 5), (8, 4)):
+        config = TrainingConfig(batch_size=16, accumulate=accumulate)
+        parts = processes * accumulate
+        with pytest.raises(ValueError, match=rf"training\.batch_size: 16 .* {parts}"):
+            config.scenes_per_batch(processes)
 
 
-def test_bf16_trains_with_finite_numbers(tiny: Tiny, tmp_path: Path) -> None:
-    result = run_anywhere(tiny("locus", "training.precision=bf16"), tmp_path / "run")
-    assert all(p.dtype == torch.float32 for p in result.model.parameters())
-    assert all(p.isfinite().all() for p in result.model.parameters())
+def test_bf16_trains_with_finite_numbers(tmp_path):
+    model = run(tiny("locus", "training.precision=bf16"), tmp_path / "run").model
+    assert all(p.dtype == torch.float32 and p.isfinite().all() for p in model.parameters())
+    assert get_args(TrainingConfig.model_fields["precision"].annotation) == tuple(DTYPES)
 
 
-def test_a_time_budget_ends_the_run(tiny: Tiny, tmp_path: Path) -> None:
-    recipe = tiny("tokengs", "training.steps=100000", "training.seconds=1.0")
-    result = run_anywhere(recipe, tmp_path / "run")
-    assert 1.0 <= result.seconds < 10.0
-    assert 1 < result.steps < 100_000
+def test_a_time_budget_ends_the_run(tmp_path):
+    recipe = tiny("tokengs", "training.steps=100000", "training.seconds=0.1")
+    result = run(recipe, tmp_path)
+    assert 0.1 <= result.seconds < 10.0
     history = result.folder.history()
-    assert history[0]["seconds"] == 0
-    schedule = recipe.build_optimizer()
+    assert 1 < result.steps == len(history) < 100_000
     clock = [0.0, *(record["seconds"] for record in history)]
+    assert clock[1] == 0
+    schedule = recipe.build_optimizer()
     expected = [schedule.learning_rate(step, clock[step]) for step in range(len(history))]
     assert [record["lr"] for record in history] == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_saves_and_ends(tiny: Tiny, tmp_path: Path, number: signal.Signals) -> None:
-    before = signal.getsignal(number)
-    history = tmp_path / "run" / "history.jsonl"
+def spoil(monkeypatch, *numbers):
+    """The training samples of these numbers hold a NaN pixel."""
 
-    def interrupt_once_training() -> None:
-        ends = time.monotonic() + 60
-        while not history.exists() and time.monotonic() < ends:
-            threading.Event().wait(0.05)
-        os.kill(os.getpid(), number)
+    def spoiled(sample, number, attempt):
+        if number in numbers:
+            sample.targets.images[0, 0, 0, 0, 0] = torch.nan
 
-    thread = threading.Thread(target=interrupt_once_training, daemon=True)
-    thread.start()
-    result = run_anywhere(tiny("tokengs", "training.steps=100000"), history.parent)
-    thread.join(timeout=60)
-    assert result.stopped_by == number.name
-    assert result.steps == len(result.folder.history())
-    assert CheckpointFile(result.folder.checkpoint).step == result.steps
-    assert signal.getsignal(number) is before
+    change_samples(monkeypatch, spoiled)
 
 
-def test_a_folder_in_use_is_refused_untouched(tiny: Tiny, tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="never overwrites"):
-        run_anywhere(tiny("tokengs"), tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-    with pytest.raises(FileExistsError, match="is a file"):
-        RunFolder(tmp_path / "notes.txt").refuse_other(resume=False)
+def test_bad_steps_are_skipped_on_demand(tmp_path, monkeypatch, caplog):
+    """By a run from its start, and by one that a bad step ended."""
+    spoil(monkeypatch, 2, 6)
+    options = ("training.steps=4", "training.ema=0.9")
+    skipping = tiny("locus", *options, "training.on_nonfinite=skip")
+    through, stopped = tmp_path / "through", tmp_path / "stopped"
+    run(skipping, through)
+    told = [r.message.split(" is ")[0] for r in caplog.records if "is skipped" in r.message]
+    assert told == ["step 2", "step 4"]
+    records = read_jsonl(through / "history.jsonl")
+    kept = [(r["step"], "loss" in r, "skipped" in r) for r in records]
+    assert kept == [(1, True, False), (2, False, True), (3, True, False), (4, False, True)]
+    assert curves_of(through / "checkpoint.safetensors").steps == [1, 3]
+    assert {path.name for path in (through / "incidents").iterdir()} == {"step-2", "step-4"}
+    counted = parts_of(through)["guard"]
+    assert (counted["incidents"], counted["skipped"]) == (2, 1), "a good step lies between the two"
+    for resume in (False, True):
+        with pytest.raises(NonFiniteError, match=r"targets\.images \(1 NaN of") as error:
+            run(tiny("locus", *options), stopped, resume)
+    incident = stopped / "incidents" / "step-2"
+    for part in ("step 2 is not finite", "mse is nan", str(incident)):
+        assert part in str(error.value)
+    assert len(losses(stopped)) == 1
+    saved = qgs.load(incident / "weights.safetensors").state_dict()
+    assert same(saved, parts_of(stopped)["weights"])
+    assert run(skipping, stopped, resume=True).resumed_at == 1
+    ours, theirs = parts_of(stopped), parts_of(through)
+    for name in ("weights", "ema"):
+        assert same(ours[name], theirs[name])
+        assert all(tensor.isfinite().all() for tensor in ours[name].values())
 
 
-def test_a_start_that_fails_leaves_no_folder(tiny: Tiny, tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    photos = {"type": "qgs/photos", "path": str(tmp_path / "nowhere"), "image_size": [32, 32]}
-    with pytest.raises(FileNotFoundError, match="nowhere"):
-        run_anywhere(resolve({**tiny("tokengs").tree, "data": photos}), out)
-    with pytest.raises(ValueError, match=r"optimizer\.warmup"):
-        run_anywhere(tiny("tokengs", "optimizer.warmup=4"), out)
-    with pytest.raises(ValueError, match=r"views\.gap"):
-        run_anywhere(tiny("tokengs", "views.inputs=9", "views.gap=[2, 3]"), out)
-    assert not out.exists()
+def test_a_bad_gradient_ends_the_run_too(tmp_path, monkeypatch):
+    build = Recipe.build_model
+
+    def poisoned(*arguments, **options):
+        model = build(*arguments, **options)
+        next(model.parameters()).register_hook(lambda gradient: gradient * float("inf"))
+        return model
+
+    monkeypatch.setattr(Recipe, "build_model", poisoned)
+    with pytest.raises(NonFiniteError, match="the first bad tensor is gradient of"):
+        run(tiny("tokengs"), tmp_path)
+    assert losses(tmp_path) == []
+
+
+def test_skipping_comes_to_an_end(tmp_path, monkeypatch):
+    spoil(monkeypatch, *range(2, 100))
+    monkeypatch.setattr(guard, "MAX_SKIPPED", 2)
+    with pytest.raises(NonFiniteError, match="2 steps in a row were skipped"):
+        run(tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50"), tmp_path)
+    assert len(read_jsonl(tmp_path / "history.jsonl")) == 3

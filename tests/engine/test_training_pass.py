@@ -1,71 +1,37 @@
 """The objective: the weighted sum of its losses, with all target views at once or few at a time."""
 
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar, TypeAlias
 
 import pytest
 import torch
 from qgs_bench.memory import peak_memory
 from qgs_bench.work import workload_of
-from torch import Tensor, nn
-from training_runs import TWO, Tiny, first_batch
+from qgs_plugintools import Case, checks_for, run_check
+from torch import nn
+from training_runs import TWO, first_batch, tiny
 from varying_head import VaryingHead
 
-from qgs.composer import Recipe
-from qgs.contracts import Loss, Outcome
+from qgs.composer.registry import load_plugin
+from qgs.contracts import Loss
 from qgs.engine.training_pass import TrainingPass, measure
-from qgs.losses import Mask, Opacity
+from qgs.losses import Photometric
 from qgs.metrics.images import psnr
-from qgs.types import Views, map_tensors
+from qgs.types import map_tensors
 
-
-def test_total_is_the_weighted_sum_over_layers_and_losses(tiny: Tiny) -> None:
-    recipe = tiny("tokengs")
-    model, losses, batch = recipe.build_model().train(), recipe.build_losses(), first_batch(recipe)
-    outcome = TrainingPass(model, losses)(batch.inputs, batch.targets)
-    prediction = model(batch.inputs)
-    expected = {"mse": 0.0, "ssim": 0.0, "visibility": 0.0}
-    for layer, weight in ((2, 1 / 3), (4, 2 / 3)):
-        rendering = model.render(prediction.layers[layer].gaussians, batch.targets.cameras)
-        for loss in losses.values():
-            terms = loss(prediction.layers[layer], rendering, batch.targets, batch.inputs)
-            for name, term in terms.items():
-                expected[name] += weight * float(term.detach())
-    assert {name: float(term) for name, term in outcome.terms.items()} == pytest.approx(expected)
-    assert float(outcome.total.detach()) == pytest.approx(sum(expected.values()))
-    torch.testing.assert_close(
-        outcome.signs["psnr"], psnr(rendering.rgb, batch.targets.images).mean().detach()
-    )
-
-
-@pytest.mark.parametrize("name", ["tokengs", "locus"])
-def test_every_parameter_gets_a_finite_gradient(tiny: Tiny, name: str) -> None:
-    recipe = tiny(name)
-    objective = TrainingPass(recipe.build_model().train(), recipe.build_losses())
-    batch = first_batch(recipe)
-    objective(batch.inputs, batch.targets).total.backward()
-    for parameter_name, parameter in objective.named_parameters():
-        assert parameter.grad is not None, parameter_name
-        assert parameter.grad.isfinite().all(), parameter_name
-
-
-TARGETS = 5
-Setting: TypeAlias = Callable[..., tuple]
-RENDERERS = ("qgs/torch", "qgs/cpu")
+TARGETS = 3
 
 
 class Flicker(Loss):
     """How much views differ in brightness: no mean over views, and undeclared as such."""
 
-    name: ClassVar[str] = "flicker"
+    name = "flicker"
 
-    def __init__(self) -> None:
-        super().__init__(Loss.Config())
+    def __init__(self, config):
+        super().__init__(config)
         self.gain = nn.Parameter(torch.tensor(0.7))
 
-    def term(self, prediction, rendering, target, inputs) -> dict[str, Tensor]:
+    def term(self, prediction, rendering, target, inputs):
         assert rendering.rgb.shape[1] == TARGETS
         brightness = rendering.rgb.mean((-3, -2, -1))
         return {"flicker": self.gain * brightness.std(1).mean() + rendering.depth.square().mean()}
@@ -74,131 +40,112 @@ class Flicker(Loss):
 class Blind(Loss):
     """Wants no rendering, and gets none, nor views at a time."""
 
-    name: ClassVar[str] = "blind"
+    name = "blind"
     renderings = "none"
 
-    def term(self, prediction, rendering, target, inputs) -> dict[str, Tensor]:
+    def term(self, prediction, rendering, target, inputs):
         assert rendering.rgb.shape[1] == 0
         assert target.images.shape[1] == TARGETS
         return {"blind": prediction.state.features.square().mean()}
 
 
-def every_loss(recipe: Recipe) -> dict[str, Loss]:
-    extra = {
-        "mask": Mask(Mask.Config()),
-        "opacity": Opacity(Opacity.Config()),
-        "blind": Blind(Loss.Config()),
-    }
-    return {**recipe.build_losses(), **extra}
+class Marked(Loss):
+    """The rendered features, which are to be those of the colours' weights."""
+
+    name = "marked"
+    renderings = "each"
+
+    def term(self, prediction, rendering, target, inputs):
+        return {"marked": (rendering.features - target.images.mean(2, True)).square().mean()}
 
 
-def with_masks(views: Views) -> Views:
-    masks = (views.images.mean(2, keepdim=True) > 0.4).float()
-    return replace(views, masks=masks)
+def setting(renderer, *kinds, dtype=torch.float32):
+    """A training pass with losses of all kinds, input views, and targets with masks."""
+    losses = ("losses.mask={type: qgs/mask}", "losses.opacity={type: qgs/opacity}")
+    options = (f"model.renderer.type={renderer}", f"views.targets={TARGETS}")
+    recipe = tiny("locus", *losses, *options)
+    batch = first_batch(recipe)
+    losses = recipe.build_losses() | {kind.name: kind(Loss.Config()) for kind in (Blind, *kinds)}
+    masks = (batch.targets.images.mean(2, keepdim=True) > 0.4).float()
+    targets = replace(batch.targets, masks=masks)
+    model = recipe.build_model().train().to(dtype)
+    return TrainingPass(model, losses), batch.inputs.to(dtype), targets.to(dtype)
 
 
-@pytest.fixture(scope="module")
-def setting(tiny: Tiny) -> Setting:
-    def make(renderer: str, *, dtype: torch.dtype = torch.float32) -> tuple:
-        recipe = tiny("locus", f"model.renderer.type={renderer}", f"views.targets={TARGETS}")
-        torch.manual_seed(0)
-        batch = first_batch(recipe)
-        model = recipe.build_model().train().to(dtype)
-        inputs, targets = batch.inputs.to(dtype), with_masks(batch.targets).to(dtype)
-        return model, every_loss(recipe), inputs, targets
-
-    return make
-
-
-def written_out(
-    model: nn.Module, losses: Mapping[str, Loss], inputs: Views, targets: Views
-) -> Tensor:
-    """The objective as its definition reads: one graph for all layers and views."""
+def written_out(objective, inputs, targets):
+    """The terms as their definition reads: one graph for all layers and views."""
+    model = objective.model
     prediction = model(inputs)
-    total = torch.zeros(())
-    for number, weight in model.supervision.weights().items():
+    found = {}
+    for number, weight in ((1, 1 / 3), (2, 2 / 3)):
         layer = prediction.layers[number]
         rendering = model.render(layer.gaussians, targets.cameras)
-        for loss in losses.values():
+        for loss in objective.losses.values():
             shown = rendering
             if loss.renderings == "none":
                 shown = map_tensors(lambda tensor: tensor[:, :0], rendering)
-            terms = loss(layer, shown, targets, inputs)
-            total = total + weight * torch.stack(list(terms.values())).sum()
-    return total
+            for name, term in loss(layer, shown, targets, inputs).items():
+                found[name] = found.get(name, 0) + weight * term
+    return found
 
 
-def gradients(module: nn.Module, total: Tensor) -> dict[str, Tensor]:
+def gradients(module, total):
     module.zero_grad()
     total.backward()
     return {n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None}
 
 
-def furthest(found: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> float:
+def furthest(found, wanted):
     """Largest difference, relative to the largest gradient."""
     assert found.keys() == wanted.keys()
     largest = max(float(g.abs().max()) for g in wanted.values())
     return max(float((found[n] - g).abs().max()) for n, g in wanted.items()) / largest
 
 
-def error(objective: TrainingPass, *batch: Views) -> float:
+def error(objective, *batch):
     """How far its gradients are from those of the definition."""
-    wanted = gradients(objective, written_out(objective.model, objective.losses, *batch))
+    wanted = gradients(objective, sum(written_out(objective, *batch).values()))
     return furthest(gradients(objective, objective(*batch).total), wanted)
 
 
-@pytest.mark.parametrize("renderer", RENDERERS)
-@pytest.mark.parametrize("render_views", [0, 1, 2, 9])
-@pytest.mark.parametrize("all_at_once", [False, True])
-def test_gradients_do_not_depend_on_it(
-    setting: Setting, renderer: str, render_views: int, all_at_once: bool
-) -> None:
-    model, losses, *batch = setting(renderer)
-    if all_at_once:
-        losses["flicker"] = Flicker()
-    objective = TrainingPass(model, losses, render_views)
-    assert error(objective, *batch) < 1e-6
-    outcome = objective(*batch)
-    assert float(outcome.total.detach()) == pytest.approx(float(sum(outcome.terms.values())))
-
-
-class Marked(Loss):
-    """The rendered features, which are to be those of the colours' weights."""
-
-    name: ClassVar[str] = "marked"
-    renderings = "each"
-
-    def term(self, prediction, rendering, target, inputs) -> dict[str, Tensor]:
-        return {"marked": (rendering.features - target.images.mean(2, True)).square().mean()}
-
-
-@pytest.mark.parametrize("renderer", RENDERERS)
-@pytest.mark.parametrize("all_at_once", [False, True])
-def test_harmonics_and_features_get_theirs(
-    setting: Setting, renderer: str, all_at_once: bool
-) -> None:
-    model, losses, *batch = setting(renderer)
-    model.head = VaryingHead(model.head)
-    losses |= {"marked": Marked(Loss.Config())} | ({"flicker": Flicker()} if all_at_once else {})
-    objective = TrainingPass(model, losses, render_views=2)
-    assert error(objective, *batch) < 1e-6
-    found = gradients(objective, objective(*batch).total)["model.head.linear.weight"]
-    assert found.unflatten(0, (-1, 28)).abs().amax((0, 2)).gt(0).all(), "all channels"
+@pytest.mark.parametrize("renderer", ["qgs/torch", "qgs/cpu"])
+@pytest.mark.parametrize("varying", [False, True], ids=["colours", "harmonics and features"])
+def test_terms_and_gradients_do_not_depend_on_how_many_views_are_rendered_at_once(
+    renderer, varying
+):
+    wrong = []
+    for all_at_once in ((), (Flicker,)):
+        objective, *batch = setting(renderer, *all_at_once, *[Marked] * varying)
+        if varying:
+            objective.model.head = VaryingHead(objective.model.head)
+        terms = written_out(objective, *batch)
+        wanted = gradients(objective, sum(terms.values()))
+        if varying:
+            channels = wanted["model.head.linear.weight"].unflatten(0, (-1, 28))
+            assert channels.abs().amax((0, 2)).gt(0).all()
+        else:
+            assert wanted.keys() == dict(objective.named_parameters()).keys()
+        for objective.render_views in (0, 1, 2, 9):
+            outcome = objective(*batch)
+            torch.testing.assert_close(outcome.terms, terms)
+            torch.testing.assert_close(outcome.total, sum(terms.values()))
+            distance = furthest(gradients(objective, outcome.total), wanted)
+            if not distance < 1e-6:
+                wrong.append((all_at_once, objective.render_views, distance))
+    assert wrong == []
 
 
 @pytest.mark.parametrize("render_views", [0, 1])
-def test_gradients_of_two_passes_are_those_of_the_definition(
-    tiny: Tiny, two: None, render_views: int
-) -> None:
+def test_gradients_of_two_passes_are_those_of_the_definition(two, render_views):
     """As one graph, in which the two passes and both comparisons stand written out."""
-    factors = "alpha_weight: 0.1, depth_weight: 0.2"
-    recipe = tiny("locus", *TWO, f"objective={{type: two/two_passes, {factors}}}")
+    objective = "objective={type: two/two_passes, alpha_weight: 0.1, depth_weight: 0.2}"
+    recipe = tiny("locus", *TWO, objective, f"training.render_views={render_views}")
     model, batch = recipe.build_model().train(), first_batch(recipe)
-    step = TrainingPass(model, recipe.build_losses(), render_views, recipe.build_objective())
+    step = TrainingPass.of(recipe, model)
     total, seen = torch.zeros(()), []
     for views in ([0, 1, 3, 4], [0, 2, 4]):
         some = batch.inputs.select(views)
-        total = total + written_out(model, step.losses, some, batch.targets) / 2
+        total = total + sum(written_out(step, some, batch.targets).values()) / 2
         seen.append(model.render(model(some).gaussians, batch.targets.cameras))
     for name, factor in (("alpha", 0.1), ("depth", 0.2)):
         one, other = (getattr(rendering, name) for rendering in seen)
@@ -208,75 +155,124 @@ def test_gradients_of_two_passes_are_those_of_the_definition(
     assert furthest(gradients(step, step(batch.inputs, batch.targets).total), wanted) < 1e-5
 
 
+def test_the_objective_of_two_passes_keeps_the_contract(two):
+    (component,) = load_plugin("two").plugin.components
+    case = Case(component.Config())
+    results = [run_check(check, case) for check in checks_for(case, ["core"])]
+    assert len(results) >= 6
+    assert [result.message for result in results if not result.ok] == []
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device")
 @pytest.mark.parametrize("render_views", [1, 2])
-def test_gradients_through_gsplat_do_not_depend_on_it(setting: Setting, render_views: int) -> None:
+def test_gradients_through_gsplat_do_not_depend_on_it(render_views):
     pytest.importorskip("gsplat", reason="gsplat is not installed")
-    model, losses, *batch = setting("qgs/gsplat")
-    objective = TrainingPass(model, losses, render_views).cuda()
-    found = error(objective, *(views.to("cuda") for views in batch))
+    objective, *batch = setting("qgs/gsplat")
+    objective.render_views = render_views
+    found = error(objective.cuda(), *(views.to("cuda") for views in batch))
     assert found < 1e-5, "its kernels add in no fixed order"
 
 
-def test_in_float64_they_are_the_same_numbers(setting: Setting) -> None:
-    model, losses, *batch = setting("qgs/torch", dtype=torch.float64)
-    assert error(TrainingPass(model, losses, 2), *batch) < 1e-13
+def test_in_float64_they_are_the_same_numbers():
+    objective, *batch = setting("qgs/torch", dtype=torch.float64)
+    objective.render_views = 2
+    assert error(objective, *batch) < 1e-13
 
 
-def test_under_autocast_the_gaussians_get_the_same_gradients(setting: Setting) -> None:
-    model, losses, *batch = setting("qgs/cpu")
-    found: dict[int, dict[str, Tensor]] = {}
-    for render_views in (0, 2):
-        objective = TrainingPass(model, losses, render_views)
-        seen = found[render_views] = {}
+def test_under_autocast_the_gaussians_get_the_same_gradients():
+    objective, *batch = setting("qgs/cpu")
+    found = []
+    for objective.render_views in (0, 2):
+        seen = {}
 
-        def note(name: str, value: Mapping[str, Tensor], seen: dict = seen) -> None:
+        def note(name, value, seen=seen):
             if name.startswith("gradient"):
                 seen.update({f"{name} {key}": tensor.float() for key, tensor in value.items()})
 
         objective.hook = note
         with torch.autocast("cpu", torch.bfloat16):
-            outcome = objective(*batch)
-        outcome.total.backward()
-    assert len(found[0]) >= 10, "Gaussians and states of two layers"
-    assert furthest(found[2], found[0]) < 1e-6
+            objective(*batch).total.backward()
+        found.append(seen)
+    assert len(seen) >= 10, "Gaussians and states of two layers"
+    assert furthest(*found) < 1e-6
 
 
-def test_a_scaled_total_scales_every_gradient(setting: Setting) -> None:
-    model, losses, *batch = setting("qgs/cpu")
-    objective = TrainingPass(model, losses, 2)
-    whole = gradients(objective, objective(*batch).total)
+def test_totals_scale_with_their_gradients_and_without_gradients_they_only_measure():
+    objective, *batch = setting("qgs/cpu")
+    objective.render_views = 2
+    outcome = objective(*batch)
+    whole = gradients(objective, outcome.total)
     quarter = gradients(objective, objective(*batch).total / 4)
     assert furthest({n: 4 * g for n, g in quarter.items()}, whole) < 1e-6
+    with torch.no_grad():
+        measured = objective(*batch).total
+    assert not measured.requires_grad
+    assert measured == outcome.total
 
 
-@pytest.mark.parametrize("render_views", [0, 2])
-def test_signs_are_those_of_all_views_of_the_last_layer(
-    setting: Setting, render_views: int
-) -> None:
-    model, losses, inputs, targets = setting("qgs/cpu")
-    outcome: Outcome = TrainingPass(model, losses, render_views)(inputs, targets)
+def test_signs_are_those_of_all_views_of_the_last_layer():
+    objective, inputs, targets = setting("qgs/cpu")
+    model = objective.model
     with torch.no_grad():
         rendering = model.render(model(inputs).gaussians, targets.cameras)
+    likeness = psnr(rendering.rgb, targets.images).mean()
     background = torch.tensor(model.renderer.config.background)
-    wanted = (
-        psnr(rendering.rgb, targets.images).mean(),
-        *measure(rendering.rgb, rendering.alpha, background),
-    )
-    torch.testing.assert_close(tuple(outcome.signs.values()), wanted)
+    wanted = (likeness, *measure(rendering.rgb, rendering.alpha, background))
+    for objective.render_views in (0, 2):
+        signs = objective(inputs, targets).signs
+        torch.testing.assert_close(tuple(signs.values()), wanted)
 
 
-def test_without_gradients_it_only_measures(setting: Setting) -> None:
-    model, losses, *batch = setting("qgs/cpu")
-    with torch.no_grad():
-        outcome = TrainingPass(model, losses, 2)(*batch)
-    assert not outcome.total.requires_grad
-    assert float(outcome.total) == pytest.approx(float(sum(outcome.terms.values())))
+def test_input_views_are_judged_too():
+    recipe = tiny("tokengs", "training.judge_inputs=true", "losses.visibility=null")
+    model, batch = recipe.build_model().train(), first_batch(recipe)
+    inputs, targets = batch.inputs, batch.targets.select([0])
+    step = TrainingPass.of(recipe, model)
+    of_inputs, of_targets = (written_out(step, inputs, views) for views in (inputs, targets))
+    wanted = {name: (2 * of_inputs[name] + term) / 3 for name, term in of_targets.items()}
+    outcome = step(inputs, targets)
+    torch.testing.assert_close(outcome.terms, wanted)
+    outcome.total.backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
+
+
+def test_views_are_joined_in_order_and_only_with_their_like():
+    batch = first_batch(tiny("tokengs"))
+    one, other = (replace(v, masks=v.images[:, :, :1]) for v in (batch.inputs, batch.targets))
+    both = one.joined(other)
+    assert both.cameras.shape == (2, 4)
+    for name in ("images", "masks"):
+        joined = torch.cat([getattr(one, name), getattr(other, name)], 1)
+        assert torch.equal(getattr(both, name), joined)
+    wider = first_batch(tiny("tokengs", "data.image_size=[16, 24]")).targets
+    for unlike in (batch.targets, replace(wider, masks=wider.images[:, :, :1])):
+        with pytest.raises(ValueError, match=r"masks|sizes"):
+            one.joined(unlike)
+
+
+def test_renderers_and_compiled_losses_follow_their_options():
+    recipe = tiny("tokengs")
+    assert recipe.tree["model"]["renderer"]["type"] == "qgs/auto"
+    model, batch = recipe.build_model().eval(), first_batch(recipe)
+    loss = Photometric(Photometric.Config(ssim_weight=0.0))
+    compiled = torch.compile(loss, backend="eager")
+    layer = model(batch.inputs).layers[2]
+    alphas = []
+    for number in (1.0, 2.0, 3.0):
+        model.renderer.config = model.renderer.config.model_copy(update={"dilation": number})
+        loss.config = Photometric.Config(mse_weight=number, ssim_weight=0.0)
+        rendering = model.render(layer.gaussians, batch.targets.cameras)
+        alphas.append(float(rendering.alpha.mean().detach()))
+        error = number * (rendering.rgb - batch.targets.images).square().mean()
+        for step in (loss, compiled):
+            found = step(layer, rendering, batch.targets, batch.inputs)["mse"]
+            torch.testing.assert_close(found, error)
+    assert alphas[0] < alphas[1] < alphas[2]
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="reads Linux's accounts")
-def test_memory_does_not_grow_with_target_views(tiny: Tiny, monkeypatch) -> None:
+def test_memory_does_not_grow_with_target_views(monkeypatch):
     # glibc gives freed buffers back, so that the resident set is what the step needs.
     monkeypatch.setenv("MALLOC_MMAP_THRESHOLD_", "65536")
     many = ("model.queries.count=512", "model.head.gaussians_per_query=64")

@@ -1,0 +1,71 @@
+"""A training in two processes, as a launcher starts them."""
+
+import multiprocessing
+import os
+import signal
+import socket
+import traceback
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from accelerate.state import AcceleratorState
+from training_runs import change_samples, run
+
+from qgs.composer import Recipe, resolve
+from qgs.data.samples import Sample
+from qgs.data.stream import SampleError
+
+SECONDS = 240
+"""After which processes that wait for each other are ended."""
+
+
+def spoil(bad: int, nan: bool) -> None:
+    """Sample `bad`, where it replaces none, has a bad pixel or cannot be made."""
+
+    def change(sample: Sample, number: int, attempt: int) -> None:
+        if number == bad and not attempt:
+            if not nan:
+                raise SampleError(f"scene 'x', frame {bad} (a.png): cannot be read")
+            sample.targets.images[0, 0, 0, 0, 0] = torch.nan
+
+    change_samples(pytest.MonkeyPatch(), change)
+
+
+def train_as(rank: int, port: int, tree: Any, folder: Path, *spoiled: Any) -> Any:
+    """What one of the processes does; it ends, and with it the other, at any other error."""
+    signal.alarm(SECONDS)
+    torch.set_num_threads(1)
+    group = {"MASTER_ADDR": "localhost", "MASTER_PORT": port, "WORLD_SIZE": 2}
+    for name, value in {**group, "RANK": rank, "LOCAL_RANK": rank}.items():
+        os.environ[name] = str(value)
+    AcceleratorState._reset_state(reset_partial_state=True)
+    if spoiled:
+        spoil(*spoiled)
+    try:
+        result = run(resolve(tree), folder, resume=True)
+    except SampleError as error:
+        return f"{error}; {getattr(error, '__notes__', '')}"
+    except BaseException:
+        traceback.print_exc()
+        os._exit(1)
+    weights = result.model.parameters()
+    total = sum(float(p.detach().double().abs().sum()) for p in weights)
+    return result.main, result.steps, dict(result.left_out), total
+
+
+def told_by_two(recipe: Recipe, folder: Path, *spoiled: Any) -> list[Any]:
+    """Continue or start the run in `folder`; what each process knows of it, or its error.
+
+    spoiled: arguments of `spoil`.
+    """
+    with socket.create_server(("localhost", 0)) as free:
+        port = free.getsockname()[1]
+    # Forked, processes need not import anything; with a CUDA torch they could not train.
+    context = multiprocessing.get_context("spawn" if torch.cuda.is_available() else "fork")
+    with ProcessPoolExecutor(2, context) as pool:
+        options = port, dict(recipe.tree), folder, *spoiled
+        jobs = [pool.submit(train_as, rank, *options) for rank in (0, 1)]
+        return [job.result() for job in jobs]
