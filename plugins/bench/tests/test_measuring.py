@@ -1,29 +1,37 @@
-"""Measuring: samples in turn, workloads from recipes, memory of a process of its own."""
+"""Measuring and predicting: samples in turn, workloads, memory of a process of its own, fits."""
 
-import math
+import json
+import subprocess
+import sys
+import time
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 import torch
-from qgs_bench.memory import peak_memory, resident_bytes
+from qgs_bench import predict
+from qgs_bench.counting import count
+from qgs_bench.memory import measure, peak_memory, resident_bytes
 from qgs_bench.run import in_turn, quartiles
-from qgs_bench.work import Operation, Workload, make_task, posed_photos, workload_of
+from qgs_bench.sweep import fit, parse_axis
+from qgs_bench.work import Workload, make_task, posed_photos, workload_of
+from torch.testing import assert_close
 
 from qgs.composer import resolve
-from qgs.geometry.transforms import to_camera, to_pixels
+from qgs.geometry.transforms import to_camera
 
 RECIPES = Path(__file__).parents[3] / "recipes"
+TOKENGS = RECIPES / "tiny/tokengs.yaml"
 SMALL = ["model.width=32", "model.heads=2", "model.queries.count=12"]
 MODEST = Workload(views=2, targets=2, size=(16, 24))
 
 
-def test_quartiles() -> None:
+def test_quartiles():
     assert [*quartiles((2.0, 8.0, 6.0, 4.0, 10.0)).values()] == [4.0, 6.0, 8.0]
 
 
-def test_tasks_take_turns() -> None:
-    calls: list[str] = []
-    heard: list[str] = []
+def test_tasks_take_turns():
+    calls, heard = [], []
     tasks = [lambda name=name: calls.append(name) for name in "abc"]
     columns = in_turn(tasks, rounds=3, warmup=1, say=heard.append)
     assert calls == ["a", "b", "c"] * 4
@@ -31,35 +39,33 @@ def test_tasks_take_turns() -> None:
     assert heard == ["warm-up 1 of 1", *(f"round {n} of 3" for n in (1, 2, 3))]
 
 
-def test_the_recipe_says_how_much_work_there_is() -> None:
+def test_the_recipe_says_how_much_work_there_is():
     recipe = resolve(RECIPES / "locus/dl3dv_4096_4views.yaml")
     assert workload_of(recipe) == Workload(views=4, targets=4, size=(256, 448))
-    assert workload_of(recipe, views=6, size=(64, 32)).size == (64, 32)
-    without_data = resolve(RECIPES / "locus/overlay.yaml")
+    assert workload_of(recipe, views=6, size=(64, 32)) == Workload(6, 4, (64, 32))
     with pytest.raises(ValueError, match=r"no data\.image_size.*--size HxW"):
-        workload_of(without_data)
-    assert workload_of(without_data, size=(8, 8)).views == without_data.views.inputs
+        workload_of(resolve(RECIPES / "locus/overlay.yaml"))
 
 
-def test_random_photos_have_poses_that_look_at_one_point() -> None:
-    views = posed_photos(2, 5, (48, 64), seed=0)
-    assert torch.equal(views.cameras.c2w[0, 0], torch.eye(4))
-    seen = to_camera(torch.tensor([0.0, 0.0, 1.0]).expand(2, 1, 3), views.cameras)
-    torch.testing.assert_close(seen[..., 2], torch.ones(2, 5, 1))
-    pixels = to_pixels(seen, views.cameras.intrinsics)
-    torch.testing.assert_close(pixels, torch.tensor([32.0, 24.0]).expand(2, 5, 1, 2))
-    assert torch.equal(views.images, posed_photos(2, 5, (48, 64), seed=0).images)
-    assert not torch.equal(views.images, posed_photos(2, 5, (48, 64), seed=1).images)
+def test_random_photos_have_poses_that_look_at_one_point():
+    views, again, others = (posed_photos(2, 5, (48, 64), seed) for seed in (0, 0, 1))
+    assert torch.equal(views.images, again.images)
+    assert not torch.equal(views.images, others.images)
+    cameras = views.cameras
+    assert torch.equal(cameras.c2w[0, 0], torch.eye(4))
+    seen = to_camera(torch.tensor([0.0, 0.0, 1.0]).expand(2, 1, 3), cameras)
+    assert_close(seen, torch.tensor([0.0, 0.0, 1.0]).expand(2, 5, 1, 3))
+    assert_close(cameras.intrinsics[0, 0], torch.tensor([64.0, 64.0, 32.0, 24.0]))
 
 
-def test_inference_leaves_the_model_alone_and_a_step_trains_every_part() -> None:
+def test_inference_leaves_the_model_alone_and_a_step_trains_every_part():
     recipe = resolve(RECIPES / "tiny/locus.yaml", SMALL)
     model = recipe.build_model()
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     for operation in ("forward", "render"):
         make_task(operation, recipe, model, MODEST)()
         assert not model.training
-        assert all(torch.equal(before[name], tensor) for name, tensor in model.state_dict().items())
+        assert_close(model.state_dict(), before, rtol=0, atol=0)
         assert all(parameter.grad is None for parameter in model.parameters())
     step = make_task("step", recipe, model, MODEST)
     step()
@@ -69,22 +75,105 @@ def test_inference_leaves_the_model_alone_and_a_step_trains_every_part() -> None
     assert [name for name in same if not name.endswith("k_norm.bias")] == []
 
 
+COMPOSE_FIRST = """
+import sys, qgs, runpy
+for name in ("mvsplat", "depthsplat", "landmark", "gslrm", "globalsplat"):
+    qgs.compose(f"tiny/{name}.yaml", device="meta")
+assert not {"torch._dynamo", "sympy"} & sys.modules.keys()
+runpy.run_module(sys.argv[2], run_name="__main__")
+"""
+
+
+def executable(file: Path, script: str) -> str:
+    """What runs `script` in place of Python."""
+    file.write_text(f"#!/bin/sh\n{script}\n")
+    file.chmod(0o755)
+    return str(file)
+
+
 @pytest.mark.parametrize(
     ("operation", "least", "most"),
-    [("forward", 1, 3), pytest.param("step", 4, math.inf, marks=pytest.mark.slow)],
+    [("forward", 1, 3), pytest.param("step", 4, torch.inf, marks=pytest.mark.slow)],
 )
-def test_memory_of_a_fresh_process(operation: Operation, least: float, most: float) -> None:
-    """A step holds weights, gradients and two moments."""
+def test_memory_of_a_fresh_process(operation, least, most, tmp_path, monkeypatch):
+    """A step holds weights, gradients and two moments.
+
+    Composing on the meta device, which takes place first, imports nothing of torch's compiler:
+    that takes seconds, and initialisers of plug-ins are what might ask for it.
+    """
     ballast = torch.zeros(2**26)  # 256 MiB that the other process must not count
-    recipe = resolve(RECIPES / "tiny/tokengs.yaml", ["model.width=512", "model.heads=8"])
+    recipe = resolve(TOKENGS, ["model.width=512", "model.heads=8"])
     weights = sum(p.numel() for p in recipe.build_model("meta").parameters()) * 4
+    python = executable(tmp_path / "python", f"exec {sys.executable} -c '{COMPOSE_FIRST}' \"$@\"")
+    monkeypatch.setattr(sys, "executable", python)
     peak = peak_memory(recipe, operation, MODEST, threads=1)
     assert least * weights < peak.peak_bytes - peak.idle_bytes < most * weights
     assert peak.idle_bytes < resident_bytes("VmRSS") - ballast.nbytes / 2
 
 
-def test_what_failed_in_the_process_is_told() -> None:
-    recipe = resolve(RECIPES / "tiny/tokengs.yaml", SMALL)
-    uneven = Workload(views=2, targets=2, size=(15, 24))
-    with pytest.raises(ChildProcessError, match="images of 15 x 24 cannot be cut into patches"):
-        peak_memory(recipe, "forward", uneven, threads=1)
+def test_what_failed_in_the_process_is_told(tmp_path, monkeypatch):
+    recipe = resolve(TOKENGS, SMALL)
+    with pytest.raises(ValueError, match="images of 15 x 24 cannot be cut into patches"):
+        measure(dict(recipe.tree), "forward", asdict(Workload(2, 2, (15, 24))), threads=1)
+    for dies, told in (("exit 1", "ended with 1: ValueError: no"), ("kill -9 $$", "was killed")):
+        python = executable(tmp_path / "python", f"echo 'ValueError: no' >&2; {dies}")
+        monkeypatch.setattr(sys, "executable", python)
+        with pytest.raises(ChildProcessError, match=told):
+            peak_memory(recipe, "forward", MODEST, threads=1)
+
+
+def test_axes_double():
+    assert parse_axis("views=2..32").values == (2, 4, 8, 16, 32)
+    assert parse_axis("size=24..100").values == (24, 48, 96)
+    for text in ("views=2-32", "targets=2..32", "views=0..4", "views=4..7"):
+        with pytest.raises(ValueError, match="AXIS=FIRST"):
+            parse_axis(text)
+
+
+def test_the_exponent_of_a_power_and_its_error():
+    found = fit([2, 4, 8, 16], [3 * n**1.5 for n in (2, 4, 8, 16)])
+    assert [*asdict(found).values()] == pytest.approx([1.5, 0, 3, 1.5])
+    noisy = fit([1, 2, 4], [1, 2, 8])  # logarithms 0, 1, 3: slope 1.5, residuals 1/6, -1/3, 1/6
+    assert (noisy.exponent, noisy.last) == pytest.approx((1.5, 2))
+    assert noisy.error == pytest.approx((6 / 36 / 2) ** 0.5)
+    assert fit([2, 4], [1, 2]).error is None
+    assert fit([2], [1]) is None
+
+
+def test_counts_follow_shapes():
+    shallow = ["model.decoder.depth=2", "model.supervision.layers=[1, 2]"]
+    recipe = resolve(TOKENGS, [*SMALL[:2], *shallow])
+    once, twice = (count(recipe, "step", Workload(2, 2, (16, 24), batch=n)) for n in (1, 2))
+    weights = sum(p.nbytes for p in recipe.build_model("meta").parameters())
+    assert once.parameters * 4 == weights
+    assert twice.splats == 2 * once.splats == 2 * 2 * 2 * 256 * 8  # scenes, views, layers
+    assert once.peak > 4 * weights, "weights, gradients and two moments"
+    assert twice.peak > once.peak
+
+
+PREDICT = """
+import json, sys, time, torch
+from qgs_bench import predict
+predict.timer = time.process_time
+torch.set_num_threads(1)
+print(json.dumps(predict.predict_recipes([sys.argv[1]], {})))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["tokengs", "locus", "mvsplat", "depthsplat"])
+def test_near_the_measured(name, monkeypatch):
+    """Of processor time, which other processes disturb less."""
+    monkeypatch.setattr(predict, "timer", time.process_time)
+    torch.set_num_threads(1)
+    path = RECIPES / f"tiny/{name}.yaml"
+    recipe = resolve(path)
+    work = workload_of(recipe)
+    # in a fresh process, which holds nothing of earlier tests
+    done = subprocess.run([sys.executable, "-c", PREDICT, path], stdout=subprocess.PIPE)
+    (found,) = json.loads(done.stdout)
+    for operation in ("forward", "step"):
+        task = make_task(operation, recipe, recipe.build_model(), work)
+        assert found[operation]["seconds"] == pytest.approx(predict._median(task, 7), rel=0.3)
+        peak = peak_memory(recipe, operation, work, threads=1).peak_bytes
+        assert found[operation]["peak_bytes"] == pytest.approx(peak, rel=0.15)

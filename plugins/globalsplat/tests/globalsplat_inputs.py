@@ -1,37 +1,32 @@
-"""Inputs of the tests: cameras side by side, noise pictures, states of two streams."""
+"""Inputs of the tests."""
+
+from dataclasses import replace
+from pathlib import Path
 
 import torch
-from qgs_globalsplat.streams import TEXTURE
+from qgs_globalsplat.losses import Frustum
+from qgs_plugintools import Case
+from qgs_plugintools.inputs import Maker, Sizes
 
 from qgs.contracts import ModelDims
-from qgs.types import Cameras, QueryState, Views
+from qgs.types import Views
 
+RECIPES = Path(__file__).parents[3] / "recipes"
+TINY = RECIPES / "tiny/globalsplat.yaml"
+SMALL = (
+    *("model.width=32", "model.heads=2", "model.decoder.depth=1", "model.supervision.layers=[1]"),
+    *("model.queries.count=40", "model.encoder.patch_size=4", "data.image_size=[16, 16]"),
+)
 DIMS = ModelDims(width=16, heads=2, depth=2)
 
 
-def cameras(count: int = 2, size: tuple[int, int] = (12, 16), scenes: int = 2) -> Cameras:
-    c2w = torch.eye(4).repeat(scenes, count, 1, 1)
-    c2w[..., 0, 3] = 0.3 * torch.arange(count) + 0.1 * torch.arange(scenes)[:, None]
-    c2w[..., 1, 3] = 0.05 * torch.arange(count)
-    lens = torch.tensor([20.0, 18.0, 7.0, 6.5]).expand(scenes, count, 4).clone()
-    return Cameras(c2w, lens, size)
+def made(component, **options):
+    return component(component.Config(**options), DIMS)
 
 
-def views(count: int = 2, size: tuple[int, int] = (12, 16)) -> Views:
-    images = torch.rand(2, count, 3, *size, generator=torch.Generator().manual_seed(0))
-    return Views(images, cameras(count, size))
-
-
-def state(count: int = 5) -> QueryState:
-    draw = torch.Generator().manual_seed(1)
-    geometry, texture = (torch.randn(2, count, DIMS.width, generator=draw) for _ in range(2))
-    return QueryState(geometry, {TEXTURE: texture})
-
-
-def lively(module: torch.nn.Module) -> torch.nn.Module:
-    """`module` with noise on all parameters, so that nothing hides behind an initial 0."""
-    torch.manual_seed(2)
-    with torch.no_grad():
-        for parameter in module.parameters():
-            parameter += 0.3 * torch.randn_like(parameter)
-    return module.double()
+def views(count: int = 2) -> Views:
+    """16 x 24 pixels of two scenes, with unequal focal lengths, off centre."""
+    sizes = Sizes(views=count, image=(16, 24))
+    made = Maker(Case(Frustum.Config()), sizes, torch.Generator()).views()
+    lens = torch.tensor([20.0, 18.0, 7.0, 6.5]).expand(2, count, 4)
+    return replace(made, cameras=replace(made.cameras, intrinsics=lens))

@@ -1,0 +1,116 @@
+"""Losses, view by view; the objective: what passes see, what is compared, who gets the gradient."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+import torch.nn.functional as F
+from globalsplat_inputs import SMALL, TINY, views
+from qgs_globalsplat.losses import Frustum, Regularisers, beyond_frusta
+from qgs_globalsplat.objective import TwoPasses, disagreement, subset
+from qgs_plugintools import Case
+from qgs_plugintools.inputs import Sizes, inputs_of
+from torch import Tensor
+from torch.testing import assert_close
+
+from qgs.composer import resolve
+from qgs.engine.training_pass import TrainingPass
+
+SOFT, NEAR = 0.1, 0.2
+
+
+def beyond_one(points: Tensor, c2w: Tensor, lens: Tensor) -> Tensor:
+    """Softplus of the distances beyond five planes, each through the centre and two corners."""
+    local = (points - c2w[:3, 3]) @ c2w[:3, :3]
+    fx, fy, cx, cy = lens.tolist()
+    corners = [
+        torch.tensor([(u - cx) / fx, (v - cy) / fy, 1.0])
+        for u, v in ((0, 0), (24, 0), (24, 16), (0, 16), (0, 0))
+    ]
+    total = F.softplus((NEAR - local[:, 2]) / SOFT)
+    for first, second in pairwise(corners):
+        inwards = F.normalize(torch.linalg.cross(first, second), dim=0)
+        total = total + F.softplus(-(local @ inwards) * inwards[2].sign() / SOFT)
+    return total
+
+
+def test_the_frustum_of_each_view():
+    """Of points in front, at the sides, behind."""
+    seen = views(3).cameras
+    points = torch.randn(2, 9, 3) * torch.tensor([0.6, 0.6, 2.0])
+    found = beyond_frusta(points, seen, SOFT, NEAR)
+    for scene in range(2):
+        lenses = zip(seen.c2w[scene], seen.intrinsics[scene], strict=True)
+        each = torch.stack([beyond_one(points[scene], *lens) for lens in lenses])
+        assert_close(found[scene], -SOFT * (-each).exp().mean(0).log())
+
+
+GIVEN, NOTHING, _, _ = inputs_of(Case(Frustum.Config()), Sizes(queries=3, gaussians=2)).values()
+"""A prediction of three queries, two Gaussians each; no rendering."""
+
+
+def test_the_input_cameras_count_and_no_others():
+    inputs = views()
+    away = replace(inputs, cameras=replace(inputs.cameras, c2w=-inputs.cameras.c2w))
+    loss = Frustum(Frustum.Config())
+    pairs = ((away, inputs), (inputs, inputs), (inputs, away))
+    one, other, turned = (loss(GIVEN, NOTHING, *pair)["frustum"] for pair in pairs)
+    assert one == other != turned
+
+
+def test_losses_are_means_over_gaussians_of_tokens_that_decode_some():
+    mask = torch.tensor([[True, True, False], [True, False, False]])
+    rest = (replace(GIVEN, state=replace(GIVEN.state, mask=mask)), NOTHING, views(), views())
+
+    def mean(x: Tensor) -> Tensor:
+        return (x[0, :4].mean() + x[1, :2].mean()) / 2
+
+    terms = Regularisers(Regularisers.Config(opacity_weight=0.5, scale_weight=2.0))(*rest)
+    assert_close(terms["mean_opacity"], 0.5 * mean(GIVEN.gaussians.opacities))
+    assert_close(terms["mean_scale"], 2.0 * mean(GIVEN.gaussians.scales))
+    terms = Frustum(Frustum.Config(weight=3.0))(*rest)
+    per_point = beyond_frusta(GIVEN.gaussians.means, views().cameras, 0.05, 0.05)
+    assert_close(terms["frustum"], 3.0 * mean(per_point))
+
+
+def test_passes_share_the_ends_and_part_the_rest():
+    for count in range(3, 13):
+        one, other = subset(count, 0), subset(count, 1)
+        assert {*one} & {*other} == {0, count - 1}
+        assert {*one} | {*other} == {*range(count)}
+        assert all(a < b for part in (one, other) for a, b in pairwise(part))
+        assert 0 <= len(one) - len(other) <= 1
+
+
+def test_both_are_judged_and_compared():
+    two = "objective={type: globalsplat/two_passes, alpha_weight: 0.1, depth_weight: 0.2}"
+    recipe = resolve(TINY, [*SMALL, "views.inputs=5", two])
+    model = recipe.build_model()
+    inputs, targets = views(5), views()
+    outcome = TrainingPass.of(recipe, model)(inputs, targets)
+    parts = [inputs.select(part) for part in ([0, 1, 3, 4], [0, 2, 4])]
+    alone = TrainingPass.of(resolve(TINY, SMALL), model)
+    one, other = (alone(part, targets).terms for part in parts)
+    wanted = {name: (one[name] + other[name]) / 2 for name in one}
+    one, other = (model.render(model(part).gaussians, targets.cameras) for part in parts)
+    wanted["alpha_consistency"] = 0.1 * (one.alpha - other.alpha).abs().mean()
+    wanted["depth_consistency"] = 0.2 * (one.depth - other.depth).abs().mean()
+    assert_close(outcome.terms, wanted)
+    assert_close(outcome.total, sum(wanted.values()))
+
+
+def test_each_is_pulled_to_the_other_that_stands_still():
+    one, other = (torch.tensor([x], requires_grad=True) for x in (1.0, 4.0))
+    apart = disagreement(one, other)
+    apart.backward()
+    assert (apart, one.grad, other.grad) == (3, -0.5, 0.5)
+
+
+def test_two_views_are_too_few_and_it_says_so():
+    with pytest.raises(ValueError, match=r"at least 3 input views, got 2: .* raise views\.inputs"):
+        TwoPasses(TwoPasses.Config()).forward(views(), views(), None)
+
+
+def test_weights_are_the_published_ones():
+    assert TwoPasses.Config().model_dump() == {"alpha_weight": 1e-3, "depth_weight": 1e-2}
