@@ -1,6 +1,7 @@
 """Attention with a bias that is a function: against plain attention, in every number of blocks."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -66,7 +67,8 @@ def test_bfloat16_comes_back_in_bfloat16_and_the_bias_stays_in_float32(attention
     assert not wrong(seen, best, 2e-2)
 
 
-def test_a_pass_without_gradients_comes_before_one_with_them():
+def test_a_pass_without_gradients_comes_before_one_with_them(monkeypatch):
+    monkeypatch.setattr(attention_bias, "_kept", SimpleNamespace())  # no memory yet
     given = case((2, 3, 20, 30, 8))
     with torch.inference_mode():
         bias = InTorch(given["queries"], given["tokens"])
