@@ -49,7 +49,9 @@ def far(views):
 
 
 def test_views_in_any_world_give_the_same_scene(model, views, far, caplog):
-    result = model.reconstruct(far)
+    result = model.train().reconstruct(far)
+    assert model.training, "as before"
+    model.eval()
     inputs = result.sample.inputs
     assert result.sample.input_frames == (0, 1), "all of them"
     torch.testing.assert_close(inputs.cameras.c2w[0, 0], torch.eye(4), atol=1e-5, rtol=0)

@@ -71,6 +71,8 @@ def test_everything_is_written_and_what_a_user_made_is_kept(checkpoint, photos, 
     assert not old.exists()
     assert PlyData.read(tmp_path / "gaussians.ply")["vertex"].count == 32
     assert kinds(record) == {2: "input", 4: "input", 3: "novel"}
+    chosen = "inputs images/2.png, images/4.png, compared with images/3.png; 1 of 7 photos held out"
+    assert record["remarks"][0].startswith(chosen)
     back = record["to_photos"]
     assert back["scale"] == pytest.approx(1 / 0.6)
     np.testing.assert_allclose(record["views"][0]["c2w"], np.eye(4), atol=1e-6)
@@ -175,9 +177,9 @@ def test_photos_that_are_not_there_are_refused(photos):
     assert frame_list("0,8", "--frames", found) == [0, 8]
     with pytest.raises(ValueError, match=r"--frames: '0-8' is no photo"):
         frame_list("0-8", "--frames", found)
-    found.frame_name = ["a/1.png", "b/1.png", *"cdefg"].__getitem__
+    found.frame_name = ["a/1.png", "b/1.png", "11.png", *"defg"].__getitem__
     assert frame_list("b/1.png", "--frames", found) == [1]
-    with pytest.raises(ValueError, match=r"'1\.png' fits 0 \(a/1\.png\), 1 \(b/1\.png\)"):
+    with pytest.raises(ValueError, match=r"'1\.png' fits 0 \(a/1\.png\), 1 \(b/1\.png\)\."):
         frame_list("1.png", "--frames", found)
 
 
