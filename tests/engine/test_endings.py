@@ -35,7 +35,7 @@ def test_a_signal_saves_and_ends(tmp_path, monkeypatch, number):
     before = signal.getsignal(number)
     # The second one, a step later, changes nothing.
     monkeypatch.setattr(TrainingProgress, "update", lambda *_: signal.raise_signal(number))
-    result = run(tiny("tokengs", "training.steps=100000"), tmp_path)
+    result = run(tiny("tokengs", "training.steps=200"), tmp_path)
     assert result.stopped_by == number.name
     assert result.steps == len(result.folder.history()) == 2
     assert CheckpointFile(result.folder.checkpoint).step == 2

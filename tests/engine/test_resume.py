@@ -156,7 +156,7 @@ def test_a_longer_budget_goes_on_without_damaged_and_lost_records(copied, caplog
 
 def test_the_clock_goes_on(copied):
     change_counters(copied, seconds=1.0)
-    budget = ("training.steps=100000", "training.seconds=1.02", "training.evaluate_every=0")
+    budget = ("training.steps=200", "training.seconds=1.02", "training.evaluate_every=0")
     result = resumed(copied, *budget)
     seconds = [record["seconds"] for record in result.folder.history()]
     assert seconds[3] == 1.0

@@ -138,11 +138,11 @@ def test_bf16_trains_with_finite_numbers(tmp_path):
 
 
 def test_a_time_budget_ends_the_run(tmp_path):
-    recipe = tiny("tokengs", "training.steps=100000", "training.seconds=0.1")
+    recipe = tiny("tokengs", "training.steps=200", "training.seconds=0.1")
     result = run(recipe, tmp_path)
     assert 0.1 <= result.seconds < 10.0
     history = result.folder.history()
-    assert 1 < result.steps == len(history) < 100_000
+    assert 1 < result.steps == len(history) < 200
     clock = [0.0, *(record["seconds"] for record in history)]
     assert clock[1] == 0
     schedule = recipe.build_optimizer()
