@@ -96,7 +96,7 @@ def test_what_fits(capsys):
 def test_a_sweep_takes_turns_and_records_what_fails(tmp_path, monkeypatch):
     calls, kept = [], []
 
-    def peak_memory(recipe, operation, work, threads) -> Peak:
+    def peak_memory(recipe, operation, work, threads):
         if (work.views, recipe.tree["model"]["queries"]["type"]) == (4, "locus/anchored"):
             raise ChildProcessError("killed\nmore")
         return Peak(2**20 * work.views**2 + 1, 1)
@@ -126,7 +126,7 @@ def test_a_sweep_takes_turns_and_records_what_fails(tmp_path, monkeypatch):
 def test_a_sweep_of_which_nothing_is_measured(monkeypatch):
     counts = []
 
-    def peak_memory(recipe, *_) -> None:
+    def peak_memory(recipe, *_):
         counts.append(recipe.tree["model"]["queries"]["count"])
         raise ChildProcessError
 

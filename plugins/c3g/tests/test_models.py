@@ -4,18 +4,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from learning import errors_of_training
+from odd_views import odd_views
 from qgs_c3g.joint import JointLayer
 from qgs_plugintools import Case
 from qgs_plugintools.checks.fields import run_training_step
-from qgs_plugintools.inputs import Maker, Sizes
 from refusals import refused
-from training_runs import first_batch
 
 from qgs.composer import resolve
 from qgs.contracts.schedule import follow
-from qgs.engine.training_pass import TrainingPass
 from qgs.model import QueryGaussianModel
-from qgs.types import Views, named_tensors
+from qgs.types import named_tensors
 
 RECIPES = Path(__file__).parents[3] / "recipes"
 TINY = RECIPES / "tiny/c3g.yaml"
@@ -57,10 +56,6 @@ def ran(*overrides: str) -> QueryGaussianModel:
     return recipe.build_model()
 
 
-def views(side: int = 16) -> Views:
-    return Maker(CASE, Sizes(image=(side, side)), torch.Generator().manual_seed(0)).views()
-
-
 def test_anchors_move_and_place_gaussians_beside_joint_attention():
     model = ran(
         ANCHORED,
@@ -69,7 +64,7 @@ def test_anchors_move_and_place_gaussians_beside_joint_attention():
         "model.supervision.layers=[1, 2]",
         "losses.anchors={type: locus/anchor_visibility}",
     )
-    first, last = model(views()).layers.values()
+    first, last = model(odd_views()).layers.values()
     assert not torch.equal(first.state["anchor.center"], last.state["anchor.center"])
     off = last.gaussians.means - last.state["anchor.center"]
     assert off.norm(dim=-1).max() < 5
@@ -109,7 +104,7 @@ def test_every_parameter_that_trains_is_read():
     for name, side in (("tiny/c3g", 16), ("c3g/re10k", 28)):
         recipe = resolve(RECIPES / f"{name}.yaml", [*NARROW, *SHALLOW])
         model = recipe.build_model().train()
-        gaussians = model(views(side)).gaussians
+        gaussians = model(odd_views(2, side, side)).gaussians
         torch.stack([x.sum() for _, x in named_tensors(gaussians)]).sum().backward()
         unread = {name for name, p in model.named_parameters() if p.grad is None}
         factors = recipe.rate_factors(model).items()
@@ -118,15 +113,6 @@ def test_every_parameter_that_trains_is_read():
 
 
 def test_it_learns():
-    recipe = resolve(TINY, [*SHALLOW, "model.queries.count=32", "data.image_size=[16, 16]"])
-    judged = TrainingPass.of(recipe, recipe.build_model().train())
-    batch = first_batch(recipe)
-    optimizer = torch.optim.AdamW(judged.parameters(), 2e-3)
-    losses = []
-    for _ in range(28):
-        total = judged(batch.inputs, batch.targets).total
-        optimizer.zero_grad()
-        total.backward()
-        optimizer.step()
-        losses.append(total.item())
-    assert losses[-1] < 0.6 * losses[0]
+    small = (*SHALLOW, "model.queries.count=32", "data.image_size=[16, 16]")
+    errors = errors_of_training(resolve(TINY, small), steps=28, rate=2e-3)
+    assert errors[-1] < 0.6 * errors[0]

@@ -9,19 +9,17 @@ import pytest
 import qgs_c3g.vggt
 import torch
 import torch.nn.functional as F
-from qgs_c3g.joint import JointLayer
+from odd_views import odd_views
 from qgs_c3g.vggt import MODULE, VggtFeatures
 from qgs_plugintools import Case, checks_for, run_check
-from qgs_plugintools.inputs import Maker, Sizes
 from refusals import refused
 from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
+from torch import nn
 from torch.testing import assert_close
 
 import qgs
 from qgs.composer import resolve
 from qgs.contracts import MissingExtraError, ModelDims
-from qgs.types import Views
 
 TINY = Path(__file__).parents[3] / "recipes/tiny/c3g.yaml"
 C = 8
@@ -31,12 +29,12 @@ C = 8
 class Aggregator(nn.Module):
     """As VGGT's: all layers' tokens (B, V, 5 + P, C), the first five of no patch."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.decay = [x.item() for x in torch.linspace(0, 1, 3)]  # VGGT's constructor does
         self.patch = nn.Conv2d(3, C, 14, 14)
 
-    def forward(self, images: Tensor) -> tuple[list[Tensor], int]:
+    def forward(self, images):
         tokens = self.patch(images.flatten(0, 1)).flatten(2).mT.unflatten(0, images.shape[:2])
         tokens = torch.tanh(tokens) + tokens[:, :1].mean(2, keepdim=True)
         return [torch.zeros(()), F.pad(tokens, (0, 0, 5, 0), value=7.0)], 5
@@ -63,14 +61,9 @@ def encoder(weights: Path, width: int = C, **options: str) -> VggtFeatures:
     return made
 
 
-def views(height: int = 28) -> Views:
-    sizes = Sizes(views=3, image=(height, 42))
-    return Maker(Case(JointLayer.Config()), sizes, torch.Generator()).views()
-
-
 def test_it_gives_the_patch_tokens_of_the_last_layer(weights):
     """Of images in [-1, 1] or, as told, in [0, 1]."""
-    given = views()
+    given = odd_views(3, 28, 42)
     for told, images in (({}, given.images * 2 - 1), ({"images": "unit"}, given.images)):
         made = encoder(weights, **told)
         memory = made(given)
@@ -84,7 +77,7 @@ def test_it_gives_the_patch_tokens_of_the_last_layer(weights):
 
 def test_a_model_of_another_width_has_a_linear_layer(weights):
     narrow = encoder(weights, width=6)
-    assert narrow(views()).features.shape[-1] == 6
+    assert narrow(odd_views(3, 28, 42)).features.shape[-1] == 6
     assert narrow.proj.weight.shape == (6, C)
     assert not [name for name, _ in encoder(weights).named_parameters() if "proj" in name]
 
@@ -101,7 +94,7 @@ def test_weights_are_the_users(weights):
 class Code:
     """Ends the tests where it is run."""
 
-    def __reduce__(self) -> tuple:
+    def __reduce__(self):
         return sys.exit, ()
 
 
@@ -136,7 +129,7 @@ def test_a_checkpoint_needs_no_file_of_weights(weights, tmp_path):
     model = recipe.build_model().eval()
     qgs.save(model, tmp_path / "checkpoint.safetensors")
     weights.unlink()
-    loaded, given = qgs.load(tmp_path / "checkpoint.safetensors"), views()
+    loaded, given = qgs.load(tmp_path / "checkpoint.safetensors"), odd_views(3, 28, 42)
     assert torch.equal(loaded(given).gaussians.means, model(given).gaussians.means)
     with pytest.raises(MissingExtraError, match="there are no weights"):
         recipe.build_model()
@@ -144,7 +137,7 @@ def test_a_checkpoint_needs_no_file_of_weights(weights, tmp_path):
 
 def test_images_must_consist_of_patches(weights):
     with pytest.raises(ValueError, match="27 x 42"):
-        encoder(weights)(views(height=27))
+        encoder(weights)(odd_views(3, 27, 42))
     problem = refused(TINY, [*overrides(weights), "data.image_size=[256, 224]"])
     assert "patches of 14 do not divide images of 256 x 224" in problem.reason
     assert "[252, 224]" in problem.fix

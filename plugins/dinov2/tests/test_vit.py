@@ -15,11 +15,11 @@ from qgs.contracts import MissingExtraError, ModelDims
 
 def test_parameters_are_as_many_as_published():
     """Less the release's mask token."""
-    for sizes, published in (
-        ((384, 12, 6), 22_056_192),
-        ((768, 12, 12), 86_579_712),
-        ((1024, 24, 16), 304_367_616),
-    ):
+    for sizes, published in {
+        (384, 12, 6): 22_056_192,
+        (768, 12, 12): 86_579_712,
+        (1024, 24, 16): 304_367_616,
+    }.items():
         with torch.device("meta"):
             vit = DinoV2(*sizes)
         assert sum(x.numel() for x in vit.parameters()) == published
@@ -49,7 +49,7 @@ def test_weights_of_a_file_are_loaded(tmp_path):
 class Code:
     """Ends the tests where it is run."""
 
-    def __reduce__(self) -> tuple:
+    def __reduce__(self):
         return sys.exit, ()
 
 

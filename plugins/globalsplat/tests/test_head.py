@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.nn.functional import layer_norm
 from torch.testing import assert_close
 
-from qgs.contracts import ModelDims
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import QueryState
 
@@ -109,8 +108,7 @@ def test_the_head_reads_both_streams_after_their_norms():
 
 
 def test_weights_start_as_told():
-    options = {"candidates": 64, "level": 6, "init_std": 0.1, "position_std": 0.5}
-    made = MergingHead(MergingHead.Config(**options), ModelDims(64, 2, 1))
+    made = head(candidates=64, level=6, init_std=0.1, position_std=0.5)
     rows = made.geometry.weight.unflatten(0, (64, 14))
     for weights, std in ((rows[:, :3], 0.5), (rows[:, 3:], 0.1), (made.texture.weight, 0.1)):
         assert weights.std().item() == pytest.approx(std * 0.99, rel=0.05)

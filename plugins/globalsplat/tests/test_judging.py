@@ -6,7 +6,8 @@ from itertools import pairwise
 import pytest
 import torch
 import torch.nn.functional as F
-from globalsplat_inputs import SMALL, TINY, views
+from globalsplat_inputs import SMALL, TINY
+from odd_views import odd_views
 from qgs_globalsplat.losses import Frustum, Regularisers, beyond_frusta
 from qgs_globalsplat.objective import TwoPasses, disagreement, subset
 from qgs_plugintools import Case
@@ -18,6 +19,7 @@ from qgs.composer import resolve
 from qgs.engine.training_pass import TrainingPass
 
 SOFT, NEAR = 0.1, 0.2
+VIEWS = odd_views(2, 16, 24)
 
 
 def beyond_one(points: Tensor, c2w: Tensor, lens: Tensor) -> Tensor:
@@ -37,7 +39,7 @@ def beyond_one(points: Tensor, c2w: Tensor, lens: Tensor) -> Tensor:
 
 def test_the_frustum_of_each_view():
     """Of points in front, at the sides, behind."""
-    seen = views(3).cameras
+    seen = odd_views(3, 16, 24).cameras
     points = torch.randn(2, 9, 3) * torch.tensor([0.6, 0.6, 2.0])
     found = beyond_frusta(points, seen, SOFT, NEAR)
     for scene in range(2):
@@ -51,26 +53,30 @@ GIVEN, NOTHING, _, _ = inputs_of(Case(Frustum.Config()), Sizes(queries=3, gaussi
 
 
 def test_the_input_cameras_count_and_no_others():
-    inputs = views()
-    away = replace(inputs, cameras=replace(inputs.cameras, c2w=-inputs.cameras.c2w))
+    away = replace(VIEWS, cameras=replace(VIEWS.cameras, c2w=-VIEWS.cameras.c2w))
     loss = Frustum(Frustum.Config())
-    pairs = ((away, inputs), (inputs, inputs), (inputs, away))
+    pairs = ((away, VIEWS), (VIEWS, VIEWS), (VIEWS, away))
     one, other, turned = (loss(GIVEN, NOTHING, *pair)["frustum"] for pair in pairs)
     assert one == other != turned
 
 
 def test_losses_are_means_over_gaussians_of_tokens_that_decode_some():
     mask = torch.tensor([[True, True, False], [True, False, False]])
-    rest = (replace(GIVEN, state=replace(GIVEN.state, mask=mask)), NOTHING, views(), views())
+    rest = (
+        replace(GIVEN, state=replace(GIVEN.state, mask=mask)),
+        NOTHING,
+        VIEWS,
+        VIEWS,
+    )
 
-    def mean(x: Tensor) -> Tensor:
+    def mean(x):
         return (x[0, :4].mean() + x[1, :2].mean()) / 2
 
     terms = Regularisers(Regularisers.Config(opacity_weight=0.5, scale_weight=2.0))(*rest)
     assert_close(terms["mean_opacity"], 0.5 * mean(GIVEN.gaussians.opacities))
     assert_close(terms["mean_scale"], 2.0 * mean(GIVEN.gaussians.scales))
     terms = Frustum(Frustum.Config(weight=3.0))(*rest)
-    per_point = beyond_frusta(GIVEN.gaussians.means, views().cameras, 0.05, 0.05)
+    per_point = beyond_frusta(GIVEN.gaussians.means, VIEWS.cameras, 0.05, 0.05)
     assert_close(terms["frustum"], 3.0 * mean(per_point))
 
 
@@ -87,13 +93,13 @@ def test_both_are_judged_and_compared():
     two = "objective={type: globalsplat/two_passes, alpha_weight: 0.1, depth_weight: 0.2}"
     recipe = resolve(TINY, [*SMALL, "views.inputs=5", two])
     model = recipe.build_model()
-    inputs, targets = views(5), views()
-    outcome = TrainingPass.of(recipe, model)(inputs, targets)
+    inputs = odd_views(5, 16, 24)
+    outcome = TrainingPass.of(recipe, model)(inputs, VIEWS)
     parts = [inputs.select(part) for part in ([0, 1, 3, 4], [0, 2, 4])]
     alone = TrainingPass.of(resolve(TINY, SMALL), model)
-    one, other = (alone(part, targets).terms for part in parts)
+    one, other = (alone(part, VIEWS).terms for part in parts)
     wanted = {name: (one[name] + other[name]) / 2 for name in one}
-    one, other = (model.render(model(part).gaussians, targets.cameras) for part in parts)
+    one, other = (model.render(model(part).gaussians, VIEWS.cameras) for part in parts)
     wanted["alpha_consistency"] = 0.1 * (one.alpha - other.alpha).abs().mean()
     wanted["depth_consistency"] = 0.2 * (one.depth - other.depth).abs().mean()
     assert_close(outcome.terms, wanted)
@@ -109,7 +115,7 @@ def test_each_is_pulled_to_the_other_that_stands_still():
 
 def test_two_views_are_too_few_and_it_says_so():
     with pytest.raises(ValueError, match=r"at least 3 input views, got 2: .* raise views\.inputs"):
-        TwoPasses(TwoPasses.Config()).forward(views(), views(), None)
+        TwoPasses(TwoPasses.Config()).forward(VIEWS, VIEWS, None)
 
 
 def test_weights_are_the_published_ones():

@@ -5,7 +5,8 @@ from collections import Counter
 
 import pytest
 import torch
-from globalsplat_inputs import DIMS, made, views
+from globalsplat_inputs import DIMS, made
+from odd_views import odd_views
 from qgs_globalsplat.encoder import PosedPatches
 from qgs_globalsplat.streams import TEXTURE, Round, SlotQueries, Stream
 from torch import Tensor
@@ -20,7 +21,7 @@ SMALL = {"rgb_width": 6, "ray_width": 5, "lens_width": 3, "bands": 2}
 
 
 def test_a_token_is_its_colours_beside_its_rays_and_its_camera():
-    encoder, given = made(PosedPatches, patch_size=4, **SMALL), views()
+    encoder, given = made(PosedPatches, patch_size=4, **SMALL), odd_views(2, 16, 24)
     memory = encoder(given)
     assert memory.features.shape == (2, 2 * 4 * 6 + 4, 11)
     assert memory.grid is memory.keys is memory.patch_rays is None
@@ -30,7 +31,8 @@ def test_a_token_is_its_colours_beside_its_rays_and_its_camera():
     patch = (scene, view, slice(None), slice(8, 12), slice(12, 16))
     assert_close(token[:6], encoder.rgb_embedding(2 * given.images[patch] - 1).flatten())
     rays = encoder.ray_embedding(plucker_rays(given.cameras)[patch]).flatten()
-    told = torch.tensor([math.log(20 / 24), math.log(18 / 16), 7 / 24, 6.5 / 16])
+    fx, fy, cx, cy = given.cameras.intrinsics[scene, view].tolist()
+    told = torch.tensor([math.log(fx / 24), math.log(fy / 16), cx / 24, cy / 16])
     x = given.cameras.c2w[scene, view, :3, 3]
     waves = [f(k * math.pi * x) for f in (torch.sin, torch.cos) for k in (1, 2)]
     camera = torch.cat([encoder.lens_mlp(told), x, *waves])
@@ -38,7 +40,7 @@ def test_a_token_is_its_colours_beside_its_rays_and_its_camera():
 
 
 def test_a_grid_stands_where_there_are_no_registers():
-    assert made(PosedPatches, patch_size=4, registers=0)(views()).grid == (2, 4, 6)
+    assert made(PosedPatches, patch_size=4, registers=0)(odd_views(2, 16, 24)).grid == (2, 4, 6)
 
 
 def test_published_widths():
@@ -49,13 +51,13 @@ def test_published_widths():
 
 def test_images_that_patches_do_not_divide_are_refused():
     with pytest.raises(ValueError, match="16 x 24 cannot be cut into patches of 5; resize"):
-        made(PosedPatches, patch_size=5)(views())
+        made(PosedPatches, patch_size=5)(odd_views(2, 16, 24))
 
 
 def test_two_streams_of_one_token():
     queries = made(SlotQueries, count=400, extra=4, std=0.5)
     assert queries.slots.std().item() == pytest.approx(0.5, rel=0.05)
-    state = queries(ImageMemory(torch.zeros(3, 1, 7)), views())
+    state = queries(ImageMemory(torch.zeros(3, 1, 7)), odd_views(2, 16, 24))
     tokens = torch.cat([queries.slots, queries.extra])
     for stream, seen in ((queries.geometry, state.features), (queries.texture, state[TEXTURE])):
         assert_close(seen, stream(tokens).expand(3, -1, -1))
@@ -71,7 +73,7 @@ def test_extra_tokens_stay_extra_when_slots_are_added():
     assert_close(many.slots[4:8], few.slots, atol=0.06, rtol=0)
 
 
-def attended(q: Tensor, k: Tensor, v: Tensor, q_norm, k_norm) -> Tensor:
+def attended(q, k, v, q_norm, k_norm) -> Tensor:
     """Head by head."""
     found = []
     for part in (slice(0, 8), slice(8, 16)):
@@ -80,7 +82,7 @@ def attended(q: Tensor, k: Tensor, v: Tensor, q_norm, k_norm) -> Tensor:
     return torch.cat(found, -1)
 
 
-def mlp(x: Tensor, layers) -> Tensor:
+def mlp(x, layers) -> Tensor:
     return layers.fc2(gelu(layers.fc1(x)))
 
 

@@ -1,14 +1,13 @@
 """Recipes: published sizes, what is refused, and trainings of small ones."""
 
 import pytest
-import torch
-from globalsplat_inputs import RECIPES, SMALL, TINY, views
-from training_runs import first_batch
+from globalsplat_inputs import RECIPES, SMALL, TINY
+from learning import errors_of_training
+from odd_views import odd_views
 
 import qgs
 from qgs.composer import RecipeError, resolve
 from qgs.engine.training import train
-from qgs.engine.training_pass import TrainingPass
 
 PUBLISHED = RECIPES / "globalsplat/re10k.yaml"
 
@@ -67,23 +66,13 @@ def test_parts_of_other_models_stand_beside_it():
         ["plugins=[locus, rooms]", "losses.visibility={type: qgs/visibility}"],
     ):
         model = qgs.compose(TINY, overrides=overrides)
-        assert model(views()).gaussians.count == 2048
+        assert model(odd_views(2, 16, 24)).gaussians.count == 2048
 
 
 def test_it_learns():
     """With every loss."""
     recipe = resolve(TINY, [*SMALL, "losses.regularisers={type: globalsplat/regularisers}"])
-    judged = TrainingPass.of(recipe, recipe.build_model().train())
-    batch = first_batch(recipe)
-    optimizer = torch.optim.Adam(judged.parameters(), 3e-3)
-    errors = []
-    for _ in range(20):
-        outcome = judged(batch.inputs, batch.targets)
-        optimizer.zero_grad()
-        outcome.total.backward()
-        optimizer.step()
-        errors.append(outcome.terms["mse"].item())
-    assert outcome.terms.keys() >= {"mse", "frustum", "mean_opacity", "mean_scale"}
+    errors = errors_of_training(recipe, steps=20, rate=3e-3)
     assert errors[-1] < 0.4 * errors[0]
 
 

@@ -1,21 +1,19 @@
 """Every formula: encoder, rays, centres and head against what is written out by hand."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 import torch.nn.functional as F
+from odd_views import odd_views
 from qgs_gslrm.encoder import Block, Transformer
 from qgs_gslrm.pixels import PATCH, AlongRays, PixelHead, PixelQueries, patch_rays_at, patches
-from qgs_plugintools import Case
-from qgs_plugintools.inputs import Maker, Sizes
 from torch import Tensor
 from torch.testing import assert_close
 
 from qgs.contracts import ModelDims
 from qgs.geometry.rays import camera_rays
-from qgs.types import Cameras, ImageMemory, QueryState, Views
+from qgs.types import Cameras, ImageMemory, QueryState
 
 P = 4
 """Pixels along a patch."""
@@ -27,14 +25,6 @@ def made(component, width: int = 16, **options):
     return component(component.Config(**options), ModelDims(width, heads=2, depth=0))
 
 
-def views() -> Views:
-    """From cameras that are turned and moved, with unequal focal lengths, off centre."""
-    sizes = Sizes(views=COUNT, image=(ROWS * P, COLUMNS * P))
-    made = Maker(Case(AlongRays.Config()), sizes, torch.Generator()).views()
-    lens = torch.tensor([9.0, 11.0, 5.5, 4.5]).expand(2, COUNT, 4)
-    return replace(made, cameras=replace(made.cameras, intrinsics=lens))
-
-
 def in_patches(maps: Tensor) -> Tensor:
     """(B, V, H, W, C) -> (B, N, K, C), one patch after the other, pixels row by row."""
     height, width = maps.shape[2:4]
@@ -44,7 +34,7 @@ def in_patches(maps: Tensor) -> Tensor:
 
 def test_rays_of_a_patch_are_spread_evenly():
     """They are those of its pixels, or of pixels of another size where their number differs."""
-    given = views().cameras
+    given = odd_views(3, 8, 12).cameras
     for count, rows, columns in ((16, 4, 4), (4, 2, 2), (2, 1, 2), (8, 2, 4), (3, 1, 3)):
         seen = patch_rays_at(patches(given, ROWS, COLUMNS), count)[1]
         factor = torch.tensor([columns / P, rows / P] * 2)
@@ -54,7 +44,7 @@ def test_rays_of_a_patch_are_spread_evenly():
 
 def test_means_lie_on_the_rays_of_their_pixels():
     """And gradients of what queries know of rays reach the cameras."""
-    given, memory = views(), ImageMemory(torch.randn(2, 18, 16), grid=GRID)
+    given, memory = odd_views(3, 8, 12), ImageMemory(torch.randn(2, 18, 16), grid=GRID)
     queries, c2w = made(PixelQueries), given.cameras.c2w.requires_grad_()
     state = queries(memory, given)
     assert state.features is memory.features
@@ -86,7 +76,7 @@ def by_formula(block: Block, x: Tensor) -> Tensor:
 
 def test_the_transformer_sees_nine_channels_of_every_pixel():
     encoder = made(Transformer, patch_size=P, depth=2, mlp_ratio=2.0, init_std=0.3)
-    given = views()
+    given = odd_views(3, 8, 12)
     origins, directions = camera_rays(given.cameras)
     colours = 2 * given.images.movedim(2, -1) - 1
     pixels = torch.cat([colours, torch.linalg.cross(origins, directions), directions], -1)

@@ -4,17 +4,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from learning import errors_of_training
+from odd_views import odd_views
 from qgs_gslrm.encoder import Transformer
 from qgs_plugintools import Case
 from qgs_plugintools.checks.fields import run_training_step
-from qgs_plugintools.inputs import Maker, Sizes
 from refusals import refused
 from torch.testing import assert_close
 
 from qgs.composer import resolve
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.model import QueryGaussianModel
-from qgs.types import Views
 
 TINY = Path(__file__).parents[3] / "recipes/tiny/gslrm.yaml"
 SMALL = (
@@ -50,11 +50,6 @@ def model(*overrides: str) -> QueryGaussianModel:
     return resolve(TINY, [*SMALL, *overrides]).build_model()
 
 
-def photos(count: int, *size: int) -> Views:
-    sizes = Sizes(batch=1, views=count, image=size)
-    return Maker(Case(Transformer.Config()), sizes, torch.Generator().manual_seed(0)).views()
-
-
 def test_what_cannot_work_is_refused():
     for overrides, option in (
         ((*LAYERS, CONTENT), "model.decoder.cross_attention"),  # no keys
@@ -64,11 +59,11 @@ def test_what_cannot_work_is_refused():
     ):
         assert refused(TINY, [*SMALL, *overrides]).option == option
     with pytest.raises(ValueError, match="images of 60 x 64 cannot be cut into patches of 8"):
-        model()(photos(1, 60, 64))
+        model()(odd_views(1, 60, 64))
 
 
 def test_there_is_a_gaussian_for_each_pixel_in_the_view_of_its_camera():
-    given = photos(3, 32, 32)
+    given = odd_views(3, 32, 32, scenes=1)
     means = model("model.head.gaussians_per_query=64")(given).gaussians.means
     seen = to_pixels(to_camera(means, given.cameras), given.cameras.intrinsics)[0]
     row, column = torch.meshgrid(torch.arange(32.0), torch.arange(32.0), indexing="ij")
@@ -80,14 +75,6 @@ def test_there_is_a_gaussian_for_each_pixel_in_the_view_of_its_camera():
 
 def test_it_learns():
     start = ("model.head.scale_bias=-3", "model.head.opacity_bias=2", "model.encoder.patch_size=4")
-    learning, given = model(*start), photos(1, 16, 16)
-    losses = []
-    optimizer = torch.optim.AdamW(learning.parameters(), lr=1e-2)
-    for _ in range(20):
-        rendered = learning.render(learning(given).gaussians, given.cameras).rgb
-        loss = (rendered - given.images).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-    assert losses[-1] < 0.4 * losses[0], losses
+    recipe = resolve(TINY, [*SMALL, *start, "data.image_size=[16, 16]"])
+    errors = errors_of_training(recipe, steps=20, rate=1e-2)
+    assert errors[-1] < 0.4 * errors[0]

@@ -21,9 +21,9 @@ PART = 4
 """Tests take this part of them, for time."""
 
 
-def vgg16(pretrained: bool = False, part: int = 1) -> nn.Module:
+def vgg16(pretrained=False, part=1) -> nn.Module:
     """torchvision's VGG-16 without its classifier, random."""
-    layers: list[nn.Module] = []
+    layers = []
     before = 3
     for channels in CHANNELS:
         if channels:
@@ -143,7 +143,7 @@ def test_the_loss_is_the_mean_of_the_metric_and_pulls_towards_the_truth(vgg):
     loss.load_pretrained()
     rgb, truth = torch.rand(2, 2, 2, 3, 24, 32)
 
-    def value(rgb: Tensor) -> Tensor:
+    def value(rgb):
         rendering, target = SimpleNamespace(rgb=rgb), SimpleNamespace(images=truth)
         return loss(None, rendering, target, None)["vgg16"]
 

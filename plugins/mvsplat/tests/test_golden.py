@@ -72,7 +72,6 @@ def test_a_published_file_gives_the_released_gaussians(name, monkeypatch):
     tree = fitting_recipe(shapes_of(weights), name)[1]
     model = qgs.compose(tree).eval()
     model.load_state_dict(names_of(resolve(tree)).from_published(weights))
-    assert (views.cameras.c2w[0, 0] - torch.eye(4)).abs().max() > 0.3
     # near and far of the files differ from view to view
     near, far, own = golden.input("near"), golden.input("far"), model.encoder.predict
     monkeypatch.setattr(model.encoder, "predict", lambda given, *_: own(given, near, far))
@@ -114,7 +113,7 @@ def test_both_ways_to_correlate_agree(monkeypatch):
     lens = feature_lenses(cameras, features.shape[-2:])
     rest = (inverse, lens, relative_poses(cameras.c2w, neighbours), neighbours)
 
-    def found() -> tuple[Tensor, Tensor]:
+    def found():
         learned = features.clone().requires_grad_()
         volume = sweep.cost_volume(learned, *rest)
         return volume, torch.autograd.grad(volume.square().sum(), learned)[0]

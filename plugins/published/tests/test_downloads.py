@@ -27,7 +27,7 @@ class Server(BaseHTTPRequestHandler):
 
     ended = Event()
 
-    def do_GET(self) -> None:
+    def do_GET(self):
         kind = self.path.split("/")[1]
         if kind == "login":
             kind = "whole" if self.headers["Authorization"] == "Basic bWU6cEBzcw==" else "401"
@@ -47,10 +47,10 @@ class Server(BaseHTTPRequestHandler):
         while kind == "endless" and not self.ended.is_set():
             self.wfile.write(sent)
 
-    def log_message(self, *_: object) -> None:
+    def log_message(self, *_):
         """Say nothing."""
 
-    def handle(self) -> None:
+    def handle(self):
         with suppress(ConnectionError):  # of a client that has given up
             super().handle()
 

@@ -35,7 +35,7 @@ def published(name: str) -> dict[str, Tensor]:
 
 
 equal = partial(assert_close, rtol=0, atol=0)
-TINY = published("tokengs_a")
+TOKENGS_A = published("tokengs_a")
 LOCUS = published("locus_full_a")
 
 
@@ -113,7 +113,7 @@ def test_every_ablation_has_a_published_name_for_each_parameter():
 
 
 def test_every_difference_is_listed_at_once():
-    weights = dict(TINY)
+    weights = dict(TOKENGS_A)
     known = names_of(resolve(TOKENGS.read(shapes_of(weights))))
     del weights["gs_tokens"]
     weights["activation_head.deconv.bias"] = torch.zeros(3)
@@ -144,7 +144,7 @@ def test_other_precisions_are_converted_only_on_demand(tmp_path):
 
 
 def test_parameters_that_share_memory_or_lie_in_strides(tmp_path):
-    weights = dict(TINY)
+    weights = dict(TOKENGS_A)
     tied = [name for name in weights if name.endswith("q_norm.weight")]
     weights |= dict.fromkeys(tied, weights[tied[0]])
     turned = weights["enc_dec_backbone.kv_proj.weight"].t().contiguous().t()
@@ -159,30 +159,30 @@ def test_parameters_that_share_memory_or_lie_in_strides(tmp_path):
 
 def test_weights_that_are_no_numbers_are_refused(tmp_path):
     for value in (torch.nan, torch.inf):
-        broken = TINY["gs_tokens"].clone()
+        broken = TOKENGS_A["gs_tokens"].clone()
         broken[3, 5] = value
         for tokens in (broken, broken.nan_to_num(0, 0).long()):
             with pytest.raises(ValueError, match="gs_tokens"):
-                imported(tmp_path, TINY | {"gs_tokens": tokens})
+                imported(tmp_path, TOKENGS_A | {"gs_tokens": tokens})
     assert os.listdir(tmp_path) == ["w.safetensors"]
 
 
 def test_nothing_is_overwritten(tmp_path):
-    imported(tmp_path, TINY)
+    imported(tmp_path, TOKENGS_A)
     with pytest.raises(FileExistsError, match=r"made\.safetensors"):
-        imported(tmp_path, TINY)
+        imported(tmp_path, TOKENGS_A)
     (tmp_path / "made.safetensors").unlink()
     with pytest.raises(FileExistsError, match=r"made\.yaml"):
-        imported(tmp_path, TINY)
+        imported(tmp_path, TOKENGS_A)
 
 
 def test_no_checkpoint_stays_without_its_recipe(tmp_path, monkeypatch):
-    def full(path: Path, text: str) -> None:
+    def full(path, text):
         raise OSError("no space left")
 
     monkeypatch.setattr("qgs_published.importing.write_text", full)
     with pytest.raises(OSError, match="no space left"):
-        imported(tmp_path, TINY)
+        imported(tmp_path, TOKENGS_A)
     assert os.listdir(tmp_path) == ["w.safetensors"]
 
 

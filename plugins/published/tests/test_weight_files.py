@@ -22,18 +22,20 @@ def torch_bytes(content: Any, zipped: bool = True) -> bytes:
     return buffer.getvalue()
 
 
+FLAT, OLD = torch_bytes(WEIGHTS), torch_bytes(WEIGHTS, zipped=False)
+
+
 def read(path: Path, content: bytes) -> WeightFile:
     path.write_bytes(content)
     return read_weight_file(path)
 
 
 def test_weights_are_read_and_where_they_lay_is_told(tmp_path):
-    flat, old = torch_bytes(WEIGHTS), torch_bytes(WEIGHTS, zipped=False)
     training = {"state_dict": WEIGHTS, "epoch": 3}
     for name, content, told in (
         ("w.safetensors", SAFE, []),
-        *((f"w.{suffix}", flat, []) for suffix in ("pt", "pth", "bin", "ckpt", "PT")),
-        ("w.pt", old, []),
+        *((f"w.{suffix}", FLAT, []) for suffix in ("pt", "pth", "bin", "ckpt", "PT")),
+        ("w.pt", OLD, []),
         ("w.pt", torch_bytes({"model": WEIGHTS}), ["'model'"]),
         ("w.pt", torch_bytes(training), ["'state_dict'; left out: epoch"]),
         ("w.pt", torch_bytes({"state_dict": {"module": WEIGHTS}}), ["'state_dict'", "'module'"]),
@@ -45,13 +47,12 @@ def test_weights_are_read_and_where_they_lay_is_told(tmp_path):
 
 
 def test_what_cannot_be_read_is_named(tmp_path):
-    flat, old = torch_bytes(WEIGHTS), torch_bytes(WEIGHTS, zipped=False)
     checkpoint = save(WEIGHTS, {"qgs.recipe": "{}"})
     mixed, twice = {"a": torch.zeros(1), "n": 3}, {"model": WEIGHTS, "module": WEIGHTS}
     objects = (torch.nn.Linear(2, 2), torch.zeros(2), {}, mixed, twice)
     for name, contents in {
-        "w.safetensors": (SAFE[:-5], flat, old, b"", save({}), checkpoint),
-        "w.pt": (flat[:500], SAFE, b"", *map(torch_bytes, objects)),
+        "w.safetensors": (SAFE[:-5], FLAT, OLD, b"", save({}), checkpoint),
+        "w.pt": (FLAT[:500], SAFE, b"", *map(torch_bytes, objects)),
         "w.npz": (b"0123456789",),
     }.items():
         for content in contents:

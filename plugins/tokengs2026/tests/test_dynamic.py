@@ -6,12 +6,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from qgs_plugintools import Case
-from qgs_plugintools.inputs import Maker, Sizes
+from odd_views import odd_views
 from qgs_tokengs2026.dynamic import MOVES, BlockCausalSelfAttention, DynamicQueries
 from qgs_tokengs2026.multiscale import MultiscaleViT
 from qgs_tokengs2026.times import TimeEmbedding, time_features
-from torch import Tensor
 from torch.testing import assert_close
 
 from qgs import QueryGaussianModel, Views
@@ -42,9 +40,8 @@ def small(*overrides: str) -> Recipe:
     return resolve(PUBLISHED, [*SMALL, *overrides])
 
 
-def views(times: Tensor | None = None, target: Tensor | None = None) -> Views:
-    maker = Maker(Case(DynamicQueries.Config()), Sizes(image=(16, 16)), torch.Generator())
-    return replace(maker.views(), times=times, target_time=target)
+def views(times=None, target=None) -> Views:
+    return replace(odd_views(), times=times, target_time=target)
 
 
 INPUTS = views(torch.zeros(2, 2), torch.zeros(2, 1))

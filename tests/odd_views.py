@@ -1,0 +1,18 @@
+"""Views whose cameras confuse nothing with anything."""
+
+from dataclasses import replace
+
+import torch
+from qgs_plugintools import Case
+from qgs_plugintools.inputs import Maker, Sizes
+
+from qgs.components import LatentQueries
+from qgs.types import Views
+
+
+def odd_views(count: int = 2, height: int = 16, width: int = 16, scenes: int = 2) -> Views:
+    """Noise; cameras are turned and moved, with unequal focal lengths, off centre."""
+    sizes = Sizes(batch=scenes, views=count, image=(height, width))
+    made = Maker(Case(LatentQueries.Config()), sizes, torch.Generator().manual_seed(0)).views()
+    lens = made.cameras.intrinsics * torch.tensor([1.0, 1.1, 0.9, 1.05])
+    return replace(made, cameras=replace(made.cameras, intrinsics=lens))
