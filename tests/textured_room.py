@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import photo_formats
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
 
 SIZE = (120, 180)
 INTRINSICS = (145.0, 147.0, 89.0, 61.0)
@@ -29,21 +31,12 @@ def walk(count: int, seed: int = 0) -> list[Shot]:
 def _poses(count: int) -> list[np.ndarray]:
     poses = []
     for place in np.linspace(0, 1, count):
-        yaw, pitch, roll = 0.5 * place - 0.2, 0.15 - 0.3 * place, 0.25 * place
+        angles = 0.5 * place - 0.2, 0.15 - 0.3 * place, 0.25 * place
         pose = np.eye(4)
-        pose[:3, :3] = _turn(1, yaw) @ _turn(0, pitch) @ _turn(2, roll)
+        pose[:3, :3] = Rotation.from_euler("YXZ", angles).as_matrix()
         pose[:3, 3] = 0.9 * place - 0.4, 0.3 * np.sin(4 * place), 0.5 * place - 0.6
         poses.append(pose)
     return poses
-
-
-def _turn(axis: int, angle: float) -> np.ndarray:
-    turn = np.eye(3)
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    turn[first, first] = turn[second, second] = np.cos(angle)
-    turn[second, first] = np.sin(angle)
-    turn[first, second] = -turn[second, first]
-    return turn
 
 
 def _shot(walls: np.ndarray, pose: np.ndarray) -> Shot:
@@ -60,16 +53,7 @@ def _shot(walls: np.ndarray, pose: np.ndarray) -> Shot:
         [np.choose(axis, np.moveaxis(hit[..., [(k + n) % 3 for k in range(3)]], -1, 0))
          for n in (1, 2)]
     )  # fmt: skip
-    grey = _sampled(walls, 2 * axis + side, (across + 1) / 2 * (walls.shape[1] - 1.001))
+    place = (across + 1) / 2 * (walls.shape[1] - 1.001)
+    grey = map_coordinates(walls, [2 * axis + side, *place], order=1)
     tint = np.array([1.0, 0.9, 0.8]) + 0.05 * axis[..., None]
     return Shot((np.clip(grey[..., None] * tint, 0, 1) * 255).astype(np.uint8), pose)
-
-
-def _sampled(walls: np.ndarray, wall: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Bilinear between the values of a wall's grid."""
-    low = np.floor(place).astype(int).clip(0, walls.shape[1] - 2)
-    u, v = place - low
-    i, j = low
-    top = walls[wall, i, j] * (1 - v) + walls[wall, i, j + 1] * v
-    bottom = walls[wall, i + 1, j] * (1 - v) + walls[wall, i + 1, j + 1] * v
-    return top * (1 - u) + bottom * u
