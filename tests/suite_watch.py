@@ -4,6 +4,7 @@ Every process counts its own tests; under pytest-xdist the controller sums them 
 numba takes to compile a kernel for the first time belongs to no test.
 """
 
+import gc
 import os
 import time
 from collections.abc import Iterator
@@ -41,6 +42,12 @@ class SuiteWatch:
         self.seconds[item.nodeid] = cpu_seconds() - self.compiling() - before
         return result
 
+    def pytest_collection_finish(self) -> None:
+        """Leave what was imported to itself: walking through it took a tenth of the time."""
+        gc.collect()
+        gc.freeze()
+        gc.set_threshold(100_000, 20, 20)
+
     @pytest.hookimpl(optionalhook=True)
     def pytest_testnodedown(self, node: Any) -> None:
         """Take over what a worker has counted."""
@@ -68,7 +75,10 @@ class SuiteWatch:
 
     def whole(self) -> float:
         """CPU seconds of all processes, collection included."""
-        return cpu_seconds() - self.compiling() + self.workers
+        if self.workers:  # they are children of this process
+            own = os.times()
+            return own.user + own.system + self.workers
+        return cpu_seconds() - self.compiling()
 
     def count(self) -> int:
         """How many tests ran."""

@@ -77,6 +77,7 @@ def real(name: str) -> PhotoScene:
         return scene(path, (image.height, image.width))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REAL)
 def test_real_photos_written_in_every_format(name, tmp_path):
     """Some poses are written with six digits, so that their rotations are not quite rotations."""
