@@ -43,7 +43,7 @@ def test_contract_of_data(run: CaseRun) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("run", [run for run in RUNS if not run.variant], ids=str)
 def test_extended_contract(run: CaseRun) -> None:
-    run.check(["extended"])
+    run.check(["construction", "extended"])
 
 
 def test_every_component_is_checked_and_its_weights_are_pinned() -> None:

@@ -13,6 +13,7 @@ from qgs_plugintools import (
     checks_for,
     run_check,
 )
+from qgs_plugintools.registry import TIERS
 
 from qgs.components import MlpFeedForward
 from qgs.renderers import GsplatRenderer
@@ -39,7 +40,7 @@ def test_one_cause_is_one_failure() -> None:
 def test_a_test_of_a_case_names_all_that_fails_and_skips_what_cannot_run(monkeypatch) -> None:
     run = CaseRun(CACHES, expected={FROZEN: "it might"})
     with pytest.raises(pytest.fail.Exception) as failure:
-        run.check(["core"])
+        run.check(["core", "construction"])
     titles = [line for line in str(failure.value).splitlines() if line.startswith(CACHES.label)]
     assert titles[0] == f"{CACHES.label}: {STATE}"
     assert titles[1].startswith(f"{CACHES.label}: {FROZEN} passes, although")
@@ -55,15 +56,16 @@ def test_further_options_of_a_class_have_the_checks_that_see_options() -> None:
 
 
 def test_tiers_divide_the_checks_and_likely_causes_come_first() -> None:
-    core, extended = (checks_for(CASE, [tier]) for tier in ("core", "extended"))
+    core, construction, extended = (checks_for(CASE, [tier]) for tier in TIERS)
     assert [check.name for check in core[:4]] == ["builds", "runs", STATE, "eval_repeats_bitwise"]
+    assert FROZEN in {check.name for check in construction}
     assert [check.name for check in extended] == ["compiles"]
-    assert len(core) + len(extended) == len(checks_for(CASE))
+    assert len(core) + len(construction) + len(extended) == len(checks_for(CASE))
 
 
 def test_expected_failures_are_strict() -> None:
     run = CaseRun(CACHES, expected={STATE: "a cache", FROZEN: "it might"})
-    verdicts = {result.check.name: result for result in run.results(["core"])}
+    verdicts = {result.check.name: result for result in run.results(["core", "construction"])}
     assert re.search(r"a cache \(seen: .* changes _cache", verdicts[STATE].message)
     assert verdicts[STATE].ok
     assert verdicts[FROZEN].verdict == "unexpected pass"

@@ -69,6 +69,8 @@ def test_videos_of_every_kind_get_poses(images, tmp_path):
     least = {
         write_turned(given / "turned.mp4", images, 90): PHOTOS,
         write_video(given / "a.mov", images, codec="libx265"): PHOTOS,
+        write_video(given / "a.webm", images, codec="libvpx-vp9"): PHOTOS,
+        write_video(given / "a.mkv", images, codec="libsvtav1"): PHOTOS,
         cut(write_video(given / "cut.mkv", images * 2, g="4"), 0.7): 3,
     }
     before = state(given)

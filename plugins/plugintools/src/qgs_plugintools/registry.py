@@ -10,8 +10,9 @@ from qgs.contracts import ModelComponent
 from qgs_plugintools.case import Case
 from qgs_plugintools.inputs import ARGUMENTS
 
-Tier: TypeAlias = Literal["core", "extended"]
-"""core: what every component needs to work at all; extended: takes seconds for each case."""
+Tier: TypeAlias = Literal["core", "construction", "extended"]
+"""core: what every component needs to work at all; construction: what `Component`, its `Config` and
+`nn.Module` give a class that does nothing unusual; extended: takes seconds for each case."""
 TIERS: tuple[Tier, ...] = get_args(Tier)
 
 BASICS = ("builds", "runs")

@@ -73,7 +73,7 @@ class CaseRun:
     def check(self, tiers: Iterable[Tier] = TIERS) -> None:
         """Make all checks inside of a pytest test, which fails with the messages of all that fail.
 
-        It is skipped where the component cannot be built or called. tiers: "core", "extended".
+        It is skipped where the component cannot be built or called. tiers: some of TIERS.
         """
         import pytest
 

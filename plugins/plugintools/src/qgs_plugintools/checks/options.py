@@ -17,7 +17,7 @@ from qgs_plugintools.registry import ALL_SLOTS, MODULES, check
 from qgs_plugintools.trees import difference
 
 
-@check(ALL_SLOTS)
+@check(ALL_SLOTS, tier="construction")
 def check_config_round_trip(case: Case) -> None:
     """Options written as YAML and read again are the same options."""
     options = case.config.model_dump(mode="json")
@@ -28,7 +28,7 @@ def check_config_round_trip(case: Case) -> None:
     expect(again == case.config, f"{case.config!r} is read again as {again!r}")
 
 
-@check(ALL_SLOTS)
+@check(ALL_SLOTS, tier="construction")
 def check_misspelt_option_is_refused(case: Case) -> None:
     """An option that does not exist is refused, and the nearest one that does is suggested.
 
@@ -44,7 +44,7 @@ def check_misspelt_option_is_refused(case: Case) -> None:
         expect(strict, f"{model.__qualname__} accepts any option; derive it from ComponentConfig")
 
 
-@check(ALL_SLOTS - {"data"})
+@check(ALL_SLOTS - {"data"}, tier="construction")
 def check_options_are_left_alone(case: Case) -> None:
     """Building a component changes nothing in its options."""
     own = replace(case, config=case.config.model_copy(deep=True))

@@ -23,7 +23,7 @@ ROUNDING = 1e-8
 """Share of the largest gradient that float32 inside of a float64 component leaves of none."""
 
 
-@check(PARAMETRIC)
+@check(PARAMETRIC, tier="construction")
 def check_builds_on_meta(case: Case) -> None:
     """Built under the meta device, a component allocates no parameter and no buffer."""
     with torch.device("meta"), OnMeta():
@@ -33,7 +33,7 @@ def check_builds_on_meta(case: Case) -> None:
     expect(not real, f"{', '.join(real)} is allocated; leave the device to the caller")
 
 
-@check(PARAMETRIC)
+@check(PARAMETRIC, tier="construction")
 def check_registers_its_parameters(case: Case) -> None:
     """Every tensor that a component keeps is a parameter or a buffer, so that it moves along.
 
@@ -51,7 +51,7 @@ def check_registers_its_parameters(case: Case) -> None:
         expect(not kept, f"{where} outside of its parameters, buffers and modules")
 
 
-@check(PARAMETRIC)
+@check(PARAMETRIC, tier="construction")
 def check_same_seed_same_parameters(case: Case) -> None:
     """Initial parameters are drawn from torch's global generator alone, which is not seeded.
 
@@ -74,7 +74,7 @@ def other_generators() -> tuple[Any, str]:
     return random.getstate(), str(numpy.random.get_state())
 
 
-@check(PARAMETRIC)
+@check(PARAMETRIC, tier="construction")
 def check_saved_weights_load(case: Case) -> None:
     """Weights saved as safetensors and loaded into a new instance give the same bits."""
     module, other, inputs = case.lively(seed=1), case.build(seed=2).eval(), inputs_of(case)
@@ -97,7 +97,7 @@ def check_state_dict_keys(case: Case) -> None:
         expect(not moved, f"pinned and present differ in {moved}; saved weights would not load")
 
 
-@check(PARAMETRIC)
+@check(PARAMETRIC, tier="construction")
 def check_moves_to_a_device(case: Case) -> None:
     """Moved to another device (CUDA, else meta), a component computes there, without the CPU."""
     device = "cuda" if torch.cuda.is_available() else "meta"
