@@ -143,10 +143,10 @@ def test_the_exponent_of_a_power_and_its_error():
 def test_counts_follow_shapes():
     shallow = ["model.decoder.depth=2", "model.supervision.layers=[1, 2]"]
     recipe = resolve(TOKENGS, [*SMALL[:2], *shallow])
-    once, twice = (count(recipe, "step", Workload(2, 2, (16, 24), batch=n)) for n in (1, 2))
+    once, twice = (count(recipe, "step", Workload(2, 3, (16, 24), batch=n)) for n in (1, 2))
     weights = sum(p.nbytes for p in recipe.build_model("meta").parameters())
     assert once.parameters * 4 == weights
-    assert twice.splats == 2 * once.splats == 2 * 2 * 2 * 256 * 8  # scenes, views, layers
+    assert twice.splats == 2 * once.splats == 2 * 3 * 2 * 256 * 8  # scenes, views, layers
     assert once.peak > 4 * weights, "weights, gradients and two moments"
     assert twice.peak > once.peak
 

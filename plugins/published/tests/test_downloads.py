@@ -101,6 +101,7 @@ def test_failures(server, cache, capsys):
         assert "p%40ss" not in printed
         assert "hidden" not in printed
         assert caught.value.__suppress_context__
+        assert caught.value.__cause__ is None
         assert [*cache.iterdir()] == []
         assert printed.count("the download ends in") == (4 if cause.endswith("0.2 s") else 0)
 
