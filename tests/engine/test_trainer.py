@@ -34,10 +34,11 @@ from qgs.io.checkpoint import CheckpointFile
 
 def test_training_lowers_the_loss(tmp_path):
     options = ("training.steps=20", "optimizer.warmup=4", "data.scenes=1", "views.mirror=0.0")
-    rate = "optimizer.learning_rate=4e-3"
-    run(tiny("locus", *options, rate), tmp_path, device="auto")
+    more = ("optimizer.learning_rate=4e-3", "training.collapse_window=10")
+    run(tiny("locus", *options, *more), tmp_path, device="auto")
     falling = losses(tmp_path)
     assert len(falling) == 20
+    assert parts_of(tmp_path)["good"]["steps"] == [18, 20]
     assert sum(falling[-5:]) < 0.95 * sum(falling[:5])
 
 
@@ -66,6 +67,7 @@ def test_a_run_leaves_recipe_history_and_checkpoint(trained_run):
         assert record["loss"] == pytest.approx(sum(record[term] for term in terms))
     assert CheckpointFile(folder.checkpoint).step == 3
     model, loaded = trained_run.model, qgs.load(folder.checkpoint)
+    assert not model.training
     assert same(loaded.state_dict(), model.state_dict())
     inputs = first_batch(recipe).inputs
     assert torch.equal(loaded(inputs).gaussians.means, model(inputs).gaussians.means)
