@@ -12,8 +12,8 @@ from qgs.composer.registry import load_plugin
 from qgs.contracts import LayerParts, MetricInput, ModelDims
 from qgs.types import ImageMemory, QueryState
 
-CHECKED = ("builds", "runs", "sizes_vary", "inputs_are_not_changed", "batch_independence")
-CHECKED += ("eval_repeats_bitwise", "zeros_stay_finite", "geometry_is_float32_under_autocast")
+CHECKED = ("builds", "runs", "inputs_are_not_changed", "eval_repeats_bitwise")
+CHECKED += ("zeros_stay_finite", "geometry_is_float32_under_autocast", "batch_independence")
 
 
 def depthsplat(scales: int) -> Case:

@@ -172,16 +172,17 @@ class Case:
     def lively(self, seed: int = 0) -> Any:
         """An instance in evaluation mode in which no parameter is zero by initialisation.
 
-        It is built once for each `seed`; every call gets a copy of its own.
+        It is built once for each `seed`; every call gets a copy of its own. See `fresh`.
         """
         if seed not in self._kept:
-            self._kept[seed] = self._build_lively(seed)
+            self._kept[seed] = self.fresh(seed)
         try:
             return copy.deepcopy(self._kept[seed])
         except (TypeError, RuntimeError):  # it keeps what cannot be copied, such as an iterator
-            return self._build_lively(seed)
+            return self.fresh(seed)
 
-    def _build_lively(self, seed: int) -> Any:
+    def fresh(self, seed: int = 0) -> Any:
+        """As `lively`, but built anew: a copy shares what a function of the component keeps."""
         module = self.build(seed).eval()
         generator = torch.Generator().manual_seed(seed + 1)
         with torch.no_grad():

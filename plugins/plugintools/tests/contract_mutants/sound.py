@@ -56,6 +56,9 @@ class TurnsAutocastOff(PlacesByALayer):
             bounded = center / (1 + center.norm(dim=-1, keepdim=True))
         return self.attention(self.norm(state.features + self.place(bounded)), state.mask)
 
+    def explain(self, state, queries):
+        return None
+
 
 @named
 class FusesInHalf(ContentCrossAttention):
