@@ -54,6 +54,13 @@ def kinds(record):
     return {view["frame"]: view["kind"] for view in record["views"]}
 
 
+def test_a_file_of_a_user_is_no_place_for_a_result(checkpoint, photos, tmp_path):
+    file = tmp_path / "scene.ply"
+    file.write_text("mine")
+    assert isinstance(run(checkpoint, photos, "--out", file).exception, FileExistsError)
+    assert file.read_text() == "mine"
+
+
 def test_everything_is_written_and_what_a_user_made_is_kept(checkpoint, photos, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     old = tmp_path / "views" / "00099_novel.png"

@@ -166,7 +166,10 @@ def test_evaluation_is_deterministic_novel_and_never_mirrored():
     views = ViewsConfig(inputs=2, gap=(3, 5), mirror=1.0)
     config = EvaluationConfig(scenes=2, samples=3)
     first, again = (evaluation_samples(source, views, config) for _ in range(2))
-    assert [s.input_frames for s in first] == [s.input_frames for s in again]
+    other = evaluation_samples(source, views, config.model_copy(update={"seed": 1}))
+    drawn, same, others = ([s.input_frames for s in found] for found in (first, again, other))
+    assert drawn == same
+    assert drawn != others
     assert len(first) == 6
     for sample in first:
         low, high = sample.input_frames

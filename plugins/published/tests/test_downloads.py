@@ -31,6 +31,11 @@ class Server(BaseHTTPRequestHandler):
         kind = self.path.split("/")[1]
         if kind == "login":
             kind = "whole" if self.headers["Authorization"] == "Basic bWU6cEBzcw==" else "401"
+        if kind == "elsewhere":
+            self.send_response(302)
+            self.send_header("Location", self.path.replace("elsewhere", "login"))
+            self.end_headers()
+            return
         if kind == "silent":
             self.ended.wait(30)
         sent = {"page": PAGE, "short": CONTENT[:-9]}.get(kind, CONTENT)
@@ -124,6 +129,8 @@ def test_passwords_are_sent_and_never_printed(server, capsys):
     url = f"http://me:p%40ss@{server}/login/a.safetensors"
     assert checkpoint_path(url).read_bytes() == CONTENT
     assert "p%40ss" not in capsys.readouterr().err
+    with pytest.raises(OSError, match="401"):  # not sent on to where a server leads
+        checkpoint_path(url.replace("login", "elsewhere"))
 
 
 def test_a_url_is_downloaded_once_and_its_hash_told(cache, capsys):
