@@ -158,7 +158,7 @@ def test_gradients_of_two_passes_are_those_of_the_definition(two, render_views):
 def test_the_objective_of_two_passes_keeps_the_contract(two):
     (component,) = load_plugin("two").plugin.components
     case = Case(component.Config())
-    results = [run_check(check, case) for check in checks_for(case, ["core"])]
+    results = [run_check(check, case) for check in checks_for(case, ["core", "construction"])]
     assert len(results) >= 6
     assert [result.message for result in results if not result.ok] == []
 
