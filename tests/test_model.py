@@ -31,7 +31,11 @@ def views() -> qgs.Views:
 def test_the_api_in_five_lines(model, views, tmp_path):
     gaussians = model(views).gaussians
     assert gaussians.means.shape == (2, 12 * 8, 3)
-    assert model.render(gaussians, views.cameras).rgb.shape == views.images.shape
+    shown = model.render(gaussians, views.cameras)
+    black = model.render(gaussians, views.cameras, torch.zeros(3))
+    white = model.render(gaussians, views.cameras, torch.ones(3))
+    assert shown.rgb.shape == views.images.shape
+    torch.testing.assert_close(white.rgb - black.rgb, (1 - shown.alpha).expand_as(shown.rgb))
     qgs.save(model, tmp_path / "model.safetensors")
     again = qgs.load(tmp_path / "model.safetensors")
     assert torch.equal(again(views).gaussians.means, gaussians.means)
