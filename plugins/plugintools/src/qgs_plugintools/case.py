@@ -1,6 +1,5 @@
 """A component with options and sizes, as the checks see it, and what a check raises."""
 
-import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -80,7 +79,6 @@ class Case:
     image_size: tuple[int, int] | None = None
     fields: Mapping[str, Callable[[Tensor], Tensor]] = field(default_factory=dict)
     state_dict: Mapping[str, tuple[int, ...]] | None = None
-    _kept: dict[int, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not isinstance(self.config, ComponentConfig):
@@ -170,19 +168,7 @@ class Case:
         return built
 
     def lively(self, seed: int = 0) -> Any:
-        """An instance in evaluation mode in which no parameter is zero by initialisation.
-
-        It is built once for each `seed`; every call gets a copy of its own. See `fresh`.
-        """
-        if seed not in self._kept:
-            self._kept[seed] = self.fresh(seed)
-        try:
-            return copy.deepcopy(self._kept[seed])
-        except (TypeError, RuntimeError):  # it keeps what cannot be copied, such as an iterator
-            return self.fresh(seed)
-
-    def fresh(self, seed: int = 0) -> Any:
-        """As `lively`, but built anew: a copy shares what a function of the component keeps."""
+        """An instance in evaluation mode in which no parameter is zero by initialisation."""
         module = self.build(seed).eval()
         generator = torch.Generator().manual_seed(seed + 1)
         with torch.no_grad():

@@ -36,7 +36,7 @@ def check_plugin(
         f"{installed.plugin.contract_version}"
     )
     results: list[CheckResult] = []
-    made = results_of(name, TIERS[:-1] if core else TIERS)
+    made = results_of(name, ("core", "construction") if core else TIERS)
     for _, group in groupby(made, key=lambda result: id(result.case)):
         of_case = list(group)
         _summarise(console, of_case)

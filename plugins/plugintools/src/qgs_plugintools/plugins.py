@@ -1,6 +1,6 @@
 """The contract suite on all components of an installed plugin."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from qgs.composer.registry import (
@@ -57,15 +57,13 @@ def runs_of(plugin: str | InstalledPlugin) -> list[CaseRun]:
     for case in cases_of(installed):
         variant = any(run.case.component is case.component for run in runs)
         runs.append(CaseRun(case, variant=variant))
-    for run, expected in zip(runs, _exemptions(installed, runs), strict=True):
-        run.expected = expected
+    _expect_exemptions(installed, runs)
     return runs
 
 
-def _exemptions(installed: InstalledPlugin, runs: list[CaseRun]) -> list[Mapping[str, str]]:
-    """The known failures of each of the `runs`: those of its class and those of its options."""
-    exemptions = installed.plugin.exemptions
-    for owner, exempted in exemptions.items():
+def _expect_exemptions(installed: InstalledPlugin, runs: list[CaseRun]) -> None:
+    """Give each of the `runs` its known failures: those of its class and those of its options."""
+    for owner, exempted in installed.plugin.exemptions.items():
         concerned = [run for run in runs if _concerns(owner, run.case)]
         if not concerned:
             fault = f"{owner!r} is neither a component of the plugin nor the options of a case"
@@ -74,15 +72,8 @@ def _exemptions(installed: InstalledPlugin, runs: list[CaseRun]) -> list[Mapping
             refuse_unexpectable(exempted, concerned)
         except (ValueError, AttributeError) as error:
             raise _unsound(installed, "exemptions", f"those of {owner!r}: {error}") from error
-    return [
-        {
-            name: expected
-            for owner, exempted in exemptions.items()
-            if _concerns(owner, run.case)
-            for name, expected in exempted.items()
-        }
-        for run in runs
-    ]
+        for run in concerned:
+            run.expected = {**run.expected, **exempted}
 
 
 def check_plugin(name: str, tiers: Iterable[Tier] = TIERS) -> Iterator[CheckResult]:

@@ -46,6 +46,7 @@ class LatentBottleneck(MultiscaleReadout):
     name = "latent_bottleneck"
     tunable = True
     writes = memory_fields("features", "keys", "values")
+    unlearned = ("feature_k_norm.bias",)  # adds the same to all logits of a latent
 
     class Config(MultiscaleReadout.Config):
         depth: int = Field(default=12, ge=1, le=256)
@@ -71,8 +72,6 @@ class LatentBottleneck(MultiscaleReadout):
         )
         self.latent_kv_proj = nn.Linear(width, 2 * width)
         self.k_norm = nn.LayerNorm(width // dims.heads, eps)
-
-    unlearned = ("feature_k_norm.bias",)  # adds the same to all logits of a latent
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
         """No weight decay on the latents (TokenGS release)."""

@@ -57,7 +57,7 @@ def check_forward_keeps_no_state(case: Case) -> None:
     computed once for all layers belongs into `ImageMemory.once`, what depends on sizes alone into a
     function of them.
     """
-    module = case.fresh()
+    module = case.lively()
     for mode in each_mode(module):
         before, kept = cloned(tensors_of(module)), attributes(module)
         module(*inputs_of(case).values())
@@ -66,7 +66,7 @@ def check_forward_keeps_no_state(case: Case) -> None:
         now = attributes(module)
         changed = sorted(n for n in kept.keys() | now.keys() if kept.get(n) != now.get(n))
         expect(not changed, f"a forward pass in {mode} changes {', '.join(changed)}")
-        fresh, inputs = case.fresh().train(mode == "training"), inputs_of(case, seed=1)
+        fresh, inputs = case.lively().train(mode == "training"), inputs_of(case, seed=1)
         first, later = (_outputs(one, inputs, 0)[0] for one in (fresh, module))
         found = difference(first, later)
         expect(not found, f"after a forward pass in {mode} another one differs: {found}")
