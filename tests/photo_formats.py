@@ -9,17 +9,14 @@ import math
 import os
 import shutil
 import struct
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from qgs.data import PhotosSource
-from qgs.data.photos.source import PhotoScene
 
 PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[2] / "shared" / "photos"))
 """Real photos, which are not in the repository."""
@@ -38,13 +35,11 @@ class PhotoSet:
     size: tuple[int, int]
 
     @property
-    def pinhole(self) -> Camera:
+    def pinhole(self):
         return "PINHOLE", 1, self.intrinsics
 
 
-def synthetic(
-    folder: Path, count: int = 6, size=(30, 40), suffix: str = "png", seed: int = 0
-) -> PhotoSet:
+def synthetic(folder, count=6, size=(30, 40), suffix="png", seed=0):
     """Photos of noise at random poses."""
     rng = np.random.default_rng(seed)
     folder.mkdir(parents=True, exist_ok=True)
@@ -58,19 +53,19 @@ def synthetic(
     return PhotoSet(files, c2w, (50.0, 52.0, 19.0, 16.0), size)
 
 
-def real_folder(name: str) -> Path:
+def real_folder(name):
     """The folder of real photos called `name`; the test is skipped without it."""
     if not (PHOTOS / name).is_dir():
         pytest.skip(f"{PHOTOS / name} is missing; set QGS_PHOTOS to the folder of real photos")
     return PHOTOS / name
 
 
-def opened(path: Any, size=(30, 40), source: Any = PhotosSource, **options: Any) -> Any:
+def opened(path, size=(30, 40), source=PhotosSource, **options):
     """The data at `path`, opened by a class of sources."""
     return source(source.Config(path=str(path), **{"image_size": size, **options}))
 
 
-def encoded(image: np.ndarray | Image.Image, kind: str = "PNG", **options: Any) -> bytes:
+def encoded(image, kind="PNG", **options):
     """The bytes of an image file. image: (H, W, 3 or 4) uint8."""
     file = io.BytesIO()
     image = image if isinstance(image, Image.Image) else Image.fromarray(image)
@@ -78,7 +73,7 @@ def encoded(image: np.ndarray | Image.Image, kind: str = "PNG", **options: Any) 
     return file.getvalue()
 
 
-def row_of_frames(count: int, step: float = 1.0, **top: Any) -> dict[str, Any]:
+def row_of_frames(count, step=1.0, **top):
     """The content of transforms.json for `images/0.png`, ...: cameras `step` apart along x."""
     frames = []
     for i in range(count):
@@ -88,18 +83,18 @@ def row_of_frames(count: int, step: float = 1.0, **top: Any) -> dict[str, Any]:
     return {**top, "frames": frames}
 
 
-def scene(path: Path | str, size=(30, 40), **options: Any) -> PhotoScene:
+def scene(path, size=(30, 40), **options):
     """The first training scene of what is `opened`."""
     return opened(path, size, **options).scenes("train")[0]
 
 
-def centred(photos: PhotoSet) -> PhotoSet:
+def centred(photos):
     """The same set, taken by a camera that every format can tell."""
     focal, (height, width) = photos.intrinsics[0], photos.size
     return PhotoSet(photos.files, photos.c2w, (focal, focal, width / 2, height / 2), photos.size)
 
 
-def copied(photos: PhotoSet, folder: Path, names: list[str] | None = None) -> list[str]:
+def copied(photos, folder, names=None):
     """Copy the files into `folder`; the names that they have there."""
     names = names or [file.name for file in photos.files]
     for file, name in zip(photos.files, names, strict=True):
@@ -108,13 +103,13 @@ def copied(photos: PhotoSet, folder: Path, names: list[str] | None = None) -> li
     return names
 
 
-def opengl(c2w: np.ndarray) -> list[list[float]]:
+def opengl(c2w):
     flipped = c2w.copy()
     flipped[:3, 1:3] *= -1
     return flipped.tolist()
 
 
-def write_nerfstudio(folder: Path, photos: PhotoSet, **top: Any) -> Path:
+def write_nerfstudio(folder, photos, **top):
     names = copied(photos, folder / "images")
     fx, fy, cx, cy = photos.intrinsics
     height, width = photos.size
@@ -128,9 +123,7 @@ def write_nerfstudio(folder: Path, photos: PhotoSet, **top: Any) -> Path:
     return folder
 
 
-def write_blender(
-    folder: Path, photos: PhotoSet, train: int, val: int = 0, times: Sequence[object] = ()
-) -> Path:
+def write_blender(folder, photos, train, val=0, times=()):
     """The first photos are for training, then `val` for validation, the rest for tests.
 
     Square pixels and a principal point in the middle are all that the format knows. times: of the
@@ -154,7 +147,7 @@ def write_blender(
     return folder
 
 
-def write_llff(folder: Path, photos: PhotoSet, images: str = "images") -> Path:
+def write_llff(folder, photos, images="images"):
     """Rows of (down, right, back, centre, (h, w, f)) as a (3, 5) matrix, then near and far."""
     copied(photos, folder / images)
     right, down, ahead, centre = (photos.c2w[:, :3, i] for i in range(4))
@@ -166,14 +159,14 @@ def write_llff(folder: Path, photos: PhotoSet, images: str = "images") -> Path:
 
 
 def write_colmap(
-    folder: Path,
-    photos: PhotoSet,
-    kind: str,
-    camera: Camera | None = None,
-    model: str = "sparse/0",
-    images: str = "images",
-    names: list[str] | None = None,
-) -> Path:
+    folder,
+    photos,
+    kind,
+    camera=None,
+    model="sparse/0",
+    images="images",
+    names=None,
+):
     """kind: text or binary. Images are listed backwards, with two observations each."""
     names = copied(photos, folder / images, names)
     (folder / model).mkdir(parents=True, exist_ok=True)
@@ -184,7 +177,7 @@ def write_colmap(
     return folder
 
 
-def world_to_camera(c2w: np.ndarray) -> tuple[float, ...]:
+def world_to_camera(c2w):
     """Quaternion w, x, y, z and translation of the inverse of a pose.
 
     Of a rotation written with few digits, the nearest one; the camera's centre stays.
@@ -194,7 +187,7 @@ def world_to_camera(c2w: np.ndarray) -> tuple[float, ...]:
     return (*quaternion(rotation), *(-rotation @ c2w[:3, 3]))
 
 
-def quaternion(rotation: np.ndarray) -> np.ndarray:
+def quaternion(rotation):
     """w, x, y, z: the eigenvector of Davenport's matrix for its largest eigenvalue, 1."""
     xx, yy, zz = np.diag(rotation)
     xy, xz, yz = (rotation[i, j] + rotation[j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
@@ -210,7 +203,7 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
     return np.linalg.eigh(davenport)[1][:, -1]
 
 
-def _write_text(folder: Path, entries: list, camera: Camera, size: tuple[int, int]) -> None:
+def _write_text(folder, entries, camera, size):
     name, _, parameters = camera
     numbers = " ".join(map(repr, map(float, parameters)))
     line = f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n7 {name} {size[1]} {size[0]} {numbers}\n"
@@ -223,7 +216,7 @@ def _write_text(folder: Path, entries: list, camera: Camera, size: tuple[int, in
     (folder / "points3D.txt").write_text("11 0 0 5 1 2 3 0.5 1 0 2 0\n")
 
 
-def _write_binary(folder: Path, entries: list, camera: Camera, size: tuple[int, int]) -> None:
+def _write_binary(folder, entries, camera, size):
     _, model, parameters = camera
     head = struct.pack("<QIiQQ", 1, 7, model, size[1], size[0])
     (folder / "cameras.bin").write_bytes(head + struct.pack(f"<{len(parameters)}d", *parameters))
@@ -236,7 +229,7 @@ def _write_binary(folder: Path, entries: list, camera: Camera, size: tuple[int, 
     (folder / "points3D.bin").write_bytes(struct.pack("<Q", 1) + point)
 
 
-def noisy_photos(folder: Path, count: int = 7, step: float = 0.1) -> Path:
+def noisy_photos(folder, count=7, step=0.1):
     """Nerfstudio photos of noise, 24 x 20, by cameras `step` apart that look the same way."""
     (folder / "images").mkdir(parents=True)
     random = np.random.default_rng(0)

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 import torch
-from photo_formats import PhotoSet, centred, synthetic, write_blender, write_llff
+from photo_formats import centred, synthetic, write_blender, write_llff
 from photo_formats import scene as read
 from PIL import Image
 from tables import fault
 
 
 @pytest.fixture
-def photos(tmp_path) -> PhotoSet:
+def photos(tmp_path):
     return centred(synthetic(tmp_path / "photos"))
 
 

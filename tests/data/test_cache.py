@@ -6,10 +6,10 @@ from qgs.data.scenes import BoundedCache
 
 
 def test_what_was_used_last_is_kept():
-    made: list[str] = []
-    cache: BoundedCache[str] = BoundedCache(6, len)
+    made = []
+    cache = BoundedCache(6, len)
 
-    def get(key: str) -> str:
+    def get(key):
         return cache.get(key, lambda: made.append(key) or key)
 
     for key in ("aaa", "bbb", "aaa", "ccc", "aaa", "bbb"):
@@ -22,7 +22,7 @@ def test_what_was_used_last_is_kept():
 
 
 def test_copies_start_empty():
-    cache: BoundedCache[np.ndarray] = BoundedCache(10**6, len)
+    cache = BoundedCache(10**6, len)
     cache.get("a", lambda: np.zeros(10**5))
     content = ForkingPickler.dumps(cache)
     assert len(content) < 1000

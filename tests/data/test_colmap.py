@@ -1,7 +1,6 @@
 """COLMAP models: camera models, lenses, names, and models that are broken."""
 
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from tables import fault
 from qgs.data.images import framing
 from qgs.data.paths import opened_path
 from qgs.data.photos import read_listing
-from qgs.data.photos.reader import PhotoFrame
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -31,18 +29,18 @@ CAMERAS = [
 ]
 
 
-def frames(folder: Path) -> list[PhotoFrame]:
+def frames(folder):
     return list(read_listing(opened_path(folder)).frames)
 
 
-def colours(directions: np.ndarray) -> np.ndarray:
+def colours(directions):
     """What a far wall shows in directions (..., 2) of the plane z = 1, as 8-bit RGB."""
     x, y = np.moveaxis(directions, -1, 0)
     levels = 128 + 80 * np.stack([np.sin(2 * x), np.cos(3 * y), np.sin(2 * x - y)], -1)
     return levels.round().clip(1, 255).astype(np.uint8)
 
 
-def pixel_centres() -> np.ndarray:
+def pixel_centres():
     v, u = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
     return np.stack([u, v], -1)
 

@@ -5,7 +5,6 @@ import math
 import re
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -23,7 +22,7 @@ from qgs.types import Cameras
 
 
 @pytest.fixture(autouse=True)
-def few_samples_measured() -> None:
+def few_samples_measured():
     """Here all are measured."""
 
 
@@ -38,7 +37,7 @@ RECIPE = {
 }
 
 
-def around(target: list[float], eyes: list[list[float]], focal: float = 16.0) -> Cameras:
+def around(target, eyes, focal=16.0):
     """Cameras (1, V) of 32 x 32 pixels at `eyes` that look at `target`."""
     places, goal = torch.tensor(eyes).float(), torch.tensor(target).float()
     down = torch.tensor([0.0, 1.0, 0.0]).expand_as(places)
@@ -46,14 +45,14 @@ def around(target: list[float], eyes: list[list[float]], focal: float = 16.0) ->
     return Cameras(look_at(places, goal - places, down)[None], intrinsics, (32, 32))
 
 
-def domain(*cameras: Cameras) -> Domain:
+def domain(*cameras):
     found = Domain()
     for both in cameras:
         found.see(both, both)
     return found
 
 
-def test_what_is_measured() -> None:
+def test_what_is_measured():
     found = domain(around([0, 0, 2], [[-0.5, 0, 0], [0.5, 0, 0]])).ranges
     assert found["views"] == (2, 2)
     assert found["baseline"] == pytest.approx((1, 1))
@@ -62,7 +61,7 @@ def test_what_is_measured() -> None:
     assert found["fov"] == pytest.approx((90, 90))
 
 
-def test_axes_that_do_not_meet_before_the_cameras_look_infinitely_far() -> None:
+def test_axes_that_do_not_meet_before_the_cameras_look_infinitely_far():
     apart = around([0, 0, 2], [[-0.5, 0, 0], [0.5, 0, 0]])
     away = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
     parallel = torch.eye(4).repeat(1, 2, 1, 1)
@@ -71,7 +70,7 @@ def test_axes_that_do_not_meet_before_the_cameras_look_infinitely_far() -> None:
         assert domain(replace(apart, c2w=poses)).ranges["depth"] == (math.inf, math.inf)
 
 
-def test_a_domain_is_read_as_it_was_written() -> None:
+def test_a_domain_is_read_as_it_was_written():
     found = domain(around([0, 0, 2], [[0, 0, 0]]))
     assert found.ranges["depth"] == (math.inf, math.inf)
     assert "baseline" not in found.ranges
@@ -79,7 +78,7 @@ def test_a_domain_is_read_as_it_was_written() -> None:
     assert (read.ranges, read.samples) == (found.ranges, 1)
 
 
-def test_a_few_pairs_of_parallel_axes_do_not_make_every_depth_one_that_was_trained() -> None:
+def test_a_few_pairs_of_parallel_axes_do_not_make_every_depth_one_that_was_trained():
     near = around([0, 0, 2], [[-0.5, 0, 0], [0.5, 0, 0]])
     parallel = replace(near, c2w=near.c2w.clone())
     parallel.c2w[..., :3, :3] = torch.eye(3)
@@ -99,14 +98,14 @@ def test_a_few_pairs_of_parallel_axes_do_not_make_every_depth_one_that_was_train
         '{"samples": 1, "ranges": ' + "[" * 9000 + "]" * 9000 + "}",
     ],
 )
-def test_a_damaged_domain_is_one_error_with_the_file(written: str, tmp_path: Path) -> None:
+def test_a_damaged_domain_is_one_error_with_the_file(written, tmp_path):
     file = tmp_path / "a.safetensors"
     save(resolve(RECIPE).build_model(), file, extra={KEY: written})
     with pytest.raises(CheckpointError, match=r"a\.safetensors"):
         _ = CheckpointFile(file).domain
 
 
-def test_the_sentence() -> None:
+def test_the_sentence():
     near, far = [[-0.1, 0, 0], [0.1, 0, 0]], [[-0.2, 0, 0], [0.2, 0, 0]]
     trained = domain(around([0, 0, 1], near), around([0, 0, 2], far))
     within = domain(around([0, 0, 1.5], [[-0.15, 0, 0], [0.15, 0, 0]]))
@@ -122,7 +121,7 @@ def test_the_sentence() -> None:
     ("first", "second", "focal", "options"),
     [(-0.9, 0.9, 8.0, ["--scale", "--frames"]), (-0.1, 0.1, 4.0, ["--scale"])],
 )
-def test_what_helps_is_named_and_the_scale_comes_first(first, second, focal, options) -> None:
+def test_what_helps_is_named_and_the_scale_comes_first(first, second, focal, options):
     """A baseline that is too wide, and a field of view that is."""
     trained = domain(around([0, 0, 1], [[-0.1, 0, 0], [0.1, 0, 0]]))
     found = domain(around([0, 0, 1], [[first, 0, 0], [second, 0, 0]], focal=focal))
@@ -133,7 +132,7 @@ def test_what_helps_is_named_and_the_scale_comes_first(first, second, focal, opt
 
 
 @pytest.mark.slow
-def test_checkpoints_tell_what_they_were_trained_on_also_when_a_run_is_continued(tmp_path) -> None:
+def test_checkpoints_tell_what_they_were_trained_on_also_when_a_run_is_continued(tmp_path):
     recipe = resolve(RECIPE)
     expected = trained_domain(recipe.build_data(), recipe.views, recipe.seed, steps=6)
     whole = train(recipe, tmp_path / "whole").folder
@@ -153,7 +152,7 @@ GROWING = "view_sampler.max_gap={schedule: linear, values: [4, 20], at: [0, 10]}
     [("locus", ["training.steps=12"]), ("tokengs", ["training.steps=12", GROWING]),
      ("tokengs_bounded", [])],
 )  # fmt: skip
-def test_the_own_test_data_of_a_recipe_lie_inside(name: str, options: list[str]) -> None:
+def test_the_own_test_data_of_a_recipe_lie_inside(name, options):
     recipe = resolve(f"recipes/tiny/{name}.yaml", options)
     source, sampler = recipe.build_data(), recipe.build_view_sampler()
     steps = recipe.training.steps
@@ -164,14 +163,14 @@ def test_the_own_test_data_of_a_recipe_lie_inside(name: str, options: list[str])
     assert not trained.differences(test)
 
 
-def test_a_scene_that_fails_is_left_out_of_the_ranges(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_that_fails_is_left_out_of_the_ranges(monkeypatch):
     recipe = resolve(RECIPE)
     source = recipe.build_data()
     monkeypatch.setattr(type(source.scenes("train")[0]), "cameras", None)
     assert trained_domain(source, recipe.views, 0).samples == 0
 
 
-def test_a_cut_checkpoint_does_not_hinder_going_on(tmp_path: Path) -> None:
+def test_a_cut_checkpoint_does_not_hinder_going_on(tmp_path):
     folder = train(resolve(RECIPE, ["training.steps=3"]), tmp_path / "run").folder
     folder.checkpoint.write_bytes(folder.checkpoint.read_bytes()[:1000])
     train(resolve(RECIPE), tmp_path / "run", resume=True)

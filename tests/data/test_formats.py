@@ -26,7 +26,6 @@ from upath import UPath
 
 from qgs.data import PhotosSource
 from qgs.data import photos as formats
-from qgs.data.photos.source import PhotoScene
 from qgs.wording import warn_once
 
 REAL = ("mary_rose", "office_walk", "desk")
@@ -37,7 +36,7 @@ def _warnings_are_told_again():
     warn_once.cache_clear()
 
 
-def variants(folder: Path, photos: PhotoSet) -> list[PhotoScene]:
+def variants(folder, photos):
     """The set at its own size: of a centred pinhole in formats that know no other, or in others."""
     if photos.intrinsics == centred(photos).intrinsics:
         paths = [
@@ -53,7 +52,7 @@ def variants(folder: Path, photos: PhotoSet) -> list[PhotoScene]:
     return [scene(path, photos.size) for path in paths]
 
 
-def assert_same(read: PhotoScene, photos: PhotoSet, poses: float = 1e-9) -> None:
+def assert_same(read, photos, poses=1e-9):
     assert read.cameras.c2w.dtype == torch.float64
     np.testing.assert_allclose(read.cameras.c2w, photos.c2w, rtol=0, atol=poses)
     expected = np.tile(photos.intrinsics, (len(photos.files), 1))
@@ -71,7 +70,7 @@ def test_a_synthetic_set(tmp_path):
             assert_same(read, photos)
 
 
-def real(name: str) -> PhotoScene:
+def real(name):
     path = real_folder(name)
     with Image.open(next((path / "images").iterdir())) as image:
         return scene(path, (image.height, image.width))

@@ -1,17 +1,14 @@
 """Evaluation indices: what is read, what is refused, which samples they name."""
 
 import json
-from collections.abc import Sequence
-from pathlib import Path
 
 import pytest
 import torch
 from line_scenes import Line, Lines
 from photo_formats import opened, synthetic, write_nerfstudio
 from tables import fault
-from torch import Tensor
 
-from qgs.contracts import EvaluationConfig, Scene, ViewsConfig
+from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.data.evaluation import (
     EvaluationPlan,
     IndexEntry,
@@ -26,11 +23,11 @@ VIEWS = ViewsConfig(inputs=2, gap=(2, 5))
 class Strip(Line):
     """A line that counts what it decodes, or cannot be decoded."""
 
-    def __init__(self, name: str, frames: int = 8, broken: Exception | None = None) -> None:
+    def __init__(self, name, frames=8, broken=None):
         super().__init__(frames, name=name)
         self.broken, self.decoded = broken, 0
 
-    def images(self, frames: Sequence[int]) -> Tensor:
+    def images(self, frames):
         if self.broken:
             raise self.broken
         self.decoded += 1
@@ -38,15 +35,15 @@ class Strip(Line):
 
 
 class Strips(Lines):
-    def scenes(self, split: str) -> Sequence[Scene]:
+    def scenes(self, split):
         return self._scenes if split == "test" else ()
 
 
-def entry(context: Sequence[int], target: Sequence[int]) -> IndexEntry:
+def entry(context, target):
     return IndexEntry(context=list(context), target=list(target))
 
 
-def test_a_published_index_is_read(tmp_path: Path) -> None:
+def test_a_published_index_is_read(tmp_path):
     file = tmp_path / "index.json"
     told = {"a": {"context": [0, 12], "target": [3, 6], "overlap": 0.5}, "b": None}
     file.write_text(json.dumps(told))
@@ -64,7 +61,7 @@ REFUSED = [
 ]
 
 
-def test_other_files_are_refused_with_the_reason(tmp_path: Path) -> None:
+def test_other_files_are_refused_with_the_reason(tmp_path):
     file, faults = tmp_path / "index.json", []
     for text, reason in REFUSED:
         file.write_text(text)
@@ -72,12 +69,12 @@ def test_other_files_are_refused_with_the_reason(tmp_path: Path) -> None:
     assert not any(faults), faults
 
 
-def test_a_missing_index_is_told_with_its_path() -> None:
+def test_a_missing_index_is_told_with_its_path():
     with pytest.raises(FileNotFoundError, match=r"no evaluation index at nowhere/index\.json"):
         read_index("nowhere/index.json")
 
 
-def test_samples_are_those_of_the_index_in_its_order() -> None:
+def test_samples_are_those_of_the_index_in_its_order():
     source = Strips(Strip("one"), Strip("two"), Strip("three"))
     index = {"three": entry([4, 1], [2, 3, 2]), "one": entry([0, 7], [5])}
     plan = EvaluationPlan(source, VIEWS, EvaluationConfig(scenes=1), index)
@@ -89,7 +86,7 @@ def test_samples_are_those_of_the_index_in_its_order() -> None:
     assert first.inputs.cameras.c2w[0, 0].tolist() == torch.eye(4).tolist()
 
 
-def test_what_is_not_judged_is_named() -> None:
+def test_what_is_not_judged_is_named():
     source = Strips(Strip("good"), Strip("short", 4), Strip("spare"))
     index = {
         "gone": entry([0, 1], [2]),
@@ -106,7 +103,7 @@ def test_what_is_not_judged_is_named() -> None:
     assert "4, -1" in failures["short"]
 
 
-def test_scenes_that_do_not_decode_are_told_and_the_rest_goes_on() -> None:
+def test_scenes_that_do_not_decode_are_told_and_the_rest_goes_on():
     broken = Strip("broken", broken=OSError("truncated file"))
     plan = EvaluationPlan(Strips(broken, Strip("good")), VIEWS, EvaluationConfig())
     failure, sample = plan.samples()
@@ -116,8 +113,8 @@ def test_scenes_that_do_not_decode_are_told_and_the_rest_goes_on() -> None:
 
 
 def test_damaged_photo_folders_are_named_and_positions_never_move_in_silence(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     photos, sets = synthetic(tmp_path / "photos", 5), tmp_path / "sets"
     for name in ("broken", "cut", "gap", "good"):
         write_nerfstudio(sets / name, photos)
@@ -137,7 +134,7 @@ def test_damaged_photo_folders_are_named_and_positions_never_move_in_silence(
     assert "view_001.png" in reasons[2]
 
 
-def test_scenes_are_decoded_one_at_a_time() -> None:
+def test_scenes_are_decoded_one_at_a_time():
     scenes = [Strip(f"scene{n}") for n in range(4)]
     samples = EvaluationPlan(Strips(*scenes), VIEWS, EvaluationConfig()).samples()
     for number in range(4):

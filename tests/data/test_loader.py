@@ -2,7 +2,6 @@
 
 import multiprocessing
 import threading
-from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -11,16 +10,15 @@ import torch
 from line_scenes import Line, Lines
 from photo_formats import synthetic, write_nerfstudio
 
-from qgs.composer import Recipe, resolve
+from qgs.composer import resolve
 from qgs.contracts import ViewsConfig
-from qgs.data.samples import Batch
 from qgs.data.stream import SampleError, Share, scenes_fingerprint, training_batches
 
 TINY = Path(__file__).parents[2] / "recipes" / "tiny" / "tokengs.yaml"
 ROOMS = resolve(TINY, ["data.image_size=[16, 16]", "data.scenes=5", "data.samples=1"])
 
 
-def photos(folder: Path, broken: int | None = None) -> Recipe:
+def photos(folder, broken=None):
     write_nerfstudio(folder, synthetic(folder.with_name("photos"), 8))
     if broken is not None:
         file = folder / "images" / f"view_{broken:03d}.png"
@@ -29,7 +27,7 @@ def photos(folder: Path, broken: int | None = None) -> Recipe:
     return resolve({**ROOMS.tree, "data": data}, ["views.gap=[4, 7]", "views.targets=6"])
 
 
-def batches(recipe: Recipe, count: int, size: int, **options) -> list[Batch]:
+def batches(recipe, count, size, **options):
     stream = training_batches(recipe.build_data(), recipe.views, size, 3, **options)
     try:
         return list(islice(stream, count))
@@ -37,7 +35,7 @@ def batches(recipe: Recipe, count: int, size: int, **options) -> list[Batch]:
         stream.close()
 
 
-def assert_same(first: Sequence[Batch], second: Sequence[Batch]) -> None:
+def assert_same(first, second):
     assert len(first) == len(second)
     for a, b in zip(first, second, strict=True):
         assert a.scenes == b.scenes
@@ -112,7 +110,7 @@ def test_a_broken_image_is_named_with_its_scene_and_file(tmp_path, workers):
 class Grouped(Lines):
     """Scenes of equal cameras, stored in groups."""
 
-    def __init__(self, count: int, groups: Sequence[Sequence[int]]) -> None:
+    def __init__(self, count, groups):
         super().__init__(*(Line(4, name=str(index)) for index in range(count)))
         self._groups = groups
 

@@ -5,7 +5,7 @@ import pytest
 from qgs.machine import TooLargeError, refuse_more_than_memory, with_unit
 
 
-def test_only_what_does_not_fit_is_refused() -> None:
+def test_only_what_does_not_fit_is_refused():
     refuse_more_than_memory("this", {"a": 4, "b": 6}, "Less.", 10)
     with pytest.raises(TooLargeError, match=r"11 bytes.*10 bytes.*b 7 bytes, a 4"):
         refuse_more_than_memory("this", {"a": 4, "b": 7}, "Less.", 10)

@@ -1,8 +1,6 @@
 """nerfstudio's masks, depth maps, splits, lenses and scaled copies."""
 
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,18 +18,18 @@ from qgs.data.samples import make_sample
 
 
 @pytest.fixture
-def folder(tmp_path) -> Path:
+def folder(tmp_path):
     return write_nerfstudio(tmp_path, synthetic(tmp_path / "photos"))
 
 
-def change(folder: Path, frame: int | None = None, **values: Any) -> None:
+def change(folder, frame=None, **values):
     file = folder / "transforms.json"
     content = json.loads(file.read_text())
     (content if frame is None else content["frames"][frame]).update(values)
     file.write_text(json.dumps(content))
 
 
-def save_mask(folder: Path, value: int = 255, size=(30, 40), kind: type = np.uint8) -> None:
+def save_mask(folder, value=255, size=(30, 40), kind=np.uint8):
     """The mask of frame 1: `value` in the left half."""
     mask = np.zeros(size, kind)
     mask[:, : size[1] // 2] = value
@@ -126,7 +124,7 @@ def test_a_split_that_names_no_frame_is_told(folder):
         read(folder)
 
 
-def parsed(folder: Path):
+def parsed(folder):
     return read_transforms(opened_path(folder) / "transforms.json")
 
 

@@ -1,7 +1,6 @@
 import json
 import math
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import photo_formats
@@ -17,7 +16,7 @@ from qgs.data.lenses import Fisheye, RadialTangential, undistorted
 GLOBAL = {"fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
 
 
-def folder(path: Path, count: int = 10, size=(64, 48), frame=None, **top) -> Path:
+def folder(path, count=10, size=(64, 48), frame=None, **top):
     """Photos whose red channel is the frame's number; `frame` changes entries of frame 1."""
     (path / "images").mkdir(exist_ok=True)
     for i in range(count):
@@ -73,7 +72,7 @@ def test_missing_images_are_counted_and_named(tmp_path, caplog):
         opened(tmp_path)
 
 
-REFUSED: list[tuple[dict, dict, str]] = [
+REFUSED = [
     ({"transform_matrix": [[math.nan] * 4] * 4}, {}, r"frame 1 \(images/1.png\).*NaN"),
     ({"transform_matrix": np.diag([2, 1, 1, 1]).tolist()}, {}, "frame 1 .*rigid"),
     ({"transform_matrix": np.diag([-1, 1, 1, 1]).tolist()}, {}, "frame 1 .*rigid"),
@@ -147,7 +146,7 @@ def test_lens_distortion_is_undone(tmp_path):
 def test_where_the_lens_would_fold_the_photo_it_sees_nothing(tmp_path, model):
     """x (1 - 0.6 x^2) is largest at 0.745, and x of its angle's polynomial at an angle of it."""
     turn = math.sqrt(1 / 1.8) if model == "OPENCV" else math.tan(math.sqrt(1 / 1.8))
-    wide: dict = {"fl_x": 30.0, "fl_y": 30.0, "cx": 32.0, "cy": 24.0}
+    wide = {"fl_x": 30.0, "fl_y": 30.0, "cx": 32.0, "cy": 24.0}
     path = folder(tmp_path, camera_model=model, k1=-0.6, **wide)
     lens = (RadialTangential if model == "OPENCV" else Fisheye)(k1=-0.6)
     image = undistorted(np.ones((48, 64), np.uint8), (30.0, 30.0, 32.0, 24.0), lens)

@@ -20,7 +20,7 @@ class MaskedLine(Line):
     """A line that wants only the left half of frame f modelled, f in percent; float64 poses."""
 
     @property
-    def cameras(self) -> Cameras:
+    def cameras(self):
         return super().cameras.to(torch.float64)
 
     def masks(self, frames):
@@ -105,7 +105,7 @@ def test_a_mirrored_camera_sees_the_mirrored_point_in_the_mirrored_pixel():
     torch.testing.assert_close(projected(flipped, mirror * point), expected)
 
 
-def projected(cameras: Cameras, point: torch.Tensor) -> torch.Tensor:
+def projected(cameras, point):
     """x, y in pixels and depth of a homogeneous world point in each camera."""
     x, y, z, _ = (torch.linalg.inv(cameras.c2w) @ point).unbind(-1)
     fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
@@ -131,7 +131,7 @@ def test_masks_follow_their_frames_into_mirrors_and_batches():
 def test_poses_far_from_the_origin_keep_their_digits():
     class Far(MaskedLine):
         @property
-        def cameras(self) -> Cameras:
+        def cameras(self):
             near = super().cameras
             c2w = near.c2w.clone()
             c2w[:, :3, 3] += 1e6
@@ -196,7 +196,7 @@ class Around(Line):
     """Cameras on a circle about the origin, at a distance of 4, that look at it."""
 
     @property
-    def cameras(self) -> Cameras:
+    def cameras(self):
         angles = torch.linspace(0, 3, self.count, dtype=torch.float64)
         eyes = 4 * torch.stack([angles.sin(), 0 * angles, -angles.cos()], -1)
         c2w = look_at(eyes, -eyes, torch.tensor([0.0, 1, 0]).expand_as(eyes).double())
@@ -234,7 +234,7 @@ def test_a_point_behind_or_beside_the_cameras_is_not_looked_at():
     assert look_at_depth(walk[:, :3]) == look_at_depth(walk)
 
 
-def test_pose_noise_moves_inputs_but_the_first_and_nothing_else() -> None:
+def test_pose_noise_moves_inputs_but_the_first_and_nothing_else():
     """Rotations and directions from the first input are off by the angle, about every axis."""
     scene, views = Line(9), ViewsConfig(inputs=3, pose_noise=2.0)
     plain = make_sample(scene, (1, 4, 7), (2, 5), views, False)
@@ -253,7 +253,7 @@ def test_pose_noise_moves_inputs_but_the_first_and_nothing_else() -> None:
     assert moved.std(dim=(0, 1)) == pytest.approx([2.0] * 3, rel=0.15)
 
 
-def test_pose_noise_of_an_evaluation_is_the_same_each_time_and_in_its_protocol() -> None:
+def test_pose_noise_of_an_evaluation_is_the_same_each_time_and_in_its_protocol():
     recipe = resolve("recipes/tiny/tokengs.yaml", ["views.pose_noise=3", "evaluation.scenes=2"])
     source = recipe.build_data()
     first, second = (
@@ -268,7 +268,7 @@ def test_pose_noise_of_an_evaluation_is_the_same_each_time_and_in_its_protocol()
     assert "noise" not in protocol_of(exact).content["poses"]
 
 
-def test_times_of_photos_are_kept() -> None:
+def test_times_of_photos_are_kept():
     plain = make_sample(Line(9), (1, 4, 7), (2,), ViewsConfig(inputs=3), False).inputs
     timed = replace(plain, times=torch.rand(1, 3), target_time=torch.rand(1, 1))
     both = stack_views([mirrored_views(timed), timed])

@@ -4,8 +4,6 @@ import io
 import json
 import sys
 import tarfile
-from pathlib import Path
-from typing import Any
 
 import kubric_to_photos
 import numpy as np
@@ -32,12 +30,12 @@ VIEWS = ViewsConfig(inputs=2, targets=2, gap=(2, 4))
 class Moving(Line):
     """`cameras` at each time, by time: frame 0 is the first of time 0."""
 
-    def __init__(self, times: int, cameras: int, held_out: tuple[int, ...] = ()) -> None:
+    def __init__(self, times, cameras, held_out=()):
         super().__init__(times * cameras, held_out, name=f"moving{times}x{cameras}")
         self.times = torch.arange(times).double().repeat_interleave(cameras) / 10
 
 
-def dnerf(folder: Path, times: dict[str, list[Any]], cameras: int = 1) -> Path:
+def dnerf(folder, times, cameras=1):
     """A folder as D-NeRF's: a transforms file for each split, a square that moves over time."""
     for part, of_part in times.items():
         (folder / part).mkdir(parents=True)
@@ -56,12 +54,12 @@ def dnerf(folder: Path, times: dict[str, list[Any]], cameras: int = 1) -> Path:
     return folder
 
 
-def photos(folder: Path) -> PhotosSource:
+def photos(folder):
     options = {"path": str(folder), "image_size": (16, 16)}
     return PhotosSource(PhotosSource.Config.model_validate(options))
 
 
-def test_times_of_dnerf(tmp_path: Path) -> None:
+def test_times_of_dnerf(tmp_path):
     folder = dnerf(tmp_path / "ball", {"train": [0, 0.25, 0.5], "test": [0.4]})
     (scene,) = photos(folder).scenes("train")
     assert scene.times is not None
@@ -74,7 +72,7 @@ def test_times_of_dnerf(tmp_path: Path) -> None:
     assert photos(equal).scenes("train")[0].times is None, "nothing moves in one moment"
 
 
-def test_a_camera_that_stands_still_while_things_move_repeats_no_pose(tmp_path: Path) -> None:
+def test_a_camera_that_stands_still_while_things_move_repeats_no_pose(tmp_path):
     folder = dnerf(tmp_path / "ball", {"train": [0, 0.5, 1], "test": [0.25]})
     for file in folder.glob("transforms_*.json"):
         content = json.loads(file.read_text())
@@ -88,13 +86,13 @@ def test_a_camera_that_stands_still_while_things_move_repeats_no_pose(tmp_path: 
     assert "repeats" in run_qgs("data", "check", folder, "--geometry", 0).output
 
 
-def test_times_that_cannot_be(tmp_path: Path) -> None:
+def test_times_that_cannot_be(tmp_path):
     for number, time in enumerate([None, "noon", float("nan"), [1]]):
         folder = dnerf(tmp_path / str(number), {"train": [0, time, 0.5]})
         assert not fault("'time'", lambda path: photos(path).scenes("train")[0].cameras, folder)
 
 
-def test_one_camera_a_time_gives_that_frame_as_all_targets() -> None:
+def test_one_camera_a_time_gives_that_frame_as_all_targets():
     scene = Moving(12, 1)
     for seed in range(40):
         inputs, targets = draw_frames(scene, VIEWS, np.random.default_rng(seed))
@@ -103,7 +101,7 @@ def test_one_camera_a_time_gives_that_frame_as_all_targets() -> None:
         assert inputs[0] < targets[0] < inputs[-1]
 
 
-def test_several_cameras_a_time_give_targets_of_one_time_and_inputs_of_several_cameras() -> None:
+def test_several_cameras_a_time_give_targets_of_one_time_and_inputs_of_several_cameras():
     scene, asked, used = Moving(9, 4), set[float](), set[tuple[int, ...]]()
     assert scene.times is not None
     for seed in range(60):
@@ -120,7 +118,7 @@ def test_several_cameras_a_time_give_targets_of_one_time_and_inputs_of_several_c
     assert {0.0, 1.0, 0.5} <= {round(part, 6) for part in asked}
 
 
-def test_times_go_from_0_to_1_and_ask_for_that_of_the_targets() -> None:
+def test_times_go_from_0_to_1_and_ask_for_that_of_the_targets():
     sample = make_sample(Moving(10, 2), (2, 11), (6, 7), VIEWS, False)
     assert sample.inputs.times is not None
     assert sample.inputs.target_time is not None
@@ -135,7 +133,7 @@ def test_times_go_from_0_to_1_and_ask_for_that_of_the_targets() -> None:
         collate([sample, still])
 
 
-def test_targets_of_two_times_are_judged_apart() -> None:
+def test_targets_of_two_times_are_judged_apart():
     scene = Moving(10, 2, held_out=(6, 7, 9))
     windows = held_out_windows(scene, VIEWS)
     assert [targets for _, targets in windows] == [(6, 7, 9)]
@@ -144,7 +142,7 @@ def test_targets_of_two_times_are_judged_apart() -> None:
     assert all(sample.inputs.target_time is not None for sample in samples)
 
 
-def test_chunks_keep_times(tmp_path: Path) -> None:
+def test_chunks_keep_times(tmp_path):
     source = photos(dnerf(tmp_path / "ball", {"train": [0, 0.5, 1 / 3], "test": [0.4]}))
     pack(source, own_splits(source), UPath(tmp_path / "packed"), {})
     options = {"path": str(tmp_path / "packed"), "image_size": (16, 16)}
@@ -174,7 +172,7 @@ DYNAMIC = (
 )
 
 
-def test_a_dynamic_model_trains_on_photos_with_times(tmp_path: Path) -> None:
+def test_a_dynamic_model_trains_on_photos_with_times(tmp_path):
     times = {"train": [i / 7 for i in range(8)], "test": [0.3]}
     folder = dnerf(tmp_path / "ball", times)
     data = f"data={{type: qgs/photos, path: {folder}, image_size: [16, 16]}}"
@@ -185,7 +183,7 @@ def test_a_dynamic_model_trains_on_photos_with_times(tmp_path: Path) -> None:
         resolve("tiny/tokengs.yaml", [*DYNAMIC])
 
 
-def kubric_tar(file: Path, camera: int, times: int) -> None:
+def kubric_tar(file, camera, times):
     """One camera of a scene, in the layout that TokenGS 2026.6 reads."""
     half = 0.5**0.5
     positions = [[float(camera), 0.1 * time, 2.0] for time in range(times)]
@@ -210,7 +208,7 @@ def kubric_tar(file: Path, camera: int, times: int) -> None:
             archive.addfile(member, io.BytesIO(content))
 
 
-def test_kubric_becomes_photos_with_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kubric_becomes_photos_with_times(tmp_path, monkeypatch):
     (tmp_path / "v0" / "scn0").mkdir(parents=True)
     for camera in range(3):
         kubric_tar(tmp_path / "v0" / "scn0" / f"output_{camera:03d}.tar", camera, 4)

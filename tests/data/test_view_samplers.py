@@ -16,7 +16,7 @@ from qgs.data.view_samplers import Span
 VIEWS = ViewsConfig(inputs=2, targets=3, gap=(2, 5))
 
 
-def test_the_default_draws_as_ever() -> None:
+def test_the_default_draws_as_ever():
     for seed in range(50):
         first, second = (np.random.default_rng(seed) for _ in range(2))
         assert Span(Span.Config()).draw(Line(12), VIEWS, first, 0) == draw_frames(
@@ -25,7 +25,7 @@ def test_the_default_draws_as_ever() -> None:
         assert first.random() == second.random(), "the generator is where it was"
 
 
-def test_a_schedule_moves_the_gap_of_the_default() -> None:
+def test_a_schedule_moves_the_gap_of_the_default():
     sampler = Span(Span.Config(min_gap=2))
     sampler.schedules = {"max_gap": Linear(schedule="linear", values=(2, 10), at=(0, 100))}
     for step, largest in ((0, 2), (50, 6), (100, 10), (END, 10)):
@@ -34,7 +34,7 @@ def test_a_schedule_moves_the_gap_of_the_default() -> None:
 
 
 @pytest.mark.parametrize(("least", "largest", "wrong"), [(9, 4, True), (4, 9, False)])
-def test_a_least_gap_above_the_largest_is_refused(least: int, largest: int, wrong: bool) -> None:
+def test_a_least_gap_above_the_largest_is_refused(least, largest, wrong):
     with pytest.raises(RecipeError, match=r"view_sampler\.min_gap") if wrong else nullcontext():
         resolve(
             "recipes/tiny/tokengs.yaml",

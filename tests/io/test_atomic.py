@@ -18,18 +18,18 @@ from qgs.io.files import (
 from qgs.io.tensors import write_tensors
 
 
-def put(folder: Path, text: str, *names: str) -> None:
+def put(folder, text, *names):
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
 
 
-def texts(folder: Path) -> dict[str, str]:
+def texts(folder):
     files = (path for path in folder.rglob("*") if path.is_file())
     return {str(path.relative_to(folder)): path.read_text() for path in files}
 
 
-def replace(folder: Path, mark: str, *names: str) -> None:
+def replace(folder, mark, *names):
     with replacing_entries(folder, mark) as fresh:
         put(fresh, "new", *names)
 
@@ -51,7 +51,7 @@ def test_entries_come_back_where_moving_fails(tmp_path, monkeypatch):
     put(tmp_path / "out", "old", "a/x", "b/x")
     rename = Path.rename
 
-    def interrupted(self: Path, target: Path) -> Path:
+    def interrupted(self, target):
         if self.parent.name == "fresh" and self.name == "b":
             raise KeyboardInterrupt
         return rename(self, target)
@@ -66,7 +66,7 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path):
     path = tmp_path / "a.txt"
     write_text(path, "old")
 
-    def fail() -> None:
+    def fail():
         with replacing(path) as temporary:
             temporary.write_text("half")
             raise KeyboardInterrupt

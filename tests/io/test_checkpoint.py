@@ -4,7 +4,6 @@ import json
 import os
 import pickle  # noqa: TID251
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -26,13 +25,12 @@ from qgs.io.checkpoint import (
     write_checkpoint,
 )
 from qgs.io.tensors import SEAL, CheckpointError, write_tensors
-from qgs.model import QueryGaussianModel
 
 RECIPES = Path(__file__).parents[2] / "recipes" / "tiny"
 
 
 @pytest.fixture(scope="module")
-def model() -> QueryGaussianModel:
+def model():
     torch.manual_seed(0)
     model = qgs.compose(RECIPES / "locus.yaml", SMALL).eval()
     with torch.no_grad():
@@ -42,29 +40,29 @@ def model() -> QueryGaussianModel:
 
 
 @pytest.fixture(scope="module")
-def written(model: QueryGaussianModel, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def written(model, tmp_path_factory):
     path = tmp_path_factory.mktemp("saved") / "new" / "model.safetensors"
     qgs.save(model, path, extra={"step": "7000", KEY: Domain({"depth": [1.0]}, 1).text})
     return path.read_bytes()
 
 
 @pytest.fixture
-def saved(written: bytes, tmp_path: Path) -> Path:
+def saved(written, tmp_path):
     path = tmp_path / "model.safetensors"
     path.write_bytes(written)
     return path
 
 
-def metadata_of(path: Path) -> dict[str, str]:
+def metadata_of(path):
     with safe_open(path, "pt") as file:
         return file.metadata()
 
 
-def tensors_of(path: Path) -> dict[str, torch.Tensor]:
+def tensors_of(path):
     return {name: tensor.clone() for name, tensor in load_file(path).items()}
 
 
-def rewrite(path: Path, tensors: dict[str, torch.Tensor] | None = None, **changed: str) -> None:
+def rewrite(path, tensors=None, **changed):
     """Write the file again with other tensors or metadata, and checksums of these."""
     write_tensors(path, tensors or tensors_of(path), metadata_of(path) | changed)
 
@@ -166,10 +164,10 @@ def test_damaged_files_are_refused_by_name(saved, written):
 class Explosive:
     """Would leave a trace if it were unpickled."""
 
-    def __init__(self, trace: Path) -> None:
+    def __init__(self, trace):
         self.trace = trace
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self):
         return os.mkdir, (str(self.trace),)
 
 
@@ -231,7 +229,7 @@ def test_forged_metadata_is_one_error_with_the_file_and_no_file_is_followed(save
     text = metadata["qgs.recipe"]
     recipes = ["null", '["optimizer"]', text[:90], '{"a":' * 5000, "{}"]
     recipes.append('{"training": [1], "plugins": 3}')
-    changed: list[dict[str, Any]] = [{"swap": {"head": {"type": "qgs/free"}}}]
+    changed = [{"swap": {"head": {"type": "qgs/free"}}}]
     names = ("secret.yaml", "/dev/zero", ["secret.yaml"], None)
     changed += [{"extends": name} for name in names]
     recipes += [json.dumps(json.loads(text) | change) for change in changed]

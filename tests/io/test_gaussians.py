@@ -3,14 +3,12 @@
 import os
 from dataclasses import replace
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from commands import run_qgs
 from plyfile import PlyData, PlyElement
-from torch import Tensor
 
 import qgs
 from qgs.extensions import ExtensionError
@@ -24,8 +22,8 @@ from qgs.io.gaussians import (
 from qgs.types import Gaussians, named_tensors
 
 
-def random_gaussians(*batch: int, harmonics: int = 0) -> Gaussians:
-    def draw(*trailing: int) -> Tensor:
+def random_gaussians(*batch, harmonics=0):
+    def draw(*trailing):
         return torch.rand(*batch, *trailing)
 
     quats = torch.nn.functional.normalize(draw(4) - 0.5, dim=-1)
@@ -33,16 +31,16 @@ def random_gaussians(*batch: int, harmonics: int = 0) -> Gaussians:
     return Gaussians(*parts, sh=torch.randn(*batch, harmonics, 3) if harmonics else None)
 
 
-def saved(path: Path, gaussians: Gaussians) -> Path:
+def saved(path, gaussians):
     save_ply(gaussians, path)
     return path
 
 
-def vertices_of(path: Path) -> np.ndarray:
+def vertices_of(path):
     return PlyData.read(str(path))["vertex"].data
 
 
-def ply(**elements: np.ndarray) -> bytes:
+def ply(**elements):
     described = [PlyElement.describe(data, name) for name, data in elements.items()]
     file = BytesIO()
     PlyData(described).write(file)
@@ -121,7 +119,7 @@ def test_files_of_fewer_degrees_are_read(tmp_path):
     vertices = vertices_of(saved(tmp_path / "scene.ply", given))
     kept = [name for name in PROPERTIES if not name.startswith("f_rest_")]
 
-    def written(rest: int) -> Path:
+    def written(rest):
         fewer = np.zeros(4, [(n, "<f4") for n in (*kept, *(f"f_rest_{i}" for i in range(rest)))])
         for name in kept:
             fewer[name] = vertices[name]

@@ -33,7 +33,7 @@ plugin = Plugin("box", 1, (), models={
 
 
 @pytest.fixture
-def shipped(install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def shipped(install, tmp_path, monkeypatch):
     """The file of the model box/small; the working directory is empty."""
     install("qgs-box", "box", PLUGIN)
     file = Path(sys.path[0]) / "models" / "small.safetensors"

@@ -17,7 +17,7 @@ OPTIONS = {"min_gap": 6, "max_gap": 12, "initial_min_gap": 4, "initial_max_gap":
 VIEWS = ViewsConfig(inputs=2, targets=3, gap=(2, 5))
 
 
-def bounded(**options) -> Bounded:
+def bounded(**options):
     return Bounded(Bounded.Config(**(OPTIONS | {"margin": 1, "warm_up_steps": 100} | options)))
 
 
@@ -25,7 +25,7 @@ def bounded(**options) -> Bounded:
     ("step", "bounds"),
     [(0, (4, 6)), (50, (5, 9)), (99, (5, 11)), (100, (6, 12)), (500, (6, 12)), (END, (6, 12))],
 )
-def test_the_gap_widens_as_in_pixelsplat(step: int, bounds: tuple[int, int]) -> None:
+def test_the_gap_widens_as_in_pixelsplat(step, bounds):
     """initial + int((final - initial) * step / warm_up_steps), at most the final number."""
     sampler, gaps, places = bounded(), set[int](), set[int]()
     for seed in range(400):
@@ -39,7 +39,7 @@ def test_the_gap_widens_as_in_pixelsplat(step: int, bounds: tuple[int, int]) -> 
     assert min(places) == 1
 
 
-def test_short_scenes_and_several_inputs() -> None:
+def test_short_scenes_and_several_inputs():
     rng = np.random.default_rng(0)
     assert bounded().draw(Line(5), VIEWS, rng, END)[0] == (0, 4)
     with pytest.raises(ValueError, match="5 frames"):
@@ -49,17 +49,17 @@ def test_short_scenes_and_several_inputs() -> None:
     assert list(inputs) == sorted(inputs)
 
 
-def gaps(batches) -> list[int]:
+def gaps(batches):
     return [frames[-1] - frames[0] for batch in batches for frames in batch.input_frames]
 
 
-def test_a_training_widens_the_gap_and_resumes_where_it_was() -> None:
+def test_a_training_widens_the_gap_and_resumes_where_it_was():
     """Two samples a batch, two batches a step: the warm-up of 5 steps ends with sample 20."""
     options = ["view_sampler.warm_up_steps=5", "view_sampler.initial_max_gap=2"]
     recipe = resolve("tiny/tokengs_bounded.yaml", [*options, "data.image_size=[16, 16]"])
     source, sampler = recipe.build_data(), recipe.build_view_sampler()
 
-    def stream(start: int, count: int):
+    def stream(start, count):
         batches = training_batches(source, recipe.views, 2, 0, start, sampler=sampler, accumulate=2)
         return gaps(islice(batches, count))
 

@@ -16,7 +16,7 @@ def photos(tmp_path):
     return synthetic(tmp_path / "photos")
 
 
-def matrix(photos) -> list[list[float]]:
+def matrix(photos):
     fx, fy, cx, cy = photos.intrinsics
     return [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
 
@@ -53,7 +53,7 @@ FORMS = {
 }  # fmt: skip
 
 
-def renamed(photos, old: str, new: str, change=lambda value: value):
+def renamed(photos, old, new, change=lambda value: value):
     others = [{key: value for key, value in c.items() if key != old} for c in named(photos)]
     return [{**o, new: change(c[old])} for o, c in zip(others, named(photos), strict=True)]
 

@@ -17,23 +17,23 @@ from tables import fault
 from upath import UPath
 
 
-def encoded(color, size=(64, 36)) -> torch.Tensor:
+def encoded(color, size=(64, 36)):
     image = Image.new("RGB" if len(color) == 3 else "RGBA", size, color)
     return as_tensor(photo_formats.encoded(image))
 
 
-def as_tensor(data: bytes) -> torch.Tensor:
+def as_tensor(data):
     return torch.tensor(list(data), dtype=torch.uint8)
 
 
-def camera(x: float = 0.0) -> list[float]:
+def camera(x=0.0):
     """A camera at (x, 2, 3) that is turned a quarter about z."""
     w2c = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0]], float)
     w2c[:, 3] = -w2c[:, :3] @ [x, 2, 3]
     return [0.5, 0.9, 0.45, 0.55, 0, 0, *w2c.flatten()]
 
 
-def record(key: str, frames: int = 4, **extra) -> dict:
+def record(key, frames=4, **extra):
     return {
         "key": key,
         "url": "",
@@ -44,7 +44,7 @@ def record(key: str, frames: int = 4, **extra) -> dict:
     }
 
 
-def write(folder, chunks: dict[str, list], index: bool = True) -> None:
+def write(folder, chunks, index=True):
     folder.mkdir(parents=True, exist_ok=True)
     for name, records in chunks.items():
         with (folder / name).open("wb") as file:
@@ -54,7 +54,7 @@ def write(folder, chunks: dict[str, list], index: bool = True) -> None:
         (folder / "index.json").write_text(json.dumps(keys))
 
 
-def data_set(path) -> None:
+def data_set(path):
     write(path / "train", {"a.torch": [record("s0"), record("s1", 7)], "b.torch": [record("s2")]})
     write(path / "test", {"a.torch": [record("t0")]})
 
@@ -203,7 +203,7 @@ BROKEN = {
 }
 
 
-def length(path) -> int:
+def length(path):
     return len(opened(path).scenes("train")[0])
 
 
@@ -220,13 +220,13 @@ def test_broken_chunks_are_told(tmp_path):
     assert not any(faults.values()), faults
 
 
-def changed(row: int, column: int, value: float) -> torch.Tensor:
+def changed(row, column, value):
     cameras = record("s0")["cameras"]
     cameras[row, column] = value
     return cameras
 
 
-UNMEANT: list[tuple[dict, str]] = [
+UNMEANT = [
     ({"cameras": changed(2, 9, torch.nan)}, r"frame 2 \(2000\).*NaN"),
     ({"cameras": changed(1, 7, 3.0)}, "frame 1 .*not rigid"),
     ({"cameras": changed(1, 7, -1.0)}, "frame 1 .*mirrors"),

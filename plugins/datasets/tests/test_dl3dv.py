@@ -16,7 +16,7 @@ from upath import UPath
 LENS = {"camera_model": "OPENCV", "k1": -0.5, "k2": 0.01, "p1": 1e-3, "p2": -2e-3}
 
 
-def photo(number: int, size=(32, 18)) -> bytes:
+def photo(number, size=(32, 18)):
     """A PNG whose red channel is 10 times its number, with a blue gradient."""
     pixels = np.zeros((size[1], size[0], 3), np.uint8)
     pixels[..., 0] = 10 * number
@@ -24,24 +24,24 @@ def photo(number: int, size=(32, 18)) -> bytes:
     return photo_formats.encoded(pixels)
 
 
-def listing(frames: int = 4, **top) -> str:
+def listing(frames=4, **top):
     given = {"w": 128, "h": 72, "fl_x": 100.0, "fl_y": 101.0, "cx": 60.0, "cy": 37.0}
     return json.dumps(row_of_frames(frames, **given | top))
 
 
-def scene_files(inside: str = "", images: str = "images_4", **top) -> dict[str, bytes]:
+def scene_files(inside="", images="images_4", **top):
     files = {f"{inside}{images}/{i}.png": photo(i) for i in range(4)}
     return {f"{inside}transforms.json": listing(**top).encode(), **files}
 
 
-def archive(path, files: dict[str, bytes]) -> None:
+def archive(path, files):
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as file, zipfile.ZipFile(file, "w") as zipped:
         for name, data in files.items():
             zipped.writestr(name, data)
 
 
-def folder(path, files: dict[str, bytes]) -> None:
+def folder(path, files):
     for name, data in files.items():
         (path / name).parent.mkdir(parents=True, exist_ok=True)
         (path / name).write_bytes(data)
@@ -70,7 +70,7 @@ def test_folders_and_archives_read_alike(tmp_path, kind):
     is_read_as_written(f"file://{local}")
 
 
-def is_read_as_written(root) -> None:
+def is_read_as_written(root):
     (scene,) = opened(root).scenes("train")
     assert scene.name == "abc"
     assert len(scene) == 4
@@ -118,7 +118,7 @@ def test_missing_photos_are_counted_and_named(tmp_path, caplog):
     assert "abc/images_4/2.png" in caplog.text
 
 
-def length(path) -> int:
+def length(path):
     return len(opened(path).scenes("train")[0])
 
 
@@ -149,7 +149,7 @@ def test_a_damaged_photo_names_archive_and_file(tmp_path):
         scene.images([1])
 
 
-def several(path, count: int = 4) -> None:
+def several(path, count=4):
     for i in range(count):
         archive(path / "1K" / f"s{i}.zip", scene_files(f"s{i}/"))
 

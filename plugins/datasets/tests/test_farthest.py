@@ -12,12 +12,11 @@ from qgs.composer import RecipeError, resolve
 from qgs.contracts import ViewsConfig
 from qgs.contracts.schedule import END
 from qgs.data.stream import trained_domain, training_batches
-from qgs.types import Cameras
 
 VIEWS = ViewsConfig(inputs=6, targets=8)
 
 
-def farthest(**options) -> Farthest:
+def farthest(**options):
     plain = {"min_gap": 20, "max_gap": 50, "initial_min_gap": 15, "initial_max_gap": 30}
     return Farthest(Farthest.Config(**(plain | {"warm_up_steps": 100} | options)))
 
@@ -33,7 +32,7 @@ def farthest(**options) -> Farthest:
         (END, 6, (20, 50)),
     ],
 )
-def test_numbers_of_inputs_and_gaps(step: int, count: int, gaps: tuple[int, int]) -> None:
+def test_numbers_of_inputs_and_gaps(step, count, gaps):
     found = set[int]()
     for seed in range(400):
         inputs, targets = farthest().draw(Line(80), VIEWS, np.random.default_rng(seed), step)
@@ -52,35 +51,35 @@ class Bend(Line):
     """Cameras that wait at the origin and go away at the end."""
 
     @property
-    def cameras(self) -> Cameras:
+    def cameras(self):
         cameras = super().cameras
         cameras.c2w[:, 0, 3] = torch.arange(self.count).clamp_min(self.count - 4).float()
         return cameras
 
 
-def test_inputs_stand_where_cameras_move() -> None:
+def test_inputs_stand_where_cameras_move():
     sampler = farthest(min_gap=20, max_gap=20)
     inputs, _ = sampler.draw(Bend(21), VIEWS.model_copy(update={"inputs": 4}), seeded(), END)
     assert inputs[1:] == (18, 19, 20)
 
 
-def seeded() -> np.random.Generator:
+def seeded():
     return np.random.default_rng(0)
 
 
-def test_points_farthest_from_each_other() -> None:
+def test_points_farthest_from_each_other():
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0], [5, 0, 0], [2, 0, 0], [9, 0, 0]])
     # the mean is at 3.7: 9 is farthest, then 0, then 5, then 2; 5 again only after 1
     assert farthest_points(points, 6) == [5, 0, 2, 4, 1, 3]
 
 
-def test_more_inputs_than_views() -> None:
+def test_more_inputs_than_views():
     options = ["view_sampler={type: datasets/farthest, fewest: 3}", "views.inputs=2"]
     with pytest.raises(RecipeError, match="fewest"):
         resolve("tiny/tokengs_bounded.yaml", options)
 
 
-def test_batches_have_as_many_inputs_in_a_step_and_their_ranges_are_measured() -> None:
+def test_batches_have_as_many_inputs_in_a_step_and_their_ranges_are_measured():
     sampler = {"type": "datasets/farthest", "min_gap": 3, "max_gap": 7, "initial_min_gap": 3}
     options = [f"view_sampler={sampler | {'initial_max_gap': 7}}", "views.inputs=4"]
     recipe = resolve("tiny/tokengs_bounded.yaml", [*options, "data.image_size=[16, 16]"])

@@ -20,7 +20,7 @@ class Arc(Line):
     """40 cameras .5 apart around what they look at, DEPTH away; files in an order of chance."""
 
     @property
-    def cameras(self) -> Cameras:
+    def cameras(self):
         angle = 0.5 / DEPTH * (SHUFFLED - 20).double()
         c2w = torch.eye(4).double().repeat(40, 1, 1)
         c2w[:, 0, 0] = c2w[:, 2, 2] = angle.cos()
@@ -29,20 +29,18 @@ class Arc(Line):
         return Cameras(c2w, torch.tensor([8.0, 8, 4, 4]).expand(40, 4), (8, 8))
 
 
-def draws(
-    count: int, views: ViewsConfig = VIEWS, **options: object
-) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+def draws(count, views=VIEWS, **options):
     sampler = Overlapping(Overlapping.Config.model_validate(options))
     scene = Arc(40, held_out=(0, 8, 16))
     return [sampler.draw(scene, views, np.random.default_rng(k), 0) for k in range(count)]
 
 
-def steps(frames: tuple[int, ...]) -> list[int]:
+def steps(frames):
     """Places of frames on the arc."""
     return sorted(int(SHUFFLED[frame]) for frame in frames)
 
 
-def test_inputs_stand_beside_the_target_wherever_their_files_are() -> None:
+def test_inputs_stand_beside_the_target_wherever_their_files_are():
     found = draws(200)
     for inputs, targets in found:
         assert list(inputs) == sorted({*inputs})
@@ -57,7 +55,7 @@ def test_inputs_stand_beside_the_target_wherever_their_files_are() -> None:
     assert len({inputs for inputs, _ in found}) > 100
 
 
-def test_apart_moves_inputs_apart() -> None:
+def test_apart_moves_inputs_apart():
     near, far = (
         np.mean([np.ptp(steps(inputs)) for inputs, _ in draws(100, apart=(factor, factor))])
         for factor in (0.5, 2.0)
@@ -65,11 +63,11 @@ def test_apart_moves_inputs_apart() -> None:
     assert far > 2 * near
 
 
-def test_a_sample_is_a_function_of_its_seed() -> None:
+def test_a_sample_is_a_function_of_its_seed():
     assert draws(20) == draws(20)
 
 
-def test_every_held_out_photo_is_judged_with_inputs_beside_it() -> None:
+def test_every_held_out_photo_is_judged_with_inputs_beside_it():
     scene = Arc(40, held_out=(0, 8, 16))
     sampler = Overlapping(Overlapping.Config())
     plan = EvaluationPlan(Lines(scene), VIEWS, EvaluationConfig(), sampler=sampler)
@@ -80,7 +78,7 @@ def test_every_held_out_photo_is_judged_with_inputs_beside_it() -> None:
         assert first < int(SHUFFLED[sample.target_frames[0]]) < last
 
 
-def test_without_held_out_photos_four_of_all_are_judged() -> None:
+def test_without_held_out_photos_four_of_all_are_judged():
     sampler = Overlapping(Overlapping.Config())
     found = sampler.windows(Arc(40), VIEWS)
     assert [targets for _, targets in found] == [(0,), (13,), (26,), (39,)]
@@ -90,13 +88,13 @@ def test_without_held_out_photos_four_of_all_are_judged() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 4])
-def test_any_number_of_inputs(count: int) -> None:
+def test_any_number_of_inputs(count):
     for inputs, targets in draws(20, VIEWS.model_copy(update={"inputs": count})):
         assert len({*inputs}) == count
         assert min(abs(int(SHUFFLED[targets[0]]) - place) for place in steps(inputs)) <= 10
 
 
-def test_cameras_without_a_common_point_and_few_photos() -> None:
+def test_cameras_without_a_common_point_and_few_photos():
     """Their depth is swept; two photos are inputs, and the third is every target."""
     scene = Line(3, step=0.1)
     inputs, targets = Overlapping(Overlapping.Config()).draw(scene, VIEWS, seeded(), 0)
@@ -105,11 +103,11 @@ def test_cameras_without_a_common_point_and_few_photos() -> None:
     assert len(targets) == 3
 
 
-def seeded() -> np.random.Generator:
+def seeded():
     return np.random.default_rng(0)
 
 
-def test_a_scene_that_moves_is_judged_in_its_order_and_not_drawn() -> None:
+def test_a_scene_that_moves_is_judged_in_its_order_and_not_drawn():
     scene, sampler = Arc(40, held_out=(3,)), Overlapping(Overlapping.Config())
     scene.times = torch.arange(40).double()
     assert sampler.windows(scene, VIEWS) == []
@@ -117,7 +115,7 @@ def test_a_scene_that_moves_is_judged_in_its_order_and_not_drawn() -> None:
         sampler.draw(scene, VIEWS, seeded(), 0)
 
 
-def test_too_few_photos_are_refused() -> None:
+def test_too_few_photos_are_refused():
     sampler = Overlapping(Overlapping.Config())
     with pytest.raises(ValueError, match="'line2' has 2 photos, and needs 3"):
         sampler.draw(Line(2), VIEWS, seeded(), 0)
@@ -126,6 +124,6 @@ def test_too_few_photos_are_refused() -> None:
 
 
 @pytest.mark.parametrize("apart", ["[2, 1]", "[0, 1]"])
-def test_bounds_are_ordered(apart: str) -> None:
+def test_bounds_are_ordered(apart):
     with pytest.raises(RecipeError, match="least"):
         resolve("finetune/photos.yaml", [f"view_sampler.apart={apart}"])

@@ -2,7 +2,6 @@
 
 import io
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +13,6 @@ from qgs_datasets.dl3dv import Dl3dvSource
 from qgs_datatools import packing
 from upath import UPath
 
-from qgs.contracts import Scene
-from qgs.data import PhotosSource
 from qgs.data.images import to_tensor
 from qgs.data.scenes import EncodedScene
 
@@ -25,17 +22,17 @@ pytestmark = pytest.mark.skipif(
 SIZE = (144, 256)
 
 
-def photos(name: str) -> PhotosSource:
+def photos(name):
     return opened(PHOTOS / name, SIZE, format="nerfstudio")
 
 
-def as_chunks(name: str, folder: Path) -> Scene:
+def as_chunks(name, folder):
     source = photos(name)
     packing.pack(source, packing.own_splits(source), UPath(folder), {})
     return opened(folder, SIZE, ChunksSource).scenes("train")[0]
 
 
-def as_archive(name: str, folder: Path) -> Scene:
+def as_archive(name, folder):
     with zipfile.ZipFile(folder / f"{name}.zip", "w") as archive:
         for file in (PHOTOS / name).rglob("*"):
             archive.write(file, file.relative_to(PHOTOS))
@@ -86,7 +83,7 @@ def test_chunks_that_somebody_else_wrote(name, split, key, crop):
         assert difference < 4  # of 255: JPEG, written again
 
 
-def cropped(scene: EncodedScene, frame: int, crop: tuple[int, int, int, int]) -> torch.Tensor:
+def cropped(scene, frame, crop):
     left, top, width, height = crop
     with Image.open(io.BytesIO(scene.encoded(frame).data)) as image:
         cut = image.convert("RGB").crop((left, top, left + width, top + height))

@@ -6,7 +6,7 @@ from fuzzing import fuzz
 
 
 @pytest.mark.slow
-def test_damaged_data_sets_are_read_or_refused(monkeypatch, capsys, tmp_path) -> None:
+def test_damaged_data_sets_are_read_or_refused(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["fuzz_data", "--count", "200"])
     assert fuzz("", prepared) == 0, capsys.readouterr().out
