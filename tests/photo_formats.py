@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from qgs.data import PhotosSource
 
@@ -46,10 +47,9 @@ def synthetic(folder, count=6, size=(30, 40), suffix="png", seed=0):
     files = tuple(folder / f"view_{i:03d}.{suffix}" for i in range(count))
     for file in files:
         Image.fromarray(rng.integers(0, 256, (*size, 3), dtype=np.uint8)).save(file)
-    rotations, _ = np.linalg.qr(rng.normal(size=(count, 3, 3)))
-    rotations *= np.sign(np.linalg.det(rotations))[:, None, None]
     c2w = np.tile(np.eye(4), (count, 1, 1))
-    c2w[:, :3, :3], c2w[:, :3, 3] = rotations, rng.normal(size=(count, 3)) * 5
+    c2w[:, :3, :3] = Rotation.random(count, rng).as_matrix()
+    c2w[:, :3, 3] = rng.normal(size=(count, 3)) * 5
     return PhotoSet(files, c2w, (50.0, 52.0, 19.0, 16.0), size)
 
 
@@ -104,9 +104,7 @@ def copied(photos, folder, names=None):
 
 
 def opengl(c2w):
-    flipped = c2w.copy()
-    flipped[:3, 1:3] *= -1
-    return flipped.tolist()
+    return (c2w * [1, -1, -1, 1]).tolist()
 
 
 def write_nerfstudio(folder, photos, **top):
@@ -178,29 +176,10 @@ def write_colmap(
 
 
 def world_to_camera(c2w):
-    """Quaternion w, x, y, z and translation of the inverse of a pose.
-
-    Of a rotation written with few digits, the nearest one; the camera's centre stays.
-    """
-    left, _, right = np.linalg.svd(c2w[:3, :3].T)
-    rotation = left @ right
-    return (*quaternion(rotation), *(-rotation @ c2w[:3, 3]))
-
-
-def quaternion(rotation):
-    """w, x, y, z: the eigenvector of Davenport's matrix for its largest eigenvalue, 1."""
-    xx, yy, zz = np.diag(rotation)
-    xy, xz, yz = (rotation[i, j] + rotation[j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
-    wx, wy, wz = (rotation[i, j] - rotation[j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
-    davenport = np.array(
-        [
-            [xx + yy + zz, wx, wy, wz],
-            [wx, xx - yy - zz, xy, xz],
-            [wy, xy, yy - xx - zz, yz],
-            [wz, xz, yz, zz - xx - yy],
-        ]
-    )
-    return np.linalg.eigh(davenport)[1][:, -1]
+    """Quaternion w, x, y, z and translation of the inverse of a pose."""
+    w2c = np.linalg.inv(c2w)
+    x, y, z, w = Rotation.from_matrix(w2c[:3, :3]).as_quat()
+    return w, x, y, z, *w2c[:3, 3]
 
 
 def _write_text(folder, entries, camera, size):
