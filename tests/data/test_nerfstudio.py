@@ -27,12 +27,12 @@ def change(folder, frame=None, **values):
 
 
 def test_masks_are_read_at_the_delivered_size(folder):
-    change(folder, 1, mask_path="m.png")
-    with pytest.raises(FileNotFoundError, match="m"):
+    change(folder, 1, mask_path="left.png")
+    with pytest.raises(FileNotFoundError, match=r"left\.png"):
         read(folder)
     mask = np.zeros((30, 40), np.uint8)
     mask[:, :20] = 255
-    Image.fromarray(mask).save(folder / "m.png")
+    Image.fromarray(mask).save(folder / "left.png")
     masks = read(folder, (15, 20)).masks([1, 2])
     assert masks[0, 0, 7, [2, 17]].tolist() == [1, 0]
     assert torch.equal(masks[1], torch.ones(1, 15, 20))
