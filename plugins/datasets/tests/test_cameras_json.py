@@ -1,6 +1,7 @@
 """`cameras.json` with c2w and K, or other names of them, and photos beside it."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,113 +11,102 @@ from tables import fault
 
 from qgs.data.photos import formats_of
 
+LENS = [50.0, 52.0, 19.0, 16.0]
+K = [[50.0, 0, 19.0], [0, 52.0, 16.0], [0, 0, 1]]
+CENTRE = {"cx": 19.0, "cy": 16.0}
+
 
 @pytest.fixture
 def photos(tmp_path):
     return synthetic(tmp_path / "photos")
 
 
-def matrix(photos):
-    fx, fy, cx, cy = photos.intrinsics
-    return [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
-
-
-def cameras(photos, **more):
-    return [{"c2w": pose.tolist(), "K": matrix(photos), **more} for pose in photos.c2w]
-
-
-def named(photos, key="image", prefix=""):
-    return [{key: prefix + f.name, **c} for f, c in zip(photos.files, cameras(photos), strict=True)]
-
-
-FORMS = {
-    "a list": lambda p: named(p),
-    "frames": lambda p: {"frames": named(p, "file_path")},
-    "names below images": lambda p: {"cameras": named(p, prefix="images/")},
-    "names in images": lambda p: {"views": named(p, "name")},
-    "no names": lambda p: cameras(p),
-    "one K": lambda p: {"K": list(p.intrinsics), "c2w": [c[:3].tolist() for c in p.c2w]},
-    "numbers of each": lambda p: {"K": [list(p.intrinsics)] * 6, "c2w": p.c2w.tolist()},
-    "padded K": lambda p: {
-        "c2w": p.c2w.tolist(),
-        "K": np.vstack([np.c_[matrix(p), [0] * 3], [0, 0, 0, 1]]).tolist(),
-    },
-    "K of each": lambda p: {
-        "c2w": p.c2w.tolist(),
-        "K": [matrix(p)] * 6,
-        "images": [file.name for file in p.files],
-    },
-    "a size": lambda p: {
-        "w": 80, "h": 60,
-        "frames": [{"c2w": c["c2w"], "K": [2 * v for v in p.intrinsics]} for c in cameras(p)],
-    },
-}  # fmt: skip
-
-
-def renamed(photos, old, new, change=lambda value: value):
-    others = [{key: value for key, value in c.items() if key != old} for c in named(photos)]
-    return [{**o, new: change(c[old])} for o, c in zip(others, named(photos), strict=True)]
-
-
-def parts(photos, value):
-    """Intrinsics in parts of the width and height."""
-    (height, width), matrix = photos.size, np.array(value)
-    matrix[0] /= width
-    matrix[1] /= height
-    return matrix.tolist()
-
-
-DIALECTS = {
-    "views, intrinsic": lambda p: {"views": renamed(p, "K", "intrinsic")},
-    "cam2world": lambda p: renamed(p, "c2w", "cam2world"),
-    "w2c": lambda p: renamed(p, "c2w", "w2c", lambda pose: np.linalg.inv(pose).tolist()),
-    "w2c of each": lambda p: {
-        "world_to_camera": np.linalg.inv(p.c2w)[:, :3].tolist(), "intrinsics": list(p.intrinsics),
-    },
-    "OpenGL": lambda p: renamed(
-        p, "c2w", "transform_matrix", lambda pose: (np.array(pose) * [1, -1, -1, 1]).tolist()
-    ),
-    "parts": lambda p: renamed(p, "K", "K", lambda value: parts(p, value)),
-    "numbers by name": lambda p: [
-        {"image": f.name, "c2w": c.tolist(), "fl_x": 50.0, "fl_y": 52.0, "cx": 19.0, "cy": 16.0}
-        for f, c in zip(p.files, p.c2w, strict=True)
-    ],
-    "3DGS": lambda p: [
-        {"id": 0, "img_name": f.stem, "width": 40, "height": 30, "fx": 50.0, "fy": 52.0,
-         "position": c[:3, 3].tolist(), "rotation": c[:3, :3].tolist(), "cx": 19.0, "cy": 16.0}
-        for f, c in zip(p.files, p.c2w, strict=True)
-    ],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("form", [*FORMS, *DIALECTS])
-def test_what_is_read_and_whether_its_meaning_is_logged(tmp_path, photos, form, caplog):
-    folder = tmp_path / "scene"
-    copied(photos, folder / ("images" if "images" in form else ""))
-    content = (FORMS | DIALECTS)[form](photos)
-    (folder / "cameras.json").write_text(json.dumps(content))
-    read = scene(folder)
-    torch.testing.assert_close(read.cameras.c2w, torch.from_numpy(photos.c2w))
-    expected = torch.tensor(photos.intrinsics).double().expand(6, 4)
-    torch.testing.assert_close(read.cameras.intrinsics, expected)
-    assert [read.frame_name(i).split("/")[-1] for i in range(6)] == [f.name for f in photos.files]
-    assert formats_of(folder) == ["cameras"]
-    assert ("is read as" in caplog.text) == (form in DIALECTS)
-
-
-def test_what_is_refused_names_the_file(tmp_path, photos):
+@pytest.fixture
+def file(photos, tmp_path):
+    """Where photos lie, and their cameras will."""
     copied(photos, tmp_path / "scene")
-    file = tmp_path / "scene" / "cameras.json"
-    poses = photos.c2w.tolist()
+    return tmp_path / "scene" / "cameras.json"
+
+
+def rows(columns, **shared):
+    """A mapping for each photo."""
+    values = zip(*columns.values(), strict=True)
+    return [{**shared, **dict(zip(columns, row, strict=True))} for row in values]
+
+
+def forms(names, poses):
+    """What is read without a word."""
+    c2w = poses.tolist()
+    plain = {"image": names, "c2w": c2w}
+    below = {"image": [f"images/{name}" for name in names], "c2w": c2w}
+    padded = np.vstack([np.c_[K, [0] * 3], [0, 0, 0, 1]]).tolist()
+    doubled = rows({"c2w": c2w}, K=[2 * number for number in LENS])
+    return {
+        "a list": rows(plain, K=K),
+        "frames": {"frames": rows({"file_path": names, "c2w": c2w}, K=K)},
+        "names below images": {"cameras": rows(below, K=K)},
+        "names in images": {"views": rows({"name": names, "c2w": c2w}, K=K)},
+        "no names": rows({"c2w": c2w}, K=K),
+        "one K": {"K": LENS, "c2w": poses[:, :3].tolist()},
+        "numbers of each": {"K": [LENS] * 6, "c2w": c2w},
+        "padded K": {"c2w": c2w, "K": padded},
+        "K of each": {"c2w": c2w, "K": [K] * 6, "images": names},
+        "a size": {"w": 80, "h": 60, "frames": doubled},
+    }
+
+
+def dialects(names, poses):
+    """What is read as something that is told."""
+    c2w, w2c = poses.tolist(), np.linalg.inv(poses)
+    plain = {"image": names, "c2w": c2w}
+    opengl = (poses * [1, -1, -1, 1]).tolist()
+    parts = (np.array(K) / [[40], [30], [1]]).tolist()
+    splats = {
+        "img_name": [Path(name).stem for name in names],
+        "position": poses[:, :3, 3].tolist(),
+        "rotation": poses[:, :3, :3].tolist(),
+    }
+    return {
+        "views, intrinsic": {"views": rows(plain, intrinsic=K)},
+        "cam2world": rows({"image": names, "cam2world": c2w}, K=K),
+        "w2c": rows({"image": names, "w2c": w2c.tolist()}, K=K),
+        "w2c of each": {"world_to_camera": w2c[:, :3].tolist(), "intrinsics": LENS},
+        "OpenGL": rows({"image": names, "transform_matrix": opengl}, K=K),
+        "parts": rows(plain, K=parts),
+        "numbers by name": rows(plain, fl_x=50.0, fl_y=52.0, **CENTRE),
+        "3DGS": rows(splats, id=0, width=40, height=30, fx=50.0, fy=52.0, **CENTRE),
+    }
+
+
+def test_what_is_read_and_whether_its_meaning_is_logged(tmp_path, photos, caplog):
+    names = [file.name for file in photos.files]
+    told = dialects(names, photos.c2w)
+    for form, content in (forms(names, photos.c2w) | told).items():
+        folder = tmp_path / form
+        copied(photos, folder / ("images" if "images" in form else ""))
+        (folder / "cameras.json").write_text(json.dumps(content))
+        caplog.clear()
+        read = scene(folder)
+        torch.testing.assert_close(read.cameras.c2w, torch.from_numpy(photos.c2w))
+        expected = torch.tensor([LENS] * 6).double()
+        torch.testing.assert_close(read.cameras.intrinsics, expected)
+        assert [Path(read.frame_name(i)).name for i in range(6)] == names
+        assert formats_of(folder) == ["cameras"]
+        assert ("is read as" in caplog.text) == (form in told), form
+
+
+def test_what_is_refused_names_the_file(photos, file):
+    names, c2w = [f.name for f in photos.files], photos.c2w.tolist()
+    plain = {"image": names, "c2w": c2w}
     for content in (
-        cameras(photos)[:4],
-        [{"c2w": 1, "K": matrix(photos), "image": "a.png"}],
-        [{"c2w": poses[0], "K": "x", "image": "a"}],
-        {"K": [matrix(photos)] * 5, "c2w": poses},
-        [*named(photos), 7],
-        [{**camera, "K": None} for camera in named(photos)],
-        renamed(photos, "c2w", "extrinsics"),
-        renamed(photos, "c2w", "location"),
+        rows({"c2w": c2w[:4]}, K=K),
+        [{"c2w": 1, "K": K, "image": "a.png"}],
+        [{"c2w": c2w[0], "K": "x", "image": "a"}],
+        {"K": [K] * 5, "c2w": c2w},
+        [*rows(plain, K=K), 7],
+        rows(plain, K=None),
+        rows({"image": names, "extrinsics": c2w}, K=K),
+        rows({"image": names, "location": c2w}, K=K),
     ):
         file.write_text(json.dumps(content))
         assert not fault(r"cameras\.json", read_cameras, file.parent)
@@ -126,32 +116,25 @@ def read_cameras(folder):
     return scene(folder, format="cameras")
 
 
-def test_four_numbers_a_camera_are_those_of_each(tmp_path, photos):
-    folder = tmp_path / "scene"
-    copied(photos, folder)
+def test_four_numbers_a_camera_are_those_of_each(photos, file):
     for count in (5, 4, 3):
-        sorted(folder.glob("*.png"))[count].unlink()
-        rows = [[50.0 + i, 51.0, 16.0, 12.0] for i in range(count)]
-        content = {"K": rows, "c2w": photos.c2w[:count].tolist()}
-        (folder / "cameras.json").write_text(json.dumps(content))
-        assert scene(folder).cameras.intrinsics.tolist() == rows
+        sorted(file.parent.glob("*.png"))[count].unlink()
+        lenses = [[50.0 + i, 51.0, 16.0, 12.0] for i in range(count)]
+        file.write_text(json.dumps({"K": lenses, "c2w": photos.c2w[:count].tolist()}))
+        assert scene(file.parent).cameras.intrinsics.tolist() == lenses
 
 
-def test_no_more_of_a_listing_is_read_than_tells_what_it_is(tmp_path, photos):
-    copied(photos, tmp_path / "scene")
-    file = tmp_path / "scene" / "cameras.json"
-    apart = {"c2w": photos.c2w.tolist(), "more": "x" * 200_000, "K": matrix(photos)}
-    file.write_text(json.dumps(apart))
+def test_no_more_of_a_listing_is_read_than_tells_what_it_is(photos, file):
+    c2w = photos.c2w.tolist()
+    file.write_text(json.dumps({"c2w": c2w, "more": "x" * 200_000, "K": K}))
     assert formats_of(file.parent) == ["cameras"]
     with file.open("w") as opened:
-        opened.write(json.dumps(named(photos)))
+        opened.write(json.dumps(rows({"c2w": c2w}, K=K)))
         opened.truncate(10**12)  # with a hole, which takes no space
     assert formats_of(file.parent) == ["cameras"]
 
 
-def test_a_file_of_that_name_without_poses_is_named_where_photos_lie_beside_it(tmp_path, photos):
-    copied(photos, tmp_path / "scene")
-    file = tmp_path / "scene" / "cameras.json"
+def test_a_file_of_that_name_without_poses_is_named_where_photos_lie_beside_it(file):
     file.write_text(json.dumps([{"id": 0, "position": [0, 0, 0]}] * 6))
     with pytest.raises(ValueError, match=r"cameras\.json"):
         scene(file.parent)
