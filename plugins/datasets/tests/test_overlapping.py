@@ -29,42 +29,47 @@ class Arc(Line):
         return Cameras(c2w, torch.tensor([8.0, 8, 4, 4]).expand(40, 4), (8, 8))
 
 
+def seeded(seed=0):
+    return np.random.default_rng(seed)
+
+
 def draws(count, views=VIEWS, **options):
-    sampler = Overlapping(Overlapping.Config.model_validate(options))
+    sampler = Overlapping(Overlapping.Config(**options))
     scene = Arc(40, held_out=(0, 8, 16))
-    return [sampler.draw(scene, views, np.random.default_rng(k), 0) for k in range(count)]
+    return [sampler.draw(scene, views, seeded(k), 0) for k in range(count)]
 
 
 def steps(frames):
     """Places of frames on the arc."""
-    return sorted(int(SHUFFLED[frame]) for frame in frames)
+    return SHUFFLED[[*frames]].sort().values.tolist()
+
+
+def apart(inputs, target):
+    """Places from a target to the nearest input."""
+    return (SHUFFLED[[*inputs]] - SHUFFLED[target]).abs().min()
 
 
 def test_inputs_stand_beside_the_target_wherever_their_files_are():
-    found = draws(200)
+    found = draws(60)
     for inputs, targets in found:
         assert list(inputs) == sorted({*inputs})
         assert len(targets) == 3
-        assert not {0, 8, 16} & {*inputs, *targets}
-        assert not {*inputs} & {*targets}
-        (target,) = steps(targets[:1])
-        assert min(abs(target - place) for place in steps(inputs)) <= 10  # .5 depths
-    apart = [steps(inputs)[1] - steps(inputs)[0] for inputs, _ in found]
-    assert min(apart) <= 2
-    assert max(apart) >= 6
-    assert len({inputs for inputs, _ in found}) > 100
+        assert not {*inputs} & {*targets, 0, 8, 16}
+        assert not {*targets} & {0, 8, 16}
+        assert apart(inputs, targets[0]) <= 10  # .5 depths
+    assert found == draws(60), "a sample is a function of its seed"
+    gaps = [np.ptp(steps(inputs)) for inputs, _ in found]
+    assert min(gaps) <= 2
+    assert max(gaps) >= 6
+    assert len({inputs for inputs, _ in found}) > 40
 
 
 def test_apart_moves_inputs_apart():
     near, far = (
-        np.mean([np.ptp(steps(inputs)) for inputs, _ in draws(100, apart=(factor, factor))])
+        np.mean([np.ptp(steps(inputs)) for inputs, _ in draws(40, apart=(factor, factor))])
         for factor in (0.5, 2.0)
     )
     assert far > 2 * near
-
-
-def test_a_sample_is_a_function_of_its_seed():
-    assert draws(20) == draws(20)
 
 
 def test_every_held_out_photo_is_judged_with_inputs_beside_it():
@@ -75,7 +80,7 @@ def test_every_held_out_photo_is_judged_with_inputs_beside_it():
     assert [sample.target_frames for sample in samples] == [(0,), (8,), (16,)]
     for sample in samples:
         first, last = steps(sample.input_frames)
-        assert first < int(SHUFFLED[sample.target_frames[0]]) < last
+        assert first < SHUFFLED[sample.target_frames[0]] < last
 
 
 def test_without_held_out_photos_four_of_all_are_judged():
@@ -84,14 +89,14 @@ def test_without_held_out_photos_four_of_all_are_judged():
     assert [targets for _, targets in found] == [(0,), (13,), (26,), (39,)]
     for inputs, (target,) in found:
         assert target not in inputs
-        assert min(abs(int(SHUFFLED[target]) - place) for place in steps(inputs)) <= 5
+        assert apart(inputs, target) <= 5
 
 
 @pytest.mark.parametrize("count", [1, 4])
 def test_any_number_of_inputs(count):
-    for inputs, targets in draws(20, VIEWS.model_copy(update={"inputs": count})):
+    for inputs, targets in draws(20, ViewsConfig(inputs=count, targets=3)):
         assert len({*inputs}) == count
-        assert min(abs(int(SHUFFLED[targets[0]]) - place) for place in steps(inputs)) <= 10
+        assert apart(inputs, targets[0]) <= 10
 
 
 def test_cameras_without_a_common_point_and_few_photos():
@@ -101,10 +106,6 @@ def test_cameras_without_a_common_point_and_few_photos():
     assert len({*inputs}) == 2
     assert {*targets} == {0, 1, 2} - {*inputs}
     assert len(targets) == 3
-
-
-def seeded():
-    return np.random.default_rng(0)
 
 
 def test_a_scene_that_moves_is_judged_in_its_order_and_not_drawn():
