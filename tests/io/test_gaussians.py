@@ -9,12 +9,12 @@ import pytest
 import torch
 from commands import run_qgs
 from plyfile import PlyData, PlyElement
+from tables import fault
 
 import qgs
 from qgs.extensions import ExtensionError
 from qgs.io.gaussians import (
     PROPERTIES,
-    SH_C0,
     load_ply,
     save_gaussians,
     save_ply,
@@ -49,29 +49,29 @@ def ply(**elements):
 
 def test_the_file_is_that_of_the_3dgs_release(tmp_path):
     """f_rest_0 to 14 are red, 15 to 29 green, 30 to 44 blue."""
-    gaussians = random_gaussians(50, harmonics=8)
-    whole = PlyData.read(str(saved(tmp_path / "scene.ply", gaussians)))
-    assert (whole.text, whole.byte_order) == (False, "<")
-    vertex = whole["vertex"].data
-    names = vertex.dtype.names or ()
-    assert len(names) == 62
-    assert names[8:10] == ("f_dc_2", "f_rest_0")
-    assert names[53:56] == ("f_rest_44", "opacity", "scale_0")
-    plain = vertices_of(saved(tmp_path / "plain.ply", replace(gaussians, sh=None)))
-    assert vertex.dtype == plain.dtype == np.dtype([(name, "<f4") for name in PROPERTIES])
-    for column, expected in (
-        (vertex["y"], gaussians.means[:, 1]),
-        (0.5 + SH_C0 * vertex["f_dc_2"], gaussians.colors[:, 2]),
-        (1 / (1 + np.exp(-vertex["opacity"])), gaussians.opacities),
-        (np.exp(vertex["scale_1"]), gaussians.scales[:, 1]),
-        (vertex["rot_0"], gaussians.quats[:, 0]),
-        (vertex["f_rest_0"], gaussians.sh[:, 0, 0]),
-        (vertex["f_rest_22"], gaussians.sh[:, 7, 1]),
-        (vertex["f_rest_33"], gaussians.sh[:, 3, 2]),
-        *((vertex[f"f_rest_{after}"], 0) for after in (8, 23, 38)),
-        *((plain[f"f_rest_{index}"], 0) for index in range(45)),
-    ):
-        np.testing.assert_allclose(column, expected, rtol=1e-5)
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{index}" for index in range(45)]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    given = random_gaussians(50, harmonics=8)
+    for gaussians in (given, replace(given, sh=None)):
+        rest = torch.zeros(50, 3, 15)
+        if gaussians.sh is not None:
+            rest[..., :8] = gaussians.sh.mT
+        columns = [
+            given.means,
+            torch.zeros(50, 3),
+            (given.colors - 0.5) / 0.28209479177387814,
+            rest.flatten(1),
+            given.opacities.logit()[:, None],
+            given.scales.log(),
+            given.quats,
+        ]
+        whole = PlyData.read(str(saved(tmp_path / "scene.ply", gaussians)))
+        assert (whole.text, whole.byte_order) == (False, "<")
+        vertex = whole["vertex"].data
+        assert vertex.dtype == np.dtype([(name, "<f4") for name in names])
+        found = torch.tensor(vertex.tolist())
+        torch.testing.assert_close(found, torch.cat(columns, 1))
 
 
 def test_the_round_trip(tmp_path):
@@ -82,10 +82,8 @@ def test_the_round_trip(tmp_path):
         given.scales[0, 0] = 0
         path = saved(tmp_path / "scene.ply", given)
         assert all(np.isfinite(vertices_of(path)[name]).all() for name in PROPERTIES)
-        found = dict(named_tensors(load_ply(path)))
-        assert found.keys() == dict(named_tensors(given)).keys()
-        for name, tensor in found.items():
-            torch.testing.assert_close(tensor, getattr(given, name))
+        found, expected = (dict(named_tensors(g)) for g in (load_ply(path), given))
+        torch.testing.assert_close(found, expected)
 
 
 def test_several_scenes_and_numbers_that_are_not_finite_leave_no_file(tmp_path):
@@ -97,8 +95,7 @@ def test_several_scenes_and_numbers_that_are_not_finite_leave_no_file(tmp_path):
         (broken, "1 of 4"),
         (harmonic, "2 of 4"),
     ):
-        with pytest.raises(ValueError, match=words):
-            save_ply(gaussians, tmp_path / "a.ply")
+        assert not fault(words, save_ply, gaussians, tmp_path / "a.ply")
     assert not list(tmp_path.iterdir())
 
 
@@ -120,12 +117,14 @@ def test_files_of_fewer_degrees_are_read(tmp_path):
     kept = [name for name in PROPERTIES if not name.startswith("f_rest_")]
 
     def written(rest):
-        fewer = np.zeros(4, [(n, "<f4") for n in (*kept, *(f"f_rest_{i}" for i in range(rest)))])
+        names = [*kept, *(f"f_rest_{index}" for index in range(rest))]
+        fewer = np.zeros(4, [(name, "<f4") for name in names])
         for name in kept:
             fewer[name] = vertices[name]
-        for index in range(9 if rest == 9 else 0):
-            fewer[f"f_rest_{index}"] = vertices[f"f_rest_{index // 3 * 15 + index % 3}"]
-        path = tmp_path / f"{rest}.ply"
+        if rest == 9:
+            for index in range(9):
+                fewer[f"f_rest_{index}"] = vertices[f"f_rest_{index // 3 * 15 + index % 3}"]
+        path = tmp_path / "fewer.ply"
         path.write_bytes(ply(vertex=fewer))
         return path
 
@@ -136,8 +135,8 @@ def test_files_of_fewer_degrees_are_read(tmp_path):
 
 
 def test_other_files_are_refused_by_name(tmp_path):
-    points = np.zeros(3, dtype=[(name, "<f4") for name in ("x", "y", "z")])
-    chunks = np.zeros(1, dtype=[("min_x", "<f4")])
+    points = np.zeros(3, [(name, "<f4") for name in "xyz"])
+    chunks = np.zeros(1, [("min_x", "<f4")])
     some = random_gaussians(3)
     whole = saved(tmp_path / "whole.ply", some).read_bytes()
     still = saved(tmp_path / "still.ply", replace(some, quats=some.quats * 0)).read_bytes()
@@ -161,13 +160,12 @@ def test_other_files_are_refused_by_name(tmp_path):
         "large": bytes(large),
         "without any": saved(tmp_path / "none.ply", random_gaussians(0)).read_bytes(),
     }.items():
-        (tmp_path / f"{name}.ply").write_bytes(content)
-        with pytest.raises(ValueError, match=rf"{name}\.ply"):
-            load_ply(tmp_path / f"{name}.ply")
+        path = tmp_path / f"{name}.ply"
+        path.write_bytes(content)
+        assert not fault(path.name, load_ply, path)
     os.mkfifo(tmp_path / "pipe.ply")  # reading it would wait for a writer
     for name in ("missing", "pipe"):
-        with pytest.raises(FileNotFoundError, match=rf"{name}\.ply"):
-            load_ply(tmp_path / f"{name}.ply")
+        assert not fault(name, load_ply, tmp_path / f"{name}.ply", kind=FileNotFoundError)
 
 
 def test_convert_keeps_the_most_opaque(tmp_path):
@@ -186,11 +184,10 @@ def test_convert_keeps_the_most_opaque(tmp_path):
 
 def test_other_suffixes_and_files_that_exist_are_refused(tmp_path):
     before = saved(tmp_path / "a.ply", random_gaussians(2)).read_bytes()
-    error = run_qgs("convert", tmp_path / "a.ply", tmp_path / "a.spz").exception
-    assert isinstance(error, ValueError)
-    assert ".splat" in str(error)
-    error = run_qgs("convert", tmp_path / "a.ply", tmp_path / "a.ply").exception
-    assert isinstance(error, FileExistsError)
+    for name, error, word in (("a.spz", ValueError, ".splat"), ("a.ply", FileExistsError, "a.ply")):
+        refused = run_qgs("convert", tmp_path / "a.ply", tmp_path / name).exception
+        assert isinstance(refused, error)
+        assert word in str(refused)
     assert (tmp_path / "a.ply").read_bytes() == before
 
 

@@ -24,8 +24,7 @@ def photos(count):
 
 def test_points_lie_on_the_walls_in_their_colours():
     """Of two photos and of more; with sizes far from the truth, and more than one batch."""
-    cases = ((2, 1.0, 400), (2, 2.0, 2400), (2, 4.0, 400), (9, 1.0, 400), (9, 4.0, 400))
-    for count, size, number in cases:
+    for count, size, number in ((2, 1.0, 400), (2, 2.0, 2400), (9, 4.0, 400)):
         views = photos(count)
         found = swept(views, number, size, generator())
         assert found.count == number
