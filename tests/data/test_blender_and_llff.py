@@ -70,8 +70,7 @@ def test_the_published_axes(tmp_path):
 def test_rows_and_images_must_agree(tmp_path, photos):
     write_llff(tmp_path, photos)
     (tmp_path / "images" / "view_003.png").unlink()
-    with pytest.raises(ValueError, match=r"6 poses, but .*images has 5 images"):
-        read(tmp_path)
+    assert not fault(r"6 poses, but .*images has 5 images", read, tmp_path)
 
 
 def test_files_that_are_no_rows_are_told(tmp_path, photos):
@@ -87,5 +86,4 @@ def test_a_row_of_nan_names_its_photo(tmp_path, photos):
     rows = np.load(tmp_path / "poses_bounds.npy")
     rows[2, 3] = np.nan
     np.save(tmp_path / "poses_bounds.npy", rows)
-    with pytest.raises(ValueError, match=r"frame 2 \(images/view_002\.png\): the pose has NaN"):
-        read(tmp_path)
+    assert not fault(r"frame 2 \(images/view_002\.png\): the pose has NaN", read, tmp_path)

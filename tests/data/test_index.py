@@ -71,8 +71,12 @@ def test_other_files_are_refused_with_the_reason(tmp_path):
 
 
 def test_a_missing_index_is_told_with_its_path():
-    with pytest.raises(FileNotFoundError, match=r"no evaluation index at nowhere/index\.json"):
-        read_index("nowhere/index.json")
+    assert not fault(
+        r"no evaluation index at nowhere/index\.json",
+        read_index,
+        "nowhere/index.json",
+        kind=FileNotFoundError,
+    )
 
 
 def test_samples_are_those_of_the_index_in_its_order():

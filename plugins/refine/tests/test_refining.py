@@ -278,5 +278,4 @@ def test_what_masks_leave_out_is_background():
     found = masked(replace(views, masks=masks), background.tolist()).images
     assert torch.equal(found[..., :12], views.images[..., :12])
     assert torch.allclose(found[..., 12:], background[:, None, None])
-    with pytest.raises(ValueError, match="--masks"):
-        masked(views, background.tolist())
+    assert not fault("--masks", masked, views, background.tolist())
