@@ -129,14 +129,6 @@ def test_missing_chunks_and_short_scenes_are_counted_and_named(tmp_path, caplog)
     assert not fault("none of their chunks exists", opened, tmp_path, kind=FileNotFoundError)
 
 
-def test_urls(tmp_path):
-    for url in (f"memory://chunks-{tmp_path}", f"file://{tmp_path}"):
-        data_set(UPath(url))
-        source = opened(url)
-        assert list(map(list, source.groups("train"))) == [[0, 1], [2]]
-        assert source.scenes("train")[1].images([3])[0, 0, 0, 0] * 255 == pytest.approx(30)
-
-
 def test_legacy_files_are_read_whole(tmp_path):
     data_set(tmp_path)
     torch.save([record("s2")], tmp_path / "train" / "b.torch", _use_new_zipfile_serialization=False)
