@@ -15,7 +15,7 @@ from PIL import Image
 from qgs_poses import making
 from qgs_poses.making import read_record
 from qgs_poses.photos import PosesError
-from walked import PHOTOS, cut, write_photos, write_turned, write_video
+from walked import PHOTOS, cut, write_photos, write_video
 
 from qgs.io.files import DiskFullError
 
@@ -60,26 +60,6 @@ def test_hopeless_ones_are_refused_in_a_sentence(images, tmp_path):
             wrong[source.name] = error
     assert not wrong
     assert state(tmp_path) == before
-
-
-@pytest.mark.slow
-def test_videos_of_every_kind_get_poses(images, tmp_path):
-    given = tmp_path / "given"
-    given.mkdir()
-    least = {
-        write_turned(given / "turned.mp4", images, 90): PHOTOS,
-        write_video(given / "a.mov", images, codec="libx265"): PHOTOS,
-        write_video(given / "a.webm", images, codec="libvpx-vp9"): PHOTOS,
-        write_video(given / "a.mkv", images, codec="libsvtav1"): PHOTOS,
-        cut(write_video(given / "cut.mkv", images * 2, g="4"), 0.7): 3,
-    }
-    before = state(given)
-    for video, count in least.items():
-        out = tmp_path / video.name
-        result = run_qgs("poses", video, "--out", out)
-        assert result.exit_code == 0, (result.output, result.exception)
-        assert len(read_record(out)["posed"]) >= count, result.output
-    assert state(given) == before
 
 
 def test_what_cannot_be_written_is_named(walk, tmp_path, monkeypatch):

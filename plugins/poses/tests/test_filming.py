@@ -54,7 +54,7 @@ def test_both_films_show_what_the_reconstruction_renders_of_the_photos_world(tmp
     qgs.save(model, checkpoint)
     photos = noisy_photos(tmp_path / "row")
     path = tmp_path / "path.json"  # what is seen lies small before the photos' cameras
-    listed = row_of_frames(4, 0.1, fl_x=20, w=24, h=20)
+    listed = row_of_frames(2, 0.2, fl_x=20, w=24, h=20)
     for frame in listed["frames"]:
         frame["transform_matrix"][2][3] = -0.38
     path.write_text(json.dumps(listed))
@@ -68,7 +68,7 @@ def test_both_films_show_what_the_reconstruction_renders_of_the_photos_world(tmp
     c2w, lens = read_path(path, (480, 480), None)
     rendered = scene.render(Cameras(c2w[None], lens[None], (480, 480))).rgb[0]
     expected = 255 * rendered.clamp(0, 1).permute(0, 2, 3, 1).numpy()
-    assert np.abs(expected[2] - expected[3]).mean() > 0.05 * 255
+    assert np.abs(expected[0] - expected[1]).mean() > 0.05 * 255
     for film in (frames(one), frames(two)):
         assert np.shape(film) == expected.shape
         assert np.abs(film - expected).mean((1, 2, 3)).max() < 0.01 * 255

@@ -36,6 +36,13 @@ def test_the_sharpest_frame_of_each_interval_is_taken(tmp_path):
     assert levels(tmp_path) == sharp
 
 
+def test_videos_of_other_kinds_are_read(tmp_path):
+    images = numbered_images(12)
+    for name, codec in (("a.mov", "libx265"), ("a.webm", "libvpx-vp9"), ("a.mkv", "libsvtav1")):
+        extract(write_video(tmp_path / name, images, codec=codec), tmp_path, 4)
+        assert levels(tmp_path) == [0, 3, 6, 9], name
+
+
 def test_a_picture_that_moves_fast_gives_more_frames(tmp_path):
     wide = np.random.default_rng(0).integers(0, 255, (12, 100, 3), np.uint8)
     wide = wide.repeat(8, 0).repeat(8, 1)

@@ -59,7 +59,7 @@ def made(command, out):
 
 def test_a_scene_is_made_in_seconds_and_can_be_made_again_in_the_photos_world(photos, tmp_path):
     out, again = tmp_path / "scene", tmp_path / "again"
-    few = "--minutes 0.01 --size 32x48 --gaussians 300"
+    few = "--minutes 0.003 --size 32x48 --gaussians 300"
     output, record = made(f"scene {photos} {few}", out)
     names = {"scene.ply", "scene.splat", "index.html", "metrics.json", "held_out.png"}
     assert {path.name for path in out.iterdir()} == names
@@ -68,7 +68,7 @@ def test_a_scene_is_made_in_seconds_and_can_be_made_again_in_the_photos_world(ph
     assert record["gaussians"] == len(PlyData.read(out / "scene.ply")["vertex"]) == 300
     assert record["command"] in output
     assert f" --model {NONE} " in record["command"]
-    command = re.sub("--seconds [^ ]+", "--seconds 0.5", record["command"])
+    command = re.sub("--seconds [^ ]+", "--seconds 0.2", record["command"])
     command = command.removeprefix("qgs ").replace(f" --out {out}", "")
     _, record = made(command, again)
     assert record["command"].replace(f" --out {again}", "") == f"qgs {command}"
