@@ -7,28 +7,21 @@ from dataclasses import replace
 
 import pytest
 import torch
-from commands import MODEL
+from training_runs import run, tiny
 
 from qgs.composer import resolve
 from qgs.data import stream
 from qgs.data.domain import KEY, OF_RECIPES, SEARCHED, Domain, verdict
 from qgs.data.evaluation import evaluation_samples
 from qgs.data.stream import trained_domain
-from qgs.engine.training import train
 from qgs.geometry.poses import look_at
 from qgs.io.checkpoint import CheckpointFile, save
 from qgs.io.tensors import CheckpointError
 from qgs.types import Cameras
 
-RECIPE = {
-    "recipe": 1,
-    "model": MODEL,
-    "plugins": ["rooms"],
-    "data": {"type": "rooms/procedural", "image_size": [16, 16], "scenes": 4, "test_scenes": 1},
-    "views": {"inputs": 2, "targets": 2, "gap": [2, 4], "scale_factor": 0.4},
-    "training": {"steps": 2, "batch_size": 2, "precision": "float32", "save_every": 0},
-    "optimizer": {"warmup": 0},
-}
+
+def recipe(*words):
+    return tiny("tokengs", "data.scenes=4", "optimizer.warmup=0", *words)
 
 
 def around(target, eyes, focal=16.0):
@@ -84,7 +77,7 @@ def test_a_few_pairs_of_parallel_axes_do_not_make_every_depth_one_that_was_train
 
 def test_a_damaged_domain_is_one_error_with_the_file(tmp_path):
     file = tmp_path / "a.safetensors"
-    model = resolve(RECIPE).build_model()
+    model = recipe().build_model()
     for written in (
         '{"samples": 1',
         '{"samples": 1, "ranges": {"fov": 50}}',
@@ -139,18 +132,17 @@ def test_the_own_test_data_of_a_recipe_lie_inside(name, options, monkeypatch):
 
 
 def test_a_scene_that_fails_is_left_out_of_the_ranges(monkeypatch):
-    recipe = resolve(RECIPE)
-    source = recipe.build_data()
+    source = recipe().build_data()
     monkeypatch.setattr(type(source.scenes("train")[0]), "cameras", None)
-    assert trained_domain(source, recipe.views, 0).samples == 0
+    assert trained_domain(source, recipe().views, 0).samples == 0
 
 
 def test_checkpoints_tell_what_they_were_trained_on_also_where_one_was_cut(tmp_path):
-    recipe = resolve(RECIPE)
-    expected = trained_domain(recipe.build_data(), recipe.views, recipe.seed).ranges
-    file = train(resolve(RECIPE, ["training.steps=1"]), tmp_path / "run").folder.checkpoint
+    two = recipe("training.steps=2")
+    expected = trained_domain(two.build_data(), two.views, two.seed).ranges
+    file = run(recipe("training.steps=1"), tmp_path).folder.checkpoint
     assert CheckpointFile(file).domain.ranges == expected
     file.write_bytes(file.read_bytes()[:1000])
-    train(recipe, tmp_path / "run", resume=True)
+    run(two, tmp_path, resume=True)
     found = CheckpointFile(file).domain
     assert (found.ranges, found.samples) == (expected, stream.MEASURED)

@@ -26,16 +26,17 @@ def test_points_of_a_model(tmp_path):
     (tmp_path / "transforms.json").unlink()
     (model / "points3D.txt").write_text("# no points\n")
     assert sparse_points(folder) is None
-    expected = torch.tensor(POINTS, dtype=torch.float64)
+    expected = torch.tensor(POINTS).double()
     for name, content in (("txt", TEXT.encode()), ("bin", BINARY)):
-        (model / f"points3D.{name}").write_bytes(content)
+        file = model / f"points3D.{name}"
+        file.write_bytes(content)
         points, colors = sparse_points(folder)
-        (model / f"points3D.{name}").unlink()
+        file.unlink()
         torch.testing.assert_close(points, expected[:, :3])
         torch.testing.assert_close(colors, expected[:, 3:] / 255)
     assert sparse_points(folder) is None
     for cut in (4, 40, -3):
-        (model / "points3D.bin").write_bytes(BINARY[:cut])
+        file.write_bytes(BINARY[:cut])
         with pytest.raises(ValueError, match=r"points3D\.bin"):
             sparse_points(folder)
 
@@ -43,7 +44,7 @@ def test_points_of_a_model(tmp_path):
 def test_gaussians_stand_at_the_points_in_the_world_of_a_scene():
     reference = ring(3).c2w[0, 1].double()
     world = reference, torch.tensor(0.5)
-    grid = torch.cartesian_prod(*[torch.arange(4.0, dtype=torch.float64)] * 3)
+    grid = torch.cartesian_prod(*[torch.arange(4.0).double()] * 3)
     found = from_points((grid, grid / 3), world, 64)
     assert found.count == 64
     back = found.means[0].double() / 0.5 @ reference[:3, :3].T + reference[:3, 3]
@@ -52,5 +53,4 @@ def test_gaussians_stand_at_the_points_in_the_world_of_a_scene():
     assert torch.allclose(found.scales, torch.tensor(0.5))
     assert from_points((grid, grid), world, 10).count == 10
     alone = from_points((grid[:1], grid[:1]), world, 10).scales
-    assert alone.isfinite().all()
-    assert alone.min() > 0
+    assert 0 < alone.min() <= alone.max() < torch.inf

@@ -1,6 +1,7 @@
 """The bytes of .splat files."""
 
 import numpy as np
+import torch
 from commands import run_qgs
 from qgs_refine.splat import SPLAT
 from test_refining import cloud
@@ -18,6 +19,6 @@ def test_the_bytes_of_a_splat_file(tmp_path):
     given = given[0][order]
     np.testing.assert_array_equal(read["mean"], given.means)
     np.testing.assert_allclose(read["scale"], given.scales, rtol=1e-6)
-    np.testing.assert_allclose(read["rgba"][:, :3] / 255, given.colors, atol=0.002)
-    np.testing.assert_allclose(read["rgba"][:, 3] / 255, given.opacities, atol=0.002)
+    rgba = torch.cat([given.colors, given.opacities[:, None]], 1)
+    np.testing.assert_allclose(read["rgba"] / 255, rgba, atol=0.002)
     np.testing.assert_allclose((read["quat"].astype(float) - 128) / 128, given.quats, atol=0.008)
