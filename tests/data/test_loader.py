@@ -25,8 +25,8 @@ def photos(folder):
     write_nerfstudio(folder, synthetic(folder.with_name("photos"), 8))
     file = folder / "images" / "view_007.png"
     file.write_bytes(file.read_bytes()[:400])
-    data = {"type": "qgs/photos", "path": str(folder), "image_size": [16, 16], "holdout": 0}
-    return resolve({**ROOMS.tree, "data": data}, ["views.gap=[4, 4]"])
+    data = f"data={{type: qgs/photos, path: {folder}, image_size: [16, 16], holdout: 0}}"
+    return resolve(ROOMS.tree, [data, "views.gap=[4, 4]"])
 
 
 def batches(recipe, count, size, **options):

@@ -10,7 +10,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import torch
-from commands import MODEL, run_qgs
+from commands import run_qgs
 from photo_formats import PhotoSet, write_colmap, write_nerfstudio
 from PIL import Image
 from plyfile import PlyData
@@ -21,6 +21,7 @@ from qgs_refine.scene import photos_start, photos_world
 from rich.console import Console
 from test_refining import RENDERER
 from textured_room import INTRINSICS, walk
+from training_runs import tiny
 
 import qgs
 from qgs.analysis.scale import further_photos
@@ -82,9 +83,7 @@ def test_a_scene_is_made_in_seconds_and_can_be_made_again_in_the_photos_world(ph
 
 def test_a_model_makes_the_start(photos, tmp_path):
     file = tmp_path / "model.safetensors"
-    data = {"type": "qgs/photos", "path": "elsewhere", "image_size": [16, 16]}
-    views = {"inputs": 2, "targets": 2, "gap": [2, 4]}
-    qgs.save(qgs.compose({"recipe": 1, "model": MODEL, "data": data, "views": views}), file)
+    qgs.save(tiny("photos").build_model(), file)
     few = "--holdout none --seconds 0.1 --size 32x48 --gaussians 300"
     model = f"--model {file} --frames 0,2 --scale 0.5"
     _, record = made(f"scene {photos} {model} {few}", tmp_path / "out")
