@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from qgs.data import PhotosSource
 
-PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[2] / "shared" / "photos"))
+PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[2] / "shared/photos"))
 """Real photos, which are not in the repository."""
 
 Camera = tuple[str, int, tuple[float, ...]]
@@ -214,7 +214,7 @@ def noisy_photos(folder, count=7, step=0.1):
     random = np.random.default_rng(0)
     for index in range(count):
         pixels = random.integers(0, 256, (20, 24, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / "images" / f"{index}.png")
+        Image.fromarray(pixels).save(folder / f"images/{index}.png")
     camera = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 10, "w": 24, "h": 20}
     (folder / "transforms.json").write_text(json.dumps(row_of_frames(count, step=step, **camera)))
     return folder

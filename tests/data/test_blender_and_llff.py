@@ -27,7 +27,7 @@ def test_alpha_is_the_mask_and_shows_the_background(tmp_path, photos):
     alpha = np.zeros((30, 40, 4), np.uint8)
     alpha[:, :20] = [10, 20, 30, 255]
     alpha[:, 20:] = [90, 90, 90, 102]
-    Image.fromarray(alpha).save(tmp_path / "train" / "view_001.png")
+    Image.fromarray(alpha).save(tmp_path / "train/view_001.png")
     scene = read(tmp_path, background=(0.0, 1.0, 0.0))
     masks = scene.masks([1, 2])
     assert masks[0, 0, 5, [3, 35]].tolist() == pytest.approx([1, 0.4])
@@ -69,7 +69,7 @@ def test_the_published_axes(tmp_path):
 
 def test_rows_and_images_must_agree(tmp_path, photos):
     write_llff(tmp_path, photos)
-    (tmp_path / "images" / "view_003.png").unlink()
+    (tmp_path / "images/view_003.png").unlink()
     assert not fault(r"6 poses, but .*images has 5 images", read, tmp_path)
 
 

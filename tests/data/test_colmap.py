@@ -5,6 +5,7 @@ import struct
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from photo_formats import scene as read
 from photo_formats import synthetic, world_to_camera, write_colmap
 from PIL import Image
@@ -83,7 +84,7 @@ def test_photos_of_every_camera_become_pinhole_photos(tmp_path, camera):
     expected = lens.img_from_cam(np.column_stack([points, np.ones(4)]))
     bent = frames(tmp_path / "text")[0].lens.distorted(points).numpy()
     focal = np.array([lens.focal_length_x, lens.focal_length_y])
-    np.testing.assert_allclose(bent * focal + [41, 29], expected, atol=1e-9)
+    assert_allclose(bent * focal + [41, 29], expected, atol=1e-9)
 
 
 def test_other_camera_models_are_refused(tmp_path):
@@ -103,21 +104,21 @@ def test_names_in_folders_are_read_in_their_order(tmp_path):
             folder = tmp_path / kind / str(len(model))
             scene = read(write_colmap(folder, photos, kind, model=model, names=names))
             assert [scene.frame_name(i) for i in range(3)] == ordered, (kind, model)
-            np.testing.assert_allclose(scene.cameras.c2w, photos.c2w[[2, 1, 0]], atol=1e-9)
+            assert_allclose(scene.cameras.c2w, photos.c2w[[2, 1, 0]], atol=1e-9)
 
 
 def test_models_that_pycolmap_writes(tmp_path):
     """Its files hold rigs and frames besides, which older versions did not know."""
     photos = synthetic(tmp_path / "photos", 3)
     folder = write_colmap(tmp_path / "a", photos, "text")
-    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
+    model = pycolmap.Reconstruction(str(folder / "sparse/0"))
     for kind in ("text", "binary"):
         copy = tmp_path / kind / "sparse"
         copy.mkdir(parents=True)
         getattr(model, f"write_{kind}")(str(copy))
         (folder / "images").rename(copy.parent / "images")
         assert (copy / f"rigs.{'txt' if kind == 'text' else 'bin'}").is_file()
-        np.testing.assert_allclose(read(copy.parent).cameras.c2w, photos.c2w, atol=1e-9)
+        assert_allclose(read(copy.parent).cameras.c2w, photos.c2w, atol=1e-9)
         folder = copy.parent
 
 
@@ -126,8 +127,8 @@ def test_quaternions_are_normalised(tmp_path):
     folder = write_colmap(tmp_path, photos, "text")
     longer = np.multiply(world_to_camera(photos.c2w[0]), [1.05] * 4 + [1] * 3)
     line = f"1 {' '.join(map(str, longer))} 7 view_000.png\n\n"
-    (folder / "sparse" / "0" / "images.txt").write_text(line)
-    np.testing.assert_allclose(frames(folder)[0].c2w, photos.c2w[0], atol=1e-9)
+    (folder / "sparse/0/images.txt").write_text(line)
+    assert_allclose(frames(folder)[0].c2w, photos.c2w[0], atol=1e-9)
 
 
 CUT = {"images.bin": (4, 60, 110, 200, -1), "cameras.bin": (40,)}

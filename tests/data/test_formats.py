@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from photo_formats import (
     centred,
     opened,
@@ -49,9 +50,9 @@ def variants(folder, photos):
 
 def assert_same(read, photos):
     assert read.cameras.c2w.dtype == torch.float64
-    np.testing.assert_allclose(read.cameras.c2w, photos.c2w, rtol=0, atol=1e-9)
+    assert_allclose(read.cameras.c2w, photos.c2w, rtol=0, atol=1e-9)
     expected = np.tile(photos.intrinsics, (len(photos.files), 1))
-    np.testing.assert_allclose(read.cameras.intrinsics, expected, rtol=0, atol=1e-9)
+    assert_allclose(read.cameras.intrinsics, expected, rtol=0, atol=1e-9)
     for i, file in enumerate(photos.files):
         assert Path(read.frame_name(i)).stem == file.stem
         pixels = read.images([i])[0].mul(255).round().byte().permute(1, 2, 0)
@@ -112,7 +113,7 @@ def test_a_folder_of_scenes(tmp_path, caplog):
 def test_scenes_split_by_folder(tmp_path):
     for part, name in (("train", "a"), ("train", "b"), ("test", "c")):
         write_llff(tmp_path / part / name, synthetic(tmp_path / "photos"))
-    (tmp_path / "train" / "b" / "images" / "view_001.png").unlink()
+    (tmp_path / "train/b/images/view_001.png").unlink()
     source = opened(tmp_path)
     assert [len(source.scenes(split)) for split in ("train", "test")] == [2, 1]
     assert source.scenes("test")[0].name == "c"
@@ -141,12 +142,12 @@ class Csv(PhotoReader):
 
 
 def test_a_distribution_adds_a_format(tmp_path, monkeypatch, caplog):
-    info = tmp_path / "site" / "csv_photos-1.0.dist-info"
+    info = tmp_path / "site/csv_photos-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: csv-photos\nVersion: 1.0\n")
     offered = "csv = csv_photos:Csv\nnerfstudio = csv_photos:Csv\nnone = csv_photos:None_\n"
     (info / "entry_points.txt").write_text(f"[{formats.GROUP}]\n{offered}")
-    (tmp_path / "site" / "csv_photos.py").write_text(CSV)
+    (tmp_path / "site/csv_photos.py").write_text(CSV)
     (folder := UPath(tmp_path / "photos")).mkdir()
     with pytest.raises(ValidationError, match="csv"):
         PhotosSource.Config(path="photos", format="csv")
@@ -179,5 +180,5 @@ def test_photos_in_memory_and_in_archives(tmp_path):
             (remote / name).write_bytes(file.read_bytes())
     expected = scene(tmp_path / "a").images(range(6))
     for url in ("memory://photos/a", f"zip://scene::file://{tmp_path}/a.zip"):
-        np.testing.assert_allclose(scene(url).cameras.c2w, photos.c2w, atol=1e-6)
+        assert_allclose(scene(url).cameras.c2w, photos.c2w, atol=1e-6)
         assert torch.equal(scene(url).images(range(6)), expected)

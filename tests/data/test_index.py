@@ -121,10 +121,10 @@ def test_damaged_photo_folders_are_named_and_positions_never_move_in_silence(tmp
     index = {name: entry([0, 3], [2]) for name in ("broken", "cut", "gap", "good")}
     for name in index:
         write_nerfstudio(sets / name, photos)
-    (sets / "broken" / "transforms.json").write_text("{")
-    photo = sets / "cut" / "images" / "view_002.png"
+    (sets / "broken/transforms.json").write_text("{")
+    photo = sets / "cut/images/view_002.png"
     photo.write_bytes(photo.read_bytes()[:200])
-    (sets / "gap" / "images" / "view_001.png").unlink()
+    (sets / "gap/images/view_001.png").unlink()
     plan = EvaluationPlan(opened(sets, (16, 16)), VIEWS, EvaluationConfig(), index)
     *failures, good = plan.samples()
     assert isinstance(good, Sample)

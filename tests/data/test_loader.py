@@ -16,14 +16,14 @@ from qgs.contracts import ViewsConfig
 from qgs.data.stream import SampleError, Share, scenes_fingerprint, training_batches
 from qgs.types import named_tensors
 
-TINY = Path(__file__).parents[2] / "recipes" / "tiny" / "tokengs.yaml"
+TINY = Path(__file__).parents[2] / "recipes/tiny/tokengs.yaml"
 ROOMS = resolve(TINY, ["data.image_size=[16, 16]", "data.scenes=5", "data.samples=1"])
 
 
 def photos(folder):
     """Of the last photo only a part is there."""
     write_nerfstudio(folder, synthetic(folder.with_name("photos"), 8))
-    file = folder / "images" / "view_007.png"
+    file = folder / "images/view_007.png"
     file.write_bytes(file.read_bytes()[:400])
     data = f"data={{type: qgs/photos, path: {folder}, image_size: [16, 16], holdout: 0}}"
     return resolve(ROOMS.tree, [data, "views.gap=[4, 4]"])

@@ -11,6 +11,7 @@ from qgs.data import PhotosSource
 from qgs.data.recognition import open_for, recognised
 
 HASH = "0a" * 32
+BLACK = (0.0, 0.0, 0.0)
 HOLDINGS = {
     "train/index.json": "datasets/chunks",
     "test/000000.torch": "datasets/chunks",
@@ -67,16 +68,14 @@ def test_a_plugin_that_fails_hinders_no_other(tmp_path, caplog, monkeypatch):
 
 def test_options_for_other_data_and_for_that_of_the_training(tmp_path):
     write_tape(tmp_path / "a.tape")
-    black = PhotosSource.Config(path="elsewhere", background=(0.0, 0.0, 0.0), holdout=3)
-    source, known = open_for(str(tmp_path), (8, 8), black, SOURCES)
-    assert source.config == TapeSource.Config(path=str(tmp_path), image_size=(8, 8))
-    assert not known
+    black = PhotosSource.Config(path="elsewhere", background=BLACK, holdout=3)
     trained = TapeSource.Config(path=str(tmp_path / ".." / tmp_path.name), image_size=(16, 16))
-    source, known = open_for(str(tmp_path), None, trained, SOURCES)
-    assert source.config == TapeSource.Config(path=str(tmp_path), image_size=(16, 16))
-    assert known
+    for size, of, opened_at in (((8, 8), black, (8, 8)), (None, trained, (16, 16))):
+        source, known = open_for(str(tmp_path), size, of, SOURCES)
+        assert source.config == TapeSource.Config(path=str(tmp_path), image_size=opened_at)
+        assert known == (of is trained)
     other = PhotosSource.config_for("there", (8, 8), black)
     assert other == PhotosSource.Config(
-        path="there", image_size=(8, 8), background=(0.0, 0.0, 0.0), holdout=0
+        path="there", image_size=(8, 8), background=BLACK, holdout=0
     )
     assert PhotosSource.config_for("there", (8, 8), SceneSourceConfig()).holdout == 0

@@ -12,6 +12,7 @@ from line_scenes import Line, Lines
 from photo_formats import scene, synthetic, write_blender
 from PIL import Image
 from tables import fault
+from torch.testing import assert_close
 from training_runs import run
 
 from qgs.composer import RecipeError, resolve
@@ -77,7 +78,7 @@ def test_times_go_from_0_to_1_and_ask_for_that_of_the_targets():
 
     sample = made(Moving(10, 2), (2, 11), (6, 7))
     assert sample.inputs.times.tolist() == [[0, 1]]
-    torch.testing.assert_close(sample.inputs.target_time, torch.tensor([[0.5]]))
+    assert_close(sample.inputs.target_time, torch.tensor([[0.5]]))
     assert sample.inputs.times.dtype == torch.float32
     several = made(Moving(10, 2), (2, 11), (4, 6)).inputs
     assert several.target_time is None, "two times cannot be asked for at once"
@@ -145,7 +146,7 @@ def test_kubric_becomes_photos_with_times(tmp_path, monkeypatch):
     assert read.times.tolist() == [0, 1, 2, 3] * 3
     assert read.cameras.intrinsics[0].tolist() == pytest.approx([17.5, 17.5, 8, 8])
     c2w = torch.tensor([[0.0, 1, 0, 2], [1, 0, 0, 0.1], [0, 0, -1, 2], [0, 0, 0, 1]]).double()
-    torch.testing.assert_close(read.cameras.c2w[9], c2w)
+    assert_close(read.cameras.c2w[9], c2w)
     image = read.images([6])[0, :, 8, 8].mul(255).round()
     assert image.tolist() == [20, 20, 30], "what is transparent stays as it is"
     (scenes / "scn1").mkdir()

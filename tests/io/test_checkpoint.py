@@ -27,7 +27,7 @@ from qgs.io.checkpoint import (
 )
 from qgs.io.tensors import SEAL, CheckpointError, write_tensors
 
-RECIPES = Path(__file__).parents[2] / "recipes" / "tiny"
+RECIPES = Path(__file__).parents[2] / "recipes/tiny"
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def written(model, tmp_path_factory):
-    path = tmp_path_factory.mktemp("saved") / "new" / "model.safetensors"
+    path = tmp_path_factory.mktemp("saved") / "new/model.safetensors"
     qgs.save(model, path, extra={"step": "7000", KEY: Domain({"depth": [1.0]}, 1).text})
     return path.read_bytes()
 

@@ -10,6 +10,7 @@ from commands import run_qgs
 from numpy.lib.recfunctions import repack_fields
 from plyfile import PlyData, PlyElement
 from tables import fault
+from torch.testing import assert_close
 
 import qgs
 from qgs.extensions import ExtensionError
@@ -71,7 +72,7 @@ def test_the_file_is_that_of_the_3dgs_release(tmp_path):
         vertex = whole["vertex"].data
         assert vertex.dtype == np.dtype([(name, "<f4") for name in names])
         found = torch.tensor(vertex.tolist())
-        torch.testing.assert_close(found, torch.cat(columns, 1))
+        assert_close(found, torch.cat(columns, 1))
 
 
 def test_the_round_trip(tmp_path):
@@ -83,7 +84,7 @@ def test_the_round_trip(tmp_path):
         path = saved(tmp_path / "scene.ply", given)
         assert all(np.isfinite(vertices_of(path)[name]).all() for name in PROPERTIES)
         found, expected = (dict(named_tensors(g)) for g in (load_ply(path), given))
-        torch.testing.assert_close(found, expected)
+        assert_close(found, expected)
 
 
 def test_several_scenes_and_numbers_that_are_not_finite_leave_no_file(tmp_path):
@@ -108,7 +109,7 @@ def test_files_of_others_are_read(tmp_path):
     for name in few:
         smaller[name] = vertices[name] * (2 if name.startswith("rot") else 1)
     PlyData([PlyElement.describe(smaller, "vertex")], text=True).write(tmp_path / "other.ply")
-    torch.testing.assert_close(load_ply(tmp_path / "other.ply").quats[0], gaussians.quats)
+    assert_close(load_ply(tmp_path / "other.ply").quats[0], gaussians.quats)
 
 
 def test_files_of_fewer_degrees_are_read(tmp_path):
@@ -171,7 +172,7 @@ def test_convert_keeps_the_most_opaque(tmp_path):
     assert "7 of 50 Gaussians" in done.output
     few = load_ply(tmp_path / "few.ply")
     best = given.opacities[0].topk(7).indices.sort().values  # in the order of the file
-    torch.testing.assert_close(few.means[0], given.means[0, best])
+    assert_close(few.means[0], given.means[0, best])
     assert torch.equal(few.sh[0], given.sh[0, best])
     assert run_qgs("convert", tmp_path / "all.ply", tmp_path / "same.PLY").exception is None
     assert torch.equal(load_ply(tmp_path / "same.PLY").means, given.means)

@@ -21,22 +21,27 @@ def bounded(**options):
     return Bounded(Bounded.Config(**(OPTIONS | {"margin": 1, "warm_up_steps": 100} | options)))
 
 
-@pytest.mark.parametrize(
-    ("step", "bounds"),
-    [(0, (4, 6)), (50, (5, 9)), (99, (5, 11)), (100, (6, 12)), (500, (6, 12)), (END, (6, 12))],
-)
-def test_the_gap_widens_as_in_pixelsplat(step, bounds):
+def test_the_gap_widens_as_in_pixelsplat():
     """initial + int((final - initial) * step / warm_up_steps), at most the final number."""
-    gaps, places = set(), set()
-    for seed in range(120):
-        rng = np.random.default_rng(seed)
-        (left, right), targets = bounded().draw(Line(30), VIEWS, rng, step)
-        gaps.add(right - left)
-        places.update(target - left for target in targets)
-        assert max(targets) < right
-        assert len(targets) == 3
-    assert (min(gaps), max(gaps)) == bounds
-    assert min(places) == 1
+    cases = (
+        (0, (4, 6)),
+        (50, (5, 9)),
+        (99, (5, 11)),
+        (100, (6, 12)),
+        (500, (6, 12)),
+        (END, (6, 12)),
+    )
+    for step, bounds in cases:
+        gaps, places = set(), set()
+        for seed in range(120):
+            rng = np.random.default_rng(seed)
+            (left, right), targets = bounded().draw(Line(30), VIEWS, rng, step)
+            gaps.add(right - left)
+            places.update(target - left for target in targets)
+            assert max(targets) < right
+            assert len(targets) == 3
+        assert (min(gaps), max(gaps)) == bounds
+        assert min(places) == 1
 
 
 def test_short_scenes_and_several_inputs():

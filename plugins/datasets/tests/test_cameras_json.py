@@ -8,6 +8,7 @@ import pytest
 import torch
 from photo_formats import copied, scene, synthetic
 from tables import fault
+from torch.testing import assert_close
 
 from qgs.data.photos import formats_of
 
@@ -25,7 +26,7 @@ def photos(tmp_path):
 def file(photos, tmp_path):
     """Where photos lie, and their cameras will."""
     copied(photos, tmp_path / "scene")
-    return tmp_path / "scene" / "cameras.json"
+    return tmp_path / "scene/cameras.json"
 
 
 def rows(columns, **shared):
@@ -87,9 +88,9 @@ def test_what_is_read_and_whether_its_meaning_is_logged(tmp_path, photos, caplog
         (folder / "cameras.json").write_text(json.dumps(content))
         caplog.clear()
         read = scene(folder)
-        torch.testing.assert_close(read.cameras.c2w, torch.from_numpy(photos.c2w))
+        assert_close(read.cameras.c2w, torch.from_numpy(photos.c2w))
         expected = torch.tensor([LENS] * 6).double()
-        torch.testing.assert_close(read.cameras.intrinsics, expected)
+        assert_close(read.cameras.intrinsics, expected)
         assert [Path(read.frame_name(i)).name for i in range(6)] == names
         assert formats_of(folder) == ["cameras"]
         assert ("is read as" in caplog.text) == (form in told), form

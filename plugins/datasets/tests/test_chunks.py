@@ -89,7 +89,7 @@ def test_frames_and_cameras(tmp_path):
 
 def test_listing_opens_no_chunk(tmp_path):
     data_set(tmp_path)
-    (tmp_path / "train" / "b.torch").write_bytes(b"nothing")
+    (tmp_path / "train/b.torch").write_bytes(b"nothing")
     source = opened(tmp_path)
     assert len(source.scenes("train")) == 3
     with pytest.raises(ValueError, match=r"b\.torch cannot be read as a torch file"):
@@ -120,31 +120,32 @@ def test_without_an_index_the_chunks_are_read(tmp_path, caplog):
 
 def test_missing_chunks_and_short_scenes_are_counted_and_named(tmp_path, caplog):
     data_set(tmp_path)
-    (tmp_path / "train" / "b.torch").unlink()
+    (tmp_path / "train/b.torch").unlink()
     source = opened(tmp_path, min_frames=5)
     assert "1 of 3 scenes" in caplog.text
     assert "s2 (b.torch)" in caplog.text
     assert names(source) == ["s1"]
     assert "fewer than 5 frames (min_frames) and are left out: s0 (4)" in caplog.text
-    (tmp_path / "train" / "a.torch").unlink()
+    (tmp_path / "train/a.torch").unlink()
     assert not fault("none of their chunks exists", opened, tmp_path, kind=FileNotFoundError)
 
 
 def test_legacy_files_are_read_whole(tmp_path):
     data_set(tmp_path)
-    torch.save([record("s2")], tmp_path / "train" / "b.torch", _use_new_zipfile_serialization=False)
-    assert not zipfile.is_zipfile(tmp_path / "train" / "b.torch")
+    torch.save([record("s2")], tmp_path / "train/b.torch", _use_new_zipfile_serialization=False)
+    assert not zipfile.is_zipfile(tmp_path / "train/b.torch")
     assert opened(tmp_path).scenes("train")[2].images([2])[0, 0, 0, 0] * 255 == pytest.approx(20)
 
 
 def test_scenes_travel_to_other_processes_without_open_files(tmp_path):
     data_set(tmp_path)
-    source = opened(tmp_path)
-    before = source.scenes("train")[0].images([1])
-    data = pickle.dumps(source)
-    assert len(data) < 2000
-    scene = pickle.loads(data).scenes("train")[0]  # noqa: S301
-    assert torch.equal(scene.images([1]), before)
+    source, scene = opened(tmp_path), first(tmp_path)
+    before = scene.images([1])
+    data = pickle.dumps((source, scene))
+    assert len(data) < 3000
+    source, scene = pickle.loads(data)  # noqa: S301
+    for copy in (scene, source.scenes("train")[0]):
+        assert torch.equal(copy.images([1]), before)
 
 
 def test_threads_share_few_open_chunks(tmp_path):
@@ -241,10 +242,10 @@ def test_a_small_file_does_not_fill_the_memory(tmp_path):
 
 def test_an_index_does_not_lead_outside(tmp_path):
     data_set(tmp_path)
-    for name in ("../test/a.torch", str(tmp_path / "test" / "a.torch"), "c:\\a.torch"):
-        (tmp_path / "train" / "index.json").write_text(json.dumps({"s0": name}))
+    for name in ("../test/a.torch", str(tmp_path / "test/a.torch"), "c:\\a.torch"):
+        (tmp_path / "train/index.json").write_text(json.dumps({"s0": name}))
         assert not fault("outside its own folder", opened, tmp_path)
-    (tmp_path / "train" / "index.json").write_text("[1]")
+    (tmp_path / "train/index.json").write_text("[1]")
     assert not fault("must map each scene's key", opened, tmp_path)
 
 

@@ -21,28 +21,25 @@ def farthest(**options):
     return Farthest(Farthest.Config(**(plain | {"warm_up_steps": 100} | options)))
 
 
-@pytest.mark.parametrize(
-    ("step", "count", "gaps"),
-    [
+def test_numbers_of_inputs_and_gaps():
+    for step, count, gaps in (
         (0, 2, (5, 10)),  # 6 // 2 times shorter
         (100, 2, (6, 16)),
         (101, 3, (10, 25)),
         (102, 4, (20, 50)),
         (104, 6, (20, 50)),
         (END, 6, (20, 50)),
-    ],
-)
-def test_numbers_of_inputs_and_gaps(step, count, gaps):
-    found = set()
-    for seed in range(120):
-        inputs, targets = farthest().draw(Line(80), VIEWS, np.random.default_rng(seed), step)
-        assert list(inputs) == sorted({*inputs})
-        gap = inputs[-1] - inputs[0]
-        found.add(gap)
-        # on a line the ends are the farthest points, so inputs are the ends of the gap
-        assert (len(inputs), len(targets), len({*targets})) == (count, 8, min(8, gap + 1))
-        assert inputs[0] <= min(targets) <= max(targets) <= inputs[-1]
-    assert (min(found), max(found)) == gaps
+    ):
+        found = set()
+        for seed in range(120):
+            inputs, targets = farthest().draw(Line(80), VIEWS, np.random.default_rng(seed), step)
+            assert list(inputs) == sorted({*inputs})
+            gap = inputs[-1] - inputs[0]
+            found.add(gap)
+            # on a line the ends are the farthest points, so inputs are the ends of the gap
+            assert (len(inputs), len(targets), len({*targets})) == (count, 8, min(8, gap + 1))
+            assert inputs[0] <= min(targets) <= max(targets) <= inputs[-1]
+        assert (min(found), max(found)) == gaps
 
 
 class Bend(Line):

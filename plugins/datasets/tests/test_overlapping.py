@@ -92,11 +92,11 @@ def test_without_held_out_photos_four_of_all_are_judged():
         assert apart(inputs, target) <= 5
 
 
-@pytest.mark.parametrize("count", [1, 4])
-def test_any_number_of_inputs(count):
-    for inputs, targets in draws(20, ViewsConfig(inputs=count, targets=3)):
-        assert len({*inputs}) == count
-        assert apart(inputs, targets[0]) <= 10
+def test_any_number_of_inputs():
+    for count in (1, 4):
+        for inputs, targets in draws(20, ViewsConfig(inputs=count, targets=3)):
+            assert len({*inputs}) == count
+            assert apart(inputs, targets[0]) <= 10
 
 
 def test_cameras_without_a_common_point_and_few_photos():
@@ -124,7 +124,7 @@ def test_too_few_photos_are_refused():
         sampler.windows(Line(2, held_out=(1,)), VIEWS)
 
 
-@pytest.mark.parametrize("apart", ["[2, 1]", "[0, 1]"])
-def test_bounds_are_ordered(apart):
-    with pytest.raises(RecipeError, match="least"):
-        resolve("finetune/photos.yaml", [f"view_sampler.apart={apart}"])
+def test_bounds_are_ordered():
+    for apart in ("[2, 1]", "[0, 1]"):
+        with pytest.raises(RecipeError, match="least"):
+            resolve("finetune/photos.yaml", [f"view_sampler.apart={apart}"])

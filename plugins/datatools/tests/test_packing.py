@@ -17,6 +17,7 @@ from PIL import Image
 from qgs_datasets.chunks import ChunksSource
 from qgs_datatools import packing
 from tables import fault
+from torch.testing import assert_close
 from upath import UPath
 
 from qgs.composer import resolve
@@ -74,7 +75,7 @@ def pack(photos, out, encoding=None, **options):
 
 
 def same(before, after, tolerance=0.0, split="train"):
-    close = partial(torch.testing.assert_close, atol=1e-4, rtol=0, check_dtype=False)
+    close = partial(assert_close, atol=1e-4, rtol=0, check_dtype=False)
     for one, other in zip(before.scenes(split), after.scenes(split), strict=True):
         frames = range(len(one))
         assert [*map(one.frame_name, frames)] == [*map(other.frame_name, frames)]
@@ -126,7 +127,7 @@ def test_chunks_read_as_their_source_does(kinds, tmp_path):
     assert cameras.dtype == torch.float32
     assert cameras[0, :4].tolist() == pytest.approx([60 / 64, 61 / 48, 31 / 64, 25 / 48])
     c2w = before.scenes("train")[0].cameras.c2w[3].float()
-    torch.testing.assert_close(cameras[3, 6:].reshape(3, 4) @ c2w, torch.eye(4)[:3])
+    assert_close(cameras[3, 6:].reshape(3, 4) @ c2w, torch.eye(4)[:3])
 
 
 def test_copies_of_copies_read_alike_at_urls_resized_and_as_jpeg(kinds, tmp_path):

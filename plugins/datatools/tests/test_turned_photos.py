@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from photo_formats import encoded, scene
 from PIL import Image
 from planted import Room
@@ -51,10 +52,10 @@ def test_cameras_and_pixels_are_the_upright_ones(written, shots):
     for case in ((6, "stored"), (8, "stored"), (3, "stored"), (6, "upright"), (8, "upright")):
         folder = written(*case)
         read = scene(folder, SIZE)
-        np.testing.assert_allclose(read.cameras.c2w, [s.c2w for s in shots[:4]], 1e-7, 1e-7)
-        np.testing.assert_allclose(read.cameras.intrinsics, [INTRINSICS] * 4, 1e-7)
+        assert_allclose(read.cameras.c2w, [s.c2w for s in shots[:4]], 1e-7, 1e-7)
+        assert_allclose(read.cameras.intrinsics, [INTRINSICS] * 4, 1e-7)
         image = read.images([1])[0].permute(1, 2, 0) * 255
-        np.testing.assert_allclose(image, shots[1].image, 1e-6)
+        assert_allclose(image, shots[1].image, 1e-6)
         assert read.stored_size(0) == SIZE
         report = check(UPath(folder), Options(threads=1))
         assert not report.findings
@@ -74,7 +75,7 @@ def test_a_lens_turns_with_its_photo(written, shots):
 def test_packed_photos_are_upright(written, shots, tmp_path):
     (frame, kept), *_ = encoded_frames(scene(written(8, "stored"), SIZE), Encoding())
     assert frame.size == SIZE
-    np.testing.assert_allclose(frame.c2w, shots[0].c2w, atol=1e-12)
+    assert_allclose(frame.c2w, shots[0].c2w, atol=1e-12)
     path = tmp_path / "packed.png"
     path.write_bytes(frame.data)
     image = Image.open(path)

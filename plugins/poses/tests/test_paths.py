@@ -11,6 +11,7 @@ from PIL import Image, ImageSequence
 from qgs_poses.film import write_film
 from qgs_poses.filming import Shot, Stage, cameras_of, open_stage, seen_depth
 from qgs_poses.paths import path_of, read_path, walk
+from tables import fault
 
 import qgs
 from qgs.geometry.transforms import moved
@@ -43,7 +44,7 @@ def test_paths_are_rigid_and_take_small_steps():
     c2w = torch.cat([path.c2w for path in paths])
     turn = c2w[..., :3, :3]
     assert torch.allclose(turn @ turn.mT, torch.eye(3), 0, 1e-5)
-    assert (torch.linalg.det(turn) > 0).all()
+    assert (turn.det() > 0).all()
     assert c2w[..., :3, 3].diff(dim=1).norm(dim=-1).max() < 0.15
 
 
@@ -51,9 +52,8 @@ def test_a_spiral_looks_at_one_point_and_a_walk_goes_from_the_first_photo_to_the
     path = path_of("spiral", cameras(), 3.0, 40).c2w[0]
     away = torch.tensor([0.0, 0, 3]) - path[:, :3, 3]
     assert torch.linalg.cross(away, path[:, :3, 2]).norm(dim=-1).max() < 1e-5
-    ends = walk(cameras().c2w[0], 30)[[0, -1], 0, 3]
-    assert ends[0] < -0.3
-    assert ends[1] > 0.3
+    start, end = walk(cameras().c2w[0], 30)[[0, -1], 0, 3]
+    assert start < -0.3 < 0.3 < end
 
 
 def test_camera_paths_in_files_are_read(tmp_path):
@@ -61,7 +61,7 @@ def test_camera_paths_in_files_are_read(tmp_path):
     pose = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
     entry = f'{{"camera_to_world": {np.ravel(pose).tolist()}, "fov": 90, "aspect": 1.5}}'
     frame = f'{{"file_path": "a.png", "transform_matrix": {pose}}}'
-    expected = torch.tensor(pose) * torch.tensor([1.0, -1, -1, 1]).double()
+    expected = torch.tensor(pose) * torch.tensor([1.0, -1, -1, 1])
     file = tmp_path / "transforms.json"
     for content, focal in (
         (f'{{"camera_path": [{entry}, {entry}], "fps": 24}}', 50),
@@ -86,12 +86,11 @@ def test_a_file_that_is_no_path_is_refused(tmp_path):
         lens.replace('"w": 9, "h": 9, ', "") + "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}]}",
     ):
         file.write_text(content)
-        with pytest.raises(ValueError, match=r"path\.json is no camera path"):
-            read_path(file, SIZE, None)
+        assert not fault("path.json is no camera path", read_path, file, SIZE, None)
 
 
 def test_size_length_and_angle_of_view():
-    world = torch.eye(4, dtype=torch.float64), 1.0
+    world = torch.eye(4).double(), 1.0
     stage = Stage(wall(3.0), cameras(), AutoRenderer(AutoRenderer.Config()), world)
     assert seen_depth(stage) == pytest.approx(3.0, rel=0.02)
     path = cameras_of(stage, Shot("orbit", seconds=0.5, rate=10))
@@ -104,15 +103,14 @@ def test_size_length_and_angle_of_view():
 
 def test_a_film_shows_the_pictures(tmp_path):
     levels = [20, 60, 100, 140, 180]
-    for suffix in (".mp4", ".webp"):
-        pictures = (np.full((31, 48, 3), level, np.uint8) for level in levels)
-        write_film(pictures, tmp_path / f"film{suffix}", 12)
-    with av.open(str(tmp_path / "film.mp4")) as container:
+    mp4, webp = tmp_path / "film.mp4", tmp_path / "film.webp"
+    for file in (mp4, webp):
+        write_film((np.full((31, 48, 3), level, np.uint8) for level in levels), file, 12)
+    with av.open(str(mp4)) as container:
         assert container.streams.video[0].codec_context.name == "h264"
-        of_mp4 = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        of_mp4 = [np.array(frame.to_image()) for frame in container.decode(video=0)]
     assert of_mp4[0].shape == (30, 48, 3)
-    frames = ImageSequence.Iterator(Image.open(tmp_path / "film.webp"))
-    of_webp = [np.array(frame.convert("RGB")) for frame in frames]
+    of_webp = [np.array(frame.convert("RGB")) for frame in ImageSequence.Iterator(Image.open(webp))]
     for found in (of_mp4, of_webp):
         assert [frame.mean() for frame in found] == pytest.approx(levels, abs=3)
 
@@ -125,10 +123,10 @@ def test_a_scene_of_photos_is_filmed_from_their_cameras(made, tmp_path):
     opened = open_stage(tmp_path / "scene.ply", str(made.folder), None)
     third = opened.cameras[:, 2:3]
     lens = third.intrinsics * SIZE[0] / third.size[0]
-    outside = Cameras(views.cameras.c2w.float(), views.cameras.intrinsics, SIZE)[:, 2:3]
     renderer = TorchRenderer(TorchRenderer.Config())
     found = renderer(opened.gaussians, Cameras(third.c2w, lens, SIZE)).rgb
-    assert torch.allclose(found, renderer(gaussians, outside).rgb, 0, 0.02)
+    expected = renderer(gaussians, views.cameras.to(torch.float32)[:, 2:3]).rgb
+    assert torch.allclose(found, expected, 0, 0.02)
 
 
 def test_the_command_films_and_overwrites_nothing(made, tmp_path):

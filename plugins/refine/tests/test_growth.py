@@ -2,6 +2,7 @@
 
 import torch
 from qgs_refine.growth import shared
+from torch.testing import assert_close
 
 POSITIONS = torch.linspace(-12, 12, 20001, dtype=torch.float64)
 
@@ -17,9 +18,9 @@ def test_the_sum_of_the_shares_is_the_whole():
     numbers = torch.tensor([1.0, 2, 3, 10, 51])
     opacities, numbers = torch.cartesian_prod(torch.tensor([0.01, 0.5, 0.99]), numbers).T.double()
     new, factor = shared(opacities, numbers.long())
-    torch.testing.assert_close(1 - (1 - new) ** numbers, opacities)
+    assert_close(1 - (1 - new) ** numbers, opacities)
     one = torch.ones_like(numbers)
-    torch.testing.assert_close(through(new, factor, numbers), through(opacities, one, one))
+    assert_close(through(new, factor, numbers), through(opacities, one, one))
 
 
 def test_more_shares_than_the_table_has_are_counted_as_its_last():

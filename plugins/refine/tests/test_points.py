@@ -7,6 +7,7 @@ import torch
 from photo_formats import synthetic, write_colmap
 from qgs_refine.points import from_points, sparse_points
 from test_refining import ring
+from torch.testing import assert_close
 from upath import UPath
 
 POINTS = [(1.0, 2.0, 3.5, 255, 0, 51), (-1.0, 0.25, 4.0, 0, 102, 255), (0.5, 0.5, 5.0, 10, 20, 30)]
@@ -32,8 +33,8 @@ def test_points_of_a_model(tmp_path):
         file.write_bytes(content)
         points, colors = sparse_points(folder)
         file.unlink()
-        torch.testing.assert_close(points, expected[:, :3])
-        torch.testing.assert_close(colors, expected[:, 3:] / 255)
+        assert_close(points, expected[:, :3])
+        assert_close(colors, expected[:, 3:] / 255)
     assert sparse_points(folder) is None
     for cut in (4, 40, -3):
         file.write_bytes(BINARY[:cut])

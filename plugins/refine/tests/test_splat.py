@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 from commands import run_qgs
+from numpy.testing import assert_allclose
 from qgs_refine.splat import SPLAT
 from test_refining import cloud
 
@@ -18,7 +19,7 @@ def test_the_bytes_of_a_splat_file(tmp_path):
     order = (given.scales.prod(-1) * given.opacities)[0].argsort(descending=True)
     given = given[0][order]
     np.testing.assert_array_equal(read["mean"], given.means)
-    np.testing.assert_allclose(read["scale"], given.scales, rtol=1e-6)
+    assert_allclose(read["scale"], given.scales, rtol=1e-6)
     rgba = torch.cat([given.colors, given.opacities[:, None]], 1)
-    np.testing.assert_allclose(read["rgba"] / 255, rgba, atol=0.002)
-    np.testing.assert_allclose((read["quat"].astype(float) - 128) / 128, given.quats, atol=0.008)
+    assert_allclose(read["rgba"] / 255, rgba, atol=0.002)
+    assert_allclose((read["quat"].astype(float) - 128) / 128, given.quats, atol=0.008)
