@@ -103,6 +103,14 @@ def copied(photos, folder, names=None):
     return names
 
 
+def uploaded(folder, place):
+    """Copy the files in `folder` to a place of another file system."""
+    for file in filter(Path.is_file, folder.rglob("*")):
+        copy = place / file.relative_to(folder).as_posix()
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_bytes(file.read_bytes())
+
+
 def opengl(c2w):
     return (c2w * [1, -1, -1, 1]).tolist()
 
@@ -145,9 +153,9 @@ def write_blender(folder, photos, train, val=0, times=()):
     return folder
 
 
-def write_llff(folder, photos, images="images"):
+def write_llff(folder, photos):
     """Rows of (down, right, back, centre, (h, w, f)) as a (3, 5) matrix, then near and far."""
-    copied(photos, folder / images)
+    copied(photos, folder / "images")
     right, down, ahead, centre = (photos.c2w[:, :3, i] for i in range(4))
     hwf = np.tile([*photos.size, photos.intrinsics[0]], (len(photos.files), 1))
     matrix = np.stack([down, right, -ahead, centre, hwf], -1)

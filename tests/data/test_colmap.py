@@ -31,6 +31,11 @@ RADIAL_FISHEYE 9 50 41 29 0.05 -0.02
 """Names, numbers and parameters."""
 
 
+@pytest.fixture
+def photos(tmp_path):
+    return synthetic(tmp_path / "photos", 3)
+
+
 def frames(folder):
     return read_listing(opened_path(folder)).frames
 
@@ -87,16 +92,14 @@ def test_photos_of_every_camera_become_pinhole_photos(tmp_path, camera):
     assert_allclose(bent * focal + [41, 29], expected, atol=1e-9)
 
 
-def test_other_camera_models_are_refused(tmp_path):
+def test_other_camera_models_are_refused(tmp_path, photos):
     camera = ("FOV", 7, (50.0, 50.0, 20.0, 15.0, 0.9))
-    photos = synthetic(tmp_path / "p", 2)
     for kind in ("text", "binary"):
         folder = write_colmap(tmp_path / kind, photos, kind, camera)
         assert not fault("image_undistorter", read, folder)
 
 
-def test_names_in_folders_are_read_in_their_order(tmp_path):
-    photos = synthetic(tmp_path / "photos", 3)
+def test_names_in_folders_are_read_in_their_order(tmp_path, photos):
     names = ["right/1 a.png", "left/2.png", "left/10.png"]
     ordered = [f"images/{name}" for name in ("left/10.png", "left/2.png", "right/1 a.png")]
     for kind in ("text", "binary"):
@@ -107,9 +110,8 @@ def test_names_in_folders_are_read_in_their_order(tmp_path):
             assert_allclose(scene.cameras.c2w, photos.c2w[[2, 1, 0]], atol=1e-9)
 
 
-def test_models_that_pycolmap_writes(tmp_path):
+def test_models_that_pycolmap_writes(tmp_path, photos):
     """Its files hold rigs and frames besides, which older versions did not know."""
-    photos = synthetic(tmp_path / "photos", 3)
     folder = write_colmap(tmp_path / "a", photos, "text")
     model = pycolmap.Reconstruction(str(folder / "sparse/0"))
     for kind in ("text", "binary"):
@@ -122,8 +124,7 @@ def test_models_that_pycolmap_writes(tmp_path):
         folder = copy.parent
 
 
-def test_quaternions_are_normalised(tmp_path):
-    photos = synthetic(tmp_path / "photos", 2)
+def test_quaternions_are_normalised(tmp_path, photos):
     folder = write_colmap(tmp_path, photos, "text")
     longer = np.multiply(world_to_camera(photos.c2w[0]), [1.05] * 4 + [1] * 3)
     line = f"1 {' '.join(map(str, longer))} 7 view_000.png\n\n"
@@ -150,8 +151,7 @@ BROKEN = (
 )
 
 
-def test_broken_models_are_told(tmp_path):
-    photos = synthetic(tmp_path / "photos", 2)
+def test_broken_models_are_told(tmp_path, photos):
     whole = write_colmap(tmp_path / "whole", photos, "binary") / "sparse/0"
     broken = [*BROKEN]
     broken += [(n, (whole / n).read_bytes()[:kept]) for n, parts in CUT.items() for kept in parts]
@@ -163,7 +163,7 @@ def test_broken_models_are_told(tmp_path):
         assert not fault("sparse/0", read, folder), content
 
 
-def test_photos_beside_the_model_are_needed(tmp_path):
-    folder = write_colmap(tmp_path, synthetic(tmp_path / "photos", 2), "text", images="pictures")
+def test_photos_beside_the_model_are_needed(tmp_path, photos):
+    folder = write_colmap(tmp_path, photos, "text", images="pictures")
     assert not fault("`images`", read, folder, kind=FileNotFoundError)
     assert read(folder, images="pictures").frame_name(1) == "pictures/view_001.png"

@@ -1,7 +1,6 @@
 """The same photos through every format: the same pixels, intrinsics and poses."""
 
 import shutil
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from photo_formats import (
     opened,
     scene,
     synthetic,
+    uploaded,
     write_blender,
     write_colmap,
     write_llff,
@@ -171,14 +171,9 @@ def test_a_distribution_adds_a_format(tmp_path, monkeypatch, caplog):
 def test_photos_in_memory_and_in_archives(tmp_path):
     photos = synthetic(tmp_path / "photos")
     write_colmap(tmp_path / "a", photos, "binary")
-    remote = UPath("memory://photos/a")
-    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
-        for file in (tmp_path / "a").rglob("*.*"):
-            name = file.relative_to(tmp_path / "a").as_posix()
-            archive.write(file, f"scene/{name}")
-            (remote / name).parent.mkdir(parents=True, exist_ok=True)
-            (remote / name).write_bytes(file.read_bytes())
+    uploaded(tmp_path / "a", UPath("memory://photos/a"))
+    shutil.make_archive(str(tmp_path / "a"), "zip", tmp_path, "a")
     expected = scene(tmp_path / "a").images(range(6))
-    for url in ("memory://photos/a", f"zip://scene::file://{tmp_path}/a.zip"):
+    for url in ("memory://photos/a", f"zip://a::file://{tmp_path}/a.zip"):
         assert_allclose(scene(url).cameras.c2w, photos.c2w, atol=1e-6)
         assert torch.equal(scene(url).images(range(6)), expected)

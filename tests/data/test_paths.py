@@ -1,11 +1,10 @@
 import threading
 import zipfile
 from functools import partialmethod
-from pathlib import Path
 
 import pytest
 import torch
-from photo_formats import opened, scene, synthetic, write_nerfstudio
+from photo_formats import opened, scene, synthetic, uploaded, write_nerfstudio
 from upath import UPath
 
 from qgs.contracts import ViewsConfig
@@ -26,10 +25,7 @@ def test_local_paths_are_told_from_urls(tmp_path, monkeypatch):
 def test_photos_of_a_store_are_read_several_at_a_time(tmp_path, monkeypatch):
     folder, url = tmp_path / "scene", f"memory://{tmp_path.name}"
     write_nerfstudio(folder, synthetic(tmp_path / "photos"))
-    for file in filter(Path.is_file, folder.rglob("*")):
-        place = UPath(url) / file.relative_to(folder).as_posix()
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_bytes(file.read_bytes())
+    uploaded(folder, UPath(url))
     expected, photos = scene(folder).images([0, 2, 1]), scene(url)
     source, views = opened(url, holdout=0), ViewsConfig(inputs=2, targets=1, gap=(1, 3))
     assert SampleStream(source, views, 0).batch([0]).scenes
