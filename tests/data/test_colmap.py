@@ -110,20 +110,6 @@ def test_names_in_folders_are_read_in_their_order(tmp_path, photos):
             assert_allclose(scene.cameras.c2w, photos.c2w[[2, 1, 0]], atol=1e-9)
 
 
-def test_models_that_pycolmap_writes(tmp_path, photos):
-    """Its files hold rigs and frames besides, which older versions did not know."""
-    folder = write_colmap(tmp_path / "a", photos, "text")
-    model = pycolmap.Reconstruction(str(folder / "sparse/0"))
-    for kind in ("text", "binary"):
-        copy = tmp_path / kind / "sparse"
-        copy.mkdir(parents=True)
-        getattr(model, f"write_{kind}")(str(copy))
-        (folder / "images").rename(copy.parent / "images")
-        assert (copy / f"rigs.{'txt' if kind == 'text' else 'bin'}").is_file()
-        assert_allclose(read(copy.parent).cameras.c2w, photos.c2w, atol=1e-9)
-        folder = copy.parent
-
-
 def test_quaternions_are_normalised(tmp_path, photos):
     folder = write_colmap(tmp_path, photos, "text")
     longer = np.multiply(world_to_camera(photos.c2w[0]), [1.05] * 4 + [1] * 3)

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from line_scenes import Line, Lines
+from line_scenes import Line, Lines, circle
 from noise_views import noise_views
 from tables import fault
 from torch.testing import assert_close
@@ -163,9 +163,7 @@ class Around(Line):
 
     @property
     def cameras(self):
-        angles = torch.linspace(0, 3, self.count).double()
-        eyes = 4 * torch.stack([angles.sin(), 0 * angles, -angles.cos()], -1)
-        c2w = look_at(eyes, -eyes, torch.tensor([0.0, 1, 0]).double().expand_as(eyes))
+        c2w = circle(torch.linspace(0, 3, self.count).double(), 4)
         return Cameras(c2w, super().cameras.intrinsics, (8, 8))
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from line_scenes import Line, Lines
+from line_scenes import Line, Lines, circle
 from qgs_datasets.overlapping import Overlapping
 
 from qgs.composer import RecipeError, resolve
@@ -21,12 +21,8 @@ class Arc(Line):
 
     @property
     def cameras(self):
-        angle = 0.5 / DEPTH * (SHUFFLED - 20).double()
-        c2w = torch.eye(4).double().repeat(40, 1, 1)
-        c2w[:, 0, 0] = c2w[:, 2, 2] = angle.cos()
-        c2w[:, 0, 2], c2w[:, 2, 0] = -angle.sin(), angle.sin()
-        c2w[:, :3, 3] = -DEPTH * c2w[:, :3, 2]
-        return Cameras(c2w, torch.tensor([8.0, 8, 4, 4]).expand(40, 4), (8, 8))
+        c2w = circle(0.5 / DEPTH * (SHUFFLED - 20).double(), DEPTH)
+        return Cameras(c2w, super().cameras.intrinsics, (8, 8))
 
 
 def seeded(seed=0):

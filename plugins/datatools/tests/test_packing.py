@@ -13,6 +13,7 @@ import photo_formats
 import pytest
 import torch
 from commands import run_qgs
+from photo_formats import row_of_frames
 from PIL import Image
 from qgs_datasets.chunks import ChunksSource
 from qgs_datatools import packing
@@ -50,19 +51,18 @@ def noise(seed, kind="RGB"):
 
 def photos(path, frames=4, suffix="png", convert="RGB", mask=False, times=None, **top):
     """A scene of noise in nerfstudio's format."""
-    entries = []
+    listing = row_of_frames(frames, 0.3, **GIVEN | top)
     (path / "images").mkdir(parents=True)
-    for i in range(frames):
-        name = f"images/{i}.{suffix}"
-        noise(i, convert).save(path / name)
-        pose = [[1, 0, 0, 0.3 * i], [0, 1, 0, 5.1], [0, 0, 1, -1000.7], [0, 0, 0, 1]]
-        entries.append({"file_path": name, "transform_matrix": pose})
+    for i, entry in enumerate(listing["frames"]):
+        entry["file_path"] = f"images/{i}.{suffix}"
+        noise(i, convert).save(path / entry["file_path"])
+        entry["transform_matrix"][2][3] = -1000.7
         if mask and i % 2:
-            entries[i]["mask_path"] = f"mask{i}.png"
-            noise(100 + i, "L").save(path / f"mask{i}.png")
+            entry["mask_path"] = f"mask{i}.png"
+            noise(100 + i, "L").save(path / entry["mask_path"])
         if times:
-            entries[i]["time"] = times[i]
-    (path / "transforms.json").write_text(json.dumps({**GIVEN, **top, "frames": entries}))
+            entry["time"] = times[i]
+    (path / "transforms.json").write_text(json.dumps(listing))
 
 
 source = partial(photo_formats.opened, size=SIZE, holdout=3)

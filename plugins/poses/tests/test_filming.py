@@ -5,22 +5,15 @@ import json
 import av
 import numpy as np
 import torch
-from commands import MODEL, run_qgs
+from commands import run_qgs
 from photo_formats import noisy_photos, row_of_frames
 from qgs_poses.paths import read_path
+from training_runs import tiny
 
 import qgs
 from qgs.analysis.scenes import reconstruct
 from qgs.cli.options import scale_settings
 from qgs.types import Cameras
-
-RECIPE = f"""
-recipe: 1
-model: {json.dumps({**MODEL, "renderer": {"background": [0, 0, 0]}})}
-plugins: [rooms]
-data: {{type: rooms/procedural, image_size: [16, 16]}}
-views: {{inputs: 2, targets: 2, gap: [2, 4], scale: constant}}
-"""
 
 
 def test_a_film_that_cannot_be_written_is_refused_at_once(tmp_path):
@@ -45,9 +38,7 @@ def frames(film):
 
 
 def test_both_films_show_what_the_reconstruction_renders_of_the_photos_world(tmp_path):
-    recipe = tmp_path / "recipe.yaml"
-    recipe.write_text(RECIPE)
-    model = qgs.compose(recipe)
+    model = tiny("tokengs", "model.renderer.background=[0, 0, 0]").build_model()
     for weights in model.parameters():  # a fresh one draws all Gaussians alike
         weights.data += 0.02 * torch.randn_like(weights)
     checkpoint = tmp_path / "checkpoint.safetensors"

@@ -9,13 +9,13 @@ from itertools import count
 
 import pytest
 import torch
+from line_scenes import circle
 from qgs_refine.growth import DEAD, FreeGaussians
 from qgs_refine.refining import Extras, mean_psnr, resized
 from qgs_refine.scene import masked
 from tables import fault
 
 import qgs
-from qgs.geometry.poses import look_at
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians, Views, map_tensors
 
@@ -49,9 +49,7 @@ def cloud(number, seed=0):
 
 def ring(views, side=24):
     """Cameras (1, views) on a quarter of a circle of radius 2 about the origin."""
-    angles = torch.linspace(0, math.pi / 2, views)
-    eyes = 2 * torch.stack([angles.sin(), 0 * angles, -angles.cos()], -1)
-    c2w = look_at(eyes, -eyes, torch.tensor([0.0, 1, 0]).expand(views, 3))
+    c2w = circle(torch.linspace(0, math.pi / 2, views), 2)
     lens = torch.tensor([side, side, side / 2, side / 2]).expand(1, views, 4)
     return Cameras(c2w[None], lens, (side, side))
 
