@@ -67,6 +67,11 @@ def rewrite(path, tensors=None, **changed):
     write_tensors(path, tensors or tensors_of(path), metadata_of(path) | changed)
 
 
+def loading_fault(match, path):
+    """What is wrong unless loading refuses a file with `match`."""
+    return fault(match, qgs.load, path, kind=CheckpointError)
+
+
 def test_a_loaded_model_is_the_saved_one(model, saved):
     loaded = qgs.load(saved)
     assert not loaded.training
@@ -152,11 +157,11 @@ def test_damaged_files_are_refused_by_name(saved, written):
         content = bytearray(written)
         content[position] ^= 1
         saved.write_bytes(content)
-        assert not fault(f"^{saved} is damaged", qgs.load, saved, kind=CheckpointError)
+        assert not loading_fault(f"^{saved} is damaged", saved)
     cut = [written[:kept] for kept in (0, 4, 100, -10)]
     for content in (*cut, b"recipe: 1\nmodel:\n"):
         saved.write_bytes(content)
-        assert not fault(str(saved), qgs.load, saved, kind=CheckpointError)
+        assert not loading_fault(str(saved), saved)
 
 
 def test_a_renamed_pickle_is_refused_unread(tmp_path):
@@ -167,15 +172,15 @@ def test_a_renamed_pickle_is_refused_unread(tmp_path):
     path = tmp_path / "model.safetensors"
     for protocol in (2, 4):
         path.write_bytes(pickle.dumps(Explosive(), protocol))
-        assert not fault("a Python pickle", qgs.load, path, kind=CheckpointError)
+        assert not loading_fault("a Python pickle", path)
     torch.save({"a": Explosive()}, path)
-    assert not fault("PyTorch", qgs.load, path, kind=CheckpointError)
+    assert not loading_fault("PyTorch", path)
     assert not (tmp_path / "trace").exists()
 
 
 def test_a_newer_format_is_refused(saved):
     rewrite(saved, **{"qgs.format_version": "99"})
-    assert not fault("qgs.format_version 99", qgs.load, saved, kind=CheckpointError)
+    assert not loading_fault("qgs.format_version 99", saved)
 
 
 def test_sizes_are_compared_before_anything_is_allocated(saved, monkeypatch):
@@ -186,7 +191,7 @@ def test_sizes_are_compared_before_anything_is_allocated(saved, monkeypatch):
         tree = resolve(recipe, [f"model.{size}"]).tree
         rewrite(saved, **{"qgs.recipe": json.dumps(tree)})
         fits_not = "does not fit the model of its recipe"
-        assert not fault(fits_not, qgs.load, saved, kind=CheckpointError)
+        assert not loading_fault(fits_not, saved)
 
 
 def test_a_changed_letter_in_any_metadata_is_refused(saved):

@@ -44,19 +44,21 @@ def record(key, frames=4, **extra):
     }
 
 
-def write(folder, chunks, index=True):
+def write(folder, index=True, **chunks):
+    """Chunks, by their names without the suffix."""
     folder.mkdir(parents=True, exist_ok=True)
+    keys = {}
     for name, records in chunks.items():
-        with (folder / name).open("wb") as file:
+        with (folder / f"{name}.torch").open("wb") as file:
             torch.save(records, file)
+        keys |= {entry["key"]: f"{name}.torch" for entry in records if index}
     if index:
-        keys = {entry["key"]: name for name, records in chunks.items() for entry in records}
         (folder / "index.json").write_text(json.dumps(keys))
 
 
 def data_set(path):
-    write(path / "train", {"a.torch": [record("s0"), record("s1", 7)], "b.torch": [record("s2")]})
-    write(path / "test", {"a.torch": [record("t0")]})
+    write(path / "train", a=[record("s0"), record("s1", 7)], b=[record("s2")])
+    write(path / "test", a=[record("t0")])
 
 
 opened = partial(photo_formats.opened, size=(16, 16), source=ChunksSource)
@@ -97,24 +99,24 @@ def test_listing_opens_no_chunk(tmp_path):
 
 
 def test_held_out_frames_serve_where_there_are_no_test_chunks(tmp_path):
-    write(tmp_path / "train", {"a.torch": [record("s0")]})
+    write(tmp_path / "train", a=[record("s0")])
     assert names(opened(tmp_path), "test") == []
     assert opened(tmp_path, holdout=3).scenes("test")[0].held_out == (1,)
-    write(tmp_path / "test", {"a.torch": [record("t0")]})
+    write(tmp_path / "test", a=[record("t0")])
     assert names(opened(tmp_path, holdout=3), "test") == ["t0"]
 
 
 def test_chunks_without_split_folders_and_first_scenes(tmp_path):
-    write(tmp_path, {"a.torch": [record("s0"), record("s1")]})
+    write(tmp_path, a=[record("s0"), record("s1")])
     assert len(opened(tmp_path).scenes("train")) == 2
     assert names(opened(tmp_path, max_scenes=1)) == ["s0"]
 
 
 def test_without_an_index_the_chunks_are_read(tmp_path, caplog):
-    write(tmp_path / "train", {"a.torch": [record("s0")], "b.torch": [record("s1")]}, index=False)
+    write(tmp_path / "train", a=[record("s0")], b=[record("s1")], index=False)
     assert names(opened(tmp_path)) == ["s0", "s1"]
     assert "has no index.json" in caplog.text
-    write(tmp_path / "train", {"c.torch": [record("s1")]}, index=False)
+    write(tmp_path / "train", c=[record("s1")], index=False)
     assert not fault(r"'s1' is in b\.torch and in c\.torch", opened, tmp_path)
 
 
@@ -149,8 +151,7 @@ def test_scenes_travel_to_other_processes_without_open_files(tmp_path):
 
 
 def test_threads_share_few_open_chunks(tmp_path):
-    chunks = {f"{i}.torch": [record(f"s{i}", 2)] for i in range(8)}
-    write(tmp_path / "train", chunks)
+    write(tmp_path / "train", **{f"c{i}": [record(f"s{i}", 2)] for i in range(8)})
     scenes = opened(tmp_path).scenes("train")
     with ThreadPoolExecutor(4) as pool:
         images = list(pool.map(lambda k: scenes[k % 8].images([1])[0, 0, 0, 0] * 255, range(64)))
@@ -166,7 +167,7 @@ def test_masks_names_sizes_and_backgrounds(tmp_path):
         "sizes": torch.tensor([[36, 64], [36, 36]]),
         "names": ["a/0.jpg", "b.jpg"],
     }
-    write(tmp_path, {"a.torch": [record("s0", 2, **extra)]})
+    write(tmp_path, a=[record("s0", 2, **extra)])
     scene = first(tmp_path, background=(0.2, 0.4, 0.6))
     masks = scene.masks([0, 1])
     assert masks[0, 0, [0, 15], 3].tolist() == [0, 1]
@@ -217,7 +218,7 @@ def test_broken_chunks_are_told(tmp_path):
     ]
     cases += [([record("s0", **extra)], f"scene 's0'{told}") for extra, told in BROKEN]
     for records, message in cases:
-        write(tmp_path, {"a.torch": records}, index=False)
+        write(tmp_path, a=records, index=False)
         assert not fault(rf"a\.torch.*{message}", all_images, tmp_path)
 
 
@@ -234,7 +235,7 @@ def test_a_small_file_does_not_fill_the_memory(tmp_path):
         ("cameras", torch.zeros(4, 18).to_sparse()),
         ("cameras", torch.zeros(4, 18, device="meta")),
     ):
-        write(tmp_path, {"a.torch": [record("s0", **{name: value})]})
+        write(tmp_path, a=[record("s0", **{name: value})])
         assert (tmp_path / "a.torch").stat().st_size < 20_000
         reason = rf"\A.*a\.torch: scene 's0': '{name}' holds a tensor.*\Z"
         assert not fault(reason, all_images, tmp_path)

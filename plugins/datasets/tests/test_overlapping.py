@@ -13,6 +13,7 @@ from qgs.types import Cameras
 
 DEPTH = 10.0
 VIEWS = ViewsConfig(inputs=2, targets=3)
+SAMPLER = Overlapping(Overlapping.Config())
 SHUFFLED = torch.randperm(40, generator=torch.Generator().manual_seed(0))
 
 
@@ -70,8 +71,7 @@ def test_apart_moves_inputs_apart():
 
 def test_every_held_out_photo_is_judged_with_inputs_beside_it():
     scene = Arc(40, held_out=(0, 8, 16))
-    sampler = Overlapping(Overlapping.Config())
-    plan = EvaluationPlan(Lines(scene), VIEWS, EvaluationConfig(), sampler=sampler)
+    plan = EvaluationPlan(Lines(scene), VIEWS, EvaluationConfig(), sampler=SAMPLER)
     samples = [*plan.samples()]
     assert [sample.target_frames for sample in samples] == [(0,), (8,), (16,)]
     for sample in samples:
@@ -80,8 +80,7 @@ def test_every_held_out_photo_is_judged_with_inputs_beside_it():
 
 
 def test_without_held_out_photos_four_of_all_are_judged():
-    sampler = Overlapping(Overlapping.Config())
-    found = sampler.windows(Arc(40), VIEWS)
+    found = SAMPLER.windows(Arc(40), VIEWS)
     assert [targets for _, targets in found] == [(0,), (13,), (26,), (39,)]
     for inputs, (target,) in found:
         assert target not in inputs
@@ -98,26 +97,25 @@ def test_any_number_of_inputs():
 def test_cameras_without_a_common_point_and_few_photos():
     """Their depth is swept; two photos are inputs, and the third is every target."""
     scene = Line(3, step=0.1)
-    inputs, targets = Overlapping(Overlapping.Config()).draw(scene, VIEWS, seeded(), 0)
+    inputs, targets = SAMPLER.draw(scene, VIEWS, seeded(), 0)
     assert len({*inputs}) == 2
     assert {*targets} == {0, 1, 2} - {*inputs}
     assert len(targets) == 3
 
 
 def test_a_scene_that_moves_is_judged_in_its_order_and_not_drawn():
-    scene, sampler = Arc(40, held_out=(3,)), Overlapping(Overlapping.Config())
+    scene = Arc(40, held_out=(3,))
     scene.times = torch.arange(40).double()
-    assert sampler.windows(scene, VIEWS) == []
+    assert SAMPLER.windows(scene, VIEWS) == []
     with pytest.raises(ValueError, match=r"moves: .* qgs/span"):
-        sampler.draw(scene, VIEWS, seeded(), 0)
+        SAMPLER.draw(scene, VIEWS, seeded(), 0)
 
 
 def test_too_few_photos_are_refused():
-    sampler = Overlapping(Overlapping.Config())
     with pytest.raises(ValueError, match="'line2' has 2 photos, and needs 3"):
-        sampler.draw(Line(2), VIEWS, seeded(), 0)
+        SAMPLER.draw(Line(2), VIEWS, seeded(), 0)
     with pytest.raises(ValueError, match="has 1 photos beside 1 held-out ones, and needs 2"):
-        sampler.windows(Line(2, held_out=(1,)), VIEWS)
+        SAMPLER.windows(Line(2, held_out=(1,)), VIEWS)
 
 
 def test_bounds_are_ordered():
