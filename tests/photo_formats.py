@@ -22,9 +22,6 @@ from qgs.data import PhotosSource
 PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[2] / "shared/photos"))
 """Real photos, which are not in the repository."""
 
-Camera = tuple[str, int, tuple[float, ...]]
-"""A COLMAP camera model: its name, number and parameters."""
-
 
 @dataclass(frozen=True)
 class PhotoSet:
@@ -34,10 +31,6 @@ class PhotoSet:
     c2w: np.ndarray
     intrinsics: tuple[float, float, float, float]
     size: tuple[int, int]
-
-    @property
-    def pinhole(self):
-        return "PINHOLE", 1, self.intrinsics
 
 
 def synthetic(folder, count=6, size=(30, 40), suffix="png", seed=0):
@@ -62,7 +55,7 @@ def real_folder(name):
 
 def opened(path, size=(30, 40), source=PhotosSource, **options):
     """The data at `path`, opened by a class of sources."""
-    return source(source.Config(path=str(path), **{"image_size": size, **options}))
+    return source(source.Config(path=str(path), image_size=size, **options))
 
 
 def encoded(image, kind="PNG", **options):
@@ -135,19 +128,18 @@ def write_blender(folder, photos, train, val=0, times=()):
     Square pixels and a principal point in the middle are all that the format knows. times: of the
     photos, as D-NeRF writes them; ... leaves one out.
     """
-    when = dict(zip(photos.files, times, strict=False))
-    parts = {"train": slice(0, train), "val": slice(train, train + val)}
-    for part, chosen in {**parts, "test": slice(train + val, None)}.items():
-        frames = []
-        for file, pose in zip(photos.files[chosen], photos.c2w[chosen], strict=True):
-            (folder / part).mkdir(parents=True, exist_ok=True)
-            Image.open(file).save(folder / part / f"{file.stem}.png")
-            frame = {"file_path": f"./{part}/{file.stem}", "rotation": 0.01}
-            if when.get(file, ...) is not ...:
-                frame["time"] = when[file]
-            frames.append({**frame, "transform_matrix": opengl(pose)})
+    parts = {"train": [], "val": [], "test": []}
+    for i, file in enumerate(photos.files):
+        part = "train" if i < train else "val" if i < train + val else "test"
+        (folder / part).mkdir(parents=True, exist_ok=True)
+        Image.open(file).save(folder / part / f"{file.stem}.png")
+        frame = {"file_path": f"./{part}/{file.stem}", "rotation": 0.01}
+        if i < len(times) and times[i] is not ...:
+            frame["time"] = times[i]
+        parts[part].append({**frame, "transform_matrix": opengl(photos.c2w[i])})
+    angle = 2 * math.atan(photos.size[1] / 2 / photos.intrinsics[0])
+    for part, frames in parts.items():
         if frames:
-            angle = 2 * math.atan(photos.size[1] / 2 / photos.intrinsics[0])
             content = {"camera_angle_x": angle, "frames": frames}
             (folder / f"transforms_{part}.json").write_text(json.dumps(content))
     return folder
@@ -173,13 +165,16 @@ def write_colmap(
     images="images",
     names=None,
 ):
-    """kind: text or binary. Images are listed backwards, with two observations each."""
+    """kind: text or binary. camera: name, number and parameters of a model of COLMAP's.
+
+    Images are listed backwards, with two observations each.
+    """
     names = copied(photos, folder / images, names)
     (folder / model).mkdir(parents=True, exist_ok=True)
     poses = map(world_to_camera, photos.c2w)
     entries = list(zip(range(1, len(names) + 1), poses, names, strict=True))[::-1]
     write = {"text": _write_text, "binary": _write_binary}[kind]
-    write(folder / model, entries, camera or photos.pinhole, photos.size)
+    write(folder / model, entries, camera or ("PINHOLE", 1, photos.intrinsics), photos.size)
     return folder
 
 
