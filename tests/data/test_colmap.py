@@ -18,6 +18,7 @@ from qgs.data.photos import read_listing
 pycolmap = pytest.importorskip("pycolmap")
 
 SIZE = (60, 80)
+KINDS = ("text", "binary")
 CAMERAS = """
 SIMPLE_PINHOLE 0 60 41 29
 PINHOLE 1 60 62 41 29
@@ -63,10 +64,10 @@ def test_photos_of_every_camera_become_pinhole_photos(tmp_path, camera):
     photos = synthetic(tmp_path / "photos", 2, SIZE)
     for file in photos.files:
         Image.fromarray(colours(directions)).save(file)
-    scene = read(write_colmap(tmp_path / "binary", photos, "binary", camera), SIZE)
-    text = read(write_colmap(tmp_path / "text", photos, "text", camera), SIZE)
-    assert torch.equal(text.cameras.intrinsics, scene.cameras.intrinsics)
-    assert torch.equal(text.images([1]), scene.images([1]))
+    folders = [write_colmap(tmp_path / kind, photos, kind, camera) for kind in KINDS]
+    (of_text, _), (of_binary, _) = map(frames, folders)
+    assert (of_text.intrinsics, of_text.lens) == (of_binary.intrinsics, of_binary.lens)
+    scene = read(folders[1], SIZE)
     fx, fy, cx, cy = scene.cameras.intrinsics[0].tolist()
     zoom = fx / lens.focal_length_x  # where undistortion would leave black edges
     middle = np.array(SIZE[::-1]) / 2
@@ -87,14 +88,14 @@ def test_photos_of_every_camera_become_pinhole_photos(tmp_path, camera):
         return
     points = torch.tensor([[0.0, 0.0], [0.3, -0.2], [-0.5, 0.4], [0.01, 0.6]]).double()
     expected = lens.img_from_cam(np.column_stack([points, np.ones(4)]))
-    bent = frames(tmp_path / "text")[0].lens.distorted(points).numpy()
+    bent = of_text.lens.distorted(points).numpy()
     focal = np.array([lens.focal_length_x, lens.focal_length_y])
     assert_allclose(bent * focal + [41, 29], expected, atol=1e-9)
 
 
 def test_other_camera_models_are_refused(tmp_path, photos):
     camera = ("FOV", 7, (50.0, 50.0, 20.0, 15.0, 0.9))
-    for kind in ("text", "binary"):
+    for kind in KINDS:
         folder = write_colmap(tmp_path / kind, photos, kind, camera)
         assert not fault("image_undistorter", read, folder)
 
@@ -102,7 +103,7 @@ def test_other_camera_models_are_refused(tmp_path, photos):
 def test_names_in_folders_are_read_in_their_order(tmp_path, photos):
     names = ["right/1 a.png", "left/2.png", "left/10.png"]
     ordered = [f"images/{name}" for name in ("left/10.png", "left/2.png", "right/1 a.png")]
-    for kind in ("text", "binary"):
+    for kind in KINDS:
         for model in ("sparse/0", "sparse", "colmap/sparse/0", "."):
             folder = tmp_path / kind / str(len(model))
             scene = read(write_colmap(folder, photos, kind, model=model, names=names))

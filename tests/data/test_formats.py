@@ -138,21 +138,19 @@ class Csv(PhotoReader):
             c2w = np.array(pose).reshape(4, 4)
             frames.append(PhotoFrame(name, folder / name, c2w, (fx, fy, cx, cy)))
         return Listing(folder / cls.listing, frames)
+
+
+plugin = Csv
 """
 
 
-def test_a_distribution_adds_a_format(tmp_path, monkeypatch, caplog):
-    info = tmp_path / "site/csv_photos-1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: csv-photos\nVersion: 1.0\n")
-    offered = "csv = csv_photos:Csv\nnerfstudio = csv_photos:Csv\nnone = csv_photos:None_\n"
-    (info / "entry_points.txt").write_text(f"[{formats.GROUP}]\n{offered}")
-    (tmp_path / "site/csv_photos.py").write_text(CSV)
-    (folder := UPath(tmp_path / "photos")).mkdir()
+def test_a_distribution_adds_a_format(install, tmp_path, caplog):
     with pytest.raises(ValidationError, match="csv"):
         PhotosSource.Config(path="photos", format="csv")
-    monkeypatch.syspath_prepend(tmp_path / "site")
+    for name, source in (("csv", CSV), ("nerfstudio", CSV), ("none", "")):
+        install(f"{name}-photos", name, source, group=formats.GROUP)
     assert PhotosSource.Config(path="photos", format="csv").format == "csv"
+    (folder := UPath(tmp_path / "photos")).mkdir()
     with pytest.raises(FileNotFoundError, match=r"transforms\.json.*poses\.csv \(csv\)"):
         formats.read_listing(folder)
     photos = synthetic(tmp_path / "photos", count=2)
@@ -165,7 +163,7 @@ def test_a_distribution_adds_a_format(tmp_path, monkeypatch, caplog):
     assert formats.read_listing(folder).file.name == "poses.csv"
     assert_same(scene(folder, format="csv"), photos)
     assert formats.readers()["nerfstudio"] in formats.READERS, "installing changes no other format"
-    assert "csv-photos 1.0" in caplog.text, "what cannot be loaded is logged with its distribution"
+    assert "none-photos 1.2" in caplog.text, "what cannot be loaded is logged with its distribution"
 
 
 def test_photos_in_memory_and_in_archives(tmp_path):

@@ -1,9 +1,7 @@
 """Frames of videos: which are taken, that they are upright, and what a damaged file costs."""
 
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
@@ -73,18 +71,9 @@ def test_the_shift_of_a_picture():
 
 def test_a_varying_rate_counts_by_time(tmp_path):
     """The first 20 frames pass in .2 s, the last 10 in 10 s."""
-    path = tmp_path / "a.mp4"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=100, options={"crf": "15", "bf": "0"})
-        stream.height, stream.width = 96, 128
-        stream.pix_fmt = "yuv420p"
-        for number, image in enumerate(numbered_images(30)):
-            frame = av.VideoFrame.from_ndarray(image)
-            frame.pts = number if number < 20 else 20 + 100 * (number - 20)
-            frame.time_base = Fraction(1, 100)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    extract(path, tmp_path, 5)
+    times = [*range(20), *range(20, 1020, 100)]
+    video = write_video(tmp_path / "a.mp4", numbered_images(30), 100, times=times, bf="0")
+    extract(video, tmp_path, 5)
     assert sum(number >= 20 for number in levels(tmp_path)) >= 4
 
 

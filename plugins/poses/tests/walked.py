@@ -1,5 +1,7 @@
 """What tests of poses share."""
 
+from fractions import Fraction
+
 import av
 import numpy as np
 from PIL import Image
@@ -20,14 +22,17 @@ def write_photos(folder, images, name="{}.png"):
     return folder
 
 
-def write_video(path, images, rate=10, codec="libx264", **options):
-    """A video of images of one size."""
+def write_video(path, images, rate=10, codec="libx264", times=None, **options):
+    """A video of images of one size. times: of these, in parts of a second as `rate` has them."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=rate, options={"crf": "15"} | options)
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = "yuv420p"
-        for image in images:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
+        for number, image in enumerate(images):
+            frame = av.VideoFrame.from_ndarray(image)
+            if times:
+                frame.pts, frame.time_base = times[number], Fraction(1, rate)
+            container.mux(stream.encode(frame))
         container.mux(stream.encode())
     return path
 
