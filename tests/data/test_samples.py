@@ -72,19 +72,20 @@ def test_only_a_scene_whose_masks_are_all_black_is_refused():
 
 def test_normalised_poses():
     scene = Line(9)
-    frames = (2, 6), (4,)
-    first = sample(scene, *frames, scale_factor=0.4)
-    assert torch.equal(first.inputs.cameras.c2w[0, 0], torch.eye(4))
-    assert first.inputs.cameras.c2w[0, 1, 0, 3] == pytest.approx(4 * 0.5 * 0.4)
-    assert first.targets.cameras.c2w[0, 0, 0, 3] == pytest.approx(2 * 0.5 * 0.4)
+
+    def made(**views):
+        both = sample(scene, (2, 6), (4,), **views)
+        return torch.cat([both.inputs.cameras.c2w[0], both.targets.cameras.c2w[0]])
+
+    constant = made(scale_factor=0.4)
+    assert torch.equal(constant[0], torch.eye(4))
+    assert constant[1:, 0, 3].tolist() == pytest.approx([4 * 0.5 * 0.4, 2 * 0.5 * 0.4])
     config = {"scale": "distance", "scale_factor": 1.0, "frame": "mean_cam"}
-    mean = sample(scene, *frames, **config).inputs.cameras.c2w
-    assert mean[0, :, 0, 3].tolist() == pytest.approx([-0.5, 0.5])
+    assert made(**config)[:2, 0, 3].tolist() == pytest.approx([-0.5, 0.5])
     with pytest.raises(ValueError, match="one point"):
         sample(Line(5, step=0.0), **config)
-    given = sample(scene, *frames, scale_factor=1.0, frame="given")
-    assert torch.equal(given.inputs.cameras.c2w[0], scene.cameras.c2w[[2, 6]])
-    assert torch.equal(given.targets.cameras.c2w[0], scene.cameras.c2w[[4]])
+    given = made(scale_factor=1.0, frame="given")
+    assert torch.equal(given, scene.cameras.c2w[[2, 6, 4]])
 
 
 def test_a_mirrored_camera_sees_the_mirrored_point_in_the_mirrored_pixel():

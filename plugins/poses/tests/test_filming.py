@@ -2,13 +2,13 @@
 
 import json
 
-import av
 import numpy as np
 import torch
 from commands import run_qgs
 from photo_formats import noisy_photos, row_of_frames
 from qgs_poses.paths import read_path
 from training_runs import tiny
+from walked import frames
 
 import qgs
 from qgs.analysis.scenes import reconstruct
@@ -30,11 +30,6 @@ def test_a_film_that_cannot_be_written_is_refused_at_once(tmp_path):
         assert type(result.exception) is error, film
     assert [*tmp_path.iterdir()] == [phone]
     assert phone.read_bytes() == b"mine"
-
-
-def frames(film):
-    with av.open(str(film)) as container:
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
 def test_both_films_show_what_the_reconstruction_renders_of_the_photos_world(tmp_path):

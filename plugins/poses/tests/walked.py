@@ -37,6 +37,12 @@ def write_video(path, images, rate=10, codec="libx264", times=None, **options):
     return path
 
 
+def frames(path):
+    """What a video shows, as RGB."""
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
 def write_turned(path, images, degrees):
     """An mp4 whose track says that it is shown `degrees` clockwise: the matrix in `tkhd`."""
     data = write_video(path, images).read_bytes()
