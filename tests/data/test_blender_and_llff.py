@@ -54,8 +54,7 @@ def test_images_cannot_be_replaced(tmp_path, photos):
 def test_the_published_axes(tmp_path):
     """A camera at (1, 2, 3) that looks along world +x with world +z up: down is -z, right is -y."""
     row = np.zeros((2, 17))
-    matrix = [[0, 0, -1, 1, 30], [0, -1, 0, 2, 40], [-1, 0, 0, 3, 50]]
-    row[:, :15] = np.ravel(matrix)
+    row[:, :15] = np.ravel([[0, 0, -1, 1, 30], [0, -1, 0, 2, 40], [-1, 0, 0, 3, 50]])
     np.save(tmp_path / "poses_bounds.npy", row)
     (tmp_path / "images").mkdir()
     for name in ("b.JPG", "a.JPG"):

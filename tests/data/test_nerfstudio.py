@@ -60,8 +60,7 @@ def test_depth_that_is_not_finite_is_unknown(folder):
     depth[3, 4], depth[5, 6] = np.nan, np.inf
     np.save(folder / "depth.npy", depth)
     change(folder, 0, depth_file_path="depth.npy")
-    depths = read(folder).depths([0])
-    assert depths[0, 0, [3, 5, 7], [4, 6, 8]].tolist() == [0, 0, 2]
+    assert read(folder).depths([0])[0, 0, [3, 5, 7], [4, 6, 8]].tolist() == [0, 0, 2]
     np.save(folder / "depth.npy", np.zeros((30, 40, 3)))
     with pytest.raises(ValueError, match="each pixel"):
         read(folder).depths([0])

@@ -71,8 +71,7 @@ def test_the_file_is_that_of_the_3dgs_release(tmp_path):
         assert (whole.text, whole.byte_order) == (False, "<")
         vertex = whole["vertex"].data
         assert vertex.dtype == np.dtype([(name, "<f4") for name in names])
-        found = torch.tensor(vertex.tolist())
-        assert_close(found, torch.cat(columns, 1))
+        assert_close(torch.tensor(vertex.tolist()), torch.cat(columns, 1))
 
 
 def test_the_round_trip(tmp_path):

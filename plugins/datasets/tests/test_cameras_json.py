@@ -89,8 +89,7 @@ def test_what_is_read_and_whether_its_meaning_is_logged(tmp_path, photos, caplog
         caplog.clear()
         read = scene(folder)
         assert_close(read.cameras.c2w, torch.from_numpy(photos.c2w))
-        expected = torch.tensor([LENS] * 6).double()
-        assert_close(read.cameras.intrinsics, expected)
+        assert_close(read.cameras.intrinsics, torch.tensor([LENS] * 6).double())
         assert [Path(read.frame_name(i)).name for i in range(6)] == names
         assert formats_of(folder) == ["cameras"]
         assert ("is read as" in caplog.text) == (form in told), form

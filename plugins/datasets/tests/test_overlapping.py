@@ -96,8 +96,7 @@ def test_any_number_of_inputs():
 
 def test_cameras_without_a_common_point_and_few_photos():
     """Their depth is swept; two photos are inputs, and the third is every target."""
-    scene = Line(3, step=0.1)
-    inputs, targets = SAMPLER.draw(scene, VIEWS, seeded(), 0)
+    inputs, targets = SAMPLER.draw(Line(3, step=0.1), VIEWS, seeded(), 0)
     assert len({*inputs}) == 2
     assert {*targets} == {0, 1, 2} - {*inputs}
     assert len(targets) == 3

@@ -29,8 +29,7 @@ def test_the_sharpest_frame_of_each_interval_is_taken(tmp_path):
     for number in {*range(40)} - {*sharp}:
         blurred = Image.fromarray(images[number]).filter(ImageFilter.GaussianBlur(3))
         images[number] = np.array(blurred)
-    video = write_video(tmp_path / "a.mp4", images, crf="1")
-    assert extract(video, tmp_path, 5) == []
+    assert extract(write_video(tmp_path / "a.mp4", images, crf="1"), tmp_path, 5) == []
     assert levels(tmp_path) == sharp
 
 

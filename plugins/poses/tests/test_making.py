@@ -47,8 +47,7 @@ def test_photos_get_the_poses_they_were_taken_with(made, shots, walk):
 
 
 def test_a_video_gets_poses_of_its_frames_where_it_is_read(shots, images, tmp_path):
-    video = write_video(tmp_path / "phone.mp4", images)
-    views = qgs.read_photos(video, size=(36, 54))
+    views = qgs.read_photos(write_video(tmp_path / "phone.mp4", images), size=(36, 54))
     assert views.images.shape == (1, PHOTOS, 3, 36, 54)
     assert read_record(tmp_path / "phone_poses")["made_by"] == "qgs poses"
     assert_close(tmp_path / "phone_poses", shots)
