@@ -61,8 +61,7 @@ def test_the_published_axes(tmp_path):
         Image.new("RGB", (40, 30)).save(tmp_path / "images" / name)
     scene = read(tmp_path)
     assert [scene.frame_name(i) for i in range(2)] == ["images/a.JPG", "images/b.JPG"]
-    right_down_ahead_centre = [[0, -1, 0], [0, 0, -1], [1, 0, 0], [1, 2, 3]]
-    assert scene.cameras.c2w[0, :3].T.tolist() == right_down_ahead_centre
+    assert scene.cameras.c2w[0, :3].T.tolist() == [[0, -1, 0], [0, 0, -1], [1, 0, 0], [1, 2, 3]]
     assert scene.cameras.intrinsics[0].tolist() == [50, 50, 20, 15]
 
 

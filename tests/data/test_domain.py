@@ -120,8 +120,7 @@ def test_the_own_test_data_of_a_recipe_lie_inside(name, options, monkeypatch):
     monkeypatch.setattr(stream, "MEASURED", 128)
     recipe = resolve(f"recipes/tiny/{name}.yaml", options)
     source, sampler = recipe.build_data(), recipe.build_view_sampler()
-    steps = recipe.training.steps
-    trained = trained_domain(source, recipe.views, recipe.seed, sampler, steps)
+    trained = trained_domain(source, recipe.views, recipe.seed, sampler, recipe.training.steps)
     test = Domain()
     for sample in evaluation_samples(source, recipe.views, recipe.evaluation, sampler):
         test.see(sample.inputs.cameras, sample.targets.cameras)

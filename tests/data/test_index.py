@@ -82,8 +82,7 @@ def test_a_missing_index_is_told_with_its_path():
 def test_samples_are_those_of_the_index_in_its_order():
     source = Strips(Strip("one"), Strip("two"), Strip("three"))
     index = {"three": entry([4, 1], [2, 3, 2]), "one": entry([0, 7], [5])}
-    plan = EvaluationPlan(source, VIEWS, EvaluationConfig(scenes=1), index)
-    first, second = plan.samples()
+    first, second = EvaluationPlan(source, VIEWS, EvaluationConfig(scenes=1), index).samples()
     assert (first.scene, second.scene) == ("three", "one")
     assert (first.input_frames, first.target_frames) == ((4, 1), (2, 3, 2))
     assert first.targets.images[0, :, 0, 0, 0].tolist() == pytest.approx([0.02, 0.03, 0.02])

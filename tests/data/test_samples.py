@@ -84,8 +84,7 @@ def test_normalised_poses():
     assert made(**config)[:2, 0, 3].tolist() == pytest.approx([-0.5, 0.5])
     with pytest.raises(ValueError, match="one point"):
         sample(Line(5, step=0.0), **config)
-    given = made(scale_factor=1.0, frame="given")
-    assert torch.equal(given, scene.cameras.c2w[[2, 6, 4]])
+    assert torch.equal(made(scale_factor=1.0, frame="given"), scene.cameras.c2w[[2, 6, 4]])
 
 
 def test_a_mirrored_camera_sees_the_mirrored_point_in_the_mirrored_pixel():
@@ -98,8 +97,7 @@ def test_a_mirrored_camera_sees_the_mirrored_point_in_the_mirrored_pixel():
     seen = to_camera(point * torch.tensor([-1, 1, 1]), flipped.cameras)
     assert_close(seen[..., 2], expected[..., 2])
     x, y = to_pixels(expected, plain.cameras.intrinsics).unbind(-1)
-    found = to_pixels(seen, flipped.cameras.intrinsics)
-    assert_close(found, torch.stack([8 - x, y], -1))
+    assert_close(to_pixels(seen, flipped.cameras.intrinsics), torch.stack([8 - x, y], -1))
 
 
 def test_masks_follow_their_frames_into_mirrors_and_batches():
@@ -186,8 +184,7 @@ def test_a_point_behind_or_beside_the_cameras_is_not_looked_at():
     assert look_at_depth(around) == pytest.approx(4)
     outwards = around @ torch.diag(torch.tensor([-1.0, 1, -1, 1])).double()
     assert look_at_depth(outwards) == 0
-    one_astray = torch.cat([around, outwards[:1]])
-    assert look_at_depth(one_astray) == pytest.approx(4, rel=0.01)
+    assert look_at_depth(torch.cat([around, outwards[:1]])) == pytest.approx(4, rel=0.01)
     eyes = torch.tensor([[-200.0, 0, 0], [200, 0, 0], [0, 0, 0]])
     goal = torch.tensor([0.0, 0, 400])
     walk = look_at(eyes, goal - eyes, torch.tensor([0.0, 1, 0]).expand(3, 3))

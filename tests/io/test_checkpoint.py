@@ -188,8 +188,7 @@ def test_sizes_are_compared_before_anything_is_allocated(saved, monkeypatch):
     monkeypatch.setattr(torch, "randn", lambda *shape: torch.empty(shape, device="meta"))
     recipe = json.loads(metadata_of(saved)["qgs.recipe"])
     for size in ("width=65536", "queries.count=1000000000", "head.gaussians_per_query=1000000000"):
-        tree = resolve(recipe, [f"model.{size}"]).tree
-        rewrite(saved, **{"qgs.recipe": json.dumps(tree)})
+        rewrite(saved, **{"qgs.recipe": json.dumps(resolve(recipe, [f"model.{size}"]).tree)})
         fits_not = "does not fit the model of its recipe"
         assert not loading_fault(fits_not, saved)
 

@@ -80,5 +80,4 @@ def test_batches_have_as_many_inputs_in_a_step_and_their_ranges_are_measured():
     batches = training_batches(source, recipe.views, 2, 0, 0, sampler=drawn, accumulate=2)
     counts = [batch.inputs.images.shape[1] for batch in islice(batches, 8)]
     assert counts == [2, 2, 3, 3, 4, 4, 2, 2]
-    ranges = trained_domain(source, recipe.views, 0, drawn, steps=600).ranges
-    assert ranges["views"] == (2, 4)
+    assert trained_domain(source, recipe.views, 0, drawn, steps=600).ranges["views"] == (2, 4)

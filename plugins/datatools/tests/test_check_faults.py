@@ -37,8 +37,7 @@ def test_faults_of_files(planted, shots):
     size = "error: frame 3 (images/3.jpg): *{} x {} pixels, but listed as 180 x 120, another {}*"
     for width, height, what in ((160, 120, "aspect"), (90, 60, "scale")):
         small = Image.fromarray(shots[3].image).resize((width, height))
-        other = planted(size.format(width, height, what))
-        other.files["images/3.jpg"] = encoded(small, "JPEG")
+        planted(size.format(width, height, what)).files["images/3.jpg"] = encoded(small, "JPEG")
     listed = f"error: {ALL}*180 x 120 pixels, but listed as "
     planted(f"{listed}120 x 180*swapped*").camera.update(w=120, h=180)
     planted(f"{listed}360 x 240: correct the listed*").camera.update(w=360, h=240)

@@ -163,8 +163,7 @@ def test_splits(six):
 
     named = packing.splits_by_list(six, ["s4", "s1"])
     assert found(named) == [["s0", "s2", "s3", "s5"], ["s1", "s4"]]
-    numbered = packing.splits_by_number(six, 3)
-    assert found(numbered) == [["s0", "s1", "s3", "s4"], ["s2", "s5"]]
+    assert found(packing.splits_by_number(six, 3)) == [["s0", "s1", "s3", "s4"], ["s2", "s5"]]
     assert not fault(
         "1 of 2 test scenes are not there: gone", packing.splits_by_list, six, ["s1", "gone"]
     )

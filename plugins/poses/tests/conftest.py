@@ -32,8 +32,7 @@ def walk(images, tmp_path_factory):
     exif = Image.Exif()
     exif[0x0112] = 6  # a quarter turn clockwise makes it upright
     photos[1].transpose(Image.Transpose.ROTATE_90).save(folder / "1.jpg", quality=95, exif=exif)
-    grey = np.array(photos[2].convert("L"), np.uint16)
-    Image.fromarray(257 * grey).save(folder / "2.png")
+    Image.fromarray(257 * np.array(photos[2].convert("L"), np.uint16)).save(folder / "2.png")
     photos[3].convert("CMYK").save(folder / "3.tif")
     photos[4].save(folder / "4.webp", quality=95)
     photos[5].convert("RGBA").save(folder.parent / "5.png")

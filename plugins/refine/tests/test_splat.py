@@ -16,8 +16,7 @@ def test_the_bytes_of_a_splat_file(tmp_path):
     run_qgs("convert", tmp_path / "scene.ply", tmp_path / "scene.splat")
     read = np.frombuffer((tmp_path / "scene.splat").read_bytes(), SPLAT)
     assert SPLAT.itemsize == 32
-    order = (given.scales.prod(-1) * given.opacities)[0].argsort(descending=True)
-    given = given[0][order]
+    given = given[0][(given.scales.prod(-1) * given.opacities)[0].argsort(descending=True)]
     np.testing.assert_array_equal(read["mean"], given.means)
     assert_allclose(read["scale"], given.scales, rtol=1e-6)
     rgba = torch.cat([given.colors, given.opacities[:, None]], 1)
