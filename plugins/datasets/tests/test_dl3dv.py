@@ -13,8 +13,6 @@ from qgs_datasets.dl3dv import Dl3dvSource, read_scene_list
 from tables import fault
 from upath import UPath
 
-LENS = {"camera_model": "OPENCV", "k1": -0.5, "k2": 0.01, "p1": 1e-3, "p2": -2e-3}
-
 
 def photo(number, size=(32, 18)):
     """A PNG whose red channel is 10 times its number, with a blue gradient."""
@@ -24,14 +22,14 @@ def photo(number, size=(32, 18)):
     return photo_formats.encoded(pixels)
 
 
-def listing(frames=4, **top):
+def listing(**top):
     given = {"w": 128, "h": 72, "fl_x": 100.0, "fl_y": 101.0, "cx": 60.0, "cy": 37.0}
-    return json.dumps(row_of_frames(frames, **given | top))
+    return json.dumps(row_of_frames(4, **given | top)).encode()
 
 
 def scene_files(inside="", images="images_4", **top):
     files = {f"{inside}{images}/{i}.png": photo(i) for i in range(4)}
-    return {f"{inside}transforms.json": listing(**top).encode(), **files}
+    return {f"{inside}transforms.json": listing(**top), **files}
 
 
 def write(path, files):
@@ -93,7 +91,7 @@ def test_reduced_photos_are_chosen(tmp_path):
 
 
 def test_distortion_is_undone(tmp_path):
-    write(tmp_path / "abc", scene_files(**LENS))
+    write(tmp_path / "abc", scene_files(k1=-0.5, k2=0.01, p1=1e-3, p2=-2e-3))
     write(tmp_path / "pinhole", scene_files())
     bent, straight = opened(tmp_path).scenes("train")
     assert torch.equal(bent.cameras.intrinsics, straight.cameras.intrinsics)
@@ -123,7 +121,7 @@ def test_incomplete_and_broken_archives_are_told(tmp_path):
     for files, file in (
         ({"abc/images_4/0.png": b""}, r"abc\.zip"),
         ({"abc/transforms.json": b"{"}, r"abc/transforms\.json::.*abc\.zip"),
-        ({"abc/transforms.json": listing().encode()}, "transforms"),
+        ({"abc/transforms.json": listing()}, "transforms"),
     ):
         write(tmp_path / "abc.zip", files)
         assert not fault(file, length, tmp_path, kind=(ValueError, OSError))
@@ -142,8 +140,8 @@ def test_a_damaged_photo_names_archive_and_file(tmp_path):
         scene(tmp_path).images([1])
 
 
-def several(path, count=4):
-    for i in range(count):
+def several(path):
+    for i in range(4):
         write(path / f"1K/s{i}.zip", scene_files(f"s{i}/"))
 
 
@@ -165,24 +163,23 @@ def test_test_scenes(tmp_path, caplog):
 
 
 def test_lists_of_scenes(tmp_path):
-    file = UPath(tmp_path / "list.txt")
-    file.write_text("# benchmark\ns1\n\ns2  # hard\ns1\n")
-    assert read_scene_list(file) == ["s1", "s2"]
-    (tmp_path / "list.json").write_text('["s3"]')
-    assert read_scene_list(UPath(tmp_path / "list.json")) == ["s3"]
-    (tmp_path / "list.json").write_text("3")
-    file.write_text("# none\n")
-    for wrong in (file, file.with_name("list.json")):
+    text, listed = UPath(tmp_path / "list.txt"), UPath(tmp_path / "list.json")
+    text.write_text("# benchmark\ns1\n\ns2  # hard\ns1\n")
+    listed.write_text('["s3"]')
+    assert read_scene_list(text) == ["s1", "s2"]
+    assert read_scene_list(listed) == ["s3"]
+    text.write_text("# none\n")
+    listed.write_text("3")
+    for wrong in (text, listed):
         assert not fault(wrong.name, read_scene_list, wrong)
-    assert not fault(
-        r"gone\.txt", read_scene_list, file.with_name("gone.txt"), kind=FileNotFoundError
-    )
+    gone = text.with_name("gone.txt")
+    assert not fault(gone.name, read_scene_list, gone, kind=FileNotFoundError)
 
 
 def test_a_scene_that_is_there_twice_is_told(tmp_path, caplog):
-    several(tmp_path, 1)
+    several(tmp_path)
     write(tmp_path / "1K/s0", scene_files())
-    assert len(opened(tmp_path).scenes("train")) == 1
+    assert len(opened(tmp_path).scenes("train")) == 4
     assert "1 scenes of" in caplog.text
 
 
@@ -202,7 +199,7 @@ def test_scenes_travel_to_other_processes_without_open_archives(tmp_path):
 
 
 def test_threads_read_one_archive(tmp_path):
-    several(tmp_path, 4)
+    several(tmp_path)
     scenes = opened(tmp_path).scenes("train")
     with ThreadPoolExecutor(4) as threads:
         red = list(threads.map(lambda k: scenes[k % 4].images([k % 3])[0, 0, 0, 0], range(24)))
