@@ -14,25 +14,20 @@ def test_a_misreading_gives_the_true_poses_back(shots):
     opengl = true @ FLIP
     w2c, opengl_w2c = np.linalg.inv([true, opengl])
     mixed = np.eye(4)[[1, 0, 2, 3]] * [1, 1, -1, 1]  # what LLFF's reader makes of other axes
-    read = [
-        (OPENGL["flipped"], opengl),
-        (OPENGL["inverted"], w2c @ FLIP),
-        (OPENGL["inverted and flipped"], opengl_w2c @ FLIP),
-        (LLFF["flipped"], opengl),
-        (LLFF["turned"], true * [-1, 1, -1, 1]),
-        (LLFF["inverted"], w2c),
-        (LLFF["OpenGL axes"], opengl @ mixed),
-        (LLFF["OpenCV axes"], true @ mixed),
-    ]
-    for convention in (OPENCV, OPENCV_C2W):
-        names = ("flipped", "inverted", "inverted and flipped")
-        read += zip(map(convention.get, names), (opengl, w2c, opengl_w2c), strict=True)
-    wrong = []
-    for misreading, poses in read:
-        first, second = map(misreading.meant, poses)
-        if not np.allclose(np.linalg.inv(second) @ first, w2c[1] @ true[0], 1e-6, 1e-12):
-            wrong.append(misreading.reason)
-    assert not wrong, wrong
+    plain = {"flipped": opengl, "inverted": w2c, "inverted and flipped": opengl_w2c}
+    misread = (
+        (OPENCV, plain),
+        (OPENCV_C2W, plain),
+        (OPENGL, {name: poses @ FLIP for name, poses in plain.items()} | {"flipped": opengl}),
+        (LLFF, {"flipped": opengl, "turned": true * [-1, 1, -1, 1], "inverted": w2c,
+                "OpenGL axes": opengl @ mixed, "OpenCV axes": true @ mixed}),
+    )  # fmt: skip
+    for convention, read in misread:
+        assert read.keys() == convention.keys()
+        for name, poses in read.items():
+            first, second = map(convention[name].meant, poses)
+            turned = np.linalg.inv(second) @ first
+            assert np.allclose(turned, w2c[1] @ true[0], 1e-6, 1e-12), name
 
 
 def test_the_convention_is_named(good, shots, tmp_path):
