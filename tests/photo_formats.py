@@ -156,15 +156,7 @@ def write_llff(folder, photos):
     return folder
 
 
-def write_colmap(
-    folder,
-    photos,
-    kind,
-    camera=None,
-    model="sparse/0",
-    images="images",
-    names=None,
-):
+def write_colmap(folder, photos, kind, camera=None, model="sparse/0", images="images", names=None):
     """kind: text or binary. camera: name, number and parameters of a model of COLMAP's.
 
     Images are listed backwards, with two observations each.

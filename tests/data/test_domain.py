@@ -113,8 +113,7 @@ GROWING = "view_sampler.max_gap={schedule: linear, values: [4, 20], at: [0, 10]}
 
 
 @pytest.mark.parametrize(
-    ("name", "options"),
-    [("tokengs", ["training.steps=12", GROWING]), ("tokengs_bounded", [])],
+    ("name", "options"), [("tokengs", ["training.steps=12", GROWING]), ("tokengs_bounded", [])]
 )
 def test_the_own_test_data_of_a_recipe_lie_inside(name, options, monkeypatch):
     monkeypatch.setattr(stream, "MEASURED", 128)

@@ -10,12 +10,7 @@ from photo_formats import opened, synthetic, write_nerfstudio
 from tables import fault
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
-from qgs.data.evaluation import (
-    EvaluationPlan,
-    IndexEntry,
-    SceneFailure,
-    read_index,
-)
+from qgs.data.evaluation import EvaluationPlan, IndexEntry, SceneFailure, read_index
 from qgs.data.samples import Sample
 
 VIEWS = ViewsConfig(inputs=2, gap=(2, 5))

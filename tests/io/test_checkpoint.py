@@ -18,13 +18,7 @@ from qgs.composer import RecipeError, resolve
 from qgs.composer.registry import available_plugins
 from qgs.data.domain import KEY, Domain
 from qgs.io import tensors as tensors_module
-from qgs.io.checkpoint import (
-    CheckpointFile,
-    load_weights,
-    save,
-    unique_tensors,
-    write_checkpoint,
-)
+from qgs.io.checkpoint import CheckpointFile, load_weights, save, unique_tensors, write_checkpoint
 from qgs.io.tensors import SEAL, CheckpointError, write_tensors
 
 RECIPES = Path(__file__).parents[2] / "recipes/tiny"

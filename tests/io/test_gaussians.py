@@ -14,12 +14,7 @@ from torch.testing import assert_close
 
 import qgs
 from qgs.extensions import ExtensionError
-from qgs.io.gaussians import (
-    PROPERTIES,
-    load_ply,
-    save_gaussians,
-    save_ply,
-)
+from qgs.io.gaussians import PROPERTIES, load_ply, save_gaussians, save_ply
 from qgs.types import Gaussians, named_tensors
 
 
