@@ -107,19 +107,19 @@ def test_files_outside_of_the_folder_are_read_only_if_allowed(tmp_path):
             assert of != "file_path" or read(mine, outside=True)
 
 
-@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
-def test_where_the_lens_would_fold_the_photo_it_sees_nothing(tmp_path, model):
+def test_where_the_lens_would_fold_the_photo_it_sees_nothing(tmp_path):
     """x (1 - 0.6 x^2) is largest at 0.745, and x of its angle's polynomial at an angle of it."""
-    fisheye = model == "OPENCV_FISHEYE"
-    turn = math.tan(math.sqrt(1 / 1.8)) if fisheye else math.sqrt(1 / 1.8)
-    lens = (Fisheye if fisheye else RadialTangential)(k1=-0.6)
-    image = undistorted(np.ones((48, 64), np.uint8), (30.0, 30.0, 32.0, 24.0), lens)
-    reach = math.ceil(30 * turn - 0.5)
-    assert not image[24, 32 + reach :].any()
-    assert image[24, 32 : 32 + reach].all()
-    wide = {"fl_x": 30.0, "fl_y": 30.0, "cx": 32.0, "cy": 24.0}
-    path = folder(tmp_path, camera_model=model, k1=-0.6, **wide)
-    assert (read(path, size=(48, 64)).images([2])[0, 2] > 0).all()
+    largest, wide = math.sqrt(1 / 1.8), {"fl_x": 30.0, "fl_y": 30.0, "cx": 32.0, "cy": 24.0}
+    for model, lens, turn in (
+        ("OPENCV", RadialTangential, largest),
+        ("OPENCV_FISHEYE", Fisheye, math.tan(largest)),
+    ):
+        image = undistorted(np.ones((48, 64), np.uint8), (*wide.values(),), lens(k1=-0.6))
+        reach = math.ceil(30 * turn - 0.5)
+        assert not image[24, 32 + reach :].any()
+        assert image[24, 32 : 32 + reach].all()
+        path = folder(tmp_path, camera_model=model, k1=-0.6, **wide)
+        assert (read(path, size=(48, 64)).images([2])[0, 2] > 0).all()
 
 
 def test_black_edges_of_undistorted_photos_are_cut_off(tmp_path):
