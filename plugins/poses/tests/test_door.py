@@ -4,7 +4,7 @@ import re
 import shutil
 import threading
 import time
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from commands import run_qgs
@@ -73,36 +73,25 @@ def test_a_folder_whose_photos_are_elsewhere_is_none(tmp_path):
 
 
 def waiting(folder, monkeypatch):
-    """A thread that has seen no poses of `folder`, and waits for the lock that the caller holds."""
+    """A call that has seen no poses of `folder`, and waits for the lock that the caller holds."""
     came = threading.Event()
-    results = []
 
-    @contextmanager
     def late(*words, **options):
         came.set()
-        with locked(*words, **options):
-            yield
-
-    def ask():
-        try:
-            results.append(door.posed_folder(folder))
-        except Exception as error:
-            results.append(error)
+        return locked(*words, **options)
 
     monkeypatch.setattr(door, "locked", late)
-    thread = threading.Thread(target=ask)
-    thread.start()
+    call = ThreadPoolExecutor(1).submit(door.posed_folder, folder)
     assert came.wait(20)
-    return thread, results
+    return call
 
 
 def test_one_that_waits_takes_what_the_other_made(folder, calls, made, monkeypatch):
     out = door.beside(folder)
     with locked(folder, out, wait=False):
-        thread, results = waiting(folder, monkeypatch)
+        call = waiting(folder, monkeypatch)
         shutil.copytree(made.folder, out, dirs_exist_ok=True)
-    thread.join(20)
-    assert results == [out]
+    assert call.result(20) == out
     assert not calls
 
 
@@ -116,11 +105,10 @@ def test_one_that_waits_for_photos_without_poses_locks_a_new_folder(folder, made
 
     monkeypatch.setattr(door, "make_locked", checked)
     with locked(folder, out, wait=False):
-        thread, results = waiting(folder, monkeypatch)
+        call = waiting(folder, monkeypatch)
         time.sleep(0.2)  # it waits for the lock of the folder that now is deleted
         out.rmdir()
-    thread.join(20)
-    assert results == [out]
+    assert call.result(20) == out
 
 
 def test_a_read_only_place_names_the_command_for_another(folder, monkeypatch):
