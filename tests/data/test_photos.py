@@ -123,11 +123,11 @@ def test_where_the_lens_would_fold_the_photo_it_sees_nothing(tmp_path):
 
 
 def test_black_edges_of_undistorted_photos_are_cut_off(tmp_path):
+    distorted = folder(tmp_path, k1=0.9, cx=36.0, cy=24.0)
+    pixels = np.full((48, 64, 3), 255, np.uint8)
+    pixels[:, :, 0] = np.arange(64) * 3 + 9
+    Image.fromarray(pixels).save(tmp_path / "images/0.png")
     for size in ((48, 64), (24, 24)):
-        distorted = folder(tmp_path, k1=0.9, cx=36.0, cy=24.0)
-        pixels = np.full((48, 64, 3), 255, np.uint8)
-        pixels[:, :, 0] = np.arange(64) * 3 + 9
-        Image.fromarray(pixels).save(tmp_path / "images/0.png")
         scene = read(distorted, size=size)
         image = scene.images([0])[0] * 255
         assert (image[1] > 240).all()  # resampling overshoots a little
