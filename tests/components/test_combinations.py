@@ -2,7 +2,6 @@
 
 import random
 from itertools import combinations, product
-from typing import Any
 
 import pytest
 from qgs_plugintools import Case
@@ -12,7 +11,7 @@ from qgs_plugintools.plugins import cases_of
 
 from qgs.composer import RecipeError, resolve
 from qgs.composer.registry import load_registry
-from qgs.contracts import Component, ComponentConfig, FieldSpec
+from qgs.contracts import Component, ComponentConfig
 
 SLOTS = ("queries", "cross_attention", "self_attention", "refinement", "centers", "supervision")
 LAYER = SLOTS[1:4]
@@ -24,11 +23,11 @@ SIZES = (Sizes(), Sizes(batch=1, views=3, image=(24, 16)))
 Choice = tuple[str, type[Component], ComponentConfig]
 
 
-def _choices(slot: str) -> list[Choice]:
+def _choices(slot):
     """Every component of a slot, with its default options and with its plugin's examples."""
     if slot == "supervision":
         component = REGISTRY.components(slot)["qgs/layers"]
-        layers: Any = component.Config
+        layers = component.Config
         return [("qgs/layers", component, layers(layers=chosen)) for chosen in ((1, 2), (2,))]
     return [
         (f"{name}/{case.component.name}", case.component, case.config)
@@ -41,13 +40,13 @@ def _choices(slot: str) -> list[Choice]:
 CHOICES = {slot: _choices(slot) for slot in SLOTS}
 
 
-def _pairwise() -> list[tuple[Choice, ...]]:
+def _pairwise():
     """Combinations in which every two choices of two slots meet, few by greedy choice."""
     counts = [range(len(choices)) for choices in CHOICES.values()]
     combined = list(product(*counts))
     random.Random(0).shuffle(combined)
     left = {pair for combination in combined for pair in _pairs(combination)}
-    taken: list[tuple[int, ...]] = []
+    taken = []
     for gain in range(len(_pairs(combined[0])), 0, -1):
         for combination in combined:
             if len(_pairs(combination) & left) >= gain:
@@ -59,12 +58,12 @@ def _pairwise() -> list[tuple[Choice, ...]]:
     ]
 
 
-def _pairs(combination: tuple[int, ...]) -> frozenset[tuple[tuple[int, int], ...]]:
+def _pairs(combination):
     return frozenset(combinations(enumerate(combination), 2))
 
 
-def _recipe(chosen: dict[str, Choice]) -> dict[str, Any]:
-    def written(slot: str) -> dict[str, Any]:
+def _recipe(chosen):
+    def written(slot):
         kind, _, config = chosen[slot]
         options = config.model_dump(mode="json")
         fewer = {name: count for name, count in (("count", 6), ("dynamic", 2)) if name in options}
@@ -88,10 +87,10 @@ def _recipe(chosen: dict[str, Choice]) -> dict[str, Any]:
     }
 
 
-def _unmet(chosen: dict[str, Choice]) -> dict[str, set[str]]:
+def _unmet(chosen):
     """What each component needs of the state and does not find there as it reads it."""
-    unmet: dict[str, set[str]] = {}
-    given: dict[str, FieldSpec] = {}
+    unmet = {}
+    given = {}
     for slot in ("queries", *LAYER, *LAYER, "centers"):
         kind, component, config = chosen[slot]
         needed = {n: s for n, s in component.fields_read(config).items() if "memory." not in n}
@@ -103,7 +102,7 @@ def _unmet(chosen: dict[str, Choice]) -> dict[str, set[str]]:
     return unmet
 
 
-def _check(parts: tuple[Choice, ...]) -> None:
+def _check(parts):
     """A combination runs, or is refused with all that it lacks."""
     chosen = dict(zip(SLOTS, parts, strict=True))
     unmet = _unmet(chosen)

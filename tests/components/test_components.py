@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from losses.judging import CAMERAS, TRUTH
+from torch.testing import assert_close
 
 from qgs import QueryState, Views
 from qgs.components import (
@@ -23,8 +24,8 @@ DIMS = ModelDims(width=16, heads=2, depth=2)
 def test_posact_its_slope_at_zero_and_its_limits():
     t = torch.tensor([-3.0, -1e-4, 0.0, 1e-4, 3.0], requires_grad=True)
     y = posact(t)
-    torch.testing.assert_close(y, t.sign() * (t.abs().exp() - 1), rtol=1e-3, atol=1e-7)
-    torch.testing.assert_close(torch.autograd.grad(y.sum(), t)[0], t.abs().exp())
+    assert_close(y, t.sign() * (t.abs().exp() - 1), rtol=1e-3, atol=1e-7)
+    assert_close(torch.autograd.grad(y.sum(), t)[0], t.abs().exp())
     saturated = torch.tensor([-1e4, -95.0, 95.0, 1e4], requires_grad=True)
     y = posact(saturated, 100.0, 1000.0)
     assert y.tolist() == [-1000.0, -1000.0, 1000.0, 1000.0]
@@ -44,7 +45,7 @@ def test_wild_raw_numbers_become_gaussians():
     head = GaussianHead(GaussianHead.Config(gaussians_per_query=2), DIMS)
     wild = head.activate(torch.randn(4, 3, 2, 14) * 1e4)
     assert wild.scales.max() <= 0.075
-    torch.testing.assert_close(wild.quats.norm(dim=-1), torch.ones(4, 3, 2))
+    assert_close(wild.quats.norm(dim=-1), torch.ones(4, 3, 2))
 
 
 def test_head_starts_with_the_spread_and_at_the_depth_it_is_told():
@@ -56,7 +57,7 @@ def test_head_starts_with_the_spread_and_at_the_depth_it_is_told():
     assert weight[:, :3].std() == pytest.approx(0.2, rel=0.05)
     assert weight[:, 3:].std() == pytest.approx(0.02, rel=0.05)
     offsets = head(QueryState(torch.zeros(1, 1, 256))).offsets
-    torch.testing.assert_close(posact(offsets), torch.tensor([0, 0, 0.1]).expand(1, 1, 32, 3))
+    assert_close(posact(offsets), torch.tensor([0, 0, 0.1]).expand(1, 1, 32, 3))
 
 
 def test_offset_centers_are_the_offsets_further_along_z_in_float32():
@@ -90,10 +91,10 @@ def test_a_bias_is_for_all_heads_or_for_each():
     ):
         weights = (logits + by_head).softmax(-1)
         read = (weights @ values).transpose(1, 2).flatten(2)
-        torch.testing.assert_close(core(features, keys, values, given), core.out_proj(read))
+        assert_close(core(features, keys, values, given), core.out_proj(read))
         explained = core.explain(features, keys, queries, given)
-        torch.testing.assert_close(explained.weights, weights[:, :, queries])
-        torch.testing.assert_close(explained.geometry, by_head[:, :, queries])
+        assert_close(explained.weights, weights[:, :, queries])
+        assert_close(explained.geometry, by_head[:, :, queries])
 
 
 def test_attention_of_other_shapes_is_refused():

@@ -4,13 +4,12 @@ from functools import cache
 from itertools import product
 from pathlib import Path
 from types import NoneType
-from typing import Any, get_args
+from typing import get_args
 
 import torch
 import yaml
 from losses.judging import CAMERAS, GOLDEN, TRUTH, judged
 from qgs_locus import plugin
-from torch import Tensor
 
 from qgs import Views
 from qgs.components import COMPONENTS
@@ -20,11 +19,11 @@ from qgs.losses import COMPONENTS as LOSSES
 from qgs.types import named_tensors
 
 RECIPES = Path(__file__).parents[2] / "recipes"
-TABLE: dict[str, Any] = yaml.safe_load((Path(__file__).parent / "limits.yaml").read_text())
+TABLE = yaml.safe_load((Path(__file__).parent / "limits.yaml").read_text())
 
 
 @cache
-def outcome(*overrides: str) -> tuple[dict[str, Any], Tensor]:
+def outcome(*overrides):
     """Options, and what the model makes of golden photos with weights of a seed."""
     recipe = resolve(TABLE["recipe"], overrides)
     with torch.random.fork_rng(devices=()), torch.no_grad():
@@ -53,7 +52,7 @@ def test_limits_of_losses_are_published_by_default_and_matter():
     depths = torch.full_like(TRUTH[:, first, :1], 1.5)
     views = Views(TRUTH[:, first], CAMERAS[:, first], depths=depths)
     means, opacities = GOLDEN["points"], GOLDEN["opacity"][..., 0]
-    losses: dict[str, Any] = {loss.name: loss for loss in (*LOSSES, *plugin.components)}
+    losses = {loss.name: loss for loss in (*LOSSES, *plugin.components)}
     wrong = []
     for row in TABLE["losses"]:
         options = dict(row)

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from renderers.scenes import make_scene
 from scipy.special import lpmv
-from torch import Tensor
+from torch.testing import assert_close
 
 from qgs.geometry.harmonics import harmonics, rotated, seen_colors
 from qgs.geometry.transforms import quat_to_matrix
@@ -17,17 +17,17 @@ from qgs.types import SH_COUNTS
 TURN = quat_to_matrix(F.normalize(torch.tensor([0.3, -0.5, 0.8, 0.2], dtype=torch.float64), dim=0))
 
 
-def directions(count: int = 50) -> Tensor:
+def directions(count=50):
     drawn = torch.randn(count, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     return F.normalize(drawn, dim=-1)
 
 
-def coefficients(*shape: int) -> Tensor:
+def coefficients(*shape):
     generator = torch.Generator().manual_seed(2)
     return torch.randn(*shape, 3, generator=generator, dtype=torch.float64)
 
 
-def legendre(degree: int, order: int, d: Tensor) -> Tensor:
+def legendre(degree, order, d):
     """The real harmonic from its definition; SciPy's functions have the Condon-Shortley phase."""
     m = abs(order)
     x, y, z = d.unbind(-1)
@@ -43,7 +43,7 @@ def test_they_are_the_real_harmonics_by_degree_and_order():
     d = directions()
     expected = [legendre(n, m, d) for n in (1, 2, 3) for m in range(-n, n + 1)]
     for count in SH_COUNTS:
-        torch.testing.assert_close(harmonics(d, count), torch.stack(expected[:count], -1))
+        assert_close(harmonics(d, count), torch.stack(expected[:count], -1))
 
 
 def test_turned_coefficients_give_the_values_of_before_degree_by_degree():
@@ -54,9 +54,9 @@ def test_turned_coefficients_give_the_values_of_before_degree_by_degree():
         turned = rotated(sh, TURN)
         before = torch.einsum("pc,gcx->pgx", harmonics(d, count), sh)
         after = torch.einsum("pc,gcx->pgx", harmonics(d @ TURN.T, count), turned)
-        torch.testing.assert_close(after, before)
-        torch.testing.assert_close(turned[0, 3:8], sh[0, 3:8])
-        torch.testing.assert_close(rotated(sh, torch.eye(3)), sh)
+        assert_close(after, before)
+        assert_close(turned[0, 3:8], sh[0, 3:8])
+        assert_close(rotated(sh, torch.eye(3)), sh)
 
 
 def test_a_view_sees_the_direction_from_its_camera_to_the_mean():
@@ -67,7 +67,7 @@ def test_a_view_sees_the_direction_from_its_camera_to_the_mean():
     step = gaussians.means[1, 4] - cameras.c2w[1, 2, :3, 3]
     values = harmonics(step / step.norm(), 8)
     expected = gaussians.colors[1, 4] + (values[:, None] * gaussians.sh[1, 4]).sum(0)
-    torch.testing.assert_close(found[1, 2, 4], expected.clamp_min(0))
+    assert_close(found[1, 2, 4], expected.clamp_min(0))
     assert found.min() == 0
     assert found.max() > 1
     with pytest.raises(ValueError, match="no spherical harmonics"):
@@ -81,4 +81,4 @@ def test_half_precision_is_raised_and_autocast_left():
         inside = seen_colors(gaussians, cameras)
         assert seen_colors(gaussians.to(torch.bfloat16), cameras).dtype == torch.float32
         assert rotated(gaussians.sh, TURN).dtype == torch.float32
-    torch.testing.assert_close(inside, outside, rtol=1e-5, atol=1e-5)
+    assert_close(inside, outside, rtol=1e-5, atol=1e-5)

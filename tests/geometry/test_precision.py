@@ -1,8 +1,7 @@
 """What `full_precision` raises, and when it leaves autocast."""
 
-from collections.abc import Mapping
 from contextlib import nullcontext
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,16 +15,16 @@ class Pair(NamedTuple):
     right: Tensor
 
 
-def half(*shape: int) -> Tensor:
+def half(*shape):
     return torch.rand(shape).bfloat16()
 
 
-def state(dtype: torch.dtype) -> QueryState:
+def state(dtype):
     return QueryState(torch.rand(1, 4, 8).to(dtype), {"place": torch.rand(1, 4, 3)})
 
 
 @full_precision
-def same(*args: Any, **kwargs: Any) -> Any:
+def same(*args, **kwargs):
     return (*args, *kwargs.values())
 
 
@@ -56,12 +55,12 @@ def test_what_needs_no_raising_is_handed_on_itself():
 class Layer(nn.Module):
     """A method of a module whose only argument is a container."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.linear = nn.Linear(8, 3)
 
     @full_precision
-    def forward(self, state: QueryState) -> Tensor:
+    def forward(self, state):
         assert not torch.is_autocast_enabled("cpu")
         return self.linear(state.features) + state["place"]
 
@@ -84,9 +83,9 @@ def test_it_compiles_without_a_break():
 
 
 def test_autocast_is_left_for_the_device_of_the_tensors(monkeypatch):
-    entered: list[Mapping[str, Any]] = []
+    entered = []
 
-    def autocast(**options: Any) -> Any:
+    def autocast(**options):
         entered.append(options)
         return nullcontext()
 

@@ -1,17 +1,14 @@
 """The golden files, and files that are like them but for a change."""
 
 import json
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
 
-from published.files import GoldenFile, read_golden
+from published.files import read_golden
 from published.models import RECIPES
 from safetensors.torch import save_file
-from torch import Tensor
 
-from qgs.composer import Recipe, resolve
+from qgs.composer import resolve
 
 GOLDEN = Path(__file__).parent
 OF_KIND = {
@@ -23,12 +20,12 @@ OF_KIND = {
 }
 INPUTS = {
     "alphas_pred", "c2w", "has_mask", "images_gt", "images_pred", "intrinsics", "masks_gt",
-    "opacity", "points", "rgb", "target_time", "times", "tuned_latents",
+    "opacity", "points", "rgb", "target_time", "times", "tuned_latents"
 }  # fmt: skip
 """Of files of models and of losses."""
 
 
-def compared_names(golden: GoldenFile) -> list[str]:
+def compared_names(golden):
     """The tensors of a file that are neither inputs nor weights."""
     return [
         name for name in golden.tensors if not name.startswith("weights.") and name not in INPUTS
@@ -36,19 +33,17 @@ def compared_names(golden: GoldenFile) -> list[str]:
 
 
 @cache
-def options_of(kind: str) -> dict[str, Any]:
+def options_of(kind):
     """The options of the golden file of that kind."""
     return read_golden(GOLDEN / f"{OF_KIND[kind]}.safetensors").config["options"]
 
 
-def recipe_with(kind: str, options: dict[str, Any]) -> Recipe:
+def recipe_with(kind, options):
     """The recipe of that kind with some other options."""
     return resolve(RECIPES.get(kind, RECIPES["tokengs"])(options_of(kind) | options))
 
 
-def changed(
-    path: Path, source: str, alter: Callable[[dict[str, Tensor]], Any] = dict, **config: Any
-) -> Path:
+def changed(path, source, alter=dict, **config):
     """A golden file after `alter(tensors)`, at `path`; some other `options` or constants."""
     golden = read_golden(GOLDEN / f"{source}.safetensors")
     alter(golden.tensors)

@@ -7,7 +7,7 @@ from published.files import read_golden
 
 VARIANTS = (
     "anchor_offset", "center_only_bias", "content_cross_attn", "content_self_attn",
-    "free_center", "full", "no_radius_state", "static_radius",
+    "free_center", "full", "no_radius_state", "static_radius"
 )  # fmt: skip
 FILES = [*(f"locus_{variant}_a" for variant in VARIANTS), "loss_a", "tokengs_a"]
 FILES += [f"tokengs_{kind}_a" for kind in ("dynamic", "latent", "multiscale")]

@@ -1,11 +1,8 @@
 """The comparison on files with something wrong."""
 
-from pathlib import Path
-
 import parity
 import torch
 from golden.files import GOLDEN, changed, compared_names, options_of
-from published.comparison import Row
 from published.files import GoldenFile, read_golden
 from published.models import DECODER_MLP, recipe_of
 
@@ -16,11 +13,11 @@ def test_the_weights_tell_a_ratio_that_is_not_whole():
     assert recipe["model"]["decoder"]["feed_forward"] == {"ratio": 2.5}
 
 
-def rows_of(path: Path) -> dict[str, Row]:
+def rows_of(path):
     return {row.name: row for row in parity.rows_of(path)}
 
 
-def problems(path: Path) -> dict[str, str]:
+def problems(path):
     return {name: row.problem for name, row in rows_of(path).items() if row.problem}
 
 
@@ -38,7 +35,7 @@ def test_altered_and_added_tensors_fail_by_name_and_others_pass(tmp_path):
         expected = {stray: "not compared: nothing here has this name"}
         names = compared_names(read_golden(GOLDEN / f"{source}.safetensors"))[::2]
 
-        def alter(tensors, expected=expected, names=names, stray=stray) -> None:
+        def alter(tensors, expected=expected, names=names, stray=stray):
             for name, tensor in tensors.items():
                 tensors[name] = tensor.double() if tensor.is_floating_point() else tensor
             for name in names:
@@ -51,7 +48,7 @@ def test_altered_and_added_tensors_fail_by_name_and_others_pass(tmp_path):
 
 
 def test_numbers_that_are_not_finite_and_missing_tensors_fail_by_name(tmp_path):
-    def alter(tensors) -> None:
+    def alter(tensors):
         tensors["keys"].fill_(torch.nan)
         del tensors["geo_bias.1"]
 
@@ -61,7 +58,7 @@ def test_numbers_that_are_not_finite_and_missing_tensors_fail_by_name(tmp_path):
     assert rows["keys"].absolute == rows["keys"].relative == torch.inf
     assert rows["values"].absolute < 1e-4
 
-    def turn(tensors) -> None:
+    def turn(tensors):
         pixels = tensors["expected.tokengs.means2d"]
         pixels[pixels.isinf()] *= -1
 

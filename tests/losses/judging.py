@@ -4,10 +4,8 @@ from pathlib import Path
 
 import torch
 from safetensors.torch import load_file
-from torch import Tensor
 
-from qgs.contracts import Loss
-from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering, Views
+from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering
 
 GOLDEN = load_file(Path(__file__).parents[1] / "golden" / "loss_a.safetensors")
 """Inputs and results of the released losses."""
@@ -15,14 +13,7 @@ CAMERAS = Cameras(GOLDEN["c2w"], GOLDEN["intrinsics"], (16, 24))
 PREDICTED, TRUTH = GOLDEN["images_pred"], GOLDEN["images_gt"]
 
 
-def judged(
-    loss: Loss,
-    views: Views,
-    means: Tensor | None = None,
-    opacities: Tensor | None = None,
-    rgb: Tensor | None = None,
-    alpha: Tensor | None = None,
-) -> dict[str, Tensor]:
+def judged(loss, views, means=None, opacities=None, rgb=None, alpha=None):
     """The terms of `loss`; what is not given is nothing, opaque or black."""
     means = views.images.new_zeros(len(views.images), 0, 3) if means is None else means
     opacities = torch.ones(means.shape[:2]) if opacities is None else opacities

@@ -5,7 +5,7 @@ import pytest
 import torch
 from commands import MODEL
 from losses.judging import judged
-from torch import Tensor
+from torch.testing import assert_close
 
 from qgs.composer import resolve
 from qgs.contracts import ViewsConfig
@@ -41,12 +41,12 @@ SEEN_FROM_IT = torch.tensor([
     [0.5, -0.5, 1.0],  # where the depth is unknown
     [-3.0, 0.0, 1.0],  # left of the image
     [-0.02, -0.02, -2.0],  # behind the camera
-    [-0.004, -0.004, 0.05],  # too near
+    [-0.004, -0.004, 0.05]  # too near
 ])  # fmt: skip
 POINTS = SEEN_FROM_IT[None] @ POSE[:3, :3].T
 
 
-def term(means: Tensor, views: Views, inputs: bool = False) -> Tensor:
+def term(means, views, inputs=False):
     config = DepthSurface.Config(beta=0.2, near=0.1, inputs=inputs)
     return judged(DepthSurface(config), views, means)["depth_surface"]
 
@@ -66,9 +66,7 @@ def test_by_hand():
         assert not gradient[:, :2].any()
 
 
-def test_a_batch_without_depth_maps_adds_nothing_and_is_logged_once(
-    caplog,
-):
+def test_a_batch_without_depth_maps_adds_nothing_and_is_logged_once(caplog):
     warn_once.cache_clear()
     means = POINTS.clone().requires_grad_()
     for _ in range(2):
@@ -108,8 +106,8 @@ def test_depths_are_scaled_and_mirrored_and_unknown_in_noisy_views_and_without_m
         return make_sample(scene, (0, 1, 2), (3,), views, mirror, noise, depths=depths).inputs
 
     own = 0.4 * scene.depths([0, 1, 2])
-    torch.testing.assert_close(inputs().depths[0], own)
-    torch.testing.assert_close(inputs(mirror=True).depths[0], own.flip(-1))
+    assert_close(inputs().depths[0], own)
+    assert_close(inputs(mirror=True).depths[0], own.flip(-1))
     noisy = inputs(noise=np.random.default_rng(0)).depths[0]
     assert [bool(depth.any()) for depth in noisy] == [True, False, False]
     bare = inputs(depths=False)

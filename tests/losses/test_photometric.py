@@ -3,16 +3,14 @@
 import pytest
 import torch
 from losses.judging import CAMERAS, PREDICTED, TRUTH, judged
-from torch import Tensor
+from torch.testing import assert_close
 
 from qgs.losses import Photometric
 from qgs.metrics.images import ssim
 from qgs.types import Cameras, Views
 
 
-def terms_of(
-    rgb: Tensor = PREDICTED, truth: Tensor = TRUTH, **options: object
-) -> dict[str, Tensor]:
+def terms_of(rgb=PREDICTED, truth=TRUTH, **options):
     cameras = Cameras(CAMERAS.c2w, CAMERAS.intrinsics, truth.shape[-2:])
     return judged(Photometric(Photometric.Config(**options)), Views(truth, cameras), rgb=rgb)
 
@@ -20,7 +18,7 @@ def terms_of(
 def test_valid_ssim_is_the_metric_of_large_enough_images():
     rgb = PREDICTED.clamp(0, 1)
     found = terms_of(rgb, ssim_weight=0.3, padding="valid")["ssim"]
-    torch.testing.assert_close(found, 0.3 * (1 - ssim(rgb, TRUTH).mean()) / 2)
+    assert_close(found, 0.3 * (1 - ssim(rgb, TRUTH).mean()) / 2)
     with pytest.raises(ValueError, match="at least 11 pixels a side, got 10 x 24"):
         terms_of(rgb[..., :10, :], TRUTH[..., :10, :], padding="valid")
 
@@ -36,4 +34,4 @@ def test_terms_have_weights_and_those_of_weight_zero_are_left_out():
     assert terms_of(ssim_weight=0.0).keys() == {"mse"}
     terms = terms_of(mse_weight=0.0, l1_weight=0.8)
     assert terms.keys() == {"l1", "ssim"}
-    torch.testing.assert_close(terms["l1"], 0.8 * (PREDICTED - TRUTH).abs().mean())
+    assert_close(terms["l1"], 0.8 * (PREDICTED - TRUTH).abs().mean())

@@ -8,7 +8,7 @@ from qgs.metrics.baselines import mean_colour, nearest_input, worse_than_nearest
 from qgs.types import Cameras, Views
 
 
-def cameras(x: list[float], turn: list[float] | None = None) -> Cameras:
+def cameras(x, turn=None):
     """Cameras along the x axis, turned by radians about y."""
     place = torch.tensor(x)
     angle = torch.zeros_like(place) if turn is None else torch.tensor(turn)
@@ -19,7 +19,7 @@ def cameras(x: list[float], turn: list[float] | None = None) -> Cameras:
     return Cameras(c2w, torch.full((1, len(x), 4), 4.0), (8, 8))
 
 
-def views(x: list[float], turn: list[float] | None = None) -> Views:
+def views(x, turn=None):
     return Views(torch.rand(1, len(x), 3, 8, 8), cameras(x, turn))
 
 

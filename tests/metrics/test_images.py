@@ -3,11 +3,12 @@
 import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from torch.testing import assert_close
 
 from qgs.metrics.images import psnr, ssim
 
 
-def pair(noise: float, size: tuple[int, int] = (24, 37)) -> tuple[torch.Tensor, torch.Tensor]:
+def pair(noise, size=(24, 37)):
     generator = torch.Generator().manual_seed(0)
     coarse = torch.rand(2, 3, 6, 8, generator=generator)
     truth = torch.nn.functional.interpolate(coarse, size, mode="bilinear")
@@ -31,7 +32,7 @@ def test_ssim_equals_scikit_image(covariance):
             for a, b in zip(images, truth, strict=True)
         ]
         found = ssim(images, truth, covariance).double()
-        torch.testing.assert_close(found, torch.tensor(expected), rtol=0, atol=atol)
+        assert_close(found, torch.tensor(expected), rtol=0, atol=atol)
     with pytest.raises(ValueError, match="at least 11 pixels a side, got 10 x 20"):
         ssim(*pair(0.1, (10, 20)), covariance)
 
@@ -44,10 +45,10 @@ def test_psnr_equals_scikit_image_on_clipped_images():
             for a, b in zip(images, truth, strict=True)
         ]
         found = psnr(images, truth).double()
-        torch.testing.assert_close(found, torch.tensor(expected), rtol=1e-5, atol=1e-4)
+        assert_close(found, torch.tensor(expected), rtol=1e-5, atol=1e-4)
 
 
 def test_identical_images_with_leading_dimensions():
     truth = pair(0.0)[1][:, None].expand(-1, 4, -1, -1, -1)
-    torch.testing.assert_close(ssim(truth, truth), torch.ones(2, 4))
-    torch.testing.assert_close(psnr(truth, truth), torch.full((2, 4), 100.0))
+    assert_close(ssim(truth, truth), torch.ones(2, 4))
+    assert_close(psnr(truth, truth), torch.full((2, 4), 100.0))

@@ -1,12 +1,11 @@
 """The renderers, each where it can run."""
 
-from collections.abc import Callable
 from importlib.util import find_spec
 
 import pytest
 import torch
 
-from qgs.contracts import Renderer, RendererConfig
+from qgs.contracts import RendererConfig
 from qgs.renderers import CpuRenderer, GsplatRenderer, TorchRenderer
 
 RENDERERS = {"torch": TorchRenderer, "cpu": CpuRenderer, "gsplat": GsplatRenderer}
@@ -15,7 +14,7 @@ NEEDS_GSPLAT = pytest.mark.skipif(not HAS_GSPLAT, reason="needs a CUDA GPU and g
 
 
 @pytest.fixture(params=["torch", "cpu", pytest.param("gsplat", marks=NEEDS_GSPLAT)])
-def build(request: pytest.FixtureRequest) -> Callable[..., Renderer]:
+def build(request):
     """`build(**options)`: the renderer under test, on tensors where the test makes them."""
     cls = RENDERERS[request.param]
 

@@ -3,24 +3,22 @@
 from functools import partial
 
 import torch
-from torch import Tensor
 from torch.nn.functional import normalize
 
-from qgs.contracts import Renderer
 from qgs.geometry.transforms import quat_to_matrix
-from qgs.types import Cameras, Gaussians, Rendering, named_tensors
+from qgs.types import Cameras, Gaussians, named_tensors
 
 
 def make_scene(
-    batch: int = 1,
-    views: int = 1,
-    count: int = 40,
-    size: tuple[int, int] = (24, 40),
-    scale: float | Tensor = 0.08,
-    harmonics: int = 0,
-    features: int = 0,
-    dtype: torch.dtype = torch.float32,
-) -> tuple[Gaussians, Cameras]:
+    batch=1,
+    views=1,
+    count=40,
+    size=(24, 40),
+    scale=0.08,
+    harmonics=0,
+    features=0,
+    dtype=torch.float32,
+):
     """Gaussians in front of turned cameras, many beyond the borders; quaternions of any length.
 
     scale: of all, or of each scene (B, 1, 1). harmonics, features: how many coefficients and
@@ -50,9 +48,7 @@ def make_scene(
     return gaussians.to(dtype), cameras.to(dtype)
 
 
-def differentiate(
-    renderer: Renderer, gaussians: Gaussians, cameras: Cameras
-) -> tuple[Rendering, dict[str, Tensor]]:
+def differentiate(renderer, gaussians, cameras):
     """The rendering, and gradients by name of a fixed random projection of all its images."""
     names = dict(named_tensors(gaussians))
     leaves = {**names, "c2w": cameras.c2w, "intrinsics": cameras.intrinsics}

@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 from renderers.scenes import differentiate, make_scene
-from torch import Tensor
+from torch.testing import assert_close
 
 from qgs.contracts import RendererConfig
 from qgs.renderers import TorchRenderer
-from qgs.types import Cameras, Gaussians, concatenated, named_tensors
+from qgs.types import Cameras, concatenated, named_tensors
 
 
-def compared(renderer, scene, tolerances=(2e-5, 2e-5), **options) -> tuple:
+def compared(renderer, scene, tolerances=(2e-5, 2e-5), **options):
     """What `renderer` makes of a scene, images and gradients, found to be what the oracle makes."""
     rendering, gradients = differentiate(renderer, *scene)
     oracle = TorchRenderer(RendererConfig(**options))
@@ -20,7 +20,7 @@ def compared(renderer, scene, tolerances=(2e-5, 2e-5), **options) -> tuple:
     of_images, of_gradients = tolerances
     for name, image in named_tensors(rendering):
         expected = getattr(images, name)
-        torch.testing.assert_close(image.double(), expected, atol=of_images, rtol=of_images)
+        assert_close(image.double(), expected, atol=of_images, rtol=of_images)
     if renderer.kind == "gsplat":
         of_gradients = max(of_gradients, 4e-4)  # they are within 2e-4 on an H100
     for name, found in gradients.items():
@@ -31,7 +31,7 @@ def compared(renderer, scene, tolerances=(2e-5, 2e-5), **options) -> tuple:
     return rendering, gradients
 
 
-def fixed_cameras(batch: int) -> Cameras:
+def fixed_cameras(batch):
     intrinsics = torch.tensor([40.0, 40.0, 20.0, 12.0]).expand(batch, 1, 4)
     return Cameras(torch.eye(4).repeat(batch, 1, 1, 1), intrinsics, (24, 40))
 
@@ -64,16 +64,16 @@ def test_features_are_blended_as_colours_over_nothing(build):
         shown = gaussians.features.repeat(1, 1, 3)[..., :width]
         found = build()(replace(gaussians, features=shown), cameras).features
         wanted = expected.rgb.repeat(1, 1, 3, 1, 1)[:, :, :width]
-        torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-6)
+        assert_close(found, wanted, rtol=1e-5, atol=1e-6)
 
 
-def extremes(gaussians: Gaussians) -> dict[str, Gaussians]:
+def extremes(gaussians):
     """A scene changed until drawing it is hard, or nothing of it can be seen."""
 
-    def times(name: str, *factor: float) -> Gaussians:
+    def times(name, *factor):
         return replace(gaussians, **{name: getattr(gaussians, name) * torch.tensor(factor)})
 
-    def at(means: Tensor) -> Gaussians:
+    def at(means):
         return replace(gaussians, means=means)
 
     means = gaussians.means
@@ -117,7 +117,7 @@ def test_zero_gaussians_show_the_background(build):
     renderer = build(background=(0.1, 0.2, 0.3))
     rendering, gradients = differentiate(renderer, gaussians[:, :0], cameras)
     expected = torch.tensor([0.1, 0.2, 0.3])[:, None, None].expand_as(rendering.rgb)
-    torch.testing.assert_close(rendering.rgb, expected)
+    assert_close(rendering.rgb, expected)
     for nothing in (rendering.alpha, rendering.depth, rendering.features, *gradients.values()):
         assert nothing.eq(0).all()
 
@@ -131,7 +131,7 @@ def test_near_and_far_are_inclusive(build):
 
 OPTIONS = {
     "near": 2.0, "far": 2.5, "dilation": 2.0, "background": (0.0, 1.0, 0.0),
-    "alpha_min": 0.2, "alpha_cap": 0.5, "transmittance_min": 0.3,
+    "alpha_min": 0.2, "alpha_cap": 0.5, "transmittance_min": 0.3
 }  # fmt: skip
 
 
@@ -158,7 +158,7 @@ def test_opaque_layers_stop_the_ray(build):
     assert gradients["colors"][0, last].eq(0).all()
     gaussians, cameras = make_scene(count=1, scale=50.0)
     capped = build()(replace(gaussians, opacities=torch.ones(1, 1)), cameras).alpha
-    torch.testing.assert_close(capped.max(), torch.tensor(0.999))
+    assert_close(capped.max(), torch.tensor(0.999))
 
 
 def test_autocast_and_half_precision_render_in_float32(build):
@@ -166,11 +166,11 @@ def test_autocast_and_half_precision_render_in_float32(build):
     expected = build()(gaussians, cameras)
     with torch.autocast("cpu", torch.bfloat16):
         rendering = build()(gaussians, cameras)
-    torch.testing.assert_close(rendering.rgb, expected.rgb)
+    assert_close(rendering.rgb, expected.rgb)
     half = replace(gaussians, colors=gaussians.colors.bfloat16())
     rendering = build()(half, cameras)
     assert rendering.rgb.dtype == torch.float32
-    torch.testing.assert_close(rendering.rgb, expected.rgb, rtol=0, atol=1e-2)
+    assert_close(rendering.rgb, expected.rgb, rtol=0, atol=1e-2)
 
 
 def test_mismatches_are_named(build):

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from renderers.scenes import differentiate, make_scene
+from torch.testing import assert_close
 
 import qgs.renderers.cpu
 from qgs.contracts import RendererConfig
@@ -45,7 +46,7 @@ def test_more_gaussians_than_a_unit_of_work_takes(more):
         assert torch.equal(padded_gradients[name][:, 300:], gradients[name]), name
         assert padded_gradients[name][:, :300].eq(0).all(), name
     for name in ("c2w", "intrinsics"):
-        torch.testing.assert_close(padded_gradients[name], gradients[name])
+        assert_close(padded_gradients[name], gradients[name])
 
 
 def test_gaussians_have_the_same_gradients_without_those_of_the_cameras():
@@ -68,7 +69,7 @@ def test_float64_comes_back_as_float64():
     single = RENDER(gaussians, cameras)
     double = RENDER(gaussians.to(torch.float64), cameras.to(torch.float64))
     assert double.rgb.dtype == double.alpha.dtype == double.depth.dtype == torch.float64
-    torch.testing.assert_close(double.rgb.float(), single.rgb, rtol=1e-4, atol=1e-5)
+    assert_close(double.rgb.float(), single.rgb, rtol=1e-4, atol=1e-5)
 
 
 def test_missing_numba_says_what_to_do(monkeypatch):
@@ -122,7 +123,7 @@ def test_an_installation_that_cannot_be_written_renders(tmp_path, home):
         environment.pop(name, None)
     found = subprocess.run(
         [sys.executable, "-c", RENDER_ONE],
-        capture_output=True, text=True, env=environment, cwd=tmp_path,
+        capture_output=True, text=True, env=environment, cwd=tmp_path
     )  # fmt: skip
     assert found.stdout.split() == [str(package / "__init__.py"), "True"], found.stderr
     assert bool(list(tmp_path.rglob("*.nbi"))) is (home == "home")

@@ -6,7 +6,7 @@ from itertools import product
 import pytest
 import torch
 from renderers.scenes import make_scene
-from torch import Tensor
+from torch.testing import assert_close
 
 from qgs.contracts import RendererConfig
 from qgs.geometry.harmonics import seen_colors
@@ -31,7 +31,7 @@ def test_rendering_passes_gradcheck():
     assert torch.autograd.gradcheck(images, leaves, fast_mode=True)
 
 
-def splat(scene: Gaussians, g: int, w2c: Tensor, lens: Tensor, size: Tensor) -> tuple[Tensor, ...]:
+def splat(scene, g, w2c, lens, size):
     """Pixel, inverse of J W S W^T J^T + 0.3, depth; J by autograd, held 15 % past the border."""
     focal, centre = lens[:2], lens[2:]
 
@@ -51,8 +51,7 @@ def splat(scene: Gaussians, g: int, w2c: Tensor, lens: Tensor, size: Tensor) -> 
 
 
 @pytest.mark.parametrize(
-    "options",
-    [{}, {"transmittance_min": 0.2, "alpha_cap": 0.6, "background": (0.1, 0.2, 0.3)}],
+    "options", [{}, {"transmittance_min": 0.2, "alpha_cap": 0.6, "background": (0.1, 0.2, 0.3)}]
 )
 def test_images_follow_the_formulas(options):
     """Of every scene and view, one pixel at a time, one Gaussian at a time."""
@@ -89,7 +88,7 @@ def test_images_follow_the_formulas(options):
                 (rendering.alpha, hit),
                 (rendering.depth, total / hit if hit else total),
             ):
-                torch.testing.assert_close(found[b, v, :, row, column], expected)
+                assert_close(found[b, v, :, row, column], expected)
 
 
 def test_a_moved_and_enlarged_world_looks_the_same():
@@ -99,5 +98,5 @@ def test_a_moved_and_enlarged_world_looks_the_same():
     render = TorchRenderer(RendererConfig())
     before = render(gaussians, cameras)
     after = render(moved(gaussians, pose, 2.0), replace(cameras, c2w=pose @ c2w))
-    torch.testing.assert_close(after.rgb, before.rgb, rtol=1e-3, atol=1e-4)
-    torch.testing.assert_close(after.depth, 2 * before.depth, rtol=1e-3, atol=1e-4)
+    assert_close(after.rgb, before.rgb, rtol=1e-3, atol=1e-4)
+    assert_close(after.depth, 2 * before.depth, rtol=1e-3, atol=1e-4)

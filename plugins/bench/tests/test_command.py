@@ -10,7 +10,6 @@ from commands import run_qgs
 from qgs_bench import output, predict, run, sweep
 from qgs_bench.memory import Peak
 from rich.console import Console
-from typer.testing import Result
 
 RECIPES = Path(__file__).parents[3] / "recipes/tiny"
 TOKENGS, LOCUS, GSLRM = (str(RECIPES / f"{name}.yaml") for name in ("tokengs", "locus", "gslrm"))
@@ -18,7 +17,7 @@ SETTINGS = ["model.width=16", "model.heads=2", "model.head.gaussians_per_query=2
 SMALL = f"--size 16x24 --device cpu --rounds 3 --warmup 0 --set {' --set '.join(SETTINGS)}"
 
 
-def bench(words: str) -> Result:
+def bench(words):
     return run_qgs("bench", *f"{words} {SMALL}".split())
 
 

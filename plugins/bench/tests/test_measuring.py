@@ -84,7 +84,7 @@ runpy.run_module(sys.argv[2], run_name="__main__")
 """
 
 
-def executable(file: Path, script: str) -> str:
+def executable(file, script):
     """What runs `script` in place of Python."""
     file.write_text(f"#!/bin/sh\n{script}\n")
     file.chmod(0o755)

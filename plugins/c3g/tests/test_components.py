@@ -5,7 +5,6 @@ import math
 import torch
 from qgs_c3g.head import C3GHead
 from qgs_c3g.joint import JointLayer
-from torch import Tensor
 from torch.testing import assert_close
 
 from qgs import QueryState
@@ -15,7 +14,7 @@ from qgs.types import ImageMemory
 DIMS = ModelDims(width=16, heads=2, depth=2)
 
 
-def by_formula(made: JointLayer, tokens: Tensor) -> Tensor:
+def by_formula(made, tokens):
     """Attention of all tokens head by head, then the MLP."""
     q, k, v = made.qkv(made.norm(tokens)).split(16, -1)
     read = []

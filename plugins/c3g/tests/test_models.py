@@ -13,7 +13,6 @@ from refusals import refused
 
 from qgs.composer import resolve
 from qgs.contracts.schedule import follow
-from qgs.model import QueryGaussianModel
 from qgs.types import named_tensors
 
 RECIPES = Path(__file__).parents[3] / "recipes"
@@ -31,7 +30,7 @@ ANCHORED = "model.queries={type: locus/anchored, count: 6}"
 CASE = Case(JointLayer.Config())
 
 
-def size(module: torch.nn.Module) -> int:
+def size(module):
     return sum(p.numel() for p in module.parameters())
 
 
@@ -50,7 +49,7 @@ def test_the_published_recipe():
     assert found == pytest.approx({step: max(0.3, 10 / 3 ** (step // 1000)) for step in found})
 
 
-def ran(*overrides: str) -> QueryGaussianModel:
+def ran(*overrides):
     recipe = resolve(TINY, [*SMALL, *overrides])
     run_training_step(recipe, CASE)
     return recipe.build_model()

@@ -41,20 +41,20 @@ class Aggregator(nn.Module):
 
 
 @pytest.fixture(autouse=True)
-def vggt(monkeypatch) -> None:
+def vggt(monkeypatch):
     monkeypatch.setitem(sys.modules, MODULE, SimpleNamespace(Aggregator=Aggregator))
     monkeypatch.setattr(qgs_c3g.vggt, "WIDTH", C)
 
 
 @pytest.fixture
-def weights(tmp_path) -> Path:
+def weights(tmp_path):
     """A file of all of VGGT's weights, which has more than the aggregator's."""
     own = {f"aggregator.{name}": x for name, x in Aggregator().state_dict().items()}
     save_file({**own, "camera_head.weight": torch.zeros(2)}, tmp_path / "model.safetensors")
     return tmp_path / "model.safetensors"
 
 
-def encoder(weights: Path, width: int = C, **options: str) -> VggtFeatures:
+def encoder(weights, width=C, **options):
     config = VggtFeatures.Config(weights=str(weights), **options)
     made = VggtFeatures(config, ModelDims(width, heads=2, depth=1))
     made.load_pretrained()
@@ -107,7 +107,7 @@ def test_weights_that_cannot_be_read_are_named(tmp_path):
             encoder(tmp_path / name)
 
 
-def overrides(weights: Path) -> list[str]:
+def overrides(weights):
     """Of the tiny recipe, to C3G's with VGGT."""
     return [
         f"model.encoder={{type: c3g/vggt_features, weights: {weights}}}",

@@ -23,6 +23,7 @@ from attending import case, exact, found, wrong
 from qgs_ellipsoid.ray_bias import EllipsoidBias
 from qgs_locus.kernels.attention_bias import biased_attention
 from qgs_locus.ray_bias import RayBias
+from torch.testing import assert_close
 
 HAS_TRITON = find_spec("triton") is not None
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
@@ -86,12 +87,12 @@ def test_gradients_are_those_of_float64(kind, middle):
 def test_bits_are_the_same_each_time_and_what_is_frozen_gets_no_gradient(kind, middle):
     given = _on_device(case((1, 2, 70, 70, 16), middle))
     whole, again = (found(IN_TRITON, kind, given, LEARNT) for _ in range(2))
-    torch.testing.assert_close(again, whole, rtol=0, atol=0)
+    assert_close(again, whole, rtol=0, atol=0)
     for learnt in (*zip(LEARNT, strict=True), ("k", "v"), ("q", "queries")):
         expected = {name: whole[name] for name in ("read", *learnt)}
         # on a GPU other products and sums are fused
         seen = found(IN_TRITON, kind, given, learnt)
-        torch.testing.assert_close(seen, expected, rtol=1e-5, atol=1e-6)
+        assert_close(seen, expected, rtol=1e-5, atol=1e-6)
 
 
 @runs

@@ -15,7 +15,6 @@ from qgs_ellipsoid.rotations import quat_product, turned
 from qgs_locus.anchors import FrustumCenters
 from qgs_locus.fields import CENTER
 from refusals import refused
-from torch import Tensor
 from torch.testing import assert_close
 
 from qgs.components import GaussianHead, posact
@@ -28,12 +27,12 @@ HALF = math.sqrt(0.5)
 OFFSET = {"radius_bound": "offset", "radius_min": 0.05}
 
 
-def _radii(raw: Tensor) -> Tensor:
+def _radii(raw):
     """As `OFFSET` says."""
     return F.softplus(raw) + 0.05
 
 
-def _state() -> QueryState:
+def _state():
     """Turned anchors of unequal radii in front of the cameras."""
     fields = {
         CENTER: torch.randn(2, 6, 3) * 0.4 + torch.tensor([0.0, 0.0, 1.5]),
@@ -176,8 +175,8 @@ STILL = "{type: ellipsoid/refine, center: false, rotation: false, radius: false}
         (f"decoder.refinement={STILL}", "decoder.refinement", "nothing is"),
         ("decoder.cross_attention={type: ellipsoid/ray_biased, bandwidth: fixed, radius_min: 0.5}",
          "decoder.cross_attention.radius_min", "no effect"),
-        ("centers={type: ellipsoid/axis_scaled, radius_bound: offset}", "centers", "softplus"),
-    ],
+        ("centers={type: ellipsoid/axis_scaled, radius_bound: offset}", "centers", "softplus")
+    ]
 )  # fmt: skip
 def test_options_without_effect_or_sense_are_refused(override, option, why):
     problem = refused(RECIPE, (f"model.{override}",))

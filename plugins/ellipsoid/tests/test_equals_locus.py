@@ -6,11 +6,10 @@ import yaml
 from qgs_ellipsoid.conversion import from_locus
 from qgs_ellipsoid.fields import RAW_RADII, ROTATION
 from qgs_locus.fields import CENTER, RAW_RADIUS
-from torch import Tensor
 from torch.testing import assert_close
 
-from qgs import Cameras, QueryGaussianModel, Views, compose
-from qgs.types import LayerPrediction, named_tensors
+from qgs import Cameras, Views, compose
+from qgs.types import named_tensors
 
 ELLIPSOID = """
 recipe: 1
@@ -34,18 +33,18 @@ model:
 LOCUS = ELLIPSOID.replace("axis_scaled", "radius_scaled").replace("ellipsoid/", "locus/")
 
 
-def _model(recipe: str, *overrides: str) -> QueryGaussianModel:
+def _model(recipe, *overrides):
     return compose(yaml.safe_load(recipe), [f"model.{each}" for each in overrides]).eval()
 
 
-def _photos() -> Views:
+def _photos():
     c2w = torch.eye(4).repeat(2, 2, 1, 1)
     c2w[:, 1, :3, 3] = torch.tensor([0.4, 0.1, -0.1])
     lens = torch.tensor([30.0, 32.0, 20.0, 14.0]).expand(2, 2, 4)
     return Views(torch.rand(2, 2, 3, 32, 40), Cameras(c2w, lens.clone(), (32, 40)))
 
 
-def _pair(refined: bool = True, bound: str = "floor") -> tuple[QueryGaussianModel, ...]:
+def _pair(refined=True, bound="floor"):
     """LocusGS whose radii differ from anchor to anchor, and its ellipsoidal equal."""
     reading = ["queries", "centers", "decoder.cross_attention"] + ["decoder.refinement"] * refined
     options = [f"{part}.radius_bound={bound}" for part in reading]
@@ -58,7 +57,7 @@ def _pair(refined: bool = True, bound: str = "floor") -> tuple[QueryGaussianMode
     return locus, ellipsoid
 
 
-def _shared(layer: LayerPrediction) -> dict[str, Tensor]:
+def _shared(layer):
     """What both models have; three equal radii are one."""
     state = layer.state
     raw = state[RAW_RADII] if RAW_RADII in state.fields else state[RAW_RADIUS].expand(-1, -1, 3)
@@ -80,7 +79,7 @@ def test_every_tensor_of_every_layer_is_that_of_locusgs(radius_refined, bound):
     assert moved.abs().max() > 0.01, "the anchors must move for this to say anything"
 
 
-def _like_locus(gradients: dict[str, Tensor]) -> dict[str, Tensor]:
+def _like_locus(gradients):
     """Gradients of three radii that are one, summed as those of the one."""
     alike = {}
     for name, gradient in gradients.items():

@@ -18,18 +18,18 @@ Inputs = tuple[Tensor, ...]
 """Centres and squared bandwidths of anchors, gamma, quaternions, origins and directions of rays."""
 
 
-def drawn(anchors: int, rays: int, radii: int = 3, thinnest: float = 1e-3) -> Inputs:
+def drawn(anchors, rays, radii=3, thinnest=1e-3):
     sigma_sq = thinnest + 0.05 * torch.rand(2, anchors, radii)
     lines = 0.5 * torch.randn(2, rays, 3), F.normalize(torch.randn(2, rays, 3), dim=-1)
     gamma = torch.tensor(0.1)
     return torch.randn(2, anchors, 3), sigma_sq, gamma, torch.randn(2, anchors, 4), *lines
 
 
-def double(inputs: Inputs) -> Inputs:
+def double(inputs):
     return tuple(x.double() for x in inputs)
 
 
-def on_the_ray(inputs: Inputs, bias_min: float = -20.0) -> Tensor:
+def on_the_ray(inputs, bias_min=-20.0):
     """By p' A p - (p' A d)^2 / d' A d, where p leads from the anchor to a point of the ray."""
     center, sigma_sq, gamma, quats, origins, directions = inputs
     rotation = anchor_rotation(quats)
@@ -40,13 +40,13 @@ def on_the_ray(inputs: Inputs, bias_min: float = -20.0) -> Tensor:
     return gamma * (-0.5 * (pp - pd**2 / dd)).clamp(bias_min, 0)
 
 
-def rays_of(inputs: Inputs) -> Tensor:
+def rays_of(inputs):
     """Patch means are shorter than unit vectors."""
     *_, origins, directions = inputs
     return 0.97 * torch.cat([torch.linalg.cross(origins, directions), directions], -1)
 
 
-def bias(inputs: Inputs, bias_min: float = -20.0) -> Tensor:
+def bias(inputs, bias_min=-20.0):
     center, sigma_sq, gamma, quats, *_ = inputs
     rays = rays_of(inputs)
     if sigma_sq.shape[-1] == 1:
@@ -56,7 +56,7 @@ def bias(inputs: Inputs, bias_min: float = -20.0) -> Tensor:
     return EllipsoidBias.of(*place, ray_tokens(rays), bias_min, gamma).dense()
 
 
-def gradients(of, inputs: Inputs, learnt: int, bias_min: float = -20.0) -> Inputs:
+def gradients(of, inputs, learnt, bias_min=-20.0):
     """Of the bias, weighed, for the first inputs. Rays that learn keep kernels out of it."""
     leaves = [x.detach().clone().requires_grad_(n < learnt) for n, x in enumerate(inputs)]
     torch.manual_seed(1)
@@ -65,7 +65,7 @@ def gradients(of, inputs: Inputs, learnt: int, bias_min: float = -20.0) -> Input
     return torch.autograd.grad(found, leaves[:learnt], weight, materialize_grads=True)
 
 
-def assert_digits(found: Inputs, best: Inputs) -> None:
+def assert_digits(found, best):
     for x, of_float64 in zip(found, best, strict=True):
         assert (x - of_float64).norm() <= 1e-6 * of_float64.norm()
 
@@ -126,7 +126,7 @@ def test_gradients_equal_those_of_the_formula(rays, radii):
 def test_blocks_do_not_show(monkeypatch, radii):
     inputs = drawn(50, 20, radii)
 
-    def found() -> Inputs:
+    def found():
         return bias(inputs), *gradients(bias, inputs, 6)
 
     whole = found()

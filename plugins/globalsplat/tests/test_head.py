@@ -7,7 +7,6 @@ import torch
 from globalsplat_inputs import made
 from qgs_globalsplat.head import MergingHead, rotation_6d
 from qgs_globalsplat.streams import TEXTURE
-from torch import Tensor
 from torch.nn.functional import layer_norm
 from torch.testing import assert_close
 
@@ -22,11 +21,11 @@ TEXTURES = torch.randn(1, 3, 16, 48, generator=DRAW).double()
 STATE = QueryState(torch.randn(2, 5, 16), {TEXTURE: torch.randn(2, 5, 16)})
 
 
-def head(**options) -> MergingHead:
+def head(**options):
     return made(MergingHead, **options)
 
 
-def orthonormal(six: Tensor) -> Tensor:
+def orthonormal(six):
     """Gram and Schmidt: the columns of a rotation."""
     a, b = six.double().view(2, 3)
     a = a / a.norm()
@@ -35,7 +34,7 @@ def orthonormal(six: Tensor) -> Tensor:
     return torch.stack([a, b, torch.linalg.cross(a, b)], 1)
 
 
-def one_gaussian(block: Tensor, colours: Tensor) -> tuple[Tensor, ...]:
+def one_gaussian(block, colours):
     """Of raw candidates (S, 14) and coefficients (S, 48), by the formulas of the paper."""
     gates = block[:, 13].exp() / block[:, 13].exp().sum()
     log_scale = (block[:, 3:6] - 2).clip(LOW, HIGH)

@@ -12,7 +12,6 @@ from qgs_globalsplat.losses import Frustum, Regularisers, beyond_frusta
 from qgs_globalsplat.objective import TwoPasses, disagreement, subset
 from qgs_plugintools import Case
 from qgs_plugintools.inputs import Sizes, inputs_of
-from torch import Tensor
 from torch.testing import assert_close
 
 from qgs.composer import resolve
@@ -22,7 +21,7 @@ SOFT, NEAR = 0.1, 0.2
 VIEWS = odd_views(2, 16, 24)
 
 
-def beyond_one(points: Tensor, c2w: Tensor, lens: Tensor) -> Tensor:
+def beyond_one(points, c2w, lens):
     """Softplus of the distances beyond five planes, each through the centre and two corners."""
     local = (points - c2w[:3, 3]) @ c2w[:3, :3]
     fx, fy, cx, cy = lens.tolist()
@@ -62,12 +61,7 @@ def test_the_input_cameras_count_and_no_others():
 
 def test_losses_are_means_over_gaussians_of_tokens_that_decode_some():
     mask = torch.tensor([[True, True, False], [True, False, False]])
-    rest = (
-        replace(GIVEN, state=replace(GIVEN.state, mask=mask)),
-        NOTHING,
-        VIEWS,
-        VIEWS,
-    )
+    rest = (replace(GIVEN, state=replace(GIVEN.state, mask=mask)), NOTHING, VIEWS, VIEWS)
 
     def mean(x):
         return (x[0, :4].mean() + x[1, :2].mean()) / 2

@@ -8,8 +8,7 @@ import torch
 from globalsplat_inputs import DIMS, made
 from odd_views import odd_views
 from qgs_globalsplat.encoder import PosedPatches
-from qgs_globalsplat.streams import TEXTURE, Round, SlotQueries, Stream
-from torch import Tensor
+from qgs_globalsplat.streams import TEXTURE, Round, SlotQueries
 from torch.nn.functional import gelu
 from torch.testing import assert_close
 
@@ -73,7 +72,7 @@ def test_extra_tokens_stay_extra_when_slots_are_added():
     assert_close(many.slots[4:8], few.slots, atol=0.06, rtol=0)
 
 
-def attended(q, k, v, q_norm, k_norm) -> Tensor:
+def attended(q, k, v, q_norm, k_norm):
     """Head by head."""
     found = []
     for part in (slice(0, 8), slice(8, 16)):
@@ -82,11 +81,11 @@ def attended(q, k, v, q_norm, k_norm) -> Tensor:
     return torch.cat(found, -1)
 
 
-def mlp(x, layers) -> Tensor:
+def mlp(x, layers):
     return layers.fc2(gelu(layers.fc1(x)))
 
 
-def one_stream(stream: Stream, x: Tensor, memory: Tensor) -> Tensor:
+def one_stream(stream, x, memory):
     cross = stream.cross_attention
     k, v = stream.kv_proj(stream.memory_norm(memory)).chunk(2, -1)
     read = attended(cross.q_proj(cross.norm(x)), k, v, cross.q_norm, stream.k_norm)

@@ -6,9 +6,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 from odd_views import odd_views
-from qgs_gslrm.encoder import Block, Transformer
+from qgs_gslrm.encoder import Transformer
 from qgs_gslrm.pixels import PATCH, AlongRays, PixelHead, PixelQueries, patch_rays_at, patches
-from torch import Tensor
 from torch.testing import assert_close
 
 from qgs.contracts import ModelDims
@@ -21,11 +20,11 @@ COUNT, ROWS, COLUMNS = GRID = (3, 2, 3)
 """Views, and their patches."""
 
 
-def made(component, width: int = 16, **options):
+def made(component, width=16, **options):
     return component(component.Config(**options), ModelDims(width, heads=2, depth=0))
 
 
-def in_patches(maps: Tensor) -> Tensor:
+def in_patches(maps):
     """(B, V, H, W, C) -> (B, N, K, C), one patch after the other, pixels row by row."""
     height, width = maps.shape[2:4]
     parts = (2, COUNT, ROWS, height // ROWS, COLUMNS, width // COLUMNS, -1)
@@ -64,7 +63,7 @@ def test_means_lie_on_the_rays_of_their_pixels():
     assert c2w.grad[..., :3, :].any(-1).all()
 
 
-def by_formula(block: Block, x: Tensor) -> Tensor:
+def by_formula(block, x):
     q, k, v = block.qkv(F.layer_norm(x, (16,))).split(16, -1)
     read = []
     for head in (slice(0, 8), slice(8, 16)):

@@ -14,7 +14,6 @@ from torch.testing import assert_close
 
 from qgs.composer import resolve
 from qgs.geometry.transforms import to_camera, to_pixels
-from qgs.model import QueryGaussianModel
 
 TINY = Path(__file__).parents[3] / "recipes/tiny/gslrm.yaml"
 SMALL = (
@@ -46,7 +45,7 @@ def test_combinations_run():
         run_training_step(resolve(TINY, [*SMALL, *overrides]), Case(Transformer.Config()))
 
 
-def model(*overrides: str) -> QueryGaussianModel:
+def model(*overrides):
     return resolve(TINY, [*SMALL, *overrides]).build_model()
 
 

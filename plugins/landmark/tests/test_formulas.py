@@ -12,7 +12,6 @@ from qgs_landmark.refinement import FramedRefinement
 from qgs_landmark.rendered import RenderedFeedback
 from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
 from qgs_locus.refinement import AnchorRefinement
-from torch import Tensor
 from torch.testing import assert_close
 
 from qgs.components.blocks import split_heads
@@ -30,11 +29,11 @@ BY_PHOTO = torch.arange(TOKENS) // (TOKENS // 2)
 """Photos of the tokens; queries of a number take photos in turn."""
 
 
-def drawn(seed: int, *shape: int) -> Tensor:
+def drawn(seed, *shape):
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed)).double()
 
 
-def cameras() -> Cameras:
+def cameras():
     """Two scenes of two photos, the cameras turned and moved."""
     c2w = torch.eye(4, dtype=torch.float64).repeat(2, 2, 1, 1)
     c2w[..., :3, :3] = quat_to_matrix(F.normalize(drawn(6, 2, 2, 4), dim=-1))
@@ -50,7 +49,7 @@ HALVED = Views(
 MEMORY = ImageMemory(drawn(1, 2, TOKENS, DIMS.width), grid=GRID)
 
 
-def started(**options: object) -> tuple[ObservedQueries, QueryState]:
+def started(**options):
     torch.manual_seed(0)
     config = ObservedQueries.Config.model_validate(options)
     queries = ObservedQueries(config, DIMS).double().eval()
@@ -60,14 +59,14 @@ def started(**options: object) -> tuple[ObservedQueries, QueryState]:
         return queries, queries(MEMORY, VIEWS)
 
 
-def in_photos(state: QueryState, view_N: Tensor) -> tuple[Tensor, Tensor]:
+def in_photos(state, view_N):
     """Depths (B, N, 1) of anchors in these photos, and their pixels there."""
     local = to_camera(state[CENTER], VIEWS.cameras)[:, view_N, torch.arange(len(view_N))]
     z = local[..., 2:]
     return z, 20 * local[..., :2] / z + torch.tensor([12.5, 7.5])
 
 
-def axes_of_photos() -> Tensor:
+def axes_of_photos():
     return VIEWS.cameras.c2w[:, BY_PHOTO, :3, :3]
 
 
@@ -101,7 +100,7 @@ def test_tokens_of_a_footprint_make_a_query():
     alone.load_state_dict(weights)
     of_tokens = alone(MEMORY, VIEWS)
 
-    def by_tile(values_BMX: Tensor) -> tuple[Tensor, ...]:
+    def by_tile(values_BMX):
         """The left and the right one, (B, N, ...); a query's view changes first."""
         found = values_BMX.unflatten(1, (2, 4, 3, 2)).flatten(2, 3).transpose(1, 2).flatten(1, 2)
         return found.unbind(2)
@@ -127,7 +126,7 @@ def test_gaussians_start_as_the_photo_that_they_stand_for(count, tile):
     attributes = head(state)
     means = FootprintCenters(FootprintCenters.Config(), DIMS)(attributes.offsets, state)
 
-    def of_queries(maps_BVHWC: Tensor) -> Tensor:
+    def of_queries(maps_BVHWC):
         parts = maps_BVHWC.unflatten(3, (-1, tile[1])).unflatten(2, (-1, tile[0]))
         found = parts.transpose(3, 4).flatten(4, 5).flatten(2, 3)
         return (found if count is None else found.transpose(1, 2)).flatten(1, 2)
@@ -201,7 +200,7 @@ def test_neighbours_are_the_nearest(pairs, monkeypatch):
     assert torch.equal(index, STEPS.norm(dim=-1).argsort(-1)[..., :5])
 
 
-def attention(count: int) -> NeighbourAttention:
+def attention(count):
     torch.manual_seed(0)
     module = NeighbourAttention(NeighbourAttention.Config(count=count), DIMS).double()
     with torch.no_grad():

@@ -16,7 +16,6 @@ from qgs_landmark.places import (
     sampled,
     spread,
 )
-from torch import Tensor
 from torch.testing import assert_close
 
 from qgs.geometry.rays import camera_rays
@@ -126,7 +125,7 @@ def test_cells_divide_a_square(rows):
     assert_close(found, torch.tensor(middles))
 
 
-def within(pixels: int, at: float, side: float) -> Tensor:
+def within(pixels, at, side):
     """How much of each column or row lies within a square about `at`."""
     first = torch.arange(pixels).double()
     return ((first + 1).clamp(max=at + side / 2) - first.clamp(min=at - side / 2)).clamp(min=0)

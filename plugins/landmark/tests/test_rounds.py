@@ -13,7 +13,7 @@ from qgs.engine.initial import initialise
 from qgs.engine.training_pass import TrainingPass
 from qgs.io.checkpoint import save
 from qgs.io.tensors import CheckpointError
-from qgs.types import Cameras, Photos, QueryState, Views
+from qgs.types import Cameras, Photos, Views
 
 RECIPE = yaml.safe_load("""
 recipe: 1
@@ -39,11 +39,11 @@ losses: {photometric: {type: qgs/photometric}}
 NO_ROUNDS = "model.feedback={type: qgs/none}"
 
 
-def built(*overrides: str) -> qgs.QueryGaussianModel:
+def built(*overrides):
     return resolve(RECIPE, overrides).build_model().eval()
 
 
-def views(count: int = 2, side: int = 32) -> Views:
+def views(count=2, side=32):
     """From cameras side by side."""
     images = torch.rand(1, count, 3, side, side, generator=torch.Generator().manual_seed(0))
     c2w = torch.eye(4).repeat(1, count, 1, 1)
@@ -52,7 +52,7 @@ def views(count: int = 2, side: int = 32) -> Views:
     return Views(images, Cameras(c2w, lens, (side, side)))
 
 
-def run(model, index: int, state: QueryState, memory):
+def run(model, index, state, memory):
     """The state and the memory after one layer."""
     state, memory = model.decoder[index](state, memory)
     return model.refinements[model.refinement_of[index]](state), memory
@@ -99,7 +99,7 @@ def test_an_evaluation_sets_the_number_of_rounds(tmp_path):
         "evaluation.scenes=1",
     )
 
-    def scores(made: int, asked: int) -> str:
+    def scores(made, asked):
         torch.manual_seed(0)
         file, out = tmp_path / f"{made}.safetensors", tmp_path / f"{made}{asked}"
         qgs.save(built(*rooms, f"model.feedback.rounds={made}"), file)
@@ -211,7 +211,7 @@ def test_rounds_start_from_rounds_of_their_kind(tmp_path):
     learned = built()
     save(learned, tmp_path / "rounds.safetensors")
 
-    def started(override: str) -> qgs.QueryGaussianModel:
+    def started(override):
         recipe = resolve(RECIPE, (f"init_from={tmp_path}/rounds.safetensors", override))
         model = recipe.build_model()
         initialise(model, recipe)

@@ -7,7 +7,6 @@ from qgs_landmark.observed import ObservedQueries
 from qgs_landmark.places import cells, patch_centres
 from qgs_landmark.sweep import mismatch
 from qgs_locus.fields import CENTER
-from torch import Tensor
 from torch.testing import assert_close
 
 from qgs.contracts import ModelDims
@@ -22,7 +21,7 @@ DEPTHS = torch.tensor([0.8, 1.1, WALL, 2.0, 3.0], dtype=torch.float64)
 FIRST = torch.zeros(1, dtype=torch.long)
 
 
-def photos(count: int = 2) -> Views:
+def photos(count=2):
     """A wall with waves of colour, seen by cameras that are moved to the right and turned."""
     turn = torch.arange(count, dtype=torch.float64) * -0.08
     c2w = torch.eye(4, dtype=torch.float64).repeat(1, count, 1, 1)
@@ -53,7 +52,7 @@ def test_differences_are_those_of_each_sample_alone():
     given, place = photos(), torch.tensor([[[0.5, 0.4], [0.3, 0.6]]], dtype=torch.float64)
     error, _ = mismatch(given, torch.tensor([0, 1]), place, DEPTHS, 5.0, 3)
 
-    def colours(view: int, pixels: Tensor) -> Tensor:
+    def colours(view, pixels):
         grid = (2 * pixels / PIXELS - 1).view(1, 1, -1, 2)
         return F.grid_sample(given.images[:, view], grid, align_corners=False)[0, :, 0]
 

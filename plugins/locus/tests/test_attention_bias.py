@@ -16,7 +16,7 @@ PLAIN = partial(biased_attention, kernel="plain")
 class InTorch(RayBias):
     """Without kernels, which give no gradients of tokens."""
 
-    def compiled(self) -> None:
+    def compiled(self):
         return None
 
 
@@ -24,7 +24,7 @@ LEARNT = ("q", "k", "v", "queries", "tokens")
 KINDS = ((RayBias, LEARNT[:4]), (InTorch, LEARNT))
 
 
-def faults(given) -> list[dict[str, float]]:
+def faults(given):
     """What is wrong with kernels, and without."""
     best = exact(RayBias, given, LEARNT)
     all_ = [wrong(found(biased_attention, kind, given, learnt), best) for kind, learnt in KINDS]

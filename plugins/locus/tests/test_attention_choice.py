@@ -39,7 +39,7 @@ def on_cuda(q):
 def chosen(monkeypatch):
     """What a GPU chooses of which a layer may take `memory` bytes, with this version of Triton."""
 
-    def of(kernel="auto", memory=0, version=(3, 5), learnt=False, **options) -> str:
+    def of(kernel="auto", memory=0, version=(3, 5), learnt=False, **options):
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (0, memory * SHARE))
         monkeypatch.setattr(attention_choice, "triton_version", lambda: version)
         q, bias = case(**options)

@@ -21,7 +21,7 @@ from qgs.contracts import ModelDims
 DIMS = ModelDims(width=16, heads=2, depth=2)
 
 
-def _state() -> QueryState:
+def _state():
     fields = {CENTER: torch.randn(2, 5, 3), RAW_RADIUS: torch.randn(2, 5, 1)}
     return QueryState(torch.randn(2, 5, DIMS.width), fields)
 
@@ -108,8 +108,8 @@ FRUSTUM = "queries.center_init={{kind: frustum, depth: {}}}"
         (FRUSTUM.format("[0, 1]"), "queries.center_init.depth", "near"),
         (FRUSTUM.format("[2, 1]"), "queries.center_init.depth", "near"),
         (FRUSTUM.format("[-1, 1]"), "queries.center_init.depth", "near"),
-        (FRUSTUM.format("[1]"), "queries.center_init.depth", ""),
-    ],
+        (FRUSTUM.format("[1]"), "queries.center_init.depth", "")
+    ]
 )  # fmt: skip
 def test_options_without_effect_or_sense_are_refused(override, option, why):
     problem = refused(RECIPE, (f"model.{override}",))

@@ -31,14 +31,14 @@ FIXED_CENTERS = ("model.queries.radius=false", "model.decoder.refinement.radius=
                  "model.centers={type: locus/anchor_offset}")  # fmt: skip
 
 
-def published_shapes(model: qgs.QueryGaussianModel) -> dict[str, tuple[int, ...]]:
+def published_shapes(model):
     state = model.state_dict()
     names = {ours: LOCUSGS.published_name(ours) for ours in state}
     assert None not in names.values()
     return {str(names[ours]): tuple(tensor.shape) for ours, tensor in state.items()}
 
 
-def composed(*overrides: str) -> qgs.QueryGaussianModel:
+def composed(*overrides):
     return qgs.compose(RECIPE, overrides, device="meta")
 
 

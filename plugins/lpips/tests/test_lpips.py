@@ -9,7 +9,7 @@ import torch
 from qgs_lpips import Lpips, LpipsLoss
 from refusals import refused
 from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
+from torch import nn
 from torch.testing import assert_close
 
 from qgs.composer import resolve
@@ -21,7 +21,7 @@ PART = 4
 """Tests take this part of them, for time."""
 
 
-def vgg16(pretrained=False, part=1) -> nn.Module:
+def vgg16(pretrained=False, part=1):
     """torchvision's VGG-16 without its classifier, random."""
     layers = []
     before = 3
@@ -37,7 +37,7 @@ def vgg16(pretrained=False, part=1) -> nn.Module:
 
 
 @pytest.fixture
-def package(tmp_path, monkeypatch) -> list[Tensor]:
+def package(tmp_path, monkeypatch):
     """A package that holds weights where `lpips` does, and cannot be imported."""
     folder = tmp_path / "packages/lpips"
     (folder / "weights/v0.1").mkdir(parents=True)
@@ -50,21 +50,21 @@ def package(tmp_path, monkeypatch) -> list[Tensor]:
 
 
 @pytest.fixture
-def vgg(tmp_path, package) -> Path:
+def vgg(tmp_path, package):
     """Random weights of VGG-16, so large that its last layers tell images apart."""
     weights = {name: 2.5 * x for name, x in vgg16(part=PART).state_dict().items()}
     save_file(weights, tmp_path / "vgg.safetensors")
     return tmp_path / "vgg.safetensors"
 
 
-def lpips_of(weights: Path | None = None) -> Lpips:
+def lpips_of(weights=None):
     made = Lpips(Lpips.Config(weights=weights and str(weights)))
     made.load_pretrained()
     return made
 
 
 @torch.no_grad()
-def by_the_formula(vgg: Path, linear: list[Tensor], both: Tensor) -> float:
+def by_the_formula(vgg, linear, both):
     """Zhang et al., 2018, equation 1, on relu1_2, relu2_2, relu3_3, relu4_3 and relu5_3."""
     model = vgg16(part=PART)
     model.load_state_dict(load_file(vgg))

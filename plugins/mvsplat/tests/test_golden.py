@@ -8,14 +8,14 @@ import pytest
 import torch
 import torch.nn.functional as F
 from published.comparison import ATOL, RTOL
-from published.files import GoldenFile, read_golden
+from published.files import read_golden
 from published.splats import views_of, weights_of
 from qgs_mvsplat import sweep
 from qgs_mvsplat.adapter import e3nn_harmonics, world_harmonics
 from qgs_mvsplat.depthsplat import nearest_neighbours
 from qgs_mvsplat.sweep import feature_lenses, relative_poses
 from qgs_published.layouts import fitting_recipe, names_of
-from torch import Tensor, nn
+from torch import nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.testing import assert_close
 
@@ -32,18 +32,18 @@ FILES = [
 ]
 
 
-def read(name: str) -> GoldenFile:
+def read(name):
     return read_golden(Path(__file__).parent / f"golden/{name}.safetensors")
 
 
 @pytest.fixture(autouse=True)
-def undrawn(monkeypatch) -> None:
+def undrawn(monkeypatch):
     """Weights that those of a file replace are not drawn: that would take most of the time."""
     for draw in ("trunc_normal_", "normal_", "uniform_", "kaiming_normal_", "kaiming_uniform_"):
         monkeypatch.setattr(nn.init, draw, lambda x, *_, **__: x)
 
 
-def directions(count: int) -> Tensor:
+def directions(count):
     generator = torch.Generator().manual_seed(0)
     return F.normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=-1)
 
@@ -59,7 +59,7 @@ def test_every_tensor():
     assert wrong == []
 
 
-def released_weights(golden: GoldenFile) -> dict[str, Tensor]:
+def released_weights(golden):
     """As the release publishes them."""
     return {f"encoder.{name}": x for name, x in weights_of(golden).items()}
 

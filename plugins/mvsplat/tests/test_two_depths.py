@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from qgs_mvsplat import DecayedSupervision, DepthError, DepthSplatEncoder, Exchange
-from qgs_plugintools import CHECKS, Case, cases_of, run_check
+from qgs_plugintools import CHECKS, cases_of, run_check
 from qgs_plugintools.inputs import inputs_of
 
 from qgs.composer.registry import load_plugin
@@ -16,7 +16,7 @@ CHECKED = ("builds", "runs", "inputs_are_not_changed", "eval_repeats_bitwise")
 CHECKED += ("zeros_stay_finite", "geometry_is_float32_under_autocast", "batch_independence")
 
 
-def depthsplat(scales: int) -> Case:
+def depthsplat(scales):
     """The example of the plugin with so many scales; of two, each has a depth."""
     cases = cases_of(load_plugin("mvsplat"))
     example = next(case for case in cases if case.component is DepthSplatEncoder)
@@ -24,14 +24,14 @@ def depthsplat(scales: int) -> Case:
     return replace(example, config=example.config.model_copy(update=sizes))
 
 
-def test_two_scales_keep_the_contract() -> None:
+def test_two_scales_keep_the_contract():
     """No check can follow the gradients: the second sweep takes none of the first."""
     case = depthsplat(scales=2)
     results = [run_check(CHECKS[name], case) for name in CHECKED]
     assert [result.message for result in results if result.verdict != "passed"] == []
 
 
-def test_the_first_sweep_learns_from_its_own_depth_alone() -> None:
+def test_the_first_sweep_learns_from_its_own_depth_alone():
     case = depthsplat(scales=2)
     encoder = case.lively()
     numbers = encoder(*inputs_of(case).values()).features
@@ -42,7 +42,7 @@ def test_the_first_sweep_learns_from_its_own_depth_alone() -> None:
     assert [bool(x.any()) for x in final] == [False, True]
 
 
-def test_layers_exchange_the_depths() -> None:
+def test_layers_exchange_the_depths():
     features = torch.arange(8.0).view(1, 2, 4)
     state, memory = QueryState(features), ImageMemory(features)
     layer = Exchange(Exchange.Config(), LayerParts(ModelDims(4, 1, 2), {}, 1.0))
@@ -51,12 +51,12 @@ def test_layers_exchange_the_depths() -> None:
     assert torch.equal(layer(once, memory)[0].features, features)
 
 
-def test_later_depths_weigh_more() -> None:
+def test_later_depths_weigh_more():
     weights = DecayedSupervision(DecayedSupervision.Config(layers=(1, 2))).weights()
     assert weights == pytest.approx({1: 0.9 / 1.9, 2: 1 / 1.9})
 
 
-def test_errors_of_depth_count_where_the_truth_is_known() -> None:
+def test_errors_of_depth_count_where_the_truth_is_known():
     views = inputs_of(depthsplat(scales=1))["views"]
     true = torch.tensor([2.0, 4, 0, 1]).view(1, 1, 1, 2, 2)
     rendered = torch.tensor([3.0, 3, 7, 0]).view(1, 1, 1, 2, 2)

@@ -3,10 +3,8 @@
 import os
 import re
 import time
-from collections.abc import Iterator
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from threading import Event, Thread
 
 import pytest
@@ -61,7 +59,7 @@ class Server(BaseHTTPRequestHandler):
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[str]:
+def server():
     """Its host and port. It has 1 s, and 0.2 s until a wait is reported."""
     running = ThreadingHTTPServer(("127.0.0.1", 0), Server)
     Thread(target=running.serve_forever, args=(0.01,), daemon=True).start()
@@ -76,12 +74,12 @@ def server() -> Iterator[str]:
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path, monkeypatch) -> Path:
+def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("QGS_CACHE", str(tmp_path))
     return tmp_path
 
 
-def files(cache: Path) -> list[str]:
+def files(cache):
     return sorted(file.name for file in cache.rglob("*") if file.is_file())
 
 

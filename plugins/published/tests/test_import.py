@@ -5,18 +5,16 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from commands import run_qgs
 from published.files import read_golden
-from qgs_published.importing import Transfer, import_weights
+from qgs_published.importing import import_weights
 from qgs_published.layouts import PublishedError, fitting_recipe, names_of
 from qgs_published.tokengs import TOKENGS
 from qgs_tokengs2026.weights import TOKENGS_2026_6
 from safetensors.torch import load_file, save_file
-from torch import Tensor
 from torch.testing import assert_close
 
 import qgs
@@ -29,7 +27,7 @@ ROOT = Path(__file__).parents[3]
 RECIPES = ROOT / "recipes"
 
 
-def published(name: str) -> dict[str, Tensor]:
+def published(name):
     """The state dict in a golden file."""
     return read_golden(ROOT / f"tests/golden/{name}.safetensors").weights()
 
@@ -39,7 +37,7 @@ TOKENGS_A = published("tokengs_a")
 LOCUS = published("locus_full_a")
 
 
-def imported(folder: Path, weights: dict[str, Tensor], **options: Any) -> Transfer:
+def imported(folder, weights, **options):
     """What was made of a file with these weights, as folder/made.safetensors."""
     folder.mkdir(exist_ok=True)
     save_file(weights, folder / "w.safetensors")

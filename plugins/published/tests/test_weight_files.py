@@ -1,12 +1,10 @@
 """Files of weights: what is read, and one clear reason for what is not."""
 
 from io import BytesIO
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from qgs_published.weight_files import WeightFile, read_weight_file
+from qgs_published.weight_files import read_weight_file
 from safetensors.torch import save
 from torch.testing import assert_close
 
@@ -16,7 +14,7 @@ WEIGHTS = {"a.weight": torch.arange(6.0).view(2, 3), "b": torch.tensor(1.5)}
 SAFE = save(WEIGHTS)
 
 
-def torch_bytes(content: Any, zipped: bool = True) -> bytes:
+def torch_bytes(content, zipped=True):
     buffer = BytesIO()
     torch.save(content, buffer, _use_new_zipfile_serialization=zipped)
     return buffer.getvalue()
@@ -25,7 +23,7 @@ def torch_bytes(content: Any, zipped: bool = True) -> bytes:
 FLAT, OLD = torch_bytes(WEIGHTS), torch_bytes(WEIGHTS, zipped=False)
 
 
-def read(path: Path, content: bytes) -> WeightFile:
+def read(path, content):
     path.write_bytes(content)
     return read_weight_file(path)
 
@@ -63,7 +61,7 @@ def test_what_cannot_be_read_is_named(tmp_path):
 
 
 def test_a_dict_that_holds_itself(tmp_path):
-    content: dict[str, Any] = {"w": torch.zeros(2)}
+    content = {"w": torch.zeros(2)}
     content["model"] = content
     with pytest.raises(CheckpointError, match="too deep"):
         read(tmp_path / "w.pt", torch_bytes(content))

@@ -12,8 +12,7 @@ from qgs_tokengs2026.multiscale import MultiscaleViT
 from qgs_tokengs2026.times import TimeEmbedding, time_features
 from torch.testing import assert_close
 
-from qgs import QueryGaussianModel, Views
-from qgs.composer import Recipe, RecipeError, resolve
+from qgs.composer import RecipeError, resolve
 from qgs.contracts import ModelDims
 from qgs.contracts.schedule import follow
 from qgs.engine.training_pass import TrainingPass
@@ -36,11 +35,11 @@ SMALL = (
 )
 
 
-def small(*overrides: str) -> Recipe:
+def small(*overrides):
     return resolve(PUBLISHED, [*SMALL, *overrides])
 
 
-def views(times=None, target=None) -> Views:
+def views(times=None, target=None):
     return replace(odd_views(), times=times, target_time=target)
 
 
@@ -48,7 +47,7 @@ INPUTS = views(torch.zeros(2, 2), torch.zeros(2, 1))
 TARGETS = replace(INPUTS.select([0]), target_time=None)
 
 
-def dynamic_queries(**options: int) -> DynamicQueries:
+def dynamic_queries(**options):
     """Whose embedding of times is no longer zero."""
     queries = DynamicQueries(DynamicQueries.Config(count=7, **options), DIMS)
     torch.nn.init.normal_(queries.time_embedding.proj.weight)
@@ -112,7 +111,7 @@ def test_static_queries_do_not_see_dynamic_ones():
 
 
 @pytest.fixture
-def model() -> QueryGaussianModel:
+def model():
     model = small().build_model().eval()
     for embedding in (model.encoder, model.queries):
         torch.nn.init.normal_(embedding.get_submodule("time_embedding").proj.weight)
@@ -157,7 +156,7 @@ def test_views_keep_the_time_that_is_asked_for():
         views(torch.zeros(2, 3))
 
 
-def judging(model: QueryGaussianModel, weight: float) -> TrainingPass:
+def judging(model, weight):
     return TrainingPass.of(small(f"objective.weight={weight}"), model)
 
 

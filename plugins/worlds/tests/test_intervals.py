@@ -14,7 +14,7 @@ MAPS = height_maps(3, 2)
 T = np.linspace(0, 6, 6000)
 
 
-def met(rows, maps, origin, way) -> float:
+def met(rows, maps, origin, way):
     """t at which a ray o + t d meets a shape, by the one pixel of an image, or inf."""
     length = np.linalg.norm(way)
     c2w = np.eye(4)
@@ -33,7 +33,7 @@ def relief(x, y, field):
     return low * (1 - a) + (field[i + 1, j] * (1 - b) + field[i + 1, j + 1] * b) * a
 
 
-def inside(primitive: Primitive, points: np.ndarray) -> np.ndarray:
+def inside(primitive, points):
     """Negative inside of a primitive, positive outside."""
     turn = np.array(primitive.turn).reshape(3, 3)
     x, y, z = ((points - primitive.center) @ turn / primitive.half).T
@@ -49,7 +49,7 @@ def inside(primitive: Primitive, points: np.ndarray) -> np.ndarray:
     }[primitive.kind]()
 
 
-def first(shape: Shape, origin: np.ndarray, way: np.ndarray) -> float:
+def first(shape, origin, way):
     """t at which a ray enters a shape, by sampling, or inf."""
     points = origin + T[:, None] * way
     f = inside(shape.body, points)
@@ -58,7 +58,7 @@ def first(shape: Shape, origin: np.ndarray, way: np.ndarray) -> float:
     return T[np.argmax(f < 0)] if (f < 0).any() else np.inf
 
 
-def drawn(kind: int, rng: Random, middle: tuple[float, float, float]) -> Primitive:
+def drawn(kind, rng, middle):
     half = [rng.uniform(0.3, 1) for _ in range(3)]
     if kind in (r.CAPSULE, r.TORUS):
         half = [half[0]] * 3

@@ -20,7 +20,7 @@ THING = Shape(Primitive(r.BOX, (0.0, 0.0, 0.1), (0.2, 0.2, 0.1)))
 LIGHT = 1.5
 
 
-def seen_from_above(shapes, points, sun=(), ambient=0.0) -> list[float]:
+def seen_from_above(shapes, points, sun=(), ambient=0.0):
     """Light that comes from white shapes below points, to a camera 1 m high."""
     heights = np.zeros((1, 9, 9), np.float32)
     heights[0, 0, 0] = 1.0  # a peak far away

@@ -26,7 +26,7 @@ def test_a_scene_is_a_function_of_seed_split_and_index(source):
 
 @pytest.mark.parametrize("size", [(17, 33), (130, 5)])
 def test_images_have_any_size_and_do_not_depend_on_threads(source, size, monkeypatch):
-    def drawn(threads: int) -> tuple[torch.Tensor, torch.Tensor]:
+    def drawn(threads):
         monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
         scene = source(image_size=size).scenes("test")[0]
         return scene.images([0, 5]), scene.depths([0, 5])

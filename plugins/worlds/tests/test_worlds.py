@@ -5,20 +5,20 @@ import pytest
 import torch
 from qgs_rooms.source import RoomScene, RoomsConfig, RoomsSource
 from qgs_worlds import rows as r
-from qgs_worlds.drawing import Drawn
 from qgs_worlds.effects import develop
 from qgs_worlds.intervals import clearances
 from qgs_worlds.places import KINDS
 from qgs_worlds.shapes import packed
 from qgs_worlds.source import WorldsSource
 from test_intervals import met
+from torch.testing import assert_close
 
 from qgs.geometry.rays import pixel_directions
 
 SIZE = 16, 24
 
 
-def source(**options) -> WorldsSource:
+def source(**options):
     return WorldsSource(WorldsSource.Config(**{"image_size": SIZE, **options}))
 
 
@@ -49,9 +49,9 @@ def test_scenes_are_scaled_to_their_depth(scenes):
         scene, factor = scaled[index], scaled[index].drawn.scale
         depths = scene.depths(range(8))
         assert depths[depths > 0].median() == pytest.approx(2, rel=0.01)
-        torch.testing.assert_close(depths, drawn[index].depths(range(8)) * factor)
+        assert_close(depths, drawn[index].depths(range(8)) * factor)
         moved = scene.cameras.c2w[:, :3, 3]
-        torch.testing.assert_close(moved, drawn[index].cameras.c2w[:, :3, 3] * factor)
+        assert_close(moved, drawn[index].cameras.c2w[:, :3, 3] * factor)
         assert torch.equal(scene.images([1]), drawn[index].images([1]))
 
 
@@ -139,7 +139,7 @@ def test_plain_parts(plain):
         assert np.ptp(drawn.effects[:3]) == 0
 
 
-def parts(drawn: Drawn) -> dict[str, np.ndarray]:
+def parts(drawn):
     """What is drawn for a scene; its cameras decide which shapes stay."""
     return {
         "shapes": packed(drawn.place.shapes),
