@@ -21,3 +21,16 @@ def refused(recipe: Any, *arguments: Any, **options: Any) -> RecipeProblem:
     """The one problem."""
     (problem,) = problems_of(recipe, *arguments, **options)
     return problem
+
+
+def wrong_refusals(recipe: Any, table: str) -> list[tuple[str, RecipeProblem]]:
+    """Of overrides in a table, below each of which stands `option: reason`, those that are refused
+    otherwise, and how."""
+    wrong = []
+    lines = table.split("\n")[1:-1]
+    for override, expected in zip(lines[::2], lines[1::2], strict=True):
+        option, _, reason = expected.strip().partition(":")
+        problem = refused(recipe, [override])
+        if problem.option != option or reason.strip() not in problem.reason:
+            wrong.append((override, problem))
+    return wrong
