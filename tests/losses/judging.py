@@ -13,13 +13,15 @@ CAMERAS = Cameras(GOLDEN["c2w"], GOLDEN["intrinsics"], (16, 24))
 PREDICTED, TRUTH = GOLDEN["images_pred"], GOLDEN["images_gt"]
 
 
-def judged(loss, views, means=None, opacities=None, rgb=None, alpha=None):
+NO_POINTS = torch.zeros(2, 0, 3)
+
+
+def judged(loss, views, means=NO_POINTS, opacities=None, rgb=None):
     """The terms of `loss`; what is not given is nothing, opaque or black."""
-    means = views.images.new_zeros(len(views.images), 0, 3) if means is None else means
-    opacities = torch.ones(means.shape[:2]) if opacities is None else opacities
     quats = torch.ones(*means.shape[:2], 4)
-    gaussians = Gaussians(means, torch.ones_like(means), quats, opacities, means.sigmoid())
-    rgb = torch.zeros_like(views.images) if rgb is None else rgb
-    alpha = rgb[:, :, :1] if alpha is None else alpha
+    opacities = quats[..., 0] if opacities is None else opacities
+    gaussians = Gaussians(means, quats[..., 1:], quats, opacities, means.sigmoid())
     prediction = LayerPrediction(gaussians, QueryState(means, {"anchor.center": means}))
+    rgb = torch.zeros_like(views.images) if rgb is None else rgb
+    alpha = rgb[:, :, :1]
     return loss(prediction, Rendering(rgb, alpha, alpha), views, views)
