@@ -1,7 +1,6 @@
 """Spherical harmonics against SciPy's Legendre functions, and as a camera sees them."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -61,7 +60,7 @@ def test_turned_coefficients_give_the_values_of_before_degree_by_degree():
 
 def test_a_view_sees_the_direction_from_its_camera_to_the_mean():
     gaussians, cameras = make_scene(2, 3, 5, harmonics=8, dtype=torch.float64)
-    gaussians = replace(gaussians, sh=10 * gaussians.sh)
+    gaussians = gaussians.replace(sh=10 * gaussians.sh)
     found = seen_colors(gaussians, cameras)
     assert found.shape == (2, 3, 5, 3)
     step = gaussians.means[1, 4] - cameras.c2w[1, 2, :3, 3]
@@ -71,7 +70,7 @@ def test_a_view_sees_the_direction_from_its_camera_to_the_mean():
     assert found.min() == 0
     assert found.max() > 1
     with pytest.raises(ValueError, match="no spherical harmonics"):
-        seen_colors(replace(gaussians, sh=None), cameras)
+        seen_colors(gaussians.replace(sh=None), cameras)
 
 
 def test_half_precision_is_raised_and_autocast_left():

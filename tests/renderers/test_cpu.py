@@ -5,7 +5,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -37,7 +36,7 @@ def test_the_number_of_threads_changes_no_bit(views):
 def test_more_gaussians_than_a_unit_of_work_takes(more):
     """Repeating a scene with opacity 0 changes neither its images nor its gradients."""
     gaussians, cameras = make_scene(batch=2, views=2, count=300, **more)
-    fillers = replace(gaussians, opacities=gaussians.opacities * 0)
+    fillers = gaussians.replace(opacities=gaussians.opacities * 0)
     padded = concatenated([fillers, gaussians], 1)
     rendering, gradients = differentiate(RENDER, gaussians, cameras)
     padded_rendering, padded_gradients = differentiate(RENDER, padded, cameras)
@@ -59,7 +58,7 @@ def test_gaussians_have_the_same_gradients_without_those_of_the_cameras():
     (alone,) = slopes(cameras, gaussians.means)
     for name in ("c2w", "intrinsics"):
         leaf = getattr(cameras, name).clone().requires_grad_()
-        together, of_leaf = slopes(replace(cameras, **{name: leaf}), gaussians.means, leaf)
+        together, of_leaf = slopes(cameras.replace(**{name: leaf}), gaussians.means, leaf)
         assert torch.equal(alone, together)
         assert of_leaf.any()
 

@@ -19,7 +19,7 @@ from qgs.composer import resolve
 from qgs.contracts import ModelDims
 from qgs.engine.initial import initialise
 from qgs.geometry.rays import camera_rays
-from qgs.geometry.transforms import quat_to_matrix, to_camera
+from qgs.geometry.transforms import to_camera
 from qgs.types import Cameras, ImageMemory, QueryState, Rendering, Views
 
 DIMS = ModelDims(width=16, heads=2, depth=2)
@@ -33,18 +33,14 @@ def drawn(seed, *shape):
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed)).double()
 
 
-def cameras():
-    """Two scenes of two photos, the cameras turned and moved."""
-    c2w = torch.eye(4, dtype=torch.float64).repeat(2, 2, 1, 1)
-    c2w[..., :3, :3] = quat_to_matrix(F.normalize(drawn(6, 2, 2, 4), dim=-1))
-    c2w[..., :3, 3] = drawn(7, 2, 2, 3)
-    return Cameras(c2w, torch.tensor([20.0, 20.0, 12.5, 7.5]).double().expand(2, 2, 4), SIZE)
-
-
-VIEWS = Views(drawn(0, 2, 2, 3, *SIZE).sigmoid(), cameras())
+LENS = torch.tensor([20.0, 20.0, 12.5, 7.5]).double()
+C2W = torch.eye(4).double().repeat(2, 2, 1, 1)
+C2W[..., :3, :3] = quat_to_matrix(F.normalize(drawn(6, 2, 2, 4), dim=-1))
+C2W[..., :3, 3] = drawn(7, 2, 2, 3)
+VIEWS = Views(drawn(0, 2, 2, 3, *SIZE).sigmoid(), Cameras(C2W, LENS.expand(2, 2, 4), SIZE))
+"""Two scenes of two photos, the cameras turned and moved."""
 HALVED = Views(
-    VIEWS.images.unflatten(3, (8, 2)).unflatten(5, (12, 2)).mean((4, 6)),
-    Cameras(VIEWS.cameras.c2w, VIEWS.cameras.intrinsics / 2, (8, 12)),
+    F.avg_pool3d(VIEWS.images, (1, 2, 2)), Cameras(C2W, VIEWS.cameras.intrinsics / 2, (8, 12))
 )
 MEMORY = ImageMemory(drawn(1, 2, TOKENS, DIMS.width), grid=GRID)
 
@@ -63,7 +59,7 @@ def in_photos(state, view_N):
     """Depths (B, N, 1) of anchors in these photos, and their pixels there."""
     local = to_camera(state[CENTER], VIEWS.cameras)[:, view_N, torch.arange(len(view_N))]
     z = local[..., 2:]
-    return z, 20 * local[..., :2] / z + torch.tensor([12.5, 7.5])
+    return z, LENS[:2] * local[..., :2] / z + LENS[2:]
 
 
 def axes_of_photos():
@@ -192,12 +188,12 @@ STEPS = CLOUD[CENTER][:, None] - CLOUD[CENTER][:, :, None]
 """From each anchor to each."""
 
 
-@pytest.mark.parametrize("pairs", [1 << 22, 100])
-def test_neighbours_are_the_nearest(pairs, monkeypatch):
-    monkeypatch.setattr("qgs_landmark.neighbours.MAX_PAIRS", pairs)
-    index, seen = nearest(CLOUD[CENTER], 5, None)
-    assert seen is None
-    assert torch.equal(index, STEPS.norm(dim=-1).argsort(-1)[..., :5])
+def test_neighbours_are_the_nearest(monkeypatch):
+    for pairs in (1 << 22, 100):
+        monkeypatch.setattr("qgs_landmark.neighbours.MAX_PAIRS", pairs)
+        index, seen = nearest(CLOUD[CENTER], 5, None)
+        assert seen is None
+        assert torch.equal(index, STEPS.norm(dim=-1).argsort(-1)[..., :5])
 
 
 def attention(count):

@@ -105,14 +105,11 @@ def test_cells_of_tiles_are_squares():
 
 
 def test_cells_divide_a_square():
-    for rows in ([1], [2], [2, 2], [3, 3], [2, 3], [2, 3, 3]):
-        middles = [
-            ((column + 0.5) / columns - 0.5, (row + 0.5) / len(rows) - 0.5)
-            for row, columns in enumerate(rows)
-            for column in range(columns)
-        ]
-        found = cells(sum(rows), rows_in_square(sum(rows)), torch.empty(0))
-        assert_close(found, torch.tensor(middles))
+    rows = torch.tensor(
+        [[-1 / 4, -1 / 4], [1 / 4, -1 / 4], [-1 / 3, 1 / 4], [0, 1 / 4], [1 / 3, 1 / 4]]
+    )
+    assert_close(cells(5, 2, rows), rows)
+    assert_close(cells(9, 3, rows), torch.cartesian_prod(*[torch.arange(-1, 2) / 3] * 2).flip(-1))
 
 
 def within(pixels, at, side):
