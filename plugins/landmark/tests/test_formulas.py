@@ -19,7 +19,7 @@ from qgs.composer import resolve
 from qgs.contracts import ModelDims
 from qgs.engine.initial import initialise
 from qgs.geometry.rays import camera_rays
-from qgs.geometry.transforms import to_camera
+from qgs.geometry.transforms import quat_to_matrix, to_camera
 from qgs.types import Cameras, ImageMemory, QueryState, Rendering, Views
 
 DIMS = ModelDims(width=16, heads=2, depth=2)

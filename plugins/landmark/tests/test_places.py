@@ -105,9 +105,7 @@ def test_cells_of_tiles_are_squares():
 
 
 def test_cells_divide_a_square():
-    rows = torch.tensor(
-        [[-1 / 4, -1 / 4], [1 / 4, -1 / 4], [-1 / 3, 1 / 4], [0, 1 / 4], [1 / 3, 1 / 4]]
-    )
+    rows = torch.tensor([[-3, -3], [3, -3], [-4, 3], [0, 3], [4, 3]]) / 12
     assert_close(cells(5, 2, rows), rows)
     assert_close(cells(9, 3, rows), torch.cartesian_prod(*[torch.arange(-1, 2) / 3] * 2).flip(-1))
 
