@@ -3,12 +3,13 @@
 import pytest
 import torch
 import yaml
+from odd_views import odd_views
 from qgs_ellipsoid.conversion import from_locus
 from qgs_ellipsoid.fields import RAW_RADII, ROTATION
 from qgs_locus.fields import CENTER, RAW_RADIUS
 from torch.testing import assert_close
 
-from qgs import Cameras, Views, compose
+from qgs import compose
 from qgs.types import named_tensors
 
 ELLIPSOID = """
@@ -37,13 +38,6 @@ def _model(recipe, *overrides):
     return compose(yaml.safe_load(recipe), [f"model.{each}" for each in overrides]).eval()
 
 
-def _photos():
-    c2w = torch.eye(4).repeat(2, 2, 1, 1)
-    c2w[:, 1, :3, 3] = torch.tensor([0.4, 0.1, -0.1])
-    lens = torch.tensor([30.0, 32.0, 20.0, 14.0]).expand(2, 2, 4)
-    return Views(torch.rand(2, 2, 3, 32, 40), Cameras(c2w, lens.clone(), (32, 40)))
-
-
 def _pair(refined=True, bound="floor"):
     """LocusGS whose radii differ from anchor to anchor, and its ellipsoidal equal."""
     reading = ["queries", "centers", "decoder.cross_attention"] + ["decoder.refinement"] * refined
@@ -65,10 +59,9 @@ def _shared(layer):
     return {**own, **dict(named_tensors(layer.gaussians))}
 
 
-@pytest.mark.parametrize("bound", ["floor", "offset"])
-@pytest.mark.parametrize("radius_refined", [False, True])
+@pytest.mark.parametrize(("radius_refined", "bound"), [(False, "floor"), (True, "offset")])
 def test_every_tensor_of_every_layer_is_that_of_locusgs(radius_refined, bound):
-    models, photos = _pair(radius_refined, bound), _photos()
+    models, photos = _pair(radius_refined, bound), odd_views(2, 32, 40)
     theirs, ours = (model(photos, layers=(1, 2, 3)) for model in models)
     for number, expected in theirs.layers.items():
         seen = ours.layers[number]
@@ -93,7 +86,7 @@ def _like_locus(gradients):
 
 def test_every_gradient_is_that_of_locusgs():
     seen = []
-    photos = _photos().to(torch.float64)
+    photos = odd_views(2, 32, 40).to(torch.float64)
     for model in _pair():
         torch.manual_seed(1)
         gaussians = model.double()(photos).gaussians
@@ -106,7 +99,7 @@ def test_every_gradient_is_that_of_locusgs():
 
 
 def test_it_is_locusgs_in_half_precision_too():
-    models, photos = _pair(), _photos()
+    models, photos = _pair(), odd_views(2, 32, 40)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         theirs, ours = (dict(named_tensors(model(photos).gaussians)) for model in models)
     assert_close(ours, theirs, rtol=1e-5, atol=1e-5)
@@ -119,7 +112,7 @@ def test_a_trained_locusgs_is_where_a_model_that_turns_can_start():
     mlps = {name.rpartition(".fc")[0] for name in absent.missing_keys}
     assert mlps == {"refinements.0.rotation_mlp"}
     assert absent.unexpected_keys == []
-    photos = _photos()
+    photos = odd_views(2, 32, 40)
     theirs, ours = (model(photos).gaussians.means for model in (locus, turning))
     assert_close(ours, theirs, rtol=1e-5, atol=1e-5)
 

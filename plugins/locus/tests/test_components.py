@@ -19,12 +19,14 @@ from qgs.components import posact
 from qgs.composer import resolve
 from qgs.contracts import ModelDims
 
-DIMS = ModelDims(width=16, heads=2, depth=2)
+
+def _made(kind, **options):
+    return kind(kind.Config(**options), ModelDims(width=16, heads=2, depth=2))
 
 
 def _state():
     fields = {CENTER: torch.randn(2, 5, 3), RAW_RADIUS: torch.randn(2, 5, 1)}
-    return QueryState(torch.randn(2, 5, DIMS.width), fields)
+    return QueryState(torch.randn(2, 5, 16), fields)
 
 
 def test_a_radius_is_read_in_two_ways_and_made_raw():
@@ -38,8 +40,7 @@ def test_a_radius_is_read_in_two_ways_and_made_raw():
 
 def test_queries_start_as_configured():
     start = NormalCenters(mean=(0.0, 0.0, 2.0), std=0.5)
-    config = AnchoredQueries.Config(count=4000, init_radius=0.3, center_init=start)
-    queries = AnchoredQueries(config, DIMS)
+    queries = _made(AnchoredQueries, count=4000, init_radius=0.3, center_init=start)
     support = queries.support(queries.start(3))
     seen = torch.stack([support.centers.mean((0, 1)), support.centers[2].std(0)])
     assert_close(seen, torch.tensor([[0.0, 0, 2], [0.5, 0.5, 0.5]]), atol=0.03, rtol=0)
@@ -49,8 +50,7 @@ def test_queries_start_as_configured():
 def test_frustum_centers_lie_in_the_frustum():
     centers = FrustumCenters(kind="frustum", depth=(0.5, 2.0), slope=0.7).sample(500)
     z = centers[:, 2:]
-    assert z.min() >= 0.5
-    assert z.max() <= 2.0
+    assert 0.5 <= z.min() <= z.max() <= 2.0
     assert (centers[:, :2].abs() <= 0.7 * z).all()
 
 
@@ -64,7 +64,7 @@ def test_centers_follow_their_formulas():
         (RadiusScaledCenters, {}, center + radius * posact(offsets)),
         (RadiusScaledCenters, {"offset": "linear"}, center + radius * offsets),
     ):
-        assert_close(kind(kind.Config(**options), DIMS)(offsets, state), expected)
+        assert_close(_made(kind, **options)(offsets, state), expected)
 
 
 def test_sine_embedding_starts_with_the_plain_angle():
@@ -76,11 +76,11 @@ def test_sine_embedding_starts_with_the_plain_angle():
 
 
 def test_bandwidths_have_their_floor():
-    attention = RayBiasedCrossAttention(RayBiasedCrossAttention.Config(), DIMS)
     raw = torch.tensor([[[-20.0], [20.0]]])
-    state = QueryState(torch.empty(1, 2, DIMS.width), {RAW_RADIUS: raw})
-    assert_close(attention.sigma_sq(state), torch.tensor([[[1e-3], [4.0]]]))
-    fixed = RayBiasedCrossAttention(RayBiasedCrossAttention.Config(bandwidth="fixed"), DIMS)
+    state = QueryState(torch.empty(1, 2, 16), {RAW_RADIUS: raw})
+    found = _made(RayBiasedCrossAttention).sigma_sq(state)
+    assert_close(found, torch.tensor([[[1e-3], [4.0]]]))
+    fixed = _made(RayBiasedCrossAttention, bandwidth="fixed")
     assert fixed.sigma_sq(state) == pytest.approx(0.01)
     assert RAW_RADIUS not in RayBiasedCrossAttention.fields_read(fixed.config)
 
