@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import time
+from copy import deepcopy
 from dataclasses import asdict
 from pathlib import Path
 
@@ -53,15 +54,15 @@ def test_random_photos_have_poses_that_look_at_one_point():
     assert not torch.equal(views.images, others.images)
     cameras = views.cameras
     assert torch.equal(cameras.c2w[0, 0], torch.eye(4))
-    seen = to_camera(torch.tensor([0.0, 0.0, 1.0]).expand(2, 1, 3), cameras)
-    assert_close(seen, torch.tensor([0.0, 0.0, 1.0]).expand(2, 5, 1, 3))
-    assert_close(cameras.intrinsics[0, 0], torch.tensor([64.0, 64.0, 32.0, 24.0]))
+    point = torch.eye(3)[2].expand(2, 1, 3)
+    assert_close(to_camera(point, cameras), point[:, None].expand(2, 5, 1, 3))
+    assert cameras.intrinsics[0, 0].tolist() == [64, 64, 32, 24]
 
 
 def test_inference_leaves_the_model_alone_and_a_step_trains_every_part():
     recipe = resolve(RECIPES / "tiny/locus.yaml", SMALL)
     model = recipe.build_model()
-    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    before = deepcopy(model.state_dict())
     for operation in ("forward", "render"):
         make_task(operation, recipe, model, MODEST)()
         assert not model.training
@@ -91,14 +92,8 @@ def executable(file, script):
     return str(file)
 
 
-@pytest.mark.parametrize(
-    ("operation", "least", "most"),
-    [("forward", 1, 3), pytest.param("step", 4, torch.inf, marks=pytest.mark.slow)],
-)
-def test_memory_of_a_fresh_process(operation, least, most, tmp_path, monkeypatch):
-    """A step holds weights, gradients and two moments.
-
-    Composing on the meta device, which takes place first, imports nothing of torch's compiler:
+def test_memory_of_a_fresh_process(tmp_path, monkeypatch):
+    """Composing on the meta device, which takes place first, imports nothing of torch's compiler:
     that takes seconds, and initialisers of plug-ins are what might ask for it.
     """
     ballast = torch.zeros(2**26)  # 256 MiB that the other process must not count
@@ -106,8 +101,8 @@ def test_memory_of_a_fresh_process(operation, least, most, tmp_path, monkeypatch
     weights = sum(p.numel() for p in recipe.build_model("meta").parameters()) * 4
     python = executable(tmp_path / "python", f"exec {sys.executable} -c '{COMPOSE_FIRST}' \"$@\"")
     monkeypatch.setattr(sys, "executable", python)
-    peak = peak_memory(recipe, operation, MODEST, threads=1)
-    assert least * weights < peak.peak_bytes - peak.idle_bytes < most * weights
+    peak = peak_memory(recipe, "forward", MODEST, threads=1)
+    assert weights < peak.peak_bytes - peak.idle_bytes < 3 * weights
     assert peak.idle_bytes < resident_bytes("VmRSS") - ballast.nbytes / 2
 
 
@@ -125,7 +120,7 @@ def test_what_failed_in_the_process_is_told(tmp_path, monkeypatch):
 def test_axes_double():
     assert parse_axis("views=2..32").values == (2, 4, 8, 16, 32)
     assert parse_axis("size=24..100").values == (24, 48, 96)
-    for text in ("views=2-32", "targets=2..32", "views=0..4", "views=4..7"):
+    for text in ["views=2-32", "targets=2..32", "views=0..4", "views=4..7"]:
         with pytest.raises(ValueError, match="AXIS=FIRST"):
             parse_axis(text)
 
@@ -134,14 +129,13 @@ def test_the_exponent_of_a_power_and_its_error():
     found = fit([2, 4, 8, 16], [3 * n**1.5 for n in (2, 4, 8, 16)])
     assert [*asdict(found).values()] == pytest.approx([1.5, 0, 3, 1.5])
     noisy = fit([1, 2, 4], [1, 2, 8])  # logarithms 0, 1, 3: slope 1.5, residuals 1/6, -1/3, 1/6
-    assert (noisy.exponent, noisy.last) == pytest.approx((1.5, 2))
-    assert noisy.error == pytest.approx((6 / 36 / 2) ** 0.5)
+    assert (noisy.exponent, noisy.error, noisy.last) == pytest.approx((1.5, 12**-0.5, 2))
     assert fit([2, 4], [1, 2]).error is None
     assert fit([2], [1]) is None
 
 
 def test_counts_follow_shapes():
-    shallow = ["model.decoder.depth=2", "model.supervision.layers=[1, 2]"]
+    shallow = "model.decoder.depth=2", "model.supervision.layers=[1, 2]"
     recipe = resolve(TOKENGS, [*SMALL[:2], *shallow])
     once, twice = (count(recipe, "step", Workload(2, 3, (16, 24), batch=n)) for n in (1, 2))
     weights = sum(p.nbytes for p in recipe.build_model("meta").parameters())

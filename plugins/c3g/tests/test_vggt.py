@@ -1,7 +1,6 @@
 """VGGT's features, with a stand-in for VGGT that has its interface and a few weights."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -71,7 +70,7 @@ def test_it_gives_the_patch_tokens_of_the_last_layer(weights):
         assert torch.equal(memory.features, expected.flatten(1, 2))
         assert memory.grid == (3, 2, 3)
         assert memory.keys is memory.values is memory.patch_rays is None
-        blind = replace(given, cameras=replace(given.cameras, c2w=given.cameras.c2w + 1))
+        blind = given.replace(cameras=given.cameras.replace(c2w=given.cameras.c2w + 1))
         assert torch.equal(made(blind).features, memory.features)
 
 

@@ -21,6 +21,8 @@ class InTorch(RayBias):
 
 
 LEARNT = ("q", "k", "v", "queries", "tokens")
+SIZES = (2, 3, 20, 30, 8)
+PATHS = ((biased_attention, InTorch), (biased_attention, RayBias), (PLAIN, InTorch))
 KINDS = ((RayBias, LEARNT[:4]), (InTorch, LEARNT))
 
 
@@ -51,52 +53,46 @@ def test_gradients_are_those_of_float64(monkeypatch):
 def test_what_other_devices_compute_is_the_same(monkeypatch):
     assert attention_bias._flash_for_cpu() is not None
     monkeypatch.setattr(attention_bias, "_flash_for_cpu", lambda: None)
-    assert not faults(case((2, 3, 20, 30, 8)))
+    assert not faults(case(SIZES))
 
 
-@pytest.mark.parametrize("attention", [biased_attention, PLAIN])
-def test_bfloat16_comes_back_in_bfloat16_and_the_bias_stays_in_float32(attention):
-    given = case((2, 3, 20, 30, 8))
+def test_bfloat16_comes_back_in_bfloat16_and_the_bias_stays_in_float32():
+    given = case(SIZES)
     best = exact(RayBias, given, LEARNT)
     for name in ("q", "k", "v", "gradient"):
         given[name] = given[name].bfloat16()
-    with torch.autocast("cpu", torch.bfloat16):
-        seen = found(attention, RayBias, given, LEARNT)
-    assert seen["read"].dtype == seen["q"].dtype == torch.bfloat16
-    assert seen["queries"].dtype == torch.float32
-    assert not wrong(seen, best, 2e-2)
+    for attention in (biased_attention, PLAIN):
+        with torch.autocast("cpu", torch.bfloat16):
+            seen = found(attention, RayBias, given, LEARNT)
+        assert seen["read"].dtype == seen["q"].dtype == torch.bfloat16
+        assert seen["queries"].dtype == torch.float32
+        assert not wrong(seen, best, 2e-2)
 
 
 def test_a_pass_without_gradients_comes_before_one_with_them(monkeypatch):
     monkeypatch.setattr(attention_bias, "_kept", SimpleNamespace())  # no memory yet
-    given = case((2, 3, 20, 30, 8))
+    given = case(SIZES)
     with torch.inference_mode():
         bias = InTorch(given["queries"], given["tokens"])
         read = biased_attention(given["q"], given["k"], given["v"], bias)
     assert torch.equal(found(biased_attention, InTorch, given, LEARNT)["read"], read)
 
 
-@pytest.mark.parametrize(
-    ("attention", "kind"),
-    [(biased_attention, InTorch), (biased_attention, RayBias), (PLAIN, InTorch)],
-    ids=["blocks", "kernels", "plain"],
-)
-def test_what_is_frozen_gets_no_gradient_and_the_others_get_the_same(attention, kind, monkeypatch):
-    given = case((2, 3, 20, 30, 8))
+def test_what_is_frozen_gets_no_gradient_and_the_others_get_the_same(monkeypatch):
+    given = case(SIZES)
     best = exact(RayBias, given, LEARNT)
     made, of_bias = [], AttentionBias.gradients
     monkeypatch.setattr(
         AttentionBias, "gradients", lambda *read: made.append(of_bias(*read)) or made[-1]
     )
-    all_ = []
     for learnt in (*zip(LEARNT, strict=True), ("queries", "tokens"), LEARNT):
-        made.clear()
-        seen = found(attention, kind, given, learnt)
-        computed = {tuple(gradient is not None for gradient in pair) for pair in made}
         wanted = {("queries" in learnt, "tokens" in learnt)} - {(False, False)}
-        if {*seen} != {"read", *learnt} or computed != wanted or wrong(seen, best):
-            all_.append((learnt, {*seen}, computed, wrong(seen, best)))
-    assert not all_, all_
+        for attention, kind in PATHS:
+            made.clear()
+            seen = found(attention, kind, given, learnt)
+            assert seen.keys() == {"read", *learnt}
+            assert {tuple(x is not None for x in pair) for pair in made} == wanted
+            assert not wrong(seen, best)
 
 
 def test_rows_that_are_asked_for_are_made_alone(monkeypatch):

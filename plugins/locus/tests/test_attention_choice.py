@@ -52,35 +52,29 @@ def chosen(monkeypatch):
 PAIRS = 2 * 5 * 7
 
 
-@pytest.mark.parametrize(
-    ("dtype", "trains", "each"),
-    [
+def test_the_plain_path_is_taken_while_it_fits(chosen):
+    for dtype, trains, each in (
         (torch.float32, True, 4 + 3 * 4),
         (torch.bfloat16, True, 4 + 2 + 3 * 2),
         (torch.float32, False, 4),
-    ],
-)
-def test_the_plain_path_is_taken_while_it_fits(dtype, trains, each, chosen):
-    with torch.set_grad_enabled(trains):
-        assert chosen(memory=PAIRS * each, dtype=dtype) == "plain"
-        assert chosen(memory=PAIRS * each - 1, dtype=dtype) == "triton"
+    ):
+        with torch.set_grad_enabled(trains):
+            assert chosen(memory=PAIRS * each, dtype=dtype) == "plain"
+            assert chosen(memory=PAIRS * each - 1, dtype=dtype) == "triton"
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
+def test_what_triton_cannot_compute_goes_through_blocks(chosen):
+    for options in (
         {"version": ()},
         {"version": (3, 2)},
         {"version": (3, 10), "kind": NotInTriton},
         {"width": 300},
         {"dtype": torch.float64},
         {"learnt": True},
-    ],
-)
-def test_what_triton_cannot_compute_goes_through_blocks(options, chosen):
-    assert chosen(**options) == "blocks"
-    with pytest.raises(ValueError, match="triton"):
-        chosen("triton", **options)
+    ):
+        assert chosen(**options) == "blocks"
+        with pytest.raises(ValueError, match="triton"):
+            chosen("triton", **options)
 
 
 @torch.no_grad()

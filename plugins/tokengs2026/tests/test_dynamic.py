@@ -1,7 +1,7 @@
 """Scenes that move: the embedding of times, which queries carry them, who reads whom."""
 
 import math
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -40,11 +40,11 @@ def small(*overrides):
 
 
 def views(times=None, target=None):
-    return replace(odd_views(), times=times, target_time=target)
+    return odd_views().replace(times=times, target_time=target)
 
 
 INPUTS = views(torch.zeros(2, 2), torch.zeros(2, 1))
-TARGETS = replace(INPUTS.select([0]), target_time=None)
+TARGETS = INPUTS.select([0]).replace(target_time=None)
 
 
 def dynamic_queries(**options):
@@ -76,8 +76,7 @@ def test_the_target_time_is_added_to_the_dynamic_queries_or_to_all():
     assert not DynamicQueries.reads_cameras
     photos = [Photos(INPUTS.images, target_time=torch.tensor([[x], [0.5]])) for x in (0.0, 1.0)]
     for dynamic, moving in ((3, [False] * 4 + [True] * 3), (0, [True] * 7)):
-        queries = dynamic_queries(dynamic=dynamic)
-        early, late = (queries(MEMORY, each) for each in photos)
+        early, late = map(partial(dynamic_queries(dynamic=dynamic), MEMORY), photos)
         changed = (early.features != late.features).any(-1)
         assert changed.tolist() == [moving, [False] * 7]
         fields = {name: x.tolist() for name, x in early.fields.items()}
@@ -120,10 +119,8 @@ def model():
 
 def test_a_prediction_depends_on_the_times_of_photos_and_on_the_time_asked_for(model):
     times, target = torch.tensor([[0.1, 0.9]] * 2), torch.tensor([[0.2]] * 2)
-    first, later, others = (
-        model(views(*given)).gaussians.means
-        for given in ((times, target), (times, target + 0.5), (times + 0.1, target))
-    )
+    asked = (views(times, target), views(times, target + 0.5), views(times + 0.1, target))
+    first, later, others = (model(given).gaussians.means for given in asked)
     assert torch.equal(first[:, :8], later[:, :8])
     assert not torch.equal(first[:, 8:], later[:, 8:])
     assert not torch.equal(first[:, :8], others[:, :8])
@@ -156,16 +153,12 @@ def test_views_keep_the_time_that_is_asked_for():
         views(torch.zeros(2, 3))
 
 
-def judging(model, weight):
-    return TrainingPass.of(small(f"objective.weight={weight}"), model)
-
-
 def test_the_objective_judges_dynamic_gaussians_again(model):
     gaussians = model(INPUTS).gaussians[:, 4 * 2 :]
     rendering = model.render(gaussians, TARGETS.cameras)
     layer = LayerPrediction(gaussians, model.queries(MEMORY, INPUTS))
     for weight in (0.5, 0.0):
-        objective = judging(model, weight)
+        objective = TrainingPass.of(small(f"objective.weight={weight}"), model)
         outcome = objective(INPUTS, TARGETS)
         losses = (loss(layer, rendering, TARGETS, INPUTS) for loss in objective.losses.values())
         expected = weight * sum(sum(terms.values()) for terms in losses)
@@ -174,7 +167,7 @@ def test_the_objective_judges_dynamic_gaussians_again(model):
 
 
 def test_no_loss_may_have_the_term_of_the_objective(model):
-    objective = judging(model, 0.3)
+    objective = TrainingPass.of(small(), model)
     loss = next(iter(objective.losses.values()))
     loss.forward = lambda *given: {"dynamic": given[0].gaussians.means.sum()}
     with pytest.raises(ValueError, match=r"losses have terms \['dynamic'\] already"):
