@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from losses.judging import CAMERAS, TRUTH
+from small_parts import DIMS, made
 from torch.testing import assert_close
 
 from qgs import QueryState, Views
@@ -17,8 +18,6 @@ from qgs.components import (
     posact,
 )
 from qgs.contracts import AttentionWeights, ModelDims, RecipeContext
-
-DIMS = ModelDims(width=16, heads=2, depth=2)
 
 
 def test_posact_its_slope_at_zero_and_its_limits():
@@ -33,26 +32,24 @@ def test_posact_its_slope_at_zero_and_its_limits():
 
 
 def test_an_image_that_patches_do_not_divide():
-    config = MultiViewViT.Config(patch_size=5)
+    encoder = made(MultiViewViT, patch_size=5)
     with pytest.raises(ValueError, match="16 x 24 cannot be cut into patches of 5"):
-        MultiViewViT(config, DIMS)(Views(TRUTH, CAMERAS))
-    problems = MultiViewViT.problems(config, RecipeContext(DIMS, (16, 24)))
+        encoder(Views(TRUTH, CAMERAS))
+    problems = encoder.problems(encoder.config, RecipeContext(DIMS, (16, 24)))
     assert [problem.option for problem in problems] == ["patch_size"]
 
 
 def test_wild_raw_numbers_become_gaussians():
     """golden/test_files.py has the numbers of tame ones."""
-    head = GaussianHead(GaussianHead.Config(gaussians_per_query=2), DIMS)
+    head = made(GaussianHead, gaussians_per_query=2)
     wild = head.activate(torch.randn(4, 3, 2, 14) * 1e4)
     assert wild.scales.max() <= 0.075
     assert_close(wild.quats.norm(dim=-1), torch.ones(4, 3, 2))
 
 
 def test_head_starts_with_the_spread_and_at_the_depth_it_is_told():
-    config = GaussianHead.Config(
-        gaussians_per_query=32, init_std=0.02, position_std=0.2, z_init=math.log(1.1)
-    )
-    head = GaussianHead(config, ModelDims(width=256, heads=4, depth=1))
+    options = {"gaussians_per_query": 32, "init_std": 0.02, "position_std": 0.2}
+    head = made(GaussianHead, ModelDims(256, 4, 1), z_init=math.log(1.1), **options)
     weight = head.linear.weight.detach().unflatten(0, (32, 14))
     assert weight[:, :3].std() == pytest.approx(0.2, rel=0.05)
     assert weight[:, 3:].std() == pytest.approx(0.02, rel=0.05)
@@ -63,8 +60,7 @@ def test_head_starts_with_the_spread_and_at_the_depth_it_is_told():
 def test_offset_centers_are_the_offsets_further_along_z_in_float32():
     offsets = torch.randn(2, 5, 1, 3, dtype=torch.bfloat16)
     for z in (1.0, -2.0):
-        centers = OffsetCenters(OffsetCenters.Config(z_offset=z), DIMS)
-        means = centers(offsets, QueryState(torch.zeros(2, 5, 16)))
+        means = made(OffsetCenters, z_offset=z)(offsets, QueryState(torch.zeros(2, 5, 16)))
         assert means.dtype == torch.float32
         assert torch.equal(means, offsets.float() + torch.tensor([0.0, 0.0, z]))
 

@@ -3,7 +3,6 @@
 import csv
 import json
 import re
-from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -12,8 +11,7 @@ from qgs_bench import output, predict, run, sweep
 from qgs_bench.memory import Peak
 from rich.console import Console
 
-RECIPES = Path(__file__).parents[3] / "recipes/tiny"
-TOKENGS, LOCUS, GSLRM = (str(RECIPES / f"{name}.yaml") for name in ("tokengs", "locus", "gslrm"))
+TOKENGS, LOCUS, GSLRM = "tiny/tokengs.yaml", "tiny/locus.yaml", "tiny/gslrm.yaml"
 SETTINGS = ["model.width=16", "model.heads=2", "model.head.gaussians_per_query=2"]
 SMALL = f"--size 16x24 --device cpu --rounds 3 --warmup 0 --set {' --set '.join(SETTINGS)}"
 

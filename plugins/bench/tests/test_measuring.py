@@ -6,7 +6,6 @@ import sys
 import time
 from copy import deepcopy
 from dataclasses import asdict
-from pathlib import Path
 
 import pytest
 import torch
@@ -21,8 +20,7 @@ from torch.testing import assert_close
 from qgs.composer import resolve
 from qgs.geometry.transforms import to_camera
 
-RECIPES = Path(__file__).parents[3] / "recipes"
-TOKENGS = RECIPES / "tiny/tokengs.yaml"
+TOKENGS = "tiny/tokengs.yaml"
 SMALL = ["model.width=32", "model.heads=2", "model.queries.count=12"]
 MODEST = Workload(views=2, targets=2, size=(16, 24))
 
@@ -41,11 +39,11 @@ def test_tasks_take_turns():
 
 
 def test_the_recipe_says_how_much_work_there_is():
-    recipe = resolve(RECIPES / "locus/dl3dv_4096_4views.yaml")
+    recipe = resolve("locus/dl3dv_4096_4views.yaml")
     assert workload_of(recipe) == Workload(views=4, targets=4, size=(256, 448))
     assert workload_of(recipe, views=6, size=(64, 32)) == Workload(6, 4, (64, 32))
     with pytest.raises(ValueError, match=r"no data\.image_size.*--size HxW"):
-        workload_of(resolve(RECIPES / "locus/overlay.yaml"))
+        workload_of(resolve("locus/overlay.yaml"))
 
 
 def test_random_photos_have_poses_that_look_at_one_point():
@@ -60,7 +58,7 @@ def test_random_photos_have_poses_that_look_at_one_point():
 
 
 def test_inference_leaves_the_model_alone_and_a_step_trains_every_part():
-    recipe = resolve(RECIPES / "tiny/locus.yaml", SMALL)
+    recipe = resolve("tiny/locus.yaml", SMALL)
     model = recipe.build_model()
     before = deepcopy(model.state_dict())
     for operation in ("forward", "render"):
@@ -160,7 +158,7 @@ def test_near_the_measured(name, monkeypatch):
     """Of processor time, which other processes disturb less."""
     monkeypatch.setattr(predict, "timer", time.process_time)
     torch.set_num_threads(1)
-    path = RECIPES / f"tiny/{name}.yaml"
+    path = f"tiny/{name}.yaml"
     recipe = resolve(path)
     work = workload_of(recipe)
     # in a fresh process, which holds nothing of earlier tests

@@ -5,13 +5,12 @@ import math
 import torch
 from qgs_c3g.head import C3GHead
 from qgs_c3g.joint import JointLayer
+from small_parts import DIMS, made
 from torch.testing import assert_close
 
 from qgs import QueryState
-from qgs.contracts import LayerParts, ModelDims
+from qgs.contracts import LayerParts
 from qgs.types import ImageMemory
-
-DIMS = ModelDims(width=16, heads=2, depth=2)
 
 
 def by_formula(made, tokens):
@@ -41,7 +40,7 @@ def test_a_layer_follows_its_formula():
 
 
 def test_the_head_follows_its_formula():
-    head = C3GHead(C3GHead.Config(gaussians_per_query=3, scale_unit=0.02), DIMS).double()
+    head = made(C3GHead, gaussians_per_query=3, scale_unit=0.02).double()
     with torch.no_grad():
         head.linear.weight *= 5
         head.linear.bias[4] = 1e5  # scales have no cap
@@ -60,7 +59,7 @@ def test_the_head_follows_its_formula():
 
 
 def test_the_head_starts_as_published():
-    head = C3GHead(C3GHead.Config(), DIMS)
+    head = made(C3GHead)
     assert head.linear.weight.shape == (14, 16)
     assert 0.125 < head.linear.weight.abs().max() <= 1 / math.sqrt(16)
     assert head.config.scale_unit == 1e-3

@@ -1,7 +1,5 @@
 """Whole models: recipes, sizes as published, parts of LocusGS beside C3G's, and that it learns."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from learning import errors_of_training
@@ -15,8 +13,7 @@ from qgs.composer import resolve
 from qgs.contracts.schedule import follow
 from qgs.types import named_tensors
 
-RECIPES = Path(__file__).parents[3] / "recipes"
-TINY = RECIPES / "tiny/c3g.yaml"
+TINY = "tiny/c3g.yaml"
 NARROW = ("model.width=16", "model.heads=2", "model.queries.count=6")
 SHALLOW = ("model.decoder.depth=2", "model.supervision.layers=[2]")
 SMALL = (
@@ -36,7 +33,7 @@ def size(module):
 
 def test_the_published_recipe():
     """Its sizes, a Gaussian for each query, and a dilation divided by 3 every 1000 steps."""
-    recipe = resolve(RECIPES / "c3g/re10k.yaml")
+    recipe = resolve("c3g/re10k.yaml")
     assert recipe.training.judge_inputs
     model = recipe.build_model("meta")
     trained = 71_368_718  # beside the backbone, for which a ViT stands
@@ -101,7 +98,7 @@ def test_layers_of_both_kinds_may_alternate():
 def test_every_parameter_that_trains_is_read():
     """Processes that train together wait for a gradient of each of them."""
     for name, side in (("tiny/c3g", 16), ("c3g/re10k", 28)):
-        recipe = resolve(RECIPES / f"{name}.yaml", [*NARROW, *SHALLOW])
+        recipe = resolve(f"{name}.yaml", [*NARROW, *SHALLOW])
         model = recipe.build_model().train()
         gaussians = model(odd_views(2, side, side)).gaussians
         torch.stack([x.sum() for _, x in named_tensors(gaussians)]).sum().backward()

@@ -1,7 +1,6 @@
 """VGGT's features, with a stand-in for VGGT that has its interface and a few weights."""
 
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -20,7 +19,7 @@ import qgs
 from qgs.composer import resolve
 from qgs.contracts import MissingExtraError, ModelDims
 
-TINY = Path(__file__).parents[3] / "recipes/tiny/c3g.yaml"
+TINY = "tiny/c3g.yaml"
 C = 8
 """Width of the stand-in's tokens in place of 2048."""
 

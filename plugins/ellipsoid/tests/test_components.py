@@ -15,14 +15,13 @@ from qgs_ellipsoid.rotations import quat_product, turned
 from qgs_locus.anchors import FrustumCenters
 from qgs_locus.fields import CENTER
 from refusals import wrong_refusals
+from small_parts import made
 from torch.testing import assert_close
 
 from qgs.components import GaussianHead, posact
-from qgs.contracts import ModelDims
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import ImageMemory, QueryState
 
-DIMS = ModelDims(width=16, heads=2, depth=2)
 HALF = math.sqrt(0.5)
 OFFSET = {"radius_bound": "offset", "radius_min": 0.05}
 
@@ -34,11 +33,7 @@ def _state():
         ROTATION: F.normalize(torch.randn(2, 6, 4), dim=-1),
         RAW_RADII: torch.randn(2, 6, 3) - 1,
     }
-    return QueryState(torch.randn(2, 6, DIMS.width), fields)
-
-
-def _made(kind, **options):
-    return kind(kind.Config(**options), DIMS)
+    return QueryState(torch.randn(2, 6, 16), fields)
 
 
 def test_products_of_quaternions_are_those_of_their_matrices():
@@ -60,7 +55,7 @@ def test_a_turn_is_about_an_axis_of_the_world_and_never_half_a_turn():
 
 def test_queries_give_what_they_learned_in_the_form_that_they_promise():
     options = {**OFFSET, "count": 500, "std": 2.0, "init_radii": (0.1, 0.2, 0.4)}
-    queries = _made(EllipsoidQueries, **options, center_init=FrustumCenters(kind="frustum"))
+    queries = made(EllipsoidQueries, **options, center_init=FrustumCenters(kind="frustum"))
     assert_close(queries.features.std().item(), 2.0, rtol=0.1, atol=0)
     assert (queries.center[:, 2] >= 0.3).all()
     at_first = queries.support(queries.start(2))
@@ -82,8 +77,8 @@ def test_attention_and_pictures_speak_of_one_ellipsoid():
     state, rays = _state(), torch.cat([0.5 * torch.randn(2, 24, 3), torch.randn(2, 24, 3)], -1)
     memory = ImageMemory(torch.randn(2, 24, 16), patch_rays=rays)
     chosen = {"sigma0": 0.3, "sigma_sq_min": 1e-5, "bias_min": -7.0, "gamma_init": 0.4}
-    bias = _made(EllipsoidCrossAttention, **chosen, **OFFSET).bias(state, memory).dense()
-    axes = _made(EllipsoidQueries, **OFFSET).support(state).axes
+    bias = made(EllipsoidCrossAttention, **chosen, **OFFSET).bias(state, memory).dense()
+    axes = made(EllipsoidQueries, **OFFSET).support(state).axes
     radii = axes.norm(dim=-2)
     ellipsoids = state[CENTER], axes / radii[..., None, :], (0.3 * radii).square()
     gamma = F.softplus(torch.tensor(0.4))
@@ -100,13 +95,13 @@ def test_the_step_of_a_centre_follows_its_options():
         ({"input_limit": 0.1, "output_limit": None}, lambda t: posact(t, 0.1, None)),
         ({"output_limit": 0.05}, lambda t: posact(t, 100.0, 0.05)),
     ):
-        refinement = _made(EllipsoidRefinement, **options)
+        refinement = made(EllipsoidRefinement, **options)
         expected = state[CENTER] + step(refinement.center_mlp(state.features))
         assert_close(refinement(state)[CENTER], expected)
 
 
 def test_a_refinement_that_starts_at_zero_can_learn():
-    refinement, state = _made(EllipsoidRefinement, zero_init=True), _state()
+    refinement, state = made(EllipsoidRefinement, zero_init=True), _state()
     refined = refinement(state)
     assert_close(refined.fields, state.fields)
     sum((field * torch.randn_like(field)).sum() for field in refined.fields.values()).backward()
@@ -118,7 +113,7 @@ def test_centers_follow_their_formula():
     state, offsets = _state(), torch.randn(2, 6, 3, 3)
     local = F.softplus(state[RAW_RADII])[:, :, None] * posact(offsets)
     steps = torch.einsum("bnij,bnkj->bnki", quat_to_matrix(state[ROTATION]), local)
-    means = _made(AxisScaledCenters)(offsets, state)
+    means = made(AxisScaledCenters)(offsets, state)
     assert_close(means, state[CENTER][:, :, None] + steps)
 
 
@@ -130,8 +125,8 @@ def test_a_radius_along_a_direction_reaches_the_surface():
 
 
 def test_gaussians_turn_and_grow_with_their_anchor():
-    head = _made(EllipsoidHead, gaussians_per_query=3, init_std=0.5)
-    plain = _made(GaussianHead, gaussians_per_query=3)
+    head = made(EllipsoidHead, gaussians_per_query=3, init_std=0.5)
+    plain = made(GaussianHead, gaussians_per_query=3)
     plain.load_state_dict(head.state_dict())
     state = _state()
     local, placed = plain(state), head(state)
@@ -144,7 +139,7 @@ def test_gaussians_turn_and_grow_with_their_anchor():
 
 
 def test_quaternions_of_no_use_become_the_identity():
-    head, state = _made(EllipsoidHead, gaussians_per_query=2), _state()
+    head, state = made(EllipsoidHead, gaussians_per_query=2), _state()
     with torch.no_grad():
         head.linear.weight.zero_()
         head.linear.bias.view(2, 14)[1, 9:13] = 1e-6

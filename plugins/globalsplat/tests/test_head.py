@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
-from globalsplat_inputs import made
 from qgs_globalsplat.head import MergingHead, rotation_6d
 from qgs_globalsplat.streams import TEXTURE
+from small_parts import made
 from torch.nn.functional import layer_norm
 from torch.testing import assert_close
 

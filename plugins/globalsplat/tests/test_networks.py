@@ -5,10 +5,10 @@ from collections import Counter
 
 import pytest
 import torch
-from globalsplat_inputs import DIMS, made
 from odd_views import odd_views
 from qgs_globalsplat.encoder import PosedPatches
 from qgs_globalsplat.streams import TEXTURE, Round, SlotQueries
+from small_parts import DIMS, made
 from torch.nn.functional import gelu
 from torch.testing import assert_close
 

@@ -1,7 +1,7 @@
 """Recipes: published sizes, what is refused, and trainings of small ones."""
 
 import pytest
-from globalsplat_inputs import RECIPES, SMALL, TINY
+from globalsplat_inputs import SMALL, TINY
 from learning import errors_of_training
 from odd_views import odd_views
 
@@ -9,7 +9,7 @@ import qgs
 from qgs.composer import RecipeError, resolve
 from qgs.engine.training import train
 
-PUBLISHED = RECIPES / "globalsplat/re10k.yaml"
+PUBLISHED = "globalsplat/re10k.yaml"
 
 
 def test_parameters_of_the_published_size():

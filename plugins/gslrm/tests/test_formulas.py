@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from odd_views import odd_views
 from qgs_gslrm.encoder import Transformer
 from qgs_gslrm.pixels import PATCH, AlongRays, PixelHead, PixelQueries, patch_rays_at, patches
+from small_parts import made
 from torch.testing import assert_close
 
 from qgs.contracts import ModelDims
@@ -18,10 +19,6 @@ P = 4
 """Pixels along a patch."""
 COUNT, ROWS, COLUMNS = GRID = (3, 2, 3)
 """Views, and their patches."""
-
-
-def made(component, width=16, **options):
-    return component(component.Config(**options), ModelDims(width, heads=2, depth=0))
 
 
 def in_patches(maps):
@@ -90,7 +87,8 @@ def test_the_transformer_sees_nine_channels_of_every_pixel():
 
 
 def test_nothing_has_a_bias_and_weights_start_as_published():
-    for part in (made(Transformer, width=128, depth=2), made(PixelHead, width=128)):
+    dims = ModelDims(width=128, heads=2, depth=0)
+    for part in (made(Transformer, dims, depth=2), made(PixelHead, dims)):
         for name, parameter in part.named_parameters():
             matrix = parameter.ndim == 2
             assert not name.endswith("bias")

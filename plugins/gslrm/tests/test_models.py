@@ -1,7 +1,5 @@
 """Models with GS-LRM's parts: they run and learn, or are refused when composed, with the reason."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from learning import errors_of_training
@@ -15,7 +13,7 @@ from torch.testing import assert_close
 from qgs.composer import resolve
 from qgs.geometry.transforms import to_camera, to_pixels
 
-TINY = Path(__file__).parents[3] / "recipes/tiny/gslrm.yaml"
+TINY = "tiny/gslrm.yaml"
 SMALL = (
     *("model.width=32", "model.heads=2", "model.encoder.depth=1"),
     *(

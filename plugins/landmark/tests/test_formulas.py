@@ -12,17 +12,16 @@ from qgs_landmark.refinement import FramedRefinement
 from qgs_landmark.rendered import RenderedFeedback
 from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
 from qgs_locus.refinement import AnchorRefinement
+from small_parts import made
 from torch.testing import assert_close
 
 from qgs.components.blocks import split_heads
 from qgs.composer import resolve
-from qgs.contracts import ModelDims
 from qgs.engine.initial import initialise
 from qgs.geometry.rays import camera_rays
 from qgs.geometry.transforms import quat_to_matrix, to_camera
 from qgs.types import Cameras, ImageMemory, QueryState, Rendering, Views
 
-DIMS = ModelDims(width=16, heads=2, depth=2)
 GRID, SIZE, PATCH = (2, 4, 6), (16, 24), 4
 TOKENS = math.prod(GRID)
 BY_PHOTO = torch.arange(TOKENS) // (TOKENS // 2)
@@ -42,13 +41,12 @@ VIEWS = Views(drawn(0, 2, 2, 3, *SIZE).sigmoid(), Cameras(C2W, LENS.expand(2, 2,
 HALVED = Views(
     F.avg_pool3d(VIEWS.images, (1, 2, 2)), Cameras(C2W, VIEWS.cameras.intrinsics / 2, (8, 12))
 )
-MEMORY = ImageMemory(drawn(1, 2, TOKENS, DIMS.width), grid=GRID)
+MEMORY = ImageMemory(drawn(1, 2, TOKENS, 16), grid=GRID)
 
 
 def started(**options):
     torch.manual_seed(0)
-    config = ObservedQueries.Config.model_validate(options)
-    queries = ObservedQueries(config, DIMS).double().eval()
+    queries = made(ObservedQueries, **options).double().eval()
     with torch.no_grad():
         for parameter in queries.depth_mlp.parameters():
             parameter += 0.3 * torch.randn_like(parameter)
@@ -83,7 +81,7 @@ def test_anchors_of_all_tokens_stand_on_the_rays_of_their_patches(each, bound):
 
 
 def test_anchors_start_between_near_and_far_in_the_logarithm():
-    queries = ObservedQueries(ObservedQueries.Config(count=None, near=0.2, far=3.2), DIMS).double()
+    queries = made(ObservedQueries, count=None, near=0.2, far=3.2).double()
     z, _ = in_photos(queries(MEMORY, VIEWS), BY_PHOTO)
     assert_close(z, torch.full_like(z, math.sqrt(0.2 * 3.2)))
 
@@ -117,10 +115,10 @@ def test_gaussians_start_as_the_photo_that_they_stand_for(count, tile):
     """With a head of zeros, each lies on the ray of its 2 x 2 pixels and has their colour."""
     each = math.prod(tile)
     queries, state = started(count=count, cells=each)
-    head = ColoredHead(ColoredHead.Config(gaussians_per_query=each), DIMS).double()
+    head = made(ColoredHead, gaussians_per_query=each).double()
     torch.nn.init.zeros_(head.linear.weight)
     attributes = head(state)
-    means = FootprintCenters(FootprintCenters.Config(), DIMS)(attributes.offsets, state)
+    means = made(FootprintCenters)(attributes.offsets, state)
 
     def of_queries(maps_BVHWC):
         parts = maps_BVHWC.unflatten(3, (-1, tile[1])).unflatten(2, (-1, tile[0]))
@@ -137,10 +135,7 @@ def test_gaussians_start_as_the_photo_that_they_stand_for(count, tile):
 
 def test_a_head_of_more_gaussians_starts_from_those_of_the_nearest_cells():
     """`init_from`: each of 2 x 2 cells has its channels in the four of 4 x 4 that divide it."""
-    small, large = (
-        ColoredHead(ColoredHead.Config(gaussians_per_query=count), DIMS).double()
-        for count in (4, 16)
-    )
+    small, large = (made(ColoredHead, gaussians_per_query=count).double() for count in (4, 16))
     large.load_state_dict(large.adapted(small.state_dict()))
     four, sixteen = (
         head.linear(MEMORY.features).unflatten(-1, (side, side, -1))
@@ -152,7 +147,7 @@ def test_a_head_of_more_gaussians_starts_from_those_of_the_nearest_cells():
 def test_a_head_leaves_weights_that_are_not_its_own():
     """They are then refused by their names and shapes."""
     theirs = {"linear.weight": torch.zeros(13, 8), "fc.weight": torch.zeros(28, 8)}
-    assert_close(ColoredHead(ColoredHead.Config(), DIMS).adapted(theirs), theirs)
+    assert_close(made(ColoredHead).adapted(theirs), theirs)
 
 
 def test_the_recipe_of_larger_photos_starts_from_the_shipped_model():
@@ -163,7 +158,7 @@ def test_the_recipe_of_larger_photos_starts_from_the_shipped_model():
 
 def test_centres_add_offsets_in_radii():
     _, state = started(count=None, cells=4)
-    centers = FootprintCenters(FootprintCenters.Config(offset="linear"), DIMS)
+    centers = made(FootprintCenters, offset="linear")
     offsets = drawn(3, 2, TOKENS, 4, 3)
     moved = centers(offsets, state) - centers(torch.zeros_like(offsets), state)
     radii = support_radius(state[RAW_RADIUS], centers.config)[..., None]
@@ -172,9 +167,7 @@ def test_centres_add_offsets_in_radii():
 
 def test_refinement_steps_in_radii_along_the_axes_of_the_photo():
     _, state = started(count=None)
-    ours, theirs = (
-        kind(kind.Config(), DIMS).double() for kind in (FramedRefinement, AnchorRefinement)
-    )
+    ours, theirs = (made(kind).double() for kind in (FramedRefinement, AnchorRefinement))
     ours.load_state_dict(theirs.state_dict())
     radii = support_radius(state[RAW_RADIUS], ours.config)
     steps = radii * (theirs(state)[CENTER] - state[CENTER])
@@ -183,7 +176,7 @@ def test_refinement_steps_in_radii_along_the_axes_of_the_photo():
     assert torch.equal(ours(state)[RAW_RADIUS], theirs(state)[RAW_RADIUS])
 
 
-CLOUD = QueryState(drawn(2, 2, 40, DIMS.width), {CENTER: drawn(3, 2, 40, 3)})
+CLOUD = QueryState(drawn(2, 2, 40, 16), {CENTER: drawn(3, 2, 40, 3)})
 STEPS = CLOUD[CENTER][:, None] - CLOUD[CENTER][:, :, None]
 """From each anchor to each."""
 
@@ -198,7 +191,7 @@ def test_neighbours_are_the_nearest(monkeypatch):
 
 def attention(count):
     torch.manual_seed(0)
-    module = NeighbourAttention(NeighbourAttention.Config(count=count), DIMS).double()
+    module = made(NeighbourAttention, count=count).double()
     with torch.no_grad():
         for parameter in module.parameters():
             parameter += 0.1 * torch.randn_like(parameter)
@@ -233,9 +226,9 @@ def test_nobody_reads_what_is_no_query():
 
 def test_errors_are_added_to_keys_and_values():
     torch.manual_seed(0)
-    feedback = RenderedFeedback(RenderedFeedback.Config(shrink=2, cells=2), DIMS).double()
+    feedback = made(RenderedFeedback, shrink=2, cells=2).double()
     with torch.no_grad():
-        feedback.marker += torch.randn(DIMS.width)
+        feedback.marker += torch.randn(16)
     given = feedback.compared(VIEWS)
     assert_close(given.images, HALVED.images)
     assert_close(given.cameras.intrinsics, HALVED.cameras.intrinsics)

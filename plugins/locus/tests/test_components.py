@@ -12,16 +12,12 @@ from qgs_locus.decoding import AnchorOffsetCenters, RadiusScaledCenters
 from qgs_locus.fields import CENTER, RAW_RADIUS, RadiusOptions, raw_radius_of, support_radius
 from qgs_locus.self_attention import sine_embedding
 from refusals import wrong_refusals
+from small_parts import made
 from torch.testing import assert_close
 
 from qgs import QueryState
 from qgs.components import posact
 from qgs.composer import resolve
-from qgs.contracts import ModelDims
-
-
-def _made(kind, **options):
-    return kind(kind.Config(**options), ModelDims(width=16, heads=2, depth=2))
 
 
 def _state():
@@ -40,7 +36,7 @@ def test_a_radius_is_read_in_two_ways_and_made_raw():
 
 def test_queries_start_as_configured():
     start = NormalCenters(mean=(0.0, 0.0, 2.0), std=0.5)
-    queries = _made(AnchoredQueries, count=4000, init_radius=0.3, center_init=start)
+    queries = made(AnchoredQueries, count=4000, init_radius=0.3, center_init=start)
     support = queries.support(queries.start(3))
     seen = torch.stack([support.centers.mean((0, 1)), support.centers[2].std(0)])
     assert_close(seen, torch.tensor([[0.0, 0, 2], [0.5, 0.5, 0.5]]), atol=0.03, rtol=0)
@@ -64,7 +60,7 @@ def test_centers_follow_their_formulas():
         (RadiusScaledCenters, {}, center + radius * posact(offsets)),
         (RadiusScaledCenters, {"offset": "linear"}, center + radius * offsets),
     ):
-        assert_close(_made(kind, **options)(offsets, state), expected)
+        assert_close(made(kind, **options)(offsets, state), expected)
 
 
 def test_sine_embedding_starts_with_the_plain_angle():
@@ -78,9 +74,9 @@ def test_sine_embedding_starts_with_the_plain_angle():
 def test_bandwidths_have_their_floor():
     raw = torch.tensor([[[-20.0], [20.0]]])
     state = QueryState(torch.empty(1, 2, 16), {RAW_RADIUS: raw})
-    found = _made(RayBiasedCrossAttention).sigma_sq(state)
+    found = made(RayBiasedCrossAttention).sigma_sq(state)
     assert_close(found, torch.tensor([[[1e-3], [4.0]]]))
-    fixed = _made(RayBiasedCrossAttention, bandwidth="fixed")
+    fixed = made(RayBiasedCrossAttention, bandwidth="fixed")
     assert fixed.sigma_sq(state) == pytest.approx(0.01)
     assert RAW_RADIUS not in RayBiasedCrossAttention.fields_read(fixed.config)
 

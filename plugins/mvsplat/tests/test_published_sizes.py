@@ -1,7 +1,5 @@
 """Parameters counted part by part, and recipes read from names and shapes."""
 
-from pathlib import Path
-
 import pytest
 from qgs_mvsplat.depthsplat_weights import DEPTHSPLAT
 from qgs_mvsplat.weights import MVSPLAT
@@ -9,7 +7,6 @@ from qgs_mvsplat.weights import MVSPLAT
 from qgs.composer import resolve
 from qgs.contracts import LayoutError
 
-RECIPES = Path(__file__).parents[3] / "recipes"
 PUBLISHED = {
     "mvsplat/re10k": """
         tensors                                      471
@@ -88,7 +85,7 @@ MISSING = {
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_the_published_models(name):
-    recipe = resolve(RECIPES / f"{name}.yaml")
+    recipe = resolve(f"{name}.yaml")
     model = recipe.build_model("meta")
     state = model.state_dict()
     sizes = dict(line.split() for line in PUBLISHED[name].strip().splitlines())

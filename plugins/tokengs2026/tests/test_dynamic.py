@@ -2,7 +2,6 @@
 
 import math
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
@@ -10,17 +9,16 @@ from odd_views import odd_views
 from qgs_tokengs2026.dynamic import MOVES, BlockCausalSelfAttention, DynamicQueries
 from qgs_tokengs2026.multiscale import MultiscaleViT
 from qgs_tokengs2026.times import TimeEmbedding, time_features
+from small_parts import made
 from torch.testing import assert_close
 
 from qgs.composer import RecipeError, resolve
-from qgs.contracts import ModelDims
 from qgs.contracts.schedule import follow
 from qgs.engine.training_pass import TrainingPass
 from qgs.types import ImageMemory, LayerPrediction, Photos
 
-PUBLISHED = Path(__file__).parents[3] / "recipes/tokengs/dynamic.yaml"
+PUBLISHED = "tokengs/dynamic.yaml"
 
-DIMS = ModelDims(width=16, heads=2, depth=1)
 MEMORY = ImageMemory(torch.zeros(2, 3, 16))
 
 
@@ -49,7 +47,7 @@ TARGETS = INPUTS.select([0]).replace(target_time=None)
 
 def dynamic_queries(**options):
     """Whose embedding of times is no longer zero."""
-    queries = DynamicQueries(DynamicQueries.Config(count=7, **options), DIMS)
+    queries = made(DynamicQueries, count=7, **options)
     torch.nn.init.normal_(queries.time_embedding.proj.weight)
     return queries
 
@@ -99,7 +97,7 @@ def test_what_reads_dynamic_queries_is_refused_without_them():
 
 def test_static_queries_do_not_see_dynamic_ones():
     state = dynamic_queries(dynamic=3)(MEMORY, views(target=torch.zeros(2, 1)))
-    attention = BlockCausalSelfAttention(BlockCausalSelfAttention.Config(), DIMS)
+    attention = made(BlockCausalSelfAttention)
     told = attention.explain(state, torch.arange(7))
     seen = torch.ones(7, 7).bool()
     seen[:4, 4:] = False
@@ -176,9 +174,7 @@ def test_no_loss_may_have_the_term_of_the_objective(model):
 
 def test_larger_patches_embed_times_as_smaller_ones():
     options = {"depth": 1, "blocks": (1,), "time_channels": 2}
-    small, large = (
-        MultiscaleViT(MultiscaleViT.Config(patch_size=side, **options), DIMS) for side in (4, 8)
-    )
+    small, large = (made(MultiscaleViT, patch_size=side, **options) for side in (4, 8))
     torch.nn.init.normal_(small.time_embedding.proj.weight)
     large.load_state_dict(large.adapted(small.state_dict()))
     times = torch.rand(2, 3)
