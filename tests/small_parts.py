@@ -1,9 +1,22 @@
 """Components of a small model."""
 
+import torch
+from torch import nn
+
 from qgs.contracts import ModelDims
 
 DIMS = ModelDims(width=16, heads=2, depth=2)
+AS_IT_IS = nn.Identity()
 
 
 def made(component, dims=DIMS, **options):
     return component(component.Config(**options), dims)
+
+
+def attended(q, k, v, q_norm=AS_IT_IS, k_norm=AS_IT_IS):
+    """What queries read with two heads of 8 numbers each, head by head."""
+    read = []
+    for head in (slice(0, 8), slice(8, 16)):
+        logits = q_norm(q[..., head]) @ k_norm(k[..., head]).mT / 8**0.5
+        read.append(logits.softmax(-1) @ v[..., head])
+    return torch.cat(read, -1)

@@ -5,7 +5,7 @@ import math
 import torch
 from qgs_c3g.head import C3GHead
 from qgs_c3g.joint import JointLayer
-from small_parts import DIMS, made
+from small_parts import DIMS, attended, made
 from torch.testing import assert_close
 
 from qgs import QueryState
@@ -14,13 +14,9 @@ from qgs.types import ImageMemory
 
 
 def by_formula(made, tokens):
-    """Attention of all tokens head by head, then the MLP."""
-    q, k, v = made.qkv(made.norm(tokens)).split(16, -1)
-    read = []
-    for head in (slice(0, 8), slice(8, 16)):
-        logits = q[..., head] @ k[..., head].mT / math.sqrt(8)
-        read.append(logits.softmax(-1) @ v[..., head])
-    result = tokens + made.proj(torch.cat(read, -1))
+    """Attention of all tokens, then the MLP."""
+    read = attended(*made.qkv(made.norm(tokens)).split(16, -1))
+    result = tokens + made.proj(read)
     return result + made.mlp(made.mlp_norm(result))
 
 

@@ -1,6 +1,5 @@
 """Losses, view by view; the objective: what passes see, what is compared, who gets the gradient."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -52,7 +51,7 @@ GIVEN, NOTHING, _, _ = inputs_of(Case(Frustum.Config()), Sizes(queries=3, gaussi
 
 
 def test_the_input_cameras_count_and_no_others():
-    away = replace(VIEWS, cameras=replace(VIEWS.cameras, c2w=-VIEWS.cameras.c2w))
+    away = VIEWS.replace(cameras=VIEWS.cameras.replace(c2w=-VIEWS.cameras.c2w))
     loss = Frustum(Frustum.Config())
     pairs = ((away, VIEWS), (VIEWS, VIEWS), (VIEWS, away))
     one, other, turned = (loss(GIVEN, NOTHING, *pair)["frustum"] for pair in pairs)
@@ -61,7 +60,7 @@ def test_the_input_cameras_count_and_no_others():
 
 def test_losses_are_means_over_gaussians_of_tokens_that_decode_some():
     mask = torch.tensor([[True, True, False], [True, False, False]])
-    rest = (replace(GIVEN, state=replace(GIVEN.state, mask=mask)), NOTHING, VIEWS, VIEWS)
+    rest = (GIVEN.replace(state=GIVEN.state.replace(mask=mask)), NOTHING, VIEWS, VIEWS)
 
     def mean(x):
         return (x[0, :4].mean() + x[1, :2].mean()) / 2

@@ -8,7 +8,7 @@ import torch
 from odd_views import odd_views
 from qgs_globalsplat.encoder import PosedPatches
 from qgs_globalsplat.streams import TEXTURE, Round, SlotQueries
-from small_parts import DIMS, made
+from small_parts import DIMS, attended, made
 from torch.nn.functional import gelu
 from torch.testing import assert_close
 
@@ -70,15 +70,6 @@ def test_extra_tokens_stay_extra_when_slots_are_added():
     assert torch.equal(many.extra, few.extra)
     assert torch.equal(many.slots[:4], few.slots)
     assert_close(many.slots[4:8], few.slots, atol=0.06, rtol=0)
-
-
-def attended(q, k, v, q_norm, k_norm):
-    """Head by head."""
-    found = []
-    for part in (slice(0, 8), slice(8, 16)):
-        logits = q_norm(q[..., part]) @ k_norm(k[..., part]).mT / 8**0.5
-        found.append(logits.softmax(-1) @ v[..., part])
-    return torch.cat(found, -1)
 
 
 def mlp(x, layers):

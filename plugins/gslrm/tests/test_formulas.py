@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from odd_views import odd_views
 from qgs_gslrm.encoder import Transformer
 from qgs_gslrm.pixels import PATCH, AlongRays, PixelHead, PixelQueries, patch_rays_at, patches
-from small_parts import made
+from small_parts import attended, made
 from torch.testing import assert_close
 
 from qgs.contracts import ModelDims
@@ -61,12 +61,7 @@ def test_means_lie_on_the_rays_of_their_pixels():
 
 
 def by_formula(block, x):
-    q, k, v = block.qkv(F.layer_norm(x, (16,))).split(16, -1)
-    read = []
-    for head in (slice(0, 8), slice(8, 16)):
-        logits = q[..., head] @ k[..., head].mT / math.sqrt(8)
-        read.append(logits.softmax(-1) @ v[..., head])
-    x = x + block.proj(torch.cat(read, -1))
+    x = x + block.proj(attended(*block.qkv(F.layer_norm(x, (16,))).split(16, -1)))
     return x + block.fc2(F.gelu(block.fc1(F.layer_norm(x, (16,)))))
 
 

@@ -25,11 +25,9 @@ from qgs.geometry.harmonics import SH_C0, harmonics
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.io.tensors import shapes_of
 
-FILES = [
-    *("mvsplat_a", "mvsplat_views3_a", "mvsplat_cases_a"),
-    *("depthsplat_a", "depthsplat_base_a", "depthsplat_base_eighth_a"),
-    *("depthsplat_small_eighth_views4_a", "depthsplat_cases_a"),
-]
+FILES = ("mvsplat_a", "mvsplat_views3_a", "mvsplat_cases_a", "depthsplat_a", "depthsplat_base_a",
+         "depthsplat_base_eighth_a", "depthsplat_small_eighth_views4_a",
+         "depthsplat_cases_a")  # fmt: skip
 
 
 def read(name):
@@ -50,25 +48,18 @@ def directions(count):
 
 def test_every_tensor():
     """But of the release's data loader: it crops to whole pixels, sources of photos here do not."""
-    wrong = []
-    for name in FILES:
-        golden = read(name)
+    for golden in map(read, FILES):
         rows = parity.compared(golden)
-        wrong += [(name, row) for row in rows if row.problem]
+        assert [row for row in rows if row.problem] == []
         assert {row.name for row in rows} == {*golden.promised()}
-    assert wrong == []
-
-
-def released_weights(golden):
-    """As the release publishes them."""
-    return {f"encoder.{name}": x for name, x in weights_of(golden).items()}
 
 
 @pytest.mark.parametrize("name", ["mvsplat_views3_a", "depthsplat_base_eighth_a"])
 def test_a_published_file_gives_the_released_gaussians(name, monkeypatch):
     """Of the recipe that fits, in worlds in which no camera stands at the origin."""
     golden = read(name)
-    weights, views = released_weights(golden), views_of(golden)
+    weights = {f"encoder.{name}": x for name, x in weights_of(golden).items()}
+    views = views_of(golden)
     tree = fitting_recipe(shapes_of(weights), name)[1]
     model = qgs.compose(tree).eval()
     model.load_state_dict(names_of(resolve(tree)).from_published(weights))
@@ -84,19 +75,16 @@ def test_a_published_file_gives_the_released_gaussians(name, monkeypatch):
     seen, sh = directions(50).float(), theirs["harmonics"][..., :16]
     turned = harmonics(seen[:, [2, 0, 1]], sh.shape[-1] - 1) @ sh[..., 1:].mT
     colours = ours.colors[..., None, :] + harmonics(seen, ours.sh.shape[-2]) @ ours.sh
-    for found, wanted in (
-        (ours.means, theirs["means"]),
-        (factors @ factors.mT, theirs["covariances"]),
-        (ours.opacities, theirs["opacities"]),
-        (colours, 0.5 + SH_C0 * sh[..., None, :, 0] + turned),
-    ):
-        assert_close(found, wanted, rtol=RTOL, atol=ATOL)
+    found = (ours.means, factors @ factors.mT, ours.opacities, colours)
+    wanted = [theirs[name] for name in ("means", "covariances", "opacities")]
+    wanted.append(0.5 + SH_C0 * sh[..., None, :, 0] + turned)
+    assert_close(found, (*wanted,), rtol=RTOL, atol=ATOL)
 
 
 def test_harmonics_are_orthonormal_and_those_of_3dgs_but_for_signs_and_axes():
     seen = directions(40_000)
     values = e3nn_harmonics(seen, 4)
-    gram = values.mT @ values / len(values)
+    gram = values.mT @ values / 40_000
     assert_close(gram, torch.eye(25).double(), rtol=0, atol=0.06)
     sign = (-1.0) ** torch.arange(1, 16)
     ours = harmonics(seen[:, [2, 0, 1]], 15) * (4 * torch.pi) ** 0.5
