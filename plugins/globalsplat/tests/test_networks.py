@@ -8,7 +8,7 @@ import torch
 from odd_views import odd_views
 from qgs_globalsplat.encoder import PosedPatches
 from qgs_globalsplat.streams import TEXTURE, Round, SlotQueries
-from small_parts import DIMS, attended, made
+from small_parts import DIMS, attended, made, shaken
 from torch.nn.functional import gelu
 from torch.testing import assert_close
 
@@ -92,10 +92,7 @@ def one_stream(stream, x, memory):
 
 def test_a_round_is_two_streams_and_a_mixer():
     """Tokens that decode nothing are read as well."""
-    layer = Round(Round.Config(memory_width=10), LayerParts(DIMS, {}, 0.5)).double()
-    with torch.no_grad():
-        for parameter in layer.parameters():  # nothing hides behind an initial 0
-            parameter += 0.3 * torch.randn_like(parameter)
+    layer = shaken(made(Round, LayerParts(DIMS, {}, 0.5), memory_width=10))
     memory = ImageMemory(torch.randn(2, 7, 10).double())
     x, y = torch.randn(2, 2, 5, 16).double()
     state = QueryState(x, {TEXTURE: y}, torch.tensor([True] * 4 + [False]).expand(2, -1))
@@ -111,7 +108,7 @@ def test_a_round_is_two_streams_and_a_mixer():
 
 
 def test_scales_start_as_published():
-    layer = Round(Round.Config(), LayerParts(DIMS, {}, 1e-3))
+    layer = made(Round, LayerParts(DIMS, {}, 1e-3))
     found = Counter(
         (".blocks." in name, f"{parameter.unique().item():.3f}")
         for name, parameter in layer.named_parameters()

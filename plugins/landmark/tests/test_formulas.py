@@ -12,7 +12,7 @@ from qgs_landmark.refinement import FramedRefinement
 from qgs_landmark.rendered import RenderedFeedback
 from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
 from qgs_locus.refinement import AnchorRefinement
-from small_parts import made
+from small_parts import made, shaken
 from torch.testing import assert_close
 
 from qgs.components.blocks import split_heads
@@ -44,13 +44,11 @@ HALVED = Views(
 MEMORY = ImageMemory(drawn(1, 2, TOKENS, 16), grid=GRID)
 
 
+@torch.no_grad()
 def started(**options):
-    torch.manual_seed(0)
     queries = made(ObservedQueries, **options).double().eval()
-    with torch.no_grad():
-        for parameter in queries.depth_mlp.parameters():
-            parameter += 0.3 * torch.randn_like(parameter)
-        return queries, queries(MEMORY, VIEWS)
+    shaken(queries.depth_mlp)
+    return queries, queries(MEMORY, VIEWS)
 
 
 def in_photos(state, view_N):
@@ -190,12 +188,7 @@ def test_neighbours_are_the_nearest(monkeypatch):
 
 
 def attention(count):
-    torch.manual_seed(0)
-    module = made(NeighbourAttention, count=count).double()
-    with torch.no_grad():
-        for parameter in module.parameters():
-            parameter += 0.1 * torch.randn_like(parameter)
-    return module
+    return shaken(made(NeighbourAttention, count=count), 0.1)
 
 
 @pytest.mark.parametrize("count", [6, 100])
@@ -225,7 +218,6 @@ def test_nobody_reads_what_is_no_query():
 
 
 def test_errors_are_added_to_keys_and_values():
-    torch.manual_seed(0)
     feedback = made(RenderedFeedback, shrink=2, cells=2).double()
     with torch.no_grad():
         feedback.marker += torch.randn(16)
