@@ -58,9 +58,8 @@ def differentiate(renderer, gaussians, cameras):
     lenses = Cameras(leaves["c2w"], leaves["intrinsics"], cameras.size)
     rendering = renderer(Gaussians(**{name: leaves[name] for name in names}), lenses)
     leaves = {name: leaf for name, leaf in leaves.items() if leaf.requires_grad}
-    generator = torch.Generator().manual_seed(1)
     images = [image for _, image in named_tensors(rendering)]
-    weights = [torch.rand(x.shape, generator=generator, dtype=torch.float64) for x in images]
-    slopes = [weight.to(image) for weight, image in zip(weights, images, strict=True)]
-    grads = torch.autograd.grad(images, list(leaves.values()), slopes)
+    torch.manual_seed(1)
+    slopes = [torch.rand(image.shape, dtype=torch.float64).to(image) for image in images]
+    grads = torch.autograd.grad(images, [*leaves.values()], slopes)
     return rendering, dict(zip(leaves, grads, strict=True))

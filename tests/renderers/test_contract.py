@@ -70,7 +70,7 @@ def extremes(gaussians):
         return gaussians.replace(means=means)
 
     means = gaussians.means
-    depths = torch.logspace(-1.5, 2, means.shape[1])[torch.randperm(means.shape[1])][:, None]
+    depths = torch.logspace(-1.5, 2, 12)[torch.randperm(12)][:, None]
     flat = means * torch.tensor([0.01, 0.01, 0.0])
     return {
         "behind": times("means", 1.0, 1.0, -1.0),
@@ -104,38 +104,32 @@ def test_extreme_gaussians_are_finite_and_exact_or_unseen(build):
 
 def test_zero_gaussians_show_the_background(build):
     gaussians, cameras = make_scene(count=4, batch=2, views=2, harmonics=3, features=4)
-    renderer = build(background=(0.1, 0.2, 0.3))
-    rendering, gradients = differentiate(renderer, gaussians[:, :0], cameras)
-    expected = torch.tensor([0.1, 0.2, 0.3])[:, None, None].expand_as(rendering.rgb)
+    colour = (0.1, 0.2, 0.3)
+    rendering, gradients = differentiate(build(background=colour), gaussians[:, :0], cameras)
+    expected = torch.tensor(colour)[:, None, None].expand_as(rendering.rgb)
     assert_close(rendering.rgb, expected)
     for nothing in (rendering.alpha, rendering.depth, rendering.features, *gradients.values()):
-        assert nothing.eq(0).all()
+        assert not nothing.any()
 
 
 def test_near_and_far_are_inclusive(build):
-    z = torch.tensor([0.5, 0.4999, 4.0, 4.001])[:, None, None]
-    gaussians = make_scene(4, count=1)[0].replace(means=z * torch.tensor([0.0, 0.0, 1.0]))
+    z = torch.tensor([0.5, 0.4999, 4.0, 4.001])
+    gaussians = make_scene(4, count=1)[0].replace(means=z[:, None, None] * torch.eye(3)[2])
     alpha = build(near=0.5, far=4.0)(gaussians, fixed_cameras(4)).alpha
     assert alpha.flatten(1).any(1).tolist() == [True, False, True, False]
 
 
-OPTIONS = {
+OPTIONS = {  # the kernels of gsplat fix the last three
     "near": 2.0, "far": 2.5, "dilation": 2.0, "background": (0.0, 1.0, 0.0),
     "alpha_min": 0.2, "alpha_cap": 0.5, "transmittance_min": 0.3
 }  # fmt: skip
 
 
 def test_every_option_has_its_effect(build):
-    scene, plain, refused = make_scene(scale=0.2), build(), []
-    for option, value in OPTIONS.items():
-        try:
-            renderer = build(**{option: value})
-        except ValueError:
-            refused.append(option)
-            continue
-        rendering, _ = compared(renderer, scene, **{option: value})
+    scene, plain = make_scene(scale=0.2), build()
+    for option, value in [*OPTIONS.items()][: 4 if plain.kind == "gsplat" else None]:
+        rendering, _ = compared(build(**{option: value}), scene, **{option: value})
         assert (rendering.rgb - plain(*scene).rgb).abs().max() > 1e-2, option
-    assert refused == (list(OPTIONS)[4:] if plain.kind == "gsplat" else [])
 
 
 def test_opaque_layers_stop_the_ray(build):
@@ -144,8 +138,7 @@ def test_opaque_layers_stop_the_ray(build):
     rendering, gradients = compared(build(), (gaussians, cameras), 1e-4, 1e-3)
     assert rendering.alpha.min() > 0.99
     assert rendering.alpha.max() < 1 - 1e-4 + 1e-6
-    last = gaussians.means[0, :, 2].argmax()
-    assert gradients["colors"][0, last].eq(0).all()
+    assert not gradients["colors"][0, gaussians.means[0, :, 2].argmax()].any()
     gaussians, cameras = make_scene(count=1, scale=50.0)
     capped = build()(gaussians.replace(opacities=torch.ones(1, 1)), cameras).alpha
     assert_close(capped.max(), torch.tensor(0.999))
@@ -158,9 +151,7 @@ def test_autocast_and_half_precision_render_in_float32(build):
         rendering = build()(gaussians, cameras)
     assert_close(rendering.rgb, expected.rgb)
     half = gaussians.replace(colors=gaussians.colors.bfloat16())
-    rendering = build()(half, cameras)
-    assert rendering.rgb.dtype == torch.float32
-    assert_close(rendering.rgb, expected.rgb, rtol=0, atol=1e-2)
+    assert_close(build()(half, cameras).rgb, expected.rgb, rtol=0, atol=1e-2)
 
 
 def test_mismatches_are_named(build):

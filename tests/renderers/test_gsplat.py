@@ -43,9 +43,9 @@ def test_arguments_are_what_gsplat_expects(calls):
     fx, fy, cx, cy = cameras.intrinsics[1, 2]
     lens = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     assert torch.equal(found.pop("Ks")[1, 2], lens)
+    assert found.pop("render_mode") == "RGB+ED"
     features = gaussians.features[:, None].expand(2, 3, 7, 2)
     backdrop = torch.tensor([0.1, 0.2, 0.3, 0, 0]).expand(2, 3, 5)
-    assert found.pop("render_mode") == "RGB+ED"
     expected = {
         **{name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities")},
         "colors": torch.cat([seen_colors(gaussians, cameras), features], -1),
@@ -63,11 +63,9 @@ def test_arguments_are_what_gsplat_expects(calls):
     assert torch.equal(of_unharmonic["colors"], plain)
     assert torch.equal(of_bare["colors"], gaussians.colors)
     assert torch.equal(of_bare["backgrounds"], backdrop[..., :3])
-    channels = torch.arange(6.0)[:, None, None].expand(2, 3, 6, 12, 20)
-    images = [rendering.rgb, rendering.features, rendering.depth]
+    channels = torch.tensor([0, 1, 2, 3, 4, 5, 0.25, 3])[:, None, None].expand(2, 3, 8, 12, 20)
+    images = [rendering.rgb, rendering.features, rendering.depth, rendering.alpha, bare.depth]
     assert torch.equal(torch.cat(images, 2), channels)
-    assert torch.equal(rendering.alpha, torch.full((2, 3, 1, 12, 20), 0.25))
-    assert torch.equal(bare.depth, channels[:, :, 3:4])
     render(gaussians[:, :0], cameras)
     assert len(calls) == 3, "kernels divide by the number of Gaussians"
 
