@@ -10,6 +10,7 @@ from qgs_worlds.intervals import clearances
 from qgs_worlds.materials import height_maps
 from qgs_worlds.raycast import trace
 from qgs_worlds.shapes import Primitive, Shape, any_turn, packed, rod
+from scipy.ndimage import map_coordinates
 
 MAPS = height_maps(3, 2)
 T = np.linspace(0, 6, 6000)
@@ -24,30 +25,23 @@ def met(rows, maps, origin, way):
     return trace(1, 1, 0, 1, rows, maps, c2w, np.array([100.0, 100.0, 0.5, 0.5]))[0][0, 0] / length
 
 
-def relief(x, y, field):
-    """Bilinear heights at x, y in [-1, 1]."""
-    last = len(field) - 1
-    a, b = ((np.clip(p, -1, 1) + 1) / 2 * last for p in (x, y))
-    i, j = (np.minimum(p.astype(int), last - 1) for p in (a, b))
-    a, b = a - i, b - j
-    low = field[i, j] * (1 - b) + field[i, j + 1] * b
-    return low * (1 - a) + (field[i + 1, j] * (1 - b) + field[i + 1, j + 1] * b) * a
-
-
 def inside(primitive, points):
     """Negative inside of a primitive, positive outside."""
     turn = np.array(primitive.turn).reshape(3, 3)
     x, y, z = ((points - primitive.center) @ turn / primitive.half).T
     extra, flat = primitive.extra, np.hypot(x, y)
-    cube = np.maximum(np.maximum(abs(x), abs(y)), abs(z)) - 1
+    cube = abs(np.stack([x, y, z])).max(0) - 1
+    field = MAPS[int(extra)]
+    places = (np.stack([x, y]) + 1) / 2 * (len(field) - 1)
+    relief = map_coordinates(field, places, order=1, mode="nearest")
     return {
-        r.ELLIPSOID: lambda: x * x + y * y + z * z - 1,
-        r.BOX: lambda: cube,
-        r.FRUSTUM: lambda: np.maximum(abs(z) - 1, flat - (1 + extra + (extra - 1) * z) / 2),
-        r.CAPSULE: lambda: np.hypot(flat, z - np.clip(z, -extra, extra)) - 1,
-        r.TORUS: lambda: np.hypot(flat - 1 + extra, z) - extra,
-        r.HEIGHT: lambda: np.maximum(cube, z - relief(x, y, MAPS[int(extra)])),
-    }[primitive.kind]()
+        r.ELLIPSOID: x * x + y * y + z * z - 1,
+        r.BOX: cube,
+        r.FRUSTUM: np.maximum(abs(z) - 1, flat - (1 + extra + (extra - 1) * z) / 2),
+        r.CAPSULE: np.hypot(flat, z - np.clip(z, -extra, extra)) - 1,
+        r.TORUS: np.hypot(flat - 1 + extra, z) - extra,
+        r.HEIGHT: np.maximum(cube, z - relief),
+    }[primitive.kind]
 
 
 def first(shape, origin, way):

@@ -68,17 +68,17 @@ def test_cameras_are_rigid_and_keep_clear_of_every_surface(scenes):
         c2w = scene.drawn.rig.c2w
         turn = c2w[:, :3, :3]
         assert clearances(scene.drawn.world.shapes, c2w[:, :3, 3]).min() > 0.15
-        assert np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max() < 1e-9
+        assert np.linalg.inv(turn) == pytest.approx(turn.transpose(0, 2, 1), abs=1e-9)
         assert np.linalg.det(turn).min() > 0.99
         assert turn[:, 2, 1].max() < 0, "the image's y axis points down"
 
 
 def test_what_is_drawn_is_spread(scenes):
     rigs = [scene.drawn.rig for scene in scenes]
-    fov = np.array([rig.fov for rig in rigs])
-    assert 18 <= fov.min() < 23 < 85 < fov.max() <= 90
-    eyes = np.stack([rig.c2w[:, :3, 3] for rig in rigs])
-    widest = np.linalg.norm(eyes[:, :, None] - eyes[:, None], axis=-1).max((1, 2))
+    c2w = np.stack([rig.c2w for rig in rigs])
+    fov = [rig.fov for rig in rigs]
+    assert 18 <= min(fov) < 23 < 85 < max(fov) <= 90
+    widest = np.linalg.norm(np.ptp(c2w[..., :3, 3], 1), axis=-1)
     low, middle, high = np.quantile(widest, (0.02, 0.5, 0.98))
     assert high / low > 100
     assert 0.1 < middle < 2
@@ -86,17 +86,17 @@ def test_what_is_drawn_is_spread(scenes):
     kinds = [scene.drawn.place.kind for scene in scenes]
     assert all(kinds.count(kind) > 10 for kind in KINDS)
     shapes = np.concatenate([scene.drawn.world.shapes for scene in scenes])
-    assert {*shapes[:, r.KIND].astype(int)} == set(range(6))
+    assert {*shapes[:, r.KIND]} == {*range(6)}
     assert (shapes[:, r.PRIMITIVE_FIELDS] >= 0).mean() > 0.05
-    roll = np.degrees([np.arcsin(rig.c2w[:, 2, 0]) for rig in rigs])
+    roll = np.degrees(np.arcsin(c2w[..., 2, 0]))
     assert 3 < np.abs(roll).max() < 20
 
 
 def test_few_views_are_featureless_or_all_sky(scenes):
-    images = torch.cat([scene.images([1, 6]) for scene in scenes]).mean(1)
-    assert (images.flatten(1).std(1) < 0.03).float().mean() < 0.1
-    sky = torch.cat([scene.depths([1, 6]) for scene in scenes]) == 0
-    assert (sky.flatten(1).float().mean(1) > 0.8).float().mean() < 0.05
+    images = torch.cat([scene.images([1, 6]) for scene in scenes]).mean(1).flatten(1)
+    assert images.std(1).quantile(0.1) > 0.03
+    depths = torch.cat([scene.depths([1, 6]) for scene in scenes]).flatten(1)
+    assert depths.quantile(0.8, 1).quantile(0.05) > 0
     assert 0.3 < images.mean() < 0.6
 
 
@@ -123,9 +123,9 @@ def test_plain_parts(plain):
     for drawn in plain["shapes"]:
         assert drawn.place.kind == "indoors"
         inner = drawn.world.shapes[drawn.place.fixed :]
-        assert {*inner[:, r.KIND].astype(int)} <= {r.BOX, r.ELLIPSOID, r.FRUSTUM}
+        assert {*inner[:, r.KIND]} <= {r.BOX, r.ELLIPSOID, r.FRUSTUM}
         assert (drawn.world.shapes[:, r.PRIMITIVE_FIELDS] == r.NOTHING).all(), "closed"
-        assert np.abs(inner[:, [r.MATRIX + k for k in (2, 5, 6, 7)]]).max() == 0, "upright"
+        assert not inner[:, [r.MATRIX + k for k in (2, 5, 6, 7)]].any(), "upright"
     for drawn in plain["textures"]:
         assert drawn.world.textures[:, r.OCTAVES].max() <= 1
         assert r.GLYPHS not in drawn.world.textures[:, r.PATTERN]
