@@ -117,12 +117,11 @@ def test_every_difference_is_listed_at_once():
     weights |= {"stranger": torch.zeros(1), "gs_anchor_xyz_raw": torch.zeros(1)}
     with pytest.raises(PublishedError) as caught:
         known.from_published(weights)
-    assert [line.strip() for line in str(caught.value).splitlines()[1:]] == [
-        "missing: gs_tokens",
-        "unexpected: stranger",
-        "unexpected: gs_anchor_xyz_raw",
-        "shape of activation_head.deconv.bias: (3,) in the file, (56,) in the recipe",
-    ]
+    assert str(caught.value).endswith("""
+  missing: gs_tokens
+  unexpected: stranger
+  unexpected: gs_anchor_xyz_raw
+  shape of activation_head.deconv.bias: (3,) in the file, (56,) in the recipe""")
 
 
 def test_other_precisions_are_converted_only_on_demand(tmp_path):
@@ -144,9 +143,8 @@ def test_parameters_that_share_memory_or_lie_in_strides(tmp_path):
     weights = dict(TOKENGS_A)
     tied = [name for name in weights if name.endswith("q_norm.weight")]
     weights |= dict.fromkeys(tied, weights[tied[0]])
-    turned = weights["enc_dec_backbone.kv_proj.weight"].t().contiguous().t()
-    assert not turned.is_contiguous()
-    weights["enc_dec_backbone.kv_proj.weight"] = turned
+    strided = "enc_dec_backbone.kv_proj.weight"
+    weights[strided] = weights[strided].t().contiguous().t()
     torch.save(weights, tmp_path / "w.pt")
     done = import_weights(tmp_path / "w.pt", None, tmp_path / "c.safetensors")
     ours = load_file(tmp_path / "c.safetensors")
