@@ -21,24 +21,18 @@ TEXTURES = torch.randn(1, 3, 16, 48, generator=DRAW).double()
 STATE = QueryState(torch.randn(2, 5, 16), {TEXTURE: torch.randn(2, 5, 16)})
 
 
-def head(**options):
-    return made(MergingHead, **options)
-
-
 def orthonormal(six):
     """Gram and Schmidt: the columns of a rotation."""
-    a, b = six.double().view(2, 3)
-    a = a / a.norm()
-    b = b - (a @ b) * a
-    b = b / b.norm()
+    q, r = torch.linalg.qr(six.double().view(2, 3).T)
+    a, b = (q * r.diagonal().sign()).T
     return torch.stack([a, b, torch.linalg.cross(a, b)], 1)
 
 
 def one_gaussian(block, colours):
     """Of raw candidates (S, 14) and coefficients (S, 48), by the formulas of the paper."""
-    gates = block[:, 13].exp() / block[:, 13].exp().sum()
+    gates = block[:, 13].softmax(0)
     log_scale = (block[:, 3:6] - 2).clip(LOW, HIGH)
-    opacity = 1 / (1 + (5 - block[:, 12]).exp())
+    opacity = (block[:, 12] - 5).sigmoid()
     sh = (gates @ colours).view(16, 3)
     return (
         gates @ block[:, :3],
@@ -52,7 +46,7 @@ def one_gaussian(block, colours):
 
 def test_blocks_are_merged_by_the_formulas():
     for level in range(5):
-        out = head(level=level).activate(GEOMETRY, TEXTURES)
+        out = made(MergingHead, level=level).activate(GEOMETRY, TEXTURES)
         places = (out.offsets, out.scales, quat_to_matrix(out.quats))
         for token in range(3):
             blocks = (x[0, token].chunk(2**level) for x in (GEOMETRY, TEXTURES))
@@ -63,18 +57,18 @@ def test_blocks_are_merged_by_the_formulas():
 
 def test_a_blend_shows_both_levels():
     levels = (1, 1.25, 2)
-    coarse, blend, fine = (head(level=x).activate(GEOMETRY, TEXTURES) for x in levels)
+    coarse, blend, fine = (made(MergingHead, level=x).activate(GEOMETRY, TEXTURES) for x in levels)
     assert_close(blend.offsets, torch.cat([coarse.offsets, fine.offsets], 2))
     clear = torch.cat([(1 - coarse.opacities) ** 0.75, (1 - fine.opacities) ** 0.25], 2)
     assert_close(1 - blend.opacities, clear)
 
 
 def test_the_published_level_grows_with_the_steps():
-    made = head(level=0.0)
+    head = made(MergingHead)
     for level, count in ((0.0, 1), (0.5, 3), (1.0, 2), (2.875, 12), (3.0, 8)):
-        made.config = made.config.model_copy(update={"level": level})
-        assert made.gaussians_per_query == count
-        assert made(STATE).offsets.shape == (2, 5, count, 3)
+        head.config = head.config.model_copy(update={"level": level})
+        assert head.gaussians_per_query == count
+        assert head(STATE).offsets.shape == (2, 5, count, 3)
 
 
 def test_quaternions_of_all_rotations():
@@ -89,7 +83,7 @@ def test_quaternions_of_all_rotations():
 
 
 def test_what_tells_no_rotation_still_gives_a_unit_quaternion():
-    same, second = [1.0, 2, 3, 1, 2, 3], [0.0, 0, 0, 1, 0, 0]
+    same, second = [1.0, 2, 3] * 2, [0.0, 0, 0, 1, 0, 0]
     vectors = torch.tensor([[0.0] * 6, same, second, [1e-9] * 6], requires_grad=True)
     quats = rotation_6d(vectors)
     assert_close(quats.norm(dim=-1), torch.ones(4))
@@ -98,22 +92,21 @@ def test_what_tells_no_rotation_still_gives_a_unit_quaternion():
 
 
 def test_the_head_reads_both_streams_after_their_norms():
-    made = head(candidates=4, level=2)
-    geometry = made.geometry(layer_norm(STATE.features, (16,))).unflatten(-1, (4, 14))
-    texture = made.texture(layer_norm(STATE[TEXTURE], (16,))).unflatten(-1, (4, 48))
-    out, wanted = made(STATE), made.activate(geometry, texture)
-    assert torch.equal(out.sh, wanted.sh)
-    assert torch.equal(out.scales, wanted.scales)
+    head = made(MergingHead, candidates=4, level=2)
+    geometry = head.geometry(layer_norm(STATE.features, (16,))).unflatten(-1, (4, 14))
+    texture = head.texture(layer_norm(STATE[TEXTURE], (16,))).unflatten(-1, (4, 48))
+    out, wanted = head(STATE), head.activate(geometry, texture)
+    assert_close((out.sh, out.scales), (wanted.sh, wanted.scales), rtol=0, atol=0)
 
 
 def test_weights_start_as_told():
-    made = head(candidates=64, level=6, init_std=0.1, position_std=0.5)
-    rows = made.geometry.weight.unflatten(0, (64, 14))
-    for weights, std in ((rows[:, :3], 0.5), (rows[:, 3:], 0.1), (made.texture.weight, 0.1)):
+    head = made(MergingHead, candidates=64, level=6, init_std=0.1, position_std=0.5)
+    rows = head.geometry.weight.unflatten(0, (64, 14))
+    for weights, std in ((rows[:, :3], 0.5), (rows[:, 3:], 0.1), (head.texture.weight, 0.1)):
         assert weights.std().item() == pytest.approx(std * 0.99, rel=0.05)
-    assert not made.geometry.bias.any() | made.texture.bias.any()
+    assert not head.geometry.bias.any() | head.texture.bias.any()
 
 
 def test_degrees():
     for degree, count in ((1, 3), (2, 8), (3, 15)):
-        assert head(sh_degree=degree)(STATE).sh.shape == (2, 5, 8, count, 3)
+        assert made(MergingHead, sh_degree=degree)(STATE).sh.shape == (2, 5, 8, count, 3)

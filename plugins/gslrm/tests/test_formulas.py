@@ -52,10 +52,9 @@ def test_means_lie_on_the_rays_of_their_pixels():
     slant = (directions * ahead).sum(-1, keepdim=True)
     for near, far in ((0.0, 500.0), (0.3, 3.0)):
         t = near * (1 - w) + far * w
-        placed = made(AlongRays, near=near, far=far)(offsets, state)
-        assert_close(placed, origins + t * directions)
-        placed = made(AlongRays, near=near, far=far, measure="depth")(offsets, state)
-        assert_close(placed, origins + t / slant * directions)
+        for options, along in (({}, t), ({"measure": "depth"}, t / slant)):
+            placed = made(AlongRays, near=near, far=far, **options)(offsets, state)
+            assert_close(placed, origins + along * directions)
     state[PATCH].sum().backward()
     assert c2w.grad[..., :3, :].any(-1).all()
 
@@ -104,11 +103,10 @@ def test_the_head_follows_its_formulas():
         head = made(PixelHead, **options)
         raw = head.linear(F.layer_norm(features, (16,))).view(2, 7, 5, channels + 11)
         position, rgb, scale, quats, opacity = raw.split((channels, 3, 3, 4, 1), -1)
-        quats = quats / quats.square().sum(-1, keepdim=True).sqrt()
+        quats = F.normalize(quats, dim=-1)
         quats[0, 0] = torch.eye(4)[0]
         out = head(QueryState(features))
-        assert_close(out.offsets, position.expand(2, 7, 5, 3))
-        assert_close(out.colors, (0.5 + rgb / math.sqrt(4 * math.pi)).clip(0, 1))
-        assert_close(out.scales, (scale + bias).clip(max=limit).exp())
-        assert_close(out.quats, quats)
-        assert_close(out.opacities, torch.sigmoid(opacity[..., 0] + logit))
+        found = (out.offsets, out.colors, out.scales, out.quats, out.opacities)
+        colors = (0.5 + rgb / math.sqrt(4 * math.pi)).clip(0, 1)
+        scale, opacity = (scale + bias).clip(max=limit).exp(), (opacity[..., 0] + logit).sigmoid()
+        assert_close(found, (position.expand(2, 7, 5, 3), colors, scale, quats, opacity))
