@@ -14,7 +14,6 @@ from qgs.components import (
     GaussianHead,
     LayerSupervision,
     MultiViewViT,
-    OffsetCenters,
     posact,
 )
 from qgs.contracts import AttentionWeights, ModelDims, RecipeContext
@@ -55,14 +54,6 @@ def test_head_starts_with_the_spread_and_at_the_depth_it_is_told():
     assert weight[:, 3:].std() == pytest.approx(0.02, rel=0.05)
     offsets = head(QueryState(torch.zeros(1, 1, 256))).offsets
     assert_close(posact(offsets), torch.tensor([0, 0, 0.1]).expand(1, 1, 32, 3))
-
-
-def test_offset_centers_are_the_offsets_further_along_z_in_float32():
-    offsets = torch.randn(2, 5, 1, 3, dtype=torch.bfloat16)
-    for z in (1.0, -2.0):
-        means = made(OffsetCenters, z_offset=z)(offsets, QueryState(torch.zeros(2, 5, 16)))
-        assert means.dtype == torch.float32
-        assert torch.equal(means, offsets.float() + torch.tensor([0.0, 0.0, z]))
 
 
 def test_supervision_weights():

@@ -11,7 +11,7 @@ from qgs_ellipsoid.fields import RAW_RADII, ROTATION, anchor_rotation
 from qgs_ellipsoid.head import AxisScaledCenters, EllipsoidHead, radii_along
 from qgs_ellipsoid.ray_bias import EllipsoidBias, ray_tokens
 from qgs_ellipsoid.refinement import EllipsoidRefinement
-from qgs_ellipsoid.rotations import quat_product, turned
+from qgs_ellipsoid.rotations import turned
 from qgs_locus.anchors import FrustumCenters
 from qgs_locus.fields import CENTER
 from refusals import wrong_refusals
@@ -34,12 +34,6 @@ def _state():
         RAW_RADII: torch.randn(2, 6, 3) - 1,
     }
     return QueryState(torch.randn(2, 6, 16), fields)
-
-
-def test_products_of_quaternions_are_those_of_their_matrices():
-    left, right = F.normalize(torch.randn(2, 7, 4), dim=-1)
-    product = quat_to_matrix(quat_product(left, right))
-    assert_close(product, quat_to_matrix(left) @ quat_to_matrix(right))
 
 
 def test_a_turn_is_about_an_axis_of_the_world_and_never_half_a_turn():

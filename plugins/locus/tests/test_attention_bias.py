@@ -93,20 +93,3 @@ def test_what_is_frozen_gets_no_gradient_and_the_others_get_the_same(monkeypatch
             assert seen.keys() == {"read", *learnt}
             assert {tuple(x is not None for x in pair) for pair in made} == wanted
             assert not wrong(seen, best)
-
-
-def test_rows_that_are_asked_for_are_made_alone(monkeypatch):
-    rows, write = [], AttentionBias.write
-
-    def counting(self, queries, *others):
-        rows.append(len(queries))
-        write(self, queries, *others)
-
-    monkeypatch.setattr(AttentionBias, "write", counting)
-    chosen = torch.tensor([7, 2, 7])
-    for kind, _ in KINDS:
-        bias = kind(torch.randn(2, 9, 5), torch.randn(2, 6, 11))
-        dense = bias.dense()
-        rows.clear()
-        assert torch.equal(bias.dense(chosen), dense[:, chosen])
-        assert rows == [3, 3]

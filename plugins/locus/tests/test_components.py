@@ -1,16 +1,11 @@
 """Anchors, refinement and decoding, each on its own."""
 
-import math
-
-import pytest
 import torch
 import torch.nn.functional as F
 import yaml
 from qgs_locus.anchors import AnchoredQueries, FrustumCenters, NormalCenters
-from qgs_locus.cross_attention import RayBiasedCrossAttention
 from qgs_locus.decoding import AnchorOffsetCenters, RadiusScaledCenters
 from qgs_locus.fields import CENTER, RAW_RADIUS, RadiusOptions, raw_radius_of, support_radius
-from qgs_locus.self_attention import sine_embedding
 from refusals import wrong_refusals
 from small_parts import made
 from torch.testing import assert_close
@@ -61,24 +56,6 @@ def test_centers_follow_their_formulas():
         (RadiusScaledCenters, {"offset": "linear"}, center + radius * offsets),
     ):
         assert_close(made(kind, **options)(offsets, state), expected)
-
-
-def test_sine_embedding_starts_with_the_plain_angle():
-    position = torch.tensor([[-1.0, 0.0, 0.5]])
-    embedding = sine_embedding(position).view(3, 128)
-    angle = (position[0] + 1) * math.pi
-    expected = torch.stack([angle.sin(), angle.cos()], -1)
-    assert_close(embedding[:, :2], expected, atol=1e-5, rtol=0)
-
-
-def test_bandwidths_have_their_floor():
-    raw = torch.tensor([[[-20.0], [20.0]]])
-    state = QueryState(torch.empty(1, 2, 16), {RAW_RADIUS: raw})
-    found = made(RayBiasedCrossAttention).sigma_sq(state)
-    assert_close(found, torch.tensor([[[1e-3], [4.0]]]))
-    fixed = made(RayBiasedCrossAttention, bandwidth="fixed")
-    assert fixed.sigma_sq(state) == pytest.approx(0.01)
-    assert RAW_RADIUS not in RayBiasedCrossAttention.fields_read(fixed.config)
 
 
 RECIPE = yaml.safe_load("""

@@ -11,7 +11,7 @@ from published.comparison import ATOL, RTOL
 from published.files import read_golden
 from published.splats import views_of, weights_of
 from qgs_mvsplat import sweep
-from qgs_mvsplat.adapter import e3nn_harmonics, world_harmonics
+from qgs_mvsplat.adapter import world_harmonics
 from qgs_mvsplat.depthsplat import nearest_neighbours
 from qgs_mvsplat.sweep import feature_lenses, relative_poses
 from qgs_published.layouts import fitting_recipe, names_of
@@ -78,17 +78,6 @@ def test_a_published_file_gives_the_released_gaussians(name, monkeypatch):
     wanted = [theirs[name] for name in ("means", "covariances", "opacities")]
     wanted.append(0.5 + SH_C0 * sh[..., None, :, 0] + turned)
     assert_close(found, (*wanted,), rtol=RTOL, atol=ATOL)
-
-
-def test_harmonics_are_orthonormal_and_those_of_3dgs_but_for_signs_and_axes():
-    seen = directions(40_000)
-    values = e3nn_harmonics(seen, 4)
-    gram = values.mT @ values / 40_000
-    assert_close(gram, torch.eye(25).double(), rtol=0, atol=0.06)
-    sign = (-1.0) ** torch.arange(1, 16)
-    ours = harmonics(seen[:, [2, 0, 1]], 15) * (4 * torch.pi) ** 0.5
-    assert_close(ours, sign * values[:, 1:16])
-    assert_close(values[:, 1:4], 3**0.5 * seen)
 
 
 def test_both_ways_to_correlate_agree(monkeypatch):

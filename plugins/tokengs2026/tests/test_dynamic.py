@@ -5,9 +5,8 @@ from functools import partial
 import pytest
 import torch
 from odd_views import odd_views
-from qgs_tokengs2026.dynamic import MOVES, BlockCausalSelfAttention, DynamicQueries
+from qgs_tokengs2026.dynamic import MOVES, DynamicQueries
 from qgs_tokengs2026.multiscale import MultiscaleViT
-from qgs_tokengs2026.times import TimeEmbedding, time_features
 from refusals import problems_of
 from small_parts import made
 from torch.testing import assert_close
@@ -52,22 +51,6 @@ def dynamic_queries(**options):
     return queries
 
 
-def test_times_as_cosines_and_sines():
-    times = torch.tensor([0.0, 2.5])
-    angles = times[:, None] * torch.tensor([1, 0.01])
-    assert_close(time_features(times, 4), torch.cat([angles.cos(), angles.sin()], -1))
-
-
-def test_the_embedding_is_that_of_a_map_of_constant_times():
-    embedding, times = TimeEmbedding(2, 16, 8), torch.tensor([[0.3], [0.8]])
-    assert not embedding(times).any()
-    for parameter in embedding.parameters():
-        torch.nn.init.normal_(parameter)
-    constant = time_features(times[:, 0], 2)[..., None, None].expand(-1, -1, 16, 24)
-    patches = embedding.proj(constant).flatten(2).mT
-    assert_close(embedding(times).expand(-1, 6, -1), patches)
-
-
 def test_the_target_time_is_added_to_the_dynamic_queries_or_to_all():
     """They do without cameras."""
     assert not DynamicQueries.reads_cameras
@@ -92,33 +75,12 @@ def test_what_reads_dynamic_queries_is_refused_without_them():
     assert f"`tokengs2026/dynamic` needs {MOVES}" in objective.reason
 
 
-def test_static_queries_do_not_see_dynamic_ones():
-    state = dynamic_queries(dynamic=3)(MEMORY, views(target=torch.zeros(2, 1)))
-    attention = made(BlockCausalSelfAttention)
-    told = attention.explain(state, torch.arange(7))
-    hidden = torch.zeros(7, 7).bool()
-    hidden[:4, 4:] = True
-    assert torch.equal(told.weights[0, 0] == 0, hidden)
-    values = attention.attention.project(attention.norm(state.features))[2]
-    expected = (told.weights @ values).transpose(1, 2).flatten(2)
-    assert_close(attention(state), attention.attention.proj(expected))
-
-
 @pytest.fixture
 def model():
     model = small().build_model().eval()
     for embedding in (model.encoder, model.queries):
         torch.nn.init.normal_(embedding.get_submodule("time_embedding").proj.weight)
     return model
-
-
-def test_a_prediction_depends_on_the_times_of_photos_and_on_the_time_asked_for(model):
-    times, target = torch.tensor([[0.1, 0.9]] * 2), torch.tensor([[0.2]] * 2)
-    asked = (views(times, target), views(times, target + 0.5), views(times + 0.1, target))
-    first, later, others = (model(given).gaussians.means for given in asked)
-    assert torch.equal(first[:, :8], later[:, :8])
-    assert not torch.equal(first[:, 8:], later[:, 8:])
-    assert not torch.equal(first[:, :8], others[:, :8])
 
 
 def test_views_without_times_are_refused(model):
