@@ -6,6 +6,7 @@ import pytest
 import torch
 from losses.judging import CAMERAS, TRUTH
 from small_parts import DIMS, made
+from tables import fault
 from torch.testing import assert_close
 
 from qgs import QueryState, Views
@@ -14,6 +15,7 @@ from qgs.components import (
     GaussianHead,
     LayerSupervision,
     MultiViewViT,
+    OffsetCenters,
     posact,
 )
 from qgs.contracts import AttentionWeights, ModelDims, RecipeContext
@@ -56,6 +58,12 @@ def test_head_starts_with_the_spread_and_at_the_depth_it_is_told():
     assert_close(posact(offsets), torch.tensor([0, 0, 0.1]).expand(1, 1, 32, 3))
 
 
+def test_offset_centers_are_the_offsets_further_along_z_in_float32():
+    offsets = torch.randn(2, 5, 1, 3).bfloat16()
+    means = made(OffsetCenters, z_offset=-2.0)(offsets, QueryState(torch.zeros(2, 5, 16)))
+    assert_close(means, offsets.float() + torch.tensor([0, 0, -2.0]))
+
+
 def test_supervision_weights():
     for layers, expected in (
         ((12,), [1.0]),
@@ -85,13 +93,16 @@ def test_a_bias_is_for_all_heads_or_for_each():
 
 
 def test_attention_of_other_shapes_is_refused():
-    whole = (2, 4, 3, 5)
-    for shapes, message in (
-        (((2, 3, 5), None, (2, 3, 5)), r"content must have shape \(B, h, Q, T\), got \(2, 3, 5\)"),
-        ((whole, (2, 3, 5), whole), r"\(2, 1, 3, 5\) or \(2, 4, 3, 5\), got \(2, 3, 5\)"),
-        ((whole, (1, 1, 3, 5), whole), r"geometry must .*got \(1, 1, 3, 5\)"),
-        ((whole, None, (2, 4, 3, 6)), r"weights must .*\(2, 4, 3, 5\), got \(2, 4, 3, 6\)"),
-    ):
-        parts = [None if shape is None else torch.zeros(shape) for shape in shapes]
-        with pytest.raises(ValueError, match=message):
-            AttentionWeights(*parts)
+    def weights(*shapes):
+        return AttentionWeights(*(shape and torch.zeros(shape) for shape in shapes))
+
+    whole, flat, long = (2, 4, 3, 5), (2, 3, 5), (2, 4, 3, 6)
+    faults = (
+        fault(r"content must .* \(B, h, Q, T\), got \(2, 3, 5\)", weights, flat, None, flat),
+        fault(r"\(2, 1, 3, 5\) or \(2, 4, 3, 5\), got \(2, 3, 5\)", weights, whole, flat, whole),
+        fault(r"geometry must .*got \(1, 1, 3, 5\)", weights, whole, (1, 1, 3, 5), whole),
+        fault(
+            r"weights must .*\(2, 4, 3, 5\), got \(2, 4, 3, 6\)", weights, whole, None, (2, 4, 3, 6)
+        ),
+    )
+    assert not any(faults), faults

@@ -5,11 +5,12 @@ from typing import NamedTuple
 from unittest.mock import Mock, call
 
 import torch
+from odd_views import odd_views
 from torch import Tensor, nn
 from torch.testing import assert_close
 
 from qgs.geometry.precision import full_precision
-from qgs.types import Gaussians, LayerPrediction, QueryState, named_tensors
+from qgs.types import QueryState, named_tensors
 
 
 class Pair(NamedTuple):
@@ -39,11 +40,8 @@ def test_half_precision_is_raised_wherever_it_is_held():
     assert isinstance(named, Pair)
     (listed,), (within,) = same([half(2)], (half(2),))
     assert listed.dtype == within.dtype == torch.float32
-    points = half(1, 4, 3)
-    gaussians = Gaussians(points, points, half(1, 4, 4), half(1, 4), points)
-    (layer,) = same(LayerPrediction(gaussians, state(torch.float64)))
-    assert {part.dtype for _, part in named_tensors(layer.gaussians)} == {torch.float32}
-    assert layer.state.features.dtype == torch.float64
+    (nested,) = same(odd_views().to(torch.bfloat16))
+    assert {part.dtype for _, part in named_tensors(nested)} == {torch.float32}
     assert given.features.dtype == torch.bfloat16, "the caller's own state is left alone"
 
 

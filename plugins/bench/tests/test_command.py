@@ -6,6 +6,7 @@ import re
 from unittest.mock import Mock
 
 import pytest
+import yaml
 from commands import run_qgs
 from qgs_bench import output, predict, run, sweep
 from qgs_bench.memory import Peak
@@ -58,19 +59,22 @@ def test_a_report_replaces_a_report_and_nothing_else(tmp_path):
     assert file.read_text() == '{"mine": true}'
 
 
+MISTAKES = """
+--size 16: "16"
+--size 16x0: "16"
+--size 15x24: 15 x 24
+--precision fp16: fp16
+--within 4: --predict
+--predict --size 15x24: patches
+--sweep views=2..4 --renderer: no renderer
+--sweep views=2..4 --memory: measures memory itself
+"""
+
+
 def test_mistakes(monkeypatch):
     nothing = dict.fromkeys(("forward", "render", "step"), 0)
     monkeypatch.setattr(predict, "_calibrate", lambda: (nothing, nothing))
-    for words, named in {
-        "--size 16": "16",
-        "--size 16x0": "16",
-        "--size 15x24": "15 x 24",
-        "--precision fp16": "fp16",
-        "--within 4": "--predict",
-        "--predict --size 15x24": "patches",
-        "--sweep views=2..4 --renderer": "no renderer",
-        "--sweep views=2..4 --memory": "measures memory itself",
-    }.items():
+    for words, named in yaml.safe_load(MISTAKES).items():
         error = run_qgs("bench", TOKENGS, *words.split(), "--device", "cpu").exception
         assert isinstance(error, ValueError), words
         assert named in str(error), words

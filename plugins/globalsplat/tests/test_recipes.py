@@ -1,6 +1,7 @@
 """Recipes: published sizes, what is refused, and trainings of small ones."""
 
 import pytest
+import yaml
 from globalsplat_inputs import SMALL, TINY
 from learning import errors_of_training
 from odd_views import odd_views
@@ -24,11 +25,16 @@ def test_parameters_of_the_published_size():
     assert (len(model.queries.slots), len(model.queries.extra)) == (2048, 9)
 
 
+LEVELS = """
+{0: 0, 9999: 0, 10000: 0, 10500: 0.25, 12000: 1, 15000: 1, 21500: 1.75, 22000: 2, 51000: 2.5,
+ 52000: 3, 219999: 3}
+"""
+
+
 def test_published_training():
     recipe = resolve(PUBLISHED)
     ((_, schedules),) = recipe.schedules.items()
-    levels = {0: 0, 9_999: 0, 10_000: 0, 10_500: 0.25, 12_000: 1, 15_000: 1, 21_500: 1.75,
-              22_000: 2, 51_000: 2.5, 52_000: 3, 219_999: 3}  # fmt: skip
+    levels = yaml.safe_load(LEVELS)
     assert {step: schedules["level"].number(step) for step in levels} == levels
     optimizer = recipe.tree["optimizer"]
     assert optimizer["initial_divisor"] * optimizer["final_divisor"] == 50

@@ -14,7 +14,7 @@ from torch.testing import assert_close
 from qgs.composer import resolve
 from qgs.contracts import MissingExtraError
 
-CHANNELS = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512, 0)
+CHANNELS = "64 64 0 128 128 0 256 256 256 0 512 512 512 0 512 512 512 0"
 """VGG-16's convolutions; 0 is a pooling."""
 RECIPE = {"recipe": 1, "plugins": ["lpips"]}
 PART = 4
@@ -25,7 +25,7 @@ def vgg16():
     """torchvision's VGG-16 without its classifier, random and narrow."""
     layers = []
     before = 3
-    for channels in CHANNELS:
+    for channels in map(int, CHANNELS.split()):
         if channels:
             layers += [nn.Conv2d(before, channels // PART, 3, padding=1), nn.ReLU()]
             before = channels // PART

@@ -43,11 +43,14 @@ def imported(folder, weights, **options):
     return import_weights(folder / "w.safetensors", None, folder / "made.safetensors", **options)
 
 
+FILES = """
+tokengs_a tokengs_latent_a tokengs_multiscale_a tokengs_dynamic_a
+locus_full_a locus_no_radius_state_a locus_content_cross_attn_a
+"""
+
+
 def test_every_tensor_arrives_bit_equal_or_is_known_as_unused(tmp_path):
-    for name in (
-        *("tokengs_a", "tokengs_latent_a", "tokengs_multiscale_a", "tokengs_dynamic_a"),
-        *("locus_full_a", "locus_no_radius_state_a", "locus_content_cross_attn_a"),
-    ):
+    for name in FILES.split():
         folder = tmp_path / name
         given = published(name)
         known = names_of(imported(folder, given).recipe)

@@ -7,6 +7,7 @@ import torch
 from odd_views import odd_views
 from qgs_tokengs2026.dynamic import MOVES, DynamicQueries
 from qgs_tokengs2026.multiscale import MultiscaleViT
+from qgs_tokengs2026.times import TimeEmbedding, time_features
 from refusals import problems_of
 from small_parts import made
 from torch.testing import assert_close
@@ -49,6 +50,13 @@ def dynamic_queries(**options):
     queries = made(DynamicQueries, count=7, **options)
     torch.nn.init.normal_(queries.time_embedding.proj.weight)
     return queries
+
+
+def test_times_are_cosines_and_sines_and_embedded_as_zeros_at_first():
+    times = torch.tensor([[0.0, 2.5]])
+    angles = times[..., None] * torch.tensor([1, 0.01])
+    assert_close(time_features(times, 4), torch.cat([angles.cos(), angles.sin()], -1))
+    assert not TimeEmbedding(4, 16, 8)(times).any()
 
 
 def test_the_target_time_is_added_to_the_dynamic_queries_or_to_all():

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+import yaml
 from pydantic import ValidationError
 from qgs_rooms.source import RoomsSource
 from qgs_worlds.source import WorldsSource
@@ -51,16 +52,15 @@ def test_slices_and_range(source):
         scenes[5]
 
 
+KINDS = {"rooms": RoomsSource, "worlds": WorldsSource}
+WRONG = """
+rooms: {fov: [80, 60], scenes: 0, rooms: 3}
+worlds: {scenes: 0, complexity: 2, light: dark, depth: [2, 1], rooms: 2}
+"""
+
+
 def test_wrong_options_are_refused():
-    for kind, option, wrong in (
-        (RoomsSource, "fov", (80.0, 60.0)),
-        (RoomsSource, "scenes", 0),
-        (RoomsSource, "rooms", 3),
-        (WorldsSource, "scenes", 0),
-        (WorldsSource, "complexity", 2),
-        (WorldsSource, "light", "dark"),
-        (WorldsSource, "depth", (2, 1)),
-        (WorldsSource, "rooms", 2),
-    ):
-        with pytest.raises(ValidationError, match=option):
-            kind.Config(image_size=SIZE, **{option: wrong})
+    for name, options in yaml.safe_load(WRONG).items():
+        for option, wrong in options.items():
+            with pytest.raises(ValidationError, match=option):
+                KINDS[name].Config(image_size=SIZE, **{option: wrong})
