@@ -1,14 +1,9 @@
 """Attention with a bias that is a function, in drawn cases, and what is wrong with its kernels."""
 
-from collections.abc import Iterable
-
 import torch
-from torch import Tensor
-
-Leaves = dict[str, Tensor]
 
 
-def case(sizes: Iterable[int], middle=(), factor=1.0, lower=-6.0) -> Leaves:
+def case(sizes, middle=(), factor=1.0, lower=-6.0):
     """sizes: scenes, heads, queries, tokens, numbers of a head. Biases by rays read of a query its
     place, `middle`, here with noise, a factor of the squared distance, and the least bias."""
     scenes, heads, queries, tokens, each = sizes
@@ -26,14 +21,14 @@ def case(sizes: Iterable[int], middle=(), factor=1.0, lower=-6.0) -> Leaves:
     }
 
 
-def direct(q, k, v, bias) -> Tensor:
+def direct(q, k, v, bias):
     """The formula, with all pairs at once."""
     scenes = zip(bias.queries, bias.tokens, strict=True)
     mask = torch.stack([bias.value(*read) for read in scenes])
     return (q @ k.mT * q.shape[-1] ** -0.5 + mask[:, None]).softmax(-1) @ v
 
 
-def found(attention, kind, given: Leaves, learnt: Iterable[str]) -> Leaves:
+def found(attention, kind, given, learnt):
     """The result, and the gradients that there are."""
     x = {name: leaf.detach().requires_grad_(name in learnt) for name, leaf in given.items()}
     read = attention(x["q"], x["k"], x["v"], kind(x["queries"], x["tokens"]))
@@ -42,11 +37,11 @@ def found(attention, kind, given: Leaves, learnt: Iterable[str]) -> Leaves:
     return {"read": read.detach(), **gradients}
 
 
-def exact(kind, given: Leaves, learnt: Iterable[str]) -> Leaves:
+def exact(kind, given, learnt):
     return found(direct, kind, {name: x.double() for name, x in given.items()}, learnt)
 
 
-def wrong(seen: Leaves, best: Leaves, tolerance: float = 1e-5) -> dict[str, float]:
+def wrong(seen, best, tolerance=1e-5):
     """Errors, relative to what is of order 1 or more: where most pairs reach the least bias,
     gradients are sums of numbers of order 1 that nearly cancel. What is 0 but for rounding is
     compared with ones."""

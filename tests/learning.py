@@ -3,11 +3,10 @@
 import torch
 from training_runs import first_batch
 
-from qgs.composer import Recipe
 from qgs.engine.training_pass import TrainingPass
 
 
-def errors_of_training(recipe: Recipe, steps: int, rate: float) -> list[float]:
+def errors_of_training(recipe, steps, rate):
     """What the objective says of the same batch in each step."""
     judged = TrainingPass.of(recipe, recipe.build_model().train())
     batch = first_batch(recipe)

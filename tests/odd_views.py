@@ -7,10 +7,9 @@ from qgs_plugintools import Case
 from qgs_plugintools.inputs import Maker, Sizes
 
 from qgs.components import LatentQueries
-from qgs.types import Views
 
 
-def odd_views(count: int = 2, height: int = 16, width: int = 16, scenes: int = 2) -> Views:
+def odd_views(count=2, height=16, width=16, scenes=2):
     """Noise; cameras are turned and moved, with unequal focal lengths, off centre."""
     sizes = Sizes(batch=scenes, views=count, image=(height, width))
     made = Maker(Case(LatentQueries.Config()), sizes, torch.Generator().manual_seed(0)).views()

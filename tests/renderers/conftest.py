@@ -8,23 +8,21 @@ import torch
 from qgs.contracts import RendererConfig
 from qgs.renderers import CpuRenderer, GsplatRenderer, TorchRenderer
 
-RENDERERS = {"torch": TorchRenderer, "cpu": CpuRenderer, "gsplat": GsplatRenderer}
-HAS_GSPLAT = torch.cuda.is_available() and find_spec("gsplat") is not None
+HAS_GSPLAT = torch.cuda.is_available() and find_spec("gsplat")
 NEEDS_GSPLAT = pytest.mark.skipif(not HAS_GSPLAT, reason="needs a CUDA GPU and gsplat")
 
 
-@pytest.fixture(params=["torch", "cpu", pytest.param("gsplat", marks=NEEDS_GSPLAT)])
+@pytest.fixture(
+    params=[TorchRenderer, CpuRenderer, pytest.param(GsplatRenderer, marks=NEEDS_GSPLAT)]
+)
 def build(request):
     """`build(**options)`: the renderer under test, on tensors where the test makes them."""
-    cls = RENDERERS[request.param]
 
-    class Moved(cls):
+    class Moved(request.param):
         """Renders on the device it needs and brings the images back."""
 
-        kind = request.param
-
         def forward(self, gaussians, cameras, background=None):
-            device = "cuda" if cls is GsplatRenderer else "cpu"
+            device = "cuda" if self.name == "gsplat" else "cpu"
             out = super().forward(gaussians.to(device), cameras.to(device), background)
             return out.to("cpu")
 

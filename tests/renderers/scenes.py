@@ -53,7 +53,7 @@ def differentiate(renderer, gaussians, cameras):
     names = dict(named_tensors(gaussians))
     leaves = {**names, "c2w": cameras.c2w, "intrinsics": cameras.intrinsics}
     leaves = {name: value.detach().clone().requires_grad_() for name, value in leaves.items()}
-    if getattr(renderer, "kind", "") == "gsplat":
+    if renderer.name == "gsplat":
         leaves["intrinsics"].requires_grad_(False)
     lenses = Cameras(leaves["c2w"], leaves["intrinsics"], cameras.size)
     rendering = renderer(Gaussians(**{name: leaves[name] for name in names}), lenses)

@@ -17,7 +17,7 @@ def compared(renderer, scene, of_images=2e-5, of_gradients=2e-5, **options):
     images, slopes = differentiate(oracle, *(part.to(torch.float64) for part in scene))
     found, expected = (dict(named_tensors(each)) for each in (rendering.to(torch.float64), images))
     assert_close(found, expected, atol=of_images, rtol=of_images)
-    if renderer.kind == "gsplat":
+    if renderer.name == "gsplat":
         of_gradients = max(of_gradients, 4e-4)  # they are within 2e-4 on an H100
     for name, found in gradients.items():
         pair = (found - slopes[name], slopes[name])
@@ -127,7 +127,7 @@ OPTIONS = {  # the kernels of gsplat fix the last three
 
 def test_every_option_has_its_effect(build):
     scene, plain = make_scene(scale=0.2), build()
-    for option, value in [*OPTIONS.items()][: 4 if plain.kind == "gsplat" else None]:
+    for option, value in [*OPTIONS.items()][: 4 if plain.name == "gsplat" else None]:
         rendering, _ = compared(build(**{option: value}), scene, **{option: value})
         assert (rendering.rgb - plain(*scene).rgb).abs().max() > 1e-2, option
 

@@ -25,15 +25,12 @@ from qgs_locus.kernels.attention_bias import biased_attention
 from qgs_locus.ray_bias import RayBias
 from torch.testing import assert_close
 
-HAS_TRITON = find_spec("triton") is not None
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 DEVICE = "cuda" if torch.cuda.is_available() and not INTERPRETED else "cpu"
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(
-        not HAS_TRITON, reason='needs triton: pip install "query-gaussians-locus[triton]"'
-    ),
+    pytest.mark.skipif(not find_spec("triton"), reason="needs triton"),
 ]
 runs = pytest.mark.skipif(
     DEVICE == "cpu" and not INTERPRETED, reason="runs on a GPU, or with TRITON_INTERPRET=1"

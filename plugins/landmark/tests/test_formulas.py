@@ -62,20 +62,23 @@ def axes_of_photos():
     return VIEWS.cameras.c2w[:, BY_PHOTO, :3, :3]
 
 
-@pytest.mark.parametrize(("each", "bound"), [(1, "floor"), (3, "offset")])
-def test_anchors_of_all_tokens_stand_on_the_rays_of_their_patches(each, bound):
-    options = {"near": 0.5, "far": 4.0, "radius": 0.7, "radius_bound": bound, "radius_min": 0.01}
-    queries, state = started(count=None, per_token=each, **options)
-    x = (MEMORY.features[:, :, None] + queries.slots).flatten(1, 2)
-    assert_close(state.features, x)
-    w = torch.sigmoid(queries.depth_mlp(x))
-    z, places = in_photos(state, BY_PHOTO.repeat_interleave(each))
-    assert_close(z, 0.5**w * 4.0 ** (1 - w))
+def test_anchors_of_all_tokens_stand_on_the_rays_of_their_patches():
     corners = torch.cartesian_prod(torch.arange(4), torch.arange(6)).flip(-1).repeat(2, 1)
-    middles = PATCH * (corners + 0.5).double().repeat_interleave(each, 0)
-    assert_close(places, middles.expand_as(places))
-    radii = support_radius(state[RAW_RADIUS], queries.config)
-    assert_close(radii, 0.7 * PATCH / math.sqrt(each) * z / 20.0)
+    for each, bound in ((1, "floor"), (3, "offset")):
+        options = {"near": 0.5, "far": 4.0, "radius": 0.7, "radius_bound": bound}
+        queries, state = started(count=None, per_token=each, radius_min=0.01, **options)
+        x = (MEMORY.features[:, :, None] + queries.slots).flatten(1, 2)
+        assert_close(state.features, x)
+        w = torch.sigmoid(queries.depth_mlp(x))
+        z, places = in_photos(state, BY_PHOTO.repeat_interleave(each))
+        middles = PATCH * (corners + 0.5).double().repeat_interleave(each, 0)
+        radii = support_radius(state[RAW_RADIUS], queries.config)
+        wanted = (
+            0.5**w * 4.0 ** (1 - w),
+            middles.expand_as(places),
+            0.7 * PATCH / each**0.5 * z / 20,
+        )
+        assert_close((z, places, radii), wanted)
 
 
 def test_anchors_start_between_near_and_far_in_the_logarithm():
@@ -191,22 +194,24 @@ def attention(count):
     return shaken(made(NeighbourAttention, count=count), 0.1)
 
 
-@pytest.mark.parametrize("count", [6, 100])
-def test_what_an_anchor_reads_is_written_out(count):
-    module = attention(count)
-    index, _ = nearest(CLOUD[CENTER], count, None)
-    scene = torch.arange(2)[:, None, None]
-    steps = STEPS[scene, torch.arange(40)[:, None], index]
-    reach = steps.norm(dim=-1, keepdim=True).amax(2, keepdim=True)
-    steps = steps / reach
-    lengths = steps.norm(dim=-1, keepdim=True)
-    place = torch.cat([steps, lengths, reach.log().expand_as(lengths)], -1)
-    q, k, v = (x.transpose(1, 2) for x in module.attention.project(module.norm(CLOUD.features)))
-    logits = (k[scene, index] * q[:, :, None]).sum(-1) / math.sqrt(8)
-    share = (logits + module.place_mlp(place)).softmax(2)[..., None]
-    read, where = ((share * x).sum(2).flatten(2) for x in (v[scene, index], place[..., None, :]))
-    expected = module.attention.proj(read) + module.place_proj(where)
-    assert_close(module(CLOUD), expected, rtol=1e-4, atol=1e-3)
+def test_what_an_anchor_reads_is_written_out():
+    for count in (6, 100):
+        module = attention(count)
+        index, _ = nearest(CLOUD[CENTER], count, None)
+        scene = torch.arange(2)[:, None, None]
+        steps = STEPS[scene, torch.arange(40)[:, None], index]
+        reach = steps.norm(dim=-1, keepdim=True).amax(2, keepdim=True)
+        steps = steps / reach
+        lengths = steps.norm(dim=-1, keepdim=True)
+        place = torch.cat([steps, lengths, reach.log().expand_as(lengths)], -1)
+        q, k, v = (x.transpose(1, 2) for x in module.attention.project(module.norm(CLOUD.features)))
+        logits = (k[scene, index] * q[:, :, None]).sum(-1) / math.sqrt(8)
+        share = (logits + module.place_mlp(place)).softmax(2)[..., None]
+        read, where = (
+            (share * x).sum(2).flatten(2) for x in (v[scene, index], place[..., None, :])
+        )
+        expected = module.attention.proj(read) + module.place_proj(where)
+        assert_close(module(CLOUD), expected, rtol=1e-4, atol=1e-3)
 
 
 def test_nobody_reads_what_is_no_query():

@@ -48,10 +48,12 @@ def views(count=2, side=32):
     return odd_views(count, side, side, scenes=1)
 
 
-def run(model, index, state, memory):
-    """The state and the memory after one layer."""
-    state, memory = model.decoder[index](state, memory)
-    return model.refinements[model.refinement_of[index]](state), memory
+def run(model, layers, state, memory):
+    """The state and the memory after these layers."""
+    for index in layers:
+        state, memory = model.decoder[index](state, memory)
+        state = model.refinements[model.refinement_of[index]](state)
+    return state, memory
 
 
 @torch.no_grad()
@@ -60,20 +62,17 @@ def test_rounds_run_the_last_layers_on_the_first_memory():
     found = model(given, layers=[1])
     memory = after = model.encoder(given)
     state = model.queries(memory, given)
-    for index in range(3):
-        state, after = run(model, index, state, after)
+    small = model.feedback.compared(given)
+    state, after = run(model, (0, 1, 2), state, after)
     for _ in range(2):
-        small = model.feedback.compared(given)
         rendering = model.render(model.decode(state), small.cameras)
         state, after = model.feedback(state, memory, rendering, small)
-        for index in (1, 2):
-            state, after = run(model, index, state, after)
+        state, after = run(model, (1, 2), state, after)
     assert list(found.layers) == [1, 3, 5, 7]
     assert model.depth == 7
     assert_close(found.state.features, state.features)
     assert_close(found.gaussians.means, model.decode(state).means)
-    before, last = (found.layers[n].gaussians.means for n in (3, 7))
-    assert not torch.allclose(before, last)
+    assert not torch.allclose(found.layers[3].gaussians.means, found.gaussians.means)
 
 
 @torch.no_grad()
@@ -118,21 +117,17 @@ def test_training_supervises_every_round_it_draws_and_learns():
         torch.manual_seed(seed)
         outcome = passes(given, given)
         torch.manual_seed(seed)
-        prediction = model(given)
-        numbers = sorted(prediction.layers)
-        ends.add(numbers[-1])
+        layers = sorted(model(given).layers.items())
+        ends.add(layers[-1][0])
         expected = torch.zeros(())
-        for rank, number in enumerate(numbers, start=1):
-            layer = prediction.layers[number]
+        for rank, (_, layer) in enumerate(layers, start=1):
             rendering = model.render(layer.gaussians, given.cameras)
             terms = passes.losses["photometric"](layer, rendering, given, given)
-            expected = expected + rank / sum(range(len(numbers) + 1)) * sum(terms.values())
-        assert_close(outcome.total, expected)
+            expected = expected + rank * sum(terms.values())
+        assert_close(outcome.total, expected / sum(range(len(layers) + 1)))
     assert ends == {5, 7}
     outcome.total.backward()
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter -= 0.01 * parameter.grad
+    torch.optim.SGD(model.parameters(), 0.01).step()
     torch.manual_seed(seed)
     assert passes(given, given).total < outcome.total
 
@@ -142,12 +137,9 @@ def test_rounds_are_traced_as_layers_are():
     model, given = built(), views()
     with qgs.trace(model, queries=[1, 3]) as trace:
         found = model(given, layers=range(1, 8))
-    assert list(trace.layers) == [1, 2, 3, 4, 5, 6, 7]
-    for number, layer in trace.layers.items():
-        features = found.layers[number].state.features[:, [1, 3]]
-        assert_close(layer.after.features, features)
-    first, again = (trace.layers[n].cross_attention.weights for n in (2, 4))
-    assert not torch.allclose(first, again)
+    after = {number: layer.after.features for number, layer in trace.layers.items()}
+    expected = {n: layer.state.features[:, [1, 3]] for n, layer in found.layers.items()}
+    assert_close(after, expected)
 
 
 def test_rounds_need_cameras():
@@ -194,9 +186,7 @@ def test_a_model_without_rounds_starts_one_with_rounds(tmp_path):
     weights = model.state_dict()
     assert all(torch.equal(weights[name], values) for name, values in plain.state_dict().items())
     memory = model.encoder(given)
-    state = model.queries(memory, given)
-    for index in (0, 1, 2, 1, 2, 1, 2):
-        state, _ = run(model, index, state, memory)
+    state, _ = run(model, (0, 1, 2, 1, 2, 1, 2), model.queries(memory, given), memory)
     assert_close(model(given).state.features, state.features)
 
 
