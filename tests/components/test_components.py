@@ -40,14 +40,6 @@ def test_an_image_that_patches_do_not_divide():
     assert [problem.option for problem in problems] == ["patch_size"]
 
 
-def test_wild_raw_numbers_become_gaussians():
-    """golden/test_files.py has the numbers of tame ones."""
-    head = made(GaussianHead, gaussians_per_query=2)
-    wild = head.activate(torch.randn(4, 3, 2, 14) * 1e4)
-    assert wild.scales.max() <= 0.075
-    assert_close(wild.quats.norm(dim=-1), torch.ones(4, 3, 2))
-
-
 def test_head_starts_with_the_spread_and_at_the_depth_it_is_told():
     options = {"gaussians_per_query": 32, "init_std": 0.02, "position_std": 0.2}
     head = made(GaussianHead, ModelDims(256, 4, 1), z_init=math.log(1.1), **options)
@@ -75,7 +67,7 @@ def test_supervision_weights():
 
 
 def test_a_bias_is_for_all_heads_or_for_each():
-    core, queries = CrossAttentionCore(16, 2), torch.tensor([2, 0])
+    core = CrossAttentionCore(16, 2)
     features, bias = torch.randn(2, 3, 16), torch.randn(2, 2, 3, 5)
     keys, values = torch.randn(2, 2, 2, 5, 8).unbind()
     logits = core.project(features) @ keys.mT / 8**0.5
@@ -87,9 +79,6 @@ def test_a_bias_is_for_all_heads_or_for_each():
         weights = (logits + by_head).softmax(-1)
         read = (weights @ values).transpose(1, 2).flatten(2)
         assert_close(core(features, keys, values, given), core.out_proj(read))
-        explained = core.explain(features, keys, queries, given)
-        assert_close(explained.weights, weights[:, :, queries])
-        assert_close(explained.geometry, by_head[:, :, queries])
 
 
 def test_attention_of_other_shapes_is_refused():

@@ -47,19 +47,6 @@ def test_images_and_gradients_match_the_oracle(build):
         assert all(gradients[name].any() for name in gradients.keys() & {"sh", "features"})
 
 
-def test_features_are_blended_as_colours_over_nothing(build):
-    """And a background that is given counts, not the configured one."""
-    gaussians, cameras = make_scene(batch=2, views=2, features=3)
-    painted = gaussians.replace(colors=gaussians.features, features=None)
-    expected = build()(painted, cameras, torch.zeros(3))
-    assert expected.features is None
-    for width in (0, 1, 7):
-        shown = gaussians.features.repeat(1, 1, 3)[..., :width]
-        found = build()(gaussians.replace(features=shown), cameras).features
-        wanted = expected.rgb.repeat(1, 1, 3, 1, 1)[:, :, :width]
-        assert_close(found, wanted)
-
-
 def extremes(gaussians):
     """A scene changed until drawing it is hard, or nothing of it can be seen."""
 
@@ -102,16 +89,6 @@ def test_extreme_gaussians_are_finite_and_exact_or_unseen(build):
     compared(build(), (together[5:11], fixed_cameras(6)), 1e-4, 1e-3)
 
 
-def test_zero_gaussians_show_the_background(build):
-    gaussians, cameras = make_scene(count=4, batch=2, views=2, harmonics=3, features=4)
-    colour = (0.1, 0.2, 0.3)
-    rendering, gradients = differentiate(build(background=colour), gaussians[:, :0], cameras)
-    expected = torch.tensor(colour)[:, None, None].expand_as(rendering.rgb)
-    assert_close(rendering.rgb, expected)
-    for nothing in (rendering.alpha, rendering.depth, rendering.features, *gradients.values()):
-        assert not nothing.any()
-
-
 def test_near_and_far_are_inclusive(build):
     z = torch.tensor([0.5, 0.4999, 4.0, 4.001])
     gaussians = make_scene(4, count=1)[0].replace(means=z[:, None, None] * torch.eye(3)[2])
@@ -142,16 +119,6 @@ def test_opaque_layers_stop_the_ray(build):
     gaussians, cameras = make_scene(count=1, scale=50.0)
     capped = build()(gaussians.replace(opacities=torch.ones(1, 1)), cameras).alpha
     assert_close(capped.max(), torch.tensor(0.999))
-
-
-def test_autocast_and_half_precision_render_in_float32(build):
-    gaussians, cameras = make_scene()
-    expected = build()(gaussians, cameras)
-    with torch.autocast("cpu", torch.bfloat16):
-        rendering = build()(gaussians, cameras)
-    assert_close(rendering.rgb, expected.rgb)
-    half = gaussians.replace(colors=gaussians.colors.bfloat16())
-    assert_close(build()(half, cameras).rgb, expected.rgb, rtol=0, atol=1e-2)
 
 
 def test_mismatches_are_named(build):

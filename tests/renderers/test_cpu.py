@@ -60,14 +60,6 @@ def test_gaussians_have_the_same_gradients_without_those_of_the_cameras():
         assert of_leaf.any()
 
 
-def test_float64_comes_back_as_float64():
-    gaussians, cameras = make_scene()
-    single = RENDER(gaussians, cameras).to(torch.float64)
-    double = RENDER(gaussians.to(torch.float64), cameras.to(torch.float64))
-    found, expected = (dict(named_tensors(each)) for each in (double, single))
-    assert_close(found, expected, rtol=1e-4, atol=1e-5)
-
-
 def test_missing_numba_says_what_to_do(monkeypatch):
     monkeypatch.setattr(qgs.renderers.cpu, "can_compile", lambda: False)
     with pytest.raises(RuntimeError, match=r'pip install "query-gaussians\[cpu\]".*qgs/torch'):
