@@ -214,6 +214,14 @@ def test_what_an_anchor_reads_is_written_out():
         assert_close(module(CLOUD), expected, rtol=1e-4, atol=1e-3)
 
 
+def test_nobody_reads_what_is_no_query():
+    module, mask = attention(6), drawn(0, 2, 40) < 0.2
+    read = module(CLOUD.replace(mask=mask))
+    for scene, held in enumerate(mask):
+        features, center = (x[scene, held][None] for x in (CLOUD.features, CLOUD[CENTER]))
+        assert_close(read[scene, held], module(QueryState(features, {CENTER: center}))[0])
+
+
 def test_errors_are_added_to_keys_and_values():
     feedback = made(RenderedFeedback, shrink=2, cells=2).double()
     with torch.no_grad():
