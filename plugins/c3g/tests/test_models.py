@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from learning import errors_of_training
 from odd_views import odd_views
 from qgs_c3g.joint import JointLayer
 from qgs_plugintools import Case
@@ -106,9 +105,3 @@ def test_every_parameter_that_trains_is_read():
         factors = recipe.rate_factors(model).items()
         assert unread == {name for name, factor in factors if factor == 0}, name
         assert len(unread) == 4, name
-
-
-def test_it_learns():
-    small = (*SHALLOW, "model.queries.count=32", "data.image_size=[16, 16]")
-    errors = errors_of_training(resolve(TINY, small), steps=28, rate=2e-3)
-    assert errors[-1] < 0.6 * errors[0]

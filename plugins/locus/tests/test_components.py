@@ -4,14 +4,13 @@ import torch
 import torch.nn.functional as F
 import yaml
 from qgs_locus.anchors import AnchoredQueries, FrustumCenters, NormalCenters
-from qgs_locus.decoding import AnchorOffsetCenters, RadiusScaledCenters
+from qgs_locus.decoding import RadiusScaledCenters
 from qgs_locus.fields import CENTER, RAW_RADIUS, RadiusOptions, raw_radius_of, support_radius
 from refusals import wrong_refusals
 from small_parts import made
 from torch.testing import assert_close
 
 from qgs import QueryState
-from qgs.components import posact
 from qgs.composer import resolve
 
 
@@ -45,17 +44,11 @@ def test_frustum_centers_lie_in_the_frustum():
     assert (centers[:, :2].abs() <= 0.7 * z).all()
 
 
-def test_centers_follow_their_formulas():
-    state = _state()
-    offsets = torch.randn(2, 5, 3, 3)
-    center = state[CENTER][:, :, None]
+def test_linear_offsets_count_in_radii():
+    state, offsets = _state(), torch.randn(2, 5, 3, 3)
+    means = made(RadiusScaledCenters, offset="linear")(offsets, state)
     radius = F.softplus(state[RAW_RADIUS])[:, :, None]
-    for kind, options, expected in (
-        (AnchorOffsetCenters, {}, center + posact(offsets)),
-        (RadiusScaledCenters, {}, center + radius * posact(offsets)),
-        (RadiusScaledCenters, {"offset": "linear"}, center + radius * offsets),
-    ):
-        assert_close(made(kind, **options)(offsets, state), expected)
+    assert_close(means, state[CENTER][:, :, None] + radius * offsets)
 
 
 RECIPE = yaml.safe_load("""
