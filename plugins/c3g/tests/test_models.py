@@ -1,4 +1,4 @@
-"""Whole models: recipes, sizes as published, parts of LocusGS beside C3G's, and that it learns."""
+"""Whole models: recipes, sizes as published, and parts of LocusGS beside C3G's."""
 
 import pytest
 import torch

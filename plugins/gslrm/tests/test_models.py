@@ -1,4 +1,4 @@
-"""Models with GS-LRM's parts: they run and learn, or are refused when composed, with the reason."""
+"""Models with GS-LRM's parts: they run, or are refused when composed, with the reason."""
 
 import pytest
 import torch
