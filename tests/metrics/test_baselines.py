@@ -8,18 +8,16 @@ from qgs.metrics.baselines import mean_colour, nearest_input, worse_than_nearest
 from qgs.types import Cameras, Views
 
 
-def cameras(x, turn=None):
+def cameras(x, turn=()):
     """Cameras along the x axis, turned by radians about y."""
-    place = torch.tensor(x)
-    angle = torch.zeros_like(place) if turn is None else torch.tensor(turn)
     c2w = torch.eye(4).repeat(1, len(x), 1, 1)
-    c2w[..., 0, 3] = place
-    c2w[..., 0, 0] = c2w[..., 2, 2] = angle.cos()
-    c2w[..., 0, 2], c2w[..., 2, 0] = angle.sin(), -angle.sin()
+    skew = torch.tensor([[0, 0, 1.0], [0, 0, 0], [-1, 0, 0]])
+    c2w[0, : len(turn), :3, :3] = torch.tensor(turn)[:, None, None].mul(skew).matrix_exp()
+    c2w[0, :, 0, 3] = torch.tensor(x)
     return Cameras(c2w, torch.full((1, len(x), 4), 4.0), (8, 8))
 
 
-def views(x, turn=None):
+def views(x, turn=()):
     return Views(torch.rand(1, len(x), 3, 8, 8), cameras(x, turn))
 
 

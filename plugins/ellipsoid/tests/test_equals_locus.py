@@ -65,7 +65,7 @@ def test_every_tensor_of_every_layer_is_that_of_locusgs(radius_refined, bound):
     theirs, ours = (model(photos, layers=(1, 2, 3)) for model in models)
     for number, expected in theirs.layers.items():
         seen = ours.layers[number]
-        assert_close(_shared(seen), _shared(expected), rtol=1e-5, atol=1e-5)
+        assert_close(_shared(seen), _shared(expected))
         identity = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(2, 40, 4)
         assert torch.equal(seen.state[ROTATION], identity)
     moved = theirs.state[CENTER] - models[0].queries.center
@@ -81,7 +81,7 @@ def test_a_trained_locusgs_is_where_a_model_that_turns_can_start():
     assert absent.unexpected_keys == []
     photos = odd_views(2, 32, 40)
     theirs, ours = (model(photos).gaussians.means for model in (locus, turning))
-    assert_close(ours, theirs, rtol=1e-5, atol=1e-5)
+    assert_close(ours, theirs)
 
 
 def test_weights_without_a_radius_are_refused():

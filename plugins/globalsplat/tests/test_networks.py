@@ -42,12 +42,6 @@ def test_a_grid_stands_where_there_are_no_registers():
     assert made(PosedPatches, patch_size=4, registers=0)(odd_views(2, 16, 24)).grid == (2, 4, 6)
 
 
-def test_published_widths():
-    fields = PosedPatches.fields_written(PosedPatches.Config())
-    assert fields["memory.features"].shape == (768,)
-    assert made(PosedPatches).camera_proj.weight.shape == (256, 64 + 3 + 24)
-
-
 def test_images_that_patches_do_not_divide_are_refused():
     with pytest.raises(ValueError, match="16 x 24 cannot be cut into patches of 5; resize"):
         made(PosedPatches, patch_size=5)(odd_views(2, 16, 24))

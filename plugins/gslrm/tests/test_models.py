@@ -1,16 +1,13 @@
 """Models with GS-LRM's parts: they run, or are refused when composed, with the reason."""
 
 import pytest
-import torch
 from odd_views import odd_views
 from qgs_gslrm.encoder import Transformer
 from qgs_plugintools import Case
 from qgs_plugintools.checks.fields import run_training_step
 from refusals import refused
-from torch.testing import assert_close
 
 from qgs.composer import resolve
-from qgs.geometry.transforms import to_camera, to_pixels
 
 TINY = "tiny/gslrm.yaml"
 SMALL = (
@@ -56,14 +53,3 @@ def test_what_cannot_work_is_refused():
         assert refused(TINY, [*SMALL, *overrides]).option == option
     with pytest.raises(ValueError, match="images of 60 x 64 cannot be cut into patches of 8"):
         model()(odd_views(1, 60, 64))
-
-
-def test_there_is_a_gaussian_for_each_pixel_in_the_view_of_its_camera():
-    given = odd_views(3, 32, 32, scenes=1)
-    means = model("model.head.gaussians_per_query=64")(given).gaussians.means
-    seen = to_pixels(to_camera(means, given.cameras), given.cameras.intrinsics)[0]
-    row, column = torch.meshgrid(torch.arange(32.0), torch.arange(32.0), indexing="ij")
-    pixels = torch.stack([column, row], -1) + 0.5
-    by_patch = pixels.view(4, 8, 4, 8, 2).transpose(1, 2).reshape(-1, 2)
-    for view, places in enumerate(seen):
-        assert_close(places.view(3, 1024, 2)[view], by_patch, atol=1e-2, rtol=0)

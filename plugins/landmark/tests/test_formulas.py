@@ -2,7 +2,6 @@
 
 import math
 
-import pytest
 import torch
 import torch.nn.functional as F
 from qgs_landmark.footprint import ColoredHead, FootprintCenters
@@ -87,6 +86,13 @@ def test_anchors_start_between_near_and_far_in_the_logarithm():
     assert_close(z, torch.full_like(z, math.sqrt(0.2 * 3.2)))
 
 
+def in_tiles(maps_BVHWC, rows, columns, in_turn=True):
+    """(B, N, K, C): tiles of so many rows and columns of all photos, in turn or one by one."""
+    parts = maps_BVHWC.unflatten(3, (-1, columns)).unflatten(2, (-1, rows))
+    found = parts.transpose(3, 4).flatten(4, 5).flatten(2, 3)
+    return (found.transpose(1, 2) if in_turn else found).flatten(1, 2)
+
+
 def test_tokens_of_a_footprint_make_a_query():
     """Two side by side in each of 4 x 3 tiles: their features, and the mean of their depths."""
     queries, state = started(count=24, tokens=2, cells=8)
@@ -95,43 +101,29 @@ def test_tokens_of_a_footprint_make_a_query():
     alone.load_state_dict(weights)
     of_tokens = alone(MEMORY, VIEWS)
 
-    def by_tile(values_BMX):
-        """The left and the right one, (B, N, ...); a query's view changes first."""
-        found = values_BMX.unflatten(1, (2, 4, 3, 2)).flatten(2, 3).transpose(1, 2).flatten(1, 2)
-        return found.unbind(2)
-
-    left, right = by_tile(of_tokens.features)
+    left, right = in_tiles(of_tokens.features.unflatten(1, GRID), 1, 2).unbind(2)
     expected = (left + right) / 2 + queries.apart_proj((right - left) / 2)
     assert_close(state.features, expected, rtol=1e-5, atol=1e-6)
-    left, right = by_tile(in_photos(of_tokens, BY_PHOTO)[0])
+    depths, _ = in_photos(of_tokens, BY_PHOTO)
+    left, right = in_tiles(depths.unflatten(1, GRID), 1, 2).unbind(2)
     z, _ = in_photos(state, torch.arange(24) % 2)
     assert_close(z, (left * right).sqrt())
 
 
-@pytest.mark.parametrize(
-    ("count", "tile"),  # rows and columns of 2 x 2 pixels in a footprint
-    [(None, (2, 2)), (12, (4, 4)), (24, (2, 4))],
-)
-def test_gaussians_start_as_the_photo_that_they_stand_for(count, tile):
+def test_gaussians_start_as_the_photo_that_they_stand_for():
     """With a head of zeros, each lies on the ray of its 2 x 2 pixels and has their colour."""
-    each = math.prod(tile)
-    queries, state = started(count=count, cells=each)
-    head = made(ColoredHead, gaussians_per_query=each).double()
-    torch.nn.init.zeros_(head.linear.weight)
-    attributes = head(state)
-    means = made(FootprintCenters)(attributes.offsets, state)
-
-    def of_queries(maps_BVHWC):
-        parts = maps_BVHWC.unflatten(3, (-1, tile[1])).unflatten(2, (-1, tile[0]))
-        found = parts.transpose(3, 4).flatten(4, 5).flatten(2, 3)
-        return (found if count is None else found.transpose(1, 2)).flatten(1, 2)
-
-    expected = of_queries(HALVED.images.movedim(2, -1)).clamp(0.02, 0.98)
-    assert_close(attributes.colors, expected, rtol=0, atol=1e-6)
-    origins, rays = map(of_queries, camera_rays(HALVED.cameras))
-    assert_close(F.normalize(means - origins, dim=-1), rays)
-    radii = support_radius(state[RAW_RADIUS], queries.config)[..., None]
-    assert_close(attributes.scales, (0.8 / math.e * radii).expand_as(attributes.scales))
+    for count, rows, columns in ((None, 2, 2), (12, 4, 4), (24, 2, 4)):
+        queries, state = started(count=count, cells=rows * columns)
+        head = made(ColoredHead, gaussians_per_query=rows * columns).double()
+        torch.nn.init.zeros_(head.linear.weight)
+        attributes = head(state)
+        means = made(FootprintCenters)(attributes.offsets, state)
+        maps = (HALVED.images.movedim(2, -1), *camera_rays(HALVED.cameras))
+        colors, origins, rays = (in_tiles(x, rows, columns, in_turn=bool(count)) for x in maps)
+        assert_close(attributes.colors, colors.clamp(0.02, 0.98), rtol=0, atol=1e-6)
+        assert_close(F.normalize(means - origins, dim=-1), rays)
+        radii = support_radius(state[RAW_RADIUS], queries.config)[..., None]
+        assert_close(attributes.scales, (0.8 / math.e * radii).expand_as(attributes.scales))
 
 
 def test_a_head_of_more_gaussians_starts_from_those_of_the_nearest_cells():
