@@ -1,5 +1,7 @@
 """Components of a small model."""
 
+import sys
+
 import torch
 from torch import nn
 
@@ -28,3 +30,10 @@ def shaken(module, by=0.3):
     for parameter in module.double().parameters():
         parameter += by * torch.randn_like(parameter)
     return module
+
+
+class Code:
+    """Ends the tests where it is run, as that of a stranger's file."""
+
+    def __reduce__(self):
+        return sys.exit, ()

@@ -12,6 +12,7 @@ from qgs_c3g.vggt import MODULE, VggtFeatures
 from qgs_plugintools import Case, checks_for, run_check
 from refusals import refused
 from safetensors.torch import load_file, save_file
+from small_parts import Code
 from torch import nn
 from torch.testing import assert_close
 
@@ -87,13 +88,6 @@ def test_weights_are_the_users(weights):
     for suffix in (".safetensors", ".pt"):
         made = encoder(weights.with_suffix(suffix)).aggregator
         assert_close(made.state_dict(prefix="aggregator."), given, rtol=0, atol=0)
-
-
-class Code:
-    """Ends the tests where it is run."""
-
-    def __reduce__(self):
-        return sys.exit, ()
 
 
 def test_weights_that_cannot_be_read_are_named(tmp_path):

@@ -1,13 +1,12 @@
 """DINOv2's transformer: names, sizes, weights of files; plugins/mvsplat tests its numbers."""
 
-import sys
-
 import pytest
 import torch
 from qgs_dinov2 import DinoMultiViewViT
 from qgs_dinov2.vit import GRID, DinoV2, VitConfig
 from qgs_dinov2.weight_file import load_weights
 from safetensors.torch import save_file
+from small_parts import Code
 from torch.testing import assert_close
 
 from qgs.contracts import MissingExtraError, ModelDims
@@ -32,13 +31,6 @@ def test_weights_of_a_file_are_loaded(tmp_path):
         encoder.load_pretrained()
         loaded = encoder.rgb_embedding.vit.state_dict(prefix=prefix)
         assert_close(loaded, published, rtol=0, atol=0)
-
-
-class Code:
-    """Ends the tests where it is run."""
-
-    def __reduce__(self):
-        return sys.exit, ()
 
 
 def test_other_files_are_refused(tmp_path):
