@@ -121,6 +121,12 @@ def test_opaque_layers_stop_the_ray(build):
     assert_close(capped.max(), torch.tensor(0.999))
 
 
+def test_half_precision_is_rendered_in_float32(build):
+    gaussians, cameras = make_scene()
+    found, expected = (build()(x, cameras).rgb for x in (gaussians.to(torch.bfloat16), gaussians))
+    assert_close(found, expected, rtol=0, atol=1e-2)
+
+
 def test_mismatches_are_named(build):
     gaussians, cameras = make_scene(batch=2, views=2)
     render = build()
