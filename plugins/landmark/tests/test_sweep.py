@@ -5,9 +5,9 @@ from qgs_landmark.observed import ObservedQueries
 from qgs_landmark.places import cells, patch_centres
 from qgs_landmark.sweep import mismatch
 from qgs_locus.fields import CENTER
+from small_parts import made
 from torch.testing import assert_close
 
-from qgs.contracts import ModelDims
 from qgs.geometry.rays import camera_rays
 from qgs.types import Cameras, ImageMemory, Views
 
@@ -67,8 +67,7 @@ def test_depths_that_no_other_photo_sees_do_not_count():
 
 
 def test_anchors_start_where_the_photos_agree():
-    config = ObservedQueries.Config(count=None, near=0.5, far=4.5, sweep=25)
-    queries = ObservedQueries(config, ModelDims(width=8, heads=2, depth=1)).double().eval()
-    state = queries(ImageMemory(torch.randn(1, 96, 8).double(), grid=(2, 6, 8)), photos())
+    queries = made(ObservedQueries, count=None, near=0.5, far=4.5, sweep=25).double().eval()
+    state = queries(ImageMemory(torch.randn(1, 96, 16).double(), grid=(2, 6, 8)), photos())
     depth = state[CENTER][0, :48, 2].view(6, 8)[1:-1, 2:-2]
     assert_close(depth, torch.full_like(depth, WALL), rtol=0.05, atol=0.0)
