@@ -1,7 +1,10 @@
 """Every limit and epsilon of the releases is an option: published by default, and it matters."""
 
 from functools import cache
+from itertools import product
 from pathlib import Path
+from types import NoneType
+from typing import get_args
 
 import torch
 import yaml
@@ -9,6 +12,7 @@ from losses.judging import CAMERAS, GOLDEN, TRUTH, judged
 from qgs_locus import plugin
 
 from qgs import Views
+from qgs.components import COMPONENTS
 from qgs.composer import resolve
 from qgs.composer.recipe import flat
 from qgs.losses import COMPONENTS as LOSSES
@@ -57,6 +61,24 @@ def test_limits_of_losses_are_published_by_default_and_matter():
             if getattr(configs[0], option) != published or terms[0] == terms[1]:
                 wrong.append((loss.name, option))
     assert wrong == []
+
+
+def test_no_limit_was_forgotten():
+    """Of all floating-point options, those of optimisers aside."""
+    known = {
+        (name, option)
+        for row in TABLE["components"]
+        for name, option in product(row["component"], row["limits"])
+    }
+    known |= {(row["loss"], option) for row in TABLE["losses"] for option in row}
+    found = set()
+    for component in (*COMPONENTS, *LOSSES, *plugin.components):
+        for option, field in component.Config.model_fields.items():
+            kinds = {field.annotation, *get_args(field.annotation)} - {NoneType}
+            if float in kinds and component.slot != "optimizer":
+                found.add((component.name, option))
+    forgotten = {pair for pair in found - known if pair[1] not in TABLE["beginnings"]}
+    assert forgotten == set(), "add these to limits.yaml, with another value that must matter"
 
 
 def test_the_recipes_have_the_limits_of_their_releases():

@@ -38,10 +38,15 @@ STRAYS = {
 }
 
 
-def problems(path, golden):
+def written(path, golden):
     contiguous = {name: tensor.contiguous().clone() for name, tensor in golden.tensors.items()}
     save_file(contiguous, path, {"config": json.dumps(golden.config)})
-    return {row.name: row.problem for row in parity.rows_of(path) if row.problem}
+    return path
+
+
+def problems(path, golden):
+    rows = parity.rows_of(written(path, golden))
+    return {row.name: row.problem for row in rows if row.problem}
 
 
 def test_altered_and_added_tensors_fail_by_name_and_others_pass(tmp_path):
@@ -65,3 +70,20 @@ def test_numbers_that_are_not_finite_and_missing_tensors_fail_by_name(tmp_path):
     golden.tensors["keys"].fill_(torch.nan)
     del golden.tensors["geo_bias.1"]
     assert problems(tmp_path / "file", golden).keys() == {"keys", "geo_bias.1"}
+
+
+def test_wrong_options_fail(tmp_path):
+    passed = []
+    for source, wrong in (
+        ("locus_full_a", {"gaussian_scale_cap": 0.08}),
+        ("locus_full_a", {"anchor_radius_min": 0.5}),
+        ("locus_full_a", {"anchor_radius_affects_bias": False}),
+        ("locus_full_a", {"self_attn_variant": "content_only"}),
+        ("tokengs_a", {"gaussian_z_offset": 1.5}),
+        ("tokengs_a", {"enc_num_heads": 2}),
+    ):
+        golden = read_golden(FILES[source])
+        golden.config["options"] |= wrong
+        if parity.report(written(tmp_path / "file", golden)):
+            passed.append((source, wrong))
+    assert passed == []
