@@ -83,7 +83,7 @@ def pairwise(slots):
                 yield [slot[index] for slot, index in zip(slots, combination, strict=True)]
 
 
-@pytest.mark.parametrize("parts", pairwise([choices(path) for path in PATHS]))
+@pytest.mark.parametrize("parts", list(pairwise([choices(path) for path in PATHS])))
 def test_every_two_options_run_together_or_are_refused_with_all_that_they_lack(parts):
     overrides = [written(path, *part) for path, part in zip(PATHS, parts, strict=True)]
     told = str(problems_of(RECIPE, overrides))

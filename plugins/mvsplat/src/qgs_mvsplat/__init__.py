@@ -17,7 +17,7 @@ _SMALL = DepthSplatEncoder.Config(
     near=0.2,
     far=3.0,
     features=32,
-    cnn=(8, 16, 16),
+    cnn=(4, 8, 8),
     candidates=16,
     vit=VitConfig(width=16, depth=4, heads=2),
     blocks=(0, 1, 2, 3),
