@@ -1,12 +1,10 @@
 """`qgs` as a user types it, a model of one layer, and overrides that make recipes small."""
 
-from typing import Any
-
-from typer.testing import CliRunner, Result
+from typer.testing import CliRunner
 
 from qgs.cli import app
 
-MODEL: dict[str, Any] = {
+MODEL = {
     "width": 16,
     "heads": 2,
     "encoder": {"type": "qgs/multiview_vit", "patch_size": 8, "depth": 1},
@@ -18,10 +16,17 @@ MODEL: dict[str, Any] = {
 SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8")
 
 
-def run_qgs(*words: object) -> Result:
+def run_qgs(*words):
     return CliRunner().invoke(app, [*map(str, words)])
 
 
-def sets(*overrides: str) -> list[str]:
+def done(*words):
+    """The result of a command that must end well."""
+    result = CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def sets(*overrides):
     """The words of a command that make SMALL and these overrides."""
     return [word for setting in (*SMALL, *overrides) for word in ("--set", setting)]

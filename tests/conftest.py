@@ -7,13 +7,13 @@ from suite_watch import SuiteWatch
 __all__ = ["install"]
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure(config):
     """Have the whole suite, tests of plugins too, say what it costs."""
     config.pluginmanager.register(SuiteWatch(config), "suite-watch")
 
 
 @pytest.fixture(autouse=True)
-def _seeded_on_one_thread() -> None:
+def _seeded_on_one_thread():
     """The models are so small that a second thread only waits."""
     import torch  # the controller of several processes needs none
 
@@ -22,6 +22,6 @@ def _seeded_on_one_thread() -> None:
 
 
 @pytest.fixture(autouse=True)
-def few_samples_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+def few_samples_measured(monkeypatch):
     """A training measures the ranges of its views in .1 s, not in a second."""
     monkeypatch.setattr("qgs.data.stream.MEASURED", 48)

@@ -26,7 +26,7 @@ class FreshEnvironment:
 
     folder: Path
 
-    def run(self, command: str, cwd: Path, timeout: float = 600) -> str:
+    def run(self, command, cwd, timeout=600):
         """Standard output of a bash script in the activated environment; it must end well."""
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", command],
@@ -40,14 +40,14 @@ class FreshEnvironment:
         assert done.returncode == 0, f"{command}\n{done.stdout}"
         return done.stdout
 
-    def variables(self) -> dict[str, str]:
+    def variables(self):
         """Environment variables as `source bin/activate` leaves them."""
         kept = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
         path = f"{self.folder / 'bin'}{os.pathsep}{kept['PATH']}"
         return {**kept, "PATH": path, "VIRTUAL_ENV": str(self.folder), "COLUMNS": "200"}
 
 
-def make_fresh_environment(folder: Path) -> FreshEnvironment:
+def make_fresh_environment(folder):
     """Build the wheels of qgs and three plugins and install them into a new environment."""
     wheels = folder / "wheels"
     build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--wheel-dir", str(wheels)]
@@ -61,7 +61,7 @@ def make_fresh_environment(folder: Path) -> FreshEnvironment:
     return environment
 
 
-def _lend_packages(folder: Path) -> None:
+def _lend_packages(folder):
     lent = folder / "lent"
     lent.mkdir()
     for site in {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}:

@@ -4,31 +4,29 @@ import re
 from pathlib import Path
 
 from guide_hooks import filled
-from qgs_plugintools import Case, checks_for, run_check
+from qgs_plugintools import checks_for, run_check
 
 DOCS = Path(__file__).parents[1] / "docs"
 BLOCK = re.compile(r'^```(\w+)(?: title="([^"]*)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
 
 
-def text_of(page: str) -> str:
+def text_of(page):
     """A page as it is in the repository."""
-    return (DOCS / page).read_text(encoding="utf-8")
+    return (DOCS / page).read_text()
 
 
-def all_pages() -> dict[str, str]:
+def all_pages():
     """Path below docs/ to text of every page, with the parts that are written from the code."""
-    return {
-        str(path.relative_to(DOCS)): filled(path.read_text("utf-8")) for path in DOCS.rglob("*.md")
-    }
+    return {str(path.relative_to(DOCS)): filled(path.read_text()) for path in DOCS.rglob("*.md")}
 
 
-def blocks(page: str, kind: str) -> dict[str, str]:
+def blocks(page, kind):
     """Title, or position, to text of the blocks of one kind."""
     found = BLOCK.findall(text_of(page))
     return {t or str(i): text for i, (k, t, text) in enumerate(found) if k == kind}
 
 
-def contract_failures(*cases: Case) -> list[str]:
+def contract_failures(*cases):
     """What components of the guide do not keep of their contracts."""
     outcomes = [run_check(check, case) for case in cases for check in checks_for(case, ["core"])]
     return [outcome.message for outcome in outcomes if outcome.verdict == "failed"]

@@ -24,14 +24,14 @@ from qgs.types import Cameras, Gaussians, Views
 QUERIES, PER_QUERY, DEPTH = 12, 4, 3
 
 
-def build_model() -> QueryGaussianModel:
+def build_model():
     torch.manual_seed(0)
     dims = ModelDims(width=16, heads=2, depth=DEPTH)
 
     def make(component, **options):
         return component(component.Config(**options), dims)
 
-    def layer() -> CrossSelfMlp:
+    def layer():
         kinds = (ContentCrossAttention, ContentSelfAttention, MlpFeedForward)
         sublayers = {kind.slot: make(kind) for kind in kinds}
         return CrossSelfMlp(CrossSelfMlp.Config(), LayerParts(dims, sublayers, 0.1))
@@ -50,12 +50,12 @@ def build_model() -> QueryGaussianModel:
 
 
 @pytest.fixture
-def model() -> QueryGaussianModel:
+def model():
     return build_model()
 
 
 @pytest.fixture
-def cameras() -> Cameras:
+def cameras():
     """Two cameras (1, 2) of 32x32, the identity and one to its right."""
     c2w = torch.eye(4).repeat(1, 2, 1, 1)
     c2w[0, 1, 0, 3] = 0.3
@@ -64,13 +64,13 @@ def cameras() -> Cameras:
 
 
 @pytest.fixture
-def views(cameras: Cameras) -> Views:
+def views(cameras):
     generator = torch.Generator().manual_seed(1)
     return Views(torch.rand(1, 2, 3, 32, 32, generator=generator), cameras)
 
 
 @pytest.fixture
-def gaussians() -> Gaussians:
+def gaussians():
     """As many as the model makes, spread over what the cameras see."""
     generator = torch.Generator().manual_seed(2)
     count = QUERIES * PER_QUERY

@@ -2,29 +2,26 @@
 
 import json
 import sys
-from collections.abc import Callable
 from textwrap import dedent
 
 import pytest
 
 
 @pytest.fixture
-def install(
-    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., None]:
+def install(tmp_path_factory, monkeypatch):
     """Make a distribution importable: install(distribution, plugin name, module source).
 
     editable: as `pip install -e` leaves it. group: of its entry point.
     """
 
     def install(
-        distribution: str,
-        plugin: str,
-        source: str,
-        version: str = "1.2",
-        editable: bool = False,
-        group: str = "qgs.plugins",
-    ) -> None:
+        distribution,
+        plugin,
+        source,
+        version="1.2",
+        editable=False,
+        group="qgs.plugins",
+    ):
         folder, safe = tmp_path_factory.mktemp("site"), distribution.replace("-", "_")
         (folder / f"_test_{safe}.py").write_text(dedent(source))
         info = folder / f"{safe}-{version}.dist-info"

@@ -16,12 +16,12 @@ def circle(angles: torch.Tensor, radius: float) -> torch.Tensor:
 class Line(Scene):
     """Cameras along a line; frame f is an image of the value f / 100, brighter to the right."""
 
-    def __init__(self, count: int, held_out=(), step: float = 0.5, name: str = "") -> None:
+    def __init__(self, count, held_out=(), step=0.5, name=""):
         self.name = name or f"line{count}"
         self.held_out, self.count, self.step = held_out, count, step
 
     @property
-    def cameras(self) -> Cameras:
+    def cameras(self):
         c2w = torch.eye(4).repeat(self.count, 1, 1)
         c2w[:, 0, 3] = self.step * torch.arange(self.count) + 3
         return Cameras(c2w, torch.tensor([8.0, 8, 3, 4]).expand(self.count, 4), (8, 8))
@@ -34,7 +34,7 @@ class Line(Scene):
 class Lines(SceneSource):
     name = "lines"
 
-    def __init__(self, *scenes: Scene) -> None:
+    def __init__(self, *scenes):
         super().__init__(SceneSourceConfig(image_size=(8, 8)))
         self._scenes = scenes
 

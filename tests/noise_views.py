@@ -5,7 +5,7 @@ import torch
 from qgs.types import Cameras, Views
 
 
-def noise_views(height: int, width: int, scenes: int = 2, seed: int = 0) -> Views:
+def noise_views(height, width, scenes=2, seed=0):
     """Two views of each scene."""
     generator = torch.Generator().manual_seed(seed)
     turns = 0.1 * torch.randn(scenes, 2, 3, 3, generator=generator)

@@ -1,14 +1,9 @@
 """What a recipe that is refused is refused for."""
 
-from collections.abc import Callable
-from typing import Any
-
-from qgs.composer import RecipeError, RecipeProblem, resolve
+from qgs.composer import RecipeError, resolve
 
 
-def problems_of(
-    recipe: Any, *arguments: Any, by: Callable = resolve, **options: Any
-) -> tuple[RecipeProblem, ...]:
+def problems_of(recipe, *arguments, by=resolve, **options):
     """All problems for which `by`, called with these arguments, refuses a recipe."""
     try:
         by(recipe, *arguments, **options)
@@ -17,7 +12,7 @@ def problems_of(
     return ()
 
 
-def refused(recipe: Any, *arguments: Any, **options: Any) -> RecipeProblem:
+def refused(recipe, *arguments, **options):
     """The one problem."""
     (problem,) = problems_of(recipe, *arguments, **options)
     return problem

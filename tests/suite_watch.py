@@ -7,8 +7,6 @@ numba takes to compile a kernel for the first time belongs to no test.
 import gc
 import os
 import time
-from collections.abc import Iterator
-from typing import Any
 
 import pytest
 
@@ -18,7 +16,7 @@ MAX_SHARE = 1 / 20
 DEAREST = 10
 
 
-def cpu_seconds() -> float:
+def cpu_seconds():
     """Of this process and of the children that it has waited for."""
     times = os.times()
     return times.user + times.system + times.children_user + times.children_system
@@ -27,43 +25,43 @@ def cpu_seconds() -> float:
 class SuiteWatch:
     """Hooks of pytest that print what a whole run cost, and fail it beyond the limits."""
 
-    def __init__(self, config: pytest.Config) -> None:
+    def __init__(self, config):
         self.config = config
-        self.seconds: dict[str, float] = {}
+        self.seconds = {}
         self.workers = 0.0
         controls = config.getoption("dist", "no") != "no" and not hasattr(config, "workerinput")
         self.compiling = (lambda: 0.0) if controls else compilation_clock()
 
     @pytest.hookimpl(wrapper=True, tryfirst=True)
-    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
+    def pytest_runtest_protocol(self, item):
         """Count the CPU time of a test with its fixtures."""
         before = cpu_seconds() - self.compiling()
         result = yield
         self.seconds[item.nodeid] = cpu_seconds() - self.compiling() - before
         return result
 
-    def pytest_collection_finish(self) -> None:
+    def pytest_collection_finish(self):
         """Leave what was imported to itself: walking through it took a tenth of the time."""
         gc.collect()
         gc.freeze()
         gc.set_threshold(100_000, 20, 20)
 
     @pytest.hookimpl(optionalhook=True)
-    def pytest_testnodedown(self, node: Any) -> None:
+    def pytest_testnodedown(self, node):
         """Take over what a worker has counted."""
         seconds, whole = node.workeroutput.get("cost", ({}, 0.0))
         self.seconds |= seconds
         self.workers += whole
 
     @pytest.hookimpl(trylast=True)
-    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+    def pytest_sessionfinish(self, session):
         """Hand over what this worker has counted, or judge the whole run."""
         if hasattr(self.config, "workeroutput"):
             self.config.workeroutput["cost"] = (self.seconds, cpu_seconds() - self.compiling())
         elif self.faults() and session.exitstatus == pytest.ExitCode.OK:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
-    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+    def pytest_terminal_summary(self, terminalreporter):
         """Print the cost, the dearest tests and the faults."""
         if hasattr(self.config, "workeroutput") or not self.seconds:
             return
@@ -73,22 +71,22 @@ class SuiteWatch:
         for fault in self.faults():
             terminalreporter.write_line(f"FAILED: {fault}", red=True)
 
-    def whole(self) -> float:
+    def whole(self):
         """CPU seconds of all processes, collection included."""
         if self.workers:  # they are children of this process
             own = os.times()
             return own.user + own.system + self.workers
         return cpu_seconds() - self.compiling()
 
-    def count(self) -> int:
+    def count(self):
         """How many tests ran."""
         return len(self.seconds)
 
-    def dearest(self) -> list[tuple[float, str]]:
+    def dearest(self):
         """Seconds and names of the tests, the dearest first."""
         return sorted(((seconds, name) for name, seconds in self.seconds.items()), reverse=True)
 
-    def faults(self) -> list[str]:
+    def faults(self):
         """What the whole fast suite does not keep; a run of some tests may cost what it will."""
         if not is_whole(self.config):
             return []
@@ -107,29 +105,29 @@ class SuiteWatch:
         return found
 
 
-def is_whole(config: pytest.Config) -> bool:
+def is_whole(config):
     """Whether all fast tests of the repository were asked for."""
     chosen = config.option.keyword or config.getoption("lf", False)
     fast = config.option.markexpr == "not slow"
     return fast and not chosen and config.args_source == pytest.Config.ArgsSource.TESTPATHS
 
 
-def compilation_clock() -> Any:
+def compilation_clock():
     """A function that gives the seconds that numba has compiled for in this process."""
     try:
         from numba.core import event
     except ImportError:
         return lambda: 0.0
     spent = [0.0]
-    started: list[float] = []
+    started = []
 
     class Compilation(event.Listener):
         """Counts the outermost of compilations that wait for each other."""
 
-        def on_start(self, event: Any) -> None:
+        def on_start(self, event):
             started.append(time.process_time())
 
-        def on_end(self, event: Any) -> None:
+        def on_end(self, event):
             began = started.pop()
             if not started:
                 spent[0] += time.process_time() - began

@@ -1,11 +1,9 @@
 """Tables of what must be refused: what is not, or for another reason, is told."""
 
 import re
-from collections.abc import Callable
-from typing import Any
 
 
-def fault(match: str, function: Callable[..., Any], *given: Any, kind: Any = ValueError) -> str:
+def fault(match, function, *given, kind=ValueError):
     """What is wrong unless `function` raises `kind` with `match`; an empty text if nothing is."""
     try:
         function(*given)

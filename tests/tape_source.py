@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 from qgs.contracts import Plugin, Scene, SceneSource
@@ -13,14 +12,14 @@ from qgs.types import Cameras
 class Tape(Scene):
     """A file of images (F, H, W, 3) uint8 and poses (F, 4, 4); one in three is held out."""
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, file):
         with np.load(file) as arrays:
             self._images, self._c2w = arrays["images"], arrays["c2w"]
         self.name = file.stem
         self.held_out = tuple(range(1, len(self._images), 3))
 
     @property
-    def cameras(self) -> Cameras:
+    def cameras(self):
         height, width = self._images.shape[1:3]
         intrinsics = torch.tensor([width, width, width / 2, height / 2]).expand(len(self._c2w), 4)
         return Cameras(torch.from_numpy(self._c2w), intrinsics.double(), (height, width))
@@ -38,7 +37,7 @@ class TapeSource(SceneSource):
         path: str
         """The folder."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config):
         super().__init__(config)
         self._tapes = [Tape(file) for file in sorted(Path(config.path).glob("*.tape"))]
 
@@ -53,7 +52,7 @@ class TapeSource(SceneSource):
 plugin = Plugin("tapes", 1, (TapeSource,))
 
 
-def install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def install(folder, monkeypatch):
     """Install the plugin for a test; `folder` gets the metadata of its distribution."""
     info = folder / "qgs_tapes-1.0.dist-info"
     info.mkdir(parents=True)
@@ -62,7 +61,7 @@ def install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(folder)
 
 
-def write_tape(file: Path, frames: int = 6, size: tuple[int, int] = (16, 16)) -> None:
+def write_tape(file, frames=6, size=(16, 16)):
     """Noise, seen by cameras a step apart."""
     file.parent.mkdir(parents=True, exist_ok=True)
     images = np.random.default_rng(0).integers(0, 256, (frames, *size, 3), np.uint8)

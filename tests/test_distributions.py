@@ -8,10 +8,10 @@ import qgs
 ROOT = Path(__file__).parents[1]
 
 
-def test_messages_name_the_distributions_of_this_repository() -> None:
-    offered: dict[str, dict[str, str]] = {}
+def test_messages_name_the_distributions_of_this_repository():
+    offered = {}
     for file in ROOT.glob("plugins/*/pyproject.toml"):
-        project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
+        project = tomllib.loads(file.read_text())["project"]
         for group, entries in project["entry-points"].items():
             offered.setdefault(group, {}).update(dict.fromkeys(entries, project["name"]))
     assert {group: offered[group] for group in qgs.DISTRIBUTIONS} == qgs.DISTRIBUTIONS

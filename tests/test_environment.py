@@ -7,7 +7,7 @@ ENVIRONMENT = Path(__file__).parents[1] / "tools" / "environment.sh"
 FAKE_PYTHON = '#!/bin/sh\nif [ "$2" = venv ]; then mkdir -p "$3/bin"; fi\n'
 
 
-def make_environment(directory: Path) -> subprocess.CompletedProcess[str]:
+def make_environment(directory):
     """Source the script with a Python that only makes folders, and make `directory`."""
     python = directory.parent / "python"
     python.write_text(FAKE_PYTHON)
@@ -21,7 +21,7 @@ make_environment "{directory}"
     return subprocess.run(["bash", "-c", script], capture_output=True, text=True)
 
 
-def test_an_environment_of_someone_else_is_never_deleted(tmp_path: Path) -> None:
+def test_an_environment_of_someone_else_is_never_deleted(tmp_path):
     venv = tmp_path / ".venv"
     venv.mkdir()
     (venv / "notes.txt").write_text("mine")
@@ -31,7 +31,7 @@ def test_an_environment_of_someone_else_is_never_deleted(tmp_path: Path) -> None
     assert [path.name for path in venv.iterdir()] == ["notes.txt"]
 
 
-def test_an_environment_of_its_own_is_made_again(tmp_path: Path) -> None:
+def test_an_environment_of_its_own_is_made_again(tmp_path):
     venv = tmp_path / ".venv"
     venv.mkdir()
     (venv / ".qgs-made").touch()

@@ -37,9 +37,9 @@ class HostWaits(TorchFunctionMode):
     device. `numpy` is none: CPU kernels use it, and it refuses tensors of another device.
     """
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
-        self.found: list[str] = []
+        self.found = []
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
         name, kwargs = getattr(func, "__name__", ""), kwargs or {}
@@ -67,7 +67,7 @@ def test_a_forward_pass_never_waits(tmp_path):
         with HostWaits() as waits:
             model(views)
         found += [f"{name}: {call}" for call in waits.found]
-    assert found == []
+    assert not found
 
 
 def test_waits_are_found():
@@ -79,7 +79,7 @@ def test_waits_are_found():
     assert waits.found == expected
 
 
-def name_of(function: ast.expr) -> str:
+def name_of(function):
     return getattr(function, "attr", "") or getattr(function, "id", "")
 
 
@@ -92,7 +92,7 @@ def test_no_module_reaches_a_higher_layer_by_name():
     found = []
     files = {*(ROOT / "qgs").rglob("*.py")}
     for file in sorted(files - {ROOT / "qgs/__init__.py"}):  # whose table is the exception
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        for node in ast.walk(ast.parse(file.read_text())):
             by_name = False
             if isinstance(node, ast.Call) and name_of(node.func).endswith(IMPORTERS):
                 by_name = any("qgs" in ast.unparse(argument) for argument in node.args)
@@ -100,4 +100,4 @@ def test_no_module_reaches_a_higher_layer_by_name():
                 by_name = f"{node.value.id}.{node.attr}" in PUBLIC
             if by_name:
                 found.append(f"{file.relative_to(ROOT)}:{node.lineno}: {ast.unparse(node)}")
-    assert found == []
+    assert not found

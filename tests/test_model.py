@@ -13,18 +13,18 @@ RECIPES = Path(__file__).parents[1] / "recipes"
 SMALL = ["model.width=32", "model.heads=2", "model.queries.count=12"]
 
 
-def small(name: str, *overrides: str) -> qgs.QueryGaussianModel:
+def small(name, *overrides):
     overrides = [*SMALL, *overrides]
     return qgs.compose(RECIPES / f"tiny/{name}.yaml", overrides=overrides).eval()
 
 
 @pytest.fixture(params=["tokengs", "locus"])
-def model(request: pytest.FixtureRequest) -> qgs.QueryGaussianModel:
+def model(request):
     return small(request.param)
 
 
 @pytest.fixture
-def views() -> qgs.Views:
+def views():
     return noise_views(16, 24)
 
 

@@ -13,12 +13,12 @@ from qgs.cli import COMMANDS, GROUP
 from qgs.composer.slots import SECTIONS, SLOTS
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+README = (ROOT / "README.md").read_text()
 
 
 def test_the_readme_shows_the_overlay_and_paths_that_exist():
     (shown,) = re.findall(r"```yaml\n(.*?)```", README, re.DOTALL)
-    recipe = (ROOT / "recipes/locus/overlay.yaml").read_text(encoding="utf-8")
+    recipe = (ROOT / "recipes/locus/overlay.yaml").read_text()
     assert yaml.safe_load(shown) == yaml.safe_load(recipe)
     paths = re.findall(r"[`(](?:\./)?((?:recipes|tools|docs|plugins|tests)/[\w./-]+)[`)]", README)
     assert paths

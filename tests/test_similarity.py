@@ -4,25 +4,24 @@ from itertools import product
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
-from qgs.similarity import Padding, mean_ssim, similarity_map
+from qgs.similarity import mean_ssim, similarity_map
 
 
-def pair(*shape: int) -> tuple[Tensor, Tensor]:
+def pair(*shape):
     torch.manual_seed(0)
     truth = torch.rand(shape)
     return (truth + 0.2 * torch.randn(shape)).requires_grad_(), truth
 
 
-def slow(x: Tensor, y: Tensor, padding: Padding) -> Tensor:
+def slow(x, y, padding):
     """Equation 13 of Wang et al. 2004, every window of 11 x 11 pixels copied out, in float64."""
     offset = torch.arange(-5.0, 6.0, dtype=torch.float64)
     weights = torch.exp(-(offset[:, None] ** 2 + offset**2) / (2 * 1.5**2)).flatten()
     border = 5 if padding == "same" else 0
     x, y = x.double(), y.double()
 
-    def mean(image: Tensor) -> Tensor:
+    def mean(image):
         planes = image.reshape(-1, 1, *image.shape[-2:])
         windows = F.unfold(planes, 11, padding=border)
         return (weights / weights.sum() * windows.mT).sum(-1)
@@ -49,7 +48,7 @@ def test_values_and_gradients():
             off = (slope - reference).abs().max() / reference.abs().max()
             if not ((found - expected).abs() <= (1e-12 if exact else 2e-7) and off <= 3e-6):
                 wrong.append((padding, size, dtype, found - expected, off))
-    assert wrong == []
+    assert not wrong
 
 
 def test_any_leading_dimensions_and_strides():

@@ -28,7 +28,7 @@ BALLS = [x[:, 0] for x in (THREE, *CUBES)]
 
 
 @pytest.fixture
-def memory() -> ImageMemory:
+def memory():
     return ImageMemory(
         keys=torch.zeros(2, 4, 6, 8),
         values=torch.zeros(2, 4, 6, 8),
@@ -38,7 +38,7 @@ def memory() -> ImageMemory:
     )
 
 
-def zeros(*shape: int) -> torch.Tensor:
+def zeros(*shape):
     return torch.zeros(shape)
 
 
@@ -55,13 +55,13 @@ def zeros(*shape: int) -> torch.Tensor:
         (SpatialSupport, [zeros(1, 2, 3), zeros(1, 2, 3)], r"SpatialSupport\.axes"),
     ],
 )
-def test_what_does_not_fit_together_is_refused(make: type, parts: list, message: str) -> None:
+def test_what_does_not_fit_together_is_refused(make, parts, message):
     with pytest.raises(ValueError, match=message):
         make(*parts)
 
 
-def test_memo_does_not_leak_between_gradient_modes(memory: ImageMemory) -> None:
-    def doubled() -> torch.Tensor:
+def test_memo_does_not_leak_between_gradient_modes(memory):
+    def doubled():
         return memory.once("test.doubled", lambda: 2 * memory.patch_rays)
 
     with torch.no_grad():
@@ -72,13 +72,13 @@ def test_memo_does_not_leak_between_gradient_modes(memory: ImageMemory) -> None:
     assert doubled() is doubled()
 
 
-def test_a_state_knows_its_fields_by_name() -> None:
+def test_a_state_knows_its_fields_by_name():
     state = QueryState(torch.zeros(2, 3, 4), {"place": torch.zeros(2, 3, 1)})
     assert "place" in state
     assert "elsewhere" not in state
 
 
-def test_every_nested_tensor_is_mapped_and_named() -> None:
+def test_every_nested_tensor_is_mapped_and_named():
     state = QueryState(torch.zeros(1, 2, 4), {"place": torch.ones(1, 2, 3)})
     value = {"state": state, 3: [torch.ones(2), "text", (torch.zeros(1), None)]}
     assert [name for name, _ in named_tensors(value, "value")] == [
@@ -95,14 +95,14 @@ def test_every_nested_tensor_is_mapped_and_named() -> None:
     assert map_tensors(lambda x: x, value) is value
 
 
-def rich_gaussians(count: int, seed: int = 0) -> Gaussians:
+def rich_gaussians(count, seed=0):
     """Gaussians (2, count) with everything that they may have."""
     generator = torch.Generator().manual_seed(seed)
     shapes = ((3,), (3,), (4,), (), (3,), (8, 3), (2,))
     return Gaussians(*(torch.rand(2, count, *shape, generator=generator) for shape in shapes))
 
 
-def test_the_most_opaque_keep_all_that_they_have() -> None:
+def test_the_most_opaque_keep_all_that_they_have():
     gaussians = rich_gaussians(9)
     kept = gaussians.most_opaque(4)
     for scene in range(2):
@@ -115,7 +115,7 @@ def test_the_most_opaque_keep_all_that_they_have() -> None:
     assert gaussians[:, :3].features.shape == (2, 3, 2)
 
 
-def test_containers_are_put_together_tensor_by_tensor() -> None:
+def test_containers_are_put_together_tensor_by_tensor():
     one, other = rich_gaussians(3), rich_gaussians(4, seed=1)
     both = concatenated([one, other], 1)
     assert both.count == 7

@@ -18,17 +18,17 @@ class Shot:
     image: np.ndarray
     c2w: np.ndarray
 
-    def encoded(self, kind: str = "JPEG") -> bytes:
+    def encoded(self, kind="JPEG"):
         return photo_formats.encoded(self.image, kind, quality=92)
 
 
-def walk(count: int, seed: int = 0) -> list[Shot]:
+def walk(count, seed=0):
     """Photos along a rising arc that turns and rolls, so that no convention is ambiguous."""
     walls = np.random.default_rng(seed).random((6, 40, 40))
     return [_shot(walls, pose) for pose in _poses(count)]
 
 
-def _poses(count: int) -> list[np.ndarray]:
+def _poses(count):
     poses = []
     for place in np.linspace(0, 1, count):
         angles = 0.5 * place - 0.2, 0.15 - 0.3 * place, 0.25 * place
@@ -39,7 +39,7 @@ def _poses(count: int) -> list[np.ndarray]:
     return poses
 
 
-def _shot(walls: np.ndarray, pose: np.ndarray) -> Shot:
+def _shot(walls, pose):
     """Every pixel's ray meets the box's walls, at 1.2, 1 and 1.5 from the origin, from inside."""
     fx, fy, cx, cy = INTRINSICS
     y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5

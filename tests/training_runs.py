@@ -1,22 +1,21 @@
 """Runs of tiny models, for the tests of training."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import pytest
 import torch
 from rich.console import Console
 
 from qgs.composer import Recipe, resolve
-from qgs.data.samples import Batch, Sample
 from qgs.data.stream import SampleStream, training_batches
 from qgs.engine.distributed import StopRequest
 from qgs.engine.folder import RunFolder, read_state
 from qgs.engine.tracking import TrainingProgress
-from qgs.engine.training import Trainer, TrainingResult, train
+from qgs.engine.training import Trainer, train
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "tiny"
 
@@ -42,7 +41,7 @@ TWO = ("plugins=[rooms, locus, two]", "objective={type: two/two_passes}", "views
 """With the fixture `two`: train on two passes of the model."""
 
 
-def tiny(name: str, *overrides: str) -> Recipe:
+def tiny(name, *overrides):
     """A recipe of recipes/tiny, smaller yet, with overrides."""
     return resolve(RECIPES / f"{name}.yaml", [*SMALL, *overrides])
 
@@ -50,12 +49,12 @@ def tiny(name: str, *overrides: str) -> Recipe:
 tiny_recipe: Tiny = tiny
 
 
-def run(recipe: Recipe, folder: Path, resume: bool = False, device: str = "cpu") -> TrainingResult:
+def run(recipe, folder, resume=False, device="cpu"):
     return train(recipe, folder, console=QUIET, device=device, resume=resume)
 
 
 @pytest.fixture(scope="session")
-def trained_run(tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
+def trained_run(tmp_path_factory):
     """A finished run of `tiny("locus", *TRAINED)`, 3 steps; a test that changes it takes a copy."""
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
@@ -64,16 +63,16 @@ def trained_run(tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
 
 
 def run_calling(
-    after_step: Callable[[Trainer, StopRequest], Any],
-    recipe: Recipe,
-    folder: Path,
-    resume: bool = False,
-) -> TrainingResult:
+    after_step,
+    recipe,
+    folder,
+    resume=False,
+):
     """A run that calls `after_step(trainer, stop)` after each step."""
     stop = StopRequest()
 
     class Calling(TrainingProgress):
-        def update(self, *_: float) -> bool:
+        def update(self, *_):
             after_step(trainer, stop)
             return False
 
@@ -81,11 +80,11 @@ def run_calling(
         return trainer.run(Calling(QUIET), stop)
 
 
-def weights(result: TrainingResult) -> dict[str, torch.Tensor]:
+def weights(result):
     return result.model.state_dict()
 
 
-def same(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
+def same(first, second):
     """Whether two mappings hold the same tensors, to the bit, and the same values."""
     return first.keys() == second.keys() and all(
         torch.equal(value, second[name]) if torch.is_tensor(value) else value == second[name]
@@ -93,16 +92,16 @@ def same(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
     )
 
 
-def parts_of(folder: Path) -> Mapping[str, Any]:
+def parts_of(folder):
     """What the saved state of a run holds, by part."""
     return read_state(RunFolder(folder).state).parts
 
 
-def saved_step(folder: Path) -> int:
+def saved_step(folder):
     return parts_of(folder)["counters"]["step"]
 
 
-def assert_equal_runs(first: Path, second: Path) -> None:
+def assert_equal_runs(first, second):
     """Same weights, optimiser state and random states to the bit, same history but for time."""
     ours, theirs = parts_of(first), parts_of(second)
     for parts in (ours, theirs):
@@ -114,27 +113,25 @@ def assert_equal_runs(first: Path, second: Path) -> None:
     assert one == other
 
 
-def first_batch(recipe: Recipe) -> Batch:
+def first_batch(recipe):
     return next(training_batches(recipe.build_data(), recipe.views, 2, seed=0))
 
 
-def losses(run: Path) -> list[float]:
+def losses(run):
     return [record["loss"] for record in RunFolder(run).history()]
 
 
-def read_jsonl(path: Path) -> list[dict[str, Any]]:
+def read_jsonl(path):
     """The records of a JSONL file, each strictly JSON."""
-    lines = path.read_text(encoding="utf-8").splitlines()
+    lines = path.read_text().splitlines()
     return [json.loads(line, parse_constant=pytest.fail) for line in lines]
 
 
-def change_samples(
-    monkeypatch: pytest.MonkeyPatch, change: Callable[[Sample, int, int], None]
-) -> None:
+def change_samples(monkeypatch, change):
     """`change(sample, number, attempt)` alters each training sample in place, or raises."""
     made = SampleStream._made
 
-    def changed(stream: SampleStream, number: int, attempt: int) -> Sample:
+    def changed(stream, number, attempt):
         sample = made(stream, number, attempt)
         change(sample, number, attempt)
         return sample

@@ -6,26 +6,23 @@ import signal
 import socket
 import traceback
 from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from accelerate.state import AcceleratorState
 from training_runs import change_samples, run
 
-from qgs.composer import Recipe, resolve
-from qgs.data.samples import Sample
+from qgs.composer import resolve
 from qgs.data.stream import SampleError
 
 SECONDS = 240
 """After which processes that wait for each other are ended."""
 
 
-def spoil(bad: int, nan: bool) -> None:
+def spoil(bad, nan):
     """Sample `bad`, where it replaces none, has a bad pixel or cannot be made."""
 
-    def change(sample: Sample, number: int, attempt: int) -> None:
+    def change(sample, number, attempt):
         if number == bad and not attempt:
             if not nan:
                 raise SampleError(f"scene 'x', frame {bad} (a.png): cannot be read")
@@ -34,7 +31,7 @@ def spoil(bad: int, nan: bool) -> None:
     change_samples(pytest.MonkeyPatch(), change)
 
 
-def train_as(rank: int, port: int, tree: Any, folder: Path, *spoiled: Any) -> Any:
+def train_as(rank, port, tree, folder, *spoiled):
     """What one of the processes does; it ends, and with it the other, at any other error."""
     signal.alarm(SECONDS)
     torch.set_num_threads(1)
@@ -56,7 +53,7 @@ def train_as(rank: int, port: int, tree: Any, folder: Path, *spoiled: Any) -> An
     return result.main, result.steps, dict(result.left_out), total
 
 
-def told_by_two(recipe: Recipe, folder: Path, *spoiled: Any) -> list[Any]:
+def told_by_two(recipe, folder, *spoiled):
     """Continue or start the run in `folder`; what each process knows of it, or its error.
 
     spoiled: arguments of `spoil`.

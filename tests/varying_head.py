@@ -6,16 +6,13 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from qgs.components import GaussianHead
-from qgs.types import GaussianAttributes, QueryState
-
 HARMONICS, FEATURES = 8, 4
 
 
 class VaryingHead(nn.Module):
     """What `head` decodes, with `sh` (B, N, K, 8, 3) and `features` (B, N, K, 4) in addition."""
 
-    def __init__(self, head: GaussianHead) -> None:
+    def __init__(self, head):
         super().__init__()
         self.head, self.config = head, head.config
         channels = head.gaussians_per_query * (3 * HARMONICS + FEATURES)
@@ -23,7 +20,7 @@ class VaryingHead(nn.Module):
         self.linear = nn.Linear(head.linear.in_features, channels, bias=False)
         nn.init.normal_(self.linear.weight, std=0.1, generator=generator)
 
-    def forward(self, state: QueryState) -> GaussianAttributes:
+    def forward(self, state):
         normed = F.layer_norm(state.features, state.features.shape[-1:])
         raw = self.linear(normed).unflatten(-1, (self.head.gaussians_per_query, -1))
         sh, features = raw.split([3 * HARMONICS, FEATURES], -1)

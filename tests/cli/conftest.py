@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import run_qgs, sets
+from commands import done, run_qgs, sets
 
 from qgs.analysis import saving
 
@@ -20,23 +20,17 @@ QUICK = sets(
 )
 
 
-def train(out, *words):
-    return run_qgs("train", RECIPE, "--out", out, *QUICK, *words)
-
-
 @pytest.fixture(scope="session")
 def training():
     """A function: train a tiny model for two steps into a folder, with these words more."""
-    return train
+    return lambda out, *words: run_qgs("train", RECIPE, "--out", out, *QUICK, *words)
 
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
     """What that printed and its folder, which no test changes."""
     out = tmp_path_factory.mktemp("trained") / "run"
-    result = train(out)
-    assert result.exit_code == 0, result.output
-    return result.output, out
+    return done("train", RECIPE, "--out", out, *QUICK).output, out
 
 
 @pytest.fixture

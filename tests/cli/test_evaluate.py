@@ -3,12 +3,11 @@
 import csv
 import json
 import shutil
-from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from commands import MODEL, run_qgs
+from commands import MODEL, done, run_qgs
 from photo_formats import noisy_photos
 from PIL import Image
 from training_runs import run as train
@@ -17,8 +16,6 @@ import qgs
 from qgs.cli.evaluate import evaluation_folder
 from qgs.cli.options import tuning_settings
 from qgs.composer import resolve
-
-evaluated = partial(run_qgs, "eval")
 
 
 def summary(folder):
@@ -37,25 +34,23 @@ def test_an_index_becomes_a_protocol_and_strict_evaluations_that_lack_a_scene_fa
     index = tmp_path / "two: rooms.json"
     out = tmp_path / "out"
     entry = {"context": [0, 3], "target": [1, 2]}
-    index.write_text(json.dumps({"test/000001": entry, "test/000002": entry, "absent": entry}))
-    words = (trained[1], "--index", index, "--out", out, "--batch", 2)
-    result = evaluated(*words)
-    assert result.exit_code == 0, result.output
-    told = summary(out)
-    assert told["protocol"]["name"] == "two: rooms"
-    assert told["protocol"]["settings"]["views"]["index"]["scenes"] == 3
-    assert len(told["missing"]) == 1
+    index.write_text(json.dumps({"test/000001": entry, "absent": entry}))
+    words = ("eval", trained[1], "--index", index, "--out", out, "--batch", 2)
+    done(*words)
+    protocol = summary(out)["protocol"]
+    assert protocol["name"] == "two: rooms"
+    assert protocol["settings"]["views"]["index"]["scenes"] == 2
     assert str(tmp_path) not in (out / "summary.json").read_text()
-    assert evaluated(*words, "--strict").exit_code == 1
+    assert run_qgs(*words, "--strict").exit_code == 1
     index.write_text(json.dumps({"test/000001": entry}))
-    assert evaluated(*words, "--strict").exit_code == 0
+    done(*words, "--strict")
 
 
 def test_other_settings_go_into_a_folder_of_their_own_and_are_told(run):
     (run / "checkpoint_ema.safetensors").write_bytes((run / "checkpoint.safetensors").read_bytes())
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    result = evaluated(run, "--tune", 2, "--set", "evaluation.scenes=1", "--device", "cpu")
-    assert f"qgs eval {run / 'checkpoint_ema.safetensors'}" in result.output
+    shown = done("eval", run, "--tune", 2, "--set", "evaluation.scenes=1", "--device", "cpu").output
+    assert f"qgs eval {run / 'checkpoint_ema.safetensors'}" in shown
     told = summary(run / "evaluation-2")
     assert told["tuning"]["steps"] == 2
     assert (told["scenes"], told["step"]) == (1, 2)
@@ -78,17 +73,11 @@ plugin = Plugin("mine", 1, (Mean,))
 
 def test_a_metric_of_a_plugin_that_was_installed_later(run, tmp_path, install):
     install("mine", "mine", PLUGIN)
+    out = tmp_path / "out"
     more = ("plugins=[mine]", "metrics.level.type=mine/mean")
-    evaluated(
-        run / "checkpoint.safetensors",
-        "--set",
-        more[0],
-        "--set",
-        more[1],
-        "--out",
-        tmp_path / "out",
-    )
-    assert "level" in summary(tmp_path / "out")["columns"]
+    words = [word for setting in more for word in ("--set", setting)]
+    done("eval", run / "checkpoint.safetensors", *words, "--out", out)
+    assert "level" in summary(out)["columns"]
     judged = resolve(resolve(run / "recipe.yaml").tree, ("training.steps=3", *more))
     result = train(judged, run, resume=True)
     assert result.resumed_at == 2
@@ -104,17 +93,13 @@ def test_other_weights_of_a_run_keep_its_evaluation(tmp_path):
         ("checkpoint_ema", True): "evaluation_ema-3",
         ("checkpoint", True): "evaluation-2",
     }
-    found = {
-        (name, other): evaluation_folder(tmp_path / f"{name}.safetensors", other).name
-        for name, other in cases
-    }
-    assert found == cases
+    for (name, other), folder in cases.items():
+        assert evaluation_folder(tmp_path / f"{name}.safetensors", other).name == folder
 
 
 def test_settings_of_the_trained_model_are_refused(trained):
-    error = evaluated(trained[1], "--set", "training.steps=1").exception
-    assert isinstance(error, ValueError)
-    assert "would change the trained model" in str(error)
+    with pytest.raises(ValueError, match="would change the trained model"):
+        done("eval", trained[1], "--set", "training.steps=1")
 
 
 def test_tune_says_what_and_how_often():
@@ -140,7 +125,7 @@ def test_an_evaluation_names_its_photos_and_says_where_a_copy_is_better(tmp_path
         model.head.linear.bias.unflatten(0, (-1, 14))[:, 6:9] = 5.0
     domain = {"samples": 4, "ranges": {"baseline": [0, 9]}}
     qgs.save(model, tmp_path / "checkpoint.safetensors", extra={"trained_on": json.dumps(domain)})
-    assert evaluated(tmp_path).exit_code == 0
+    done("eval", tmp_path)
     folder = tmp_path / "evaluation"
     remarks = summary(folder)["remarks"]
     for word in ("17% is cut off", "worse than the nearest", "within"):

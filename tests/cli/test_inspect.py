@@ -3,7 +3,7 @@
 import sys
 
 import pytest
-from commands import run_qgs
+from commands import done
 
 from qgs.cli import main
 from qgs.composer import resolve
@@ -40,16 +40,14 @@ def test_list_explains_options():
         "recipe": ["seed", "init_from"],
     }
     for name, parts in cases.items():
-        result = run_qgs("list", name)
-        assert result.exit_code == 0, result.output
-        output = " ".join(result.output.replace("\N{BOX DRAWINGS LIGHT VERTICAL}", "|").split())
-        assert [part for part in parts if part not in output] == []
+        shown = done("list", name).output.replace("\N{BOX DRAWINGS LIGHT VERTICAL}", "|")
+        output = " ".join(shown.split())
+        assert not [part for part in parts if part not in output]
         assert "qgs/mlp" not in output
 
 
 def test_compose_prints_a_recipe_that_composes_again(tmp_path):
-    result = run_qgs("compose", "a.yaml", "--set", "model.queries.count=5")
-    assert result.exit_code == 0, result.output
+    result = done("compose", "a.yaml", "--set", "model.queries.count=5")
     assert "--set #1" in result.stdout
     assert "a.yaml:3" in result.stdout
     (tmp_path / "again.yaml").write_text(result.stdout)

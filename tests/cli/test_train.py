@@ -5,7 +5,8 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
-from commands import MODEL, run_qgs, sets
+import pytest
+from commands import MODEL, done, sets
 
 from qgs.cli.train import with_absolute_path
 from qgs.composer import resolve
@@ -27,13 +28,12 @@ def test_a_finished_run_is_left_as_it_is(training, trained):
     _, run = trained
     files = [path for path in run.rglob("*") if path.is_file()]
     before = [(path.read_bytes(), path.stat().st_mtime_ns) for path in files]
-    again = training(run, "--resume")
-    assert again.exit_code == 0, again.output
+    assert training(run, "--resume").exit_code == 0
     other = training(run, "--resume", "--set", "seed=3")
     assert "seed: 3" in str(other.exception)
     assert isinstance(training(run).exception, FileExistsError)
     assert [(path.read_bytes(), path.stat().st_mtime_ns) for path in files] == before
-    assert run_qgs("eval", run).exit_code == 0
+    done("eval", run)
     assert [path.read_bytes() for path in files] == [text for text, _ in before]
 
 
@@ -64,10 +64,9 @@ def test_what_is_missing_is_told_before_training(tmp_path, monkeypatch):
         (("evaluation.index=null", "plugins=[rooms]", ROOMS), "runs/locus/dl3dv"),
     )
     for overrides, message in cases:
-        result = run_qgs("train", FINETUNE, "--out", "run", "--device", "cpu", *sets(*overrides))
-        assert isinstance(result.exception, FileNotFoundError)
-        assert re.search(message, str(result.exception))
-        assert list(tmp_path.iterdir()) == []
+        with pytest.raises(FileNotFoundError, match=message):
+            done("train", FINETUNE, "--out", "run", "--device", "cpu", *sets(*overrides))
+        assert not list(tmp_path.iterdir())
 
 
 def test_paths_become_absolute_and_urls_stay(tmp_path, monkeypatch):

@@ -1,6 +1,5 @@
 """A plugin whose components depend on each other, and recipes in the working directory."""
 
-from collections.abc import Callable
 from pathlib import Path
 from textwrap import dedent
 
@@ -115,18 +114,18 @@ plugin = Plugin("second", 1, (LatentQueries,))
 
 
 @pytest.fixture
-def installed(install: Callable[..., None]) -> None:
+def installed(install):
     """Sound plugins: `spatial` and `mine`, whose components depend on each other, and `second`."""
     for name, source in (("spatial", SPATIAL), ("mine", MINE), ("second", SECOND)):
         install(f"qgs-{name}", name, source)
 
 
 @pytest.fixture
-def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+def write(tmp_path, monkeypatch):
     """Write recipes into the working directory: write(text) or write(text, name)."""
     monkeypatch.chdir(tmp_path)
 
-    def write(text: str, name: str = "recipe.yaml") -> Path:
+    def write(text, name="recipe.yaml"):
         Path(name).write_text(dedent(text).lstrip("\n"))
         return Path(name)
 

@@ -6,7 +6,6 @@ Those that are refused with a recipe are cases/plugins.txt.
 import sys
 import traceback
 from pathlib import Path
-from typing import Any
 
 import pytest
 from refusals import refused
@@ -116,7 +115,7 @@ def test_what_fails_when_it_is_built_names_its_distribution_but_missing_data(wri
 
 
 def test_a_plugin_in_memory_has_no_distribution():
-    names: dict[str, Any] = {}
+    names = {}
     exec(FAULTY, names)
     model = {"decoder": {"refinement": {"type": "faulty/silent"}}}
     recipe = {"recipe": 1, "plugins": ["faulty"], "model": model}

@@ -25,17 +25,17 @@ model: {width: 16, heads: 2, decoder: {depth: 2}, supervision: {layers: [2]}}
 REFUSED = re.compile(r" *# refused: (\S+): (.+)")
 
 
-def split(text: str, mark: str) -> list[tuple[str, str]]:
+def split(text, mark):
     """Headings, marked at the start of their lines, and the text below each."""
     found = re.split(f"^{mark} (.+)\n", text, flags=re.MULTILINE)
     return list(zip(found[1::2], found[2::2], strict=True))
 
 
-def has_all(text: str, words: str) -> bool:
+def has_all(text, words):
     return all(word in text for word in words.split("; "))
 
 
-def faults(files: dict[str, str]) -> list[str]:
+def faults(files):
     """What is not as the case says."""
     overrides = [REFUSED.sub("", line) for line in files.get("--set", "").splitlines() if line]
     expected = [
@@ -77,7 +77,7 @@ def test_recipes_are_refused_or_resolved(
     monkeypatch,
 ):
     wrong = []
-    cases = split((CASES / f"{subject}.txt").read_text(encoding="utf-8"), "===")
+    cases = split((CASES / f"{subject}.txt").read_text(), "===")
     for number, (title, text) in enumerate(cases):
         folder = tmp_path / str(number)
         folder.mkdir()

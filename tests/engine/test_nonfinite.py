@@ -140,7 +140,7 @@ def test_an_incident_can_be_seen_again(step, tmp_path):
         own = dict(named_tensors({"inputs": bad.inputs, "targets": bad.targets}))
         saved = {name: file.get_tensor(name)[2:] for name in file.keys()}  # noqa: SIM118
         torch.testing.assert_close(saved, own, rtol=0, atol=0, equal_nan=True)
-    example = GUIDE.read_text(encoding="utf-8").split("incidents/step-N")[1].split("```python\n")[1]
+    example = GUIDE.read_text().split("incidents/step-N")[1].split("```python\n")[1]
     ran = {}
     exec(example.split("```")[0].replace("RUN/incidents", str(tmp_path / "incidents")), ran)
     targets = ran["views"](ran["saved"], "targets")

@@ -106,7 +106,7 @@ def test_a_pattern_names_a_part_and_all_below_it():
             factors = recipe.rate_factors(module)
             found = {n.removeprefix("model.") for n, factor in factors.items() if factor == 0.5}
             wrong += [pattern] * (found != wanted or not found)
-    assert wrong == []
+    assert not wrong
 
 
 def test_a_pattern_that_matches_nothing_ends_the_start(tmp_path):

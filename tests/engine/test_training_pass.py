@@ -132,7 +132,7 @@ def test_terms_and_gradients_do_not_depend_on_how_many_views_are_rendered_at_onc
             distance = furthest(gradients(objective, outcome.total), wanted)
             if not distance < 1e-6:
                 wrong.append((all_at_once, objective.render_views, distance))
-    assert wrong == []
+    assert not wrong
 
 
 @pytest.mark.parametrize("render_views", [0, 1])

@@ -2,7 +2,6 @@
 
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
@@ -10,19 +9,18 @@ from noise_views import noise_views
 
 from qgs.composer import resolve
 from qgs.engine.training_pass import TrainingPass
-from qgs.types import Views
 
 FILE = Path(__file__).parents[2] / "docs/examples/nano_locus.py"
 MAX_LINES = 300
 
 
 @pytest.fixture
-def nano(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def nano(monkeypatch):
     monkeypatch.syspath_prepend(FILE.parent)
     return import_module(FILE.stem)
 
 
-def parts(v: Views) -> tuple[torch.Tensor, ...]:
+def parts(v):
     return v.images, v.cameras.c2w, v.cameras.intrinsics
 
 
@@ -72,6 +70,6 @@ def test_it_trains(nano, monkeypatch, capsys):
 
 
 def test_it_can_be_read_in_one_sitting():
-    text = FILE.read_text(encoding="utf-8")
+    text = FILE.read_text()
     assert len(text.splitlines()) <= MAX_LINES
     assert "import qgs" not in text

@@ -13,7 +13,7 @@ MAX_LINES = 120
 
 
 def test_it_is_short_trains_and_saves_a_scene(tmp_path, monkeypatch, capsys):
-    assert len(EXAMPLE.read_text(encoding="utf-8").splitlines()) <= MAX_LINES
+    assert len(EXAMPLE.read_text().splitlines()) <= MAX_LINES
     recipe, out = tmp_path / "recipe.yaml", tmp_path / "scene.ply"
     smaller = ["model.queries.count=64", "data.image_size=[32, 32]"]
     recipe.write_text(annotated(resolve("tiny/locus.yaml", smaller)))

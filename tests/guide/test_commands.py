@@ -3,7 +3,6 @@
 import re
 import shlex
 import tomllib
-from collections.abc import Iterator
 from typing import Any
 
 import typer
@@ -16,7 +15,7 @@ from qgs.cli import app
 TEMPLATE = {path.name: text for path, text in rendered("sightline")}
 README = TEMPLATE["README.md"]
 TEXTS = {path.name: text_of(path.name) for path in sorted(DOCS.glob("*.md"))} | {"README": README}
-PROJECT = tomllib.loads((DOCS.parent / "pyproject.toml").read_text("utf-8"))["project"]
+PROJECT = tomllib.loads((DOCS.parent / "pyproject.toml").read_text())["project"]
 PLUGIN = tomllib.loads(TEMPLATE["pyproject.toml"])["project"]
 
 UsageError = typer.BadParameter.__base__ or typer.BadParameter
@@ -25,7 +24,7 @@ COMMAND = re.compile(r"`qgs ([^`\n]+)`|^(?: {4}|! )?qgs (.+)$", re.MULTILINE)
 PLACEHOLDER = re.compile(r"^(COMMAND|[A-Z]+=.*)$")
 
 
-def commands() -> Iterator[tuple[str, str]]:
+def commands():
     for page, text in TEXTS.items():
         for found in COMMAND.finditer(text):
             shown = (found[1] or found[2]).partition("  #")[0].strip()
@@ -33,7 +32,7 @@ def commands() -> Iterator[tuple[str, str]]:
                 yield page, shown
 
 
-def parse(group: Any, words: list[str]) -> None:
+def parse(group, words):
     """Let the command line read `words`, without running anything; raises its UsageError."""
     command, context = group, group.make_context("qgs", list(words))
     while isinstance(command, TyperGroup):
@@ -57,7 +56,7 @@ def test_every_command_that_is_shown_is_one():
             only_named = all(re.fullmatch(r"[a-z-]+", word) for word in words)
             if not (only_named and type(error).__name__ == "MissingParameter"):
                 wrong.append(f"{page}: qgs {text}: {error}")
-    assert wrong == []
+    assert not wrong
 
 
 def test_extras_that_are_named_exist():
@@ -67,7 +66,7 @@ def test_extras_that_are_named_exist():
             in_plugin = of == "." and page in ("README", "plugin.md")
             known = (PLUGIN if in_plugin else PROJECT)["optional-dependencies"]
             wrong += [f"{page}: {x}" for x in (word or several).split(",") if x not in known]
-    assert wrong == []
+    assert not wrong
 
 
 def test_a_plugin_depends_on_qgs_and_on_what_qgs_depends_on():

@@ -3,7 +3,6 @@
 import re
 from functools import cache
 from pkgutil import resolve_name
-from typing import Any
 
 import guide_reference
 import yaml
@@ -14,7 +13,7 @@ from qgs.composer.errors import Problems
 from qgs.composer.registry import load_registry
 from qgs.composer.slots import SLOTS
 from qgs.composer.yaml_text import load_text
-from qgs.contracts import Component, ComponentConfig
+from qgs.contracts import Component
 
 EQUATIONS, _, REST = all_pages()["equations.md"].partition("## Where paper and release differ")
 RELEASES = REST.partition("## Defaults that are not TokenGS's")[2]
@@ -56,7 +55,7 @@ two passes | depth_weight | {:g} \|D
 """Name of a row, option, how the row's formula gives the option's default."""
 
 
-def rows_of(text: str) -> list[list[str]]:
+def rows_of(text):
     """The cells of the rows of all tables, but for heads, whose first cell is empty."""
     lines = [line for line in text.splitlines() if line.startswith("|") and "---" not in line]
     rows = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
@@ -68,12 +67,12 @@ ROWS = rows_of(EQUATIONS)
 
 
 @cache
-def configs(slot: str) -> dict[str, type[ComponentConfig]]:
+def configs(slot):
     components = load_registry(guide_reference.PLUGINS).components(slot)
     return {name: component.Config for name, component in components.items()}
 
 
-def owners(option: str, where: str) -> list[type[ComponentConfig]]:
+def owners(option, where):
     """The Configs that have an `option` of a row: a named section's, or its linked classes'.
 
     What is written at the top of a recipe has neither.
@@ -86,13 +85,13 @@ def owners(option: str, where: str) -> list[type[ComponentConfig]]:
     elif name in RecipeSettings.model_fields:
         return [RecipeSettings]
     else:
-        things: list[Any] = linked(where)
+        things = linked(where)
         classes = [x for x in things if isinstance(x, type) and issubclass(x, Component)]
         found = [kind.Config for kind in classes]
     return [config for config in found if name in config.model_fields]
 
 
-def linked(cell: str) -> list[Any]:
+def linked(cell):
     """What the references to code in a cell lead to."""
     return [resolve_name(name) for name in re.findall(r"\]\[(qgs\w*\.[\w.]+)\]", cell)]
 
@@ -115,11 +114,11 @@ def test_constants_are_the_defaults():
                 shown = wording.format(-default if "- {" in wording else default)
                 wrong += [f"{name}: {shown}"] * (shown not in formula)
         wrong += [] if found else [line]
-    assert wrong == []
+    assert not wrong
 
 
 def test_defaults_that_are_not_tokengss_are_those_of_its_recipe_taken_back():
-    base = yaml.safe_load((DOCS.parent / "recipes/tokengs/base.yaml").read_text("utf-8"))["model"]
+    base = yaml.safe_load((DOCS.parent / "recipes/tokengs/base.yaml").read_text())["model"]
     listed = {}
     for _, _, _, cell in rows_of(RELEASES):
         *options, kind = re.findall(r"`([^`]+)`", cell)

@@ -20,14 +20,14 @@ from qgs.types import QueryState
 
 
 @pytest.fixture(autouse=True)
-def _in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _in_a_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
 def test_quick_start_runs():
     Path("mine.yaml").write_text(blocks("index.md", "yaml")["mine.yaml"])
     (code,) = blocks("index.md", "python").values()
-    names: dict[str, torch.Tensor] = {}
+    names = {}
     exec(code, names)
     assert names["means"].shape == (1, 32 * 8, 3)
     assert names["image"].shape == (1, 2, 3, 32, 48)
@@ -86,4 +86,4 @@ def test_the_reference_explains_every_option():
                 plain = config.model_construct(**{option: default}).model_dump(mode="json")[option]
                 right &= yaml.safe_load(shown[option]) == plain
             wrong += [] if right else [f"{config.__qualname__}: {option}"]
-    assert wrong == []
+    assert not wrong

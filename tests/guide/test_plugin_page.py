@@ -4,10 +4,8 @@ The slow tests in tests/outside type every command of the page in a fresh enviro
 """
 
 import sys
-from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
@@ -25,7 +23,7 @@ from qgs.types import QueryState
 
 
 @pytest.fixture(scope="module")
-def package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ModuleType]:
+def package(tmp_path_factory):
     """That of the distribution as it is at the end of the page; we are in its folder."""
     files = {str(path): text for path, text in rendered("sightline")}
     for title, text in (blocks("plugin.md", "python") | blocks("plugin.md", "yaml")).items():
@@ -37,7 +35,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ModuleType]:
         patch.chdir(tmp_path_factory.mktemp("qgs-sightline"))
         for path, text in files.items():
             Path(path).parent.mkdir(parents=True, exist_ok=True)
-            Path(path).write_text(text, encoding="utf-8")
+            Path(path).write_text(text)
         patch.syspath_prepend(Path("src").resolve())
         yield import_module("qgs_sightline")
     for name in [name for name in sys.modules if name.startswith("qgs_sightline")]:

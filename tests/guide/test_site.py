@@ -23,7 +23,7 @@ DOCUMENTED = re.compile(r"^::: ([\w.]+)", re.MULTILINE)
 EVERY_DOCUMENTED = [name for page in PAGES.values() for name in DOCUMENTED.findall(page)]
 
 
-def anchors(page: str) -> set[str]:
+def anchors(page):
     """What headings of a page can be linked to as."""
     page = re.sub(r"^```.*?^```$", "", page, flags=re.DOTALL | re.MULTILINE)
     found = set()
@@ -43,10 +43,10 @@ def test_links_lead_to_pages_and_headings():
             known = anchors(PAGES.get(place, "")) | {""}
             if not (DOCS / place).is_file() or anchor not in known:
                 wrong.append(f"{path} links to {target}")
-    assert wrong == []
+    assert not wrong
 
 
-def exists(name: str) -> bool:
+def exists(name):
     try:
         return resolve_name(name) is not None
     except (ImportError, AttributeError):
@@ -60,7 +60,7 @@ def test_references_to_code_are_right_and_documented():
             known = any(f"{name}.".startswith(f"{whole}.") for whole in EVERY_DOCUMENTED)
             if not (known and exists(name) and f".{name}".endswith(f".{label.strip('`')}")):
                 wrong.append(f"{path}: {label} leads to {name}")
-    assert wrong == []
+    assert not wrong
 
 
 def test_what_a_page_documents_exists_and_is_documented_once():
@@ -68,7 +68,7 @@ def test_what_a_page_documents_exists_and_is_documented_once():
 
 
 def test_pages_are_in_the_navigation():
-    site = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8")
+    site = (DOCS.parent / "mkdocs.yml").read_text()
     assert sorted(re.findall(r": ([\w/]+\.md)$", site, re.MULTILINE)) == sorted(PAGES)
 
 
@@ -108,4 +108,4 @@ def test_pages_are_readable_in_the_repository():
             wrong += [f"{path}: {x[0]}" for x in re.finditer(pattern, f"{plain}\n# ", re.MULTILINE)]
         files = [folder / target.partition("#")[0] for target in LINK.findall(plain)]
         wrong += [f"{path} links to {file}" for file in files if not file.exists()]
-    assert wrong == []
+    assert not wrong

@@ -2,7 +2,6 @@
 
 import json
 import re
-from typing import Any
 
 import pytest
 from guide_pages import DOCS
@@ -11,14 +10,14 @@ from run_notebook import run
 FILE = DOCS / "tour.ipynb"
 
 
-def outputs(notebook: dict[str, Any]) -> list[list[str]]:
+def outputs(notebook):
     """For each cell of code the kinds of its outputs."""
     cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
     return [[m for o in c["outputs"] for m in o.get("data", [o["output_type"]])] for c in cells]
 
 
 def test_what_the_notebook_shows_is_stored():
-    text = FILE.read_text(encoding="utf-8")
+    text = FILE.read_text()
     shown = outputs(json.loads(text))
     assert all(shown)
     assert sum("image/png" in kinds for kinds in shown) >= 6
@@ -29,7 +28,7 @@ def test_what_the_notebook_shows_is_stored():
 
 @pytest.mark.slow
 def test_the_notebook_runs_and_shows_what_is_stored():
-    stored = json.loads(FILE.read_text(encoding="utf-8"))
+    stored = json.loads(FILE.read_text())
     before = outputs(stored)
     names = run(stored)
     assert outputs(stored) == before

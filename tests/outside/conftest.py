@@ -1,10 +1,10 @@
 """One fresh environment for all tests that need one: making it takes most of the time."""
 
 import pytest
-from fresh_environment import FreshEnvironment, make_fresh_environment
+from fresh_environment import make_fresh_environment
 
 
 @pytest.fixture(scope="session")
-def fresh(tmp_path_factory: pytest.TempPathFactory) -> FreshEnvironment:
+def fresh(tmp_path_factory):
     """qgs, LocusGS, rooms and tools for authors from their wheels, nothing from the source tree."""
     return make_fresh_environment(tmp_path_factory.mktemp("fresh"))

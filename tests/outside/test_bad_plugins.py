@@ -1,7 +1,6 @@
 """Bad plugins, really installed: reported by distribution, and no other plugin is harmed."""
 
 import shutil
-from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
@@ -21,7 +20,7 @@ SOURCES = {
 """Distribution -> name of its plugin, module."""
 
 
-def write_wheel(folder: Path, distribution: str) -> None:
+def write_wheel(folder, distribution):
     plugin, source = SOURCES[distribution]
     module = distribution.replace("-", "_")
     info = f"{module}-0.7.dist-info"
@@ -47,7 +46,7 @@ def test_recipes_that_use_one_are_refused_and_no_others(fresh, tmp_path):
     assert "locus/ray_biased" in listed
     for distribution, (plugin, _) in SOURCES.items():
         recipe = f"recipe: 1\nextends: tiny/tokengs.yaml\nplugins: [{plugin}]\n"
-        (tmp_path / f"{plugin}.yaml").write_text(recipe, encoding="utf-8")
+        (tmp_path / f"{plugin}.yaml").write_text(recipe)
         refused = fresh.run(f"! qgs compose {plugin}.yaml", tmp_path)
         assert f"{plugin}.yaml:3: plugins.1" in refused
         assert f"{distribution} 0.7" in refused

@@ -1,7 +1,5 @@
 """The guide's tutorial, every file and every command of it, as a new user would type them."""
 
-from collections.abc import Iterator
-
 import pytest
 from guide_pages import BLOCK, text_of
 
@@ -11,7 +9,7 @@ SHORTER = " --set training.steps=3 --set optimizer.warmup=1" + ONE_SCENE
 STEPS = "training.steps=50"
 
 
-def script_of(page: str) -> Iterator[str]:
+def script_of(page):
     """The tutorial as a bash script; files to write are here-documents, other files are shown."""
     for kind, title, text in BLOCK.findall(page):
         verb, colon, path = title.partition(": ")

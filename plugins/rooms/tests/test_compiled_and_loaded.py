@@ -54,7 +54,7 @@ for count, size in ((40, (24, 40)), (2000, (64, 64)), (5000, (128, 128))):
 def test_bits_do_not_depend_on_the_cache(tmp_path, monkeypatch, code, first, everything):
     """Compiled at once; some of them loaded and the others compiled; all of them loaded."""
 
-    def drawn(cache: str, kinds: list[str]) -> set[str]:
+    def drawn(cache, kinds):
         monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / cache))
         command = [sys.executable, "-c", code, *kinds]
         return set(

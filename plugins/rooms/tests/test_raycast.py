@@ -5,7 +5,7 @@ from qgs_rooms.intersections import hit
 from qgs_rooms.shapes import TEXTURE_FIELDS, Room, box, cylinder, sphere
 
 
-def hits(shape, x: float, y: float) -> float:
+def hits(shape, x, y):
     """How far along the x axis a ray from (x, y, 1) meets a shape."""
     origin, forward = (tuple(map(np.float32, place)) for place in ((x, y, 1), (1, 0, 0)))
     return hit(np.array([shape.row()], np.float32), 0, origin, forward)

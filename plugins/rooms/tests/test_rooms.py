@@ -12,11 +12,11 @@ from qgs.io.models import checkpoint_path
 from qgs.types import Cameras, Views
 
 
-def scenes(size: tuple[int, int] = (16, 24)):
+def scenes(size=(16, 24)):
     return RoomsSource(RoomsSource.Config(image_size=size)).scenes("train")
 
 
-def seen_from_another(scene, mirror: bool) -> tuple[torch.Tensor, ...]:
+def seen_from_another(scene, mirror):
     """Photos of two cameras, the second one's at the first one's pixels, and where these agree.
 
     They agree where depth says that both see one point.
@@ -51,7 +51,7 @@ def test_colours_reproject_through_depth(mirror):
     assert aligned < 0.5 * unaligned
 
 
-def distances(shapes: np.ndarray, eyes: np.ndarray) -> np.ndarray:
+def distances(shapes, eyes):
     """Metres (F, S) from points to the boxes around shapes, 0 inside."""
     offset = eyes[:, None] - shapes[None, :, 1:4]
     cos, sin = shapes[:, 7], shapes[:, 8]

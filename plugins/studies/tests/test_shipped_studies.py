@@ -7,7 +7,7 @@ import pytest
 def test_the_table_of_scenes_left_out_compares_the_same_seeds(tmp_path):
     """LocusGS has a third seed, a lucky one, and of the second scene alone there are results."""
 
-    def judge(run: str, psnr: str) -> None:
+    def judge(run, psnr):
         folder = tmp_path / run.replace("/", "/study/runs/", 1) / "evaluation"
         folder.mkdir(parents=True)
         head = "scene,model_psnr,nearest_input_psnr,mean_colour_psnr"

@@ -193,7 +193,7 @@ def test_the_studies_that_are_shown_can_be_copied(tmp_path):
     shown = {"help": [textwrap.dedent(example[0])]}
     (tmp_path / "mine.yaml").write_text("recipe: 1\nextends: tiny/locus.yaml\nmodel: {width: 96}\n")
     for file in ("plugins/studies/README.md", "docs/studies.md"):
-        page = (RECIPES.parent / file).read_text(encoding="utf-8")
+        page = (RECIPES.parent / file).read_text()
         shown[file] = re.findall(r"```\w+\n(study: 1\n.*?)```", page, re.DOTALL)
     for place, texts in shown.items():
         assert len(texts) == 1, place

@@ -91,7 +91,7 @@ def test_the_viewer(page):
 def test_a_page_draws_and_asks_for_nothing(page, tmp_path):
     source = open_source(MODEL, Wanted())
     file = tmp_path / "scene.html"
-    file.write_text(scene_html(source.look(source.frames)), encoding="utf-8")
+    file.write_text(scene_html(source.look(source.frames)))
     page.open(file.as_uri())
     page.until("the canvas", "!!document.querySelector('canvas')")
     drawn(page)
@@ -138,7 +138,7 @@ def page_of_two_scenes():
 
 def test_a_report(page, tmp_path):
     file = tmp_path / "report.html"
-    file.write_text(page_of_two_scenes(), encoding="utf-8")
+    file.write_text(page_of_two_scenes())
     page.open(file.as_uri())
     page.until("the script", "document.readyState == 'complete' && !!window.theme.textContent")
     _choose(page)

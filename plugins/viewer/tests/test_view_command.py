@@ -54,4 +54,4 @@ def test_a_page_never_replaces_a_file(ply, opened, tmp_path):
     page.write_text("mine")
     assert isinstance(view(ply, "--html", page).exception, FileExistsError)
     assert page.read_text() == "mine"
-    assert opened == []
+    assert not opened
