@@ -37,8 +37,12 @@ QUIET = Console(quiet=True)
 TRAINED = ("training.ema=0.5", "training.evaluate_every=2")
 Tiny: TypeAlias = Callable[..., Recipe]
 """The function `tiny`, for tests of plug-ins."""
-TWO = ("plugins=[rooms, locus, two]", "objective={type: two/two_passes}", "views.inputs=5")
-"""With the fixture `two`: train on two passes of the model."""
+TWO = (
+    "plugins=[rooms, locus, globalsplat]",
+    "objective.type=globalsplat/two_passes",
+    "views.inputs=5",
+)
+"""Train on two passes of the model."""
 
 
 def tiny(name, *overrides):

@@ -2,6 +2,7 @@
 
 import json
 import signal
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -54,7 +55,7 @@ def test_two_processes_continue_what_one_began(tmp_path):
     ids=["accumulated", "two passes", "keys that nothing reads"],
 )
 @pytest.mark.slow
-def test_two_processes_have_the_loss_curve_of_one(tmp_path, two, name, options, in_two):
+def test_two_processes_have_the_loss_curve_of_one(tmp_path, name, options, in_two):
     run(tiny(name, *options), tmp_path / "alone")
     train_in_two_processes(tiny(name, *options, *in_two), tmp_path / "two")
     assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
@@ -75,9 +76,7 @@ def test_all_processes_leave_out_a_step_that_one_found_bad(tmp_path):
     seen = [load_file(incident / f"batch{n}.safetensors")["targets.images"] for n in ("", "-1")]
     assert [int(images.isnan().sum()) for images in seen] == [0, 1]
     judged = read_jsonl(tmp_path / "evaluations.jsonl")
-    assert [(record["step"], record["weights"]) for record in judged] == [
-        (step, weights) for step in (2, 3) for weights in ("raw", "ema")
-    ]
+    assert [record["step"] for record in judged] == [2, 2, 3, 3]
 
 
 @pytest.mark.parametrize(("bad", "steps"), [(1, 0), (3, 1)], ids=["first", "later"])
@@ -98,20 +97,17 @@ def test_two_processes_stop_together_at_a_sample_that_one_cannot_make_or_leave_i
     assert len(losses(folder)) == 3
 
 
-@pytest.mark.parametrize(
-    ("wanted", "cuda", "gsplat", "expected", "told"),
-    [
-        ("auto", False, False, "cpu", 0),
+def test_the_device_and_what_is_said(monkeypatch):
+    for wanted, cuda, gsplat, expected, told in (
+        ("auto", False, None, "cpu", 0),
         ("auto", False, True, "cpu", 0),
-        ("auto", True, False, "cpu", 1),
+        ("auto", True, None, "cpu", 1),
         ("auto", True, True, "cuda", 0),
         ("cpu", True, True, "cpu", 0),
-        ("cuda", True, False, "cuda", 0),
-    ],
-)
-def test_the_device_and_what_is_said(monkeypatch, wanted, cuda, gsplat, expected, told):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
-    monkeypatch.setattr(distributed, "find_spec", lambda name: gsplat or None)
-    said = []
-    assert distributed.choose_device(wanted, said.append) == expected
-    assert ["gsplat" in line for line in said] == [True] * told
+        ("cuda", True, None, "cuda", 0),
+    ):
+        monkeypatch.setattr(torch.cuda, "is_available", Mock(return_value=cuda))
+        monkeypatch.setattr(distributed, "find_spec", Mock(return_value=gsplat))
+        said = []
+        assert distributed.choose_device(wanted, said.append) == expected
+        assert ["gsplat" in line for line in said] == [True] * told

@@ -47,13 +47,12 @@ def test_data_that_fails_leaves_a_run_that_goes_on(trained_run, tmp_path, monkey
         if number == 4:
             raise OSError("the disk is gone")
 
-    recipe = tiny("locus", *TRAINED)
     with monkeypatch.context() as patch:
         change_samples(patch, broken)
         with pytest.raises(OSError, match="the disk is gone") as caught:
             run(tiny("locus", *TRAINED, "training.evaluate_every=0"), tmp_path)
     assert caught.value.__notes__ == ["The run is saved at step 2; continue with --resume"]
-    assert run(recipe, tmp_path, resume=True).resumed_at == 2
+    assert run(tiny("locus", *TRAINED), tmp_path, resume=True).resumed_at == 2
     whole = trained_run.folder.path
     assert_equal_runs(tmp_path, whole)
     first, second = (read_jsonl(folder / "evaluations.jsonl") for folder in (tmp_path, whole))
@@ -93,11 +92,10 @@ def test_bad_samples_are_skipped_counted_and_named_if_asked_for(tmp_path, monkey
     with pytest.raises(SampleError, match="frame 1"):
         run(tiny("tokengs"), tmp_path / "stops")
     skipping = tiny("tokengs", "training.on_bad_sample=skip")
-    result = run(skipping, tmp_path / "skips")
-    assert result.steps == 3
-    assert [reason.split(" (")[0][-7:] for reason in result.left_out] == ["frame 1", "frame 3"]
+    skipped = run(skipping, tmp_path / "skips").left_out
+    assert [reason.split(" (")[0][-7:] for reason in skipped] == ["frame 1", "frame 3"]
     assert caplog.text.count("a sample is left out") == 2
-    assert parts_of(tmp_path / "skips")["counters"]["left_out"] == result.left_out
+    assert parts_of(tmp_path / "skips")["counters"]["left_out"] == skipped
     bad.update(range(100))
     with pytest.raises(SampleError, match=str(MAX_REPLACED + 1)):
         run(skipping, tmp_path / "ends")

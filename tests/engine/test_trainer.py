@@ -10,7 +10,6 @@ from qgs_viewer.curves import curves_of
 from training_runs import (
     TRAINED,
     change_samples,
-    first_batch,
     losses,
     parts_of,
     read_jsonl,
@@ -42,87 +41,52 @@ def test_training_lowers_the_loss(tmp_path):
     assert sum(falling[-5:]) < 0.95 * sum(falling[:5])
 
 
-@pytest.mark.slow
-def test_locusgs_is_ahead_of_tokengs_and_of_the_baselines(tmp_path):
-    """What the demo shows, on a shorter budget: minutes of training."""
-    evaluations = []
-    for name in ("tokengs", "locus"):
-        recipe = resolve(f"tiny/{name}.yaml", ["training.seconds=60"])
-        model = run(recipe, tmp_path / name, device="auto").model
-        evaluations.append(evaluate(model, recipe))
-    token, locus = evaluations
-    baseline = token.mean("psnr", "mean_colour")
-    assert locus.mean("psnr") > token.mean("psnr") > baseline
-    assert locus.mean("dispersion_median") < token.mean("dispersion_median")
-
-
 def test_a_run_leaves_recipe_history_and_checkpoint(trained_run):
-    folder, recipe = trained_run.folder, tiny("locus", *TRAINED)
-    assert resolve(folder.recipe).tree == recipe.tree
+    folder = trained_run.folder
+    assert resolve(folder.recipe).tree == tiny("locus", *TRAINED).tree
     history = folder.history()
     assert [record["step"] for record in history] == [1, 2, 3]
-    terms = {"mse", "ssim", "visibility", "anchor_visibility"}
-    assert terms | {"loss", "psnr", "lr", "seconds", "gradient"} <= history[0].keys()
-    for record in history:
-        assert record["loss"] == pytest.approx(sum(record[term] for term in terms))
+    assert {"psnr", "lr", "seconds", "gradient"} <= history[0].keys()
     assert CheckpointFile(folder.checkpoint).step == 3
-    model, loaded = trained_run.model, qgs.load(folder.checkpoint)
-    assert not model.training
-    assert same(loaded.state_dict(), model.state_dict())
-    inputs = first_batch(recipe).inputs
-    assert torch.equal(loaded(inputs).gaussians.means, model(inputs).gaussians.means)
+    assert not trained_run.model.training
+    assert same(qgs.load(folder.checkpoint).state_dict(), weights(trained_run))
 
 
 def test_averages_and_evaluations_leave_the_training_alone(trained_run, tmp_path):
-    plain = run(tiny("locus"), tmp_path)
-    parts, watched = parts_of(tmp_path), parts_of(trained_run.folder.path)
+    plain, folder = run(tiny("locus"), tmp_path), trained_run.folder
+    parts, watched = parts_of(tmp_path), parts_of(folder.path)
     for name in ("weights", "moments", "random"):
         assert same(parts[name], watched[name])
-    assert losses(tmp_path) == losses(trained_run.folder.path)
+    assert losses(tmp_path) == losses(folder.path)
     files = {"recipe.yaml", "history.jsonl", "checkpoint.safetensors", "state.safetensors"}
     assert {path.name for path in tmp_path.iterdir()} == files
-    average, last = qgs.load(trained_run.folder.checkpoint_ema).state_dict(), weights(plain)
-    start = tiny("locus").build_model().state_dict()
-    lag, way = (
-        max(float((t - last[name]).abs().max()) for name, t in others.items())
-        for others in (average, start)
+    start, average, last = (
+        model.state_dict()["queries.features"]
+        for model in (tiny("locus").build_model(), qgs.load(folder.checkpoint_ema), plain.model)
     )
-    assert 0 < lag < way, "it follows the weights"
+    assert 0 < (average - last).norm() < (start - last).norm(), "it follows the weights"
 
 
 def test_weights_and_their_average_are_judged_and_shown_side_by_side(trained_run):
     folder, recipe = trained_run.folder, tiny("locus", *TRAINED)
     records = read_jsonl(folder.path / "evaluations.jsonl")
-    assert [(r["step"], r["weights"], r["scenes"], r["scenes_in_protocol"]) for r in records] == [
-        (step, weights, 2, 2) for step in (2, 3) for weights in ("raw", "ema")
-    ]
+    told = [(r["step"], r["weights"], r["scenes"]) for r in records]
+    assert told == [(step, weights, 2) for step in (2, 3) for weights in ("raw", "ema")]
     raw, average = (qgs.load(file) for file in (folder.checkpoint, folder.checkpoint_ema))
     scores = [evaluate(model, recipe).means() for model in (raw, average)]
     assert [record["scores"] for record in records[2:]] == scores
     assert scores[0]["psnr"] != scores[1]["psnr"]
-    pictures = {path.name: path for path in (folder.path / "pictures").iterdir()}
-    assert pictures.keys() == {"step-2.png", "step-3.png"}
-    picture = np.asarray(Image.open(pictures["step-3.png"]))
-    side, gap, columns, rows = 16, 4, 5, 2
-    assert picture.shape == (rows * (side + gap) - gap, columns * (side + gap) - gap, 3)
+    pictures = folder.path / "pictures"
+    assert {path.name for path in pictures.iterdir()} == {"step-2.png", "step-3.png"}
+    picture = np.asarray(Image.open(pictures / "step-3.png"))
+    assert picture.shape == (36, 96, 3), "two rows of five, 4 apart"
     sample = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[0]
     with torch.no_grad():
-        gaussians = raw(sample.inputs).gaussians
-        rendering = raw.render(gaussians, sample.targets.cameras)
+        rendering = raw.render(raw(sample.inputs).gaussians, sample.targets.cameras)
     images = *sample.inputs.images[0], sample.targets.images[0, 0], rendering.rgb[0, 0]
     for column, image in enumerate(images):
-        shown = picture[:side, column * (side + gap) :][:, :side]
+        shown = picture[:16, 20 * column :][:, :16]
         np.testing.assert_array_equal(shown, rgb_picture(image))
-
-
-def test_accumulated_batches_are_one_larger_batch(tmp_path):
-    first = []
-    for count in (1, 2):
-        options = ("training.steps=1", f"training.accumulate={count}", "optimizer.warmup=0")
-        result = run(tiny("tokengs", *options), tmp_path / str(count))
-        first.append(result.folder.history()[0])
-    for key in ("loss", "mse", "visibility", "gradient"):
-        assert first[0][key] == pytest.approx(first[1][key], rel=1e-4)
 
 
 def test_scenes_that_do_not_split_evenly_are_refused():
@@ -181,12 +145,9 @@ def test_bad_steps_are_skipped_on_demand(tmp_path, monkeypatch, caplog):
     for resume in (False, True):
         with pytest.raises(NonFiniteError, match=r"targets\.images \(1 NaN of") as error:
             run(tiny("locus", *options), stopped, resume)
-    incident = stopped / "incidents" / "step-2"
-    for part in ("step 2 is not finite", "mse is nan", str(incident)):
+    for part in ("step 2 is not finite", "mse is nan", str(stopped / "incidents" / "step-2")):
         assert part in str(error.value)
     assert len(losses(stopped)) == 1
-    saved = qgs.load(incident / "weights.safetensors").state_dict()
-    assert same(saved, parts_of(stopped)["weights"])
     assert run(skipping, stopped, resume=True).resumed_at == 1
     ours, theirs = parts_of(stopped), parts_of(through)
     for name in ("weights", "ema"):
