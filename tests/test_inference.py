@@ -4,7 +4,7 @@ import ast
 from pathlib import Path
 
 import torch
-from noise_views import noise_views
+from odd_views import odd_views
 from torch.overrides import TorchFunctionMode
 
 import qgs
@@ -14,20 +14,12 @@ ROOT = Path(__file__).parents[1]
 MODELS = "tokengs locus ellipsoid gslrm c3g globalsplat mvsplat depthsplat landmark tokengs_latent"
 IMPORTERS = ("import_module", "__import__")
 PUBLIC = {f"qgs.{name}" for name in qgs.__all__}
-READS = [
-    "item",
-    "tolist",
-    "cpu",
-    "__float__",
-    "__int__",
-    "__bool__",
-    "__index__",
-    "nonzero",
-    "unique",
-    "masked_select",
-]
-COPIES = ["tensor", "new_tensor", "as_tensor", "from_numpy"]
-MAKERS = ["arange", "linspace", "zeros", "ones", "full", "empty", "eye", "rand", "randn"]
+WAITING = """
+item tolist cpu __float__ __int__ __bool__ __index__ nonzero unique masked_select
+tensor new_tensor as_tensor from_numpy
+"""
+"""What reads values, and what copies numbers."""
+MAKERS = "arange linspace zeros ones full empty eye rand randn"
 
 
 class HostWaits(TorchFunctionMode):
@@ -47,8 +39,8 @@ class HostWaits(TorchFunctionMode):
             isinstance(index, torch.Tensor) and index.dtype == torch.bool
             for index in (args[1] if isinstance(args[1], tuple) else args[1:2])
         )
-        made = name in MAKERS and kwargs.get("device") is None
-        if made or by_mask or name in READS + COPIES:
+        made = name in MAKERS.split() and kwargs.get("device") is None
+        if made or by_mask or name in WAITING.split():
             self.found.append(name)
         return func(*args, **kwargs)
 
@@ -62,7 +54,7 @@ def test_a_forward_pass_never_waits(tmp_path):
         if name == "tokengs":  # one that was loaded also looks whether views are unlike its own
             qgs.save(model, tmp_path / "model.safetensors")
             model = qgs.load(tmp_path / "model.safetensors")
-        views = noise_views(*recipe.tree["data"]["image_size"], scenes=1)
+        views = odd_views(2, *recipe.tree["data"]["image_size"], 1)
         model(views)  # the first time it may warn of them
         with HostWaits() as waits:
             model(views)

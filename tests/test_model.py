@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from noise_views import noise_views
+from odd_views import odd_views
 from varying_head import VaryingHead
 
 import qgs
@@ -25,17 +25,17 @@ def model(request):
 
 @pytest.fixture
 def views():
-    return noise_views(16, 24)
+    return odd_views(width=24)
 
 
 def test_the_api_in_five_lines(model, views, tmp_path):
     gaussians = model(views).gaussians
     assert gaussians.means.shape == (2, 12 * 8, 3)
-    shown = model.render(gaussians, views.cameras)
-    black = model.render(gaussians, views.cameras, torch.zeros(3))
-    white = model.render(gaussians, views.cameras, torch.ones(3))
-    assert shown.rgb.shape == views.images.shape
-    torch.testing.assert_close(white.rgb - black.rgb, (1 - shown.alpha).expand_as(shown.rgb))
+    black, white = (
+        model.render(gaussians, views.cameras, torch.full((3,), grey)) for grey in (0.0, 1.0)
+    )
+    assert black.rgb.shape == views.images.shape
+    torch.testing.assert_close(white.rgb - black.rgb, (1 - black.alpha).expand_as(black.rgb))
     qgs.save(model, tmp_path / "model.safetensors")
     again = qgs.load(tmp_path / "model.safetensors")
     assert torch.equal(again(views).gaussians.means, gaussians.means)
@@ -60,8 +60,8 @@ def test_permuting_queries_permutes_gaussians(model, views):
 def test_geometry_is_float32_under_autocast(model, views):
     with torch.autocast("cpu", dtype=torch.bfloat16):
         prediction = model(views)
-    found = prediction.gaussians
-    tensors = [found.means, found.scales, found.quats, *prediction.state.fields.values()]
+    geometry = {**vars(prediction.gaussians), **prediction.state.fields}
+    tensors = [x for name, x in geometry.items() if torch.is_tensor(x)]
     assert {tensor.dtype for tensor in tensors} == {torch.float32}
 
 
