@@ -77,9 +77,7 @@ class Page:
         self.call("Page.navigate", url=url)
 
     def evaluate(self, code):
-        found = self.call(
-            "Runtime.evaluate", expression=code, awaitPromise=True, returnByValue=True
-        )
+        found = self.call("Runtime.evaluate", expression=code, returnByValue=True)
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 

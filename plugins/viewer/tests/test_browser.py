@@ -142,7 +142,6 @@ def test_a_report(page, tmp_path):
     page.open(file.as_uri())
     page.until("the script", "document.readyState == 'complete' && !!window.theme.textContent")
     _choose(page)
-    _name_at_length(page)
     _slide(page)
     _zoom(page)
     _darken(page)
@@ -160,21 +159,6 @@ def _choose(page):
     page.evaluate("document.querySelector('.scenes > input:checked').focus()")
     page.key("ArrowLeft", 37)
     assert page.evaluate(shown) == [True, False]
-
-
-def _name_at_length(page):
-    """File names of 60 characters without a space push no photo out of its column."""
-    page.evaluate(
-        "document.querySelectorAll('.scene figcaption').forEach("
-        "caption => caption.textContent = 'x'.repeat(60))"
-    )
-    side = "document.querySelector('.scene {}').getBoundingClientRect().{}"
-    right, left = side.format(".inputs figure", "right"), side.format(".kinds", "left")
-    assert page.evaluate(f"{right} <= {left}")
-    assert page.evaluate(
-        "[...document.querySelectorAll('.scene .rows figure')].filter(f => f.checkVisibility())"
-        ".every(f => f.scrollWidth <= f.clientWidth + 1)"
-    )
 
 
 def box_of(page, element):
@@ -218,12 +202,6 @@ def _zoom(page):
     assert page.evaluate("document.querySelector('#zoom img').clientHeight") > 400
     page.key("Escape", 27)
     assert not page.evaluate(opened)
-    back = "document.activeElement.alt?.startsWith('tokengs, render')"
-    page.until("the focus on the picture that was seen last", back, 10)
-    page.evaluate("document.querySelector('.inputs img').click()")
-    assert page.evaluate(opened)
-    page.evaluate("document.getElementById('zoom').click()")
-    assert not page.evaluate(opened)
 
 
 def _darken(page):
@@ -234,7 +212,6 @@ def _darken(page):
     page.evaluate(press)
     dark = page.evaluate(paper)
     assert dark != white
-    assert page.evaluate("document.getElementById('theme').textContent") == "Light"
     page.evaluate(press)
     system = [{"name": "prefers-color-scheme", "value": "dark"}]
     page.call("Emulation.setEmulatedMedia", features=system)

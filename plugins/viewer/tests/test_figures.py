@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from commands import run_qgs
+from commands import done
 from matplotlib.collections import LineCollection
 from numpy.testing import assert_allclose
 from PIL import Image
@@ -48,16 +48,15 @@ def seen_by(model, sample):
     return image, (image - truth).abs().mean(0, keepdim=True), rendering.depth[0, 0], truth
 
 
-@pytest.mark.parametrize("kinds", [PAIR, PAIR[:1]])
-def test_novel_views_show_the_middle_target_with_its_score_error_and_depths_on_one_scale(kinds):
-    show = exhibition_of(*kinds)
+def test_novel_views_show_the_middle_target_with_its_score_error_and_depths_on_one_scale():
+    show = exhibition_of(*PAIR)
     true = torch.linspace(1, 9, 2 * SIDE * SIDE).view(2, 1, SIDE, SIDE)
     first, second = show.samples
     known = replace(first, targets=replace(first.targets, depths=true[None]))
     made = novel_views.made(replace(show, samples=[known, second]))
     axes = made.figure.axes
     seen = [seen_by(model, sample) for sample in show.samples for model in show.models.values()]
-    own = seen[: len(kinds)]
+    own = seen[:2]
     brightest = depth_range(torch.stack([error for _, error, _, _ in seen]))[1]
     near, far = depth_range(torch.cat([true[1], *(depth for _, _, depth, _ in own)]))
     expected = [rgb_picture(first.inputs.images[0, 1]), depth_picture(true[1], near, far)]
@@ -161,13 +160,13 @@ def checkpoint(tmp_path):
 def test_figures_are_written_and_explained(checkpoint, tmp_path):
     out = tmp_path / "figures"
     words = ["figures", checkpoint, "--out", out, "--device", "cpu"]
-    done = run_qgs(*words, "--only", "dispersion", "--only", "curves")
-    assert done.exit_code == 0, done.output
+    done(*words, "--only", "dispersion", "--only", "curves")
     written = {"dispersion.pdf", "dispersion.png", "figures.md"}
     assert {file.name for file in out.iterdir()} == written
     assert "![dispersion](dispersion.png)" in (out / "figures.md").read_text()
     assert tuple(FIGURES) == NAMES
-    assert isinstance(run_qgs(*words).exception, FileExistsError)
+    with pytest.raises(FileExistsError):
+        done(*words)
 
 
 def test_the_scene_that_was_asked_for_comes_first(checkpoint):
@@ -179,10 +178,5 @@ def test_the_scene_that_was_asked_for_comes_first(checkpoint):
 @pytest.mark.slow
 def test_all_figures_of_the_models_in_the_box(tmp_path):
     out = tmp_path / "figures"
-    done = run_qgs("figures", "rooms/tokengs-64", "rooms/locus-64", "--out", out)
-    assert done.exit_code == 0, done.output
+    done("figures", "rooms/tokengs-64", "rooms/locus-64", "--out", out)
     assert {file.stem for file in out.glob("*.pdf")} == {*FIGURES}
-    for name in FIGURES:
-        pixels = Image.open(out / f"{name}.png").convert("L")
-        assert pixels.width > 1400
-        assert len(set(pixels.resize((64, 64)).tobytes())) > 20
