@@ -1,18 +1,19 @@
 """`qgs` as a user types it, a model of one layer, and overrides that make recipes small."""
 
+import yaml
 from typer.testing import CliRunner
 
 from qgs.cli import app
 
-MODEL = {
-    "width": 16,
-    "heads": 2,
-    "encoder": {"type": "qgs/multiview_vit", "patch_size": 8, "depth": 1},
-    "queries": {"type": "qgs/latent", "count": 8, "std": 1.0},
-    "decoder": {"depth": 1},
-    "head": {"type": "qgs/gaussian_head", "gaussians_per_query": 4},
-    "supervision": {"type": "qgs/layers", "layers": [1]},
-}
+MODEL = yaml.safe_load("""
+width: 16
+heads: 2
+encoder: {type: qgs/multiview_vit, patch_size: 8, depth: 1}
+queries: {type: qgs/latent, count: 8, std: 1.0}
+decoder: {depth: 1}
+head: {type: qgs/gaussian_head, gaussians_per_query: 4}
+supervision: {type: qgs/layers, layers: [1]}
+""")
 SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8")
 
 

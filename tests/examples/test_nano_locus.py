@@ -24,7 +24,7 @@ def parts(v):
     return v.images, v.cameras.c2w, v.cameras.intrinsics
 
 
-def test_layers_renderings_loss_and_gradients_are_the_frameworks(nano):
+def test_loss_and_gradients_are_the_frameworks(nano):
     """With weights that differ everywhere from where they start."""
     recipe = resolve("tiny/locus.yaml", ["model.renderer.type=qgs/torch"])
     passes = TrainingPass.of(recipe, recipe.build_model()).train()
@@ -32,8 +32,9 @@ def test_layers_renderings_loss_and_gradients_are_the_frameworks(nano):
     with torch.no_grad():
         for parameter in passes.parameters():
             parameter += 0.03 * torch.randn(parameter.shape)
-    weights = {name: p.detach().clone() for name, p in model.named_parameters()}
-    p = nano.Weights({name: weight.requires_grad_() for name, weight in weights.items()})
+    p = nano.Weights(
+        {name: weight.detach().requires_grad_() for name, weight in model.named_parameters()}
+    )
     inputs, targets = (odd_views(2, 8, 16, seed=seed) for seed in (0, 3))
 
     loss = passes(inputs, targets).total
@@ -41,25 +42,9 @@ def test_layers_renderings_loss_and_gradients_are_the_frameworks(nano):
     value = nano.loss(p, parts(inputs), parts(targets))
     value.backward()
     torch.testing.assert_close(value, loss, rtol=1e-5, atol=1e-5)
-    assert p.keys() == weights.keys(), "no weight was missing under its name"
-    for name, parameter in model.named_parameters():
-        torch.testing.assert_close(p[name].grad, parameter.grad, rtol=1e-3, atol=1e-5, msg=name)
-
-    with torch.no_grad():
-        prediction = model.eval()(inputs, layers=[1, 2, 3, 4])
-        layers = nano.forward(p, *parts(inputs))
-        cameras = targets.cameras
-        expected = model.render(prediction.gaussians, cameras).rgb[1, 1]
-        lens = cameras.c2w[1, 1], cameras.intrinsics[1, 1], cameras.size
-        image = nano.render(vars(prediction.gaussians), 1, *lens)
-    assert expected.std() > 0.01
-    torch.testing.assert_close(image, expected, rtol=1e-5, atol=1e-5)
-    assert layers.keys() == prediction.layers.keys()
-    for number, layer in layers.items():
-        state, gaussians = prediction.layers[number].state, prediction.layers[number].gaussians
-        known = {"mu": state["anchor.center"], "rho": state["anchor.raw_radius"], **vars(gaussians)}
-        for name, found in layer.items():
-            torch.testing.assert_close(found, known[name], rtol=1e-5, atol=1e-5, msg=name)
+    gradients = {name: parameter.grad for name, parameter in model.named_parameters()}
+    found = {name: weight.grad for name, weight in p.items()}
+    torch.testing.assert_close(found, gradients, rtol=1e-3, atol=1e-5)
 
 
 def test_it_trains(nano, monkeypatch, capsys):

@@ -1,6 +1,6 @@
 """`qgs diff` shows where two recipes differ."""
 
-from commands import run_qgs
+from commands import done
 
 
 def test_diff_shows_what_differs(tmp_path, monkeypatch):
@@ -8,8 +8,7 @@ def test_diff_shows_what_differs(tmp_path, monkeypatch):
     (tmp_path / "a.yaml").write_text("recipe: 1\nmodel: {width: 16, heads: 2}\n")
     changes = "model: {queries: {count: 4099}}\nevaluation: {index: '[red]'}\n"
     (tmp_path / "b.yaml").write_text(f"recipe: 1\nextends: a.yaml\n{changes}")
-    result = run_qgs("diff", tmp_path / "a.yaml", tmp_path / "b.yaml")
-    assert result.exit_code == 0, result.output
+    shown = done("diff", tmp_path / "a.yaml", tmp_path / "b.yaml").output
     for words in ("model.queries.count", f"{3 * 16:+,}", "[red]"):
-        assert words in result.output
-    assert "model.width" not in result.output
+        assert words in shown
+    assert "model.width" not in shown

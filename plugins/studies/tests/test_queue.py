@@ -11,7 +11,7 @@ from pathlib import Path
 
 import kill
 import pytest
-from commands import run_qgs
+from commands import done
 from qgs_studies.plan import planned, run_of
 from qgs_studies.queue import Queue, _end, _signal, last_record
 from qgs_studies.results import Results
@@ -54,25 +54,22 @@ def test_two_queues_share_a_folder_and_additions_run_alone(study):
     assert "2 seeds x 4 scenes" in (out / "table.md").read_text()
 
     study.write_text(study.read_text().replace("seeds: [0, 1]", "seeds: [0, 1, 2]"))
-    result = run_qgs("study", study, "--out", out, "--only", 4, "--device", "cpu")
-    assert result.exit_code == 0, result.output
-    assert "6 runs, 2 of them missing" in result.output
+    told = done("study", study, "--out", out, "--only", 4, "--device", "cpu").output
+    assert "6 runs, 2 of them missing" in told
     assert begun(out) == {**runs, "locus/seed-2": 1}
 
     changed = study.read_text().replace("qgs/content}", "locus/ray_biased, bandwidth: fixed}")
     study.write_text(changed)
-    refused = run_qgs("study", study, "--out", out, "--workers", 0)
-    assert "`flat`" in str(refused.exception)
+    with pytest.raises(ValueError, match="`flat`"):
+        done("study", study, "--out", out, "--workers", 0)
 
 
 def test_what_failed_comes_last_and_a_collapse_is_final(study, plan, monkeypatch):
     first, second, third, fourth = plan.runs
-    for run, text in (
-        (first, "CollapseError: training collapsed at step 7\n"),
-        (second, "OSError: no space left\n"),
-    ):
-        run.failure.parent.mkdir(parents=True, exist_ok=True)
-        run.failure.write_text(text)
+    first.failure.parent.mkdir(parents=True)
+    first.failure.write_text("CollapseError: training collapsed at step 7\n")
+    second.failure.parent.mkdir(parents=True, exist_ok=True)
+    second.failure.write_text("OSError: no space left\n")
     started = []
 
     def start(queue, run):
@@ -87,8 +84,7 @@ def test_what_failed_comes_last_and_a_collapse_is_final(study, plan, monkeypatch
     assert started == [third, fourth, second]
     assert queue.failures == {}, "what failed before is no failure of this call"
     assert str(first.failure) in shown.getvalue()
-    result = run_qgs("study", study, "--out", plan.folder, "--slurm")
-    assert result.exit_code == 0
+    done("study", study, "--out", plan.folder, "--slurm")
     assert "#SBATCH --array=1,2,3" in (plan.folder / "slurm.sh").read_text()
 
 

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
-from commands import run_qgs, sets
+from commands import done, sets
 
 RECIPE = Path(__file__).parents[3] / "recipes/tiny/locus.yaml"
 
@@ -18,14 +18,13 @@ def test_a_slurm_job_is_that_of_the_example(tmp_path, monkeypatch):
     index.parent.mkdir(parents=True)
     index.write_text('{"a": {"context": [0, 2], "target": [1]}}')
     words = ("train", "locus/re10k.yaml", "--out", "runs/locus", "--set", "training.workers=7")
-    result = run_qgs(*words, "--slurm", "8")
-    assert result.exit_code == 0, result.output
+    done(*words, "--slurm", "8")
     script = (tmp_path / "runs/locus.slurm.sh").read_text()
     shown = script.replace(sys.executable, "python").replace(str(tmp_path), ".")
     assert shown == (RECIPE.parents[2] / "docs/examples/train_8_gpus.sh").read_text()
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["locus.slurm.sh"]
-    uneven = run_qgs(*words, "--slurm", "5")
-    assert "training.batch_size" in str(uneven.exception)
+    with pytest.raises(ValueError, match=r"training\.batch_size"):
+        done(*words, "--slurm", "5")
 
 
 @pytest.mark.slow
@@ -39,8 +38,7 @@ def test_a_slurm_job_saves_at_the_signal_and_goes_on(tmp_path):
         "training={seconds: null, steps: 300, save_every: 0, batch_size: 2}",
         "optimizer.warmup=1",
     )
-    result = run_qgs("train", RECIPE, "--out", out, "--slurm", "2", "--device", "cpu", *words)
-    assert result.exit_code == 0, result.output
+    done("train", RECIPE, "--out", out, "--slurm", "2", "--device", "cpu", *words)
     stub = tmp_path / "bin/scontrol"
     stub.parent.mkdir()
     stub.write_text(f'#!/bin/sh\necho "$@" >> {asked}\n')
