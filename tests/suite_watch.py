@@ -7,6 +7,7 @@ numba takes to compile a kernel for the first time belongs to no test.
 import gc
 import os
 import time
+from operator import itemgetter
 
 import pytest
 
@@ -32,12 +33,16 @@ class SuiteWatch:
         controls = config.getoption("dist", "no") != "no" and not hasattr(config, "workerinput")
         self.compiling = (lambda: 0.0) if controls else compilation_clock()
 
+    def spent(self):
+        """CPU seconds of this process and its children, but for what numba compiled."""
+        return cpu_seconds() - self.compiling()
+
     @pytest.hookimpl(wrapper=True, tryfirst=True)
     def pytest_runtest_protocol(self, item):
         """Count the CPU time of a test with its fixtures."""
-        before = cpu_seconds() - self.compiling()
+        before = self.spent()
         result = yield
-        self.seconds[item.nodeid] = cpu_seconds() - self.compiling() - before
+        self.seconds[item.nodeid] = self.spent() - before
         return result
 
     def pytest_collection_finish(self):
@@ -57,7 +62,7 @@ class SuiteWatch:
     def pytest_sessionfinish(self, session):
         """Hand over what this worker has counted, or judge the whole run."""
         if hasattr(self.config, "workeroutput"):
-            self.config.workeroutput["cost"] = (self.seconds, cpu_seconds() - self.compiling())
+            self.config.workeroutput["cost"] = (self.seconds, self.spent())
         elif self.faults() and session.exitstatus == pytest.ExitCode.OK:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
@@ -65,8 +70,10 @@ class SuiteWatch:
         """Print the cost, the dearest tests and the faults."""
         if hasattr(self.config, "workeroutput") or not self.seconds:
             return
-        terminalreporter.section(f"cost: {self.whole() / 60:.1f} CPU minutes, {self.count()} items")
-        for seconds, name in self.dearest()[:DEAREST]:
+        minutes = self.whole() / 60
+        terminalreporter.section(f"cost: {minutes:.1f} CPU minutes, {len(self.seconds)} items")
+        dearest = sorted(self.seconds.items(), key=itemgetter(1))[-DEAREST:]
+        for name, seconds in reversed(dearest):
             terminalreporter.write_line(f"{seconds:6.2f} s  {name}")
         for fault in self.faults():
             terminalreporter.write_line(f"FAILED: {fault}", red=True)
@@ -76,32 +83,21 @@ class SuiteWatch:
         if self.workers:  # they are children of this process
             own = os.times()
             return own.user + own.system + self.workers
-        return cpu_seconds() - self.compiling()
-
-    def count(self):
-        """How many tests ran."""
-        return len(self.seconds)
-
-    def dearest(self):
-        """Seconds and names of the tests, the dearest first."""
-        return sorted(((seconds, name) for name, seconds in self.seconds.items()), reverse=True)
+        return self.spent()
 
     def faults(self):
         """What the whole fast suite does not keep; a run of some tests may cost what it will."""
         if not is_whole(self.config):
             return []
-        limit = MAX_SHARE * self.whole()
+        limit, count = MAX_SHARE * self.whole(), len(self.seconds)
         found = [
-            f"{name} takes {seconds:.1f} of {self.whole():.0f} CPU seconds, more than a twentieth: "
+            f"{name} takes {seconds:.1f} CPU seconds, more than a twentieth of all: "
             "make it smaller, share what it makes, or mark it slow"
-            for seconds, name in self.dearest()
+            for name, seconds in self.seconds.items()
             if seconds > limit
         ]
-        if self.count() > MAX_ITEMS:
-            found.append(
-                f"{self.count()} items are more than {MAX_ITEMS}: make tables of what repeats "
-                "(CONTRIBUTING.md, Tests)"
-            )
+        if count > MAX_ITEMS:
+            found.append(f"{count} items are more than {MAX_ITEMS}: make tables of what repeats")
         return found
 
 

@@ -21,21 +21,14 @@ make_environment "{directory}"
     return subprocess.run(["bash", "-c", script], capture_output=True, text=True)
 
 
-def test_an_environment_of_someone_else_is_never_deleted(tmp_path):
+def test_its_own_environment_is_made_again_and_that_of_someone_else_never_deleted(tmp_path):
     venv = tmp_path / ".venv"
     venv.mkdir()
-    (venv / "notes.txt").write_text("mine")
-    result = make_environment(venv)
-    assert result.returncode == 1
-    assert "move" in result.stderr
-    assert [path.name for path in venv.iterdir()] == ["notes.txt"]
-
-
-def test_an_environment_of_its_own_is_made_again(tmp_path):
-    venv = tmp_path / ".venv"
-    venv.mkdir()
-    (venv / ".qgs-made").touch()
     (venv / "left-over").touch()
-    result = make_environment(venv)
-    assert result.returncode == 0, result.stderr
+    refused = make_environment(venv)
+    assert refused.returncode == 1
+    assert "move" in refused.stderr
+    assert [path.name for path in venv.iterdir()] == ["left-over"]
+    (venv / ".qgs-made").touch()
+    assert make_environment(venv).returncode == 0
     assert {path.name for path in venv.iterdir()} == {".qgs-made", "bin"}

@@ -22,7 +22,7 @@ def test_the_readme_shows_the_overlay_and_paths_that_exist():
     assert yaml.safe_load(shown) == yaml.safe_load(recipe)
     paths = re.findall(r"[`(](?:\./)?((?:recipes|tools|docs|plugins|tests)/[\w./-]+)[`)]", README)
     assert paths
-    assert [path for path in paths if not (ROOT / path).exists()] == []
+    assert all((ROOT / path).exists() for path in paths), paths
 
 
 def test_pages_list_all_slots_with_their_defaults_and_all_commands():

@@ -34,21 +34,18 @@ def slow(x, y, padding):
 
 def test_values_and_gradients():
     """Of either image, which goes another way."""
-    sizes = [(1, 1), (3, 7), (11, 11), (16, 40), (33, 12), (12, 15)]
-    wrong = []
+    sizes = [(1, 1), (3, 7), (11, 11), (16, 40), (33, 12)]
     for size, padding, dtype in product(sizes, ["same", "valid"], [torch.float32, torch.float64]):
+        if padding == "valid" and min(size) < 11:
+            continue
         images, truth = pair(2, 3, *size)
-        exact = dtype == torch.float64
         for x, y in ((images, truth), (truth, images)):
-            if padding == "valid" and min(size) < 11:
-                continue
             found = mean_ssim(x.to(dtype), y.to(dtype), padding)
             expected = slow(x, y, padding)
             slope, reference = (torch.autograd.grad(3 * v, images)[0] for v in (found, expected))
             off = (slope - reference).abs().max() / reference.abs().max()
-            if not ((found - expected).abs() <= (1e-12 if exact else 2e-7) and off <= 3e-6):
-                wrong.append((padding, size, dtype, found - expected, off))
-    assert not wrong
+            assert (found - expected).abs() <= (2e-7 if dtype == torch.float32 else 1e-12)
+            assert off <= 3e-6, (size, padding, dtype)
 
 
 def test_any_leading_dimensions_and_strides():
@@ -69,4 +66,4 @@ def test_the_same_bits_whatever_the_threads():
         torch.set_num_threads(count)
         value = mean_ssim(images, truth, "same")
         found.append((value, *torch.autograd.grad(value, images)))
-    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+    torch.testing.assert_close(*found, rtol=0, atol=0)

@@ -27,8 +27,7 @@ HEAVY = {"accelerate", "gsplat", "matplotlib", "numba", "pydantic", "scipy"}
 
 def test_libraries_wait_until_they_are_needed():
     """One process, which starts up as far as `import qgs`, the help, containers, components."""
-    command = [sys.executable, "-c", STAGES]
-    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    shown = subprocess.check_output([sys.executable, "-c", STAGES], text=True)
     package, *_, helped, containers, components = (set(line.split()) for line in shown.splitlines())
     assert package & (HEAVY | {"torch", "typer", "yaml"}) == set()
     assert helped & (HEAVY | {"torch"}) == set()

@@ -27,17 +27,6 @@ CUBES = [THREE, FOUR, ONE, THREE]
 BALLS = [x[:, 0] for x in (THREE, *CUBES)]
 
 
-@pytest.fixture
-def memory():
-    return ImageMemory(
-        keys=torch.zeros(2, 4, 6, 8),
-        values=torch.zeros(2, 4, 6, 8),
-        features=torch.zeros(2, 6, 32),
-        patch_rays=torch.ones(2, 6, 6, requires_grad=True),
-        grid=(1, 2, 3),
-    )
-
-
 def zeros(*shape):
     return torch.zeros(shape)
 
@@ -60,9 +49,14 @@ def test_what_does_not_fit_together_is_refused(make, parts, message):
         make(*parts)
 
 
-def test_memo_does_not_leak_between_gradient_modes(memory):
+def test_memo_does_not_leak_between_gradient_modes():
+    keys, rays = zeros(2, 4, 6, 8), torch.ones(2, 6, 6, requires_grad=True)
+    memory = ImageMemory(
+        keys=keys, values=keys, features=zeros(2, 6, 32), patch_rays=rays, grid=(1, 2, 3)
+    )
+
     def doubled():
-        return memory.once("test.doubled", lambda: 2 * memory.patch_rays)
+        return memory.once("test.doubled", lambda: 2 * rays)
 
     with torch.no_grad():
         assert not doubled().requires_grad
@@ -72,14 +66,10 @@ def test_memo_does_not_leak_between_gradient_modes(memory):
     assert doubled() is doubled()
 
 
-def test_a_state_knows_its_fields_by_name():
-    state = QueryState(torch.zeros(2, 3, 4), {"place": torch.zeros(2, 3, 1)})
-    assert "place" in state
-    assert "elsewhere" not in state
-
-
 def test_every_nested_tensor_is_mapped_and_named():
     state = QueryState(torch.zeros(1, 2, 4), {"place": torch.ones(1, 2, 3)})
+    assert "place" in state
+    assert "elsewhere" not in state
     value = {"state": state, 3: [torch.ones(2), "text", (torch.zeros(1), None)]}
     assert [name for name, _ in named_tensors(value, "value")] == [
         "value.state.features",
@@ -90,7 +80,7 @@ def test_every_nested_tensor_is_mapped_and_named():
     doubled = map_tensors(lambda x: 2 * x if x.any() else x, value)
     assert torch.equal(doubled["state"]["place"], torch.full((1, 2, 3), 2.0))
     assert doubled["state"].features is state.features
-    assert doubled[3][1:] == ["text", value[3][2]]
+    assert doubled[3][1] == "text"
     assert doubled[3][2] is value[3][2]  # no tensor in it changed
     assert map_tensors(lambda x: x, value) is value
 
@@ -104,14 +94,12 @@ def rich_gaussians(count, seed=0):
 
 def test_the_most_opaque_keep_all_that_they_have():
     gaussians = rich_gaussians(9)
-    kept = gaussians.most_opaque(4)
+    kept = vars(gaussians.most_opaque(4))
     for scene in range(2):
         index = gaussians.opacities[scene].topk(4).indices.sort().values
-        for (_, x), (name, all_of) in zip(
-            named_tensors(kept), named_tensors(gaussians), strict=True
-        ):
-            assert torch.equal(x[scene], all_of[scene, index]), name
-    assert kept[0].sh.shape == (4, 8, 3)
+        for name, tensor in vars(gaussians).items():
+            assert torch.equal(kept[name][scene], tensor[scene, index]), name
+    assert gaussians[0].sh.shape == (9, 8, 3)
     assert gaussians[:, :3].features.shape == (2, 3, 2)
 
 

@@ -42,9 +42,9 @@ def test_held_out_times_are_compared_with_and_never_inputs(photos):
 def test_frames_that_are_given_are_taken_as_they_are_or_refused(photos):
     sample, _ = choose_sample(GivenScene(photos), ViewsConfig(), None, [1, 3], [2])
     assert (sample.input_frames, sample.target_frames) == ((1, 3), (2,))
-    for frames, compared in (([1, 5], []), ([-1, 2], []), ([1, 1], []), ([0, 3], [3])):
+    for compared, *frames in ((0, 1, 5), (0, -1, 2), (0, 1, 1), (3, 0, 3)):
         with pytest.raises(ValueError, match="frames"):
-            checked_window(5, frames, compared)
+            checked_window(5, frames, [compared])
 
 
 def test_every_nth_photo_is_held_out_or_the_middle_one():

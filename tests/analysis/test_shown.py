@@ -13,10 +13,6 @@ def test_a_model_says_its_slots_in_a_few_lines():
     total = sum(parameter.numel() for parameter in model.parameters())
     assert f"{total:,} parameters" in heading
     assert "24 queries of 4 Gaussians" in heading
-    assert len(lines) == 12
     cells = r"^  decoder\.cross_attention +qgs/content, locus/ray_biased +[\d,]+$"
     assert re.search(cells, repr(model), re.M)
-    counts = [int(line.split()[-1].replace(",", "")) for line in lines[:10]]
-    assert sum(counts) == total
-    for word in ("locus/anchored", "qgs/gaussian_head", "qgs/auto"):
-        assert word in repr(model)
+    assert sum(int(line.split()[-1].replace(",", "")) for line in lines[:10]) == total

@@ -71,7 +71,5 @@ def test_every_key_is_described(schema):
 
 def test_nulls_and_schedules_are_valid_and_mistakes_are_not(schema):
     is_valid = jsonschema.Draft202012Validator(schema).is_valid
-    given = [
-        json.loads(json.dumps(recipe)) for recipe in yaml.safe_load_all(SOUND + "---" + MISTAKEN)
-    ]
-    assert [is_valid(recipe) for recipe in given] == [True] * 2 + [False] * 9
+    recipes = yaml.safe_load_all(f"{SOUND}---{MISTAKEN}")
+    assert [is_valid(json.loads(json.dumps(x))) for x in recipes] == [True] * 2 + [False] * 9

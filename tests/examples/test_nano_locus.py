@@ -1,4 +1,4 @@
-"""docs/examples/nano_locus.py is recipes/tiny/locus.yaml: outputs, renderings, loss, gradients."""
+"""docs/examples/nano_locus.py is recipes/tiny/locus.yaml: its loss and gradients."""
 
 from importlib import import_module
 from pathlib import Path
@@ -20,10 +20,6 @@ def nano(monkeypatch):
     return import_module(FILE.stem)
 
 
-def parts(v):
-    return v.images, v.cameras.c2w, v.cameras.intrinsics
-
-
 def test_loss_and_gradients_are_the_frameworks(nano):
     """With weights that differ everywhere from where they start."""
     recipe = resolve("tiny/locus.yaml", ["model.renderer.type=qgs/torch"])
@@ -39,7 +35,8 @@ def test_loss_and_gradients_are_the_frameworks(nano):
 
     loss = passes(inputs, targets).total
     loss.backward()
-    value = nano.loss(p, parts(inputs), parts(targets))
+    parts = ((v.images, v.cameras.c2w, v.cameras.intrinsics) for v in (inputs, targets))
+    value = nano.loss(p, *parts)
     value.backward()
     torch.testing.assert_close(value, loss, rtol=1e-5, atol=1e-5)
     gradients = {name: parameter.grad for name, parameter in model.named_parameters()}

@@ -4,6 +4,8 @@ from copy import deepcopy
 from functools import cache
 
 import torch
+import torch.nn.functional as F
+import yaml
 from commands import MODEL
 from qgs_viewer.figures.exhibits import Exhibition, exhibit
 from qgs_viewer.sources import ModelSource
@@ -21,14 +23,14 @@ VIEWS = ViewsConfig(inputs=2, gap=(1, 5), scale="auto")
 BY_DISTANCE = VIEWS.model_copy(update={"scale": "distance", "scale_factor": 0.7})
 KINDS = ("tokengs", "locus", "ellipsoid")
 PAIR = KINDS[:2]
-RECIPE = {
-    "recipe": 1,
-    "model": MODEL,
-    "plugins": ["rooms"],
-    "data": {"type": "rooms/procedural", "image_size": [16, 16], "test_scenes": 3},
-    "views": {"inputs": 2, "targets": 2, "gap": [2, 4], "scale_factor": 0.4},
-    "evaluation": {"scenes": 2},
-}
+REST = """
+recipe: 1
+plugins: [rooms]
+data: {type: rooms/procedural, image_size: [16, 16], test_scenes: 3}
+views: {inputs: 2, targets: 2, gap: [2, 4], scale_factor: 0.4}
+evaluation: {scenes: 2}
+"""
+RECIPE = {"model": MODEL, **yaml.safe_load(REST)}
 """Of a model that takes no time, with rooms of its own."""
 
 
@@ -56,7 +58,7 @@ def cloud(count):
     """Gaussians (1, G) in a cube of side 2 around the origin."""
     make = torch.Generator().manual_seed(3)
     means = torch.rand(1, count, 3, generator=make) * 2 - 1
-    quats = torch.nn.functional.normalize(torch.randn(1, count, 4, generator=make), dim=-1)
+    quats = F.normalize(torch.randn(1, count, 4, generator=make), dim=-1)
     scales = 0.04 + 0.08 * torch.rand(1, count, 3, generator=make)
     opacities = torch.rand(1, count, generator=make) * 0.7 + 0.2
     return Gaussians(means, scales, quats, opacities, torch.rand(1, count, 3, generator=make))

@@ -1,7 +1,5 @@
 """What a look knows of a model, how its Gaussians are painted, and where it is seen from."""
 
-from copy import deepcopy
-
 import numpy as np
 import pytest
 import torch
@@ -11,7 +9,7 @@ from qgs_viewer.look import NEUTRAL, Look, look_inside
 from qgs_viewer.pictures import attention_pictures_of
 from qgs_viewer.placement import Placement
 from qgs_viewer.server import first_eye, quiet_server, stand, up_of
-from small import BY_DISTANCE, KINDS, SIDE, arc, cloud, exhibit_of, pinhole, source_of
+from small import BY_DISTANCE, KINDS, SIDE, arc, cloud, exhibit_of, model_of, pinhole, source_of
 from torch.testing import assert_close
 
 import qgs
@@ -33,15 +31,14 @@ def test_supports_and_attention_are_those_of_a_traced_pass(kind):
         found, expected = look.support(layer), model.queries.support(state)
         assert (found is None) == (expected is None) == (kind == "tokengs")
         if found:
-            assert_close(found.centers, expected.centers.double())
-            assert_close(found.axes, expected.axes.double())
+            assert_close(vars(found), vars(expected.to(torch.float64)))
     for layer, traced in layers.items():
         for found, expected in (
             (look.attention(5, layer), traced.cross_attention),
             (look.self_attention(5, layer), traced.self_attention),
         ):
-            for part in ("content", "geometry", "weights"):
-                if (values := getattr(expected, part)) is not None:
+            for part, values in vars(expected).items():
+                if values is not None:
                     assert_close(getattr(found, part), values[:, :, [5]])
     parts = ["result", "content", "geometry"][: 2 + (kind != "tokengs")]
     assert [*attention_pictures_of(look, 5, 1, 32)] == parts
@@ -68,13 +65,11 @@ def test_other_inputs_leave_the_scene_where_it_is():
     source = source_of("locus", BY_DISTANCE)
     for frames in ((1, 4), (4, 1), (0, 2, 5)):
         look = source.look(frames)
-        c2w = look.views.cameras.c2w[0, :, :3].double()
-        shown = source.cameras().c2w[list(frames), :3]
-        place = look.placement
-        placed = torch.cat(
-            [place.rotation @ c2w[..., :3], place.points(c2w[..., 3])[..., None]], -1
-        )
-        assert_close(placed, shown, rtol=0, atol=1e-5)
+        c2w = look.views.cameras.c2w[0].double()
+        shown = source.cameras().c2w[list(frames)]
+        turned, places = look.placement.rotation @ c2w[:, :3, :3], c2w[:, :3, 3]
+        assert_close(turned, shown[:, :3, :3], rtol=0, atol=1e-5)
+        assert_close(look.placement.points(places), shown[:, :3, 3], rtol=0, atol=1e-5)
 
 
 def test_a_picked_query_stands_out():
@@ -94,8 +89,7 @@ def test_a_picked_query_stands_out():
 def test_the_background_is_that_of_the_model():
     shown = exhibit_of("locus")
     assert shown.look.background == NEUTRAL
-    model = deepcopy(shown.model)
-    model.renderer.config = model.renderer.config.model_copy(update={"background": (0.1, 0.2, 0.3)})
+    model = model_of("locus", "model.renderer.background=[0.1, 0.2, 0.3]")
     assert look_inside(model, shown.look.views).background == (0.1, 0.2, 0.3)
 
 

@@ -27,12 +27,11 @@ def test_covariances_are_those_of_points_that_were_placed_one_by_one():
 
 def test_a_click_hits_what_the_renderer_shows_there():
     """Where one Gaussian stands out: two approximations of a splat may order similar ones."""
-    gaussians = cloud(60)
     view = pinhole(arc([0], 4), (60.0, 55.0, 30.0, 35.0))
-    scene = gaussians.to(torch.float64)
+    scene = cloud(60).to(torch.float64)
     scene.colors.requires_grad_()
     picture = TorchRenderer(TorchRenderer.Config())(scene, view[None], torch.zeros(3).double())
-    found = splats(gaussians, Placement.identity())
+    found = splats(cloud(60), Placement.identity())
     eye = view.c2w[0, :3, 3].numpy()
     checked = 0
     for v, u in product(range(8, 60, 6), repeat=2):
@@ -40,8 +39,7 @@ def test_a_click_hits_what_the_renderer_shows_there():
         (weights,) = torch.autograd.grad(pixel, scene.colors, retain_graph=True)
         (first, second), numbers = weights[0, :, 0].topk(2)
         if first > 0.05 and second < 0.6 * first:
-            pixels = torch.tensor([[u + 0.5, v + 0.5]])
-            way = on_photo(view, pixels, 1.0)[0, 0].numpy() - eye
+            way = on_photo(view, torch.tensor([[u + 0.5, v + 0.5]]), 1.0)[0, 0].numpy() - eye
             assert hit(found, eye, way / np.linalg.norm(way)) == numbers[0]
             checked += 1
     assert checked > 20
