@@ -34,7 +34,11 @@ def trained(tmp_path_factory):
 
 
 @pytest.fixture
-def small_pictures(monkeypatch):
-    """Overview and orbit are most of the work of saving; one test looks at real ones."""
-    monkeypatch.setattr(saving, "overview", lambda result: np.zeros((4, 4, 3), np.uint8))
+def short_orbit(monkeypatch):
     monkeypatch.setattr(saving, "orbit_path", partial(saving.orbit_path, frames=2, side=16))
+
+
+@pytest.fixture
+def small_pictures(monkeypatch, short_orbit):
+    """Overview and orbit are most of the work of saving; one test looks at a real one."""
+    monkeypatch.setattr(saving, "overview", lambda result: np.zeros((4, 4, 3), np.uint8))

@@ -6,7 +6,6 @@ import shutil
 
 import numpy as np
 import pytest
-import torch
 from commands import MODEL, done, run_qgs
 from photo_formats import noisy_photos
 from PIL import Image
@@ -86,15 +85,11 @@ def test_a_metric_of_a_plugin_that_was_installed_later(run, tmp_path, install):
 
 def test_other_weights_of_a_run_keep_its_evaluation(tmp_path):
     (tmp_path / "evaluation_ema-2").mkdir()
-    cases = {
-        ("checkpoint", False): "evaluation",
-        ("checkpoint_ema", False): "evaluation_ema",
-        ("published", False): "evaluation_published",
-        ("checkpoint_ema", True): "evaluation_ema-3",
-        ("checkpoint", True): "evaluation-2",
-    }
-    for (name, other), folder in cases.items():
-        assert evaluation_folder(tmp_path / f"{name}.safetensors", other).name == folder
+    names = ("checkpoint", "published", "checkpoint_ema")
+    files = [tmp_path / f"{name}.safetensors" for name in names]
+    usual, other = ([evaluation_folder(f, x).name for f in files] for x in (False, True))
+    assert usual == ["evaluation", "evaluation_published", "evaluation_ema"]
+    assert other == ["evaluation-2", "evaluation_published-2", "evaluation_ema-3"]
 
 
 def test_settings_of_the_trained_model_are_refused(trained):
@@ -103,13 +98,10 @@ def test_settings_of_the_trained_model_are_refused(trained):
 
 
 def test_tune_says_what_and_how_often():
-    cases = {
-        "7": ["evaluation.tuning_steps=7"],
-        "0": ["evaluation.tuning_steps=0"],
-        "latents": ["evaluation.tuning_steps=50", "evaluation.tuning=latents"],
-        "queries:20": ["evaluation.tuning_steps=20", "evaluation.tuning=queries"],
-    }
-    assert {tune: tuning_settings(tune) for tune in cases} == cases
+    assert tuning_settings("0") == ["evaluation.tuning_steps=0"]
+    for tune, what, steps in (("latents", "latents", 50), ("queries:20", "queries", 20)):
+        settings = [f"evaluation.tuning_steps={steps}", f"evaluation.tuning={what}"]
+        assert tuning_settings(tune) == settings
 
 
 def test_an_evaluation_names_its_photos_and_says_where_a_copy_is_better(tmp_path):
@@ -118,11 +110,10 @@ def test_an_evaluation_names_its_photos_and_says_where_a_copy_is_better(tmp_path
     for file in sorted(noisy_photos(tmp_path, 9).glob("images/*")):
         pixels = 90 + rng.integers(0, 9, (20, 24, 3), np.uint8)
         Image.fromarray(pixels).save(file)
-    data = {"type": "qgs/photos", "path": str(tmp_path), "image_size": [16, 16], "holdout": 3}
-    views = {"inputs": 2, "targets": 2, "gap": [2, 4], "scale": "constant"}
-    model = qgs.compose({"recipe": 1, "model": MODEL, "data": data, "views": views})
-    with torch.no_grad():
-        model.head.linear.bias.unflatten(0, (-1, 14))[:, 6:9] = 5.0
+    data = f"data={{type: qgs/photos, path: {tmp_path}, image_size: [16, 16], holdout: 3}}"
+    views = "views={inputs: 2, targets: 2, gap: [2, 4], scale: constant}"
+    model = qgs.compose({"recipe": 1, "model": MODEL}, [data, views])
+    model.head.linear.bias.data.unflatten(0, (-1, 14))[:, 6:9] = 5.0
     domain = {"samples": 4, "ranges": {"baseline": [0, 9]}}
     qgs.save(model, tmp_path / "checkpoint.safetensors", extra={"trained_on": json.dumps(domain)})
     done("eval", tmp_path)

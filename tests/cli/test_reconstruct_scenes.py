@@ -4,6 +4,7 @@ import shutil
 from unittest.mock import Mock
 
 import pytest
+import yaml
 from commands import MODEL
 from photo_formats import centred, opened, synthetic, write_llff, write_nerfstudio
 from PIL import Image
@@ -52,9 +53,9 @@ def test_photos_of_any_format_are_opened_for_a_model_of_other_data(folders):
     for trained in (elsewhere, ROOMS):
         assert chosen(trained, llff) == ((2,), (), WHOLE)
         assert chosen(trained, llff, SIZE) == ((2,), (), SIZE)
-        scene, _ = chosen_scene(trained, str(llff), None, None)
-        assert scene.frame_name(2) == "images/view_002.png"
-        assert scene.images([2])[0, :, 3, 3].mul(255).round().tolist() == [20, 0, 0]
+    scene, _ = chosen_scene(elsewhere, str(llff), None, None)
+    assert scene.frame_name(2) == "images/view_002.png"
+    assert scene.images([2])[0, :, 3, 3].mul(255).round().tolist() == [20, 0, 0]
 
 
 def test_a_scene_of_a_trained_set_is_known_for_what_it_is(folders):
@@ -66,18 +67,21 @@ def test_a_scene_of_a_trained_set_is_known_for_what_it_is(folders):
         assert chosen(trained, other)[:2] == ((2,), ())
 
 
+WHOLE_SIZES = """
+- [[1280, 720], 4, [112, 64]]
+- [[360, 540], 4, [64, 96]]
+- [[30, 40], 16, [64, 80]]
+- [[30, 40], null, [64, 64]]
+- [null, 4, [64, 64]]
+"""
+"""Stored size, multiple, size of what is seen."""
+
+
 def test_photos_of_another_kind_are_seen_whole():
-    cases = (
-        ((1280, 720), 4, (112, 64)),
-        ((360, 540), 4, (64, 96)),
-        ((30, 40), 16, (64, 80)),
-        ((30, 40), None, (64, 64)),
-        ((512, 512), 4, (64, 64)),
-        (None, 4, (64, 64)),
-    )
-    for stored, multiple, whole in cases:
-        scene = Mock(cameras=Mock(size=(64, 64)), stored_size=lambda frame, size=stored: size)
-        assert whole_size(scene, multiple) == whole, stored
+    scene = Mock()
+    scene.cameras.size = (64, 64)
+    for scene.stored_size.return_value, multiple, whole in yaml.safe_load(WHOLE_SIZES):
+        assert [*whole_size(scene, multiple)] == whole
 
 
 def test_one_scene_of_chunks(folders, tmp_path):

@@ -14,7 +14,7 @@ from photo_formats import synthetic, write_nerfstudio
 from rich.console import Console
 from training_runs import same, tiny
 
-from qgs.composer import Recipe, RecipeError, resolve
+from qgs.composer import Recipe, resolve
 from qgs.contracts import CONTRACT_VERSION, Column, ComponentConfig, Metric, Plugin
 from qgs.data.evaluation import evaluation_samples
 from qgs.engine.evaluation import evaluate
@@ -267,12 +267,3 @@ def test_a_protocol_has_a_metrics_definition_and_options():
     told = {"type": "mine/mae", "definition": "mean absolute error", "power": 1.0}
     assert plain.content["metrics"]["error"] == told
     assert plain.sha256 == same.sha256 != other.sha256
-
-
-def test_written_metrics_lie_over_the_default_ones():
-    metrics = "metrics={lpips: {type: lpips/vgg16}, psnr: null}"
-    recipe = tiny("tokengs", metrics, "plugins=[rooms, lpips]")
-    assert list(recipe.build_metrics()) == ["ssim", "dispersion", "lpips"]
-    assert resolve(recipe.tree).tree == recipe.tree
-    with pytest.raises(RecipeError, match=r"metrics\.psnr"):
-        tiny("tokengs", "metrics.psnr.covariance=sample")

@@ -30,7 +30,6 @@ from training_runs import (
 )
 
 import qgs
-from qgs.composer import resolve
 from qgs.engine.distributed import RandomStates
 from qgs.engine.folder import OtherRunError, RunFolder, read_state, write_state
 from qgs.io.checkpoint import CheckpointFile
@@ -99,33 +98,6 @@ def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
     for record in history:
         assert record["depth_consistency"] > 0
         assert sum(record[term] for term in terms) == pytest.approx(record["loss"])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "overrides"),
-    [
-        ("locus", ("training.ema=0.9", "training.render_views=1")),
-        ("tokengs", ("training.accumulate=2", "views.mirror=0.5")),
-        ("locus", ("training.precision=bf16",)),
-    ],
-)
-def test_several_kills_and_workers_change_nothing(tmp_path, name, overrides):
-    options = ("steps=40", "save_every=5", "collapse_window=10")
-    recipe = tiny(name, *(f"training.{option}" for option in options), *overrides)
-    with_workers = resolve(recipe.tree, ["training.workers=2"])
-    run(recipe, tmp_path / "through")
-    for steps, killed in ((13, recipe), (17, with_workers), (28, with_workers)):
-
-        def kill(trainer, stop, steps=steps):
-            if trainer.step == steps:
-                raise Killed
-
-        with pytest.raises(Killed):
-            run_calling(kill, killed, tmp_path / "killed", resume=True)
-        assert len(RunFolder(tmp_path / "killed").history()) == steps
-    assert run(recipe, tmp_path / "killed", resume=True).resumed_at == 25
-    assert_equal_runs(tmp_path / "through", tmp_path / "killed")
 
 
 def test_a_kill_between_the_first_two_files_loses_nothing(tmp_path, monkeypatch):
