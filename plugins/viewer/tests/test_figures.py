@@ -97,7 +97,6 @@ def test_anchors_are_shown_layer_by_layer_of_models_that_have_them():
     layers = chosen_layers(exhibit_of("locus").look.depth, anchors.LAYERS, 0)
     assert titles(made)[:-1] == ["start", *(f"after layer {n}" for n in layers[1:])]
     assert "Not shown: tokengs" in made.caption
-    assert len(pictures(made)) == len(titles(made))
     with pytest.raises(NothingToShowError, match="tokengs: the queries have no anchors"):
         anchors.anchors(exhibition_of("tokengs"))
 
@@ -117,7 +116,7 @@ def test_an_anchor_lies_where_it_was_when_its_query_read():
         assert there.all(1).sum() == len(attention.PARTS)
 
 
-@pytest.mark.parametrize("kind", [*PAIR, "landmark"])  # its layers differ
+@pytest.mark.parametrize("kind", ["locus", "landmark"])  # whose layers differ
 def test_edges_lead_to_the_queries_that_are_read_most(kind):
     shown, query = exhibit_of(kind), 5
     last = shown.look.depth
@@ -144,7 +143,7 @@ def test_files_are_of_the_width_of_a_page_with_text_and_the_same_each_time(tmp_p
         assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
     text = (tmp_path / "a.pdf").read_bytes()
     assert b"/FontFile2" in text
-    assert b"/CreationDate" not in text
+    assert b"/CreationDate" not in text, "a second later it would be another"
     assert Image.open(tmp_path / "a.png").width == round(WIDTH * DPI)
 
 

@@ -18,8 +18,9 @@ show_pictures()
 
 @pytest.mark.parametrize("known", [True, False])
 def test_a_model_shows_the_way_from_views_to_gaussians(known):
-    overrides = ["model.decoder.layers={0: {cross_attention: {type: qgs/content}}}"]
-    model = qgs.compose("recipes/tiny/locus.yaml", overrides)
+    model = qgs.compose(
+        "tiny/locus.yaml", ["model.decoder.layers.0.cross_attention.type=qgs/content"]
+    )
     model.recipe = model.recipe if known else None
     html = model._repr_html_()
     svg = ElementTree.fromstring(html[html.index("<svg") : html.index("</svg>") + 6])

@@ -41,7 +41,7 @@ BASE = {"gaussians", "views/0", "views/1"}
 
 
 def nodes(panel):
-    names = {*BASE, "views/2", "anchors", "support", "path", "reading"}
+    names = BASE | {"views/2", "anchors", "support", "path", "reading"}
     return {name for name in names if panel.server.scene.get_handle_by_name(f"/{name}")}
 
 

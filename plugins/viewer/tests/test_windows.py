@@ -3,6 +3,7 @@
 import pytest
 import textured_room
 import torch
+import yaml
 from small import arc, pinhole
 
 from qgs.analysis.scenes import GivenScene
@@ -12,7 +13,7 @@ from qgs.data.domain import Domain
 from qgs.data.inputs import choose_windows, trained_ratios
 from qgs.types import Views
 
-TRAINED = Domain({"baseline": [0.1, 0.3], "turn": [2.0, 20.0], "depth": [1.0, 1.0]})
+TRAINED = Domain(yaml.safe_load("{baseline: [0.1, 0.3], turn: [2.0, 20.0], depth: [1.0, 1.0]}"))
 
 
 def scene_of(c2w, held_out=()):
@@ -32,21 +33,16 @@ def windows_of(scene, count=1, inputs=2):
 
 
 def test_any_number_of_inputs_that_are_not_held_out():
-    wrong = []
     for held_out, count in (((), 3), ((3, 11), 24), ((), 24)):
         scene = scene_of(orbit(count, 6.0), held_out)
         for inputs in {1, 2, 3, min(5, count)}:
             windows = windows_of(scene, 6, inputs)
-            good = [
-                len({*chosen}) == inputs
-                and not {*chosen} & {*held_out, *targets}
-                and {*targets} <= {*(held_out or range(count))}
-                and (targets or inputs == count)
-                for chosen, targets in windows
-            ]
-            if not all(good) or windows[:1] != windows_of(scene, 1, inputs):
-                wrong.append((held_out, count, inputs, windows))
-    assert not wrong, wrong
+            assert windows[:1] == windows_of(scene, 1, inputs)
+            for chosen, targets in windows:
+                assert len({*chosen}) == inputs
+                assert not {*chosen} & {*held_out, *targets}
+                assert {*targets} <= {*(held_out or range(count))}
+                assert targets or inputs == count
     with pytest.raises(ValueError, match="too few"):
         windows_of(scene_of(orbit(3, 6.0)), 1, 5)
 
@@ -75,7 +71,8 @@ def test_inputs_are_as_far_apart_as_in_training_whatever_the_unit():
 
 
 def test_a_training_with_all_distances_says_nothing_about_the_best():
-    varied = Domain({"baseline": [0.002, 0.9], "turn": [0.4, 43.0], "depth": [0.002, 4.0]}, 512)
+    ranges = "{baseline: [0.002, 0.9], turn: [0.4, 43.0], depth: [0.002, 4.0]}"
+    varied = Domain(yaml.safe_load(ranges), 512)
     assert trained_ratios(varied) == trained_ratios(Domain())
 
 
