@@ -19,20 +19,12 @@ from qgs.engine.training import Trainer, train
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "tiny"
 
-SMALL = (
-    "model.width=32",
-    "model.heads=2",
-    "model.queries.count=24",
-    "model.decoder.depth=2",
-    "model.supervision.layers=[1, 2]",
-    "model.head.gaussians_per_query=4",
-    "data.image_size=[16, 16]",
-    "views.targets=2",
-    "evaluation.scenes=2",
-    "training.steps=3",
-    "training.seconds=null",
-    "optimizer.warmup=2",
-)
+SMALL = """
+model.width=32 model.heads=2 model.queries.count=24
+model.decoder.depth=2 model.supervision.layers=[1,2] model.head.gaussians_per_query=4
+data.image_size=[16,16] views.targets=2 evaluation.scenes=2
+training.steps=3 training.seconds=null optimizer.warmup=2
+"""
 QUIET = Console(quiet=True)
 TRAINED = ("training.ema=0.5", "training.evaluate_every=2")
 Tiny: TypeAlias = Callable[..., Recipe]
@@ -47,7 +39,7 @@ TWO = (
 
 def tiny(name, *overrides):
     """A recipe of recipes/tiny, smaller yet, with overrides."""
-    return resolve(RECIPES / f"{name}.yaml", [*SMALL, *overrides])
+    return resolve(RECIPES / f"{name}.yaml", [*SMALL.split(), *overrides])
 
 
 tiny_recipe: Tiny = tiny

@@ -150,21 +150,20 @@ def test_a_damaged_state_is_refused_and_nothing_is_replaced(copied):
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         metadata = file.metadata()
     contents = [state.read_bytes()[:-100], RunFolder(copied).checkpoint.read_bytes()]
-
-    def damage(changes, text=metadata["qgs.state"]):
-        """Tensors that are None are left out."""
-        kept = {name: t for name, t in (tensors | changes).items() if t is not None}
-        write_tensors(state, kept, metadata | {"qgs.state": text})
+    weight, one = "queries.features", torch.ones(1)
+    for name, changed in (
+        (f"weights/{weight}", one),
+        (f"ema/{weight}", None),
+        (f"moments/model.{weight}/exp_avg", None),
+        ("moments/foo/exp_avg", one),
+        ("random/", None),
+    ):
+        kept = {n: tensor for n, tensor in tensors.items() if not n.startswith(name)}
+        write_tensors(state, kept if changed is None else kept | {name: changed}, metadata)
         contents.append(state.read_bytes())
-
-    weight = "queries.features"
-    damage({f"weights/{weight}": torch.ones(1)})
-    damage({f"ema/{weight}": None})
-    damage({f"moments/model.{weight}/exp_avg": None})
-    damage({"moments/foo/exp_avg": torch.ones(1)})
-    damage({name: None for name in tensors if name.startswith("random/")})
     for text in ("null", '{"counters": ', '{"a":' * 5000, '{"weights": {}}'):
-        damage({}, text)
+        write_tensors(state, tensors, metadata | {"qgs.state": text})
+        contents.append(state.read_bytes())
     for content in contents:
         state.write_bytes(content)
         before = {path: path.read_bytes() for path in copied.glob("*.*")}

@@ -34,13 +34,13 @@ from qgs.engine.distributed import RandomStates
 from qgs.engine.folder import OtherRunError, RunFolder, read_state, write_state
 from qgs.io.checkpoint import CheckpointFile
 
-SCHEDULED = (
-    "model.renderer.dilation={schedule: steps, values: [4, 2, 1], at: [1, 3]}",
-    "losses.photometric.ssim_weight={schedule: linear, values: [0.4, 0], at: [0, 4]}",
-    "objective.alpha_weight={schedule: steps, values: [0, 1], at: [2]}",
-    "optimizer.learning_rate={schedule: cosine, values: [1.0e-3, 0], at: [0, 4]}",
-    "optimizer.warmup=2000",
-)
+SCHEDULED = """
+model.renderer.dilation={schedule: steps, values: [4, 2, 1], at: [1, 3]}
+losses.photometric.ssim_weight={schedule: linear, values: [0.4, 0], at: [0, 4]}
+objective.alpha_weight={schedule: steps, values: [0, 1], at: [2]}
+optimizer.learning_rate={schedule: cosine, values: [1.0e-3, 0], at: [0, 4]}
+optimizer.warmup=2000
+"""
 
 
 class Killed(BaseException):
@@ -59,7 +59,8 @@ def change_counters(folder, **values):
 
 
 def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
-    recipe = tiny("locus", *TWO, *SCHEDULED, "training.steps=4")
+    options = (*TWO, *SCHEDULED.strip().splitlines())
+    recipe = tiny("locus", *options, "training.steps=4")
     whole, parts, again = (tmp_path / name for name in ("whole", "parts", "again.safetensors"))
     run(recipe, whole, resume=True)
     seen = []
@@ -77,7 +78,7 @@ def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
     assert qgs.load(again).renderer.config.dilation == 2
     for other in ("objective.depth_weight=0.5", "losses.photometric.ssim_weight.values=[0.4, 0.1]"):
         with pytest.raises(OtherRunError, match=other.split("=")[0]):
-            run(tiny("locus", *TWO, *SCHEDULED, other), parts, resume=True)
+            run(tiny("locus", *options, other), parts, resume=True)
     assert run_calling(note, recipe, parts, resume=True).resumed_at == 2
     assert_equal_runs(whole, parts)
     # After a step there stand the numbers of the next one.
@@ -124,7 +125,6 @@ def test_a_longer_budget_goes_on_without_damaged_and_lost_records(copied, caplog
         for line in (1, 2):
             assert f"{file}, line {line} is damaged" in caplog.text
     assert "steps: 4" in (copied / "recipe.yaml").read_text()
-    assert CheckpointFile(copied / "checkpoint.safetensors").step == 4
     last = resumed(in_halves, *longer, "training.accumulate=2").folder.history()[-1]
     for name in ("lr", "loss", "gradient"):
         assert last[name] == pytest.approx(history[-1][name], rel=1e-4)
