@@ -45,7 +45,7 @@ def test_loss_and_gradients_are_the_frameworks(nano):
 
 
 def test_it_trains(nano, monkeypatch, capsys):
-    monkeypatch.setattr(nano, "QUERIES", 64)
+    monkeypatch.setattr(nano, "QUERIES", 16)
     nano.main(3)
     first, _, last = (line.split()[-1] for line in capsys.readouterr().out.splitlines())
     assert float(last) < float(first)

@@ -84,7 +84,7 @@ def test_photos_that_look_elsewhere_are_no_inputs():
 
 
 def test_the_depth_of_a_walk_is_seen_in_its_photos():
-    shots = textured_room.walk(12)
+    shots = textured_room.walk(6)
     images = torch.stack([torch.from_numpy(s.image).permute(2, 0, 1) / 255 for s in shots])
     c2w = torch.stack([torch.from_numpy(s.c2w) for s in shots])
     cameras = pinhole(c2w.float(), textured_room.INTRINSICS, images.shape[2:])
