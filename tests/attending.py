@@ -7,8 +7,7 @@ def case(sizes, middle=(), factor=1.0, lower=-6.0):
     """sizes: scenes, heads, queries, tokens, numbers of a head. Biases by rays read of a query its
     place, `middle`, here with noise, a factor of the squared distance, and the least bias."""
     scenes, heads, queries, tokens, each = sizes
-    noise = torch.randn(scenes, queries, 3 + len(middle))
-    place, matrices = noise.tensor_split([3], -1)
+    place, matrices = torch.randn(scenes, queries, 3 + len(middle)).tensor_split([3], -1)
     factor = factor * (0.1 + torch.rand(scenes, queries, 1))
     read = [place, torch.tensor(middle) + 0.3 * matrices, factor, torch.ones_like(factor) * lower]
     return {

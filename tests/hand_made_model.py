@@ -27,14 +27,12 @@ def cameras():
     """Two cameras (1, 2) of 32x32, the identity and one to its right."""
     c2w = torch.eye(4).repeat(1, 2, 1, 1)
     c2w[0, 1, 0, 3] = 0.3
-    intrinsics = torch.tensor([32.0, 32.0, 16.0, 16.0]).expand(1, 2, 4)
-    return Cameras(c2w, intrinsics, (32, 32))
+    return Cameras(c2w, torch.tensor([32.0, 32.0, 16.0, 16.0]).expand(1, 2, 4), (32, 32))
 
 
 @pytest.fixture
 def views(cameras):
-    generator = torch.Generator().manual_seed(1)
-    return Views(torch.rand(1, 2, 3, 32, 32, generator=generator), cameras)
+    return Views(torch.rand(1, 2, 3, 32, 32, generator=torch.Generator().manual_seed(1)), cameras)
 
 
 @pytest.fixture

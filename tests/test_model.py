@@ -68,8 +68,7 @@ def test_harmonics_and_features_of_a_head_come_through(views):
     found = model(views)
     attributes = model.head(found.state)
     for name in ("sh", "features"):
-        expected = getattr(attributes, name).flatten(1, 2)
-        assert torch.equal(getattr(found.gaussians, name), expected)
+        assert torch.equal(getattr(found.gaussians, name), getattr(attributes, name).flatten(1, 2))
     assert torch.equal(found.gaussians.colors, plain.colors)
     rendering = model.render(found.gaussians, views.cameras)
     assert rendering.features.shape == (2, 2, 4, 16, 24)

@@ -100,8 +100,7 @@ def test_what_cannot_be_reconstructed_is_refused(model, views, photos):
 
 def test_photos_are_read_in_their_own_world_and_size(photos):
     views = qgs.read_photos(photos)
-    stored = scene(photos, (20, 24))
-    assert torch.equal(views.images[0], stored.images(range(7)))
+    assert torch.equal(views.images[0], scene(photos, (20, 24)).images(range(7)))
     assert views.cameras.intrinsics[0, 0].tolist() == [20, 20, 12, 10]
     assert views.cameras.c2w[0, :, 0, 3].tolist() == [0, 5, 10, 15, 20, 25, 30]
     few = qgs.read_photos(photos, size=(10, 12), frames=["2.png", 0])

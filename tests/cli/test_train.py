@@ -29,8 +29,7 @@ def test_a_finished_run_is_left_as_it_is(training, trained):
     files = [path for path in run.rglob("*") if path.is_file()]
     before = [(path.read_bytes(), path.stat().st_mtime_ns) for path in files]
     assert training(run, "--resume").exit_code == 0
-    other = training(run, "--resume", "--set", "seed=3")
-    assert "seed: 3" in str(other.exception)
+    assert "seed: 3" in str(training(run, "--resume", "--set", "seed=3").exception)
     assert isinstance(training(run).exception, FileExistsError)
     assert [(path.read_bytes(), path.stat().st_mtime_ns) for path in files] == before
     done("eval", run)

@@ -77,8 +77,7 @@ def test_what_is_not_finite_is_named():
     assert "mse is nan" in not_finite({"mse": float("nan"), "gradient": 0.5}, module)
     module.weight.grad = torch.full((2, 2), torch.inf)
     module.bias.grad = torch.zeros(2)
-    message = not_finite({"mse": 1.0, "gradient": float("inf")}, module)
-    assert message.endswith("from weight")
+    assert not_finite({"mse": 1.0, "gradient": float("inf")}, module).endswith("from weight")
 
 
 def test_gaussians_invisible_from_the_start_end_a_run_at_the_window_or_its_end(tmp_path):

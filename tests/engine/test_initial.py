@@ -49,8 +49,7 @@ def test_old_queries_stay_and_new_ones_are_noisy_copies(learned):
             assert torch.equal(now[:COUNT], before[:count])
             assert sum(f"{parameter}: {COUNT} -> {count}, " in line for line in told) == 1
             if count > COUNT:
-                copied = before[torch.arange(COUNT, count) % COUNT]
-                noise = (now[COUNT:] - copied) / GROWTH_NOISE
+                noise = (now[COUNT:] - before[torch.arange(COUNT, count) % COUNT]) / GROWTH_NOISE
                 assert noise.abs().max() < 6
                 assert noise.abs().min() > 0
                 if noise.numel() > 1000:

@@ -68,8 +68,7 @@ def test_every_trained_parameter_decays_but_the_head_and_1d_ones():
     model.queries.features.requires_grad_(False)
     trained = {p: n for n, p in model.named_parameters() if p.requires_grad}
     for module in (model, nn.ModuleDict({"model": model})):
-        factors = recipe.rate_factors(module)
-        optimizer = make_optimizer(module, recipe.build_optimizer(), factors)
+        optimizer = make_optimizer(module, recipe.build_optimizer(), recipe.rate_factors(module))
         assert [group["weight_decay"] for group in optimizer.param_groups] == [0.1, 0.0]
         assert optimizer.defaults["betas"] == (0.9, 0.95)
         decaying, others = ([trained[p] for p in g["params"]] for g in optimizer.param_groups)

@@ -85,8 +85,7 @@ def test_weights_and_their_average_are_judged_and_shown_side_by_side(trained_run
         rendering = raw.render(raw(sample.inputs).gaussians, sample.targets.cameras)
     images = *sample.inputs.images[0], sample.targets.images[0, 0], rendering.rgb[0, 0]
     for column, image in enumerate(images):
-        shown = picture[:16, 20 * column :][:, :16]
-        np.testing.assert_array_equal(shown, rgb_picture(image))
+        np.testing.assert_array_equal(picture[:16, 20 * column :][:, :16], rgb_picture(image))
 
 
 def test_scenes_that_do_not_split_evenly_are_refused():

@@ -148,8 +148,7 @@ def test_gradients_of_two_passes_are_those_of_the_definition():
         total = total + factor * (one - other).abs().mean() / 2
     wanted = gradients(step, total)
     for step.render_views in (0, 1):
-        found = step(batch.inputs, batch.targets).total
-        assert furthest(gradients(step, found), wanted) < 1e-5
+        assert furthest(gradients(step, step(batch.inputs, batch.targets).total), wanted) < 1e-5
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device")
@@ -206,8 +205,7 @@ def test_signs_are_those_of_all_views_of_the_last_layer():
     likeness = psnr(rendering.rgb, targets.images).mean()
     wanted = (likeness, *measure(rendering.rgb, rendering.alpha, torch.full((3,), 0.5)))
     for objective.render_views in (0, 2):
-        signs = objective(inputs, targets).signs
-        torch.testing.assert_close(tuple(signs.values()), wanted)
+        torch.testing.assert_close(tuple(objective(inputs, targets).signs.values()), wanted)
 
 
 def test_input_views_are_judged_too():

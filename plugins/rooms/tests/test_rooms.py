@@ -32,8 +32,7 @@ def test_colours_reproject_through_depth(mirror):
     c2w = views.cameras.c2w[0, 0]
     local = to_camera((points @ c2w[:3, :3].T + c2w[:3, 3])[None], views.cameras)[0, 1]
     grid = (to_pixels(local, other) / 48 - 1).view(1, *size, 2)
-    stack = torch.cat([second, depths[1]])[None]
-    *seen, depth = F.grid_sample(stack, grid, align_corners=False)[0]
+    *seen, depth = F.grid_sample(torch.cat([second, depths[1]])[None], grid, align_corners=False)[0]
     z = local[:, 2].view(size)
     agrees = (grid[0].abs() < 0.95).all(-1) & (z > 0) & ((depth - z).abs() < 0.02)
     assert agrees.float().mean() > 0.3
@@ -66,7 +65,6 @@ def test_cameras_are_rigid_and_keep_clear_of_every_surface():
 
 @pytest.mark.parametrize("name", ["locus-64", "tokengs-64"])
 def test_models_come_with_their_training_curves(name):
-    file = checkpoint_path(f"rooms/{name}")
-    curves = curves_of(file)
+    curves = curves_of(checkpoint_path(f"rooms/{name}"))
     assert list(curves.steps) == list(range(100, 40_001, 100))
     assert curves.psnr[0] + 5 < curves.psnr[-1]

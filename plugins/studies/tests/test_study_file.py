@@ -55,8 +55,7 @@ def test_a_variant_is_the_base_or_its_own_recipe_with_the_budget(tmp_path):
         assert (recipe.training.steps, recipe.training.seconds, recipe.seed) == (200, None, 0)
     # in batches of 2 with 2 targets
     for budget, steps, seconds in (("seconds: 30", 20_000, 30.0), ("images: 4001", 1001, None)):
-        study = read(tmp_path, SOUND.replace("steps: 200", budget))
-        training = composed(study)["full"].training
+        training = composed(read(tmp_path, SOUND.replace("steps: 200", budget)))["full"].training
         assert (training.steps, training.seconds) == (steps, seconds)
 
 
@@ -102,8 +101,7 @@ def test_what_is_wrong_is_told_with_its_line_before_anything_trains(tmp_path):
     rows = WRONG.replace("VARIANT", VARIANT).strip("\n").splitlines()
     many = "".join(f"  v{n}:\n" for n in range(198))
     for row in rows:
-        cells = row.replace(r"\n", "\n").replace("MANY", many).split(" | ")
-        written, instead, place, word = cells
+        written, instead, place, word = row.replace(r"\n", "\n").replace("MANY", many).split(" | ")
         assert SOUND.count(written) == 1, written
         with pytest.raises(RecipeError) as caught:
             composed(read(tmp_path, SOUND.replace(written, instead)))

@@ -106,5 +106,4 @@ def source_of(kind, views=VIEWS):
 
 
 def exhibition_of(*kinds, query=None):
-    samples = [sample_of(), sample_of((0, 5))]
-    return Exhibition([exhibit_of(kind) for kind in kinds], samples, query)
+    return Exhibition([exhibit_of(kind) for kind in kinds], [sample_of(), sample_of((0, 5))], query)

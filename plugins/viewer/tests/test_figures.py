@@ -41,8 +41,7 @@ def words(*axes):
 @torch.no_grad()
 def seen_by(model, sample):
     """Render, error and depth of the middle target, and the photo."""
-    gaussians = model(sample.inputs).gaussians
-    rendering = model.render(gaussians, sample.targets.cameras[:, 1:2])
+    rendering = model.render(model(sample.inputs).gaussians, sample.targets.cameras[:, 1:2])
     image = rendering.rgb[0, 0].clamp(0, 1)
     truth = sample.targets.images[0, 1]
     return image, (image - truth).abs().mean(0, keepdim=True), rendering.depth[0, 0], truth
@@ -67,8 +66,7 @@ def test_novel_views_show_the_middle_target_with_its_score_error_and_depths_on_o
         expected.append(depth_picture(depth, near, far))
     shown = pictures(made)
     assert all(any(np.array_equal(one, other) for other in shown) for one in expected)
-    place = titles(made).index("true depth")
-    assert words(axes[place]) == [f"{near:.2g} to {far:.2g}"]
+    assert words(axes[titles(made).index("true depth")]) == [f"{near:.2g} to {far:.2g}"]
     assert "the true depth, which is shown" in made.caption
     unknown = novel_views.made(show)
     assert "true depth" not in "".join([unknown.caption, *titles(unknown)])

@@ -19,8 +19,7 @@ from qgs.types import Views
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_supports_and_attention_are_those_of_a_traced_pass(kind):
-    shown = exhibit_of(kind)
-    model, look = shown.model, source_of(kind).look((1, 4))
+    model, look = exhibit_of(kind).model, source_of(kind).look((1, 4))
     with torch.no_grad(), qgs.trace(model) as record:
         assert_close(look.gaussians.means, model(look.views).gaussians.means)
     layers = record.layers

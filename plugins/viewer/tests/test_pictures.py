@@ -19,8 +19,7 @@ def test_outlines_hold_every_projected_surface_point_and_touch_the_outermost(cam
     axes = 0.15 * torch.randn(1, 5, 3, 3)
     ellipses = queries.project_support(SpatialSupport(centers, axes), camera)
     assert ellipses.whole.all()
-    sphere = F.normalize(torch.randn(20000, 3), dim=-1)
-    surface = centers[0, :, None] + sphere @ axes[0].mT
+    surface = centers[0, :, None] + F.normalize(torch.randn(20000, 3), dim=-1) @ axes[0].mT
     in_camera = to_camera(surface.view(1, -1, 3), camera)[0, 0]
     pixels = to_pixels(in_camera, camera.intrinsics[0, 0]).view(5, -1, 2)
     local = torch.linalg.solve(ellipses.axes, (pixels - ellipses.centers[:, None]).mT)

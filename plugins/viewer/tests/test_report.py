@@ -115,8 +115,7 @@ def test_distributions_add_sections_and_those_that_fail_are_named(install, caplo
     sections = {section.title: section for section in offered_sections(shown, [sample])}
     assert [*sections] == ["Mine"]
     assert sections["Mine"].figures[""][0].caption == "plain: 32 of test/000000"
-    named = re.findall(r"`broken(\d)` of qgs-broken-\d 1.2", caplog.text)
-    assert named == ["0", "1", "2", "3"]
+    assert re.findall(r"`broken(\d)` of qgs-broken-\d 1.2", caplog.text) == ["0", "1", "2", "3"]
 
 
 def test_the_section_has_all_models_and_the_code_of_the_viewer_once():

@@ -42,11 +42,11 @@ def found_alike(photos, tmp_path):
     (_, inputs, compared), found = next(iter(entry.search.found.items()))
     done("reconstruct", MODEL, photos, "--out", tmp_path / "out")
     record = json.loads((tmp_path / "out/cameras.json").read_text())
-    assert record["to_photos"]["scale"] == pytest.approx(found.factor, rel=1e-6)
+    assert record["to_photos"]["scale"] == pytest.approx(found.factor)
     assert record["to_photos"]["search"] == found.record
     opened = open_source(MODEL, Wanted(photos=str(photos)))
     assert tuple(opened.frames) == inputs
-    assert opened.views.scale_factor == pytest.approx(found.factor, rel=1e-6)
+    assert opened.views.scale_factor == pytest.approx(found.factor)
     score = entry.evaluation.scores[0]
     quality = [view["psnr"] for view in record["views"] if view["kind"] == "novel"]
     if len(score.views) == 1:

@@ -62,8 +62,7 @@ def test_a_query_is_picked_and_followed_through_the_layers(server, panel):
         panel.layer.value = layer
         assert panel.choice.layer == layer
         ball = server.scene.get_handle_by_name("/support").vertices
-        center = panel.look.support(layer).centers[0, 3].numpy()
-        assert abs(ball.mean(0) - center).max() < 1e-4
+        assert abs(ball.mean(0) - panel.look.support(layer).centers[0, 3].numpy()).max() < 1e-4
     assert nodes(panel) == BASE | {"anchors", "support"}
     assert not any(picture.visible for picture in panel.pictures.values())
     panel.number.value = -1

@@ -18,8 +18,7 @@ TRAINED = Domain(yaml.safe_load("{baseline: [0.1, 0.3], turn: [2.0, 20.0], depth
 
 def scene_of(c2w, held_out=()):
     """Grey photos."""
-    images = torch.full((1, len(c2w), 3, 64, 64), 0.5)
-    scene = GivenScene(Views(images, pinhole(c2w.float())[None]))
+    scene = GivenScene(Views(torch.full((1, len(c2w), 3, 64, 64), 0.5), pinhole(c2w.float())[None]))
     scene.held_out = held_out
     return scene
 
@@ -72,8 +71,7 @@ def test_inputs_are_as_far_apart_as_in_training_whatever_the_unit():
 
 def test_a_training_with_all_distances_says_nothing_about_the_best():
     ranges = "{baseline: [0.002, 0.9], turn: [0.4, 43.0], depth: [0.002, 4.0]}"
-    varied = Domain(yaml.safe_load(ranges), 512)
-    assert trained_ratios(varied) == trained_ratios(Domain())
+    assert trained_ratios(Domain(yaml.safe_load(ranges), 512)) == trained_ratios(Domain())
 
 
 def test_photos_that_look_elsewhere_are_no_inputs():
