@@ -52,10 +52,10 @@ def far(views):
 
 def test_views_in_any_world_give_the_same_scene(model, views, far, caplog):
     result = model.train().reconstruct(far)
-    assert model.training, "as before"
+    assert model.training  # as before
     model.eval()
     inputs = result.sample.inputs
-    assert result.sample.input_frames == (0, 1), "all of them"
+    assert result.sample.input_frames == (0, 1)  # all of them
     torch.testing.assert_close(inputs.cameras.c2w[0, 0], torch.eye(4), atol=1e-5, rtol=0)
     assert float(inputs.cameras.c2w[0, 1, :3, 3].norm()) == pytest.approx(0.5, rel=1e-4)
     assert not caplog.text
@@ -71,7 +71,7 @@ def test_gaussians_with_harmonics_lie_in_the_world_of_the_photos(model, far, tmp
     inputs = result.sample.inputs.cameras
     own = model.render(result.gaussians, inputs)
     plain = model.render(result.gaussians.replace(sh=None), inputs)
-    assert (own.rgb - plain.rgb).abs().max() > 0.02, "there is something to turn"
+    assert (own.rgb - plain.rgb).abs().max() > 0.02  # there is something to turn
     file = tmp_path / "placed.ply"
     assert result.save(file) == [file]
     renderer = AutoRenderer(AutoRenderer.Config(far=1e5))  # in the unit of the photos
@@ -117,7 +117,7 @@ def test_a_loaded_model_checks_the_first_views_that_it_reconstructs(tmp_path, fa
     qgs.save(qgs.compose(RECIPE), file, extra={"trained_on": json.dumps(ranges)})
     model = qgs.load(file).train()
     model(far)
-    assert not caplog.text, "in training nothing is looked at"
+    assert not caplog.text  # in training nothing is looked at
     model.eval()
     model(far)
     model(far)

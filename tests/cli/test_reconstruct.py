@@ -116,7 +116,7 @@ def test_a_call_gives_what_the_command_gives(checkpoint, photos, tmp_path, small
         by_command = tmp_path / "command" / file.name
         assert file.is_dir() or file.read_bytes() == by_command.read_bytes(), file
     own = qgs.load_ply(tmp_path / "call" / "gaussians.ply")
-    torch.testing.assert_close(own.means, result.gaussians.means, msg="in the model's world")
+    torch.testing.assert_close(own.means, result.gaussians.means)  # in the model's world
 
 
 def test_photos_of_the_training_are_not_called_novel_and_those_held_out_never_refined_on(

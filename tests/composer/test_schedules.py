@@ -46,7 +46,7 @@ def test_an_annotated_recipe_has_the_same_schedules(tmp_path):
     again.write_text(annotated(recipe))
     assert resolve(again).schedules == recipe.schedules
     assert recipe.schedules.keys() == {("model", "renderer"), ("losses", "photometric")}
-    assert recipe.build_model("meta").renderer.config.dilation == 10, "of the first step"
+    assert recipe.build_model("meta").renderer.config.dilation == 10  # of the first step
 
 
 class Blend(MlpFeedForward):

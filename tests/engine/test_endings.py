@@ -56,7 +56,7 @@ def test_data_that_fails_leaves_a_run_that_goes_on(trained_run, tmp_path, monkey
     whole = trained_run.folder.path
     assert_equal_runs(tmp_path, whole)
     first, second = (read_jsonl(folder / "evaluations.jsonl") for folder in (tmp_path, whole))
-    assert first == second[2:], "of step 3"
+    assert first == second[2:]  # of step 3
 
 
 @pytest.mark.slow
@@ -110,7 +110,7 @@ def test_an_evaluation_that_fails_is_told_and_ends_nothing(tmp_path, monkeypatch
 
     monkeypatch.setattr(periodic, "evaluate", failing)
     run(tiny("tokengs", "training.evaluate_every=1"), tmp_path)
-    assert saved == [1, 2, 3], "saved before it is judged"
+    assert saved == [1, 2, 3]  # saved before it is judged
     assert "the evaluation at step 2 failed: ValueError: no scene could be judged" in caplog.text
 
 

@@ -100,7 +100,7 @@ def judged():
         patch.setattr(Recipe, "build_data", opened := Mock(return_value=source))
         model = recipe.build_model().train()
         evaluations = evaluate(model, recipe), evaluate(model, recipe)
-    assert opened.call_count == 2, "once each"
+    assert opened.call_count == 2  # once each
     assert model.training
     return recipe, *evaluations
 

@@ -203,7 +203,7 @@ def test_the_average_is_the_weighted_mean_of_all_weights_so_far():
         expected = 0.9 * expected + 0.1 * weight
         average.update()
     expected = {"first.weight": expected, "seen": torch.tensor(5)}
-    torch.testing.assert_close(average.state(), expected, msg="shared weights once")
+    torch.testing.assert_close(average.state(), expected)  # shared weights once
     with average.applied():
         torch.testing.assert_close(model.first.weight.data, expected["first.weight"])
     assert torch.equal(model.first.weight, weight)

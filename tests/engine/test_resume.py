@@ -86,7 +86,7 @@ def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
     history = RunFolder(whole).history()
     rates = [5e-4 * (1 + math.cos(math.pi * step / 4)) for step in range(4)]
     assert [record["lr"] for record in history] == pytest.approx(rates)
-    assert history[3]["ssim"] == pytest.approx(history[0]["ssim"] / 4, rel=0.2), "0.1 is left"
+    assert history[3]["ssim"] == pytest.approx(history[0]["ssim"] / 4, rel=0.2)  # 0.1 is left
     assert [record["alpha_consistency"] > 0 for record in history] == [False, False, True, True]
     terms = [
         "mse",

@@ -64,7 +64,7 @@ def test_averages_and_evaluations_leave_the_training_alone(trained_run, tmp_path
         model.state_dict()["queries.features"]
         for model in (tiny("locus").build_model(), qgs.load(folder.checkpoint_ema), plain.model)
     )
-    assert 0 < (average - last).norm() < (start - last).norm(), "it follows the weights"
+    assert 0 < (average - last).norm() < (start - last).norm()  # it follows the weights
 
 
 def test_weights_and_their_average_are_judged_and_shown_side_by_side(trained_run):
@@ -79,7 +79,7 @@ def test_weights_and_their_average_are_judged_and_shown_side_by_side(trained_run
     pictures = folder.path / "pictures"
     assert {path.name for path in pictures.iterdir()} == {"step-2.png", "step-3.png"}
     picture = np.asarray(Image.open(pictures / "step-3.png"))
-    assert picture.shape == (36, 96, 3), "two rows of five, 4 apart"
+    assert picture.shape == (36, 96, 3)  # two rows of five, 4 apart
     sample = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[0]
     with torch.no_grad():
         rendering = raw.render(raw(sample.inputs).gaussians, sample.targets.cameras)
@@ -139,7 +139,7 @@ def test_bad_steps_are_skipped_on_demand(tmp_path, monkeypatch, caplog):
     assert curves_of(through / "checkpoint.safetensors").steps == [1, 3]
     assert {path.name for path in (through / "incidents").iterdir()} == {"step-2", "step-4"}
     counted = parts_of(through)["guard"]
-    assert (counted["incidents"], counted["skipped"]) == (2, 1), "a good step lies between the two"
+    assert (counted["incidents"], counted["skipped"]) == (2, 1)  # a good step lies between the two
     for resume in (False, True):
         with pytest.raises(NonFiniteError, match=r"targets\.images \(1 NaN of") as error:
             run(tiny("locus", *options), stopped, resume)

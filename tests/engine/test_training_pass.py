@@ -157,7 +157,7 @@ def test_gradients_through_gsplat_do_not_depend_on_it():
     objective, *batch = setting("qgs/gsplat")
     objective.render_views = 2
     found = error(objective.cuda(), *(views.to("cuda") for views in batch))
-    assert found < 1e-5, "its kernels add in no fixed order"
+    assert found < 1e-5  # its kernels add in no fixed order
 
 
 def test_in_float64_they_are_the_same_numbers():
@@ -180,7 +180,7 @@ def test_under_autocast_the_gaussians_get_the_same_gradients():
         with torch.autocast("cpu", torch.bfloat16):
             objective(*batch).total.backward()
         found.append(seen)
-    assert len(seen) >= 10, "Gaussians and states of two layers"
+    assert len(seen) >= 10  # Gaussians and states of two layers
     assert furthest(*found) < 1e-6
 
 

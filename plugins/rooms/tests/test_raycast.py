@@ -20,7 +20,7 @@ def test_hits_are_where_geometry_puts_them():
     for shape in round_:
         assert hits(shape, 0, 0.5) == pytest.approx(5 - np.sqrt(0.75))
     turned = box(0, 0, 0, (2, 2, 2), 0).moved(5, 0, np.pi / 4)
-    assert hits(turned, 0, 0) == pytest.approx(5 - np.sqrt(2)), "its corner"
+    assert hits(turned, 0, 0) == pytest.approx(5 - np.sqrt(2))  # its corner
 
 
 def test_depth_is_z_along_the_camera():

@@ -24,7 +24,7 @@ def test_colours_reproject_through_depth(mirror):
         Views(scene.images(frames)[None], scene.cameras[frames][None]),
         scene.depths(frames),
     )
-    assert depths.min() > 0, "a room is closed"
+    assert depths.min() > 0  # a room is closed
     if mirror:
         views, depths = mirrored_views(views), depths.flip(-1)
     (first, second), (one, other) = views.images[0], views.cameras[0].intrinsics
@@ -58,7 +58,7 @@ def test_cameras_are_rigid_and_keep_clear_of_every_surface():
         turn, eyes = scene.cameras.c2w[:, :3, :3], scene.cameras.c2w[:, :3, 3]
         assert (turn @ turn.mT - torch.eye(3)).abs().max() < 1e-5
         assert torch.linalg.det(turn).min() > 0.99
-        assert turn[:, 2, 1].max() < 0, "the image's y axis points down"
+        assert turn[:, 2, 1].max() < 0  # the image's y axis points down
         assert (torch.tensor(scene.size[:2]) / 2 - eyes[:, :2].abs()).min() > 0.2
         assert distances(scene.room.shapes, eyes.numpy()).min() > 0.2
 

@@ -82,7 +82,7 @@ def test_what_failed_comes_last_and_a_collapse_is_final(study, plan, monkeypatch
     queue = Queue(plan, 4, 1, "cpu", Console(file=(shown := io.StringIO())))
     assert queue.work() == "SIGTERM"
     assert started == [third, fourth, second]
-    assert queue.failures == {}, "what failed before is no failure of this call"
+    assert queue.failures == {}  # what failed before is no failure of this call
     assert str(first.failure) in shown.getvalue()
     done("study", study, "--out", plan.folder, "--slurm")
     assert "#SBATCH --array=1,2,3" in (plan.folder / "slurm.sh").read_text()
@@ -143,4 +143,4 @@ def test_the_last_whole_record_tells_how_far_a_run_is(tmp_path):
 
 def test_an_exit_code_of_no_signal_ends_no_study():
     assert (_end(255), _end(-9)) == ("ended with exit code 255", "was ended by SIGKILL")
-    assert [_signal(code) for code in (255, 137, -9, 1)] == [0, 9, 9, 0], "others go on"
+    assert [_signal(code) for code in (255, 137, -9, 1)] == [0, 9, 9, 0]  # others go on

@@ -125,7 +125,7 @@ def test_verdicts_and_the_answer(tmp_path, lead, answer, verdict):
     found = results(tmp_path, lead)
     assert re.match(answer, found.answer())
     assert [judged.verdict for judged in found.judgements()] == ["seen", verdict, "seen"]
-    assert found.rank_correlation()[0] is None, "of three variants any order is likely"
+    assert found.rank_correlation()[0] is None  # of three variants any order is likely
 
 
 def test_the_best_of_one_needs_no_correction(tmp_path):

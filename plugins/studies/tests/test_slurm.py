@@ -48,7 +48,7 @@ def test_a_slurm_job_saves_at_the_signal_and_goes_on(tmp_path):
     command, history = ["bash", str(tmp_path / "run.slurm.sh")], out / "history.jsonl"
     job = subprocess.Popen(command, env=environment)
     while not history.exists() or len(history.read_bytes().splitlines()) < 3:
-        assert job.poll() is None, "the training ended too early"
+        assert job.poll() is None  # the training ended too early
         time.sleep(0.1)
     job.terminate()
     job.wait(60)

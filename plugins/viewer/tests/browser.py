@@ -117,7 +117,7 @@ def chromium(profile):
         port_file = profile / "DevToolsActivePort"
         end = time.monotonic() + 60
         while not port_file.is_file() or not port_file.read_text().strip():
-            assert time.monotonic() < end, "chromium did not start"
+            assert time.monotonic() < end  # chromium did not start
             time.sleep(0.1)
         port = port_file.read_text().split()[0]
         pages = json.load(urlopen(f"http://127.0.0.1:{port}/json"))

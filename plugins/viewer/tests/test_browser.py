@@ -96,7 +96,7 @@ def test_a_page_draws_and_asks_for_nothing(page, tmp_path):
     page.until("the canvas", "!!document.querySelector('canvas')")
     drawn(page)
     grey = (abs(page.picture() - 127.5).max(-1) < 1).mean()
-    assert grey > 0.02, "the background of the model, not that of the page"
+    assert grey > 0.02  # the background of the model, not that of the page
     assert_alone(page, file)
     page.evaluate(
         "window.canvas = document.querySelector('canvas[data-engine]');"
@@ -118,7 +118,7 @@ def test_a_page_draws_and_asks_for_nothing(page, tmp_path):
     page.until(
         "a film", "window.film?.size > 10000 && saved.endsWith(film.type.slice(6).split(';')[0])"
     )
-    assert page.targets == ["worker"], "it sorts the Gaussians as the page is turned"
+    assert page.targets == ["worker"]  # it sorts the Gaussians as the page is turned
     assert page.errors == []
 
 
@@ -146,7 +146,7 @@ def test_a_report(page, tmp_path):
     _zoom(page)
     _darken(page)
     _turn(page)
-    assert page.targets.count("worker") == 2, "each scene sorts its Gaussians in a worker"
+    assert page.targets.count("worker") == 2  # each scene sorts its Gaussians in a worker
     assert page.errors == []
     assert_alone(page, file)
 
@@ -215,7 +215,7 @@ def _darken(page):
     page.evaluate(press)
     system = [{"name": "prefers-color-scheme", "value": "dark"}]
     page.call("Emulation.setEmulatedMedia", features=system)
-    assert page.evaluate(paper) == white, "the button wins"
+    assert page.evaluate(paper) == white  # the button wins
     page.evaluate("document.documentElement.style.colorScheme = ''")
     assert page.evaluate(paper) == dark
     page.call("Emulation.setEmulatedMedia", features=[])

@@ -141,7 +141,7 @@ def test_files_are_of_the_width_of_a_page_with_text_and_the_same_each_time(tmp_p
         assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
     text = (tmp_path / "a.pdf").read_bytes()
     assert b"/FontFile2" in text
-    assert b"/CreationDate" not in text, "a second later it would be another"
+    assert b"/CreationDate" not in text  # a second later it would be another
     assert Image.open(tmp_path / "a.png").width == round(WIDTH * DPI)
 
 

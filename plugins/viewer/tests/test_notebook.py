@@ -34,7 +34,7 @@ def test_a_model_shows_the_way_from_views_to_gaussians(known):
     counts = [int(t.split()[0].replace(",", "")) for t in texts if t.endswith(" parameters")]
     assert sum(counts) == sum(parameter.numel() for parameter in model.parameters())
     assert_tidy(svg)
-    assert "#" not in html[: html.index("<table>")], "it takes the colours of its page"
+    assert "#" not in html[: html.index("<table>")]  # it takes the colours of its page
 
 
 def assert_tidy(svg):
@@ -49,7 +49,7 @@ def assert_tidy(svg):
     _, _, *size = map(float, svg.get("viewBox").split())
     assert ((low > 0) & (high < size)).all()
     meet = (low < high[:, 0]) & (low[:, 0] < high)
-    assert meet.all(-1).sum() == len(low), "each with itself"
+    assert meet.all(-1).sum() == len(low)  # each with itself
     start = numbers("{*}text", "x", "y")
     assert ((low[:, 0] < start) & (start < high[:, 0])).all(-1).any(1).all()
 

@@ -70,7 +70,7 @@ def test_every_scene_can_be_chosen_and_is_there_without_choosing(page):
 
 def test_pictures_are_in_the_page_and_have_words(page):
     alts = [picture["alt"] for picture in tags(page, "img") if "src" in picture]
-    assert alts.count("") == 3, "thumbnails beside their names"
+    assert alts.count("") == 3  # thumbnails beside their names
     assert {f"{html.escape(RUN)}, error", "more, depth", "Truth, depth"} <= {*alts}
     sliders = [found["aria-label"] for found in tags(page, "input") if found["type"] == "range"]
     assert [html.escape(RUN) in label for label in sliders] == [True, False] * 3
