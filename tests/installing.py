@@ -14,14 +14,7 @@ def install(tmp_path_factory, monkeypatch):
     editable: as `pip install -e` leaves it. group: of its entry point.
     """
 
-    def install(
-        distribution,
-        plugin,
-        source,
-        version="1.2",
-        editable=False,
-        group="qgs.plugins",
-    ):
+    def install(distribution, plugin, source, version="1.2", editable=False, group="qgs.plugins"):
         folder, safe = tmp_path_factory.mktemp("site"), distribution.replace("-", "_")
         (folder / f"_test_{safe}.py").write_text(dedent(source))
         info = folder / f"{safe}-{version}.dist-info"

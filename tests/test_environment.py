@@ -3,7 +3,7 @@
 import subprocess
 from pathlib import Path
 
-ENVIRONMENT = Path(__file__).parents[1] / "tools" / "environment.sh"
+ENVIRONMENT = Path(__file__).parents[1] / "tools/environment.sh"
 FAKE_PYTHON = '#!/bin/sh\nif [ "$2" = venv ]; then mkdir -p "$3/bin"; fi\n'
 
 

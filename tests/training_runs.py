@@ -17,7 +17,7 @@ from qgs.engine.folder import RunFolder, read_state
 from qgs.engine.tracking import TrainingProgress
 from qgs.engine.training import Trainer, train
 
-RECIPES = Path(__file__).parents[1] / "recipes" / "tiny"
+RECIPES = Path(__file__).parents[1] / "recipes/tiny"
 
 SMALL = """
 model.width=32 model.heads=2 model.queries.count=24
@@ -58,12 +58,7 @@ def trained_run(tmp_path_factory):
         return run(tiny("locus", *TRAINED), tmp_path_factory.mktemp("trained") / "run")
 
 
-def run_calling(
-    after_step,
-    recipe,
-    folder,
-    resume=False,
-):
+def run_calling(after_step, recipe, folder, resume=False):
     """A run that calls `after_step(trainer, stop)` after each step."""
     stop = StopRequest()
 

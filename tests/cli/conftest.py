@@ -9,7 +9,7 @@ from commands import done, run_qgs, sets
 
 from qgs.analysis import saving
 
-RECIPE = Path(__file__).parents[2] / "recipes" / "tiny" / "locus.yaml"
+RECIPE = Path(__file__).parents[2] / "recipes/tiny/locus.yaml"
 QUICK = sets(
     "data.image_size=[32, 32]",
     "views.targets=2",

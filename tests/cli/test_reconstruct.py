@@ -115,7 +115,7 @@ def test_a_call_gives_what_the_command_gives(checkpoint, photos, tmp_path, small
     for file in result.save(tmp_path / "call"):
         by_command = tmp_path / "command" / file.name
         assert file.is_dir() or file.read_bytes() == by_command.read_bytes(), file
-    own = qgs.load_ply(tmp_path / "call" / "gaussians.ply")
+    own = qgs.load_ply(tmp_path / "call/gaussians.ply")
     torch.testing.assert_close(own.means, result.gaussians.means)  # in the model's world
 
 
@@ -141,7 +141,7 @@ def test_photos_of_the_training_are_not_called_novel_and_those_held_out_never_re
         assert refined["refinement"]["frames"] == frames
         assert refined["views"][0]["size"] == size
         assert PlyData.read(out / "gaussians.ply")["vertex"].count == 32
-        assert PlyData.read(out / "refined" / "gaussians.ply")["vertex"].count == count
+        assert PlyData.read(out / "refined/gaussians.ply")["vertex"].count == count
 
 
 @pytest.mark.parametrize("own", [False, True])

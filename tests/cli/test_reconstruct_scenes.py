@@ -59,11 +59,11 @@ def test_photos_of_any_format_are_opened_for_a_model_of_other_data(folders):
 
 
 def test_a_scene_of_a_trained_set_is_known_for_what_it_is(folders):
-    shutil.copytree(folders / "b", folders / "test" / "c")
+    shutil.copytree(folders / "b", folders / "test/c")
     trained = recipe("qgs/photos", path=str(folders), holdout=3)
     for path, name in ((folders / "a", None), (folders, "a")):
         assert chosen(trained, path, name=name) == ((1,), (0, 2, 3), SIZE)
-    for other in (folders / "test" / "c", folders.parent / "llff"):
+    for other in (folders / "test/c", folders.parent / "llff"):
         assert chosen(trained, other)[:2] == ((2,), ())
 
 
@@ -100,7 +100,7 @@ def test_a_scene_that_is_not_named_or_not_there(folders, tmp_path):
     with pytest.raises(ValueError, match="holds no scene 'c', but a, b: name one"):
         chosen(ROOMS, folders, name="c")
     (tmp_path / "empty").mkdir()
-    (tmp_path / "empty" / "transforms.txt").touch()
+    (tmp_path / "empty/transforms.txt").touch()
     with pytest.raises(FileNotFoundError, match="lists no cameras"):
         chosen(ROOMS, tmp_path / "empty")
 

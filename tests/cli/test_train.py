@@ -12,7 +12,7 @@ from qgs.cli.train import with_absolute_path
 from qgs.composer import resolve
 from qgs.engine import training as engine
 
-FINETUNE = Path(__file__).parents[2] / "recipes" / "locus" / "dl3dv_4096_2views.yaml"
+FINETUNE = Path(__file__).parents[2] / "recipes/locus/dl3dv_4096_2views.yaml"
 ROOMS = "data={type: rooms/procedural, image_size: [16, 16]}"
 
 
@@ -44,7 +44,7 @@ def test_a_signal_ends_with_its_number(training, tmp_path, monkeypatch):
         lambda *words, **options: replace(real(*words, **options), stopped_by="SIGTERM"),
     )
     assert training(tmp_path / "run").exit_code == 128 + 15
-    assert not (tmp_path / "run" / "evaluation").exists()
+    assert not (tmp_path / "run/evaluation").exists()
 
 
 def test_a_collapse_is_told_without_a_traceback(training, tmp_path):
@@ -52,7 +52,7 @@ def test_a_collapse_is_told_without_a_traceback(training, tmp_path):
     assert result.exit_code == 1
     assert isinstance(result.exception, SystemExit)
     assert "training collapsed" in result.output
-    assert (tmp_path / "run" / "checkpoint.safetensors").is_file()
+    assert (tmp_path / "run/checkpoint.safetensors").is_file()
 
 
 def test_what_is_missing_is_told_before_training(tmp_path, monkeypatch):

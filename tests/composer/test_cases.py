@@ -69,13 +69,7 @@ def faults(files):
 
 
 @pytest.mark.parametrize("subject", sorted(file.stem for file in CASES.iterdir()))
-def test_recipes_are_refused_or_resolved(
-    subject,
-    installed,
-    install,
-    tmp_path,
-    monkeypatch,
-):
+def test_recipes_are_refused_or_resolved(subject, installed, install, tmp_path, monkeypatch):
     wrong = []
     cases = split((CASES / f"{subject}.txt").read_text(), "===")
     for number, (title, text) in enumerate(cases):

@@ -10,7 +10,7 @@ import yaml
 from qgs.composer.registry import load_registry
 from qgs.composer.schema import recipe_schema
 
-COMMITTED = Path(__file__).parents[2] / "recipes" / "recipe.schema.json"
+COMMITTED = Path(__file__).parents[2] / "recipes/recipe.schema.json"
 SHIPPED = "c3g datasets dinov2 ellipsoid globalsplat gslrm landmark locus lpips mvsplat rooms"
 SHIPPED += " tokengs2026 worlds"
 SOUND = """

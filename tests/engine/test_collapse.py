@@ -6,13 +6,7 @@ from training_runs import run, run_calling, tiny
 
 import qgs
 from qgs.engine.folder import RunFolder
-from qgs.engine.guard import (
-    EMPTY_ALPHA,
-    CollapseDetector,
-    CollapseError,
-    GoodWeights,
-    not_finite,
-)
+from qgs.engine.guard import EMPTY_ALPHA, CollapseDetector, CollapseError, GoodWeights, not_finite
 from qgs.engine.training_pass import measure
 from qgs.io.checkpoint import CheckpointFile
 

@@ -69,7 +69,7 @@ def test_all_processes_leave_out_a_step_that_one_found_bad(tmp_path):
     train_in_two_processes(recipe, tmp_path, 3, True)
     records = read_jsonl(tmp_path / "history.jsonl")
     assert ["loss" in record for record in records] == [True, False, True]
-    incident = tmp_path / "incidents" / "step-2"
+    incident = tmp_path / "incidents/step-2"
     found = json.loads((incident / "report.json").read_text())["found"]
     assert [report["process"] for report in found] == [0, 1]
     assert [bool(report["first"]) for report in found] == [False, True]

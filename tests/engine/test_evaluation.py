@@ -235,8 +235,8 @@ def test_photo_folders_are_judged_on_held_out_frames_beside_a_broken_one(tmp_pat
     folder = tmp_path / "set"
     for name in ("a", "b", "c"):
         write_nerfstudio(folder / name, synthetic(tmp_path / "photos", 12, (32, 32)))
-    (folder / "b" / "transforms.json").write_text("{")
-    (folder / "c" / "images" / "view_006.png").write_bytes(b"no photo")
+    (folder / "b/transforms.json").write_text("{")
+    (folder / "c/images/view_006.png").write_bytes(b"no photo")
     data = f"data={{type: qgs/photos, path: {folder}, image_size: [32, 32], holdout: 4}}"
     recipe = tiny("tokengs", data, "evaluation.scenes=9")
     summary = (evaluation := evaluate(recipe.build_model(), recipe)).summary()

@@ -130,7 +130,7 @@ def test_an_incident_can_be_seen_again(step, tmp_path):
     bad.targets.images[0, 0, 0, 0, 0] = NAN
     told, in_data = step.guard(tmp_path).look_into(7, step.batches, "loss term mse is nan")
     assert in_data
-    place = tmp_path / "incidents" / "step-7"
+    place = tmp_path / "incidents/step-7"
     with safe_open(place / "batch.safetensors", "pt") as file:
         shown = {n: json.loads(text) for n, text in file.metadata().items() if "qgs." not in n}
         assert tuple(shown["scenes"]) == good.scenes + bad.scenes

@@ -197,7 +197,7 @@ def test_random_states_come_back():
 @pytest.mark.slow
 def test_killed_runs_go_on_from_whole_files():
     """Some kills must come inside a save, for this to prove anything."""
-    tool = Path(__file__).parents[2] / "tools" / "kill.py"
+    tool = Path(__file__).parents[2] / "tools/kill.py"
     done = subprocess.run(
         [sys.executable, str(tool), "training", "--kills=12", "--width=192", "--steps=150"],
         env={**os.environ, "OMP_NUM_THREADS": "1"},

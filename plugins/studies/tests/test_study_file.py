@@ -10,14 +10,7 @@ from pathlib import Path
 import pytest
 from commands import done
 from qgs_studies.hypotheses import parsed
-from qgs_studies.plan import (
-    composed,
-    evaluation_file,
-    planned,
-    recipe_file,
-    run_of,
-    write_plan,
-)
+from qgs_studies.plan import composed, evaluation_file, planned, recipe_file, run_of, write_plan
 from qgs_studies.study import read_study
 
 from qgs.composer import RecipeError, resolve

@@ -141,6 +141,6 @@ def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
     assert new_folder(None).name == "demo"
     (tmp_path / "demo").mkdir()
     assert new_folder(None).name == "demo-2"
-    (tmp_path / "demo" / "report.html").touch()
+    (tmp_path / "demo/report.html").touch()
     with pytest.raises(FileExistsError, match="not empty"):
         new_folder(tmp_path / "demo")
