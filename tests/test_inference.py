@@ -63,10 +63,9 @@ def test_a_forward_pass_never_waits(tmp_path):
 def test_waits_are_found():
     x = torch.ones(3)
     with HostWaits() as waits:
-        _ = float(x.sum()), x.tolist(), bool(x.any()), x[x > 0], x.new_tensor([1.0])
-        _ = torch.arange(3), torch.arange(3, device=x.device), torch.tensor(1.0), x[:, None]
-    expected = ["__float__", "tolist", "__bool__", "__getitem__", "new_tensor", "arange", "tensor"]
-    assert waits.found == expected
+        _ = float(x.sum()), x[x > 0], x.new_tensor([1.0]), torch.arange(3)
+        _ = torch.arange(3, device=x.device), x[:, None]
+    assert waits.found == ["__float__", "__getitem__", "new_tensor", "arange"]
 
 
 def name_of(function):

@@ -71,7 +71,6 @@ def test_all_processes_leave_out_a_step_that_one_found_bad(tmp_path):
     assert ["loss" in record for record in records] == [True, False, True]
     incident = tmp_path / "incidents/step-2"
     found = json.loads((incident / "report.json").read_text())["found"]
-    assert [report["process"] for report in found] == [0, 1]
     assert [bool(report["first"]) for report in found] == [False, True]
     seen = [load_file(incident / f"batch{n}.safetensors")["targets.images"] for n in ("", "-1")]
     assert [int(images.isnan().sum()) for images in seen] == [0, 1]

@@ -160,8 +160,8 @@ def test_evaluations_write_the_same_files(judged, tmp_path):
 
 
 def test_batches_pass_through_the_model_together_and_change_no_score(tmp_path):
-    frames = {"room0": ([0, 4], [2]), "room1": ([0, 4], [1, 2, 3])}
-    index = write_index(tmp_path, **frames, room2=([0, 2, 4], [1]), room3=([1], [2]))
+    frames = {"room0": ([0, 4], [2]), "room1": ([0, 4], [1, 2, 3]), "room2": ([0, 2, 4], [1])}
+    index = write_index(tmp_path, **frames, room3=([1], [2]))
     samples = ("evaluation.scenes=3", "evaluation.samples=2")
     for options, passes in ((index,), [(2, 2), (1, 3), (1, 1)]), (samples, [(4, 2), (2, 2)]):
         recipe = tiny("locus", *options)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from rich.console import Console
 from safetensors.torch import load_file
-from training_runs import tiny
+from training_runs import tiny, weights
 
 from qgs.composer import resolve
 from qgs.engine.initial import initialise
@@ -67,7 +67,7 @@ def test_the_recipes_seed_decides_the_noise(learned):
     def features(seed):
         torch.rand(seed)  # the global random state plays no part
         model, _ = started(learned("tokengs", "model.queries.count=30", f"seed={seed}"))
-        return model.queries.get_parameter("features").detach()
+        return model.queries.features
 
     assert torch.equal(features(1), features(1))
     assert not torch.equal(features(1), features(2))
@@ -76,11 +76,13 @@ def test_the_recipes_seed_decides_the_noise(learned):
 def test_larger_patches_give_the_tokens_of_coarser_images(learned):
     recipe = learned("tokengs", "model.encoder.patch_size=16", "data.image_size=[64, 64]")
     model, told = started(recipe)
-    coarse = resolve(recipe.tree, ["model.encoder.patch_size=8", "data.image_size=[32, 32]"])
-    images = torch.rand(1, 2, 3, 32, 32)
+    coarse, _ = started(
+        resolve(recipe.tree, ["model.encoder.patch_size=8", "data.image_size=[32, 32]"])
+    )
+    images = torch.rand(2, 3, 32, 32)
     fine = images.repeat_interleave(2, -1).repeat_interleave(2, -2)
-    tokens = model.encoder.rgb_embedding(fine[0])
-    assert torch.allclose(tokens, started(coarse)[0].encoder.rgb_embedding(images[0]), atol=1e-5)
+    found, tokens = model.encoder.rgb_embedding(fine), coarse.encoder.rgb_embedding(images)
+    torch.testing.assert_close(found, tokens, atol=1e-5, rtol=1e-5)
     assert "encoder.ray_embedding.proj.weight: (32, 6, 8, 8) -> (32, 6, 16, 16)" in told
 
 
@@ -90,6 +92,6 @@ def test_training_starts_from_a_run(trained_run, tmp_path):
     console = Console(file=StringIO(), width=300)
     grown = tiny("locus", "model.queries.count=32", start, *still)
     result = train(grown, tmp_path, device="cpu", console=console)
-    before, after = (r.model.queries.get_parameter("center") for r in (trained_run, result))
+    before, after = (weights(r)["queries.center"] for r in (trained_run, result))
     torch.testing.assert_close(after[:COUNT], before, rtol=0, atol=1e-6)
     assert "queries.center: 24 -> 32" in console.file.getvalue()

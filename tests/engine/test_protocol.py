@@ -10,6 +10,12 @@ from qgs.composer import resolve
 from qgs.engine.protocol import index_of, protocol_of
 
 INDEX = {"a": {"context": [0, 3], "target": [1, 2]}, "b": None}
+OTHERS = """
+{"a": {"context": [3, 0], "target": [1, 2]}, "b": null}
+{"a": {"context": [0, 3], "target": [1]}, "b": null}
+{"a": {"context": [0, 3], "target": [1, 2]}, "b": {"context": [0], "target": [1]}}
+{"a": {"context": [0, 3], "target": [1, 2]}}
+"""
 
 
 def indexed(file, *overrides):
@@ -38,15 +44,9 @@ def test_the_content_of_the_index_is_hashed_and_neither_its_place_nor_its_form(f
     copy = tmp_path / "renamed.json"
     copy.write_text(json.dumps(dict(reversed(INDEX.items())), indent=4))
     assert indexed(copy).sha256 == first.sha256
-    other = [
-        INDEX | {"a": {"context": [3, 0], "target": [1, 2]}},
-        INDEX | {"a": {"context": [0, 3], "target": [1]}},
-        INDEX | {"b": {"context": [0], "target": [1]}},
-        {"a": INDEX["a"]},
-    ]
     hashes = {first.sha256}
-    for index in other:
-        file.write_text(json.dumps(index))
+    for other in OTHERS.strip().splitlines():
+        file.write_text(other)
         hashes.add(indexed(file).sha256)
     assert len(hashes) == 5
 
@@ -80,12 +80,13 @@ def test_whatever_decides_the_numbers_is_hashed_and_nothing_else(file):
 def test_splits_count_only_where_no_index_names_the_frames(file):
     index = index_of(tiny("tokengs", f"evaluation.index={file}"))
     photos = tiny("tokengs").tree | {"plugins": ["datasets"]}
-    for kind, split in (
-        ("qgs/photos", "data.holdout=4"),
-        ("qgs/photos", "data.max_frames=9"),
-        ("datasets/chunks", "data.holdout=4"),
-        ("datasets/dl3dv", "data.holdout=4"),
+    for kind_and_split in (
+        "qgs/photos data.holdout=4",
+        "qgs/photos data.max_frames=9",
+        "datasets/chunks data.holdout=4",
+        "datasets/dl3dv data.holdout=4",
     ):
+        kind, split = kind_and_split.split()
         tree = {**photos, "data": {"type": kind, "path": "x", "image_size": [16, 16]}}
         recipes = [resolve(tree), resolve(tree, [split])]
         assert len({protocol_of(recipe, index).sha256 for recipe in recipes}) == 1, kind

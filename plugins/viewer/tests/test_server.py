@@ -29,20 +29,18 @@ def status(port, host):
 
 
 def test_the_page_is_served_under_names_of_this_machine_alone(port):
-    own = ("localhost:{}", "127.0.0.1:{}", "[::1]:{}", "192.168.1.7:{}")
-    answers = {**dict.fromkeys(own, 200), "rebound.example:{}": 403, "": 403}
-    answers["127.0.0.1.example:{}"] = 403
-    assert {host: status(port, host) for host in answers} == answers
+    for host in ("localhost:{}", "127.0.0.1:{}", "[::1]:{}", "192.168.1.7:{}"):
+        assert status(port, host) == 200, host
+    for host in ("rebound.example:{}", "127.0.0.1.example:{}", ""):
+        assert status(port, host) == 403, host
 
 
 def test_its_own_page_alone_reads_the_scene(port):
     with opened(port, f"http://127.0.0.1:{port}") as socket:
         assert socket.recv(10)
-    read = []
     for origin in ("http://127.0.0.1:1", "https://page.example", "null"):
-        with suppress(InvalidStatus), opened(port, origin):
-            read.append(origin)
-    assert not read
+        with pytest.raises(InvalidStatus):
+            opened(port, origin)
 
 
 def test_a_broken_message_ends_its_connection_alone(port, capfd, caplog):

@@ -78,9 +78,10 @@ def test_text_is_shown_as_it_is(server):
     source.title = f"title {text}"
     source.notes = (f"note {text}",)
     panel_of(server, source)
-    contents = [handle.content for handle in controls(server.gui, viser.GuiMarkdownHandle)]
-    assert sum("title " in content or "note " in content for content in contents) == 2
-    assert "<script" not in "".join(contents)
+    contents = "".join(text.content for text in controls(server.gui, viser.GuiMarkdownHandle))
+    assert "title " in contents
+    assert "note " in contents
+    assert "<script" not in contents
 
 
 def test_a_picked_query_is_let_go(server, panel):
@@ -152,6 +153,5 @@ def test_a_page_is_small_and_asks_for_nothing():
     page = scene_html(Look(cloud(4096)))
     without_data = re.sub(r'__VISER_EMBED_DATA__="[^"]*"', "", page)
     assert len(without_data) < len(page) < 2_000_000
-    assert not re.search(
-        r"""(?:src|href)\s*=\s*["']?(https?:)?//|<link rel="stylesheet""", without_data
-    )
+    outside = r"""(?:src|href)\s*=\s*["']?(https?:)?//|<link rel="stylesheet"""
+    assert not re.search(outside, without_data)
