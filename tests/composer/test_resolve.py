@@ -6,15 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from refusals import refused
 
 from qgs.composer import compose, resolve
-from qgs.composer.errors import Origin, Problems
-from qgs.composer.files import merge
+from qgs.composer.errors import Problems
 from qgs.composer.recipe import annotated
-from qgs.composer.yaml_text import dump, from_plain, inline, load_text
+from qgs.composer.yaml_text import dump, inline, load_text
 
 SMALL = yaml.safe_load("""
 recipe: 1
@@ -69,26 +66,6 @@ def test_what_is_dumped_is_read_back():
     value["scalars"] = [*texts, *numbers, None, True, [], {}]
     assert load_text(dump(value), "f", Problems()) == value
     assert load_text(inline(value), "f", Problems()) == value
-
-
-INTEGERS = st.integers(-(2**63) + 1, 2**63 - 1)
-TREES = st.dictionaries(
-    st.sampled_from("abc"),
-    st.recursive(
-        INTEGERS | st.lists(INTEGERS, max_size=2),
-        lambda inner: st.dictionaries(st.sampled_from("abc"), inner, max_size=3),
-        max_leaves=6,
-    ),
-)
-
-
-@settings(max_examples=60, deadline=None)
-@given(TREES, TREES)
-def test_merging_twice_is_merging_once_and_nothing_changes_nothing(a, b):
-    a, b, empty = (from_plain(tree, Origin("f")) for tree in (a, b, {}))
-    assert merge(a, a) == a
-    assert merge(merge(a, b), b) == merge(a, b)
-    assert merge(empty, a) == merge(a, empty) == a
 
 
 def test_an_annotated_recipe_shows_where_each_line_comes_from(write):

@@ -10,6 +10,7 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+import yaml
 from photo_formats import synthetic, write_nerfstudio
 from rich.console import Console
 from training_runs import same, tiny
@@ -69,14 +70,26 @@ def mine(*options):
     return resolve(tiny("tokengs").tree, options, plugins=[plugin])
 
 
-def write_index(folder, **scenes):
+def write_index(folder, scenes):
+    """An index of scenes whose frames are told in YAML."""
     file = folder / "some_index.json"
-    entries = {
-        name.replace("room", "test/00000"): frames and {"context": frames[0], "target": frames[1]}
-        for name, frames in scenes.items()
-    }
-    file.write_text(json.dumps(entries))
+    file.write_text(json.dumps(yaml.safe_load(scenes)))
     return f"evaluation.index={file}"
+
+
+FOUR = """
+test/000000: {context: [0, 4], target: [2]}
+test/000001: {context: [0, 4], target: [1, 2, 3]}
+test/000002: {context: [0, 2, 4], target: [1]}
+test/000003: {context: [1], target: [2]}
+"""
+PARTLY = """
+test/000000: {context: [0, 3], target: [1, 2]}
+test/000001: {context: [0, 99], target: [1]}
+gone: {context: [0, 3], target: [1]}
+nil: null
+"""
+"""Of the last three none can be judged."""
 
 
 def shown(evaluation):
@@ -160,8 +173,7 @@ def test_evaluations_write_the_same_files(judged, tmp_path):
 
 
 def test_batches_pass_through_the_model_together_and_change_no_score(tmp_path):
-    frames = {"room0": ([0, 4], [2]), "room1": ([0, 4], [1, 2, 3]), "room2": ([0, 2, 4], [1])}
-    index = write_index(tmp_path, **frames, room3=([1], [2]))
+    index = write_index(tmp_path, FOUR)
     samples = ("evaluation.scenes=3", "evaluation.samples=2")
     for options, passes in ((index,), [(2, 2), (1, 3), (1, 1)]), (samples, [(4, 2), (2, 2)]):
         recipe = tiny("locus", *options)
@@ -176,8 +188,7 @@ def test_batches_pass_through_the_model_together_and_change_no_score(tmp_path):
 
 
 def test_what_is_missing_is_told_in_the_same_line_as_the_score(tmp_path):
-    named = {"room0": ([0, 3], [1, 2]), "room1": ([0, 99], [1]), "gone": ([0, 3], [1])}
-    recipe = tiny("tokengs", write_index(tmp_path, **named, nil=None))
+    recipe = tiny("tokengs", write_index(tmp_path, PARTLY))
     evaluation = evaluate(recipe.build_model(), recipe)
     summary = evaluation.summary()
     assert summary["missing"] == {

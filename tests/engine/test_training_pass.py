@@ -239,7 +239,7 @@ def test_renderers_and_compiled_losses_follow_their_options():
     compiled = torch.compile(loss, backend="eager")
     layer = model(batch.inputs)
     alphas = []
-    for number in (1.0, 2.0, 3.0):
+    for number in (1.0, 3.0):
         model.renderer.config = model.renderer.config.model_copy(update={"dilation": number})
         loss.config = Photometric.Config(mse_weight=number, ssim_weight=0.0)
         rendering = model.render(layer.gaussians, batch.targets.cameras)
@@ -248,7 +248,7 @@ def test_renderers_and_compiled_losses_follow_their_options():
         for step in (loss, compiled):
             found = step(layer, rendering, batch.targets, batch.inputs)["mse"]
             torch.testing.assert_close(found, error)
-    assert alphas[0] < alphas[1] < alphas[2]
+    assert alphas[0] < alphas[1]
 
 
 @pytest.mark.slow

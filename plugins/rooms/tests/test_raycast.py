@@ -24,7 +24,8 @@ def test_hits_are_where_geometry_puts_them():
 
 
 def test_depth_is_z_along_the_camera():
-    c2w = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1], [0, 0, 0, 1]], float)
+    c2w = np.eye(4)
+    c2w[:3] = [0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1]
     shapes = np.array([box(1.75, 0, 0.9, (0.5, 0.2, 0.2), 0).row()], np.float32)
     room = Room(shapes, np.zeros((6, TEXTURE_FIELDS)), (8.0, 40.0, 40.0), np.zeros((2, 4)))
     (depth,) = cast_depths(room, c2w[None], np.array([20.0, 20.0, 10.5, 10.5]), (21, 21))

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import fill_evidence
 import numpy as np
 import pytest
+import yaml
 from qgs_studies.figures import write_figures
 from qgs_studies.intervals import crossed_interval
 from qgs_studies.output import latex, markdown, record, table_rows, write_files
@@ -97,30 +98,20 @@ def test_trainings_that_failed_are_in_the_answer(plain):
     assert "other seed 0 failed: CollapseError: training collapsed at step 7: it" in found.notes()
 
 
-@pytest.mark.parametrize(
-    ("lead", "answer", "verdict"),
-    [
-        ((2, 2, 2), r"Yes: other, the best of 2, is better than full, PSNR \+2.0", "seen"),
-        (
-            (0, 0, 0),
-            "Undecided: other cannot be told from full, .*; worse, each at 95 %: less.",
-            "undecided",
-        ),
-        (
-            (-2, -2, -2),
-            "No: all 2 are worse; the nearest, less, is worse than full",
-            "contradicted",
-        ),
-        # seeds that disagree, however sure the scenes are
-        ((1, -0.6, 0.7), "Undecided: other cannot be told from full", "undecided"),
-        # chance has two tries: its own interval at 95 % lies above 0, that of the best of two not
-        (
-            (0.5, 0.68, 0.32),
-            r"Undecided: other cannot .* PSNR \+0.5.*97.5 % interval \[-.* for the best of 2",
-            "seen",
-        ),
-    ],
-)
+VERDICTS = r"""
+- [[2, 2, 2], 'Yes: other, the best of 2, is better than full, PSNR \+2.0', seen]
+- [[0, 0, 0], 'Undecided: other cannot .* full, .*; worse, each at 95 %: less.', undecided]
+- [[-2, -2, -2], 'No: all 2 are worse; the nearest, less, is worse than full', contradicted]
+# seeds that disagree, however sure the scenes are
+- [[1, -0.6, 0.7], 'Undecided: other cannot be told from full', undecided]
+# chance has two tries: its own interval at 95 % lies above 0, that of the best of two not
+- - [0.5, 0.68, 0.32]
+  - 'Undecided: other cannot .* PSNR \+0.5.*97.5 % interval \[-.* for the best of 2'
+  - seen
+"""
+
+
+@pytest.mark.parametrize(("lead", "answer", "verdict"), yaml.safe_load(VERDICTS))
 def test_verdicts_and_the_answer(tmp_path, lead, answer, verdict):
     found = results(tmp_path, lead)
     assert re.match(answer, found.answer())

@@ -64,25 +64,12 @@ def test_the_viewer(page):
 
         places = iter([(620, 380), (560, 300), (700, 420), (500, 250), (600, 500)])
         page.until("a query", picks)
-        picked = drawn(page, opened)
+        drawn(page, opened)
         told = f"document.body.innerText.includes('query {panel.choice.query}')"
         page.until("its words", told)
-        page.evaluate("document.querySelector('[role=slider]').focus()")
-        for _ in range(panel.look.depth - 1):
-            page.key("ArrowLeft", 37)
-            time.sleep(1)  # every step is a message of its own
-        page.until("the layer", lambda: panel.choice.layer == 1)
-        drawn(page, picked)
         page.key("Escape", 27)
         page.until("no query", lambda: panel.choice.query is None)
         page.until("no words", f"!{told}")
-
-        before = panel.look
-        boxes = "[...document.querySelectorAll('input[type=checkbox]')]"
-        page.evaluate(f"{boxes}.filter(box => !box.checked).at(-1).click()")
-        page.until("another look", lambda: panel.look is not before)
-        assert len(panel.look.frames) == 3
-        drawn(page)
         assert page.errors == []
         outside = [urlsplit(r) for r in page.requests if not r.startswith(("data:", "blob:"))]
         assert {place.netloc for place in outside} == {address}
