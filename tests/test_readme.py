@@ -46,11 +46,11 @@ def test_the_models_score_what_the_readme_says(side):
     (nearest,) = re.findall(of_photo, README, re.MULTILINE)
     assert len(models) >= 2
     entries = contest.judge(contest.checkpoints([model[0] for model in models]), None, "cpu")
-    for (_, psnr, ssim, count, size), entry in zip(models, entries, strict=True):
-        for method, scores in (("model", (psnr, ssim)), ("nearest_input", nearest)):
+    for (_, *own, count, size), entry in zip(models, entries, strict=True):
+        for method, (psnr, ssim) in (("model", own), ("nearest_input", nearest)):
             found = entry.evaluation.means(method)
-            assert found["psnr"] == pytest.approx(float(scores[0]), abs=0.02)
-            assert found["ssim"] == pytest.approx(float(scores[1]), abs=0.002)
+            assert found["psnr"] == pytest.approx(float(psnr), abs=0.02)
+            assert found["ssim"] == pytest.approx(float(ssim), abs=0.002)
         assert entry.evaluation.gaussians == int(count.replace(",", ""))
         parameters = sum(p.numel() for p in entry.contender.model.parameters())
         assert f"{parameters / 1e6:.2f}" == size

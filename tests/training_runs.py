@@ -98,7 +98,7 @@ def assert_equal_runs(first, second):
     for parts in (ours, theirs):
         del parts["counters"]["seconds"]
     assert ours.keys() == theirs.keys()
-    assert [name for name in ours if not same(ours[name], theirs[name])] == []
+    assert all(same(ours[name], theirs[name]) for name in ours)
     histories = (RunFolder(folder).history() for folder in (first, second))
     one, other = ([{**record, "seconds": 0} for record in history] for history in histories)
     assert one == other

@@ -16,5 +16,5 @@ def test_the_loop_is_smooth_closed_and_rigid_and_passes_between_the_inputs(camer
 def test_one_input_is_enough_and_what_it_sees_stays_in_the_middle(cameras):
     c2w = orbit(cameras[:, :1], depth=2.0, frames=8).c2w[0]
     seen = torch.linalg.inv(c2w) @ torch.tensor([0.0, 0, 2, 1])
-    torch.testing.assert_close(seen[:, :2], torch.zeros(8, 2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(seen[:, :2], torch.zeros(8, 2))
     assert (seen[:, 2] > 0).all()

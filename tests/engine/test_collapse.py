@@ -67,7 +67,7 @@ def test_good_weights_are_the_older_of_two_copies_made_before_the_images_got_wor
 
 def test_what_is_not_finite_is_named():
     module = torch.nn.Linear(2, 2)
-    assert not_finite({"mse": 1.0, "gradient": 0.5}, module) == ""
+    assert not not_finite({"mse": 1.0, "gradient": 0.5}, module)
     assert "mse is nan" in not_finite({"mse": float("nan"), "gradient": 0.5}, module)
     module.weight.grad = torch.full((2, 2), torch.inf)
     module.bias.grad = torch.zeros(2)

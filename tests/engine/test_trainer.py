@@ -159,7 +159,7 @@ def test_a_bad_gradient_ends_the_run_too(tmp_path, monkeypatch):
     monkeypatch.setattr(Recipe, "build_model", Mock(return_value=model))
     with pytest.raises(NonFiniteError, match="the first bad tensor is gradient of"):
         run(tiny("tokengs"), tmp_path)
-    assert losses(tmp_path) == []
+    assert not losses(tmp_path)
 
 
 def test_skipping_comes_to_an_end(tmp_path, monkeypatch):

@@ -82,7 +82,7 @@ def test_what_failed_comes_last_and_a_collapse_is_final(study, plan, monkeypatch
     queue = Queue(plan, 4, 1, "cpu", Console(file=(shown := io.StringIO())))
     assert queue.work() == "SIGTERM"
     assert started == [third, fourth, second]
-    assert queue.failures == {}  # what failed before is no failure of this call
+    assert not queue.failures  # what failed before is no failure of this call
     assert str(first.failure) in shown.getvalue()
     done("study", study, "--out", plan.folder, "--slurm")
     assert "#SBATCH --array=1,2,3" in (plan.folder / "slurm.sh").read_text()

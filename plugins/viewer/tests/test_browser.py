@@ -70,7 +70,7 @@ def test_the_viewer(page):
         page.key("Escape", 27)
         page.until("no query", lambda: panel.choice.query is None)
         page.until("no words", f"!{told}")
-        assert page.errors == []
+        assert not page.errors
         outside = [urlsplit(r) for r in page.requests if not r.startswith(("data:", "blob:"))]
         assert {place.netloc for place in outside} == {address}
 
@@ -106,7 +106,7 @@ def test_a_page_draws_and_asks_for_nothing(page, tmp_path):
         "a film", "window.film?.size > 10000 && saved.endsWith(film.type.slice(6).split(';')[0])"
     )
     assert page.targets == ["worker"]  # it sorts the Gaussians as the page is turned
-    assert page.errors == []
+    assert not page.errors
 
 
 def assert_alone(page, file):
@@ -134,7 +134,7 @@ def test_a_report(page, tmp_path):
     _darken(page)
     _turn(page)
     assert page.targets.count("worker") == 2  # each scene sorts its Gaussians in a worker
-    assert page.errors == []
+    assert not page.errors
     assert_alone(page, file)
 
 

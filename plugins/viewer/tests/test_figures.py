@@ -123,7 +123,7 @@ def test_edges_lead_to_the_queries_that_are_read_most(kind):
     order = order[: attention.EDGES]
     found, relative = attention.strongest_edges(shown, query, last, "weights")
     assert found.tolist() == order
-    assert_allclose(relative, shares[order] / shares[order[0]], rtol=1e-4, atol=1e-6)
+    assert_allclose(relative, shares[order] / shares[order[0]], rtol=1e-4)
     axis = attention.self_attention(exhibition_of(kind, query=query)).figure.axes[-1]
     (edges,) = (lines for lines in axis.collections if isinstance(lines, LineCollection))
     nodes = attention.nodes_of(shown, last)

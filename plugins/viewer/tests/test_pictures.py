@@ -49,7 +49,7 @@ def test_rendered_weights_add_up_to_the_coverage(model, gaussians, cameras):
     weights = queries.rendered_weights(model, gaussians, cameras)
     assert weights.shape == (1, gaussians.count)
     coverage = model.render(gaussians, cameras).alpha.sum()
-    assert float(weights.sum()) == pytest.approx(float(coverage), rel=1e-4)
+    torch.testing.assert_close(weights.sum(), coverage, rtol=1e-4, atol=0)
 
 
 def test_notable_queries_are_heavy_well_inside_the_picture_apart_and_small(
