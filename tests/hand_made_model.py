@@ -39,13 +39,9 @@ def views(cameras):
 def gaussians():
     """As many as the model makes, spread over what the cameras see."""
     generator = torch.Generator().manual_seed(2)
-    count = 48
-    xy = torch.rand(1, count, 2, generator=generator) - 0.5
-    z = torch.rand(1, count, 1, generator=generator) + 1
-    return Gaussians(
-        torch.cat([xy * z, z], -1),
-        torch.full((1, count, 3), 0.05),
-        torch.tensor([1.0, 0, 0, 0]).expand(1, count, 4),
-        torch.full((1, count), 0.8),
-        torch.rand(1, count, 3, generator=generator),
-    )
+    xy, z, colours = torch.rand(1, 48, 6, generator=generator).split([2, 1, 3], -1)
+    z = z + 1
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(1, 48, 4)
+    means = torch.cat([(xy - 0.5) * z, z], -1)
+    scales, opacities = torch.full((1, 48, 3), 0.05), torch.full((1, 48), 0.8)
+    return Gaussians(means, scales, quats, opacities, colours)

@@ -20,15 +20,16 @@ from qgs.types import (
     named_tensors,
 )
 
-THREE, FOUR, ONE = torch.zeros(1, 2, 5, 3), torch.zeros(1, 2, 5, 4), torch.zeros(1, 2, 5)
 CAMERA = Cameras(torch.eye(4)[None, None], torch.ones(1, 1, 4), (8, 8))
-RGB, ALPHA = torch.zeros(1, 2, 3, 4, 5), torch.zeros(1, 2, 1, 4, 5)
-
-BALLS = [x[:, 0] for x in (THREE, THREE, FOUR, ONE, THREE)]
 
 
 def zeros(*shape):
     return torch.zeros(shape)
+
+
+THREE, ONE = zeros(1, 2, 5, 3), zeros(1, 2, 5)
+RGB, ALPHA = zeros(1, 2, 3, 4, 5), zeros(1, 2, 1, 4, 5)
+BALLS = [x[:, 0] for x in (THREE, THREE, zeros(1, 2, 5, 4), ONE, THREE)]
 
 
 def test_what_does_not_fit_together_is_refused():
