@@ -72,8 +72,9 @@ class SuiteWatch:
             return
         minutes = self.whole() / 60
         terminalreporter.section(f"cost: {minutes:.1f} CPU minutes, {len(self.seconds)} items")
-        dearest = sorted(self.seconds.items(), key=itemgetter(1))[-DEAREST:]
-        for name, seconds in reversed(dearest):
+        for name, seconds in sorted(self.seconds.items(), key=itemgetter(1), reverse=True)[
+            :DEAREST
+        ]:
             terminalreporter.write_line(f"{seconds:6.2f} s  {name}")
         for fault in self.faults():
             terminalreporter.write_line(f"FAILED: {fault}", red=True)

@@ -49,8 +49,7 @@ def test_permuting_queries_permutes_gaussians_and_scenes_of_a_batch_are_independ
     with torch.no_grad():
         for parameter in model.queries.parameters():
             parameter.copy_(parameter[order])
-    after = model(views).gaussians.means.unflatten(1, (12, 8))
-    torch.testing.assert_close(after, before[:, order])
+    torch.testing.assert_close(model(views).gaussians.means.unflatten(1, (12, 8)), before[:, order])
 
 
 def test_geometry_is_float32_under_autocast(model, views):

@@ -75,8 +75,7 @@ def test_gaussians_with_harmonics_lie_in_the_world_of_the_photos(model, far, tmp
     file = tmp_path / "placed.ply"
     assert result.save(file) == [file]
     renderer = AutoRenderer(AutoRenderer.Config(far=1e5))  # in the unit of the photos
-    placed = renderer(qgs.load_ply(file), far.cameras)
-    for seen in (placed, result.render(far.cameras)):
+    for seen in (renderer(qgs.load_ply(file), far.cameras), result.render(far.cameras)):
         torch.testing.assert_close(seen.rgb, own.rgb, atol=5e-3, rtol=0)
         depth = seen.depth * float(result.world[1])
         torch.testing.assert_close(depth, own.depth, atol=5e-3, rtol=1e-2)

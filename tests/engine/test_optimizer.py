@@ -132,8 +132,7 @@ def test_a_factor_scales_the_step_and_frozen_parts_stay_and_are_not_remembered(t
     """
     options = "warmup: 0, weight_decay: 0.0, learning_rate: 4.0e-3"
     parts = '{"*": 0.5, encoder: 0, "decoder.*.feed_forward": 0, head: 1, head.linear.bias: 2}'
-    optimizer = f"optimizer={{{options}, parts: {parts}}}"
-    recipe = tiny("tokengs", "training.steps=1", optimizer)
+    recipe = tiny("tokengs", "training.steps=1", f"optimizer={{{options}, parts: {parts}}}")
     before = recipe.build_model().state_dict()
     result = run(recipe, tmp_path)
     moments = {key.rsplit("/", 1)[0] for key in parts_of(tmp_path)["moments"]}

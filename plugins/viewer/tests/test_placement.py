@@ -17,8 +17,7 @@ def test_covariances_are_those_of_points_that_were_placed_one_by_one():
     turn = torch.from_numpy(Rotation.from_euler("xyz", [0.3, -0.8, 1.1]).as_matrix())
     place = Placement(turn, torch.tensor([1.0, -2.0, 0.5]).double(), 1.7)
     found = splats(gaussians, place)
-    turns = Rotation.from_quat(gaussians.quats[0], scalar_first=True).as_matrix()
-    for g, turn in enumerate(turns):
+    for g, turn in enumerate(Rotation.from_quat(gaussians.quats[0], scalar_first=True).as_matrix()):
         axes = turn * gaussians.scales[0, g].numpy()  # one standard deviation along each
         ends = place.points(gaussians.means[0, g] + torch.from_numpy(axes.T)).numpy()
         arms = ends - found.centers[g]
