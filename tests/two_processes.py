@@ -15,9 +15,6 @@ from training_runs import change_samples, run
 from qgs.composer import resolve
 from qgs.data.stream import SampleError
 
-SECONDS = 240
-"""After which processes that wait for each other are ended."""
-
 
 def spoil(bad, nan):
     """Sample `bad`, where it replaces none, has a bad pixel or cannot be made."""
@@ -33,7 +30,7 @@ def spoil(bad, nan):
 
 def train_as(rank, port, tree, folder, *spoiled):
     """What one of the processes does; it ends, and with it the other, at any other error."""
-    signal.alarm(SECONDS)
+    signal.alarm(240)  # after which processes that wait for each other are ended
     torch.set_num_threads(1)
     group = {"MASTER_ADDR": "localhost", "MASTER_PORT": port, "WORLD_SIZE": 2}
     for name, value in {**group, "RANK": rank, "LOCAL_RANK": rank}.items():

@@ -1,6 +1,5 @@
 """`model.reconstruct` and `qgs.read_photos`; a model given views in another world warns."""
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -112,8 +111,8 @@ def test_photos_are_read_in_their_own_world_and_size(photos):
 def test_a_loaded_model_checks_the_first_views_that_it_reconstructs(tmp_path, far, caplog):
     """One whose training saw baselines of 0.1 to 0.5."""
     file = tmp_path / "m.safetensors"
-    ranges = {"samples": 4, "ranges": {"baseline": [0.1, 0.5]}}
-    qgs.save(qgs.compose(RECIPE), file, extra={"trained_on": json.dumps(ranges)})
+    ranges = '{"samples": 4, "ranges": {"baseline": [0.1, 0.5]}}'
+    qgs.save(qgs.compose(RECIPE), file, extra={"trained_on": ranges})
     model = qgs.load(file).train()
     model(far)
     assert not caplog.text  # in training nothing is looked at

@@ -112,8 +112,8 @@ def test_an_evaluation_names_its_photos_and_says_where_a_copy_is_better(tmp_path
     views = "views={inputs: 2, targets: 2, gap: [2, 4], scale: constant}"
     model = qgs.compose({"recipe": 1, "model": MODEL}, [data, views])
     model.head.linear.bias.data.unflatten(0, (-1, 14))[:, 6:9] = 5.0
-    domain = {"samples": 4, "ranges": {"baseline": [0, 9]}}
-    qgs.save(model, tmp_path / "checkpoint.safetensors", extra={"trained_on": json.dumps(domain)})
+    domain = '{"samples": 4, "ranges": {"baseline": [0, 9]}}'
+    qgs.save(model, tmp_path / "checkpoint.safetensors", extra={"trained_on": domain})
     done("eval", tmp_path)
     folder = tmp_path / "evaluation"
     remarks = summary(folder)["remarks"]

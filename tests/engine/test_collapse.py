@@ -24,7 +24,7 @@ def observed(*signs):
     return detector
 
 
-def test_a_window_of_dead_steps_is_a_collapse():
+def test_a_window_of_dead_steps_and_no_less_is_a_collapse():
     for dead, words in (
         (ALIVE | {"alpha": 1e-4}, "empty"),
         (ALIVE | {"gradient": 0.0}, "vanished"),
@@ -34,9 +34,7 @@ def test_a_window_of_dead_steps_is_a_collapse():
         detector = observed(ALIVE, *[dead] * 10)
         assert detector.dead_after(11)
         assert words in detector.symptom
-
-
-def test_one_living_step_and_plain_images_at_the_start_are_no_collapse():
+    # one living step, and plain images at the start
     assert not observed(*[*[DEAD] * 9, ALIVE] * 5).dead_after(50)
     assert not observed(*[PLAIN] * 50).dead_after(50)
 

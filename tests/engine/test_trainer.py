@@ -134,8 +134,8 @@ def test_bad_steps_are_skipped_on_demand(tmp_path, monkeypatch, caplog):
     told = [r.message.split(" is ")[0] for r in caplog.records if "is skipped" in r.message]
     assert told == ["step 2", "step 4"]
     records = read_jsonl(through / "history.jsonl")
-    kept = [(r["step"], "loss" in r, "skipped" in r) for r in records]
-    assert kept == [(1, True, False), (2, False, True), (3, True, False), (4, False, True)]
+    assert ["loss" in r for r in records] == [True, False, True, False]
+    assert ["skipped" in r for r in records] == [False, True, False, True]
     assert curves_of(through / "checkpoint.safetensors").steps == [1, 3]
     assert {path.name for path in (through / "incidents").iterdir()} == {"step-2", "step-4"}
     counted = parts_of(through)["guard"]

@@ -29,7 +29,13 @@ hypotheses:
   - {claim: less@noisy - less < full@noisy - full, note: degrades more}
 published: {full: 24.0, less: 23.0, other: 22.0}
 """
-COLUMNS = {"psnr": {"heading": "PSNR", "better": "higher", "digits": 2, "unit": "dB"}}
+SUMMARY = """
+protocol: {name: made up}
+columns: {psnr: {heading: PSNR, better: higher, digits: 2, unit: dB}}
+step: 9
+missing: {}
+null_entries: []
+"""
 OFFSETS = {"full": 0, "less": -1, "other": 0, "four": -3, "five": -4}
 
 
@@ -45,8 +51,7 @@ def write_run(folder, values, views):
     rows = [f"{scene},0 3,1 2,{value!r},15.5," for scene, value in values.items()]
     head = "scene,input_frames,target_frames,model_psnr,nearest_input_psnr,problem"
     (folder / "scenes.csv").write_text("\n".join([head, *rows]) + "\n")
-    summary = {"protocol": {"name": "made up"}, "columns": COLUMNS, "step": 9, "missing": {}}
-    summary |= {"scenes_in_protocol": len(values), "null_entries": []}
+    summary = yaml.safe_load(SUMMARY) | {"scenes_in_protocol": len(values)}
     (folder / "summary.json").write_text(json.dumps(summary))
     (folder / "protocol.json").write_text(json.dumps({"views": {"drawn": views}}))
 

@@ -36,7 +36,8 @@ RECIPE = {"model": MODEL, **yaml.safe_load(REST)}
 
 def stand_in(file, queries=8):
     """Write an untrained model of RECIPE that knows on what views it was trained; its name."""
-    domain = Domain({"baseline": [0.1, 0.3], "turn": [2.0, 20.0], "depth": [1.0, 2.0]}, 48)
+    ranges = "{baseline: [0.1, 0.3], turn: [2.0, 20.0], depth: [1.0, 2.0]}"
+    domain = Domain(yaml.safe_load(ranges), 48)
     model = resolve(RECIPE, [f"model.queries.count={queries}"]).build_model()
     qgs.save(model, file, extra={KEY: domain.text, "step": "7000"})
     return str(file)
