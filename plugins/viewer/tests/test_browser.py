@@ -133,7 +133,6 @@ def test_a_report(page, tmp_path):
     _zoom(page)
     _darken(page)
     _turn(page)
-    assert page.targets.count("worker") == 2  # each scene sorts its Gaussians in a worker
     assert not page.errors
     assert_alone(page, file)
 
@@ -205,10 +204,12 @@ def _darken(page):
 def _turn(page):
     assert not page.evaluate("!!document.querySelector('iframe')")
     page.evaluate("document.querySelector('.open').click()")
-    left, top, width = box_of(page, "iframe")
 
     def both_drawn():
+        left, top, width = box_of(page, "iframe")
         shot = page.picture()[top + 160 : top + 400, left : left + width]
-        return all(half.std() > 8 for half in np.array_split(shot, 2, axis=1))
+        halves = np.array_split(shot, 2, axis=1)
+        # each scene sorts its Gaussians in a worker
+        return page.targets.count("worker") == 2 and all(half.std() > 8 for half in halves)
 
     page.until("both scenes", both_drawn, 180)
