@@ -5,7 +5,6 @@ but qgs and its plugins are lent through a folder of links, so that qgs can only
 wheel. Whether the wheels require what they import cannot be seen there: test_dependencies.py.
 """
 
-import os
 import re
 import subprocess
 import sys
@@ -28,10 +27,10 @@ class FreshEnvironment:
 
     def run(self, command, cwd, timeout=600):
         """Standard output of a bash script in the activated environment; it must end well."""
+        activate = f"unset PYTHONPATH; export COLUMNS=200; source {self.folder}/bin/activate"
         done = subprocess.run(
-            ["bash", "-euo", "pipefail", "-c", command],
+            ["bash", "-euo", "pipefail", "-c", f"{activate}\n{command}"],
             cwd=cwd,
-            env=self.variables(),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -39,12 +38,6 @@ class FreshEnvironment:
         )
         assert done.returncode == 0, f"{command}\n{done.stdout}"
         return done.stdout
-
-    def variables(self):
-        """Environment variables as `source bin/activate` leaves them."""
-        kept = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-        path = f"{self.folder / 'bin'}{os.pathsep}{kept['PATH']}"
-        return {**kept, "PATH": path, "VIRTUAL_ENV": str(self.folder), "COLUMNS": "200"}
 
 
 def make_fresh_environment(folder):

@@ -1,7 +1,5 @@
 """The model as a whole, composed from the tiny recipes made smaller still."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from odd_views import odd_views
@@ -9,13 +7,10 @@ from varying_head import VaryingHead
 
 import qgs
 
-RECIPES = Path(__file__).parents[1] / "recipes"
-SMALL = ["model.width=32", "model.heads=2", "model.queries.count=12"]
-
 
 def small(name, *overrides):
-    overrides = [*SMALL, *overrides]
-    return qgs.compose(RECIPES / f"tiny/{name}.yaml", overrides=overrides).eval()
+    overrides = ["model.width=32", "model.heads=2", "model.queries.count=12", *overrides]
+    return qgs.compose(f"tiny/{name}.yaml", overrides).eval()
 
 
 @pytest.fixture(params=["tokengs", "locus"])

@@ -5,12 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-INIT = Path(__file__).parents[1] / "qgs/__init__.py"
-
 
 def test_the_climate_model_in_our_folder_is_refused(tmp_path):
     (tmp_path / "qgs").mkdir()
-    shutil.copy(INIT, tmp_path / "qgs")
+    shutil.copy(Path(__file__).parents[1] / "qgs/__init__.py", tmp_path / "qgs")
     told = []
     for other in ("query_gaussians-0.1.dist-info", "qgs-0.2.8.dist-info"):
         (tmp_path / other).mkdir()

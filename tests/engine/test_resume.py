@@ -75,9 +75,9 @@ def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
     qgs.save(qgs.load(stopped.folder.checkpoint), again)
     assert CheckpointFile(again).step == 2
     assert qgs.load(again).renderer.config.dilation == 2
-    other = "losses.photometric.ssim_weight.values=[0.4, 0.1]"
-    with pytest.raises(OtherRunError, match=r"losses\.photometric\.ssim_weight"):
-        run(tiny("locus", *options, other), parts, resume=True)
+    for other in ("objective.depth_weight=0.5", "losses.photometric.ssim_weight.values=[0.4, 0.1]"):
+        with pytest.raises(OtherRunError, match=other.split("=")[0]):
+            run(tiny("locus", *options, other), parts, resume=True)
     assert run_calling(note, recipe, parts, resume=True).resumed_at == 2
     assert_equal_runs(whole, parts)
     # After a step there stand the numbers of the next one.

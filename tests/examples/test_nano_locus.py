@@ -11,7 +11,6 @@ from qgs.composer import resolve
 from qgs.engine.training_pass import TrainingPass
 
 FILE = Path(__file__).parents[2] / "docs/examples/nano_locus.py"
-MAX_LINES = 300
 
 
 @pytest.fixture
@@ -53,5 +52,5 @@ def test_it_trains(nano, monkeypatch, capsys):
 
 def test_it_can_be_read_in_one_sitting():
     text = FILE.read_text()
-    assert len(text.splitlines()) <= MAX_LINES
+    assert len(text.splitlines()) <= 300
     assert "import qgs" not in text

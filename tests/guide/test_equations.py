@@ -16,7 +16,6 @@ from qgs.composer.yaml_text import load_text
 from qgs.contracts import Component
 
 EQUATIONS, _, REST = all_pages()["equations.md"].partition("## Where paper and release differ")
-RELEASES = REST.partition("## Defaults that are not TokenGS's")[2]
 CONSTANTS = r"""
 support radius | radius_min | softplus(ρ), {:g})
 bias | bias_min | clamped to [{:g}, 0]
@@ -118,7 +117,7 @@ def test_constants_are_the_defaults():
 def test_defaults_that_are_not_tokengss_are_those_of_its_recipe_taken_back():
     base = yaml.safe_load((DOCS.parent / "recipes/tokengs/base.yaml").read_text())["model"]
     listed = {}
-    for _, _, _, cell in rows_of(RELEASES):
+    for _, _, _, cell in rows_of(REST.partition("## Defaults that are not TokenGS's")[2]):
         *options, kind = re.findall(r"`([^`]+)`", cell)
         for option in options:
             ((key, value),) = load_text(option, kind, Problems()).items()
