@@ -23,10 +23,13 @@ def photos(tmp_path_factory):
 
 def saved(file, kind, **data):
     """A model of such data."""
-    recipe = {"recipe": 1, "model": MODEL, "plugins": ["rooms", *["tapes"] * ("tapes" in kind)]}
-    recipe["views"] = {"inputs": 2, "targets": 2, "gap": [2, 4], "scale": "constant"}
-    recipe["data"] = {"type": kind, "image_size": [16, 16], **data}
-    qgs.save(qgs.compose(recipe), file)
+    overrides = [
+        "plugins=[rooms, tapes]" if "tapes" in kind else "plugins=[rooms]",
+        "views={inputs: 2, targets: 2, gap: [2, 4], scale: constant}",
+        f"data={{type: {kind}, image_size: [16, 16]}}",
+        *(f"data.{name}={value}" for name, value in data.items()),
+    ]
+    qgs.save(qgs.compose({"recipe": 1, "model": MODEL}, overrides), file)
     return file
 
 

@@ -19,9 +19,8 @@ WHOLE = (16, 24)
 
 
 def recipe(kind, **options):
-    plugins = ["rooms", "datasets"]
     data = {"type": kind, "image_size": [*SIZE], **options}
-    return resolve({"recipe": 1, "plugins": plugins, "model": MODEL, "data": data})
+    return resolve({"recipe": 1, "model": MODEL, "data": data}, ["plugins=[rooms, datasets]"])
 
 
 ROOMS = recipe("rooms/procedural")

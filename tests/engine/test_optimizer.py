@@ -164,16 +164,17 @@ plugin = Plugin("plain", 1, (Plain,))
 def test_a_plugin_adds_an_optimiser_by_one_class(tmp_path, install):
     """With moments of several shapes; some parameters get no gradient, and have none."""
     install("plain", "plain", PLAIN)
-    fixed = ("decoder.cross_attention.bandwidth=fixed", "centers.type=locus/anchor_offset")
-    tree = {**tiny("locus", *(f"model.{option}" for option in fixed)).tree}
-    tree["plugins"] = ["rooms", "locus", "plain"]
-    parts = {"encoder": 0, "head": 0.5}
-    tree["optimizer"] = {"type": "plain/plain", "learning_rate": 0.02, "parts": parts}
-    recipe = resolve(tree)
+    recipe = tiny(
+        "locus",
+        "model.decoder.cross_attention.bandwidth=fixed",
+        "model.centers.type=locus/anchor_offset",
+        "plugins=[rooms, locus, plain]",
+        "optimizer={type: plain/plain, learning_rate: 0.02, parts: {encoder: 0, head: 0.5}}",
+    )
     through, halves = tmp_path / "through", tmp_path / "halves"
     history = run(recipe, through).folder.history()
     assert [record["lr"] for record in history] == [0.02] * 3
-    run(resolve(tree, ["training.steps=2"]), halves)
+    run(resolve(recipe.tree, ["training.steps=2"]), halves)
     assert run(recipe, halves, resume=True).resumed_at == 2
     assert_equal_runs(through, halves)
     moments = parts_of(through)["moments"]

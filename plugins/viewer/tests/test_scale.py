@@ -60,8 +60,8 @@ def test_a_room_in_another_unit_has_its_own_scale_in_all_commands(room, tmp_path
 
 def test_all_commands_choose_the_same_inputs_of_photos_that_the_model_knows(room, tmp_path):
     name = str(tmp_path / "own.safetensors")
-    data = {"type": "qgs/photos", "path": str(room), "holdout": 4}
-    qgs.save(resolve({**qgs.load(MODEL).recipe, "data": data}).build_model(), name)
+    data = f"data={{type: qgs/photos, path: {room}, holdout: 4}}"
+    qgs.save(qgs.compose(qgs.load(MODEL).recipe, [data]), name)
     sample = qgs.load(name).reconstruct(room).sample
     opened = open_source(name, Wanted(photos=str(room)))
     (entry,) = judge(checkpoints([name]), str(room), "cpu")
