@@ -18,7 +18,7 @@ def refused(recipe, *arguments, **options):
     return problem
 
 
-def wrong_refusals(recipe: Any, table: str) -> list[tuple[str, RecipeProblem]]:
+def wrong_refusals(recipe, table):
     """Of overrides in a table, below each of which stands `option: reason`, those that are refused
     otherwise, and how."""
     wrong = []

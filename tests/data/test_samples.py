@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from line_scenes import Line, Lines, circle
-from noise_views import noise_views
+from odd_views import odd_views
 from tables import fault
 from torch.testing import assert_close
 
@@ -88,7 +88,7 @@ def test_normalised_poses():
 
 
 def test_a_mirrored_camera_sees_the_mirrored_point_in_the_mirrored_pixel():
-    plain = noise_views(8, 8)
+    plain = odd_views(2, 8, 8)
     flipped = mirrored_views(plain)
     assert torch.equal(flipped.images, plain.images.flip(-1))
     assert_close(torch.linalg.det(flipped.cameras.c2w), torch.ones(2, 2))
