@@ -1,17 +1,17 @@
 """Views whose cameras confuse nothing with anything."""
 
-from dataclasses import replace
-
 import torch
-from qgs_plugintools import Case
-from qgs_plugintools.inputs import Maker, Sizes
 
-from qgs.components import LatentQueries
+from qgs.types import Cameras, Views
 
 
 def odd_views(count=2, height=16, width=16, scenes=2, seed=0):
-    """Noise; cameras are turned and moved, with unequal focal lengths, off centre."""
-    sizes = Sizes(batch=scenes, views=count, image=(height, width))
-    made = Maker(Case(LatentQueries.Config()), sizes, torch.Generator().manual_seed(seed)).views()
-    lens = made.cameras.intrinsics * torch.tensor([1.0, 1.1, 0.9, 1.05])
-    return replace(made, cameras=replace(made.cameras, intrinsics=lens))
+    """Noise; cameras are turned and moved a little, with unequal focal lengths, off centre."""
+    generator = torch.Generator().manual_seed(seed)
+    turns = 0.1 * torch.randn(scenes, count, 3, 3, generator=generator)
+    c2w = torch.eye(4).repeat(scenes, count, 1, 1)
+    c2w[..., :3, :3] = torch.linalg.matrix_exp(turns - turns.mT)
+    c2w[..., :3, 3] = 0.2 * torch.randn(scenes, count, 3, generator=generator)
+    lens = torch.tensor([0.9 * width, width, width / 2 - 0.5, height / 2 + 0.5])
+    images = torch.rand(scenes, count, 3, height, width, generator=generator)
+    return Views(images, Cameras(c2w, lens.expand(scenes, count, 4), (height, width)))
