@@ -2,7 +2,7 @@
 
 Installing torch again for every test would take minutes. All packages of the present environment
 but qgs and its plugins are lent through a folder of links, so that qgs can only come from its
-wheel. Whether the wheels require what they import cannot be seen there: test_dependencies.py.
+wheel. Whether the wheels require what they import cannot be seen there: tools/lint.
 """
 
 import re

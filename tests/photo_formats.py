@@ -6,21 +6,16 @@ The writers share no code with the readers: they follow the descriptions of the 
 import io
 import json
 import math
-import os
 import shutil
 import struct
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from qgs.data import PhotosSource
-
-PHOTOS = Path(os.environ.get("QGS_PHOTOS", Path(__file__).parents[2] / "shared/photos"))
-"""Real photos, which are not in the repository."""
 
 
 @dataclass(frozen=True)
@@ -44,13 +39,6 @@ def synthetic(folder, count=6, size=(30, 40), suffix="png", seed=0):
     c2w[:, :3, :3] = Rotation.random(count, rng).as_matrix()
     c2w[:, :3, 3] = rng.normal(size=(count, 3)) * 5
     return PhotoSet(files, c2w, (50.0, 52.0, 19.0, 16.0), size)
-
-
-def real_folder(name):
-    """The folder of real photos called `name`; the test is skipped without it."""
-    if not (PHOTOS / name).is_dir():
-        pytest.skip(f"{PHOTOS / name} is missing; set QGS_PHOTOS to the folder of real photos")
-    return PHOTOS / name
 
 
 def opened(path, size=(30, 40), source=PhotosSource, **options):

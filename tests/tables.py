@@ -10,3 +10,9 @@ def fault(match, function, *given, kind=ValueError):
     except kind as error:
         return "" if re.search(match, str(error)) else f"{match} is not in: {error}"
     return f"{match}: nothing is raised"
+
+
+def must_refuse(match, function, *given, kind=ValueError):
+    """`function` raises `kind` with `match`."""
+    found = fault(match, function, *given, kind=kind)
+    assert not found, found

@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 SOURCES = ("qgs", "plugins", "tests", "tools", "docs/examples")
 TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_LINES = 600
-MAX_TOKENS = {"qgs": 120_400, "plugins": 253_050, "tests": 189_000, "tools": 38_500}
+MAX_TOKENS = {"qgs": 120_400, "plugins": 253_050, "tests": 189_700, "tools": 38_500}
 """Tokens of Python by group, as `python tools/size.py` counts them: what was reached, no more."""
 MACHINE_PATH = re.compile(r"(?<![\w.$}])/(?:home|root|work|Users|opt|mnt|tmp)/\w")
 

@@ -76,9 +76,12 @@ def test_recipes_are_refused_or_resolved(subject, installed, install, tmp_path, 
         folder = tmp_path / str(number)
         folder.mkdir()
         monkeypatch.chdir(folder)
-        files = dict(split(f"--- recipe.yaml\n{text}", "---"))
+        headed = split(f"--- recipe.yaml\n{text}", "---")
+        files = dict(headed)
+        assert len(files) == len(headed), title
         for name, content in {"small.yaml": SMALL, **files}.items():
             kind, _, plugin = name.partition(" ")
+            assert kind in ("--set", "resolved", "plugin") or kind.endswith(".yaml"), title
             if plugin:
                 source = f"from qgs.contracts import *\n{content}"
                 install(f"qgs-{plugin}", plugin, source, version="0.7")

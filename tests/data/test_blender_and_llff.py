@@ -6,7 +6,7 @@ import torch
 from photo_formats import centred, synthetic, write_blender, write_llff
 from photo_formats import scene as read
 from PIL import Image
-from tables import fault
+from tables import must_refuse
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def test_the_published_axes(tmp_path):
 def test_rows_and_images_must_agree(tmp_path, photos):
     write_llff(tmp_path, photos)
     (tmp_path / "images/view_003.png").unlink()
-    assert not fault(r"6 poses, but .*images has 5 images", read, tmp_path)
+    must_refuse(r"6 poses, but .*images has 5 images", read, tmp_path)
 
 
 def test_files_that_are_no_rows_are_told(tmp_path, photos):
@@ -76,7 +76,7 @@ def test_files_that_are_no_rows_are_told(tmp_path, photos):
     objects, narrow = np.array([[None] * 17]), np.tile([1.0] * 16 + [0.5], (6, 1))
     for content in (np.zeros((3, 15)), objects, narrow, b"hello"):
         file.write_bytes(content) if isinstance(content, bytes) else np.save(file, content)
-        assert not fault(r"poses_bounds\.npy", read, tmp_path)
+        must_refuse(r"poses_bounds\.npy", read, tmp_path)
 
 
 def test_a_row_of_nan_names_its_photo(tmp_path, photos):
@@ -84,4 +84,4 @@ def test_a_row_of_nan_names_its_photo(tmp_path, photos):
     rows = np.load(tmp_path / "poses_bounds.npy")
     rows[2, 3] = np.nan
     np.save(tmp_path / "poses_bounds.npy", rows)
-    assert not fault(r"frame 2 \(images/view_002\.png\): the pose has NaN", read, tmp_path)
+    must_refuse(r"frame 2 \(images/view_002\.png\): the pose has NaN", read, tmp_path)

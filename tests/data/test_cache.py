@@ -10,7 +10,11 @@ def test_what_was_used_last_is_kept():
     cache = BoundedCache(6, len)
 
     def get(key):
-        return cache.get(key, lambda: made.append(key) or key)
+        def make():
+            made.append(key)
+            return key
+
+        return cache.get(key, make)
 
     for key in ("aaa", "bbb", "aaa", "ccc", "aaa", "bbb"):
         assert get(key) == key

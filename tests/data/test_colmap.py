@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from photo_formats import scene as read
 from photo_formats import synthetic, world_to_camera, write_colmap
 from PIL import Image
-from tables import fault
+from tables import must_refuse
 
 from qgs.data.images import framing
 from qgs.data.paths import opened_path
@@ -97,7 +97,7 @@ def test_other_camera_models_are_refused(tmp_path, photos):
     camera = ("FOV", 7, (50.0, 50.0, 20.0, 15.0, 0.9))
     for kind in KINDS:
         folder = write_colmap(tmp_path / kind, photos, kind, camera)
-        assert not fault("image_undistorter", read, folder)
+        must_refuse("image_undistorter", read, folder)
 
 
 def test_names_in_folders_are_read_in_their_order(tmp_path, photos):
@@ -147,10 +147,10 @@ def test_broken_models_are_told(tmp_path, photos):
         kind = "text" if name.endswith("txt") else "binary"
         folder = write_colmap(tmp_path / kind, photos, kind)
         (folder / "sparse/0" / name).write_bytes(content)
-        assert not fault("sparse/0", read, folder), content
+        must_refuse("sparse/0", read, folder), content
 
 
 def test_photos_beside_the_model_are_needed(tmp_path, photos):
     folder = write_colmap(tmp_path, photos, "text", images="pictures")
-    assert not fault("`images`", read, folder, kind=FileNotFoundError)
+    must_refuse("`images`", read, folder, kind=FileNotFoundError)
     assert read(folder, images="pictures").frame_name(1) == "pictures/view_001.png"

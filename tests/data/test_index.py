@@ -7,7 +7,7 @@ import pytest
 import torch
 from line_scenes import Line, Lines
 from photo_formats import opened, synthetic, write_nerfstudio
-from tables import fault
+from tables import must_refuse
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.data.evaluation import EvaluationPlan, IndexEntry, SceneFailure, read_index
@@ -62,11 +62,11 @@ def test_other_files_are_refused_with_the_reason(tmp_path):
     file = tmp_path / "index.json"
     for text, reason in REFUSED:
         file.write_text(text)
-        assert not fault(reason, read_index, str(file))
+        must_refuse(reason, read_index, str(file))
 
 
 def test_a_missing_index_is_told_with_its_path():
-    assert not fault(
+    must_refuse(
         r"no evaluation index at nowhere/index\.json",
         read_index,
         "nowhere/index.json",

@@ -9,7 +9,7 @@ import pytest
 import torch
 from line_scenes import Line, Lines
 from photo_formats import synthetic, write_nerfstudio
-from tables import fault
+from tables import must_refuse
 
 from qgs.composer import resolve
 from qgs.contracts import ViewsConfig
@@ -67,7 +67,7 @@ def test_worker_processes_change_nothing_and_end_with_an_error_that_names_the_fi
                 assert len(multiprocessing.active_children()) == workers
                 found.append(batch)
 
-        assert not fault(r"'shelf': .*7\.png", follow, kind=SampleError)
+        must_refuse(r"'shelf': .*7\.png", follow, kind=SampleError)
         assert not multiprocessing.active_children()
         return found
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from photo_formats import row_of_frames
 from PIL import Image
-from tables import fault
+from tables import must_refuse
 
 from qgs.data.lenses import Fisheye, RadialTangential, undistorted
 
@@ -54,7 +54,7 @@ def test_missing_images_are_counted_and_named(tmp_path, caplog):
     assert len(scene) == 9
     for i in set(range(10)) - {3, 5}:
         (tmp_path / f"images/{i}.png").unlink()
-    assert not fault(r"\b10\b.*\b1\b", opened, tmp_path, kind=FileNotFoundError)
+    must_refuse(r"\b10\b.*\b1\b", opened, tmp_path, kind=FileNotFoundError)
 
 
 REFUSED = {
@@ -81,16 +81,16 @@ REFUSED = {
 
 def test_what_cannot_be_meant_is_refused(tmp_path):
     for text, word in REFUSED.items():
-        assert not fault(word, opened, folder(tmp_path, **json.loads(text)))
+        must_refuse(word, opened, folder(tmp_path, **json.loads(text)))
 
 
 def test_folders_and_files_that_are_not_there(tmp_path, monkeypatch):
-    assert not fault("does not exist", opened, tmp_path / "nothing", kind=FileNotFoundError)
+    must_refuse("does not exist", opened, tmp_path / "nothing", kind=FileNotFoundError)
     Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
     monkeypatch.setenv("QGS_NO_POSES", "1")
-    assert not fault("no camera poses", opened, tmp_path)
+    must_refuse("no camera poses", opened, tmp_path)
     (tmp_path / "transforms.json").write_text("{")
-    assert not fault("not valid JSON", opened, tmp_path)
+    must_refuse("not valid JSON", opened, tmp_path)
 
 
 def test_files_outside_of_the_folder_are_read_only_if_allowed(tmp_path):
@@ -103,7 +103,7 @@ def test_files_outside_of_the_folder_are_read_only_if_allowed(tmp_path):
         assert read(folder(mine, frame={of: "linked/images/1.png"}))
         for place in ("../other/images/1.png", f"{tmp_path}/other/images/1.png"):
             folder(mine, frame={of: place})
-            assert not fault(r"other/images/1\.png", opened, mine), of
+            must_refuse(r"other/images/1\.png", opened, mine), of
             assert of != "file_path" or read(mine, outside=True)
 
 

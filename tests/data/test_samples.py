@@ -5,7 +5,7 @@ import pytest
 import torch
 from line_scenes import Line, Lines, circle
 from odd_views import odd_views
-from tables import fault
+from tables import must_refuse
 from torch.testing import assert_close
 
 from qgs.composer import resolve
@@ -67,7 +67,7 @@ def test_targets_are_novel_while_there_are_enough():
 
 def test_only_a_scene_whose_masks_are_all_black_is_refused():
     sample(MaskedLine(2), (0,), (0,))
-    assert not fault("line1", sample, MaskedLine(1), (0,), (0,))
+    must_refuse("line1", sample, MaskedLine(1), (0,), (0,))
 
 
 def test_normalised_poses():
@@ -230,4 +230,4 @@ def test_times_of_photos_are_kept():
     both = stack_views([mirrored_views(timed), timed])
     for name in ("times", "target_time"):
         assert torch.equal(getattr(both, name), getattr(timed, name).repeat(2, 1))
-    assert not fault("target_time, times", stack_views, [timed, plain])
+    must_refuse("target_time, times", stack_views, [timed, plain])

@@ -11,7 +11,7 @@ import torch
 from line_scenes import Line, Lines
 from photo_formats import scene, synthetic, write_blender
 from PIL import Image
-from tables import fault
+from tables import must_refuse
 from torch.testing import assert_close
 from training_runs import run
 
@@ -49,7 +49,7 @@ def test_times_of_dnerf(tmp_path):
 
 def test_times_that_cannot_be(tmp_path):
     for time in (..., None, "noon", float("nan"), [1]):
-        assert not fault("'time'", scene, dnerf(tmp_path, 0, time, 0.5))
+        must_refuse("'time'", scene, dnerf(tmp_path, 0, time, 0.5))
 
 
 def test_one_camera_a_time_gives_that_frame_as_all_targets():
@@ -84,7 +84,7 @@ def test_times_go_from_0_to_1_and_ask_for_that_of_the_targets():
     assert several.target_time is None, "two times cannot be asked for at once"
     still = made(Line(9), (2, 6), (4,))
     assert still.inputs.times is None
-    assert not fault("line9", collate, [sample, still])
+    must_refuse("line9", collate, [sample, still])
 
 
 def test_targets_of_two_times_are_judged_apart():
@@ -113,7 +113,7 @@ def test_a_dynamic_model_trains_on_photos_with_times(tmp_path):
     folder = dnerf(tmp_path, *(i / 7 for i in range(8)), 0.3)
     data = f"data={{type: qgs/photos, path: '{folder}', image_size: [16, 16]}}"
     assert run(resolve("tiny/tokengs.yaml", [*DYNAMIC, data]), tmp_path / "run").steps == 2
-    assert not fault("times", resolve, "tiny/tokengs.yaml", DYNAMIC, kind=RecipeError)
+    must_refuse("times", resolve, "tiny/tokengs.yaml", DYNAMIC, kind=RecipeError)
 
 
 def kubric_tar(file, camera, times):
@@ -150,4 +150,4 @@ def test_kubric_becomes_photos_with_times(tmp_path, monkeypatch):
     assert image.tolist() == [20, 20, 30], "what is transparent stays as it is"
     (scenes / "scn1").mkdir()
     tarfile.open(scenes / "scn1/output_000.tar", "w").close()
-    assert not fault(r"output_000\.tar", kubric_to_photos.main, kind=SystemExit)
+    must_refuse(r"output_000\.tar", kubric_to_photos.main, kind=SystemExit)

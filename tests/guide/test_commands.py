@@ -58,11 +58,14 @@ def test_every_command_that_is_shown_is_one():
 
 
 def test_extras_that_are_named_exist():
+    seen = set()
     for page, text in TEXTS.items():
         for word, of, several in re.findall(r"extras? `(\w+)`|(gaussians|\.)\[([\w,]+)\]", text):
+            seen.add(page)
             in_plugin = of == "." and page in ("README", "plugin.md")
             known = (PLUGIN if in_plugin else PROJECT)["optional-dependencies"]
             assert {*(word or several).split(",")} <= known.keys(), page
+    assert seen >= {"index.md", "plugin.md"}
 
 
 def test_a_plugin_depends_on_qgs_and_on_what_qgs_depends_on():

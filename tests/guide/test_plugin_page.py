@@ -9,8 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 from guide_pages import blocks, contract_failures
-from qgs_plugintools import cases_of
+from qgs_locus.cross_attention import RayBiasedCrossAttention
+from qgs_plugintools import Case, cases_of
+from qgs_plugintools.inputs import inputs_of
 from qgs_plugintools.new_command import rendered
+from torch.testing import assert_close
 
 from qgs.composer import RecipeError, resolve
 from qgs.composer.registry import InstalledPlugin
@@ -58,6 +61,33 @@ def test_the_second_component_computes_its_formula(package):
     middle, corner = centers(offsets, QueryState(torch.zeros(1, 1, 16)))[0, 0]
     assert middle.tolist() == [0.0, 0.0, 2.0]  # depth is the geometric mean of near and far
     assert corner.tolist() == [16.0, -16.0, 8.0]  # the far corner of the frustum
+
+
+def test_the_field_starts_changes_and_places(package):
+    depth, dims = package.depth, ModelDims(16, 2, 1)
+    queries = depth.DepthQueries(depth.DepthQueries.Config(count=4), dims)
+    refinement = depth.DepthRefinement(depth.DepthRefinement.Config(), dims)
+    centers = depth.DepthCenters(depth.DepthCenters.Config(), dims)
+    state = refinement(queries.start(2))
+    learned = queries.log_depth + refinement.step(queries.features)
+    means = centers(torch.zeros(2, 4, 1, 3), state)
+    assert_close(means[1, :, 0, 2:], learned.clamp(-4, 4).exp())
+    assert not means[..., :2].any()
+
+
+@torch.no_grad()
+def test_every_second_head_reads_close_rays_alone_and_says_so(package):
+    case = Case(package.NearbyAttention.Config(reach=0.5))
+    inputs, attention = inputs_of(case), case.build()
+    explained = attention.explain(*inputs.values(), torch.arange(6))
+    shared = RayBiasedCrossAttention.bias(attention, *inputs.values()).dense()
+    assert torch.equal(explained.geometry[:, 0], shared)
+    hidden = explained.geometry[:, 1].isinf()
+    kept = shared >= -0.5 * attention.gamma * 0.25
+    assert hidden.any()
+    assert (~hidden).any(-1).all()
+    assert not (hidden & kept).any()
+    assert not explained.weights[:, 1][hidden].any()
 
 
 def test_the_recipes_work_and_what_the_page_says_is_refused(package):

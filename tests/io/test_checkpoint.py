@@ -11,7 +11,7 @@ import torch
 from commands import SMALL
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from tables import fault
+from tables import fault, must_refuse
 
 import qgs
 from qgs.composer import RecipeError, resolve
@@ -88,7 +88,7 @@ def test_only_plugins_that_are_used_are_needed(tmp_path, monkeypatch):
         monkeypatch.setattr(f"{module}.available_plugins", lambda: without_rooms)
     assert set(CheckpointFile(path).recipe.releases) == {"qgs", "locus", "datasets"}
     assert qgs.load(path).queries.count == 8
-    assert not fault(
+    must_refuse(
         "offers a plugin `rooms`", qgs.compose, RECIPES / "photos.yaml", SMALL, kind=RecipeError
     )
 
@@ -124,7 +124,7 @@ def test_weights_that_are_not_finite_are_refused(saved):
     tensors["head.linear.bias"][0] = torch.inf
     rewrite(saved, tensors)
     names = r"head\.linear\.bias.*queries\.features"
-    assert not fault(rf"{saved.name}: .*{names}", qgs.load, saved)
+    must_refuse(rf"{saved.name}: .*{names}", qgs.load, saved)
 
 
 def test_every_difference_is_listed_at_once(saved):
@@ -196,14 +196,14 @@ def test_a_changed_letter_in_any_metadata_is_refused(saved):
             rest = dict(metadata)
             del rest[name]
             save_file(own, saved, rest | changed)
-            assert not fault("", CheckpointFile, saved, kind=CheckpointError)
+            must_refuse("", CheckpointFile, saved, kind=CheckpointError)
 
 
 def test_files_of_the_format_without_a_seal_are_read(saved):
     own, metadata = tensors_of(saved), metadata_of(saved)
     del metadata[SEAL]
     save_file(own, saved, metadata)
-    assert not fault("lack", CheckpointFile, saved, kind=CheckpointError)
+    must_refuse("lack", CheckpointFile, saved, kind=CheckpointError)
     save_file(own, saved, metadata | {"qgs.format_version": "2"})
     assert CheckpointFile(saved).recipe.tree
 

@@ -9,7 +9,7 @@ import torch
 from commands import run_qgs
 from numpy.lib.recfunctions import repack_fields
 from plyfile import PlyData, PlyElement
-from tables import fault
+from tables import must_refuse
 from torch.testing import assert_close
 
 import qgs
@@ -90,7 +90,7 @@ def test_several_scenes_and_numbers_that_are_not_finite_leave_no_file(tmp_path):
         (broken, "1 of 4"),
         (harmonic, "2 of 4"),
     ):
-        assert not fault(words, save_ply, gaussians, tmp_path / "a.ply")
+        must_refuse(words, save_ply, gaussians, tmp_path / "a.ply")
     assert not list(tmp_path.iterdir())
 
 
@@ -122,7 +122,7 @@ def test_files_of_fewer_degrees_are_read(tmp_path):
     first, zeros = rest[0:3] + rest[15:18] + rest[30:33], rest[3:15] + rest[18:30]
     assert torch.equal(load_ply(written(first)).sh, given.sh)
     assert load_ply(written(zeros)).sh is None
-    assert not fault("10 properties", load_ply, written(zeros[:10]))
+    must_refuse("10 properties", load_ply, written(zeros[:10]))
 
 
 def test_other_files_are_refused_by_name(tmp_path):
@@ -153,10 +153,10 @@ def test_other_files_are_refused_by_name(tmp_path):
     }.items():
         path = tmp_path / f"{name}.ply"
         path.write_bytes(content)
-        assert not fault(path.name, load_ply, path)
+        must_refuse(path.name, load_ply, path)
     os.mkfifo(tmp_path / "pipe.ply")  # reading it would wait for a writer
     for name in ("missing", "pipe"):
-        assert not fault(name, load_ply, tmp_path / f"{name}.ply", kind=FileNotFoundError)
+        must_refuse(name, load_ply, tmp_path / f"{name}.ply", kind=FileNotFoundError)
 
 
 def test_convert_keeps_the_most_opaque(tmp_path):
@@ -190,12 +190,12 @@ def test_an_installed_distribution_adds_a_format(install, tmp_path):
     install("qgs-xyz", "xyz", source, group="qgs.scene_writers")
     save_gaussians(random_gaussians(5), tmp_path / "a.XYZ")
     assert (tmp_path / "a.XYZ").read_text() == "5"
-    assert not fault(r"\.xyz", save_gaussians, random_gaussians(5), tmp_path / "a.abc")
+    must_refuse(r"\.xyz", save_gaussians, random_gaussians(5), tmp_path / "a.abc")
 
 
 def test_a_format_that_cannot_be_imported_is_refused_before_the_work(install, tmp_path):
     install("qgs-xyz", "xyz", "import no_such_package", group="qgs.scene_writers")
-    assert not fault(
+    must_refuse(
         r"qgs-xyz 1\.2",
         save_gaussians,
         random_gaussians(5),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from photo_formats import copied, scene, synthetic
-from tables import fault
+from tables import must_refuse
 from torch.testing import assert_close
 
 from qgs.data.photos import formats_of
@@ -109,7 +109,7 @@ def test_what_is_refused_names_the_file(photos, file):
         rows({"image": names, "location": c2w}, K=K),
     ):
         file.write_text(json.dumps(content))
-        assert not fault(r"cameras\.json", read_cameras, file.parent)
+        must_refuse(r"cameras\.json", read_cameras, file.parent)
 
 
 def read_cameras(folder):
@@ -136,7 +136,7 @@ def test_no_more_of_a_listing_is_read_than_tells_what_it_is(photos, file):
 
 def test_a_file_of_that_name_without_poses_is_named_where_photos_lie_beside_it(file):
     file.write_text(json.dumps([{"id": 0, "position": [0, 0, 0]}] * 6))
-    assert not fault(r"cameras\.json", scene, file.parent)
+    must_refuse(r"cameras\.json", scene, file.parent)
     for photo in file.parent.glob("*.png"):
         photo.unlink()
     assert formats_of(file.parent) == []

@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from qgs_datasets.chunk_files import load_chunk, stays_inside
 from qgs_datasets.chunks import ChunksSource
-from tables import fault
+from tables import must_refuse
 from upath import UPath
 
 
@@ -117,7 +117,7 @@ def test_without_an_index_the_chunks_are_read(tmp_path, caplog):
     assert names(opened(tmp_path)) == ["s0", "s1"]
     assert "has no index.json" in caplog.text
     write(tmp_path / "train", c=[record("s1")], index=False)
-    assert not fault(r"'s1' is in b\.torch and in c\.torch", opened, tmp_path)
+    must_refuse(r"'s1' is in b\.torch and in c\.torch", opened, tmp_path)
 
 
 def test_missing_chunks_and_short_scenes_are_counted_and_named(tmp_path, caplog):
@@ -129,7 +129,7 @@ def test_missing_chunks_and_short_scenes_are_counted_and_named(tmp_path, caplog)
     assert names(source) == ["s1"]
     assert "fewer than 5 frames (min_frames) and are left out: s0 (4)" in caplog.text
     (tmp_path / "train/a.torch").unlink()
-    assert not fault("none of their chunks exists", opened, tmp_path, kind=FileNotFoundError)
+    must_refuse("none of their chunks exists", opened, tmp_path, kind=FileNotFoundError)
 
 
 def test_legacy_files_are_read_whole(tmp_path):
@@ -219,7 +219,7 @@ def test_broken_chunks_are_told(tmp_path):
     cases += [([record("s0", **extra)], f"scene 's0'{told}") for extra, told in BROKEN]
     for records, message in cases:
         write(tmp_path, a=records, index=False)
-        assert not fault(rf"a\.torch.*{message}", all_images, tmp_path)
+        must_refuse(rf"a\.torch.*{message}", all_images, tmp_path)
 
 
 HUGE = torch.zeros(1, dtype=torch.uint8).expand(10**12)
@@ -238,16 +238,16 @@ def test_a_small_file_does_not_fill_the_memory(tmp_path):
         write(tmp_path, a=[record("s0", **{name: value})])
         assert (tmp_path / "a.torch").stat().st_size < 20_000
         reason = rf"\A.*a\.torch: scene 's0': '{name}' holds a tensor.*\Z"
-        assert not fault(reason, all_images, tmp_path)
+        must_refuse(reason, all_images, tmp_path)
 
 
 def test_an_index_does_not_lead_outside(tmp_path):
     data_set(tmp_path)
     for name in ("../test/a.torch", str(tmp_path / "test/a.torch"), "c:\\a.torch"):
         (tmp_path / "train/index.json").write_text(json.dumps({"s0": name}))
-        assert not fault("outside its own folder", opened, tmp_path)
+        must_refuse("outside its own folder", opened, tmp_path)
     (tmp_path / "train/index.json").write_text("[1]")
-    assert not fault("must map each scene's key", opened, tmp_path)
+    must_refuse("must map each scene's key", opened, tmp_path)
 
 
 def test_names_that_stay_inside():
@@ -258,9 +258,9 @@ def test_names_that_stay_inside():
 
 def test_folders_that_are_not_there(tmp_path):
     absent, empty = tmp_path / "nothing", "holds no chunks.*qgs data pack"
-    assert not fault("does not exist", opened, absent, kind=FileNotFoundError)
-    assert not fault(empty, opened, tmp_path, kind=FileNotFoundError)
-    assert not fault("cannot be opened as a path or URL", opened, "nosuch://bucket")
+    must_refuse("does not exist", opened, absent, kind=FileNotFoundError)
+    must_refuse(empty, opened, tmp_path, kind=FileNotFoundError)
+    must_refuse("cannot be opened as a path or URL", opened, "nosuch://bucket")
 
 
 def test_code_in_a_chunk_is_not_run(tmp_path):
@@ -269,7 +269,7 @@ def test_code_in_a_chunk_is_not_run(tmp_path):
             return os.mkdir, (str(tmp_path / "made"),)
 
     torch.save([Payload()], tmp_path / "a.torch")
-    assert not fault("cannot be read as a torch file", load_chunk, UPath(tmp_path / "a.torch"))
+    must_refuse("cannot be read as a torch file", load_chunk, UPath(tmp_path / "a.torch"))
     assert not (tmp_path / "made").exists()
 
 
@@ -281,4 +281,4 @@ def test_a_chunk_that_cannot_be_read_is_named_without_torchs_advice(tmp_path):
         with pytest.raises(ValueError, match=r"0\.torch") as error:
             load_chunk(UPath(file))
         assert "trust" not in str(error.value)
-    assert not fault(r"1\.torch", load_chunk, UPath(tmp_path / "1.torch"), kind=FileNotFoundError)
+    must_refuse(r"1\.torch", load_chunk, UPath(tmp_path / "1.torch"), kind=FileNotFoundError)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from photo_formats import row_of_frames
 from qgs_datasets.dl3dv import Dl3dvSource, read_scene_list
-from tables import fault
+from tables import must_refuse
 from upath import UPath
 
 
@@ -105,7 +105,7 @@ def length(path):
 
 def test_photos_of_another_aspect_are_refused(tmp_path):
     write(tmp_path / "abc", {**scene_files(), "images_4/0.png": photo(0, (18, 32))})
-    assert not fault(r"0\.png.*swapped", length, tmp_path)
+    must_refuse(r"0\.png.*swapped", length, tmp_path)
 
 
 def test_missing_photos_are_counted_and_named(tmp_path, caplog):
@@ -124,10 +124,10 @@ def test_incomplete_and_broken_archives_are_told(tmp_path):
         ({"abc/transforms.json": listing()}, "transforms"),
     ):
         write(tmp_path / "abc.zip", files)
-        assert not fault(file, length, tmp_path, kind=(ValueError, OSError))
+        must_refuse(file, length, tmp_path, kind=(ValueError, OSError))
     (tmp_path / "abc.zip").write_bytes(b"PK nothing")
     opened(tmp_path)  # listed without being opened
-    assert not fault(r"abc\.zip", length, tmp_path)
+    must_refuse(r"abc\.zip", length, tmp_path)
 
 
 def test_a_damaged_photo_names_archive_and_file(tmp_path):
@@ -171,9 +171,9 @@ def test_lists_of_scenes(tmp_path):
     text.write_text("# none\n")
     listed.write_text("3")
     for wrong in (text, listed):
-        assert not fault(wrong.name, read_scene_list, wrong)
+        must_refuse(wrong.name, read_scene_list, wrong)
     gone = text.with_name("gone.txt")
-    assert not fault(gone.name, read_scene_list, gone, kind=FileNotFoundError)
+    must_refuse(gone.name, read_scene_list, gone, kind=FileNotFoundError)
 
 
 def test_a_scene_that_is_there_twice_is_told(tmp_path, caplog):
@@ -184,9 +184,9 @@ def test_a_scene_that_is_there_twice_is_told(tmp_path, caplog):
 
 
 def test_folders_that_are_not_there(tmp_path):
-    assert not fault("nothing", opened, tmp_path / "nothing", kind=FileNotFoundError)
+    must_refuse("nothing", opened, tmp_path / "nothing", kind=FileNotFoundError)
     (tmp_path / "a.txt").write_text("")
-    assert not fault(r"a\.txt", opened, tmp_path, kind=FileNotFoundError)
+    must_refuse(r"a\.txt", opened, tmp_path, kind=FileNotFoundError)
 
 
 def test_scenes_travel_to_other_processes_without_open_archives(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from photo_formats import encoded, row_of_frames, scene
 from PIL import Image
 from qgs_datatools.check import Options, check
-from tables import fault
+from tables import must_refuse
 from upath import UPath
 
 SIZE = (4, 6)
@@ -145,7 +145,7 @@ def test_what_is_refused_is_told_alike(method, tmp_path):
     key, _, _, files = KINDS[method]
     read, (finding,) = photos(tmp_path, files, key)
     for frame, name in enumerate(files):
-        assert not fault(re.escape(name), getattr(read, method), [frame])
+        must_refuse(re.escape(name), getattr(read, method), [frame])
     assert finding.severity == "error"
     assert finding.frames == (*range(len(files)),)
     assert next(iter(files)) in str(finding)

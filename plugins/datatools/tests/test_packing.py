@@ -17,7 +17,7 @@ from photo_formats import row_of_frames
 from PIL import Image
 from qgs_datasets.chunks import ChunksSource
 from qgs_datatools import packing
-from tables import fault
+from tables import must_refuse
 from torch.testing import assert_close
 from upath import UPath
 
@@ -164,7 +164,7 @@ def test_splits(six):
     named = packing.splits_by_list(six, ["s4", "s1"])
     assert found(named) == [["s0", "s2", "s3", "s5"], ["s1", "s4"]]
     assert found(packing.splits_by_number(six, 3)) == [["s0", "s1", "s3", "s4"], ["s2", "s5"]]
-    assert not fault(
+    must_refuse(
         "1 of 2 test scenes are not there: gone", packing.splits_by_list, six, ["s1", "gone"]
     )
 
@@ -174,7 +174,7 @@ def test_what_is_there_is_never_overwritten(six, tmp_path):
     (tmp_path / "notes/a.txt").write_text("mine")
     pack(six, tmp_path / "chunks")
     for folder, held in (("notes", r"not empty \(a\.txt\)"), ("chunks", "never overwrites")):
-        assert not fault(held, pack, six, tmp_path / folder, kind=FileExistsError)
+        must_refuse(held, pack, six, tmp_path / folder, kind=FileExistsError)
 
 
 def test_scenes_that_cannot_be_read_stop_a_packing_or_are_left_out(six, tmp_path):

@@ -67,11 +67,11 @@ def test_queries_give_what_they_learned_in_the_form_that_they_promise():
 def test_attention_and_pictures_speak_of_one_ellipsoid():
     state, rays = _state(), torch.cat([0.5 * torch.randn(2, 24, 3), torch.randn(2, 24, 3)], -1)
     memory = ImageMemory(torch.randn(2, 24, 16), patch_rays=rays)
-    chosen = {"sigma0": 0.3, "sigma_sq_min": 1e-5, "bias_min": -7.0, "gamma_init": 0.4}
+    chosen = {"sigma0": 0.3, "sigma_sq_min": 0.05, "bias_min": -7.0, "gamma_init": 0.4}
     bias = made(EllipsoidCrossAttention, **chosen, **OFFSET).bias(state, memory).dense()
     axes = made(EllipsoidQueries, **OFFSET).support(state).axes
     radii = axes.norm(dim=-2)
-    ellipsoids = state[CENTER], axes / radii[..., None, :], (0.3 * radii).square()
+    ellipsoids = state[CENTER], axes / radii[..., None, :], (0.3 * radii).square().clamp(min=0.05)
     gamma = F.softplus(torch.tensor(0.4))
     expected = EllipsoidBias.of(*ellipsoids, ray_tokens(rays), -7.0, gamma).dense()
     assert_close(bias, expected, rtol=1e-4, atol=1e-4)
@@ -83,6 +83,15 @@ def test_the_step_of_a_centre_is_linear_on_demand():
     refinement, state = made(EllipsoidRefinement, center_step="linear"), _state()
     expected = state[CENTER] + refinement.center_mlp(state.features)
     assert_close(refinement(state)[CENTER], expected)
+
+
+def test_a_refinement_that_starts_at_zero_can_learn():
+    refinement, state = made(EllipsoidRefinement, zero_init=True), _state()
+    refined = refinement(state)
+    assert_close(refined.fields, state.fields)
+    sum((field * torch.randn_like(field)).sum() for field in refined.fields.values()).backward()
+    for mlp in (refinement.center_mlp, refinement.rotation_mlp, refinement.radius_mlp):
+        assert mlp.fc2.weight.grad.any()
 
 
 def test_centers_follow_their_formula():

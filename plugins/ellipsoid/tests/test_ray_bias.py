@@ -133,3 +133,11 @@ def test_blocks_do_not_show(monkeypatch, radii):
     whole = found()
     monkeypatch.setitem(BLOCK, "cpu", 2 * 20 * 7)
     assert_close(found(), whole)
+
+
+@both
+def test_a_ray_without_direction_stays_finite(radii):
+    *inputs, origins, directions = drawn(4, 3, radii)
+    inputs = *inputs, origins, 0 * directions
+    for x in (bias(inputs), *gradients(bias, inputs, 3)):
+        assert x.isfinite().all()

@@ -80,9 +80,12 @@ def test_what_is_frozen_gets_no_gradient_and_the_others_get_the_same(monkeypatch
     given = case(SIZES)
     best = exact(RayBias, given, LEARNT)
     made, of_bias = [], AttentionBias.gradients
-    monkeypatch.setattr(
-        AttentionBias, "gradients", lambda *read: made.append(of_bias(*read)) or made[-1]
-    )
+
+    def kept(*read):
+        made.append(of_bias(*read))
+        return made[-1]
+
+    monkeypatch.setattr(AttentionBias, "gradients", kept)
     for learnt in (*zip(LEARNT, strict=True), ("queries", "tokens"), LEARNT):
         wanted = {("queries" in learnt, "tokens" in learnt)} - {(False, False)}
         for attention, kind in PATHS:

@@ -11,7 +11,7 @@ from PIL import Image, ImageSequence
 from qgs_poses.film import write_film
 from qgs_poses.filming import Shot, Stage, cameras_of, open_stage, seen_depth
 from qgs_poses.paths import path_of, read_path, walk
-from tables import fault
+from tables import must_refuse
 from walked import frames
 
 import qgs
@@ -87,7 +87,7 @@ def test_a_file_that_is_no_path_is_refused(tmp_path):
         lens.replace('"w": 9, "h": 9, ', "") + "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}]}",
     ):
         file.write_text(content)
-        assert not fault("path.json is no camera path", read_path, file, SIZE, None)
+        must_refuse("path.json is no camera path", read_path, file, SIZE, None)
 
 
 def test_size_length_and_angle_of_view():

@@ -13,7 +13,7 @@ from line_scenes import circle
 from qgs_refine.growth import DEAD, FreeGaussians
 from qgs_refine.refining import Extras, mean_psnr, resized
 from qgs_refine.scene import masked
-from tables import fault
+from tables import must_refuse
 
 import qgs
 from qgs.renderers import AutoRenderer
@@ -151,14 +151,14 @@ def test_unusable_input_is_refused():
     def refined(gaussians=four, given=views, seconds=1, wanted=4):
         qgs.refine(gaussians, given, seconds, count=wanted)
 
-    for wrong in (
-        {"gaussians": map_tensors(lambda x: x.expand(2, *x.shape[1:]), four)},
-        {"gaussians": map_tensors(lambda x: x * math.nan, four)},
-        {"given": views.select([])},
-        {"seconds": 0},
-        {"wanted": 0},
+    for word, wrong in (
+        ("2 scenes", {"gaussians": map_tensors(lambda x: x.expand(2, *x.shape[1:]), four)}),
+        ("not finite", {"gaussians": map_tensors(lambda x: x * math.nan, four)}),
+        ("0 photos", {"given": views.select([])}),
+        ("0 seconds", {"seconds": 0}),
+        ("count=0", {"wanted": 0}),
     ):
-        assert not fault("Gaussians", partial(refined, **wrong))
+        must_refuse(word, partial(refined, **wrong))
 
 
 def test_moments_follow_their_gaussians():
@@ -275,4 +275,4 @@ def test_what_masks_leave_out_is_background():
     found = masked(replace(views, masks=masks), background.tolist()).images
     assert torch.equal(found[..., :12], views.images[..., :12])
     assert torch.allclose(found[..., 12:], background[:, None, None])
-    assert not fault("--masks", masked, views, background.tolist())
+    must_refuse("--masks", masked, views, background.tolist())

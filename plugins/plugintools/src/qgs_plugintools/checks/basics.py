@@ -172,7 +172,7 @@ def check_compiles(case: Case) -> None:
     from torch._dynamo.testing import CompileCounterWithBackend
 
     module = case.lively()
-    counter = CompileCounterWithBackend("eager")
+    counter = CompileCounterWithBackend("aot_eager")
     torch._dynamo.reset()
     try:
         compiled: Any = torch.compile(module, backend=counter)

@@ -167,4 +167,5 @@ def check_parameters_learn(case: Case) -> None:
         if step and (draws_nothing or len(learned) == len(parameters)):
             break
     idle = [name for name in parameters if name not in learned]
-    expect(not idle, f"no gradient reaches {', '.join(idle)}")
+    remedy = "if a release has them all the same, name them in `unlearned` of their module"
+    expect(not idle, f"no gradient reaches {', '.join(idle)}; {remedy}")
