@@ -26,8 +26,8 @@ from qgs_plugintools.trees import (
 
 Patch = tuple[int, int, int]  # view, row and column
 
-_SIDE, _SIDE_OF_PIXELS = 6, 4
-"""Rows and columns of patches that are changed, a scene each; fewer where a token is a pixel."""
+_SIDE = 6
+"""Rows and columns of patches that are changed, a scene each; 4 where a token is a pixel."""
 
 _LEAST_SHARE = 0.6
 """Of the largest mean share at one displacement. Strided 3 x 3 convolutions, whose centres are
@@ -75,7 +75,7 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
             expect(not declared, "`writes` has memory.grid, but `grid` of the ImageMemory is None")
             continue
         patch, grid = _patch_size(where, views, memory), memory.grid
-        side = _SIDE if patch > 1 else _SIDE_OF_PIXELS
+        side = _SIDE if patch > 1 else 4
         tokens = torch.arange(math.prod(grid)).view(grid)[:, :side, :side].flatten()
         changed = module(_one_patch_each(views, _places(tokens, grid), patch))
         for name in ("keys", "values", "features"):

@@ -167,5 +167,4 @@ def check_parameters_learn(case: Case) -> None:
         if step and (draws_nothing or len(learned) == len(parameters)):
             break
     idle = [name for name in parameters if name not in learned]
-    remedy = "if a release has them all the same, name them in `unlearned` of their module"
-    expect(not idle, f"no gradient reaches {', '.join(idle)}; {remedy}")
+    expect(not idle, f"no gradient reaches {', '.join(idle)}: let it, or name it `unlearned`")
