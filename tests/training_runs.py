@@ -1,16 +1,14 @@
 """Runs of tiny models, for the tests of training."""
 
 import json
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import TypeAlias
 
 import pytest
 import torch
 from rich.console import Console
 
-from qgs.composer import Recipe, resolve
+from qgs.composer import resolve
 from qgs.data.stream import SampleStream, training_batches
 from qgs.engine.distributed import StopRequest
 from qgs.engine.folder import RunFolder, read_state
@@ -27,8 +25,6 @@ training.steps=3 training.seconds=null optimizer.warmup=2
 """
 QUIET = Console(quiet=True)
 TRAINED = ("training.ema=0.5", "training.evaluate_every=2")
-Tiny: TypeAlias = Callable[..., Recipe]
-"""The function `tiny`, for tests of plug-ins."""
 TWO = (
     "plugins=[rooms, locus, globalsplat]",
     "objective.type=globalsplat/two_passes",
@@ -40,9 +36,6 @@ TWO = (
 def tiny(name, *overrides):
     """A recipe of recipes/tiny, smaller yet, with overrides."""
     return resolve(RECIPES / f"{name}.yaml", [*SMALL.split(), *overrides])
-
-
-tiny_recipe: Tiny = tiny
 
 
 def run(recipe, folder, resume=False, device="cpu"):

@@ -2,13 +2,13 @@
 
 import re
 
-from training_runs import tiny_recipe
+from training_runs import tiny
 
 LAYER = "model.decoder.layers={0: {cross_attention: {type: qgs/content}}}"
 
 
 def test_a_model_says_its_slots_in_a_few_lines():
-    model = tiny_recipe("locus", LAYER).build_model()
+    model = tiny("locus", LAYER).build_model()
     heading, *lines = repr(model).splitlines()
     total = sum(parameter.numel() for parameter in model.parameters())
     assert f"{total:,} parameters" in heading

@@ -79,7 +79,8 @@ WHOLE_SIZES = """
 def test_photos_of_another_kind_are_seen_whole():
     scene = Mock()
     scene.cameras.size = (64, 64)
-    for scene.stored_size.return_value, multiple, whole in yaml.safe_load(WHOLE_SIZES):
+    for stored, multiple, whole in yaml.safe_load(WHOLE_SIZES):
+        scene.stored_size.return_value = stored
         assert [*whole_size(scene, multiple)] == whole
 
 

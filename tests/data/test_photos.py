@@ -103,7 +103,7 @@ def test_files_outside_of_the_folder_are_read_only_if_allowed(tmp_path):
         assert read(folder(mine, frame={of: "linked/images/1.png"}))
         for place in ("../other/images/1.png", f"{tmp_path}/other/images/1.png"):
             folder(mine, frame={of: place})
-            must_refuse(r"other/images/1\.png", opened, mine), of
+            must_refuse(r"other/images/1\.png", opened, mine)
             assert of != "file_path" or read(mine, outside=True)
 
 

@@ -148,7 +148,8 @@ def test_gradients_of_two_passes_are_those_of_the_definition():
         # half of the gradient that |one - other| has with nothing fixed, its value in full
         total = total + factor * (one - other).abs().mean() / 2
     wanted = gradients(step, total)
-    for step.render_views in (0, 1):
+    for at_once in (0, 1):
+        step.render_views = at_once
         assert furthest(gradients(step, step(batch.inputs, batch.targets).total), wanted) < 1e-5
 
 
@@ -170,7 +171,8 @@ def test_in_float64_they_are_the_same_numbers():
 def test_under_autocast_the_gaussians_get_the_same_gradients():
     objective, *batch = setting("qgs/cpu")
     found = []
-    for objective.render_views in (0, 2):
+    for at_once in (0, 2):
+        objective.render_views = at_once
         seen = {}
 
         def note(name, value, seen=seen):
@@ -205,7 +207,8 @@ def test_signs_are_those_of_all_views_of_the_last_layer():
         rendering = model.render(model(inputs).gaussians, targets.cameras)
     likeness = psnr(rendering.rgb, targets.images).mean()
     wanted = (likeness, *measure(rendering.rgb, rendering.alpha, torch.full((3,), 0.5)))
-    for objective.render_views in (0, 2):
+    for at_once in (0, 2):
+        objective.render_views = at_once
         torch.testing.assert_close(tuple(objective(inputs, targets).signs.values()), wanted)
 
 

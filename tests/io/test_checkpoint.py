@@ -11,7 +11,7 @@ import torch
 from commands import SMALL
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from tables import fault, must_refuse
+from tables import must_refuse
 
 import qgs
 from qgs.composer import RecipeError, resolve
@@ -61,9 +61,8 @@ def rewrite(path, tensors=None, **changed):
     write_tensors(path, tensors or tensors_of(path), metadata_of(path) | changed)
 
 
-def loading_fault(match, path):
-    """What is wrong unless loading refuses a file with `match`."""
-    return fault(match, qgs.load, path, kind=CheckpointError)
+def must_not_load(match, path):
+    must_refuse(match, qgs.load, path, kind=CheckpointError)
 
 
 def test_a_loaded_model_is_the_saved_one(model, saved):
@@ -151,11 +150,11 @@ def test_damaged_files_are_refused_by_name(saved, written):
         content = bytearray(written)
         content[position] ^= 1
         saved.write_bytes(content)
-        assert not loading_fault(f"^{saved} is damaged", saved)
+        must_not_load(f"^{saved} is damaged", saved)
     cut = [written[:kept] for kept in (0, 4, 100, -10)]
     for content in (*cut, b"recipe: 1\nmodel:\n"):
         saved.write_bytes(content)
-        assert not loading_fault(str(saved), saved)
+        must_not_load(str(saved), saved)
 
 
 def test_a_renamed_pickle_is_refused_unread(tmp_path):
@@ -166,15 +165,15 @@ def test_a_renamed_pickle_is_refused_unread(tmp_path):
     path = tmp_path / "model.safetensors"
     for protocol in (2, 4):
         path.write_bytes(pickle.dumps(Explosive(), protocol))
-        assert not loading_fault("a Python pickle", path)
+        must_not_load("a Python pickle", path)
     torch.save({"a": Explosive()}, path)
-    assert not loading_fault("PyTorch", path)
+    must_not_load("PyTorch", path)
     assert not (tmp_path / "trace").exists()
 
 
 def test_a_newer_format_is_refused(saved):
     rewrite(saved, **{"qgs.format_version": "99"})
-    assert not loading_fault("qgs.format_version 99", saved)
+    must_not_load("qgs.format_version 99", saved)
 
 
 def test_sizes_are_compared_before_anything_is_allocated(saved, monkeypatch):
@@ -184,7 +183,7 @@ def test_sizes_are_compared_before_anything_is_allocated(saved, monkeypatch):
     for size in ("width=65536", "queries.count=1000000000", "head.gaussians_per_query=1000000000"):
         rewrite(saved, **{"qgs.recipe": json.dumps(resolve(recipe, [f"model.{size}"]).tree)})
         fits_not = "does not fit the model of its recipe"
-        assert not loading_fault(fits_not, saved)
+        must_not_load(fits_not, saved)
 
 
 def test_a_changed_letter_in_any_metadata_is_refused(saved):

@@ -10,12 +10,10 @@ from qgs_ellipsoid.fields import anchor_rotation
 from qgs_ellipsoid.ray_bias import EllipsoidBias, ray_tokens
 from qgs_locus import ray_bias as locus
 from qgs_locus.kernels.attention_bias import BLOCK
-from torch import Tensor
 from torch.testing import assert_close
 
 both = pytest.mark.parametrize("radii", [1, 3])
-Inputs = tuple[Tensor, ...]
-"""Centres and squared bandwidths of anchors, gamma, quaternions, origins and directions of rays."""
+# Inputs: centres and squared bandwidths of anchors, gamma, quaternions, origins and directions.
 
 
 def drawn(anchors, rays, radii=3, thinnest=1e-3):

@@ -5,7 +5,7 @@ import copy
 import pytest
 import torch
 from qgs_refine.tuning import tune, tuning_loss
-from training_runs import tiny_recipe
+from training_runs import tiny
 
 from qgs.data.evaluation import evaluation_samples
 from qgs.types import map_tensors
@@ -21,7 +21,7 @@ LATENTS = (
 
 def opened(*words):
     """The recipe, its model and the input views of a scene."""
-    recipe = tiny_recipe(*words)
+    recipe = tiny(*words)
     samples = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)
     return recipe, recipe.build_model().eval(), samples[0].inputs
 
@@ -56,7 +56,7 @@ def test_the_input_views_are_met_better_and_weights_are_bit_equal(words):
 
 
 def test_latents_are_tuned_at_their_own_rate():
-    assert tiny_recipe("tokengs", *LATENTS).evaluation.rate == 1e-2
+    assert tiny("tokengs", *LATENTS).evaluation.rate == 1e-2
 
 
 def test_every_floating_field_is_tuned_and_no_other(monkeypatch):

@@ -167,4 +167,4 @@ def check_parameters_learn(case: Case) -> None:
         if step and (draws_nothing or len(learned) == len(parameters)):
             break
     idle = [name for name in parameters if name not in learned]
-    expect(not idle, f"no gradient reaches {', '.join(idle)}: let it, or name it `unlearned`")
+    expect(not idle, f"no gradient reaches {', '.join(idle)}: use it or name it in `unlearned`")
