@@ -18,46 +18,16 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
     from contextlib import AbstractContextManager
 
-    from qgs.analysis.reconstruction import Reconstruction
-    from qgs.analysis.scenes import read_photos
-    from qgs.composer import compose
+    from qgs.checkpoint.gaussians import load_ply, save_ply
+    from qgs.checkpoint.model_file import load, save
     from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
-    from qgs.io.checkpoint import load, save
-    from qgs.io.gaussians import load_ply, save_ply
     from qgs.model import QueryGaussianModel
+    from qgs.recipe import compose
+    from qgs.reconstruction.result import Reconstruction
+    from qgs.reconstruction.scenes import read_photos
     from qgs.types import Cameras, Gaussians, Prediction, QueryState, Rendering, Views
 
 __version__ = "0.1.0"
-
-DISTRIBUTIONS = {
-    "qgs.plugins": {
-        name: f"query-gaussians-{name}"
-        for name in (
-            *("locus", "ellipsoid", "landmark", "c3g", "gslrm", "globalsplat", "mvsplat"),
-            *("tokengs2026", "dinov2", "lpips", "rooms", "datasets", "worlds"),
-        )
-    },
-    "qgs.commands": {
-        "data": "query-gaussians-datatools",
-        "bench": "query-gaussians-bench",
-        "scene": "query-gaussians-refine",
-    }
-    | dict.fromkeys(("poses", "video"), "query-gaussians-poses")
-    | dict.fromkeys(("compare", "diff", "study"), "query-gaussians-studies")
-    | dict.fromkeys(("convert", "export", "import"), "query-gaussians-published")
-    | dict.fromkeys(("view", "demo", "report", "figures"), "query-gaussians-viewer")
-    | dict.fromkeys(("new-plugin", "check-plugin"), "query-gaussians-plugintools"),
-    "qgs.poses": {"folder": "query-gaussians-poses"},
-    "qgs.videos": {"reconstruction": "query-gaussians-poses"},
-    "qgs.jobs": {"slurm": "query-gaussians-studies"},
-    "qgs.downloads": {"checkpoint": "query-gaussians-published"},
-    "qgs.pages": {"gaussians": "query-gaussians-viewer"},
-    "qgs.traces": {"queries": "query-gaussians-viewer"},
-    "qgs.refiners": dict.fromkeys(
-        ("gaussians", "reconstruction", "tuned", "tuner", "tuning_loss"), "query-gaussians-refine"
-    ),
-}
-"""This repository's other distributions, by entry point; messages name those that are missing."""
 
 # PyPI's distribution `qgs`, a climate model, installs a package of the same name: in one folder the
 # files of both would mix. Looked up by file name: importlib.metadata would double the import time.
@@ -74,14 +44,14 @@ has allocated any; with 4 KiB pages a forward pass takes some 5 % longer. Set it
 _ELSEWHERE = {
     "CONTRACT_VERSION": "qgs.contracts.plugin",
     "Plugin": "qgs.contracts.plugin",
-    "QueryGaussianModel": "qgs.analysis",
-    "compose": "qgs.analysis",
-    "Reconstruction": "qgs.analysis.reconstruction",
-    "load": "qgs.analysis",
-    "load_ply": "qgs.io.gaussians",
-    "read_photos": "qgs.analysis.scenes",
-    "save": "qgs.io.checkpoint",
-    "save_ply": "qgs.io.gaussians",
+    "QueryGaussianModel": "qgs.reconstruction",
+    "compose": "qgs.reconstruction",
+    "Reconstruction": "qgs.reconstruction.result",
+    "load": "qgs.reconstruction",
+    "load_ply": "qgs.checkpoint.gaussians",
+    "read_photos": "qgs.reconstruction.scenes",
+    "save": "qgs.checkpoint.model_file",
+    "save_ply": "qgs.checkpoint.gaussians",
 }
 """Where public names come from that are not of `qgs.types`."""
 
@@ -110,8 +80,8 @@ __all__ = [
 def refine(gaussians: Gaussians, views: Views, seconds: float, **options: Any) -> Any:
     """Optimise Gaussians (1, G) of one scene on its photos `views` (1, V) for some seconds.
 
-    Returns a `qgs_refine.RefinedScene`, whose `gaussians` are the result; `options` as in
-    `qgs_refine.refine`. Raises ExtensionError where query-gaussians-refine is not installed.
+    Returns a `qgs_photos.refine.RefinedScene`, whose `gaussians` are the result; `options` as in
+    `qgs_photos.refine.refine`. Raises ExtensionError where query-gaussians-photos is not installed.
     """
     from qgs.extensions import function
 

@@ -8,9 +8,10 @@ from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
-from qgs import DISTRIBUTIONS
-
 T = TypeVar("T")
+
+INSTALL_ALL = 'run `pip install "query-gaussians[all]"`, which has all plug-ins of this project'
+"""What to do where something of another distribution is missing."""
 
 
 class ExtensionError(ValueError):
@@ -53,8 +54,7 @@ def function(group: str, name: str) -> Any:
     for entry in installed(group):
         if entry.name == name:
             return imported(entry)
-    missing = DISTRIBUTIONS[group][name]
-    raise ExtensionError(f"this needs {missing}: run `pip install {missing}`")
+    raise ExtensionError(f"this needs a plug-in with {group} {name!r}: {INSTALL_ALL}")
 
 
 @lru_cache(maxsize=16)

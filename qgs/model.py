@@ -17,7 +17,7 @@ from qgs.contracts import (
     Renderer,
     Supervision,
 )
-from qgs.data.domain import Domain
+from qgs.domain import Domain
 from qgs.types import (
     Cameras,
     Gaussians,
@@ -44,7 +44,7 @@ class QueryGaussianModel(nn.Module):
     """
 
     reconstruct: Callable[..., Any]
-    """From photos in any world to a `Reconstruction`; `qgs.analysis` adds this method."""
+    """From photos in any world to a `Reconstruction`; `qgs.reconstruction` adds this method."""
 
     def __init__(
         self,

@@ -48,6 +48,14 @@ def name_shown(name: str, most: int = 500) -> str:
     return name if len(name) <= most else f"{name[:most]} ... ({len(name):,} characters)"
 
 
+def one_line(error: Exception) -> str:
+    """An exception in one line; its kind is left out where the message is for users."""
+    message = " ".join(str(error).split())
+    if isinstance(error, ValueError | FileNotFoundError) and message:
+        return message
+    return f"{type(error).__name__}: {message}" if message else type(error).__name__
+
+
 @lru_cache(maxsize=4096)
 def warn_once(message: str) -> None:
     """Log `message`, unless this process has logged it before."""

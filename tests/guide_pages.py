@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from guide_hooks import filled
-from qgs_plugintools import checks_for, run_check
+from qgs_dev import checks_for, run_check
 
 DOCS = Path(__file__).parents[1] / "docs"
 BLOCK = re.compile(r'^```(\w+)(?: title="([^"]*)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)

@@ -1,6 +1,6 @@
 """What a recipe that is refused is refused for."""
 
-from qgs.composer import RecipeError, resolve
+from qgs.recipe import RecipeError, resolve
 
 
 def problems_of(recipe, *arguments, by=resolve, **options):

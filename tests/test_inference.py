@@ -8,7 +8,7 @@ from odd_views import odd_views
 from torch.overrides import TorchFunctionMode
 
 import qgs
-from qgs.composer import resolve
+from qgs.recipe import resolve
 
 ROOT = Path(__file__).parents[1]
 MODELS = "tokengs locus ellipsoid gslrm c3g globalsplat mvsplat depthsplat landmark tokengs_latent"

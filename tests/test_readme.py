@@ -10,7 +10,7 @@ from guide_pages import text_of
 from qgs_viewer import contest
 
 from qgs.cli import COMMANDS, GROUP
-from qgs.composer.slots import SECTIONS, SLOTS
+from qgs.recipe.slots import SECTIONS, SLOTS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

@@ -15,11 +15,11 @@ import pytest
 import yaml
 from published.files import read_golden
 from published.models import recipe_of
-from qgs_studies.plan import composed, differences, planned
-from qgs_studies.study import read_study
+from qgs_research.studies.plan import composed, differences, planned
+from qgs_research.studies.study import read_study
 
 import qgs
-from qgs.composer import Recipe, registry, resolve
+from qgs.recipe import Recipe, registry, resolve
 
 ROOT = Path(__file__).parents[1]
 RECIPES = ROOT / "recipes"

@@ -19,7 +19,7 @@ print()
 held()
 qgs.Views, qgs.Cameras, qgs.Gaussians
 held()
-import qgs.components, qgs.renderers
+import qgs.tokengs, qgs.renderers
 held()
 for name in ("mvsplat", "depthsplat", "landmark", "gslrm", "globalsplat"):
     qgs.compose(f"tiny/{name}.yaml", device="meta")

@@ -8,12 +8,12 @@ import pytest
 import torch
 from rich.console import Console
 
-from qgs.composer import resolve
 from qgs.data.stream import SampleStream, training_batches
-from qgs.engine.distributed import StopRequest
-from qgs.engine.folder import RunFolder, read_state
-from qgs.engine.tracking import TrainingProgress
-from qgs.engine.training import Trainer, train
+from qgs.recipe import resolve
+from qgs.train.distributed import StopRequest
+from qgs.train.folder import RunFolder, read_state
+from qgs.train.tracking import TrainingProgress
+from qgs.train.training import Trainer, train
 
 RECIPES = Path(__file__).parents[1] / "recipes/tiny"
 

@@ -12,8 +12,8 @@ import torch
 from accelerate.state import AcceleratorState
 from training_runs import change_samples, run
 
-from qgs.composer import resolve
 from qgs.data.stream import SampleError
+from qgs.recipe import resolve
 
 
 def spoil(bad, nan):

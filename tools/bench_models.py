@@ -16,12 +16,12 @@ from functools import partial
 from operator import truediv
 
 import torch
-from qgs_bench.run import in_turn
-from qgs_bench.work import posed_photos
+from qgs_research.bench.run import in_turn
+from qgs_research.bench.work import posed_photos
 from torch import Tensor
 
-from qgs.composer import resolve
 from qgs.model import QueryGaussianModel
+from qgs.recipe import resolve
 from qgs.types import Prediction, Views
 
 SIZES = {

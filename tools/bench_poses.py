@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from qgs_poses.film import write_film
-from qgs_poses.making import Options, make_poses
+from qgs_photos.poses.film import write_film
+from qgs_photos.poses.making import Options, make_poses
 from rich.console import Console
 
-from qgs.data.paths import opened_path
 from qgs.data.photos import read_listing
+from qgs.paths import opened_path
 
 
 def aligned(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

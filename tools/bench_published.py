@@ -21,11 +21,11 @@ from unittest.mock import MagicMock
 import torch
 from bench_models import SIZES, compare
 from bench_models import build as published_size
-from qgs_bench.work import posed_photos
+from qgs_research.bench.work import posed_photos
 from torch import Tensor, nn
 
-from qgs.composer import resolve
 from qgs.geometry.rays import plucker_rays
+from qgs.recipe import resolve
 from qgs.types import Views
 
 ABSENT = ("tyro", "lpips", "gsplat", "gsplat.rendering", "tokengs.rendering.fused_ssim")

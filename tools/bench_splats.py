@@ -22,9 +22,9 @@ from unittest.mock import MagicMock
 
 import torch
 from bench_models import compare
-from qgs_bench.work import posed_photos
-from qgs_mvsplat.depthsplat_weights import DEPTHSPLAT
-from qgs_mvsplat.weights import MVSPLAT
+from qgs_research.bench.work import posed_photos
+from qgs_zoo.mvsplat.depthsplat_weights import DEPTHSPLAT
+from qgs_zoo.mvsplat.weights import MVSPLAT
 from torch import Tensor
 
 import qgs

@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 import torch
-from qgs_rooms.source import RoomsConfig, RoomsSource
+from qgs_worlds.rooms.source import RoomsConfig, RoomsSource
 from qgs_worlds.source import WorldsConfig, WorldsSource
 
 from qgs.contracts import Scene

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from qgs.drawing.figures import categorical, figure_style, hex_color
-from qgs.io.files import replacing, write_text
+from qgs.files import replacing, write_text
 
 DOCS = Path(__file__).parents[1] / "docs"
 UNITS = {"noise": "degrees of noise", "views": "input views"}

@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 import torch
 from fuzzing import JUNK, FaultError, Use, fuzz, other_bytes, other_leaf, refused
-from qgs_datatools.check import Options, check
-from qgs_datatools.sources import sources
+from qgs_photos.datatools.check import Options, check
+from qgs_photos.datatools.sources import sources
 
 from qgs.contracts import ViewsConfig
-from qgs.data.paths import opened_path
 from qgs.data.recognition import open_for
 from qgs.data.stream import SampleStream
+from qgs.paths import opened_path
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 formats: Any = importlib.import_module("photo_formats")

@@ -28,11 +28,11 @@ from qgs_viewer.look import Look
 from qgs_viewer.server import first_eye
 
 import qgs
-from qgs.composer import resolve
+from qgs.checkpoint.model_file import CheckpointFile
+from qgs.checkpoint.tensors import SEAL, seal
 from qgs.contracts import LearnedQueries
-from qgs.engine.initial import initialise
-from qgs.io.checkpoint import CheckpointFile
-from qgs.io.tensors import SEAL, seal
+from qgs.recipe import resolve
+from qgs.train.initial import initialise
 
 SEALED = "forged"
 RECIPE = Path(__file__).parents[1] / "recipes" / "tiny" / "locus.yaml"

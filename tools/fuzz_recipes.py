@@ -20,11 +20,11 @@ from typing import Any
 import yaml
 from fuzzing import FaultError, Use, fuzz, refused
 
-from qgs.composer import PluginError, RecipeError, resolve
-from qgs.composer.recipe import annotated, flat
-from qgs.composer.registry import load_usable_plugins
-from qgs.composer.slots import SLOTS
 from qgs.contracts import MissingExtraError
+from qgs.recipe import PluginError, RecipeError, resolve
+from qgs.recipe.recipe import annotated, flat
+from qgs.recipe.registry import load_usable_plugins
+from qgs.recipe.slots import SLOTS
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 RAW = (

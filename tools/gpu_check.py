@@ -24,13 +24,13 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from qgs_bench.run import in_turn, quartiles
-from qgs_ellipsoid.fields import anchor_rotation
-from qgs_ellipsoid.ray_bias import EllipsoidBias
-from qgs_ellipsoid.ray_bias import ray_tokens as ellipsoid_tokens
+from qgs_anchors.ellipsoid.fields import anchor_rotation
+from qgs_anchors.ellipsoid.ray_bias import EllipsoidBias
+from qgs_anchors.ellipsoid.ray_bias import ray_tokens as ellipsoid_tokens
 from qgs_locus.kernels.attention_bias import biased_attention
 from qgs_locus.ray_bias import RayBias
 from qgs_locus.ray_bias import ray_tokens as locus_tokens
+from qgs_research.bench.run import in_turn, quartiles
 from torch import Tensor
 
 ROOT = Path(__file__).parents[1]
@@ -63,10 +63,10 @@ def checks(out: Path) -> Iterator[list[Step]]:
         # Triton compiles each case of these tests for some 15 s, on one core.
         Step(
             "Triton kernels",
-            [*tests, "-n", "8", "plugins/ellipsoid/tests/test_attention_triton.py"],
+            [*tests, "-n", "8", "plugins/anchors/tests/ellipsoid/test_attention_triton.py"],
         ),
     ]
-    contract = ("tests/renderers", "tests/engine/test_training_pass.py", "-k", "gsplat")
+    contract = ("tests/renderers", "tests/train/test_training_pass.py", "-k", "gsplat")
     yield [
         Step("renderer contract on gsplat", [*tests, *contract], 1800),
         *(

@@ -22,9 +22,9 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 
 from guide_reference import reference
-from qgs_plugintools import CHECKS
+from qgs_dev import CHECKS
 
-from qgs.composer.slots import SLOTS
+from qgs.recipe.slots import SLOTS
 
 ROOT = Path(__file__).parents[1]
 PART = re.compile(r"^<!-- from the code: (.*) -->\n(.*?)^<!-- end -->$", re.MULTILINE | re.DOTALL)

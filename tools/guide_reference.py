@@ -8,12 +8,12 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from qgs.composer import slots
-from qgs.composer.decode import DecoderSettings, ModelSettings, RecipeSettings
-from qgs.composer.registry import Registry, load_registry
-from qgs.composer.slots import SLOTS
-from qgs.composer.yaml_text import dump
 from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
+from qgs.recipe import slots
+from qgs.recipe.decode import DecoderSettings, ModelSettings, RecipeSettings
+from qgs.recipe.registry import Registry, load_registry
+from qgs.recipe.slots import SLOTS
+from qgs.recipe.yaml_text import dump
 
 PLUGINS = ("locus", "ellipsoid", "landmark", "c3g", "gslrm", "globalsplat", "mvsplat")
 PLUGINS += ("tokengs2026", "dinov2", "lpips", "rooms", "worlds", "datasets")

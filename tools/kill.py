@@ -23,8 +23,8 @@ from typing import Any
 import torch
 
 import qgs
-from qgs.engine.folder import RunFolder, read_state
-from qgs.io.files import is_leftover
+from qgs.files import is_leftover
+from qgs.train.folder import RunFolder, read_state
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 QGS = str(Path(sys.executable).with_name("qgs"))
@@ -149,7 +149,7 @@ def workers_of(out: Path) -> list[int]:
             words = (folder / "cmdline").read_bytes().split(b"\0")
         except OSError:
             continue
-        if b"qgs_studies.work" in words and str(out).encode() in words:
+        if b"qgs_research.studies.work" in words and str(out).encode() in words:
             found.append(int(folder.name))
     return found
 

@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from PIL import Image
 
+from qgs.files import replacing, write_text
 from qgs.geometry.transforms import quat_to_matrix
-from qgs.io.files import replacing, write_text
 
 
 def camera_frames(tar: Path, out: Path) -> Iterator[dict[str, Any]]:

@@ -19,11 +19,11 @@ from typing import Any
 
 import torch
 import yaml
-from qgs_datasets.chunk_files import list_scenes, load_chunk
+from qgs_photos.datasets.chunk_files import list_scenes, load_chunk
 from upath import UPath
 
-from qgs.engine.results import markdown_table
-from qgs.io.files import write_text
+from qgs.evaluate.results import markdown_table
+from qgs.files import write_text
 
 STUDY = Path(__file__).parents[1] / "recipes" / "studies" / "photos" / "scene_left_out.yaml"
 INPUTS = 4

@@ -22,9 +22,6 @@ from qgs_viewer.queries import notable_queries, support_picture
 from qgs_worlds.source import WorldsConfig, WorldsSource
 
 import qgs
-from qgs.analysis.saving import orbit_path
-from qgs.composer import resolve
-from qgs.data.evaluation import evaluation_samples
 from qgs.data.samples import Sample
 from qgs.drawing.figures import INK
 from qgs.drawing.images import (
@@ -35,9 +32,12 @@ from qgs.drawing.images import (
     side_by_side,
     write_png,
 )
-from qgs.io.files import replacing
+from qgs.evaluate.plan import evaluation_samples
+from qgs.files import replacing
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
+from qgs.recipe import resolve
+from qgs.reconstruction.saving import orbit_path
 from qgs.types import Cameras, Gaussians, Prediction, Views
 
 ROOT = Path(__file__).parents[1]

@@ -20,19 +20,19 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from PIL import Image
-from qgs_studies.intervals import interval
+from qgs_research.studies.intervals import interval
 from qgs_viewer.contest import checkpoints, recipes_alike
 from real_photos import apart, chosen, judged, trained_on
 
-from qgs.analysis.scale import ScaleSearch, constant_scale
+from qgs.checkpoint.model_file import load
 from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.data.samples import Sample, make_sample
 from qgs.drawing.figures import INK, MUTED, categorical, figure_picture, figure_style, hex_color
-from qgs.io.checkpoint import load
-from qgs.io.files import replacing, write_text
+from qgs.files import replacing, write_text
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.model import QueryGaussianModel
+from qgs.reconstruction.scale import ScaleSearch, constant_scale
 
 Scores: TypeAlias = dict[str, list[list[float]]]
 """By "VARIANT/seed-N", or "nearest/": PSNR and SSIM of each window."""

@@ -23,24 +23,24 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from qgs_datasets.overlapping import apart
-from qgs_refine import refine
+from qgs_photos.datasets.overlapping import apart
+from qgs_photos.refine import refine
 from qgs_viewer.contest import checkpoints, recipes_alike
 
-from qgs.analysis.scale import ScaleSearch, at_factors, constant_scale
+from qgs.checkpoint.model_file import CheckpointFile, load
 from qgs.cli.options import parse_size
 from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.data.depth import scene_depth
-from qgs.data.domain import Domain
-from qgs.data.evaluation import held_out_windows
 from qgs.data.inputs import choose_windows
 from qgs.data.samples import Sample, make_sample, own_world
+from qgs.domain import Domain
+from qgs.evaluate.plan import held_out_windows
 from qgs.geometry.rays import pixel_directions
 from qgs.geometry.transforms import to_camera, to_pixels
-from qgs.io.checkpoint import CheckpointFile, load
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.model import QueryGaussianModel
+from qgs.reconstruction.scale import ScaleSearch, at_factors, constant_scale
 from qgs.types import Cameras, Views
 
 SYSTEMS = ("landmark", "locus", "tokengs")

@@ -16,7 +16,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-from qgs.io.files import write_text
+from qgs.files import write_text
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -28,7 +28,7 @@ OPACITY_BIAS, NEAR, FAR, BACKGROUND = -1.0, 0.025, 125.0, 0.5
 Gaussians = dict[str, Tensor]
 
 
-# ---- Blocks: qgs/components/blocks.py ----
+# ---- Blocks: qgs/tokengs/blocks.py ----
 class Weights(dict[str, Tensor]):
     """Parameters by name. One that is missing is made where it is first used."""
 
@@ -72,7 +72,7 @@ def self_attention(p: Weights, name: str, x: Tensor) -> Tensor:
     return linear(p, f"{name}.proj", read, WIDTH)
 
 
-# ---- Rays and encoder: qgs/geometry/rays.py, qgs/components/encoder.py ----
+# ---- Rays and encoder: qgs/geometry/rays.py, qgs/tokengs/encoder.py ----
 def plucker_map(c2w: Tensor, intrinsics: Tensor, height: int, width: int) -> Tensor:
     """Moment o x d and unit direction d of the ray through each pixel: (B, V, 6, H, W)."""
     v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
@@ -109,7 +109,7 @@ def encode(p: Weights, images: Tensor, c2w: Tensor, intrinsics: Tensor) -> Seque
     return norm(p, "encoder.k_norm", split(k)), split(v), rays.reshape(len(images), -1, 6)
 
 
-# ---- Decoder layer: qgs/components/decoder.py, qgs_locus/{fields,ray_bias,*_attention}.py ----
+# ---- Decoder layer: qgs/tokengs/decoder.py, qgs_locus/{fields,ray_bias,*_attention}.py ----
 def support_radius(rho: Tensor) -> Tensor:
     # At r = 0 all Gaussians of an anchor would lie on one point and their offsets get no gradient.
     return F.softplus(rho).clamp_min(1e-3)
@@ -150,7 +150,7 @@ def posact(t: Tensor) -> Tensor:
     return torch.where(t >= 0, torch.expm1(t), -torch.expm1(-t))
 
 
-# ---- Head, centres: qgs/components/{head,centers}.py, qgs_locus/decoding.py; qgs/model.py ----
+# ---- Head, centres: qgs/tokengs/{head,centers}.py, qgs_locus/decoding.py; qgs/model.py ----
 def decode(p: Weights, x: Tensor, mu: Tensor, rho: Tensor) -> Gaussians:
     """N*K Gaussians: means at offsets from the anchor that are multiples of its radius."""
     sizes = (3, 3, 3, 4, 1)
@@ -266,7 +266,7 @@ def loss(p: Weights, inputs: Sequence[Tensor], targets: Sequence[Tensor]) -> Ten
     return total
 
 
-# ---- Data and the loop: qgs/data/samples.py, qgs/engine/training.py ----
+# ---- Data and the loop: qgs/data/samples.py, qgs/train/training.py ----
 def blobs(views: int, size: int = 32) -> tuple[Tensor, Tensor, Tensor]:
     """A scene of 40 random blobs from cameras side by side; the first is the world's frame."""
     g = {"means": torch.rand(1, 40, 3) * 1.6 + torch.tensor([-0.8, -0.8, 1])}

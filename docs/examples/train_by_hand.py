@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 import qgs
-from qgs.composer import Recipe, resolve
 from qgs.contracts import Loss
 from qgs.data.samples import Batch
 from qgs.data.stream import training_batches
+from qgs.recipe import Recipe, resolve
 
 
 def loss_of(model: qgs.QueryGaussianModel, losses: dict[str, Loss], batch: Batch) -> Tensor:

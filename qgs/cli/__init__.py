@@ -8,38 +8,13 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from qgs import DISTRIBUTIONS
 from qgs.cli import evaluate, inspect, reconstruct, train
-from qgs.extensions import installed
+from qgs.extensions import INSTALL_ALL, installed
 from qgs.terminal import show_safely
+from qgs.wording import listed
 
 GROUP = "qgs.commands"
 """Group of entry points NAME = "module:app", where `app` is a `typer.Typer`."""
-
-HELP = {
-    "data": "Check and pack data sets.",
-    "view": "Turn a reconstruction in the browser, pick a query, see its anchor and what it reads.",
-    "scene": (
-        "The best scene of photos in a given time: scene.ply, scene.splat, a page, held-out scores."
-    ),
-    "poses": "Camera poses of photos or a video, by COLMAP: sparse/0 and images, checked at once.",
-    "video": "A camera path through Gaussians, as mp4 or webp.",
-    "demo": "Trained models on rooms unseen in training, or on your photos; writes report.html.",
-    "report": "Evaluate trained models and show their scenes side by side; writes report.html.",
-    "figures": "Figures of trained models for a paper, as PDF and PNG.",
-    "diff": "Which slots and options of two recipes differ, and what that costs in parameters.",
-    "compare": "Compare the results of the first RUN with those of each other, scene by scene.",
-    "study": (
-        "Train every variant with every seed, evaluate all by one protocol, and compare the scores."
-    ),
-    "bench": "Size, latency and memory of models: any number of recipes in turn.",
-    "convert": "Write Gaussians as PLY, .splat or in a plugin's format.",
-    "export": "Write a checkpoint as one new file, with --half at half the size.",
-    "import": "Turn published weights into a checkpoint; every tensor is accounted for.",
-    "new-plugin": "Write a plugin to start from: one component, its contract tests, a recipe.",
-    "check-plugin": "Test every component of a plugin against its contract.",
-}
-"""Help of the commands of this repository's other distributions; entry points hold none."""
 
 
 class CommandGroup(TyperGroup):
@@ -51,43 +26,49 @@ class CommandGroup(TyperGroup):
         return [*own, *sorted({entry.name for entry in installed(GROUP)} - {*own})]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """The command of that name; one of a distribution is not imported yet."""
+        """Our command of that name, or the imported one of a distribution; else ValueError."""
         own = super().get_command(ctx, cmd_name)
         if own is not None:
             return own
-        if offers := [entry for entry in installed(GROUP) if entry.name == cmd_name]:
-            return OfferedCommand(cmd_name, offers)
-        if missing := DISTRIBUTIONS[GROUP].get(cmd_name):
-            raise ValueError(f"`qgs {cmd_name}` is not installed: run `pip install {missing}`")
-        return None
+        offers = [entry for entry in installed(GROUP) if entry.name == cmd_name]
+        if not offers:
+            raise ValueError(
+                f"there is no command `qgs {cmd_name}` here; if a plug-in has it, {INSTALL_ALL}"
+            )
+        return offered_command(cmd_name, offers)
 
 
-class OfferedCommand(TyperCommand):
-    """A distribution's command: help from metadata, its code imported when it runs."""
+def offered_command(name: str, offers: list[EntryPoint]) -> Any:
+    """The command `name` of a distribution, or one that says why it cannot be used."""
+    releases = listed(
+        sorted({f"{entry.dist.name} {entry.dist.version}" for entry in offers if entry.dist})
+    )
+    named = f"the command `qgs {name}` of {releases}"
+    if len(offers) > 1:
+        return UnusableCommand(name, f"{named} is offered several times; uninstall all but one")
+    entry = offers[0]
+    try:
+        app = entry.load()
+        assert isinstance(app, typer.Typer), f"it is a {type(app)}, not a typer.Typer"
+    except (Exception, SystemExit) as error:  # importing runs the distribution's code
+        reason = f"cannot be used: `{entry.value}`: {type(error).__name__}: {error}"
+        return UnusableCommand(name, f"{named} {reason}; update {releases}")
+    app._add_completion = False  # what it would install completes no command of qgs
+    command = typer.main.get_command(app)
+    command.name = name
+    return command
 
-    def __init__(self, name: str, offers: list[EntryPoint]) -> None:
-        self.offers = offers
-        dists = [entry.dist for entry in offers if entry.dist]
-        self.releases = ", ".join(sorted(f"{dist.name} {dist.version}" for dist in dists))
-        own = {DISTRIBUTIONS[GROUP].get(name)} == {dist.name for dist in dists}
-        summary = "; ".join(dist.metadata["Summary"] or "Commands" for dist in dists)
-        super().__init__(name, help=HELP[name] if own else f"{summary} ({self.releases})")
 
-    def make_context(
-        self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
-    ) -> Any:
-        """The context of the real command. Raises ValueError where there is none."""
-        entry, command = self.offers[0], f"the command `qgs {self.name}` of {self.releases}"
-        if len(self.offers) > 1:
-            raise ValueError(f"{command} is offered several times; uninstall all but one")
-        try:
-            app = entry.load()
-            assert isinstance(app, typer.Typer), f"it is a {type(app)}, not a typer.Typer"
-        except (Exception, SystemExit) as error:
-            reason = f"cannot be used: `{entry.value}`: {type(error).__name__}: {error}"
-            raise ValueError(f"{command} {reason}; update {self.releases}") from error
-        app._add_completion = False  # what it would install completes no command of qgs
-        return typer.main.get_command(app).make_context(info_name, args, parent, **extra)
+class UnusableCommand(TyperCommand):
+    """A distribution's command that cannot run; its help is the reason."""
+
+    def __init__(self, name: str, reason: str) -> None:
+        self.reason = reason
+        super().__init__(name, help=reason)
+
+    def make_context(self, *given: Any, **extra: Any) -> Any:
+        """Raise ValueError with the reason."""
+        raise ValueError(self.reason)
 
 
 app = typer.Typer(

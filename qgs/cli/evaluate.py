@@ -15,10 +15,10 @@ from qgs.cli import options
 from qgs.cli.options import Checkpoint, Device, Overrides, Threads, Tune
 
 if TYPE_CHECKING:
-    from qgs.composer import Recipe
-    from qgs.data.domain import Domain
-    from qgs.engine.results import Evaluation
+    from qgs.domain import Domain
+    from qgs.evaluate.results import Evaluation
     from qgs.model import QueryGaussianModel
+    from qgs.recipe import Recipe
 
 
 def evaluate(
@@ -49,11 +49,11 @@ def evaluate(
     settings += options.tuning_settings(tune)
     console = Console()
 
-    from qgs.composer import resolve
-    from qgs.engine.distributed import choose_device
-    from qgs.engine.evaluation import SECTIONS
-    from qgs.engine.folder import RunFolder
-    from qgs.io.checkpoint import CheckpointFile
+    from qgs.checkpoint.model_file import CheckpointFile
+    from qgs.evaluate.evaluation import SECTIONS
+    from qgs.recipe import resolve
+    from qgs.train.distributed import choose_device
+    from qgs.train.folder import RunFolder
 
     options.use_threads(threads)
     free = (*SECTIONS, "model.feedback.rounds")
@@ -100,7 +100,7 @@ def evaluate_into(
     trained_on: Domain | None = None,
 ) -> Evaluation:
     """Evaluate `model` as `recipe` says, write the results into `folder` and show them."""
-    from qgs.engine.evaluation import evaluate as judge
+    from qgs.evaluate.evaluation import evaluate as judge
 
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("judging scenes", total=None)

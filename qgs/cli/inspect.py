@@ -26,7 +26,7 @@ def list_components(
     Imports every installed plugin; for a NAME such as rooms/locus-64 that of the name alone.
     """
     from qgs.cli.tables import details, overview
-    from qgs.composer.registry import load_registry, load_usable_plugins
+    from qgs.recipe.registry import load_registry, load_usable_plugins
 
     plugin, slash, _ = (name or "").partition("/")
     registry, broken = (load_registry([plugin]), []) if slash else load_usable_plugins()
@@ -42,8 +42,8 @@ def compose(recipe: RecipeFile, overrides: Overrides = None) -> None:
     The recipe goes to standard output and is valid YAML; the parameters go to standard error.
     """
     from qgs.cli.tables import parameter_table
-    from qgs.composer import resolve
-    from qgs.composer.recipe import annotated
+    from qgs.recipe import resolve
+    from qgs.recipe.recipe import annotated
 
     resolved = resolve(recipe, overrides or ())
     model = resolved.build_model("meta")
@@ -60,9 +60,9 @@ def schema(
     ] = None,
 ) -> None:
     """JSON Schema of a recipe with everything that is installed; imports every plugin."""
-    from qgs.composer.registry import load_usable_plugins
-    from qgs.composer.schema import recipe_schema
-    from qgs.io.files import write_text
+    from qgs.files import write_text
+    from qgs.recipe.registry import load_usable_plugins
+    from qgs.recipe.schema import recipe_schema
 
     text = json.dumps(recipe_schema(load_usable_plugins()[0]), indent=1) + "\n"
     typer.echo(text, nl=False) if out is None else write_text(out, text)
@@ -81,9 +81,9 @@ def recipes(
 
     A file of that name in the working directory comes first.
     """
-    from qgs.composer.errors import did_you_mean
-    from qgs.composer.files import files_of, recipe_folder
-    from qgs.io.files import refuse_existing, write_text
+    from qgs.files import refuse_existing, write_text
+    from qgs.recipe.errors import did_you_mean
+    from qgs.recipe.files import files_of, recipe_folder
 
     home = recipe_folder().resolve()
     found = {path.relative_to(home).as_posix(): path for path in sorted(home.rglob("*.yaml"))}

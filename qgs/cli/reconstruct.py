@@ -27,7 +27,7 @@ from qgs.wording import numbered
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from qgs.analysis.reconstruction import Reconstruction
+    from qgs.reconstruction.result import Reconstruction
 
 
 def reconstruct(
@@ -99,12 +99,12 @@ def reconstruct(
 
     from rich.console import Console
 
-    from qgs.analysis.scenes import chosen_scene
-    from qgs.analysis.scenes import reconstruct as run
-    from qgs.composer import resolve
-    from qgs.engine.distributed import choose_device
-    from qgs.io.checkpoint import load
-    from qgs.io.gaussians import scene_writers
+    from qgs.checkpoint.gaussians import scene_writers
+    from qgs.checkpoint.model_file import load
+    from qgs.recipe import resolve
+    from qgs.reconstruction.scenes import chosen_scene
+    from qgs.reconstruction.scenes import reconstruct as run
+    from qgs.train.distributed import choose_device
 
     if find := scene_writers().get(out.suffix.lower()):
         find()  # one that cannot be imported is an error now, not after the work
@@ -147,9 +147,9 @@ def show(result: Reconstruction, what: str, console: Console) -> None:
     """
     from rich.table import Table
 
-    from qgs.analysis.reconstruction import KINDS
     from qgs.metrics.baselines import BASELINES
     from qgs.metrics.images import Psnr
+    from qgs.reconstruction.result import KINDS
 
     count = f"{result.gaussians.count:,} Gaussians"
     table = Table(title=f"{result.sample.scene}: {f'{what}, {count}' if what else count}")

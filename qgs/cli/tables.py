@@ -8,16 +8,16 @@ from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
-from qgs.analysis.shown import parameter_counts
-from qgs.composer import Recipe
-from qgs.composer.decode import SETTINGS
-from qgs.composer.errors import did_you_mean
-from qgs.composer.registry import Registry, default_config
-from qgs.composer.schema import recipe_schema
-from qgs.composer.slots import LAYER_SLOTS, MODEL_SLOTS, SLOTS
-from qgs.composer.yaml_text import inline
-from qgs.io.models import about, card_of, checkpoint_path
+from qgs.checkpoint.models import about, card_of, checkpoint_path
 from qgs.model import QueryGaussianModel
+from qgs.recipe import Recipe
+from qgs.recipe.decode import SETTINGS
+from qgs.recipe.errors import did_you_mean
+from qgs.recipe.registry import Registry, default_config
+from qgs.recipe.schema import recipe_schema
+from qgs.recipe.slots import LAYER_SLOTS, MODEL_SLOTS, SLOTS
+from qgs.recipe.yaml_text import inline
+from qgs.reconstruction.shown import parameter_counts
 
 Schema = Mapping[str, Any]
 

@@ -16,7 +16,7 @@ from qgs.extensions import function
 from qgs.wording import listed
 
 if TYPE_CHECKING:
-    from qgs.composer import Recipe
+    from qgs.recipe import Recipe
 
 
 def train(
@@ -47,11 +47,11 @@ def train(
     \b
         torchrun --standalone --nproc-per-node=8 -m qgs train RECIPE --out RUN
     """
-    from qgs.composer import resolve
-    from qgs.engine.guard import TrainingError
-    from qgs.engine.protocol import index_of
-    from qgs.engine.training import train as train_model
-    from qgs.io.checkpoint import CheckpointFile
+    from qgs.checkpoint.model_file import CheckpointFile
+    from qgs.evaluate.protocol import index_of
+    from qgs.recipe import resolve
+    from qgs.train.guard import TrainingError
+    from qgs.train.training import train as train_model
 
     use_threads(threads)
     console = Console()
@@ -97,7 +97,7 @@ def train(
 
 def with_absolute_path(recipe: Recipe) -> Recipe:
     """`recipe` with absolute paths of data and index, so that its run can be judged anywhere."""
-    from qgs.data.paths import is_local, opened_path
+    from qgs.paths import is_local, opened_path
 
     def absolute(section: dict[str, Any], *keys: str) -> dict[str, Any]:
         given = {key: section.get(key) for key in keys}

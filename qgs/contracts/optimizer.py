@@ -44,7 +44,7 @@ class Optimizer(Component):
     optimiser to `learning_rate(...)` times the group's factor before each step. Training saves and
     restores the state of torch's optimiser.
 
-    The kinds of schedules that a recipe can write are in `qgs.components.schedules`.
+    The kinds of schedules that a recipe can write are in `qgs.tokengs.schedules`.
     """
 
     slot: ClassVar[str] = "optimizer"

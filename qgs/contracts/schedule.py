@@ -1,4 +1,4 @@
-"""Numbers that follow the steps of training; the kinds are in `qgs.components.schedules`."""
+"""Numbers that follow the steps of training; the kinds are in `qgs.tokengs.schedules`."""
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping

@@ -14,8 +14,8 @@ from torch import Tensor
 from upath import UPath
 
 from qgs.contracts import Scene
-from qgs.data.paths import LARGEST, open_file
 from qgs.machine import is_out_of_memory, with_unit
+from qgs.paths import LARGEST, open_file
 from qgs.wording import name_shown
 
 TURNED = "have an EXIF orientation, which is not followed: they are read as they are stored"

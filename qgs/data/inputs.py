@@ -9,8 +9,8 @@ import torch
 
 from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.data.depth import scene_depth
-from qgs.data.domain import Domain
 from qgs.data.samples import evenly
+from qgs.domain import Domain
 from qgs.geometry.rays import pixel_directions
 
 Window: TypeAlias = tuple[Frames, Frames]

@@ -5,9 +5,8 @@ from collections.abc import Mapping
 from upath import UPath
 
 from qgs.contracts import Component, SceneSource, SceneSourceConfig, component_of
-from qgs.data.evaluation import one_line
-from qgs.data.paths import opened_path
-from qgs.wording import warn_once
+from qgs.paths import opened_path
+from qgs.wording import one_line, warn_once
 
 
 def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from qgs.io.files import replacing
+from qgs.files import replacing
 from qgs.types import Cameras
 
 Picture = np.ndarray  # uint8 (H, W, 3)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from commands import done, run_qgs, sets
 
-from qgs.analysis import saving
+from qgs.reconstruction import saving
 
 RECIPE = Path(__file__).parents[2] / "recipes/tiny/locus.yaml"
 QUICK = sets(

@@ -14,7 +14,7 @@ from training_runs import run as train
 import qgs
 from qgs.cli.evaluate import evaluation_folder
 from qgs.cli.options import tuning_settings
-from qgs.composer import resolve
+from qgs.recipe import resolve
 
 
 def summary(folder):

@@ -6,7 +6,7 @@ import pytest
 from commands import done
 
 from qgs.cli import main
-from qgs.composer import resolve
+from qgs.recipe import resolve
 
 SMALL = """recipe: 1
 model:

@@ -6,7 +6,7 @@ import pytest
 from commands import done
 
 import qgs
-from qgs.composer import RecipeError, resolve
+from qgs.recipe import RecipeError, resolve
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 

@@ -12,7 +12,7 @@ from PIL import Image
 from plyfile import PlyData
 
 import qgs
-from qgs.analysis.scenes import frame_list
+from qgs.reconstruction.scenes import frame_list
 
 
 @pytest.fixture(scope="module")

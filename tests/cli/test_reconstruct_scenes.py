@@ -8,11 +8,11 @@ import yaml
 from commands import MODEL
 from photo_formats import centred, opened, synthetic, write_llff, write_nerfstudio
 from PIL import Image
-from qgs_datatools import packing
+from qgs_photos.datatools import packing
 from upath import UPath
 
-from qgs.analysis.scenes import chosen_scene, whole_size
-from qgs.composer import resolve
+from qgs.recipe import resolve
+from qgs.reconstruction.scenes import chosen_scene, whole_size
 
 SIZE = (16, 16)
 WHOLE = (16, 24)

@@ -9,8 +9,8 @@ import pytest
 from commands import MODEL, done, sets
 
 from qgs.cli.train import with_absolute_path
-from qgs.composer import resolve
-from qgs.engine import training as engine
+from qgs.recipe import resolve
+from qgs.train import training as engine
 
 FINETUNE = Path(__file__).parents[2] / "recipes/locus/dl3dv_4096_2views.yaml"
 ROOMS = "data={type: rooms/procedural, image_size: [16, 16]}"

@@ -12,8 +12,8 @@ from PIL import Image
 from tables import must_refuse
 
 from qgs.data.images import framing
-from qgs.data.paths import opened_path
 from qgs.data.photos import read_listing
+from qgs.paths import opened_path
 
 pycolmap = pytest.importorskip("pycolmap")
 

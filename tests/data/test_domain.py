@@ -9,14 +9,14 @@ import pytest
 import torch
 from training_runs import run, tiny
 
-from qgs.composer import resolve
+from qgs.checkpoint.model_file import CheckpointFile, save
+from qgs.checkpoint.tensors import CheckpointError
 from qgs.data import stream
-from qgs.data.domain import KEY, OF_RECIPES, SEARCHED, Domain, verdict
-from qgs.data.evaluation import evaluation_samples
 from qgs.data.stream import trained_domain
+from qgs.domain import KEY, OF_RECIPES, SEARCHED, Domain, verdict
+from qgs.evaluate.plan import evaluation_samples
 from qgs.geometry.poses import look_at
-from qgs.io.checkpoint import CheckpointFile, save
-from qgs.io.tensors import CheckpointError
+from qgs.recipe import resolve
 from qgs.types import Cameras
 
 

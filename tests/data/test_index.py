@@ -10,8 +10,8 @@ from photo_formats import opened, synthetic, write_nerfstudio
 from tables import must_refuse
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
-from qgs.data.evaluation import EvaluationPlan, IndexEntry, SceneFailure, read_index
 from qgs.data.samples import Sample
+from qgs.evaluate.plan import EvaluationPlan, IndexEntry, SceneFailure, read_index
 
 VIEWS = ViewsConfig(inputs=2, gap=(2, 5))
 

@@ -11,9 +11,9 @@ from line_scenes import Line, Lines
 from photo_formats import synthetic, write_nerfstudio
 from tables import must_refuse
 
-from qgs.composer import resolve
 from qgs.contracts import ViewsConfig
 from qgs.data.stream import SampleError, Share, scenes_fingerprint, training_batches
+from qgs.recipe import resolve
 from qgs.types import named_tensors
 
 TINY = Path(__file__).parents[2] / "recipes/tiny/tokengs.yaml"

@@ -10,8 +10,8 @@ from photo_formats import synthetic, write_nerfstudio
 from PIL import Image
 
 from qgs.data.lenses import Fisheye, RadialTangential
-from qgs.data.paths import opened_path
 from qgs.data.photos.nerfstudio import image_name, read_transforms
+from qgs.paths import opened_path
 
 
 @pytest.fixture

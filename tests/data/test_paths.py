@@ -8,8 +8,8 @@ from photo_formats import opened, scene, synthetic, uploaded, write_nerfstudio
 from upath import UPath
 
 from qgs.contracts import ViewsConfig
-from qgs.data.paths import is_local, open_file, opened_path, read_file, read_json
 from qgs.data.stream import SampleStream
+from qgs.paths import is_local, open_file, opened_path, read_file, read_json
 
 
 def test_local_paths_are_told_from_urls(tmp_path, monkeypatch):

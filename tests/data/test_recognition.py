@@ -1,14 +1,14 @@
 """Which source opens a path: those of qgs and of plugins alike."""
 
 import pytest
-from qgs_datasets import plugin as datasets
+from qgs_photos.datasets import plugin as datasets
 from tape_source import TapeSource, plugin, write_tape
 from upath import UPath
 
-from qgs.composer.registry import InstalledPlugin, Registry, builtin
 from qgs.contracts import SceneSourceConfig
 from qgs.data import PhotosSource
 from qgs.data.recognition import open_for, recognised
+from qgs.recipe.registry import InstalledPlugin, Registry, builtin
 
 HASH = "0a" * 32
 BLACK = (0.0, 0.0, 0.0)

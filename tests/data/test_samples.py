@@ -8,13 +8,13 @@ from odd_views import odd_views
 from tables import must_refuse
 from torch.testing import assert_close
 
-from qgs.composer import resolve
 from qgs.contracts import EvaluationConfig, ViewsConfig
-from qgs.data.evaluation import evaluation_samples, held_out_windows
 from qgs.data.samples import collate, draw_frames, make_sample, mirrored_views, stack_views
-from qgs.engine.protocol import protocol_of
+from qgs.evaluate.plan import evaluation_samples, held_out_windows
+from qgs.evaluate.protocol import protocol_of
 from qgs.geometry.poses import look_at, look_at_depth
 from qgs.geometry.transforms import to_camera, to_pixels
+from qgs.recipe import resolve
 from qgs.types import Cameras
 
 

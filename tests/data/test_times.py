@@ -15,10 +15,10 @@ from tables import must_refuse
 from torch.testing import assert_close
 from training_runs import run
 
-from qgs.composer import RecipeError, resolve
 from qgs.contracts import EvaluationConfig, ViewsConfig
-from qgs.data.evaluation import evaluation_samples, held_out_windows
 from qgs.data.samples import collate, draw_frames, make_sample
+from qgs.evaluate.plan import evaluation_samples, held_out_windows
+from qgs.recipe import RecipeError, resolve
 
 VIEWS = ViewsConfig(inputs=2, targets=2, gap=(2, 4))
 

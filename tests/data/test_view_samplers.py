@@ -5,12 +5,12 @@ import pytest
 from line_scenes import Line
 from training_runs import tiny
 
-from qgs.components.schedules import Linear
-from qgs.composer import RecipeError
 from qgs.contracts import ViewsConfig
 from qgs.contracts.schedule import END
 from qgs.data.samples import draw_frames
 from qgs.data.view_samplers import Span
+from qgs.recipe import RecipeError
+from qgs.tokengs.schedules import Linear
 
 VIEWS = ViewsConfig(inputs=2, targets=3, gap=(2, 5))
 

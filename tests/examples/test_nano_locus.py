@@ -7,8 +7,8 @@ import pytest
 import torch
 from odd_views import odd_views
 
-from qgs.composer import resolve
-from qgs.engine.training_pass import TrainingPass
+from qgs.recipe import resolve
+from qgs.train.training_pass import TrainingPass
 
 FILE = Path(__file__).parents[2] / "docs/examples/nano_locus.py"
 

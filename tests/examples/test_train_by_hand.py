@@ -5,8 +5,8 @@ import runpy
 from pathlib import Path
 
 import qgs
-from qgs.composer import resolve
-from qgs.composer.recipe import annotated
+from qgs.recipe import resolve
+from qgs.recipe.recipe import annotated
 
 EXAMPLE = Path(__file__).parents[2] / "docs/examples/train_by_hand.py"
 

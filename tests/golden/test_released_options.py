@@ -6,8 +6,8 @@ import yaml
 from published.files import read_golden
 from published.models import RECIPES
 
-from qgs.composer import resolve
-from qgs.composer.recipe import flat
+from qgs.recipe import resolve
+from qgs.recipe.recipe import flat
 
 FOLDER = Path(__file__).parent
 CASES = yaml.safe_load((FOLDER / "released_options.yaml").read_text())

@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 from guide_pages import DOCS, text_of
-from qgs_plugintools.new_command import rendered
+from qgs_dev.new_command import rendered
 from typer.core import TyperGroup
 
 from qgs.cli import app
@@ -74,6 +74,6 @@ def test_a_plugin_depends_on_qgs_and_on_what_qgs_depends_on():
         for project in (PROJECT, PLUGIN)
         for extras in [project["optional-dependencies"].values()]
     )
-    of_ours = {"query-gaussians", "query-gaussians-plugintools"}
+    of_ours = {"query-gaussians", "query-gaussians-dev"}
     assert theirs - of_ours == {"pydantic", "torch", "pytest"} <= ours
     assert of_ours <= theirs

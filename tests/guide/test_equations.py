@@ -8,12 +8,12 @@ import guide_reference
 import yaml
 from guide_pages import DOCS, all_pages
 
-from qgs.composer.decode import RecipeSettings
-from qgs.composer.errors import Problems
-from qgs.composer.registry import load_registry
-from qgs.composer.slots import SLOTS
-from qgs.composer.yaml_text import load_text
 from qgs.contracts import Component
+from qgs.recipe.decode import RecipeSettings
+from qgs.recipe.errors import Problems
+from qgs.recipe.registry import load_registry
+from qgs.recipe.slots import SLOTS
+from qgs.recipe.yaml_text import load_text
 
 EQUATIONS, _, REST = all_pages()["equations.md"].partition("## Where paper and release differ")
 CONSTANTS = r"""

@@ -9,12 +9,12 @@ import pytest
 import torch
 import yaml
 from guide_pages import blocks, contract_failures, text_of
-from qgs_plugintools import Case
+from qgs_dev import Case
 
-from qgs.composer import RecipeError, resolve
-from qgs.composer.registry import load_registry
-from qgs.composer.slots import SLOTS
 from qgs.contracts import ModelDims
+from qgs.recipe import RecipeError, resolve
+from qgs.recipe.registry import load_registry
+from qgs.recipe.slots import SLOTS
 from qgs.types import QueryState
 
 

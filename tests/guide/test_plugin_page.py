@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 import torch
 from guide_pages import blocks, contract_failures
+from qgs_dev import Case, cases_of
+from qgs_dev.inputs import inputs_of
+from qgs_dev.new_command import rendered
 from qgs_locus.cross_attention import RayBiasedCrossAttention
-from qgs_plugintools import Case, cases_of
-from qgs_plugintools.inputs import inputs_of
-from qgs_plugintools.new_command import rendered
 from torch.testing import assert_close
 
-from qgs.composer import RecipeError, resolve
-from qgs.composer.registry import InstalledPlugin
 from qgs.contracts import ModelDims
+from qgs.recipe import RecipeError, resolve
+from qgs.recipe.registry import InstalledPlugin
 from qgs.types import QueryState
 
 

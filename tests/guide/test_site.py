@@ -9,7 +9,7 @@ from pkgutil import resolve_name
 from posixpath import normpath
 
 import pytest
-import qgs_plugintools
+import qgs_dev
 from guide_hooks import written
 from guide_pages import DOCS, all_pages, text_of
 
@@ -75,7 +75,7 @@ def test_public_names_are_documented():
     page = PAGES["api/testing.md"]
     documented = {name.rpartition(".")[2] for name in DOCUMENTED.findall(page)}
     headings = set(re.findall(r"^## (\w+)$", page, re.MULTILINE))
-    assert documented | headings == set(qgs_plugintools.__all__)
+    assert documented | headings == set(qgs_dev.__all__)
 
 
 def test_the_site_is_built_without_a_warning(tmp_path):

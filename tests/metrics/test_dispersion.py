@@ -8,7 +8,7 @@ import torch
 from torch.testing import assert_close
 
 from qgs.contracts import MetricInput
-from qgs.engine.results import spread
+from qgs.evaluate.results import spread
 from qgs.metrics.dispersion import Dispersion, token_dispersion
 
 

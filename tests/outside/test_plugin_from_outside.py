@@ -7,8 +7,8 @@ import pytest
 pytestmark = pytest.mark.slow
 
 ORIGIN = """
-import pathlib, qgs, qgs_locus, qgs_plugintools
-print(*{pathlib.Path(x.__file__).parents[1] for x in (qgs, qgs_locus, qgs_plugintools)})
+import pathlib, qgs, qgs_locus, qgs_dev
+print(*{pathlib.Path(x.__file__).parents[1] for x in (qgs, qgs_locus, qgs_dev)})
 """
 
 

@@ -3,21 +3,21 @@
 from typing import Any
 
 import torch
-from qgs_dinov2.vit import PATCH, VitConfig
-from qgs_mvsplat.adapter import band_mask, camera_quaternions, turn_of_harmonics
-from qgs_mvsplat.depthsplat import DepthPredictor, finer_candidates, nearest_neighbours
-from qgs_mvsplat.depthsplat_encoder import DepthSplatEncoder
-from qgs_mvsplat.depthsplat_head import WorldHead
-from qgs_mvsplat.mvsplat import Sweep, expected_disparity
-from qgs_mvsplat.pixels import OnRays, PixelQueries
-from qgs_mvsplat.sweep import (
+from qgs_zoo.dinov2.vit import PATCH, VitConfig
+from qgs_zoo.mvsplat.adapter import band_mask, camera_quaternions, turn_of_harmonics
+from qgs_zoo.mvsplat.depthsplat import DepthPredictor, finer_candidates, nearest_neighbours
+from qgs_zoo.mvsplat.depthsplat_encoder import DepthSplatEncoder
+from qgs_zoo.mvsplat.depthsplat_head import WorldHead
+from qgs_zoo.mvsplat.mvsplat import Sweep, expected_disparity
+from qgs_zoo.mvsplat.pixels import OnRays, PixelQueries
+from qgs_zoo.mvsplat.sweep import (
     feature_lenses,
     inverse_depth_candidates,
     relative_poses,
     warp_grid,
 )
-from qgs_mvsplat.two_depths import Exchange
-from qgs_mvsplat.windows import shift_mask
+from qgs_zoo.mvsplat.two_depths import Exchange
+from qgs_zoo.mvsplat.windows import shift_mask
 from torch import Tensor
 
 from published.files import GoldenFile

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from qgs_published.layouts import names_of
+from qgs_research.published.layouts import names_of
 from torch import Tensor
 
 from published.depthsplat import depthsplat_tensors
@@ -13,8 +13,8 @@ from published.mvsplat import mvsplat_tensors
 from published.recording import model_tensors
 from published.splat_cases import cases_tensors
 from published.tokengs import tokengs_recipe
-from qgs.composer import resolve
 from qgs.contracts.weights import real_ratio
+from qgs.recipe import resolve
 from qgs.types import Cameras, Views
 
 RECIPES: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {

@@ -1,18 +1,18 @@
 """Every tensor of a golden file of MVSplat, computed by the components."""
 
 import torch
-from qgs_mvsplat.adapter import band_mask, camera_quaternions, turn_of_harmonics
-from qgs_mvsplat.head import RayHead
-from qgs_mvsplat.mvsplat import MVSplatEncoder, Sweep
-from qgs_mvsplat.pixels import OnRays, PixelQueries
-from qgs_mvsplat.sweep import (
+from qgs_zoo.mvsplat.adapter import band_mask, camera_quaternions, turn_of_harmonics
+from qgs_zoo.mvsplat.head import RayHead
+from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder, Sweep
+from qgs_zoo.mvsplat.pixels import OnRays, PixelQueries
+from qgs_zoo.mvsplat.sweep import (
     cyclic_neighbours,
     feature_lenses,
     inverse_depth_candidates,
     relative_poses,
     warp_grid,
 )
-from qgs_mvsplat.windows import shift_mask
+from qgs_zoo.mvsplat.windows import shift_mask
 from torch import Tensor
 
 from published.files import GoldenFile

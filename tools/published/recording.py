@@ -13,14 +13,14 @@ from qgs_locus.anchors import AnchoredQueries
 from qgs_locus.cross_attention import RayBiasedCrossAttention
 from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
 from qgs_locus.self_attention import AnchorAwareSelfAttention
-from qgs_tokengs2026.latents import LatentBottleneck
-from qgs_tokengs2026.times import time_features
+from qgs_zoo.tokengs2026.latents import LatentBottleneck
+from qgs_zoo.tokengs2026.times import time_features
 from torch import Tensor, nn
 
-from qgs.components import CrossSelfMlp
-from qgs.components.encoder import PatchViT, imagenet_normalised
 from qgs.geometry.rays import camera_rays, plucker_rays
 from qgs.model import QueryGaussianModel
+from qgs.tokengs import CrossSelfMlp
+from qgs.tokengs.encoder import PatchViT, imagenet_normalised
 from qgs.types import Gaussians, ImageMemory, QueryState, Views
 
 

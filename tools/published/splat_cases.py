@@ -1,11 +1,11 @@
 """Single Gaussians, a warp and opacities of MVSplat's and DepthSplat's files of cases."""
 
 import torch
-from qgs_mvsplat.adapter import band_mask, camera_quaternions, turn_of_harmonics
-from qgs_mvsplat.depthsplat_head import WorldHead
-from qgs_mvsplat.head import RayHead, mapped_opacity
-from qgs_mvsplat.pixels import PIXEL, OnRays, in_world, pixel_fields, ray_directions
-from qgs_mvsplat.sweep import warp_grid, warped
+from qgs_zoo.mvsplat.adapter import band_mask, camera_quaternions, turn_of_harmonics
+from qgs_zoo.mvsplat.depthsplat_head import WorldHead
+from qgs_zoo.mvsplat.head import RayHead, mapped_opacity
+from qgs_zoo.mvsplat.pixels import PIXEL, OnRays, in_world, pixel_fields, ray_directions
+from qgs_zoo.mvsplat.sweep import warp_grid, warped
 from torch import Tensor
 
 from published.files import GoldenFile

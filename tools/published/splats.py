@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from qgs_mvsplat.windows import out_of_windows
+from qgs_zoo.mvsplat.windows import out_of_windows
 from torch import Tensor, nn
 
 from published.files import GoldenFile, GoldenFileError

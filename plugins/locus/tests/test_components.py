@@ -11,7 +11,7 @@ from small_parts import made
 from torch.testing import assert_close
 
 from qgs import QueryState
-from qgs.composer import resolve
+from qgs.recipe import resolve
 
 
 def _state():

@@ -11,7 +11,7 @@ __all__ = ["cameras", "gaussians", "install", "model"]
 @pytest.fixture(autouse=True, scope="module")
 def _short_loops():
     """Files beside the point take no time: loops of reconstructions and pages, overviews."""
-    from qgs.analysis import saving
+    from qgs.reconstruction import saving
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(saving.orbit_path, "__defaults__", (2, 32))

@@ -11,11 +11,11 @@ from qgs_viewer.figures.exhibits import Exhibition, exhibit
 from qgs_viewer.sources import ModelSource
 
 import qgs
-from qgs.composer import resolve
 from qgs.contracts import Scene, ViewsConfig
-from qgs.data.domain import KEY, Domain
 from qgs.data.samples import make_sample
+from qgs.domain import KEY, Domain
 from qgs.geometry.poses import look_at
+from qgs.recipe import resolve
 from qgs.types import Cameras, Gaussians
 
 QUERIES, FRAMES, SIDE = 12, 6, 64

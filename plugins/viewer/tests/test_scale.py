@@ -12,11 +12,11 @@ from qgs_viewer.sources import Wanted, open_source
 from small import Walk, model_of
 
 import qgs
-from qgs.analysis import scale
-from qgs.composer import resolve
 from qgs.contracts import ViewsConfig
-from qgs.data.domain import Domain
+from qgs.domain import Domain
 from qgs.drawing.images import rgb_picture, write_png
+from qgs.recipe import resolve
+from qgs.reconstruction import scale
 
 MODEL, UNIT = "rooms/tokengs-64", 7.0
 

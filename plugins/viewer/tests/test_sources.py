@@ -10,8 +10,8 @@ from qgs_viewer.sources import ModelSource, Wanted, open_source
 from small import BY_DISTANCE, VIEWS, Walk, model_of
 
 import qgs
-from qgs.analysis.reconstruction import choose_sample, reconstruct_sample
-from qgs.io.gaussians import load_ply
+from qgs.checkpoint.gaussians import load_ply
+from qgs.reconstruction.result import choose_sample, reconstruct_sample
 
 
 def finish(folder, views, *settings):

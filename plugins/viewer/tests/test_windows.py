@@ -6,11 +6,11 @@ import torch
 import yaml
 from small import arc, pinhole
 
-from qgs.analysis.scenes import GivenScene
 from qgs.contracts import ViewsConfig
 from qgs.data.depth import scene_depth
-from qgs.data.domain import Domain
 from qgs.data.inputs import choose_windows, trained_ratios
+from qgs.domain import Domain
+from qgs.reconstruction.scenes import GivenScene
 from qgs.types import Views
 
 TRAINED = Domain(yaml.safe_load("{baseline: [0.1, 0.3], turn: [2.0, 20.0], depth: [1.0, 1.0]}"))

@@ -4,7 +4,7 @@ import pytest
 import torch
 import yaml
 from pydantic import ValidationError
-from qgs_rooms.source import RoomsSource
+from qgs_worlds.rooms.source import RoomsSource
 from qgs_worlds.source import WorldsSource
 
 SIZE = 16, 24

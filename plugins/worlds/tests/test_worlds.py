@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from qgs_rooms.source import RoomScene, RoomsConfig, RoomsSource
 from qgs_worlds import rows as r
 from qgs_worlds.effects import develop
 from qgs_worlds.intervals import clearances
 from qgs_worlds.places import KINDS
+from qgs_worlds.rooms.source import RoomScene, RoomsConfig, RoomsSource
 from qgs_worlds.shapes import packed
 from qgs_worlds.source import WorldsSource
 from test_intervals import met

@@ -16,10 +16,10 @@ import torch
 from upath import UPath
 
 from qgs.data.lenses import Fisheye, Lens, RadialTangential, bending
-from qgs.data.paths import open_file
 from qgs.data.photos.checks import listed_size
 from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_folder
 from qgs.geometry.transforms import quat_to_matrix
+from qgs.paths import open_file
 from qgs.wording import name_shown
 
 _PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")

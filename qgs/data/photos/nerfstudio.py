@@ -12,7 +12,6 @@ from upath import UPath
 
 from qgs.data.images import image_size
 from qgs.data.lenses import Fisheye, Intrinsics, Lens, RadialTangential, Size, bending
-from qgs.data.paths import read_json
 from qgs.data.photos.checks import FrameProblem, listed_size
 from qgs.data.photos.reader import (
     Listing,
@@ -22,6 +21,7 @@ from qgs.data.photos.reader import (
     numbers,
     with_images,
 )
+from qgs.paths import read_json
 
 Value = TypeVar("Value")
 

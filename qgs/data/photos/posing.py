@@ -5,9 +5,9 @@ from pathlib import Path
 
 from upath import UPath
 
-from qgs.data.paths import is_local
 from qgs.data.photos.reader import image_files
 from qgs.extensions import function
+from qgs.paths import is_local
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 REFUSE = "QGS_NO_POSES"

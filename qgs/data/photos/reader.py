@@ -12,7 +12,7 @@ from upath import UPath
 
 from qgs.contracts import Problem
 from qgs.data.lenses import Intrinsics, Lens, Size
-from qgs.data.paths import listing
+from qgs.paths import listing
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _COPY = re.compile(r"images(_\d+)?")

@@ -29,7 +29,6 @@ from qgs.data.images import (
     to_tensor,
 )
 from qgs.data.lenses import Mode, Size, undistorted, whole_zoom
-from qgs.data.paths import is_local, opened_path, read_file
 from qgs.data.photos import formats_of, read_listing, readers
 from qgs.data.photos.checks import refuse_fatal_problems, refuse_outside, size_problems
 from qgs.data.photos.posing import VIDEOS, posed
@@ -37,6 +36,7 @@ from qgs.data.photos.reader import PhotoFrame, existing
 from qgs.data.photos.turning import turned, turned_size, upright
 from qgs.data.samples import held_out_frames
 from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, LazySource
+from qgs.paths import is_local, opened_path, read_file
 from qgs.types import Cameras
 from qgs.wording import listed, warn_once
 

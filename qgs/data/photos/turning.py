@@ -8,9 +8,9 @@ from PIL import Image
 
 from qgs.data.images import opened_image, orientation
 from qgs.data.lenses import RadialTangential, Size
-from qgs.data.paths import is_local
 from qgs.data.photos.checks import size_problems
 from qgs.data.photos.reader import PhotoFrame
+from qgs.paths import is_local
 
 _TURNS = {3: 2, 6: 1, 8: 3}
 """EXIF orientation to quarter turns clockwise; the others mirror, which no camera does."""

@@ -8,8 +8,6 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from qgs.components import NORM_EPS, CrossAttentionCore
-from qgs.components.blocks import attention_weights, merge_heads
 from qgs.contracts import (
     AttentionWeights,
     CrossAttention,
@@ -20,6 +18,8 @@ from qgs.contracts import (
     memory_fields,
     without_effect,
 )
+from qgs.tokengs import NORM_EPS, CrossAttentionCore
+from qgs.tokengs.blocks import attention_weights, merge_heads
 from qgs.types import ImageMemory, QueryState
 from qgs_locus.fields import (
     CENTER,

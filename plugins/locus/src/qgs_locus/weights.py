@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from qgs.components.weights import BACKBONE_RENAMES, DECODER, backbone
 from qgs.contracts.weights import Rename, Shapes, WeightLayout
+from qgs.tokengs.weights import BACKBONE_RENAMES, DECODER, backbone
 
 _CROSS = DECODER + "{}.gs_cross_attn."
 _UNUSED_NORMS = ("anchor_norm.", "plucker_norm.", "q_pos_norm.", "k_pos_norm.")

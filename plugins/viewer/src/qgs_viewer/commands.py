@@ -85,8 +85,8 @@ def view(
         raise ValueError(f"--set changes `views` alone here, got {listed(foreign)}: leave it out")
     pixels = parse_size(size)
 
-    from qgs.engine.distributed import choose_device
-    from qgs.io.files import refuse_existing, write_text
+    from qgs.files import refuse_existing, write_text
+    from qgs.train.distributed import choose_device
     from qgs_viewer.sources import Wanted, open_source
 
     if html is not None:

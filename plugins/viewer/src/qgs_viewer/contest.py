@@ -15,23 +15,29 @@ import yaml
 from rich import box
 from rich.table import Table
 
-from qgs.analysis.scale import ScaleSearch, photo_settings
-from qgs.analysis.scenes import Size, holding_out, installed_sources, size_multiple, whole_size
-from qgs.composer import Recipe, resolve
-from qgs.composer.schema import summary_of
+from qgs.checkpoint.model_file import CheckpointFile
+from qgs.checkpoint.models import about, checkpoint_path
 from qgs.contracts import Scene, ViewsConfig
-from qgs.data.domain import OF_RECIPES, Domain
-from qgs.data.evaluation import evaluation_samples
 from qgs.data.inputs import Window, choose_windows
 from qgs.data.recognition import is_training_data, open_for
 from qgs.data.view_samplers import Span
-from qgs.engine.distributed import choose_device
-from qgs.engine.evaluation import evaluate
-from qgs.engine.results import Evaluation
-from qgs.engine.training import train
-from qgs.io.checkpoint import CheckpointFile
-from qgs.io.models import about, checkpoint_path
+from qgs.domain import OF_RECIPES, Domain
+from qgs.evaluate.evaluation import evaluate
+from qgs.evaluate.plan import evaluation_samples
+from qgs.evaluate.results import Evaluation
 from qgs.metrics.baselines import BASELINES
+from qgs.recipe import Recipe, resolve
+from qgs.recipe.schema import summary_of
+from qgs.reconstruction.scale import ScaleSearch, photo_settings
+from qgs.reconstruction.scenes import (
+    Size,
+    holding_out,
+    installed_sources,
+    size_multiple,
+    whole_size,
+)
+from qgs.train.distributed import choose_device
+from qgs.train.training import train
 from qgs.wording import counted, listed, short_names
 from qgs_viewer.curves import Curves, curves_of
 from qgs_viewer.report import Contender, Report

@@ -7,7 +7,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from qgs.drawing.figures import MUTED, categorical, figure_style, hex_color, running_mean
-from qgs.io.files import read_records
+from qgs.files import read_records
 from qgs.metrics.images import Psnr
 
 

@@ -154,7 +154,7 @@ def compare_trainings(
     recipes: Sequence[str], seconds: float, seed: int, target: Path, device: str
 ) -> None:
     """Train `recipes` one after the other under one budget, and write their report."""
-    from qgs.engine.guard import TrainingError
+    from qgs.train.guard import TrainingError
     from qgs_viewer import contest
     from qgs_viewer.hints import next_commands
 
@@ -205,8 +205,8 @@ def write(report: Report, target: Path, console: Console) -> None:
     """Show the table; write the report and, of every model, the first scene as a PLY."""
     import torch
 
-    from qgs.io.files import write_text
-    from qgs.io.gaussians import save_ply
+    from qgs.checkpoint.gaussians import save_ply
+    from qgs.files import write_text
     from qgs_viewer.contest import table_of
     from qgs_viewer.report import report_html, samples_of
 

@@ -5,10 +5,10 @@ from html import escape
 
 import torch
 
-from qgs.analysis.shown import heading, parameter_counts, slot_rows
 from qgs.contracts import LearnedQueries
 from qgs.drawing.images import depth_picture, depth_range, png_bytes, rgb_picture, side_by_side
 from qgs.model import QueryGaussianModel
+from qgs.reconstruction.shown import heading, parameter_counts, slot_rows
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Prediction
 

@@ -10,7 +10,7 @@ from typing import Any, get_args
 import numpy as np
 import viser
 
-from qgs.analysis.scenes import frame_list
+from qgs.reconstruction.scenes import frame_list
 from qgs_viewer.choice import Choice, Others, anchor_colors, painted
 from qgs_viewer.look import Look
 from qgs_viewer.pictures import PARTS, attention_pictures_of, sheet

@@ -11,7 +11,6 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from qgs.analysis.saving import orbit_path
 from qgs.contracts import Column, LearnedQueries
 from qgs.data.samples import Sample
 from qgs.drawing import images, page_environment
@@ -20,6 +19,7 @@ from qgs.drawing.images import Picture, depth_picture, depth_range, rgb_picture
 from qgs.geometry.poses import largest_distance
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
+from qgs.reconstruction.saving import orbit_path
 from qgs.types import Prediction
 from qgs.wording import listed, warn_once
 from qgs_viewer.curves import Curves, curves_figure

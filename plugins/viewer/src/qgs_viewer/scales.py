@@ -2,14 +2,14 @@
 
 from collections.abc import Collection
 
-from qgs.analysis.scale import FoundScale
+from qgs.reconstruction.scale import FoundScale
 from qgs.wording import counted
 
 OF_SHOWN = {
     "--scale": "--scale",
     **{n: f"{n} of qgs reconstruct" for n in ("--frames", "--inputs")},
 }
-"""Names of `qgs.data.domain.REMEDIES` for commands that choose the input views themselves."""
+"""Names of `qgs.domain.REMEDIES` for commands that choose the input views themselves."""
 
 
 def summary(found: Collection[FoundScale], option: str = "--scale FACTOR") -> str:

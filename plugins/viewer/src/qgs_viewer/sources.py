@@ -12,19 +12,19 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from qgs.analysis.reconstruction import checked_window, choose_sample
-from qgs.analysis.scale import ScaleSearch, photo_settings
-from qgs.analysis.scenes import choice, chosen_scene, frame_list, named_scene
-from qgs.composer import Recipe, resolve
+from qgs.checkpoint.gaussians import load_ply
+from qgs.checkpoint.model_file import CheckpointFile
 from qgs.contracts import Scene, ViewsConfig
-from qgs.data.domain import SEARCHED, Domain, verdict
 from qgs.data.images import framing
 from qgs.data.recognition import is_training_data
 from qgs.data.samples import make_sample, own_world, views_in
+from qgs.domain import SEARCHED, Domain, verdict
 from qgs.geometry.poses import relative_to, scaled
-from qgs.io.checkpoint import CheckpointFile
-from qgs.io.gaussians import load_ply
 from qgs.model import QueryGaussianModel
+from qgs.recipe import Recipe, resolve
+from qgs.reconstruction.result import checked_window, choose_sample
+from qgs.reconstruction.scale import ScaleSearch, photo_settings
+from qgs.reconstruction.scenes import choice, chosen_scene, frame_list, named_scene
 from qgs.types import Cameras
 from qgs.wording import listed
 from qgs_viewer.look import NEUTRAL, Look, look_inside

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from qgs_rooms.procedural import lens
 
 from qgs_worlds.intervals import clearances
 from qgs_worlds.places import Place
 from qgs_worlds.raycast import trace
+from qgs_worlds.rooms.procedural import lens
 
 CLEARANCE = 0.2  # metres from a camera to the box around any shape, at least, before scaling
 FOV = (18.0, 90.0)  # across the longer side of an image, degrees: from a long lens to a wide one

@@ -1,9 +1,9 @@
 """Images and depth maps of a world, in bands of rows."""
 
 import numpy as np
-from qgs_rooms.bands import in_bands
 
 from qgs_worlds.raycast import trace
+from qgs_worlds.rooms.bands import in_bands
 from qgs_worlds.rows import World
 from qgs_worlds.shading import paint
 

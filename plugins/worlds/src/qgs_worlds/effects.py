@@ -6,9 +6,9 @@ import math
 import numpy as np
 from numba import njit
 from PIL import Image
-from qgs_rooms.textures import INNER, OPTIONS
 
 from qgs_worlds import rows as r
+from qgs_worlds.rooms.textures import INNER, OPTIONS
 
 _SHOULDER = 0.6  # of full brightness, from where on highlights are compressed
 _STEP, _ENTRIES = 1 / 512, 2048  # of the table of the tone curve

@@ -9,11 +9,11 @@ import math
 
 import numpy as np
 from numba import njit
-from qgs_rooms.intersections import NONE, ONE, TINY, ZERO, reciprocal, slab
-from qgs_rooms.textures import OPTIONS
 
 from qgs_worlds import rows as r
 from qgs_worlds.kernels import BORROWING
+from qgs_worlds.rooms.intersections import NONE, ONE, TINY, ZERO, reciprocal, slab
+from qgs_worlds.rooms.textures import OPTIONS
 
 NEAR = np.float32(0.01)
 _HALF, _TWO = np.float32(0.5), np.float32(2)

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from qgs_rooms.textures import INNER
+from qgs_worlds.rooms.textures import INNER
 
 BORROWING: dict[str, Any] = {**INNER, "_nrt": False}
 """For functions that allocate no arrays: they count no references to those that they are given,

@@ -6,9 +6,9 @@ from random import Random
 
 import numpy as np
 from numba import njit
-from qgs_rooms.textures import OPTIONS
 
 from qgs_worlds import rows as r
+from qgs_worlds.rooms.textures import OPTIONS
 from qgs_worlds.textures import chance, noise
 from qgs_worlds.things import spread
 

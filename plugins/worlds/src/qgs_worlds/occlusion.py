@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 from numba import njit
-from qgs_rooms.intersections import ZERO
-from qgs_rooms.textures import INNER
 
 from qgs_worlds import rows as r
 from qgs_worlds.intervals import hollow, local
 from qgs_worlds.kernels import BORROWING, REDUCING
+from qgs_worlds.rooms.intersections import ZERO
+from qgs_worlds.rooms.textures import INNER
 
 
 @njit(**INNER)

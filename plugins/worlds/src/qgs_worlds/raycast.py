@@ -2,9 +2,6 @@
 
 import numpy as np
 from numba import njit
-from qgs_rooms.intersections import NONE, ZERO
-from qgs_rooms.raycast import covered, ray_basis, row_base, span
-from qgs_rooms.textures import INNER, OPTIONS
 
 from qgs_worlds import rows as r
 from qgs_worlds.intervals import (
@@ -20,6 +17,9 @@ from qgs_worlds.intervals import (
     torus,
 )
 from qgs_worlds.kernels import BORROWING
+from qgs_worlds.rooms.intersections import NONE, ZERO
+from qgs_worlds.rooms.raycast import covered, ray_basis, row_base, span
+from qgs_worlds.rooms.textures import INNER, OPTIONS
 
 SKY = -1  # part p of shape i has code 8 i + p
 

@@ -4,14 +4,14 @@ import math
 
 import numpy as np
 from numba import njit
-from qgs_rooms.intersections import ONE, ZERO
-from qgs_rooms.textures import OPTIONS
 
 from qgs_worlds import rows as r
 from qgs_worlds.intervals import height_at, hollow, local_point
 from qgs_worlds.kernels import BORROWING
 from qgs_worlds.occlusion import surroundings, visible
 from qgs_worlds.raycast import SKY
+from qgs_worlds.rooms.intersections import ONE, ZERO
+from qgs_worlds.rooms.textures import OPTIONS
 from qgs_worlds.shadows import lit
 from qgs_worlds.textures import color, noise
 

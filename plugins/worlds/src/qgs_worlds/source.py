@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 import torch
 from pydantic import Field, field_validator
-from qgs_rooms.procedural import DrawnConfig, DrawnScene, DrawnSource, ImageCache
-from qgs_rooms.source import RoomScene, RoomsConfig
 from torch import Tensor
 
 from qgs.contracts import Split
 from qgs.types import Cameras
+from qgs_worlds.rooms.procedural import DrawnConfig, DrawnScene, DrawnSource, ImageCache
+from qgs_worlds.rooms.source import RoomScene, RoomsConfig
 
 if TYPE_CHECKING:
     from qgs_worlds.drawing import Drawn

@@ -44,7 +44,7 @@ def figures(
 
     Models stand side by side; figures.md explains each figure.
     """
-    from qgs.engine.distributed import choose_device
+    from qgs.train.distributed import choose_device
     from qgs_viewer.demo import new_folder
     from qgs_viewer.figures.gallery import open_exhibition, refuse_unknown, write_all
 

@@ -3,11 +3,11 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from qgs.analysis.scale import ScaleSearch
-from qgs.data.domain import SEARCHED, Domain, verdict
-from qgs.data.evaluation import evaluation_samples
-from qgs.io.checkpoint import load
-from qgs.io.files import write_text
+from qgs.checkpoint.model_file import load
+from qgs.domain import SEARCHED, Domain, verdict
+from qgs.evaluate.plan import evaluation_samples
+from qgs.files import write_text
+from qgs.reconstruction.scale import ScaleSearch
 from qgs.wording import listed
 from qgs_viewer import contest
 from qgs_viewer.curves import curves_figure, curves_of

@@ -16,7 +16,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from qgs.drawing.figures import INK, figure_style, hex_color
 from qgs.drawing.images import Picture
-from qgs.io.files import replacing
+from qgs.files import replacing
 
 WIDTH = 7.0  # inches of a figure across a page of two columns
 DPI = 220

@@ -1,0 +1,1 @@
+"""Beyond LocusGS: anchors with an ellipsoid for a support, and Landmark."""

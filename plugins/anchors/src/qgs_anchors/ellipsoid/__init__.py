@@ -1,0 +1,26 @@
+"""Ellipsoidal anchors for qgs: LocusGS with three radii and a rotation for its support."""
+
+from qgs.contracts import Plugin
+from qgs_anchors.ellipsoid.anchors import EllipsoidQueries
+from qgs_anchors.ellipsoid.cross_attention import EllipsoidCrossAttention
+from qgs_anchors.ellipsoid.head import AxisScaledCenters, EllipsoidHead
+from qgs_anchors.ellipsoid.refinement import EllipsoidRefinement
+
+plugin = Plugin(
+    name="ellipsoid",
+    contract_version=1,
+    components=(
+        EllipsoidQueries,
+        EllipsoidCrossAttention,
+        EllipsoidRefinement,
+        EllipsoidHead,
+        AxisScaledCenters,
+    ),
+    examples=(
+        EllipsoidQueries.Config(count=8, init_radii=(0.5, 1.0, 2.0), radius_bound="offset"),
+        EllipsoidCrossAttention.Config(bandwidth="fixed"),
+        EllipsoidRefinement.Config(center=False, zero_init=True),
+        EllipsoidRefinement.Config(rotation=False, radius=False, center_step="linear"),
+        AxisScaledCenters.Config(offset="linear"),
+    ),
+)

@@ -1,0 +1,66 @@
+"""`ellipsoid/anchored`: every query has a 3D anchor, a centre with an ellipsoid around it."""
+
+from typing import Annotated
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from qgs_locus.anchors import FrustumCenters, NormalCenters
+from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, raw_radius_of
+from torch import nn
+
+from qgs.contracts import Fields, LearnedQueries, ModelDims
+from qgs.types import QueryState, SpatialSupport
+from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_axes, shape_fields
+
+Radius = Annotated[float, Field(gt=0)]
+
+
+class EllipsoidQueries(LearnedQueries):
+    """N learned vectors, centres mu, rotations and raw radii, shared by all scenes."""
+
+    name = "anchored"
+
+    class Config(RadiusOptions):
+        count: int = Field(default=4096, ge=1)
+        """N, the number of queries."""
+        std: float = Field(default=0.01, ge=0)
+        """Standard deviation of the normal distribution that the features start from."""
+        init_radii: tuple[Radius, Radius, Radius] = (1.0, 1.0, 1.0)
+        """softplus of the raw radii that every anchor starts with, along the world's axes."""
+        center_init: Annotated[NormalCenters | FrustumCenters, Field(discriminator="kind")] = (
+            NormalCenters()
+        )
+        """Distribution that the anchor centres start from."""
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.features = nn.Parameter(torch.randn(config.count, dims.width) * config.std)
+        self.center = nn.Parameter(config.center_init.sample(config.count))
+        identity = [torch.ones(config.count, 1), torch.zeros(config.count, 3)]
+        self.rotation = nn.Parameter(torch.cat(identity, -1))
+        raw = [torch.full((config.count, 1), raw_radius_of(r)) for r in config.init_radii]
+        self.raw_radii = nn.Parameter(torch.cat(raw, -1))
+
+    @classmethod
+    def fields_written(cls, config: Config) -> Fields:
+        """Centre, rotation and raw radii."""
+        return {**CENTER_FIELD, **shape_fields(config)}
+
+    def decays(self, name: str, parameter: nn.Parameter) -> bool:
+        """No weight decay on rotations, whose length has no effect."""
+        return name != "rotation" and super().decays(name, parameter)
+
+    def start(self, batch_size: int) -> QueryState:
+        """Features (B, N, D); fields centre (B, N, 3), rotation (B, N, 4), raw radii (B, N, 3)."""
+        quats = F.normalize(self.rotation, dim=-1)
+        fields = {CENTER: self.center, ROTATION: quats, RAW_RADII: self.raw_radii}
+        fields = {name: x.expand(batch_size, -1, -1) for name, x in fields.items()}
+        features = self.features.expand(batch_size, -1, -1)
+        return QueryState(features=features, fields=fields)
+
+    def support(self, state: QueryState) -> SpatialSupport:
+        """The ellipsoids."""
+        return SpatialSupport(centers=state[CENTER], axes=anchor_axes(state, self.config))

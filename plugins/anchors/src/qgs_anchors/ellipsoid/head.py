@@ -1,0 +1,71 @@
+"""`ellipsoid/gaussian_head`, `ellipsoid/axis_scaled`: Gaussians relative to their anchor."""
+
+from qgs_locus.decoding import RadiusScaledCenters
+from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, support_radius
+from torch import Tensor
+
+from qgs.contracts import Fields
+from qgs.geometry.precision import full_precision
+from qgs.geometry.transforms import quat_to_matrix
+from qgs.tokengs import GaussianHead
+from qgs.types import GaussianAttributes, QueryState
+from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_axes, shape_fields
+from qgs_anchors.ellipsoid.rotations import quat_product, unit_quats
+
+
+class EllipsoidHead(GaussianHead):
+    """`qgs/gaussian_head` whose rotations and scales are relative to the anchor.
+
+    A Gaussian is turned with its anchor. Its scale s along an axis is multiplied by the radius that
+    the ellipsoid has in that direction: s / |u / r|, with u the axis in the anchor's frame.
+    """
+
+    name = "gaussian_head"
+
+    class Config(GaussianHead.Config, RadiusOptions):
+        """As `qgs/gaussian_head`; `scale_cap` is a multiple of the anchor's radius."""
+
+    config: Config
+
+    @classmethod
+    def fields_read(cls, config: Config) -> Fields:
+        """The shape of the anchors."""
+        return shape_fields(config)
+
+    def forward(self, state: QueryState) -> GaussianAttributes:
+        """(B, N, D) and the anchors' shapes -> attributes of (B, N, K) Gaussians."""
+        local = super().forward(state)
+        quats = unit_quats(local.quats)
+        turn = unit_quats(state[ROTATION])[:, :, None].expand_as(quats)
+        scales = local.scales * radii_along(support_radius(state[RAW_RADII], self.config), quats)
+        return local.replace(quats=quat_product(turn, quats), scales=scales)
+
+
+@full_precision
+def radii_along(radii_BN3: Tensor, quats_BNK4: Tensor) -> Tensor:
+    """Radii (B, N, K, 3) of ellipsoids along the axes of their Gaussians.
+
+    quats: Gaussian to anchor. In direction u of the anchor's frame the radius is 1 / |u / r|.
+    """
+    return 1 / (quat_to_matrix(quats_BNK4) / radii_BN3[:, :, None, :, None]).norm(dim=-2)
+
+
+class AxisScaledCenters(RadiusScaledCenters):
+    """mean = mu + R diag(r) posact(offset), with the options of `locus/radius_scaled`."""
+
+    name = "axis_scaled"
+
+    @classmethod
+    def fields_read(cls, config: RadiusScaledCenters.Config) -> Fields:
+        """Centres and shapes."""
+        return {**CENTER_FIELD, **shape_fields(config)}
+
+    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
+        """(B, N, K, 3) -> (B, N, K, 3)."""
+        displaced = self.config.displacement(offsets)
+        return _placed(state[CENTER], anchor_axes(state, self.config), displaced)
+
+
+@full_precision
+def _placed(center_BN3: Tensor, axes_BN33: Tensor, offsets_BNK3: Tensor) -> Tensor:
+    return center_BN3[:, :, None] + offsets_BNK3 @ axes_BN33.mT

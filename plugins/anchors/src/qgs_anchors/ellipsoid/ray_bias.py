@@ -1,0 +1,93 @@
+"""The attention bias between ellipsoidal anchors and image rays: b = -1/2 min (x-mu)' A (x-mu).
+
+The minimum is over the points x of a ray; A = R diag(1 / sigma^2) R' is the anchor's own metric
+with bandwidths sigma_i = sigma0 r_i. In coordinates where the ellipsoid is a unit ball,
+W = diag(1 / sigma) R', the direction d of a Plücker ray (m, d) is W d, and its moment around the
+centre cof(W) (m - mu x d), as W a x W b = cof(W) (a x b). The minimum is
+|cof(W) (m - mu x d)|^2 / |W d|^2.
+"""
+
+from typing import Any, Self
+
+import torch
+from qgs_locus.kernels.attention_bias import AttentionBias, Kernel
+from qgs_locus.ray_bias import clamped, normalised_rays
+from torch import Tensor
+
+from qgs.geometry.precision import full_precision
+from qgs_anchors.ellipsoid.rotations import unit
+
+UPWARD = (0.0, 0.0, 1.0)
+"""The direction of a ray that has none."""
+
+
+@full_precision
+def ray_tokens(rays_BM6: Tensor, direction_eps: float = 1e-6) -> Tensor:
+    """Moments, directions and unit directions as rows: (B, M, 6) -> (B, 9, M).
+
+    direction_eps: least |d| that a ray is divided by; a shorter direction counts as in LocusGS's
+    bias.
+    """
+    m_BM3, d_BM3 = normalised_rays(rays_BM6, direction_eps)
+    return torch.cat([m_BM3, d_BM3, unit(d_BM3, UPWARD)], -1).mT.contiguous()
+
+
+class EllipsoidBias(AttentionBias):
+    """gamma * clamp(b, bias_min, 0).
+
+    Reads of a query mu, the rows of cof(W) and of W, gamma / 2 and gamma * bias_min; of a token m,
+    d and d / |d|.
+    """
+
+    @classmethod
+    @full_precision
+    def of(
+        cls,
+        center_BN3: Tensor,
+        rotation_BN33: Tensor,
+        sigma_sq_BN3: Tensor,
+        tokens_B9M: Tensor,
+        bias_min: float,
+        gamma: Tensor,
+    ) -> Self:
+        """rotation: anchor to world. sigma_sq: along the axes of the anchor. tokens: `ray_tokens`,
+        the same for all layers. gamma: 0-d, positive.
+        """
+        sigma_BN3 = sigma_sq_BN3.sqrt()
+        ball_BN9 = (rotation_BN33 / sigma_BN3[..., None, :]).mT.flatten(2)
+        weights_BN3 = sigma_BN3 / sigma_BN3.prod(-1, keepdim=True)
+        # A rotation is its own cofactor matrix but for rounding, which this keeps out of the ratio.
+        cofactors_BN9 = (_cofactors(rotation_BN33) * weights_BN3[..., None, :]).mT.flatten(2)
+        rest_BN2 = torch.stack([gamma / 2, gamma * bias_min]).expand(*center_BN3.shape[:2], 2)
+        parts = [center_BN3, cofactors_BN9, ball_BN9, rest_BN2]
+        return cls(torch.cat(parts, -1), tokens_B9M)
+
+    def value(self, queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
+        """(n, M), through (n, M, 3) moments and directions."""
+        center_n3, *matrices, factor_n1, lower_n1 = queries_nF.split([3, 9, 9, 1, 1], -1)
+        cofactors_n33, ball_n33 = (matrix.unflatten(-1, (3, 3)) for matrix in matrices)
+        m_M3, d_M3, unit_M3 = (tokens_GM[rows : rows + 3].mT for rows in (0, 3, 6))
+        e_nM3 = m_M3 - torch.linalg.cross(center_n3[:, None], d_M3[None], dim=-1)
+        moment_nM = _times(cofactors_n33, e_nM3).square().sum(-1)
+        along_nM = _times(ball_n33, unit_M3[None]).square().sum(-1)
+        return clamped(-factor_n1 * moment_nM / along_nM, lower_n1)
+
+    def compiled(self) -> tuple[Kernel, Kernel]:
+        from qgs_anchors.ellipsoid.kernels import ray_bias_numba as kernels  # needs numba
+
+        return kernels.write, kernels.gradients
+
+    def triton_functions(self) -> tuple[Any, Any]:
+        from qgs_anchors.ellipsoid.kernels import ray_bias_triton as functions  # needs triton
+
+        return functions.value, functions.gradients
+
+
+def _times(matrix_n33: Tensor, vectors: Tensor) -> Tensor:
+    """(n, 3, 3) and (n or 1, M, 3) -> (n, M, 3), without the rounding of a GPU's matrix units."""
+    return (matrix_n33[:, None] * vectors[..., None, :]).sum(-1)
+
+
+def _cofactors(matrix: Tensor) -> Tensor:
+    """Cofactor matrices of (..., 3, 3)."""
+    return torch.linalg.cross(matrix.roll(-1, -1), matrix.roll(-2, -1), dim=-2)

@@ -1,0 +1,37 @@
+"""Landmark for qgs: LocusGS whose anchors start at what the photos see."""
+
+from qgs.contracts import Plugin
+from qgs_anchors.landmark.footprint import ColoredHead, FootprintCenters
+from qgs_anchors.landmark.neighbours import NeighbourAttention
+from qgs_anchors.landmark.observed import ObservedQueries
+from qgs_anchors.landmark.refinement import FramedRefinement
+from qgs_anchors.landmark.rendered import RenderedFeedback
+
+plugin = Plugin(
+    name="landmark",
+    contract_version=1,
+    components=(
+        ObservedQueries,
+        NeighbourAttention,
+        FramedRefinement,
+        RenderedFeedback,
+        FootprintCenters,
+        ColoredHead,
+    ),
+    examples=(
+        ObservedQueries.Config(count=None),
+        ObservedQueries.Config(count=None, per_token=2, radius_bound="offset"),
+        ObservedQueries.Config(count=7, cells=4, sweep=6),
+        ObservedQueries.Config(count=8, tokens=3, sweep=6),
+        NeighbourAttention.Config(count=3, hidden=8),
+        ColoredHead.Config(gaussians_per_query=6),
+        FootprintCenters.Config(offset="linear"),
+        FramedRefinement.Config(center=False),
+        RenderedFeedback.Config(rounds=1, layers=1, shrink=1, cells=1),
+    ),
+    exemptions={
+        NeighbourAttention: {
+            "updates_are_explained": "beside values it reads places, relative to the query"
+        },
+    },
+)

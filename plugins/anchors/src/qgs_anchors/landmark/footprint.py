@@ -1,0 +1,116 @@
+"""`landmark/footprint`, `landmark/colored`: Gaussians that start as the photo that they see."""
+
+from collections.abc import Mapping
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from qgs_locus.decoding import RadiusScaledCenters
+from qgs_locus.fields import CENTER, RAW_RADIUS, RadiusOptions, radius_field, support_radius
+from torch import Tensor
+
+from qgs.contracts import Fields
+from qgs.geometry.precision import at_least_float32
+from qgs.tokengs import GaussianHead
+from qgs.tokengs.head import CHANNELS
+from qgs.types import GaussianAttributes, QueryState
+from qgs_anchors.landmark.fields import (
+    COLORS,
+    FOOTPRINT,
+    FOOTPRINT_FIELD,
+    FRAME,
+    FRAME_FIELD,
+    color_field,
+    in_world,
+)
+from qgs_anchors.landmark.places import cells, rows_in_square
+
+COLOR_MARGIN = 0.02
+"""Colours of photos keep this far from 0 and 1, where no step would change them."""
+
+_OF_CHANNELS = ("linear.weight", "linear.bias")
+
+
+class FootprintCenters(RadiusScaledCenters):
+    """mean = mu + r (u, v, 0) + r posact(offset), in the frame of the anchor's photo.
+
+    (u, v) is the middle of the Gaussian's cell relative to that of the footprint, in sides of a
+    square of its area. Where the radius is the side, offsets of 0 put each Gaussian onto the ray of
+    its cell.
+    """
+
+    name = "footprint"
+
+    class Config(RadiusScaledCenters.Config):
+        """See `locus/radius_scaled`."""
+
+    config: Config
+
+    @classmethod
+    def fields_read(cls, config: Config) -> Fields:
+        """Anchors, the axes of their photos, and their footprints."""
+        return {**super().fields_read(config), **FRAME_FIELD, **FOOTPRINT_FIELD}
+
+    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
+        """(B, N, K, 3) -> (B, N, K, 3)."""
+        count, (size_BN2, rows_BN1) = offsets.shape[2], state[FOOTPRINT].tensor_split([2], -1)
+        rows = rows_BN1[0, 0, 0].round().long().clamp_max(count)
+        rows = torch.where(rows > 0, rows, rows_in_square(count))
+        cell_BNK2 = size_BN2[:, :, None] * cells(count, rows, offsets)
+        steps_BNK3 = F.pad(cell_BNK2, (0, 1)) + self.config.displacement(offsets)
+        r_BN1 = support_radius(state[RAW_RADIUS], self.config)
+        steps_BNK3 = in_world(r_BN1[:, :, None] * steps_BNK3, state[FRAME])
+        return state[CENTER][:, :, None] + steps_BNK3
+
+
+class ColoredHead(GaussianHead):
+    """`qgs/gaussian_head` whose raw colours of 0 are those of the photo, whose scales are in radii.
+
+    The colour of a Gaussian is (tanh(raw + atanh(2 c - 1)) + 1) / 2, c that of its cell.
+    """
+
+    name = "colored"
+
+    class Config(GaussianHead.Config, RadiusOptions):
+        gaussians_per_query: int = Field(default=4, ge=1)
+        """K, the Gaussians of each query; `cells` of the queries is the same."""
+        scale_cap: float = Field(default=0.8, gt=0)
+        """Largest scale, in radii of the anchor; a raw scale of 0 gives 1/e of it."""
+
+    config: Config
+
+    @classmethod
+    def fields_read(cls, config: Config) -> Fields:
+        """Colours and radii."""
+        return {**color_field(config.gaussians_per_query), **radius_field(config)}
+
+    def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """A Gaussian takes the weights of the nearest of more or fewer cells.
+
+        Both are those of a square, as with `count: null`; a grid of a tile may have other places.
+        """
+        return {
+            name: self._of_cells(values) if name in _OF_CHANNELS else values
+            for name, values in learned.items()
+        }
+
+    def _of_cells(self, rows: Tensor) -> Tensor:
+        """Rows (K' * 14, ...) of other cells as those (K * 14, ...) of this head's.
+
+        Rows that do not divide into channels are of another kind of head, and stay.
+        """
+        if len(rows) % sum(CHANNELS):
+            return rows
+        rows_KC = rows.unflatten(0, (-1, sum(CHANNELS)))
+        counts = self.gaussians_per_query, len(rows_KC)
+        own, theirs = (cells(k, rows_in_square(k), rows) for k in counts)
+        return rows_KC[torch.cdist(own, theirs).argmin(-1)].flatten(0, 1)
+
+    def forward(self, state: QueryState) -> GaussianAttributes:
+        raw_BNC = at_least_float32(self.linear(self.norm(state.features)))
+        position, rgb, rest = raw_BNC.unflatten(-1, (-1, sum(CHANNELS))).tensor_split([3, 6], -1)
+        seen_BNK3 = state[COLORS].clamp(COLOR_MARGIN, 1 - COLOR_MARGIN)
+        raw_BNKC = torch.cat([position, rgb + torch.atanh(2 * seen_BNK3 - 1), rest], -1)
+        found = self.activate(raw_BNKC)
+        r_BN1 = support_radius(state[RAW_RADIUS], self.config)
+        return found.replace(scales=found.scales * r_BN1[:, :, None])

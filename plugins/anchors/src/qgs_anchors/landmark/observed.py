@@ -1,0 +1,251 @@
+"""`landmark/observed`: queries whose anchors start on rays of the photos, at a predicted depth."""
+
+import math
+from collections.abc import Iterable
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field, ValidationInfo, field_validator
+from qgs_locus.fields import (
+    CENTER,
+    CENTER_FIELD,
+    RAW_RADIUS,
+    RadiusOptions,
+    ball_support,
+    radius_field,
+    raw_radii,
+    support_radius,
+)
+from torch import Tensor, nn
+
+from qgs.contracts import (
+    Fields,
+    ModelDims,
+    OptionError,
+    Problem,
+    Queries,
+    RecipeContext,
+    memory_fields,
+    without_effect,
+)
+from qgs.geometry.constants import constant
+from qgs.geometry.precision import at_least_float32, full_precision
+from qgs.tokengs import Mlp
+from qgs.types import ImageMemory, QueryState, SpatialSupport, Views
+from qgs_anchors.landmark.fields import (
+    COLORS,
+    FOOTPRINT,
+    FOOTPRINT_FIELD,
+    FRAME,
+    FRAME_FIELD,
+    color_field,
+)
+from qgs_anchors.landmark.places import (
+    aspect_of,
+    cells,
+    colors_at,
+    patches,
+    rays_at,
+    rows_in_square,
+    rows_in_tile,
+    sampled,
+    side_of,
+    spread,
+)
+from qgs_anchors.landmark.sweep import mismatch
+
+SHARPNESS = 300.0
+"""1 / t at first: a difference of .01 in RGB makes a depth e times less likely."""
+UNSEEN = 0.2
+"""Difference in RGB at first that a depth which no other photo sees is taken to have."""
+SAMPLES = 4
+"""Samples along each side of a window."""
+
+
+class ObservedQueries(Queries):
+    """A query at a place of a photo: the token there, and an anchor on the ray through it.
+
+    The anchor's depth z, along the camera's axis, is near^w far^(1 - w), with w the sigmoid of an
+    MLP of the token. With a sweep w is the mean of D values from 0 to 1, with weights softmax(
+    MLP(token) - c / t): c is how much the photo differs from the others where it shows that depth.
+    The radius is `radius` sides of the anchor's footprint at its depth: the part of the photo that
+    is its share of all photos, a tile or a square; its side is the root of its area. A query of S
+    tokens starts with the mean of theirs + a matrix times how all but the first differ from it; w
+    is the mean of theirs.
+    """
+
+    name = "observed"
+    reads = memory_fields("features", "grid")
+
+    class Config(RadiusOptions):
+        count: int | None = Field(default=256, ge=1)
+        """N, the number of queries, spread evenly over all input photos, whatever their number and
+        size: in equal tiles if tiles with nearly square cells fit every photo, else in rows; null
+        for `per_token` at the centre of each token's patch."""
+        tokens: int = Field(default=1, ge=1)
+        """S, places of its footprint whose tokens and depths make a query of `count`."""
+        per_token: int = Field(default=1, ge=1)
+        """Queries of each token where `count` is null; each has a learned vector of its own."""
+        near: float = Field(default=0.2, gt=0)
+        """Least depth, world units."""
+        far: float = Field(default=3.0, gt=0, validate_default=True)
+        """Largest depth, world units."""
+        sweep: int | None = Field(default=None, ge=2)
+        """D, the depths at which photos are compared; null for a depth by the token alone."""
+        window: float = Field(default=1.5, gt=0)
+        """Side of the squares that are compared, in sides of a square of 1/S of the footprint."""
+        radius: float = Field(default=1.0, gt=0)
+        """Radius that an anchor starts with, in sides of its footprint at its depth."""
+        std: float = Field(default=0.3, ge=0)
+        """Standard deviation that the learned vectors start from, which are added to tokens."""
+        cells: int | None = Field(default=None, ge=1)
+        """K, parts of its footprint whose colours a query knows, for the Gaussians of
+        `landmark/colored`; null where nothing reads them. 8 are rows of 2, 3 and 3 where `count` is
+        null, and 2 rows of 4 where it is a number, whatever the number of photos."""
+
+        @field_validator("far")
+        @classmethod
+        def _far_is_behind_near(cls, far: float, info: ValidationInfo) -> float:
+            near = info.data.get("near")
+            if near is not None and far <= near:
+                raise OptionError(
+                    f"far must be more than near, {near:g}, got {far:g}",
+                    "give the depths at which the scene begins and ends",
+                )
+            return far
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.slots = nn.Parameter(torch.randn(config.per_token, dims.width) * config.std)
+        self.depth_mlp = Mlp(dims.width, dims.width, config.sweep or 1)
+        nn.init.zeros_(self.depth_mlp.fc2.weight)
+        nn.init.zeros_(self.depth_mlp.fc2.bias)
+        if config.sweep is not None:
+            self.sharpness = nn.Parameter(torch.tensor(math.log(SHARPNESS)))
+            self.unseen = nn.Parameter(torch.tensor(UNSEEN))
+            self.match_proj = nn.Linear(config.sweep, dims.width)
+        if config.tokens > 1:
+            self.apart_proj = nn.Linear((config.tokens - 1) * dims.width, dims.width, bias=False)
+
+    @classmethod
+    def fields_written(cls, config: Config) -> Fields:
+        """Centre, raw radius, the axes of the photo, footprint, and colours."""
+        colors = color_field(config.cells) if config.cells else {}
+        anchor = {**CENTER_FIELD, **radius_field(config), **FRAME_FIELD}
+        return {**anchor, **FOOTPRINT_FIELD, **colors}
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """`per_token` where points are chosen without regard to tokens, `tokens` where by them."""
+        if config.count is None:
+            yield from without_effect(config, ("tokens",), "`count` is null")
+        else:
+            yield from without_effect(config, ("per_token",), "`count` is a number")
+
+    def forward(self, memory: ImageMemory, views: Views) -> QueryState:
+        """Features (B, N, D), fields of anchors (B, N, ...), those of footprints with `cells`."""
+        assert memory.grid is not None
+        config, device, size = self.config, memory.features.device, views.cameras.size
+        if config.count is None:
+            view_N, place_N2, share_2 = patches(memory.grid, config.per_token, size, device)
+            x_BND = (memory.features[:, :, None] + self.slots).flatten(1, 2)
+            x_BND, nearness_BN1 = self._swept(x_BND, views, view_N, place_N2)
+        else:
+            photos, aspect = memory.grid[0], aspect_of(config.cells or 1)
+            view_N, place_N2, share_2 = spread(config.count, photos, size, aspect, device)
+            middle_S2 = cells(config.tokens, rows_in_tile(config.tokens), place_N2)
+            view_X, place_X2 = _divided(view_N, place_N2, share_2 * middle_S2)
+            place_BX2 = place_X2.expand(len(memory.features), -1, -1)
+            x_BXD = sampled(memory.features, memory.grid, view_X, place_BX2) + self.slots
+            x_BND, nearness_BN1 = self._joined(*self._swept(x_BXD, views, view_X, place_X2))
+        return QueryState(x_BND, self._fields(nearness_BN1, views, view_N, place_N2, share_2))
+
+    def _swept(
+        self, x_BND: Tensor, views: Views, view_N: Tensor, place_N2: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Features, with what a sweep shows in them, and w, how near places are (B, N, 1)."""
+        if self.config.sweep is None:
+            return x_BND, at_least_float32(self.depth_mlp(x_BND)).sigmoid()
+        match_BND = self._match(views, view_N, place_N2.expand(len(x_BND), -1, -1))
+        x_BND = x_BND + self.match_proj(match_BND.softmax(-1))
+        share_BND = (at_least_float32(self.depth_mlp(x_BND)) + match_BND).softmax(-1)
+        # Not as a matrix product, which autocast makes in half precision.
+        nearness_D = _nearness(self.config.sweep, x_BND.device)
+        return x_BND, (share_BND * nearness_D).sum(-1, keepdim=True)
+
+    def _joined(self, x_BXD: Tensor, nearness_BX1: Tensor) -> tuple[Tensor, Tensor]:
+        """Features and nearness of queries, from those of their tokens."""
+        tokens = self.config.tokens
+        if tokens == 1:
+            return x_BXD, nearness_BX1
+        x_BNSD, nearness_BNS1 = (x.unflatten(1, (-1, tokens)) for x in (x_BXD, nearness_BX1))
+        mean_BND = x_BNSD.mean(2)
+        apart_BNSD = x_BNSD[:, :, 1:] - mean_BND[:, :, None]  # the first is minus the others
+        return mean_BND + self.apart_proj(apart_BNSD.flatten(2)), nearness_BNS1.mean(2)
+
+    def _match(self, views: Views, view_N: Tensor, place_BN2: Tensor) -> Tensor:
+        """Logits (B, N, D) of depths, by how well photos agree there."""
+        assert self.config.sweep is not None
+        depth_D = self._depth(_nearness(self.config.sweep, place_BN2.device))
+        side = self.config.window * side_of(len(view_N), views.cameras.shape[1], views.cameras.size)
+        error_BND, seen_BND = mismatch(views, view_N, place_BN2, depth_D, side, SAMPLES)
+        return -self.sharpness.exp() * torch.where(seen_BND, error_BND, self.unseen)
+
+    def _depth(self, nearness: Tensor) -> Tensor:
+        """World units."""
+        return self.config.far * (self.config.near / self.config.far) ** nearness
+
+    @full_precision
+    def _fields(
+        self,
+        nearness_BN1: Tensor,
+        views: Views,
+        view_N: Tensor,
+        place_N2: Tensor,
+        share_2: Tensor,
+    ) -> dict[str, Tensor]:
+        """share_2: width and height of footprints, as shares of the photo's."""
+        config, cameras, z_BN1 = self.config, views.cameras, self._depth(nearness_BN1)
+        place_BN2 = place_N2.expand(len(z_BN1), -1, -1)
+        origin_BN3, direction_BN3 = rays_at(cameras, view_N, place_BN2)
+        (height, width), (_, photos) = cameras.size, cameras.shape
+        side = side_of(len(view_N), photos, cameras.size)
+        focal_BN1 = cameras.intrinsics[:, view_N, :2].mean(-1, keepdim=True)
+        radii_BN1 = config.radius * side * z_BN1 / focal_BN1
+        rows = 0 if config.cells is None else self._rows_of_cells(config.cells)
+        shape_3 = F.pad(
+            share_2.to(z_BN1) * constant([width, height], z_BN1) / side, (0, 1), value=rows
+        )
+        anchors = {
+            CENTER: origin_BN3 + z_BN1 * direction_BN3,
+            RAW_RADIUS: raw_radii(radii_BN1, config),
+            FRAME: cameras.c2w[:, view_N, :3, :3].mT,
+            FOOTPRINT: shape_3.expand(*z_BN1.shape[:2], -1),
+        }
+        if config.cells is None:
+            return anchors
+        cell_K2 = share_2 * cells(config.cells, rows, share_2)
+        view_X, place_X2 = _divided(view_N, place_N2, cell_K2)
+        place_BX2 = place_X2.expand(len(z_BN1), -1, -1)
+        colors = colors_at(views.images, side / math.sqrt(config.cells), view_X, place_BX2)
+        return anchors | {COLORS: colors.unflatten(1, (-1, config.cells))}
+
+    def _rows_of_cells(self, count: int) -> int:
+        return rows_in_square(count) if self.config.count is None else rows_in_tile(count)
+
+    def support(self, state: QueryState) -> SpatialSupport:
+        """Balls of the support radius."""
+        return ball_support(state[CENTER], support_radius(state[RAW_RADIUS], self.config))
+
+
+def _divided(view_N: Tensor, place_N2: Tensor, step_K2: Tensor) -> tuple[Tensor, Tensor]:
+    """Views (N * K,) of, and places (N * K, 2) at, K steps from each place."""
+    place_X2 = (place_N2[:, None] + step_K2).flatten(0, 1)
+    return view_N.repeat_interleave(len(step_K2)), place_X2
+
+
+def _nearness(count: int, device: torch.device) -> Tensor:
+    """From 0, which is `far`, to 1, which is `near`: (count,)."""
+    return torch.linspace(0, 1, count, device=device)

@@ -1,0 +1,106 @@
+"""`landmark/rendered`: rounds in which tokens know how the rendering of their photo is wrong."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.contracts import (
+    ComponentConfig,
+    Feedback,
+    ModelDims,
+    Problem,
+    RecipeContext,
+    memory_fields,
+)
+from qgs.tokengs.blocks import split_heads
+from qgs.types import Cameras, ImageMemory, QueryState, Rendering, Views
+
+CHANNELS = 7
+"""Photo minus rendering and rendered RGB, alpha."""
+ERROR_GAIN = 4.0
+"""Errors are some tenths; the other channels reach 1."""
+
+
+class RenderedFeedback(Feedback):
+    """Keys and values + MLP(patch of the error), features + a learned vector of the query.
+
+    The error maps of a photo are averaged into `cells` x `cells` for each token; a 3 x 3
+    convolution over tokens, GELU and a linear layer make keys and values of them, which are added
+    to those of the encoder. Rays of the tokens stay, so that attention with a bias by rays finds
+    the errors where the Gaussians of an anchor fall.
+    """
+
+    name = "rendered"
+    reads = memory_fields("keys", "values", "grid")
+
+    class Config(ComponentConfig):
+        rounds: int = Field(default=2, ge=1, le=16)
+        """Rounds of an evaluation, and the most of a training step."""
+        least: int = Field(default=1, ge=1)
+        """Fewest rounds of a training step, which draws their number up to `rounds`."""
+        layers: int = Field(default=2, ge=1)
+        """How many of the last decoder layers a round repeats."""
+        shrink: int = Field(default=2, ge=1)
+        """The input photos are rendered at 1/`shrink` of their size."""
+        cells: int = Field(default=2, ge=1)
+        """Means of the error that a token gets along each side of its patch."""
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.rounds, self.layers = config.rounds, config.layers
+        self.marker = nn.Parameter(torch.zeros(dims.width))
+        self.embedding = nn.Conv2d(CHANNELS * config.cells**2, dims.width, 3, padding=1)
+        self.kv_proj = nn.Linear(dims.width, 2 * dims.width)
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """More layers than there are, fewer rounds than the fewest, a size that does not divide."""
+        depth, size = context.dims.depth, context.image_size
+        if config.layers > depth:
+            reason = f"a round repeats {config.layers} layers of a decoder of depth {depth}"
+            yield Problem("layers", reason, f"write at most {depth}, or raise model.decoder.depth")
+        if config.least > config.rounds:
+            reason = f"training draws from {config.least} to {config.rounds} rounds"
+            yield Problem("least", reason, f"write at most {config.rounds}, or raise `rounds`")
+        if size and any(side % config.shrink for side in size):
+            reason = f"images of {size[0]} x {size[1]} (H x W) cannot be {config.shrink} times less"
+            yield Problem("shrink", reason, "choose a number that divides both sides")
+
+    def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """As learned; without any, from a model without rounds, errors change nothing at first."""
+        if learned:
+            return dict(learned)
+        own = self.state_dict()
+        return own | {k: torch.zeros_like(own[k]) for k in own if k.startswith("kv_proj.")}
+
+    def drawn(self) -> int:
+        """Uniformly from `least` to `rounds`."""
+        return int(torch.randint(self.config.least, self.config.rounds + 1, ()))
+
+    def compared(self, views: Views) -> Views:
+        """Photos of 1/`shrink` of the size, each pixel the mean of those that it covers."""
+        by, cameras = self.config.shrink, views.cameras
+        size = (cameras.size[0] // by, cameras.size[1] // by)
+        images = F.avg_pool2d(views.images.flatten(0, 1), by).unflatten(0, views.images.shape[:2])
+        return Views(images, Cameras(cameras.c2w, cameras.intrinsics / by, size))
+
+    def forward(
+        self, state: QueryState, memory: ImageMemory, rendering: Rendering, photos: Views
+    ) -> tuple[QueryState, ImageMemory]:
+        assert memory.grid is not None
+        _, rows, columns = memory.grid
+        error = ERROR_GAIN * (photos.images - rendering.rgb)
+        maps_BVCHW = torch.cat([error, rendering.rgb, rendering.alpha], 2)
+        cells, keys = self.config.cells, memory["keys"]
+        fine = F.adaptive_avg_pool2d(maps_BVCHW.flatten(0, 1), (rows * cells, columns * cells))
+        x_XDhw = F.gelu(self.embedding(F.pixel_unshuffle(fine, cells)))
+        x_BMD = x_XDhw.flatten(2).mT.unflatten(0, photos.images.shape[:2]).flatten(1, 2)
+        k_BhMd, v_BhMd = (split_heads(x, keys.shape[1]) for x in self.kv_proj(x_BMD).chunk(2, -1))
+        memory = replace(memory, keys=keys + k_BhMd, values=memory["values"] + v_BhMd)
+        return state.replace(features=state.features + self.marker), memory

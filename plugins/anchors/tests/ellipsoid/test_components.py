@@ -1,0 +1,152 @@
+"""Anchors, attention, refinement, decoding and head, each on its own, by formulas."""
+
+import math
+
+import torch
+import torch.nn.functional as F
+import yaml
+from qgs_anchors.ellipsoid.anchors import EllipsoidQueries
+from qgs_anchors.ellipsoid.cross_attention import EllipsoidCrossAttention
+from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_rotation
+from qgs_anchors.ellipsoid.head import AxisScaledCenters, EllipsoidHead, radii_along
+from qgs_anchors.ellipsoid.ray_bias import EllipsoidBias, ray_tokens
+from qgs_anchors.ellipsoid.refinement import EllipsoidRefinement
+from qgs_anchors.ellipsoid.rotations import turned
+from qgs_locus.anchors import FrustumCenters
+from qgs_locus.fields import CENTER
+from refusals import wrong_refusals
+from small_parts import made, shaken
+from torch.testing import assert_close
+
+from qgs.geometry.transforms import quat_to_matrix
+from qgs.tokengs import GaussianHead, posact
+from qgs.types import ImageMemory, QueryState
+
+HALF = math.sqrt(0.5)
+OFFSET = {"radius_bound": "offset", "radius_min": 0.05}
+
+
+def _state():
+    """Turned anchors of unequal radii in front of the cameras."""
+    fields = {
+        CENTER: torch.randn(2, 6, 3) * 0.4 + torch.tensor([0.0, 0.0, 1.5]),
+        ROTATION: F.normalize(torch.randn(2, 6, 4), dim=-1),
+        RAW_RADII: torch.randn(2, 6, 3) - 1,
+    }
+    return QueryState(torch.randn(2, 6, 16), fields)
+
+
+def test_a_turn_is_about_an_axis_of_the_world_and_never_half_a_turn():
+    about_z = torch.tensor([HALF, 0.0, 0.0, HALF]).double()
+    for length in (0.0, 0.01, 1.0, 1e4):
+        angle = 2 * math.atan(length / 2)
+        quat = turned(about_z, torch.tensor([length, 0.0, 0.0]).double())
+        assert_close(quat.norm().item(), 1.0)
+        c, s = math.cos(angle), math.sin(angle)
+        about_x = torch.tensor([[1.0, 0, 0], [0, c, -s], [0, s, c]]).double()
+        assert_close(quat_to_matrix(quat), about_x @ quat_to_matrix(about_z))
+
+
+def test_queries_give_what_they_learned_in_the_form_that_they_promise():
+    options = {**OFFSET, "count": 500, "std": 2.0, "init_radii": (0.1, 0.2, 0.4)}
+    queries = made(EllipsoidQueries, **options, center_init=FrustumCenters(kind="frustum"))
+    assert_close(queries.features.std().item(), 2.0, rtol=0.1, atol=0)
+    assert (queries.center[:, 2] >= 0.3).all()
+    at_first = queries.support(queries.start(2))
+    expected = torch.diag(torch.tensor([0.15, 0.25, 0.45]))
+    assert_close(at_first.axes, expected.expand(2, 500, 3, 3))
+    decaying = [name for name, p in queries.named_parameters() if queries.decays(name, p)]
+    assert decaying == ["features", "center", "raw_radii"]
+    state = shaken(queries, 1.0).start(2)
+    assert_close(state[ROTATION][1], F.normalize(queries.rotation, dim=-1))
+    assert torch.equal(state[CENTER][1], queries.center)
+    axes = quat_to_matrix(state[ROTATION]) * (F.softplus(state[RAW_RADII]) + 0.05)[:, :, None]
+    assert_close(queries.support(state).axes, axes)
+
+
+def test_attention_and_pictures_speak_of_one_ellipsoid():
+    state, rays = _state(), torch.cat([0.5 * torch.randn(2, 24, 3), torch.randn(2, 24, 3)], -1)
+    memory = ImageMemory(torch.randn(2, 24, 16), patch_rays=rays)
+    chosen = {"sigma0": 0.3, "sigma_sq_min": 0.05, "bias_min": -7.0, "gamma_init": 0.4}
+    bias = made(EllipsoidCrossAttention, **chosen, **OFFSET).bias(state, memory).dense()
+    axes = made(EllipsoidQueries, **OFFSET).support(state).axes
+    radii = axes.norm(dim=-2)
+    ellipsoids = state[CENTER], axes / radii[..., None, :], (0.3 * radii).square().clamp(min=0.05)
+    gamma = F.softplus(torch.tensor(0.4))
+    expected = EllipsoidBias.of(*ellipsoids, ray_tokens(rays), -7.0, gamma).dense()
+    assert_close(bias, expected, rtol=1e-4, atol=1e-4)
+    assert bias.min() == -7.0 * gamma
+    assert bias.max() > -1.0
+
+
+def test_the_step_of_a_centre_is_linear_on_demand():
+    refinement, state = made(EllipsoidRefinement, center_step="linear"), _state()
+    expected = state[CENTER] + refinement.center_mlp(state.features)
+    assert_close(refinement(state)[CENTER], expected)
+
+
+def test_a_refinement_that_starts_at_zero_can_learn():
+    refinement, state = made(EllipsoidRefinement, zero_init=True), _state()
+    refined = refinement(state)
+    assert_close(refined.fields, state.fields)
+    sum((field * torch.randn_like(field)).sum() for field in refined.fields.values()).backward()
+    for mlp in (refinement.center_mlp, refinement.rotation_mlp, refinement.radius_mlp):
+        assert mlp.fc2.weight.grad.any()
+
+
+def test_centers_follow_their_formula():
+    state, offsets = _state(), torch.randn(2, 6, 3, 3)
+    local = F.softplus(state[RAW_RADII])[:, :, None] * posact(offsets)
+    steps = torch.einsum("bnij,bnkj->bnki", quat_to_matrix(state[ROTATION]), local)
+    means = made(AxisScaledCenters)(offsets, state)
+    assert_close(means, state[CENTER][:, :, None] + steps)
+
+
+def test_a_radius_along_a_direction_reaches_the_surface():
+    radii, quats = 0.1 + torch.rand(2, 5, 3), F.normalize(torch.randn(2, 5, 4, 4), dim=-1)
+    surface = quat_to_matrix(quats) * radii_along(radii, quats)[..., None, :]
+    in_ball = surface / radii[:, :, None, :, None]
+    assert_close(in_ball.norm(dim=-2), torch.ones(2, 5, 4, 3))
+
+
+def test_gaussians_turn_and_grow_with_their_anchor():
+    head = made(EllipsoidHead, gaussians_per_query=3, init_std=0.5)
+    plain = made(GaussianHead, gaussians_per_query=3)
+    plain.load_state_dict(head.state_dict())
+    state = _state()
+    local, placed = plain(state), head(state)
+    expected = anchor_rotation(state[ROTATION])[:, :, None] @ quat_to_matrix(local.quats)
+    assert_close(quat_to_matrix(placed.quats), expected, atol=1e-5, rtol=0)
+    radii = F.softplus(state[RAW_RADII])
+    assert_close(placed.scales, local.scales * radii_along(radii, local.quats))
+    for name in ("offsets", "opacities", "colors"):
+        assert torch.equal(getattr(placed, name), getattr(local, name))
+
+
+def test_quaternions_of_no_use_become_the_identity():
+    head, state = made(EllipsoidHead, gaussians_per_query=2), _state()
+    with torch.no_grad():
+        head.linear.weight.zero_()
+        head.linear.bias.view(2, 14)[1, 9:13] = 1e-6
+    out = head(state)
+    assert_close(out.quats[..., 0, :], state[ROTATION])
+    assert_close(out.quats.norm(dim=-1), torch.ones(2, 6, 2))
+
+
+RECIPE = yaml.safe_load("""
+recipe: 1
+plugins: [locus, ellipsoid]
+model: {queries: {type: ellipsoid/anchored}}
+""")
+REFUSED = """
+model.decoder.refinement={type: ellipsoid/refine, center: false, rotation: false, radius: false}
+    model.decoder.refinement: nothing is
+model.decoder.cross_attention={type: ellipsoid/ray_biased, bandwidth: fixed, radius_min: 0.5}
+    model.decoder.cross_attention.radius_min: no effect
+model.centers={type: ellipsoid/axis_scaled, radius_bound: offset}
+    model.centers: softplus
+"""
+
+
+def test_options_without_effect_or_sense_are_refused():
+    assert wrong_refusals(RECIPE, REFUSED) == []

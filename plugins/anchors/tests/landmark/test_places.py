@@ -1,0 +1,126 @@
+"""Places in photos against loops over pixels, and against torch's own sampling."""
+
+import math
+from itertools import product
+
+import pytest
+import torch
+import torch.nn.functional as F
+import yaml
+from odd_views import odd_views
+from qgs_anchors.landmark.places import (
+    aspect_of,
+    cells,
+    colors_at,
+    patch_centres,
+    rays_at,
+    rows_in_square,
+    rows_in_tile,
+    sampled,
+    spread,
+)
+from torch.testing import assert_close
+
+from qgs.geometry.rays import camera_rays
+
+GRID = (3, 4, 6)
+"""Views, rows, columns."""
+SIZE = (16, 24)
+CPU = torch.device("cpu")
+
+
+def test_bilinear_features_are_those_of_torch():
+    maps, place = torch.randn(2, 72, 5).double(), torch.rand(2, 50, 2).double()
+    view = torch.randint(3, (50,))
+    images = maps.unflatten(1, GRID)[:, view].movedim(-1, 2).flatten(0, 1)
+    at = 2 * place.view(100, 1, 1, 2) - 1
+    expected = F.grid_sample(images, at, padding_mode="border", align_corners=False)
+    assert_close(sampled(maps, GRID, view, place), expected.view(2, 50, 5))
+
+
+def test_rays_are_those_of_pixels():
+    cameras = odd_views(3, *SIZE).cameras.to(torch.float64)
+    view_N = torch.arange(3).repeat_interleave(math.prod(SIZE))
+    place = patch_centres(*SIZE, CPU).double().repeat(3, 1).expand(2, -1, -1)
+    origin, direction = rays_at(cameras, view_N, place)
+    origins, directions = (x.flatten(1, 3) for x in camera_rays(cameras))
+    assert_close(origin, origins)
+    depth = (direction * cameras.c2w[:, view_N, :3, 2]).sum(-1)
+    found = F.normalize(direction, dim=-1), depth
+    expected = directions, torch.ones_like(depth)
+    assert_close(found, expected, rtol=0, atol=1e-6)  # rotations are float32
+
+
+def test_points_are_spread_evenly_over_all_photos():
+    size = torch.tensor([64.0, 48.0])
+    pixels = patch_centres(48, 64, CPU) * size
+    for views, count in product((1, 2, 5), (1, 256, 300)):
+        view_N, place, _ = spread(count, views, (48, 64), 1.0, CPU)
+        numbers = view_N.bincount(minlength=views)
+        assert numbers.max() - numbers.min() <= 1
+        for view in range(views) if count > 1 else ():
+            own = place[view_N == view] * size
+            area = 48 * 64 / len(own)
+            nearest, owner = torch.cdist(pixels, own).min(1)
+            assert nearest.max() < 0.9 * area**0.5  # half a diagonal of a part is .71 of its side
+            held = owner.bincount(minlength=len(own)) / area
+            assert 0.5 < held.min() <= held.max() < 1.6
+
+
+TILES = """
+- [256, 2, 64, 64, 0.5, 16, 8]
+- [256, 8, 64, 64, 0.5, 8, 4]
+- [512, 2, 64, 64, 1, 16, 16]
+- [64, 1, 128, 64, 0.5, 16, 4]
+- [64, 1, 64, 128, 0.5, 8, 8]
+- [48, 1, 24, 32, 1, 6, 8]
+- [24, 2, 64, 64, 1, 4, 3]
+- [128, 2, 128, 64, 1]
+- [24, 2, 64, 128, 1]
+- [512, 4, 64, 64, 1]
+- [26, 2, 64, 64, 1]
+- [255, 2, 64, 64, 1]
+- [2, 5, 64, 64, 1]
+"""
+"""Points, photos, their height and width, aspect; rows and columns, but not of points in rows."""
+
+
+def test_points_are_in_tiles_where_these_divide_the_photos():
+    for count, views, height, width, aspect, *grid in yaml.safe_load(TILES):
+        view, place, share = spread(count, views, (height, width), aspect, CPU)
+        wide, high = (share * torch.tensor([width, height])).tolist()
+        assert wide * high * count == pytest.approx(views * height * width, rel=1e-5)
+        if grid:
+            assert [height / high, width / wide] == pytest.approx(grid, rel=1e-5)
+            for of in range(views):
+                assert_close(place[view == of], patch_centres(*grid, CPU))
+        else:
+            assert wide == pytest.approx(high, rel=1e-5)
+
+
+def test_cells_of_tiles_are_squares():
+    counts = 1, 2, 3, 4, 6, 8
+    assert [*map(rows_in_square, counts)] == [1, 1, 2, 2, 2, 3]
+    assert [*map(rows_in_tile, counts)] == [1, 1, 2, 2, 2, 2]
+    assert [*map(aspect_of, counts)] == pytest.approx([1, 0.5, 1, 1, 2 / 3, 0.5])
+
+
+def test_cells_divide_a_square():
+    rows = torch.tensor([[-3, -3], [3, -3], [-4, 3], [0, 3], [4, 3]]) / 12
+    assert_close(cells(5, 2, rows), rows)
+    assert_close(cells(9, 3, rows), torch.cartesian_prod(*[torch.arange(-1, 2) / 3] * 2).flip(-1))
+
+
+def within(pixels, at, side):
+    """How much of each column or row lies within a square about `at`."""
+    first = torch.arange(pixels).double()
+    return ((first + 1).clamp(max=at + side / 2) - first.clamp(min=at - side / 2)).clamp(min=0)
+
+
+def test_colours_are_means_of_squares():
+    images = torch.rand(2, 3, 3, *SIZE).double()
+    for x, y, side in ((15, 7, 2), (23, 15, 2), (1, 1, 2), (8.4, 8, 3), (14.7, 6.4, 3)):
+        place = torch.tensor([x / 24, y / 16]).double().expand(2, 3, 2)
+        found = colors_at(images, side, torch.arange(3), place)
+        shares = within(16, y, side)[:, None] * within(24, x, side) / side**2
+        assert_close(found, (images * shares).sum((-1, -2)), rtol=0, atol=1e-6)

@@ -1,0 +1,207 @@
+"""Rounds of feedback: a model's passes against calls of its parts, training, traces, refusals."""
+
+import pytest
+import torch
+import yaml
+from commands import run_qgs
+from odd_views import odd_views
+from refusals import wrong_refusals
+from torch.testing import assert_close
+
+import qgs
+from qgs.checkpoint.model_file import save
+from qgs.checkpoint.tensors import CheckpointError
+from qgs.recipe import resolve
+from qgs.train.initial import initialise
+from qgs.train.training_pass import TrainingPass
+from qgs.types import Photos
+
+RECIPE = yaml.safe_load("""
+recipe: 1
+plugins: [landmark, locus]
+model:
+  width: 32
+  heads: 2
+  encoder: {patch_size: 8, depth: 1}
+  queries: {type: landmark/observed, count: null, near: 0.5, far: 4.0, cells: 4}
+  decoder:
+    depth: 3
+    layer_scale: 0.3
+    cross_attention: {type: locus/ray_biased}
+    self_attention: {type: landmark/neighbours, count: 4}
+    refinement: {type: landmark/refine, zero_init: true}
+  feedback: {type: landmark/rendered, rounds: 2, layers: 2}
+  head: {type: landmark/colored, opacity_bias: 1.0}
+  centers: {type: landmark/footprint}
+  supervision: {layers: [1, 3]}
+  renderer: {type: qgs/torch}
+losses: {photometric: {type: qgs/photometric}}
+""")
+NO_ROUNDS = "model.feedback={type: qgs/none}"
+
+
+def built(*overrides):
+    return resolve(RECIPE, overrides).build_model().eval()
+
+
+def views(count=2, side=32):
+    return odd_views(count, side, side, scenes=1)
+
+
+def run(model, layers, state, memory):
+    """The state and the memory after these layers."""
+    for index in layers:
+        state, memory = model.decoder[index](state, memory)
+        state = model.refinements[model.refinement_of[index]](state)
+    return state, memory
+
+
+@torch.no_grad()
+def test_rounds_run_the_last_layers_on_the_first_memory():
+    model, given = built(), views()
+    found = model(given, layers=[1])
+    memory = after = model.encoder(given)
+    state = model.queries(memory, given)
+    small = model.feedback.compared(given)
+    state, after = run(model, (0, 1, 2), state, after)
+    for _ in range(2):
+        rendering = model.render(model.decode(state), small.cameras)
+        state, after = model.feedback(state, memory, rendering, small)
+        state, after = run(model, (1, 2), state, after)
+    assert list(found.layers) == [1, 3, 5, 7]
+    assert model.depth == 7
+    assert_close(found.state.features, state.features)
+    assert_close(found.gaussians.means, model.decode(state).means)
+    assert not torch.allclose(found.layers[3].gaussians.means, found.gaussians.means)
+
+
+@torch.no_grad()
+def test_a_built_model_makes_other_numbers_of_rounds():
+    model, given = built(), views()
+    for rounds in (0, 1, 4):
+        model.feedback.rounds = rounds
+        assert list(model(given).layers) == [3 + 2 * n for n in range(rounds + 1)]
+        with pytest.raises(ValueError, match=f"layers 1..{3 + 2 * rounds}"):
+            model(given, layers=[4 + 2 * rounds])
+
+
+def test_an_evaluation_sets_the_number_of_rounds(tmp_path):
+    """The scores of N rounds are those of a model whose recipe has N."""
+    rooms = (
+        "plugins=[landmark, locus, rooms]",
+        "data={type: rooms/procedural, image_size: [16, 16]}",
+        "views.targets=2",
+        "evaluation.scenes=1",
+    )
+
+    def scores(made, asked):
+        torch.manual_seed(0)
+        file, out = tmp_path / f"{made}.safetensors", tmp_path / f"{made}{asked}"
+        qgs.save(built(*rooms, f"model.feedback.rounds={made}"), file)
+        result = run_qgs("eval", file, "--set", f"model.feedback.rounds={asked}", "--out", out)
+        assert result.exit_code == 0, result.output
+        return (out / "scenes.csv").read_text()
+
+    assert scores(2, 1) == scores(1, 1) != scores(2, 2)
+    file = tmp_path / "2.safetensors"
+    refusal = run_qgs("eval", file, "--set", "model.feedback.rounds_more=1").exception
+    assert "would change the trained model" in str(refusal)
+
+
+def test_training_supervises_every_round_it_draws_and_learns():
+    """The total is that of the layers and of the ends of rounds, later ones weighing more."""
+    recipe = resolve(RECIPE)
+    model, given, ends = recipe.build_model().train(), views(side=16), set()
+    passes = TrainingPass.of(recipe, model)
+    for seed in range(3):
+        torch.manual_seed(seed)
+        outcome = passes(given, given)
+        torch.manual_seed(seed)
+        layers = sorted(model(given).layers.items())
+        ends.add(layers[-1][0])
+        expected = torch.zeros(())
+        for rank, (_, layer) in enumerate(layers, start=1):
+            rendering = model.render(layer.gaussians, given.cameras)
+            terms = passes.losses["photometric"](layer, rendering, given, given)
+            expected = expected + rank * sum(terms.values())
+        assert_close(outcome.total, expected / sum(range(len(layers) + 1)))
+    assert ends == {5, 7}
+    outcome.total.backward()
+    torch.optim.SGD(model.parameters(), 0.01).step()
+    torch.manual_seed(seed)
+    assert passes(given, given).total < outcome.total
+
+
+@torch.no_grad()
+def test_rounds_are_traced_as_layers_are():
+    model, given = built(), views()
+    with qgs.trace(model, queries=[1, 3]) as trace:
+        found = model(given, layers=range(1, 8))
+    after = {number: layer.after.features for number, layer in trace.layers.items()}
+    expected = {n: layer.state.features[:, [1, 3]] for n, layer in found.layers.items()}
+    assert_close(after, expected)
+
+
+def test_rounds_need_cameras():
+    with pytest.raises(ValueError, match="RenderedFeedback"):
+        built()(Photos(views().images))
+
+
+REFUSED = """
+model.feedback.layers=4
+    model.feedback.layers:
+model.feedback.least=3
+    model.feedback.least:
+model.head.gaussians_per_query=2
+    model.head:
+model.centers.radius_min=0.1
+    model.centers:
+model.queries.cells=null
+    model.head:
+model.queries.far=0.1
+    model.queries.far:
+"""
+
+
+def test_what_cannot_work_is_refused():
+    assert wrong_refusals(RECIPE, REFUSED) == []
+
+
+@torch.no_grad()
+def test_a_number_of_anchors_is_that_for_any_number_of_photos():
+    model = built("model.queries.count=20")
+    assert [model(views(count)).gaussians.count for count in (2, 5)] == [80, 80]
+
+
+@torch.no_grad()
+def test_a_model_without_rounds_starts_one_with_rounds(tmp_path):
+    """They repeat its layers: what they add to keys, values and features is 0 at first."""
+    plain = built(NO_ROUNDS)
+    save(plain, tmp_path / "plain.safetensors")
+    grown = resolve(RECIPE, (f"init_from={tmp_path}/plain.safetensors",))
+    model, given = grown.build_model().eval(), views()
+    said = initialise(model, grown)
+    assert "feedback.marker: none -> (32,)" in said
+    assert "learned with model.feedback.type: qgs/none (here landmark/rendered)" in said
+    weights = model.state_dict()
+    assert all(torch.equal(weights[name], values) for name, values in plain.state_dict().items())
+    memory = model.encoder(given)
+    state, _ = run(model, (0, 1, 2, 1, 2, 1, 2), model.queries(memory, given), memory)
+    assert_close(model(given).state.features, state.features)
+
+
+def test_rounds_start_from_rounds_of_their_kind(tmp_path):
+    learned = built()
+    save(learned, tmp_path / "rounds.safetensors")
+
+    def started(override):
+        recipe = resolve(RECIPE, (f"init_from={tmp_path}/rounds.safetensors", override))
+        model = recipe.build_model()
+        initialise(model, recipe)
+        return model
+
+    more = started("model.feedback.rounds=3").state_dict()
+    assert all(map(torch.equal, more.values(), learned.state_dict().values()))
+    for other in (NO_ROUNDS, "model.feedback.cells=1"):
+        with pytest.raises(CheckpointError, match=r"feedback\.embedding\.weight"):
+            started(other)

@@ -1,0 +1,31 @@
+"""The contract suite: checks that every component of a slot must pass.
+
+    import pytest
+    from qgs_dev import runs_of
+
+    @pytest.mark.parametrize("run", runs_of("sightline"), ids=str)
+    def test_contract(run):
+        run.check()
+
+`qgs check-plugin sightline` makes the same checks and prints a report.
+"""
+
+import qgs_dev.checks  # noqa: F401  (registers the checks)
+from qgs_dev.case import CannotCheck, Case, ContractError
+from qgs_dev.plugins import cases_of, check_plugin, runs_of
+from qgs_dev.registry import CHECKS, checks_for
+from qgs_dev.running import CaseRun, CheckResult, run_check
+
+__all__ = [
+    "CHECKS",
+    "CannotCheck",
+    "Case",
+    "CaseRun",
+    "CheckResult",
+    "ContractError",
+    "cases_of",
+    "check_plugin",
+    "checks_for",
+    "run_check",
+    "runs_of",
+]

@@ -1,0 +1,188 @@
+"""A component with options and sizes, as the checks see it, and what a check raises."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from pydantic_core import to_jsonable_python
+from torch import Tensor, nn
+
+from qgs.contracts import (
+    Component,
+    ComponentConfig,
+    DecoderLayer,
+    LayerParts,
+    ModelComponent,
+    ModelDims,
+    Problem,
+    RecipeContext,
+    Renderer,
+    component_of,
+)
+from qgs.recipe.build import load_pretrained
+from qgs.recipe.errors import did_you_mean
+from qgs.recipe.yaml_text import dump
+from qgs.tokengs import ContentCrossAttention, ContentSelfAttention, MlpFeedForward
+from qgs_dev.modules import seeded
+from qgs_dev.soundness import component_fault
+
+SMALL = ModelDims(width=32, heads=2, depth=2)
+
+IMAGE_SIZES = ((16, 24), (24, 16), (28, 42), (32, 48), (64, 96))
+"""Sizes that are tried in turn until the component's `problems` accepts one."""
+
+SUBLAYERS: Mapping[str, Any] = {
+    "cross_attention": ContentCrossAttention,
+    "self_attention": ContentSelfAttention,
+    "feed_forward": MlpFeedForward,
+}
+"""What a decoder layer is given in its slots."""
+
+LAYER_SCALE = 0.3
+
+NOISE = 0.1
+"""Added to parameters where initial zeros would hide what a component does."""
+
+
+class ContractError(AssertionError):
+    """A component does not keep its contract; the message says what it did instead."""
+
+
+class CannotCheck(Exception):  # noqa: N818 (not an error: the reason of a skip)
+    """A check cannot be run here; the message is the reason."""
+
+
+def expect(holds: bool, seen: str) -> None:
+    """Raise ContractError with what was `seen` unless the contract `holds`."""
+    if not holds:
+        raise ContractError(seen)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A component to check: `Case(MyAttention.Config(bandwidth="fixed"))`.
+
+    config: options of a component; the class that nests it is the one checked.
+    dims: sizes to build it with. image_size: (H, W) of the views; None tries a few small ones.
+    fields: for state fields that cannot hold just any number, name -> what makes a valid field
+        of normally distributed numbers, such as `{"my.quat": lambda x: F.normalize(x, dim=-1)}`.
+    state_dict: name -> shape of every entry, pinned, so that saved weights stay loadable; None
+        pins nothing.
+    Raises TypeError for anything but the options of a complete component, ValueError for `fields`
+    that the component neither requires nor provides.
+    """
+
+    config: ComponentConfig
+    dims: ModelDims = SMALL
+    image_size: tuple[int, int] | None = None
+    fields: Mapping[str, Callable[[Tensor], Tensor]] = field(default_factory=dict)
+    state_dict: Mapping[str, tuple[int, ...]] | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.config, ComponentConfig):
+            raise TypeError(
+                f"{self.config!r} is not a component's options; write Case(MyComponent.Config())"
+            )
+        component = component_of(self.config)
+        fault = component_fault(component)
+        if fault:
+            raise TypeError(f"{component.__qualname__} cannot be checked: {fault}")
+        known = {*component.fields_read(self.config), *component.fields_written(self.config)}
+        for name in self.fields.keys() - known:
+            raise ValueError(
+                f"fields names {name!r}, which this component neither requires nor provides; "
+                f"{did_you_mean(name, known, 'fields')}"
+            )
+
+    @property
+    def component(self) -> type[Component]:
+        """The class under test."""
+        return component_of(self.config)
+
+    @property
+    def slot(self) -> str:
+        """The slot that it fills."""
+        return self.component.slot
+
+    @property
+    def has_parameters(self) -> bool:
+        """Whether it is built with the sizes of the model."""
+        return issubclass(self.component, ModelComponent)
+
+    @cached_property  # every check of the case is named by it
+    def label(self) -> str:
+        """Slot and name, and the options that differ from their defaults, in YAML."""
+        changed = {
+            name: getattr(self.config, name)
+            for name, option in type(self.config).model_fields.items()
+            if option.is_required() or getattr(self.config, name) != option.get_default()
+        }
+        written = dump(to_jsonable_python(changed, fallback=repr), flow=True).strip()
+        options = f"({written[1:-1]})" if changed else ""
+        return f"{self.slot}/{self.component.name}{options}"
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W) of the views."""
+        if self.image_size is not None:
+            return self.image_size
+        return next((size for size in IMAGE_SIZES if not self.problems(size)), IMAGE_SIZES[0])
+
+    @property
+    def device(self) -> str:
+        """The CPU if it can run there, else its GPU; raises CannotCheck if that is missing."""
+        component = self.component
+        if not issubclass(component, Renderer) or "cpu" in component.devices:
+            return "cpu"
+        if "cuda" in component.devices and torch.cuda.is_available():
+            return "cuda"
+        raise CannotCheck(f"runs on {' or '.join(component.devices)} alone, which is not here")
+
+    def problems(self, size: tuple[int, int] | None = None) -> list[Problem]:
+        """What the component says of its options, with images of `size`."""
+        return list(self.component.problems(self.config, RecipeContext(self.dims, size)))
+
+    def build(self, seed: int = 0) -> Any:
+        """A new instance, parameters drawn under `seed`. CannotCheck where its data is missing."""
+        try:
+            with seeded(seed):
+                built = self.construct()
+        except FileNotFoundError as error:
+            if self.slot != "data":
+                raise
+            raise CannotCheck(f"the data of this case is not here: {error}") from error
+        return built.to(self.device) if isinstance(built, nn.Module) else built
+
+    def construct(self) -> Any:
+        """A new instance, drawn from the global random state."""
+        make: Any = self.component
+        if issubclass(make, DecoderLayer):
+            inside = {slot: SUBLAYERS[slot] for slot in make.sublayers}
+            parts = {slot: part(part.Config(), self.dims) for slot, part in inside.items()}
+            return make(self.config, LayerParts(self.dims, parts, LAYER_SCALE))
+        built = make(self.config, self.dims) if self.has_parameters else make(self.config)
+        if isinstance(built, nn.Module):
+            load_pretrained(built)
+        return built
+
+    def lively(self, seed: int = 0) -> Any:
+        """An instance in evaluation mode in which no parameter is zero by initialisation."""
+        module = self.build(seed).eval()
+        generator = torch.Generator().manual_seed(seed + 1)
+        with torch.no_grad():
+            for parameter in module.parameters():
+                parameter += NOISE * torch.randn(parameter.shape, generator=generator).to(parameter)
+        return module
+
+    def with_at_most(self, **sizes: int) -> "Case":
+        """With options that are larger lowered to these; itself where the component refuses it."""
+        lower = {n: x for n, x in sizes.items() if (getattr(self.config, n, None) or 0) > x}
+        config = self.config.model_copy(update=lower)
+        smaller = replace(self, config=config, state_dict=None)
+        return self if smaller.problems(smaller.size) else smaller
+
+    def with_dims(self, **sizes: int) -> "Case":
+        """The same component in a model of other sizes."""
+        return replace(self, dims=replace(self.dims, **sizes), state_dict=None)

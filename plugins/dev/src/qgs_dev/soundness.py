@@ -1,0 +1,69 @@
+"""What a class must be so that recipes can use it as a component."""
+
+import inspect
+import re
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
+
+from torch.nn import Module
+
+from qgs.contracts import (
+    Component,
+    ComponentConfig,
+    Metric,
+    Objective,
+    Optimizer,
+    Renderer,
+    ViewSampler,
+)
+from qgs.contracts.schedule import number_kinds
+from qgs.recipe.slots import SLOTS
+
+DEVICES = ("cpu", "cuda", "mps")
+"""Types of the devices that a renderer can render on."""
+
+
+def component_fault(component: object) -> str:
+    """Why a recipe cannot use the class `component`, as a relative clause; "" if it can."""
+    if not (inspect.isclass(component) and issubclass(component, Component)):
+        return "which is no qgs component"
+    slot, name = SLOTS.get(getattr(component, "slot", "")), getattr(component, "name", None)
+    if slot is None or not issubclass(component, slot.contract):
+        return "which implements no slot's contract"
+    if not isinstance(name, str):
+        return "which has no `name`"
+    if not re.fullmatch(r"[^\s/]+", name):  # else `type: PLUGIN/NAME` would be ambiguous
+        return f"whose name {name!r} is empty or has a slash or a blank"
+    if inspect.isabstract(component):
+        return f"which leaves {', '.join(sorted(component.__abstractmethods__))} abstract"
+    if issubclass(component, Renderer):
+        given: object = component.devices
+        if not (isinstance(given, tuple) and given and set(given) <= set(DEVICES)):
+            return f"whose `devices` is {given!r}; give some of {DEVICES} as a tuple"
+    if issubclass(component, Metric) and not getattr(component, "definition", ""):
+        return "which gives no `definition`; describe what it measures, since protocols hash it"
+    config: object = component.Config
+    if not (inspect.isclass(config) and issubclass(config, ComponentConfig)):
+        return "whose Config is no ComponentConfig"
+    if not config.model_config.get("frozen"):
+        return "whose Config is not frozen; leave `frozen` of its `model_config` at True"
+    if "type" in config.model_fields:
+        return "whose Config has an option `type`, which names the component itself"
+    fields: Mapping[str, Any] = config.model_fields
+    scheduled: object = component.scheduled
+    known = {n for n, option in fields.items() if number_kinds(option.annotation)}
+    if not (isinstance(scheduled, frozenset) and scheduled <= known):
+        return f"whose `scheduled` is {scheduled!r}, not a frozenset of options that are numbers"
+    if scheduled and not issubclass(component, Module | Objective | Optimizer | ViewSampler):
+        return f"which lists `scheduled` options; those of the slot `{component.slot}` stay"
+    return _schema_fault(config)
+
+
+@cache
+def _schema_fault(config: type[ComponentConfig]) -> str:
+    try:
+        config.model_json_schema()
+        return ""
+    except Exception as error:
+        return f"whose Config has options that YAML cannot express: {str(error).splitlines()[0]}"

@@ -1,0 +1,77 @@
+"""MLPs that break the contract in one expression of their forward pass."""
+
+import random
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from contract_mutants.mutant import mutant
+from torch import Tensor
+
+from qgs.tokengs import MlpFeedForward
+
+
+def register(
+    name: str, check: str, seen: str, forward: Callable[[Any, Callable[..., Tensor], Tensor], Any]
+) -> None:
+    """forward: of the component, the sound forward pass, and features (B, N, D)."""
+
+    def forward_of(self: Any, features: Tensor) -> Any:
+        return forward(self, lambda x: MlpFeedForward.forward(self, x), features)
+
+    mutant(check, seen)(type(name, (MlpFeedForward,), {"forward": forward_of}))
+
+
+register("ForgetsToReturn", "runs", "it gives a NoneType, not a Tensor", lambda self, mlp, x: None)
+register(
+    "DetachesASummand", "gradients_match_differences", "in evaluation: Jacobian",
+    lambda self, mlp, x: mlp(x) + x.square().detach(),
+)  # fmt: skip
+register(  # the same numbers in both modes
+    "DetachesASummandInTraining", "gradients_match_differences", "in training: Jacobian",
+    lambda self, mlp, x: mlp(x) + self.training * (x.square().detach() - x.square()),
+)  # fmt: skip
+register(
+    "DividesByLength", "zeros_stay_finite", "with zeros, output",
+    lambda self, mlp, x: mlp(x / x.norm(dim=-1, keepdim=True)),
+)  # fmt: skip
+register(
+    "Exponentiates", "large_numbers_stay_finite", "with inputs times 1e4, output",
+    lambda self, mlp, x: mlp(x.exp()),
+)  # fmt: skip
+register(
+    "CentresOnTheBatch", "batch_independence", "scene 0 has a gradient",
+    lambda self, mlp, x: mlp(x - x.mean(0, keepdim=True)),
+)  # fmt: skip
+register(
+    "ReturnsItsInput", "outputs_share_no_memory", "in the memory of `features`",
+    lambda self, mlp, x: x.view_as(x),
+)  # fmt: skip
+register(
+    "AddsNoise", "eval_repeats_bitwise", "the second time output",
+    lambda self, mlp, x: mlp(x) + 0.01 * torch.randn_like(x),
+)  # fmt: skip
+register(
+    "DropsByPythonsRandom", "training_draws_from_torch", "numpy's or random's",
+    lambda self, mlp, x: mlp(x) * (random.random() if self.training else 1),
+)  # fmt: skip
+register(
+    "StaysOnCpu", "moves_to_a_device", "device",
+    lambda self, mlp, x: mlp(x) * torch.ones(x.shape[-1]),
+)  # fmt: skip
+register(
+    "CancelsDigits", "autocast_is_close", "`output` is off by",
+    lambda self, mlp, x: mlp((x + 300) - 300),
+)  # fmt: skip
+register(
+    "GivesFloat32", "float64_stays_float64", "`output` is 2x6x32 float32",
+    lambda self, mlp, x: mlp(x).float(),
+)  # fmt: skip
+register(
+    "LoopsOverQueries", "compiles", "3 more graphs are compiled",
+    lambda self, mlp, x: torch.stack([self.mlp(self.norm(each)) for each in x.unbind(1)], 1),
+)  # fmt: skip
+register(
+    "DetachesWhenCompiled", "compiles", "features has a gradient",
+    lambda self, mlp, x: mlp(x.detach() if torch.compiler.is_compiling() else x),
+)  # fmt: skip

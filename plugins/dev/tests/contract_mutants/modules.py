@@ -1,0 +1,273 @@
+"""Components that are built, kept, saved or differentiated wrongly, whatever their slot."""
+
+from dataclasses import replace
+
+import torch
+from contract_mutants.mutant import mutant
+from contract_mutants.slots import ChangedEncoder, Loss
+from contract_mutants.spatial import AtPlaces, PlacesByALayer
+from pydantic import BaseModel, ConfigDict, Field, field_serializer
+from torch import nn
+
+from qgs.contracts import ComponentConfig
+from qgs.losses import Opacity
+from qgs.tokengs import (
+    ContentCrossAttention,
+    ContentSelfAttention,
+    CrossAttentionCore,
+    FreeCenters,
+    MlpFeedForward,
+)
+
+
+@mutant("builds", "RuntimeError: no kernel for width 32")
+class RaisesWhenBuilt(MlpFeedForward):
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        raise RuntimeError(f"no kernel for width {dims.width}")
+
+
+@mutant("sizes_vary", "`output` is of shape")
+class FixedNumberOfQueries(MlpFeedForward):
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.place = nn.Parameter(torch.zeros(6, dims.width))
+
+    def forward(self, features):
+        return super().forward(features + self.place)
+
+
+@mutant("sizes_vary", "in a model of width 48 with 3 heads, RuntimeError")
+class FixedNumberOfHeads(ContentCrossAttention):
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.core = CrossAttentionCore(dims.width, 2, config.norm_eps)
+
+
+@mutant("unmet_requirement_fails_at_compose", "view size is not")
+@mutant("strides_make_no_difference", "view size is not")
+class ViewsAField(PlacesByALayer):
+    """Takes a field for contiguous; queries expand theirs to all scenes."""
+
+    def forward(self, state):
+        center = state["place.center"]
+        place = self.place(center.view(-1, 3)).view(*center.shape[:2], -1)
+        return self.attention(self.norm(state.features + place), state.mask)
+
+
+@mutant("config_round_trip", "is read again as", options={"z_offset": 0.3})
+class RoundsAnOption(FreeCenters):
+    class Config(FreeCenters.Config):
+        @field_serializer("z_offset")
+        def _rounded(self, z_offset: float) -> float:
+            return float(round(z_offset))
+
+
+@mutant("misspelt_option_is_refused", "`z_offset_x` is accepted")
+class IgnoresUnknownOptions(FreeCenters):
+    class Config(FreeCenters.Config):
+        model_config = ConfigDict(extra="ignore")
+
+
+class Inner(BaseModel):
+    depth: float = 1.0
+
+
+class Outer(ComponentConfig):
+    inners: tuple[Inner, ...] = ()
+
+
+@mutant("misspelt_option_is_refused", "Inner accepts any option")
+class IgnoresUnknownInnerOptions(MlpFeedForward):
+    class Config(MlpFeedForward.Config):
+        outer: Outer | None = None
+
+
+@mutant("options_are_left_alone", "when it is built, ")
+class AppendsToAnOption(MlpFeedForward):
+    class Config(MlpFeedForward.Config):
+        sizes: list[int] = Field(default=[1])
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        config.sizes.append(2)
+
+
+@mutant("scheduled_options_are_read_anew", "with `weight: 0.05` set after it was built")
+class ReadsItsWeightOnce(Opacity):
+    def __init__(self, config):
+        super().__init__(config)
+        self.weight = config.weight
+
+    def term(self, prediction, rendering, target, inputs):
+        opacities = prediction.gaussians.opacities
+        return self.weight * -(opacities + self.config.eps).log().mean()
+
+
+PINNED = {
+    "norm.weight": (32,),
+    "norm.bias": (32,),
+    "mlp.fc1.weight": (128, 32),
+    "mlp.fc1.bias": (128,),
+    "mlp.fc2.weight": (32, 128),
+    "mlp.fc2.bias": (32,),
+}
+
+
+"""What saved weights of `qgs/mlp` hold in a model of width 32."""
+
+
+@mutant("builds_on_meta", "scale is allocated")
+class AllocatesOnCpu(MlpFeedForward):
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.scale = nn.Parameter(torch.ones(dims.width, device="cpu"))
+
+    def forward(self, features):
+        return self.scale * super().forward(features)
+
+
+@mutant("registers_its_parameters", "keeps layers outside")
+class KeepsLayersInAList(MlpFeedForward):
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.layers = [nn.Linear(dims.width, dims.width)]
+
+
+@mutant("same_seed_same_parameters", "torch is in one state")
+class SeedsWhenBuilt(MlpFeedForward):
+    def __init__(self, config, dims):
+        torch.manual_seed(0)
+        super().__init__(config, dims)
+
+
+@mutant("same_seed_same_parameters", "differ: mlp.fc1.weight")
+class DrawsFromItsOwnGenerator(MlpFeedForward):
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        generator = torch.Generator()
+        generator.seed()
+        with torch.no_grad():
+            self.mlp.fc1.weight.normal_(generator=generator)
+
+
+@mutant("saved_weights_load", "with the same state dict, output")
+class KeepsARandomBufferUnsaved(MlpFeedForward):
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.register_buffer("noise", torch.randn(dims.width), persistent=False)
+
+    def forward(self, features):
+        return super().forward(features) + self.noise
+
+
+@mutant("state_dict_keys", "'norm.bias'", case={"state_dict": PINNED})
+class RenamesItsNorm(MlpFeedForward):
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.layer_norm = self.norm
+        del self.norm
+
+    def forward(self, features):
+        return self.mlp(self.layer_norm(features))
+
+
+@mutant("parameters_learn", "no gradient reaches unused.weight")
+class HasAnUnusedLayer(MlpFeedForward):
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.unused = nn.Linear(dims.width, dims.width)
+
+
+@mutant("parameters_learn", "no gradient reaches shift")
+class ShiftsAllLogits(ContentCrossAttention):
+    """What is added to all logits alike changes no weight: its gradient is a rounding error."""
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.shift = nn.Parameter(torch.zeros(1, 1, 1))
+
+    def forward(self, state, memory):
+        shift = self.shift.float().expand(1, 1, memory.keys.shape[2])
+        return self.core(state.features, memory.keys, memory.values, shift)
+
+
+@mutant("inputs_are_not_changed", "the inputs differ: offsets")
+class ClampsItsInputInPlace(FreeCenters):
+    def forward(self, offsets, state):
+        return super().forward(offsets.data.clamp_(-0.1, 0.1), state)
+
+
+@mutant("forward_keeps_no_state", "changes _cache")
+class CachesByShape(MlpFeedForward):
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self._cache: dict[tuple[int, ...], torch.Tensor] = {}
+
+    def forward(self, features):
+        zeros = self._cache.setdefault(tuple(features.shape), torch.zeros_like(features))
+        return super().forward(features) + zeros
+
+
+@mutant("forward_keeps_no_state", "another one differs")
+class ScalesByItsFirstInput(MlpFeedForward):
+    """Keeps a number in a closure, which no attribute shows."""
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        kept: list[float] = []
+
+        def first(x: torch.Tensor) -> float:
+            if not kept and x.device.type != "meta":
+                kept.append(x.detach().mean().item())
+            return kept[0] if kept else 0.0
+
+        self.first = first
+
+    def forward(self, features):
+        return super().forward(features) + self.first(features)
+
+
+@mutant("training_draws_from_torch", "torch is in one state")
+class SeedsInTraining(MlpFeedForward):
+    def forward(self, features):
+        if self.training:
+            torch.manual_seed(0)
+        return super().forward(features)
+
+
+@mutant("gradients_reach_inputs", "memory.keys, memory.values")
+class DetachesTheImages(ContentCrossAttention):
+    def forward(self, state, memory):
+        return self.core(state.features, memory.keys.detach(), memory.values.detach())
+
+
+@mutant("terms_have_gradients", "no gradient comes from the term")
+class DetachedLoss(Loss):
+    renderings = "each"
+
+    def term(self, prediction, rendering, target, inputs):
+        return (rendering.rgb.detach() - target.images.detach()).square().mean()
+
+
+@mutant("coincident_queries_stay_finite", "with coincident queries")
+class DividesBySpread(ContentSelfAttention):
+    def forward(self, state):
+        features = state.features
+        spread = (features - features[:, :1]).norm(dim=(1, 2), keepdim=True)
+        return super().forward(state.replace(features=features / spread))
+
+
+@mutant("points_behind_cameras_stay_finite", "in the centre of a camera")
+class DividesByDepth(AtPlaces, ContentSelfAttention):
+    def forward(self, state):
+        place = state["place.center"]
+        return super().forward(state) + place[..., :1] / place[..., 2:]
+
+
+@mutant("duplicated_view_stays_finite", "with a duplicated view")
+class DividesByBaseline(ChangedEncoder):
+    def given(self, views):
+        eyes = views.cameras.c2w[..., :3, 3]
+        baseline = (eyes - eyes[:, :1]).norm(dim=-1).sum(1)
+        return replace(views, images=views.images / baseline[:, None, None, None, None])

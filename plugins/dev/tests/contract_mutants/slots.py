@@ -1,0 +1,335 @@
+"""Encoders, heads, queries, losses, data, objectives ... that break the contract of their slot."""
+
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from contract_mutants.mutant import mutant
+from contract_mutants.sound import StridedConvolutions
+from qgs_zoo.tokengs2026.latents import LatentBottleneck
+from torch import Tensor, nn
+
+from qgs.contracts import (
+    MEMORY_FIELDS,
+    AttentionWeights,
+    Column,
+    CrossAttention,
+    Loss,
+    Outcome,
+    Scene,
+    SceneSource,
+)
+from qgs.metrics.images import Psnr
+from qgs.tokengs import (
+    ContentCrossAttention,
+    ContentSelfAttention,
+    GaussianHead,
+    LatentQueries,
+    LayerSupervision,
+    MultiViewViT,
+    NoFeedback,
+    OneCycleAdamW,
+    OnePass,
+)
+from qgs.tokengs.blocks import CrossAttentionCore, split_heads
+from qgs.types import Cameras, ImageMemory, Views
+
+
+class ChangedEncoder(MultiViewViT):
+    """A sound encoder, whose input or output mutants change."""
+
+    class Config(MultiViewViT.Config):
+        depth: int = 1
+
+    def given(self, views: Views) -> Views:
+        return views
+
+    def result(self, memory: ImageMemory) -> ImageMemory:
+        return memory
+
+    def forward(self, views):
+        return self.result(super().forward(self.given(views)))
+
+
+@mutant("head_gives_gaussians", "quaternions are 2")
+class GivesLongQuaternions(GaussianHead):
+    def activate(self, raw):
+        good = super().activate(raw)
+        return replace(good, quats=2 * good.quats)
+
+
+@mutant("queries_are_shared_by_scenes", "scene 1 of 3", options={"count": 6})
+class NumbersScenes(LatentQueries):
+    def start(self, batch_size):
+        state = super().start(batch_size)
+        scene = torch.arange(batch_size).to(state.features)[:, None, None]
+        return state.replace(features=state.features + scene)
+
+
+@mutant("queries_resize", "cannot be loaded", options={"count": 6})
+class NeverResizes(LatentQueries):
+    def resized(self, learned, generator):
+        return dict(learned)
+
+
+@mutant("supervision_weights", "weights sum to 2", options={"layers": (1, 2)})
+class WeighsTwice(LayerSupervision):
+    def weights(self, rounds=()):
+        factor = 1 if rounds else 2
+        return {layer: factor * weight for layer, weight in super().weights(rounds).items()}
+
+
+@mutant("supervision_weights", "with rounds that end at [3, 4]", options={"layers": (1, 2)})
+class IgnoresRounds(LayerSupervision):
+    def weights(self, rounds=()):
+        return super().weights()
+
+
+@mutant("feedback_compares_the_photos", "rays through the corners")
+class HalvesTheLensAlone(NoFeedback):
+    def compared(self, views):
+        cameras = replace(views.cameras, intrinsics=views.cameras.intrinsics / 2)
+        return replace(views, cameras=cameras)
+
+
+class NoiseScene(Scene):
+    """Two frames of another noise each time."""
+
+    name = "noise"
+
+    @property
+    def cameras(self):
+        lens = torch.tensor([16.0, 16.0, 12.0, 8.0]).expand(2, 4)
+        return Cameras(torch.eye(4).expand(2, 4, 4), lens, (16, 24))
+
+    def images(self, frames):
+        return torch.rand(len(frames), 3, 16, 24)
+
+
+@mutant("scenes_repeat", "opened again, 1: values differ")
+class DrawsItsImages(SceneSource):
+    def scenes(self, split):
+        return [NoiseScene()]
+
+
+@mutant("scenes_are_as_listed", "has 2 frames and holds out [2]")
+class HoldsOutTooMuch(DrawsItsImages):
+    def scenes(self, split):
+        (scene,) = super().scenes(split)
+        scene.held_out = (1, 2)
+        return [scene]
+
+
+@mutant("loss_is_a_mean_over_scenes", "against the mean over scenes")
+class SumsOverScenes(Loss):
+    renderings = "each"
+
+    def term(self, prediction, rendering, target, inputs):
+        return (rendering.rgb - target.images).square().mean((1, 2, 3, 4)).sum()
+
+
+@mutant("renderings_as_declared", "against the mean over views")
+class TakesTheWorstView(Loss):
+    renderings = "each"
+
+    def term(self, prediction, rendering, target, inputs):
+        return (rendering.rgb - target.images).square().mean((2, 3, 4)).amax(1).mean()
+
+
+@mutant("metric_gives_its_columns", "it has values for ['', 'lost'], columns for ['']")
+class GivesAValueWithoutColumn(Psnr):
+    def forward(self, given):
+        return {"": super().forward(given), "lost": given.images.mean()}
+
+
+@mutant("truth_scores_best", "lower is better, but PSNR is 100 for the truth")
+class ReversesItsDirection(Psnr):
+    column = Column("PSNR", "lower")
+
+
+@mutant("optimizer_steps", "it leaves out parameters")
+class OptimizesDecayingGroups(OneCycleAdamW):
+    def build(self, groups):
+        return super().build([group for group in groups if group["decays"]])
+
+
+@mutant("optimizer_continues", "three and three from a checkpoint")
+class CountsItsOwnSteps(OneCycleAdamW):
+    calls = 0
+
+    def learning_rate(self, step, seconds):
+        self.calls += 1
+        return 0.1 / self.calls
+
+
+@mutant("patch_rays_are_those_of_the_grid", "of patches of 8 pixels")
+class RoundsItsRays(ChangedEncoder):
+    def result(self, memory):
+        return replace(memory, patch_rays=memory.patch_rays.bfloat16().to(memory.patch_rays))
+
+
+@mutant("tokens_are_those_of_the_grid", "of `keys`, 8% of what changes a token comes from its own")
+class OrdersTokensByColumn(ChangedEncoder):
+    def result(self, memory):
+        def turned(x: Tensor, tokens: int) -> Tensor:
+            x = x.unflatten(tokens, memory.grid).transpose(tokens + 1, tokens + 2)
+            return x.flatten(tokens, tokens + 2)
+
+        keys, values = turned(memory.keys, 2), turned(memory.values, 2)
+        return replace(memory, keys=keys, values=values, features=turned(memory.features, 1))
+
+
+@mutant("tokens_are_those_of_the_grid", "if tokens were ordered by view, column, row")
+class ConvolvesAndOrdersByColumn(StridedConvolutions):
+    def ordered(self, x_BVDHW):
+        return x_BVDHW.mT.reshape(x_BVDHW.shape)
+
+
+@mutant("tokens_are_those_of_the_grid", "(+0, +0, -1) of it", options={"kernel": 4})
+class ConvolvesAndShiftsByAColumn(StridedConvolutions):
+    def ordered(self, x_BVDHW):
+        return F.pad(x_BVDHW, (1, -1))
+
+
+@mutant("tokens_are_those_of_the_grid", "of what changes a token comes from its own patch")
+class ConvolvesAndRollsRows(StridedConvolutions):
+    """Up, against the half patch that these convolutions are off."""
+
+    def ordered(self, x_BVDHW):
+        return x_BVDHW.roll(-1, -2)
+
+
+@mutant("tokens_are_those_of_the_grid", "hardly more than from others")
+class PoolsEachView(StridedConvolutions):
+    def ordered(self, x_BVDHW):
+        return x_BVDHW.mean((-1, -2), keepdim=True).expand_as(x_BVDHW)
+
+
+@mutant("tokens_are_those_of_the_grid", "`values` stays as it is")
+class IgnoresImages(ChangedEncoder):
+    def given(self, views):
+        return replace(views, images=0 * views.images)
+
+
+LATENTS = {"depth": 1, "blocks": (1,), "latents": 5, "latent_depth": 1}
+
+
+@mutant("project_makes_the_memory_again", "made anew from its own", options=LATENTS)
+class ProjectsDoubles(LatentBottleneck):
+    def project(self, features, memory):
+        return super().project(2 * features, memory)
+
+
+@mutant("project_makes_the_memory_again", "does not declare `tunable`", options=LATENTS)
+class ProjectsInSecret(LatentBottleneck):
+    tunable = False
+
+
+@mutant("memo_is_of_the_memory_alone", "depends on a weight")
+class SharesItsProjection(CrossAttention):
+    """Keys and values by the weights of whichever layer comes first."""
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.core = CrossAttentionCore(dims.width, dims.heads)
+        self.kv = nn.Linear(dims.width, 2 * dims.width)
+
+    @classmethod
+    def fields_read(cls, config):
+        return {"memory.features": MEMORY_FIELDS["memory.features"]}
+
+    def forward(self, state, memory):
+        both = memory.once("mutants.kv", lambda: self.kv(memory.features))
+        keys, values = (split_heads(x, self.dims.heads) for x in both.chunk(2, -1))
+        return self.core(state.features, keys, values)
+
+
+@mutant("explanation_is_a_softmax", "off the softmax")
+class ExplainsBySigmoid(ContentSelfAttention):
+    def explain(self, state, queries):
+        content = super().explain(state, queries).content
+        return AttentionWeights(content, None, torch.sigmoid(content))
+
+
+def explained_twice_as_sharply(given: AttentionWeights) -> AttentionWeights:
+    content = 2 * given.content
+    logits = content if given.geometry is None else content + given.geometry
+    return AttentionWeights(content, given.geometry, logits.softmax(-1))
+
+
+@mutant("explanation_is_of_the_forward_pass", "the weights change otherwise")
+class ExplainsCrossAttentionTooSharply(ContentCrossAttention):
+    def explain(self, state, memory, queries):
+        return explained_twice_as_sharply(super().explain(state, memory, queries))
+
+
+@mutant("updates_are_explained", "of them is left")
+class ExplainsSelfAttentionTooSharply(ContentSelfAttention):
+    def explain(self, state, queries):
+        return explained_twice_as_sharply(super().explain(state, queries))
+
+
+@mutant("explanation_is_a_softmax", "content is not finite: a mask is geometry")
+class MasksItsContent(ContentSelfAttention):
+    def explain(self, state, queries):
+        content = super().explain(state, queries).content
+        content = content.masked_fill(content < content.mean(), -torch.inf)
+        return AttentionWeights(content, None, content.softmax(-1))
+
+
+@mutant("masked_queries_are_not_read", "of the others")
+class IgnoresTheMask(ContentSelfAttention):
+    def forward(self, state):
+        return self.attention(self.norm(state.features))
+
+
+@mutant("masked_queries_are_not_judged", "when masked queries and their Gaussians change")
+class JudgesWhatIsMasked(Loss):
+    renderings = "none"
+
+    def term(self, prediction, rendering, target, inputs):
+        return prediction.gaussians.scales.mean()
+
+
+@mutant("head_gives_gaussians", "gives {'features'}, and provides None")
+class GivesFeaturesUntold(GaussianHead):
+    def activate(self, raw):
+        return replace(super().activate(raw), features=1 * raw[..., :2])
+
+
+@mutant("unread_cameras_make_no_difference", "has no attribute 'cameras'")
+class ReadsCamerasUntold(MultiViewViT):
+    reads_cameras = False
+
+
+class Changed(OnePass):
+    """A sound objective, whose outcome mutants change."""
+
+    def result(self, outcome: Outcome) -> Outcome:
+        return outcome
+
+    def forward(self, inputs, targets, passes):
+        return self.result(super().forward(inputs, targets, passes))
+
+
+@mutant("objective_gives_an_outcome", "has no gradient in the model's parameters")
+class DetachesTheTotal(Changed):
+    def result(self, outcome):
+        return replace(outcome, total=outcome.total.detach())
+
+
+@mutant("objective_gives_an_outcome", "against the sum of the terms")
+class HidesATerm(Changed):
+    def result(self, outcome):
+        return replace(outcome, total=2 * outcome.total)
+
+
+@mutant("objective_repeats", "the second time")
+class CountsItsJudgements(Changed):
+    calls = 0
+
+    def result(self, outcome):
+        self.calls += 1
+        factor = 1 + 1 / self.calls
+        terms = {name: factor * x for name, x in outcome.terms.items()}
+        return replace(outcome, total=factor * outcome.total, terms=terms)

@@ -1,0 +1,205 @@
+"""Components that keep the contract in ways that a check could take for a fault."""
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from contract_mutants.mutant import named
+from contract_mutants.renderers import RefusesWhatItDeclares
+from contract_mutants.spatial import PlacesByALayer
+from einops import rearrange
+from torch import nn
+
+from qgs.contracts import (
+    MEMORY_FIELDS,
+    ComponentConfig,
+    FieldSpec,
+    LearnedQueries,
+    PatchEncoder,
+    SelfAttention,
+)
+from qgs.geometry.rays import patch_rays, plucker_rays
+from qgs.losses import Opacity
+from qgs.tokengs import (
+    ContentCrossAttention,
+    MlpFeedForward,
+    MultiViewViT,
+)
+from qgs.tokengs.blocks import merge_heads
+from qgs.tokengs.encoder import keys_and_values
+from qgs.types import ImageMemory, QueryState
+
+
+@named
+class DropsOut(MlpFeedForward):
+    def forward(self, features):
+        return F.dropout(super().forward(features), 0.2, self.training)
+
+
+@named
+class LooksNowhere(SelfAttention):
+    """The ablation of a slot: queries exchange nothing."""
+
+    def forward(self, state):
+        return torch.zeros_like(state.features)
+
+
+@named
+class TurnsAutocastOff(PlacesByALayer):
+    """PyTorch's own idiom for float32 geometry, which torch refuses on meta."""
+
+    def forward(self, state):
+        center = state["place.center"]
+        with torch.autocast(center.device.type, enabled=False):
+            bounded = center / (1 + center.norm(dim=-1, keepdim=True))
+        return self.attention(self.norm(state.features + self.place(bounded)), state.mask)
+
+    def explain(self, state, queries):
+        return None
+
+
+@named
+class FusesInHalf(ContentCrossAttention):
+    """Attention by one kernel in half precision, spelled out in any other."""
+
+    def forward(self, state, memory):
+        keys, values = memory.keys, memory.values
+        query = self.core.project(state.features).to(values.dtype)
+        if values.dtype == torch.bfloat16:
+            read = F.scaled_dot_product_attention(query, keys, values)
+        else:
+            read = (query @ keys.mT * query.shape[-1] ** -0.5).softmax(-1) @ values
+        return self.core.out_proj(merge_heads(read))
+
+
+@named
+class DecodesItsQueries(LearnedQueries):
+    """Codes of each query, and what all share: a layer, and the logarithm of a size."""
+
+    class Config(ComponentConfig):
+        count: int = 8
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.code = nn.Parameter(torch.randn(config.count, 16))
+        self.log_size = nn.Parameter(torch.zeros(()))
+        self.up = nn.Linear(16, dims.width)
+
+    @property
+    def count(self) -> int:
+        return self.code.shape[0]
+
+    @classmethod
+    def fields_written(cls, config):
+        return {"place.size": FieldSpec((1,))}
+
+    def start(self, batch_size):
+        size = self.log_size.exp().expand(batch_size, self.count, 1)
+        return QueryState(
+            self.up(self.code).expand(batch_size, -1, -1), {"place.size": size.clone()}
+        )
+
+    def resized(self, learned, generator):
+        codes = super().resized({"code": learned["code"]}, generator)
+        return {**learned, **codes}
+
+
+@named
+class SeesFar(MultiViewViT):
+    """Convolutions over 19 pixels, before patches of 8 are cut."""
+
+    class Config(MultiViewViT.Config):
+        depth: int = 1
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        layers = [(3, 16), (16, 16), (16, 3)]
+        self.stem = nn.Sequential(
+            *(nn.Sequential(nn.Conv2d(i, o, 7, padding=3), nn.Tanh()) for i, o in layers)
+        )
+
+    def embed(self, views, plucker):
+        seen = self.stem(views.images.flatten(0, 1)).unflatten(0, views.images.shape[:2])
+        return super().embed(replace(views, images=seen), plucker)
+
+
+class StridedConvolutions(PatchEncoder):
+    """Each halves the sides. Kernels of 3 put a token's centre nearly half a patch off."""
+
+    class Config(PatchEncoder.Config):
+        kernel: int = 3
+        patch_size: Literal[4, 8, 16] = 8
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        sizes = pairwise([9, *[dims.width] * (config.patch_size.bit_length() - 1)])
+        layers = [(nn.Conv2d(i, o, config.kernel, 2, padding=1), nn.GELU()) for i, o in sizes]
+        self.layers = nn.Sequential(*(part for layer in layers for part in layer))
+        self.kv_proj = nn.Linear(dims.width, 2 * dims.width)
+        self.k_norm = nn.LayerNorm(dims.width // dims.heads)
+
+    def ordered(self, x_BVDHW):
+        return x_BVDHW
+
+    def forward(self, views):
+        rays = plucker_rays(views.cameras)
+        x = self.layers(torch.cat([views.images, rays], 2).flatten(0, 1))
+        x = self.ordered(x.unflatten(0, views.images.shape[:2]))
+        features = rearrange(x, "b v d h w -> b (v h w) d")
+        keys, values = keys_and_values(features, self.kv_proj, self.k_norm)
+        rays = patch_rays(rays, self.config.patch_size)
+        return ImageMemory(features, keys, values, rays, self.grid(views))
+
+
+@named
+class ConvolvesByThree(StridedConvolutions):
+    class Config(StridedConvolutions.Config): ...
+
+
+@named
+class ConvolvesByFour(StridedConvolutions):
+    class Config(StridedConvolutions.Config):
+        kernel: int = 4
+
+
+@named
+class WeighsNothing(Opacity):
+    """The ablation of a loss."""
+
+    class Config(Opacity.Config):
+        """A weight of 0."""
+
+        weight: float = 0.0
+
+
+@named
+class RefusesIntrinsics(RefusesWhatItDeclares):
+    camera_gradients = ("c2w",)
+
+
+@named
+class EachHeadSeesASide(ContentCrossAttention):
+    """A bias for each head that hides what lies left, or right, of the camera's axis."""
+
+    @classmethod
+    def fields_read(cls, config):
+        return {
+            **super().fields_read(config),
+            "memory.patch_rays": MEMORY_FIELDS["memory.patch_rays"],
+        }
+
+    def bias(self, state, memory):
+        side_B1M = memory.patch_rays[:, None, :, 3]
+        heads = torch.arange(self.dims.heads).to(side_B1M.device) % 2 == 1
+        bias_BhM = side_B1M.square().masked_fill((side_B1M < 0.05) == heads[:, None], -torch.inf)
+        return bias_BhM[:, :, None].expand(-1, -1, state.features.shape[1], -1)
+
+    def forward(self, state, memory):
+        bias = self.bias(state, memory)
+        return self.core(state.features, memory.keys, memory.values, bias)
+
+    def explain(self, state, memory, queries):
+        bias = self.bias(state, memory)
+        return self.core.explain(state.features, memory.keys, queries, bias)

@@ -1,0 +1,236 @@
+"""Components that read or write other fields, lose digits, or know an order or the world frame."""
+
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from contract_mutants.mutant import mutant, named
+from contract_mutants.renderers import ChangedRenderer
+from torch import Tensor, nn
+
+from qgs.contracts import MEMORY_FIELDS, Fields, FieldSpec, Loss, Refinement
+from qgs.tokengs import (
+    ContentCrossAttention,
+    ContentSelfAttention,
+    CrossSelfMlp,
+    FreeCenters,
+    GaussianHead,
+    MlpFeedForward,
+    NoRefinement,
+)
+from qgs.types import GaussianAttributes, QueryState
+
+CHECK = "reads_within_requires"
+
+
+PLACE: Fields = {"place.center": FieldSpec((3,), frame="world")}
+
+
+class AtPlaces:
+    """A component that reads centres."""
+
+    @classmethod
+    def fields_read(cls, config):
+        return PLACE
+
+
+class PlacesByALayer(AtPlaces, ContentSelfAttention):
+    """Attention that has a layer for centres."""
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.place = nn.Linear(3, dims.width)
+
+
+class Steps(AtPlaces, Refinement):
+    """Sound: it moves the centres by a layer."""
+
+    name = "steps"
+
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.step = nn.Linear(dims.width, 3)
+
+    @classmethod
+    def fields_written(cls, config):
+        return PLACE
+
+    def moved(self, center: Tensor, step: Tensor) -> dict[str, Tensor]:
+        return {"place.center": center + step.to(center)}
+
+    def forward(self, state):
+        return state.replace(fields=self.moved(state["place.center"], self.step(state.features)))
+
+
+@mutant(CHECK, "reads some of memory.features, memory.patch_rays")
+class ReadsMemoryUndeclared(ContentCrossAttention):
+    def forward(self, state, memory):
+        return super().forward(state, memory) + memory.features.mean(1, keepdim=True)
+
+
+@mutant(CHECK, "reads anchor.center")
+class ReadsAFieldIfThere(ContentSelfAttention):
+    def forward(self, state):
+        center = state.fields.get("anchor.center")
+        update = super().forward(state)
+        return update if center is None else update + center.sum(-1, keepdim=True)
+
+
+@mutant(CHECK, "reads some of rendering.alpha")
+class ReadsAnUndeclaredRendering(Loss):
+    renderings = "none"
+
+    def term(self, prediction, rendering, target, inputs):
+        return {"small": prediction.gaussians.scales.mean() + rendering.rgb.sum()}
+
+
+@mutant("requires_are_read", "requires memory.features, which")
+class RequiresTooMuch(ContentCrossAttention):
+    @classmethod
+    def fields_read(cls, config):
+        return MEMORY_FIELDS
+
+
+@mutant("writes_equal_provides", "writes place.center, which")
+class WritesMore(NoRefinement):
+    def forward(self, state):
+        return state.replace(fields={"place.center": state.features[..., :3].clone()})
+
+
+@mutant("unmet_requirement_fails_at_compose", "KeyError")
+class NeedsAFieldUndeclared(ContentSelfAttention):
+    def forward(self, state):
+        return super().forward(state) + state["place.center"].sum(-1, keepdim=True)
+
+
+@mutant("writes_equal_provides", "it loses unrelated.center")
+class LayerLosesFields(CrossSelfMlp):
+    def forward(self, state, memory):
+        state, memory = super().forward(state, memory)
+        return QueryState(state.features, mask=state.mask), memory
+
+
+CHECK = "geometry_is_float32_under_autocast"
+
+
+TURN = torch.tensor([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
+
+
+RADIUS = {"place.radius": FieldSpec((1,))}
+
+
+@mutant(CHECK, "bfloat16, not float32")
+class GivesHalf(FreeCenters):
+    def forward(self, offsets, state):
+        return offsets @ torch.eye(3).to(offsets)
+
+
+@mutant(CHECK, "place.center: values differ")
+class TurnsInHalf(Steps):
+    def turned(self, step: Tensor, center: Tensor) -> Tensor:
+        return (step.to(center) @ TURN.to(center)).to(center)
+
+    def moved(self, center, step):
+        return super().moved(center, self.turned(step, center))
+
+
+@mutant(CHECK, "place.center: values")
+class TurnsByALayerInHalf(TurnsInHalf):
+    def turned(self, step, center):
+        return step.to(center) + F.linear(center, TURN.to(center)).to(center)
+
+
+@named
+class TurnsInFull(TurnsInHalf):
+    """Sound: its layer runs in half precision, and what it does in space does not."""
+
+    def turned(self, step, center):
+        step *= 2
+        return (step.to(center)[..., None, :] * TURN.T.to(center)).sum(-1)
+
+
+@mutant(CHECK, "opacities: values differ")
+class DecodesInHalf(GaussianHead):
+    def activate(self, raw):
+        good = super().activate(raw)
+        opacities = torch.sigmoid(raw[..., -1] + self.config.opacity_bias).to(good.scales)
+        return GaussianAttributes(good.offsets, good.scales, good.quats, opacities, good.colors)
+
+
+@mutant(CHECK, "explain.geometry")
+class BiasesInHalf(ContentCrossAttention):
+    @classmethod
+    def fields_read(cls, config):
+        memory = ("memory.keys", "memory.values", "memory.patch_rays")
+        return {**PLACE, **{name: MEMORY_FIELDS[name] for name in memory}}
+
+    def bias(self, state, memory):
+        center, directions = state["place.center"], memory.patch_rays[..., 3:]
+        return (center @ directions.transpose(-1, -2)).to(center)
+
+    def forward(self, state, memory):
+        bias = self.bias(state, memory)
+        return self.core(state.features, memory.keys, memory.values, bias)
+
+    def explain(self, state, memory, queries):
+        bias = self.bias(state, memory)
+        return self.core.explain(state.features, memory.keys, queries, bias)
+
+
+@mutant("explanation_is_of_the_forward_pass", "the weights change otherwise")
+class ExplainsNoBias(BiasesInHalf):
+    """What it says of itself leaves out what geometry adds."""
+
+    def bias(self, state, memory):
+        apart = state["place.center"][:, :, None] - memory.patch_rays[:, None, :, 3:]
+        return -apart.square().sum(-1)
+
+    def explain(self, state, memory, queries):
+        return self.core.explain(state.features, memory.keys, queries)
+
+
+@mutant("forward_keeps_no_state", "in training changes the state")
+@mutant("batch_independence", "in training, scene 0 has a gradient")
+class BatchNormed(MlpFeedForward):
+    def __init__(self, config, dims):
+        super().__init__(config, dims)
+        self.statistics = nn.BatchNorm1d(dims.width)
+
+    def forward(self, features):
+        return self.statistics(super().forward(features).transpose(1, 2)).transpose(1, 2)
+
+
+@mutant("query_permutation", "permuted queries")
+class NumbersQueries(ContentSelfAttention):
+    def forward(self, state):
+        number = torch.arange(state.features.shape[1]).to(state.features)
+        return super().forward(state) + number[:, None]
+
+
+@mutant("query_permutation", "with 200 permuted queries")
+class AttendsWithinWindows(ContentSelfAttention):
+    """Of 16 consecutive queries."""
+
+    def forward(self, state):
+        return torch.cat([self.attention(x) for x in self.norm(state.features).split(16, 1)], 1)
+
+
+@mutant("view_permutation", "permuted views")
+class NumbersTokens(ContentCrossAttention):
+    def forward(self, state, memory):
+        number = torch.arange(memory.keys.shape[2]).to(memory.keys)
+        return self.core(state.features, memory.keys + number[:, None], memory.values)
+
+
+@mutant("view_permutation", "`ordered_views` is declared")
+class DeclaresAnOrder(ContentCrossAttention):
+    ordered_views = True
+
+
+@mutant("world_frame_makes_no_difference", "in a moved world, rgb")
+class DarkensByHeight(ChangedRenderer):
+    """Above the first camera, along the world's y axis: no shift of the world changes it."""
+
+    def given(self, gaussians, cameras):
+        height = gaussians.means[..., 1:2] - cameras.c2w[:, :1, 1, 3:]
+        return replace(gaussians, colors=gaussians.colors * height.sigmoid()), cameras

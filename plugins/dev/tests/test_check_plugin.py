@@ -1,0 +1,137 @@
+"""The contract suite on a whole plugin: its report, its examples, its exemptions."""
+
+import pytest
+from commands import run_qgs
+from contract_mutants.modules import CachesByShape, RaisesWhenBuilt
+from qgs_dev import runs_of
+
+from qgs.contracts import CONTRACT_VERSION, MissingExtraError, Plugin
+from qgs.data import PhotosSource
+from qgs.recipe.registry import InstalledPlugin, PluginError
+from qgs.renderers import TorchRenderer
+from qgs.tokengs import (
+    FreeCenters,
+    GaussianHead,
+    MlpFeedForward,
+)
+
+UNBOUNDED = FreeCenters.Config(output_limit=None)
+LARGE = "large_numbers_stay_finite"
+GRADIENTS, INPUTS = "gradients_match_differences", "gradients_reach_inputs"
+
+
+class CannotDefault(MlpFeedForward):
+    name = "cannot_default"
+
+    class Config(MlpFeedForward.Config):
+        def model_post_init(self, context) -> None:
+            raise RuntimeError("no defaults today")
+
+
+class NeedsMore(MlpFeedForward):
+    name = "needs_more"
+
+    def __init__(self, config, dims):
+        raise MissingExtraError('needs_more needs numba: run `pip install "query-gaussians[cpu]"`')
+
+
+class OnOtherDevices(TorchRenderer):
+    name = "on_other_devices"
+    devices = ("cuda",)
+
+
+def _installed(*components, **parts) -> InstalledPlugin:
+    return InstalledPlugin(Plugin("mine", CONTRACT_VERSION, components, **parts), "qgs-mine", "1.2")
+
+
+def _report(monkeypatch, installed: InstalledPlugin, *options: str):
+    for module in ("qgs_dev.check_command", "qgs_dev.plugins"):
+        monkeypatch.setattr(f"{module}.load_plugin", lambda name: installed)
+    return run_qgs("check-plugin", "mine", *options)
+
+
+def test_the_report_has_a_cause_once(monkeypatch) -> None:
+    result = _report(monkeypatch, _installed(MlpFeedForward, RaisesWhenBuilt), "--core")
+    assert result.exit_code == 1
+    lines = result.output.splitlines()
+    assert lines[0] == f"plugin mine of qgs-mine 1.2, contract version {CONTRACT_VERSION}"
+    assert any(line.startswith("ok     feed_forward/mlp: ") for line in lines)
+    assert any(line.startswith("FAILED feed_forward/raises_when_built: ") for line in lines)
+    assert result.output.count("no kernel") == 1
+    assert sum(line.startswith("  skipped: ") for line in lines) == 1
+    assert ", 1 failed, 0 expected to fail, " in lines[-1]
+
+
+def test_the_report_names_what_is_exempt(monkeypatch) -> None:
+    exempt = {CachesByShape: {"forward_keeps_no_state": "it is a cache"}}
+    result = _report(monkeypatch, _installed(CachesByShape, exemptions=exempt), "--core")
+    assert result.exit_code == 0, result.output
+    assert "expected to fail: forward_keeps_no_state: it is a cache (seen: " in result.output
+    assert "0 failed, 1 expected to fail, 0 skipped" in result.output
+
+
+def test_exemptions_are_of_a_class_or_of_options() -> None:
+    exempt = {FreeCenters: {GRADIENTS: "all"}, UNBOUNDED: {INPUTS: "these"}}
+    installed = _installed(FreeCenters, examples=(UNBOUNDED,), exemptions=exempt)
+    known = [(run.case.config, run.variant, run.expected) for run in runs_of(installed)]
+    first = (FreeCenters.Config(), False, {GRADIENTS: "all"})
+    assert known == [first, (UNBOUNDED, True, {GRADIENTS: "all", INPUTS: "these"})]
+
+
+@pytest.mark.parametrize(
+    ("exemptions", "examples"),
+    [
+        ({FreeCenters: {"large_number_stay_finite": "why"}}, ()),
+        ({FreeCenters: {"supervision_weights": "why"}}, ()),
+        ({FreeCenters: {LARGE: ""}}, ()),
+        ({GaussianHead: {LARGE: "why"}}, ()),
+        ({UNBOUNDED: {INPUTS: "why"}}, ()),
+        ({UNBOUNDED: {LARGE: "why"}}, (UNBOUNDED,)),  # made of the first case of a class alone
+    ],
+)
+def test_unsound_exemptions_are_refused(exemptions, examples) -> None:
+    installed = _installed(FreeCenters, examples=examples, exemptions=exemptions)
+    with pytest.raises(PluginError, match="exemptions"):
+        runs_of(installed)
+
+
+@pytest.mark.parametrize(
+    ("component", "why"),
+    [
+        (CannotDefault, "its default options are refused: RuntimeError: no defaults today"),
+        (PhotosSource, "there is no default for `path`"),
+    ],
+)
+def test_what_has_no_default_options_is_named(monkeypatch, component, why) -> None:
+    result = _report(monkeypatch, _installed(component), "--core")
+    assert result.exit_code == 1
+    assert f"not checked: {component.slot}/{component.name}: {why}" in result.output
+    assert "list a Config of it in `examples` of the Plugin" in result.output
+
+
+@pytest.mark.parametrize(
+    ("component", "why"),
+    [
+        (NeedsMore, 'needs_more needs numba: run `pip install "query-gaussians[cpu]"`'),
+        (OnOtherDevices, "runs on cuda alone, which is not here"),
+    ],
+)
+def test_what_cannot_be_built_here_is_not_checked(monkeypatch, component, why) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    result = _report(monkeypatch, _installed(FreeCenters, component), "--core")
+    assert result.exit_code == 1
+    lines = result.output.splitlines()
+    unchecked = [line for line in lines if line.startswith("not checked ")]
+    assert [line.split(":")[0] for line in unchecked] == [
+        f"not checked {component.slot}/{component.name}"
+    ]
+    assert any(line.startswith("  skipped: ") and line.endswith(f"checks: {why}") for line in lines)
+    assert lines[-1].endswith(", 1 not checked")
+
+
+@pytest.mark.slow
+def test_locus_passes() -> None:
+    result = run_qgs("check-plugin", "locus")
+    assert result.exit_code == 0, result.output
+    assert "7 components" in result.output
+    assert " 0 failed" in result.output

@@ -1,0 +1,68 @@
+"""Every component of this repository keeps its contract, and its weights keep their names."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+from qgs_dev import CaseRun, runs_of
+from qgs_dev.plugins import without_case
+
+from qgs.recipe.registry import load_plugin
+
+PINNED = json.loads((Path(__file__).parent / "state_dicts.json").read_text())
+"""Plugin -> label of a case -> name -> shape of a weight, so that saved weights stay loadable."""
+
+WITHOUT_CASE = {"vggt_features"}
+"""Components that need weights of their own, which the tests of their plugin make."""
+
+
+def all_runs() -> Iterator[CaseRun]:
+    for plugin, pinned in PINNED.items():
+        for run in runs_of(plugin):
+            run.case = replace(run.case, state_dict=pinned.get(run.case.label))
+            yield run
+
+
+RUNS = list(all_runs())
+
+
+@pytest.mark.parametrize("run", [run for run in RUNS if run.case.slot != "data"], ids=str)
+def test_contract(run: CaseRun) -> None:
+    run.check(["core"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", [run for run in RUNS if run.case.slot == "data"], ids=str)
+def test_contract_of_data(run: CaseRun) -> None:
+    run.check(["core"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", [run for run in RUNS if not run.variant], ids=str)
+def test_extended_contract(run: CaseRun) -> None:
+    run.check(["construction", "extended"])
+
+
+def shapes_of(run: CaseRun) -> dict[str, list[int]]:
+    return {name: [*weight.shape] for name, weight in run.case.build().state_dict().items()}
+
+
+def test_every_component_is_checked_and_its_weights_are_pinned() -> None:
+    unchecked = set()
+    for plugin, pinned in PINNED.items():
+        runs = {run.case.label: run for run in runs_of(plugin) if run.case.has_parameters}
+        firsts = {label for label, run in runs.items() if not run.variant}
+        missing = {label: shapes_of(runs[label]) for label in firsts - pinned.keys()}
+        assert not missing, f"add to {plugin} in state_dicts.json: {json.dumps(missing)}"
+        assert pinned.keys() <= runs.keys(), plugin
+        unchecked |= {component.name for component in without_case(load_plugin(plugin))}
+    assert unchecked == WITHOUT_CASE
+
+
+def test_every_plugin_of_this_repository_is_checked() -> None:
+    entries = entry_points(group="qgs.plugins")
+    ours = {x.name for x in entries if x.dist and x.dist.name.startswith("query-gaussians-")}
+    assert PINNED.keys() == {"qgs", *ours}

@@ -1,0 +1,74 @@
+"""Every check catches the components that are broken in the way that it is for."""
+
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from contract_mutants import sound, spatial
+from contract_mutants.mutant import MUTANTS, Mutant
+from qgs_dev import CHECKS, Case, checks_for, run_check
+
+from qgs.contracts import Component, ModelDims
+from qgs.renderers import TorchRenderer
+from qgs.tokengs import ContentCrossAttention
+
+for file in sorted(Path(sound.__file__).parent.glob("*.py")):
+    import_module(f"contract_mutants.{file.stem}")
+
+pytestmark = pytest.mark.slow
+
+
+def test_every_check_has_a_mutant() -> None:
+    assert {mutant.check for mutant in MUTANTS} == set(CHECKS)
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=str)
+def test_the_mutant_is_caught_by_the_check_that_is_meant(mutant: Mutant) -> None:
+    case, meant = mutant.to_case(), CHECKS[mutant.check]
+    result = run_check(meant, case)
+    assert result.verdict == "failed", result
+    assert mutant.seen in result.message
+    assert mutant.component.name in result.message
+    assert meant.contract in result.message
+
+
+SOUND = [
+    component
+    for component in vars(sound).values()
+    if getattr(component, "__module__", "") == sound.__name__ and "name" in vars(component)
+]
+
+
+@pytest.mark.parametrize("component", [*SOUND, spatial.TurnsInFull])
+def test_a_sound_component_passes(component: type[Component]) -> None:
+    case = Case(component.Config())
+    results = [run_check(check, case) for check in checks_for(case, ["core"])]
+    assert not [result.message for result in results if not result.ok]
+
+
+FAR = sound.SeesFar.Config(depth=8, layer_scale=1.0)
+GRID = ("tokens_are_those_of_the_grid",)
+GRADIENTS = ("render_gradients_match_differences", "camera_gradients_match_differences")
+
+
+@pytest.mark.parametrize(
+    ("checks", "case"),
+    [
+        (GRID, Case(FAR)),
+        *[
+            (GRID, Case(encoder.Config(patch_size=patch), image_size=size))
+            for encoder in (sound.ConvolvesByThree, sound.ConvolvesByFour)
+            for patch, size in [(4, None), (16, None), (8, (64, 64)), (8, (16, 24))]
+        ],
+        (["saved_weights_load"], Case(ContentCrossAttention.Config(), ModelDims(48, 3, 1))),
+        (GRADIENTS, Case(TorchRenderer.Config(dilation=0.1))),
+        (GRADIENTS, Case(TorchRenderer.Config(dilation=1.0))),
+        (GRADIENTS, Case(TorchRenderer.Config(alpha_min=1 / 128))),
+        (GRADIENTS, Case(TorchRenderer.Config(background=(0, 0, 0)))),
+        (GRADIENTS, Case(TorchRenderer.Config(), image_size=(17, 23))),
+    ],
+)
+def test_a_sound_component_of_unusual_options_passes(checks: list[str], case: Case) -> None:
+    for name in checks:
+        result = run_check(CHECKS[name], case)
+        assert result.verdict == "passed", result.message

@@ -1,0 +1,101 @@
+"""`qgs new-plugin`: what it writes, and what it refuses."""
+
+import math
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import pytest
+import torch
+from commands import run_qgs
+from qgs_dev.new_command import check_name, rendered
+
+from qgs.contracts import ModelDims
+from qgs.recipe.errors import Problems
+from qgs.recipe.yaml_text import load_mapping
+from qgs.types import ImageMemory, QueryState
+
+
+@pytest.fixture(autouse=True)
+def _in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def test_it_writes_a_complete_distribution(tmp_path: Path) -> None:
+    result = run_qgs("new-plugin", "far-sighted")
+    assert result.exit_code == 0, result.output
+    folder = tmp_path / "qgs-far-sighted"
+    written = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    assert written == {
+        ".gitignore",
+        "README.md",
+        "pyproject.toml",
+        "recipe.yaml",
+        "src/qgs_far_sighted/__init__.py",
+        "src/qgs_far_sighted/abstaining.py",
+        "src/qgs_far_sighted/py.typed",
+        "tests/test_contract.py",
+    }
+    project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+    assert project["name"] == "qgs-far-sighted"
+    assert project["entry-points"]["qgs.plugins"] == {"far-sighted": "qgs_far_sighted:plugin"}
+    assert [path.name for path in tmp_path.iterdir()] == ["qgs-far-sighted"], "nothing is left over"
+
+
+def test_what_it_writes_needs_no_tidying(tmp_path: Path) -> None:
+    run_qgs("new-plugin", "tidy")
+    for command in (["check", "--select", "E,F,W,I,UP,B"], ["format", "--check"]):
+        ruff = [sys.executable, "-m", "ruff", *command, "--no-cache", "qgs-tidy"]
+        done = subprocess.run(ruff, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout
+
+
+WORDS = ["no", "on", "yes", "off", "n", "inf", "nan"]
+"""What other readers of YAML take for values."""
+
+
+@pytest.fixture
+def _packages_are_listed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    listed = packages_distributions()
+    monkeypatch.setattr("qgs_dev.new_command.packages_distributions", lambda: listed)
+
+
+@pytest.mark.usefixtures("_packages_are_listed_once")
+def test_names_that_are_taken_as_they_are() -> None:
+    for name in ("a", "wide", "far-sighted", "far_sighted", "view2d", *WORDS):
+        check_name(name)
+        (text,) = [text for path, text in rendered(name) if path.name == "recipe.yaml"]
+        assert load_mapping(text, "recipe.yaml", Problems())["plugins"][-1] == name
+
+
+@pytest.mark.usefixtures("_packages_are_listed_once")
+def test_names_that_are_refused(tmp_path: Path) -> None:
+    names = ("Far Sighted", "../escape", "", "locus", "class", "torch")
+    errors = {name: run_qgs("new-plugin", "--", name).exception for name in names}
+    assert [name for name, error in errors.items() if not isinstance(error, ValueError)] == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    result = run_qgs("new-plugin", "wide", "--out", "mine")
+    assert isinstance(result.exception, FileExistsError)
+    assert list(tmp_path.rglob("*")) == [tmp_path / "mine"]
+
+
+@pytest.mark.parametrize("sink", [-0.5, 1.5])
+def test_its_component_computes_its_formula(sink: float) -> None:
+    (source,) = [text for path, text in rendered("mine") if path.name == "abstaining.py"]
+    names: dict = {}
+    exec(source, names)
+    attention = names["AbstainingAttention"]
+    module = attention(attention.Config(sink_init=sink), ModelDims(16, 2, 1))
+    state = QueryState(torch.randn(2, 3, 16))
+    keys, values = torch.randn(2, 2, 2, 6, 8)
+    memory = ImageMemory(torch.randn(2, 6, 16), keys, values, torch.randn(2, 6, 6), (1, 2, 3))
+    logits = module.core.project(state.features) @ keys.transpose(-1, -2) / 8**0.5
+    read = logits.exp() @ values / (math.exp(sink) + logits.exp().sum(-1, keepdim=True))
+    expected = module.core.out_proj(read.transpose(1, 2).flatten(2))
+    torch.testing.assert_close(module(state, memory), expected)

@@ -1,0 +1,71 @@
+"""How checks are run and reported: causes, places of errors, expected failures, arguments."""
+
+import re
+from pathlib import Path
+
+import pytest
+from contract_mutants import modules
+from contract_mutants.modules import CachesByShape, RaisesWhenBuilt
+from qgs_dev import (
+    CHECKS,
+    Case,
+    CaseRun,
+    checks_for,
+    run_check,
+)
+from qgs_dev.registry import TIERS
+
+from qgs.renderers import GsplatRenderer
+from qgs.tokengs import MlpFeedForward
+
+CASE = Case(MlpFeedForward.Config())
+CACHES = Case(CachesByShape.Config())
+STATE, FROZEN = "forward_keeps_no_state", "config_round_trip"
+
+
+def test_an_error_is_reported_with_its_place_in_the_component() -> None:
+    file = Path(modules.__file__)
+    culprit = "raise RuntimeError"
+    line = 1 + [culprit in text for text in file.read_text().splitlines()].index(True)
+    result = run_check(CHECKS["builds"], Case(RaisesWhenBuilt.Config()))
+    assert f" (raised under {file}:{line})\n" in result.message
+
+
+def test_one_cause_is_one_failure() -> None:
+    results = list(CaseRun(Case(RaisesWhenBuilt.Config())).results(["core"]))
+    assert [r.check.name for r in results if not r.ok] == ["builds"]
+    assert {r.verdict for r in results[1:]} == {"skipped"}
+
+
+def test_a_test_of_a_case_names_all_that_fails_and_skips_what_cannot_run(monkeypatch) -> None:
+    run = CaseRun(CACHES, expected={FROZEN: "it might"})
+    with pytest.raises(pytest.fail.Exception) as failure:
+        run.check(["core", "construction"])
+    titles = [line for line in str(failure.value).splitlines() if line.startswith(CACHES.label)]
+    assert titles[0] == f"{CACHES.label}: {STATE}"
+    assert titles[1].startswith(f"{CACHES.label}: {FROZEN} passes, although")
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(pytest.skip.Exception, match="runs on cuda alone"):
+        CaseRun(Case(GsplatRenderer.Config())).check(["core"])
+
+
+def test_further_options_of_a_class_have_the_checks_that_see_options() -> None:
+    variant = {check.name for check in checks_for(CASE, variant=True)}
+    assert {"builds", "runs", "gradients_match_differences"} <= variant
+    assert variant < {check.name for check in checks_for(CASE)}
+
+
+def test_tiers_divide_the_checks_and_likely_causes_come_first() -> None:
+    core, construction, extended = (checks_for(CASE, [tier]) for tier in TIERS)
+    assert [check.name for check in core[:4]] == ["builds", "runs", STATE, "eval_repeats_bitwise"]
+    assert FROZEN in {check.name for check in construction}
+    assert [check.name for check in extended] == ["compiles"]
+    assert len(core) + len(construction) + len(extended) == len(checks_for(CASE))
+
+
+def test_expected_failures_are_strict() -> None:
+    run = CaseRun(CACHES, expected={STATE: "a cache", FROZEN: "it might"})
+    verdicts = {result.check.name: result for result in run.results(["core", "construction"])}
+    assert re.search(r"a cache \(seen: .* changes _cache", verdicts[STATE].message)
+    assert verdicts[STATE].ok
+    assert verdicts[FROZEN].verdict == "unexpected pass"

@@ -1,1 +1,0 @@
-"""`EllipsoidBias` compiled, for CPUs and GPUs. The formula is in `qgs_ellipsoid.ray_bias`."""

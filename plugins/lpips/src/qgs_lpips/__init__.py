@@ -1,7 +1,0 @@
-"""LPIPS for qgs: how different rendered and true images look to VGG-16, as a loss and a metric."""
-
-from qgs.contracts import Plugin
-from qgs_lpips.loss import LpipsLoss
-from qgs_lpips.metric import Lpips
-
-plugin = Plugin(name="lpips", contract_version=1, components=(LpipsLoss, Lpips))

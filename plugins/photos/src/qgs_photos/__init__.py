@@ -1,0 +1,1 @@
+"""From a camera to a scene: formats, checks, poses, refinement."""

@@ -1,0 +1,18 @@
+"""Published data sets as `qgs` reads them: chunks in pixelSplat's format, and DL3DV's archives."""
+
+from qgs.contracts import Plugin
+from qgs_photos.datasets.bounded import Bounded
+from qgs_photos.datasets.chunks import ChunksSource
+from qgs_photos.datasets.dl3dv import Dl3dvSource
+from qgs_photos.datasets.farthest import Farthest
+from qgs_photos.datasets.overlapping import Overlapping
+
+plugin = Plugin(
+    name="datasets",
+    contract_version=1,
+    components=(ChunksSource, Dl3dvSource, Bounded, Farthest, Overlapping),
+    examples=(
+        ChunksSource.Config(path="chunks"),  # type: ignore[call-arg]
+        Dl3dvSource.Config(path="dl3dv"),  # type: ignore[call-arg]
+    ),
+)

@@ -1,0 +1,221 @@
+"""`cameras.json`, as feed-forward projects ship with their demos: poses, intrinsics, photos beside.
+
+What its numbers mean is read off their names; a name that leaves it open is refused.
+"""
+
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from upath import UPath
+
+from qgs.data.images import image_size
+from qgs.data.lenses import Size
+from qgs.data.photos.checks import FrameProblem, listed_size
+from qgs.data.photos.reader import (
+    Listing,
+    PhotoFrame,
+    PhotoReader,
+    existing,
+    image_files,
+    numbers,
+)
+from qgs.paths import open_file, read_json
+from qgs.wording import listed, warn_once
+
+_LISTS = ("frames", "cameras", "views")
+_NAMES = ("image", "image_path", "file_path", "filename", "file_name", "file", "name", "img_name")
+_C2W = ("c2w", "cam2world", "cam_to_world", "camera_to_world", "camtoworld")
+_W2C = ("w2c", "world2cam", "world_to_cam", "world_to_camera", "worldtocam")
+_OPENGL = ("transform_matrix",)
+_OPEN = ("extrinsics", "extrinsic", "pose")  # used for both directions
+_K = ("K", "intrinsics", "intrinsic", "camera_matrix")
+_FOCAL = (("fx", "fl_x"), ("fy", "fl_y"), ("cx",), ("cy",))
+_NORMALISED = 3.0  # intrinsics up to here are in parts of the width and height
+_START = 4_000_000  # bytes of a file that are looked at; a thousand cameras have a tenth of that
+_FORM = '{"frames": [{"image": "0.png", "c2w": 4 x 4, "K": 3 x 3}, ...]}'
+
+
+class CamerasJson(PhotoReader):
+    """A list of cameras, or one under `frames`, `cameras` or `views`, or lists of their values.
+
+    A camera has a pose: `c2w` or one of its other names, OpenCV camera-to-world (3 or 4, 4); `w2c`,
+    its inverse; `transform_matrix`, OpenGL as nerfstudio writes it; or `position` and `rotation`
+    (3, 3), camera-to-world as 3DGS writes them. And intrinsics: `K` or one of its other names,
+    (3, 3), or fx, fy, cx, cy, in a list or by these names, in pixels of `w` by `h`, or of the file
+    without these; where none is above 3, in parts of width and height. What all share may stand at
+    the top. Images are named by one of `_NAMES`, or are those beside the file, or in images, by
+    name.
+    """
+
+    name = "cameras"
+    listing = "cameras.json"
+    poses = "opencv c2w"
+
+    @classmethod
+    def recognises(cls, folder: UPath) -> bool:
+        """See `PhotoReader`: other programs give other files this name, without photos beside."""
+        file = folder / cls.listing
+        if not file.is_file():
+            return False
+        with open_file(file) as opened:
+            start = opened.read(_START)
+        if b'"to_photos"' in start:  # what `qgs reconstruct` writes beside its pictures
+            return False
+        known = all(key in start for key in (b'"c2w"', b'"K"'))
+        return known or any(map(image_files, (folder, folder / "images")))
+
+    @classmethod
+    def read(cls, folder: UPath, images: str | None) -> Listing:
+        """See `PhotoReader`. Raises ValueError for unnamed images of another number."""
+        file = folder / cls.listing
+        cameras = _cameras(file, read_json(file, f"write {_FORM}"))
+        names = [next((n for k in _NAMES if isinstance(n := c.get(k), str)), "") for c in cameras]
+        if not cameras:
+            raise ValueError(f"{file} lists no cameras: expected {_FORM}")
+        folders = [folder / images] if images else [folder, folder / "images"]
+        if any(names):  # relative to the first of the folders that holds some of them
+            names = _with_suffixes(names, folders)
+            held = (place for place in folders if existing(place / name for name in names if name))
+            place = next(held, folders[0])
+        else:
+            found = {place: image_files(place) for place in folders if place.is_dir()}
+            place, files = max(found.items(), key=lambda item: len(item[1]), default=(folder, []))
+            names = [item.name for item in files]
+            if len(names) != len(cameras):
+                raise ValueError(
+                    f"{file} lists {len(cameras)} cameras without names of images, but {place} has "
+                    f"{len(names)} images: name them, as in {_FORM}"
+                )
+        pairs = zip(cameras, names, strict=True)
+        read = [_Camera(camera, place, name) for camera, name in pairs]
+        if meant := sorted({camera.meaning for camera in read} - {"c2w and K in pixels"}):
+            warn_once(f"{file} is read as {listed(meant, 3)}")
+        return Listing(file, [camera.frame(folder) for camera in read])
+
+
+def _with_suffixes(names: list[str], folders: list[UPath]) -> list[str]:
+    """`names`, of which those without a suffix get that of the photo of the name."""
+    known = {photo.stem: photo.name for folder in folders for photo in image_files(folder)}
+    return [name if "." in name else known.get(name, name) for name in names]
+
+
+def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
+    """The entry of each camera, with defaults from the top level. Raises ValueError."""
+    top = data if isinstance(data, Mapping) else {}
+    given = next((top[key] for key in _LISTS if isinstance(top.get(key), list)), data)
+    if not isinstance(given, list):
+        pose, matrix = _first(top, (*_C2W, *_W2C, *_OPENGL, *_OPEN)), _first(top, _K)
+        columns: Any = [top.get(key) for key in (pose, matrix, "images")]
+        poses, matrices, names = columns
+        if not isinstance(poses, list):
+            return []
+        one = numbers(matrices)  # (4, 4) may be fx, fy, cx, cy of four cameras
+        shared = one.shape in ((3, 3), (4,)) or (one.shape == (4, 4) and not one[3, :3].any())
+        matrices = [matrices] * len(poses) if shared else matrices
+        names = names if isinstance(names, list) and len(names) == len(poses) else [""] * len(poses)
+        matrices = matrices if isinstance(matrices, list) else []
+        if (count := len(matrices)) != len(poses):
+            raise ValueError(
+                f"{file} has {len(poses)} matrices {pose} and {count} {matrix or 'K'}: write "
+                f"{_FORM}"
+            )
+        rows = zip(poses, matrices, names, strict=True)
+        given = [{pose: one, matrix: K, "image": name or None} for one, K, name in rows]
+    return [{**top, **camera} if isinstance(camera, Mapping) else {} for camera in given]
+
+
+def _first(values: Mapping[str, Any], keys: tuple[str, ...]) -> str:
+    """The first of `keys` that is given; "" for none."""
+    return next((key for key in keys if values.get(key) is not None), "")
+
+
+class _Camera:
+    """What an entry of the file says. name: of its photo, below `place`; "" for none."""
+
+    def __init__(self, values: Mapping[str, Any], place: UPath, name: str) -> None:
+        self.values, self.place, self.name = values, place, name
+        self.problems = list[FrameProblem]()
+        sides = [values.get(s, values.get(long)) for s, long in (("h", "height"), ("w", "width"))]
+        self.size: Size | None = None
+        if None not in sides:
+            plain = (s if isinstance(s, int | float) else math.nan for s in sides)
+            self.size, wrong = listed_size(*plain)
+            self.problems += wrong
+        if not name:
+            self._wrong("path", "no image is named")
+        self.pose, pose = self._pose()
+        self.intrinsics, matrix = self._intrinsics()
+        self.meaning = f"{pose} and {matrix}"
+
+    def _wrong(self, field: str, reason: str) -> None:
+        self.problems.append(FrameProblem(field, reason, f"write {_FORM}"))
+
+    def _pose(self) -> tuple[np.ndarray, str]:
+        """OpenCV camera-to-world (4, 4), and what was read as that."""
+        values, key = self.values, _first(self.values, (*_C2W, *_W2C, *_OPENGL))
+        pose, meaning = numbers(values.get(key)), key
+        if not key and {"position", "rotation"} <= values.keys():
+            rotation, position = (numbers(values[k]) for k in ("rotation", "position"))
+            meaning = "position and rotation (camera-to-world, as 3DGS writes them)"
+            if rotation.shape == (3, 3) and position.shape == (3,):
+                pose = np.c_[rotation, position]
+        elif not key:
+            unclear = _first(values, _OPEN)
+            reason = f"{unclear!r} may map from or to the world" if unclear else "it has no pose"
+            self._wrong("c2w", f"{reason}: expected {listed([*_C2W[:1], *_W2C[:1]])}")
+            return np.full((4, 4), np.nan), meaning
+        if pose.shape == (3, 4):
+            pose = np.vstack([pose, [0, 0, 0, 1]])
+        if pose.shape != (4, 4):
+            self._wrong("c2w", f"{key or 'rotation'!r} has the shape {pose.shape}")
+            return np.full((4, 4), np.nan), meaning
+        if key in _W2C:
+            meaning = f"{key} (world-to-camera)"
+            singular = not np.isfinite(pose).all() or abs(np.linalg.det(pose)) < 1e-9
+            pose = np.full((4, 4), np.nan) if singular else np.linalg.inv(pose)
+        if key in _OPENGL:
+            meaning, pose = f"{key} (OpenGL camera-to-world)", pose * [1, -1, -1, 1]
+        return pose, f"{key} (camera-to-world)" if key in _C2W[1:] else meaning
+
+    def _intrinsics(self) -> tuple[np.ndarray, str]:
+        """fx, fy, cx, cy in pixels, and what was read as that."""
+        key = _first(self.values, _K)
+        matrix = numbers(self.values.get(key))
+        names = [_first(self.values, names) for names in _FOCAL]
+        if not key and names[0]:
+            fx = self.values[names[0]]
+            matrix = numbers([fx, self.values.get(names[1], fx)])
+            centre = [self.values.get(name) for name in names[2:]]
+            if None in centre and (size := self._photo_size()):
+                centre = [size[1] / 2, size[0] / 2]
+            matrix = np.append(matrix, numbers(centre))
+        if matrix.shape in ((3, 3), (4, 4)):
+            matrix = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+        if matrix.shape != (4,):
+            reason = f"{key!r} has the shape {matrix.shape}" if key else "it has no intrinsics"
+            self._wrong("intrinsics", f"{reason}: expected 'K', 3 x 3")
+            return np.full(4, np.nan), "no intrinsics"
+        if np.abs(matrix).max() <= _NORMALISED and (size := self._photo_size()):
+            height, width = size
+            scaled = matrix * [width, height, width, height]
+            return scaled, f"{key or 'fx'} in parts of width and height"
+        return matrix, f"{key or names[0]} in pixels"
+
+    def _photo_size(self) -> Size | None:
+        """As listed, else that of the file; None of one that cannot be read."""
+        if self.size is None and self.name:
+            with suppress(ValueError):
+                self.size = image_size(self.place / self.name)
+        return self.size
+
+    def frame(self, folder: UPath) -> PhotoFrame:
+        """The photo, with its name below `folder`."""
+        name, place = self.name, self.place
+        fx, fy, cx, cy = self.intrinsics.tolist()
+        inside = name if place == folder or not name else f"{place.name}/{name}"
+        return PhotoFrame(
+            inside, place / name, self.pose, (fx, fy, cx, cy), self.size, problems=(*self.problems,)
+        )

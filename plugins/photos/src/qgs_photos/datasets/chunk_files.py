@@ -1,0 +1,376 @@
+"""Files of RealEstate10K-style chunks: reading, checking, and which scenes a folder holds.
+
+The format is pixelSplat's (data release of RealEstate10K and ACID, and DepthSplat's of DL3DV):
+PATH/{train,test}/index.json maps a scene's key to a file such as 000000.torch, which is a list of
+mappings, one a scene, with `key`, `url`, `timestamps` (V,), `cameras` (V, 18) float32 and `images`,
+a list of V uint8 tensors with the bytes of JPEG or PNG files. A row of `cameras` is fx, fy, cx, cy
+divided by the image's width and height, two numbers without use, and the rows of the 3 x 4 OpenCV
+world-to-camera matrix.
+
+`qgs` adds keys that other readers ignore: `names` (V strings), `sizes` (V, 2), the height and width
+of every image, `masks`, a list of V uint8 tensors with the bytes of PNG files, empty where a frame
+has none, `held_out`, the frames that training is not to see, and `times` (V,) float64, see `Scene`.
+"""
+
+import io
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import PurePosixPath
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from upath import UPath
+
+from qgs.data.images import decode_mask, encoded_size
+from qgs.data.lenses import Intrinsics, Size
+from qgs.data.photos.checks import (
+    LARGEST_SIDE,
+    FrameProblem,
+    intrinsics_problems,
+    pose_problems,
+    size_problems,
+)
+from qgs.paths import is_local, listing, open_file, read_json
+from qgs.wording import listed, name_shown, warn_once
+
+INDEX = "index.json"
+SUFFIX = ".torch"
+_RIGID = 0.9e-3  # of rotations against orthonormality, below what `pose_problems` refuses
+_IN_PIXELS = 50.0  # a focal length above is no multiple of the image's width or height
+_DIVIDED_TWICE = 0.02  # a focal length below is an angle of view of more than 175 degrees
+
+
+@dataclass(frozen=True)
+class Record:
+    """A scene as a chunk holds it (see the top of this file), undecoded; where: for messages."""
+
+    where: str
+    key: str
+    cameras: Tensor
+    images: Sequence[Tensor]
+    names: Sequence[str]
+    sizes: Tensor | None
+    masks: Sequence[Tensor] | None
+    held_out: tuple[int, ...]
+    times: Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def place(self, frame: int) -> str:
+        """File, key, frame number and name, for messages."""
+        return f"{self.where}, frame {frame} ({self.names[frame]})"
+
+    @cached_property
+    def w2c(self) -> Tensor:
+        """(V, 4, 4) float64 world-to-camera, OpenCV axes, as stored."""
+        matrix = torch.eye(4, dtype=torch.float64).repeat(len(self), 1, 1)
+        matrix[:, :3] = self.cameras[:, 6:].double().reshape(-1, 3, 4)
+        return matrix
+
+    @cached_property
+    def image_sizes(self) -> list[Size]:
+        """(H, W) of every image: as the chunk says, else all as `stored_size` of the first."""
+        if self.sizes is not None:
+            return [(int(height), int(width)) for height, width in self.sizes.tolist()]
+        return [self.stored_size(0)] * len(self)
+
+    def stored_size(self, frame: int) -> Size:
+        """(H, W) in the header of an image. Raises ValueError for no readable image."""
+        try:
+            return encoded_size(io.BytesIO(self.images[frame].numpy().tobytes()))
+        except OSError as error:
+            raise ValueError(
+                f"{self.place(frame)}: the bytes are no readable image ({error}): pack the data "
+                "set again with `qgs data pack`, or remove the scene from index.json"
+            ) from error
+
+    def intrinsics(self, frame: int, size: Size) -> Intrinsics:
+        """fx, fy, cx, cy in pixels of an image of `size` (H, W)."""
+        fx, fy, cx, cy = self.cameras[frame, :4].double().tolist()
+        return fx * size[1], fy * size[0], cx * size[1], cy * size[0]
+
+
+def parse_record(file: str, data: Any) -> Record:
+    """The scene in an entry of the chunk `file`. Raises ValueError for another structure."""
+    if not isinstance(data, Mapping) or not isinstance(data.get("key"), str):
+        raise ValueError(
+            f"{file} holds {a_type(data)}, expected a mapping with 'key', 'cameras' and 'images': "
+            "is it a chunk of RealEstate10K's format?"
+        )
+    where = f"{file}: scene {data['key']!r}"
+    for name in ("cameras", "images", "sizes", "masks", "timestamps", "held_out", "times"):
+        value = data.get(name)
+        for item in value if isinstance(value, list | tuple) else [value]:
+            plain = not isinstance(item, Tensor) or _is_plain(item)
+            _expect(plain, where, f"{name!r} holds a tensor whose numbers are not all stored")
+    images = _files(where, "images", data.get("images"))
+    count = len(images)
+    _expect(count > 0, where, "there are no frames")
+    cameras = _tensor(where, "cameras", data.get("cameras"), (count, 18))
+    _expect(cameras.is_floating_point(), where, f"'cameras' are {cameras.dtype}, expected float32")
+    sizes, masks, names, times = (data.get(key) for key in ("sizes", "masks", "names", "times"))
+    if sizes is not None:
+        sizes = _tensor(where, "sizes", sizes, (count, 2))
+        fits = bool(((sizes >= 1) & (sizes <= LARGEST_SIDE)).all())
+        _expect(fits, where, f"'sizes' must be pixels from 1 to {LARGEST_SIDE}")
+    if masks is not None:
+        masks = _files(where, "masks", masks)
+        _expect(len(masks) == count, where, f"{len(masks)} masks for {count} images")
+    if names is None:  # RealEstate10K's: the time of a frame in its video
+        stamps = data.get("timestamps")
+        names = stamps.flatten().tolist() if isinstance(stamps, Tensor) else range(count)
+    fits = isinstance(names, list | range) and len(names) == count
+    _expect(fits, where, f"'names', or 'timestamps', must be {count}")
+    held_out = data.get("held_out", ())
+    held_out = held_out.flatten().tolist() if isinstance(held_out, Tensor) else held_out
+    fits = isinstance(held_out, list | tuple) and {*held_out} <= {*range(count)}
+    _expect(fits, where, f"'held_out' must list frames from 0 to {count - 1}")
+    if times is not None:
+        times = _tensor(where, "times", times, (count,)).to(torch.float64, copy=True)
+        _expect(bool(times.isfinite().all()), where, "'times' must be finite numbers")
+    names = [str(name) for name in names]
+    return Record(where, data["key"], cameras, images, names, sizes, masks, tuple(held_out), times)
+
+
+def _expect(valid: bool, where: str, reason: str) -> None:
+    if not valid:
+        fix = "pack the data set again with `qgs data pack`, or remove the scene from index.json"
+        raise ValueError(f"{where}: {reason}: {fix}")
+
+
+def a_type(value: object) -> str:
+    """The type of `value` with its article, such as "an int"."""
+    name = type(value).__name__
+    return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
+
+
+def _is_plain(data: Tensor) -> bool:
+    """Whether its numbers are all stored: an expanded tensor of a small file can fill the memory.
+
+    Sparse, quantised and nested tensors and those of other devices are refused too.
+    """
+    strided = data.layout == torch.strided and data.device.type == "cpu"
+    if not strided or data.is_quantized or data.is_nested:
+        return False
+    return data.numel() * data.itemsize <= data.untyped_storage().nbytes()
+
+
+def _tensor(where: str, name: str, data: Any, shape: tuple[int, ...]) -> Tensor:
+    if isinstance(data, np.ndarray):
+        data = torch.from_numpy(data)
+    found = list(data.shape) if isinstance(data, Tensor) else a_type(data)
+    wanted = f"a tensor of shape {list(shape)}, as there are {shape[0]} images"
+    _expect(found == list(shape), where, f"{name!r} must be {wanted}, got {found}")
+    assert isinstance(data, Tensor)
+    return data.detach()
+
+
+def _files(where: str, name: str, data: Any) -> Sequence[Tensor]:
+    valid = isinstance(data, list | tuple) and all(
+        isinstance(item, Tensor) and item.dtype == torch.uint8 and item.ndim == 1 for item in data
+    )
+    wanted = "a list of one-dimensional uint8 tensors with the bytes of image files"
+    _expect(valid, where, f"{name!r} must be {wanted}, got {a_type(data)}")
+    return data
+
+
+def read_mask(record: Record, frame: int) -> np.ndarray | None:
+    """The mask of a frame, (H, W) uint8 of its image's shape; None without. Raises ValueError."""
+    data = None if record.masks is None else record.masks[frame].numpy().tobytes()
+    if not data:
+        return None
+    try:
+        mask = decode_mask(io.BytesIO(data))
+    except OSError as error:
+        fix = "pack the chunk again, or remove the scene from index.json"
+        raise ValueError(
+            f"the mask of {record.place(frame)} is unusable ({error}): {fix}"
+        ) from error
+    for problem in size_problems(mask.shape[:2], record.image_sizes[frame]):
+        raise ValueError(f"the mask of {record.place(frame)}: {problem}")
+    return mask
+
+
+def require_usable(record: Record) -> None:
+    """Raise ValueError for the first camera with a fatal problem, naming its frame."""
+    rotation = record.w2c[:, :3, :3]
+    error = rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)
+    focal = record.cameras[:, :2]
+    usable = (
+        torch.isfinite(record.cameras).all()
+        and error.abs().max() < _RIGID
+        and torch.linalg.det(rotation).min() > 0
+        and focal.min() > 0
+        and focal.max() < _IN_PIXELS
+    )
+    # checking all frames at once first is ten times as fast as one by one
+    for frame in () if usable else range(len(record)):
+        for problem in camera_problems(record, frame):
+            if problem.fatal:
+                raise ValueError(f"{record.place(frame)}: {problem}")
+
+
+def camera_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
+    """What is wrong with the camera of a frame."""
+    yield from pose_problems(record.w2c[frame].numpy())
+    of_unit = list(unit_problems(record, frame))
+    yield from of_unit
+    if not of_unit:
+        size = record.image_sizes[frame]
+        yield from intrinsics_problems(record.intrinsics(frame, size), size)
+
+
+def unit_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
+    """Problems of the unit of a frame's intrinsics, fractions of the image's sides."""
+    values = record.cameras[frame, :4].tolist()
+    focal = max(values[:2])
+    divided_twice = 0 < focal < _DIVIDED_TWICE
+    if divided_twice or focal >= _IN_PIXELS:
+        numbers = ", ".join(f"{value:.6g}" for value in values)
+        unit = "divided twice" if divided_twice else "like pixels"
+        yield FrameProblem(
+            "intrinsics",
+            f"the intrinsics ({numbers}) look {unit}",
+            "chunks hold fx and cx divided once by the image's width, fy and cy by its height",
+        )
+
+
+def load_chunk(path: UPath) -> list[Any]:
+    """The entries of a chunk, tensors and plain containers; a local zip file is memory-mapped.
+
+    Raises FileNotFoundError, and ValueError for a file that is no list.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"chunk {path} does not exist: download it, or take its scenes out of index.json"
+        )
+    try:
+        file = str(path) if is_local(path) else open_file(path)
+        mapped = is_local(path) and zipfile.is_zipfile(file)
+        # weights_only refuses Python objects, whose loading could run code
+        data = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
+    except Exception as error:  # damaged files raise anything
+        reason = "damaged, or with Python objects, whose loading could run code"
+        if type(error).__name__ != "UnpicklingError":  # whose text advises to trust the file
+            reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise ValueError(
+            f"{path} cannot be read as a torch file of tensors and lists ({reason}): copy or "
+            "pack it again"
+        ) from error
+    if not isinstance(data, list):
+        raise ValueError(
+            f"{path} holds {a_type(data)}, expected a list of mappings: is it a chunk of "
+            "RealEstate10K's format?"
+        )
+    return data
+
+
+class Chunk:
+    """An open chunk. entries: its scenes by key, as stored."""
+
+    def __init__(self, path: UPath) -> None:
+        self.path = path
+        self.entries: dict[str, Any] = {}
+        self._parsed: dict[str, Record] = {}
+        for place, entry in enumerate(load_chunk(path)):
+            key = entry.get("key") if isinstance(entry, dict) else None
+            if not isinstance(key, str):
+                parse_record(f"{path}: entry {place}", entry)  # raises
+            elif key in self.entries:
+                raise ValueError(f"{path} holds the scene {key!r} twice: pack the data set again")
+            else:
+                self.entries[key] = entry
+
+    def record(self, key: str) -> Record:
+        """A scene. Raises ValueError when it is not in this chunk or is malformed."""
+        if key not in self.entries:
+            raise ValueError(
+                f"{self.path} does not hold the scene {key!r}, which index.json places there: "
+                "remove index.json to have the chunks read instead, or pack the data set again"
+            )
+        if key not in self._parsed:
+            self._parsed[key] = parse_record(str(self.path), self.entries[key])
+        return self._parsed[key]
+
+
+def has_chunks(folder: UPath) -> bool:
+    """Whether a folder looks like one of chunks: it holds an index.json or .torch files."""
+    return folder.is_dir() and (
+        (folder / INDEX).is_file() or any(item.suffix == SUFFIX for item in folder.iterdir())
+    )
+
+
+def stays_inside(name: str) -> bool:
+    """Whether a relative name, with either kind of slash, stays inside the folder it starts in."""
+    parts = PurePosixPath(name.replace("\\", "/")).parts
+    return bool(parts) and parts[0] != "/" and ".." not in parts and ":" not in parts[0]
+
+
+def read_chunk_index(path: UPath) -> dict[str, str]:
+    """An index.json: key to file name. Raises ValueError for a file outside the folder."""
+    index = read_json(path, "copy it again, or remove it to have the chunks read instead")
+    if not isinstance(index, dict) or not all(isinstance(name, str) for name in index.values()):
+        raise ValueError(f"{path} must map each scene's key to the name of its chunk file")
+    inside = {name for name in set(index.values()) if stays_inside(name)}
+    for key, name in index.items():
+        if name not in inside:
+            raise ValueError(
+                f"{path} places the scene {name_shown(key)} in {name_shown(name)!r}, outside its "
+                "own folder: correct the index, or remove it to have the chunks read instead"
+            )
+    return index
+
+
+def list_scenes(folder: UPath) -> dict[str, UPath]:
+    """The scenes of a folder by key, in the order of its index, or else of its chunks.
+
+    Scenes whose chunk is missing are left out and logged. Raises FileNotFoundError when none is
+    left, ValueError for an index or a chunk that cannot be read.
+    """
+    if not (folder / INDEX).is_file():
+        return _scanned(folder)
+    index = read_chunk_index(folder / INDEX)
+    # one listing of the folder; asking a store for each of a thousand files takes minutes
+    present = {item.name for item in listing(folder)}
+    there = {n for n in set(index.values()) if n in present or ("/" in n and (folder / n).exists())}
+    here = {key: folder / name for key, name in index.items() if name in there}
+    missing = [f"{key} ({name})" for key, name in index.items() if name not in there]
+    if not here:
+        raise FileNotFoundError(
+            f"{folder / INDEX} names {len(index)} scenes, and none of their chunks exists: "
+            "download the chunks beside it"
+        )
+    if missing:
+        warn_once(
+            f"{len(missing)} of {len(index)} scenes of {folder / INDEX} are left out, because "
+            f"their chunks do not exist: {listed(missing)}"
+        )
+    return here
+
+
+def _scanned(folder: UPath) -> dict[str, UPath]:
+    paths = sorted((item for item in listing(folder) if item.suffix == SUFFIX), key=str)
+    if not paths:
+        raise FileNotFoundError(
+            f"{folder} holds neither {INDEX} nor chunks ({SUFFIX} files): give the folder that "
+            "holds train/ and test/"
+        )
+    files: dict[str, UPath] = {}
+    for path in paths:
+        for key in Chunk(path).entries:
+            if key in files:
+                raise ValueError(
+                    f"the scene {key!r} is in {files[key].name} and in {path.name} of {folder}: "
+                    f"remove one of the files, or write an {INDEX}"
+                )
+            files[key] = path
+    warn_once(
+        f"{folder} has no {INDEX}, so that all of its {len(paths)} chunks are opened at every "
+        f"start to list {len(files)} scenes"
+    )
+    return files

@@ -1,0 +1,241 @@
+"""`datasets/chunks`: RealEstate10K-style chunks; their format is described in `chunk_files`."""
+
+import io
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+from typing import ClassVar
+
+import numpy as np
+import torch
+from PIL import Image
+from pydantic import Field
+from torch import Tensor
+from upath import UPath
+
+from qgs.contracts import SceneSource, Split
+from qgs.data.images import CropResize, decode_rgb, to_tensor
+from qgs.data.lenses import Size
+from qgs.data.samples import held_out_frames
+from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, LazySource
+from qgs.paths import opened_path
+from qgs.types import Cameras
+from qgs.wording import listed, warn_once
+from qgs_photos.datasets.chunk_files import (
+    SUFFIX,
+    Chunk,
+    Record,
+    has_chunks,
+    list_scenes,
+    read_mask,
+    require_usable,
+)
+
+_OPEN = 4  # chunks kept open
+_SAME_ASPECT = 0.01  # relative difference between an image's aspect ratio and the scene's
+
+
+class ChunksConfig(SceneSource.Config):
+    """Options of `datasets/chunks`."""
+
+    path: str
+    """Folder or fsspec URL with train/ and test/, relative to the working directory. Chunks at a
+    URL are read whole, by every process and worker: copy them to a local disk to train."""
+    holdout: int = Field(default=0, ge=0)
+    """Every n-th frame of a scene is kept for evaluation, from frame n // 2 on; 0 keeps those that
+    `qgs data pack` took over from its source, which other chunks have none of."""
+    max_scenes: int = Field(default=0, ge=0)
+    """Only the first scenes of each split; 0 for all."""
+    min_frames: int = Field(default=0, ge=0)
+    """Leave out scenes with fewer frames, which opens every chunk once at the start; 0 for none."""
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """RGB in [0, 1] behind transparent pixels."""
+
+
+class ChunkScene(EncodedScene):
+    """One scene of a chunk, read from the file when it is wanted. World: that of its poses."""
+
+    def __init__(
+        self, name: str, file: UPath, config: ChunksConfig, chunks: BoundedCache[Chunk]
+    ) -> None:
+        self.name, self._file, self._config, self._chunks = name, file, config, chunks
+
+    @property
+    def _record(self) -> Record:
+        return self._chunks.get(str(self._file), lambda: Chunk(self._file)).record(self.name)
+
+    @cached_property
+    def _length(self) -> int:
+        return len(self._record)
+
+    def __len__(self) -> int:
+        return self._length
+
+    @cached_property
+    def held_out(self) -> Sequence[int]:  # type: ignore[override]  # known once the chunk is open
+        """See `Scene`: as the option says, else as the chunk does."""
+        every = self._config.holdout
+        return held_out_frames(len(self), every) if every else self._record.held_out
+
+    @cached_property
+    def times(self) -> Tensor | None:  # type: ignore[override]  # known once the chunk is open
+        """See `Scene`."""
+        return self._record.times
+
+    @cached_property
+    def cameras(self) -> Cameras:
+        """See `Scene`; float64. Raises ValueError for cameras that cannot be used."""
+        record, target = self._record, self._config.image_size
+        require_usable(record)
+        intrinsics = record.cameras[:, :4].double()
+        sizes = torch.tensor(record.image_sizes)
+        for height, width in set(record.image_sizes):
+            alike = (sizes == torch.tensor([height, width])).all(1)
+            pixels = intrinsics[alike] * torch.tensor([width, height, width, height])
+            intrinsics[alike] = CropResize((height, width), target).intrinsics(pixels)
+        return Cameras(torch.linalg.inv(record.w2c), intrinsics, target)
+
+    def frame_name(self, frame: int) -> str:
+        """See `Scene`: the writer's name of a frame, else its time stamp."""
+        return self._record.names[frame]
+
+    def stored_size(self, frame: int) -> Size:
+        """See `Scene`."""
+        return self._record.stored_size(frame)
+
+    def images(self, frames: Sequence[int]) -> Tensor:
+        """See `Scene`. Raises ValueError for an image that cannot be decoded."""
+        record = self._record
+        return to_tensor(np.stack([self._pixels(record, frame) for frame in frames]))
+
+    def masks(self, frames: Sequence[int]) -> Tensor | None:
+        """See `Scene`; a frame without a mask has one of ones."""
+        record = self._record
+        if record.masks is None:
+            return None
+        masks = np.stack([self._mask(record, frame) for frame in frames])
+        return torch.from_numpy(masks)[:, None].float().div_(255)
+
+    def encoded(self, frame: int) -> EncodedFrame:
+        """See `EncodedScene`."""
+        record = self._record
+        size = record.stored_size(frame)
+        mask = None if record.masks is None else record.masks[frame].numpy().tobytes()
+        return EncodedFrame(
+            name=record.names[frame],
+            data=record.images[frame].numpy().tobytes(),
+            c2w=torch.linalg.inv(record.w2c[frame]).numpy(),
+            intrinsics=record.intrinsics(frame, size),
+            size=size,
+            mask=mask or None,
+            background=self._config.background,
+        )
+
+    def _pixels(self, record: Record, frame: int) -> np.ndarray:
+        file = io.BytesIO(record.images[frame].numpy().tobytes())
+        try:
+            image = decode_rgb(file, self._config.background)
+        except OSError as error:
+            raise ValueError(
+                f"{record.place(frame)} cannot be read as an image ({error}): copy or pack the "
+                "chunk again, or take the scene out of index.json"
+            ) from error
+        # intrinsics were cropped for the size that the scene gives
+        height, width = record.image_sizes[frame]
+        if abs(image.width * height / (image.height * width) - 1) > _SAME_ASPECT:
+            raise ValueError(
+                f"{record.place(frame)} is {image.width} x {image.height} pixels, and its scene's "
+                f"images are {width} x {height}, another aspect ratio: chunks of mixed sizes need "
+                "'sizes', which `qgs data pack` writes"
+            )
+        return CropResize((image.height, image.width), self._config.image_size).image(image)
+
+    def _mask(self, record: Record, frame: int) -> np.ndarray:
+        mask = read_mask(record, frame)
+        if mask is None:
+            return np.full(self._config.image_size, 255, np.uint8)
+        crop = CropResize((mask.shape[0], mask.shape[1]), self._config.image_size)
+        return crop.image(Image.fromarray(mask))
+
+
+class ChunksSource(LazySource):
+    """Chunks under PATH/train and PATH/test; a folder without these is the training split.
+
+    A data set without test chunks is evaluated on the held-out frames of its training scenes,
+    where there are any. Scenes that an index.json names and whose chunks do not exist are left out,
+    counted and named in a warning.
+    """
+
+    name = "chunks"
+    Config = ChunksConfig
+    tells_times: ClassVar[bool] = True
+    not_in_protocol: ClassVar[frozenset[str]] = frozenset({"path", "max_scenes", "min_frames"})
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
+
+    def __init__(self, config: ChunksConfig) -> None:
+        super().__init__(config)
+        opener = partial(ChunkScene, config=config, chunks=BoundedCache(_OPEN))
+        self._nothing = LazyScenes({}, opener)
+        splits: dict[Split, LazyScenes] = {"train": self._nothing}
+        for split, folder in _folders(opened_path(config.path)).items():
+            files = _long_enough(folder, config, opener)
+            splits[split] = LazyScenes(files, opener, config.max_scenes)
+        self.splits = splits
+
+    @classmethod
+    def recognises(cls, path: UPath) -> bool:
+        """Chunk files or an index.json in train or test, or chunk files in the folder itself."""
+        inside = [path, *path.iterdir()] if path.is_dir() else []
+        splits = [item for item in inside if item.name in ("train", "test")]
+        return any(map(has_chunks, splits)) or any(item.suffix == SUFFIX for item in inside)
+
+    def scenes(self, split: Split) -> LazyScenes:
+        """See `SceneSource`. Without test chunks, a training scene says if frames are held out."""
+        if split in self.splits:
+            return self.splits[split]
+        train, first = self.splits["train"], self.groups("train")[:1]
+        return train if any(train[i].held_out for group in first for i in group) else self._nothing
+
+    def groups(self, split: Split) -> Sequence[Sequence[int]]:
+        """See `SceneSource`: one group for each chunk file."""
+        by_file: dict[str, list[int]] = {}
+        for index, file in enumerate(self.scenes(split).places.values()):
+            by_file.setdefault(str(file), []).append(index)
+        return list(by_file.values())
+
+
+def _folders(path: UPath) -> dict[Split, UPath]:
+    if not path.is_dir():
+        raise FileNotFoundError(
+            f"the chunks' folder {path} does not exist: give the folder that holds train/ and test/"
+        )
+    folders: dict[Split, UPath] = {"train": path / "train", "test": path / "test"}
+    found: dict[Split, UPath] = {s: inside for s, inside in folders.items() if has_chunks(inside)}
+    if not found and has_chunks(path):
+        return {"train": path}
+    if not found:
+        inside = listed(sorted(item.name for item in path.iterdir())) or "nothing"
+        raise FileNotFoundError(
+            f"{path} holds no chunks: expected train/ or test/ with index.json and .torch files, "
+            f"found {inside}. `qgs data pack` makes chunks of other formats"
+        )
+    return found
+
+
+def _long_enough(
+    folder: UPath, config: ChunksConfig, opener: Callable[[str, UPath], ChunkScene]
+) -> dict[str, UPath]:
+    """The scenes with `min_frames` frames; the others are counted and named."""
+    files = list_scenes(folder)
+    if not config.min_frames:
+        return files
+    # in the order of the files: few of them stay open
+    by_file = sorted(files.items(), key=lambda item: str(item[1]))
+    frames = {key: len(opener(key, file)) for key, file in by_file}
+    short = {key: count for key, count in frames.items() if count < config.min_frames}
+    if short:
+        names = listed(f"{key} ({count})" for key, count in short.items())
+        warn_once(
+            f"{len(short)} of {len(files)} scenes of {folder} have fewer than "
+            f"{config.min_frames} frames (min_frames) and are left out: {names}"
+        )
+    return {key: file for key, file in files.items() if key not in short}

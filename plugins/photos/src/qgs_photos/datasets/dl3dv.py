@@ -1,0 +1,175 @@
+"""`datasets/dl3dv`: DL3DV's scenes, from archives or folders."""
+
+import re
+import zipfile
+from collections.abc import Iterator
+from functools import partial
+from typing import Any, ClassVar
+
+from pydantic import Field
+from upath import UPath
+
+from qgs.contracts import SceneSource
+from qgs.data.photos import formats_of
+from qgs.data.photos.source import PhotoScene, PhotosConfig, image_cache
+from qgs.data.scenes import LazyScenes, LazySource
+from qgs.paths import opened_path, read_file, read_json
+from qgs.wording import listed, warn_once
+
+LISTING = "transforms.json"
+_INSIDE = ("", "gaussian_splat", "nerfstudio")  # folders of a scene that may hold the listing
+_DEPTH = 2  # folders between the data set's and a scene
+_HASH = re.compile(r"[0-9a-f]{64}")
+
+
+class Dl3dvConfig(SceneSource.Config):
+    """Options of `datasets/dl3dv`."""
+
+    path: str
+    """Folder or fsspec URL of the data set, of a subset or of one scene, relative to the working
+    directory."""
+    images: str | None = None
+    """Folder of photos to read, such as images_4; null for the least reduced one of a scene."""
+    test_scenes: str | None = None
+    """File that names the test scenes, all others being for training: an evaluation index, a JSON
+    list or lines of text; null trains on all."""
+    holdout: int = Field(default=0, ge=0)
+    """Every n-th frame of a scene is kept for evaluation, from frame n // 2 on; 0 for none."""
+    max_scenes: int = Field(default=0, ge=0)
+    """Only the first scenes of each split by name; 0 for all."""
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """RGB in [0, 1] behind transparent pixels."""
+
+
+class Dl3dvSource(LazySource):
+    """Scenes of DL3DV, read in place: archives are not unpacked.
+
+    Without `test_scenes` all scenes are for training, and are evaluated on their held-out frames if
+    `holdout` asks for any. Intrinsics are those of transforms.json, scaled to the photos' size.
+    Images and test scenes that do not exist are left out, counted and named in a warning.
+    """
+
+    name = "dl3dv"
+    Config = Dl3dvConfig
+    not_in_protocol: ClassVar[frozenset[str]] = frozenset({"path", "test_scenes", "max_scenes"})
+    split_options: ClassVar[frozenset[str]] = frozenset({"holdout"})
+
+    def __init__(self, config: Dl3dvConfig) -> None:
+        super().__init__(config)
+        places = find_scenes(opened_path(config.path))
+        train, test = places, places if config.holdout else {}
+        if config.test_scenes is not None:
+            named = read_scene_list(opened_path(config.test_scenes))
+            absent = [name for name in named if name not in places]
+            test = {name: places[name] for name in named if name in places}
+            train = {name: place for name, place in places.items() if name not in test}
+            if absent:
+                count = f"{len(absent)} of {len(named)}"
+                warn_once(f"{count} test scenes are missing in the data: {listed(absent, 3)}")
+        same = config.model_dump(include={"path", "images", "holdout", "background", "image_size"})
+        photos = PhotosConfig(format="nerfstudio", **same)
+        opener = partial(_opened, config=photos, cache=image_cache(0))
+        self.splits = {
+            "train": LazyScenes(train, opener, config.max_scenes),
+            "test": LazyScenes(test, opener, config.max_scenes),
+        }
+
+    @classmethod
+    def recognises(cls, path: UPath) -> bool:
+        """Archives, and folders named by a hash or laid out as DL3DV's benchmark, also in folders
+        such as 1K. A folder of photos that lists them itself is left to `qgs/photos`.
+        """
+        if path.is_file():
+            return path.suffix == ".zip"
+        return not formats_of(path) and any(
+            place.suffix == ".zip" or _HASH.fullmatch(name) or not formats_of(place)
+            for name, place in _places(path, _DEPTH)
+        )
+
+
+def _opened(name: str, place: UPath, **options: Any) -> PhotoScene:
+    return PhotoScene(name, scene_folder(place), **options)
+
+
+def find_scenes(path: UPath) -> dict[str, UPath]:
+    """Folders and archives of scenes at or below `path` by name, folders before archives.
+
+    Raises FileNotFoundError for none.
+    """
+    if not path.exists():
+        raise FileNotFoundError(
+            f"the DL3DV folder {path} does not exist: give the folder that holds 1K/, {{hash}}.zip "
+            "or {hash}/"
+        )
+    found = sorted(_places(path, _DEPTH), key=lambda item: (item[1].suffix == ".zip", str(item[1])))
+    scenes: dict[str, UPath] = {}
+    for name, place in found:
+        scenes.setdefault(name, place)
+    if not scenes:
+        inside = listed(sorted(item.name for item in path.iterdir())) or "nothing"
+        raise FileNotFoundError(
+            f"{path} holds no scenes of DL3DV: expected {{hash}}.zip or {{hash}}/{LISTING}, also "
+            f"in folders such as 1K/, found {inside}"
+        )
+    if len(found) > len(scenes):
+        warn_once(
+            f"{len(found) - len(scenes)} scenes of {path} are there more than once, as folders or "
+            "archives; one of each is read, the folder if there is one"
+        )
+    return dict(sorted(scenes.items()))
+
+
+def _places(path: UPath, depth: int) -> Iterator[tuple[str, UPath]]:
+    if path.suffix == ".zip" and path.is_file():
+        yield path.stem, path
+    elif not path.is_dir():
+        return
+    elif any((path / inside / LISTING).is_file() for inside in _INSIDE):
+        yield path.name, path
+    elif depth:
+        for item in path.iterdir():
+            if not item.name.startswith("."):
+                yield from _places(item, depth - 1)
+
+
+def scene_folder(place: UPath) -> UPath:
+    """The folder with transforms.json of a folder or an archive.
+
+    Raises FileNotFoundError without it, ValueError for an archive that cannot be read.
+    """
+    tops = [place]
+    if place.suffix == ".zip":
+        try:
+            top = UPath(f"zip:///::{place}")  # open as long as paths below it live
+            folders = (item for item in top.iterdir() if item.is_dir())
+            tops = [top, *(item for item in folders if item.name not in _INSIDE)]
+        except (zipfile.BadZipFile, OSError) as error:
+            reason = f"{place} is no zip archive or is cut off ({error})"
+            raise ValueError(f"{reason}: download it again") from error
+    for top in tops:
+        for inside in _INSIDE:
+            folder = top / inside if inside else top
+            if (folder / LISTING).is_file():
+                return folder
+    raise FileNotFoundError(
+        f"{place} holds no {LISTING}, at its top or in gaussian_splat/ or nerfstudio/: download "
+        "the scene again, or remove it"
+    )
+
+
+def read_scene_list(file: UPath) -> list[str]:
+    """Scenes: keys of a JSON mapping, a list, or lines. Raises FileNotFoundError, ValueError."""
+    if not file.is_file():
+        raise FileNotFoundError(f"the list of scenes {file} does not exist")
+    if file.suffix == ".json":
+        names = read_json(file, "correct it")
+        if not isinstance(names, dict | list) or not all(isinstance(name, str) for name in names):
+            raise ValueError(
+                f"{file} must be a mapping whose keys are scenes, or a list of scenes, in JSON"
+            )
+    else:
+        lines = read_file(file).decode("utf-8-sig").splitlines()
+        names = [name for line in lines if (name := line.partition("#")[0].strip())]
+    if not names:
+        raise ValueError(f"the list of scenes {file} names no scene: write one on each line")
+    return list(dict.fromkeys(names))

@@ -1,0 +1,69 @@
+"""LLFF: `poses_bounds.npy` beside a folder of photos (Mildenhall et al., 2019)."""
+
+import numpy as np
+from upath import UPath
+
+from qgs.data.images import load_array
+from qgs.data.photos.checks import listed_size
+from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_files, image_folder
+from qgs.paths import open_file
+
+
+class Llff(PhotoReader):
+    """The photos by name, each with its row: 15 numbers of a (3, 5) matrix, near and far.
+
+    The matrix is a camera-to-world whose axes are (down, right, back), then height, width and focal
+    length; the principal point is the middle. Near and far are checked, not used.
+    """
+
+    name = "llff"
+    listing = "poses_bounds.npy"
+    poses = "llff"
+
+    @classmethod
+    def read(cls, folder: UPath, images: str | None) -> Listing:
+        """See `PhotoReader`. Raises ValueError unless there are as many photos as rows."""
+        file, photos = folder / cls.listing, image_folder(folder, images)
+        rows = _rows(file)
+        files = image_files(photos)
+        if len(files) != len(rows):
+            raise ValueError(
+                f"{file} has {len(rows)} poses, but {photos} has {len(files)} images: they belong "
+                "together in the order of the names, so give all images and no others"
+            )
+        return Listing(file, [_frame(*pair) for pair in zip(files, rows, strict=True)])
+
+
+def _rows(file: UPath) -> np.ndarray:
+    """(N, 17) float64. Raises ValueError for a file of something else, and for near > far."""
+    try:
+        with open_file(file) as opened:
+            rows = load_array(opened)
+    except Exception as error:  # NumPy raises anything on damaged headers
+        raise ValueError(
+            f"{file} is no NumPy file of numbers ({error}): export it again"
+        ) from error
+    if rows.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
+        raise ValueError(f"{file} must have shape (N, 17), got {rows.shape}: export it again")
+    if (wrong := np.flatnonzero(~(rows[:, 15] <= rows[:, 16]))).size:
+        near, far = rows[wrong[0], 15:]
+        raise ValueError(
+            f"{file}, row {wrong[0]}: near {near:g} must be at most far {far:g}: "
+            "export it again with near and far at the end of each row"
+        )
+    return rows.astype(np.float64)
+
+
+def _frame(path: UPath, row: np.ndarray) -> PhotoFrame:
+    down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
+    c2w = np.eye(4)
+    c2w[:3] = np.stack([right, down, -back, centre], 1)  # OpenCV's axes
+    size, problems = listed_size(float(height), float(width))
+    return PhotoFrame(
+        name=f"{path.parent.name}/{path.name}",
+        path=path,
+        c2w=c2w,
+        intrinsics=(float(focal), float(focal), float(width / 2), float(height / 2)),
+        size=size,
+        problems=problems,
+    )

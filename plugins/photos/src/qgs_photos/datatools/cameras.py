@@ -1,0 +1,114 @@
+"""Poses and intrinsics of a scene: each by itself, and poses against each other."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from qgs.data.lenses import Intrinsics, Size
+from qgs.data.photos.checks import FrameProblem, intrinsics_problems, pose_problems
+from qgs_photos.datatools.decoding import DecodedScene
+from qgs_photos.datatools.findings import Finding
+
+_SAME = 2e-6  # of a rotation's entries, and of coordinates that float32 holds
+_DOUBLE = 1e-9  # of coordinates that float64 holds, after they were computed
+_FLOAT32 = 2e-7  # of coordinates that were float32 before they were written
+_OF_EXTENT = 1e-4  # of the cameras' extent: the largest distance that counts as none
+_FAR_OFF_CENTRE = 0.25  # of a side, from the middle
+
+
+def camera_findings(scene: DecodedScene, sized: set[int]) -> tuple[list[Finding], list[Finding]]:
+    """What is wrong with poses, and with the rest. sized: frames whose listed size is wrong."""
+    poses: list[Finding] = []
+    others: list[Finding] = []
+    for frame, (photo, result) in enumerate(zip(scene.photos, scene.decoded, strict=True)):
+        listed = photo.listed
+        unread = bool(listed.problems) and not np.isfinite(listed.c2w).all()
+        of_pose = [] if unread else list(pose_problems(listed.c2w))
+        rest = list(listed.problems)
+        if not listed.problems and frame not in sized:
+            rest += _of_intrinsics(listed.intrinsics, listed.size or result.size)
+        for problems, found in ((of_pose, poses), (rest, others)):
+            found += [scene.finding([frame], p.reason, p.fix) for p in problems]
+    return poses, others
+
+
+def _of_intrinsics(intrinsics: Intrinsics, size: Size | None) -> list[FrameProblem]:
+    problems = list(intrinsics_problems(intrinsics, size))
+    if size is None or problems:
+        return problems
+    height, width = size
+    _, _, cx, cy = intrinsics
+    if max(abs(cx / width - 0.5), abs(cy / height - 0.5)) <= _FAR_OFF_CENTRE:
+        return []
+    reason = (
+        f"the principal point ({cx:.6g}, {cy:.6g}) is far from the middle of the {width} x "
+        f"{height} pixels"
+    )
+    fix = "correct cx and cy, unless the photo is cut from a larger one"
+    return [FrameProblem("intrinsics", reason, fix, fatal=False)]
+
+
+def sharing_findings(
+    scene: DecodedScene, usable: Sequence[int], *, float32: bool
+) -> Iterator[Finding]:
+    """Frames of `usable` that share a pose or a place. float32: the precision of the format."""
+    if len(usable) < 2:
+        return
+    poses = np.stack([scene.photos[frame].listed.c2w for frame in usable])
+    near, one_point = _tolerances(poses, float32)
+    if np.ptp(poses[:, :3, 3], axis=0).max() <= one_point:
+        reason = f"all {len(usable)} cameras stand on one point, so that depth is undetermined"
+        yield scene.finding(usable, reason, "export the poses with their translations")
+        return
+    for place in _groups(poses[:, :3, 3], near):
+        groups = _groups(poses[place, :3, :3].reshape(len(place), 9), _SAME)
+        firsts = [usable[place[same[0]]] for same in groups]
+        for first, same in zip(firsts, groups, strict=True):
+            for other in (usable[place[index]] for index in same[1:]):
+                if scene.photos[first].listed.time == scene.photos[other].listed.time:
+                    yield _duplicate(scene, first, other)
+        if len(groups) > 1:
+            first, *rest = firsts
+            yield scene.finding(
+                rest,
+                f"the camera stands on the same point as that of {scene.label(first)}, a zero "
+                "baseline, which determines no depth",
+                "correct the position, or remove one of the frames",
+            )
+
+
+def _tolerances(poses: np.ndarray, float32: bool) -> tuple[float, float]:
+    """Distances up to which two cameras, and all, share a point, by the poses' precision."""
+    rotations, centres = poses[:, :3, :3], poses[:, :3, 3]
+    off_rigid = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
+    distance, extent = np.abs(centres).max(), np.ptp(centres, axis=0).max()
+    precision = max(_SAME if float32 else _DOUBLE, float(np.median(off_rigid)))
+    together = _SAME if float32 else min(precision, _FLOAT32)
+    return min(distance * precision, extent * _OF_EXTENT), distance * together
+
+
+def _groups(rows: np.ndarray, tolerance: float) -> list[list[int]]:
+    """Groups of indices of rows (F, D) that differ from the group's first by no more."""
+    order = np.argsort(rows[:, 0], kind="stable")
+    sorted_ = rows[order, 0]
+    groups: dict[int, list[int]] = {}
+    leader = np.full(len(rows), -1)
+    for index in range(len(rows)):
+        if leader[index] >= 0:
+            groups[leader[index]].append(index)
+            continue
+        groups[index] = [index]
+        low, high = np.searchsorted(sorted_, rows[index, 0] + np.array([-1.0, 1.0]) * tolerance)
+        near = order[low : high + 1]
+        same = near[np.abs(rows[near] - rows[index]).max(1) <= tolerance]
+        leader[same[leader[same] < 0]] = index
+    return list(groups.values())
+
+
+def _duplicate(scene: DecodedScene, first: int, second: int) -> Finding:
+    which = scene.label(first)
+    if scene.decoded[first].digest and scene.decoded[first].digest == scene.decoded[second].digest:
+        reason, fix = f"the photo and its pose repeat {which}", "remove one of the two"
+        return scene.finding([second], reason, fix, "warning")
+    reason = f"the pose repeats that of {which}, whose photo is another one"
+    return scene.finding([second], reason, "correct the pose, or remove one of the frames")

@@ -1,0 +1,220 @@
+"""`qgs data check` and `qgs data pack`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from qgs.contracts import SceneSource
+    from qgs_photos.datatools.check import CheckReport, SceneReport
+    from qgs_photos.datatools.packing import Packed, Splits
+
+app = typer.Typer(no_args_is_help=True, help="Check and pack data sets.")
+
+_ROWS = 40
+
+
+@app.command("check")
+def check(
+    path: Annotated[str, typer.Argument(help="Data set: a folder, an archive, a chunk, a URL.")],
+    index: Annotated[
+        list[str] | None,
+        typer.Option(help="Evaluation index to compare with the scenes; repeatable."),
+    ] = None,
+    format: Annotated[
+        str, typer.Option(help="Only scenes in this format, such as colmap or chunks.")
+    ] = "auto",
+    images: Annotated[
+        str | None, typer.Option(help="Folder of photos to read, such as images_4.")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="HTML page to write, with cameras and the worst pairs.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Read only the headers of images, match none.")
+    ] = False,
+    geometry: Annotated[
+        int, typer.Option(help="In how many scenes poses are judged by photos.", min=0)
+    ] = 20,
+    threads: Annotated[int, typer.Option(help="Threads that decode images.", min=1)] = 8,
+) -> None:
+    """Find what is wrong with a data set: one line for each fault, with scene, frame and remedy.
+
+    Every image is decoded, and poses are compared with what neighbouring photos share. Exit code 1
+    when there are errors, 0 when there are none or only warnings. Imports every installed plugin to
+    ask which reads PATH; with --format PLUGIN/NAME that one, with another format none.
+    """
+    from qgs.paths import opened_path
+    from qgs_photos.datatools.check import Options, check
+
+    console = Console()
+    options = Options(geometry, quick, threads, format, images)
+    indices = [opened_path(name) for name in index or []]
+    with console.status("listing scenes") as status:
+        result = check(
+            opened_path(path), options, indices,
+            lambda done, total, name: status.update(f"{done} of {total} scenes, now {name}"),
+        )  # fmt: skip
+    _print(console, result)
+    if report is not None:
+        from qgs.files import write_text
+        from qgs_photos.datatools.page import check_html
+
+        write_text(report, check_html(result))
+        _line(console, f"report: {report}")
+    if result.errors:
+        raise typer.Exit(1)
+
+
+def _print(console: Console, result: CheckReport) -> None:
+    if result.scenes:
+        console.print(_table(result.scenes))
+    if (hidden := len(result.scenes) - _ROWS) > 0:
+        _line(console, f"and {hidden} more scenes, none of them with more findings than these")
+    for finding in result.findings:
+        _line(console, str(finding))
+    for summary in result.indices:
+        _line(console, f"index {summary}")
+    for note in [*result.notes, *filter(None, [result.auto_scale])]:
+        _line(console, f"note: {note}")
+    warnings = len(result.findings) - result.errors
+    counts = {"scene": len(result.scenes), "error": result.errors, "warning": warnings}
+    parts = (f"{count} {what}{'' if count == 1 else 's'}" for what, count in counts.items())
+    _line(console, f"{result.path}: {', '.join(parts)}")
+
+
+def _line(console: Console, text: str) -> None:
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def _table(scenes: Sequence[SceneReport]) -> Table:
+    table = Table(header_style="bold", box=None, pad_edge=False)
+    table.add_column("scene", overflow="fold", min_width=12)
+    table.add_column("format")
+    for column in ("frames", "decodable", "missing", "bad poses", "epipolar px"):
+        table.add_column(column, justify="right")
+    if len(scenes) > _ROWS:
+        scenes = sorted(scenes, key=lambda scene: -len(scene.findings))[:_ROWS]
+    for scene in scenes:
+        counts = (scene.listed, scene.decodable, scene.missing, scene.pose_problems)
+        table.add_row(scene.name, scene.kind, *map(str, counts), scene.epipolar)
+    return table
+
+
+@app.command("pack")
+def pack(
+    path: Annotated[str, typer.Argument(help="Data set, or recipe (.yaml) whose data to pack.")],
+    out: Annotated[str, typer.Option(help="New folder or URL for the chunks.")],
+    options: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Option of the source, such as images=images_4; repeatable."),
+    ] = None,
+    image_size: Annotated[
+        tuple[int, int] | None,
+        typer.Option(help="Height and width of all images; their own by default.", min=1),
+    ] = None,
+    jpeg: Annotated[
+        int | None,
+        typer.Option(
+            help="Quality of images written anew, as JPEG instead of PNG.", min=1, max=100
+        ),
+    ] = None,
+    chunk_mb: Annotated[int, typer.Option(help="Size of a chunk, in megabytes.", min=1)] = 100,
+    test_scenes: Annotated[
+        str | None, typer.Option(help="File that names the test scenes: an index, a list.")
+    ] = None,
+    test_every: Annotated[
+        int | None, typer.Option(help="Every n-th scene is a test scene.", min=2)
+    ] = None,
+    leave_out_broken: Annotated[
+        bool, typer.Option(help="Leave out scenes that cannot be read, and name them.")
+    ] = False,
+) -> None:
+    """Turn any data set into chunks, the format that training reads fastest.
+
+    JPEG and PNG photos of pinhole cameras stay as they are; others are undistorted, resized if
+    asked to, and written as PNG. Called again, it finishes what was interrupted. Imports every
+    installed plugin to ask which reads a data set; for a recipe only its own.
+    """
+    from qgs.paths import opened_path
+    from qgs_photos.datatools import packing
+    from qgs_photos.datatools.entries import Encoding
+
+    console = Console()
+    source, settings = _opened(path, options or [], image_size)
+    splits = _splits(source, test_scenes, test_every)
+    settings |= {"test_scenes": test_scenes, "test_every": test_every}
+    name = TextColumn("{task.description}")
+    columns = (MofNCompleteColumn(), BarColumn(), TimeRemainingColumn(), name)
+    quiet = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=quiet) as bar:
+        task = bar.add_task("", total=sum(map(len, splits.values())))
+        packed = packing.pack(
+            source,
+            splits,
+            opened_path(out),
+            settings,
+            Encoding(image_size is not None, jpeg),
+            chunk_bytes=chunk_mb * 2**20,
+            leave_out_broken=leave_out_broken,
+            progress=lambda name: bar.update(task, advance=1, description=name),
+        )
+    _print_packed(console, packed, out)
+
+
+def _opened(
+    path: str, options: list[str], image_size: tuple[int, int] | None
+) -> tuple[SceneSource, dict[str, Any]]:
+    """The source of scenes at `path`, and what it was asked for."""
+    from qgs.data.recognition import recognised
+    from qgs.paths import opened_path
+    from qgs.recipe import resolve
+    from qgs_photos.datatools.sources import left_out, sources
+
+    recipe: Any = path
+    if Path(path).suffix not in {".yaml", ".yml"}:
+        for note in left_out():
+            _line(Console(), note)
+        kind = recognised(opened_path(path), sources())
+        plugin = kind.partition("/")[0]
+        recipe = {"recipe": 1, "data": {"type": kind, "path": path}}
+        recipe["plugins"] = [] if plugin == "qgs" else [plugin]
+    source = resolve(recipe, [f"data.{option}" for option in options]).build_data()
+    if image_size is not None:
+        source = type(source)(source.config.model_copy(update={"image_size": image_size}))
+    return source, {"source": type(source).name, **source.config.model_dump(mode="json")}
+
+
+def _splits(source: SceneSource, test_scenes: str | None, test_every: int | None) -> Splits:
+    from qgs.paths import opened_path
+    from qgs_photos.datasets.dl3dv import read_scene_list
+    from qgs_photos.datatools.packing import own_splits, splits_by_list, splits_by_number
+
+    if test_scenes is not None and test_every is not None:
+        raise typer.BadParameter("give --test-scenes or --test-every, not both")
+    if test_scenes is not None:
+        return splits_by_list(source, read_scene_list(opened_path(test_scenes)))
+    return own_splits(source) if test_every is None else splits_by_number(source, test_every)
+
+
+def _print_packed(console: Console, packed: Packed, out: str) -> None:
+    scenes = ", ".join(f"{count} {split}" for split, count in packed.scenes.items())
+    again = f", {packed.resumed} of them packed before" if packed.resumed else ""
+    _line(
+        console,
+        f"{out}: scenes {scenes}{again}; {packed.frames} images now, {packed.kept} kept as they "
+        f"were, {packed.frames - packed.kept} written anew",
+    )
+    if not packed.scenes["test"]:
+        _line(console, "there are no test scenes: held-out frames are what is evaluated")
+    if packed.left_out:
+        _line(console, f"{len(packed.left_out)} scenes could not be read and are left out:")
+        for name, reason in packed.left_out.items():
+            _line(console, f"  {name}: {reason}")

@@ -1,0 +1,136 @@
+"""A scene as the entry of a chunk: images keep their bytes where they can."""
+
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from qgs.contracts import Scene
+from qgs.data.images import CropResize, decode_mask, decode_rgb
+from qgs.data.lenses import undistorted, whole_zoom
+from qgs.data.scenes import EncodedFrame, EncodedScene
+
+ChunkEntry: TypeAlias = dict[str, Any]
+
+_KEPT_FORMATS = {"JPEG", "MPO", "PNG"}  # MPO: a JPEG with further pictures behind it
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How images are rewritten. resized: all, as delivered. jpeg: quality; None for PNG."""
+
+    resized: bool = False
+    jpeg: int | None = None
+
+    def image(self, pixels: np.ndarray) -> bytes:
+        """(H, W, 3) uint8 as the bytes of a file."""
+        return _file(pixels, self.jpeg)
+
+
+def _file(pixels: np.ndarray, jpeg: int | None = None) -> bytes:
+    file, image = io.BytesIO(), Image.fromarray(pixels)
+    if jpeg is None:
+        image.save(file, format="PNG")
+    else:
+        image.save(file, format="JPEG", quality=jpeg, subsampling=0)
+    return file.getvalue()
+
+
+def encoded_frames(scene: Scene, encoding: Encoding) -> Iterator[tuple[EncodedFrame, bool]]:
+    """The decodable frames in order, and whether each keeps its bytes. Raises as the scene."""
+    for index in range(len(scene)):
+        if isinstance(scene, EncodedScene) and not encoding.resized:
+            yield _stored(scene, index, encoding)
+        else:
+            yield _delivered(scene, index, encoding), False
+
+
+def _stored(scene: EncodedScene, index: int, encoding: Encoding) -> tuple[EncodedFrame, bool]:
+    frame = scene.encoded(index)
+    try:
+        pixels = np.array(decode_rgb(io.BytesIO(frame.data), frame.background))
+        mask = None if frame.mask is None else decode_mask(io.BytesIO(frame.mask))
+    except OSError as error:
+        raise ValueError(
+            f"scene {scene.name!r}, frame {index} ({frame.name}) cannot be read as an image "
+            f"({error}): replace the file, or leave the scene out"
+        ) from error
+    with Image.open(io.BytesIO(frame.data)) as image:  # every reader gets three channels out of it
+        plain = image.mode == "RGB" and not image.has_transparency_data
+        stays = frame.lens is None and plain and image.format in _KEPT_FORMATS
+    if stays:
+        return frame, True
+    if frame.lens is not None:
+        pixels = undistorted(pixels, frame.intrinsics, frame.lens)
+        mask = None if mask is None else undistorted(mask, frame.intrinsics, frame.lens)
+        zoom = whole_zoom(frame.intrinsics, frame.lens, frame.size, frame.size)
+        if zoom > 1:
+            crop = CropResize(frame.size, frame.size, zoom)
+            own = crop.intrinsics(torch.tensor(frame.intrinsics, dtype=torch.float64)).tolist()
+            frame = replace(frame, intrinsics=tuple(own))
+            pixels = crop.image(Image.fromarray(pixels))
+            mask = None if mask is None else crop.image(Image.fromarray(mask))
+    mask_file = None if mask is None else _file(mask)
+    return replace(frame, data=encoding.image(pixels), lens=None, mask=mask_file), False
+
+
+def _delivered(scene: Scene, index: int, encoding: Encoding) -> EncodedFrame:
+    cameras, masks = scene.cameras[index], scene.masks([index])
+    fx, fy, cx, cy = cameras.intrinsics.double().tolist()
+    pixels = scene.images([index])[0].permute(1, 2, 0).mul(255).round().byte().numpy()
+    mask = None if masks is None else masks[0, 0].mul(255).round().byte().numpy()
+    return EncodedFrame(
+        name=scene.frame_name(index),
+        data=encoding.image(np.ascontiguousarray(pixels)),
+        c2w=cameras.c2w.double().numpy(),
+        intrinsics=(fx, fy, cx, cy),
+        size=cameras.size,
+        mask=None if mask is None else _file(mask),
+    )
+
+
+def chunk_entry(
+    key: str, frames: Sequence[EncodedFrame], held_out: Sequence[int], times: Tensor | None = None
+) -> ChunkEntry:
+    """The entry of a scene; see `qgs_photos.datasets.chunk_files` for its keys."""
+    names = [frame.name for frame in frames]
+    entry = {
+        "key": key,
+        "url": "",
+        "timestamps": _timestamps(names),
+        "cameras": torch.from_numpy(np.stack([_camera(frame) for frame in frames])),
+        "images": [_bytes(frame.data) for frame in frames],
+        "names": names,
+        "sizes": torch.tensor([frame.size for frame in frames], dtype=torch.int32),
+    }
+    if any(frame.mask is not None for frame in frames):
+        entry["masks"] = [_bytes(frame.mask or b"") for frame in frames]
+    if held_out:
+        entry["held_out"] = torch.tensor(list(held_out), dtype=torch.int64)
+    if times is not None:
+        entry["times"] = times.double().clone()
+    return entry
+
+
+def _bytes(data: bytes) -> Tensor:
+    return torch.from_numpy(np.frombuffer(data, np.uint8).copy())
+
+
+def _camera(frame: EncodedFrame) -> np.ndarray:
+    """(18,) float32: normalised intrinsics, two zeros, rows of the world-to-camera matrix."""
+    height, width = frame.size
+    fx, fy, cx, cy = frame.intrinsics
+    w2c = np.linalg.inv(frame.c2w)[:3].flatten()
+    values = [fx / width, fy / height, cx / width, cy / height, 0.0, 0.0, *w2c]
+    return np.array(values, np.float32)
+
+
+def _timestamps(names: Sequence[str]) -> Tensor:
+    """The frames' names where all are whole numbers, as time stamps are; else their order."""
+    stamps = all(name.isascii() and name.isdigit() and len(name) < 19 for name in names)
+    return torch.tensor([int(n) for n in (names if stamps else range(len(names)))]).long()

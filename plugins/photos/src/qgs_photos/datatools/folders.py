@@ -1,0 +1,83 @@
+"""Scenes in folders of photos, and DL3DV's, as candidates for a check."""
+
+from collections.abc import Iterator
+from functools import partial
+
+from upath import UPath
+
+from qgs.data.photos import formats_of, read_listing, readers
+from qgs.data.photos.checks import refuse_outside
+from qgs.data.photos.reader import existing
+from qgs.data.photos.source import folder_name
+from qgs.data.photos.turning import upright
+from qgs.paths import read_file
+from qgs_photos.datasets.dl3dv import find_scenes, scene_folder
+from qgs_photos.datatools.candidates import Candidate, Photo
+from qgs_photos.datatools.conventions import LLFF, OPENCV, OPENCV_C2W, OPENGL
+from qgs_photos.datatools.findings import Finding
+from qgs_photos.datatools.sources import kind_of
+
+_POSES = {"opengl": OPENGL, "opencv": OPENCV, "opencv c2w": OPENCV_C2W, "llff": LLFF}
+
+
+def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Candidate | Finding]:
+    """The scenes of format `wanted` in `root`: itself, its folders, or those in train and test."""
+    if formats_of(root):
+        yield from _listings(root, folder_name(root), wanted, images)
+        return
+    inside = sorted((item for item in root.iterdir() if item.is_dir()), key=lambda item: item.name)
+    scenes = [item for item in inside if formats_of(item)]
+    for folder in scenes:
+        yield from _listings(folder, folder.name, wanted, images)
+    for folder in inside:
+        if folder in scenes or folder.name.startswith("."):
+            continue
+        if scenes:
+            yield _no_scene(folder, wanted)
+        elif folder.name in ("train", "test"):
+            yield from photo_folders(folder, wanted, images)
+
+
+def _listings(folder: UPath, name: str, wanted: str, images: str | None) -> Iterator[Candidate]:
+    """A candidate for each of the listings that a folder holds, or for the wanted one."""
+    held = [kind for kind in formats_of(folder) if wanted in ("auto", kind)]
+    for kind in held:
+        label = f"{name} ({kind})" if len(held) > 1 else name
+        photos = partial(_photos, folder, kind, images)
+        yield Candidate(label, name, kind, _POSES[readers()[kind].poses], photos)
+
+
+def _no_scene(folder: UPath, wanted: str) -> Finding:
+    kind = kind_of(folder, wanted)
+    reason = "the folder lists no cameras and is no scene"
+    fix = "make poses for it, or move it away"
+    if kind != "photos":
+        reason = f"the folder is another data set ({kind}) and is not checked with the photos"
+        reason, fix = f"{reason} beside it", f"run `qgs data check {folder}`"
+    return Finding(folder.name, reason, fix, severity="warning")
+
+
+def dl3dv_scenes(path: UPath, images: str | None) -> list[Candidate]:
+    """The scenes below `path`. Raises FileNotFoundError when there is none."""
+    return [
+        Candidate(
+            name, name, "dl3dv", OPENGL,
+            lambda place=place: _photos(scene_folder(place), "nerfstudio", images),
+        )
+        for name, place in find_scenes(path).items()
+    ]  # fmt: skip
+
+
+def _photos(folder: UPath, kind: str, images: str | None) -> list[Photo]:
+    listing = read_listing(folder, kind, images)
+    refuse_outside(folder, listing)
+    frames = [*map(upright, listing.frames)]
+    there = existing(frame.path for frame in frames if frame.name)
+    masks = existing(frame.mask for frame in frames if frame.mask is not None)
+    return [
+        Photo(
+            frame, partial(read_file, frame.path), frame.path in there,
+            frame.mask is None or frame.mask == frame.path or frame.mask in masks,
+        )
+        for frame in frames
+    ]  # fmt: skip

@@ -1,0 +1,200 @@
+"""Frames of a video: of each interval of time and of motion the sharpest."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from av.error import FFmpegError
+from PIL import Image
+
+from qgs.wording import counted
+from qgs_photos.poses.photos import LEAST, PosesError, laplacian_variance
+
+FEWEST, MOST, PER_SECOND = 40, 240, 2.0
+"""How many frames are taken of a video, and the least rate of them."""
+# 120 at even steps of time are too few where the camera turns fast: of a walk through an office as
+# a video, 42 of 120 frames got poses, and 143 of the 143 that follow the motion.
+STEP = 0.06
+"""Shift of the picture, in parts of its width, after which another frame is taken."""
+_JUDGED = 8  # frames of an interval that are compared
+_SIDE, _THUMB = 640, (48, 64)
+_WINDOW = np.outer(np.hanning(_THUMB[0]), np.hanning(_THUMB[1]))
+
+
+def extract(
+    video: Path,
+    folder: Path,
+    count: int | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[str]:
+    """Write the sharpest frame of each interval as JPEG, upright, numbered from 0 on.
+
+    count: of even intervals of time; by default as `Intervals` has them, and where these are more
+    than MOST, the sharpest of each few neighbours. progress: seconds done and in all. Returns
+    remarks. What cannot be decoded is left out. Raises PosesError for no video, and for fewer than
+    LEAST frames.
+    """
+    times, broken = _times(video)
+    if len(times) < LEAST:
+        raise PosesError(
+            f"{video} has {counted(len(times), 'frame')} that can be read, and poses need {LEAST} "
+            "at least: take a longer video, or copy it again"
+        )
+    start = times[0]
+    # the last frame is shown as long as the others in the mean
+    length = float(times[-1] - start) * len(times) / (len(times) - 1) or 1.0
+    intervals = Intervals(float(start), length, count)
+    every = max(int(len(times) / (length * intervals.rate) / _JUDGED), 1)
+    place, best, sharpest, faults, last = 0, None, -1.0, 0, start
+    scores = dict[Path, float]()
+
+    def keep() -> None:
+        if best is not None:
+            scores[_write(best, folder / f"{place:05d}.jpg")] = sharpest
+
+    for number, (time, frame) in enumerate(_decoded(video)):
+        if frame is None:
+            faults += 1
+            continue
+        here, last = intervals.place(float(time), frame), max(last, time)
+        if here != place:
+            keep()
+            best, sharpest = None, -1.0
+        place = here
+        progress(int(time - start), int(length))
+        if best is not None and number % every:
+            continue
+        score = _sharpness(frame)
+        if score > sharpest:
+            best, sharpest = frame, score
+    keep()
+    if len(scores) < LEAST:
+        raise PosesError(
+            f"{video} has {counted(len(scores), 'frame')} that can be decoded, and poses need "
+            f"{LEAST} at least: convert it to H.264, or copy it again"
+        )
+    if count is None:
+        for path in {*scores} - {*thinned(scores, MOST)}:
+            path.unlink()
+    if not (broken or faults):
+        return []
+    at = f"{float(last - start):.1f} s"
+    return [f"{video} is damaged: frames are taken up to {at}, where they could be decoded"]
+
+
+def thinned(scores: Mapping[Path, float], most: int) -> list[Path]:
+    """At most `most` of the frames: of each even number of neighbours the one of highest score."""
+    best = dict[int, Path]()
+    for number, path in enumerate(sorted(scores)):
+        part = number * most // len(scores)
+        best[part] = max(best.get(part, path), path, key=scores.__getitem__)
+    return list(best.values())
+
+
+class Intervals:
+    """Intervals of time, 1 / `rate` s long, or shorter ones in which the picture moves by STEP.
+
+    count: of intervals of time alone. start, length: of the video, in seconds.
+    """
+
+    def __init__(self, start: float, length: float, count: int | None) -> None:
+        self.start, self.count = start, count
+        self.rate = count / length if count else max(PER_SECOND, FEWEST / length)
+        self._place, self._opened, self._moved = 0, start, 0.0
+        self._thumb: np.ndarray | None = None
+
+    def place(self, time: float, frame: Any) -> int:
+        """The number of the interval of the next frame."""
+        if self.count:
+            return min(max(int((time - self.start) * self.rate + 1e-6), 0), self.count - 1)
+        thumb = _grey(frame, _THUMB)
+        if self._thumb is not None:
+            self._moved += shift(self._thumb, thumb)
+        self._thumb = thumb
+        if max((time - self._opened) * self.rate + 1e-6, self._moved / STEP) >= 1:
+            self._place, self._opened, self._moved = self._place + 1, time, 0.0
+        return self._place
+
+
+def shift(before: np.ndarray, after: np.ndarray) -> float:
+    """How far a small picture moved, in parts of its sides: the peak of the phase correlation."""
+    one, other = (np.fft.rfft2((x - x.mean()) * _WINDOW) for x in (before, after))
+    product = one * other.conj()
+    found = np.fft.irfft2(product / (np.abs(product) + 1e-9), s=_THUMB)
+    peak = np.array(np.unravel_index(found.argmax(), _THUMB))
+    sides = np.array(_THUMB)
+    return float(np.linalg.norm(((peak + sides // 2) % sides - sides // 2) / sides))
+
+
+def _opened(video: Path) -> Any:
+    """The container and its first video stream. Raises PosesError where there is none."""
+    try:
+        container = av.open(str(video))
+    except (FFmpegError, ValueError) as error:
+        raise PosesError(
+            f"{video} cannot be read as a video ({error}): convert it to H.264 in mp4, or copy it "
+            "again"
+        ) from error
+    # a cover picture of a song is a video of one frame
+    if not container.streams.video:
+        container.close()
+        raise PosesError(f"{video} has no pictures: give a video")
+    return container
+
+
+def _times(video: Path) -> tuple[list[Fraction], bool]:
+    """When each frame is shown, ascending, from the packets alone; whether the file is cut off."""
+    times, broken = list[Fraction](), False
+    with _opened(video) as container:
+        stream = container.streams.video[0]
+        try:
+            for packet in container.demux(stream):
+                if packet.pts is not None:
+                    times.append(packet.pts * stream.time_base)
+                broken |= packet.is_corrupt
+        except FFmpegError:
+            broken = True
+    return sorted(times), broken
+
+
+def _decoded(video: Path) -> Iterator[tuple[Fraction, Any]]:
+    """Time and frame; (0, None) for a packet that cannot be decoded."""
+    with _opened(video) as container:
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        with suppress(FFmpegError):  # what follows a hole in the file is lost
+            for packet in container.demux(stream):
+                try:
+                    frames = packet.decode()
+                except FFmpegError:
+                    yield Fraction(0), None
+                    continue
+                for frame in frames:
+                    if frame.pts is not None:
+                        yield frame.pts * stream.time_base, frame
+
+
+def _sharpness(frame: Any) -> float:
+    scale = _SIDE / max(frame.width, frame.height)
+    height, width = (max(round(side * scale) // 2 * 2, 4) for side in (frame.height, frame.width))
+    return laplacian_variance(_grey(frame, (height, width)))
+
+
+def _grey(frame: Any, size: tuple[int, int]) -> np.ndarray:
+    grey = frame.reformat(width=size[1], height=size[0], format="gray").to_ndarray()
+    return grey.astype(np.float32)
+
+
+def _write(frame: Any, path: Path) -> Path:
+    """As JPEG, turned as the video says."""
+    image = Image.fromarray(frame.to_ndarray(format="rgb24"))
+    turns = round(frame.rotation / 90) % 4  # counterclockwise, in degrees
+    if turns:
+        kinds = (Image.Transpose.ROTATE_90, Image.Transpose.ROTATE_180, Image.Transpose.ROTATE_270)
+        image = image.transpose(kinds[turns - 1])
+    image.save(path, quality=95, subsampling=0)
+    return path

@@ -1,0 +1,105 @@
+"""Camera paths: about what photos show, along them, or as a file lists them."""
+
+import json
+import math
+from collections.abc import Mapping
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from upath import UPath
+
+from qgs.data.photos.checks import pose_problems
+from qgs.data.photos.nerfstudio import read_transforms
+from qgs.data.photos.reader import PhotoFrame
+from qgs.geometry.poses import look_at, mean_camera
+from qgs.reconstruction.saving import SWAY, orbit
+from qgs.types import Cameras
+
+KINDS = ("orbit", "spiral", "walk")
+_OPENGL = np.array([1.0, -1.0, -1.0, 1.0])  # of a pose's columns
+_SMOOTH = 1.5  # photos over which a walk is smoothed
+_TURNS = 2.0  # of a spiral
+
+
+def path_of(kind: str, cameras: Cameras, depth: float, frames: int) -> Cameras:
+    """A path (1, frames) of a kind of KINDS past `cameras` (1, V).
+
+    depth: of what they show. The intrinsics are those of the first camera.
+    """
+    if kind == "orbit":
+        return orbit(cameras, depth, frames)
+    poses = cameras.c2w[0]
+    c2w = spiral(poses, depth, frames) if kind == "spiral" else walk(poses, frames)
+    intrinsics = cameras.intrinsics[:, :1].expand(1, frames, 4)
+    return Cameras(c2w[None], intrinsics, cameras.size)
+
+
+def spiral(c2w: Tensor, depth: float, frames: int) -> Tensor:
+    """Poses (frames, 4, 4) that circle the mean of `c2w` (V, 4, 4) and look at one point.
+
+    They move to and fro meanwhile, as the spirals of LLFF (Mildenhall et al., 2019) do.
+    """
+    right, down, forward, centre = mean_camera(c2w)[:3].unbind(-1)
+    angle = torch.arange(frames).to(c2w) * (2 * math.pi * _TURNS / frames)
+    reach = SWAY * depth
+    across = reach * (angle.cos()[:, None] * right + angle.sin()[:, None] * down)
+    eye = centre + across + reach * (angle / _TURNS).sin()[:, None] * forward
+    return look_at(eye, centre + depth * forward - eye, down.expand_as(eye))
+
+
+def walk(c2w: Tensor, frames: int) -> Tensor:
+    """Poses (frames, 4, 4) along those of photos (V, 4, 4) in their order, smoothed."""
+    count = len(c2w)
+    times = torch.linspace(0, count - 1, frames).to(c2w)
+    gaps = times[:, None] - torch.arange(count).to(c2w)
+    weights = torch.softmax(-0.5 * (gaps / min(_SMOOTH, count / 4)) ** 2, -1)
+    _, down, forward, centre = torch.einsum("tv,vij->tij", weights, c2w)[:, :3].unbind(-1)
+    return look_at(centre, forward, down)
+
+
+def read_path(file: Path, size: tuple[int, int], fov: float | None) -> tuple[Tensor, Tensor]:
+    """Poses (T, 4, 4) in OpenCV axes and intrinsics (T, 4) in pixels of `size` (H, W), float64.
+
+    file: a camera path of nerfstudio's viewer, or a transforms file. fov: vertical angle of view in
+    degrees instead of the file's. Raises ValueError where it is neither.
+    """
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+        if entries := data.get("camera_path"):
+            read = [_keyframe(entry, size) for entry in entries]
+        else:
+            read = [_photo(frame, size) for frame in read_transforms(UPath(file))]
+        poses = np.stack([pose for pose, _ in read])
+        for problem in chain(*map(pose_problems, poses)):
+            raise ValueError(problem)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{file} is no camera path ({type(error).__name__}: {error}): give one that "
+            "nerfstudio's viewer saved, a transforms.json, or one of " + ", ".join(KINDS)
+        ) from error
+    height, width = size
+    given = fov and _focal(fov, height)
+    lenses = [(given or focal,) * 2 + (width / 2, height / 2) for _, focal in read]
+    return torch.from_numpy(poses), torch.tensor(lenses, dtype=torch.float64)
+
+
+def _keyframe(entry: Mapping[str, Any], size: tuple[int, int]) -> tuple[np.ndarray, float]:
+    """The pose of an entry of a path of nerfstudio's viewer, in OpenCV axes, and fy."""
+    pose = np.array(entry["camera_to_world"], np.float64).reshape(4, 4)
+    return pose * _OPENGL, _focal(float(entry.get("fov") or 50.0), size[0])
+
+
+def _photo(frame: PhotoFrame, size: tuple[int, int]) -> tuple[np.ndarray, float]:
+    """The pose of a photo of a transforms file and fy at another size."""
+    if frame.problems or frame.size is None:
+        raise ValueError(f"{frame.name}: {next(iter(frame.problems), 'add its h and w')}")
+    return frame.c2w, frame.intrinsics[1] * size[0] / frame.size[0]
+
+
+def _focal(angle: float, height: int) -> float:
+    """In pixels, of a vertical angle of view in degrees."""
+    return height / 2 / math.tan(math.radians(angle) / 2)

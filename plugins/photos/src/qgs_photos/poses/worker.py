@@ -1,0 +1,195 @@
+"""COLMAP in a process of its own, `python -m qgs_photos.poses.worker`: torch is never in it.
+
+One line of JSON on standard input is the job; when that input ends, so does this process, so that
+it never outlives the command that started it. Standard output has lines of JSON between
+those that COLMAP logs.
+"""
+
+import json
+import os
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from qgs_photos.poses.job import FEATURES, MAPPING, MATCHING, Job
+
+COLMAP: Any = pycolmap  # takes dictionaries for options, which its types do not say
+
+FEW_FEATURES = 40  # of a photo; fewer give no poses
+FEW_MATCHES = 15  # of two photos, COLMAP's own least number for a pair
+FEW_POINTS = 30  # of a model
+SMALL = {"init_min_tri_angle": 4.0, "init_min_num_inliers": 50}
+"""Of the first two photos where COLMAP finds none by its own limits, 16 degrees and 100 points."""
+SMALL_SIDE = 1000
+"""Longer side in pixels up to which photos are doubled first, which finds more and takes longer."""
+BETTER = 0.99  # of the error in pixels: what a refined principal point must reach
+FREE_CENTRE = 20  # photos of a camera from which on its principal point is refined
+
+
+def main() -> None:
+    """Read a job, do it, and write the result beside the models."""
+    job = Job(**json.loads(sys.stdin.readline()))
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    result = mapped(job)
+    Path(job.models, "result.json").write_text(json.dumps(result), encoding="utf-8")
+
+
+def _end_with_parent() -> None:
+    sys.stdin.read()
+    os._exit(3)
+
+
+def tell(stage: str, done: int, total: int) -> None:
+    """A line for the process that reads this one's output."""
+    print(json.dumps({"stage": stage, "done": done, "total": total}), flush=True)
+
+
+def mapped(job: Job) -> Mapping[str, Any]:
+    """Features, matches, poses; the models are in `job.models`/0, 1, ..., the largest in `best`.
+
+    Returns "refused" with a word and numbers where there is nothing to go on with, else the names
+    of the photos of each model, largest first.
+    """
+    COLMAP.set_random_seed(job.seed)
+    names = [name for group in job.groups for name in group]
+    tell(FEATURES, 0, len(names))
+    for group in job.groups:
+        small = max(job.sizes[group[0]]) <= SMALL_SIDE
+        sift = {"max_num_features": job.features, "first_octave": -1 if small else 0}
+        extraction = {"num_threads": job.threads, "sift": sift}
+        COLMAP.extract_features(
+            job.database,
+            job.images,
+            image_names=group,
+            camera_mode=COLMAP.CameraMode.SINGLE,
+            reader_options={
+                "camera_model": "SIMPLE_RADIAL",
+                "existing_camera_id": _camera(job.database, group),
+            },
+            extraction_options=extraction,
+            device=COLMAP.Device.cpu,
+        )
+    found = _features(job.database)
+    if sum(count >= FEW_FEATURES for count in found.values()) < 3:
+        return {"refused": "features", "counts": found}
+    tell(MATCHING, 0, len(names))
+    settings = {
+        "matching_options": {"num_threads": job.threads},
+        "verification_options": {"ransac": {"random_seed": job.seed}},
+        "device": COLMAP.Device.cpu,
+    }
+    if job.sequential:
+        pairing = {"overlap": 10, "quadratic_overlap": True, "loop_detection": False}
+        COLMAP.match_sequential(job.database, pairing_options=pairing, **settings)
+    else:
+        # blocks of 5 for steps of progress
+        COLMAP.match_exhaustive(job.database, pairing_options={"block_size": 5}, **settings)
+    pairs = _pairs(job.database)
+    if pairs < 2:
+        return {"refused": "overlap", "pairs": pairs}
+    return _models(job, len(names))
+
+
+def _camera(database: str, group: Sequence[str]) -> int:
+    """The camera of those of `group` that an interrupted process left; -1 for a new one."""
+    with COLMAP.Database.open(database) as opened:
+        images = opened.read_all_images()
+    return next((image.camera_id for image in images if image.name in group), -1)
+
+
+def _features(database: str) -> dict[str, int]:
+    """Photo to number of features."""
+    with COLMAP.Database.open(database) as opened:
+        return {
+            image.name: opened.num_keypoints_for_image(image.image_id)
+            for image in opened.read_all_images()
+        }
+
+
+def _pairs(database: str) -> int:
+    """How many pairs of photos share FEW_MATCHES features that one motion explains."""
+    with COLMAP.Database.open(database) as opened:
+        _, counts = opened.read_two_view_geometry_num_inliers()
+    return sum(count >= FEW_MATCHES for count in counts)
+
+
+def _models(job: Job, total: int) -> Mapping[str, Any]:
+    done = 2  # the first two come together
+
+    def began() -> None:
+        nonlocal done
+        done = 2
+        tell(MAPPING, done, total)
+
+    def further() -> None:
+        nonlocal done
+        done += 1
+        tell(MAPPING, min(done, total), total)
+
+    tell(MAPPING, 0, total)
+    options = {"num_threads": job.threads, "random_seed": job.seed, "min_model_size": 3}
+    for mapper in ({}, SMALL):
+        models = COLMAP.incremental_mapping(
+            job.database,
+            job.images,
+            job.models,
+            options={**options, "mapper": mapper},
+            initial_image_pair_callback=began,
+            next_image_callback=further,
+        )
+        # photos from one place give models of next to no points
+        solid = [model for model in models.values() if model.num_points3D() >= FEW_POINTS]
+        if solid:
+            break
+    else:
+        return {"refused": "motion"}
+    ordered = sorted(solid, key=lambda model: -model.num_reg_images())
+    best = Path(job.models, "best")
+    best.mkdir()
+    _scaled(_centred(ordered[0], job.threads), job.sizes).write(best)
+    names = [sorted(image.name for image in model.images.values()) for model in ordered]
+    error = ordered[0].compute_mean_reprojection_error()
+    return {"models": names, "error": error, "points": ordered[0].num_points3D()}
+
+
+def _centred(model: Any, threads: int) -> Any:
+    """`model` with principal points refined, where enough photos share a camera and it fits better.
+
+    COLMAP keeps them in the middle of the image; photos that are cut out of larger ones then turn.
+    Long lenses do not show where it is: the error of `mary_rose` (19 degrees) stays the same, and
+    its cameras would turn by half a degree.
+    """
+    counts = dict.fromkeys(model.cameras, 0)
+    for image in model.images.values():
+        counts[image.camera_id] += 1
+    if all(count < FREE_CENTRE for count in counts.values()):
+        return model
+    options = COLMAP.BundleAdjustmentOptions()
+    options.refine_principal_point = True
+    options.print_summary = False
+    options.ceres.solver_options.num_threads = threads
+    moved = COLMAP.Reconstruction(model)
+    COLMAP.bundle_adjustment(moved, options)
+    errors = [each.compute_mean_reprojection_error() for each in (model, moved)]
+    return moved if errors[1] < BETTER * errors[0] else model
+
+
+def _scaled(model: Any, sizes: Mapping[str, tuple[int, int]]) -> Any:
+    """`model` in pixels of the photos of `sizes`, of which COLMAP saw smaller copies."""
+    scales = dict[int, Any]()
+    for image in model.images.values():
+        camera, (height, width) = model.cameras[image.camera_id], sizes[image.name]
+        if image.camera_id not in scales:
+            scales[image.camera_id] = (width / camera.width, height / camera.height)
+            camera.rescale(width, height)
+        for point in image.points2D:
+            point.xy = point.xy * scales[image.camera_id]
+    return model
+
+
+if __name__ == "__main__":
+    main()

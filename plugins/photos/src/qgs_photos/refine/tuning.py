@@ -1,0 +1,101 @@
+"""Tuning at test time: the queries or latents of a scene, fitted to its input views (TokenGS)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from qgs.contracts.schedule import END, follow
+from qgs.contracts.settings import Tuned
+from qgs.losses import Photometric
+from qgs.model import QueryGaussianModel
+from qgs.recipe import Recipe
+from qgs.types import Prediction, Views, map_tensors, named_tensors
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """prediction: of what was tuned. losses: before each step, and after the last one."""
+
+    prediction: Prediction
+    losses: Sequence[float]
+
+
+def tuning_loss(recipe: Recipe) -> Photometric:
+    """What tuning minimises: the first `qgs/photometric` of `recipe`, else one with defaults.
+
+    Weights that follow the training are those of its end, so that a protocol means one thing.
+    """
+    follow((losses := recipe.build_losses(pretrained=False)).values(), END)
+    for loss in losses.values():
+        if isinstance(loss, Photometric) and any(loss.weights()):
+            return loss
+    return Photometric(Photometric.Config())
+
+
+def tuner(model: QueryGaussianModel, recipe: Recipe) -> Callable[[Views], Tuning]:
+    """`tune` with the options of `recipe`'s `evaluation`."""
+    settings = recipe.evaluation
+    what, steps, rate = settings.tuning, settings.tuning_steps, settings.rate
+    return partial(tune, model, loss=tuning_loss(recipe), steps=steps, rate=rate, what=what)
+
+
+def tune(
+    model: QueryGaussianModel,
+    views: Views,
+    loss: Photometric,
+    steps: int,
+    rate: float = 1e-4,
+    what: Tuned = "queries",
+) -> Tuning:
+    """Fit what the model holds of the scenes `views` (B, V) to these views; weights stay.
+
+    what: "queries", all features and floating fields of the initial state, so LocusGS's anchors
+    too; or "latents", the features of the image memory; the encoder makes keys and values of them
+    anew in every step. `loss` compares the last layer with the photos; the optimiser is Adam.
+    TokenGS takes 50 steps, at a rate of 1e-4 of queries and 1e-2 of latents.
+    Raises ValueError for less than one step, and for latents of an encoder that has none to tune.
+    """
+    if steps < 1:
+        raise ValueError(f"tuning takes at least one step, got {steps}")
+    if what == "latents" and not model.encoder.tunable:
+        raise ValueError(
+            f"there are no latents to tune: the encoder, {type(model.encoder).__name__}, makes no "
+            "memory of other features; tune the queries instead (--tune queries)"
+        )
+    # Encoded once: weights and photos stay, so the memory does too.
+    with torch.no_grad():
+        memory = model.encoder(views)
+        start = model.queries(memory, views)
+    tuned = map_tensors(
+        lambda x: x.detach().clone().requires_grad_(x.is_floating_point()),
+        start if what == "queries" else memory.features,
+    )
+    leaves = [tensor for _, tensor in named_tensors(tuned) if tensor.requires_grad]
+    optimizer = torch.optim.Adam(leaves, lr=rate)
+
+    def predicted() -> tuple[Prediction, Tensor]:
+        # The part that is fixed was computed once, outside.
+        if what == "queries":
+            prediction = model.predict(views, memory, tuned, ())
+        else:
+            prediction = model.predict(views, model.encoder.project(tuned, memory), start, ())
+        rendering = model.render(prediction.gaussians, views.cameras)
+        terms = loss(prediction.layers[model.depth], rendering, views, views)
+        return prediction, torch.stack(list(terms.values())).sum()
+
+    losses = []
+    with torch.enable_grad():
+        for _ in range(steps):
+            _, value = predicted()
+            # Not backward(): that would leave gradients in the model's weights.
+            gradients = torch.autograd.grad(value, leaves, allow_unused=True)
+            for leaf, gradient in zip(leaves, gradients, strict=True):
+                leaf.grad = gradient
+            optimizer.step()
+            losses.append(float(value.detach()))
+    with torch.no_grad():
+        prediction, value = predicted()
+    return Tuning(prediction, [*losses, float(value)])

@@ -1,0 +1,284 @@
+import json
+import math
+import os
+import pickle  # noqa: TID251  as multiprocessing does
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import numpy as np
+import photo_formats
+import pytest
+import torch
+from PIL import Image
+from qgs_photos.datasets.chunk_files import load_chunk, stays_inside
+from qgs_photos.datasets.chunks import ChunksSource
+from tables import must_refuse
+from upath import UPath
+
+
+def as_tensor(data):
+    return torch.tensor(list(data), dtype=torch.uint8)
+
+
+def encoded(color, size=(64, 36)):
+    mode = "RGB" if len(color) == 3 else "RGBA"
+    return as_tensor(photo_formats.encoded(Image.new(mode, size, color)))
+
+
+def camera(x=0.0):
+    """A camera at (x, 2, 3) that is turned a quarter about z."""
+    w2c = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0]], float)
+    w2c[:, 3] = -w2c[:, :3] @ [x, 2, 3]
+    return [0.5, 0.9, 0.45, 0.55, 0, 0, *w2c.flatten()]
+
+
+def record(key, frames=4, **extra):
+    return {
+        "key": key,
+        "url": "",
+        "timestamps": torch.arange(frames) * 1000,
+        "cameras": torch.tensor([camera(i) for i in range(frames)]),
+        "images": [encoded((10 * i, 50, 200)) for i in range(frames)],
+        **extra,
+    }
+
+
+def write(folder, index=True, **chunks):
+    """Chunks, by their names without the suffix."""
+    folder.mkdir(parents=True, exist_ok=True)
+    keys = {}
+    for name, records in chunks.items():
+        with (folder / f"{name}.torch").open("wb") as file:
+            torch.save(records, file)
+        keys |= {entry["key"]: f"{name}.torch" for entry in records if index}
+    if index:
+        (folder / "index.json").write_text(json.dumps(keys))
+
+
+def data_set(path):
+    write(path / "train", a=[record("s0"), record("s1", 7)], b=[record("s2")])
+    write(path / "test", a=[record("t0")])
+
+
+opened = partial(photo_formats.opened, size=(16, 16), source=ChunksSource)
+first = partial(photo_formats.scene, size=(16, 16), source=ChunksSource)
+
+
+def names(source, split="train"):
+    return [scene.name for scene in source.scenes(split)]
+
+
+def test_frames_and_cameras(tmp_path):
+    data_set(tmp_path)
+    source = opened(tmp_path)
+    assert names(source) == ["s0", "s1", "s2"]
+    assert names(source, "test") == ["t0"]
+    scene = source.scenes("train")[1]
+    assert len(scene) == 7
+    c2w = scene.cameras.c2w[5]
+    assert c2w.dtype == torch.float64
+    assert c2w[:3, 3].tolist() == pytest.approx([5, 2, 3])
+    assert c2w[:3, 0].tolist() == [0, 1, 0]  # the camera's x axis
+    # 64 x 36 cropped to 36 x 36, 14 pixels off the left, then scaled by 16 / 36
+    wanted = np.array([0.5 * 64, 0.9 * 36, 0.45 * 64 - 14, 0.55 * 36]) * 16 / 36
+    assert scene.cameras.intrinsics[0].tolist() == pytest.approx(wanted.tolist(), rel=1e-6)
+    pixels = scene.images([6, 2])[:, :, 5, 5].mul(255).round()
+    assert pixels.tolist() == [[60, 50, 200], [20, 50, 200]]
+    assert scene.frame_name(3) == "3000"
+    assert scene.masks([0]) is None
+
+
+def test_listing_opens_no_chunk(tmp_path):
+    data_set(tmp_path)
+    (tmp_path / "train/b.torch").write_bytes(b"nothing")
+    source = opened(tmp_path)
+    assert len(source.scenes("train")) == 3
+    with pytest.raises(ValueError, match=r"b\.torch cannot be read as a torch file"):
+        source.scenes("train")[2].cameras  # noqa: B018
+
+
+def test_held_out_frames_serve_where_there_are_no_test_chunks(tmp_path):
+    write(tmp_path / "train", a=[record("s0")])
+    assert names(opened(tmp_path), "test") == []
+    assert opened(tmp_path, holdout=3).scenes("test")[0].held_out == (1,)
+    write(tmp_path / "test", a=[record("t0")])
+    assert names(opened(tmp_path, holdout=3), "test") == ["t0"]
+
+
+def test_chunks_without_split_folders_and_first_scenes(tmp_path):
+    write(tmp_path, a=[record("s0"), record("s1")])
+    assert len(opened(tmp_path).scenes("train")) == 2
+    assert names(opened(tmp_path, max_scenes=1)) == ["s0"]
+
+
+def test_without_an_index_the_chunks_are_read(tmp_path, caplog):
+    write(tmp_path / "train", a=[record("s0")], b=[record("s1")], index=False)
+    assert names(opened(tmp_path)) == ["s0", "s1"]
+    assert "has no index.json" in caplog.text
+    write(tmp_path / "train", c=[record("s1")], index=False)
+    must_refuse(r"'s1' is in b\.torch and in c\.torch", opened, tmp_path)
+
+
+def test_missing_chunks_and_short_scenes_are_counted_and_named(tmp_path, caplog):
+    data_set(tmp_path)
+    (tmp_path / "train/b.torch").unlink()
+    source = opened(tmp_path, min_frames=5)
+    assert "1 of 3 scenes" in caplog.text
+    assert "s2 (b.torch)" in caplog.text
+    assert names(source) == ["s1"]
+    assert "fewer than 5 frames (min_frames) and are left out: s0 (4)" in caplog.text
+    (tmp_path / "train/a.torch").unlink()
+    must_refuse("none of their chunks exists", opened, tmp_path, kind=FileNotFoundError)
+
+
+def test_legacy_files_are_read_whole(tmp_path):
+    data_set(tmp_path)
+    torch.save([record("s2")], tmp_path / "train/b.torch", _use_new_zipfile_serialization=False)
+    assert not zipfile.is_zipfile(tmp_path / "train/b.torch")
+    assert opened(tmp_path).scenes("train")[2].images([2])[0, 0, 0, 0] * 255 == pytest.approx(20)
+
+
+def test_scenes_travel_to_other_processes_without_open_files(tmp_path):
+    data_set(tmp_path)
+    source, scene = opened(tmp_path), first(tmp_path)
+    before = scene.images([1])
+    data = pickle.dumps((source, scene))
+    assert len(data) < 3000
+    source, scene = pickle.loads(data)  # noqa: S301
+    for copy in (scene, source.scenes("train")[0]):
+        assert torch.equal(copy.images([1]), before)
+
+
+def test_threads_share_few_open_chunks(tmp_path):
+    write(tmp_path / "train", **{f"c{i}": [record(f"s{i}", 2)] for i in range(8)})
+    scenes = opened(tmp_path).scenes("train")
+    with ThreadPoolExecutor(4) as pool:
+        images = list(pool.map(lambda k: scenes[k % 8].images([1])[0, 0, 0, 0] * 255, range(64)))
+    assert images == pytest.approx([10] * 64)
+    assert len(scenes[0]._chunks._kept) == 4
+
+
+def test_masks_names_sizes_and_backgrounds(tmp_path):
+    mask = np.repeat([[0], [255]], [18, 18], 0).repeat(64, 1).astype(np.uint8)
+    extra = {
+        "masks": [as_tensor(photo_formats.encoded(mask)), torch.empty(0).byte()],
+        "images": [encoded((9, 9, 9, 0)), encoded((0, 0, 0), (36, 36))],
+        "sizes": torch.tensor([[36, 64], [36, 36]]),
+        "names": ["a/0.jpg", "b.jpg"],
+    }
+    write(tmp_path, a=[record("s0", 2, **extra)])
+    scene = first(tmp_path, background=(0.2, 0.4, 0.6))
+    masks = scene.masks([0, 1])
+    assert masks[0, 0, [0, 15], 3].tolist() == [0, 1]
+    assert torch.equal(masks[1], torch.ones(1, 16, 16))
+    assert scene.frame_name(0) == "a/0.jpg"
+    assert scene.cameras.intrinsics[1].tolist() == pytest.approx([8, 14.4, 7.2, 8.8])
+    assert scene.images([0])[0, :, 0, 0].tolist() == pytest.approx([0.2, 0.4, 0.6])
+
+
+def changed(row, column, value):
+    """Cameras of a record with another number."""
+    cameras = record("s0")["cameras"]
+    cameras[row, column] = value
+    return cameras
+
+
+PHOTOS = record("s0", 3)["images"]
+BROKEN = (
+    ({"cameras": torch.zeros(5, 18)}, ": 'cameras'"),
+    ({"times": torch.zeros(3)}, ": 'times'"),
+    ({"times": torch.tensor([0, 1, 2, math.nan])}, ": 'times'"),
+    ({"images": None}, ": 'images'"),
+    ({"frames": 0}, ""),
+    ({"cameras": changed(2, 9, torch.nan)}, r", frame 2 \(2000\).*NaN"),
+    ({"cameras": changed(1, 7, 3.0)}, ", frame 1 .*not rigid"),
+    ({"cameras": changed(1, 7, -1.0)}, ", frame 1 .*mirrors"),
+    ({"cameras": changed(3, 0, 500.0)}, ", frame 3 .*pixels"),
+    ({"cameras": changed(3, 1, -1.0)}, ", frame 3 .*focal"),
+    ({"images": [torch.zeros(9).byte()] * 4}, ", frame 0 "),
+    ({"images": [*PHOTOS, encoded((1, 2, 3), (64, 64))]}, ", frame 3 .*64 x"),
+    ({"images": [*PHOTOS, encoded((1, 2, 3))[:60]]}, ", frame 3 "),
+)
+"""What is wrong with a scene, and what is told behind its name."""
+
+
+def all_images(path):
+    scene = first(path)
+    return scene.images(range(len(scene.cameras.c2w)))
+
+
+def test_broken_chunks_are_told(tmp_path):
+    (tmp_path / "index.json").write_text('{"s0": "a.torch"}')
+    cases = [
+        ({"key": "s0"}, "dict"),
+        ([1], "'key'"),
+        ([record("s9")], "'s0'"),
+        ([record("s0"), record("s0")], "'s0' twice"),
+    ]
+    cases += [([record("s0", **extra)], f"scene 's0'{told}") for extra, told in BROKEN]
+    for records, message in cases:
+        write(tmp_path, a=records, index=False)
+        must_refuse(rf"a\.torch.*{message}", all_images, tmp_path)
+
+
+HUGE = torch.zeros(1, dtype=torch.uint8).expand(10**12)
+
+
+def test_a_small_file_does_not_fill_the_memory(tmp_path):
+    for name, value in (
+        ("images", [HUGE]),
+        ("masks", [HUGE] * 4),
+        ("timestamps", HUGE),
+        ("held_out", HUGE),
+        ("cameras", torch.zeros(1).expand(4, 18)),
+        ("cameras", torch.zeros(4, 18).to_sparse()),
+        ("cameras", torch.zeros(4, 18, device="meta")),
+    ):
+        write(tmp_path, a=[record("s0", **{name: value})])
+        assert (tmp_path / "a.torch").stat().st_size < 20_000
+        reason = rf"\A.*a\.torch: scene 's0': '{name}' holds a tensor.*\Z"
+        must_refuse(reason, all_images, tmp_path)
+
+
+def test_an_index_does_not_lead_outside(tmp_path):
+    data_set(tmp_path)
+    for name in ("../test/a.torch", str(tmp_path / "test/a.torch"), "c:\\a.torch"):
+        (tmp_path / "train/index.json").write_text(json.dumps({"s0": name}))
+        must_refuse("outside its own folder", opened, tmp_path)
+    (tmp_path / "train/index.json").write_text("[1]")
+    must_refuse("must map each scene's key", opened, tmp_path)
+
+
+def test_names_that_stay_inside():
+    inside = ["a", "a/b.torch", "a..b", ".hidden", "a\\b"]
+    outside = ["..", "a/../b", "/a", "\\a", "a\\..\\..\\b", "c:/a", "", "C:a"]
+    assert [name for name in inside + outside if stays_inside(name)] == inside
+
+
+def test_folders_that_are_not_there(tmp_path):
+    absent, empty = tmp_path / "nothing", "holds no chunks.*qgs data pack"
+    must_refuse("does not exist", opened, absent, kind=FileNotFoundError)
+    must_refuse(empty, opened, tmp_path, kind=FileNotFoundError)
+    must_refuse("cannot be opened as a path or URL", opened, "nosuch://bucket")
+
+
+def test_code_in_a_chunk_is_not_run(tmp_path):
+    class Payload:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "made"),)
+
+    torch.save([Payload()], tmp_path / "a.torch")
+    must_refuse("cannot be read as a torch file", load_chunk, UPath(tmp_path / "a.torch"))
+    assert not (tmp_path / "made").exists()
+
+
+def test_a_chunk_that_cannot_be_read_is_named_without_torchs_advice(tmp_path):
+    file = tmp_path / "0.torch"
+    torch.save([UPath(tmp_path)], file)
+    for content in (file.read_bytes(), file.read_bytes()[:300], b""):
+        file.write_bytes(content)
+        with pytest.raises(ValueError, match=r"0\.torch") as error:
+            load_chunk(UPath(file))
+        assert "trust" not in str(error.value)
+    must_refuse(r"1\.torch", load_chunk, UPath(tmp_path / "1.torch"), kind=FileNotFoundError)

@@ -1,0 +1,206 @@
+import json
+import pickle  # noqa: TID251  as multiprocessing does
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import numpy as np
+import photo_formats
+import pytest
+import torch
+from photo_formats import row_of_frames
+from qgs_photos.datasets.dl3dv import Dl3dvSource, read_scene_list
+from tables import must_refuse
+from upath import UPath
+
+
+def photo(number, size=(32, 18)):
+    """A PNG whose red channel is 10 times its number, with a blue gradient."""
+    pixels = np.zeros((size[1], size[0], 3), np.uint8)
+    pixels[..., 0] = 10 * number
+    pixels[..., 2] = np.linspace(0, 255, size[0])
+    return photo_formats.encoded(pixels)
+
+
+def listing(**top):
+    given = {"w": 128, "h": 72, "fl_x": 100.0, "fl_y": 101.0, "cx": 60.0, "cy": 37.0}
+    return json.dumps(row_of_frames(4, **given | top)).encode()
+
+
+def scene_files(inside="", images="images_4", **top):
+    files = {f"{inside}{images}/{i}.png": photo(i) for i in range(4)}
+    return {f"{inside}transforms.json": listing(**top), **files}
+
+
+def write(path, files):
+    """An archive or a folder, by the suffix of `path`."""
+    if path.suffix != ".zip":
+        for name, data in files.items():
+            (path / name).parent.mkdir(parents=True, exist_ok=True)
+            (path / name).write_bytes(data)
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as file, zipfile.ZipFile(file, "w") as zipped:
+        for name, data in files.items():
+            zipped.writestr(name, data)
+
+
+opened = partial(photo_formats.opened, size=(9, 16), source=Dl3dvSource)
+scene = partial(photo_formats.scene, size=(9, 16), source=Dl3dvSource)
+
+
+PLACES = (
+    ("1K/abc.zip", "abc/", "images_4"),
+    ("abc.zip", "", "images_4"),
+    ("2K/abc", "", "images_4"),
+    ("abc", "gaussian_splat/", "images_4"),
+    ("abc.zip", "abc/gaussian_splat/", "images_4"),
+    ("abc", "", "images"),
+)
+"""Archives and folders, folders inside them, and those of photos."""
+
+
+def test_folders_and_archives_read_alike(tmp_path):
+    for number, (name, inside, images) in enumerate(PLACES):
+        local = tmp_path / str(number)
+        for root in (UPath(local), UPath(f"memory://dl3dv{local}")):
+            write(root / name, scene_files(inside, images))
+            is_read_as_written(root)
+        is_read_as_written(f"file://{local}")
+
+
+def is_read_as_written(root):
+    (scene,) = opened(root).scenes("train")
+    assert scene.name == "abc"
+    assert len(scene) == 4
+    opengl = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+    opengl[0, 3] = 2
+    assert torch.equal(scene.cameras.c2w[2], opengl)
+    # an eighth of the listed 128 x 72, whatever the size of the photos
+    assert scene.cameras.intrinsics[0].tolist() == pytest.approx([12.5, 12.625, 7.5, 4.625])
+    assert scene.images([3, 1])[:, 0, 4, 4].mul(255).round().tolist() == [30, 10]
+
+
+def test_reduced_photos_are_chosen(tmp_path):
+    files = {**scene_files(images="images_8"), **scene_files()}
+    write(tmp_path / "abc", {**files, "images_8/0.png": photo(9, (16, 9))})
+    for options, red in (({"images": "images_8"}, 90), ({}, 0)):
+        assert scene(tmp_path, **options).images([0])[0, 0, 0, 0] * 255 == pytest.approx(red)
+    with pytest.raises(FileNotFoundError, match="images_2"):
+        scene(tmp_path, images="images_2")
+
+
+def test_distortion_is_undone(tmp_path):
+    write(tmp_path / "abc", scene_files(k1=-0.5, k2=0.01, p1=1e-3, p2=-2e-3))
+    write(tmp_path / "pinhole", scene_files())
+    bent, straight = opened(tmp_path).scenes("train")
+    assert torch.equal(bent.cameras.intrinsics, straight.cameras.intrinsics)
+    difference = (bent.images([0]) - straight.images([0]))[0, 2].abs()
+    assert difference[3:6, 7:9].max() < 0.01 < difference[:, 13].min()
+
+
+def length(path):
+    return len(scene(path).cameras.c2w)
+
+
+def test_photos_of_another_aspect_are_refused(tmp_path):
+    write(tmp_path / "abc", {**scene_files(), "images_4/0.png": photo(0, (18, 32))})
+    must_refuse(r"0\.png.*swapped", length, tmp_path)
+
+
+def test_missing_photos_are_counted_and_named(tmp_path, caplog):
+    files = scene_files("abc/")
+    del files["abc/images_4/2.png"]
+    write(tmp_path / "abc.zip", files)
+    assert length(tmp_path) == 3
+    assert "1 of 4 images" in caplog.text
+    assert "abc/images_4/2.png" in caplog.text
+
+
+def test_incomplete_and_broken_archives_are_told(tmp_path):
+    for files, file in (
+        ({"abc/images_4/0.png": b""}, r"abc\.zip"),
+        ({"abc/transforms.json": b"{"}, r"abc/transforms\.json::.*abc\.zip"),
+        ({"abc/transforms.json": listing()}, "transforms"),
+    ):
+        write(tmp_path / "abc.zip", files)
+        must_refuse(file, length, tmp_path, kind=(ValueError, OSError))
+    (tmp_path / "abc.zip").write_bytes(b"PK nothing")
+    opened(tmp_path)  # listed without being opened
+    must_refuse(r"abc\.zip", length, tmp_path)
+
+
+def test_a_damaged_photo_names_archive_and_file(tmp_path):
+    archive = tmp_path / "abc.zip"
+    write(archive, scene_files("abc/"))
+    data = bytearray(archive.read_bytes())
+    data[data.index(photo(1)) + 60] ^= 255
+    archive.write_bytes(data)
+    with pytest.raises(ValueError, match=r"abc/images_4/1\.png::.*abc\.zip"):
+        scene(tmp_path).images([1])
+
+
+def several(path):
+    for i in range(4):
+        write(path / f"1K/s{i}.zip", scene_files(f"s{i}/"))
+
+
+def names(path, split, **options):
+    return [scene.name for scene in opened(path, **options).scenes(split)]
+
+
+def test_test_scenes(tmp_path, caplog):
+    several(tmp_path)
+    assert names(tmp_path, "train") == ["s0", "s1", "s2", "s3"]
+    assert names(tmp_path, "test") == []
+    index = tmp_path / "index.json"
+    index.write_text('{"s2": null, "gone": null, "s0": null}')
+    assert names(tmp_path, "train", test_scenes=str(index)) == ["s1", "s3"]
+    assert names(tmp_path, "test", test_scenes=str(index)) == ["s2", "s0"]
+    assert "1 of 3 test scenes" in caplog.text
+    held_out = opened(tmp_path, holdout=3, max_scenes=2).scenes("test")
+    assert [scene.held_out for scene in held_out] == [(1,), (1,)]
+
+
+def test_lists_of_scenes(tmp_path):
+    text, listed = UPath(tmp_path / "list.txt"), UPath(tmp_path / "list.json")
+    text.write_text("# benchmark\ns1\n\ns2  # hard\ns1\n")
+    listed.write_text('["s3"]')
+    assert read_scene_list(text) == ["s1", "s2"]
+    assert read_scene_list(listed) == ["s3"]
+    text.write_text("# none\n")
+    listed.write_text("3")
+    for wrong in (text, listed):
+        must_refuse(wrong.name, read_scene_list, wrong)
+    gone = text.with_name("gone.txt")
+    must_refuse(gone.name, read_scene_list, gone, kind=FileNotFoundError)
+
+
+def test_a_scene_that_is_there_twice_is_told(tmp_path, caplog):
+    several(tmp_path)
+    write(tmp_path / "1K/s0", scene_files())
+    assert len(opened(tmp_path).scenes("train")) == 4
+    assert "1 scenes of" in caplog.text
+
+
+def test_folders_that_are_not_there(tmp_path):
+    must_refuse("nothing", opened, tmp_path / "nothing", kind=FileNotFoundError)
+    (tmp_path / "a.txt").write_text("")
+    must_refuse(r"a\.txt", opened, tmp_path, kind=FileNotFoundError)
+
+
+def test_scenes_travel_to_other_processes_without_open_archives(tmp_path):
+    several(tmp_path)
+    source, before = opened(tmp_path), scene(tmp_path)
+    before.images([1])
+    source, copy = pickle.loads(pickle.dumps((source, before)))  # noqa: S301
+    for again in (copy, source.scenes("train")[0]):
+        assert torch.equal(again.images([1]), before.images([1]))
+
+
+def test_threads_read_one_archive(tmp_path):
+    several(tmp_path)
+    scenes = opened(tmp_path).scenes("train")
+    with ThreadPoolExecutor(4) as threads:
+        red = list(threads.map(lambda k: scenes[k % 4].images([k % 3])[0, 0, 0, 0], range(24)))
+    assert red == pytest.approx([10 * (k % 3) / 255 for k in range(24)])

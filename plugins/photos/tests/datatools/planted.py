@@ -1,0 +1,102 @@
+"""Sound data sets of several formats, and scenes to plant faults in."""
+
+import json
+import shutil
+from fnmatch import fnmatchcase
+
+import numpy as np
+import torch
+from photo_formats import encoded
+from qgs_photos.datatools.check import Options, check
+from textured_room import INTRINSICS, SIZE
+from upath import UPath
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+HASH = "0123456789abcdef" * 4
+ALL = "frames 0-5 (images/0.jpg to images/5.jpg): "
+CAMERA = dict(zip(("fl_x", "fl_y", "cx", "cy", "h", "w"), INTRINSICS + SIZE, strict=True))
+
+
+class Room:
+    """What is written of a nerfstudio folder. poses: OpenCV. files: bytes by name."""
+
+    def __init__(self, shots):
+        self.files = {f"images/{n}.jpg": shot.encoded() for n, shot in enumerate(shots)}
+        self.frames = [{"file_path": name} for name in self.files]
+        self.poses = np.stack([shot.c2w for shot in shots])
+        self.camera = dict(CAMERA)
+
+    def mask(self, masks):
+        for number, mask in enumerate(masks):
+            self.files[f"masks/{number}.png"] = encoded(mask)
+            self.frames[number]["mask_path"] = f"masks/{number}.png"
+
+    def write(self, folder):
+        for frame, pose in zip(self.frames, self.poses @ FLIP, strict=True):
+            frame["transform_matrix"] = pose.tolist()
+        listing = json.dumps({**self.camera, "frames": self.frames})
+        for name, data in {**self.files, "transforms.json": listing.encode()}.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(data)
+
+
+class Planted:
+    """Rooms, each with a fault, and the lines that are told of it, without the room's name."""
+
+    def __init__(self, shots, root):
+        self.shots = shots
+        self.root = root
+        self.rooms = {}
+
+    def __call__(self, *lines):
+        room = Room(self.shots)
+        self.rooms[room] = lines
+        return room
+
+    def check(self, geometry=99):
+        """All rooms at once."""
+        for number, room in enumerate(self.rooms):
+            room.write(self.root / f"room {number:02}")
+        report = check(UPath(self.root), Options(geometry))
+        assert not report.general
+        wrong = []
+        for scene, lines in zip(report.scenes, self.rooms.values(), strict=True):
+            found = [str(f).replace(f"{scene.name}, ", "") for f in scene.findings]
+            if not alike(found, lines):
+                wrong.append((lines, found))
+        assert not wrong, wrong
+
+
+def alike(lines, patterns):
+    """Whether these are the lines of the patterns, and no others."""
+    return len(lines) == len(patterns) and all(map(fnmatchcase, lines, patterns))
+
+
+def told(path, index=(), geometry=1):
+    return [*map(str, check(UPath(path), Options(geometry), index).findings)]
+
+
+def good_sets(root, shots):
+    """A nerfstudio folder, chunks with two scenes and an index, and an archive, all sound."""
+    Room(shots).write(root / "room")
+    shutil.make_archive(str(root / "archives" / HASH), "zip", root / "room")
+    save(root / "chunks/test/0.torch", [record("a", shots), record("b", shots[:3])])
+    (root / "chunks/test/index.json").write_text('{"a": "0.torch", "b": "0.torch"}')
+    (root / "chunks/evaluation.json").write_text(
+        '{"a": {"context": [0, 5], "target": [2]}, "b": {"context": [0, 2], "target": [1]}}'
+    )
+
+
+def record(key, shots):
+    """A scene of a chunk."""
+    lens = np.array(INTRINSICS) / (SIZE[::-1] * 2)
+    cameras = [[*lens, 0, 0, *np.linalg.inv(shot.c2w)[:3].flatten()] for shot in shots]
+    images = [torch.frombuffer(bytearray(s.encoded()), dtype=torch.uint8) for s in shots]
+    stamps = torch.arange(len(shots))
+    cameras = torch.tensor(cameras, dtype=torch.float32)
+    return {"key": key, "url": "", "timestamps": stamps, "cameras": cameras, "images": images}
+
+
+def save(chunk, content):
+    chunk.parent.mkdir(parents=True, exist_ok=True)
+    torch.save(content, chunk)

@@ -1,0 +1,256 @@
+"""Each planted fault is found as exactly one line; the untouched sets pass without any."""
+
+import os
+
+import numpy as np
+import pytest
+import torch
+from photo_formats import encoded
+from PIL import Image, ImageDraw
+from planted import ALL, FLIP, HASH, INTRINSICS, SIZE, alike, record, save, told
+from qgs_photos.datatools.check import Options, check
+from upath import UPath
+
+from qgs.data.photos.source import present_frames
+
+FX, FY, CX, CY = INTRINSICS
+
+
+def test_untouched_sets_pass(good):
+    for name in ("room", "chunks", "archives"):
+        report = check(UPath(good / name), Options())
+        assert [*report.findings, *report.notes] == []
+        for scene in report.scenes:
+            assert scene.geometry.agrees
+            assert scene.geometry.pixels < 0.6
+            assert scene.listed == scene.decodable > 0
+
+
+def test_faults_of_files(planted, shots):
+    missing = planted("error: images/2.jpg: *does not exist*")
+    del missing.files["images/2.jpg"]
+    cut = planted("error: frame 2 (images/2.jpg): *cannot be decoded*")
+    cut.files["images/2.jpg"] = cut.files["images/2.jpg"][:-400]
+    pipe = planted("error: frame 2 (images/2.jpg): *is a pipe*")
+    del pipe.files["images/2.jpg"]
+    (planted.root / "room 02/images").mkdir(parents=True)
+    os.mkfifo(planted.root / "room 02/images/2.jpg")
+
+    size = "error: frame 3 (images/3.jpg): *{} x {} pixels, but listed as 180 x 120, another {}*"
+    for width, height, what in ((160, 120, "aspect"), (90, 60, "scale")):
+        small = Image.fromarray(shots[3].image).resize((width, height))
+        planted(size.format(width, height, what)).files["images/3.jpg"] = encoded(small, "JPEG")
+    listed = f"error: {ALL}*180 x 120 pixels, but listed as "
+    planted(f"{listed}120 x 180*swapped*").camera.update(w=120, h=180)
+    planted(f"{listed}360 x 240: correct the listed*").camera.update(w=360, h=240)
+
+    scaled_copy = planted()
+    for key in scaled_copy.camera:
+        scaled_copy.camera[key] *= 4
+    for name in [*scaled_copy.files]:
+        scaled_copy.files[name.replace("images", "images_4")] = scaled_copy.files.pop(name)
+    planted.check()
+
+
+def test_faults_of_cameras(planted):
+    opencv = planted(f"error: {ALL}*OpenCV poses read as OpenGL*negate columns 1 and 2*")
+    opencv.poses @= FLIP
+    planted("error: frame 1 (images/1.jpg): the pose mirrors*").poses[1, :, 0] *= -1
+    planted("error: frame 4 (images/4.jpg): the pose has NaN*").poses[4] = np.nan
+    off = planted("error: frame 1 (images/1.jpg): the principal point lies off the image*")
+    off.frames[1]["cx"] = 200.0
+    normalised = {"fl_x": 0.8, "fl_y": 1.2, "cx": 0.5, "cy": 0.5}
+    planted(f"error: {ALL}*look normalised*").camera |= normalised
+
+    repeats = "frame 5 (images/5.jpg): the {}pose repeat* frame 2 (images/2.jpg)*"
+    same_pose = planted(f"error: {repeats.format('')}")
+    same_photo = planted(f"warning: {repeats.format('photo and its ')}")
+    same_photo.files["images/5.jpg"] = same_photo.files["images/2.jpg"]
+    for room in (same_pose, same_photo):
+        room.poses[5] = room.poses[2]
+
+    same_point = (
+        "error: frame 3 (images/3.jpg): the camera stands on the same point as that of frame 2 "
+        "(images/2.jpg), a zero baseline*"
+    )
+    far, far_too, here = planted(), planted(same_point), planted(same_point)
+    for room in (here, far_too):
+        room.poses[3, :3, 3] = room.poses[2, :3, 3]
+    for room in (far, far_too):
+        room.poses[:, :3, 3] += [2e5, 3e5, 100]  # metres of a map's grid
+    planted.check()
+
+
+def test_faults_that_several_frames_show_together(planted, shots):
+    two = "frames 1, 4 (images/1.jpg to images/4.jpg): "
+    both = planted(f"error: {two}their poses look exchanged*")
+    both.poses[[1, 4]] = both.poses[[4, 1]]
+    off = planted("warning: frame 3 (images/3.jpg): the pose or the intrinsics do not fit *")
+    off.poses[3, 1, 3] += 0.3
+    focal = planted(f"error: {ALL}the focal lengths do not fit*")
+    focal.camera.update(fl_x=1.3 * FX, fl_y=1.3 * FY)
+    planted(f"error: {ALL}cx and cy look exchanged*").camera.update(cx=CY, cy=CX)
+    cut = planted(f"error: {ALL}the intrinsics do not fit*")
+    cut.camera["w"] -= 45
+    bgr = planted(f"warning: {two}red and blue look exchanged: *")
+    black = planted("error: frame 2 (images/2.jpg): the image is black*")
+    plain = planted(
+        "warning: *: the poses are not judged against the photos: too few matches, below 24 in "
+        "every pair that was tried: look at the cameras yourself, in the picture that --report "
+        "draws"
+    )
+
+    def put(room, number, pixels):
+        room.files[f"images/{number}.jpg"] = encoded(pixels, "JPEG", quality=92, subsampling=0)
+
+    for number, shot in enumerate(shots):
+        put(cut, number, shot.image[:, 45:])
+        put(plain, number, 0 * shot.image + np.uint8([20 * number, 30, 90]))
+        if number in (1, 4):
+            put(bgr, number, shot.image[..., ::-1])
+    put(black, 2, 0 * shots[2].image)
+    planted.check()
+
+
+def poster(shot):
+    """A mask that is white on a part of the wall at z = 1.5."""
+    corners = np.array([[-0.5, -0.4, 1.5], [0.5, -0.4, 1.5], [0.5, 0.4, 1.5], [-0.5, 0.4, 1.5]])
+    x, y, z = ((corners - shot.c2w[:3, 3]) @ shot.c2w[:3, :3]).T
+    pixels = np.stack([FX * x / z + CX, FY * y / z + CY], -1)
+    mask = Image.new("L", SIZE[::-1])
+    ImageDraw.Draw(mask).polygon(pixels.flatten().tolist(), fill=255)
+    return np.array(mask)
+
+
+def test_faults_of_masks(planted, shots):
+    masks = np.stack([*map(poster, shots)])
+    planted().mask(masks)
+    planted(f"error: {ALL}the mask is all black*").mask(0 * masks)
+    planted(f"warning: {ALL}the mask is all white*").mask(0 * masks + 255)
+    planted(f"warning: {ALL}*look inverted*").mask(255 - masks)
+    of_next = "warning: frames 0-4 (images/0.jpg to images/4.jpg): the mask fits the next photo *"
+    planted(of_next).mask(np.roll(masks, -1, 0))
+    for what, mask in (("is all black", 0 * masks[2]), ("looks inverted", 255 - masks[2])):
+        one = planted(f"warning: frame 2 (images/2.jpg): the mask {what}*")
+        one.mask([*masks[:2], mask, *masks[3:]])
+    damaged = planted(
+        "error: frame 0 (images/0.jpg): its mask does not exist in masks: add it, or list no mask",
+        "error: frame 1 (images/1.jpg): *1.png cannot be read as the mask of a photo*",
+    )
+    damaged.mask(masks)
+    del damaged.files["masks/0.png"]
+    damaged.files["masks/1.png"] = b"no image"
+    planted.check()
+
+
+def test_a_camera_that_stands_still_may_film_what_moves(planted):
+    """Two frames have one pose; times tell them apart, but are wrong in the last room."""
+    repeats = "error: frame 5 (images/5.jpg): the pose repeats *"
+    wrong = (
+        "error: frame 2 (images/2.jpg): 'time' must be a finite number, got '2': correct it",
+        "error: frames 4-5 (images/4.jpg to images/5.jpg): it has no 'time', like 3 of 6 frames, "
+        "and the others have: write it for each, or for none where nothing moves",
+        repeats,
+    )
+    cases = (([], [repeats]), ([0.5] * 6, [repeats]), (range(6), []), ([0, 1, "2", 3], wrong))
+    for times, lines in cases:
+        room = planted(*lines)
+        room.poses[5] = room.poses[2]
+        for frame, time in zip(room.frames, times, strict=False):
+            frame["time"] = time
+    planted.check(geometry=0)
+
+
+def test_photos_have_one_number_in_reading_and_in_checking(planted):
+    """Behind a photo that is missing, the number in a message is the one that `--frames` takes."""
+    nan = "error: frame 2 (images/3.jpg): the pose has NaN*"
+    room = planted("error: images/1.jpg: the image does not exist*", nan)
+    del room.files["images/1.jpg"]
+    room.poses[3] = np.nan
+    planted.check()
+    with pytest.raises(ValueError, match=r"frame 2 \(images/3\.jpg\): the pose has NaN"):
+        present_frames(UPath(planted.root / "room 00"))
+
+
+def test_faults_of_a_scene_in_a_chunk(shots, tmp_path):
+    nan, point, cut, opengl, swapped, pixels = records = [record(key, shots) for key in "abcdef"]
+    nan["cameras"][2, 9:] = np.nan
+    point["cameras"][:, [9, 13, 17]] = 0
+    cut["images"][4] = cut["images"][4][:-400].clone()
+    opengl["cameras"][:, 10:] *= -1
+    swapped["cameras"][:, :4] *= torch.tensor([1.5, 1 / 1.5] * 2)
+    pixels["cameras"][:, :4] *= torch.tensor([180, 120] * 2)
+    save(tmp_path / "test/0.torch", records)
+    found = told(tmp_path, geometry=6)
+    expected = (
+        "error: a, frame 2 (2): the pose has NaN*",
+        "error: b, frames 0-5 (0 to 5): *on one point*",
+        "error: c, frame 4 (4): the image cannot be decoded*",
+        "error: d, frames 0-5 (0 to 5): *OpenGL poses read as OpenCV*negate rows 1 and 2*",
+        "error: e, frames 0-5 (0 to 5): *width and height are swapped*",
+        "error: f, frames 0-5 (0 to 5): *look like pixels*",
+    )
+    assert alike(found, expected), found
+
+
+def test_faults_of_chunks_and_their_index(chunks):
+    """0 is sound but for its index, 1 is missing, and 2 to 4 hold no scenes."""
+    index = '{"a": "0.torch", "c": "1.torch", "d": "0.torch", "e": "2.torch", "f": "3.torch"}'
+    (chunks / "test/index.json").write_text(index)
+    for number, content in ((2, {"key": "e"}), (3, [torch.zeros(2)] * 2), (4, [])):
+        save(chunks / f"test/{number}.torch", content)
+    found = told(chunks, geometry=0)
+    expected = (
+        "error: test/2.torch: *places there 1 scene: e*",
+        "error: test/3.torch: *places there 1 scene: f*",
+        "error: test/4.torch: the chunk holds no scene: pack the data set again*",
+        "error: test/1.torch: the chunk does not exist; index.json places there 1 scene: c: "
+        "download the chunk, or take its scenes out of index.json",
+        "error: d: test/index.json places the scene in 0.torch, which does not hold it: take the "
+        "scene out of index.json, or get the chunk that holds it",
+        "warning: b: test/0.torch holds the scene, but test/index.json does not name it, so that "
+        "it is never read: add it to index.json",
+    )
+    assert alike(found, expected), found
+
+
+def test_an_index_is_checked_where_it_is_given_and_where_it_lies_with_the_chunks(chunks):
+    given = UPath(chunks.with_name("given.json"))
+    for file in (given, chunks / "evaluation.json"):
+        file.write_text(
+            '{"nowhere": {"context": [0], "target": [1]}, "a": null, '
+            '"b": {"context": [0, 2], "target": [3]}}'
+        )
+    found = told(chunks, [given], geometry=0)
+    expected = (
+        "error: nowhere: the index given.json *not there*",
+        "error: b, frame 3: the index given.json *3 frames are 0 to 2*",
+        "error: nowhere: the index evaluation.json *not there*",
+        "error: b, frame 3: the index evaluation.json *3 frames are 0 to 2*",
+    )
+    assert alike(found, expected), found
+
+
+def test_other_data_sets_beside_scenes_are_named(room, chunks):
+    assert told(room.parent) == [
+        "warning: chunks: the folder is another data set (chunks) and is not checked with the "
+        f"photos beside it: run `qgs data check {chunks}`"
+    ]
+
+
+def test_single_files_are_data_sets_too(good):
+    options = Options(headers_only=True)
+    for file, held in (
+        (f"archives/{HASH}.zip", [HASH]),
+        ("chunks/test/0.torch", ["a", "b"]),
+        ("room/transforms.json", ["room"]),
+    ):
+        assert [scene.name for scene in check(UPath(good / file), options).scenes] == held
+
+
+def test_nothing_passes_in_silence(good):
+    room = UPath(good / "room")
+    with pytest.raises(FileNotFoundError, match="holds no chunks: leave --format out"):
+        check(room, Options(format="chunks"))
+    with pytest.raises(FileNotFoundError, match="no evaluation index at"):
+        check(room, Options(geometry=0), [room / "none.json"])

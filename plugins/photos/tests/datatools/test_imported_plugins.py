@@ -1,0 +1,48 @@
+"""Commands import the plugins that are asked for; those that import all say so."""
+
+import re
+import sys
+
+from commands import run_qgs
+from qgs_photos.datatools import sources
+
+ALL = {
+    "list": "list",
+    "list queries": "list",
+    "schema": "schema",
+    "data check photos": "data check",
+    "data pack photos --out chunks": "data pack",
+}
+"""Commands that import every plugin, and where they say so."""
+SOME = (
+    "list qgs/latent",
+    "list rooms/locus-64",
+    "compose recipe.yaml",
+    "recipes",
+    "eval absent.safetensors",
+    "data check photos --format nerfstudio",
+    "data check photos --format rooms/absent",
+    "data pack recipe.yaml --out chunks",
+    "--help",
+    "data check --help",
+)
+
+
+def test_commands_import_the_plugins_that_are_asked_for(install, tmp_path, monkeypatch):
+    source = "from qgs.contracts import Plugin\nplugin = Plugin('marked', 1, ())"
+    install("marked", "marked", source)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "recipe.yaml").write_text("recipe: 1\nmodel: {}")
+    (tmp_path / "photos/other").mkdir(parents=True)
+    (tmp_path / "photos/transforms.json").write_text("{}")
+    imported = []
+    for words in (*ALL, *SOME):
+        sources._imported.cache_clear()
+        run_qgs(*words.split())
+        if sys.modules.pop("_test_marked", None):
+            imported.append(words)
+    sources._imported.cache_clear()
+    assert imported == [*ALL]
+    for command in ALL.values():
+        words = re.findall(r"\w+", run_qgs(*command.split(), "--help").output)
+        assert "mports every" in " ".join(words)

@@ -1,0 +1,268 @@
+"""Chunks read as their source does, however they were packed and interrupted."""
+
+import io
+import json
+import os
+import signal
+from contextlib import contextmanager
+from functools import partial
+from itertools import count
+
+import numpy as np
+import photo_formats
+import pytest
+import torch
+from commands import run_qgs
+from photo_formats import row_of_frames
+from PIL import Image
+from qgs_photos.datasets.chunks import ChunksSource
+from qgs_photos.datatools import packing
+from tables import must_refuse
+from torch.testing import assert_close
+from upath import UPath
+
+from qgs.recipe import resolve
+
+SIZE = (24, 32)
+GIVEN = {"w": 64, "h": 48, "fl_x": 60.0, "fl_y": 61.0, "cx": 31.0, "cy": 25.0}
+KEPT = {
+    "png": {},
+    "jpg": {"suffix": "jpg"},
+    "mpo": {"suffix": "mpo"},
+    "masks": {"mask": True},
+    "times": {"times": [0.1, 0.2, 0.2, 0.7]},
+    "late": {"times": [1.7e9, 1.7e9, 1.7e9 + 0.01, 0]},
+}
+LENS = {"k1": -0.2, "camera_model": "OPENCV"}
+CHANGED = {
+    "webp": {"suffix": "webp"},
+    "grey": {"convert": "L"},
+    "transparent": {"convert": "RGBA"},
+    "distorted": {"p1": 0.01, **LENS},
+    "distorted masks": {"mask": True, **LENS},
+}
+"""Scenes whose photos keep their bytes, and others."""
+
+
+def noise(seed, kind="RGB"):
+    pixels = np.random.default_rng(seed).integers(0, 256, (48, 64, 4), np.uint8)
+    return Image.fromarray(pixels).convert(kind)
+
+
+def photos(path, frames=4, suffix="png", convert="RGB", mask=False, times=None, **top):
+    """A scene of noise in nerfstudio's format."""
+    listing = row_of_frames(frames, 0.3, **GIVEN | top)
+    (path / "images").mkdir(parents=True)
+    for i, entry in enumerate(listing["frames"]):
+        entry["file_path"] = f"images/{i}.{suffix}"
+        noise(i, convert).save(path / entry["file_path"])
+        entry["transform_matrix"][2][3] = -1000.7
+        if mask and i % 2:
+            entry["mask_path"] = f"mask{i}.png"
+            noise(100 + i, "L").save(path / entry["mask_path"])
+        if times:
+            entry["time"] = times[i]
+    (path / "transforms.json").write_text(json.dumps(listing))
+
+
+source = partial(photo_formats.opened, size=SIZE, holdout=3)
+packed = partial(photo_formats.opened, size=SIZE, source=ChunksSource)
+
+
+def pack(photos, out, encoding=None, **options):
+    splits = packing.own_splits(photos)
+    return packing.pack(photos, splits, UPath(out), {"path": "photos"}, encoding, **options)
+
+
+def same(before, after, tolerance=0.0, split="train"):
+    close = partial(assert_close, atol=1e-4, rtol=0, check_dtype=False)
+    for one, other in zip(before.scenes(split), after.scenes(split), strict=True):
+        frames = range(len(one))
+        assert [*map(one.frame_name, frames)] == [*map(other.frame_name, frames)]
+        assert [*one.held_out] == [*other.held_out]
+        assert (one.images(frames) - other.images(frames)).abs().max() <= tolerance, one.name
+        for expected, given in ((one.times, other.times), (one.masks(frames), other.masks(frames))):
+            assert given is None if expected is None else torch.equal(expected, given)
+        close(one.cameras.intrinsics, other.cameras.intrinsics)
+        close(one.cameras.c2w, other.cameras.c2w)
+
+
+@pytest.fixture(scope="module")
+def kinds(tmp_path_factory):
+    """A folder of scenes, called as their kinds."""
+    root = tmp_path_factory.mktemp("kinds")
+    for kind, options in {**KEPT, **CHANGED}.items():
+        photos(root / kind, **options)
+    return root
+
+
+def scenes(folder, count):
+    """A source of scenes s0, s1 ... of two photos."""
+    for number in range(count):
+        photos(folder / f"scenes/s{number}", frames=2)
+    return source(folder / "scenes")
+
+
+@pytest.fixture
+def six(tmp_path):
+    return scenes(tmp_path, 6)
+
+
+def test_chunks_read_as_their_source_does(kinds, tmp_path):
+    before = source(kinds, background=(0.2, 0.5, 0.9))
+    result = pack(before, tmp_path)
+    count = len(KEPT) + len(CHANGED)
+    assert result.scenes == {"train": count, "test": 0}
+    assert (result.frames, result.kept) == (4 * count, 4 * len(KEPT))
+    for split in ("train", "test"):  # the same scenes, for their held-out frames
+        same(before, packed(tmp_path), split=split)
+
+    entries = torch.load(tmp_path / "train/000000.torch", weights_only=True)
+    entries = {entry["key"]: entry for entry in entries}
+    for kind, options in KEPT.items():
+        file = kinds / f"{kind}/images/2.{options.get('suffix', 'png')}"
+        assert bytes(entries[kind]["images"][2].numpy()) == file.read_bytes()
+    assert {"url", "timestamps"} <= entries["png"].keys()
+    cameras = entries["png"]["cameras"]
+    assert cameras.dtype == torch.float32
+    assert cameras[0, :4].tolist() == pytest.approx([60 / 64, 61 / 48, 31 / 64, 25 / 48])
+    c2w = before.scenes("train")[0].cameras.c2w[3].float()
+    assert_close(cameras[3, 6:].reshape(3, 4) @ c2w, torch.eye(4)[:3])
+
+
+def test_copies_of_copies_read_alike_at_urls_resized_and_as_jpeg(kinds, tmp_path):
+    before = source(kinds)
+    for url, encoding, tolerance in (
+        (f"memory://packed{tmp_path}", None, 0),
+        (f"file://{tmp_path}/same", None, 0),
+        (f"{tmp_path}/png", packing.Encoding(resized=True), 0),
+        (f"{tmp_path}/jpeg", packing.Encoding(resized=True, jpeg=90), 0.5),
+    ):
+        pack(before, url, encoding)
+        before = packed(UPath(url))
+        same(source(kinds), before, tolerance)
+        names = sorted(item.name for item in (UPath(url) / "train").iterdir())
+        assert names == ["000000.torch", "index.json"]
+    with Image.open(io.BytesIO(before.scenes("train")[0].encoded(0).data)) as image:
+        assert (image.format, image.size) == ("JPEG", (32, 24))
+
+
+def test_chunks_are_bounded_in_size_and_order_is_kept(six, tmp_path):
+    one_scene = 2 * (tmp_path / "scenes/s0/images/0.png").stat().st_size
+    pack(six, tmp_path / "chunks", chunk_bytes=int(2.5 * one_scene))
+    after = packed(tmp_path / "chunks")
+    assert list(after.names("train")) == [f"s{i}" for i in range(6)]
+    assert list(map(list, after.groups("train"))) == [[0, 1], [2, 3], [4, 5]]
+    files = (tmp_path / "chunks/train").glob("*.torch")
+    assert all(file.stat().st_size < 2.5 * one_scene + 20_000 for file in files)
+
+
+def test_splits(six):
+    def found(splits):
+        return [*map(list, splits.values())]
+
+    named = packing.splits_by_list(six, ["s4", "s1"])
+    assert found(named) == [["s0", "s2", "s3", "s5"], ["s1", "s4"]]
+    assert found(packing.splits_by_number(six, 3)) == [["s0", "s1", "s3", "s4"], ["s2", "s5"]]
+    must_refuse(
+        "1 of 2 test scenes are not there: gone", packing.splits_by_list, six, ["s1", "gone"]
+    )
+
+
+def test_what_is_there_is_never_overwritten(six, tmp_path):
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes/a.txt").write_text("mine")
+    pack(six, tmp_path / "chunks")
+    for folder, held in (("notes", r"not empty \(a\.txt\)"), ("chunks", "never overwrites")):
+        must_refuse(held, pack, six, tmp_path / folder, kind=FileExistsError)
+
+
+def test_scenes_that_cannot_be_read_stop_a_packing_or_are_left_out(six, tmp_path):
+    out = tmp_path / "chunks"
+    image = tmp_path / "scenes/s3/images/1.png"
+    whole = image.read_bytes()
+    image.write_bytes(whole[:200])
+    with pytest.raises(ValueError, match=r"scene 's3', frame 1 \(images/1\.png\) cannot be read"):
+        pack(six, out, chunk_bytes=1)
+    assert not list(out.rglob("index.json"))
+    with pytest.raises(ValueError, match=r"other settings .*chunk_bytes was 1, is 2"):
+        pack(six, out, chunk_bytes=2)
+
+    result = pack(six, tmp_path / "others", leave_out_broken=True)
+    assert result.scenes["train"] == 5
+    assert "images/1.png" in result.left_out["s3"]
+    alone = {"train": {"s3": ("train", 3)}, "test": {}}
+    with pytest.raises(ValueError, match="no scene to pack: s3: "):
+        packing.pack(six, alone, UPath(tmp_path / "none"), {}, leave_out_broken=True)
+
+    image.write_bytes(whole)
+    six = source(tmp_path / "scenes")
+    result = pack(six, out, chunk_bytes=1)
+    assert (result.scenes["train"], result.resumed, result.frames) == (6, 2, 8)
+    same(six, packed(out))
+
+
+def packed_until_killed(before, out, moment):
+    """How a process of its own ends that packs, killed when it has written or moved a file."""
+    process = os.fork()
+    if process:
+        return os.waitpid(process, 0)[1]
+    moments = count(1)
+    opened = packing.opened_replacing
+
+    @contextmanager
+    def opened_until_killed(path):
+        with opened(path) as file:
+            yield file
+            next(moments) == moment and os.kill(os.getpid(), signal.SIGKILL)
+        next(moments) == moment and os.kill(os.getpid(), signal.SIGKILL)
+
+    packing.opened_replacing = opened_until_killed
+    try:
+        pack(before, out, chunk_bytes=1)
+        os._exit(0)
+    finally:
+        os._exit(1)
+
+
+def test_a_killed_packing_goes_on(tmp_path):
+    before = scenes(tmp_path, 4)
+    out = tmp_path / "chunks"
+    moments = count(1)
+    while (ended := packed_until_killed(before, out, next(moments))) == signal.SIGKILL:
+        assert not list(out.rglob("index.json"))
+    assert ended == 0
+    assert next(moments) > 6
+    assert not (out / "packing.json").exists()
+    assert not list((out / "train").glob(".*"))
+    same(before, packed(out))
+
+
+def command(words):
+    result = run_qgs("data", "pack", *words.split())
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_the_command(six, tmp_path):
+    out, small = tmp_path / "out", tmp_path / "small"
+    told = command(f"{tmp_path}/scenes --out {out} --test-every 3 --set holdout=0")
+    assert "scenes 4 train, 2 test; 12 images now, 12 kept" in told
+    assert packed(out).scenes("train")[0].held_out == ()
+    assert list(packed(out).names("test")) == ["s2", "s5"]
+    told = command(f"{out} --out {small} --image-size 8 12 --jpeg 80")
+    assert "scenes 4 train, 2 test; 12 images now, 0 kept as they were, 12 written" in told
+    assert packed(small, size=(8, 12)).scenes("test")[0].encoded(0).size == (8, 12)
+
+
+def test_the_command_packs_the_data_of_a_recipe(tmp_path):
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(
+        "recipe: 1\nplugins: [rooms]\n"
+        "data: {type: rooms/procedural, scenes: 2, test_scenes: 1, views_per_scene: 2, "
+        "image_size: [16, 16]}\n"
+    )
+    command(f"{recipe} --out {tmp_path}/chunks")
+    after = packed(tmp_path / "chunks", size=(16, 16))
+    for split in ("train", "test"):
+        same(resolve(recipe).build_data(), after, 1e-6, split)

@@ -1,0 +1,89 @@
+"""Data of a source that a plugin brings is checked and packed as that of qgs is."""
+
+import re
+
+import numpy as np
+import photo_formats
+import pytest
+import tape_source
+import torch
+from commands import run_qgs
+from qgs_photos.datasets.chunks import ChunksSource
+from qgs_photos.datatools import sources
+from tape_source import Tape
+
+
+def run(words):
+    return run_qgs("data", *words.split())
+
+
+@pytest.fixture
+def tapes(tmp_path, monkeypatch):
+    tape_source.install(tmp_path / "site", monkeypatch)
+    sources._imported.cache_clear()
+    for name in "ab":
+        tape_source.write_tape(tmp_path / f"tapes/{name}.tape")
+    yield tmp_path / "tapes"
+    sources._imported.cache_clear()
+
+
+def test_check(tapes):
+    commands = [f"check {tapes} --quick --format {format}" for format in ("auto", "tapes/tape")]
+    for good in map(run, commands):
+        assert good.exit_code == 0, good.output
+        assert "2 scenes, 0 errors" in good.output
+    refused = str(run(f"check {tapes} --format rooms/procedural").exception)
+    assert refused.startswith("there is no format 'rooms/procedural': use one of auto, nerfstudio")
+    arrays = dict(np.load(tapes / "b.tape"))
+    arrays["c2w"][3] = np.nan
+    with (tapes / "b.tape").open("wb") as file:
+        np.savez(file, **arrays)
+    for bad in map(run, commands):
+        assert bad.exit_code == 1
+        assert "error: b, frame 3 (3): the pose has NaN" in bad.output
+
+
+def test_missing_images_are_told_and_counted(tapes, monkeypatch):
+    monkeypatch.setattr(Tape, "missing", ("2.png", "4.png"))
+    (tapes / "index.json").write_text('{"a": {"context": [0, 6], "target": [2]}}')
+    output = run(f"check {tapes} --quick").output
+    assert re.search("a +tapes/tape +8 +6 +2 ", output)
+    assert (
+        "error: a: listed images that do not exist: 2.png, 4.png; later frames move up in an "
+        "index: add the files, or take them out of what lists them" in output
+    )
+    assert "context frame 6, but the scene's 6 frames are 0 to 5" in output
+
+
+def test_a_source_that_fails_is_told_and_the_others_go_on(tapes, monkeypatch):
+    cannot = "a, frame 1 (1): the image cannot be decoded (KeyError: 'x')"
+    faults = (("images", KeyError("x"), cannot), ("frame_name", RuntimeError("no"), "a: Runtime"))
+    for method, error, line in faults:
+        whole = getattr(Tape, method)
+
+        def fails(scene, asked, whole=whole, error=error):
+            if scene.name == "a" and asked in (1, [1]):
+                raise error
+            return whole(scene, asked)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Tape, method, fails)
+            output = run(f"check {tapes} --quick").output
+        assert f"error: {line}" in output
+        assert re.search("b +tapes/tape +6 +6 +0 ", output)
+        assert "2 scenes, 1 error" in output
+
+
+def test_masks_are_looked_at(tapes, monkeypatch):
+    monkeypatch.setattr(Tape, "masks", lambda self, frames: torch.ones(len(frames), 1, 8, 8))
+    output = run(f"check {tapes} --geometry 0").output
+    reason = "its mask (1, 1, 8, 8) is not of shape (1, 1, 16, 16) and in [0, 1]: replace the mask"
+    assert f"error: b, frames 0-5 (0 to 5): {reason}" in output
+
+
+def test_pack(tapes):
+    packed = run(f"pack {tapes} --out {tapes}/chunks --set image_size=[16,16]")
+    assert packed.exception is None, packed.output
+    scenes = photo_formats.opened(tapes / "chunks", (16, 16), ChunksSource).scenes("train")
+    told = [(scene.name, len(scene), scene.held_out) for scene in scenes]
+    assert told == [("a", 6, (1, 4)), ("b", 6, (1, 4))]

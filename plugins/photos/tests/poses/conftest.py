@@ -1,0 +1,53 @@
+"""A textured room, photographed while walking, and the poses that COLMAP finds of it."""
+
+import numpy as np
+import pytest
+import textured_room
+from PIL import Image
+from qgs_photos.poses.making import Options, make_poses
+from walked import PHOTOS, SCALE, cut, quiet
+
+
+@pytest.fixture(scope="session")
+def shots():
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("SIZE", "INTRINSICS"):
+            larger = tuple(SCALE * number for number in getattr(textured_room, name))
+            patch.setattr(textured_room, name, larger)
+        return textured_room.walk(PHOTOS)
+
+
+@pytest.fixture(scope="session")
+def images(shots):
+    return [shot.image for shot in shots]
+
+
+@pytest.fixture(scope="session")
+def walk(images, tmp_path_factory):
+    """Photos of every kind, of which one shows something else, among files that are none."""
+    folder = tmp_path_factory.mktemp("walk") / "Küche und Flur"
+    folder.mkdir()
+    photos = [*map(Image.fromarray, images)]
+    photos[0].save(folder / "0 Fo’to #{} %20 'ä'.JPG", quality=95)
+    exif = Image.Exif()
+    exif[0x0112] = 6  # a quarter turn clockwise makes it upright
+    photos[1].transpose(Image.Transpose.ROTATE_90).save(folder / "1.jpg", quality=95, exif=exif)
+    Image.fromarray(257 * np.array(photos[2].convert("L"), np.uint16)).save(folder / "2.png")
+    photos[3].convert("CMYK").save(folder / "3.tif")
+    photos[4].save(folder / "4.webp", quality=95)
+    photos[5].convert("RGBA").save(folder.parent / "5.png")
+    (folder / "5.png").symlink_to(folder.parent / "5.png")
+    noise = np.random.default_rng(7).integers(0, 255, images[0].shape, np.uint8)
+    Image.fromarray(noise).save(folder / "other.png")
+    Image.fromarray(noise).save(folder / "broken.png")
+    cut(folder / "broken.png", 0.5)
+    for name in ("empty.jpg", "a.HEIC", "._0.jpg"):
+        (folder / name).touch()
+    (folder / "folder.jpg").mkdir()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def made(walk, tmp_path_factory):
+    """Of copies of the photos that are smaller than they are."""
+    return make_poses(walk, tmp_path_factory.mktemp("made") / "poses", Options(side=240), quiet())

@@ -1,0 +1,88 @@
+"""What people give: each kind ends with poses or with one sentence, and theirs stays as it was."""
+
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import wave
+
+import numpy as np
+import pytest
+from commands import run_qgs
+from PIL import Image
+from qgs_photos.poses import making
+from qgs_photos.poses.photos import PosesError
+from walked import cut, write_photos, write_video
+
+from qgs.files import DiskFullError
+
+
+def state(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_hopeless_ones_are_refused_in_a_sentence(images, tmp_path):
+    given = tmp_path / "given here"
+    images = [image[::2, ::2] for image in images[:4]]
+    pictures = {
+        "none": [],
+        "two photos": images[:2],
+        "one view": images[:1] * 4,
+        "bare": [np.full_like(image, 127) for image in images],
+        "blurred": [np.array(Image.fromarray(i).resize((9, 6)).resize((180, 120))) for i in images],
+        "noise": np.random.default_rng(0).integers(0, 255, (3, 160, 240, 3), np.uint8),
+        "tiny": [image[:10, :10] for image in images],
+        "cut off": images,
+    }
+    for name, each in pictures.items():
+        write_photos(given / name, each)
+    for photo in (given / "cut off").iterdir():
+        cut(photo, 0.2)
+    write_photos(given / "GIF", images, "{}.gif")
+    (write_photos(given / "HEIC", []) / "a.heic").touch()
+    write_video(given / "one frame.mp4", images[:1])
+    write_video(given / "still.mp4", images[:1] * 40)
+    cut(write_video(given / "cut off.mp4", images * 8), 0.5)  # without its index, at the end
+    (given / "empty.mp4").touch()
+    (given / "text.mp4").write_bytes(b"no video" * 40)
+    with wave.open(str(given / "sound.mp4"), "wb") as sound:
+        sound.setparams((1, 2, 8000, 0, "NONE", ""))
+        sound.writeframes(bytes(9000))
+
+    before = state(tmp_path)
+    wrong = {}
+    for source in given.iterdir():
+        error = run_qgs("poses", source, "--out", tmp_path / "out").exception
+        if type(error) is not PosesError or "\n" in str(error) or (tmp_path / "out").exists():
+            wrong[source.name] = error
+    assert not wrong
+    assert state(tmp_path) == before
+
+
+def test_what_cannot_be_written_is_named(walk, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "file/out", "/proc/out"):
+        assert isinstance(run_qgs("poses", walk, "--out", out).exception, OSError)
+
+    def full(*rest):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(making, "prepare", full)
+    result = run_qgs("poses", walk, "--out", tmp_path / "out")
+    assert isinstance(result.exception, DiskFullError)
+
+
+@pytest.mark.slow
+def test_a_crash_of_colmap_is_one_sentence(walk, tmp_path):
+    code = "import sys; from qgs.cli import main; sys.argv[0] = 'qgs'; main()"
+    command = [sys.executable, "-uc", code, "poses", walk, "--out", tmp_path]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    process = subprocess.Popen(command, **pipes)
+    next(line for line in process.stdout if line.startswith("features"))
+    list_children = shlex.split(f"ps -o pid= --ppid {process.pid}")
+    os.kill(int(subprocess.check_output(list_children)), signal.SIGSEGV)
+    text, _ = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "error: COLMAP ended in the stage" in text
+    assert "Traceback" not in text

@@ -1,0 +1,96 @@
+"""Frames of videos: which are taken, that they are upright, and what a damaged file costs."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageFilter
+from qgs_photos.poses.frames import FEWEST, extract, shift, thinned
+from walked import cut, write_turned, write_video
+
+
+def numbered_images(count):
+    """Each with its number as grey level, and edges."""
+    images = np.full((count, 96, 128, 3), 20, np.uint8)
+    images += 4 * np.arange(count, dtype=np.uint8)[:, None, None, None]
+    images[:, ::8] = 255
+    return [*images]
+
+
+def levels(folder):
+    """The numbers of the images that the frames show."""
+    frames = [np.array(Image.open(path))[4::8] for path in sorted(folder.glob("*.jpg"))]
+    return [round((float(np.median(frame)) - 20) / 4) for frame in frames]
+
+
+def test_the_sharpest_frame_of_each_interval_is_taken(tmp_path):
+    images = numbered_images(40)
+    sharp = [3, 12, 19, 28, 33]
+    for number in {*range(40)} - {*sharp}:
+        blurred = Image.fromarray(images[number]).filter(ImageFilter.GaussianBlur(3))
+        images[number] = np.array(blurred)
+    assert extract(write_video(tmp_path / "a.mp4", images, crf="1"), tmp_path, 5) == []
+    assert levels(tmp_path) == sharp
+
+
+def test_videos_of_other_kinds_are_read(tmp_path):
+    images = numbered_images(12)
+    for name, codec in (("a.mov", "libx265"), ("a.webm", "libvpx-vp9"), ("a.mkv", "libsvtav1")):
+        extract(write_video(tmp_path / name, images, codec=codec), tmp_path, 4)
+        assert levels(tmp_path) == [0, 3, 6, 9], name
+
+
+def test_a_picture_that_moves_fast_gives_more_frames(tmp_path):
+    wide = np.random.default_rng(0).integers(0, 255, (12, 100, 3), np.uint8)
+    wide = wide.repeat(8, 0).repeat(8, 1)
+    counts = []
+    for step in (0, 8):  # pixels of 128
+        images = [np.ascontiguousarray(wide[:, step * n : step * n + 128]) for n in range(80)]
+        folder = tmp_path / str(step)
+        folder.mkdir()
+        extract(write_video(folder / "a.mp4", images, rate=20), folder)
+        counts.append(len([*folder.glob("*.jpg")]))
+    assert counts[0] == FEWEST
+    assert 60 <= counts[1] <= 80
+
+
+def test_of_more_frames_than_wanted_the_sharpest_of_neighbours_are_kept():
+    scores = {Path(f"{n:05d}.jpg"): float(n % 5 == 2) for n in range(50)}
+    assert [int(path.stem) for path in thinned(scores, 10)] == [*range(2, 50, 5)]
+    assert thinned(scores, 50) == [*scores]
+    assert len(thinned(scores, 33)) == 33
+
+
+def test_the_shift_of_a_picture():
+    rng = np.random.default_rng(0)
+    wide = np.kron(rng.random((12, 40)), np.ones((4, 4))).astype(np.float32)
+    assert shift(wide[:, :64], wide[:, 8:72]) == pytest.approx(8 / 64)
+    assert shift(wide[:, :64], wide[:, :64]) == 0
+
+
+def test_a_varying_rate_counts_by_time(tmp_path):
+    """The first 20 frames pass in .2 s, the last 10 in 10 s."""
+    times = [*range(20), *range(20, 1020, 100)]
+    video = write_video(tmp_path / "a.mp4", numbered_images(30), 100, times=times, bf="0")
+    extract(video, tmp_path, 5)
+    assert sum(number >= 20 for number in levels(tmp_path)) >= 4
+
+
+def test_a_turned_phone_gives_upright_frames(tmp_path):
+    image = np.zeros((64, 96, 3), np.uint8)
+    image[:32, :48] = 255  # bright at the upper left
+    for degrees in (90, 180, 270):
+        extract(write_turned(tmp_path / "a.mp4", [image] * 6, degrees), tmp_path, 3)
+        found = Image.open(tmp_path / "00001.jpg").convert("L")
+        expected = Image.fromarray(image).convert("L").rotate(-degrees, expand=True)
+        assert found.size == expected.size
+        assert np.abs(np.array(found, float) - np.array(expected, float)).mean() < 4
+
+
+def test_a_broken_tail_costs_its_frames(tmp_path):
+    video = cut(write_video(tmp_path / "a.mkv", numbered_images(55), g="5"), 0.6)
+    remarks = extract(video, tmp_path, 12)
+    found = levels(tmp_path)
+    assert len(found) >= 5
+    assert max(found) < 50
+    assert len(found) == 12 or remarks

@@ -1,0 +1,111 @@
+"""Poses of a textured room against the ones that its photos were rendered with."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import textured_room
+from bench_poses import aligned
+from PIL import Image
+from qgs_photos.poses import making
+from qgs_photos.poses.making import Options, make_poses, read_record
+from qgs_photos.poses.photos import PosesError
+from upath import UPath
+from walked import PHOTOS, SCALE, quiet, write_photos, write_video
+
+import qgs
+from qgs.data.photos import formats_of, read_listing
+
+
+def assert_close(folder, shots):
+    frames = read_listing(UPath(folder)).frames
+    assert len(frames) == PHOTOS
+    turn, distance = aligned(
+        np.stack([frame.c2w for frame in frames]), np.stack([shot.c2w for shot in shots])
+    )
+    assert np.median(turn) < 1
+    assert np.median(distance) < 0.02
+
+
+def test_photos_get_the_poses_they_were_taken_with(made, shots, walk):
+    names = ["0 Fo’to #{} %20 'ä'.JPG", "1.jpg", "2.png", "3.tif.png", "4.webp.png", "5.png"]
+    assert made.posed == names
+    assert made.without == ["other.png"]
+    assert made.faulty.keys() == {"broken.png", "empty.jpg"}
+    assert formats_of(UPath(made.folder)) == ["colmap"]
+    assert_close(made.folder, shots)
+    assert next(made.summary) == f"{PHOTOS} of {PHOTOS + 1} photos have poses"
+    assert "a.HEIC" in made.remarks[0]
+    assert "3.tif" in read_record(made.folder)["source"]
+    assert not (made.folder / "working").exists()
+    # points of the model lie on the photos as they are kept, not on the copies that COLMAP saw
+    size = shots[0].image.shape[:2]
+    frames = read_listing(UPath(made.folder)).frames
+    assert {Image.open(frame.path).size[::-1] for frame in frames} == {size}
+    assert {frame.size for frame in frames} == {size}
+    assert frames[0].intrinsics[0] == pytest.approx(145 * SCALE, rel=0.05)
+
+
+def test_a_video_gets_poses_of_its_frames_where_it_is_read(shots, images, tmp_path):
+    views = qgs.read_photos(write_video(tmp_path / "phone.mp4", images), size=(36, 54))
+    assert views.images.shape == (1, PHOTOS, 3, 36, 54)
+    assert read_record(tmp_path / "phone_poses")["made_by"] == "qgs poses"
+    assert_close(tmp_path / "phone_poses", shots)
+
+
+def test_an_interrupted_call_goes_on_where_it_was_but_for_other_options(
+    images, tmp_path, monkeypatch
+):
+    def interrupted(*rest):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(making, "run", interrupted)
+    photos = write_photos(tmp_path / "photos", images[:3])
+    out = tmp_path / "out"
+    done = out / "working/done"
+    # another number of threads wipes nothing
+    for options, kept in ((Options(), False), (Options(threads=7), True), (Options(seed=1), False)):
+        with pytest.raises(KeyboardInterrupt):
+            make_poses(photos, out, options, quiet())
+        assert done.exists() == kept
+        done.touch()
+    assert read_record(out) is None
+
+
+def test_other_folders_are_left_alone(walk, made, tmp_path):
+    notes = tmp_path / "notes.txt"
+    notes.write_text("keep")
+    for taken in (tmp_path, notes, made.folder):
+        with pytest.raises(FileExistsError):
+            make_poses(walk, taken, Options(), quiet())
+    assert notes.read_text() == "keep"
+
+
+def test_a_photo_of_several_models_is_in_the_largest_alone():
+    models = map(list, ["abcd", "bc", "def", "eg"])
+    assert making.apart([*models]) == [["a", "b", "c", "d"], ["e", "f"]]
+
+
+def test_the_summary_says_what_to_do_where_some_have_none_and_what_differs(made):
+    whole = replace(made, threads=1, without=[])
+    few = replace(whole, without=["a"])
+    several = replace(whole, threads=2)
+    for word, one in (("between", few), ("another run", several)):
+        assert [word in " ".join(each.summary) for each in (whole, one)] == [False, True]
+
+
+@pytest.mark.slow
+def test_one_thread_and_a_seed_give_the_same_file(walk, tmp_path):
+    for name in "ab":
+        make_poses(walk, tmp_path / name, Options(threads=1), quiet())
+    one, other = ((tmp_path / name / "sparse/0/images.bin").read_bytes() for name in "ab")
+    assert one == other
+
+
+@pytest.mark.slow
+def test_turning_on_the_spot_gives_no_poses(monkeypatch, shots, tmp_path):
+    turns = [shot.c2w * [1, 1, 1, 0] + np.diag([0, 0, 0, 1]) for shot in shots]
+    monkeypatch.setattr(textured_room, "_poses", lambda count: turns)
+    folder = write_photos(tmp_path / "photos", [shot.image for shot in textured_room.walk(PHOTOS)])
+    with pytest.raises(PosesError, match="turn on the spot"):
+        make_poses(folder, tmp_path / "poses", Options(), quiet())

@@ -1,0 +1,146 @@
+"""Camera paths, what they are filmed of, and the files that come of it."""
+
+import math
+
+import av
+import numpy as np
+import pytest
+import torch
+from commands import run_qgs
+from PIL import Image, ImageSequence
+from qgs_photos.poses.film import write_film
+from qgs_photos.poses.filming import Shot, Stage, cameras_of, open_stage, seen_depth
+from qgs_photos.poses.paths import path_of, read_path, walk
+from tables import must_refuse
+from walked import frames
+
+import qgs
+from qgs.checkpoint.gaussians import save_ply
+from qgs.geometry.transforms import moved
+from qgs.renderers import AutoRenderer, TorchRenderer
+from qgs.types import Cameras, Gaussians
+
+SIZE = (36, 54)
+
+
+def cameras():
+    """A row of cameras that looks along z."""
+    c2w = torch.eye(4).repeat(7, 1, 1)
+    c2w[:, 0, 3] = torch.linspace(-0.5, 0.5, 7)
+    return Cameras(c2w[None], torch.tensor([44.0, 44, 27, 18]).expand(1, 7, 4), SIZE)
+
+
+def wall(depth):
+    """Coloured Gaussians (1, 400) on a plane z = depth."""
+    means = torch.rand(1, 400, 3) * 4 - 2
+    means[..., 2] = depth
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(1, 400, 4)
+    opacities = torch.full((1, 400), 0.9)
+    return Gaussians(means, 0 * means + 0.15, quats, opacities, torch.rand(1, 400, 3))
+
+
+def test_paths_are_rigid_and_take_small_steps():
+    paths = [path_of(kind, cameras(), 3.0, 40) for kind in ("orbit", "spiral", "walk")]
+    assert [path.size for path in paths] == [SIZE] * 3
+    c2w = torch.cat([path.c2w for path in paths])
+    turn = c2w[..., :3, :3]
+    assert torch.allclose(turn @ turn.mT, torch.eye(3), 0, 1e-5)
+    assert (turn.det() > 0).all()
+    assert c2w[..., :3, 3].diff(dim=1).norm(dim=-1).max() < 0.15
+
+
+def test_a_spiral_looks_at_one_point_and_a_walk_goes_from_the_first_photo_to_the_last():
+    path = path_of("spiral", cameras(), 3.0, 40).c2w[0]
+    away = torch.tensor([0.0, 0, 3]) - path[:, :3, 3]
+    assert torch.linalg.cross(away, path[:, :3, 2]).norm(dim=-1).max() < 1e-5
+    start, end = walk(cameras().c2w[0], 30)[[0, -1], 0, 3]
+    assert start < -0.3 < 0.3 < end
+
+
+def test_camera_paths_in_files_are_read(tmp_path):
+    """Those of nerfstudio's viewer, and transforms."""
+    pose = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    entry = f'{{"camera_to_world": {np.ravel(pose).tolist()}, "fov": 90, "aspect": 1.5}}'
+    frame = f'{{"file_path": "a.png", "transform_matrix": {pose}}}'
+    expected = torch.tensor(pose) * torch.tensor([1.0, -1, -1, 1])
+    file = tmp_path / "transforms.json"
+    for content, focal in (
+        (f'{{"camera_path": [{entry}, {entry}], "fps": 24}}', 50),
+        (f'{{"fl_x": 80, "w": 75, "h": 50, "frames": [{frame}, {frame}]}}', 160),
+    ):
+        file.write_text(content)
+        c2w, lens = read_path(file, (100, 150), None)
+        assert c2w.tolist() == [expected.tolist()] * 2
+        np.testing.assert_allclose(lens, [[focal, focal, 75, 50]] * 2)
+
+
+def test_a_file_that_is_no_path_is_refused(tmp_path):
+    lens = '{"fl_x": 9, "w": 9, "h": 9, "frames": [{"file_path": "a", "transform_matrix": '
+    file = tmp_path / "path.json"
+    for content in (
+        "{",
+        "{}",
+        "[1]",
+        '{"frames": []}',
+        '{"camera_path": [{"camera_to_world": [1, 2]}]}',
+        lens + "[1, 2]}]}",
+        lens.replace('"w": 9, "h": 9, ', "") + "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}]}",
+    ):
+        file.write_text(content)
+        must_refuse("path.json is no camera path", read_path, file, SIZE, None)
+
+
+def test_size_length_and_angle_of_view():
+    world = torch.eye(4).double(), 1.0
+    stage = Stage(wall(3.0), cameras(), AutoRenderer(AutoRenderer.Config()), world)
+    assert seen_depth(stage) == pytest.approx(3.0, rel=0.02)
+    path = cameras_of(stage, Shot("orbit", seconds=0.5, rate=10))
+    assert path.shape == (1, 5)
+    assert path.size == (480, 720)
+    path = cameras_of(stage, Shot("spiral", (100, 200), 0.5, 10, fov=60))
+    focal = 50 / math.tan(math.radians(30))
+    assert path.intrinsics[0, 0].tolist() == pytest.approx([focal, focal, 100, 50])
+
+
+def test_a_film_shows_the_pictures(tmp_path):
+    levels = [20, 60, 100, 140, 180]
+    mp4, webp = tmp_path / "film.mp4", tmp_path / "film.webp"
+    for file in (mp4, webp):
+        write_film((np.full((31, 48, 3), level, np.uint8) for level in levels), file, 12)
+    with av.open(str(mp4)) as container:
+        assert container.streams.video[0].codec_context.name == "h264"
+    of_mp4 = frames(mp4)
+    assert of_mp4[0].shape == (30, 48, 3)
+    of_webp = [np.array(frame.convert("RGB")) for frame in ImageSequence.Iterator(Image.open(webp))]
+    for found in (of_mp4, of_webp):
+        assert [frame.mean() for frame in found] == pytest.approx(levels, abs=3)
+
+
+def test_a_scene_of_photos_is_filmed_from_their_cameras(made, tmp_path):
+    """What is rendered in the stage's world is what the photos' world shows."""
+    views = qgs.read_photos(made.folder, size=SIZE)
+    gaussians = moved(wall(1.5), views.cameras.c2w[0, 0], 1.0)
+    save_ply(gaussians, tmp_path / "scene.ply")
+    opened = open_stage(tmp_path / "scene.ply", str(made.folder), None)
+    third = opened.cameras[:, 2:3]
+    lens = third.intrinsics * SIZE[0] / third.size[0]
+    renderer = TorchRenderer(TorchRenderer.Config())
+    found = renderer(opened.gaussians, Cameras(third.c2w, lens, SIZE)).rgb
+    expected = renderer(gaussians, views.cameras.to(torch.float32)[:, 2:3]).rgb
+    assert torch.allclose(found, expected, 0, 0.02)
+
+
+def test_the_command_films_and_overwrites_nothing(made, tmp_path):
+    save_ply(wall(3.0), tmp_path / "scene.ply")
+    out = tmp_path / "a.mp4"
+    film = f"{tmp_path} {made.folder} --out {out} --path walk --seconds 0.4 --rate 5 --size 32x48"
+    result = run_qgs("video", *film.split())
+    assert result.exit_code == 0, result.output
+    assert len(frames(out)) == 2
+    for refused, error in (
+        (film, FileExistsError),
+        (f"{tmp_path}", ValueError),
+        (f"{tmp_path} --out {tmp_path}/a.gif", ValueError),
+        ("nothing", FileNotFoundError),
+    ):
+        assert isinstance(run_qgs("video", *refused.split()).exception, error)

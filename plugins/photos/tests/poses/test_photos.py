@@ -1,0 +1,71 @@
+"""Photos made ready: their order and names, and that the user's files stay as they are."""
+
+import os
+
+import numpy as np
+import pytest
+from PIL import Image
+from qgs_photos.poses.photos import camera_groups, photo_files, prepare
+from walked import write_photos
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Of photos, of those that are kept, and of those for COLMAP."""
+    folders = [tmp_path / name for name in ("images", "kept", "small")]
+    for folder in folders:
+        folder.mkdir()
+    return folders
+
+
+def test_photos_are_in_the_order_of_their_numbers_and_so_are_their_names_as_text(folders):
+    photos, kept, small = folders
+    levels = [10 * number for number in range(12)]
+    images = [np.full((80, 100, 3), level, np.uint8) for level in levels]
+    for form, name in (("{:03}.png", "{:03}.png"), ("IMG {}.png", "{0:02}_IMG {0}.png")):
+        ready, faulty = prepare(photo_files(write_photos(photos, images, form)), kept, small, 1000)
+        assert not faulty
+        names = [name.format(number) for number in range(12)]
+        assert [photo.name for photo in ready] == names
+        assert [photo.thumb.mean() for photo in ready] == levels
+        assert all((folder / file).is_file() for folder in (kept, small) for file in names)
+        for file in photos.iterdir():
+            file.unlink()
+
+
+def test_files_of_the_user_are_linked_or_copied_and_not_written_onto(folders, monkeypatch):
+    photos, kept, small = folders
+    write_photos(photos, np.full((3, 80, 100, 3), 90, np.uint8))
+    files = photo_files(photos.parent)  # in a folder `images`
+    before = [file.read_bytes() for file in files]
+    for file in files:
+        os.link(file, small / file.name)
+    prepare(files, kept, small, 70)  # smaller copies of what is there
+    assert Image.open(small / "0.png").size == (70, 56)
+    assert [file.read_bytes() for file in files] == before
+    assert files[0].samefile(kept / "0.png")
+
+    def refused(*rest):
+        raise OSError(18, "Invalid cross-device link")
+
+    monkeypatch.setattr(os, "link", refused)
+    prepare(files, kept, small, 1000)
+    assert not files[0].samefile(kept / "0.png")
+    assert (kept / "0.png").read_bytes() == before[0]
+
+
+def test_photos_of_one_size_and_focal_length_share_a_camera(folders):
+    photos, kept, small = folders
+    for name, focal, width in (
+        ("a", 25.0, 100),
+        ("b", 50.0, 100),
+        ("c", 25.0, 100),
+        ("d", 25.0, 90),
+    ):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0x920A] = focal
+        Image.new("RGB", (width, 80)).save(photos / f"{name}.jpg", exif=exif)
+    damaged = b"Exif\0\0MM\0*\0\0\0\x08\xff\xff" + bytes(30)
+    Image.new("RGB", (100, 80)).save(photos / "e.jpg", exif=damaged)
+    ready, _ = prepare(photo_files(photos), kept, small, 1000)
+    assert camera_groups(ready) == [["a.jpg", "c.jpg"], ["b.jpg"], ["d.jpg"], ["e.jpg"]]

@@ -1,0 +1,278 @@
+"""Refinement brings Gaussians nearer to the photos of their scene; the clock is a fake."""
+
+import math
+import os
+import signal
+from dataclasses import replace
+from functools import partial
+from itertools import count
+
+import pytest
+import torch
+from line_scenes import circle
+from qgs_photos.refine.growth import DEAD, FreeGaussians
+from qgs_photos.refine.refining import Extras, mean_psnr, resized
+from qgs_photos.refine.scene import masked
+from tables import must_refuse
+
+import qgs
+from qgs.renderers import AutoRenderer
+from qgs.types import Cameras, Gaussians, Views, map_tensors
+
+RENDERER = AutoRenderer(AutoRenderer.Config())
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch):
+    """Every step takes a second; a function given to this is called at each reading."""
+    hooks = []
+    readings = count()
+
+    def read():
+        now = next(readings)
+        for hook in hooks:
+            hook(now)
+        return float(now)
+
+    monkeypatch.setattr("qgs_photos.refine.refining.perf_counter", read)
+    return hooks.append
+
+
+def cloud(number, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    normal = torch.randn(1, number, 7, generator=generator)
+    even = torch.rand(1, number, 7, generator=generator)
+    quats = torch.nn.functional.normalize(normal[..., 3:], dim=-1)
+    scales, opacities = 0.05 + 0.1 * even[..., :3], 0.3 + 0.6 * even[..., 3]
+    return Gaussians(0.3 * normal[..., :3], scales, quats, opacities, even[..., 4:])
+
+
+def ring(views, side=24):
+    """Cameras (1, views) on a quarter of a circle of radius 2 about the origin."""
+    c2w = circle(torch.linspace(0, math.pi / 2, views), 2)
+    lens = torch.tensor([side, side, side / 2, side / 2]).expand(1, views, 4)
+    return Cameras(c2w[None], lens, (side, side))
+
+
+def photos(views, side=24, number=60):
+    """Photos of a cloud."""
+    cameras = ring(views, side)
+    return Views(RENDERER(cloud(number), cameras).rgb.clamp(0, 1), cameras)
+
+
+def free(gaussians):
+    """Parameters that are learnt with one rate, whatever is given."""
+    names = ("means", "log_scales", "quats", "opacity_logits", "color_logits", "colors", "sh")
+    return FreeGaussians(gaussians, dict.fromkeys(names, 1e-2))
+
+
+def learn(given, *names):
+    """A step in which all numbers of these names become smaller."""
+    gaussians = given.gaussians()
+    sum(getattr(gaussians, name).sum() for name in names).backward()
+    given.optimizer.step()
+
+
+def generator():
+    return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Photos to optimise on, and others between them."""
+    every = photos(9)
+    return every.select([0, 1, 3, 4, 5, 7, 8]), every.select([2, 6])
+
+
+def test_photos_that_are_not_optimised_on_are_met_better(scene):
+    views, compared = scene
+    start = cloud(40, seed=1)
+    before = start.means.clone()
+    result, again = (qgs.refine(start, views, 100, compared=compared) for _ in range(2))
+    refined = result.gaussians
+    assert torch.equal(refined.means, again.gaussians.means)
+    assert torch.equal(start.means, before)
+    assert result.steps == 100  # the first, in which kernels compile, is not counted; the sweep is
+    first, last = result.curve[0].psnr, result.curve[-1].psnr
+    assert first == pytest.approx(mean_psnr(start, compared, RENDERER), abs=0.3)
+    assert last > first + 6
+    assert last == pytest.approx(mean_psnr(refined, compared, RENDERER))
+    seconds = [point.seconds for point in result.curve]
+    assert seconds == sorted(seconds)
+    assert not refined.means.requires_grad
+    assert refined.sh is refined.features is None
+    assert torch.allclose(refined.quats.norm(dim=-1), torch.ones(()))
+
+
+def test_there_are_as_many_as_wanted(scene):
+    start = cloud(30)
+    for wanted in (90, 12, 30):
+        assert qgs.refine(start, scene[0], 30, count=wanted).gaussians.count == wanted
+    two_steps = qgs.refine(start, scene[0], 1.5, count=12).gaussians.opacities[:, :6]
+    most_opaque = start.opacities.topk(6).values
+    assert torch.allclose(two_steps.sort(descending=True).values, most_opaque, 0, 0.06)
+
+
+def test_harmonics_are_refined_and_features_kept(scene):
+    """New Gaussians start with none of both, copies with those of their parents."""
+    views, compared = scene
+    marks = torch.arange(1.0, 31)[None, :, None]
+    start = replace(cloud(30), sh=torch.zeros(1, 30, 8, 3), features=marks)
+    result = qgs.refine(start, views, 60, count=50, compared=compared).gaussians
+    assert result.sh.shape == (1, 50, 8, 3)
+    assert result.sh.abs().max() > 1e-3
+    assert {*result.features.flatten().tolist()} <= {*range(31)}
+    assert (result.features == start.most_opaque(15).features[0, 0, 0]).any()
+
+
+def test_an_interrupt_keeps_what_there_is(scene, clock):
+    clock(lambda now: os.kill(os.getpid(), signal.SIGINT) if now == 11 else None)
+    result = qgs.refine(cloud(30), scene[0], 1000)
+    assert result.stopped_by == "SIGINT"
+    assert result.steps == 6  # that of the twelfth reading is finished
+    assert result.gaussians.count == 30
+
+
+def test_a_coarser_level_shows_the_same_scene():
+    fine = photos(3, 64, 20)
+    masks = fine.images[:, :, :1]
+    given = replace(fine, masks=masks, times=torch.rand(1, 3), target_time=torch.rand(1, 1))
+    coarse = resized(given, 2)
+    assert coarse.images.shape[-2:] == (32, 32)
+    assert torch.equal(coarse.masks, coarse.images[:, :, :1])
+    assert coarse.times is given.times
+    assert coarse.target_time is given.target_time
+    assert mean_psnr(cloud(20), coarse, RENDERER) > 32
+
+
+def test_unusable_input_is_refused():
+    views, four = photos(2), cloud(4)
+
+    def refined(gaussians=four, given=views, seconds=1, wanted=4):
+        qgs.refine(gaussians, given, seconds, count=wanted)
+
+    for word, wrong in (
+        ("2 scenes", {"gaussians": map_tensors(lambda x: x.expand(2, *x.shape[1:]), four)}),
+        ("not finite", {"gaussians": map_tensors(lambda x: x * math.nan, four)}),
+        ("0 photos", {"given": views.select([])}),
+        ("0 seconds", {"seconds": 0}),
+        ("count=0", {"wanted": 0}),
+    ):
+        must_refuse(word, partial(refined, **wrong))
+
+
+def test_moments_follow_their_gaussians():
+    """After growth every Gaussian that was not touched learns on as before."""
+    opacities = torch.full((1, 40), 0.1)
+    opacities[0, :5] = DEAD / 5
+    opacities[0, 7] = 0.99  # drawn more often
+    given = free(replace(cloud(40), opacities=opacities))
+    learn(given, "means", "opacities")
+    before = given.values["means"].detach().clone()
+    given.grow(44, generator())
+    means = given.values["means"]
+    assert (means[:40] != before).any(1).nonzero()[:, 0].tolist() == [0, 1, 2, 3, 4]
+    assert (given.values["opacity_logits"].sigmoid() >= DEAD - 1e-6).all()
+    (group,) = (g for g in given.optimizer.param_groups if g["name"] == "means")
+    assert group["params"][0] is means
+    moments = given.optimizer.state[means]["exp_avg"]
+    assert moments.shape == (44, 3)
+    assert not moments[[0, 1, 2, 3, 4, 40, 41, 42, 43]].any()
+    assert moments[5:40].any()
+    learn(given, "means")
+
+
+def test_colors_beside_harmonics_may_have_any_value():
+    colors = torch.linspace(-0.7, 1.6, 60).reshape(1, 20, 3)
+    given = free(replace(cloud(20), colors=colors, sh=torch.zeros(1, 20, 3, 3)))
+    given.grow(24, generator())
+    assert torch.equal(given.gaussians().colors[:, :20], colors)
+    learn(given, "colors")
+    assert (given.gaussians().colors[:, :20] < colors).all()
+
+
+def test_where_none_is_alive_none_is_moved():
+    start = cloud(6)
+    given = free(replace(start, opacities=0 * start.opacities))
+    given.grow(9, generator())
+    assert given.count == 9
+    assert torch.equal(given.values["means"][:6], start.means[0])
+
+
+def test_growth_leaves_the_rendering_as_it_is():
+    """Also of fog, Gaussians that are all faint, of which many copies are made at once."""
+    fog = 0.01 + 0.05 * torch.rand(1, 200)
+    given = free(replace(cloud(200), opacities=fog))
+    cameras = ring(7)
+    before = Views(RENDERER(given.gaussians(), cameras).rgb.detach(), cameras)
+    given.grow(400, generator())
+    assert mean_psnr(given.gaussians(), before, RENDERER) > 35
+
+
+def refined(views, seconds, **extras):
+    """The true cloud, refined on views that are not quite true."""
+    return qgs.refine(cloud(60), views, seconds, swept=0.0, extras=Extras(**extras))
+
+
+def test_a_photo_with_a_wrong_pose_is_met_and_the_others_stay():
+    """A small shift looks like a turn, so what the corrected camera sees is compared."""
+    true = photos(5)
+    wrong = true.cameras.c2w.clone()
+    wrong[0, 2, :3, 3] += 0.04 * wrong[0, 2, :3, 0]  # a fiftieth of the distance
+
+    def posed(c2w):
+        return replace(true, cameras=replace(true.cameras, c2w=c2w))
+
+    def found(seconds, poses):
+        return refined(posed(wrong), seconds, poses=poses).cameras.c2w
+
+    assert torch.equal(found(3, poses=False), wrong)
+    better = found(200, poses=True)
+    before, after = (
+        mean_psnr(cloud(60), posed(c2w).select([2]), RENDERER) for c2w in (wrong, better)
+    )
+    assert after > before + 3
+    assert 0 < (better - wrong)[0, [0, 1, 3, 4], :3, 3].norm(dim=-1).max() < 0.01
+    turns = better[0, :, :3, :3]
+    assert torch.allclose(turns @ turns.mT, torch.eye(3), 0, 1e-5)
+
+
+def test_a_darker_photo_leaves_the_gaussians_alone():
+    true = photos(3)
+    dark = true.images * torch.tensor([1.0, 0.6, 1])[:, None, None, None]
+    plain, adjusted = (
+        refined(replace(true, images=dark), 120, exposure=exposure).gaussians
+        for exposure in (False, True)
+    )
+    assert mean_psnr(adjusted, true, RENDERER) > mean_psnr(plain, true, RENDERER) + 0.5
+
+
+def test_harmonics_grow_with_time():
+    seen = []
+
+    class Watching(torch.nn.Module):
+        def forward(self, gaussians, cameras):
+            seen.append(0 if gaussians.sh is None else gaussians.sh.shape[-2])
+            return RENDERER(gaussians, cameras)
+
+    def watched(start, seconds):
+        options = {"renderer": Watching(), "extras": Extras(degree=2)}
+        return qgs.refine(start, photos(2), seconds, **options).gaussians.sh.shape
+
+    assert watched(cloud(30), 40) == (1, 30, 8, 3)
+    assert seen == sorted(seen)
+    assert {*seen} == {0, 3, 8}
+    # a start with harmonics of its own keeps them all
+    given = replace(cloud(30), sh=torch.zeros(1, 30, 3, 3))
+    assert watched(given, 5) == given.sh.shape
+
+
+def test_what_masks_leave_out_is_background():
+    views = photos(2)
+    masks = torch.zeros(1, 2, 1, 24, 24)
+    masks[..., :12] = 1
+    background = torch.tensor([0.1, 0.2, 0.3])
+    found = masked(replace(views, masks=masks), background.tolist()).images
+    assert torch.equal(found[..., :12], views.images[..., :12])
+    assert torch.allclose(found[..., 12:], background[:, None, None])
+    must_refuse("--masks", masked, views, background.tolist())

@@ -1,0 +1,186 @@
+"""`qgs scene` on a tiny folder: its files, what it chooses, and the command that it prints."""
+
+import io
+import json
+import re
+import shutil
+from dataclasses import replace
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+import torch
+from commands import run_qgs
+from photo_formats import PhotoSet, write_colmap, write_nerfstudio
+from PIL import Image
+from plyfile import PlyData
+from qgs_photos.refine import scene as making
+from qgs_photos.refine.planning import (
+    LEAST_STEPS,
+    NONE,
+    Plan,
+    Scenes,
+    affordable,
+    judged_frames,
+    sized,
+)
+from qgs_photos.refine.refining import Extras
+from qgs_photos.refine.scene import photos_start, photos_world
+from rich.console import Console
+from test_refining import RENDERER
+from textured_room import INTRINSICS, walk
+from training_runs import tiny
+
+import qgs
+from qgs.data.samples import views_in
+from qgs.geometry.transforms import moved
+from qgs.reconstruction.scale import further_photos
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory):
+    """Nine photos of a textured box, 48 wide and 32 high."""
+    folder = tmp_path_factory.mktemp("files")
+    shots = walk(9)
+    files = [folder / f"{number}.png" for number in range(9)]
+    for file, shot in zip(files, shots, strict=True):
+        Image.fromarray(shot.image).resize((48, 32)).save(file)
+    lens = [number / 3.75 for number in INTRINSICS]
+    return PhotoSet(files, np.stack([shot.c2w for shot in shots]), lens, (32, 48))
+
+
+@pytest.fixture(scope="module")
+def photos(taken, tmp_path_factory):
+    return write_nerfstudio(tmp_path_factory.mktemp("photos"), taken)
+
+
+@pytest.fixture
+def scenes(photos):
+    return Scenes(str(photos), None, "8", None, None)
+
+
+def made(command, out):
+    """The output and metrics.json of a `qgs scene` that writes into `out`."""
+    result = run_qgs(*f"{command} --out {out}".split())
+    assert result.exception is None, result.output
+    return result.output, json.loads((out / "metrics.json").read_text())
+
+
+def test_a_scene_is_made_in_seconds_and_can_be_made_again_in_the_photos_world(photos, tmp_path):
+    out, again = tmp_path / "scene", tmp_path / "again"
+    few = "--minutes 0.003 --size 32x48 --gaussians 300"
+    output, record = made(f"scene {photos} {few}", out)
+    names = {"scene.ply", "scene.splat", "index.html", "metrics.json", "held_out.png"}
+    assert {path.name for path in out.iterdir()} == names
+    assert [row["photo"] for row in record["held_out"]] == ["images/4.png"]
+    assert record["refined_on"] == [f"images/{number}.png" for number in range(9) if number != 4]
+    assert record["gaussians"] == len(PlyData.read(out / "scene.ply")["vertex"]) == 300
+    assert record["command"] in output
+    assert f" --model {NONE} " in record["command"]
+    command = re.sub("--seconds [^ ]+", "--seconds 0.2", record["command"])
+    command = command.removeprefix("qgs ").replace(f" --out {out}", "")
+    _, record = made(command, again)
+    assert record["command"].replace(f" --out {again}", "") == f"qgs {command}"
+
+    views = qgs.read_photos(photos).select([4])
+    background = torch.tensor(record["background"])
+    rgb = RENDERER(qgs.load_ply(again / "scene.ply"), views.cameras, background).rgb
+    psnr = -10 * (rgb - views.images).square().mean().log10()
+    assert float(psnr) == pytest.approx(record["mean"]["psnr"], abs=0.3)
+
+
+def test_a_model_makes_the_start(photos, tmp_path):
+    file = tmp_path / "model.safetensors"
+    qgs.save(tiny("photos").build_model(), file)
+    few = "--holdout none --seconds 0.1 --size 32x48 --gaussians 300"
+    model = f"--model {file} --frames 0,2 --scale 0.5"
+    _, record = made(f"scene {photos} {model} {few}", tmp_path / "out")
+    assert record["held_out"] == []
+    assert len(record["refined_on"]) == 9
+    assert "--frames images/0.png,images/2.png --scale 0.5 " in record["command"]
+
+
+def test_without_the_viewer_there_is_no_page(monkeypatch):
+    monkeypatch.setattr("qgs.extensions.installed", lambda group: ())
+    console = Console(file=io.StringIO(), width=200)
+    assert making._page_writer(console) is None
+    assert "pip install query-gaussians-viewer" in console.file.getvalue()
+
+
+def test_options_that_cannot_be_used_are_refused(photos, tmp_path):
+    out = tmp_path / "out"
+    for options, message in (
+        ("--model none --scale 0.4", "--scale are of a model"),
+        ("--minutes 0", "--minutes"),
+        ("--seconds inf", "--seconds"),
+        ("--holdout 1", "--holdout"),
+        ("--size big", "HxW"),
+    ):
+        error = run_qgs(*f"scene {photos} --out {out} {options}".split()).exception
+        assert isinstance(error, ValueError)
+        assert message in str(error)
+    assert not out.exists()
+    # nor is a folder with something in it written into
+    assert isinstance(run_qgs("scene", photos, "--out", photos).exception, FileExistsError)
+
+
+def scene_of(count, held_out=(), **parts):
+    return MagicMock(held_out=held_out, __len__=lambda self: count, **parts)
+
+
+def test_judged_frames():
+    """A split of the photos' own goes first."""
+    cases = [(20, "8", (4, 12)), (7, "8", (3,)), (3, "8", (1,)), (2, "8", ()), (7, "3", (1, 4))]
+    for count, holdout, held in cases:
+        assert judged_frames(scene_of(count), holdout) == held
+        assert judged_frames(scene_of(count), NONE) == ()
+    own = scene_of(20, (0, 5))
+    assert (judged_frames(own, "8"), judged_frames(own, NONE)) == ((0, 5), ())
+
+
+def test_more_time_buys_larger_photos_and_more_gaussians(scenes):
+    assert sized(scenes.probe, 128) == (32, 48)  # photos are never enlarged
+    scenes.probe.stored_size = lambda frame: (720, 1280)
+    step, size = 0.01, (128, 128)
+    rows = [affordable(step, size, 2048, scenes, t, (None, None)) for t in (1, 120, 1200, 1e9)]
+    assert rows == sorted(rows)
+    sizes = [size for size, _ in rows]
+    assert sizes[::3] == [(96, 171), (720, 1280)]
+    assert len({*sizes}) == 4
+    wanted = (90, 160), 77
+    assert affordable(step, size, 2048, scenes, 1, wanted) == wanted
+    assert step * LEAST_STEPS < 120
+
+
+def test_a_plan_is_a_command_line():
+    plan = Plan("rooms/locus-64", ("a b.jpg", "c.jpg"), 0.381966, (64, 112), 900, 30.4, "8")
+    words = "--scene walk --model rooms/locus-64 --frames 'a b.jpg,c.jpg' --scale 0.38197 "
+    words += "--size 64x112 --gaussians 900 --seconds 30 --holdout 8 --degree "
+    start = "qgs scene 'my photos' --out out "
+    assert plan.command("my photos", "out", "walk") == f"{start}{words}0"
+    plan = replace(plan, extras=Extras(degree=2, exposure=True, poses=True), masks=True)
+    command = plan.command("my photos", "out", "walk")
+    assert command == f"{start}{words}2 --exposure --refine-poses --masks"
+
+
+def test_points_of_colmap_are_part_of_the_start(taken, photos, scenes, tmp_path):
+    """Of a folder of scenes, one of which is a COLMAP model with a point at (0, 0, 5)."""
+    shutil.copytree(photos, tmp_path / "other")
+    write_colmap(tmp_path / "mine", taken, "text")
+    of_colmap = Scenes(str(tmp_path), "mine", "8", None, None)
+    world = photos_world(of_colmap)
+    views = views_in(world, of_colmap.probe, of_colmap.frames)
+    found = photos_start(of_colmap.probe, world, views, 100, 40)
+    assert found.count == 41
+    point = moved(found, world[0], 1 / float(world[1])).means[0, 0]
+    assert torch.allclose(point, torch.tensor([0.0, 0, 5]), 0, 1e-4)
+    found = photos_start(scenes.probe, photos_world(scenes), views, 100, 40)
+    assert found.count == making.TIMED
+
+
+def test_a_start_is_judged_on_photos_taken_nearby_whatever_their_order():
+    c2w = torch.eye(4).repeat(6, 1, 1)
+    c2w[:, 0, 3] = torch.tensor([0, 5, 1, 0.4, 3, 0.6])
+    scene = scene_of(6, times=None, cameras=MagicMock(c2w=c2w))
+    for inputs, count, judged in (((0, 2), 2, (3, 5)), ((0, 2), 3, (3, 4, 5)), ((4,), 2, (1, 2))):
+        assert further_photos(scene, inputs, (), count) == judged

@@ -1,0 +1,95 @@
+"""Token tuning: the input views are met better, the weights stay as they are."""
+
+import copy
+
+import pytest
+import torch
+from qgs_photos.refine.tuning import tune, tuning_loss
+from training_runs import tiny
+
+from qgs.evaluate.plan import evaluation_samples
+from qgs.types import map_tensors
+
+MSE = "losses.photometric.ssim_weight=0.0"
+LATENTS = (
+    "plugins=[tokengs2026]",
+    "model.encoder={type: tokengs2026/latent_bottleneck, depth: 1, blocks: [1], latents: 12, "
+    "latent_depth: 1, patch_size: 8, layer_scale: 0.3}",
+    "evaluation.tuning=latents",
+)
+
+
+def opened(*words):
+    """The recipe, its model and the input views of a scene."""
+    recipe = tiny(*words)
+    samples = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)
+    return recipe, recipe.build_model().eval(), samples[0].inputs
+
+
+@pytest.mark.parametrize("words", [("tokengs",), ("locus",), ("tokengs", *LATENTS)])
+def test_the_input_views_are_met_better_and_weights_are_bit_equal(words):
+    """And what does not change is encoded once; the losses are the recipe's, on the inputs."""
+    recipe, model, inputs = opened(*words, MSE)
+    latents = "latents" in recipe.evaluation.tuning
+    before = copy.deepcopy(model.state_dict())
+    untuned = model(inputs).gaussians
+    calls = []
+    part = model.encoder.latent_blocks[0] if latents else model.encoder
+    part.register_forward_hook(lambda *_: calls.append(1))
+    loss = tuning_loss(recipe)
+    tuning = tune(model, inputs, loss, 8, *((0.1, "latents") if latents else (1e-2,)))
+    assert len(calls) == 1
+    torch.testing.assert_close(model.state_dict(), before, rtol=0, atol=0)
+    assert all(weights.grad is None and weights.requires_grad for weights in model.parameters())
+    assert not tuning.prediction.gaussians.means.requires_grad
+
+    def error(gaussians):
+        return float((model.render(gaussians, inputs.cameras).rgb - inputs.images).square().mean())
+
+    assert len(tuning.losses) == 9
+    assert tuning.losses[-1] < 0.99 * tuning.losses[0]
+    with torch.no_grad():
+        assert tuning.losses[0] == pytest.approx(error(untuned), rel=1e-6)
+        assert tuning.losses[-1] == pytest.approx(error(tuning.prediction.gaussians), rel=1e-6)
+    with pytest.raises(ValueError, match="at least one step, got 0"):
+        tune(model, inputs, loss, steps=0)
+
+
+def test_latents_are_tuned_at_their_own_rate():
+    assert tiny("tokengs", *LATENTS).evaluation.rate == 1e-2
+
+
+def test_every_floating_field_is_tuned_and_no_other(monkeypatch):
+    recipe, model, inputs = opened("locus")
+    start = model.queries.start(1)
+    numbers = torch.arange(start.features.shape[1])[None]
+    labelled = start.replace(fields={"stranger.label": numbers})
+    monkeypatch.setattr(model.queries, "forward", lambda memory, views: labelled)
+    seen = []
+    predict = model.predict
+
+    def recorded(views, memory, state, *rest):
+        seen.append(map_tensors(torch.clone, state))
+        return predict(views, memory, state, *rest)
+
+    monkeypatch.setattr(model, "predict", recorded)
+    tune(model, inputs, tuning_loss(recipe), steps=1, rate=1e-3)
+    assert torch.equal(seen[0].features, start.features)
+    assert not torch.equal(seen[-1].features, start.features)
+    for name in ("anchor.center", "anchor.raw_radius"):
+        assert not torch.equal(seen[-1][name], start[name])
+    assert torch.equal(seen[-1]["stranger.label"], numbers)
+
+
+def test_a_forward_pass_starts_from_the_given_state():
+    _, model, inputs = opened("locus")
+    start = model.queries.start(1)
+    shifted = start.replace(fields={"anchor.center": start["anchor.center"] + 1})
+    with torch.no_grad():
+        plain, same, moved = (
+            model(inputs, state=s).gaussians.means for s in (None, start, shifted)
+        )
+    assert torch.equal(plain, same)
+    assert not torch.allclose(plain, moved)
+    with pytest.raises(ValueError, match="the memory is of 1 scenes, the initial state of 2"):
+        model(inputs, state=model.queries.start(2))

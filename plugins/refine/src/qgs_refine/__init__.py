@@ -1,5 +1,0 @@
-"""Per-scene refinement for qgs: predicted Gaussians, optimised on the photos of their scene."""
-
-from qgs_refine.refining import CurvePoint, RefinedScene, refine
-
-__all__ = ["CurvePoint", "RefinedScene", "refine"]

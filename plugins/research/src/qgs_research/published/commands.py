@@ -1,0 +1,51 @@
+"""`qgs import`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from qgs.cli.options import Overrides
+
+app = typer.Typer(help="Published weights in, checkpoints out.")
+
+
+@app.command()
+def import_(
+    weights: Annotated[
+        Path, typer.Argument(help="Published weights: .safetensors, or .pt .pth .bin .ckpt.")
+    ],
+    recipe: Annotated[
+        str, typer.Option(help="Recipe file whose model they are; auto for the one that fits.")
+    ],
+    out: Annotated[Path, typer.Option(help="New checkpoint; never overwritten.")],
+    overrides: Overrides = None,
+    to_float32: Annotated[
+        bool,
+        typer.Option("--to-float32", help="Convert other precisions instead of refusing them."),
+    ] = False,
+) -> None:
+    """Turn published weights into a checkpoint; every tensor is accounted for.
+
+    With `--recipe auto` the recipe that fits, after every --set, is written beside the checkpoint,
+    as .yaml. A recipe without data knows no image size: give `--set data.type=qgs/photos --set
+    data.path=PHOTOS --set data.image_size=[256,256]`, or `qgs reconstruct --size`.
+    """
+    from qgs.recipe import resolve
+    from qgs_research.published.importing import import_weights
+
+    resolved = None if recipe == "auto" else resolve(recipe, overrides or ())
+    done = import_weights(weights, resolved, out, overrides=overrides or (), to_float32=to_float32)
+    name = done.layout.name
+    lines = [*done.notes, f"{name} ({done.layout.source}): {done.count} tensors used"]
+    if done.unused:
+        lines.append(f"knowingly dropped, {name} never reads these {len(done.unused)}:")
+        lines += [f"  {tensor}" for tensor in done.unused]
+    if done.settings:
+        lines.append(f"the recipe differs from {name} in options that no weight shows:")
+        lines += [f"  {path}: {a} ({name}: {b})" for path, (a, b) in done.settings.items()]
+    lines.append(f"wrote {out}")
+    if done.recipe_file:
+        lines.append(f"wrote {done.recipe_file}; names and shapes do not determine:")
+        lines += [f"  {choice}" for choice in done.layout.undecided]
+    typer.echo("\n".join(lines))

@@ -1,0 +1,38 @@
+"""`qgs convert`: Gaussians in another form."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from qgs.checkpoint.gaussians import load_ply, save_gaussians
+from qgs.files import refuse_existing
+
+app = typer.Typer(help="Gaussians, written in another form.")
+
+
+@app.command()
+def convert(
+    source: Annotated[
+        Path, typer.Argument(metavar="IN", help="PLY of qgs or of any 3DGS program.")
+    ],
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT", help="New file, never overwritten: .ply, .splat or a plugin's format."
+        ),
+    ],
+    count: Annotated[
+        int | None, typer.Option(min=1, help="Keep this many, the most opaque; default: all.")
+    ] = None,
+) -> None:
+    """Write Gaussians as PLY, .splat or in a plugin's format.
+
+    With --count the most opaque ones alone.
+    """
+    refuse_existing(out)
+    gaussians = load_ply(source)
+    kept = gaussians if count is None else gaussians.most_opaque(count)
+    save_gaussians(kept, out)
+    size = f"{out.stat().st_size / 1e6:.2f} MB"
+    typer.echo(f"wrote {out}: {kept.count:,} of {gaussians.count:,} Gaussians, {size}")

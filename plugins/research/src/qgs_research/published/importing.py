@@ -1,0 +1,150 @@
+"""A checkpoint from published weights: every tensor used, dropped by name, or an error."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from qgs.checkpoint.model_file import refuse_nonfinite, write_checkpoint
+from qgs.checkpoint.tensors import shapes_of
+from qgs.contracts import WeightLayout
+from qgs.files import refuse_existing, write_text
+from qgs.recipe import Recipe, resolve
+from qgs.recipe.recipe import differing_predictions
+from qgs.recipe.yaml_text import dump
+from qgs.wording import listed
+from qgs_research.published.exporting import new_checkpoint_path
+from qgs_research.published.layouts import (
+    Names,
+    PublishedError,
+    fitting_recipe,
+    names_of,
+    recognise,
+)
+from qgs_research.published.weight_files import WeightFile, read_weight_file
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """What `import_weights` did.
+
+    count: parameters in the checkpoint. unused: names in the file that the published code never
+    reads. settings: paths of options that weights do not determine and in which the model differs
+    from the published one, to both values. notes: how the file was read and converted.
+    recipe_file: the recipe that was written; None where one was given.
+    """
+
+    layout: WeightLayout
+    recipe: Recipe
+    count: int
+    unused: tuple[str, ...]
+    settings: Mapping[str, tuple[str, str]]
+    notes: tuple[str, ...] = ()
+    recipe_file: Path | None = None
+
+
+def import_weights(
+    weights: str | Path,
+    recipe: Recipe | None,
+    out: str | Path,
+    *,
+    overrides: Sequence[str] = (),
+    to_float32: bool = False,
+) -> Transfer:
+    """Write a checkpoint of `recipe` with published weights.
+
+    recipe: None for the one that fits, changed by `overrides` (such as "data.image_size=[64, 64]"),
+        which is then also written beside `out`, as .yaml.
+    out: a new .safetensors file.
+    to_float32: convert weights of other floating-point types instead of refusing them.
+    Raises FileNotFoundError, FileExistsError, ValueError for another suffix, RecipeError about
+    `overrides`, CheckpointError and PublishedError; nothing is written then.
+    """
+    out = new_checkpoint_path(out)
+    recipe_file = out.with_suffix(".yaml") if recipe is None else None
+    if recipe_file:
+        refuse_existing(recipe_file)
+    file = _without_prefix(read_weight_file(weights))
+    shapes = shapes_of(file.tensors)
+    text = ""
+    if recipe is None:
+        layout, tree = fitting_recipe(shapes, str(weights))
+        recipe = resolve(tree, overrides)
+        origin = f"{file.path.name}, weights of {layout.name} ({layout.source})"
+        lines = [
+            f"# Derived from the names and shapes of {origin}.",
+            "# Shapes do not determine the following, which is as published:",
+            *(f"#   {choice}" for choice in layout.undecided),
+            *(f"# Overridden: {override}" for override in overrides),
+        ]
+        text = "\n".join(lines) + "\n" + dump(dict(recipe.tree if overrides else tree))
+    try:
+        names = names_of(recipe)
+    except PublishedError as error:
+        raise PublishedError(f"{file.path} does not fit the recipe: {error}") from error
+    tensors, converted = _as_float32(file, names, to_float32)
+    settings = differing_predictions(recipe.tree, resolve(names.layout.read(shapes)).tree)
+    imported = f"{names.layout.name} weights {file.path.name}"
+    write_checkpoint(out, tensors, recipe.tree, recipe.releases, {"imported": imported})
+    if recipe_file:
+        try:
+            write_text(recipe_file, text)
+        except BaseException:
+            out.unlink()
+            raise
+    dropped = tuple(name for name in names.unused if name in file.tensors)
+    notes = (*file.notes, *converted)
+    return Transfer(names.layout, recipe, len(tensors), dropped, settings, notes, recipe_file)
+
+
+def _without_prefix(file: WeightFile) -> WeightFile:
+    """`file` without a prefix that all its names share, where published names remain; with a note.
+
+    Training frameworks prepend the attribute that holds the model (`model.`, `module.`).
+    """
+    modules = next(iter(file.tensors)).split(".")[:-1]
+    for depth in range(1, len(modules) + 1):
+        prefix = ".".join(modules[:depth]) + "."
+        tensors = {name.removeprefix(prefix): tensor for name, tensor in file.tensors.items()}
+        if (
+            all(name.startswith(prefix) for name in file.tensors)
+            and recognise(shapes_of(tensors))[0]
+        ):
+            note = f"took {prefix!r} off all {len(tensors)} names"
+            return WeightFile(file.path, tensors, (*file.notes, note))
+    return file
+
+
+def _as_float32(
+    file: WeightFile, names: Names, allowed: bool
+) -> tuple[dict[str, Tensor], list[str]]:
+    """Contiguous float32 tensors under our names, and a note of what was converted.
+
+    Raises PublishedError for other types, where they are not `allowed`, and for NaN and infinity.
+    """
+    given = names.from_published(file.tensors, file.path)
+    others = {name: t.dtype for name, t in given.items() if t.dtype != torch.float32}
+    kinds = Counter(str(dtype).removeprefix("torch.") for dtype in others.values())
+    report = ", ".join(f"{count} of {len(given)} are {kind}" for kind, count in kinds.items())
+    strange = [names.published[n] for n, dtype in others.items() if not dtype.is_floating_point]
+    if strange:
+        raise PublishedError(
+            f"{file.path} holds weights that are no real numbers: {listed(strange)} ({report})"
+        )
+    if others and not allowed:
+        raise PublishedError(
+            f"{file.path} holds weights that are not float32 ({report}); take the float32 file, or "
+            "convert with --to-float32"
+        )
+    tensors: dict[str, Tensor] = {}
+    stored: set[int] = set()
+    for name, tensor in given.items():
+        tensor = tensor.to(torch.float32).contiguous()
+        # A torch file may store several names once; a checkpoint holds each on its own.
+        tensors[name] = tensor.clone() if tensor.data_ptr() in stored else tensor
+        stored.add(tensor.data_ptr())
+    refuse_nonfinite({names.published[name]: t for name, t in tensors.items()}, file.path)
+    return tensors, [f"converted to float32: {report}"] if others else []

@@ -1,0 +1,138 @@
+"""Published codebases: their names for our parameters, and the recipe that their shapes give."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from qgs.checkpoint.model_file import unique_tensors
+from qgs.checkpoint.tensors import differing_tensors, shapes_of
+from qgs.contracts import LayoutError, WeightLayout
+from qgs.contracts.weights import Shapes
+from qgs.recipe import Recipe, RecipeError, resolve
+from qgs.recipe.registry import InstalledPlugin, load_registry, load_usable_plugins
+from qgs.wording import listed
+from qgs_research.published.tokengs import TOKENGS
+
+
+class PublishedError(ValueError):
+    """Weights that do not fit a recipe, or a model that a published layout cannot hold."""
+
+
+@dataclass(frozen=True)
+class Names:
+    """The parameters of one recipe's model under both names.
+
+    shapes: of our parameters. published: our name to the published one, both unique.
+    unnamed: our names without a published one. unused: published names that a file may also hold,
+    whose parameters the published code ignores.
+    """
+
+    layout: WeightLayout
+    shapes: Shapes
+    published: Mapping[str, str]
+    unnamed: tuple[str, ...]
+    unused: tuple[str, ...]
+
+    def from_published(
+        self, weights: Mapping[str, Tensor], origin: object = "the file"
+    ) -> dict[str, Tensor]:
+        """A published state dict under our names, `unused` left out.
+
+        Raises PublishedError with every difference in names and shapes.
+        """
+        wanted = {theirs: self.shapes[ours] for ours, theirs in self.published.items()}
+        found = [f"no published name: {name}" for name in self.unnamed]
+        given = {name: w for name, w in weights.items() if name not in self.unused}
+        if found := found + differing_tensors(shapes_of(given), wanted):
+            raise PublishedError(
+                f"{origin} does not fit the recipe, whose model is a {self.layout.name} "
+                f"(`--recipe auto` writes one that fits), {len(found)} differences:\n  "
+                + listed(found, 20, "\n  ")
+            )
+        return {ours: weights[theirs] for ours, theirs in self.published.items()}
+
+
+def names_of(recipe: Recipe) -> Names:
+    """Both names of the parameters of the model of `recipe`, by the first layout that can hold it.
+
+    Raises PublishedError with the components that each layout does not know.
+    """
+    registry = load_registry([name for name in recipe.releases if name != "qgs"])
+    reasons = []
+    for layout in _layouts(registry.plugins.values()):
+        found = _unknown_components(recipe, layout)
+        if not found:
+            return _names_in(recipe, layout)
+        reasons += [f"\n  {layout.name}: {line}" for line in found]
+    raise PublishedError("no published layout can hold this model:" + "".join(reasons))
+
+
+def _layouts(plugins: Iterable[InstalledPlugin]) -> list[WeightLayout]:
+    return [TOKENGS, *(layout for installed in plugins for layout in installed.plugin.layouts)]
+
+
+def _unknown_components(recipe: Recipe, layout: WeightLayout) -> list[str]:
+    """Components of `recipe` that a codebase does not know, one line each."""
+    found: dict[str, None] = {}
+    types: dict[str, set[str]] = {}
+    for path, chosen in recipe.parts.items():
+        slot = path[-1]
+        if path[0] != "model" or slot not in layout.components:
+            continue
+        known = layout.components[slot]
+        types.setdefault(slot, set()).add(chosen.type)
+        if chosen.type not in known:
+            has = f"{layout.name} has {' or '.join(known)}"
+            found[f"{chosen.path} is {chosen.type}; {has}"] = None
+    return list(found) + [
+        f"decoder layers differ in their {slot} ({', '.join(sorted(several))})"
+        for slot, several in types.items()
+        if len(several) > 1
+    ]
+
+
+def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
+    model = recipe.build_model("meta")
+    shapes = shapes_of(unique_tensors(model))
+    named = {name: layout.published_name(name) for name in shapes}
+    published = {ours: theirs for ours, theirs in named.items() if theirs is not None}
+    # Two of our parameters under one published name would be an error in the layout's renames.
+    assert len(set(published.values())) == len(published)
+    unnamed = tuple(name for name in shapes if name not in published)
+    # Stored beside the used ones, and never read by the published code.
+    beside = (rule.renamed(name) for name in published.values() for rule in layout.unused)
+    unused = tuple(name for name in beside if name is not None)
+    return Names(layout, shapes, published, unnamed, unused)
+
+
+def recognise(shapes: Shapes) -> tuple[WeightLayout | None, list[WeightLayout]]:
+    """The layout that fits a state dict best, None without one, and the layouts of all plugins."""
+    layouts = _layouts(load_usable_plugins()[0].plugins.values())
+    found = [layout for layout in layouts if set(layout.marks) <= set(shapes)]
+    # A codebase's later release has all names of the earlier one.
+    return max(found, key=lambda layout: len(layout.marks), default=None), layouts
+
+
+def fitting_recipe(shapes: Shapes, origin: str) -> tuple[WeightLayout, dict[str, Any]]:
+    """The layout of a state dict and the recipe that its sizes give, a plain mapping.
+
+    Raises PublishedError, about `origin`, when no installed layout knows the names or when names
+    and shapes make no recipe.
+    """
+    layout, known = recognise(shapes)
+    if layout is None:
+        names = "; ".join(f"{one.name} has {', '.join(one.marks)}" for one in known)
+        raise PublishedError(
+            f"{origin} has the names of no published model that is known here ({names}); its "
+            f"names are {listed(shapes, 3)}"
+        )
+    try:
+        tree = layout.read(shapes)
+        resolve(tree)
+    except (LayoutError, RecipeError) as error:
+        raise PublishedError(
+            f"{origin} looks like {layout.name}, but no recipe fits its shapes: {error}"
+        ) from error
+    return layout, tree

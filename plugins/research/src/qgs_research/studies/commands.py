@@ -1,0 +1,154 @@
+"""`qgs study` and `qgs compare`."""
+
+import os
+import signal
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from qgs.cli.options import Device
+
+app = typer.Typer(help="Train variants of a model by seeds, and compare them.")
+compare_app = typer.Typer(help="Compare results of evaluations.")
+
+
+@compare_app.command()
+def compare(
+    runs: Annotated[
+        list[str], typer.Argument(metavar="RUN...", help="Run folders, or folders of `qgs eval`.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for comparison.json and comparison.md.")
+    ] = None,
+    across_protocols: Annotated[
+        bool, typer.Option("--across-protocols", help="Compare results of different protocols.")
+    ] = False,
+) -> None:
+    """Compare the results of the first RUN with those of each other, scene by scene.
+
+    Nothing is evaluated. Runs of one recipe with several seeds count as one side.
+    """
+    from qgs_research.studies.comparison import compare as compared
+    from qgs_research.studies.stored import read_results
+
+    console = Console()
+    comparisons = compared([read_results(run) for run in runs], across_protocols)
+    comparisons.show(console)
+    if out:
+        comparisons.write(out)
+    end = f"written to {out}" if out else "add --out FOLDER to keep this as JSON and Markdown"
+    console.print(end, soft_wrap=True)
+
+
+@app.command()
+def study(
+    file: Annotated[
+        str, typer.Argument(metavar="STUDY", help="Study file, or one that comes with qgs.")
+    ],
+    out: Annotated[
+        Path, typer.Option(help="Folder of the study; what is there already is not run again.")
+    ],
+    workers: Annotated[
+        int, typer.Option(min=0, help="Runs at a time here; 0 trains nothing, and only reports.")
+    ] = 1,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="CPU threads of a run; default: cores / workers.")
+    ] = None,
+    only: Annotated[
+        int | None, typer.Option(min=0, help="Train the run of this number, from 0, alone.")
+    ] = None,
+    slurm: Annotated[
+        bool,
+        typer.Option("--slurm", help="Write OUT/slurm.sh, an array of runs; train nothing."),
+    ] = False,
+    device: Device = "auto",
+) -> None:
+    """Train every variant with every seed, evaluate all by one protocol, and compare the scores.
+
+    It is checked as a whole before anything trains. Give the same command
+    again at any time: each run is trained once, a killed one continues,
+    and only missing ones run. OUT/study.html has the answer, OUT/table.*
+    the numbers.
+
+    \b
+        study: 1
+        base: tiny/locus.yaml
+        variants:
+          locus:
+          mine: {model: {decoder: {cross_attention: {sigma0: 0.2}}}}
+        reference: locus
+        seeds: [0, 1, 2]
+        budget: {steps: 2100}   # or seconds, or images
+        hypotheses:
+          - mine > locus
+
+    \b
+        qgs study mine_study.yaml --out studies/mine --workers 2
+
+    A variant is `base` with or without changes, or the name of a recipe file.
+    docs/studies.md has all keys of a study (differs, evaluations, published
+    ...). Studies that come with qgs: studies/tiny/structural.yaml and others.
+    """
+    from qgs.wording import counted
+    from qgs_research.studies.output import show
+    from qgs_research.studies.page import write_all
+    from qgs_research.studies.plan import planned, write_plan
+    from qgs_research.studies.results import Results
+    from qgs_research.studies.study import read_study
+
+    console = Console()
+    with console.status("composing and checking all variants"):
+        plan = planned(read_study(file), out)
+        write_plan(plan)
+    for name, recipe in plan.recipes.items():
+        for warning in recipe.warnings:
+            console.print(f"warning: {name}: {warning}", highlight=False, soft_wrap=True)
+    missing = [run for run in plan.runs if not plan.done(run)]
+    count = f"{counted(len(plan.runs), 'run')}, {len(missing)} of them missing"
+    console.print(f"{plan.size}: {count}", highlight=False)
+    if slurm:
+        from qgs_research.studies.slurm import write_script
+
+        script = write_script(plan, file, threads or 1, device)
+        console.print(f"wrote {script}; submit it with: sbatch {script}", soft_wrap=True)
+        return
+    stopped, failed = None, 0
+    if workers and missing:
+        from qgs_research.studies.queue import Queue
+
+        threads = threads or max(_usable_cores() // workers, 1)
+        chosen = plan.runs if only is None else [plan.runs[only]]
+        queue = Queue(plan, workers, threads, device, console, _gpus(device), chosen)
+        stopped, failed = queue.work(), len(queue.failures)
+    results = Results(plan)
+    if results.columns:
+        page = write_all(results)
+        show(results, console)
+        console.print(f"written to {page}", soft_wrap=True, highlight=False)
+    else:
+        console.print("no run is finished: there is nothing to report yet")
+    if stopped:
+        console.print(f"stopped by {stopped}; the same command goes on", highlight=False)
+        raise typer.Exit(128 + signal.Signals[stopped])
+    if failed:
+        raise typer.Exit(1)
+
+
+def _gpus(device: str) -> list[str]:
+    """GPUs that may be used, as CUDA_VISIBLE_DEVICES names them."""
+    if device == "cpu":
+        return []
+    given = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if given is not None:
+        return [name for name in given.split(",") if name]
+    import torch
+
+    return [str(number) for number in range(torch.cuda.device_count())]
+
+
+def _usable_cores() -> int:
+    """CPU cores that this process may use; all of the machine where the system does not say."""
+    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ()
+    return len(allowed) or os.cpu_count() or 1

@@ -1,0 +1,62 @@
+"""Files of weights: what is read, and one clear reason for what is not."""
+
+from io import BytesIO
+
+import pytest
+import torch
+from qgs_research.published.weight_files import read_weight_file
+from safetensors.torch import save
+from torch.testing import assert_close
+
+from qgs.checkpoint.tensors import CheckpointError
+
+WEIGHTS = {"a.weight": torch.arange(6.0).view(2, 3), "b": torch.tensor(1.5)}
+SAFE = save(WEIGHTS)
+
+
+def torch_bytes(content, zipped=True):
+    buffer = BytesIO()
+    torch.save(content, buffer, _use_new_zipfile_serialization=zipped)
+    return buffer.getvalue()
+
+
+FLAT, OLD = torch_bytes(WEIGHTS), torch_bytes(WEIGHTS, zipped=False)
+
+
+def read(path, content):
+    path.write_bytes(content)
+    return read_weight_file(path)
+
+
+def test_weights_are_read_and_where_they_lay_is_told(tmp_path):
+    training = {"state_dict": WEIGHTS, "epoch": 3}
+    for name, content, told in (
+        ("w.safetensors", SAFE, []),
+        *((f"w.{suffix}", FLAT, []) for suffix in ("pt", "pth", "bin", "ckpt", "PT")),
+        ("w.pt", OLD, []),
+        ("w.pt", torch_bytes({"model": WEIGHTS}), ["'model'"]),
+        ("w.pt", torch_bytes(training), ["'state_dict'; left out: epoch"]),
+        ("w.pt", torch_bytes({"state_dict": {"module": WEIGHTS}}), ["'state_dict'", "'module'"]),
+        ("w.pt", torch_bytes({"module": WEIGHTS, "lr": {"a": 0.1}}), ["'module'; left out: lr"]),
+    ):
+        file = read(tmp_path / name, content)
+        assert file.notes == tuple(f"the weights lie below {what}" for what in told)
+        assert_close(file.tensors, WEIGHTS, rtol=0, atol=0)
+
+
+def test_what_cannot_be_read_is_named(tmp_path):
+    checkpoint = save(WEIGHTS, {"qgs.recipe": "{}"})
+    mixed, twice = {"a": torch.zeros(1), "n": 3}, {"model": WEIGHTS, "module": WEIGHTS}
+    endless = {"w": torch.zeros(2)}
+    endless["model"] = endless
+    objects = (torch.nn.Linear(2, 2), torch.zeros(2), {}, mixed, twice, endless)
+    for name, contents in {
+        "w.safetensors": (SAFE[:-5], FLAT, OLD, b"", save({}), checkpoint),
+        "w.pt": (FLAT[:500], SAFE, b"", *map(torch_bytes, objects)),
+        "w.npz": (b"0123456789",),
+    }.items():
+        for content in contents:
+            with pytest.raises(CheckpointError, match=str(tmp_path / name)):
+                read(tmp_path / name, content)
+    with pytest.raises(FileNotFoundError):
+        read_weight_file(tmp_path)

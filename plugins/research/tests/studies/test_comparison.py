@@ -1,0 +1,124 @@
+"""Paired comparisons of results, and their intervals."""
+
+import json
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from commands import done
+from qgs_research.studies.comparison import compare
+from qgs_research.studies.intervals import crossed_error, crossed_interval, paired_interval
+from qgs_research.studies.stored import StoredResults
+from scipy import stats
+
+from qgs.contracts import Column
+from qgs.evaluate.protocol import Protocol
+
+COLUMNS = {"psnr": Column("PSNR", "higher", 2), "lpips": Column("LPIPS", "lower")}
+
+
+def results(name, recipe="", seed=None, step=None, **psnr):
+    """Of one training, with an LPIPS of PSNR / 100."""
+    scenes = {scene: {"model_psnr": v, "model_lpips": v / 100} for scene, v in psnr.items()}
+    protocol = Protocol("rooms", {"format": 1, "views": "rooms"})
+    frames = dict.fromkeys(scenes, ("0 3", "1 2"))
+    stored = StoredResults(name, protocol, COLUMNS, scenes, frames, len(scenes))
+    return replace(stored, recipe=recipe, seed=seed, step=step, budget="60 s" * bool(recipe))
+
+
+def test_the_bootstrap_interval_is_that_of_scipy():
+    differences = np.random.default_rng(1).normal(0.3, 1.0, 60)
+    expected = stats.bootstrap((differences,), np.mean, method="percentile").confidence_interval
+    found = paired_interval(differences)
+    assert found == pytest.approx(tuple(expected), abs=0.02)
+    assert found == paired_interval(differences)
+    assert paired_interval(np.ones(1)) is None
+
+
+def test_scenes_pair_by_name_and_lower_is_better_for_lpips():
+    first = results("first", a=10.0, b=12.0, c=11.0, only=50.0)
+    second = results("second", c=11.0, b=10.0, a=9.0, other=1.0, another=2.0)
+    (pair,) = compare([first, second]).pairs
+    psnr, lpips = pair.differences
+    assert (psnr.first, psnr.second, psnr.scenes) == (11.0, 10.0, 3)
+    assert psnr.difference == pytest.approx(1.0)
+    assert (psnr.wins, psnr.losses, lpips.wins, lpips.losses) == (2, 0, 0, 2)
+    record = pair.record()
+    assert (record["only_first"], record["only_second"]) == (["only"], ["other", "another"])
+
+
+def test_the_first_is_compared_with_each_of_the_others():
+    three = [results(name, a=value, b=value) for name, value in zip("xyz", (3, 2, 5), strict=True)]
+    seeds = [results(name, "A", s, 100, a=1.0 + s, b=2.0) for s, name in enumerate("xy")]
+    cases = ((three, ["xy", "xz"], [1, -2]), (seeds, ["xy"], [-0.5]))  # or seeds of one recipe
+    for given, names, differences in cases:
+        pairs = compare(given).pairs
+        assert [pair.first.name + pair.second.name for pair in pairs] == names
+        assert [pair.differences[0].difference for pair in pairs] == differences
+
+
+def test_what_cannot_be_compared_is_refused():
+    first, second = results("x", a=1.0, b=2.0), results("y", a=1.0, b=2.0)
+    for pair in ([first, first], [first, results("y", c=1.0)], [first]):
+        with pytest.raises(ValueError, match="x"):
+            compare(pair)
+    halls = replace(second, protocol=Protocol("halls", {"format": 1, "views": "halls"}))
+    moved = replace(second, frames={**second.frames, "b": ("0 4", "1 2")})
+    for other, key, told in ((halls, "same_protocol", False), (moved, "other_frames", ["b"])):
+        with pytest.raises(ValueError, match="across-protocols"):
+            compare([first, other])
+        assert compare([first, other], across_protocols=True).pairs[0].record()[key] == told
+
+
+def test_trainings_of_one_recipe_are_one_side_paired_by_seed():
+    ours = [results(f"r/a/{s}", "A", s, 100, a=10.0 + s, b=12.0) for s in range(3)]
+    theirs = [results(f"r/b/{s}", "B", s, 190, a=9.0 + s, b=11.5) for s in (2, 0)]
+    found = compare([*ours, *theirs])
+    (pair,) = found.pairs
+    psnr = pair.differences[0]
+    assert (psnr.trainings, psnr.scenes, psnr.difference) == (2, 2, pytest.approx(0.75))
+    assert (pair.first.name, pair.second.name) == ("r/a", "r/b")
+    assert "r/a: seed 1 left out" in found.markdown()
+    assert "1.90 times" in found.markdown()
+
+
+def test_two_runs_compare_scene_by_scene(tmp_path):
+    runs = tmp_path / "locus-64", tmp_path / "tokengs-64"
+    means = []
+    for run in runs:
+        folder = run / "evaluation"
+        done("eval", f"rooms/{run.name}", "--set", "evaluation.scenes=2", "--out", folder)
+        means.append(json.loads((folder / "summary.json").read_text())["model"]["psnr"])
+    done("compare", *runs, "--out", tmp_path)
+    psnr = json.loads((tmp_path / "comparison.json").read_text())["pairs"][0]["differences"][0]
+    assert psnr["difference"] == pytest.approx(means[0] - means[1])
+    assert psnr["low"] <= psnr["difference"] <= psnr["high"]
+    assert psnr["wins"] + psnr["losses"] == psnr["scenes"] == 2
+
+
+def test_the_interval_over_trainings_and_scenes_holds_the_truth():
+    """In 95 of 100 cases, whichever varies more, also for few scenes; and no wider than needed."""
+    deviations = ((0.1, 1.0, 0.1), (1.0, 0.1, 0.1), (0, 0, 1.0))
+    for case in product(deviations, ((3, 3), (3, 5), (3, 32), (5, 5))):
+        rng, count = np.random.default_rng(0), 4000
+        (of_training, of_scene, rest), (trainings, scenes) = case
+        values = rng.normal(0, of_training, (count, trainings, 1))
+        values = values + rng.normal(0, of_scene, (count, 1, scenes))
+        values = values + rng.normal(0, rest, (count, trainings, scenes))
+        error, freedom = crossed_error(values)
+        half = stats.t.ppf(0.975, freedom) * error
+        low, high = crossed_interval(values[0])
+        assert high - low == pytest.approx(2 * half[0])
+        assert 0.93 <= (np.abs(values.mean((1, 2))) <= half).mean() <= 0.985, case
+        truth = of_training**2 / trainings + of_scene**2 / scenes + rest**2 / (trainings * scenes)
+        least = stats.t.ppf(0.975, min(trainings, scenes) - 1) * truth**0.5
+        assert np.median(half) <= 1.25 * least, case
+
+
+def test_an_interval_needs_two_of_each_and_widens_with_confidence():
+    assert crossed_interval(np.full((3, 4), 2.0)) == (2.0, 2.0)
+    assert crossed_interval(np.ones((1, 4))) is crossed_interval(np.ones((4, 1))) is None
+    values = np.random.default_rng(0).normal(size=(3, 8))
+    usual, sure = crossed_interval(values), crossed_interval(values, 0.99)
+    assert sure[0] < usual[0] < usual[1] < sure[1]

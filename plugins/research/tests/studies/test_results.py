@@ -1,0 +1,196 @@
+"""Tables and verdicts of made-up scores, held against numbers made by hand."""
+
+import csv
+import json
+import re
+import shutil
+from types import SimpleNamespace
+
+import fill_evidence
+import numpy as np
+import pytest
+import yaml
+from qgs_research.studies.figures import write_figures
+from qgs_research.studies.intervals import crossed_interval
+from qgs_research.studies.output import latex, markdown, record, table_rows, write_files
+from qgs_research.studies.plan import Plan, run_of
+from qgs_research.studies.results import Results
+from qgs_research.studies.study import read_study
+
+STUDY = """study: 1
+variants: {full: tiny/locus.yaml, less: tiny/locus.yaml, other: tiny/locus.yaml}
+reference: full
+seeds: [0, 1, 2]
+budget: {steps: 9}
+evaluations: {noisy: {views: {pose_noise: 1.0}}}
+hypotheses:
+  - less < full
+  - other > full
+  - {claim: less@noisy - less < full@noisy - full, note: degrades more}
+published: {full: 24.0, less: 23.0, other: 22.0}
+"""
+SUMMARY = """
+protocol: {name: made up}
+columns: {psnr: {heading: PSNR, better: higher, digits: 2, unit: dB}}
+step: 9
+missing: {}
+null_entries: []
+"""
+OFFSETS = {"full": 0, "less": -1, "other": 0, "four": -3, "five": -4}
+
+
+def score(variant, evaluation, seed, scene):
+    """Clear but for `other`, with noise of a tenth that is the same each time."""
+    rng = np.random.default_rng([*f"{variant}{evaluation}".encode(), seed, scene])
+    noise = 0.5 * bool(evaluation) * (2 if variant == "less" else 1)
+    return 20.0 + OFFSETS[variant] - noise + scene + 0.1 * float(rng.normal())
+
+
+def write_run(folder, values, views):
+    folder.mkdir(parents=True)
+    rows = [f"{scene},0 3,1 2,{value!r},15.5," for scene, value in values.items()]
+    head = "scene,input_frames,target_frames,model_psnr,nearest_input_psnr,problem"
+    (folder / "scenes.csv").write_text("\n".join([head, *rows]) + "\n")
+    summary = yaml.safe_load(SUMMARY) | {"scenes_in_protocol": len(values)}
+    (folder / "summary.json").write_text(json.dumps(summary))
+    (folder / "protocol.json").write_text(json.dumps({"views": {"drawn": views}}))
+
+
+def results(folder, lead=(0, 0, 0), views=lambda variant, evaluation: evaluation, text=STUDY):
+    """Of 8 scenes. lead: of `other`, for each seed. views: what a protocol says."""
+    (folder / "study.yaml").write_text(text)
+    study = read_study(folder / "study.yaml")
+    plan = Plan(study, folder, dict.fromkeys(study.variants, SimpleNamespace()))
+    for variant in plan.recipes:
+        for seed, ahead in enumerate(lead):
+            for name in plan.evaluations:
+                more = ahead * (variant == "other")
+                values = {f"s{n}": score(variant, name, seed, n) + more for n in range(8)}
+                where = run_of(folder, variant, seed).evaluation(name)
+                write_run(where, values, views(variant, name))
+    return Results(plan)
+
+
+@pytest.fixture
+def plain(tmp_path):
+    return results(tmp_path)
+
+
+def test_numbers_are_those_of_the_definition(plain):
+    less, full = (
+        np.array([[score(variant, "", seed, n) for n in range(8)] for seed in range(3)])
+        for variant in ("less", "full")
+    )
+    row = plain.rows()[1]
+    assert row.variant == "less"
+    mean, apart = row.scores["psnr"], row.differences["psnr"]
+    assert mean.mean == pytest.approx(less.mean())
+    assert mean.deviation == pytest.approx(less.mean(1).std(ddof=1))
+    assert apart.mean == pytest.approx((less - full).mean())
+    assert (apart.low, apart.high) == pytest.approx(crossed_interval(less - full))
+    assert apart.covers == "3 seeds x 8 scenes"
+    assert plain.judgements()[2].estimate.mean == pytest.approx(-0.5, abs=0.15)
+
+
+def test_trainings_that_failed_are_in_the_answer(plain):
+    for seed in range(3):
+        run = run_of(plain.plan.folder, "other", seed)
+        shutil.rmtree(run.folder)
+        run.failure.write_text("CollapseError: training collapsed at step 7: it\nLikely causes")
+    found = Results(plain.plan)
+    assert found.answer().startswith("No: less is worse than full, PSNR ")
+    assert found.answer().endswith("Left out: 3 of 3 trainings of other failed (CollapseError).")
+    assert "other seed 0 failed: CollapseError: training collapsed at step 7: it" in found.notes()
+
+
+VERDICTS = r"""
+- [[2, 2, 2], 'Yes: other, the best of 2, is better than full, PSNR \+2.0', seen]
+- [[0, 0, 0], 'Undecided: other cannot .* full, .*; worse, each at 95 %: less.', undecided]
+- [[-2, -2, -2], 'No: all 2 are worse; the nearest, less, is worse than full', contradicted]
+# seeds that disagree, however sure the scenes are
+- [[1, -0.6, 0.7], 'Undecided: other cannot be told from full', undecided]
+# chance has two tries: its own interval at 95 % lies above 0, that of the best of two not
+- - [0.5, 0.68, 0.32]
+  - 'Undecided: other cannot .* PSNR \+0.5.*97.5 % interval \[-.* for the best of 2'
+  - seen
+"""
+
+
+@pytest.mark.parametrize(("lead", "answer", "verdict"), yaml.safe_load(VERDICTS))
+def test_verdicts_and_the_answer(tmp_path, lead, answer, verdict):
+    found = results(tmp_path, lead)
+    assert re.match(answer, found.answer())
+    assert [judged.verdict for judged in found.judgements()] == ["seen", verdict, "seen"]
+    assert found.rank_correlation()[0] is None  # of three variants any order is likely
+
+
+def test_the_best_of_one_needs_no_correction(tmp_path):
+    alone = re.sub(r"less: tiny/locus.yaml, |less: 23.0, |  - .*less.*\n", "", STUDY)
+    answer = results(tmp_path, (0.5, 0.68, 0.32), text=alone).answer()
+    assert re.match(r"Yes: other is better than full, PSNR \+0.* \(95 % interval \[\+", answer)
+
+
+def test_one_seed_leaves_it_open_however_sure_the_scenes_are(tmp_path):
+    found = results(tmp_path, [1])
+    judged = found.judgements()[1]
+    assert judged.estimate.low > 0
+    assert (judged.verdict, judged.reason) == ("undecided", "one training a side")
+    assert found.answer().startswith("Not known: other, the best of 2, has PSNR +")
+    assert "says nothing of training" in found.answer()
+    assert "6 of 9 runs are missing: full seed 1" in "\n".join(found.notes())
+    write_files(found)
+    assert "| noisy | 23.01 (–) |" in fill_evidence.page_of(tmp_path)
+
+
+def test_files_hold_the_same_numbers(plain, tmp_path):
+    write_files(plain)
+    write_figures(plain)
+    table = json.loads((tmp_path / "results.json").read_text())["table"]
+    rows = csv.reader((tmp_path / "table.csv").open())
+    written = [["" if cell is None else str(cell) for cell in row.values()] for row in table]
+    assert [*rows] == [[*table[0]], *written]
+    assert len(written) == 6
+    assert len((tmp_path / "runs.csv").read_text().splitlines()) == 1 + 3 * 3 * 2
+    assert "degrades more" in markdown(plain)
+    assert latex(plain).count(r"\toprule") == 2
+    names = {path.name for path in (tmp_path / "figures").iterdir()}
+    assert names == {f"values{n}.{s}" for n in ("", "-noisy") for s in ("pdf", "png")}
+
+
+def test_numbers_of_unlike_protocols_are_not_compared(tmp_path):
+    """The answer is by the first evaluation that all share, the table shows no difference."""
+
+    views = {"full": "two", "less": "two", "other": "six"}
+    found = results(tmp_path, views=lambda variant, evaluation: evaluation or views[variant])
+    first = "Undecided: other cannot be told from full, PSNR in the evaluation `no"
+    assert found.answer().startswith(first)
+    cells = {row[0]: row[3:6] for row in table_rows(found)[1:]}
+    assert cells["full"] == ["reference", "–", "–"]
+    assert cells["other"] == ["–", "–", "–"]
+    assert cells["less"][0].startswith("-0.9")
+    assert any("protocols differ" in note and "other" in note for note in found.notes())
+    reasons = [j.reason for j in found.judgements()]
+    assert reasons == ["", "the interval holds 0, judged by unlike protocols", ""]
+    row = record(found)["table"][2]
+    assert [row[name] for name in ("variant", "difference", "low")] == ["other", None, None]
+
+
+def test_a_variant_without_the_metric_is_a_row_of_dashes(plain, tmp_path):
+    for seed in range(3):
+        file = run_of(tmp_path, "less", seed).evaluation("") / "scenes.csv"
+        file.write_text(re.sub(r"(,1 2),[^,]*", r"\1,", file.read_text()))
+    found = Results(plain.plan)
+    row = next(row for row in table_rows(found) if row[0] == "less")
+    assert row[1:6] == ["–"] * 5
+    write_files(found)
+    assert "\n,less,0,\n" in (tmp_path / "runs.csv").read_text()
+
+
+def test_published_values_are_shown_and_ranked_from_five_variants_on(tmp_path):
+    text = STUDY.replace("{full:", "{four: tiny/locus.yaml, five: tiny/locus.yaml, full:", 1)
+    text = text.replace("other: 22.0", "other: 22.0, four: 21.5, five: 21.0")
+    found = results(tmp_path, (-2, -2, -2), text=text)
+    assert found.rank_correlation() == (pytest.approx(1.0), 5)
+    head, *rows = table_rows(found)
+    shown = {row[0]: row[head.index("published")] for row in rows}
+    assert (shown["full"], shown["four"]) == ("24.000", "21.500")

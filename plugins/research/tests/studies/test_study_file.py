@@ -1,0 +1,187 @@
+"""What a study may say, and what it is told otherwise: file, line, reason, remedy."""
+
+import json
+import re
+import shutil
+import textwrap
+from contextlib import nullcontext
+from pathlib import Path
+
+import pytest
+from commands import done
+from qgs_research.studies.hypotheses import parsed
+from qgs_research.studies.plan import (
+    composed,
+    evaluation_file,
+    planned,
+    recipe_file,
+    run_of,
+    write_plan,
+)
+from qgs_research.studies.study import read_study
+
+from qgs.contracts import OptionError
+from qgs.recipe import RecipeError, resolve
+
+RECIPES = Path(__file__).parents[4] / "recipes"
+SOUND = f"""study: 1
+base: {RECIPES}/tiny/locus.yaml
+variants:
+  full:
+  flat: {{model: {{decoder: {{cross_attention: {{type: qgs/content}}}}}}}}
+  tokengs: {RECIPES}/tiny/tokengs.yaml
+reference: full
+budget: {{steps: 200}}
+differs: [losses.anchor_visibility]
+hypotheses: [flat < full]
+"""
+
+
+def read(folder, text):
+    (folder / "study.yaml").write_text(text)
+    return read_study(folder / "study.yaml")
+
+
+def cross_attention(recipe):
+    return recipe.tree["model"]["decoder"]["cross_attention"]["type"]
+
+
+def test_a_variant_is_the_base_or_its_own_recipe_with_the_budget(tmp_path):
+    recipes = composed(read(tmp_path, SOUND))
+    types = {n: r.tree["model"]["queries"]["type"] for n, r in recipes.items()}
+    assert types == {"full": "locus/anchored", "flat": "locus/anchored", "tokengs": "qgs/latent"}
+    assert cross_attention(recipes["flat"]) == "qgs/content"
+    for recipe in recipes.values():
+        assert (recipe.training.steps, recipe.training.seconds, recipe.seed) == (200, None, 0)
+    # in batches of 2 with 2 targets
+    for budget, steps, seconds in (("seconds: 30", 20_000, 30.0), ("images: 4001", 1001, None)):
+        training = composed(read(tmp_path, SOUND.replace("steps: 200", budget)))["full"].training
+        assert (training.steps, training.seconds) == (steps, seconds)
+
+
+def test_a_study_extends_another_and_replaces_variants_by_name(tmp_path):
+    read(tmp_path, SOUND)
+    (tmp_path / "small.yaml").write_text(
+        "study: 1\nextends: study.yaml\nvariants: {tokengs: null, flat: {model: {width: 64}}}\n"
+        "overlay: {training: {batch_size: 1}}\nseeds: [7]\ndiffers: []\n"
+    )
+    recipes = composed(read_study(tmp_path / "small.yaml"))
+    assert [*recipes] == ["full", "flat"]
+    assert recipes["flat"].dims.width == 64
+    assert cross_attention(recipes["flat"]) == "locus/ray_biased"
+    assert all(r.training.batch_size == 1 and r.seed == 7 for r in recipes.values())
+
+
+VARIANT = "{model: {decoder: {cross_attention: {type: qgs/content}}}}"
+WRONG = r"""
+reference: full | reference: ful | :7: reference | `full`
+budget: {steps: 200} | budget: {steps: 200, seconds: 3} | :8: budget | got 2
+[flat < full] | [flat < fulll] | :10: hypotheses.0 | `full`
+study: 1\n | study: 1\nsead: [0]\n | :2: sead | `seeds`
+study: 1 | study: true | :1: study | true
+  flat: |   FULL: | :3: variants | `FULL`
+variants:\n | variants:\nMANY | :3: variants | 200
+reference | published: {full: good}\nreference | :7: published.full | number
+qgs/content} | qgs/contents} | :5: variants.flat: model.decoder.cross_attention.type | `qgs/content`
+  full:\n |   full: 3\n | :4: variants.full | number 3
+  tokengs: |   ../up: | :6: variants.../up | letters
+tiny/tokengs.yaml | tiny/tokens.yaml | :6: variants.tokengs | tokens.yaml
+tiny/locus.yaml | tiny/locuss.yaml | :2: base | locuss.yaml
+VARIANT | tiny/locus.yaml | :5: variants.flat | `full`
+VARIANT | {views: {inputs: 3}} | :5: variants.flat | `differs: [views.inputs]`
+differs: [ | differs: [views.inputs,  | differs | `views.inputs`
+differs: [losses.anchor_visibility] |  | :6: variants.tokengs | anchor_visibility]`
+budget: | evaluations: {more: {model: {width: 8}}}\nbudget: | :8: evaluations.more.model | only set
+"""
+"""What is written, what is written instead, where that is told, and a word of it."""
+
+
+def test_what_is_wrong_is_told_with_its_line_before_anything_trains(tmp_path):
+    unlike = {}
+    rows = WRONG.replace("VARIANT", VARIANT).strip("\n").splitlines()
+    many = "".join(f"  v{n}:\n" for n in range(198))
+    for row in rows:
+        written, instead, place, word = row.replace(r"\n", "\n").replace("MANY", many).split(" | ")
+        assert SOUND.count(written) == 1, written
+        with pytest.raises(RecipeError) as caught:
+            composed(read(tmp_path, SOUND.replace(written, instead)))
+        text = str(caught.value)
+        if not (text.startswith("1 problem in the study") and place in text and word in text):
+            unlike[instead] = text
+    assert not unlike
+
+
+def study_with_indices(folder):
+    folder.mkdir()
+    for name in ("2views.json", "3views.json"):
+        shutil.copy(RECIPES / "studies/rooms" / name, folder)
+    overlay = "overlay: {evaluation: {index: 2views.json}}\n"
+    more = "evaluations: {more: {evaluation: {index: 3views.json}}}\n"
+    return read(folder, SOUND + overlay + more)
+
+
+def test_a_study_that_was_moved_knows_its_runs_by_what_the_index_holds(tmp_path):
+    """Wherever the index lies now; another index is refused, also under the old name."""
+    out, old, new = (tmp_path / name for name in ("out", "old", "new"))
+    plan = planned(study_with_indices(old), out)
+    write_plan(plan)
+    for name in plan.evaluations:
+        results = run_of(out, "flat", 0).evaluation(name)
+        results.mkdir(parents=True)
+        index = json.loads((old / f"{3 if name else 2}views.json").read_text())
+        (results / "protocol.json").write_text(json.dumps({"views": {"index": index}}))
+    shutil.rmtree(old)
+    study = study_with_indices(new)
+    write_plan(planned(study, out))
+    assert resolve(recipe_file(out, "flat")).evaluation.index == str(new / "2views.json")
+    assert str(new / "3views.json") in evaluation_file(out, "more").read_text()
+    for file, remedy in (("2views.json", "another --out"), ("3views.json", "`more` another name")):
+        text = (new / file).read_text()
+        index = json.loads(text)
+        index.popitem()
+        (new / file).write_text(json.dumps(index))
+        with pytest.raises(ValueError, match=f"{file}.*{remedy}"):
+            planned(study, out)
+        (new / file).write_text(text)
+
+
+@pytest.mark.parametrize("name", ["2views.json", "3views.json"])
+def test_variants_judged_by_the_same_index_under_two_names_are_alike(tmp_path, name):
+    shutil.copy(RECIPES / "studies/rooms/2views.json", tmp_path / "again.json")
+    ours = f"evaluation: {{index: {RECIPES}/studies/rooms/{name}}}"
+    text = SOUND.replace(VARIANT, VARIANT[:-1] + f", {ours}}}")
+    text = text.replace("  full:\n", f"  full: {{evaluation: {{index: {tmp_path}/again.json}}}}\n")
+    text = re.sub(r"differs: \[loss.*\n|  tokengs:.*\n", "", text)
+    with nullcontext() if name[0] == "2" else pytest.raises(RecipeError, match="index"):
+        composed(read(tmp_path, text))
+
+
+def test_a_metric_that_cannot_be_measured_here_is_refused_before_training(tmp_path):
+    metrics = "{plugins: [lpips], metrics: {lpips: {type: lpips/vgg16}}}"
+    text = SOUND + f"metric: lpips\noverlay: {metrics}\n"
+    with pytest.raises(OptionError, match="lpips"):
+        planned(read(tmp_path, text), tmp_path / "out")
+
+
+def test_hypotheses_are_sums_that_weigh_alike():
+    contrast = parsed("a@noisy - a > b@noisy - b", "ab", ["noisy"])
+    assert contrast.sign == 1
+    assert contrast.terms == {("a", "noisy"): 1, ("a", ""): -1, ("b", "noisy"): -1, ("b", ""): 1}
+    for text in ("a", "a < b < c", "a - b < c", "a < a", "a b < c + c", "a@x < b", "< b"):
+        with pytest.raises(OptionError):
+            parsed(text, "abc", ["noisy"])
+
+
+def test_the_studies_that_are_shown_can_be_copied(tmp_path):
+    """As they are, but for the recipe that docs/studies.md calls the reader's own."""
+    lines = [line.rstrip() for line in done("study", "--help").output.splitlines()]
+    example = re.search(r"^ {5}study: 1\n( {5}.*\n)+", "\n".join(lines), re.MULTILINE)
+    shown = {"help": [textwrap.dedent(example[0])]}
+    (tmp_path / "mine.yaml").write_text("recipe: 1\nextends: tiny/locus.yaml\nmodel: {width: 96}\n")
+    for file in ("plugins/research/src/qgs_research/studies/README.md", "docs/studies.md"):
+        page = (RECIPES.parent / file).read_text()
+        shown[file] = re.findall(r"```\w+\n(study: 1\n.*?)```", page, re.DOTALL)
+    for place, texts in shown.items():
+        assert len(texts) == 1, place
+        plan = planned(read(tmp_path, texts[0]), tmp_path / place)
+        assert len(plan.runs) == 3 * len(plan.recipes) >= 6, place

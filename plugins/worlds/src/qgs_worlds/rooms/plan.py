@@ -1,0 +1,171 @@
+"""The plan of a room: walls, openings, furniture and lights, drawn from a seed."""
+
+import math
+from random import Random
+
+import numpy as np
+
+from qgs_worlds.rooms.furniture import AGAINST_WALLS, CENTRAL, LOOSE, Piece
+from qgs_worlds.rooms.materials import Materials
+from qgs_worlds.rooms.shapes import Room, Shape, box, cylinder
+
+CLEARANCE = 0.4  # metres between a camera and the nearest shape
+_GAP = 0.05  # metres between pieces
+
+Size = tuple[float, float, float]
+Point = tuple[float, float, float]
+# Corners of a piece that fits wherever any does.
+_SMALLEST: tuple[Point, Point] = ((-0.15, -0.15, 0.0), (0.15, 0.15, 0.3))
+
+
+def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
+    """A room of `size` whose furniture leaves the camera centres `eyes` (F, 3) free."""
+    m = Materials(rng)
+    wall = m.wall()
+    walls = [wall] + [m.wall() if rng.random() < 0.4 else wall for _ in range(3)]
+    surfaces = [*walls, m.floor(), m.pale()]
+    furnisher = Furnisher(size, eyes)
+    _centre(rng, m, furnisher)
+    for side in range(4):
+        _against_wall(rng, m, furnisher, side)
+    for _ in range(3):
+        maker = rng.choice(LOOSE)
+        x, y = (rng.uniform(-0.4, 0.4) * extent for extent in size[:2])
+        furnisher.place(maker(rng, m), x, y, rng.uniform(0, 2 * math.pi))
+    window_side = rng.randrange(4)
+    shapes = furnisher.shapes + _on_walls(rng, m, size, window_side) + _fixed(rng, m, size)
+    head = [m.rows[i] for i in surfaces]
+    rows = np.array([(*shape.row()[:9], shape.texture + 6) for shape in shapes], np.float32)
+    return Room(rows, np.array(head + m.rows), size, _lights(rng, size, window_side))
+
+
+class Furnisher:
+    """Places pieces one by one where they hit neither each other nor the cameras."""
+
+    def __init__(self, size: Size, eyes: np.ndarray) -> None:
+        self.size, self.eyes = size, eyes.tolist()
+        self.shapes: list[Shape] = []
+        self._taken: list[tuple[float, float, float, float]] = []
+
+    def place(self, piece: Piece, x: float, y: float, turn: float) -> bool:
+        """Put `piece` at (x, y), turned; False, and nothing is placed, where it does not fit."""
+        low, high = turned(*bounds(piece), x, y, turn)
+        if not self.free(low, high):
+            return False
+        self._taken.append((low[0], low[1], high[0], high[1]))
+        self.shapes += [shape.moved(x, y, turn) for shape in piece]
+        return True
+
+    def free(self, low: Point, high: Point) -> bool:
+        """Whether the box between two corners is in the room, off other pieces and the cameras."""
+        half_x, half_y = self.size[0] / 2, self.size[1] / 2
+        if low[0] < -half_x or high[0] > half_x or low[1] < -half_y or high[1] > half_y:
+            return False
+        for x0, y0, x1, y1 in self._taken:
+            beside_x = low[0] >= x1 + _GAP or high[0] <= x0 - _GAP
+            if not (beside_x or low[1] >= y1 + _GAP or high[1] <= y0 - _GAP):
+                return False
+        for x, y, z in self.eyes:
+            apart = zip(low, (x, y, z), high, strict=True)
+            dx, dy, dz = (max(start - eye, eye - end, 0.0) for start, eye, end in apart)
+            if dx * dx + dy * dy + dz * dz <= CLEARANCE**2:
+                return False
+        return True
+
+
+def bounds(shapes: list[Shape]) -> tuple[Point, Point]:
+    """Lowest and highest corner of the box around `shapes`."""
+    corners = [shape.bounds() for shape in shapes]
+    x0, y0, z0, x1, y1, z1 = zip(*corners, strict=True)
+    return (min(x0), min(y0), min(z0)), (max(x1), max(y1), max(z1))
+
+
+def turned(low: Point, high: Point, x: float, y: float, turn: float) -> tuple[Point, Point]:
+    """Corners of a box that holds the given one after it was turned about z and moved."""
+    cos, sin = math.cos(turn), math.sin(turn)
+    xs = [x + cos * a - sin * b for a in (low[0], high[0]) for b in (low[1], high[1])]
+    ys = [y + sin * a + cos * b for a in (low[0], high[0]) for b in (low[1], high[1])]
+    return (min(xs), min(ys), low[2]), (max(xs), max(ys), high[2])
+
+
+def _centre(rng: Random, m: Materials, furnisher: Furnisher) -> None:
+    maker = rng.choice(CENTRAL)
+    turn = float(rng.randrange(4)) * math.pi / 2 + rng.gauss(0, 0.12)
+    piece = maker(rng, m)
+    for _ in range(4):
+        x, y = (rng.uniform(-0.18, 0.18) * extent for extent in furnisher.size[:2])
+        if furnisher.place(piece, x, y, turn):
+            return
+
+
+def _against_wall(rng: Random, m: Materials, furnisher: Furnisher, side: int) -> None:
+    """Pieces in a row along one wall, backs to it. Side 0 is -x, 1 is -y, 2 is +x, 3 is +y."""
+    across, along = furnisher.size[side % 2], furnisher.size[1 - side % 2]
+    turn = math.pi / 2 + side * math.pi / 2
+    position = -along / 2 + rng.uniform(0.1, 0.6)
+    while position < along / 2 - 0.4:
+        spot = turned(*_SMALLEST, *_from_wall(side, across / 2 - 0.2, position + 0.2), turn)
+        if furnisher.free(*spot):
+            piece = rng.choice(AGAINST_WALLS)(rng, m)
+            low, high = bounds(piece)
+            at = _from_wall(side, across / 2 - float(high[1]) - 0.02, position - float(low[0]))
+            if furnisher.place(piece, *at, turn):
+                position += float(high[0] - low[0])
+        position += rng.uniform(0.1, 0.5)
+
+
+def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
+    """The point `away` from the centre towards wall `side`, `along` it."""
+    angle = math.pi + side * math.pi / 2
+    cos, sin = math.cos(angle), math.sin(angle)
+    return cos * away + sin * along, sin * away - cos * along
+
+
+def _on_walls(rng: Random, m: Materials, size: Size, window_side: int) -> list[Shape]:
+    """A window on one wall, pictures on the others."""
+    shapes: list[Shape] = []
+    for side in range(4):
+        across, along = size[side % 2], size[1 - side % 2]
+        turn = math.pi / 2 + side * math.pi / 2
+        if side == window_side:
+            hung = _framed(m.pale(), m.window(), rng.uniform(1.2, 2.0), 1.25, 0.95, 0.07)
+            places = [rng.uniform(-0.15, 0.15) * along]
+        else:
+            places = [along * (rng.uniform(-0.06, 0.06) + k) for k in (-0.27, 0.0, 0.27)]
+            places = [place for place in places if rng.random() < 0.65]
+            hung = []
+        for place in places:
+            width, height = [rng.uniform(0.4, 0.75) for _ in range(2)]
+            item = hung or _framed(m.timber(), m.picture(), width, height, 1.45, 0.05)
+            x, y = _from_wall(side, across / 2, place)
+            shapes += [shape.moved(x, y, turn) for shape in item]
+    return shapes
+
+
+def _framed(
+    frame: int, inner: int, width: float, height: float, bottom: float, border: float
+) -> list[Shape]:
+    return [
+        box(0, 0, bottom, (width, 0.06, height), frame),
+        box(0, 0, bottom + border, (width - 2 * border, 0.08, height - 2 * border), inner),
+    ]
+
+
+def _fixed(rng: Random, m: Materials, size: Size) -> list[Shape]:
+    """The rug, the skirting boards and the ceiling lamp."""
+    board = m.pale()
+    w, d, h = size
+    shapes = [box(0, side * d / 2, 0, (w, 0.04, 0.09), board) for side in (-1, 1)]
+    shapes += [box(side * w / 2, 0, 0, (0.04, d, 0.09), board) for side in (-1, 1)]
+    shapes.append(cylinder(0, 0, h - 0.12, 0.25, 0.12, m.glow()))
+    if rng.random() < 0.75:
+        rug = box(0, 0, 0, (rng.uniform(0.35, 0.6) * w, rng.uniform(0.35, 0.6) * d, 0.012), m.rug())
+        x, y = [rng.uniform(-0.3, 0.3) for _ in range(2)]
+        shapes.append(rug.moved(x, y, rng.gauss(0, 0.1)))
+    return shapes
+
+
+def _lights(rng: Random, size: Size, window_side: int) -> np.ndarray:
+    x, y = _from_wall(window_side, size[window_side % 2] / 2 - 0.1, 0.0)
+    lamp = (0.0, 0.0, size[2] - 0.2, rng.uniform(0.55, 0.95))
+    return np.array([lamp, (x, y, 1.6, rng.uniform(0.45, 1.2))])

@@ -1,0 +1,32 @@
+import numpy as np
+import pytest
+from qgs_worlds.rooms.casting import cast_depths
+from qgs_worlds.rooms.intersections import hit
+from qgs_worlds.rooms.shapes import TEXTURE_FIELDS, Room, box, cylinder, sphere
+
+
+def hits(shape, x, y):
+    """How far along the x axis a ray from (x, y, 1) meets a shape."""
+    origin, forward = (tuple(map(np.float32, place)) for place in ((x, y, 1), (1, 0, 0)))
+    return hit(np.array([shape.row()], np.float32), 0, origin, forward)
+
+
+def test_hits_are_where_geometry_puts_them():
+    block = box(5, 0, 0, (2, 2, 2), 0)
+    round_ = sphere(5, 0, 0, 1.0, 0), cylinder(5, 0, 0, 1.0, 2.0, 0)
+    for shape in (block, *round_):
+        assert hits(shape, 0, 0) == pytest.approx(4)
+        assert np.isinf([hits(shape, 0, 1.2), hits(shape, 9, 0)]).all()
+    for shape in round_:
+        assert hits(shape, 0, 0.5) == pytest.approx(5 - np.sqrt(0.75))
+    turned = box(0, 0, 0, (2, 2, 2), 0).moved(5, 0, np.pi / 4)
+    assert hits(turned, 0, 0) == pytest.approx(5 - np.sqrt(2))  # its corner
+
+
+def test_depth_is_z_along_the_camera():
+    c2w = np.eye(4)
+    c2w[:3] = [0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1]
+    shapes = np.array([box(1.75, 0, 0.9, (0.5, 0.2, 0.2), 0).row()], np.float32)
+    room = Room(shapes, np.zeros((6, TEXTURE_FIELDS)), (8.0, 40.0, 40.0), np.zeros((2, 4)))
+    (depth,) = cast_depths(room, c2w[None], np.array([20.0, 20.0, 10.5, 10.5]), (21, 21))
+    assert depth[[10, 4, 4], [10, 3, 17]] == pytest.approx([1.5, 4, 4])

@@ -1,0 +1,70 @@
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from qgs_viewer.curves import curves_of
+from qgs_worlds.rooms.source import RoomsSource
+
+from qgs.checkpoint.models import checkpoint_path
+from qgs.data.samples import mirrored_views
+from qgs.geometry.rays import pixel_directions
+from qgs.geometry.transforms import to_camera, to_pixels
+from qgs.types import Views
+
+
+def scenes(size=(16, 24)):
+    return RoomsSource(RoomsSource.Config(image_size=size)).scenes("train")
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_colours_reproject_through_depth(mirror):
+    """Where depth says that two cameras see one point."""
+    scene, frames, size = scenes((96, 96))[1], [2, 4], (96, 96)
+    views, depths = (
+        Views(scene.images(frames)[None], scene.cameras[frames][None]),
+        scene.depths(frames),
+    )
+    assert depths.min() > 0  # a room is closed
+    if mirror:
+        views, depths = mirrored_views(views), depths.flip(-1)
+    (first, second), (one, other) = views.images[0], views.cameras[0].intrinsics
+    points = (pixel_directions(one, size) * depths[0, 0, ..., None]).flatten(0, 1)
+    c2w = views.cameras.c2w[0, 0]
+    local = to_camera((points @ c2w[:3, :3].T + c2w[:3, 3])[None], views.cameras)[0, 1]
+    grid = (to_pixels(local, other) / 48 - 1).view(1, *size, 2)
+    *seen, depth = F.grid_sample(torch.cat([second, depths[1]])[None], grid, align_corners=False)[0]
+    z = local[:, 2].view(size)
+    agrees = (grid[0].abs() < 0.95).all(-1) & (z > 0) & ((depth - z).abs() < 0.02)
+    assert agrees.float().mean() > 0.3
+    aligned, unaligned = (
+        (colours - first).abs().mean(0)[agrees].mean() for colours in (torch.stack(seen), second)
+    )
+    assert aligned < 0.05
+    assert aligned < 0.5 * unaligned
+
+
+def distances(shapes, eyes):
+    """Metres (F, S) from points to the boxes around shapes, 0 inside."""
+    offset = eyes[:, None] - shapes[None, :, 1:4]
+    cos, sin = shapes[:, 7], shapes[:, 8]
+    along = cos * offset[..., 0] + sin * offset[..., 1]
+    across = cos * offset[..., 1] - sin * offset[..., 0]
+    local = np.stack([along, across, offset[..., 2]], -1)
+    return np.linalg.norm(np.maximum(np.abs(local) - shapes[:, 4:7], 0), axis=-1)
+
+
+def test_cameras_are_rigid_and_keep_clear_of_every_surface():
+    for scene in scenes()[:40]:
+        turn, eyes = scene.cameras.c2w[:, :3, :3], scene.cameras.c2w[:, :3, 3]
+        assert (turn @ turn.mT - torch.eye(3)).abs().max() < 1e-5
+        assert torch.linalg.det(turn).min() > 0.99
+        assert turn[:, 2, 1].max() < 0  # the image's y axis points down
+        assert (torch.tensor(scene.size[:2]) / 2 - eyes[:, :2].abs()).min() > 0.2
+        assert distances(scene.room.shapes, eyes.numpy()).min() > 0.2
+
+
+@pytest.mark.parametrize("name", ["locus-64", "tokengs-64"])
+def test_models_come_with_their_training_curves(name):
+    curves = curves_of(checkpoint_path(f"rooms/{name}"))
+    assert list(curves.steps) == list(range(100, 40_001, 100))
+    assert curves.psnr[0] + 5 < curves.psnr[-1]

@@ -1,0 +1,1 @@
+"""Other published systems, one package each."""

@@ -1,0 +1,158 @@
+"""DINOv2's vision transformer (Oquab et al., arXiv 2304.07193) under the names of its weights.
+
+No register tokens, no mask token, MLPs with GELU: ViT-S, B and L with patches of 14. Written from
+facts of facebookresearch/dinov2 (Apache-2.0), without its code.
+"""
+
+import math
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from pydantic import Field, ValidationInfo, field_validator
+from torch import Tensor, nn
+
+from qgs.contracts import ComponentConfig, OptionError
+from qgs.tokengs.blocks import LayerScale, Mlp, merge_heads, split_heads
+
+PATCH = 14
+"""Side of a patch, pixels."""
+GRID = 37
+"""Patches a side of the images that the positions were trained on, 518 x 518."""
+EPS = 1e-6
+"""Added to the variance by every LayerNorm."""
+SHIFT = 0.1
+"""Added to the number of patches a side before positions are resized (DINOv2 release)."""
+
+
+class VitConfig(ComponentConfig):
+    """Sizes of the transformer: ViT-S by default."""
+
+    width: int = Field(default=384, ge=1)
+    """384 for ViT-S, 768 for ViT-B, 1024 for ViT-L."""
+    depth: int = Field(default=12, ge=1, le=256)
+    """Number of blocks: 12, or 24 for ViT-L."""
+    heads: int = Field(default=6, ge=1)
+    """Attention heads: 6, 12 or 16, each of 64 channels."""
+    weights: str | None = None
+    """File of pretrained weights, .safetensors, .pth or .pt; null starts from random numbers."""
+
+    @field_validator("heads")
+    @classmethod
+    def _heads_divide_the_width(cls, heads: int, info: ValidationInfo) -> int:
+        width = info.data.get("width", heads)
+        if width % heads:
+            raise OptionError(
+                f"{heads} heads do not divide a width of {width}", f"write {math.gcd(heads, width)}"
+            )
+        return heads
+
+
+class Attention(nn.Module):
+    """Multi-head self-attention with fused qkv: (X, T, C) -> (X, T, C)."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(width, 3 * width)
+        self.proj = nn.Linear(width, width)
+
+    def forward(self, x_XTC: Tensor) -> Tensor:
+        parts = self.qkv(x_XTC).chunk(3, -1)
+        q_XhTd, k_XhTd, v_XhTd = (split_heads(part, self.heads) for part in parts)
+        return self.proj(merge_heads(F.scaled_dot_product_attention(q_XhTd, k_XhTd, v_XhTd)))
+
+
+class Block(nn.Module):
+    """Pre-norm attention and MLP, each with LayerScale."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(width, EPS)
+        self.attn = Attention(width, heads)
+        self.ls1 = LayerScale(width, 1.0)
+        self.norm2 = nn.LayerNorm(width, EPS)
+        self.mlp = Mlp(width, 4 * width, width)
+        self.ls2 = LayerScale(width, 1.0)
+
+    def forward(self, x_XTC: Tensor) -> Tensor:
+        x_XTC = x_XTC + self.ls1(self.attn(self.norm1(x_XTC)))
+        return x_XTC + self.ls2(self.mlp(self.norm2(x_XTC)))
+
+
+class PatchEmbed(nn.Module):
+    """14 x 14 convolution with stride 14: (X, 3, 14 h, 14 w) -> (X, h w, C)."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.proj = nn.Conv2d(3, width, PATCH, PATCH)
+
+    def forward(self, images_X3HW: Tensor) -> Tensor:
+        return self.proj(images_X3HW).flatten(2).mT
+
+
+class DinoV2(nn.Module):
+    """Images (X, 3, 14 h, 14 w), normalised by ImageNet's statistics, to tokens of their patches.
+
+    X counts images: none sees another.
+    """
+
+    def __init__(self, width: int, depth: int, heads: int) -> None:
+        super().__init__()
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
+        self.pos_embed = nn.Parameter(torch.zeros(1, 1 + GRID**2, width))
+        self.patch_embed = PatchEmbed(width)
+        self.blocks = nn.ModuleList(Block(width, heads) for _ in range(depth))
+        self.norm = nn.LayerNorm(width, EPS)
+        nn.init.normal_(self.cls_token, std=1e-6)
+        nn.init.trunc_normal_(self.pos_embed, std=0.02)
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                nn.init.trunc_normal_(module.weight, std=0.02)
+                nn.init.zeros_(module.bias)
+
+    def forward(self, images: Tensor, blocks: Collection[int]) -> list[Tensor]:
+        """Tokens (X, h w, C) after each of the `blocks` (0 is the first), after the last norm.
+
+        Every map passes the norm that training put behind the last block (DINOv2 release). Blocks
+        behind the last one of `blocks` are not run.
+        """
+        grid = images.shape[-2] // PATCH, images.shape[-1] // PATCH
+        x_XPC = self.patch_embed(images)
+        x_XTC = torch.cat([self.cls_token.expand(len(images), -1, -1), x_XPC], 1)
+        x_XTC = x_XTC + self.positions(*grid)
+        found = []
+        for index, block in enumerate(self.blocks[: max(blocks) + 1]):
+            x_XTC = block(x_XTC)
+            if index in blocks:
+                found.append(self.norm(x_XTC)[:, 1:])  # without the class token
+        return found
+
+    def positions(self, rows: int, columns: int) -> Tensor:
+        """Embeddings (1, 1 + rows*columns, C), class token first, of a grid of another size."""
+        if rows == columns == GRID:
+            return self.pos_embed
+        own_1PC = self.pos_embed[:, 1:]
+        map_1CGG = rearrange(own_1PC.float(), "x (g k) c -> x c g k", g=GRID)
+        # The release gives the factor, not the size: source coordinates step by 37 / (n + 0.1),
+        # and pretrained weights expect positions that are off by that much.
+        factor = ((rows + SHIFT) / GRID, (columns + SHIFT) / GRID)
+        resized_1Chw = F.interpolate(map_1CGG, scale_factor=factor, mode="bicubic")
+        resized_1PC = resized_1Chw.flatten(2).mT.to(own_1PC.dtype)
+        return torch.cat([self.pos_embed[:, :1], resized_1PC], 1)
+
+    def load_published(self, weights: Mapping[str, Tensor]) -> None:
+        """Copy the hub's state dict, or one in which its names follow a prefix.
+
+        `pretrained.` is that of Depth Anything V2; other tensors of the file are not read. Raises
+        ValueError for a file without these names, RuntimeError for other shapes.
+        """
+        own = self.state_dict()
+        mark = "patch_embed.proj.weight"
+        prefix = next((n.removesuffix(mark) for n in weights if n.endswith(mark)), None)
+        if prefix is None:
+            raise ValueError(f"there is no {mark}")
+        found: dict[str, Any] = {n: weights[prefix + n] for n in own if prefix + n in weights}
+        self.load_state_dict(found)

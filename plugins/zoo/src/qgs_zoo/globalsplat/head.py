@@ -1,0 +1,219 @@
+"""`globalsplat/merging_head`: from two streams to Gaussians, candidates merged by gates.
+
+Axes: B scenes, N tokens, C candidates of a token, G Gaussians of a token.
+"""
+
+import math
+from collections.abc import Iterable
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.contracts import (
+    GAUSSIAN_FIELDS,
+    ComponentConfig,
+    Fields,
+    Head,
+    ModelDims,
+    Problem,
+    RecipeContext,
+)
+from qgs.geometry.constants import constant
+from qgs.geometry.harmonics import SH_C0
+from qgs.geometry.precision import full_precision
+from qgs.types import GaussianAttributes, QueryState
+from qgs_zoo.globalsplat.streams import TEXTURE, TEXTURE_FIELD
+
+CHANNELS = (3, 3, 6, 1)
+"""Of geometry, per candidate: position, log scale, rotation, opacity; then the gate."""
+
+
+class MergingHead(Head):
+    """Candidates of every token, whose blocks a softmax gate merges into K = 2^level Gaussians.
+
+    Geometry decodes position, log scale, 6D rotation, opacity and gate; texture the coefficients of
+    spherical harmonics. Blocks are averaged: positions, rotations, coefficients, log scales, to
+    which log(size of the block) / 3 is added, and logs of transmittance, which opacities are.
+    Between two whole levels both are shown, with logs of transmittance scaled by their shares.
+    """
+
+    name = "merging_head"
+    reads = TEXTURE_FIELD
+    scheduled = frozenset({"level"})
+
+    class Config(ComponentConfig):
+        candidates: int = Field(default=16, ge=1)
+        """Candidates of each token, a power of two."""
+        level: float = Field(default=3.0, ge=0)
+        """s: each token gives 2^s Gaussians; between whole numbers, those of both neighbours."""
+        sh_degree: int = Field(default=3, ge=0, le=3)
+        """Degree of the spherical harmonics; 0 for colours that are the same from anywhere."""
+        init_std: float = Field(default=0.02, gt=0)
+        """Standard deviation of the truncated normal that the weights start from."""
+        position_std: float | None = Field(default=None, gt=0)
+        """The same for the weights that make positions; null for `init_std`."""
+        scale_bias: float = -2.0
+        """Added to raw log scales."""
+        scale_min: float = Field(default=1e-4, gt=0)
+        """Scales of candidates are at least 1/e of it, world units."""
+        scale_max: float = Field(default=0.05, gt=0)
+        """Scales of candidates are at most e^2 times it, world units."""
+        opacity_bias: float = -5.0
+        """Added to the opacity logits."""
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.coefficients = (config.sh_degree + 1) ** 2
+        self.geometry_norm = nn.LayerNorm(dims.width)
+        self.geometry = nn.Linear(dims.width, config.candidates * (sum(CHANNELS) + 1))
+        self.texture_norm = nn.LayerNorm(dims.width)
+        self.texture = nn.Linear(dims.width, config.candidates * self.coefficients * 3)
+        for linear in (self.geometry, self.texture):
+            nn.init.zeros_(linear.bias)
+            nn.init.trunc_normal_(linear.weight, std=config.init_std)
+        if config.position_std is not None:
+            rows_C3D = torch.empty(config.candidates, CHANNELS[0], dims.width)
+            nn.init.trunc_normal_(rows_C3D, std=config.position_std)
+            with torch.no_grad():
+                self.geometry.weight.unflatten(0, (config.candidates, -1))[:, :3] = rows_C3D
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        most = round(math.log2(config.candidates))
+        if 2**most != config.candidates:
+            reason = f"must be a power of two, got {config.candidates}"
+            yield Problem("candidates", reason, f"write {2**most}")
+        if config.level > most:
+            reason = f"2^{config.level:g} Gaussians cannot be merged of {config.candidates}"
+            yield Problem("level", reason, f"write at most {most}, or raise `candidates`")
+        if config.scale_min >= config.scale_max:
+            reason = f"it is not below `scale_max`, {config.scale_max:g}"
+            yield Problem("scale_min", reason, "write a smaller one")
+
+    @classmethod
+    def fields_written(cls, config: Config) -> Fields:
+        """Harmonics, unless their degree is 0."""
+        sh = "gaussians.sh"
+        return {sh: GAUSSIAN_FIELDS[sh]} if config.sh_degree else {}
+
+    @property
+    def gaussians_per_query(self) -> int:
+        """K at the present level; during a blend that of both its levels."""
+        return sum(count for count, _ in stages(self.config.level))
+
+    def forward(self, state: QueryState) -> GaussianAttributes:
+        """Candidates, merged, and what they are of Gaussians."""
+        each = (self.config.candidates, -1)
+        geometry = self.geometry(self.geometry_norm(state.features)).unflatten(-1, each)
+        texture = self.texture(self.texture_norm(state[TEXTURE])).unflatten(-1, each)
+        return self.activate(geometry, texture)
+
+    @full_precision
+    def activate(self, geometry: Tensor, texture: Tensor) -> GaussianAttributes:
+        """Raw channels (B, N, C, 14) and (B, N, C, 48) to attributes, in float32 or better."""
+        gates = geometry[..., -1]
+        candidates = torch.cat([self.bounded(geometry[..., :-1]), texture], -1)
+        parts = []
+        for count, share in stages(self.config.level):
+            x = merged(candidates, gates, count)
+            *place, log_scale, rotation, clear, texture = x.split(
+                (*CHANNELS, texture.shape[-1]), -1
+            )
+            log_scale = log_scale + growth(self.config.candidates, count)
+            parts.append(torch.cat([*place, log_scale, rotation, share * clear, texture], -1))
+        return self._attributes(torch.cat(parts, 2))
+
+    def bounded(self, raw: Tensor) -> Tensor:
+        """Raw candidates (..., 13), with what is merged: log scales and logs of transmittance."""
+        place, log_scale, rotation, opacity = raw.split(CHANNELS, -1)
+        config = self.config
+        low, high = math.log(config.scale_min) - 1, math.log(config.scale_max) + 2
+        log_scale = (log_scale + config.scale_bias).clamp(low, high)
+        # Zeros would be no rotation; this starts every candidate at the identity.
+        rotation = rotation + constant([1, 0, 0, 0, 1, 0], rotation)
+        # Logs of transmittance add up where Gaussians overlap; opacities do not.
+        clear = -F.softplus(opacity + config.opacity_bias)
+        return torch.cat([place, log_scale, rotation, clear], -1)
+
+    def _attributes(self, x_BNKX: Tensor) -> GaussianAttributes:
+        """Of merged candidates."""
+        offsets, log_scale, rotation, clear, texture = x_BNKX.split(
+            (*CHANNELS, 3 * self.coefficients), -1
+        )
+        sh_BNKC3 = texture.unflatten(-1, (self.coefficients, 3))
+        return GaussianAttributes(
+            offsets=offsets,
+            scales=log_scale.exp(),
+            quats=rotation_6d(rotation),
+            opacities=-torch.expm1(clear[..., 0]),
+            colors=0.5 + SH_C0 * sh_BNKC3[..., 0, :],
+            sh=sh_BNKC3[..., 1:, :] if self.config.sh_degree else None,
+        )
+
+
+LEAST_LENGTH = 1e-4
+"""What a vector is divided by at least when it is made a unit one."""
+
+
+@full_precision
+def merged(candidates: Tensor, gates: Tensor, count: int) -> Tensor:
+    """Blocks of C / count candidates, averaged by the softmax of their gates.
+
+    candidates: (..., C, X). gates: (..., C). Returns (..., count, X).
+    """
+    weights = gates.unflatten(-1, (count, -1)).softmax(-1)
+    return (weights[..., None] * candidates.unflatten(-2, (count, -1))).sum(-2)
+
+
+def growth(candidates: int, count: int) -> float:
+    """Added to the log scales of `count` Gaussians merged of `candidates`: they fill one volume."""
+    return math.log(candidates / count) / 3
+
+
+def stages(level: float) -> list[tuple[int, float]]:
+    """Numbers of Gaussians that are shown at s = `level`, and the share of each.
+
+    2^s with the share 1 for a whole s; else those of both neighbours, blended.
+    """
+    low = math.floor(level)
+    share = level - low
+    return [(2**low, 1 - share), (2 ** (low + 1), share)] if share else [(2**low, 1.0)]
+
+
+@full_precision
+def rotation_6d(vectors: Tensor) -> Tensor:
+    """Unit quaternions (..., 4), w x y z, of the rotations whose first two columns are nearest.
+
+    vectors: (..., 6), two columns, orthonormalised in their order (Zhou et al. 2019). Where they do
+    not tell a rotation (zeros, parallel ones) the quaternion is a unit one still.
+    """
+    first, second = vectors.split(3, -1)
+    first = F.normalize(first, dim=-1, eps=LEAST_LENGTH)
+    second = second - (first * second).sum(-1, keepdim=True) * first
+    second = F.normalize(second, dim=-1, eps=LEAST_LENGTH)
+    third = torch.linalg.cross(first, second, dim=-1)
+    return quaternions(torch.stack([first, second, third], -1))
+
+
+@full_precision
+def quaternions(matrices: Tensor) -> Tensor:
+    """Unit quaternions (..., 4), w x y z, of rotation matrices (..., 3, 3).
+
+    With q the quaternion, 4 q q' is linear in the matrix; its longest row is taken, so that none is
+    divided by a small number.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrices.unbind(-2))
+    outer = [
+        1 + a + e + i, h - f, c - g, d - b,
+        h - f, 1 + a - e - i, d + b, c + g,
+        c - g, d + b, 1 - a + e - i, h + f,
+        d - b, c + g, h + f, 1 - a - e + i,
+    ]  # fmt: skip
+    rows = torch.stack(outer, -1).unflatten(-1, (4, 4))
+    longest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None]
+    row = rows.gather(-2, longest.expand(*longest.shape[:-1], 4)).squeeze(-2)
+    return F.normalize(row, dim=-1)

@@ -1,0 +1,163 @@
+"""`globalsplat/slots`, `globalsplat/round`: tokens as two streams, geometry and texture, which read
+the photos and are then mixed."""
+
+from collections.abc import Iterable
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.contracts import (
+    ComponentConfig,
+    DecoderLayer,
+    Fields,
+    FieldSpec,
+    LayerParts,
+    LearnedQueries,
+    ModelDims,
+    Problem,
+    RecipeContext,
+)
+from qgs.geometry.precision import at_least_float32
+from qgs.tokengs import NORM_EPS, CrossAttentionCore, LayerScale, Mlp
+from qgs.tokengs.encoder import EncoderBlock, keys_and_values
+from qgs.types import ImageMemory, QueryState
+
+TEXTURE = "globalsplat.texture"
+"""State field (B, N, D): the stream of texture; that of geometry are the features."""
+
+TEXTURE_FIELD: Fields = {TEXTURE: FieldSpec(("D",))}
+
+
+class SlotQueries(LearnedQueries):
+    """N learned tokens; the last `extra` decode no Gaussians, the mask leaves them out.
+
+    Geometry = Linear(LayerNorm(token)), texture = another Linear(LayerNorm(token)).
+    """
+
+    name = "slots"
+    writes = TEXTURE_FIELD
+
+    class Config(ComponentConfig):
+        """Defaults are GlobalSplat's."""
+
+        count: int = Field(default=2057, ge=1)
+        """N, the number of all tokens."""
+        extra: int = Field(default=9, ge=0)
+        """Tokens among them that decode no Gaussians (4 auxiliary, 1 of scale, 4 registers)."""
+        std: float = Field(default=0.02, gt=0)
+        """Standard deviation of the normal distribution that the tokens start from."""
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        width = dims.width
+        self.slots = nn.Parameter(torch.randn(config.count - config.extra, width) * config.std)
+        extra = torch.randn(config.extra, width) * config.std
+        self.extra = nn.Parameter(extra) if config.extra else None
+        self.geometry = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width))
+        self.texture = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width))
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """No token that decodes Gaussians."""
+        if config.extra >= config.count:
+            reason = f"all {config.count} tokens are extra ones, which decode no Gaussians"
+            yield Problem("extra", reason, f"write at most {config.count - 1}, or raise `count`")
+
+    def start(self, batch_size: int) -> QueryState:
+        """The two streams of all tokens, the same in every scene."""
+        tokens_ND = self.slots if self.extra is None else torch.cat([self.slots, self.extra])
+        streams = (self.geometry(tokens_ND), at_least_float32(self.texture(tokens_ND)))
+        geometry_BND, texture_BND = (x.expand(batch_size, -1, -1) for x in streams)
+        return QueryState(
+            features=geometry_BND, fields={TEXTURE: texture_BND}, mask=self._mask(batch_size)
+        )
+
+    def _mask(self, batch_size: int) -> Tensor | None:
+        if self.extra is None:
+            return None
+        places = torch.arange(self.config.count, device=self.slots.device)
+        return (places < len(self.slots)).expand(batch_size, -1)
+
+
+class Round(DecoderLayer):
+    """Each stream: cross-attention, MLP, ViT blocks over the tokens; then a mixer of both.
+
+    `decoder.layer_scale` is that of cross-attention, MLP and mixer (GlobalSplat: 1e-3). Tokens that
+    the mask leaves out decode no Gaussians, but all tokens read them: they are registers.
+    """
+
+    name = "round"
+    writes = TEXTURE_FIELD
+
+    class Config(ComponentConfig):
+        """Defaults are GlobalSplat's."""
+
+        memory_width: int | None = Field(default=None, ge=1)
+        """Width of the image memory's features where the encoder has one of its own (of
+        globalsplat/patches, rgb_width + ray_width); null for features of the model's width."""
+        blocks: int = Field(default=2, ge=0)
+        """ViT blocks of each stream."""
+        block_layer_scale: float = Field(default=0.01, gt=0)
+        """Initial value of every LayerScale factor of the ViT blocks."""
+        mlp_ratio: float = Field(default=4.0, ge=1)
+        """Hidden width (rounded down) of the streams' MLPs over the model's width."""
+
+    def __init__(self, config: Config, parts: LayerParts) -> None:
+        super().__init__(config, parts)
+        dims, layer_scale = parts.dims, parts.layer_scale
+        self.geometry = Stream(config, dims, layer_scale)
+        self.texture = Stream(config, dims, layer_scale)
+        self.geometry_norm = nn.LayerNorm(dims.width)
+        self.texture_norm = nn.LayerNorm(dims.width)
+        self.mixer = Mlp(2 * dims.width, dims.width, 2 * dims.width)
+        self.mixer_scale = LayerScale(2 * dims.width, layer_scale)
+
+    @classmethod
+    def fields_read(cls, config: Config) -> Fields:
+        """Features of the memory, as wide as the options say, and the stream of texture."""
+        return {"memory.features": FieldSpec((config.memory_width or "D",)), **TEXTURE_FIELD}
+
+    def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
+        """One round; the memory is passed on."""
+        geometry_BND = self.geometry(state.features, memory.features)
+        texture_BND = self.texture(state[TEXTURE], memory.features)
+        both = [self.geometry_norm(geometry_BND), self.texture_norm(texture_BND)]
+        update = self.mixer_scale(self.mixer(torch.cat(both, -1)))
+        to_geometry_BND, to_texture_BND = update.chunk(2, -1)
+        fields = {TEXTURE: texture_BND + to_texture_BND}
+        return state.replace(features=geometry_BND + to_geometry_BND, fields=fields), memory
+
+
+class Stream(nn.Module):
+    """(x (B, N, D), memory (B, M, C)) -> x: pre-norm, each update scaled and added."""
+
+    unlearned = ("k_norm.bias",)  # adds the same to all logits of a query
+
+    def __init__(self, config: Round.Config, dims: ModelDims, layer_scale: float) -> None:
+        super().__init__()
+        width, memory_width = dims.width, config.memory_width or dims.width
+        self.memory_norm = nn.LayerNorm(memory_width)
+        self.kv_proj = nn.Linear(memory_width, 2 * width)
+        self.k_norm = nn.LayerNorm(width // dims.heads)
+        self.cross_attention = CrossAttentionCore(width, dims.heads)
+        self.cross_scale = LayerScale(width, layer_scale)
+        self.norm = nn.LayerNorm(width)
+        self.mlp = Mlp(width, int(config.mlp_ratio * width), width)
+        self.mlp_scale = LayerScale(width, layer_scale)
+        scale = config.block_layer_scale
+        self.blocks = nn.ModuleList(
+            EncoderBlock(width, dims.heads, config.mlp_ratio, scale, NORM_EPS)
+            for _ in range(config.blocks)
+        )
+
+    def forward(self, x_BND: Tensor, memory_BMC: Tensor) -> Tensor:
+        """The stream after its reading, its MLP and its blocks."""
+        keys, values = keys_and_values(self.memory_norm(memory_BMC), self.kv_proj, self.k_norm)
+        x_BND = x_BND + self.cross_scale(self.cross_attention(x_BND, keys, values))
+        x_BND = x_BND + self.mlp_scale(self.mlp(self.norm(x_BND)))
+        for block in self.blocks:
+            x_BND = block(x_BND)
+        return x_BND

@@ -1,0 +1,202 @@
+"""`gslrm/pixels`, `gslrm/pixel_head`, `gslrm/along_rays`: a query for each image token, Gaussians
+of its pixels, means along their rays."""
+
+from collections.abc import Iterable
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange, repeat
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.contracts import (
+    Centers,
+    ComponentConfig,
+    Fields,
+    FieldSpec,
+    Head,
+    ModelDims,
+    Problem,
+    Queries,
+    RecipeContext,
+    memory_fields,
+)
+from qgs.geometry.constants import constant
+from qgs.geometry.harmonics import SH_C0
+from qgs.geometry.precision import at_least_float32, full_precision
+from qgs.tokengs import NORM_EPS
+from qgs.types import Cameras, GaussianAttributes, ImageMemory, QueryState, Views
+
+PATCH = "gslrm.patch"
+
+PATCH_FIELD: Fields = {
+    PATCH: FieldSpec(
+        (4, 3),
+        frame="world",
+        encoding="camera centre; directions of z = 1: upper left corner, step across, step down",
+    )
+}
+"""The rays of all points of a patch (B, N, 4, 3): they are affine in the place on the patch."""
+
+
+class PixelQueries(Queries):
+    """A query for each image token, with its features, that knows the rays of its patch."""
+
+    name = "pixels"
+    reads = memory_fields("features", "grid")
+    writes = PATCH_FIELD
+
+    def forward(self, memory: ImageMemory, views: Views) -> QueryState:
+        """Features (B, M, D) of the tokens, `gslrm.patch` (B, M, 4, 3)."""
+        assert memory.grid is not None
+        _, rows, columns = memory.grid
+        fields = {PATCH: patches(views.cameras, rows, columns)}
+        return QueryState(features=memory.features, fields=fields)
+
+
+@full_precision
+def patches(cameras: Cameras, rows: int, columns: int) -> Tensor:
+    """`gslrm.patch` of images (B, V) cut into rows x columns patches: (B, V*rows*columns, 4, 3)."""
+    (height, width), c2w = cameras.size, cameras.c2w
+    options = {"dtype": c2w.dtype, "device": c2w.device}
+    left = torch.arange(columns, **options) * (width / columns)
+    upper = torch.arange(rows, **options) * (height / rows)
+    fx, fy, cx, cy = (x_BV[..., None] for x_BV in cameras.intrinsics.unbind(-1))
+    x_BVRC = repeat((left - cx) / fx, "b v c -> b v r c", r=rows)
+    y_BVRC = repeat((upper - cy) / fy, "b v r -> b v r c", c=columns)
+    zero, one = torch.zeros_like(x_BVRC), torch.ones_like(x_BVRC)
+    across, down = (width / columns / fx)[..., None], (height / rows / fy)[..., None]
+    parts = ((x_BVRC, y_BVRC, one), (across + zero, zero, zero), (zero, down + zero, zero))
+    local_BVRC33 = torch.stack([torch.stack(part, -1) for part in parts], -2)
+    world_BVRC33 = torch.einsum("bvij,bvrckj->bvrcki", c2w[..., :3, :3], local_BVRC33)
+    origin_BVRC13 = c2w[:, :, None, None, None, :3, 3].expand_as(world_BVRC33[..., :1, :])
+    return torch.cat([origin_BVRC13, world_BVRC33], -2).flatten(1, 3)
+
+
+@full_precision
+def patch_rays_at(patch_BN43: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """World-frame origins (B, N, 1, 3) of K = `count` rays, and directions (B, N, K, 3).
+
+    Directions have length 1 along the axis of their camera.
+
+    They go through the centres of a grid of K equal cells of the patch, row by row, as nearly
+    square as K allows: through those of its pixels where K is their number.
+    """
+    origin_BN3, corner_BN3, across_BN3, down_BN3 = patch_BN43.unbind(-2)
+    index_K = torch.arange(count, device=patch_BN43.device)
+    # The divisor next to the square root: K cells as nearly square as K allows. It stays a tensor,
+    # since torch.compile would make a graph for each K that Python divides.
+    n_K = index_K + 1
+    rows = torch.where((count % n_K == 0) & (n_K * n_K <= count), n_K, 1).amax()
+    columns = count // rows
+    u_K1 = ((index_K % columns).to(patch_BN43) + 0.5)[:, None] / columns
+    v_K1 = ((index_K // columns).to(patch_BN43) + 0.5)[:, None] / rows
+    corner_BN13, across_BN13, down_BN13 = (
+        x[..., None, :] for x in (corner_BN3, across_BN3, down_BN3)
+    )
+    return origin_BN3[..., None, :], corner_BN13 + down_BN13 * v_K1 + across_BN13 * u_K1
+
+
+class AlongRays(Centers):
+    """mean = o + t d on the ray of the Gaussian's pixel, t = (1 - w) near + w far.
+
+    w is the sigmoid of the mean of the three raw offsets; d is a unit vector, or for `measure:
+    depth` one of length 1 along the camera's axis. K Gaussians of a query stand on the rays of
+    `patch_rays_at`.
+    """
+
+    name = "along_rays"
+    reads = PATCH_FIELD
+
+    class Config(ComponentConfig):
+        near: float = Field(default=0.0, ge=0)
+        """Least distance from the camera, world units."""
+        far: float = Field(default=500.0, gt=0)
+        """Largest distance from the camera, world units (500 for scenes, in the paper)."""
+        measure: Literal["distance", "depth"] = "distance"
+        """Whether t counts along the ray, or along the camera's axis (gs-lrm-unofficial)."""
+
+    config: Config
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        if config.far <= config.near:
+            reason = f"far must be beyond near, got near {config.near:g} and far {config.far:g}"
+            yield Problem("far", reason, "give the distances at which the scene begins and ends")
+
+    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
+        """(B, N, K, 3) -> (B, N, K, 3)."""
+        origins, directions = patch_rays_at(state[PATCH], offsets.shape[2])
+        return _placed(origins, directions, offsets, self.config)
+
+
+@full_precision
+def _placed(
+    origins: Tensor, directions: Tensor, offsets: Tensor, config: AlongRays.Config
+) -> Tensor:
+    if config.measure == "distance":
+        directions = F.normalize(directions, dim=-1)
+    # A sigmoid keeps every Gaussian between near and far, so that none starts behind its camera.
+    w_BNK1 = offsets.mean(-1, keepdim=True).sigmoid()
+    return origins + ((1 - w_BNK1) * config.near + w_BNK1 * config.far) * directions
+
+
+class PixelHead(Head):
+    """LayerNorm, then D -> K (3 or 1 + 11) linear, both without biases."""
+
+    name = "pixel_head"
+
+    class Config(ComponentConfig):
+        gaussians_per_query: int = Field(default=64, ge=1)
+        """K, the Gaussians of each token: one per pixel where it is the square of the encoder's
+        `patch_size`, fewer or more on an even grid otherwise."""
+        position_channels: Literal[1, 3] = 3
+        """Raw numbers that place a Gaussian on its ray; of three the mean counts (paper: 1).
+        With 1, centres other than `gslrm/along_rays` get three equal offsets."""
+        scale_bias: float = -2.3
+        """Added to the logarithm of scales, world units."""
+        scale_limit: float | None = -1.2
+        """Largest logarithm of a scale, world units; null for none."""
+        opacity_bias: float = -2.0
+        """Added to the opacity logit."""
+        init_std: float = Field(default=0.02, gt=0)
+        """Standard deviation of the normal distribution that the weights start from."""
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.channels = (config.position_channels, 3, 3, 4, 1)
+        self.norm = nn.LayerNorm(dims.width, NORM_EPS, bias=False)
+        outputs = config.gaussians_per_query * sum(self.channels)
+        self.linear = nn.Linear(dims.width, outputs, bias=False)
+        nn.init.normal_(self.linear.weight, std=config.init_std)
+
+    def decays(self, name: str, parameter: nn.Parameter) -> bool:
+        """Weight decay on the linear layer too (paper); a head has none by default."""
+        return parameter.ndim != 1
+
+    def forward(self, state: QueryState) -> GaussianAttributes:
+        """(B, N, D) -> attributes of (B, N, K) Gaussians, float32 or better."""
+        raw_BNC = at_least_float32(self.linear(self.norm(state.features)))
+        raw_BNKC = rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(self.channels))
+        position, rgb, scale, rotation, opacity = raw_BNKC.split(self.channels, -1)
+        scale = scale + self.config.scale_bias
+        if self.config.scale_limit is not None:
+            # Without a bound one Gaussian can cover an image and stop the others from learning.
+            scale = scale.clamp_max(self.config.scale_limit)
+        return GaussianAttributes(
+            offsets=position.expand(*position.shape[:-1], 3),
+            scales=scale.exp(),
+            quats=_unit(rotation),
+            opacities=torch.sigmoid(opacity[..., 0] + self.config.opacity_bias),
+            colors=(0.5 + SH_C0 * rgb).clamp(0, 1),
+        )
+
+
+def _unit(quats: Tensor) -> Tensor:
+    """Quaternions (..., 4) of length 1; the identity for those of length 0."""
+    length = quats.norm(dim=-1, keepdim=True)
+    identity = constant([1.0, 0.0, 0.0, 0.0], quats)
+    return torch.where(length > 0, quats / torch.where(length > 0, length, 1), identity)

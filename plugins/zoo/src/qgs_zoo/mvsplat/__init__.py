@@ -1,0 +1,68 @@
+"""MVSplat and DepthSplat for qgs: depth from a plane sweep, one Gaussian per pixel."""
+
+from qgs.contracts import Plugin
+from qgs_zoo.dinov2.vit import VitConfig
+from qgs_zoo.mvsplat.depth_error import DepthError
+from qgs_zoo.mvsplat.depthsplat_encoder import DepthSplatEncoder
+from qgs_zoo.mvsplat.depthsplat_head import WorldHead
+from qgs_zoo.mvsplat.depthsplat_weights import DEPTHSPLAT
+from qgs_zoo.mvsplat.head import RayHead
+from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder
+from qgs_zoo.mvsplat.pixels import OnRays, PixelQueries
+from qgs_zoo.mvsplat.two_depths import DecayedSupervision, Exchange
+from qgs_zoo.mvsplat.weights import MVSPLAT
+
+_SMALL = DepthSplatEncoder.Config(
+    near=0.2,
+    far=3.0,
+    features=32,
+    cnn=(4, 8, 8),
+    candidates=16,
+    vit=VitConfig(width=16, depth=4, heads=2),
+    blocks=(0, 1, 2, 3),
+    dpt=(8, 8, 8, 16),
+    full_features=8,
+    regressor=8,
+)
+
+_BIASES = "instance norms take biases of the CNN away again: they are stored and learn nothing"
+
+plugin = Plugin(
+    name="mvsplat",
+    contract_version=1,
+    components=(
+        *(MVSplatEncoder, PixelQueries, RayHead, OnRays),
+        *(DepthSplatEncoder, WorldHead, Exchange, DecayedSupervision, DepthError),
+    ),
+    layouts=(MVSPLAT, DEPTHSPLAT),
+    examples=(
+        MVSplatEncoder.Config(
+            near=0.2,
+            far=3.0,
+            cnn_widths=(8, 8, 8),
+            features=8,
+            candidates=4,
+            cost_width=32,
+            cost_levels=1,
+            depth_levels=1,
+        ),
+        _SMALL,
+        RayHead.Config(opacity_exponent=1.0),
+        OnRays.Config(measure="depth"),
+        WorldHead.Config(scale_max=0.1),
+        DecayedSupervision.Config(layers=(1, 2), decay=0.5),
+    ),
+    exemptions={
+        MVSplatEncoder: {
+            "compiles": "the sweep takes the other photos one after another, for the memory that "
+            "all at once would take: each number of photos has a graph of its own",
+            "parameters_learn": _BIASES,
+            "tokens_are_those_of_the_grid": "before training, instance norms over whole maps and "
+            "the softmax over depths spread what a pixel shows over its image",
+        },
+        DepthSplatEncoder: {
+            "parameters_learn": f"{_BIASES}; and zeros start behind each other, in the blocks and "
+            "at the end of a U-Net and of a correction, and each takes a step to open",
+        },
+    },
+)

@@ -1,0 +1,322 @@
+"""DepthSplat (Xu et al., arXiv 2410.13862): depth from a plane sweep and a pretrained ViT.
+
+Modules have the names of the released weights. Levels: 0, 1, 2 are 1/2, 1/4, 1/8 of the images.
+"""
+
+from collections.abc import Sequence
+from typing import Annotated, Literal, NamedTuple, TypeAlias
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field, ValidationInfo, field_validator
+from torch import Tensor, nn
+
+from qgs.contracts import ComponentConfig, OptionError
+from qgs.geometry.precision import at_least_float32, full_precision
+from qgs.tokengs.encoder import imagenet_normalised
+from qgs.types import Cameras
+from qgs_zoo.dinov2.vit import PATCH, DinoV2, VitConfig
+from qgs_zoo.mvsplat.cnn import CNN, WIDTHS, Stages
+from qgs_zoo.mvsplat.convolutions import (
+    conv3,
+    resized,
+    two_convolutions,
+)
+from qgs_zoo.mvsplat.dpt import LEVELS, DptHead
+from qgs_zoo.mvsplat.mvsplat import Sweep, expected_disparity
+from qgs_zoo.mvsplat.sweep import (
+    cost_volume,
+    cyclic_neighbours,
+    feature_lenses,
+    inverse_depth_candidates,
+    relative_poses,
+)
+from qgs_zoo.mvsplat.unet import OverViews, UNet
+from qgs_zoo.mvsplat.windows import WindowTransformer, with_positions
+
+Width: TypeAlias = Annotated[int, Field(ge=1)]
+Block: TypeAlias = Annotated[int, Field(ge=0)]
+
+GAUSSIAN_CHANNELS = 1 + 2 + 3 + 4
+"""Raw opacity, place in the pixel, scale, quaternion; harmonics follow."""
+
+
+class DepthSplatConfig(ComponentConfig):
+    """DepthSplatConfig of the networks: by default of the small model on RealEstate10K."""
+
+    features: int = Field(default=128, ge=32, multiple_of=32)
+    """Channels of the multi-view features and of the first cost volume's networks; half as many in
+    the second's."""
+    cnn: tuple[Width, Width, Width] = WIDTHS
+    """Channels of the three stages of the CNN."""
+    candidates: int = Field(default=128, ge=16, multiple_of=8)
+    """Inverse depths of the first sweep, evenly between those of `far` and `near`; the second has a
+    quarter."""
+    scales: Literal[1, 2] = 1
+    """Sweeps: the second has twice the resolution, around the depths of the first."""
+    stride: Literal[4, 8] = 4
+    """Pixels a side of a feature of the first sweep."""
+    neighbours: int = Field(default=2, ge=1)
+    """Views that each view is matched with where there are more than three: the nearest."""
+    vit: VitConfig
+    """DINOv2's sizes and weights; `{}` for a ViT-S that starts from random numbers."""
+    blocks: tuple[Block, Block, Block, Block] = Field(default=(2, 5, 8, 11), validate_default=True)
+    """Blocks of the ViT whose tokens are read, 0 for the first; ViT-L: 4, 11, 17, 23."""
+    dpt: tuple[Width, Width, Width, Width] = (48, 96, 192, 384)
+    """Channels of both DPT heads at 1/2, 1/4, 1/8 and 1/16; ViT-B: 96, 192, 384, 768; ViT-L: 128,
+    256, 512, 1024."""
+    full_features: int = Field(default=64, ge=4, multiple_of=4)
+    """Channels of full-size features, twice those of the DPT head that corrects depths; ViT-B: 96,
+    ViT-L: 128."""
+    regressor: int = Field(default=64, ge=1)
+    """Channels between the two networks that predict Gaussians."""
+
+    @field_validator("blocks")
+    @classmethod
+    def _blocks_ascend_in_the_vit(
+        cls, blocks: tuple[int, int, int, int], info: ValidationInfo
+    ) -> tuple[int, int, int, int]:
+        depth = info.data["vit"].depth if "vit" in info.data else blocks[-1] + 1
+        if list(blocks) != sorted(set(blocks)) or blocks[-1] >= depth:
+            raise OptionError(
+                f"blocks must ascend and be less than the depth of the ViT, {depth}, got {blocks}",
+                "write such as [2, 5, 8, 11]",
+            )
+        return blocks
+
+    def level(self, scale: int) -> int:
+        """Of the cost volume of a scale, 0 for 1/2."""
+        return self.stride.bit_length() - 2 - scale
+
+    @property
+    def finest(self) -> int:
+        """Level of the last cost volume."""
+        return self.level(self.scales - 1)
+
+    @property
+    def cnn_levels(self) -> tuple[int, int, int]:
+        """Levels of the CNN's stages."""
+        return (0, 0, 1) if self.stride == 4 else (0, 1, 2)
+
+
+class Depths(NamedTuple):
+    """What the depth predictor gives.
+
+    depths: camera-frame z in world units (B, V, H, W) of each scale, the last corrected.
+    confidence: largest probability of the last sweep (B V, 1, H, W). maps: of the ViT, (B V, C,
+    H/8, W/8). joined: other features, for a DPT head.
+    """
+
+    depths: list[Tensor]
+    confidence: Tensor
+    maps: list[Tensor]
+    joined: list[tuple[list[Tensor], list[Tensor]]]
+
+
+class Pyramid(nn.Module):
+    """Maps of each scale: the first as it is, the second of half the channels, twice the size."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        finer = (nn.ConvTranspose2d(width, width // 2, 2, 2), nn.GELU())
+        last = conv3(width // 2, width // 2)
+        self.stages = nn.ModuleList([nn.Identity(), nn.Sequential(*finer, last)])
+
+    def forward(self, x_NChw: Tensor) -> list[Tensor]:
+        return [stage(x_NChw) for stage in self.stages]
+
+
+def nearest_neighbours(c2w_BV44: Tensor, count: int) -> Tensor:
+    """The views (B, V, J) that each view is matched with.
+
+    All others in ascending order up to three views; of more the `count` nearest, nearest first.
+    """
+    scenes, views = c2w_BV44.shape[:2]
+    if views <= 3:
+        return cyclic_neighbours(scenes, views, c2w_BV44.device).sort(-1).values
+    centre_BV3 = at_least_float32(c2w_BV44[..., :3, 3])
+    order_BVV = torch.cdist(centre_BV3, centre_BV3).argsort(-1)
+    # The first is taken for the view itself without a look (released code): of two cameras at one
+    # place it may be the other one.
+    return order_BVV[..., 1 : count + 1]
+
+
+def bounds(sweep: Sweep) -> tuple[Tensor, Tensor]:
+    """Least and largest inverse depth (B V, 1, 1), of `far` and `near`."""
+    least, most = (1 / x.flatten()[:, None, None] for x in (sweep.far, sweep.near))
+    return least, most
+
+
+@full_precision
+def finer_candidates(coarse_N1hw: Tensor, sweep: Sweep, first: int, count: int) -> Tensor:
+    """Inverse depths (N, D, 2h, 2w) around those of the first scale, which had `first`."""
+    height, width = coarse_N1hw.shape[-2:]
+    # No gradient: the first scale learns from its own depth.
+    centre_N1hw = resized(coarse_N1hw.detach(), (2 * height, 2 * width))
+    least, most = (x[:, None] for x in bounds(sweep))
+    step = (most - least) / (first - 1) / 2
+    low_N1hw = (centre_N1hw - count // 2 * step).clamp(least, most)
+    high_N1hw = (centre_N1hw + (count // 2 - 1) * step).clamp(least, most)
+    # Linear between clamped ends: near a bound the steps shrink, and the centre is none of them.
+    part_D11 = torch.linspace(0, 1, count, device=centre_N1hw.device).to(centre_N1hw)[:, None, None]
+    return low_N1hw + part_D11 * (high_N1hw - low_N1hw)
+
+
+class DepthPredictor(nn.Module):
+    """Images and cameras to depths of all pixels."""
+
+    def __init__(self, sizes: DepthSplatConfig) -> None:
+        super().__init__()
+        self.sizes, width, vit = sizes, sizes.features, sizes.vit
+        strides = (1, 2) if sizes.stride == 4 else (2, 2)
+        self.backbone = CNN(width, strides, sizes.cnn)
+        self.transformer = WindowTransformer(width)
+        self.pretrained = DinoV2(vit.width, vit.depth, vit.heads)
+        if sizes.scales > 1:
+            self.mv_pyramid, self.mono_pyramid = Pyramid(width), Pyramid(vit.width)
+        self.regressor, self.regressor_residual = nn.ModuleList(), nn.ModuleList()
+        self.depth_head = nn.ModuleList()
+        for scale in range(sizes.scales):
+            count, own = self.candidates(scale), width // 2**scale
+            cnn = width if scale == 0 else sizes.cnn[1]
+            inputs = count + cnn + own + vit.width // 2**scale
+            unet = UNet(own, 3 + scale, pre_norm=True)
+            norm = nn.GroupNorm(8, own)
+            last = conv3(own, own)
+            self.regressor.append(OverViews(conv3(inputs, own), norm, nn.GELU(), unet, last))
+            self.regressor_residual.append(nn.Conv2d(inputs, own, 1))
+            self.depth_head.append(two_convolutions(own, 2 * own, count, "replicate"))
+        self.upsampler = dpt_head(sizes, depth=True)
+
+    def candidates(self, scale: int) -> int:
+        """How many depths the sweep of a scale tries."""
+        return self.sizes.candidates // 4**scale
+
+    def forward(
+        self, images_BV3HW: Tensor, cameras: Cameras, near_BV: Tensor, far_BV: Tensor
+    ) -> Depths:
+        """near, far: camera-frame z in world units."""
+        size, shape = images_BV3HW.shape[-2:], images_BV3HW.shape[:2]
+        normalized_N3HW = imagenet_normalised(images_BV3HW).flatten(0, 1)
+        neighbours_BVJ = nearest_neighbours(cameras.c2w, self.sizes.neighbours)
+        sweep = Sweep(cameras, neighbours_BVJ, near_BV, far_BV)
+        cnn = self.backbone(normalized_N3HW)
+        x_BVChw = with_positions(cnn.features.unflatten(0, shape))
+        x_NChw = self.transformer(x_BVChw, neighbours_BVJ).flatten(0, 1)
+        maps = self.vit_maps(normalized_N3HW)
+        mono_NChw = maps[-1]
+        if self.sizes.stride == 4:
+            mono_NChw = resized(mono_NChw, x_NChw.shape[-2:])
+        several = self.sizes.scales > 1
+        multi = self.mv_pyramid(x_NChw) if several else [x_NChw]
+        mono = self.mono_pyramid(mono_NChw) if several else [mono_NChw]
+        coarse, confidence_N1hw = self.match(cnn, multi, mono, sweep)
+        # Inverse depth joins here, depth itself where Gaussians are predicted (released code).
+        joined = self.beside(cnn, multi, coarse[-1])
+        correction_N1HW = at_least_float32(self.upsampler(maps, joined))
+        full = [resized(x, size) for x in coarse]
+        full[-1] = (full[-1] + correction_N1HW).clamp(*(x[:, None] for x in bounds(sweep)))
+        depths = [(1 / x[:, 0]).unflatten(0, shape) for x in full]
+        confidence_N1HW = F.interpolate(confidence_N1hw, size, mode="nearest")
+        return Depths(depths, confidence_N1HW, maps, self.beside(cnn, multi))
+
+    def match(
+        self, cnn: Stages, multi: Sequence[Tensor], mono: Sequence[Tensor], sweep: Sweep
+    ) -> tuple[list[Tensor], Tensor]:
+        """Inverse depth (B V, 1, h, w) of each scale, largest probability of the last."""
+        found: list[Tensor] = []  # `list[Tensor]()` would break the graph of torch.compile
+        views, confidence = sweep.near.shape[1], multi[0]
+        poses_BVJ44 = relative_poses(sweep.cameras.c2w, sweep.neighbours)
+        for scale, (own, features) in enumerate(zip(multi, mono, strict=True)):
+            count = self.candidates(scale)
+            if scale == 0:
+                candidates = inverse_depth_candidates(sweep.near, sweep.far, count)
+                candidates = candidates.flatten(0, 1)[..., None, None]
+            else:
+                candidates = finer_candidates(found[-1], sweep, self.candidates(0), count)
+            cost_BVDhw = cost_volume(
+                own.unflatten(0, sweep.near.shape),
+                candidates.unflatten(0, sweep.near.shape),
+                feature_lenses(sweep.cameras, (own.shape[-2], own.shape[-1])),
+                poses_BVJ44,
+                sweep.neighbours,
+            )
+            seen = [cost_BVDhw.flatten(0, 1), cnn.second if scale else cnn.features, own, features]
+            seen = torch.cat(seen, 1)
+            refined = self.regressor[scale](seen, views) + self.regressor_residual[scale](seen)
+            inverse, confidence = expected_disparity(self.depth_head[scale](refined), candidates)
+            found.append(inverse)
+        return found, confidence
+
+    def vit_maps(self, images_N3HW: Tensor) -> list[Tensor]:
+        """Tokens of the chosen blocks as maps (N, C, H/8, W/8)."""
+        height, width = images_N3HW.shape[-2:]
+        grid = (height // PATCH, width // PATCH)
+        small = resized(images_N3HW, (grid[0] * PATCH, grid[1] * PATCH))
+        tokens = self.pretrained(small, self.sizes.blocks)
+        maps = (x_NPC.mT.unflatten(2, grid) for x_NPC in tokens)
+        return [resized(x, (height // 8, width // 8)) for x in maps]
+
+    def beside(
+        self, cnn: Stages, multi: Sequence[Tensor], depth: Tensor | None = None
+    ) -> list[tuple[list[Tensor], list[Tensor]]]:
+        """What joins the ViT's maps at 1/2, 1/4, 1/8: before and behind their own channels."""
+        # The release has the order CNN, ViT, transformer, depth. Where its CNN ends at 1/4, nothing
+        # joins at 1/8.
+        found: list[tuple[list[Tensor], list[Tensor]]] = [([], []) for _ in range(LEVELS)]
+        stages = (cnn.first, cnn.second, cnn.features)
+        for x, level in zip(stages, self.sizes.cnn_levels, strict=True):
+            found[level][0].append(x)
+        levels = [*map(self.sizes.level, range(len(multi))), self.sizes.finest]
+        for x, level in zip([*multi, depth], levels, strict=True):
+            if x is not None:  # at 1/2 the release has the ViT's own map last instead
+                found[level][level > 0].append(x)
+        return found
+
+
+def dpt_head(sizes: DepthSplatConfig, depth: bool) -> DptHead:
+    """A head that reads CNN, transformer and ViT; with `depth` one that also gets and gives it."""
+    others = [0] * LEVELS
+    for width, level in zip((*sizes.cnn[:2], sizes.features), sizes.cnn_levels, strict=True):
+        others[level] += width
+    for scale in range(sizes.scales):
+        others[sizes.level(scale)] += sizes.features // 2**scale
+    others[sizes.finest] += depth
+    features = sizes.full_features // 2 if depth else sizes.full_features
+    return DptHead(sizes.vit.width, sizes.dpt, features, others, depth)
+
+
+class DepthSplat(nn.Module):
+    """Images and cameras to depths and raw Gaussians of all pixels.
+
+    harmonics: coefficients per colour.
+    """
+
+    def __init__(self, sizes: DepthSplatConfig, harmonics: int) -> None:
+        super().__init__()
+        self.depth_predictor = DepthPredictor(sizes)
+        self.feature_upsampler = dpt_head(sizes, depth=False)
+        features, hidden = sizes.full_features, sizes.regressor
+        self.gaussian_regressor = two_convolutions(features + 5, hidden, hidden, "zeros")
+        raw = GAUSSIAN_CHANNELS + 3 * harmonics
+        self.gaussian_head = two_convolutions(hidden + features + 4, raw, raw, "replicate")
+        with torch.no_grad():  # scales and harmonics start from their offsets alone
+            for parameter in self.gaussian_head[2].parameters():
+                parameter[3:6] = 0
+                parameter[GAUSSIAN_CHANNELS:] = 0
+
+    def forward(
+        self, images_BV3HW: Tensor, cameras: Cameras, near_BV: Tensor, far_BV: Tensor
+    ) -> tuple[list[Tensor], Tensor]:
+        """Depths (B, V, H, W) of each scale, raw Gaussians (B, V, 10 + 3 K, H, W)."""
+        found = self.depth_predictor(images_BV3HW, cameras, near_BV, far_BV)
+        features_NFHW = self.feature_upsampler(found.maps, found.joined)
+        images_N3HW = images_BV3HW.flatten(0, 1)
+        # Depth itself, up to `far`, not its inverse (released code).
+        depth_N1HW = found.depths[-1].flatten(0, 1)[:, None]
+        seen = torch.cat([images_N3HW, depth_N1HW, found.confidence, features_NFHW], 1)
+        hidden = self.gaussian_regressor(seen)
+        raw = self.gaussian_head(
+            torch.cat([hidden, images_N3HW, features_NFHW, found.confidence], 1)
+        )
+        return found.depths, raw.unflatten(0, images_BV3HW.shape[:2])

@@ -1,0 +1,79 @@
+"""`mvsplat/depthsplat`: DepthSplat's networks as an encoder, a token for each pixel."""
+
+from collections.abc import Iterable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from qgs.contracts import ModelDims, Problem, RecipeContext
+from qgs.geometry.harmonics import SH_C0
+from qgs.geometry.precision import at_least_float32
+from qgs.types import Views
+from qgs_zoo.dinov2.weight_file import load_weights
+from qgs_zoo.mvsplat.adapter import coefficients
+from qgs_zoo.mvsplat.depthsplat import GAUSSIAN_CHANNELS, DepthSplat, DepthSplatConfig
+from qgs_zoo.mvsplat.encoder import DepthRange, SweepEncoder
+from qgs_zoo.mvsplat.pixels import WIDTHS, degree_of
+
+
+class DepthSplatEncoder(SweepEncoder):
+    """Every pixel's depth and raw Gaussian, from a plane sweep and a pretrained ViT.
+
+    The memory has a token for each pixel. Its D numbers, the model's width, are those of
+    `qgs_zoo.mvsplat.pixels.CHANNELS` and harmonics, to whose constant the pixel's colour is added: 38
+    for degree 2 (published). A wider model has zeros behind them.
+    """
+
+    name = "depthsplat"
+
+    class Config(DepthSplatConfig, DepthRange):
+        coarse_depth: bool = False
+        """Whether the last of the D numbers is the logarithm of the first sweep's depth, for
+        `mvsplat/exchange`; of two scales, in a model wider than the other numbers (published:
+        39)."""
+
+    config: Config
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        if config.coarse_depth and config.scales == 1:
+            reason = "with one scale there is no coarse depth"
+            yield Problem("coarse_depth", reason, "write false, or set scales to 2")
+        if config.coarse_depth and context.dims.width in WIDTHS:
+            width = context.dims.width
+            reason = f"a model of width {width} has no room for a coarse depth"
+            yield Problem("coarse_depth", reason, f"set model.width to {width + 1}")
+        if config.features % (32 * config.scales):
+            reason = f"{config.features} features make no heads of 32 channels in both scales"
+            yield Problem("features", reason, "write a multiple of 64")
+        yield from super().problems(config, context)
+
+    @classmethod
+    def multiple(cls, config: Config) -> int:
+        return 4 * config.stride  # the U-Nets halve the features of each sweep
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.network = DepthSplat(config, coefficients(degree_of(dims.width)))
+
+    def load_pretrained(self) -> None:
+        if self.config.vit.weights is not None:
+            load_weights(self.network.depth_predictor.pretrained, self.config.vit.weights)
+
+    def decays(self, name: str, parameter: nn.Parameter) -> bool:
+        """Weight decay on everything (released code)."""
+        return True
+
+    def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
+        depths, raw_BVCHW = self.network(views.images, views.cameras, near_BV, far_BV)
+        raw_BVCHW = at_least_float32(raw_BVCHW)
+        first = GAUSSIAN_CHANNELS
+        gaussian, sh_BV3KHW = raw_BVCHW[:, :, :first], raw_BVCHW[:, :, first:].unflatten(2, (3, -1))
+        constant = sh_BV3KHW[:, :, :, :1] + ((views.images - 0.5) / SH_C0)[:, :, :, None]
+        sh_BV3KHW = torch.cat([constant, sh_BV3KHW[:, :, :, 1:]], 3)
+        logs = [depth[:, :, None].log() for depth in depths]
+        numbers = torch.cat([logs[-1], gaussian, sh_BV3KHW.flatten(2, 3)], 2)
+        coarse = logs[:1] if self.config.coarse_depth else []
+        left = self.dims.width - numbers.shape[2] - len(coarse)
+        return torch.cat([F.pad(numbers, (0, 0, 0, 0, 0, left)), *coarse], 2)

@@ -1,0 +1,104 @@
+"""The weights of DepthSplat: published names, and the recipe that fits a state dict."""
+
+from typing import Any
+
+from qgs.contracts.weights import (
+    LayoutError,
+    Rename,
+    Shapes,
+    WeightLayout,
+    layer_count,
+    size_at,
+    whole_ratio,
+)
+from qgs_zoo.mvsplat.depthsplat import GAUSSIAN_CHANNELS
+from qgs_zoo.mvsplat.pixels import WIDTHS
+
+_PREDICTOR = "encoder.depth_predictor."
+_VIT = _PREDICTOR + "pretrained."
+_UPSAMPLER = "encoder.feature_upsampler."
+_HEAD = "encoder.gaussian_head.2.weight"
+HEAD_WIDTH = 64
+"""Channels of a head of every DINOv2."""
+BLOCKS = {12: [2, 5, 8, 11], 24: [4, 11, 17, 23]}
+"""Depth of the ViT to the blocks that are read."""
+_EMPTY = dict.fromkeys(("cross_attention", "self_attention", "feed_forward", "refinement"))
+
+
+def _encoder(shapes: Shapes) -> dict[str, Any]:
+    scales = layer_count(shapes, _PREDICTOR + "regressor.")
+    width, depth = size_at(shapes, _VIT + "norm.weight", 0), layer_count(shapes, _VIT + "blocks.")
+    if scales not in (1, 2) or depth not in BLOCKS:
+        raise LayoutError(f"{scales} scales and a ViT of {depth} blocks are not published")
+    dpt = [size_at(shapes, f"{_UPSAMPLER}projects.{n}.weight", 0) for n in range(4)]
+    joined = size_at(shapes, _UPSAMPLER + "concat_projects.2.weight", 1)
+    stages = (f"{_PREDICTOR}backbone.layer{n}.0.conv1.weight" for n in (1, 2, 3))
+    return {
+        "type": "mvsplat/depthsplat",
+        "near": 0.5,
+        "far": 100.0,
+        "features": size_at(shapes, _PREDICTOR + "backbone.conv2.weight", 0),
+        "cnn": [size_at(shapes, name, 0) for name in stages],
+        "candidates": size_at(shapes, _PREDICTOR + "depth_head.0.2.weight", 0),
+        "scales": scales,
+        # At 1/8 other features join only where the CNN goes down to it.
+        "stride": 4 if joined == dpt[2] else 8,
+        "vit": {
+            "width": width,
+            "depth": depth,
+            "heads": whole_ratio(width, HEAD_WIDTH, "width of the ViT over that of a head"),
+        },
+        "blocks": BLOCKS[depth],
+        "dpt": dpt,
+        "full_features": size_at(shapes, _UPSAMPLER + "scratch.layer1_rn.weight", 0),
+        "regressor": size_at(shapes, "encoder.gaussian_regressor.0.weight", 0),
+        "coarse_depth": scales == 2,
+    }
+
+
+def _read(shapes: Shapes) -> dict[str, Any]:
+    encoder, raw = _encoder(shapes), size_at(shapes, _HEAD, 0)
+    two, numbers = encoder["scales"] == 2, raw + 1  # the depth stands in front
+    if numbers not in WIDTHS:
+        raise LayoutError(f"{_HEAD}: {raw} is not {GAUSSIAN_CHANNELS} and harmonics of a degree")
+    decoder = {"depth": 2, "layer": {"type": "mvsplat/exchange"}} if two else {"depth": 0}
+    supervision = {"type": "mvsplat/decayed", "layers": [1, 2]}
+    model = {
+        "width": numbers + two,
+        "heads": 1,
+        "encoder": encoder,
+        "queries": {"type": "mvsplat/pixels"},
+        "decoder": {**decoder, **_EMPTY},
+        "head": {"type": "mvsplat/depthsplat_gaussians"},
+        "centers": {"type": "mvsplat/on_rays", "measure": "depth"},
+        "supervision": supervision if two else {"type": "qgs/layers", "layers": [0]},
+    }
+    photometric = {"type": "qgs/photometric", "mse_weight": 1.0, "ssim_weight": 0.0}
+    views = {"frame": "given", "scale": "constant", "scale_factor": 1.0}
+    losses = {"photometric": photometric}
+    plugins = ["mvsplat"]
+    return {"recipe": 1, "plugins": plugins, "model": model, "views": views, "losses": losses}
+
+
+DEPTHSPLAT = WeightLayout(
+    name="DepthSplat",
+    source="cvg/depthsplat",
+    components={
+        "encoder": ("mvsplat/depthsplat",),
+        "queries": ("mvsplat/pixels",),
+        "head": ("mvsplat/depthsplat_gaussians",),
+        "centers": ("mvsplat/on_rays",),
+    },
+    renames=(Rename("encoder.network.", "encoder."),),
+    marks=(_PREDICTOR + "pretrained.norm.weight", _UPSAMPLER + "projects.0.weight", _HEAD),
+    read=_read,
+    undecided=(
+        "near and far: 0.5 and 100, of RealEstate10K (DL3DV: 0.5 and 200)",
+        "views that each is matched with: the nearest 2",
+        "bounds of the scales: the release's",
+        "losses: mean squared error of both depths where there are two, to which the release adds "
+        "0.05 LPIPS (plugin `lpips`)",
+        "frame and scale of the world: as given; renderer, training: the framework's defaults",
+    ),
+)
+"""The released DepthSplat, in files of Lightning or of a bare state dict."""

@@ -1,0 +1,193 @@
+"""`mvsplat/mvsplat`: CNN, window transformer, plane sweep and two U-Nets (arXiv 2403.14627)."""
+
+from typing import Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.contracts import ModelDims
+from qgs.geometry.precision import full_precision
+from qgs.tokengs.encoder import imagenet_normalised
+from qgs.types import Cameras, Views
+from qgs_zoo.mvsplat.cnn import CNN, WIDTHS
+from qgs_zoo.mvsplat.convolutions import conv3, resized, two_convolutions
+from qgs_zoo.mvsplat.encoder import DepthRange, SweepEncoder
+from qgs_zoo.mvsplat.sweep import (
+    cost_volume,
+    cyclic_neighbours,
+    feature_lenses,
+    inverse_depth_candidates,
+    relative_poses,
+)
+from qgs_zoo.mvsplat.unet import OverViews, UNet, group_norm
+from qgs_zoo.mvsplat.windows import WindowTransformer, with_positions
+
+FACTOR = 4
+"""Size of an image over that of its features."""
+
+
+class Backbone(nn.Module):
+    """Features of all views at 1/4 of the images, of the CNN and of the transformer behind it."""
+
+    def __init__(self, width: int, stages: tuple[int, int, int]) -> None:
+        super().__init__()
+        self.backbone = CNN(width, (2, 1), stages)
+        self.transformer = WindowTransformer(width)
+
+    def forward(self, images_BV3HW: Tensor, neighbours_BVJ: Tensor) -> tuple[Tensor, Tensor]:
+        """Both (B, V, D, H/4, W/4)."""
+        normalized = imagenet_normalised(images_BV3HW).flatten(0, 1)
+        cnn = self.backbone(normalized).features.unflatten(0, images_BV3HW.shape[:2])
+        return cnn, self.transformer(with_positions(cnn), neighbours_BVJ)
+
+
+class MVSplatEncoder(SweepEncoder):
+    """Every pixel's depth and raw Gaussian, from features of all views and a plane sweep.
+
+    The memory has a token for each pixel, or square of them. Its D numbers, the model's width, are
+    those of `qgs_zoo.mvsplat.pixels.CHANNELS` and harmonics: 86 for degree 4 (published). Views are
+    compared in their order; a single view is compared with itself.
+    """
+
+    name = "mvsplat"
+
+    class Config(DepthRange):
+        cnn_widths: tuple[int, int, int] = WIDTHS
+        """Channels of the three stages of the CNN."""
+        features: int = Field(default=128, ge=4, multiple_of=4)
+        """Width of the features that the sweep compares."""
+        stride: Literal[1, 2, 4] = 1
+        """Pixels along the side of the square that has a Gaussian: 1 for one per pixel
+        (published)."""
+        candidates: int = Field(default=128, ge=2)
+        """Depths that the plane sweep compares, evenly in inverse depth from `near` to `far`."""
+        cost_width: int = Field(default=128, ge=32, multiple_of=32)
+        """Channels of the U-Net over the cost volume."""
+        cost_levels: int = Field(default=3, ge=1, le=6)
+        """Levels of that U-Net; the lowest has attention over all views."""
+        depth_width: int = Field(default=32, ge=32, multiple_of=32)
+        """Channels of the U-Net that refines depths at full size."""
+        depth_levels: int = Field(default=5, ge=1, le=8)
+        """Levels of that U-Net; the lowest has attention over all views."""
+        cost_volume: bool = True
+        """Whether views are compared; false has zeros in place of correlations, so that depths
+        come from features alone, with as many parameters (the paper's ablation)."""
+
+    config: Config
+
+    @classmethod
+    def multiple(cls, config: Config) -> int:
+        cost, depth = (2 ** (x - 1) for x in (config.cost_levels, config.depth_levels))
+        return max(2 * FACTOR, FACTOR * cost, config.stride * depth)
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.backbone = Backbone(config.features, config.cnn_widths)
+        self.depth_predictor = DepthPredictor(config, dims.width)
+
+    def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
+        neighbours = cyclic_neighbours(*views.cameras.shape, device=near_BV.device)
+        # The transformer reads other views in ascending order, the sweep in cyclic order.
+        cnn, features = self.backbone(views.images, neighbours.sort(-1).values)
+        sweep = Sweep(views.cameras, neighbours, near_BV, far_BV)
+        return self.depth_predictor(views.images, cnn, features, sweep)
+
+
+class Sweep(NamedTuple):
+    """What the plane sweep reads of cameras (B, V): neighbours (B, V, J), near and far (B, V)."""
+
+    cameras: Cameras
+    neighbours: Tensor
+    near: Tensor
+    far: Tensor
+
+
+class DepthPredictor(nn.Module):
+    """From features at 1/4 to depths and raw Gaussians at full size."""
+
+    def __init__(self, config: MVSplatEncoder.Config, numbers: int) -> None:
+        super().__init__()
+        count, cost, fine = config.candidates, config.cost_width, config.depth_width
+        width, gaussian = config.features, numbers - 2
+        matched = count + width
+        self.corr_refine_net = OverViews(
+            *(conv3(matched, cost), group_norm(cost), nn.GELU()),
+            *(UNet(cost, config.cost_levels, pre_norm=False), conv3(cost, count)),
+        )
+        self.compares = config.cost_volume
+        self.regressor_residual = nn.Conv2d(matched, count, 1)
+        self.depth_head_lowres = two_convolutions(count, 2 * count, count)
+        self.stride, scale = config.stride, FACTOR // config.stride
+        upscale = nn.Upsample(scale_factor=scale, mode="bilinear", align_corners=True)
+        # GELU comes behind the resizing, not in front of it.
+        self.upsampler = nn.Sequential(conv3(2 * width, width), upscale, nn.GELU())
+        self.proj_feature = conv3(width, fine)
+        self.refine_unet = OverViews(
+            *(conv3(3 + fine + 2, fine), nn.GroupNorm(4, fine), nn.GELU()),
+            UNet(fine, config.depth_levels, pre_norm=False),
+        )
+        self.to_gaussians = two_convolutions(fine + 3 + width, 2 * gaussian, gaussian)
+        self.to_disparity = two_convolutions(fine, 2 * fine, 2)
+
+    def forward(
+        self, images_BV3HW: Tensor, cnn_BVDhw: Tensor, features_BVDhw: Tensor, sweep: Sweep
+    ) -> Tensor:
+        """(B, V, C, H, W): logarithm of the depth, opacity logit, raw Gaussian."""
+        views = images_BV3HW.shape[1]
+        # These networks see images in [0, 1]; only the CNN's are normalised.
+        images_N3HW, cnn_NDhw = images_BV3HW.flatten(0, 1), cnn_BVDhw.flatten(0, 1)
+        features_NDhw = features_BVDhw.flatten(0, 1)
+        disparity_N1hw, confidence_N1hw = self.match(features_BVDhw, sweep)
+        if self.stride > 1:
+            images_N3HW = F.avg_pool2d(images_N3HW, self.stride)
+        size = images_N3HW.shape[2:]
+        disparity_N1HW = resized(disparity_N1hw, size)
+        confidence_N1HW = F.interpolate(confidence_N1hw, tuple(size), mode="nearest")
+        full_NDHW = self.upsampler(torch.cat([features_NDhw, cnn_NDhw], 1))
+        projected = self.proj_feature(full_NDHW)
+        seen = torch.cat([images_N3HW, projected, disparity_N1HW, confidence_N1HW], 1)
+        refined = self.refine_unet(seen, views)
+        raw = self.to_gaussians(torch.cat([refined, images_N3HW, full_NDHW], 1))
+        change_N1HW, logit_N1HW = self.to_disparity(refined).split(1, 1)
+        log_depth = refined_log_depth(disparity_N1HW, change_N1HW, sweep.near, sweep.far)
+        return torch.cat([log_depth, logit_N1HW, raw], 1).unflatten(0, (-1, views))
+
+    def match(self, features_BVDhw: Tensor, sweep: Sweep) -> tuple[Tensor, Tensor]:
+        """Inverse depth and largest probability (B V, 1, h, w) of the candidates at 1/4."""
+        count = self.regressor_residual.out_channels
+        candidates_BVD = inverse_depth_candidates(sweep.near, sweep.far, count)
+        size = features_BVDhw.shape[3:]
+        volume_BVDhw = features_BVDhw.new_zeros(*candidates_BVD.shape, *size)
+        if self.compares:
+            volume_BVDhw = cost_volume(
+                features_BVDhw,
+                candidates_BVD[..., None, None],
+                feature_lenses(sweep.cameras, size),
+                relative_poses(sweep.cameras.c2w, sweep.neighbours),
+                sweep.neighbours,
+            )
+        matched = torch.cat([volume_BVDhw, features_BVDhw], 2).flatten(0, 1)
+        refined = self.corr_refine_net(matched, features_BVDhw.shape[1])
+        refined = refined + self.regressor_residual(matched)
+        logits_NDhw = self.depth_head_lowres(refined)
+        return expected_disparity(logits_NDhw, candidates_BVD.flatten(0, 1)[..., None, None])
+
+
+@full_precision
+def expected_disparity(logits_NDhw: Tensor, candidates_NDhw: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean of candidates under the softmax of logits, and its largest probability."""
+    probability = logits_NDhw.softmax(1)
+    disparity = (probability * candidates_NDhw).sum(1, keepdim=True)
+    return disparity, probability.amax(1, keepdim=True)
+
+
+@full_precision
+def refined_log_depth(
+    disparity_N1HW: Tensor, change_N1HW: Tensor, near_BV: Tensor, far_BV: Tensor
+) -> Tensor:
+    """Logarithm of the depth (B V, 1, H, W), between near and far."""
+    least, most = (1 / x.flatten()[:, None, None, None] for x in (far_BV, near_BV))
+    fine = (disparity_N1HW + change_N1HW).clamp(least, most)
+    return -fine.log()

@@ -1,0 +1,162 @@
+"""`mvsplat/pixels`, `mvsplat/on_rays`: a query for each pixel, means on the rays through it."""
+
+from collections.abc import Iterable
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from einops import repeat
+from torch import Tensor
+
+from qgs.contracts import (
+    Centers,
+    ComponentConfig,
+    Fields,
+    FieldSpec,
+    Problem,
+    Queries,
+    RecipeContext,
+    memory_fields,
+)
+from qgs.geometry.precision import full_precision
+from qgs.types import Cameras, ImageMemory, QueryState, Views
+from qgs_zoo.mvsplat.adapter import coefficients, quaternions, world_harmonics
+
+PIXEL, TURN = "mvsplat.pixel", "mvsplat.turn"
+PIXEL_FIELDS: Fields = {
+    PIXEL: FieldSpec(
+        (4, 3),
+        frame="world",
+        encoding="camera centre; directions of z = 1: upper left corner, step across, step down",
+    ),
+    TURN: FieldSpec((4,), frame="world", encoding="unit quaternion w x y z, camera to world"),
+}
+"""The rays through a pixel, and the rotation of its camera."""
+RAY_FIELD: Fields = {PIXEL: PIXEL_FIELDS[PIXEL]}
+
+CHANNELS = (1, 1, 2, 3, 4)
+"""Per pixel: logarithm of the depth (world units), opacity logit, raw place in the pixel, raw
+scales, raw quaternion x y z w in the camera's frame; behind them harmonics, colour by colour."""
+LOG_DEPTH = 20.0
+"""Bound of the logarithm of a depth, so that any features give a finite place and a scale."""
+
+
+WIDTHS = {sum(CHANNELS) + 3 * coefficients(degree): degree for degree in (1, 2, 3, 4)}
+"""Widths of a model, and the degree of harmonics that they have room for."""
+
+
+def degree_of(width: int) -> int:
+    """Degree of the harmonics in the numbers of a pixel, D = `width`; those beyond are not read."""
+    return max([1, *(degree for least, degree in WIDTHS.items() if least <= width)])
+
+
+def numbers_of(features_BND: Tensor) -> Tensor:
+    """The numbers of pixels: features, with zeros for what a narrow model has no room for."""
+    return F.pad(features_BND, (0, max(0, min(WIDTHS) - features_BND.shape[-1])))
+
+
+def width_problems(context: RecipeContext) -> Iterable[Problem]:
+    """A model too narrow for the numbers of a pixel."""
+    least = min(WIDTHS)
+    if context.dims.width < least:
+        reason = f"the model is {context.dims.width} wide, but a pixel has {least} numbers or more"
+        fix = f"set model.width to one of {[*WIDTHS]}, for harmonics of degree 1, 2, 3, 4"
+        yield Problem("", reason, fix)
+
+
+class PixelQueries(Queries):
+    """A query for each pixel, which knows the rays through its pixel and its camera's rotation.
+
+    Its features are the encoder's numbers, harmonics turned into the world.
+    """
+
+    name = "pixels"
+    reads = memory_fields("features", "grid")
+    writes = PIXEL_FIELDS
+
+    @classmethod
+    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
+        return width_problems(context)
+
+    def forward(self, memory: ImageMemory, views: Views) -> QueryState:
+        assert memory.grid is not None
+        features = in_world(memory.features, views.cameras.c2w[..., :3, :3])
+        _, rows, columns = memory.grid
+        return QueryState(features, pixel_fields(views.cameras, rows, columns))
+
+
+@full_precision
+def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
+    """Numbers of pixels, ordered by view, with their harmonics turned into the world."""
+    numbers_BMC, degree = numbers_of(features_BMD), degree_of(features_BMD.shape[-1])
+    views = rotation_BV33.shape[1]
+    first, last = sum(CHANNELS), sum(CHANNELS) + 3 * coefficients(degree)
+    sh_BVPXK = numbers_BMC[..., first:last].unflatten(1, (views, -1)).unflatten(-1, (3, -1))
+    world = torch.einsum("bvkl,bvpxl->bvpxk", world_harmonics(rotation_BV33, degree), sh_BVPXK)
+    world = world.flatten(1, 2).flatten(2)
+    changed = torch.cat([numbers_BMC[..., :first], world, numbers_BMC[..., last:]], -1)
+    return changed[..., : features_BMD.shape[-1]]
+
+
+@full_precision
+def pixel_fields(cameras: Cameras, rows: int, columns: int) -> dict[str, Tensor]:
+    """PIXEL_FIELDS of images (B, V) seen as rows x columns pixels: (B, V*rows*columns, ...)."""
+    (height, width), c2w = cameras.size, cameras.c2w
+    left = torch.arange(columns, device=c2w.device).to(c2w) * (width / columns)
+    upper = torch.arange(rows, device=c2w.device).to(c2w) * (height / rows)
+    fx, fy, cx, cy = (x_BV[..., None] for x_BV in cameras.intrinsics.unbind(-1))
+    x_BVRC = repeat((left - cx) / fx, "b v c -> b v r c", r=rows)
+    y_BVRC = repeat((upper - cy) / fy, "b v r -> b v r c", c=columns)
+    right_BV3, down_BV3, ahead_BV3 = c2w[..., :3, :3].unbind(-1)
+
+    def each(x_BV3: Tensor) -> Tensor:
+        return x_BV3[:, :, None, None]
+
+    corner = x_BVRC[..., None] * each(right_BV3) + y_BVRC[..., None] * each(down_BV3)
+    corner = corner + each(ahead_BV3)
+    across, below = right_BV3 * (width / columns / fx), down_BV3 * (height / rows / fy)
+    others = (each(x).expand_as(corner) for x in (c2w[..., :3, 3], across, below))
+    origin, across, below = others
+    pixel = torch.stack([origin, corner, across, below], -2).flatten(1, 3)
+    turn = each(quaternions(c2w[..., :3, :3])).expand(*corner.shape[:-1], 4).flatten(1, 3)
+    return {PIXEL: pixel, TURN: turn}
+
+
+class OnRays(Centers):
+    """mean = o + t d; d goes through the place of the Gaussian in its pixel.
+
+    Offsets are two raw numbers, whose sigmoids are that place from the upper left corner, and the
+    logarithm of t in world units.
+    """
+
+    name = "on_rays"
+    reads = RAY_FIELD
+
+    class Config(ComponentConfig):
+        measure: Literal["distance", "depth"] = "distance"
+        """Whether t counts along the ray (MVSplat), or along the camera's axis (DepthSplat). In
+        MVSplat it was found as a depth by the plane sweep; its weights expect the difference."""
+
+    config: Config
+
+    def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
+        return _placed(offsets, state[PIXEL], self.config.measure == "distance")
+
+
+@full_precision
+def _placed(offsets_BNK3: Tensor, pixel_BN43: Tensor, distance: bool) -> Tensor:
+    directions = ray_directions(offsets_BNK3[..., :2], pixel_BN43, distance)
+    return pixel_BN43[:, :, None, 0] + depths(offsets_BNK3[..., 2:]) * directions
+
+
+def ray_directions(place_BNK2: Tensor, pixel_BN43: Tensor, unit: bool) -> Tensor:
+    """Of rays through raw places in pixels (B, N, K, 3): of length 1, or of z = 1."""
+    _, corner, across, down = pixel_BN43[:, :, None].unbind(-2)
+    u, v = place_BNK2.sigmoid()[..., None].unbind(-2)
+    directions = corner + u * across + v * down
+    return F.normalize(directions, dim=-1) if unit else directions
+
+
+def depths(log_depth: Tensor) -> Tensor:
+    """Depths, world units, of their logarithms."""
+    return log_depth.clamp(-LOG_DEPTH, LOG_DEPTH).exp()

@@ -1,0 +1,139 @@
+"""The U-Net of latent diffusion without its time, whose attention joins the tokens of all views."""
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from torch import Tensor, nn
+
+from qgs_zoo.mvsplat.convolutions import conv3, zeroed
+
+HEAD_WIDTH = 32
+
+
+def group_norm(width: int) -> nn.GroupNorm:
+    """8 groups, 4 for a width that is no multiple of 8."""
+    return nn.GroupNorm(8 if width % 8 == 0 else 4, width)
+
+
+class OverViews(nn.Sequential):
+    """A sequence that passes V, the views in (B V, C, H, W), on to its U-Nets and attentions."""
+
+    def forward(self, x_NCHW: Tensor, views: int) -> Tensor:
+        for module in self:
+            takes_views = isinstance(module, OverViews | ViewAttention | UNet)
+            x_NCHW = module(x_NCHW, views) if takes_views else module(x_NCHW)
+        return x_NCHW
+
+
+class ResidualBlock(nn.Module):
+    """Two convolutions and a skip; a norm in front of each (`pre_norm`) or behind each."""
+
+    def __init__(self, inputs: int, outputs: int, pre_norm: bool) -> None:
+        super().__init__()
+        first, second = conv3(inputs, outputs), conv3(outputs, outputs)
+        if pre_norm:
+            self.in_layers = nn.Sequential(group_norm(inputs), nn.SiLU(), first)
+            # The identity stands where the release has a dropout of 0, which counts in the names.
+            last: Any = (group_norm(outputs), nn.SiLU(), nn.Identity(), zeroed(second))
+        else:
+            self.in_layers = nn.Sequential(first, group_norm(outputs), nn.SiLU())
+            last = (second, zeroed(group_norm(outputs)), nn.SiLU())
+        self.out_layers = nn.Sequential(*last)
+        same = inputs == outputs
+        self.skip_connection = nn.Identity() if same else nn.Conv2d(inputs, outputs, 1)
+
+    def forward(self, x_NCHW: Tensor) -> Tensor:
+        return self.skip_connection(x_NCHW) + self.out_layers(self.in_layers(x_NCHW))
+
+
+class ViewAttention(nn.Module):
+    """Attention over the tokens of all views of a scene, in heads of 32 channels, no positions."""
+
+    def __init__(self, width: int, pre_norm: bool) -> None:
+        super().__init__()
+        self.pre_norm = pre_norm
+        self.norm = group_norm(width)
+        self.qkv = nn.Conv1d(width, 3 * width, 1)
+        self.proj_out = nn.Conv1d(width, width, 1)
+        zeroed(self.proj_out if pre_norm else self.norm)
+
+    def forward(self, x_NCHW: Tensor, views: int) -> Tensor:
+        """(B V, C, H, W) -> (B V, C, H, W)."""
+        x_NCT = x_NCHW.flatten(2)
+        raw_NCT = self.qkv(self.norm(x_NCT) if self.pre_norm else x_NCT)
+        # The rows of `qkv` are ordered head by head: q, k and v of the first, of the second, ...
+        pattern = "(b v) (h three d) t -> three b h (v t) d"
+        q, k, v = rearrange(raw_NCT, pattern, v=views, three=3, d=HEAD_WIDTH)
+        read = F.scaled_dot_product_attention(q, k, v)
+        out_NCT = self.proj_out(rearrange(read, "b h (v t) d -> (b v) (h d) t", v=views))
+        out_NCT = out_NCT if self.pre_norm else self.norm(out_NCT)
+        return x_NCHW + out_NCT.view_as(x_NCHW)
+
+
+class Downsample(nn.Module):
+    """A 3x3 convolution of stride 2."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.op = nn.Conv2d(width, width, 3, 2, padding=1)
+
+    def forward(self, x_NCHW: Tensor) -> Tensor:
+        return self.op(x_NCHW)
+
+
+class Upsample(nn.Module):
+    """Nearest neighbours to twice the size, and a 3x3 convolution."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.conv = conv3(width, width)
+
+    def forward(self, x_NCHW: Tensor) -> Tensor:
+        return self.conv(F.interpolate(x_NCHW, scale_factor=2, mode="nearest"))
+
+
+class UNet(nn.Module):
+    """One residual block per level down, two per level up: (B V, C, H, W) -> the same shape.
+
+    Attention stands behind the residual blocks of the lowest level alone. H and W are multiples of
+    2 ** (levels - 1).
+    """
+
+    def __init__(self, width: int, levels: int, pre_norm: bool) -> None:
+        super().__init__()
+
+        def block(inputs: int, lowest: bool) -> list[nn.Module]:
+            attention = [ViewAttention(width, pre_norm)] if lowest else []
+            return [ResidualBlock(inputs, width, pre_norm), *attention]
+
+        down: list[list[nn.Module]] = [[conv3(width, width)]]
+        up: list[list[nn.Module]] = []
+        for level in range(levels):
+            down.append(block(width, lowest=level == levels - 1))
+            if level < levels - 1:
+                down.append([Downsample(width)])
+        for level in reversed(range(levels)):
+            up += [block(2 * width, lowest=level == levels - 1) for _ in range(2)]
+            up[-1] += [Upsample(width)] if level else []
+        self.input_blocks = nn.ModuleList(OverViews(*modules) for modules in down)
+        blocks = (ResidualBlock(width, width, pre_norm) for _ in range(2))
+        self.middle_block = nn.Sequential(next(blocks), nn.Identity(), next(blocks))
+        self.output_blocks = nn.ModuleList(OverViews(*modules) for modules in up)
+        final = conv3(width, width)
+        if pre_norm:
+            self.out = nn.Sequential(group_norm(width), nn.SiLU(), zeroed(final))
+        else:
+            self.out = nn.Sequential(final, group_norm(width), nn.SiLU())
+
+    def forward(self, x_NCHW: Tensor, views: int) -> Tensor:
+        """Maps of `views` views of each scene, one scene after another."""
+        skips = []
+        for module in self.input_blocks:
+            x_NCHW = module(x_NCHW, views)
+            skips.append(x_NCHW)
+        x_NCHW = self.middle_block(x_NCHW)
+        for module in self.output_blocks:
+            x_NCHW = module(torch.cat([x_NCHW, skips.pop()], 1), views)
+        return self.out(x_NCHW)

@@ -1,0 +1,24 @@
+"""TokenGS 2026.6 for qgs: latents that read several encoder blocks, and scenes that move."""
+
+from qgs.contracts import Plugin
+from qgs_zoo.tokengs2026.dynamic import BlockCausalSelfAttention, DynamicObjective, DynamicQueries
+from qgs_zoo.tokengs2026.latents import LatentBottleneck
+from qgs_zoo.tokengs2026.multiscale import MultiscaleViT
+from qgs_zoo.tokengs2026.weights import TOKENGS_2026_6
+
+plugin = Plugin(
+    name="tokengs2026",
+    contract_version=1,
+    components=(
+        MultiscaleViT,
+        LatentBottleneck,
+        DynamicQueries,
+        BlockCausalSelfAttention,
+        DynamicObjective,
+    ),
+    layouts=(TOKENGS_2026_6,),
+    examples=(
+        MultiscaleViT.Config(blocks=(2, 3), time_channels=2),
+        LatentBottleneck.Config(depth=2, blocks=(1, 2), latents=6, latent_depth=2),
+    ),
+)

@@ -1,0 +1,157 @@
+"""Queries of moving scenes: static, and dynamic for the requested time (TokenGS 2026.6)."""
+
+from collections.abc import Iterable
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.contracts import (
+    AttentionWeights,
+    ComponentConfig,
+    Fields,
+    FieldSpec,
+    ModelDims,
+    Objective,
+    Outcome,
+    Passes,
+    Problem,
+    Queries,
+    RecipeContext,
+)
+from qgs.tokengs.decoder import ContentSelfAttention
+from qgs.types import (
+    ImageMemory,
+    LayerPrediction,
+    Prediction,
+    QueryState,
+    Views,
+    map_tensors,
+)
+from qgs_zoo.tokengs2026.times import TimeEmbedding, without_times
+
+MOVES = "dynamic.moves"
+"""Field (B, N), bool: True for dynamic queries, which stand for the requested time."""
+_FIELDS: Fields = {MOVES: FieldSpec((), torch.bool)}
+
+
+class DynamicQueries(Queries):
+    """N learned vectors; to the last of them, the dynamic ones, the requested time is added."""
+
+    name = "dynamic"
+    reads_cameras = False
+
+    class Config(ComponentConfig):
+        count: int = Field(default=1280, ge=1)
+        """N, the number of queries, static and dynamic (TokenGS: 1024 and 256)."""
+        dynamic: int = Field(default=256, ge=0)
+        """Number of dynamic queries, the last of the N; with 0 all queries get the time."""
+        std: float = Field(default=0.02, ge=0)
+        """Standard deviation of the normal distribution that the features start from."""
+        time_channels: int = Field(default=2, ge=0, multiple_of=2)
+        """Channels that the requested time is embedded with; 0 for none."""
+        patch_size: int = Field(default=8, ge=1)
+        """Side of the patches that embed the time; the release takes the encoder's."""
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        fixed, moving = config.count - config.dynamic, config.dynamic
+        self.features = nn.Parameter(torch.randn(fixed, dims.width) * config.std)
+        if moving:
+            self.dynamic = nn.Parameter(torch.randn(moving, dims.width) * config.std)
+        if config.time_channels:
+            self.time_embedding = TimeEmbedding(config.time_channels, dims.width, config.patch_size)
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        yield from without_times(config.time_channels, context)
+        if config.dynamic >= config.count:
+            yield Problem(
+                "dynamic",
+                f"{config.dynamic} dynamic queries leave none of {config.count} to be static",
+                f"set dynamic to {config.count - 1} or less, or raise count",
+            )
+
+    @classmethod
+    def fields_written(cls, config: Config) -> Fields:
+        return _FIELDS if config.dynamic else {}
+
+    def forward(self, memory: ImageMemory, views: Views) -> QueryState:
+        """With dynamic ones, the field `dynamic.moves` (B, N).
+
+        Raises ValueError for views without a target time.
+        """
+        config, batch = self.config, len(memory.features)
+        parts: list[Tensor] = [self.features, *([self.dynamic] if config.dynamic else [])]
+        x_BND = torch.cat(parts).expand(batch, -1, -1)
+        first = len(self.features) if config.dynamic else 0
+        moves_N = torch.arange(config.count, device=x_BND.device) >= first
+        if config.time_channels:
+            if views.target_time is None:
+                raise ValueError(
+                    "tokengs2026/dynamic queries need the requested time: compare with photos of "
+                    "one time, give the input views a target_time (B, 1), or set "
+                    "model.queries.time_channels to 0"
+                )
+            x_BND = x_BND + moves_N[:, None] * self.time_embedding(views.target_time)
+        return QueryState(x_BND, {MOVES: moves_N.expand(batch, -1)} if config.dynamic else {})
+
+
+class BlockCausalSelfAttention(ContentSelfAttention):
+    """Dynamic queries read all queries, static ones the static ones alone."""
+
+    name = "block_causal"
+    reads = _FIELDS
+
+    def forward(self, state: QueryState) -> Tensor:
+        return self.attention(self.norm(state.features), _readable(state))
+
+    def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
+        return self.attention.explain(self.norm(state.features), queries, _readable(state))
+
+
+class DynamicObjective(Objective):
+    """One pass; its losses, plus those of the Gaussians of dynamic queries rendered alone."""
+
+    name = "dynamic"
+    reads = _FIELDS
+    scheduled = frozenset({"weight"})
+    judges_inputs = False  # input photos show other moments than the reconstructed one
+
+    class Config(ComponentConfig):
+        weight: float = Field(default=0.3, ge=0)
+        """Weight of the second losses (TokenGS: 0.3 for 5,000 steps, then to 0 over 10,000)."""
+
+    config: Config
+
+    def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
+        """All losses of the whole prediction, and the term `dynamic`."""
+        prediction = passes.predict(inputs)
+        whole = passes.judge(prediction, targets, inputs)
+        added = torch.zeros_like(whole.total)
+        if self.config.weight:
+            layers = {number: _alone(layer) for number, layer in prediction.layers.items()}
+            last = layers[max(layers)]
+            alone = Prediction(last.gaussians, last.state, layers)
+            added = self.config.weight * passes.judge(alone, targets, inputs).total
+        return Outcome.mean([whole], dynamic=added)
+
+
+def _alone(layer: LayerPrediction) -> LayerPrediction:
+    """Dynamic queries of a layer and their Gaussians; which these are is equal in all scenes."""
+    moves_N = layer.state[MOVES][0]
+    each = layer.gaussians.count // len(moves_N)
+    of_gaussians = moves_N.repeat_interleave(each)
+    return LayerPrediction(
+        map_tensors(lambda x: x[:, of_gaussians], layer.gaussians),
+        map_tensors(lambda x: x[:, moves_N], layer.state),
+    )
+
+
+def _readable(state: QueryState) -> Tensor:
+    """(B, N, N): True where the query of the row may read that of the column."""
+    moves_BN = state[MOVES]
+    readable_BNN = moves_BN[:, :, None] | ~moves_BN[:, None]
+    return readable_BNN if state.mask is None else readable_BNN & state.mask[:, None]

@@ -1,0 +1,118 @@
+"""The weights of TokenGS 2026.6: published names, and the recipe that fits a state dict."""
+
+from typing import Any
+
+from qgs.contracts.weights import (
+    LayoutError,
+    Rename,
+    Shapes,
+    WeightLayout,
+    layer_count,
+    size_at,
+)
+from qgs.tokengs.weights import (
+    BACKBONE_RENAMES,
+    CROSS_QUERY,
+    DECODER,
+    read_tokengs,
+)
+
+READOUT = "enc_dec_backbone.multiscale_norms."
+DYNAMIC, TIME, TARGET_TIME = "gs_tokens_dynamic", "patch_time_embed", "patch_time_embed_tgt"
+LATENTS = "enc_dec_backbone.latents"
+LATENT_BLOCK = "enc_dec_backbone.latent_blocks."
+
+_RENAMES = (
+    Rename("encoder.time_embedding.", "patch_time_embed."),
+    Rename("queries.time_embedding.", "patch_time_embed_tgt."),
+    Rename("queries.dynamic", DYNAMIC),
+    Rename("encoder.norms.{}.", READOUT + "{}."),
+    Rename("encoder.latents", LATENTS),
+    Rename("encoder.feature_kv_proj.", "enc_dec_backbone.latent_feature_kv_proj."),
+    Rename("encoder.feature_k_norm.", "enc_dec_backbone.latent_feature_k_norm."),
+    Rename("encoder.latent_kv_proj.", "enc_dec_backbone.latent_kv_proj."),
+    *(
+        Rename(f"encoder.latent_blocks.{{}}.{ours}", LATENT_BLOCK + f"{{}}.{theirs}")
+        for ours, theirs in (
+            ("cross_attention.norm.", "gs_cross_attn.gs_token_norm."),
+            ("cross_attention.", "gs_cross_attn."),
+            ("cross_scale.", "gs_cross_attn_scale."),
+            ("self_norm.", "gs_self_attn.norm."),
+            ("self_attention.", "gs_self_attn.gs_self_attn."),
+            ("self_scale.", "gs_self_attn_scale."),
+            ("mlp_norm.", "mlp.norm."),
+            ("mlp.", "mlp.mlp."),
+            ("mlp_scale.", "mlp_scale."),
+        )
+    ),
+)
+
+
+def _read(shapes: Shapes) -> dict[str, Any]:
+    tree = read_tokengs(shapes)
+    model = tree["model"]
+    model["encoder"] |= _encoder(shapes, model["encoder"]["depth"])
+    model["encoder"]["time_channels"] = _channels(shapes, TIME)
+    dynamic, timed = DYNAMIC in shapes, _channels(shapes, TARGET_TIME)
+    if dynamic:
+        model["decoder"]["self_attention"] = {"type": "tokengs2026/block_causal"}
+    if dynamic or timed:
+        moving = size_at(shapes, DYNAMIC, 0) if dynamic else 0
+        model["queries"] = {
+            "type": "tokengs2026/dynamic",
+            "count": model["queries"]["count"] + moving,
+            "dynamic": moving,
+            "patch_size": model["encoder"]["patch_size"],
+            "time_channels": timed,
+        }
+    model["centers"]["z_offset"] = 0.0
+    tree |= {"plugins": ["tokengs2026"], "views": {"frame": "mean_cam"}}
+    return tree | ({"evaluation": {"tuning": "latents"}} if LATENTS in shapes else {})
+
+
+def _channels(shapes: Shapes, module: str) -> int:
+    """Channels of a time embedding; 0 without one."""
+    name = f"{module}.proj.weight"
+    return size_at(shapes, name, 1) if name in shapes else 0
+
+
+def _encoder(shapes: Shapes, depth: int) -> dict[str, Any]:
+    """Options of the encoder, of `depth` blocks, that TokenGS does not have."""
+    scales = layer_count(shapes, READOUT)
+    if scales > depth:
+        raise LayoutError(f"{READOUT}: {scales} norms, one for each block read, of {depth} blocks")
+    step = 2 if 2 * scales <= depth + 1 else 1
+    found: dict[str, Any] = {"blocks": list(range(depth - step * (scales - 1), depth + 1, step))}
+    if LATENTS not in shapes:
+        return {"type": "tokengs2026/multiscale_vit", **found}
+    blocks = layer_count(shapes, LATENT_BLOCK)
+    found |= {"latents": size_at(shapes, LATENTS, 0), "latent_depth": blocks}
+    return {"type": "tokengs2026/latent_bottleneck", **found}
+
+
+TOKENGS_2026_6 = WeightLayout(
+    name="TokenGS 2026.6",
+    source="nv-tlabs/TokenGS",
+    components={
+        "encoder": ("tokengs2026/multiscale_vit", "tokengs2026/latent_bottleneck"),
+        "queries": ("qgs/latent", "tokengs2026/dynamic"),
+        "cross_attention": ("qgs/content",),
+        "self_attention": ("qgs/content", "tokengs2026/block_causal"),
+        "feed_forward": ("qgs/mlp",),
+        "refinement": ("qgs/none",),
+        "head": ("qgs/gaussian_head",),
+        "centers": ("qgs/free",),
+    },
+    renames=(*BACKBONE_RENAMES, *_RENAMES, CROSS_QUERY),
+    marks=(DECODER + "0.gs_cross_attn.q_proj.weight", READOUT + "0.weight"),
+    read=_read,
+    undecided=(
+        "activations of the head and of the positions, their clamps and epsilons: TokenGS's",
+        "blocks that the encoder reads: every second one up to the last",
+        "supervised layers: the last",
+        "frame of the world: the mean camera",
+        "scale of the world, losses, renderer, training: the framework's defaults",
+    ),
+)
+"""The release of June 2026. Runs with `use_multiscale_encoder: False` are not recognised: they name
+the norm of the block that they read as TokenGS does."""

@@ -1,0 +1,149 @@
+"""VGGT's features, with a stand-in for VGGT that has its interface and a few weights."""
+
+import sys
+from types import SimpleNamespace
+
+import pytest
+import qgs_zoo.c3g.vggt
+import torch
+import torch.nn.functional as F
+from odd_views import odd_views
+from qgs_dev import Case, checks_for, run_check
+from qgs_zoo.c3g.vggt import MODULE, VggtFeatures
+from refusals import refused
+from safetensors.torch import load_file, save_file
+from small_parts import Code
+from torch import nn
+from torch.testing import assert_close
+
+import qgs
+from qgs.contracts import MissingExtraError, ModelDims
+from qgs.recipe import resolve
+
+TINY = "tiny/c3g.yaml"
+C = 8
+"""Width of the stand-in's tokens in place of 2048."""
+
+
+class Aggregator(nn.Module):
+    """As VGGT's: all layers' tokens (B, V, 5 + P, C), the first five of no patch."""
+
+    def __init__(self):
+        super().__init__()
+        self.decay = [x.item() for x in torch.linspace(0, 1, 3)]  # VGGT's constructor does
+        self.patch = nn.Conv2d(3, C, 14, 14)
+
+    def forward(self, images):
+        tokens = self.patch(images.flatten(0, 1)).flatten(2).mT.unflatten(0, images.shape[:2])
+        tokens = torch.tanh(tokens) + tokens[:, :1].mean(2, keepdim=True)
+        return [torch.zeros(()), F.pad(tokens, (0, 0, 5, 0), value=7.0)], 5
+
+
+@pytest.fixture(autouse=True)
+def vggt(monkeypatch):
+    monkeypatch.setitem(sys.modules, MODULE, SimpleNamespace(Aggregator=Aggregator))
+    monkeypatch.setattr(qgs_zoo.c3g.vggt, "WIDTH", C)
+
+
+@pytest.fixture
+def weights(tmp_path):
+    """A file of all of VGGT's weights, which has more than the aggregator's."""
+    own = {f"aggregator.{name}": x for name, x in Aggregator().state_dict().items()}
+    save_file({**own, "camera_head.weight": torch.zeros(2)}, tmp_path / "model.safetensors")
+    return tmp_path / "model.safetensors"
+
+
+def encoder(weights, width=C, **options):
+    config = VggtFeatures.Config(weights=str(weights), **options)
+    made = VggtFeatures(config, ModelDims(width, heads=2, depth=1))
+    made.load_pretrained()
+    return made
+
+
+def test_it_gives_the_patch_tokens_of_the_last_layer(weights):
+    """Of images in [-1, 1] or, as told, in [0, 1]."""
+    given = odd_views(3, 28, 42)
+    for told, images in (({}, given.images * 2 - 1), ({"images": "unit"}, given.images)):
+        made = encoder(weights, **told)
+        memory = made(given)
+        expected = made.aggregator(images)[0][-1][:, :, 5:]
+        assert torch.equal(memory.features, expected.flatten(1, 2))
+        assert memory.grid == (3, 2, 3)
+        assert memory.keys is memory.values is memory.patch_rays is None
+        blind = given.replace(cameras=given.cameras.replace(c2w=given.cameras.c2w + 1))
+        assert torch.equal(made(blind).features, memory.features)
+
+
+def test_a_model_of_another_width_has_a_linear_layer(weights):
+    narrow = encoder(weights, width=6)
+    assert narrow(odd_views(3, 28, 42)).features.shape[-1] == 6
+    assert narrow.proj.weight.shape == (6, C)
+    assert not [*encoder(weights).proj.parameters()]
+
+
+def test_weights_are_the_users(weights):
+    given = load_file(weights)
+    torch.save(given, weights.with_suffix(".pt"))
+    del given["camera_head.weight"]
+    for suffix in (".safetensors", ".pt"):
+        made = encoder(weights.with_suffix(suffix)).aggregator
+        assert_close(made.state_dict(prefix="aggregator."), given, rtol=0, atol=0)
+
+
+def test_weights_that_cannot_be_read_are_named(tmp_path):
+    save_file({"aggregator.patch.bias": torch.zeros(C)}, tmp_path / "other.safetensors")
+    (tmp_path / "cut.pt").write_bytes(b"no weights")
+    torch.save({"aggregator.patch.bias": Code()}, tmp_path / "code.pt")
+    for name in ("absent.safetensors", "my.ckpt", "other.safetensors", "cut.pt", "code.pt"):
+        with pytest.raises(MissingExtraError, match=name):
+            encoder(tmp_path / name)
+
+
+def overrides(weights):
+    """Of the tiny recipe, to C3G's with VGGT."""
+    return [
+        f"model.encoder={{type: c3g/vggt_features, weights: {weights}}}",
+        *("model.width=8", "model.heads=2", "model.queries.count=6", "data.image_size=[28, 42]"),
+        "optimizer.parts={encoder: 0.01, queries: 0.01}",
+    ]
+
+
+def test_without_vggt_the_message_names_what_installs_it(weights, monkeypatch):
+    monkeypatch.setitem(sys.modules, MODULE, None)
+    recipe = resolve(TINY, overrides(weights))
+    for device in ("cpu", "meta"):
+        with pytest.raises(MissingExtraError, match=r"pip install git\+https.*qgs/multiview_vit"):
+            recipe.build_model(device)
+
+
+def test_a_checkpoint_needs_no_file_of_weights(weights, tmp_path):
+    recipe = resolve(TINY, overrides(weights))
+    model = recipe.build_model().eval()
+    qgs.save(model, tmp_path / "checkpoint.safetensors")
+    weights.unlink()
+    loaded, given = qgs.load(tmp_path / "checkpoint.safetensors"), odd_views(3, 28, 42)
+    assert torch.equal(loaded(given).gaussians.means, model(given).gaussians.means)
+    with pytest.raises(MissingExtraError, match="there are no weights"):
+        recipe.build_model()
+
+
+def test_images_must_consist_of_patches(weights):
+    with pytest.raises(ValueError, match="27 x 42"):
+        encoder(weights)(odd_views(3, 27, 42))
+    problem = refused(TINY, [*overrides(weights), "data.image_size=[256, 224]"])
+    assert "patches of 14 do not divide images of 256 x 224" in problem.reason
+    assert "[252, 224]" in problem.fix
+
+
+def test_what_needs_rays_or_keys_is_refused_with_it(weights):
+    attention = "model.decoder.cross_attention={type: qgs/content}"
+    layer = "model.decoder.layer={type: qgs/cross_self_mlp}"
+    problem = refused(TINY, [*overrides(weights), layer, attention])
+    assert "`qgs/content` needs memory.keys" in problem.reason
+
+
+def test_it_keeps_the_contract_of_encoders(weights):
+    case = Case(VggtFeatures.Config(weights=str(weights)))
+    results = [run_check(check, case) for check in checks_for(case, ("core",))]
+    assert [(r.check.name, r.message) for r in results if not r.ok] == []
+    assert sum(r.verdict == "passed" for r in results) > 20

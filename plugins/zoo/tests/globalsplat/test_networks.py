@@ -1,0 +1,111 @@
+"""Memory tokens and both streams at the start, channel by channel; a round by its sums."""
+
+import math
+from collections import Counter
+
+import pytest
+import torch
+from odd_views import odd_views
+from qgs_zoo.globalsplat.encoder import PosedPatches
+from qgs_zoo.globalsplat.streams import TEXTURE, Round, SlotQueries
+from small_parts import DIMS, attended, made, shaken
+from torch.nn.functional import gelu
+from torch.testing import assert_close
+
+from qgs.contracts import LayerParts
+from qgs.geometry.rays import plucker_rays
+from qgs.types import ImageMemory, QueryState
+
+SMALL = {"rgb_width": 6, "ray_width": 5, "lens_width": 3, "bands": 2}
+
+
+def test_a_token_is_its_colours_beside_its_rays_and_its_camera():
+    encoder, given = made(PosedPatches, patch_size=4, **SMALL), odd_views(2, 16, 24)
+    memory = encoder(given)
+    assert memory.features.shape == (2, 2 * 4 * 6 + 4, 11)
+    assert memory.grid is memory.keys is memory.patch_rays is None
+    assert torch.equal(memory.features[0, -4:], encoder.registers)
+    scene, view, row, column = 1, 1, 2, 3
+    token = memory.features[scene, view * 24 + row * 6 + column]
+    patch = (scene, view, slice(None), slice(8, 12), slice(12, 16))
+    assert_close(token[:6], encoder.rgb_embedding(2 * given.images[patch] - 1).flatten())
+    rays = encoder.ray_embedding(plucker_rays(given.cameras)[patch]).flatten()
+    fx, fy, cx, cy = given.cameras.intrinsics[scene, view].tolist()
+    told = torch.tensor([math.log(fx / 24), math.log(fy / 16), cx / 24, cy / 16])
+    x = given.cameras.c2w[scene, view, :3, 3]
+    waves = [f(k * math.pi * x) for f in (torch.sin, torch.cos) for k in (1, 2)]
+    camera = torch.cat([encoder.lens_mlp(told), x, *waves])
+    assert_close(token[6:], rays + encoder.camera_proj(camera))
+
+
+def test_a_grid_stands_where_there_are_no_registers():
+    assert made(PosedPatches, patch_size=4, registers=0)(odd_views(2, 16, 24)).grid == (2, 4, 6)
+
+
+def test_images_that_patches_do_not_divide_are_refused():
+    with pytest.raises(ValueError, match="16 x 24 cannot be cut into patches of 5; resize"):
+        made(PosedPatches, patch_size=5)(odd_views(2, 16, 24))
+
+
+def test_two_streams_of_one_token():
+    queries = made(SlotQueries, count=400, extra=4, std=0.5)
+    assert queries.slots.std().item() == pytest.approx(0.5, rel=0.05)
+    state = queries(ImageMemory(torch.zeros(3, 1, 7)), odd_views(2, 16, 24))
+    tokens = torch.cat([queries.slots, queries.extra])
+    for stream, seen in ((queries.geometry, state.features), (queries.texture, state[TEXTURE])):
+        assert_close(seen, stream(tokens).expand(3, -1, -1))
+    assert torch.equal(state.mask, torch.arange(400).expand(3, -1) < 396)
+    assert made(SlotQueries, count=4, extra=0).start(2).mask is None
+
+
+def test_extra_tokens_stay_extra_when_slots_are_added():
+    few, many = (made(SlotQueries, count=n, extra=2) for n in (6, 12))
+    many.load_state_dict(many.resized(few.state_dict(), torch.Generator()))
+    assert torch.equal(many.extra, few.extra)
+    assert torch.equal(many.slots[:4], few.slots)
+    assert_close(many.slots[4:8], few.slots, atol=0.06, rtol=0)
+
+
+def mlp(x, layers):
+    return layers.fc2(gelu(layers.fc1(x)))
+
+
+def one_stream(stream, x, memory):
+    cross = stream.cross_attention
+    k, v = stream.kv_proj(stream.memory_norm(memory)).chunk(2, -1)
+    read = attended(cross.q_proj(cross.norm(x)), k, v, cross.q_norm, stream.k_norm)
+    x = x + stream.cross_scale.gamma * cross.out_proj(read)
+    x = x + stream.mlp_scale.gamma * mlp(stream.norm(x), stream.mlp)
+    for block in stream.blocks:
+        core = block.attention
+        read = attended(*core.qkv(block.norm1(x)).chunk(3, -1), core.q_norm, core.k_norm)
+        x = x + block.scale1.gamma * core.proj(read)
+        x = x + block.scale2.gamma * mlp(block.norm2(x), block.mlp)
+    return x
+
+
+def test_a_round_is_two_streams_and_a_mixer():
+    """Tokens that decode nothing are read as well."""
+    layer = shaken(made(Round, LayerParts(DIMS, {}, 0.5), memory_width=10))
+    memory = ImageMemory(torch.randn(2, 7, 10).double())
+    x, y = torch.randn(2, 2, 5, 16).double()
+    state = QueryState(x, {TEXTURE: y}, torch.tensor([True] * 4 + [False]).expand(2, -1))
+    after, passed = layer(state, memory)
+    assert passed is memory
+    assert after.mask is state.mask
+    x = one_stream(layer.geometry, x, memory.features)
+    y = one_stream(layer.texture, y, memory.features)
+    both = torch.cat([layer.geometry_norm(x), layer.texture_norm(y)], -1)
+    update = layer.mixer_scale.gamma * mlp(both, layer.mixer)
+    assert_close(after.features, x + update[..., :16])
+    assert_close(after[TEXTURE], y + update[..., 16:])
+
+
+def test_scales_start_as_published():
+    layer = made(Round, LayerParts(DIMS, {}, 1e-3))
+    found = Counter(
+        (".blocks." in name, f"{parameter.unique().item():.3f}")
+        for name, parameter in layer.named_parameters()
+        if name.endswith("gamma")
+    )
+    assert found == {(True, "0.010"): 2 * 2 * 2, (False, "0.001"): 2 * 2 + 1}

@@ -1,0 +1,156 @@
+"""Scenes that move: the embedding of times, which queries carry them, who reads whom."""
+
+from functools import partial
+
+import pytest
+import torch
+from odd_views import odd_views
+from qgs_zoo.tokengs2026.dynamic import MOVES, DynamicQueries
+from qgs_zoo.tokengs2026.multiscale import MultiscaleViT
+from qgs_zoo.tokengs2026.times import TimeEmbedding, time_features
+from refusals import problems_of
+from small_parts import made
+from torch.testing import assert_close
+
+from qgs.contracts.schedule import follow
+from qgs.recipe import resolve
+from qgs.train.training_pass import TrainingPass
+from qgs.types import ImageMemory, LayerPrediction, Photos
+
+PUBLISHED = "tokengs/dynamic.yaml"
+
+MEMORY = ImageMemory(torch.zeros(2, 3, 16))
+
+
+VIT = "type: tokengs2026/multiscale_vit, depth: 1, blocks: [1], time_channels: 4"
+SIZES = (
+    "width=16 heads=2 queries.count=7 queries.dynamic=3 queries.std=1 decoder.depth=2 "
+    "decoder.layer_scale=0.5 head.gaussians_per_query=2 head.init_std=0.5 supervision.layers=[2]"
+)
+SMALL = (
+    *("plugins=[tokengs2026, rooms]", "evaluation.tuning=queries"),
+    *(f"model.encoder={{{VIT}, layer_scale: 0.5}}", *(f"model.{x}" for x in SIZES.split())),
+)
+
+
+def small(*overrides):
+    return resolve(PUBLISHED, [*SMALL, *overrides])
+
+
+def views(times=None, target=None):
+    return odd_views().replace(times=times, target_time=target)
+
+
+INPUTS = views(torch.zeros(2, 2), torch.zeros(2, 1))
+TARGETS = INPUTS.select([0]).replace(target_time=None)
+
+
+def dynamic_queries(**options):
+    """Whose embedding of times is no longer zero."""
+    queries = made(DynamicQueries, count=7, **options)
+    torch.nn.init.normal_(queries.time_embedding.proj.weight)
+    return queries
+
+
+def test_times_are_cosines_and_sines_and_embedded_as_zeros_at_first():
+    times = torch.tensor([[0.0, 2.5]])
+    angles = times[..., None] * torch.tensor([1, 0.01])
+    assert_close(time_features(times, 4), torch.cat([angles.cos(), angles.sin()], -1))
+    assert not TimeEmbedding(4, 16, 8)(times).any()
+
+
+def test_the_target_time_is_added_to_the_dynamic_queries_or_to_all():
+    """They do without cameras."""
+    assert not DynamicQueries.reads_cameras
+    photos = [Photos(INPUTS.images, target_time=torch.tensor([[x], [0.5]])) for x in (0.0, 1.0)]
+    for dynamic, moving in ((3, [False] * 4 + [True] * 3), (0, [True] * 7)):
+        early, late = map(partial(dynamic_queries(dynamic=dynamic), MEMORY), photos)
+        changed = (early.features != late.features).any(-1)
+        assert changed.tolist() == [moving, [False] * 7]
+        fields = {name: x.tolist() for name, x in early.fields.items()}
+        assert fields == ({MOVES: [moving] * 2} if dynamic else {})
+
+
+def test_that_nothing_reads_which_queries_move_is_no_warning():
+    content = ("model.decoder.self_attention={type: qgs/content}", "objective={type: qgs/one_pass}")
+    for dynamic in (3, 0):
+        assert small(*content, f"model.queries.dynamic={dynamic}").warnings == []
+
+
+def test_what_reads_dynamic_queries_is_refused_without_them():
+    attention, objective = problems_of(PUBLISHED, ["model.queries.dynamic=0"])
+    assert MOVES in attention.reason
+    assert f"`tokengs2026/dynamic` needs {MOVES}" in objective.reason
+
+
+@pytest.fixture
+def model():
+    model = small().build_model().eval()
+    for embedding in (model.encoder, model.queries):
+        torch.nn.init.normal_(embedding.get_submodule("time_embedding").proj.weight)
+    return model
+
+
+def test_views_without_times_are_refused(model):
+    with pytest.raises(ValueError, match=r"reads the times of photos .*time_channels to 0"):
+        model(views(target=torch.zeros(2, 1)))
+    with pytest.raises(ValueError, match=r"requested time: .* target_time \(B, 1\)"):
+        model(views(torch.zeros(2, 2)))
+
+
+def test_what_reads_times_is_refused_beside_data_that_tell_none():
+    assert small("data={type: qgs/photos, path: x}")
+    found = problems_of(PUBLISHED, [*SMALL, "data={type: rooms/procedural}"])
+    reason = "the data of this recipe have no times: `time_channels: {}` reads them"
+    assert {problem.option: problem.reason for problem in found} == {
+        "model.encoder.time_channels": reason.format(4),
+        "model.queries.time_channels": reason.format(2),
+    }
+
+
+def test_views_keep_the_time_that_is_asked_for():
+    both = views(torch.tensor([[0.1, 0.9]] * 2), torch.zeros(2, 1))
+    chosen = both.select([1])
+    assert torch.equal(chosen.times, both.times[:, 1:])
+    assert chosen.target_time is both.target_time
+    with pytest.raises(ValueError, match=r"Views.times must have shape \(2, 2\), got \(2, 3\)"):
+        views(torch.zeros(2, 3))
+
+
+def test_the_objective_judges_dynamic_gaussians_again(model):
+    gaussians = model(INPUTS).gaussians[:, 4 * 2 :]
+    rendering = model.render(gaussians, TARGETS.cameras)
+    layer = LayerPrediction(gaussians, model.queries(MEMORY, INPUTS))
+    for weight in (0.5, 0.0):
+        objective = TrainingPass.of(small(f"objective.weight={weight}"), model)
+        outcome = objective(INPUTS, TARGETS)
+        losses = [loss(layer, rendering, TARGETS, INPUTS) for loss in objective.losses.values()]
+        expected = weight * sum(value for terms in losses for value in terms.values())
+        assert_close(outcome.terms["dynamic"], expected)
+        assert_close(outcome.total.detach(), sum(outcome.terms.values()))
+
+
+def test_no_loss_may_have_the_term_of_the_objective(model):
+    objective = TrainingPass.of(small(), model)
+    loss = next(iter(objective.losses.values()))
+    loss.forward = lambda *given: {"dynamic": given[0].gaussians.means.sum()}
+    with pytest.raises(ValueError, match=r"losses have terms \['dynamic'\] already"):
+        objective(INPUTS, TARGETS)
+
+
+def test_larger_patches_embed_times_as_smaller_ones():
+    options = {"depth": 1, "blocks": (1,), "time_channels": 2}
+    small, large = (made(MultiscaleViT, patch_size=side, **options) for side in (4, 8))
+    torch.nn.init.normal_(small.time_embedding.proj.weight)
+    large.load_state_dict(large.adapted(small.state_dict()))
+    times = torch.rand(2, 3)
+    assert_close(large.time_embedding(times), small.time_embedding(times))
+
+
+def test_the_published_weight_of_dynamic_gaussians():
+    objective = resolve(PUBLISHED).build_objective()
+    weights = []
+    for step in (0, 5000, 10_000, 15_000, 20_000):
+        follow([objective], step)
+        weights.append(objective.config.weight)
+    assert weights == pytest.approx([0.3, 0.3, 0.15, 0, 0])

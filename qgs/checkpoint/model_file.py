@@ -1,0 +1,234 @@
+"""A model as one safetensors file that carries its recipe; pickles are never read."""
+
+import json
+import os
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+import qgs
+from qgs.checkpoint.models import checkpoint_path
+from qgs.checkpoint.tensors import (
+    SEAL,
+    CheckpointError,
+    TensorFile,
+    differing_tensors,
+    differing_types,
+    nonfinite,
+    shapes_of,
+    write_tensors,
+)
+from qgs.contracts.schedule import END, follow, steps_followed
+from qgs.domain import KEY, Domain, FirstViews
+from qgs.machine import TooLargeError
+from qgs.model import QueryGaussianModel
+from qgs.recipe import Recipe, RecipeError
+from qgs.recipe.registry import available_plugins
+from qgs.wording import listed
+
+FORMAT_VERSION = 3
+"""Raised when the metadata of checkpoints change."""
+
+_RECIPE, _FORMAT, _EXTRA = "qgs.recipe", "qgs.format_version", "qgs.extra."
+_PLUGINS, _DISTRIBUTIONS, _VERSION = "qgs.plugins", "qgs.distributions", "qgs.version"
+
+
+class CheckpointFile(TensorFile):
+    """A checkpoint, opened once for all that it holds.
+
+        with CheckpointFile("rooms/locus-64") as file:
+            model, recipe, step = file.model(), file.recipe, file.step
+
+    name: a path, of a run folder too, PLUGIN/NAME of a shipped model, or a URL; see
+    `checkpoint_path`. Parts are read when they are used.
+    extra: the metadata that `save` was given.
+    Raises FileNotFoundError, and CheckpointError for another kind of file or a later format.
+    """
+
+    def __init__(self, name: str | os.PathLike[str]) -> None:
+        super().__init__(checkpoint_path(name))
+        self.name = os.fspath(name)
+        if _RECIPE not in self.metadata:
+            raise CheckpointError(
+                f"{self.path} is a safetensors file without a qgs recipe; only files written by "
+                "qgs.save or `qgs train` can be loaded. Published weights become a checkpoint by "
+                f"`qgs import {self.path} --recipe auto --out CHECKPOINT.safetensors`"
+            )
+        if self.refuse_newer(_FORMAT, FORMAT_VERSION) > 2 and SEAL not in self.metadata:
+            raise self.damaged(f"its metadata lack {SEAL}")
+        self.extra = {
+            key.removeprefix(_EXTRA): value
+            for key, value in self.metadata.items()
+            if key.startswith(_EXTRA)
+        }
+
+    @cached_property
+    def recipe(self) -> Recipe:
+        """The recipe of the model.
+
+        Raises CheckpointError that names the releases which wrote the file, where components are
+        missing here or differ.
+        """
+        try:
+            return self.stored_recipe(_RECIPE)
+        except RecipeError as error:
+            names = {**self.mapping(_DISTRIBUTIONS), "qgs": "query-gaussians"}
+            versions = self.mapping(_PLUGINS).items()
+            releases = {plugin: f"{names.get(plugin, plugin)} {v}" for plugin, v in versions}
+            available = {"qgs", *available_plugins()}
+            absent = [release for plugin, release in releases.items() if plugin not in available]
+            raise CheckpointError(
+                f"{self.path} was made with {listed(releases.values())}, and its recipe fails "
+                f"here; install {listed(absent) or 'those releases'}:\n{error}"
+            ) from error
+
+    @cached_property
+    def tensors(self) -> dict[str, Tensor]:
+        """The weights, memory-mapped; raises CheckpointError where they are not those saved."""
+        return self.read()
+
+    @cached_property
+    def step(self) -> int | None:
+        """The training step; None where the file has none, as for imported weights."""
+        if "step" not in self.extra:
+            return None
+        with self.entry(_EXTRA + "step") as text:
+            return int(text)
+
+    @cached_property
+    def domain(self) -> Domain:
+        """The ranges of the views that the model was trained on; empty where unknown."""
+        key = _EXTRA + KEY
+        if key not in self.metadata:
+            return Domain()
+        with self.entry(key):
+            return Domain.read(self.mapping(key))
+
+    def untrained(self, device: str | torch.device | None = None) -> QueryGaussianModel:
+        """The model with initial parameters; "meta" takes no memory. Raises CheckpointError."""
+        try:
+            return self.recipe.build_model(device, pretrained=False)
+        except (RecipeError, TooLargeError) as error:
+            raise CheckpointError(
+                f"{self.path}: the model of its recipe cannot be built: {error}"
+            ) from error
+
+    def model(self, device: str | torch.device | None = None) -> QueryGaussianModel:
+        """The model on `device` (default: CPU), in evaluation mode, half precision as float32.
+
+        Raises CheckpointError, and ValueError for weights that are NaN or infinite.
+        """
+        # Sizes are compared on the meta device, before the recipe's model takes memory.
+        refuse_misfit(self.untrained("meta"), self.tensors, str(self.path))
+        model = self.untrained()
+        load_weights(model, self.tensors, str(self.path))
+        follow(model.modules(), END if self.step is None else self.step)
+        model.trained_on = self.domain
+        local = Path(self.name).expanduser().exists()
+        model.loaded_from = str(self.path.resolve()) if local else self.name
+        settings = self.recipe.tree.get("views")
+        model.register_forward_pre_hook(FirstViews(settings, self.domain))
+        return (model if device is None else model.to(device)).eval()
+
+
+def load(
+    name: str | os.PathLike[str], device: str | torch.device | None = None
+) -> QueryGaussianModel:
+    """The model of a checkpoint, in evaluation mode; name, device and errors: `CheckpointFile`."""
+    with CheckpointFile(name) as file:
+        return file.model(device)
+
+
+def save(
+    model: QueryGaussianModel,
+    path: str | os.PathLike[str],
+    *,
+    extra: Mapping[str, str] | None = None,
+    weights: Mapping[str, Tensor] | None = None,
+) -> None:
+    """Write the weights of `model` and its resolved recipe to `path`, atomically.
+
+    extra: more metadata, such as the training step. weights: written instead of the model's present
+    ones, named as by `unique_tensors`.
+    Raises ValueError for a model that was not composed from a recipe, OSError for a full disk.
+    """
+    if model.recipe is None:
+        raise ValueError(
+            "this model was built by hand and has no recipe to save; build it with qgs.compose"
+        )
+    tensors = {
+        name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
+        for name, tensor in (weights or unique_tensors(model)).items()
+    }
+    step = steps_followed(model.modules())
+    followed = {} if step in (None, END) else {"step": str(step)}
+    write_checkpoint(path, tensors, model.recipe, model.releases, followed | dict(extra or {}))
+
+
+def write_checkpoint(
+    path: str | os.PathLike[str],
+    tensors: Mapping[str, Tensor],
+    tree: Mapping[str, Any],
+    releases: Mapping[str, tuple[str, str]],
+    extra: Mapping[str, str],
+) -> None:
+    """Write a checkpoint from its parts, without copying a tensor.
+
+    tensors: on the CPU, contiguous, named as by `unique_tensors`. tree: the resolved recipe.
+    releases: as `Recipe.releases`.
+    """
+    metadata = {
+        _RECIPE: json.dumps(tree),
+        _PLUGINS: json.dumps({name: version for name, (_, version) in releases.items()}),
+        _DISTRIBUTIONS: json.dumps({name: origin for name, (origin, _) in releases.items()}),
+        _FORMAT: str(FORMAT_VERSION),
+        _VERSION: qgs.__version__,
+        **{_EXTRA + key: value for key, value in extra.items()},
+    }
+    write_tensors(path, tensors, metadata)
+
+
+def unique_tensors(model: nn.Module) -> dict[str, Tensor]:
+    """Parameters and persistent buffers, a shared one only under its first name."""
+    first_names: dict[int, str] = {}
+    state = model.state_dict(keep_vars=True)
+    for name, tensor in state.items():
+        first_names.setdefault(id(tensor), name)
+    return {name: state[name] for name in first_names.values()}
+
+
+def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -> None:
+    """Copy `tensors`, read from `origin`, into `model`; nothing is copied where one does not fit.
+
+    Raises CheckpointError that lists differences in names, shapes and types, and ValueError for NaN
+    and infinity.
+    """
+    refuse_misfit(model, tensors, origin)
+    refuse_nonfinite(tensors, origin)
+    with torch.no_grad():
+        for name, tensor in unique_tensors(model).items():
+            tensor.copy_(tensors[name])
+
+
+def refuse_nonfinite(tensors: Mapping[str, Tensor], origin: object) -> None:
+    """Raise ValueError for NaN and infinity in weights read from `origin`."""
+    if broken := nonfinite(tensors.items()):
+        fix = "its training had diverged, or the file is damaged: take another"
+        raise ValueError(f"{origin}: weights are not finite: {listed(broken)}; {fix}")
+
+
+def refuse_misfit(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -> None:
+    """Raise CheckpointError that lists in what `tensors` differ from those of `model`."""
+    own = unique_tensors(model)
+    differences = differing_tensors(shapes_of(tensors), shapes_of(own))
+    if differences := differences + differing_types(tensors, own, widened=True):
+        raise CheckpointError(
+            f"{origin} does not fit the model of its recipe, {len(differences)} differences:\n  "
+            + listed(differences, 20, "\n  ")
+            + "\nInstall the versions of qgs and of its plugins that wrote the file; if they are, "
+            "it is damaged: copy it again."
+        )

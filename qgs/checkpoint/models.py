@@ -1,0 +1,66 @@
+"""Checkpoints by name: a path, a model that an installed plugin ships, or any URL of fsspec."""
+
+import os
+from pathlib import Path
+
+from qgs.extensions import function
+from qgs.recipe.errors import did_you_mean
+from qgs.recipe.registry import available_plugins, load_plugin
+
+CHECKPOINT = "checkpoint.safetensors"
+"""In a run folder: the latest good weights."""
+
+
+def checkpoint_path(name: str | os.PathLike[str]) -> Path:
+    """The local file that `name` stands for; anything that exists under that name comes first.
+
+    name: a path, of a run folder for the checkpoint in it, PLUGIN/NAME of a model that an installed
+    plugin ships (`qgs list`), or a URL that fsspec opens, see `qgs_research.published.downloads`.
+    Raises FileNotFoundError, PluginError for a plugin that cannot be used, ExtensionError for
+    downloads that are not installed, OSError for one that fails.
+    """
+    text = os.fspath(name)
+    path = Path(text).expanduser()
+    plugin, slash, model = text.partition("/")
+    if path.exists():
+        path = path / CHECKPOINT if path.is_dir() else path
+    elif "://" in text:
+        return function("qgs.downloads", "checkpoint")(text)
+    elif slash and "/" not in model and path.suffix != ".safetensors":
+        if plugin in available_plugins():
+            return _shipped(plugin, text)
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no checkpoint at {path}; give a run folder of `qgs train`, a .safetensors file, its "
+            "URL, or PLUGIN/NAME of a model that `qgs list` shows"
+        )
+    return path
+
+
+def _shipped(plugin: str, name: str) -> Path:
+    installed = load_plugin(plugin)
+    if name not in installed.models:
+        hint = did_you_mean(name, installed.models, "models") if installed.models else "it has none"
+        raise FileNotFoundError(
+            f"there is no file {name}, and {installed.released_as} ships no model of that name; "
+            f"{hint}"
+        )
+    file = installed.models[name]
+    if not file.is_file():
+        raise FileNotFoundError(
+            f"{installed.released_as} should ship the model {name}, but {file} is not there; "
+            f"install {installed.released_as} again"
+        )
+    return file
+
+
+def card_of(file: Path) -> str:
+    """The card of a model, NAME.md beside the checkpoint NAME.safetensors; "" without one."""
+    card = file.with_suffix(".md")
+    return card.read_text(encoding="utf-8") if card.is_file() else ""
+
+
+def about(file: Path) -> str:
+    """What the model in `file` is: the first paragraph of its card; "" without one."""
+    paragraphs = [part for part in card_of(file).split("\n\n") if not part.startswith("#")]
+    return " ".join(paragraphs[0].split()) if paragraphs else ""

@@ -1,0 +1,210 @@
+"""Safetensors files: opened once, read as possibly hostile data, written atomically."""
+
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+import qgs
+from qgs.contracts.weights import Shapes
+from qgs.files import replacing
+from qgs.recipe import Recipe, RecipeError, resolve
+from qgs.wording import name_shown
+
+SEAL, _DIGEST = "qgs.seal", "qgs.digest"
+"""Metadata entries with the checksums of all others, and of the tensors."""
+_PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}
+
+
+class CheckpointError(ValueError):
+    """A file without usable weights; the message names the file, the fault and the remedy."""
+
+
+class TensorFile:
+    """A safetensors file, open for reading; a context manager.
+
+    path: of the file. metadata: its text entries.
+    Before it maps anything, safetensors compares the sizes in the header with the size of the file.
+    Raises OSError and MemoryError of the system, and CheckpointError for any but a whole file.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise FileNotFoundError(f"no file at {self.path}")
+        with self._whole():
+            self._file: Any = safe_open(self.path, "pt")
+        self.metadata: Mapping[str, str] = self._file.metadata() or {}
+        if SEAL in self.metadata and self.metadata[SEAL] != seal(self.metadata):
+            raise self.damaged("its metadata are not those that were written")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._file.__exit__(*exception)
+
+    def read(self) -> dict[str, Tensor]:
+        """All tensors, memory-mapped; they outlive the open file."""
+        with self._whole():
+            tensors = {name: self._file.get_tensor(name) for name in self._file.keys()}  # noqa: SIM118
+        if (written := self.metadata.get(_DIGEST)) and written != digest(tensors):
+            raise self.damaged("its tensors are not those that were written")
+        return tensors
+
+    @contextmanager
+    def _whole(self) -> Iterator[None]:
+        try:
+            yield
+        # A wrong header makes safetensors and torch raise anything.
+        except Exception as error:
+            if isinstance(error, MemoryError) or getattr(error, "errno", None) is not None:
+                raise  # the system's, such as a failing disk
+            if kind := pickle_kind(self.path):  # opens it: PermissionError is of here
+                raise CheckpointError(
+                    f"{self.path} is {kind}, which can run code when it is read; use the "
+                    "safetensors file of the run, or name published weights .pt"
+                ) from error
+            raise CheckpointError(
+                f"{self.path} is not a whole safetensors file ({name_shown(str(error))}); it may "
+                "be cut off: copy it again"
+            ) from error
+
+    def damaged(self, what: str) -> CheckpointError:
+        """The error for a file that is not as it was written. what: part and reason."""
+        return CheckpointError(
+            f"{self.path} is damaged: {name_shown(what, 5000)}. Copy the file again from where it "
+            "came, or take another checkpoint of the run"
+        )
+
+    @contextmanager
+    def entry(self, key: str) -> Iterator[str]:
+        """The text of the metadata entry `key`; errors in the block become CheckpointErrors."""
+        try:
+            yield self.metadata[key]
+        except (RecipeError, CheckpointError):
+            raise
+        except Exception as error:  # forged JSON makes later code raise anything
+            kind = "nested too deep" if isinstance(error, RecursionError) else str(error)[:200]
+            what = f"`{key}` in its metadata cannot be read ({type(error).__name__}: {kind})"
+            raise self.damaged(what) from error
+
+    def mapping(self, key: str) -> dict[str, Any]:
+        """The JSON mapping in the entry `key`. Raises CheckpointError."""
+        with self.entry(key) as text:
+            found = json.loads(text)
+            if not isinstance(found, dict):
+                raise TypeError(f"expected a mapping, got {type(found).__name__}")
+            return found
+
+    def stored_recipe(self, key: str) -> Recipe:
+        """The resolved recipe in the entry `key`; no file that it names is followed.
+
+        Raises CheckpointError, and RecipeError where components here do not fit the recipe.
+        """
+        tree = self.mapping(key)
+        if unresolved := [name for name in ("extends", "swap") if name in tree]:
+            raise self.damaged(f"its recipe has `{unresolved[0]}`, and qgs writes resolved recipes")
+        with self.entry(key):
+            return resolve(tree)
+
+    def refuse_newer(self, key: str, ours: int) -> int:
+        """The format version in the entry `key`; CheckpointError where it is above `ours`."""
+        with self.entry(key) as text:
+            written = int(text[:20])
+        if written > ours:
+            raise CheckpointError(
+                f"{self.path} has {key} {written}, and qgs {qgs.__version__} reads {ours}: "
+                "install the newer qgs that wrote it"
+            )
+        return written
+
+
+def write_tensors(
+    path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
+) -> None:
+    """Write `tensors`, contiguous and on the CPU, to `path`; see `replacing`. Raises OSError."""
+    with replacing(path) as temporary:
+        try:
+            metadata = {**metadata, _DIGEST: digest(tensors)}
+            save_file(dict(tensors), temporary, {**metadata, SEAL: seal(metadata)})
+        except SafetensorError as error:  # it gives the number of an OSError as text only
+            if number := re.search(r"os error (\d+)", str(error)):
+                raise OSError(int(number[1]), str(error), os.fspath(path)) from error
+            raise
+
+
+def digest(tensors: Mapping[str, Tensor]) -> str:
+    """A checksum of the names, dtypes, shapes and bytes of contiguous tensors on the CPU."""
+    total = blake2b(digest_size=16)
+    for name, tensor in sorted(tensors.items()):
+        total.update(f"{name} {tensor.dtype} {list(tensor.shape)}\n".encode())
+        total.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return total.hexdigest()
+
+
+def seal(metadata: Mapping[str, str]) -> str:
+    """A checksum of all metadata entries but SEAL."""
+    entries = sorted((key, text) for key, text in metadata.items() if key != SEAL)
+    return blake2b(json.dumps(entries).encode(), digest_size=16).hexdigest()
+
+
+def pickle_kind(path: str | os.PathLike[str]) -> str:
+    """The kind of a file that can run code when it is read; "" for any other file."""
+    with open(path, "rb") as file:
+        start = file.read(9)
+    if start[8:] == b"{":  # safetensors: a length whose bytes may look like a pickle, then JSON
+        return ""
+    return next((kind for magic, kind in _PICKLES.items() if start.startswith(magic)), "")
+
+
+def shapes_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
+    """Names to shapes."""
+    return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+
+
+def nonfinite(tensors: Iterable[tuple[str, Tensor]]) -> list[str]:
+    """Names of the tensors, all on one device, that hold NaN or infinity."""
+    names, finite = [], []
+    for name, tensor in tensors:
+        names.append(name)
+        finite.append(tensor.isfinite().all())
+    # One read for all: each read would make the host wait for the device.
+    flags = torch.stack(finite).tolist() if finite else []
+    return [name for name, is_finite in zip(names, flags, strict=True) if not is_finite]
+
+
+def differing_tensors(file: Shapes, recipe: Shapes) -> list[str]:
+    """Differences in names and shapes between a file and the model of a recipe, one line each."""
+    found = [f"missing: {name}" for name in recipe if name not in file]
+    found += [f"unexpected: {name}" for name in file if name not in recipe]
+    return found + [
+        f"shape of {name}: {file[name]} in the file, {shape} in the recipe"
+        for name, shape in recipe.items()
+        if name in file and file[name] != shape
+    ]
+
+
+def differing_types(
+    file: Mapping[str, Tensor], recipe: Mapping[str, Tensor], widened: bool = False
+) -> list[str]:
+    """Differences in dtypes, one line each, of the tensors that both have.
+
+    widened: accept half precision in the file where the recipe has float32.
+    """
+    halves = (torch.float16, torch.bfloat16) if widened else ()
+    return [
+        f"type of {name}: {file[name].dtype} in the file, {tensor.dtype} in the recipe"
+        for name, tensor in recipe.items()
+        if name in file and file[name].dtype != tensor.dtype
+        if tensor.dtype != torch.float32 or file[name].dtype not in halves
+    ]

@@ -1,0 +1,1 @@
+"""Evaluation: which views are judged, by which protocol, and the scores."""

@@ -1,0 +1,212 @@
+"""Which views an evaluation compares: drawn by seed, or named by an index file."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, TypeAlias
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewSampler, ViewsConfig
+from qgs.contracts.schedule import END
+from qgs.data.images import framing
+from qgs.data.samples import Frames, Sample, evenly, gap_range, make_sample, moments, spread
+from qgs.data.view_samplers import Span
+from qgs.paths import opened_path, read_json
+from qgs.wording import listed, one_line
+
+FrameList: TypeAlias = Annotated[list[Annotated[int, Field(strict=True)]], Field(min_length=1)]
+
+
+class IndexEntry(BaseModel):
+    """Frames of one scene, as positions in its list of frames; what else a file says is ignored."""
+
+    model_config = ConfigDict(frozen=True)
+
+    context: FrameList
+    """The input frames; the first sets the model's frame."""
+    target: FrameList
+    """The frames that are judged."""
+
+
+EvaluationIndex: TypeAlias = Mapping[str, IndexEntry | None]
+"""Scene name to its frames; None for a scene that is listed but not judged."""
+
+ViewsOf: TypeAlias = Callable[[Scene, Frames, Frames], ViewsConfig]
+"""From a scene, input and target frames to the settings with which their sample is made."""
+
+GIVEN = "frames as context and as target"
+"""What `given_targets` are; a score on them means nothing, the nearest input view is perfect."""
+
+
+def given_targets(inputs: Iterable[int], targets: Iterable[int]) -> tuple[int, ...]:
+    """Frames, in order, that a model is given and judged on."""
+    return tuple(sorted(set(inputs) & set(targets)))
+
+
+_FORM = '{"scene": null or {"context": [frames], "target": [frames]}}'
+
+
+def read_index(path: str) -> EvaluationIndex:
+    """The index in the JSON file `path`, which may be an fsspec URL.
+
+    Raises FileNotFoundError, and ValueError for another form and for no scene to judge.
+    """
+    file = opened_path(path)
+    if not file.is_file():
+        raise FileNotFoundError(
+            f"there is no evaluation index at {path}; evaluation.index is a JSON file of the form "
+            f"{_FORM}, relative to the working directory"
+        )
+    written = read_json(file, f"write {_FORM}")
+    try:
+        index = TypeAdapter(dict[str, IndexEntry | None]).validate_python(written)
+    except ValidationError as error:
+        wrong = [f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors()]
+        reason = listed(wrong, between="; ")
+        raise ValueError(f"{path} is no evaluation index {_FORM}: {reason}") from error
+    if not any(index.values()):
+        raise ValueError(f"the evaluation index {path} names no scene to judge")
+    return index
+
+
+@dataclass(frozen=True)
+class SceneFailure:
+    """A scene that could not be judged, and why."""
+
+    scene: str
+    reason: str
+
+
+class EvaluationPlan:
+    """The scenes of a test split that are judged, and on which views; never mirrored.
+
+    With an index, its scenes and frames. Without one, of the first `evaluation.scenes` scenes:
+    the windows of `sampler` (default: `Span`), else of a scene with held-out frames
+    `held_out_windows`, evenly thinned to `evaluation.scenes`; else `evaluation.samples` samples,
+    inputs drawn by `sampler` as at the end of training with `evaluation.seed`, targets the other
+    frames of the span, or of one time. Targets of T times are T samples. views_of: makes the
+    settings of a sample, such as its scale. depths: targets have true depth where scenes do.
+
+    wanted, null, unlisted: see `qgs.evaluate.results.Evaluation`. framing: of the first photo,
+    once `samples` has run. Raises ValueError without scenes.
+    """
+
+    def __init__(
+        self,
+        source: SceneSource,
+        views: ViewsConfig,
+        evaluation: EvaluationConfig,
+        index: EvaluationIndex | None = None,
+        sampler: ViewSampler | None = None,
+        views_of: ViewsOf | None = None,
+        depths: bool = False,
+    ) -> None:
+        self.framing: str | None = None
+        self._scenes = source.scenes("test")
+        if not len(self._scenes):
+            raise ValueError(f"the data source {type(source).name!r} has no test scenes")
+        self._views, self._evaluation, self._index = views, evaluation, index
+        self._views_of = views_of or (lambda *window: views)
+        self._depths = depths
+        self._sampler = sampler or Span(Span.Config())
+        names = source.names("test")
+        self._places = {name: place for place, name in enumerate(names)}
+        entries = dict.fromkeys(names[: evaluation.scenes], True) if index is None else index
+        self.wanted = tuple(name for name, entry in entries.items() if entry)
+        self.null = tuple(name for name, entry in entries.items() if not entry)
+        self.unlisted = tuple(name for name in self._places if index and name not in index)
+
+    def samples(self) -> Iterator[Sample | SceneFailure]:
+        """The samples, one decoded at a time; a scene that fails ends with its failure."""
+        for name in self.wanted:
+            try:
+                if name not in self._places:
+                    raise ValueError("not among the test scenes of the data")
+                place = self._places[name]
+                scene = self._scenes[place]
+                # a generator for each scene: a failing one changes no noise of the others
+                noise = np.random.default_rng([self._evaluation.seed, place])
+                for inputs, targets in self._choices(scene, place):
+                    if self.framing is None:
+                        self.framing = framing(scene, inputs[0])
+                    views = self._views_of(scene, inputs, targets)
+                    for part in [targets] if scene.times is None else moments(scene, targets):
+                        yield make_sample(scene, inputs, part, views, False, noise, self._depths)
+            except Exception as error:  # whatever a reader raises; the other scenes go on
+                yield SceneFailure(name, one_line(error))
+
+    def _choices(self, scene: Scene, place: int) -> Iterator[tuple[Frames, Frames]]:
+        """Input and target frames of each sample."""
+        if self._index is not None:
+            yield _named(scene, self._index)
+        elif windows := self._sampler.windows(scene, self._views):
+            yield from evenly(windows, self._evaluation.scenes)
+        elif scene.held_out:
+            yield from evenly(held_out_windows(scene, self._views), self._evaluation.scenes)
+        else:
+            for k in range(self._evaluation.samples):
+                rng = np.random.default_rng([self._evaluation.seed, place, k])
+                inputs, drawn = self._sampler.draw(scene, self._views, rng, END)
+                every = range(inputs[0], inputs[-1] + 1) if scene.times is None else drawn
+                yield inputs, tuple(sorted({*every} - {*inputs} or {*drawn}))
+
+
+def evaluation_samples(
+    source: SceneSource,
+    views: ViewsConfig,
+    evaluation: EvaluationConfig,
+    sampler: ViewSampler | None = None,
+    **options: Any,
+) -> Sequence[Sample]:
+    """Samples of a plan without an index; raises ValueError for the first scene that fails."""
+    samples: list[Sample] = []
+    for sample in EvaluationPlan(source, views, evaluation, None, sampler, **options).samples():
+        if isinstance(sample, SceneFailure):
+            raise ValueError(f"scene {sample.scene!r} cannot be judged: {sample.reason}")
+        samples.append(sample)
+    return samples
+
+
+def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
+    """Input and target frames such that every held-out frame is a target once.
+
+    A window of the largest gap (in training frames, or times) is centred on the first such frame
+    not yet covered and shifted into the scene, inputs evenly spaced; all within are targets.
+    """
+    usable = moments(scene)
+    gap = gap_range(len(usable), views, scene)[1]
+    when = np.arange(len(scene)) if scene.times is None else scene.times.numpy()
+    starts = when[[frames[0] for frames in usable]]
+    windows: list[tuple[Frames, Frames]] = []
+    covered: set[int] = set()
+    for frame in sorted(scene.held_out, key=lambda frame: (when[frame], frame)):
+        if frame in covered:
+            continue
+        centre = int(np.searchsorted(starts, when[frame]))
+        # centred, and at the ends of the scene shifted into it
+        first = min(max(centre - (gap + 1) // 2, 0), len(usable) - 1 - gap)
+        span = usable[first : first + gap + 1]
+        start, end = when[span[0][0]], when[span[-1][0]]
+        inside = {f for f in scene.held_out if start < when[f] < end or when[f] == when[frame]}
+        targets = sorted(inside - covered)
+        covered.update(targets)
+        windows.append((spread(span, views.inputs), tuple(targets)))
+    return windows
+
+
+def _named(scene: Scene, index: EvaluationIndex) -> tuple[Frames, Frames]:
+    """The frames of `scene` that `index` names; raises ValueError where it lacks one."""
+    entry = index[scene.name]
+    assert entry is not None
+    # frames are positions, which a missing image moves
+    if scene.missing:
+        raise ValueError(
+            f"{len(scene.missing)} of its listed images do not exist, so that positions "
+            f"of the index would mean other frames: {listed(scene.missing, 3)}"
+        )
+    outside = [f for f in (*entry.context, *entry.target) if not 0 <= f < len(scene)]
+    if outside:
+        ends = f"{scene.label(0)} to {scene.label(len(scene) - 1)}"
+        raise ValueError(f"the index names frames {listed(outside)}, the scene has {ends}")
+    return tuple(entry.context), tuple(entry.target)

@@ -1,0 +1,128 @@
+"""Evaluation protocols: exactly what decides the numbers, named and hashed."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from qgs.contracts import Metric, SceneSource, SceneSourceConfig
+from qgs.contracts.schedule import END, at_step
+from qgs.data.view_samplers import Span
+from qgs.evaluate.plan import EvaluationIndex, read_index
+from qgs.extensions import function
+from qgs.recipe import Recipe
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Settings of an evaluation under a name; results with one hash are comparable.
+
+    content: everything that decides a score of given Gaussians, and nothing else: no path, and not
+    the renderer's type or device, since all renderers give the same image.
+    """
+
+    name: str
+    content: Mapping[str, Any]
+
+    @property
+    def canonical(self) -> str:
+        """`content` as JSON with sorted keys and no spaces, which is hashed."""
+        return _canonical(self.content)
+
+    @property
+    def sha256(self) -> str:
+        """Hash of `canonical` in UTF-8, hexadecimal."""
+        return _sha256(self.content)
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.sha256[:12]})"
+
+    def settings(self) -> dict[str, Any]:
+        """`content` with size and hash in place of the index, which may be long."""
+        views = self.content["views"]
+        if index := views.get("index"):
+            views = {"index": {"scenes": len(index), "sha256": _sha256(index)}}
+        return {**self.content, "views": views}
+
+
+def index_of(recipe: Recipe) -> EvaluationIndex | None:
+    """The index that `recipe` names, None where views are drawn. Raises as `read_index`."""
+    return read_index(recipe.evaluation.index) if recipe.evaluation.index else None
+
+
+def protocol_of(
+    recipe: Recipe,
+    index: EvaluationIndex | None = None,
+    scenes: Sequence[str] = (),
+    step: int = END,
+) -> Protocol:
+    """The protocol of `recipe` on the views of `index`, or on views drawn from `scenes`.
+
+    With an index the kind of data, its split, and options at their defaults are left out, so that
+    one data set in two formats has one protocol. Scheduled options of the renderer are those after
+    `step` steps.
+    """
+    evaluation, part = recipe.evaluation, recipe.parts["data",]
+    renderer = recipe.parts["model", "renderer"]
+    config, source = part.config, part.component
+    assert isinstance(config, SceneSourceConfig)
+    assert issubclass(source, SceneSource)
+    # The size is there at the top level, for all kinds of data.
+    left_out = {"image_size", *source.not_in_protocol}
+    if index is None:
+        data = {"type": recipe.tree["data"]["type"]}
+        data |= config.model_dump(mode="json", exclude=left_out)
+        views = recipe.views.model_dump(mode="json", include={"inputs", "targets", "gap"})
+        rule = evaluation.model_dump(include={"scenes", "samples", "seed"})
+        judged: dict[str, Any] = {"drawn": {**views, **rule, "names": list(scenes)}}
+        # The default sampler is what `gap` says; any other one draws other views.
+        sampler = recipe.parts["view_sampler",]
+        if sampler.options != Span.Config().model_dump() or sampler.type != "qgs/span":
+            judged["drawn"]["sampler"] = {"type": sampler.type, **sampler.options}
+    else:
+        # An index names scenes and frames itself, whatever the split.
+        left_out |= source.split_options
+        data = config.model_dump(mode="json", exclude=left_out, exclude_defaults=True)
+        judged = {"index": {n: entry.model_dump() if entry else None for n, entry in index.items()}}
+    tuning, metrics = None, {}
+    if evaluation.tuning_steps:
+        tuning = {
+            "what": evaluation.tuning,
+            "steps": evaluation.tuning_steps,
+            "rate": evaluation.rate,
+            "optimizer": "Adam",
+            "loss": function("qgs.refiners", "tuning_loss")(recipe).config.model_dump(mode="json"),
+        }
+    for path, chosen in recipe.parts.items():
+        metric = chosen.component
+        if issubclass(metric, Metric):
+            options = chosen.config.model_dump(mode="json", exclude=set(metric.not_in_protocol))
+            metrics[path[-1]] = {"type": chosen.type, "definition": metric.definition, **options}
+    # Options without effect are left out: they must not part equal protocols.
+    factor = () if recipe.views.scale in ("auto", "search") else ("scale_factor",)
+    noise = {"noise": [recipe.views.pose_noise, evaluation.seed]} if recipe.views.pose_noise else {}
+    content = {
+        "format": 1,
+        "image_size": list(config.image_size),
+        "crop": "centre crop to the aspect ratio of image_size, then Lanczos resize",
+        "data": data,
+        "poses": recipe.views.model_dump(include={"frame", "scale", *factor}) | noise,
+        "views": judged,
+        "renderer": at_step(renderer.config, renderer.schedules, step).model_dump(mode="json"),
+        "metrics": metrics,
+        "tuning": tuning,
+    }
+    # The name is for people: it is not part of the hash.
+    file = (evaluation.index or "drawn").replace("\\", "/").rsplit("/", 1)[-1]
+    return Protocol(evaluation.protocol or file.removesuffix(".json"), content)
+
+
+def _canonical(value: Any) -> str:
+    return json.dumps(
+        value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+    )
+
+
+def _sha256(value: Any) -> str:
+    return hashlib.sha256(_canonical(value).encode()).hexdigest()

@@ -1,0 +1,286 @@
+"""Scores of an evaluation: by scene, their means, files and tables."""
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from qgs.contracts import Column
+from qgs.data.samples import Frames
+from qgs.evaluate.plan import GIVEN, SceneFailure, given_targets
+from qgs.evaluate.protocol import Protocol
+from qgs.files import write_text
+from qgs.metrics.baselines import BASELINES
+from qgs.metrics.dispersion import OPACITY_USED
+from qgs.wording import listed, numbered
+
+METHODS = ("model", *BASELINES)
+TUNING = ("tuning_loss_before", "tuning_loss_after")
+FRAME_COLUMNS = ("scene", "input_frames", "target_frames")
+NAME_COLUMNS = ("input_names", "target_names")
+"""Columns of scenes.csv before the values, the second if frames have names; `problem` is last."""
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Mean, variance (over the population) and median of a value over scenes."""
+    found = {"mean": np.mean(values), "variance": np.var(values), "median": np.median(values)}
+    return {name: float(value) for name, value in found.items()}
+
+
+@dataclass(frozen=True)
+class SceneScore:
+    """One scene. views: input and target frames of each of its samples; names: as in `Sample`.
+
+    values: means over the samples of METHOD_METRIC, "gaussians_used", of tuned scenes TUNING; less
+    those whose metric needs what the method or the scene lacks.
+    """
+
+    scene: str
+    views: Sequence[tuple[Frames, Frames]]
+    values: Mapping[str, float]
+    names: Mapping[int, str] = field(default_factory=dict)
+
+    @property
+    def given(self) -> tuple[int, ...]:
+        """Frames that one of the samples has as input and as target."""
+        both = [given_targets(*frames) for frames in self.views]
+        return tuple(sorted({frame for frames in both for frame in frames}))
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All scenes and what they amount to; the same weights and recipe give the same numbers.
+
+    columns: by name of the value. scores: of the judged scenes. wanted: names of all scenes of the
+    protocol. missing: those without a score. null: scenes that the index lists without frames.
+    unlisted: scenes of the data that the index lacks. gaussians: of a scene, the most of any.
+    incomplete: values that scenes lack, and why. held_out: how many held-out frames were judged,
+    and how many there are; None where the test scenes hold none out. step: optimiser steps behind
+    the weights.
+    remarks: sentences on what was judged and what came of it.
+    """
+
+    protocol: Protocol
+    columns: Mapping[str, Column]
+    scores: Sequence[SceneScore]
+    wanted: Sequence[str]
+    gaussians: int
+    missing: Sequence[SceneFailure] = ()
+    null: Sequence[str] = ()
+    unlisted: Sequence[str] = ()
+    incomplete: Mapping[str, str] = field(default_factory=dict)
+    held_out: tuple[int, int] | None = None
+    step: int | None = None
+    remarks: Sequence[str] = ()
+
+    def mean(self, metric: str, method: str = "model") -> float | None:
+        """Mean over scenes of one of `columns`, each scene once; None if none has this value."""
+        values = self._values(f"{method}_{metric}")
+        return sum(values) / len(values) if values else None
+
+    def means(self, method: str = "model") -> dict[str, float | None]:
+        """`mean` of all `columns`."""
+        return {name: self.mean(name, method) for name in self.columns}
+
+    @property
+    def statement(self) -> str:
+        """The model's first value, usually PSNR, and over how many scenes, in one line."""
+        line = f"over {self._of_wanted(len(self.scores))} scene{'s' * (len(self.wanted) != 1)}"
+        if known := [name for name, value in self.means().items() if value is not None]:
+            column = self.columns[known[0]]
+            line = f"{column.heading} {column.shown(self.mean(known[0]))} {line}"
+        missing = listed([failure.scene for failure in self.missing])
+        return f"{line}; missing: {missing}" if missing else line
+
+    def summary(self) -> dict[str, Any]:
+        """Everything but the scores of single scenes, as plain values for JSON.
+
+        over_scenes: of each value of the model the mean, variance and median over scenes.
+        """
+        values = {name: self._values(f"model_{name}") for name in self.columns}
+        used, p = spread(self._values("gaussians_used")), self.protocol
+        return {
+            "protocol": {"name": p.name, "sha256": p.sha256, "settings": p.settings()},
+            "step": self.step,
+            "statement": self.statement,
+            "scenes": len(self.scores),
+            "scenes_in_protocol": len(self.wanted),
+            "samples": sum(len(score.views) for score in self.scores),
+            "missing": {failure.scene: failure.reason for failure in self.missing},
+            "null_entries": list(self.null),
+            "not_in_index": list(self.unlisted),
+            "context_and_target": {s.scene: list(s.given) for s in self.scores if s.given},
+            "columns": {name: asdict(column) for name, column in self.columns.items()},
+            **{method: self.means(method) for method in METHODS},
+            "incomplete": dict(self.incomplete),
+            "over_scenes": {n: {**spread(v), "scenes": len(v)} for n, v in values.items() if v},
+            "gaussians": self.gaussians,
+            "gaussians_used": {"opacity_above": OPACITY_USED, **used},
+            "tuning": self._tuning(),
+            "held_out_frames": self.held_out,
+            "remarks": list(self.remarks),
+        }
+
+    def write(self, folder: str | Path) -> None:
+        """Write scenes.csv, summary.json, table.md and protocol.json, each whole or not at all.
+
+        protocol.json is `Protocol.canonical`: its SHA-256 is the protocol's hash.
+        """
+        folder = Path(folder)
+        write_text(folder / "scenes.csv", self._csv())
+        write_text(folder / "summary.json", as_json(self.summary()))
+        table = f"{markdown_table(self._rows())}\n\n{bullets(self._notes())}\n"
+        write_text(folder / "table.md", table)
+        write_text(folder / "protocol.json", self.protocol.canonical)
+
+    def show(self, console: Console) -> None:
+        """Print the table and the notes of table.md."""
+        print_table(console, str(self.protocol), self._rows())
+        print_lines(console, self._notes())
+
+    def _values(self, name: str) -> list[float]:
+        return [score.values[name] for score in self.scores if name in score.values]
+
+    def _of_wanted(self, count: int) -> str:
+        wanted = len(self.wanted)
+        return str(count) if count == wanted else f"{count} of {wanted}"
+
+    def _tuning(self) -> dict[str, Any] | None:
+        settings = self.protocol.content["tuning"]
+        if settings is None:
+            return None
+        before, after = (sum(self._values(name)) / len(self.scores) for name in TUNING)
+        return {**settings, "loss_before": before, "loss_after": after}
+
+    def _rows(self) -> list[list[str]]:
+        """Means of all methods, then the model's variance and median over scenes."""
+        judged = self._of_wanted(len(self.scores))
+        rows = [["method", *(column.title for column in self.columns.values()), "scenes"]]
+        for method in METHODS:
+            cells = [self.columns[name].shown(v) for name, v in self.means(method).items()]
+            rows.append([method.replace("_", " "), *cells, judged])
+        found = {name: self._values(f"model_{name}") for name in self.columns}
+        for kind in ("variance", "median"):
+            cells = [column.shown(None) for column in self.columns.values()]
+            for place, (name, values) in enumerate(found.items()):
+                if values:
+                    digits = self.columns[name].digits + (kind == "variance")
+                    cells[place] = f"{spread(values)[kind]:.{digits}f}"
+            rows.append([f"model, {kind}", *cells, judged])
+        return rows
+
+    def _csv(self) -> str:
+        judged = {score.scene: score for score in self.scores}
+        reasons = {failure.scene: failure.reason for failure in self.missing}
+        columns = list(dict.fromkeys(name for score in self.scores for name in score.values))
+        text = io.StringIO()
+        named = NAME_COLUMNS if any(score.names for score in self.scores) else ()
+        fields = [*FRAME_COLUMNS, *named, *columns, "problem"]
+        writer = csv.DictWriter(text, fields, lineterminator="\n")
+        writer.writeheader()
+        # Every wanted scene has a row, so that a missing one shows in the file.
+        for name in self.wanted:
+            row: dict[str, Any] = {"scene": name, "problem": reasons.get(name, "")}
+            if score := judged.get(name):
+                sides = [*zip(*score.views, strict=True)]
+                for key, side in zip(FRAME_COLUMNS[1:], sides, strict=True):
+                    row[key] = "; ".join(" ".join(map(str, frames)) for frames in side)
+                for key, side in zip(named, sides, strict=bool(named)):
+                    names = ([score.names.get(f, str(f)) for f in frames] for frames in side)
+                    row[key] = "; ".join(", ".join(frames) for frames in names)
+                row |= score.values
+            writer.writerow(row)
+        return text.getvalue()
+
+    def _notes(self) -> Iterator[str]:
+        yield self.statement
+        protocol, poses = self.protocol, self.protocol.content["poses"]
+        height, width = protocol.content["image_size"]
+        counts = sorted({len(inputs) for score in self.scores for inputs, _ in score.views})
+        yield (
+            f"protocol {protocol.name}, sha256 {protocol.sha256}: {' or '.join(map(str, counts))} "
+            f"input views of {width} x {height} pixels, poses {poses['frame']}, scale "
+            f"{poses['scale']} {poses.get('scale_factor', '')}".rstrip()
+        )
+        yield from (f"missing {f.scene}: {f.reason}" for f in self.missing[:10])
+        if more := self.missing[10:]:
+            yield f"{len(more)} more missing scenes are in scenes.csv"
+        if null := self.null:
+            yield f"null entries of the index, not judged ({len(null)}): {listed(null)}"
+        if names := self.unlisted:
+            yield f"scenes that the index lacks, not judged ({len(names)}): {listed(names)}"
+        if given := [score for score in self.scores if score.given]:
+            named = [
+                f"{s.scene} ({listed(numbered(f, s.names.get(f, '')) for f in s.given)})"
+                for s in given
+            ]
+            yield (
+                f"{len(given)} scene{'s' if len(given) > 1 else ''} with {GIVEN}, on which the "
+                f"nearest input view is perfect: {listed(named)}"
+            )
+        for name, why in self.incomplete.items():
+            count = len(self._values(f"model_{name}"))
+            over = f"over {self._of_wanted(count)} scenes" if count else "empty"
+            yield f"{self.columns[name].heading} is {over}: {why}"
+        if self.held_out:
+            yield "judged on {} of {} held-out frames".format(*self.held_out)
+        used = spread(self._values("gaussians_used"))
+        yield (
+            f"{self.gaussians:,} Gaussians a scene, {used['mean']:,.0f} of them used (opacity "
+            f"above {OPACITY_USED:.4f}; mean over scenes, median {used['median']:,.0f})"
+        )
+        if tuning := self._tuning():
+            yield (
+                f"{tuning['what']} tuned on the input views: {tuning['steps']} steps of Adam at "
+                f"{tuning['rate']}, photometric loss {tuning['loss_before']:.4f} -> "
+                f"{tuning['loss_after']:.4f}"
+            )
+        yield from self.remarks
+
+
+def as_json(value: Mapping[str, Any]) -> str:
+    """A file's text; raises ValueError for NaN and infinities."""
+    return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def markdown_table(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of equal length, headers first, as a Markdown table; numbers to the right."""
+    cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
+    first, *rest = (max(map(len, column)) for column in zip(*cells, strict=True))
+    rule = "|".join(["", ":" + "-" * (first + 1), *("-" * (width + 1) + ":" for width in rest), ""])
+    lines = []
+    for name, *values in cells:
+        right = [value.rjust(width) for value, width in zip(values, rest, strict=True)]
+        lines.append(f"| {' | '.join([name.ljust(first), *right])} |")
+    return "\n".join([lines[0], rule, *lines[1:]])
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """Lines as a Markdown list."""
+    return "\n".join(f"- {line}" for line in lines)
+
+
+def print_table(
+    console: Console, title: str, rows: Sequence[Sequence[str]], **options: Any
+) -> None:
+    """Print rows, headers first; numbers to the right. options: of rich's Table."""
+    table = Table(title=escape(title) or None, title_justify="left", **options)
+    for place, header in enumerate(rows[0]):
+        table.add_column(header, justify="right" if place else "left", overflow="fold")
+    for row in rows[1:]:
+        table.add_row(*row)
+    console.print(table)
+
+
+def print_lines(console: Console, lines: Iterable[str]) -> None:
+    """Print lines of plain text."""
+    for line in lines:
+        console.print(escape(line), highlight=False, soft_wrap=True)

@@ -1,0 +1,187 @@
+"""A recipe file with everything it extends, and `--set` overrides laid over it."""
+
+import os
+from collections.abc import Mapping, Sequence
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import qgs
+from qgs.paths import open_file
+from qgs.recipe.errors import Origin, Problems, nearest
+from qgs.recipe.slots import type_at
+from qgs.recipe.yaml_text import (
+    MAX_DEPTH,
+    KeyPath,
+    ListNode,
+    MapNode,
+    Node,
+    from_plain,
+    load_mapping,
+    load_text,
+)
+
+
+def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
+    """`over` laid over `base`, both at `path`.
+
+    A component of another `type`, or a mapping of another `kind` or `schedule`, keeps nothing of
+    the old one. `plugins` are united, other lists replaced. `null` replaces what it lies over: in
+    place of an option it is a value, in place of a component or a section it leaves the default, in
+    place of a swap it drops the swap.
+    """
+    other_type = "type" in over and type_at(base, path) not in (None, type_at(over, path))
+    kinds = [key for key in ("kind", "schedule") if key in over]
+    other_kind = any(base.get(key) not in (None, over[key]) for key in kinds)
+    if other_type or other_kind or (path[:1] == ("swap",) and len(path) == 2):
+        return over
+    merged = MapNode(over.origin, base.entries())
+    for key, value, origin in over.entries():
+        below, old = (*path, key), base.get(key)
+        if path == ("swap",) and value is None and old is not None:
+            del merged[key]
+            continue
+        if below == ("plugins",) and isinstance(old, ListNode) and isinstance(value, ListNode):
+            added = [item for item in zip(value, value.origins, strict=True) if item[0] not in old]
+            value = ListNode(value.origin, [*zip(old, old.origins, strict=True), *added])
+        elif isinstance(old, MapNode) and isinstance(value, MapNode):
+            value = merge(old, value, below)
+        merged[key], merged.origins[key] = value, origin
+    return merged
+
+
+def recipe_folder() -> Path:
+    """The recipes that come with qgs: in its wheel, else in the repository that it runs from."""
+    package = Path(qgs.__file__).parent
+    inside = package / "recipes"
+    return inside if inside.is_dir() else package.parent / "recipes"
+
+
+def found_recipe(file: Path, name: str | Path) -> Path:
+    """`file` where it exists, else the recipe called `name`, if there is one, of `recipe_folder`.
+
+    name: such as tiny/locus.yaml, or recipes/tiny/locus.yaml.
+    """
+    home = recipe_folder()
+    for folder in (home, home.parent):
+        shipped = Path(os.path.normpath(folder / name))
+        if not os.path.exists(file) and shipped.is_relative_to(home) and os.path.isfile(shipped):
+            return shipped
+    return file
+
+
+def read_recipe(recipe: str | Path | Mapping[str, Any], problems: Problems) -> MapNode:
+    """The merged tree of `recipe`, without its `extends`."""
+    files = _Files(problems)
+    if not isinstance(recipe, Mapping):
+        return files.read(found_recipe(Path(recipe), recipe), (), None)
+    if isinstance(recipe, MapNode):  # which knows where it was written
+        return files.with_bases(recipe, Path(), ())
+    origin = Origin("<mapping>")
+    try:
+        node = from_plain(recipe, origin)
+    except ValueError as error:
+        problems.stop(origin, "", str(error), "give mappings, lists, strings, numbers, bools, None")
+        return MapNode(origin)
+    assert isinstance(node, MapNode)
+    return files.with_bases(node, Path(), ())
+
+
+def files_of(recipe: Path) -> list[Path]:
+    """A recipe file and all that it extends, each once, links resolved; raises RecipeError."""
+    files = _Files(problems := Problems())
+    files.read(recipe, (), None)
+    problems.raise_any()
+    return [*files.trees]
+
+
+class _Files:
+    """Reads the files of one recipe, each once. trees: by resolved path."""
+
+    def __init__(self, problems: Problems) -> None:
+        self._problems = problems
+        self.trees: dict[Path, MapNode] = {}
+
+    def read(self, file: Path, chain: tuple[Path, ...], extended_at: Origin | None) -> MapNode:
+        """The merged tree of `file`, an empty one, and a problem, where that fails.
+
+        chain: the files that extend each other down to `file`. extended_at: the last `extends`.
+        """
+        place = Path(os.path.realpath(file))
+        if place in self.trees:
+            return self.trees[place]
+        try:
+            with open_file(file) as opened:
+                text = opened.read().decode("utf-8")
+        except UnicodeDecodeError:
+            self._problems.stop(Origin(str(file)), "", "this is no UTF-8 text", "save it as UTF-8")
+            return MapNode(Origin(str(file)))
+        except (OSError, ValueError) as error:  # ValueError: no name that a file can have
+            reason = f"{file} cannot be read: {getattr(error, 'strerror', None) or error}"
+            fix = "check the path, or take one of `qgs recipes`"
+            if isinstance(error, FileNotFoundError):
+                reason = f"{file} does not exist"
+                stems = [path.stem for path in file.parent.glob("*.yaml") if path not in chain]
+                if near := nearest(file.stem, stems):
+                    fix = f"did you mean `{file.parent / near}.yaml`?"
+            if extended_at:
+                home = "the file it stands in" if chain else "the working directory"
+                fix += f" (`extends` is relative to {home})"
+            origin, option = extended_at or Origin(str(file)), "extends" if extended_at else ""
+            self._problems.stop(origin, option, reason, fix)
+            return MapNode(origin)
+        node = load_mapping(text, str(file), self._problems)
+        self.trees[place] = self.with_bases(node, file.parent, (*chain, file))
+        return self.trees[place]
+
+    def with_bases(self, node: MapNode, folder: Path, chain: tuple[Path, ...]) -> MapNode:
+        """`node` laid over the files that it extends, the later ones over the earlier ones."""
+        written, at = node.get("extends"), node.origins.get("extends", node.origin)
+        if not isinstance(written, ListNode):
+            written = ListNode(at, [] if written is None else [(written, at)])
+        layers: list[MapNode] = []
+        for name, origin in zip(written, written.origins, strict=True):
+            if not isinstance(name, str):
+                reason = "`extends` names one recipe file or a list of them"
+                fix = "write `extends: base.yaml`, relative to this file"
+                self._problems.stop(at, "extends", reason, fix)
+                continue
+            file = found_recipe(Path(os.path.normpath(folder / name)), name)
+            places = [os.path.realpath(above) for above in chain]
+            if (place := os.path.realpath(file)) in places:
+                circle = " -> ".join(map(str, [*chain[places.index(place) :], file]))
+                reason = f"recipes extend each other in a circle: {circle}"
+                self._problems.stop(origin, "extends", reason, "remove one `extends` of the circle")
+            else:
+                layers.append(self.read(file, chain, origin))
+        return reduce(merge, [*layers, node.without("extends")])
+
+
+def apply_overrides(tree: MapNode, overrides: Sequence[str], problems: Problems) -> MapNode:
+    """`tree` with every override laid over it in order; the n-th has the origin `--set #n`."""
+    assert not isinstance(overrides, str), f"overrides are a list of strings: [{overrides!r}]"
+    for number, text in enumerate(overrides, start=1):
+        tree = merge(tree, _read_override(text, Origin(f"--set #{number}"), problems))
+    return tree
+
+
+def _read_override(text: str, origin: Origin, problems: Problems) -> MapNode:
+    name, equals, value = text.partition("=")
+    name = name.strip()
+    path = name.split(".")
+    reason = f"an override cannot set `{name}`"
+    if not equals or not all(path) or len(path) > MAX_DEPTH:
+        reason = f"{text!r:.100} is no override"
+        fix = "write `path.to.option=value`, such as `model.queries.count=128`"
+    elif path[0] == "extends":
+        fix = "write a recipe that extends both, or set single options"
+    elif path[0] == "swap" and len(path) > 1:
+        fix = "set the option itself, or give all swaps as `swap={PATTERN: {type: NAME}}`"
+    else:
+        node: Node = load_text(value, origin.file, problems, 0, tuple(path))
+        for key in reversed(path):
+            node = MapNode(origin, [(key, node, origin)])
+        assert isinstance(node, MapNode)
+        return node
+    problems.add(origin, name, reason, fix)
+    return MapNode(origin)

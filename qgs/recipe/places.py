@@ -1,0 +1,136 @@
+"""The places of a recipe that hold components: defaults, decoder layers, swaps."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+
+from qgs.recipe.errors import Origin, Problems, nearest
+from qgs.recipe.files import merge
+from qgs.recipe.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, Slot, slot_at
+from qgs.recipe.yaml_text import KeyPath, MapNode, Node, kind_of
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place and what is written there.
+
+    path: the place, decoder layers numbered. source: where a user finds it: the template, a layer's
+    override, or a swap. node: None where nothing is written.
+    """
+
+    path: KeyPath
+    source: KeyPath
+    slot: Slot
+    node: Node | None
+    origin: Origin
+
+
+def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place]:
+    """All places of `tree`; a layer's overrides are laid over the decoder's template."""
+    places = [_place(tree, ("model", name)) for name in MODEL_SLOTS]
+    template = [_place(tree, ("model", "decoder", name)) for name in LAYER_SLOTS]
+    places += template
+    layers = tree.child("model", "decoder", "layers")
+    indices = [str(index) for index in range(depth)]
+    for key, _, origin in layers.without(*indices).entries():
+        reason = f"there is no layer `{key}` in a decoder of depth {depth}"
+        fix = f"name layers by their index, 0 to {depth - 1}"
+        problems.add(origin, f"model.decoder.layers.{key}", reason, fix)
+    for index in indices:
+        places += [_layer_place(place, index, layers.child(index)) for place in template]
+    for name, section in SECTIONS.items():
+        if section.named:
+            written = tree.child(name).items()
+            places += [_place(tree, (name, key)) for key, node in written if node is not None]
+        elif section.default or tree.get(name) is not None:
+            places.append(_place(tree, (name,)))
+    return {place.path: place for place in places}
+
+
+def _place(tree: MapNode, path: KeyPath) -> Place:
+    parent, slot = tree.child(*path[:-1]), slot_at(path)
+    assert slot is not None
+    origin = parent.origins.get(path[-1], parent.origin)
+    return Place(path, path, slot, parent.get(path[-1]), origin)
+
+
+def _layer_place(template: Place, index: str, layer: MapNode) -> Place:
+    """The place of one slot in layer `index`. layer: what is written for this layer alone."""
+    name, base = template.path[-1], template.node
+    path = ("model", "decoder", "layers", index, name)
+    node = layer.get(name)
+    if node is None:
+        return replace(template, path=path)
+    if isinstance(node, MapNode) and (base is None or isinstance(base, MapNode)):
+        node = merge(MapNode(template.origin) if base is None else base, node, path)
+    return Place(path, path, template.slot, node, layer.origins[name])
+
+
+def apply_swaps(
+    swaps: MapNode, places: Mapping[KeyPath, Place], problems: Problems
+) -> dict[KeyPath, Place]:
+    """`places` with every swap made; `swaps` maps patterns to components.
+
+    A pattern is a place's path in which `*`, `?` and `[...]` stand for parts of one segment, with
+    or without the leading `model.`; decoder layers are addressed as `decoder.layers.INDEX.SLOT`.
+    `null` in place of a component drops a swap that was inherited.
+    """
+    result = dict(places)
+    # Swaps of the decoder's template would be lost under the layers made from it.
+    swappable = [path for path in places if path[:2] != ("model", "decoder") or len(path) == 5]
+    for pattern, node, origin in swaps.entries():
+        name = f"swap.{pattern}"
+        if node is None:
+            reason = f"there is no inherited swap `{pattern}` that null could drop"
+            fix = "remove this line, or name the pattern as inherited"
+            problems.add(origin, name, reason, fix)
+            continue
+        if not isinstance(node, MapNode) or node.get("type") is None:
+            reason = f"a swap puts a component, this is {kind_of(node)} without a `type`"
+            problems.add(origin, name, reason, "write `PATTERN: {type: PLUGIN/NAME, ...}`")
+            continue
+        hits = [path for path in swappable if _matches(pattern, path)]
+        if not hits:
+            reason = f"the pattern `{pattern}` matches no place"
+            known = dict.fromkeys(_starred(path).removeprefix("model.") for path in swappable)
+            fix = near_pattern(pattern, swappable) or f"places: {', '.join(known)}"
+            problems.add(origin, name, reason, fix)
+        for path in hits:
+            place, shown = result[path], ".".join(path)
+            if place.source[0] == "swap":
+                reason = f"`{shown}` is already swapped by `{place.source[1]}` ({place.origin})"
+                fix = "narrow one of the two patterns, or remove one"
+            elif "layers" in place.source:
+                reason = f"`{shown}` is already set for this layer at {place.origin}"
+                fix = f"narrow the pattern, or remove `{shown}` (null removes an inherited one)"
+            else:
+                result[path] = replace(place, source=("swap", pattern), node=node, origin=origin)
+                continue
+            problems.add(origin, name, reason, fix)
+            break
+    return result
+
+
+def _matches(pattern: str, path: KeyPath) -> bool:
+    parts = tuple(pattern.split("."))
+    shown = path[1:] if path[0] == "model" and parts[0] != "model" else path
+    return len(parts) == len(shown) and all(map(fnmatchcase, shown, parts))
+
+
+def near_pattern(pattern: str, paths: Iterable[KeyPath]) -> str:
+    """A fix: the nearest name of `paths`, at the layers of `pattern` if it is there, else at all.
+
+    Layers are compared as one: of hundreds, each has the same names.
+    """
+    names = {".".join(path).removeprefix("model.") for path in paths}
+    given = tuple(pattern.removeprefix("model.").split("."))
+    near = nearest(_starred(given), {_starred(tuple(name.split("."))) for name in names})
+    if not near:
+        return ""
+    pairs = zip(near.split("."), given, strict=False)
+    at_layers = ".".join(own if own.isdigit() and x == "*" else x for x, own in pairs)
+    return f"did you mean `{at_layers if at_layers in names else near}`?"
+
+
+def _starred(path: KeyPath) -> str:
+    return ".".join("*" if x.isdigit() else x for x in path)

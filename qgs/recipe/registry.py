@@ -1,0 +1,207 @@
+"""Installed components: found by metadata, imported when a recipe or a command asks for them."""
+
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import qgs
+import qgs.data
+import qgs.losses
+import qgs.metrics
+import qgs.renderers
+import qgs.tokengs
+from qgs import extensions
+from qgs.contracts import Component, ComponentConfig, OptionError
+from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
+from qgs.recipe.errors import Origin, Problems
+from qgs.recipe.slots import SLOTS
+from qgs.recipe.yaml_text import ListNode, MapNode, kind_of
+
+BUILTIN = Plugin(
+    name="qgs",
+    contract_version=CONTRACT_VERSION,
+    components=(
+        *qgs.tokengs.COMPONENTS,
+        *qgs.renderers.COMPONENTS,
+        *qgs.losses.COMPONENTS,
+        *qgs.metrics.COMPONENTS,
+        *qgs.data.COMPONENTS,
+    ),
+    examples=(
+        qgs.tokengs.LayerSupervision.Config(layers=(1, 2)),
+        qgs.data.PhotosSource.Config(path="photos"),  # type: ignore[call-arg]
+    ),
+)
+
+
+class PluginError(OptionError):
+    """A plugin that cannot be used: `reason` names its distribution, `fix` the remedy."""
+
+
+@dataclass(frozen=True)
+class InstalledPlugin:
+    """A plugin and its distribution, "" for none. folder: of the module that holds the Plugin."""
+
+    plugin: Plugin
+    distribution: str = ""
+    version: str = "0"
+    folder: Path = Path()
+
+    @property
+    def released_as(self) -> str:
+        """Name and version of the distribution, as messages give them; "" for none."""
+        return f"{self.distribution} {self.version}" if self.distribution else ""
+
+    @property
+    def models(self) -> dict[str, Path]:
+        """`PLUGIN/NAME` of every model that it ships to its file, which may be missing."""
+        models = self.plugin.models.items()
+        return {f"{self.plugin.name}/{name}": self.folder / file for name, file in models}
+
+
+@dataclass(frozen=True)
+class Registry:
+    """The plugins that one recipe uses. unusable: those that could not be loaded."""
+
+    plugins: Mapping[str, InstalledPlugin]
+    unusable: frozenset[str] = frozenset()
+
+    def components(self, slot: str) -> dict[str, type[Component]]:
+        """`PLUGIN/NAME` to component, of one slot."""
+        return {
+            f"{name}/{component.name}": component
+            for name, installed in self.plugins.items()
+            for component in installed.plugin.components
+            if component.slot == slot
+        }
+
+
+def builtin() -> InstalledPlugin:
+    """The plugin `qgs`."""
+    return InstalledPlugin(BUILTIN, "query-gaussians", qgs.__version__)
+
+
+def available_plugins() -> dict[str, list[EntryPoint]]:
+    """Name to entry points of every installed plugin, by metadata alone."""
+    found: dict[str, list[EntryPoint]] = {}
+    for entry in extensions.installed(ENTRY_POINT_GROUP):
+        found.setdefault(entry.name, []).append(entry)
+    return found
+
+
+def load_registry(names: Iterable[str]) -> Registry:
+    """The built-in components and those of the plugins `names`; raises PluginError."""
+    return Registry({"qgs": builtin(), **{name: load_plugin(name) for name in names}})
+
+
+def load_plugins(tree: MapNode, problems: Problems, given: Sequence[Plugin] = ()) -> Registry:
+    """The components of the recipe's `plugins`; a problem for each that cannot be used."""
+    at_hand = {plugin.name: InstalledPlugin(plugin) for plugin in given}
+    plugins, seen = {"qgs": builtin()}, dict[str, Origin]()
+    written = tree.get("plugins")
+    if written is not None and not isinstance(written, ListNode):
+        reason = f"`plugins` is a list, this is {kind_of(written)}"
+        problems.add(tree.origins["plugins"], "plugins", reason, "write `plugins: [NAME]`")
+    written = written if isinstance(written, ListNode) else ListNode(tree.origin)
+    for index, (name, origin) in enumerate(zip(written, written.origins, strict=True)):
+        path = f"plugins.{index}"
+        if not isinstance(name, str):
+            reason = f"a plugin is a name, this is {kind_of(name)}"
+            problems.add(origin, path, reason, "write `plugins: [NAME]`")
+        elif name in seen:
+            reason = f"the plugin `{name}` is already listed at {seen[name]}"
+            problems.add(origin, path, reason, "list it once")
+        else:
+            seen[name] = origin
+            try:
+                plugins[name] = at_hand.get(name) or load_plugin(name)
+            except PluginError as error:
+                problems.add(origin, path, error.reason, error.fix, error)
+    return Registry(plugins, unusable=frozenset(seen.keys() - plugins.keys()))
+
+
+def load_usable_plugins() -> tuple[Registry, list[str]]:
+    """The components of every installed plugin that can be used, and why the others cannot."""
+    plugins, broken = {"qgs": builtin()}, []
+    available = available_plugins()
+    for release in map(_release, available.pop("qgs", [])):
+        broken.append(f"{release} offers a plugin `qgs`, the framework's name; uninstall {release}")
+    for name in sorted(available):
+        try:
+            plugins[name] = load_plugin(name)
+        except PluginError as error:
+            broken.append(str(error))
+    return Registry(plugins), broken
+
+
+def load_plugin(name: str) -> InstalledPlugin:
+    """Import and check the plugin `name`; raises PluginError."""
+    if name == "qgs":
+        return builtin()
+    available = available_plugins()
+    if not (entries := available.get(name)):
+        installed = ", ".join(sorted(available)) or "none"
+        fix = f"install the one that does, or {extensions.INSTALL_ALL}; installed plugins: {installed}"
+        raise PluginError(f"no installed distribution offers a plugin `{name}`", fix)
+    if len(entries) > 1:
+        releases = ", ".join(sorted(map(_release, entries)))
+        reason = f"several distributions offer a plugin `{name}`: {releases}"
+        raise PluginError(reason, "uninstall all of them but one")
+    entry, release = entries[0], _release(entries[0])
+    assert entry.dist is not None
+    named = f"the plugin `{name}` of {release}"
+    try:
+        plugin = entry.load()
+    except (Exception, SystemExit) as error:
+        message = f"cannot be imported from `{entry.value}`: {type(error).__name__}: {error}"
+        missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
+        fix = f"update or correct {release}"
+        if missing == entry.module:
+            fix = f"install {release} again, its files are gone"
+        elif missing.partition(".")[0] not in ("", "qgs", entry.module.partition(".")[0]):
+            fix = f"install `{missing.partition('.')[0]}`, which {release} needs"
+        raise PluginError(f"{named} {message}", f"{fix}, or do without the plugin") from error
+    if fault := _plugin_fault(plugin, name):
+        raise PluginError(f"{named} {fault}", f"update or correct {release}, or do without it")
+    folder = Path(sys.modules[entry.module].__file__ or "").parent
+    return InstalledPlugin(plugin, entry.dist.name, entry.dist.version, folder)
+
+
+def _release(entry: EntryPoint) -> str:
+    assert entry.dist is not None
+    return f"{entry.dist.name} {entry.dist.version}"
+
+
+def _plugin_fault(plugin: object, name: str) -> str:
+    """Why the plugin at the entry point `name` cannot be used, as the end of a sentence; or ""."""
+    if not isinstance(plugin, Plugin):
+        return f"is no qgs.Plugin: its entry point leads to an object of type {type(plugin)}"
+    if plugin.contract_version != CONTRACT_VERSION:
+        versions = f"version {plugin.contract_version}; this qgs has version {CONTRACT_VERSION}"
+        return f"was written for contract {versions}"
+    if plugin.name != name:
+        return f"calls itself `{plugin.name}`; the two names must be one"
+    for component in plugin.components:
+        if not (isinstance(component, type) and getattr(component, "slot", None) in SLOTS):
+            return f"lists {component!r}, which implements no slot's contract"
+    return ""
+
+
+def default_config(component: type[Component]) -> ComponentConfig | None:
+    """Its default options; None if one must be given, or if a plugin's own validator fails."""
+    try:
+        return component.Config()
+    except (Exception, SystemExit):
+        return None
+
+
+def component_failure(
+    kind: str, called: str, error: Exception, installed: InstalledPlugin
+) -> PluginError:
+    """`called`, a function of the component `kind`, raised `error`; names the distribution."""
+    release = installed.released_as
+    origin = f"the plugin `{installed.plugin.name}`{f' of {release}' if release else ''}"
+    reason = f"{origin} fails: `{called}` of `{kind}` raises {type(error).__name__}: {error}"
+    return PluginError(reason, f"update or correct {release or 'it'}, or choose another component")

@@ -1,0 +1,87 @@
+"""The places of a recipe that hold components, and what stands there by default."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from qgs import contracts
+from qgs.recipe.yaml_text import KeyPath, MapNode
+
+
+@dataclass(frozen=True)
+class Slot:
+    """One kind of place. default: the `type` of a place that names none; None if it must.
+
+    The rest is for slots that are top-level sections. named: whether the section maps names to
+    components; else it is one component, and there is always one if there is a `default`.
+    defaults: name to type of the components of a recipe that lacks the section. defaults_stay:
+    whether they also stand beside those that are written; `NAME: null` drops one.
+    """
+
+    contract: type[contracts.Component]
+    default: str | None = None
+    named: bool = False
+    defaults: Mapping[str, str] = field(default_factory=dict)
+    defaults_stay: bool = False
+
+    @property
+    def name(self) -> str:
+        """The slot's name, as components know it."""
+        return self.contract.slot
+
+
+DEFAULT_LOSSES = {"photometric": "qgs/photometric", "visibility": "qgs/visibility"}
+DEFAULT_METRICS = {"psnr": "qgs/psnr", "ssim": "qgs/ssim", "dispersion": "qgs/dispersion"}
+SLOTS = {
+    slot.name: slot
+    for slot in (
+        Slot(contracts.Encoder, "qgs/multiview_vit"),
+        Slot(contracts.Queries, "qgs/latent"),
+        Slot(contracts.DecoderLayer, "qgs/cross_self_mlp"),
+        Slot(contracts.CrossAttention, "qgs/content"),
+        Slot(contracts.SelfAttention, "qgs/content"),
+        Slot(contracts.FeedForward, "qgs/mlp"),
+        Slot(contracts.Refinement, "qgs/none"),
+        Slot(contracts.Feedback, "qgs/none"),
+        Slot(contracts.Head, "qgs/gaussian_head"),
+        Slot(contracts.Centers, "qgs/free"),
+        Slot(contracts.Supervision, "qgs/layers"),
+        Slot(contracts.Renderer, "qgs/auto"),
+        Slot(contracts.Loss, named=True, defaults=DEFAULT_LOSSES),
+        Slot(contracts.Objective, "qgs/one_pass"),
+        Slot(contracts.Metric, named=True, defaults=DEFAULT_METRICS, defaults_stay=True),
+        Slot(contracts.Optimizer, "qgs/adamw"),
+        Slot(contracts.SceneSource),
+        Slot(contracts.ViewSampler, "qgs/span"),
+    )
+}
+AFTER_LAYERS = ("feedback", "head", "centers", "supervision", "renderer")
+MODEL_SLOTS = ("encoder", "queries", *AFTER_LAYERS)
+SUBLAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward")
+LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
+_SECTIONS = ("losses", "objective", "data", "view_sampler", "metrics", "optimizer")
+SECTIONS = {name: SLOTS[name] for name in _SECTIONS}
+"""Slots that are top-level sections of a recipe."""
+
+
+def slot_at(path: KeyPath) -> Slot | None:
+    """The slot at a place of a recipe; None where no component belongs."""
+    match path:
+        case ("model", name) if name in MODEL_SLOTS:
+            return SLOTS[name]
+        case ("model", "decoder", name) | ("model", "decoder", "layers", _, name):
+            return SLOTS[name] if name in LAYER_SLOTS else None
+        case (name, *below) if name in SECTIONS and len(below) == SECTIONS[name].named:
+            return SLOTS[name]
+    return None
+
+
+def type_at(node: Any, path: KeyPath) -> Any:
+    """The `type` of the component written as `node` at `path`: its own, or the slot's default.
+
+    `type: null` leaves the default, as `null` does in place of a component.
+    """
+    if isinstance(node, MapNode) and node.get("type") is not None:
+        return node["type"]
+    slot = slot_at(path)
+    return slot.default if slot else None

@@ -1,0 +1,139 @@
+"""The files of a reconstruction: PLY, pictures of all views, an orbit, cameras.json."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from qgs.checkpoint.gaussians import save_gaussians, save_ply, scene_writers
+from qgs.drawing import images
+from qgs.drawing.figures import figure_picture, grid_figure
+from qgs.drawing.images import Picture, depth_picture, depth_range, rgb_picture
+from qgs.files import replacing_entries, write_text
+from qgs.geometry.poses import look_at
+from qgs.metrics.images import Psnr
+from qgs.reconstruction.result import Reconstruction, sample_cameras
+from qgs.types import Cameras
+from qgs.wording import numbered
+
+ORBIT_FRAMES, ORBIT_SIDE, FRAMES_PER_SECOND = 48, 320, 16
+SWAY = 0.12
+"""Of an orbit, per distance to what is seen."""
+OVERVIEW_COLUMNS = 8
+
+
+def orbit_path(
+    inputs: Cameras, depths: Tensor, frames: int = ORBIT_FRAMES, side: int = ORBIT_SIDE
+) -> Cameras:
+    """`orbit` about the middle of the rendered `depths`, at least `side` pixels large."""
+    near, far = depth_range(depths)
+    return images.finer(orbit(inputs, (near + far) / 2, frames), side)
+
+
+def orbit(inputs: Cameras, depth: float, frames: int) -> Cameras:
+    """A loop (1, frames) past the input cameras (1, V), swaying by SWAY times `depth`."""
+    angles = torch.arange(frames, device=inputs.c2w.device) * (2 * math.pi / frames)
+    count = inputs.shape[1]
+    # From 0, the first input, to count - 1, the last, and back.
+    times_T = (1 - angles.cos()) / 2 * (count - 1)
+    distances_TV = times_T[:, None] - torch.arange(count, device=times_T.device)
+    weights_TV = torch.softmax(-0.5 * (distances_TV / 0.6) ** 2, -1)
+    mean = torch.einsum("tv,vij->tij", weights_TV, inputs.c2w[0])
+    _, down, forward, centre = mean[:, :3].unbind(-1)
+    right, down, forward, centre = look_at(centre, forward, down)[:, :3].unbind(-1)
+    reach = SWAY * depth
+    eye = centre + reach * angles.sin()[:, None] * right
+    eye = eye - reach / 2 * angles.cos()[:, None] * down
+    c2w = look_at(eye, centre + depth * forward - eye, down)
+    return Cameras(c2w[None], inputs.intrinsics[:, :1].expand(1, frames, 4), inputs.size)
+
+
+def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
+    """Write gaussians.ply, overview.png, views/, depth/, orbit.gif and cameras.json into `out`.
+
+    All is in the model's world; cameras.json has the similarity to that of the photos. An
+    earlier result is replaced, all at the end; FileExistsError for other entries of these names.
+    With the suffix of a scene writer (.ply, .splat, ...) `out` is one file of the Gaussians, in the
+    world of the photos.
+    """
+    if out.suffix.lower() in scene_writers():
+        save_gaussians(result.in_photos_world, out)
+        return [out]
+    path = orbit_path(result.sample.inputs.cameras, result.rendering.depth)
+    with torch.no_grad():
+        frames = result.model.render(result.gaussians, path).rgb[0]
+    rows = _pictures(result)
+    with replacing_entries(out, "gaussians.ply") as fresh:
+        save_ply(result.gaussians, fresh / "gaussians.ply")
+        for i, score in enumerate(result.scores):
+            name = f"{score.frame:05d}_{score.kind.split()[0]}.png"
+            pair = images.side_by_side([rows["photo"][i], rows["render"][i]])
+            images.write_png(pair, fresh / "views" / name)
+            images.write_png(rows["depth"][i], fresh / "depth" / name)
+        images.write_png(overview(result), fresh / "overview.png")
+        images.write_gif([rgb_picture(f) for f in frames], fresh / "orbit.gif", FRAMES_PER_SECOND)
+        write_text(fresh / "cameras.json", json.dumps(_camera_record(result, path), indent=1))
+        names = sorted(entry.name for entry in fresh.iterdir())
+    return [out / name for name in names]
+
+
+def _pictures(result: Reconstruction) -> dict[str, list[Picture]]:
+    """Photo, render and depth of every view."""
+    sample, rendering = result.sample, result.rendering
+    near, far = depth_range(rendering.depth)
+    return {
+        "photo": [rgb_picture(i) for i in (*sample.inputs.images[0], *sample.targets.images[0])],
+        "render": [rgb_picture(image) for image in rendering.rgb[0]],
+        "depth": [depth_picture(depth, near, far) for depth in rendering.depth[0]],
+    }
+
+
+def overview(result: Reconstruction, dpi: int = 120) -> Picture:
+    """Photos over renders and depth, of at most OVERVIEW_COLUMNS views: inputs stay longest."""
+    scores = result.scores
+    shown = sorted(range(min(len(scores), OVERVIEW_COLUMNS)), key=lambda i: scores[i].frame)
+    titles = []
+    for score in (scores[i] for i in shown):
+        file = Path(result.sample.names.get(score.frame, "")).name
+        quality = f"{Psnr.column.shown(score.psnr)} {Psnr.column.unit}"
+        titles.append(f"frame {numbered(score.frame, file)}\n{score.kind.split()[0]}, {quality}")
+    rows = {kind: [pictures[i] for i in shown] for kind, pictures in _pictures(result).items()}
+    scale = depth_range(result.rendering.depth)
+    return figure_picture(grid_figure(rows, titles, depth_row=("depth", *scale)), dpi)
+
+
+def _camera_record(result: Reconstruction, path: Cameras) -> dict[str, Any]:
+    reference, scale = result.world
+    names, cameras = result.sample.names, _plain(sample_cameras(result.sample))
+    return {
+        "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
+        "scene": result.sample.scene,
+        "model": result.model.loaded_from,
+        "tuning": result.tuning,
+        "remarks": list(result.remarks),
+        "refinement": result.refinement,
+        "background": result.model.renderer.config.background,
+        "to_photos": {
+            "rule": "a point p of this world is reference_c2w applied to p / scale in the photos'",
+            "reference_c2w": reference.tolist(),
+            "scale": float(scale),
+            "search": result.scale.record if result.scale else None,
+        },
+        "views": [
+            {"frame": s.frame, "photo": names.get(s.frame), "kind": s.kind}
+            | {"psnr": round(s.psnr, 3), **camera}
+            for s, camera in zip(result.scores, cameras, strict=True)
+        ],
+        "orbit": _plain(path),
+    }
+
+
+def _plain(cameras: Cameras) -> list[dict[str, Any]]:
+    c2w, intrinsics = cameras.c2w[0].tolist(), cameras.intrinsics[0].tolist()
+    return [
+        {"c2w": pose, "intrinsics": lens, "size": list(cameras.size)}
+        for pose, lens in zip(c2w, intrinsics, strict=True)
+    ]

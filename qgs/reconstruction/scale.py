@@ -1,0 +1,259 @@
+"""The scale of a scene's world: the factor at which a model renders the photos best.
+
+Photos have a world in any unit, a model sees the unit of its training. The model runs on the inputs
+at several factors, and the photos that it renders decide. Inputs alone mislead: at a factor that is
+too small, surfaces close to the cameras render them well, so further photos are judged as well.
+"""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from qgs.contracts import Frames, Scene, ViewsConfig
+from qgs.data.samples import Sample, make_sample
+from qgs.domain import TOLERANCE, Domain
+from qgs.geometry.poses import look_at_depth, scaled
+from qgs.metrics.images import psnr
+from qgs.model import QueryGaussianModel
+from qgs.types import Views, map_tensors
+from qgs.wording import listed
+
+FURTHER = 2
+"""Photos that are judged with the inputs, at most."""
+STEP, MOST = 1.6, 16
+"""Ratio of neighbouring factors at first, and how many there are before the search goes finer."""
+BASELINES, BELOW, ABOVE = (0.06, 0.25), 2.0, 4.0
+"""Baselines where those of the training are unknown; how far the search goes past both ends."""
+NEAREST, REACH = 0.8, 6.0
+"""Least depth that cameras look at where that of the training is unknown; up to REACH times it."""
+PENALTY = 5.0
+"""dB for each e-fold by which depths are below those of the training, for inputs alone."""
+POOR = 14.0
+"""dB of the judged photos below which no scale fits: then novel views have 12 dB in the mean."""
+PIXELS = 2**18
+"""Of inputs in one forward pass, which bounds memory."""
+
+
+@dataclass(frozen=True)
+class FoundScale:
+    """The best factor of all translations, and the photos that it was found on.
+
+    psnr: mean of the inputs and, counted twice, of the `further` photos, in dB. names: of their
+    files. tried: each factor with its psnr.
+    """
+
+    factor: float
+    psnr: float
+    further: Frames
+    names: Sequence[str]
+    tried: Sequence[tuple[float, float]]
+    seconds: float = field(compare=False)
+
+    @property
+    def poor(self) -> str:
+        """A remark where no factor gave a good result or the inputs alone decide, else ""."""
+        if not self.psnr >= POOR:  # NaN is poor too
+            return (
+                f"no scale fits, at the best the photos are rendered at {self.psnr:.1f} dB: choose "
+                "inputs that overlap more (--frames), or give the scale (--scale)"
+            )
+        alone = "inputs alone can mislead the search: add photos between them, or give --scale"
+        return "" if self.further else alone
+
+    @property
+    def text(self) -> str:
+        """Factor, photos and quality."""
+        judged = " and ".join(["the inputs", *filter(None, [listed(self.names)])])
+        return f"scale {self.factor:.3g}, found on {judged}: {self.psnr:.1f} dB"
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """For JSON; the same in each run."""
+        tried = [[round(factor, 5), round(quality, 3)] for factor, quality in self.tried]
+        return {"result": self.text, "further_frames": list(self.further), "tried": tried}
+
+
+class ScaleSearch:
+    """The settings of views for windows of scenes, with the found factor in place of `search`.
+
+    found: by scene, inputs and compared frames; no window is searched twice.
+    """
+
+    def __init__(self, model: QueryGaussianModel, views: ViewsConfig) -> None:
+        self.model, self.views = model, views
+        self.found: dict[tuple[str, Frames, Frames], FoundScale] = {}
+
+    def __call__(self, scene: Scene, inputs: Frames, compared: Frames) -> ViewsConfig:
+        """See `find_scale`."""
+        if self.views.scale != "search":
+            return self.views
+        key = scene.name, tuple(inputs), tuple(compared)
+        if key not in self.found:
+            self.found[key] = find_scale(self.model, scene, *key[1:], self.views)
+        return constant_scale(self.views, self.found[key].factor)
+
+
+def photo_settings(views: ViewsConfig, own: bool, overrides: Sequence[str] = ()) -> ViewsConfig:
+    """`views` for photos of a user: `search` in place of a constant scale not set for them.
+
+    own: whether the model was trained on these photos. overrides: settings of `views`.
+    """
+    known = own or any(text.startswith("views.scale") for text in overrides)
+    search = views.scale == "constant" and not known
+    return views.model_copy(update={"scale": "search"}) if search else views
+
+
+def constant_scale(views: ViewsConfig, factor: float) -> ViewsConfig:
+    """`views` with this factor of all translations."""
+    return views.model_copy(update={"scale": "constant", "scale_factor": factor})
+
+
+@torch.no_grad()
+def find_scale(
+    model: QueryGaussianModel, scene: Scene, inputs: Frames, compared: Frames, views: ViewsConfig
+) -> FoundScale:
+    """Search the factor at which `model` renders inputs and `further_photos` of `scene` best.
+
+    Factors STEP apart cover what the trained ranges allow, and more past an end that is best;
+    thirds of a step lie around the best, and the last one is the vertex of a parabola in log scale.
+    Without further photos one of three or more inputs is judged and not given to the model; of two,
+    factors that bring what the cameras look at nearer than in training lose PENALTY. Where the
+    model is; restores its mode.
+    """
+    began, training = time.perf_counter(), model.training
+    further, given = further_photos(scene, inputs, compared), tuple(inputs)
+    if not further and len(inputs) > 2:
+        middle = len(inputs) // 2
+        further, given = given[middle : middle + 1], given[:middle] + given[middle + 1 :]
+    sample = make_sample(scene, given, further, constant_scale(views, 1.0), mirror=False)
+    frames = given if len(given) > 1 else given + further
+    low, high, nearest = search_range(model.trained_on or Domain(), scene, frames)
+    count = min(math.ceil(math.log(high / low) / math.log(STEP)) + 1, MOST)
+    ratio = (high / low) ** (1 / max(count - 1, 1))
+    trial = _Trial(model.eval(), sample, low, ratio ** (1 / 3), 0.0 if further else nearest)
+    try:
+        best = trial.best(range(0, 3 * count, 3))
+        if ratio > 1:
+            while (end := trial.past(best)) and len(trial.tried) < MOST:
+                best = trial.best(end)
+            best = trial.best([best + place for place in (-2, -1, 1, 2)])
+            best = trial.best([best + trial.vertex(best)])
+    finally:
+        model.train(training)
+    return FoundScale(
+        factor=trial.factor(best),
+        psnr=trial.psnr(best),
+        further=further,
+        names=[scene.frame_name(frame) for frame in further],
+        tried=sorted((trial.factor(place), trial.psnr(place)) for place in trial.tried),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def further_photos(scene: Scene, inputs: Frames, compared: Frames, most: int = FURTHER) -> Frames:
+    """At most `most` photos in the middle of the inputs, none held out or compared with.
+
+    The middle has the smallest largest distance from inputs: of centres, over that between inputs,
+    plus the angle between axes. None of scenes that move.
+    """
+    left = [f for f in range(len(scene)) if f not in {*inputs, *compared, *scene.held_out}]
+    if scene.times is not None or not left:
+        return ()
+    c2w = scene.cameras.c2w.double()
+    own, other = c2w[list(inputs)], c2w[left]
+    apart = torch.cdist(other[:, :3, 3], own[:, :3, 3])
+    extent = float(torch.cdist(own[:, :3, 3], own[:, :3, 3]).max() or apart.max()) or 1.0
+    turn = (other[:, :3, 2] @ own[:, :3, 2].T).clamp(-1, 1).acos()
+    far = (apart / extent + turn).amax(1).tolist()
+    return tuple(sorted(frame for _, frame in sorted(zip(far, left, strict=True))[:most]))
+
+
+def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, float, float]:
+    """The smallest and largest factor of a search, and from where on depths are as in training.
+
+    The last is 0 where the depth that the cameras look at is unknown.
+    """
+    depth = float(look_at_depth(scene.cameras.c2w))
+    centres = scene.cameras.c2w[list(frames), :3, 3].double()
+    baseline, found = float(torch.cdist(centres, centres).max()), list[float]()
+    low, high = trained.ranges.get("baseline", BASELINES)
+    if baseline > 0 and high > 0:
+        found += [max(low, high / 10) / baseline / BELOW, high / baseline * ABOVE]
+    near = trained.ranges.get("depth", (NEAREST, math.inf))[0]
+    near = near if 0 < near < math.inf else NEAREST
+    if depth > 0:
+        found += [near / TOLERANCE / depth, near * REACH / depth]
+    nearest = near * TOLERANCE / depth if depth > 0 else 0.0
+    # cameras on one point: no factor changes what they see
+    return min(found, default=1.0), max(found, default=1.0), nearest
+
+
+class _Trial:
+    """PSNR of `sample`, whose factor is 1, at the factors low * step ** place.
+
+    tried: means of inputs and of further photos by place. nearest: a factor below which PENALTY
+    goes off the score.
+    """
+
+    def __init__(
+        self, model: QueryGaussianModel, sample: Sample, low: float, step: float, nearest: float
+    ) -> None:
+        self._model, self._low, self._step, self._nearest = model, low, step, nearest
+        device = next(model.parameters()).device
+        self._inputs, self._further = sample.inputs.to(device), sample.targets.to(device)
+        self.tried: dict[float, tuple[float, float]] = {}
+
+    def factor(self, place: float) -> float:
+        return self._low * self._step**place
+
+    def psnr(self, place: float) -> float:
+        own, further = self.tried[place]
+        return own if math.isnan(further) else (own + 2 * further) / 3
+
+    def score(self, place: float) -> float:
+        below = self._nearest / self.factor(place)
+        found = self.psnr(place) - PENALTY * math.log(max(below, 1.0))
+        return -math.inf if math.isnan(found) else found
+
+    def best(self, places: Sequence[float]) -> float:
+        """Try those places; the best of all so far."""
+        new = [place for place in places if place not in self.tried]
+        each = max(PIXELS // self._inputs.images[:, :, 0].numel(), 1)
+        for start in range(0, len(new), each):
+            part = new[start : start + each]
+            factors = self._inputs.images.new_tensor([self.factor(place) for place in part])
+            # not through its hooks: one warns of views unlike the training's, which are tried here
+            gaussians = self._model.forward(at_factors(self._inputs, factors)).gaussians
+            columns = []
+            for views in (self._inputs, self._further):
+                cameras = at_factors(views, factors).cameras
+                empty = not views.images.shape[1]
+                seen = views.images if empty else self._model.render(gaussians, cameras).rgb
+                columns.append(psnr(seen, views.images).mean(1).expand(len(part)).tolist())
+            self.tried.update(zip(part, zip(*columns, strict=True), strict=True))
+        return max(self.tried, key=self.score)
+
+    def past(self, place: float) -> Sequence[float]:
+        """Places past the ends of those that were tried, where `place` is such an end."""
+        low, high = min(self.tried), max(self.tried)
+        return [low - 6, low - 3] if place == low else [high + 3, high + 6] * (place == high)
+
+    def vertex(self, place: float) -> float:
+        """Of the parabola through the scores at `place`, the best, and beside it, from `place`."""
+        if not {place - 1, place + 1} <= self.tried.keys():
+            return 0.0
+        left, middle, right = (self.score(place + side) for side in (-1, 0, 1))
+        bend = left - 2 * middle + right
+        return 0.5 * (left - right) / bend if bend < 0 else 0.0
+
+
+def at_factors(views: Views, factors: Tensor) -> Views:
+    """Views (1, V) as (F, V), with translations multiplied by each of `factors` (F,)."""
+    many = map_tensors(lambda tensor: tensor.expand(len(factors), *tensor.shape[1:]), views)
+    c2w = scaled(many.cameras.c2w, factors[:, None])
+    return replace(many, cameras=replace(many.cameras, c2w=c2w))

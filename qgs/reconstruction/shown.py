@@ -1,0 +1,75 @@
+"""What models look like when they are printed: sizes, and a line for each slot."""
+
+from torch import nn
+
+from qgs.model import QueryGaussianModel
+from qgs.recipe.slots import LAYER_SLOTS, SUBLAYER_SLOTS
+
+
+def parameter_counts(model: QueryGaussianModel) -> dict[str, int]:
+    """Component to its number of parameters, decoder layers summed by slot.
+
+    `decoder.layer` has what is not of its sublayers.
+    """
+    sublayers = {
+        f"decoder.{slot}": sum(map(_count, modules))
+        for slot in SUBLAYER_SLOTS
+        if (modules := [getattr(layer, slot) for layer in model.decoder if hasattr(layer, slot)])
+    }
+    return {
+        "encoder": _count(model.encoder),
+        "queries": _count(model.queries),
+        "decoder.layer": _count(model.decoder) - sum(sublayers.values()),
+        **sublayers,
+        "decoder.refinement": _count(model.refinements),
+        "feedback": _count(model.feedback),
+        "head": _count(model.head),
+        "centers": _count(model.centers),
+    }
+
+
+def _count(module: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def model_text(self: QueryGaussianModel) -> str:
+    """Sizes, then a line for each slot: its component and number of parameters."""
+    rows = slot_rows(self)
+    wide = [max(len(row[column]) for row in rows) for column in range(3)]
+    lines = [f"  {slot:<{wide[0]}}  {kind:<{wide[1]}}  {n:>{wide[2]}}" for slot, kind, n in rows]
+    return "\n".join([heading(self), *(line.rstrip() for line in lines)])
+
+
+def heading(model: QueryGaussianModel) -> str:
+    """Class, parameters, decoder layers, queries and device."""
+    tree = (model.recipe or {}).get("model", {})
+    options = {**tree.get("queries", {}), **tree.get("head", {})}
+    parts = [f"{_count(model):,} parameters", f"{len(model.decoder)} decoder layers"]
+    if {"count", "gaussians_per_query"} <= options.keys():
+        parts.append(f"{options['count']:,} queries of {options['gaussians_per_query']} Gaussians")
+    device = next((parameter.device for parameter in model.parameters()), "cpu")
+    return f"{type(model).__name__}: {', '.join(parts)}, on {device}"
+
+
+def slot_rows(model: QueryGaussianModel) -> list[tuple[str, str, str]]:
+    """Slot, types of its components (without a recipe their classes) and parameters."""
+    counts = {name: f"{count:,}" for name, count in parameter_counts(model).items()}
+    counts |= {"supervision": "", "renderer": ""}
+    kinds = {name: _types(model, name.removeprefix("decoder.")) for name in counts}
+    return [(name, ", ".join(dict.fromkeys(kinds[name])), count) for name, count in counts.items()]
+
+
+def _types(model: QueryGaussianModel, slot: str) -> list[str]:
+    """What stands in a slot, in one of the decoder by layer."""
+    tree = model.recipe["model"] if model.recipe else None
+    if slot not in LAYER_SLOTS:
+        return [tree[slot]["type"] if tree else type(getattr(model, slot)).__name__]
+    if tree is None:
+        modules = model.refinements if slot == "refinement" else model.decoder
+        if slot in SUBLAYER_SLOTS:
+            modules = [getattr(layer, slot) for layer in model.decoder if hasattr(layer, slot)]
+        return [type(module).__name__ for module in modules]
+    own = tree["decoder"].get("layers", {})
+    layers = [own.get(str(index), {}) for index in range(len(model.decoder))]
+    chosen = [layer.get(slot, tree["decoder"].get(slot)) for layer in layers]
+    return [one["type"] for one in chosen if one]

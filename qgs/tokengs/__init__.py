@@ -1,0 +1,59 @@
+"""The default components: TokenGS, one file per slot."""
+
+from qgs.contracts import Component
+from qgs.tokengs.blocks import NORM_EPS, CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
+from qgs.tokengs.centers import FreeCenters, OffsetCenters, posact
+from qgs.tokengs.decoder import (
+    ContentCrossAttention,
+    ContentSelfAttention,
+    CrossSelfMlp,
+    MlpFeedForward,
+    NoFeedback,
+    NoRefinement,
+)
+from qgs.tokengs.encoder import MultiViewViT
+from qgs.tokengs.head import GaussianHead
+from qgs.tokengs.optimizer import OneCycleAdamW
+from qgs.tokengs.queries import LatentQueries
+from qgs.tokengs.supervision import LayerSupervision, OnePass
+
+COMPONENTS: tuple[type[Component], ...] = (
+    MultiViewViT,
+    LatentQueries,
+    CrossSelfMlp,
+    ContentCrossAttention,
+    ContentSelfAttention,
+    MlpFeedForward,
+    NoRefinement,
+    NoFeedback,
+    GaussianHead,
+    FreeCenters,
+    OffsetCenters,
+    LayerSupervision,
+    OnePass,
+    OneCycleAdamW,
+)
+
+__all__ = [
+    "COMPONENTS",
+    "NORM_EPS",
+    "ContentCrossAttention",
+    "ContentSelfAttention",
+    "CrossAttentionCore",
+    "CrossSelfMlp",
+    "FreeCenters",
+    "GaussianHead",
+    "LatentQueries",
+    "LayerScale",
+    "LayerSupervision",
+    "Mlp",
+    "MlpFeedForward",
+    "MultiViewViT",
+    "NoFeedback",
+    "NoRefinement",
+    "OffsetCenters",
+    "OneCycleAdamW",
+    "OnePass",
+    "SelfAttentionCore",
+    "posact",
+]

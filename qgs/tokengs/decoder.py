@@ -1,0 +1,133 @@
+"""The default decoder layer: attention by content alone, an MLP, no refinement (TokenGS)."""
+
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.contracts import (
+    AttentionWeights,
+    ComponentConfig,
+    CrossAttention,
+    DecoderLayer,
+    Feedback,
+    FeedForward,
+    LayerParts,
+    ModelDims,
+    Refinement,
+    SelfAttention,
+    memory_fields,
+)
+from qgs.tokengs.blocks import NORM_EPS, CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
+from qgs.types import ImageMemory, QueryState, Rendering, Views
+
+
+class CrossSelfMlp(DecoderLayer):
+    """Cross-attention, self-attention, MLP; each update is scaled and added (TokenGS release)."""
+
+    name = "cross_self_mlp"
+    sublayers = ("cross_attention", "self_attention", "feed_forward")
+
+    def __init__(self, config: ComponentConfig, parts: LayerParts) -> None:
+        super().__init__(config, parts)
+        width, layer_scale = parts.dims.width, parts.layer_scale
+        self.cross_attention = parts.sublayers["cross_attention"]
+        self.cross_scale = LayerScale(width, layer_scale)
+        self.self_attention = parts.sublayers["self_attention"]
+        self.self_scale = LayerScale(width, layer_scale)
+        self.feed_forward = parts.sublayers["feed_forward"]
+        self.feed_forward_scale = LayerScale(width, layer_scale)
+
+    def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
+        # Each part reads what the part before it wrote: first the photos, then the other queries.
+        x_BND = state.features + self.cross_scale(self.cross_attention(state, memory))
+        state = state.replace(features=x_BND)  # self-attention reads fields too
+        x_BND = x_BND + self.self_scale(self.self_attention(state))
+        x_BND = x_BND + self.feed_forward_scale(self.feed_forward(x_BND))
+        return state.replace(features=x_BND), memory
+
+
+class ContentCrossAttention(CrossAttention):
+    """By content alone: softmax(q k / sqrt(d)) v over all image tokens."""
+
+    name = "content"
+    reads = memory_fields("keys", "values")
+
+    class Config(ComponentConfig):
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
+        """Added to the variance by every LayerNorm."""
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        # No keys and values of its own: the encoder projects them once for all layers.
+        self.core = CrossAttentionCore(dims.width, dims.heads, config.norm_eps)
+
+    def forward(self, state: QueryState, memory: ImageMemory) -> Tensor:
+        return self.core(state.features, memory["keys"], memory["values"])
+
+    def explain(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> AttentionWeights:
+        return self.core.explain(state.features, memory["keys"], queries)
+
+
+class ContentSelfAttention(SelfAttention):
+    """Pre-norm self-attention over the N queries of a scene."""
+
+    name = "content"
+
+    class Config(ComponentConfig):
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
+        """Added to the variance by every LayerNorm."""
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.norm = nn.LayerNorm(dims.width, config.norm_eps)
+        self.attention = SelfAttentionCore(dims.width, dims.heads, config.norm_eps)
+
+    def forward(self, state: QueryState) -> Tensor:
+        return self.attention(self.norm(state.features), state.mask)
+
+    def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
+        return self.attention.explain(self.norm(state.features), queries, state.mask)
+
+
+class MlpFeedForward(FeedForward):
+    """LayerNorm, D -> ratio*D -> D with GELU."""
+
+    name = "mlp"
+
+    class Config(ComponentConfig):
+        ratio: float = Field(default=4.0, ge=1)
+        """Hidden width (rounded down) over the model's width."""
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
+        """Added to the variance by the LayerNorm."""
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.norm = nn.LayerNorm(dims.width, config.norm_eps)  # pre-norm: the stream stays as it is
+        self.mlp = Mlp(dims.width, int(config.ratio * dims.width), dims.width)
+
+    def forward(self, features: Tensor) -> Tensor:  # (B, N, D)
+        return self.mlp(self.norm(features))
+
+
+class NoRefinement(Refinement):
+    """Returns the state unchanged."""
+
+    name = "none"
+
+    def forward(self, state: QueryState) -> QueryState:
+        return state
+
+
+class NoFeedback(Feedback):
+    """Every layer runs once."""
+
+    name = "none"
+    reads_cameras = False
+
+    def forward(
+        self, state: QueryState, memory: ImageMemory, rendering: Rendering, photos: Views
+    ) -> tuple[QueryState, ImageMemory]:
+        return state, memory

@@ -1,0 +1,90 @@
+"""`qgs/gaussian_head`: one linear layer from a query to its Gaussians (TokenGS, LocusGS)."""
+
+import math
+from collections.abc import Iterable
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from pydantic import Field
+from torch import Tensor, nn
+
+from qgs.contracts import ComponentConfig, Head, ModelDims, Problem, RecipeContext, without_effect
+from qgs.geometry.precision import at_least_float32
+from qgs.tokengs.blocks import NORM_EPS
+from qgs.types import GaussianAttributes, QueryState
+
+CHANNELS = (3, 3, 3, 4, 1)
+"""Per Gaussian: position, RGB, scale, rotation, opacity (both releases)."""
+
+
+class GaussianHead(Head):
+    """D -> K * 14 linear, then the published activations in float32."""
+
+    name = "gaussian_head"
+
+    class Config(ComponentConfig):
+        """Defaults are the LocusGS release's."""
+
+        gaussians_per_query: int = Field(default=64, ge=1)
+        """K, the Gaussians decoded from each query."""
+        init_std: float = Field(default=0.002, gt=0)
+        """Standard deviation of the truncated normal that the weights start from."""
+        position_std: float | None = Field(default=None, gt=0)
+        """The same for the weights that make positions; null for `init_std`."""
+        z_init: float = 0.0
+        """What the biases of the z of positions start from, raw (TokenGS 2026.6: log 1.1)."""
+        norm: bool = False
+        """A LayerNorm before the linear layer (in neither release; steadier for small models)."""
+        norm_eps: float = Field(default=NORM_EPS, gt=0)
+        """Added to the variance by that LayerNorm."""
+        scale_cap: float = Field(default=0.075, gt=0)
+        """Largest scale, world units; a raw scale of 0 gives 1/e of it."""
+        scale_input_limit: float | None = Field(default=10.0, gt=0)
+        """Raw scales are clamped to +- this before the exponential; null for no clamp (TokenGS)."""
+        opacity_bias: float = -2.0
+        """Added to the opacity logit."""
+        quat_eps: float = Field(default=1e-4, gt=0)
+        """Least length that a raw quaternion is divided by (TokenGS: 1e-12)."""
+
+    config: Config
+
+    def __init__(self, config: Config, dims: ModelDims) -> None:
+        super().__init__(config, dims)
+        self.norm = nn.LayerNorm(dims.width, config.norm_eps) if config.norm else nn.Identity()
+        self.linear = nn.Linear(dims.width, config.gaussians_per_query * sum(CHANNELS))
+        # Small weights: all Gaussians of a query start at one place, near one size and grey.
+        nn.init.zeros_(self.linear.bias)
+        nn.init.trunc_normal_(self.linear.weight, std=config.init_std)
+        if config.position_std is not None:  # spread initial positions divide the scene sooner
+            rows_K3D = torch.empty(config.gaussians_per_query, CHANNELS[0], dims.width)
+            nn.init.trunc_normal_(rows_K3D, std=config.position_std)
+            with torch.no_grad():
+                self.linear.weight.unflatten(0, (-1, sum(CHANNELS)))[:, : CHANNELS[0]] = rows_K3D
+        with torch.no_grad():
+            self.linear.bias.unflatten(0, (-1, sum(CHANNELS)))[:, CHANNELS[0] - 1] = config.z_init
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        if not config.norm:
+            yield from without_effect(config, ("norm_eps",), "`norm` is false")
+
+    def forward(self, state: QueryState) -> GaussianAttributes:
+        raw_BNC = self.linear(self.norm(state.features))
+        return self.activate(rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(CHANNELS)))
+
+    def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
+        """Raw channels (B, N, K, 14) to attributes, in float32 or better."""
+        offsets, rgb, scale, rotation, opacity = at_least_float32(raw_BNKC).split(CHANNELS, -1)
+        cap, limit = self.config.scale_cap, self.config.scale_input_limit
+        if limit is not None:  # exp of a stray output would be infinite, its gradient NaN
+            scale = scale.clamp(-limit, limit)
+        return GaussianAttributes(
+            offsets=offsets,
+            # cap / e at 0, never above the cap (TokenGS release): one huge Gaussian hides a scene
+            scales=torch.exp(scale - (1 - math.log(cap))).clamp_max(cap),
+            # eps: a raw quaternion near 0 would turn by any amount in a step
+            quats=F.normalize(rotation, dim=-1, eps=self.config.quat_eps),
+            opacities=torch.sigmoid(opacity[..., 0] + self.config.opacity_bias),
+            colors=(torch.tanh(rgb) + 1) / 2,
+        )

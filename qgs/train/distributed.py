@@ -1,0 +1,167 @@
+"""Devices, processes and random states of a run; requests to stop."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from importlib.util import find_spec
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import torch
+from accelerate import Accelerator
+from accelerate.utils import (
+    DistributedDataParallelKwargs,
+    DistributedType,
+    InitProcessGroupKwargs,
+    gather_object,
+)
+from torch import Tensor
+
+from qgs.train.precision import ACCELERATE
+
+TIMEOUT = timedelta(hours=24)
+"""How long processes wait while one evaluates or saves. NCCL's default of 10 minutes would end such
+runs; a process that died is noticed by the launcher, which ends the others."""
+
+_PARALLEL = (DistributedType.NO, DistributedType.MULTI_CPU, DistributedType.MULTI_GPU)
+
+
+def make_accelerator(device: str, unread: bool = False) -> Accelerator:
+    """The processes that a launcher started (DDP), or this one alone.
+
+    unread: whether some parameters never get a gradient, which DDP must then search for.
+    Raises ValueError for a launcher's request of anything but DDP.
+    """
+    group = InitProcessGroupKwargs(timeout=TIMEOUT)
+    parallel = DistributedDataParallelKwargs(find_unused_parameters=unread)
+    options = {"cpu": device == "cpu", "mixed_precision": ACCELERATE}
+    accelerator = Accelerator(**options, kwargs_handlers=[group, parallel])
+    if accelerator.distributed_type not in _PARALLEL:
+        kind = accelerator.distributed_type.value
+        raise ValueError(f"training runs in one process or under DDP: launch it without {kind}")
+    return accelerator
+
+
+def mean(accelerator: Accelerator, value: Tensor) -> Tensor:
+    """Mean of `value` over processes."""
+    reduced = accelerator.reduce(value, "mean")
+    assert isinstance(reduced, Tensor)
+    return reduced
+
+
+def gathered(accelerator: Accelerator, own: Any) -> list[Any]:
+    """The `own` of every process, by rank."""
+    return gather_object([own]) if accelerator.num_processes > 1 else [own]
+
+
+class RandomStates:
+    """The generators of Python, NumPy and torch, of every process by its rank."""
+
+    def __init__(self, accelerator: Accelerator) -> None:
+        self._accelerator = accelerator
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and JSON values; all processes must call it."""
+        version, words, gauss = random.getstate()
+        own: dict[str, Any] = {
+            "python": [version, list(words), gauss],
+            "numpy": _with_key(np.random.get_state(legacy=False), np.ndarray.tolist),
+            "torch": torch.get_rng_state(),
+        }
+        if self._accelerator.device.type == "cuda":
+            own["cuda"] = torch.cuda.get_rng_state(self._accelerator.device)
+        ranks = enumerate(gathered(self._accelerator, own))
+        return {f"{rank}/{key}": value for rank, found in ranks for key, value in found.items()}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Restore this process's generators; a rank that `state` lacks keeps its own."""
+        prefix, device = f"{self._accelerator.process_index}/", self._accelerator.device
+        own = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
+        if not own:
+            return
+        version, words, gauss = own["python"]
+        random.setstate((version, tuple(words), gauss))
+        np.random.set_state(_with_key(own["numpy"], lambda key: np.array(key, np.uint32)))
+        torch.set_rng_state(own["torch"])
+        if device.type == "cuda" and "cuda" in own:
+            torch.cuda.set_rng_state(own["cuda"], device)
+
+
+def _with_key(state: Any, function: Callable[[Any], Any]) -> dict[str, Any]:
+    """NumPy's state with `function` of the 624 words of its Mersenne Twister."""
+    return {**state, "state": {**state["state"], "key": function(state["state"]["key"])}}
+
+
+DEVICES = ("auto", "cpu", "cuda")
+
+
+def choose_device(wanted: str = "auto", say: Callable[[str], None] = print) -> str:
+    """ "cpu" or "cuda" for one of DEVICES; raises ValueError for others, and "cuda" without one.
+
+    "auto" takes CUDA if there is one and gsplat is installed; `say` gets a note if it is missing.
+    """
+    if wanted not in DEVICES:
+        raise ValueError(f"the device must be one of {', '.join(DEVICES)}, got {wanted!r}")
+    available = torch.cuda.is_available()
+    if wanted == "cuda" and not available:
+        raise ValueError(
+            "the device 'cuda' was asked for, but torch finds none: install a torch with CUDA and "
+            "its driver, or choose 'cpu'"
+        )
+    if wanted != "auto":
+        return wanted
+    # The renderer `qgs/auto` has only gsplat for tensors on a GPU.
+    if available and find_spec("gsplat") is None:
+        say(
+            "Computing on the CPU although a CUDA device is there: its renderer, gsplat, is not "
+            'installed (`pip install "query-gaussians[gsplat]"`, or --device cuda for recipes with '
+            "another one)"
+        )
+        return "cpu"
+    return "cuda" if available else "cpu"
+
+
+@dataclass
+class StopRequest:
+    """Whether training was asked to stop, and by which signal."""
+
+    signal: signal.Signals | None = None
+
+    def __bool__(self) -> bool:
+        return self.signal is not None
+
+
+@contextmanager
+def stop_requests(quiet: bool = False) -> Iterator[StopRequest]:
+    """Turn SIGINT and SIGTERM inside the block into a request; print so once unless `quiet`.
+
+    Does nothing outside the main thread, where Python cannot handle signals.
+    """
+    request = StopRequest()
+    if threading.current_thread() is not threading.main_thread():
+        yield request
+        return
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        if request:  # launchers and terminals each send the signal: repeats mean nothing new
+            return
+        request.signal = signal.Signals(number)
+        message = f"{request.signal.name}: finishing the step, then saving (Ctrl-\\ ends at once)"
+        if not quiet:  # print is not reentrant, and a handler may interrupt it
+            os.write(2, f"\n{message}\n".encode())
+
+    # Restored afterwards: a notebook goes on with handlers of its own.
+    before = {s: signal.signal(s, ask) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield request
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,85 @@
+"""`init_from`: a training that starts from the weights of another one."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from qgs.checkpoint.model_file import CheckpointFile, load_weights, unique_tensors
+from qgs.checkpoint.tensors import CheckpointError, differing_tensors, shapes_of
+from qgs.model import QueryGaussianModel
+from qgs.recipe import Recipe
+from qgs.recipe.recipe import differing_predictions
+
+_QUERIES = "queries."
+
+
+def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
+    """Give `model`, freshly built from `recipe`, the weights of `recipe.init_from`, if any.
+
+    `init_from` is a name as `CheckpointFile` takes it. Queries grow or shrink by their own rule
+    (`Queries.resized`) with random numbers of the recipe's seed, encoder, feedback and head adapt
+    weights (`ModelComponent.adapted`); everything else must have the same names and shapes.
+
+    Returns lines about weights of another size, new ones, and options that make the same weights
+    predict other Gaussians. Raises FileNotFoundError, CheckpointError with every difference.
+    """
+    if recipe.init_from is None:
+        return []
+    with CheckpointFile(recipe.init_from) as file:
+        path, theirs, stored = file.path, file.recipe, file.tensors
+        count = file.untrained("meta").queries.count
+    learned = {n: t.float() if t.is_floating_point() else t for n, t in stored.items()}
+    options = [
+        f"{option}: {their} (here {ours})"
+        for option, (their, ours) in differing_predictions(theirs.tree, recipe.tree).items()
+        if option != "model.queries.count"
+    ]
+    weights = dict(learned)
+    for part in ("encoder", "feedback", "head"):
+        adapted = getattr(model, part).adapted(_part(f"{part}.", learned))
+        weights |= {f"{part}.{name}": values.cpu() for name, values in adapted.items()}
+    found = _differences(weights, model, count)
+    if found:
+        first = (
+            f"init_from: {path} does not fit this recipe; only the number of queries, sizes that "
+            "encoder and head adapt (of patches, to a multiple) and new feedback may differ:"
+        )
+        trained = "options of the model that the checkpoint was trained with:"
+        raise CheckpointError("\n  ".join([first, *found, trained, *(f"  {o}" for o in options)]))
+    generator = torch.Generator().manual_seed(recipe.seed)
+    resized = model.queries.resized(_part(_QUERIES, learned), generator)
+    weights |= {_QUERIES + name: values for name, values in resized.items()}
+    load_weights(model, weights, str(path))
+    changes = [
+        _change(name, learned.get(name), values)
+        for name, values in weights.items()
+        if name not in learned or values.shape != learned[name].shape
+    ]
+    return [f"weights start from {path}", *changes, *(f"learned with {o}" for o in options)]
+
+
+def _part(prefix: str, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The weights of one part of the model, by their names in it."""
+    return {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
+
+
+def _change(name: str, old: Tensor | None, new: Tensor) -> str:
+    if old is None or not name.startswith(_QUERIES):
+        return f"{name}: {'none' if old is None else tuple(old.shape)} -> {tuple(new.shape)}"
+    before, after = len(old), len(new)
+    kept = f"{before} kept, {after - before} noisy copies of them"
+    return f"{name}: {before} -> {after}, {'the first are kept' if after < before else kept}"
+
+
+def _differences(
+    learned: Mapping[str, Tensor], model: QueryGaussianModel, count: int | None
+) -> list[str]:
+    """Differences from the weights of a model of `count` queries, except in that number."""
+    own, theirs = shapes_of(unique_tensors(model)), shapes_of(learned)
+    for name in own.keys() & theirs.keys():
+        ours, shape = own[name], theirs[name]
+        per_query = ours[:1] == (model.queries.count,) and shape[:1] == (count,)
+        if name.startswith(_QUERIES) and per_query and ours[1:] == shape[1:]:
+            del own[name], theirs[name]
+    return differing_tensors(theirs, own)

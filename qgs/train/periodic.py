@@ -1,0 +1,150 @@
+"""Evaluations and pictures while a model trains."""
+
+import json
+import logging
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from accelerate import Accelerator
+
+from qgs.data.samples import Sample
+from qgs.drawing.images import (
+    Picture,
+    depth_picture,
+    depth_range,
+    rgb_picture,
+    side_by_side,
+    write_png,
+)
+from qgs.evaluate.evaluation import Measures, evaluate
+from qgs.evaluate.plan import EvaluationPlan
+from qgs.evaluate.protocol import index_of
+from qgs.files import read_records, write_text
+from qgs.model import QueryGaussianModel
+from qgs.recipe import Recipe
+from qgs.train.distributed import RandomStates, StopRequest
+from qgs.train.parameters import MovingAverage
+from qgs.train.tracking import Trackers
+
+SAMPLES = 4
+"""Samples that are drawn, the same ones each time."""
+
+_GAP = 4
+_COUNTS = ("statement", "scenes", "scenes_in_protocol", "samples")
+
+_log = logging.getLogger(__name__)
+
+
+class _StoppedError(Exception):
+    """Training was asked to stop in the middle of an evaluation."""
+
+
+class PeriodicEvaluation:
+    """Judges the model on the recipe's test views, beside its moving average where there is one.
+
+    Appends to RUN/evaluations.jsonl and writes RUN/pictures/step-N.png; restores random states and
+    the model's mode. One process judges and the others wait.
+
+    latest: the step of the latest evaluation of this session.
+    """
+
+    def __init__(
+        self,
+        accelerator: Accelerator,
+        recipe: Recipe,
+        model: QueryGaussianModel,
+        average: MovingAverage | None,
+        folder: Path,
+        trackers: Trackers,
+    ) -> None:
+        self.latest: int | None = None
+        self._accelerator, self._recipe, self._model = accelerator, recipe, model
+        self._average, self._folder, self._trackers = average, folder, trackers
+        self._random = RandomStates(accelerator)
+        self._stop = StopRequest()
+        Measures(recipe)  # a metric that is wrong must fail now, not after the training
+
+    def run(self, step: int, stop: StopRequest | None = None) -> None:
+        """Evaluate after `step` optimiser steps. All processes must call this.
+
+        stop: where it is requested, the evaluation ends between two scenes. A failing evaluation is
+        logged as a warning and does not end the training.
+        """
+        self.latest = step
+        self._stop = StopRequest() if stop is None else stop
+        # An evaluation must not change what the training draws afterwards.
+        states = self._random.state()
+        try:
+            if self._accelerator.is_main_process:
+                self._evaluate(step)
+        except _StoppedError:
+            _log.warning("the evaluation at step %d is given up: training was asked to stop", step)
+        except Exception as error:  # the run is saved, and worth more than an evaluation
+            kind = type(error).__name__
+            _log.warning("the evaluation at step %d failed: %s: %s", step, kind, error)
+            _log.debug("where it failed", exc_info=True)
+        # The others wait here, see TIMEOUT in `distributed`.
+        self._accelerator.wait_for_everyone()
+        self._random.load_state(states)
+
+    def _evaluate(self, step: int) -> None:
+        records = [self._record("raw", step)]
+        if self._average:
+            # The average is judged second: it is applied to the weights for as long as that takes.
+            with self._average.applied():
+                records.append(self._record("ema", step))
+        place = self._folder / "evaluations.jsonl"
+        # A resumed run evaluates again what lies after its last save.
+        kept = [record for record in read_records(place) if record["step"] < step]
+        write_text(place, "".join(json.dumps(record) + "\n" for record in (*kept, *records)))
+        for record in records:
+            group, scores = f"evaluation/{record['weights']}", record["scores"]
+            self._trackers.log({f"{group}/{name}": score for name, score in scores.items()}, step)
+        picture = self._picture()
+        write_png(picture, self._folder / "pictures" / f"step-{step}.png")
+        self._trackers.picture("evaluation", picture, step)
+
+    def _between_scenes(self, done: int, wanted: int) -> None:
+        if self._stop:
+            raise _StoppedError
+
+    def _record(self, weights: str, step: int) -> dict[str, Any]:
+        evaluation = evaluate(self._model, self._recipe, step, observe=self._between_scenes)
+        summary = evaluation.summary()
+        return {
+            "step": step,
+            "weights": weights,
+            "protocol": summary["protocol"]["sha256"],
+            **{name: summary[name] for name in _COUNTS},
+            "scores": {n: score for n, score in evaluation.means().items() if score is not None},
+        }
+
+    @torch.no_grad()
+    def _picture(self) -> Picture:
+        """A row per sample: input views, the first target view, its rendering and its depth."""
+        recipe, model, training = self._recipe, self._model, self._model.training
+        data = recipe.build_data(), recipe.views, recipe.evaluation
+        plan = EvaluationPlan(*data, index_of(recipe), recipe.build_view_sampler())
+        # A broken test scene has been reported by the scores; pictures take the next one.
+        usable = (sample for sample in plan.samples() if isinstance(sample, Sample))
+        model.eval()
+        try:
+            rows = [_row(model, sample) for sample in islice(usable, SAMPLES)]
+        finally:
+            model.train(training)
+        width = max(row.shape[1] for row in rows)
+        wider = [((0, _GAP), (0, width - row.shape[1]), (0, 0)) for row in rows]
+        padded = [np.pad(r, w, constant_values=255) for r, w in zip(rows, wider, strict=True)]
+        return np.concatenate(padded)[:-_GAP]
+
+
+def _row(model: QueryGaussianModel, sample: Sample) -> Picture:
+    device = next(model.parameters()).device
+    target = sample.targets.select(slice(0, 1)).to(device)
+    rendering = model.render(model(sample.inputs.to(device)).gaussians, target.cameras)
+    photos = [rgb_picture(image) for image in (*sample.inputs.images[0], target.images[0, 0])]
+    depth = depth_picture(rendering.depth[0, 0], *depth_range(rendering.depth))
+    return side_by_side([*photos, rgb_picture(rendering.rgb[0, 0]), depth], _GAP)

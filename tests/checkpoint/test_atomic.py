@@ -1,0 +1,101 @@
+"""Files and folders that appear whole or not at all."""
+
+import errno
+from pathlib import Path
+from unittest.mock import Mock
+
+import pytest
+import torch
+from safetensors import SafetensorError
+
+from qgs.checkpoint.tensors import write_tensors
+from qgs.files import DiskFullError, is_leftover, replacing, replacing_entries, write_text
+
+
+def put(folder, text, *names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+
+def texts(folder):
+    files = filter(Path.is_file, folder.rglob("*"))
+    return {str(path.relative_to(folder)): path.read_text() for path in files}
+
+
+def replace(folder, mark, *names):
+    with replacing_entries(folder, mark) as fresh:
+        put(fresh, "new", *names)
+
+
+def test_entries_are_replaced_whole_and_the_rest_stays(tmp_path):
+    put(tmp_path / "out", "old", "views/old.png", "notes.txt")
+    replace(tmp_path / "out", "views", "views/new.png")
+    assert texts(tmp_path) == {"out/views/new.png": "new", "out/notes.txt": "old"}
+
+
+def test_entries_of_no_earlier_result_stay(tmp_path):
+    put(tmp_path / "out", "old", "depth/sensor.png")
+    names = "scene.ply", "depth/0.png"
+    with pytest.raises(FileExistsError, match="depth"):
+        replace(tmp_path / "out", "scene.ply", *names)
+    assert texts(tmp_path) == {"out/depth/sensor.png": "old"}
+
+
+def test_entries_come_back_where_moving_fails(tmp_path, monkeypatch):
+    put(tmp_path / "out", "old", "a/x", "b/x")
+    rename = Path.rename
+
+    def interrupted(self, target):
+        if self.parent.name == "fresh" and self.name == "b":
+            raise KeyboardInterrupt
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        replace(tmp_path / "out", "a", "a/x", "b/x")
+    assert texts(tmp_path) == {"out/a/x": "old", "out/b/x": "old"}
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path):
+    path = tmp_path / "a.txt"
+    write_text(path, "old")
+
+    def fail():
+        with replacing(path) as temporary:
+            temporary.write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert texts(tmp_path) == {"a.txt": "old"}
+
+
+def test_a_disk_is_called_full_only_where_it_is(tmp_path, monkeypatch):
+    for words, number in (
+        ("I/O error: No space left on device (os error 28)", None),
+        ("I/O error: Disk quota exceeded (os error 122)", None),
+        ("I/O error: File too large (os error 27)", errno.EFBIG),
+        ("I/O error: Permission denied (os error 13)", errno.EACCES),
+    ):
+        failure = SafetensorError(words)
+        monkeypatch.setattr("qgs.checkpoint.tensors.save_file", Mock(side_effect=failure))
+        with pytest.raises(OSError, match=r"a\.safetensors") as caught:
+            write_tensors(tmp_path / "a.safetensors", {"a": torch.ones(1)}, {})
+        full = number is None
+        assert isinstance(caught.value, DiskFullError) == full
+        assert full or caught.value.errno == number
+        assert words in str(caught.value)
+        assert not list(tmp_path.iterdir())
+
+
+def test_leftovers_of_killed_processes_are_told_from_what_users_made(tmp_path):
+    for name in (".state.safetensors.tmp", "notes.12.tmp", ".git", "state.safetensors"):
+        (tmp_path / name).touch()
+        assert not is_leftover(tmp_path / name)
+    (tmp_path / ".tmpA9b0zZ").touch()
+    assert is_leftover(tmp_path / ".tmpA9b0zZ")
+    (tmp_path / ".folder.12.tmp").mkdir()
+    assert not is_leftover(tmp_path / ".folder.12.tmp")
+    with replacing(tmp_path / "state") as temporary:
+        assert is_leftover(temporary)

@@ -1,0 +1,256 @@
+"""Checkpoints: the same model back, from a file that is opened once, or a reason."""
+
+import json
+import os
+import pickle  # noqa: TID251
+from pathlib import Path
+from unittest.mock import Mock
+
+import pytest
+import torch
+from commands import SMALL
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from tables import must_refuse
+
+import qgs
+from qgs.checkpoint import tensors as tensors_module
+from qgs.checkpoint.model_file import (
+    CheckpointFile,
+    load_weights,
+    save,
+    unique_tensors,
+    write_checkpoint,
+)
+from qgs.checkpoint.tensors import SEAL, CheckpointError, write_tensors
+from qgs.domain import KEY, Domain
+from qgs.recipe import RecipeError, resolve
+from qgs.recipe.registry import available_plugins
+
+RECIPES = Path(__file__).parents[2] / "recipes/tiny"
+
+
+@pytest.fixture(scope="module")
+def model():
+    torch.manual_seed(0)
+    model = qgs.compose(RECIPES / "locus.yaml", SMALL).eval()
+    for parameter in model.parameters():
+        parameter.data += 0.01 * torch.randn_like(parameter)
+    return model
+
+
+@pytest.fixture(scope="module")
+def written(model, tmp_path_factory):
+    path = tmp_path_factory.mktemp("saved") / "new/model.safetensors"
+    qgs.save(model, path, extra={"step": "7000", KEY: Domain({"depth": [1.0]}, 1).text})
+    return path.read_bytes()
+
+
+@pytest.fixture
+def saved(written, tmp_path):
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(written)
+    return path
+
+
+def metadata_of(path):
+    with safe_open(path, "pt") as file:
+        return file.metadata()
+
+
+def tensors_of(path):
+    return {name: tensor.clone() for name, tensor in load_file(path).items()}
+
+
+def rewrite(path, tensors=None, **changed):
+    """Write the file again with other tensors or metadata, and checksums of these."""
+    write_tensors(path, tensors or tensors_of(path), metadata_of(path) | changed)
+
+
+def must_not_load(match, path):
+    must_refuse(match, qgs.load, path, kind=CheckpointError)
+
+
+def test_a_loaded_model_is_the_saved_one(model, saved):
+    loaded = qgs.load(saved)
+    assert not loaded.training
+    own, found = (dict(m.named_parameters()) for m in (model, loaded))
+    torch.testing.assert_close(found, own, rtol=0, atol=0)
+    recipe, metadata = CheckpointFile(saved).recipe, metadata_of(saved)
+    assert recipe.tree == loaded.recipe == model.recipe
+    assert metadata["qgs.version"] == qgs.__version__
+    assert json.loads(metadata["qgs.plugins"]) == {n: v for n, (_, v) in recipe.releases.items()}
+    distributions = json.loads(metadata["qgs.distributions"])
+    assert distributions["qgs"] == "query-gaussians"
+    assert distributions["rooms"] == "query-gaussians-worlds"
+
+
+def test_only_plugins_that_are_used_are_needed(tmp_path, monkeypatch):
+    path = tmp_path / "photos.safetensors"
+    save(qgs.compose(RECIPES / "photos.yaml", SMALL), path)
+    without_rooms = {n: e for n, e in available_plugins().items() if n != "rooms"}
+    for module in ("qgs.recipe.registry", "qgs.checkpoint.model_file"):
+        monkeypatch.setattr(f"{module}.available_plugins", lambda: without_rooms)
+    assert set(CheckpointFile(path).recipe.releases) == {"qgs", "locus", "datasets"}
+    assert qgs.load(path).queries.count == 8
+    must_refuse(
+        "offers a plugin `rooms`", qgs.compose, RECIPES / "photos.yaml", SMALL, kind=RecipeError
+    )
+
+
+def test_a_model_without_a_step_is_saved_without_one(tmp_path):
+    """As an imported one: what follows the training is at its end, in every copy."""
+    ramp = "model.renderer.dilation={schedule: linear, values: [10, 0.5], at: [1, 9]}"
+    recipe = resolve(RECIPES / "tokengs.yaml", [*SMALL, ramp])
+    first, second = tmp_path / "first.safetensors", tmp_path / "second.safetensors"
+    tensors = {k: x.detach() for k, x in unique_tensors(recipe.build_model()).items()}
+    write_checkpoint(first, tensors, recipe.tree, recipe.releases, {})
+    save(qgs.load(first), second)
+    assert CheckpointFile(second).step is None
+    assert qgs.load(second).renderer.config.model_dump()["dilation"] == 0.5
+    save(recipe.build_model(), first, extra={"note": "ä = b"})
+    assert CheckpointFile(first).step == 0
+    assert CheckpointFile(first).extra == {"step": "0", "note": "ä = b"}
+
+
+def test_shared_tensors_are_stored_once_and_stay_shared():
+    module = torch.nn.ModuleDict({"a": torch.nn.Linear(3, 3), "b": torch.nn.Linear(3, 3)})
+    module["b"].weight = module["a"].weight
+    tensors = unique_tensors(module)
+    assert sorted(tensors) == ["a.bias", "a.weight", "b.bias"]
+    load_weights(module, {name: torch.ones_like(t) for name, t in tensors.items()}, "test")
+    assert module["b"].weight is module["a"].weight
+    assert (module["b"].weight == 1).all()
+
+
+def test_weights_that_are_not_finite_are_refused(saved):
+    tensors = tensors_of(saved)
+    tensors["queries.features"][0, 0] = torch.nan
+    tensors["head.linear.bias"][0] = torch.inf
+    rewrite(saved, tensors)
+    names = r"head\.linear\.bias.*queries\.features"
+    must_refuse(rf"{saved.name}: .*{names}", qgs.load, saved)
+
+
+def test_every_difference_is_listed_at_once(saved):
+    tensors = tensors_of(saved)
+    del tensors["head.linear.bias"], tensors["encoder.norm.weight"]
+    tensors["head.linear.weight"] = torch.zeros(2, 2)
+    tensors["queries.features"] = tensors["queries.features"].view(torch.int32)
+    tensors["stranger"] = torch.zeros(1)
+    rewrite(saved, tensors)
+    with pytest.raises(CheckpointError) as caught:
+        qgs.load(saved)
+    lines = [line.strip().partition(" in the file")[0] for line in str(caught.value).splitlines()]
+    assert lines[1:6] == [
+        "missing: encoder.norm.weight",
+        "missing: head.linear.bias",
+        "unexpected: stranger",
+        "shape of head.linear.weight: (2, 2)",
+        "type of queries.features: torch.int32",
+    ]
+
+
+def test_damaged_files_are_refused_by_name(saved, written):
+    for position in (-100, -5):
+        content = bytearray(written)
+        content[position] ^= 1
+        saved.write_bytes(content)
+        must_not_load(f"^{saved} is damaged", saved)
+    cut = [written[:kept] for kept in (0, 4, 100, -10)]
+    for content in (*cut, b"recipe: 1\nmodel:\n"):
+        saved.write_bytes(content)
+        must_not_load(str(saved), saved)
+
+
+def test_a_renamed_pickle_is_refused_unread(tmp_path):
+    class Explosive:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "trace"),)
+
+    path = tmp_path / "model.safetensors"
+    for protocol in (2, 4):
+        path.write_bytes(pickle.dumps(Explosive(), protocol))
+        must_not_load("a Python pickle", path)
+    torch.save({"a": Explosive()}, path)
+    must_not_load("PyTorch", path)
+    assert not (tmp_path / "trace").exists()
+
+
+def test_a_newer_format_is_refused(saved):
+    rewrite(saved, **{"qgs.format_version": "99"})
+    must_not_load("qgs.format_version 99", saved)
+
+
+def test_sizes_are_compared_before_anything_is_allocated(saved, monkeypatch):
+    monkeypatch.setattr(torch.nn.init, "normal_", None)
+    monkeypatch.setattr(torch, "randn", lambda *shape: torch.empty(shape, device="meta"))
+    recipe = json.loads(metadata_of(saved)["qgs.recipe"])
+    for size in ("width=65536", "queries.count=1000000000", "head.gaussians_per_query=1000000000"):
+        rewrite(saved, **{"qgs.recipe": json.dumps(resolve(recipe, [f"model.{size}"]).tree)})
+        fits_not = "does not fit the model of its recipe"
+        must_not_load(fits_not, saved)
+
+
+def test_a_changed_letter_in_any_metadata_is_refused(saved):
+    """Of the recipe, the step, the ranges, the seal itself, and their names."""
+    own, metadata = tensors_of(saved), metadata_of(saved)
+    assert len(metadata) == 9
+    for name, text in metadata.items():
+        for changed in ({name: text[:-1] + "x"}, {name[:-1] + "x": text}):
+            rest = dict(metadata)
+            del rest[name]
+            save_file(own, saved, rest | changed)
+            must_refuse("", CheckpointFile, saved, kind=CheckpointError)
+
+
+def test_files_of_the_format_without_a_seal_are_read(saved):
+    own, metadata = tensors_of(saved), metadata_of(saved)
+    del metadata[SEAL]
+    save_file(own, saved, metadata)
+    must_refuse("lack", CheckpointFile, saved, kind=CheckpointError)
+    save_file(own, saved, metadata | {"qgs.format_version": "2"})
+    assert CheckpointFile(saved).recipe.tree
+
+
+def test_forged_metadata_is_one_error_with_the_file_and_no_file_is_followed(
+    saved, written, monkeypatch
+):
+    monkeypatch.chdir(saved.parent)
+    Path("secret.yaml").write_text("the: secret\n")
+    text = metadata_of(saved)["qgs.recipe"]
+    recipes = ["null", '["optimizer"]', text[:90], '{"a":' * 5000, "{}"]
+    recipes.append('{"training": [1], "plugins": 3}')
+    names = ("secret.yaml", "/dev/zero", ["secret.yaml"], None)
+    changes = [{"swap": {"head": {"type": "qgs/free"}}}, *({"extends": name} for name in names)]
+    recipes += [json.dumps(json.loads(text) | change) for change in changes]
+    unknown = json.dumps(json.loads(text) | {"plugins": ["none"]})
+    for entries in (
+        *({"qgs.recipe": recipe} for recipe in recipes),
+        {"qgs.format_version": "x"},
+        {"qgs.plugins": "[1]", "qgs.recipe": unknown},
+    ):
+        saved.write_bytes(written)
+        rewrite(saved, **entries)
+        with pytest.raises(CheckpointError) as caught:
+            _ = CheckpointFile(saved).recipe
+        told = str(caught.value)
+        assert told.startswith(str(saved)), entries
+        assert "the: secret" not in told
+        assert len(told) < 2000
+
+
+def test_errors_of_the_system_are_no_damage(saved, monkeypatch):
+    for error in (PermissionError(13, "no"), OSError(5, "disk"), MemoryError()):
+        monkeypatch.setattr(tensors_module, "safe_open", Mock(side_effect=error))
+        with pytest.raises(type(error)) as raised:
+            CheckpointFile(saved)
+        assert raised.value is error
+
+
+def test_loading_opens_the_file_once(saved, monkeypatch):
+    opened = Mock(wraps=tensors_module.safe_open)
+    monkeypatch.setattr(tensors_module, "safe_open", opened)
+    with CheckpointFile(saved) as file:
+        _ = file.model(), file.recipe, file.tensors, file.step, file.domain, file.extra
+    assert opened.call_count == 1

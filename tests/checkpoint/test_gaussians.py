@@ -1,0 +1,207 @@
+"""Files of Gaussians: PLY as other programs write and read it, .splat, a format of a plug-in."""
+
+import os
+from dataclasses import replace
+from io import BytesIO
+
+import numpy as np
+import torch
+from commands import run_qgs
+from numpy.lib.recfunctions import repack_fields
+from plyfile import PlyData, PlyElement
+from tables import must_refuse
+from torch.testing import assert_close
+
+import qgs
+from qgs.checkpoint.gaussians import PROPERTIES, load_ply, save_gaussians, save_ply
+from qgs.extensions import ExtensionError
+from qgs.types import Gaussians, named_tensors
+
+
+def random_gaussians(*batch, harmonics=0):
+    def draw(*trailing):
+        return torch.rand(*batch, *trailing)
+
+    quats = torch.nn.functional.normalize(draw(4) - 0.5, dim=-1)
+    parts = (draw(3) * 10 - 5, draw(3) * 0.5 + 1e-3, quats, draw() * 0.98 + 0.01, draw(3))
+    return Gaussians(*parts, sh=torch.randn(*batch, harmonics, 3) if harmonics else None)
+
+
+def saved(path, gaussians):
+    save_ply(gaussians, path)
+    return path
+
+
+def vertices_of(path):
+    return PlyData.read(str(path))["vertex"].data
+
+
+def ply(**elements):
+    described = [PlyElement.describe(data, name) for name, data in elements.items()]
+    file = BytesIO()
+    PlyData(described).write(file)
+    return file.getvalue()
+
+
+def test_the_file_is_that_of_the_3dgs_release(tmp_path):
+    """f_rest_0 to 14 are red, 15 to 29 green, 30 to 44 blue."""
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{index}" for index in range(45)]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    given = random_gaussians(50, harmonics=8)
+    for gaussians in (given, replace(given, sh=None)):
+        rest = torch.zeros(50, 3, 15)
+        if gaussians.sh is not None:
+            rest[..., :8] = gaussians.sh.mT
+        columns = [
+            given.means,
+            torch.zeros(50, 3),
+            (given.colors - 0.5) / 0.28209479177387814,
+            rest.flatten(1),
+            given.opacities.logit()[:, None],
+            given.scales.log(),
+            given.quats,
+        ]
+        whole = PlyData.read(str(saved(tmp_path / "scene.ply", gaussians)))
+        assert (whole.text, whole.byte_order) == (False, "<")
+        vertex = whole["vertex"].data
+        assert vertex.dtype == np.dtype([(name, "<f4") for name in names])
+        assert_close(torch.tensor(vertex.tolist()), torch.cat(columns, 1))
+
+
+def test_the_round_trip(tmp_path):
+    """Of opacities and scales too whose logits and logarithms are infinite."""
+    for harmonics in (0, 3, 8, 15):
+        given = random_gaussians(1, 200, harmonics=harmonics)
+        given.opacities[0, :2] = torch.tensor([0.0, 1.0])
+        given.scales[0, 0] = 0
+        path = saved(tmp_path / "scene.ply", given)
+        assert all(np.isfinite(vertices_of(path)[name]).all() for name in PROPERTIES)
+        found, expected = (dict(named_tensors(g)) for g in (load_ply(path), given))
+        assert_close(found, expected)
+
+
+def test_several_scenes_and_numbers_that_are_not_finite_leave_no_file(tmp_path):
+    broken, harmonic = random_gaussians(4), random_gaussians(4, harmonics=3)
+    broken.means[2, 0] = torch.nan
+    harmonic.sh[1:3, 2, 0] = torch.inf
+    for gaussians, words in (
+        (random_gaussians(2, 5), "one scene"),
+        (broken, "1 of 4"),
+        (harmonic, "2 of 4"),
+    ):
+        must_refuse(words, save_ply, gaussians, tmp_path / "a.ply")
+    assert not list(tmp_path.iterdir())
+
+
+def test_files_of_others_are_read(tmp_path):
+    """Text, float64, big-endian, properties in another order, quaternions that are not unit."""
+    gaussians = random_gaussians(5)
+    vertices = vertices_of(saved(tmp_path / "scene.ply", gaussians))
+    few = [name for name in PROPERTIES if not name.startswith(("f_rest", "n"))]
+    smaller = np.empty(5, dtype=[(name, ">f8") for name in reversed(few)])
+    for name in few:
+        smaller[name] = vertices[name] * (2 if name.startswith("rot") else 1)
+    PlyData([PlyElement.describe(smaller, "vertex")], text=True).write(tmp_path / "other.ply")
+    assert_close(load_ply(tmp_path / "other.ply").quats[0], gaussians.quats)
+
+
+def test_files_of_fewer_degrees_are_read(tmp_path):
+    given = random_gaussians(1, 4, harmonics=3)
+    vertices = vertices_of(saved(tmp_path / "scene.ply", given))
+    kept = [name for name in PROPERTIES if not name.startswith("f_rest_")]
+
+    def written(rest):
+        fewer = repack_fields(vertices[[*kept, *rest]])
+        fewer.dtype.names = [*kept, *(f"f_rest_{index}" for index in range(len(rest)))]
+        path = tmp_path / "fewer.ply"
+        path.write_bytes(ply(vertex=fewer))
+        return path
+
+    rest = [f"f_rest_{index}" for index in range(45)]
+    first, zeros = rest[0:3] + rest[15:18] + rest[30:33], rest[3:15] + rest[18:30]
+    assert torch.equal(load_ply(written(first)).sh, given.sh)
+    assert load_ply(written(zeros)).sh is None
+    must_refuse("10 properties", load_ply, written(zeros[:10]))
+
+
+def test_other_files_are_refused_by_name(tmp_path):
+    points = np.zeros(3, [(name, "<f4") for name in "xyz"])
+    chunks = np.zeros(1, [("min_x", "<f4")])
+    some = random_gaussians(3)
+    whole = saved(tmp_path / "whole.ply", some).read_bytes()
+    still = saved(tmp_path / "still.ply", replace(some, quats=some.quats * 0)).read_bytes()
+    large = bytearray(whole)
+    large[-28:-24] = np.float32(88).tobytes()  # the square of its exponential overflows
+    ascii = whole.replace(b"binary_little_endian", b"ascii")
+    faces = b"element face 100000000\nproperty list uint float v\nend_header"
+    for name, content in {
+        "points": ply(vertex=points),
+        "compressed": ply(vertex=points, chunk=chunks),
+        "cut": whole[:-5],
+        "noise": b"\x89PNG\r\n\xff",
+        "empty": b"",
+        "negative": whole.replace(b"vertex 3", b"vertex -3"),
+        "promise": whole.replace(b"vertex 3", b"vertex 3000000000"),
+        "text": ascii.replace(b" 3", b" " + b"9" * 19),
+        "twice": whole.replace(b"float nx", b"float x"),
+        "long": whole.replace(b"element", b"comment x\n" * 10_000 + b"element"),
+        "faces": whole.replace(b"end_header", faces),
+        "without rotation": still,
+        "large": bytes(large),
+        "without any": saved(tmp_path / "none.ply", random_gaussians(0)).read_bytes(),
+    }.items():
+        path = tmp_path / f"{name}.ply"
+        path.write_bytes(content)
+        must_refuse(path.name, load_ply, path)
+    os.mkfifo(tmp_path / "pipe.ply")  # reading it would wait for a writer
+    for name in ("missing", "pipe"):
+        must_refuse(name, load_ply, tmp_path / f"{name}.ply", kind=FileNotFoundError)
+
+
+def test_convert_keeps_the_most_opaque(tmp_path):
+    given = random_gaussians(1, 50, harmonics=8)
+    qgs.save_ply(given, tmp_path / "all.ply")
+    done = run_qgs("convert", tmp_path / "all.ply", tmp_path / "few.ply", "--count", 7)
+    assert "7 of 50 Gaussians" in done.output
+    few = load_ply(tmp_path / "few.ply")
+    best = given.opacities[0].topk(7).indices.sort().values  # in the order of the file
+    assert_close(few.means[0], given.means[0, best])
+    assert torch.equal(few.sh[0], given.sh[0, best])
+    assert run_qgs("convert", tmp_path / "all.ply", tmp_path / "same.PLY").exception is None
+    assert torch.equal(load_ply(tmp_path / "same.PLY").means, given.means)
+    assert given.most_opaque(99).count == 50
+
+
+def test_other_suffixes_and_files_that_exist_are_refused(tmp_path):
+    before = saved(tmp_path / "a.ply", random_gaussians(2)).read_bytes()
+    for name, error, word in (("a.spz", ValueError, ".splat"), ("a.ply", FileExistsError, "a.ply")):
+        refused = run_qgs("convert", tmp_path / "a.ply", tmp_path / name).exception
+        assert isinstance(refused, error)
+        assert word in str(refused)
+    assert (tmp_path / "a.ply").read_bytes() == before
+
+
+def test_an_installed_distribution_adds_a_format(install, tmp_path):
+    source = """
+        def plugin(gaussians, path):
+            path.write_text(str(gaussians.count))
+        """
+    install("qgs-xyz", "xyz", source, group="qgs.scene_writers")
+    save_gaussians(random_gaussians(5), tmp_path / "a.XYZ")
+    assert (tmp_path / "a.XYZ").read_text() == "5"
+    must_refuse(r"\.xyz", save_gaussians, random_gaussians(5), tmp_path / "a.abc")
+
+
+def test_a_format_that_cannot_be_imported_is_refused_before_the_work(install, tmp_path):
+    install("qgs-xyz", "xyz", "import no_such_package", group="qgs.scene_writers")
+    must_refuse(
+        r"qgs-xyz 1\.2",
+        save_gaussians,
+        random_gaussians(5),
+        tmp_path / "a.xyz",
+        kind=ExtensionError,
+    )
+    missing = tmp_path / "missing.safetensors"  # not even read
+    error = run_qgs("reconstruct", missing, tmp_path, "--out", tmp_path / "a.xyz").exception
+    assert isinstance(error, ExtensionError)

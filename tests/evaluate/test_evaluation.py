@@ -1,0 +1,279 @@
+"""Evaluation: the same twice, equal to the metrics it is made of, and nothing left out unsaid."""
+
+import csv
+import hashlib
+import io
+import json
+import math
+from collections import Counter
+from unittest.mock import Mock
+
+import pytest
+import torch
+import yaml
+from photo_formats import synthetic, write_nerfstudio
+from rich.console import Console
+from training_runs import same, tiny
+
+from qgs.contracts import CONTRACT_VERSION, Column, ComponentConfig, Metric, Plugin
+from qgs.evaluate.evaluation import evaluate
+from qgs.evaluate.plan import evaluation_samples
+from qgs.evaluate.protocol import protocol_of
+from qgs.evaluate.results import METHODS
+from qgs.metrics.baselines import mean_colour, nearest_input
+from qgs.metrics.dispersion import token_dispersion
+from qgs.metrics.images import psnr, ssim
+from qgs.recipe import Recipe, resolve
+
+
+class MeanAbsoluteError(Metric):
+    name = "mae"
+    definition = "mean absolute error"
+    column = Column("MAE", "lower", digits=5)
+    not_in_protocol = frozenset({"log"})
+
+    class Config(ComponentConfig):
+        power: float = 1.0
+        log: str | None = None
+
+    def forward(self, given):
+        error = (given.images - given.targets.images).abs() ** self.config.power
+        return error.mean((-3, -2, -1))
+
+
+class DepthError(Metric):
+    name = "depth"
+    definition = "rendered less true depth"
+    needs = ("depth", "true_depth")
+    column = Column("depth error", "lower")
+
+    def forward(self, given):
+        return given.depth - given.true_depth
+
+
+class Masked(Metric):
+    name = "masked"
+    definition = "mean of the mask"
+    needs = ("masks",)
+
+    def columns(self):
+        return {"mean": Column("masked", "higher")}
+
+    def forward(self, given):
+        return {"mean": given.masks}
+
+
+def mine(*options):
+    """A small TokenGS with the plugin of the metrics above."""
+    plugin = Plugin("mine", CONTRACT_VERSION, (MeanAbsoluteError, DepthError, Masked))
+    options = "plugins=[rooms, mine]", *options
+    return resolve(tiny("tokengs").tree, options, plugins=[plugin])
+
+
+def write_index(folder, scenes):
+    """An index of scenes whose frames are told in YAML."""
+    file = folder / "some_index.json"
+    file.write_text(json.dumps(yaml.safe_load(scenes)))
+    return f"evaluation.index={file}"
+
+
+FOUR = """
+test/000000: {context: [0, 4], target: [2]}
+test/000001: {context: [0, 4], target: [1, 2, 3]}
+test/000002: {context: [0, 2, 4], target: [1]}
+test/000003: {context: [1], target: [2]}
+"""
+PARTLY = """
+test/000000: {context: [0, 3], target: [1, 2]}
+test/000001: {context: [0, 99], target: [1]}
+gone: {context: [0, 3], target: [1]}
+nil: null
+"""
+"""Of the last three none can be judged."""
+
+
+def shown(evaluation):
+    console = Console(record=True, width=120, file=io.StringIO())
+    evaluation.show(console)
+    return console.export_text()
+
+
+@pytest.fixture(scope="module")
+def judged():
+    """A recipe with the metrics above, and two evaluations; only the first scene has masks."""
+    metrics = (f"metrics.{name}={{type: mine/{name}}}" for name in ("mae", "depth", "masked"))
+    recipe = mine(*metrics, "evaluation.protocol=rooms-2view")
+    source = recipe.build_data()
+
+    def masks(scene, frames):
+        return torch.ones(len(frames), 1, 16, 16) if scene.name == "test/000000" else None
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(source.scenes("test")[0]), "masks", masks)
+        patch.setattr(Recipe, "build_data", opened := Mock(return_value=source))
+        model = recipe.build_model().train()
+        evaluations = evaluate(model, recipe), evaluate(model, recipe)
+    assert opened.call_count == 2  # once each
+    assert model.training
+    return recipe, *evaluations
+
+
+def test_scores_are_the_metrics_of_model_and_baselines(judged):
+    recipe, evaluation, _ = judged
+    model = recipe.build_model().eval()
+    data = recipe.build_data()
+    sample = evaluation_samples(data, recipe.views, recipe.evaluation, depths=True)[0]
+    inputs, targets = sample.inputs, sample.targets
+    with torch.no_grad():
+        gaussians = model(inputs).gaussians
+        rendering = model.render(gaussians, targets.cameras)
+    images = {"model": rendering.rgb, "nearest_input": nearest_input(inputs, targets.cameras)}
+    images["mean_colour"] = mean_colour(inputs, targets.cameras)
+    expected = {
+        f"{method}_{metric.__name__}": metric(image, targets.images).mean()
+        for method, image in images.items()
+        for metric in (psnr, ssim)
+    }
+    expected["model_mae"] = (rendering.rgb - targets.images).abs().mean()
+    expected["model_depth"] = (rendering.depth - targets.depths).mean()
+    expected["model_dispersion_mean"] = token_dispersion(gaussians.means, 4).mean()
+    expected["gaussians_used"] = (gaussians.opacities > 1 / 255).sum()
+    score = evaluation.scores[0]
+    for name, value in expected.items():
+        assert score.values[name] == pytest.approx(value.item()), name
+    assert score.views == [(sample.input_frames, sample.target_frames)]
+    assert evaluation.gaussians == gaussians.count
+    for name in ("depth", "dispersion_mean"):
+        assert evaluation.mean(name, "nearest_input") is None
+    for method in METHODS:
+        assert evaluation.mean("masked_mean", method) == 1.0
+    assert set(evaluation.incomplete) == {"masked_mean"}
+
+
+def test_evaluations_write_the_same_files(judged, tmp_path):
+    for name, evaluation in zip("ab", judged[1:], strict=True):
+        evaluation.write(tmp_path / name)
+    files, again = ({p.name: p.read_bytes() for p in (tmp_path / n).iterdir()} for n in "ab")
+    assert files == again
+    assert files.keys() == {"protocol.json", "scenes.csv", "summary.json", "table.md"}
+    summary = json.loads(files["summary.json"])
+    rows = list(csv.DictReader(files["scenes.csv"].decode().splitlines()))
+    assert [row["scene"] for row in rows] == ["test/000000", "test/000001"]
+    assert summary["scenes"] == summary["samples"] == 2
+    for method in METHODS:
+        mean = sum(float(row[f"{method}_mae"]) for row in rows) / 2
+        assert summary[method]["mae"] == pytest.approx(mean)
+    assert summary["columns"]["mae"]["better"] == "lower"
+    protocol = summary["protocol"]
+    assert protocol["name"] == "rooms-2view"
+    assert hashlib.sha256(files["protocol.json"]).hexdigest() == protocol["sha256"]
+    assert "   MAE ↓ |" in files["table.md"].decode()
+    told = "masked is over 1 of 2 scenes: it needs masks, not known for 1 of 2 scenes"
+    for text in ("MAE ↓", f" {summary['model']['mae']:.5f} ", told):
+        assert text in shown(evaluation)
+
+
+def test_batches_pass_through_the_model_together_and_change_no_score(tmp_path):
+    index = write_index(tmp_path, FOUR)
+    samples = ("evaluation.scenes=3", "evaluation.samples=2")
+    for options, passes in ((index,), [(2, 2), (1, 3), (1, 1)]), (samples, [(4, 2), (2, 2)]):
+        recipe = tiny("locus", *options)
+        model = recipe.build_model()
+        alone = evaluate(model, recipe)
+        model.encoder.forward = encode = Mock(wraps=model.encoder.forward)
+        together = evaluate(model, recipe, batch=4)
+        assert [call.args[0].images.shape[:2] for call in encode.call_args_list] == passes
+        for ours, theirs in zip(together.scores, alone.scores, strict=True):
+            assert (ours.scene, ours.views) == (theirs.scene, theirs.views)
+            assert ours.values == pytest.approx(theirs.values, rel=0, abs=1e-6)
+
+
+def test_what_is_missing_is_told_in_the_same_line_as_the_score(tmp_path):
+    recipe = tiny("tokengs", write_index(tmp_path, PARTLY))
+    evaluation = evaluate(recipe.build_model(), recipe)
+    summary = evaluation.summary()
+    assert summary["missing"] == {
+        "test/000001": "the index names frames 99, the scene has 0 to 7",
+        "gone": "not among the test scenes of the data",
+    }
+    assert summary["null_entries"] == ["nil"]
+    assert len(summary["not_in_index"]) == 30
+    evaluation.write(tmp_path)
+    text, table = shown(evaluation), (tmp_path / "table.md").read_text()
+    line = f"PSNR {summary['model']['psnr']:.2f} over 1 of 3 scenes; missing: test/000001, gone"
+    assert summary["statement"] == line
+    for place in (text, table):
+        assert line in place
+        assert "input views of 16 x 16 pixels, poses" in place
+        assert "null entries of the index, not judged (1): nil" in place
+    assert all("1 of 3" in row for row in table.splitlines() if row.startswith("| model"))
+    rows = csv.DictReader((tmp_path / "scenes.csv").open())
+    told = {row["scene"]: row["problem"] for row in rows}
+    assert told == {"test/000000": "", **summary["missing"]}
+
+
+def test_a_failure_anywhere_ends_neither_evaluation_nor_in_silence(monkeypatch):
+    """One failed sample fails its scene."""
+    recipe = tiny("tokengs", "evaluation.scenes=4", "evaluation.samples=2")
+    model, source = recipe.build_model(), recipe.build_data()
+    rooms, encoder = type(source.scenes("test")[0]), type(model.encoder)
+    images, forward = rooms.images, encoder.forward
+    decoded = Counter()
+
+    def images_of(scene, frames):
+        decoded[scene.name] += 1
+        place = source.names("test").index(scene.name)
+        if place == 2 and decoded[scene.name] > 1:
+            raise OSError("/data/set/truncated.png is cut off")
+        return images(scene, frames) * [0, math.nan, 1, 1][place]
+
+    def encode(self, views):
+        if (views.images == 0).all((1, 2, 3, 4)).any():
+            raise RuntimeError("out of memory")
+        return forward(self, views)
+
+    monkeypatch.setattr(rooms, "images", images_of)
+    monkeypatch.setattr(encoder, "forward", encode)
+    evaluation = evaluate(model, recipe, batch=4)
+    assert [(score.scene, len(score.views)) for score in evaluation.scores] == [("test/000003", 2)]
+    memory, finite, file = (failure.reason for failure in evaluation.missing)
+    assert memory == "RuntimeError: out of memory"
+    assert "is not finite" in finite
+    assert file == "OSError: /data/set/truncated.png is cut off"
+
+
+def test_photo_folders_are_judged_on_held_out_frames_beside_a_broken_one(tmp_path):
+    folder = tmp_path / "set"
+    for name in ("a", "b", "c"):
+        write_nerfstudio(folder / name, synthetic(tmp_path / "photos", 12, (32, 32)))
+    (folder / "b/transforms.json").write_text("{")
+    (folder / "c/images/view_006.png").write_bytes(b"no photo")
+    data = f"data={{type: qgs/photos, path: {folder}, image_size: [32, 32], holdout: 4}}"
+    recipe = tiny("tokengs", data, "evaluation.scenes=9")
+    summary = (evaluation := evaluate(recipe.build_model(), recipe)).summary()
+    assert [score.scene for score in evaluation.scores] == ["a"]
+    assert list(summary["missing"]) == ["b", "c"]
+    assert summary["held_out_frames"] == (3, 3)
+    assert str(tmp_path) not in json.dumps(summary)
+
+
+def test_tuned_evaluations_say_so_and_score_the_tuned_tokens():
+    plain, tuned = tiny("locus"), tiny("locus", "evaluation.tuning_steps=2")
+    model = plain.build_model()
+    first, second = evaluate(model, plain), evaluate(model, tuned, batch=2)
+    assert same(model.state_dict(), plain.build_model().state_dict())
+    assert first.summary()["tuning"] is None
+    told = second.summary()["tuning"]
+    assert told["loss_after"] < told["loss_before"]
+    assert first.scores[0].values["model_psnr"] != second.scores[0].values["model_psnr"]
+    assert "queries tuned on the input views: 2 steps of Adam at 0.0001" in shown(second)
+
+
+def test_a_protocol_has_a_metrics_definition_and_options():
+    def protocol(options):
+        return protocol_of(mine(f"metrics.error={{type: mine/mae{options}}}"), None, ["x"])
+
+    plain, same, other = protocol(""), protocol(", log: there"), protocol(", power: 2.0")
+    told = {"type": "mine/mae", "definition": "mean absolute error", "power": 1.0}
+    assert plain.content["metrics"]["error"] == told
+    assert plain.sha256 == same.sha256 != other.sha256

@@ -1,0 +1,120 @@
+"""Plugins that cannot be used and components that fail: the distribution is named.
+
+Those that are refused with a recipe are cases/plugins.txt.
+"""
+
+import sys
+import traceback
+from pathlib import Path
+
+import pytest
+from commands import done
+from refusals import refused
+
+from qgs.recipe import RecipeError, resolve
+from qgs.recipe.registry import available_plugins, load_usable_plugins
+
+EMPTY = "from qgs.contracts import Plugin\nplugin = Plugin('{}', 1, ())"
+FAULTY = """
+from pydantic import field_validator
+from qgs.contracts import ComponentConfig, Loss, Plugin, Refinement, SceneSource, SelfAttention
+
+class Strict(SelfAttention):
+    name = "strict"
+    class Config(ComponentConfig):
+        word: str
+        @field_validator("word")
+        @classmethod
+        def strict_check(cls, word):
+            raise KeyError(word)
+    def forward(self, state):
+        raise NotImplementedError
+
+class Silent(Refinement):
+    name = "silent"
+    @classmethod
+    def fields_written(cls, config):
+        raise KeyError("oops")
+    def forward(self, state):
+        return state
+
+class Closed(SceneSource):
+    name = "closed"
+    def __init__(self, config):
+        raise FileNotFoundError("photos/ is not there")
+    def scenes(self, split):
+        raise NotImplementedError
+
+class AbstractLoss(Loss):
+    name = "abstract"
+
+plugin = Plugin("faulty", 1, (Strict, Silent, Closed, AbstractLoss))
+"""
+
+
+def test_one_name_of_two_distributions_and_one_without_its_files(write, install):
+    for name in ("first-twin", "second-twin"):
+        install(name, "twin", EMPTY.format("twin"))
+    problem = refused(write("recipe: 1\nplugins: [twin]\n"))
+    assert "first-twin 1.2, second-twin 1.2" in problem.reason
+    install("qgs-gone", "gone", "")
+    Path(sys.path[0], "_test_qgs_gone.py").unlink()
+    assert "install qgs-gone 1.2 again" in refused(write("recipe: 1\nplugins: [gone]\n")).fix
+
+
+def test_broken_plugins_and_impostors_hide_no_other_plugin(write, install, monkeypatch):
+    install("impostor", "qgs", EMPTY.format("qgs"))
+    install("qgs-raises", "raises", "raise RuntimeError('no luck')")
+    registry, broken = load_usable_plugins()
+    assert sum("impostor 1.2" in message or "qgs-raises 1.2" in message for message in broken) == 2
+    assert "qgs/latent" in registry.components("queries")
+    resolve(write("recipe: 1\n"))
+    monkeypatch.setenv("COLUMNS", "200")
+    shown = done("list").output
+    assert "qgs-raises 1.2" in shown
+    assert "qgs/latent" in shown
+    done("schema")
+
+
+def test_a_plugin_that_comes_to_a_folder_or_leaves_it_is_noticed(tmp_path, monkeypatch):
+    """Though what is installed is read once for as long as nothing changes."""
+    monkeypatch.syspath_prepend(tmp_path)
+    assert "late" not in available_plugins()
+    info = tmp_path / "late-1.0.dist-info"
+    info.mkdir()
+    (info / "entry_points.txt").write_text("[qgs.plugins]\nlate = late:plugin\n")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: late\nVersion: 1.0\n")
+    assert "late" in available_plugins()
+    info.rename(tmp_path / "gone")
+    assert "late" not in available_plugins()
+
+
+def test_the_tracebacks_of_plugins_and_components_are_all_shown(write, install):
+    install("qgs-first", "first", "{}['x']\n")
+    install("qgs-faulty", "faulty", FAULTY)
+    decoder = "{refinement: {type: faulty/silent}, self_attention: {type: faulty/strict, word: x}}"
+    with pytest.raises(RecipeError) as caught:
+        resolve(write(f"recipe: 1\nplugins: [first, faulty]\nmodel: {{decoder: {decoder}}}\n"))
+    shown = "".join(traceback.format_exception(caught.value))
+    for word in ("_test_qgs_first.py", "_test_qgs_faulty.py", "strict_check", "fields_written"):
+        assert word in shown
+
+
+def test_what_fails_when_it_is_built_names_its_distribution_but_missing_data(write, install):
+    install("qgs-faulty", "faulty", FAULTY)
+    text = "losses: {x: {type: faulty/abstract}}\ndata: {type: faulty/closed}\n"
+    recipe = resolve(write(f"recipe: 1\nplugins: [faulty]\n{text}"))
+    with pytest.raises(RecipeError, match=r"recipe.yaml:3: losses.x\n.*qgs-faulty 1\.2") as caught:
+        recipe.build_losses()
+    assert isinstance(caught.value.__cause__, TypeError)
+    with pytest.raises(FileNotFoundError, match="photos/"):
+        recipe.build_data()
+
+
+def test_a_plugin_in_memory_has_no_distribution():
+    names = {}
+    exec(FAULTY, names)
+    model = {"decoder": {"refinement": {"type": "faulty/silent"}}}
+    recipe = {"recipe": 1, "plugins": ["faulty"], "model": model}
+    problem = refused(recipe, plugins=[names["plugin"]])
+    assert problem.reason.startswith("the plugin `faulty` fails: `fields_written` of")

@@ -1,0 +1,126 @@
+"""Text of recipes, merging as an operation, and what is built from a resolved recipe."""
+
+import random
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from refusals import refused
+
+from qgs.recipe import compose, resolve
+from qgs.recipe.errors import Problems
+from qgs.recipe.recipe import annotated
+from qgs.recipe.yaml_text import dump, inline, load_text
+
+SMALL = yaml.safe_load("""
+recipe: 1
+model:
+  width: 16
+  heads: 2
+  encoder: {depth: 1}
+  queries: {count: 4}
+  decoder: {depth: 3}
+  head: {gaussians_per_query: 2}
+  supervision: {layers: [3]}
+""")
+SCALARS = """
+1e-4 = 0.0001
+1. = 1.0
+.5 = 0.5
+-3 = -3
+0o17 = 15
+0xff = 255
+017 = 17
+1_000 = '1_000'
+off = 'off'
+yes = 'yes'
+12:30 = '12:30'
+2024-01-01 = '2024-01-01'
+true = True
+False = False
+~ = None
+ = None
+'1' = '1'
+-.inf = -inf
+"""
+"""Text, value in Python."""
+ODD = "null,- a,a: b,# a,a #b,&a,[,2e5,.nan"
+"""Texts that are something else in YAML when they stand without quotes."""
+
+
+def test_scalars_are_those_of_yaml_12():
+    rows = [line.split(" = ") for line in SCALARS.strip("\n").splitlines()]
+    read = {text: repr(load_text(text, "f", Problems())) for text, _ in rows}
+    assert read == dict(rows)
+
+
+def test_what_is_dumped_is_read_back():
+    draw = random.Random(0)
+    letters = [*map(chr, [*range(1, 0x250), *range(0x2000, 0x2100), 0xFEFF, 0xFFFD, 0x1F600])]
+    texts = ["".join(draw.choices(letters, k=draw.randrange(7))) for _ in range(150)]
+    texts += [*SCALARS.split("\n"), *SCALARS.split(), *ODD.split(",")]
+    numbers = [2**63 - 1, 1 - 2**63, -0.0, 1e308, 5e-324, float("inf")]
+    numbers += [draw.uniform(-9, 9) * 10 ** draw.randrange(-20, 20) for _ in range(50)]
+    value = {text: [text, draw.choice(numbers), {text: None}] for text in texts}
+    value["scalars"] = [*texts, *numbers, None, True, [], {}]
+    assert load_text(dump(value), "f", Problems()) == value
+    assert load_text(inline(value), "f", Problems()) == value
+
+
+def test_an_annotated_recipe_shows_where_each_line_comes_from(write):
+    recipe = resolve(write("recipe: 1\nmodel:\n  head: {norm: true}\nlosses: {}\n"))
+    shown = [" ".join(line.split()) for line in annotated(recipe).splitlines()]
+    assert "norm: true # recipe.yaml:3" in shown
+    assert "losses: {} # recipe.yaml:4" in shown
+    assert "width: 1024 # default" in shown
+
+
+def test_a_layers_override_lies_over_the_template():
+    changes = "{feed_forward: {ratio: 2}, layers: {1: {feed_forward: {ratio: 5}}}}"
+    built = compose(SMALL, [f"model.decoder={changes}"])
+    assert [layer.feed_forward.mlp.fc1.out_features for layer in built.decoder] == [32, 80, 32]
+
+
+def test_same_recipe_same_parameters_and_the_global_random_state_stays():
+    before = torch.get_rng_state()
+    first, second = compose(SMALL).state_dict(), compose(SMALL).state_dict()
+    other = compose(SMALL, ["seed=1"]).queries.features
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.testing.assert_close(first, second, rtol=0, atol=0)
+    assert not torch.equal(first["queries.features"], other)
+
+
+def test_layers_with_equal_refinement_share_a_module_unless_it_forbids_that(installed):
+    overrides = ["plugins=[mine]", "model.decoder.refinement.type=mine/apart"]
+    assert len(compose(SMALL, device="meta").refinements) == 1
+    assert len(compose(SMALL, overrides, device="meta").refinements) == 3
+
+
+def test_mappings_and_files_that_hold_no_recipe(tmp_path):
+    knot = {"recipe": 1}
+    knot["model"] = knot
+    for recipe in (knot, SMALL | {"seed": b"1"}):
+        assert refused(recipe).file == "<mapping>"
+    assert "`seed` is a Tensor" in refused(SMALL | {"seed": torch.zeros(1)}).reason
+    assert resolve(SMALL | {"init_from": Path("a")}).init_from == "a"
+    binary = tmp_path / "binary.yaml"
+    binary.write_bytes(b"recipe: \xff\n")
+    for path in (tmp_path, binary):
+        assert refused(path).file == str(path)
+    with pytest.raises(ValueError, match="this recipe has no data"):
+        resolve(SMALL).build_data()
+
+
+def test_a_missing_file_suggests_its_neighbour(write):
+    write("recipe: 1\n", "base.yaml")
+    for recipe in ("bas.yaml", {"recipe": 1, "extends": "bas.yaml"}):
+        assert "`base.yaml`" in refused(recipe).fix
+
+
+def test_tabs_and_what_is_nested_deeper_than_pythons_stack(write):
+    tab = refused(write("recipe: 1\nmodel:\n\twidth: 64\n"))
+    deep = refused(write(f"recipe: 1\nseed: {'[' * 700}"))
+    assert (tab.line, deep.line) == (3, 1)
+    assert "tab" in tab.reason
+    assert "deep" in deep.reason

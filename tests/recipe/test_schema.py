@@ -1,0 +1,75 @@
+"""The JSON Schema agrees with the composer, and the committed copy with the code."""
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+import yaml
+
+from qgs.recipe.registry import load_registry
+from qgs.recipe.schema import recipe_schema
+
+COMMITTED = Path(__file__).parents[2] / "recipes/recipe.schema.json"
+SHIPPED = "c3g datasets dinov2 ellipsoid globalsplat gslrm landmark locus lpips mvsplat rooms"
+SHIPPED += " tokengs2026 worlds"
+SOUND = """
+model: {decoder: {depth: 0, cross_attention: null, layers: {1: {feed_forward: null}}}}
+losses: {visibility: null}
+---
+model:
+  renderer:
+    dilation: {schedule: steps, values: [10, 1], at: [100]}
+    far: {schedule: cosine, values: [1, 0.1], at: [0, 100]}
+losses: {photometric: {mse_weight: {schedule: constant, value: 2}}}
+"""
+MISTAKEN = """
+modle: {}
+---
+model: {queries: {type: qgs/latnet}}
+---
+model: {queries: {type: qgs/latent, count: -1}}
+---
+model: {queries: {cuont: 1}}
+---
+model: {decoder: {layers: {x: {}}}}
+---
+training: {precision: fp8}
+---
+model: {renderer: {dilation: {schedule: linaer, from: 1, to: 0}}}
+---
+model: {renderer: {dilation: {schedule: linear, value: 1}}}
+---
+model: {queries: {count: {schedule: constant, value: 1}}}
+"""
+
+
+@pytest.fixture(scope="module")
+def schema():
+    return recipe_schema(load_registry(SHIPPED.split()))
+
+
+def test_the_committed_schema_is_fresh_and_a_schema(schema):
+    assert json.loads(COMMITTED.read_text()) == schema, f"run `qgs schema --out {COMMITTED.name}`"
+    jsonschema.Draft202012Validator.check_schema(schema)
+
+
+def undescribed(schema, path=()):
+    """Paths of the properties in `schema` that have no description."""
+    if not isinstance(schema, dict | list):
+        return
+    for key, value in schema.items() if isinstance(schema, dict) else enumerate(schema):
+        below = (*path, str(key))
+        if path and path[-1] == "properties" and not value.get("description"):
+            yield ".".join(below)
+        yield from undescribed(value, below)
+
+
+def test_every_key_is_described(schema):
+    assert not list(undescribed(schema))
+
+
+def test_nulls_and_schedules_are_valid_and_mistakes_are_not(schema):
+    is_valid = jsonschema.Draft202012Validator(schema).is_valid
+    recipes = yaml.safe_load_all(f"{SOUND}---{MISTAKEN}")
+    assert [is_valid(json.loads(json.dumps(x))) for x in recipes] == [True] * 2 + [False] * 9

@@ -1,0 +1,59 @@
+"""Which photos are inputs, which are compared with, and which are held out."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from photo_formats import noisy_photos
+
+from qgs.contracts import ViewsConfig
+from qgs.data.samples import held_out_frames
+from qgs.reconstruction.result import checked_window, choose_sample
+from qgs.reconstruction.scenes import GivenScene, read_photos
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    return read_photos(noisy_photos(tmp_path_factory.mktemp("photos"), 9), size=(8, 8))
+
+
+def chosen(photos, inputs, times=range(9), held_out=(), gap=(3, 20)):
+    """Input and compared frames of photos taken at `times`."""
+    scene = GivenScene(replace(photos, times=torch.tensor([[*times]])))
+    scene.held_out = held_out
+    sample, _ = choose_sample(scene, ViewsConfig(gap=gap), inputs, None, None)
+    return sample.input_frames, sample.target_frames
+
+
+def test_inputs_spread_over_times_and_novel_frames_are_of_one_time_between(photos):
+    times = (0, 1, 2, 3, 4, 4, 5, 6, 7)
+    assert chosen(photos, 2, times, held_out=(3, 4, 5)) == ((0, 8), (4, 5))
+    assert chosen(photos, 3, gap=(3, 5))[0] == (1, 4, 7)
+
+
+def test_held_out_times_are_compared_with_and_never_inputs(photos):
+    inputs, compared = chosen(photos, 4, held_out=(3, 8))
+    assert compared == (3,)
+    assert not {3, 8} & {*inputs}
+    with pytest.raises(ValueError, match="7 times, too few"):
+        chosen(photos, 8, held_out=(3, 8))
+
+
+def test_frames_that_are_given_are_taken_as_they_are_or_refused(photos):
+    sample, _ = choose_sample(GivenScene(photos), ViewsConfig(), None, [1, 3], [2])
+    assert (sample.input_frames, sample.target_frames) == ((1, 3), (2,))
+    for compared, *frames in ((0, 1, 5), (0, -1, 2), (0, 1, 1), (3, 0, 3)):
+        with pytest.raises(ValueError, match="frames"):
+            checked_window(5, frames, [compared])
+
+
+def test_every_nth_photo_is_held_out_or_the_middle_one():
+    for count, every, *held_out in (
+        (20, 8, 4, 12),
+        (7, 8, 3),
+        (3, 8, 1),
+        (2, 8),
+        (7, 3, 1, 4),
+        (9, 0),
+    ):
+        assert [*held_out_frames(count, every)] == held_out

@@ -1,0 +1,93 @@
+"""Every limit and epsilon of the releases is an option: published by default, and it matters."""
+
+from functools import cache
+from itertools import product
+from pathlib import Path
+from types import NoneType
+from typing import get_args
+
+import torch
+import yaml
+from losses.judging import CAMERAS, GOLDEN, TRUTH, judged
+from qgs_locus import plugin
+
+from qgs import Views
+from qgs.losses import COMPONENTS as LOSSES
+from qgs.recipe import resolve
+from qgs.recipe.recipe import flat
+from qgs.tokengs import COMPONENTS
+from qgs.types import named_tensors
+
+TABLE = yaml.safe_load((Path(__file__).parent / "limits.yaml").read_text())
+
+
+@cache
+def outcome(*overrides):
+    """Options, and what the model makes of golden photos with weights of a seed."""
+    recipe = resolve(TABLE["recipe"], overrides)
+    model = recipe.build_model().eval()
+    with torch.no_grad():
+        gaussians = model(Views(TRUTH, CAMERAS)).gaussians
+    return flat(recipe.tree), torch.cat([part.flatten() for _, part in named_tensors(gaussians)])
+
+
+def test_limits_are_published_by_default_and_matter():
+    wrong = []
+    for row in TABLE["components"]:
+        beside = row.get("beside", [])
+        options, made = outcome(*beside)
+        for option, (published, other) in row["limits"].items():
+            paths = [f"{place}.{option}" for place in row["at"]]
+            wrong += [path for path in paths if options[path] != published]
+            changed = [f"{path}={other!r}" for path in paths]
+            if torch.equal(outcome(*beside, *changed)[1], made):
+                wrong += changed
+    assert wrong == []
+
+
+def test_limits_of_losses_are_published_by_default_and_matter():
+    first = slice(1)
+    depths = torch.full_like(TRUTH[:, first, :1], 1.5)
+    views = Views(TRUTH[:, first], CAMERAS[:, first], depths=depths)
+    means, opacities = GOLDEN["points"], GOLDEN["opacity"][..., 0]
+    losses = {loss.name: loss for loss in (*LOSSES, *plugin.components)}
+    wrong = []
+    for row in TABLE["losses"]:
+        options = dict(row)
+        loss, beside = losses[options.pop("loss")], options.pop("beside", {})
+        for option, (published, other) in options.items():
+            configs = [loss.Config(**beside), loss.Config(**{**beside, option: other})]
+            terms = [judged(loss(config), views, means, opacities)[loss.name] for config in configs]
+            if getattr(configs[0], option) != published or terms[0] == terms[1]:
+                wrong.append((loss.name, option))
+    assert wrong == []
+
+
+def test_no_limit_was_forgotten():
+    """Of all floating-point options, those of optimisers aside."""
+    known = {
+        (name, option)
+        for row in TABLE["components"]
+        for name, option in product(row["component"], row["limits"])
+    }
+    known |= {(row["loss"], option) for row in TABLE["losses"] for option in row}
+    found = set()
+    for component in (*COMPONENTS, *LOSSES, *plugin.components):
+        for option, field in component.Config.model_fields.items():
+            kinds = {field.annotation, *get_args(field.annotation)} - {NoneType}
+            if float in kinds and component.slot != "optimizer":
+                found.add((component.name, option))
+    forgotten = {pair for pair in found - known if pair[1] not in TABLE["beginnings"]}
+    assert forgotten == set(), "add these to limits.yaml, with another value that must matter"
+
+
+def test_the_recipes_have_the_limits_of_their_releases():
+    for recipe, *published in (
+        ("tokengs/dl3dv.yaml", None, 1e-12, None, None),
+        ("locus/dl3dv.yaml", 10.0, 1e-4, 100.0, 1000.0),
+    ):
+        model = resolve(recipe).tree["model"]
+        head, centers = model["head"], model["centers"]
+        found = [head["scale_input_limit"], head["quat_eps"]]
+        found += [centers["input_limit"], centers["output_limit"]]
+        assert found == published, recipe

@@ -1,0 +1,109 @@
+"""Runs that die are noticed, said so, and leave good weights."""
+
+import pytest
+import torch
+from training_runs import run, run_calling, tiny
+
+import qgs
+from qgs.checkpoint.model_file import CheckpointFile
+from qgs.train.folder import RunFolder
+from qgs.train.guard import EMPTY_ALPHA, CollapseDetector, CollapseError, GoodWeights, not_finite
+from qgs.train.training_pass import measure
+
+ALIVE = {"alpha": 0.5, "deviation": 0.3, "gradient": 0.1}
+PLAIN = ALIVE | {"deviation": 1e-4}
+DEAD = dict.fromkeys(ALIVE, 0.0)
+INVISIBLE = "model.head.opacity_bias=-20.0"
+
+
+def observed(*signs):
+    """A detector with a window of 10 steps, after steps with these signs of life."""
+    detector = CollapseDetector(10)
+    for step in signs:
+        detector.observe(step)
+    return detector
+
+
+def test_a_window_of_dead_steps_and_no_less_is_a_collapse():
+    for dead, words in (
+        (ALIVE | {"alpha": 1e-4}, "empty"),
+        (ALIVE | {"gradient": 0.0}, "vanished"),
+        (PLAIN, "equal the background"),
+    ):
+        assert not observed(ALIVE, *[dead] * 9).dead_after(10)
+        detector = observed(ALIVE, *[dead] * 10)
+        assert detector.dead_after(11)
+        assert words in detector.symptom
+    # one living step, and plain images at the start
+    assert not observed(*[*[DEAD] * 9, ALIVE] * 5).dead_after(50)
+    assert not observed(*[PLAIN] * 50).dead_after(50)
+
+
+def test_a_stray_splat_is_no_sign_of_life():
+    rgb = torch.ones(2, 3, 3, 32, 32)
+    rgb[0, 0, :, 4:6, 4:6] = 0
+    alpha, deviation = measure(rgb, 1 - rgb[:, :, :1], torch.ones(3))
+    assert alpha < EMPTY_ALPHA
+    assert deviation == pytest.approx(4 / 32**2)
+    symptom = observed(ALIVE, ALIVE | {"deviation": float(deviation)}).symptom
+    assert "equal the background" in symptom
+
+
+def test_good_weights_are_the_older_of_two_copies_made_before_the_images_got_worse():
+    module = torch.nn.Linear(2, 2)
+    good = GoodWeights(module)
+    for step in range(1, 101):
+        torch.nn.init.constant_(module.weight, step)
+        good.observe({"psnr": 20.0 if step <= 60 else 10.0})
+        if good.due(step, 50):
+            good.refresh(step)
+    assert good.state()["steps"] == [50, 60]
+    assert not good.due(61, 50)
+    assert good.step == 50
+    assert (good.tensors["weight"] == 50).all()
+
+
+def test_what_is_not_finite_is_named():
+    module = torch.nn.Linear(2, 2)
+    assert not not_finite({"mse": 1.0, "gradient": 0.5}, module)
+    assert "mse is nan" in not_finite({"mse": float("nan"), "gradient": 0.5}, module)
+    module.weight.grad = torch.full((2, 2), torch.inf)
+    module.bias.grad = torch.zeros(2)
+    assert not_finite({"mse": 1.0, "gradient": float("inf")}, module).endswith("from weight")
+
+
+def test_gaussians_invisible_from_the_start_end_a_run_at_the_window_or_its_end(tmp_path):
+    options = ("training.collapse_window=10", "training.save_every=1")
+    for steps, words in ((400, "for 10 steps the renderings are empty"), (3, "for the last 3")):
+        recipe = tiny("tokengs", INVISIBLE, f"training.steps={steps}", *options)
+        folder = RunFolder(tmp_path / str(steps))
+        with pytest.raises(CollapseError, match=words):
+            run(recipe, folder.path)
+        assert len(folder.history()) == min(steps, 10)
+        assert CheckpointFile(folder.checkpoint).step == 0
+
+
+def test_weights_that_are_not_finite_end_a_run_and_are_never_saved(tmp_path):
+    """Those of step 1 give NaN in step 2; those of the last step are seen before they are saved."""
+
+    def break_weights(trainer, stop):
+        trainer.model.queries.features.data.fill_(torch.nan)
+
+    features = r"queries\.features"
+    for steps, words in ((2, f"step 2: .*{features}"), (1, f"weights are not finite: {features}")):
+        recipe = tiny("tokengs", f"training.steps={steps}", "optimizer.warmup=0")
+        folder = tmp_path / str(steps)
+        with pytest.raises(CollapseError, match=words):
+            run_calling(break_weights, recipe, folder)
+        kept = qgs.load(RunFolder(folder).checkpoint).state_dict()
+        assert all(tensor.isfinite().all() for tensor in kept.values())
+
+
+def test_one_dead_step_at_the_end_fails_no_run(tmp_path, caplog):
+    def die_at_the_end(trainer, stop):
+        if trainer.step == 3:
+            trainer.guard.detector.observe(DEAD)
+
+    result = run_calling(die_at_the_end, tiny("tokengs"), tmp_path)
+    assert CheckpointFile(result.folder.checkpoint).step == 3
+    assert "for the last 1 steps" in caplog.text

@@ -1,0 +1,108 @@
+"""Two processes on one machine train the model that one would train; which device `auto` takes."""
+
+import json
+import signal
+from unittest.mock import Mock
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from training_runs import TWO, losses, parts_of, read_jsonl, run, run_calling, tiny
+from two_processes import told_by_two
+
+from qgs.train import distributed
+from qgs.train.training import ELSEWHERE
+
+PARTS = 'optimizer.parts={"decoder.0.feed_forward": 0, "head": 0.5}'
+"""One sublayer stays as it is, and the head learns slower."""
+NO_LAYERS = (
+    "model.decoder={depth: 0, cross_attention: null, self_attention: null, feed_forward: null, "
+    "refinement: null, layer_scale: 5.0e-5}",
+    "model.supervision.layers=[0]",
+)
+
+
+def train_in_two_processes(*arguments):
+    """As `told_by_two`; both processes must have the same weights."""
+    (*first, total), second = told_by_two(*arguments)
+    assert first == [True, 3, {}]
+    assert second == (False, 3, {}, total)
+
+
+def test_two_processes_continue_what_one_began(tmp_path):
+    def ask(trainer, stop):
+        stop.signal = signal.SIGINT
+
+    recipe = tiny("locus", "training.ema=0.9", PARTS)
+    two, alone = tmp_path / "two", tmp_path / "alone"
+    run(recipe, alone)
+    assert run_calling(ask, recipe, two).steps == 2
+    train_in_two_processes(recipe, two)
+    assert losses(two) == pytest.approx(losses(alone), abs=1e-5)
+    ours, theirs = parts_of(two), parts_of(alone)
+    assert ours["moments"].pop("keys") == theirs["moments"].pop("keys")
+    for name in ("weights", "moments", "ema", "good"):
+        torch.testing.assert_close(ours[name], theirs[name], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("locus", (*TWO, "training.batch_size=4", "training.accumulate=2")),
+        ("tokengs", NO_LAYERS),  # keys that nothing reads
+    ],
+)
+@pytest.mark.slow
+def test_two_processes_have_the_loss_curve_of_one(tmp_path, name, options):
+    run(tiny(name, *options), tmp_path / "alone")
+    train_in_two_processes(tiny(name, *options, "training.render_views=1"), tmp_path / "two")
+    assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "alone"), abs=1e-5)
+
+
+def test_all_processes_leave_out_a_step_that_one_found_bad(tmp_path):
+    options = ("on_nonfinite=skip", "render_views=1", "ema=0.9", "evaluate_every=2")
+    recipe = tiny("locus", *(f"training.{option}" for option in options))
+    train_in_two_processes(recipe, tmp_path, 3, True)
+    records = read_jsonl(tmp_path / "history.jsonl")
+    assert ["loss" in record for record in records] == [True, False, True]
+    incident = tmp_path / "incidents/step-2"
+    found = json.loads((incident / "report.json").read_text())["found"]
+    assert [bool(report["first"]) for report in found] == [False, True]
+    seen = [load_file(incident / f"batch{n}.safetensors")["targets.images"] for n in ("", "-1")]
+    assert [int(images.isnan().sum()) for images in seen] == [0, 1]
+    judged = read_jsonl(tmp_path / "evaluations.jsonl")
+    assert [record["step"] for record in judged] == [2, 2, 3, 3]
+
+
+@pytest.mark.parametrize(("bad", "steps"), [(1, 0), (3, 1)], ids=["first", "later"])
+@pytest.mark.slow
+def test_two_processes_stop_together_at_a_sample_that_one_cannot_make_or_leave_it_out(
+    tmp_path, bad, steps
+):
+    """Samples with odd numbers are those of the second process."""
+    folder = tmp_path / "run"
+    errors = told_by_two(tiny("locus"), folder, bad, False)
+    reason = f"scene 'x', frame {bad} (a.png): cannot be read"
+    for error, cause in zip(errors, (ELSEWHERE, reason), strict=True):
+        assert error.startswith(f"{cause}; ")
+        assert (f"saved at step {steps}; continue with --resume" in error) == bool(steps)
+    assert folder.exists() == bool(steps)
+    told = told_by_two(tiny("locus", "training.on_bad_sample=skip"), folder, bad, False)
+    assert [left_out for _, _, left_out, _ in told] == [{reason: 1}] * 2
+    assert len(losses(folder)) == 3
+
+
+def test_the_device_and_what_is_said(monkeypatch):
+    for wanted, cuda, gsplat, expected, told in (
+        ("auto", False, None, "cpu", 0),
+        ("auto", False, True, "cpu", 0),
+        ("auto", True, None, "cpu", 1),
+        ("auto", True, True, "cuda", 0),
+        ("cpu", True, True, "cpu", 0),
+        ("cuda", True, None, "cuda", 0),
+    ):
+        monkeypatch.setattr(torch.cuda, "is_available", Mock(return_value=cuda))
+        monkeypatch.setattr(distributed, "find_spec", Mock(return_value=gsplat))
+        said = []
+        assert distributed.choose_device(wanted, said.append) == expected
+        assert ["gsplat" in line for line in said] == [True] * told

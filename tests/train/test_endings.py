@@ -1,0 +1,193 @@
+"""Whatever ends a run early loses nothing: the run is saved, and says how to go on."""
+
+import multiprocessing
+import signal
+from unittest.mock import DEFAULT, Mock
+
+import pytest
+import torch
+from safetensors import SafetensorError, safe_open
+from training_runs import (
+    TRAINED,
+    assert_equal_runs,
+    change_samples,
+    losses,
+    parts_of,
+    read_jsonl,
+    run,
+    run_calling,
+    saved_step,
+    tiny,
+)
+
+from qgs.checkpoint.model_file import CheckpointFile
+from qgs.checkpoint.tensors import CheckpointError, write_tensors
+from qgs.data.stream import MAX_REPLACED, SampleError, WorkerError
+from qgs.train import periodic, training
+from qgs.train.folder import RunFolder
+from qgs.train.guard import OutOfMemoryError
+from qgs.train.periodic import PeriodicEvaluation
+from qgs.train.tracking import TrainingProgress
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_and_ends(tmp_path, monkeypatch, number):
+    before = signal.getsignal(number)
+    # The second one, a step later, changes nothing.
+    monkeypatch.setattr(TrainingProgress, "update", lambda *_: signal.raise_signal(number))
+    result = run(tiny("tokengs", "training.steps=200"), tmp_path)
+    assert result.stopped_by == number.name
+    assert result.steps == len(result.folder.history()) == 2
+    assert CheckpointFile(result.folder.checkpoint).step == 2
+    assert signal.getsignal(number) is before
+
+
+def test_data_that_fails_leaves_a_run_that_goes_on(trained_run, tmp_path, monkeypatch):
+    def broken(sample, number, attempt):
+        if number == 4:
+            raise OSError("the disk is gone")
+
+    with monkeypatch.context() as patch:
+        change_samples(patch, broken)
+        with pytest.raises(OSError, match="the disk is gone") as caught:
+            run(tiny("locus", *TRAINED, "training.evaluate_every=0"), tmp_path)
+    assert caught.value.__notes__ == ["The run is saved at step 2; continue with --resume"]
+    assert run(tiny("locus", *TRAINED), tmp_path, resume=True).resumed_at == 2
+    whole = trained_run.folder.path
+    assert_equal_runs(tmp_path, whole)
+    first, second = (read_jsonl(folder / "evaluations.jsonl") for folder in (tmp_path, whole))
+    assert first == second[2:]  # of step 3
+
+
+@pytest.mark.slow
+def test_a_killed_worker_leaves_a_run_that_goes_on(tmp_path):
+    recipe = tiny("tokengs", "training.steps=100", "training.workers=1", "training.save_every=0")
+
+    def kill(trainer, stop):
+        for child in multiprocessing.active_children():
+            child.kill()
+
+    with pytest.raises(WorkerError, match=r"lower training\.workers"):
+        run_calling(kill, recipe, tmp_path)
+    assert saved_step(tmp_path) == len(losses(tmp_path)) >= 1
+
+
+def test_a_step_without_memory_says_what_takes_less_and_the_run_is_saved(tmp_path, monkeypatch):
+    error = RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")
+    second_fails = Mock(wraps=training.compute_gradients, side_effect=[DEFAULT, error])
+    monkeypatch.setattr(training, "compute_gradients", second_fails)
+    with pytest.raises(OutOfMemoryError, match=r"step 2.*batch_size"):
+        run(tiny("tokengs"), tmp_path)
+    assert saved_step(tmp_path) == 1
+
+
+def test_bad_samples_are_skipped_counted_and_named_if_asked_for(tmp_path, monkeypatch, caplog):
+    bad = {1, 3}
+
+    def unreadable(sample, number, attempt):
+        if number + attempt in bad:
+            raise SampleError(f"scene 'x', frame {number + attempt} (a.png): cannot be read")
+
+    change_samples(monkeypatch, unreadable)
+    with pytest.raises(SampleError, match="frame 1"):
+        run(tiny("tokengs"), tmp_path / "stops")
+    skipping = tiny("tokengs", "training.on_bad_sample=skip")
+    skipped = run(skipping, tmp_path / "skips").left_out
+    assert [reason.split(" (")[0][-7:] for reason in skipped] == ["frame 1", "frame 3"]
+    assert caplog.text.count("a sample is left out") == 2
+    assert parts_of(tmp_path / "skips")["counters"]["left_out"] == skipped
+    bad.update(range(100))
+    with pytest.raises(SampleError, match=str(MAX_REPLACED + 1)):
+        run(skipping, tmp_path / "ends")
+
+
+def test_an_evaluation_that_fails_is_told_and_ends_nothing(tmp_path, monkeypatch, caplog):
+    saved = []
+
+    def failing(*_, **options):
+        saved.append(saved_step(tmp_path))
+        raise ValueError("no scene could be judged")
+
+    monkeypatch.setattr(periodic, "evaluate", failing)
+    run(tiny("tokengs", "training.evaluate_every=1"), tmp_path)
+    assert saved == [1, 2, 3]  # saved before it is judged
+    assert "the evaluation at step 2 failed: ValueError: no scene could be judged" in caplog.text
+
+
+def test_a_stop_is_heard_between_two_scenes(tmp_path, monkeypatch):
+    between = PeriodicEvaluation._between_scenes
+
+    def asked(periodic, done, wanted):
+        assert done == 1
+        signal.raise_signal(signal.SIGTERM)
+        between(periodic, done, wanted)
+
+    monkeypatch.setattr(PeriodicEvaluation, "_between_scenes", asked)
+    result = run(tiny("tokengs", "training.evaluate_every=1"), tmp_path)
+    assert (result.steps, result.stopped_by) == (1, "SIGTERM")
+    assert not (tmp_path / "evaluations.jsonl").exists()
+
+
+def test_a_full_disk_is_told_with_what_to_do(copied, monkeypatch):
+    def full(tensors, path, metadata):
+        path.write_bytes(bytes(40_000))
+        raise SafetensorError("I/O error: No space left on device (os error 28)")
+
+    recipe = tiny("locus", *TRAINED, "training.steps=4")
+    state = RunFolder(copied).state
+    whole = state.read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr("qgs.checkpoint.tensors.save_file", full)
+        with pytest.raises(OSError, match="--resume"):
+            run(recipe, copied, resume=True)
+    assert state.read_bytes() == whole
+    assert run(recipe, copied, resume=True).steps == 4
+
+
+def test_a_damaged_state_is_refused_and_nothing_is_replaced(copied):
+    recipe, state = tiny("locus", *TRAINED, "training.steps=4"), RunFolder(copied).state
+    with safe_open(state, "pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        metadata = file.metadata()
+    contents = [state.read_bytes()[:-100], RunFolder(copied).checkpoint.read_bytes()]
+    weight, one = "queries.features", torch.ones(1)
+    for name, changed in (
+        (f"weights/{weight}", one),
+        (f"ema/{weight}", None),
+        (f"moments/model.{weight}/exp_avg", None),
+        ("moments/foo/exp_avg", one),
+        ("random/", None),
+    ):
+        kept = {n: tensor for n, tensor in tensors.items() if not n.startswith(name)}
+        write_tensors(state, kept if changed is None else kept | {name: changed}, metadata)
+        contents.append(state.read_bytes())
+    for text in ("null", '{"counters": ', '{"a":' * 5000, '{"weights": {}}'):
+        write_tensors(state, tensors, metadata | {"qgs.state": text})
+        contents.append(state.read_bytes())
+    for content in contents:
+        state.write_bytes(content)
+        before = {path: path.read_bytes() for path in copied.glob("*.*")}
+        with pytest.raises(CheckpointError, match=str(state)):
+            run(recipe, copied, resume=True)
+        assert before == {path: path.read_bytes() for path in copied.glob("*.*")}
+
+
+def test_a_folder_in_use_is_refused_untouched(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="never overwrites"):
+        run(tiny("tokengs"), tmp_path)
+    with pytest.raises(FileExistsError, match="is a file"):
+        run(tiny("tokengs"), tmp_path / "notes.txt")
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_a_start_that_fails_leaves_no_folder(tmp_path):
+    out = tmp_path / "run"
+    nowhere = f"data={{type: qgs/photos, path: {tmp_path / 'nowhere'}, image_size: [32, 32]}}"
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        run(tiny("tokengs", nowhere), out)
+    with pytest.raises(ValueError, match=r"optimizer\.warmup"):
+        run(tiny("tokengs", "optimizer.warmup=3"), out)
+    with pytest.raises(ValueError, match=r"views\.gap"):
+        run(tiny("tokengs", "views.inputs=9", "views.gap=[2, 3]"), out)
+    assert not out.exists()

@@ -1,0 +1,97 @@
+"""`init_from`: queries grow and shrink by the published rule, all else is taken as it is."""
+
+from io import StringIO
+
+import pytest
+import torch
+from rich.console import Console
+from safetensors.torch import load_file
+from training_runs import tiny, weights
+
+from qgs.checkpoint.model_file import save
+from qgs.checkpoint.tensors import CheckpointError
+from qgs.recipe import resolve
+from qgs.train.initial import initialise
+from qgs.train.training import train
+
+COUNT = 24
+GROWTH_NOISE = 0.01  # LocusGS release
+
+
+def started(recipe):
+    model = recipe.build_model()
+    return model, initialise(model, recipe)
+
+
+@pytest.fixture
+def learned(tmp_path):
+    """`learned("locus", "a.b=c")`: that tiny model, from a checkpoint of another seed."""
+
+    def make(name, *options):
+        path = tmp_path / f"{name}.safetensors"
+        save(tiny(name, "seed=7").build_model(), path)
+        return tiny(name, f"init_from={path}", *options)
+
+    return make
+
+
+def test_old_queries_stay_and_new_ones_are_noisy_copies(learned):
+    for count in (10, 25, 96):
+        recipe = learned("locus", f"model.queries.count={count}")
+        model, told = started(recipe)
+        old = load_file(recipe.tree["init_from"])
+        for parameter, now in model.state_dict().items():
+            before = old[parameter]
+            if not parameter.startswith("queries."):
+                assert torch.equal(now, before)
+                continue
+            assert len(now) == count
+            assert torch.equal(now[:COUNT], before[:count])
+            assert sum(f"{parameter}: {COUNT} -> {count}, " in line for line in told) == 1
+            if count > COUNT:
+                noise = (now[COUNT:] - before[torch.arange(COUNT, count) % COUNT]) / GROWTH_NOISE
+                assert noise.abs().max() < 6
+                assert noise.abs().min() > 0
+                if noise.numel() > 1000:
+                    assert noise.std() == pytest.approx(1, abs=0.1)
+                    assert noise.mean() == pytest.approx(0, abs=0.1)
+
+
+def test_weights_that_do_not_fit_are_refused(learned):
+    recipe = learned("tokengs", "model.head.gaussians_per_query=2")
+    with pytest.raises(CheckpointError, match=r"model\.head\.gaussians_per_query: 4 \(here 2\)"):
+        started(recipe)
+
+
+def test_the_recipes_seed_decides_the_noise(learned):
+    def features(seed):
+        torch.rand(seed)  # the global random state plays no part
+        model, _ = started(learned("tokengs", "model.queries.count=30", f"seed={seed}"))
+        return model.queries.features
+
+    assert torch.equal(features(1), features(1))
+    assert not torch.equal(features(1), features(2))
+
+
+def test_larger_patches_give_the_tokens_of_coarser_images(learned):
+    recipe = learned("tokengs", "model.encoder.patch_size=16", "data.image_size=[64, 64]")
+    model, told = started(recipe)
+    coarse, _ = started(
+        resolve(recipe.tree, ["model.encoder.patch_size=8", "data.image_size=[32, 32]"])
+    )
+    images = torch.rand(2, 3, 32, 32)
+    fine = images.repeat_interleave(2, -1).repeat_interleave(2, -2)
+    found, tokens = model.encoder.rgb_embedding(fine), coarse.encoder.rgb_embedding(images)
+    torch.testing.assert_close(found, tokens)
+    assert "encoder.ray_embedding.proj.weight: (32, 6, 8, 8) -> (32, 6, 16, 16)" in told
+
+
+def test_training_starts_from_a_run(trained_run, tmp_path):
+    start = f"init_from={trained_run.folder.path}"
+    still = ("optimizer.learning_rate=1e-9", "optimizer.weight_decay=0.0")
+    console = Console(file=StringIO(), width=300)
+    grown = tiny("locus", "model.queries.count=32", start, *still)
+    result = train(grown, tmp_path, device="cpu", console=console)
+    before, after = (weights(r)["queries.center"] for r in (trained_run, result))
+    torch.testing.assert_close(after[:COUNT], before, rtol=0, atol=1e-6)
+    assert "queries.center: 24 -> 32" in console.file.getvalue()

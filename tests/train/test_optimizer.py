@@ -1,0 +1,215 @@
+"""Learning rates; which parameters decay, learn slower or stay; the moving average."""
+
+import re
+
+import pytest
+import torch
+from refusals import refused
+from torch import nn
+from training_runs import assert_equal_runs, parts_of, run, tiny
+
+from qgs.contracts import TrainingConfig
+from qgs.recipe import resolve
+from qgs.tokengs import OneCycleAdamW
+from qgs.train.parameters import MovingAverage, make_optimizer
+
+
+def adamw(steps, warmup, seconds=None, **options):
+    config = OneCycleAdamW.Config(warmup=warmup, learning_rate=4e-4, **options)
+    return OneCycleAdamW(config, TrainingConfig(steps=steps, seconds=seconds))
+
+
+def test_the_rates_of_steps_alone_and_with_plenty_of_time_follow_torch():
+    for steps, warmup in ((40, 10), (100, 2), (7, 3), (50, 40)):
+        schedule, timed = adamw(steps, warmup), adamw(steps, warmup, seconds=1e6)
+        optimizer = torch.optim.SGD([nn.Parameter(torch.zeros(1))])
+        reference = torch.optim.lr_scheduler.OneCycleLR(
+            optimizer,
+            4e-4,
+            steps,
+            pct_start=warmup / steps,
+            div_factor=schedule.options.initial_divisor,
+            final_div_factor=schedule.options.final_divisor,
+        )
+        for step in range(steps):
+            (rate,) = reference.get_last_lr()
+            assert schedule.learning_rate(step, 0.0) == pytest.approx(rate, rel=1e-9)
+            assert timed.learning_rate(step, step * 0.1) == pytest.approx(rate, rel=1e-3)
+            optimizer.step()
+            if step < steps - 1:
+                reference.step()
+
+
+def test_a_time_budget_takes_over_when_it_runs_out_first():
+    """A warm-up of 2,000 steps is cut to a tenth of the time."""
+    for warmup, seconds, top in ((10, 20.0, 9), (2000, 10.0, 20)):
+        schedule = adamw(10_000, warmup, seconds)
+        rates = [schedule.learning_rate(step, step * seconds / 200) for step in range(201)]
+        assert max(rates) == rates[top] == pytest.approx(schedule.peak)
+        assert rates[:top] == sorted(rates[:top])
+        assert rates[top:] == sorted(rates[top:], reverse=True)
+        assert rates[-1] == pytest.approx(schedule.last)
+
+
+def test_a_linear_warm_up_none_and_an_end_above_the_first_rate():
+    schedule = adamw(100, 11, warmup_shape="linear", initial_divisor=1000.0, final_divisor=0.01)
+    rates = [schedule.learning_rate(step, 0.0) for step in range(100)]
+    assert rates[:11] == pytest.approx([4e-7 + (4e-4 - 4e-7) * step / 10 for step in range(11)])
+    assert rates[-1] == pytest.approx(4e-5)
+    for warmup in (0, 1):
+        schedule = adamw(10, warmup)
+        assert schedule.learning_rate(0, 0.0) == pytest.approx(schedule.peak)
+        assert schedule.learning_rate(9, 0.0) == pytest.approx(schedule.last)
+
+
+def test_every_trained_parameter_decays_but_the_head_and_1d_ones():
+    recipe = tiny("locus", "optimizer.weight_decay=0.1")
+    model = recipe.build_model()
+    model.queries.features.requires_grad_(False)
+    trained = {p: n for n, p in model.named_parameters() if p.requires_grad}
+    for module in (model, nn.ModuleDict({"model": model})):
+        optimizer = make_optimizer(module, recipe.build_optimizer(), recipe.rate_factors(module))
+        assert [group["weight_decay"] for group in optimizer.param_groups] == [0.1, 0.0]
+        assert optimizer.defaults["betas"] == (0.9, 0.95)
+        decaying, others = ([trained[p] for p in g["params"]] for g in optimizer.param_groups)
+        assert sorted(decaying + others) == sorted(trained.values())
+        expected = {n for p, n in trained.items() if p.ndim == 1 or n.startswith("head.")}
+        assert set(others) == expected
+
+
+PATTERNS = r"""
+encoder = encoder\..*
+encoder.* = encoder\..*
+model.queries = queries\..*
+queries.features = queries\.features
+decoder.*.cross_attention = decoder\.\d\.cross_attention\..*
+decoder.[01] = decoder\.[01]\..*
+decoder.cross_attention = decoder\.\d\.cross_attention\..*
+decoder.layers.[01].cross_attention = decoder\.[01]\.cross_attention\..*
+decoder.refinement = refinements\..*
+model.decoder.layers.2.refinement = refinements\..*
+decoder.*.*_scale.gamma = decoder\.\d\.\w+_scale\.gamma
+"""
+"""A pattern, and what all names of its parameters match."""
+
+
+def test_a_pattern_names_a_part_and_all_below_it():
+    plain = tiny("locus", "model.decoder.depth=4")
+    model = plain.build_model("meta")
+    for line in PATTERNS.strip().splitlines():
+        pattern, expected = line.split(" = ")
+        recipe = resolve(plain.tree, [f'optimizer.parts={{"{pattern}": 0.5}}'])
+        wanted = {name for name, _ in model.named_parameters() if re.fullmatch(expected, name)}
+        for module in (model, nn.ModuleDict({"model": model})):
+            factors = recipe.rate_factors(module)
+            found = {n.removeprefix("model.") for n, factor in factors.items() if factor == 0.5}
+            assert found == wanted != set(), pattern
+
+
+FIXES = """
+encodr: `encoder`
+decoder.9.self_attention: `decoder.*.self_attention`
+decoder.1.self_atention: `decoder.1.self_attention`
+decoder.refinment.x: `decoder.refinement`
+*.*.*.*.*.*.*.*: encoder, queries, decoder, refinements, head
+"""
+
+
+def test_a_pattern_that_matches_nothing_ends_the_start(tmp_path):
+    for line in FIXES.strip().splitlines():
+        pattern, fix = line.split(": ")
+        recipe = tiny("locus", f'optimizer.parts={{"{pattern}": 0.1}}')
+        problem = refused(recipe, tmp_path / "run", by=run)
+        assert (problem.file[:5], problem.option) == ("--set", f"optimizer.parts.{pattern}")
+        assert fix in problem.fix
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_factor_scales_the_step_and_frozen_parts_stay_and_are_not_remembered(tmp_path):
+    """The first step of AdamW without decay is the learning rate, whatever the gradient.
+
+    The last pattern that matches counts.
+    """
+    options = "warmup: 0, weight_decay: 0.0, learning_rate: 4.0e-3"
+    parts = '{"*": 0.5, encoder: 0, "decoder.*.feed_forward": 0, head: 1, head.linear.bias: 2}'
+    recipe = tiny("tokengs", "training.steps=1", f"optimizer={{{options}, parts: {parts}}}")
+    before = recipe.build_model().state_dict()
+    result = run(recipe, tmp_path)
+    moments = {key.rsplit("/", 1)[0] for key in parts_of(tmp_path)["moments"]}
+    factors = {"queries.features": 0.5, "head.linear.weight": 1, "head.linear.bias": 2}
+    for name, parameter in result.model.named_parameters():
+        step = float((parameter.detach() - before[name]).abs().max())
+        if name in factors:
+            assert step == pytest.approx(4e-3 * factors[name], rel=1e-2)
+        frozen = name.startswith("encoder.") or ".feed_forward." in name
+        assert (step == 0) == frozen, name
+        assert (parameter.grad is None) == frozen, name
+        assert (f"model.{name}" in moments) != frozen, name
+
+
+PLAIN = """
+from torch.optim import Adafactor
+from qgs.contracts import Optimizer, Plugin
+
+class Plain(Optimizer):
+    \"\"\"Adafactor at one rate.\"\"\"
+    name = "plain"
+    def build(self, groups):
+        return Adafactor(groups, lr=self.config.learning_rate)
+
+plugin = Plugin("plain", 1, (Plain,))
+"""
+
+
+def test_a_plugin_adds_an_optimiser_by_one_class(tmp_path, install):
+    """With moments of several shapes; some parameters get no gradient, and have none."""
+    install("plain", "plain", PLAIN)
+    recipe = tiny(
+        "locus",
+        "model.decoder.cross_attention.bandwidth=fixed",
+        "model.centers.type=locus/anchor_offset",
+        "plugins=[rooms, locus, plain]",
+        "optimizer={type: plain/plain, learning_rate: 0.02, parts: {encoder: 0, head: 0.5}}",
+    )
+    through, halves = tmp_path / "through", tmp_path / "halves"
+    history = run(recipe, through).folder.history()
+    assert [record["lr"] for record in history] == [0.02] * 3
+    run(resolve(recipe.tree, ["training.steps=2"]), halves)
+    assert run(recipe, halves, resume=True).resumed_at == 2
+    assert_equal_runs(through, halves)
+    moments = parts_of(through)["moments"]
+    keys = {key.rsplit("/")[-1] for key in moments}
+    assert keys == {"keys", "step", "row_var", "col_var", "variance"}
+    assert not [key for key in moments if "raw_radius" in key]
+
+
+class Small(nn.Module):
+    """A weight, one that is shared, and a counter."""
+
+    def __init__(self):
+        super().__init__()
+        self.first = nn.Linear(3, 2, bias=False)
+        self.second = self.first
+        self.register_buffer("seen", torch.zeros((), dtype=torch.long))
+
+
+def test_the_average_is_the_weighted_mean_of_all_weights_so_far():
+    model = Small()
+    average = MovingAverage(model, 0.9)
+    expected = weight = model.first.weight.detach().clone()
+    for _ in range(5):
+        weight = torch.randn(2, 3)
+        model.first.weight.data.copy_(weight)
+        model.seen.add_(1)
+        expected = 0.9 * expected + 0.1 * weight
+        average.update()
+    expected = {"first.weight": expected, "seen": torch.tensor(5)}
+    torch.testing.assert_close(average.state(), expected)  # shared weights once
+    with average.applied():
+        torch.testing.assert_close(model.first.weight.data, expected["first.weight"])
+    assert torch.equal(model.first.weight, weight)
+
+
+def test_the_average_of_half_precision_weights_is_float32():
+    average = MovingAverage(Small().to(torch.bfloat16), 0.999)
+    assert average.state()["first.weight"].dtype == torch.float32

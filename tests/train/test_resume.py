@@ -1,0 +1,203 @@
+"""A run that was interrupted or killed, and continued, is the run that was not."""
+
+import json
+import math
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+import torch
+from accelerate import Accelerator
+from training_runs import (
+    TRAINED,
+    TWO,
+    assert_equal_runs,
+    parts_of,
+    read_jsonl,
+    run,
+    run_calling,
+    same,
+    tiny,
+    weights,
+)
+
+import qgs
+from qgs.checkpoint.model_file import CheckpointFile
+from qgs.train.distributed import RandomStates
+from qgs.train.folder import OtherRunError, RunFolder, read_state, write_state
+
+SCHEDULED = """
+model.renderer.dilation={schedule: steps, values: [4, 2, 1], at: [1, 3]}
+losses.photometric.ssim_weight={schedule: linear, values: [0.4, 0], at: [0, 4]}
+objective.alpha_weight={schedule: steps, values: [0, 1], at: [2]}
+optimizer.learning_rate={schedule: cosine, values: [1.0e-3, 0], at: [0, 4]}
+optimizer.warmup=2000
+"""
+
+
+class Killed(BaseException):
+    """Ends a run as a kill does, from the loop's point of view: nothing is saved any more."""
+
+
+def resumed(folder, *options):
+    """Continue a copy of `trained_run`."""
+    return run(tiny("locus", *TRAINED, *options), folder, resume=True)
+
+
+def change_counters(folder, **values):
+    state = read_state(folder / "state.safetensors")
+    parts = {**state.parts, "counters": {**state.parts["counters"], **values}}
+    write_state(folder / "state.safetensors", state.recipe.tree, parts)
+
+
+def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
+    options = (*TWO, *SCHEDULED.strip().splitlines())
+    recipe = tiny("locus", *options, "training.steps=4")
+    whole, parts, again = (tmp_path / name for name in ("whole", "parts", "again.safetensors"))
+    run(recipe, whole, resume=True)
+    seen = []
+
+    def note(trainer, stop):
+        loss = trainer.training_pass.losses["photometric"]
+        seen.append((trainer.model.renderer.config.dilation, loss.config.ssim_weight))
+        if trainer.step == 1:
+            stop.signal = signal.SIGTERM  # the next step is the last
+
+    stopped = run_calling(note, recipe, parts)
+    assert (stopped.steps, stopped.stopped_by) == (2, "SIGTERM")
+    qgs.save(qgs.load(stopped.folder.checkpoint), again)
+    assert CheckpointFile(again).step == 2
+    assert qgs.load(again).renderer.config.dilation == 2
+    for other in ("objective.depth_weight=0.5", "losses.photometric.ssim_weight.values=[0.4, 0.1]"):
+        with pytest.raises(OtherRunError, match=other.split("=")[0]):
+            run(tiny("locus", *options, other), parts, resume=True)
+    assert run_calling(note, recipe, parts, resume=True).resumed_at == 2
+    assert_equal_runs(whole, parts)
+    # After a step there stand the numbers of the next one.
+    assert seen == [(2, pytest.approx(0.3)), (2, 0.2), (1, pytest.approx(0.1)), (1, 0)]
+    history = RunFolder(whole).history()
+    rates = [5e-4 * (1 + math.cos(math.pi * step / 4)) for step in range(4)]
+    assert [record["lr"] for record in history] == pytest.approx(rates)
+    assert history[3]["ssim"] == pytest.approx(history[0]["ssim"] / 4, rel=0.2)  # 0.1 is left
+    assert [record["alpha_consistency"] > 0 for record in history] == [False, False, True, True]
+    terms = [
+        "mse",
+        "ssim",
+        "visibility",
+        "anchor_visibility",
+        "alpha_consistency",
+        "depth_consistency",
+    ]
+    for record in history:
+        assert record["depth_consistency"] > 0
+        assert sum(record[term] for term in terms) == pytest.approx(record["loss"])
+
+
+def test_a_kill_between_the_first_two_files_loses_nothing(tmp_path, monkeypatch):
+    recipe = tiny("tokengs", "training.steps=1", "optimizer.warmup=0")
+    with monkeypatch.context() as patch:
+        patch.setattr("qgs.train.folder.save", Mock(side_effect=Killed))
+        with pytest.raises(Killed):
+            run(recipe, tmp_path)
+    assert run(recipe, tmp_path, resume=True).resumed_at == 1
+    assert CheckpointFile(tmp_path / "checkpoint.safetensors").step == 1
+
+
+def test_a_longer_budget_goes_on_without_damaged_and_lost_records(copied, caplog):
+    files = copied / "history.jsonl", copied / "evaluations.jsonl"
+    for file in files:
+        file.write_text(f'{{"step": 2, "lo\n[1]\n{file.read_text()}{{"step": 4}}\n')
+    in_halves = Path(shutil.copytree(copied, copied.with_name("halves")))
+    longer = ("training.steps=4", "training.evaluate_every=4", "evaluation.scenes=1")
+    assert resumed(copied, *longer, "training.save_every=7").steps == 4
+    history, evaluations = (read_jsonl(file) for file in files)
+    assert [record["step"] for record in history] == [1, 2, 3, 4]
+    assert [record["step"] for record in evaluations] == [2, 2, 3, 3, 4, 4]
+    for file in files:
+        for line in (1, 2):
+            assert f"{file}, line {line} is damaged" in caplog.text
+    assert "steps: 4" in (copied / "recipe.yaml").read_text()
+    last = resumed(in_halves, *longer, "training.accumulate=2").folder.history()[-1]
+    for name in ("lr", "loss", "gradient"):
+        assert last[name] == pytest.approx(history[-1][name], rel=1e-4)
+    samples = [parts_of(folder)["counters"]["samples"] for folder in (copied, in_halves)]
+    assert samples == [8, 8]
+
+
+def test_the_clock_goes_on(copied):
+    change_counters(copied, seconds=1.0)
+    budget = ("training.steps=200", "training.seconds=1.02", "training.evaluate_every=0")
+    result = resumed(copied, *budget)
+    seconds = [record["seconds"] for record in result.folder.history()]
+    assert seconds[3] == 1.0
+    assert seconds[4] > 1.0
+    assert 1.02 <= result.seconds < 10
+
+
+def test_a_run_killed_before_its_first_save_starts_again(trained_run, copied):
+    for file in copied.glob("*.safetensors"):
+        file.unlink()
+    for name in (".state.safetensors.4711.tmp", ".tmpA9b0zZ"):
+        (copied / name).write_text("half a state")
+    with pytest.raises(OtherRunError, match=r"seed: 1 here, 0 in the run"):
+        resumed(copied, "seed=1")
+    assert resumed(copied).resumed_at is None
+    assert_equal_runs(copied, trained_run.folder.path)
+    assert not list(copied.glob(".*"))
+
+
+def test_a_finished_run_is_left_as_it_is_and_others_are_refused(trained_run, copied):
+    def files():
+        return {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in copied.glob("*.*")}
+
+    before = files()
+    again = resumed(copied)
+    assert (again.resumed_at, again.steps, again.stopped_by) == (3, 3, None)
+    assert same(weights(trained_run), weights(again))
+    with pytest.raises(OtherRunError, match=r"rate: 0\.001 here, 0\.0015 in") as caught:
+        resumed(copied, "optimizer.learning_rate=1e-3", "seed=4", "training.save_every=3")
+    assert "seed: 4 here, 0 in the run" in str(caught.value)
+    assert "training.save_every:" not in str(caught.value)
+    with pytest.raises(OtherRunError, match=r"see 2 samples.*see 3.*batch_size=2"):
+        resumed(copied, "training.batch_size=3")
+    folder = RunFolder(copied)
+    folder.take()
+    with pytest.raises(FileExistsError, match="another process is training"):
+        resumed(copied)
+    folder.close()
+    resumed(copied)
+    assert files() == before
+    change_counters(copied, scenes="others")
+    with pytest.raises(OtherRunError, match="other training scenes"):
+        resumed(copied)
+
+
+def test_random_states_come_back():
+    states = RandomStates(Accelerator(cpu=True))
+
+    def draw():
+        return random.random(), np.random.normal(), float(torch.rand(()))
+
+    np.random.normal()
+    saved = states.state()
+    first = draw()
+    values = {k: v for k, v in saved.items() if not torch.is_tensor(v)}
+    states.load_state(saved | json.loads(json.dumps(values)))
+    assert draw() == first
+
+
+@pytest.mark.slow
+def test_killed_runs_go_on_from_whole_files(monkeypatch):
+    """Some kills must come inside a save, for this to prove anything."""
+    tool = Path(__file__).parents[2] / "tools/kill.py"
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    command = [sys.executable, tool, "training", "--kills=12", "--width=192", "--steps=150"]
+    told = subprocess.check_output(command, text=True)
+    assert re.match(r"12 kills, [1-9]\d* inside a save", told), told

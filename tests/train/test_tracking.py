@@ -1,0 +1,119 @@
+"""What trackers are told, and what a person reads while a model trains."""
+
+import io
+import json
+import re
+import sys
+import time
+from importlib.machinery import ModuleSpec
+from unittest.mock import MagicMock
+
+import pytest
+from accelerate import PartialState
+from rich.console import Console
+from training_runs import TRAINED, run, tiny
+
+from qgs.contracts import MissingExtraError
+from qgs.train import tracking
+from qgs.train.tracking import Trackers, TrainingProgress
+
+FILE_TRACKER = """
+import json
+from qgs.train.tracking import Tracker
+
+class Lines(Tracker):
+    def __init__(self, run, options, step):
+        self.file = (run / "lines.jsonl").open("w")
+        self.log({"width": options["model.width"]}, step)
+    def log(self, values, step):
+        self.file.write(json.dumps([step, values]) + "\\n")
+    def close(self):
+        self.file.close()
+
+plugin = Lines
+"""
+FAILING_TRACKER = """
+from qgs.train.tracking import Tracker
+
+class Failing(Tracker):
+    def __init__(self, run, options, step):
+        self.closed = run / "closed"
+        if FAILS == "opens":
+            raise OSError("no service")
+    def log(self, values, step):
+        raise OSError("no service")
+    def close(self):
+        self.closed.write_text(FAILS)
+
+plugin = Failing
+"""
+
+
+def test_distributions_offer_trackers_and_one_that_fails_is_left_out(tmp_path, install, caplog):
+    group = {"group": "qgs.trackers"}
+    install("qgs-lines", "lines", FILE_TRACKER, **group)
+    for name in ("opens", "logs"):
+        install(f"qgs-{name}", name, f"FAILS = {name!r}\n{FAILING_TRACKER}", **group)
+    result = run(tiny("tokengs", "training.trackers=[opens, logs, lines]"), tmp_path)
+    first, *lines = map(json.loads, (tmp_path / "lines.jsonl").open())
+    assert first == [0, {"width": 32}]
+    assert lines == [[record["step"], record] for record in result.folder.history()]
+    opens, logs = (record.message for record in caplog.records)
+    assert " opens " in opens
+    assert " logs " in logs
+    assert (tmp_path / "closed").read_text() == "logs"
+
+
+def test_a_missing_tracker_is_told_before_anything_is_made(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="tensorboard, wandb"):
+        Trackers(("linez",))
+    monkeypatch.setattr(tracking, "find_spec", lambda name: None)
+    with pytest.raises(MissingExtraError, match=r"query-gaussians\[tensorboard\]"):
+        run(tiny("tokengs", "training.trackers=[tensorboard]"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_tensorboard_gets_what_the_history_gets_and_drops_what_was_lost(copied):
+    """Of a resumed run: as if it had been told of steps that came after the last save."""
+    name = "tensorboard.backend.event_processing.event_accumulator"
+    module = pytest.importorskip(name, reason="the extra `tensorboard` is not installed")
+    recipe = tiny("locus", *TRAINED, "training.trackers=[tensorboard]", "training.steps=4")
+    lost = Trackers(("tensorboard",))
+    lost.open(copied, recipe)
+    for step in range(1, 6):
+        lost.log({"loss": float(step)}, step)
+    lost.close()
+    time.sleep(1.1)  # files of one second are read in the order of a number in their names
+    last = run(recipe, copied, resume=True).folder.history()[-1]
+    events = module.EventAccumulator(str(copied / "tensorboard")).Reload()
+    told = [(event.step, event.value) for event in events.Scalars("loss")]
+    assert told == [(1, 1.0), (2, 2.0), (3, 3.0), (4, pytest.approx(last["loss"]))]
+    for name in ("lr", "evaluation/raw/psnr", "evaluation/ema/ssim"):
+        assert [event.step for event in events.Scalars(name)] == [4]
+    assert len(events.Images("evaluation")) == 1
+
+
+def test_a_resumed_run_goes_on_in_its_run_of_wandb(tmp_path, monkeypatch):
+    wandb = MagicMock(__spec__=ModuleSpec("wandb", None))
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    PartialState(cpu=True)  # accelerate's trackers ask it which process they are in
+    for step in (0, 4):
+        trackers = Trackers(("wandb",))
+        trackers.open(tmp_path, tiny("locus"), step)
+        trackers.log({"loss": 0.5}, step + 1)
+    first, second = (call.kwargs["id"] for call in wandb.init.call_args_list)
+    assert first == second != ""
+    logged = [call.kwargs["step"] for call in wandb.init.return_value.log.call_args_list]
+    assert logged == [1, 5]
+
+
+def test_speed_and_time_left_are_those_since_the_run_began_or_resumed(monkeypatch):
+    """0.74 of the budget, 100 s for each 0.25; and 0.399 of it, 10 s for each 0.1."""
+    monkeypatch.setattr(tracking, "_LOG_SECONDS", 0.0)
+    resumed = [(501, 0.1, 20.0, 4008, 10_000.0, 0.501), (601, 0.1, 20.0, 4808, 10_010.0, 0.601)]
+    new = [(1, 0.1, 20.0, 8, 0.0, 0.01), (26, 0.1, 20.0, 208, 100.0, 0.26)]
+    for steps, told in ((new, "2.0 images/s .*0:04:56"), (resumed, "80 images/s .*0:00:40")):
+        console = Console(width=200, file=io.StringIO())
+        with TrainingProgress(console) as bar:
+            assert all(bar.update(*numbers) for numbers in steps)
+        assert re.search(rf" {told} left", console.file.getvalue())

@@ -1,0 +1,170 @@
+"""Whole runs of tiny models on procedural rooms, and what they leave."""
+
+from typing import get_args
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from qgs_viewer.curves import curves_of
+from training_runs import (
+    TRAINED,
+    change_samples,
+    losses,
+    parts_of,
+    read_jsonl,
+    run,
+    same,
+    tiny,
+    weights,
+)
+
+import qgs
+from qgs.checkpoint.model_file import CheckpointFile
+from qgs.contracts import TrainingConfig
+from qgs.drawing.images import rgb_picture
+from qgs.evaluate.evaluation import evaluate
+from qgs.evaluate.plan import evaluation_samples
+from qgs.recipe import Recipe, resolve
+from qgs.train import guard
+from qgs.train.guard import NonFiniteError
+from qgs.train.precision import DTYPES
+
+
+def test_training_lowers_the_loss(tmp_path):
+    options = ("training.steps=20", "optimizer.warmup=4", "data.scenes=1", "views.mirror=0.0")
+    more = ("optimizer.learning_rate=4e-3", "training.collapse_window=10")
+    run(tiny("locus", *options, *more), tmp_path, device="auto")
+    assert parts_of(tmp_path)["good"]["steps"] == [18, 20]
+    falling = losses(tmp_path)
+    assert sum(falling[-5:]) < 0.95 * sum(falling[:5])
+
+
+def test_a_run_leaves_recipe_history_and_checkpoint(trained_run):
+    folder = trained_run.folder
+    assert resolve(folder.recipe).tree == tiny("locus", *TRAINED).tree
+    history = folder.history()
+    assert [record["step"] for record in history] == [1, 2, 3]
+    assert {"psnr", "lr", "seconds", "gradient"} <= history[0].keys()
+    assert CheckpointFile(folder.checkpoint).step == 3
+    assert not trained_run.model.training
+    assert same(qgs.load(folder.checkpoint).state_dict(), weights(trained_run))
+
+
+def test_averages_and_evaluations_leave_the_training_alone(trained_run, tmp_path):
+    plain, folder = run(tiny("locus"), tmp_path), trained_run.folder
+    parts, watched = parts_of(tmp_path), parts_of(folder.path)
+    for name in ("weights", "moments", "random"):
+        assert same(parts[name], watched[name])
+    assert losses(tmp_path) == losses(folder.path)
+    files = {"recipe.yaml", "history.jsonl", "checkpoint.safetensors", "state.safetensors"}
+    assert {path.name for path in tmp_path.iterdir()} == files
+    start, average, last = (
+        model.state_dict()["queries.features"]
+        for model in (tiny("locus").build_model(), qgs.load(folder.checkpoint_ema), plain.model)
+    )
+    assert 0 < (average - last).norm() < (start - last).norm()  # it follows the weights
+
+
+def test_weights_and_their_average_are_judged_and_shown_side_by_side(trained_run):
+    folder, recipe = trained_run.folder, tiny("locus", *TRAINED)
+    records = read_jsonl(folder.path / "evaluations.jsonl")
+    told = [(r["step"], r["weights"], r["scenes"]) for r in records]
+    assert told == [(step, weights, 2) for step in (2, 3) for weights in ("raw", "ema")]
+    raw, average = (qgs.load(file) for file in (folder.checkpoint, folder.checkpoint_ema))
+    scores = [evaluate(model, recipe).means() for model in (raw, average)]
+    assert [record["scores"] for record in records[2:]] == scores
+    assert scores[0]["psnr"] != scores[1]["psnr"]
+    pictures = folder.path / "pictures"
+    assert {path.name for path in pictures.iterdir()} == {"step-2.png", "step-3.png"}
+    picture = np.asarray(Image.open(pictures / "step-3.png"))
+    assert picture.shape == (36, 96, 3)  # two rows of five, 4 apart
+    sample = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[0]
+    with torch.no_grad():
+        rendering = raw.render(raw(sample.inputs).gaussians, sample.targets.cameras)
+    images = *sample.inputs.images[0], sample.targets.images[0, 0], rendering.rgb[0, 0]
+    for column, image in enumerate(images):
+        np.testing.assert_array_equal(picture[:16, 20 * column :][:, :16], rgb_picture(image))
+
+
+def test_scenes_that_do_not_split_evenly_are_refused():
+    for processes, accumulate in ((3, 1), (1, 5), (8, 4)):
+        config = TrainingConfig(batch_size=16, accumulate=accumulate)
+        with pytest.raises(ValueError, match=r"training\.batch_size: 16"):
+            config.scenes_per_batch(processes)
+
+
+def test_bf16_trains_with_finite_numbers(tmp_path):
+    model = run(tiny("locus", "training.precision=bf16"), tmp_path / "run").model
+    assert all(p.dtype == torch.float32 and p.isfinite().all() for p in model.parameters())
+    assert get_args(TrainingConfig.model_fields["precision"].annotation) == tuple(DTYPES)
+
+
+def test_a_time_budget_ends_the_run(tmp_path):
+    recipe = tiny("tokengs", "training.steps=200", "training.seconds=0.1")
+    result = run(recipe, tmp_path)
+    assert 0.1 <= result.seconds < 10.0
+    history = result.folder.history()
+    assert 1 < result.steps == len(history) < 200
+    clock = [0.0, *(record["seconds"] for record in history)]
+    assert clock[1] == 0
+    schedule = recipe.build_optimizer()
+    for step, record in enumerate(history):
+        assert record["lr"] == pytest.approx(schedule.learning_rate(step, clock[step]))
+
+
+def spoil(monkeypatch, *numbers):
+    """The training samples of these numbers hold a NaN pixel."""
+
+    def spoiled(sample, number, attempt):
+        if number in numbers:
+            sample.targets.images[0, 0, 0, 0, 0] = torch.nan
+
+    change_samples(monkeypatch, spoiled)
+
+
+def test_bad_steps_are_skipped_on_demand(tmp_path, monkeypatch, caplog):
+    """By a run from its start, and by one that a bad step ended."""
+    spoil(monkeypatch, 2, 6)
+    options = ("training.steps=4", "training.ema=0.9")
+    skipping = tiny("locus", *options, "training.on_nonfinite=skip")
+    through, stopped = tmp_path / "through", tmp_path / "stopped"
+    run(skipping, through)
+    told = [r.message.split(" is ")[0] for r in caplog.records if "is skipped" in r.message]
+    assert told == ["step 2", "step 4"]
+    records = read_jsonl(through / "history.jsonl")
+    assert ["loss" in r for r in records] == [True, False, True, False]
+    assert ["skipped" in r for r in records] == [False, True, False, True]
+    assert curves_of(through / "checkpoint.safetensors").steps == [1, 3]
+    assert {path.name for path in (through / "incidents").iterdir()} == {"step-2", "step-4"}
+    counted = parts_of(through)["guard"]
+    assert (counted["incidents"], counted["skipped"]) == (2, 1)  # a good step lies between the two
+    for resume in (False, True):
+        with pytest.raises(NonFiniteError, match=r"targets\.images \(1 NaN of") as error:
+            run(tiny("locus", *options), stopped, resume)
+    for part in ("step 2 is not finite", "mse is nan", str(stopped / "incidents/step-2")):
+        assert part in str(error.value)
+    assert len(losses(stopped)) == 1
+    assert run(skipping, stopped, resume=True).resumed_at == 1
+    ours, theirs = parts_of(stopped), parts_of(through)
+    for name in ("weights", "ema"):
+        assert same(ours[name], theirs[name])
+        assert all(tensor.isfinite().all() for tensor in ours[name].values())
+
+
+def test_a_bad_gradient_ends_the_run_too(tmp_path, monkeypatch):
+    model = tiny("tokengs").build_model()
+    next(model.parameters()).register_hook(lambda gradient: gradient * torch.inf)
+    monkeypatch.setattr(Recipe, "build_model", Mock(return_value=model))
+    with pytest.raises(NonFiniteError, match="the first bad tensor is gradient of"):
+        run(tiny("tokengs"), tmp_path)
+    assert not losses(tmp_path)
+
+
+def test_skipping_comes_to_an_end(tmp_path, monkeypatch):
+    spoil(monkeypatch, *range(2, 100))
+    monkeypatch.setattr(guard, "MAX_SKIPPED", 2)
+    with pytest.raises(NonFiniteError, match="2 steps in a row were skipped"):
+        run(tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50"), tmp_path)
+    assert len(read_jsonl(tmp_path / "history.jsonl")) == 3

@@ -1,0 +1,270 @@
+"""The objective: the weighted sum of its losses, with all target views at once or few at a time."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from qgs_research.bench.memory import peak_memory
+from qgs_research.bench.work import workload_of
+from torch import nn
+from training_runs import TWO, first_batch, tiny
+from varying_head import VaryingHead
+
+from qgs.contracts import Loss
+from qgs.losses import Photometric
+from qgs.metrics.images import psnr
+from qgs.train.training_pass import TrainingPass, measure
+from qgs.types import map_tensors
+
+TARGETS = 3
+
+
+class Flicker(Loss):
+    """How much views differ in brightness: no mean over views, and undeclared as such."""
+
+    name = "flicker"
+
+    def __init__(self, config):
+        super().__init__(config)
+        self.gain = nn.Parameter(torch.tensor(0.7))
+
+    def term(self, prediction, rendering, target, inputs):
+        assert rendering.rgb.shape[1] == TARGETS
+        brightness = rendering.rgb.mean((-3, -2, -1))
+        return {"flicker": self.gain * brightness.std(1).mean() + rendering.depth.square().mean()}
+
+
+class Blind(Loss):
+    """Wants no rendering, and gets none, nor views at a time."""
+
+    name = "blind"
+    renderings = "none"
+
+    def term(self, prediction, rendering, target, inputs):
+        assert rendering.rgb.shape[1] == 0
+        assert target.images.shape[1] == TARGETS
+        return {"blind": prediction.state.features.square().mean()}
+
+
+class Marked(Loss):
+    """The rendered features, which are to be those of the colours' weights."""
+
+    name = "marked"
+    renderings = "each"
+
+    def term(self, prediction, rendering, target, inputs):
+        return {"marked": (rendering.features - target.images.mean(2, True)).square().mean()}
+
+
+def setting(renderer, *kinds, dtype=torch.float32):
+    """A training pass with losses of all kinds, input views, and targets with masks."""
+    losses = ("losses.mask={type: qgs/mask}", "losses.opacity={type: qgs/opacity}")
+    options = (f"model.renderer.type={renderer}", f"views.targets={TARGETS}")
+    recipe = tiny("locus", *losses, *options)
+    batch = first_batch(recipe)
+    losses = recipe.build_losses() | {kind.name: kind(Loss.Config()) for kind in (Blind, *kinds)}
+    masks = (batch.targets.images.mean(2, keepdim=True) > 0.4).float()
+    targets = replace(batch.targets, masks=masks)
+    model = recipe.build_model().train().to(dtype)
+    return TrainingPass(model, losses), batch.inputs.to(dtype), targets.to(dtype)
+
+
+def written_out(objective, inputs, targets):
+    """The terms as their definition reads: one graph for all layers and views."""
+    model = objective.model
+    prediction = model(inputs)
+    found = {}
+    for number, weight in ((1, 1 / 3), (2, 2 / 3)):
+        layer = prediction.layers[number]
+        rendering = model.render(layer.gaussians, targets.cameras)
+        for loss in objective.losses.values():
+            shown = rendering
+            if loss.renderings == "none":
+                shown = map_tensors(lambda tensor: tensor[:, :0], rendering)
+            for name, term in loss(layer, shown, targets, inputs).items():
+                found[name] = found.get(name, 0) + weight * term
+    return found
+
+
+def gradients(module, total):
+    module.zero_grad()
+    total.backward()
+    return {n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None}
+
+
+def furthest(found, wanted):
+    """Largest difference, relative to the largest gradient."""
+    assert found.keys() == wanted.keys()
+    largest = max(float(g.abs().max()) for g in wanted.values())
+    return max(float((found[n] - g).abs().max()) for n, g in wanted.items()) / largest
+
+
+def error(objective, *batch):
+    """How far its gradients are from those of the definition."""
+    wanted = gradients(objective, sum(written_out(objective, *batch).values()))
+    return furthest(gradients(objective, objective(*batch).total), wanted)
+
+
+@pytest.mark.parametrize(("renderer", "varying"), [("qgs/torch", False), ("qgs/cpu", True)])
+def test_terms_and_gradients_do_not_depend_on_how_many_views_are_rendered_at_once(
+    renderer, varying
+):
+    wrong = []
+    for all_at_once in ((), (Flicker,)):
+        objective, *batch = setting(renderer, *all_at_once, *[Marked] * varying)
+        if varying:
+            objective.model.head = VaryingHead(objective.model.head)
+        terms = written_out(objective, *batch)
+        wanted = gradients(objective, sum(terms.values()))
+        if varying:
+            channels = wanted["model.head.linear.weight"].unflatten(0, (-1, 28))
+            assert channels.abs().amax((0, 2)).gt(0).all()
+        else:
+            assert wanted.keys() == dict(objective.named_parameters()).keys()
+        for at_once in (0, 1, 2, 9):
+            objective.render_views = at_once
+            outcome = objective(*batch)
+            torch.testing.assert_close(outcome.terms, terms)
+            torch.testing.assert_close(outcome.total, sum(terms.values()))
+            distance = furthest(gradients(objective, outcome.total), wanted)
+            if not distance < 1e-6:
+                wrong.append((all_at_once, at_once, distance))
+    assert not wrong
+
+
+def test_gradients_of_two_passes_are_those_of_the_definition():
+    """As one graph, in which the two passes and both comparisons stand written out."""
+    recipe = tiny("locus", *TWO, "objective.alpha_weight=0.1", "objective.depth_weight=0.2")
+    model, batch = recipe.build_model().train(), first_batch(recipe)
+    step = TrainingPass.of(recipe, model)
+    total, seen = torch.zeros(()), []
+    for views in ([0, 1, 3, 4], [0, 2, 4]):
+        some = batch.inputs.select(views)
+        total = total + sum(written_out(step, some, batch.targets).values()) / 2
+        seen.append(model.render(model(some).gaussians, batch.targets.cameras))
+    for name, factor in (("alpha", 0.1), ("depth", 0.2)):
+        one, other = (getattr(rendering, name) for rendering in seen)
+        # half of the gradient that |one - other| has with nothing fixed, its value in full
+        total = total + factor * (one - other).abs().mean() / 2
+    wanted = gradients(step, total)
+    for at_once in (0, 1):
+        step.render_views = at_once
+        assert furthest(gradients(step, step(batch.inputs, batch.targets).total), wanted) < 1e-5
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device")
+def test_gradients_through_gsplat_do_not_depend_on_it():
+    pytest.importorskip("gsplat", reason="gsplat is not installed")
+    objective, *batch = setting("qgs/gsplat")
+    objective.render_views = 2
+    found = error(objective.cuda(), *(views.to("cuda") for views in batch))
+    assert found < 1e-5  # its kernels add in no fixed order
+
+
+def test_in_float64_they_are_the_same_numbers():
+    objective, *batch = setting("qgs/torch", dtype=torch.float64)
+    objective.render_views = 2
+    assert error(objective, *batch) < 1e-13
+
+
+def test_under_autocast_the_gaussians_get_the_same_gradients():
+    objective, *batch = setting("qgs/cpu")
+    found = []
+    for at_once in (0, 2):
+        objective.render_views = at_once
+        seen = {}
+
+        def note(name, value, seen=seen):
+            if name.startswith("gradient"):
+                seen.update({f"{name} {key}": tensor.float() for key, tensor in value.items()})
+
+        objective.hook = note
+        with torch.autocast("cpu", torch.bfloat16):
+            objective(*batch).total.backward()
+        found.append(seen)
+    assert len(seen) >= 10  # Gaussians and states of two layers
+    assert furthest(*found) < 1e-6
+
+
+def test_totals_scale_with_their_gradients_and_without_gradients_they_only_measure():
+    objective, *batch = setting("qgs/cpu")
+    objective.render_views = 2
+    total = objective(*batch).total
+    whole = gradients(objective, 4 * total)
+    part = gradients(objective, objective(*batch).total)
+    assert furthest({n: 4 * g for n, g in part.items()}, whole) < 1e-6
+    with torch.no_grad():
+        measured = objective(*batch).total
+    assert not measured.requires_grad
+    assert measured == total
+
+
+def test_signs_are_those_of_all_views_of_the_last_layer():
+    objective, inputs, targets = setting("qgs/cpu")
+    model = objective.model
+    with torch.no_grad():
+        rendering = model.render(model(inputs).gaussians, targets.cameras)
+    likeness = psnr(rendering.rgb, targets.images).mean()
+    wanted = (likeness, *measure(rendering.rgb, rendering.alpha, torch.full((3,), 0.5)))
+    for at_once in (0, 2):
+        objective.render_views = at_once
+        torch.testing.assert_close(tuple(objective(inputs, targets).signs.values()), wanted)
+
+
+def test_input_views_are_judged_too():
+    recipe = tiny("tokengs", "training.judge_inputs=true", "losses.visibility=null")
+    model, batch = recipe.build_model().train(), first_batch(recipe)
+    inputs, targets = batch.inputs, batch.targets.select([0])
+    step = TrainingPass.of(recipe, model)
+    of_inputs, of_targets = (written_out(step, inputs, views) for views in (inputs, targets))
+    wanted = {name: (2 * of_inputs[name] + term) / 3 for name, term in of_targets.items()}
+    torch.testing.assert_close(step(inputs, targets).terms, wanted)
+
+
+def test_views_are_joined_in_order_and_only_with_their_like():
+    batch = first_batch(tiny("tokengs"))
+    one, other = (replace(v, masks=v.images[:, :, :1]) for v in (batch.inputs, batch.targets))
+    both = one.joined(other)
+    assert both.cameras.shape == (2, 4)
+    for name in ("images", "masks"):
+        joined = torch.cat([getattr(one, name), getattr(other, name)], 1)
+        assert torch.equal(getattr(both, name), joined)
+    wider = first_batch(tiny("tokengs", "data.image_size=[16, 24]")).targets
+    for unlike in (batch.targets, replace(wider, masks=wider.images[:, :, :1])):
+        with pytest.raises(ValueError, match=r"masks|sizes"):
+            one.joined(unlike)
+
+
+def test_renderers_and_compiled_losses_follow_their_options():
+    recipe = tiny("tokengs", "model.renderer.type=qgs/auto")
+    model, batch = recipe.build_model().eval(), first_batch(recipe)
+    loss = Photometric(Photometric.Config(ssim_weight=0.0))
+    compiled = torch.compile(loss, backend="eager")
+    layer = model(batch.inputs)
+    alphas = []
+    for number in (1.0, 3.0):
+        model.renderer.config = model.renderer.config.model_copy(update={"dilation": number})
+        loss.config = Photometric.Config(mse_weight=number, ssim_weight=0.0)
+        rendering = model.render(layer.gaussians, batch.targets.cameras)
+        alphas.append(rendering.alpha.mean())
+        error = number * (rendering.rgb - batch.targets.images).square().mean()
+        for step in (loss, compiled):
+            found = step(layer, rendering, batch.targets, batch.inputs)["mse"]
+            torch.testing.assert_close(found, error)
+    assert alphas[0] < alphas[1]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="reads Linux's accounts")
+def test_memory_does_not_grow_with_target_views(monkeypatch):
+    # glibc gives freed buffers back, so that the resident set is what the step needs.
+    monkeypatch.setenv("MALLOC_MMAP_THRESHOLD_", "65536")
+    many = ("model.queries.count=512", "model.head.gaussians_per_query=64")
+    large = ("data.image_size=[256, 256]", "model.encoder.patch_size=16", "training.render_views=2")
+    steps = []
+    for targets in (2, 16):
+        recipe = tiny("tokengs", *many, *large, f"views.targets={targets}")
+        peak = peak_memory(recipe, "step", workload_of(recipe), threads=1)
+        steps.append(peak.peak_bytes - peak.idle_bytes)
+    assert steps[1] <= 1.3 * steps[0]
