@@ -1,7 +1,7 @@
 """Query-based feed-forward 3D Gaussian splatting from composable, checked components.
 
 model = qgs.compose("recipes/tiny/locus.yaml", overrides=["model.queries.count=128"])
-result = model.reconstruct("photos")  # or Views, in any world
+result = qgs.reconstruct(model, "photos")  # or Views, in any world
 prediction = model(views)  # in the model's own world
 rendering = model.render(prediction.gaussians, cameras)
 qgs.save(model, path); model = qgs.load(path)
@@ -14,20 +14,18 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
-    from contextlib import AbstractContextManager
+from qgs.version import __version__ as __version__
 
+if TYPE_CHECKING:
     from qgs.checkpoint.gaussians import load_ply, save_ply
     from qgs.checkpoint.model_file import load, save
     from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
     from qgs.model import QueryGaussianModel
     from qgs.recipe import compose
     from qgs.reconstruction.result import Reconstruction
-    from qgs.reconstruction.scenes import read_photos
+    from qgs.reconstruction.scenes import read_photos, reconstruct
+    from qgs.reconstruction.trace import trace
     from qgs.types import Cameras, Gaussians, Prediction, QueryState, Rendering, Views
-
-__version__ = "0.1.0"
 
 # PyPI's distribution `qgs`, a climate model, installs a package of the same name: in one folder the
 # files of both would mix. Looked up by file name: importlib.metadata would double the import time.
@@ -44,14 +42,16 @@ has allocated any; with 4 KiB pages a forward pass takes some 5 % longer. Set it
 _ELSEWHERE = {
     "CONTRACT_VERSION": "qgs.contracts.plugin",
     "Plugin": "qgs.contracts.plugin",
-    "QueryGaussianModel": "qgs.reconstruction",
-    "compose": "qgs.reconstruction",
+    "QueryGaussianModel": "qgs.model",
     "Reconstruction": "qgs.reconstruction.result",
-    "load": "qgs.reconstruction",
+    "compose": "qgs.recipe",
+    "load": "qgs.checkpoint.model_file",
     "load_ply": "qgs.checkpoint.gaussians",
     "read_photos": "qgs.reconstruction.scenes",
+    "reconstruct": "qgs.reconstruction.scenes",
     "save": "qgs.checkpoint.model_file",
     "save_ply": "qgs.checkpoint.gaussians",
+    "trace": "qgs.reconstruction.trace",
 }
 """Where public names come from that are not of `qgs.types`."""
 
@@ -70,38 +70,11 @@ __all__ = [
     "load",
     "load_ply",
     "read_photos",
-    "refine",
+    "reconstruct",
     "save",
     "save_ply",
     "trace",
 ]
-
-
-def refine(gaussians: Gaussians, views: Views, seconds: float, **options: Any) -> Any:
-    """Optimise Gaussians (1, G) of one scene on its photos `views` (1, V) for some seconds.
-
-    Returns a `qgs_photos.refine.RefinedScene`, whose `gaussians` are the result; `options` as in
-    `qgs_photos.refine.refine`. Raises ExtensionError where query-gaussians-photos is not installed.
-    """
-    from qgs.extensions import function
-
-    return function("qgs.refiners", "gaussians")(gaussians, views, seconds, **options)
-
-
-def trace(
-    model: QueryGaussianModel,
-    layers: Collection[int] | None = None,
-    queries: Sequence[int] | None = None,
-) -> AbstractContextManager[Any]:
-    """Record states and attention weights of `queries` in `layers` (numbers; None: all of them).
-
-    Gives a `qgs_viewer.trace.Trace` of the last forward pass inside the `with` block. Raises
-    ValueError for layers or queries that do not exist, ExtensionError where
-    query-gaussians-viewer is not installed.
-    """
-    from qgs.extensions import function
-
-    return function("qgs.traces", "queries")(model, layers, queries)
 
 
 def __getattr__(name: str) -> Any:

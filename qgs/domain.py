@@ -36,16 +36,13 @@ WORDS = {
 }
 """What is measured of a sample, lengths in the model's units."""
 REMEDIES = {
-    "--scale": ("another scale of the world", {"baseline", "depth", "fov"}),
-    "--frames": ("other input views", {"baseline", "turn", "depth"}),
-    "--inputs": ("another number of them", {"views"}),
+    "scale": ("another scale of the world", {"baseline", "depth", "fov"}),
+    "frames": ("other input views", {"baseline", "turn", "depth"}),
+    "inputs": ("another number of them", {"views"}),
 }
-"""What may bring views into the trained range, by option of `qgs reconstruct`, and which of WORDS
-it helps. The scale comes first: it costs nothing and moves baseline and depth together."""
-OF_RECIPES = {"--scale": "views.scale", "--frames": "views.gap", "--inputs": "views.inputs"}
-"""The same in recipes, for commands that evaluate one."""
-SEARCHED = {"--scale": ""}
-"""Where the best scale was searched: another one is no remedy."""
+"""What may bring views into the trained range, by option, and which of WORDS it helps.
+
+The scale comes first: it costs nothing and moves baseline and depth together."""
 
 
 @dataclass
@@ -105,17 +102,17 @@ class Domain:
         return phrases
 
 
-def verdict(trained: Domain, found: Domain, options: Mapping[str, str] = {}) -> str:
-    """A sentence that compares views with the training's, and what may help.
+def verdict(trained: Domain, found: Domain, fixed: Collection[str] = ()) -> str:
+    """Return a sentence that compares views with the training's, and what may help.
 
-    trained: empty if unknown. options: as in `remedies`.
+    trained: empty if unknown. fixed: as in `remedies`.
     """
     if not trained.values:
         return "the checkpoint does not record the views on which this model was trained"
     if outside := trained.differences(found):
         return (
             f"the views lie outside what this model was trained on: {', '.join(outside.values())}. "
-            f"Expect a worse result than inside: {remedies(outside, options)}"
+            f"Expect a worse result than inside: {remedies(outside, fixed)}"
         )
     return (
         "the cameras lie within what this model was trained on, in distance, direction, depth and "
@@ -123,15 +120,15 @@ def verdict(trained: Domain, found: Domain, options: Mapping[str, str] = {}) -> 
     )
 
 
-def remedies(outside: Collection[str], options: Mapping[str, str] = {}) -> str:
-    """What to try where views leave the trained range in `outside`, of WORDS.
+def remedies(outside: Collection[str], fixed: Collection[str] = ()) -> str:
+    """Return what to try where views leave the trained range in `outside`, of WORDS.
 
-    options: other names of those of REMEDIES, such as OF_RECIPES; one without a name is left out.
+    fixed: options of REMEDIES that cannot help, such as a scale that was searched.
     """
     tries = [
-        f"{what} ({options.get(option, option)})"
+        f"{what} ({option})"
         for option, (what, helped) in REMEDIES.items()
-        if helped & {*outside} and options.get(option, option)
+        if helped & {*outside} and option not in fixed
     ]
     last = "train on views like these"
     return f"try {', then '.join(tries)}, or {last}" if tries else last
@@ -173,8 +170,8 @@ class FirstViews:
             return
         if faults := [*filter(None, self._faults(views))]:
             warn_once(
-                f"{'; '.join(faults)}. Expect a poor result. `model.reconstruct(views)` brings "
-                "cameras in any frame and unit to those of the model"
+                f"{'; '.join(faults)}. Expect a poor result. `qgs.reconstruct(model, views)` "
+                "brings cameras in any frame and unit to those of the model"
             )
 
     def _faults(self, views: Views) -> Iterator[str]:

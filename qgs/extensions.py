@@ -46,17 +46,6 @@ def _where(entry: EntryPoint) -> str:
     return f"{entry.group} {entry.name!r}{of} ({entry.value})"
 
 
-def function(group: str, name: str) -> Any:
-    """The function that entry point `name` of `group` offers.
-
-    Raises ExtensionError with the distribution to install where none does, or to update.
-    """
-    for entry in installed(group):
-        if entry.name == name:
-            return imported(entry)
-    raise ExtensionError(f"this needs a plug-in with {group} {name!r}: {INSTALL_ALL}")
-
-
 @lru_cache(maxsize=16)
 def _read(group: str, searched: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]:
     return tuple(entry_points(group=group))

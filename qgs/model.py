@@ -1,6 +1,6 @@
 """The model: views to image memory, queries through the decoder layers, states to Gaussians."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -18,6 +18,7 @@ from qgs.contracts import (
     Supervision,
 )
 from qgs.domain import Domain
+from qgs.model_text import model_text
 from qgs.types import (
     Cameras,
     Gaussians,
@@ -42,9 +43,6 @@ class QueryGaussianModel(nn.Module):
     trained_on: statistics of the training views, as its checkpoint records them, or None.
     loaded_from: its checkpoint as `qgs.load` takes it, an absolute path; "" if it was not loaded.
     """
-
-    reconstruct: Callable[..., Any]
-    """From photos in any world to a `Reconstruction`; `qgs.reconstruction` adds this method."""
 
     def __init__(
         self,
@@ -76,6 +74,9 @@ class QueryGaussianModel(nn.Module):
         self.releases: Mapping[str, tuple[str, str]] = {}
         self.trained_on: Domain | None = None
         self.loaded_from = ""
+
+    def __repr__(self) -> str:
+        return model_text(self)
 
     @property
     def depth(self) -> int:

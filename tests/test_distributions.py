@@ -1,17 +1,22 @@
-"""Messages name the distributions of this repository, whose entry points are as told."""
+"""One line installs all distributions of this repository, from a checkout and as a release."""
 
 import tomllib
 from pathlib import Path
 
-import qgs
-
 ROOT = Path(__file__).parents[1]
 
 
-def test_messages_name_the_distributions_of_this_repository():
-    offered = {}
-    for file in ROOT.glob("plugins/*/pyproject.toml"):
-        project = tomllib.loads(file.read_text())["project"]
-        for group, entries in project["entry-points"].items():
-            offered.setdefault(group, {}).update(dict.fromkeys(entries, project["name"]))
-    assert {group: offered[group] for group in qgs.DISTRIBUTIONS} == qgs.DISTRIBUTIONS
+def project(folder):
+    return tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"]
+
+
+def test_all_distributions_are_named_where_everything_is_installed():
+    folders = sorted(path.parent.name for path in ROOT.glob("plugins/*/pyproject.toml"))
+    lines = (ROOT / "plugins/all.txt").read_text().split("\n")
+    assert (
+        sorted(line.removeprefix("-e plugins/") for line in lines if "plugins/" in line) == folders
+    )
+    names = {project(f"plugins/{folder}")["name"] for folder in folders}
+    everything = project(".")["optional-dependencies"]["all"]
+    assert names == {name.split(">")[0] for name in everything if name.startswith("query-")}
+    assert names == {f"query-gaussians-{folder}" for folder in folders}

@@ -79,7 +79,7 @@ def main() -> None:
     scene = recipe.build_data().scenes("test")[0]
     frames = list(range(recipe.views.inputs))
     photos = qgs.Views(scene.images(frames)[None], scene.cameras[frames][None])
-    result = model.reconstruct(photos)  # normalises the poses as in training
+    result = qgs.reconstruct(model, photos)  # normalises the poses as in training
     qgs.save_ply(result.in_photos_world, options.out)
     qgs.save(model, options.out.with_suffix(".safetensors"))
     print(f"{result.in_photos_world.count} Gaussians in {options.out}")

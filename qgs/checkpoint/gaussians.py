@@ -1,4 +1,4 @@
-"""Gaussians as files: PLY of the 3DGS release, and formats that distributions add."""
+"""Gaussians as files: PLY of the 3DGS release, .splat, and formats that distributions add."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -37,6 +37,9 @@ REST = tuple(f"f_rest_{index}" for index in range(3 * SH_COUNTS[-1]))
 as zeros too: the viewer of the 3DGS release and plugins of game engines need all of them."""
 PROPERTIES = (*_MEANS, "nx", "ny", "nz", *_COLORS, *REST, "opacity", *_SCALES, *_QUATS)
 
+SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+"""A Gaussian of a .splat file, 32 bytes. Source: github.com/antimatter15/splat, convert.py."""
+
 _HEADER = 2**16  # bytes of a header, at most: that of the 3DGS release has 1,500
 
 
@@ -60,8 +63,10 @@ def scene_writers() -> Mapping[str, Callable[[], Callable[[Gaussians, str | Path
 
     Finding one raises ExtensionError where its distribution cannot be imported.
     """
-    added = {f".{e.name.lower()}": partial(imported, e) for e in installed(WRITER_GROUP)}
-    return {**added, ".ply": lambda: save_ply}
+    added = {
+        f".{entry.name.lower()}": partial(imported, entry) for entry in installed(WRITER_GROUP)
+    }
+    return {**added, ".ply": lambda: save_ply, ".splat": lambda: save_splat}
 
 
 def save_ply(gaussians: Gaussians, path: str | Path) -> None:
@@ -88,6 +93,28 @@ def save_ply(gaussians: Gaussians, path: str | Path) -> None:
             vertices[name] = column
     with replacing(path) as temporary, temporary.open("wb") as file:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(file)
+
+
+def save_splat(gaussians: Gaussians, path: str | Path) -> None:
+    """Write one scene, (G, ...) or (1, G, ...), the largest and most opaque Gaussians first.
+
+    Colours, opacities and quaternions, w x y z, get 8 bits. Warns that spherical harmonics and
+    `features` are left out. Raises as `save_ply`.
+    """
+    scene = one_scene(gaussians, ".splat", "sh", "features")
+    # Viewers draw a file while it loads, so what covers most comes first.
+    first = (scene.scales.prod(-1) * scene.opacities).argsort(descending=True, stable=True)
+    scene = scene[first]
+
+    def as_bytes(values: Tensor) -> Tensor:
+        return values.round().clamp(0, 255).byte()
+
+    records = np.empty(scene.count, SPLAT)
+    records["mean"], records["scale"] = scene.means, scene.scales
+    records["rgba"] = as_bytes(torch.cat([scene.colors, scene.opacities[:, None]], -1) * 255)
+    records["quat"] = as_bytes(F.normalize(scene.quats, dim=-1) * 128 + 128)
+    with replacing(path) as temporary:
+        temporary.write_bytes(records.tobytes())
 
 
 def load_ply(path: str | Path) -> Gaussians:

@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-import qgs
 from qgs.checkpoint.models import checkpoint_path
 from qgs.checkpoint.tensors import (
     SEAL,
@@ -28,6 +27,7 @@ from qgs.machine import TooLargeError
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, RecipeError
 from qgs.recipe.registry import available_plugins
+from qgs.version import __version__
 from qgs.wording import listed
 
 FORMAT_VERSION = 3
@@ -186,7 +186,7 @@ def write_checkpoint(
         _PLUGINS: json.dumps({name: version for name, (_, version) in releases.items()}),
         _DISTRIBUTIONS: json.dumps({name: origin for name, (origin, _) in releases.items()}),
         _FORMAT: str(FORMAT_VERSION),
-        _VERSION: qgs.__version__,
+        _VERSION: __version__,
         **{_EXTRA + key: value for key, value in extra.items()},
     }
     write_tensors(path, tensors, metadata)

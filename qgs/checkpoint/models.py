@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from qgs.extensions import function
+from qgs.checkpoint.download import downloaded
 from qgs.recipe.errors import did_you_mean
 from qgs.recipe.registry import available_plugins, load_plugin
 
@@ -15,9 +15,9 @@ def checkpoint_path(name: str | os.PathLike[str]) -> Path:
     """The local file that `name` stands for; anything that exists under that name comes first.
 
     name: a path, of a run folder for the checkpoint in it, PLUGIN/NAME of a model that an installed
-    plugin ships (`qgs list`), or a URL that fsspec opens, see `qgs_research.published.downloads`.
-    Raises FileNotFoundError, PluginError for a plugin that cannot be used, ExtensionError for
-    downloads that are not installed, OSError for one that fails.
+    plugin ships (`qgs list`), or a URL that fsspec opens, see `qgs.checkpoint.download`.
+    Raises FileNotFoundError, PluginError for a plugin that cannot be used, OSError for a
+    download that fails.
     """
     text = os.fspath(name)
     path = Path(text).expanduser()
@@ -25,10 +25,14 @@ def checkpoint_path(name: str | os.PathLike[str]) -> Path:
     if path.exists():
         path = path / CHECKPOINT if path.is_dir() else path
     elif "://" in text:
-        return function("qgs.downloads", "checkpoint")(text)
-    elif slash and "/" not in model and path.suffix != ".safetensors":
-        if plugin in available_plugins():
-            return _shipped(plugin, text)
+        return downloaded(text)
+    elif (
+        slash
+        and "/" not in model
+        and path.suffix != ".safetensors"
+        and plugin in available_plugins()
+    ):
+        return _shipped(plugin, text)
     if not path.is_file():
         raise FileNotFoundError(
             f"no checkpoint at {path}; give a run folder of `qgs train`, a .safetensors file, its "

@@ -14,10 +14,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-import qgs
 from qgs.contracts.weights import Shapes
 from qgs.files import replacing
 from qgs.recipe import Recipe, RecipeError, resolve
+from qgs.version import __version__
 from qgs.wording import name_shown
 
 SEAL, _DIGEST = "qgs.seal", "qgs.digest"
@@ -123,7 +123,7 @@ class TensorFile:
             written = int(text[:20])
         if written > ours:
             raise CheckpointError(
-                f"{self.path} has {key} {written}, and qgs {qgs.__version__} reads {ours}: "
+                f"{self.path} has {key} {written}, and qgs {__version__} reads {ours}: "
                 "install the newer qgs that wrote it"
             )
         return written

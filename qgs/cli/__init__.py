@@ -8,7 +8,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from qgs.cli import evaluate, inspect, reconstruct, train
+from qgs.cli import convert, evaluate, inspect, reconstruct, train
 from qgs.extensions import INSTALL_ALL, installed
 from qgs.terminal import show_safely
 from qgs.wording import listed
@@ -88,6 +88,7 @@ COMMANDS = {
     "train": train.train,
     "eval": evaluate.evaluate,
     "reconstruct": reconstruct.reconstruct,
+    "convert": convert.convert,
 }
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)

@@ -46,16 +46,17 @@ def evaluate(
     settings = list(overrides or ())
     if index is not None:
         settings.append(f"evaluation.index={json.dumps(index, ensure_ascii=False)}")
-    settings += options.tuning_settings(tune)
     console = Console()
 
     from qgs.checkpoint.model_file import CheckpointFile
     from qgs.evaluate.evaluation import SECTIONS
+    from qgs.evaluate.tuning import tuning_settings
     from qgs.recipe import resolve
     from qgs.train.distributed import choose_device
     from qgs.train.folder import RunFolder
 
     options.use_threads(threads)
+    settings += tuning_settings(tune)
     free = (*SECTIONS, "model.feedback.rounds")
     if foreign := [s for s in settings if not {k := s.split("=")[0], k.split(".")[0]} & {*free}]:
         raise ValueError(f"{foreign[0]} would change the trained model; set only {', '.join(free)}")

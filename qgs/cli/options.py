@@ -1,6 +1,5 @@
 """Options that several commands share."""
 
-import os
 import re
 from typing import Annotated, TypeAlias
 
@@ -41,14 +40,6 @@ ViewsSettings: TypeAlias = Annotated[
     list[str] | None,
     typer.Option("--set", help="Change an option of the recipe's `views`; repeatable."),
 ]
-NoPoses: TypeAlias = Annotated[
-    bool,
-    typer.Option(
-        "--no-poses",
-        help="Refuse photos without camera poses and videos, of which poses are made otherwise.",
-        callback=lambda given: os.environ.update(QGS_NO_POSES="1") if given else None,
-    ),
-]
 Scale: TypeAlias = Annotated[
     float | None,
     typer.Option(
@@ -61,21 +52,6 @@ TUNE_HELP = (
     "features of the photos; 0 for none."
 )
 Tune: TypeAlias = Annotated[str | None, typer.Option(metavar="[WHAT:]STEPS", help=TUNE_HELP)]
-
-
-def tuning_settings(tune: str | None) -> list[str]:
-    """The settings that --tune stands for; WHAT alone takes 50 steps (TokenGS).
-
-    Raises ValueError for any other text.
-    """
-    if tune is None:
-        return []
-    match = re.fullmatch(r"(?:(queries|latents):)?(\d+)|(queries|latents)", tune)
-    if match is None:
-        raise ValueError(f"--tune must be STEPS, queries[:STEPS] or latents[:STEPS], got {tune!r}")
-    what, steps = match[1] or match[3], match[2]
-    settings = [f"evaluation.tuning_steps={steps or 50}"]
-    return [*settings, *([f"evaluation.tuning={what}"] if what else [])]
 
 
 def scale_settings(scale: float | None) -> list[str]:

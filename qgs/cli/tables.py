@@ -9,15 +9,16 @@ from rich.markup import escape
 from rich.table import Table
 
 from qgs.checkpoint.models import about, card_of, checkpoint_path
+from qgs.contracts import LAYER_SLOTS
 from qgs.model import QueryGaussianModel
+from qgs.model_text import parameter_counts
 from qgs.recipe import Recipe
 from qgs.recipe.decode import SETTINGS
 from qgs.recipe.errors import did_you_mean
 from qgs.recipe.registry import Registry, default_config
 from qgs.recipe.schema import recipe_schema
-from qgs.recipe.slots import LAYER_SLOTS, MODEL_SLOTS, SLOTS
+from qgs.recipe.slots import MODEL_SLOTS, SLOTS
 from qgs.recipe.yaml_text import inline
-from qgs.reconstruction.shown import parameter_counts
 
 Schema = Mapping[str, Any]
 

@@ -11,8 +11,7 @@ import typer
 from rich.console import Console
 
 from qgs.cli.evaluate import evaluate_into
-from qgs.cli.options import Device, NoPoses, Overrides, Threads, use_threads
-from qgs.extensions import function
+from qgs.cli.options import Device, Overrides, Threads, use_threads
 from qgs.wording import listed
 
 if TYPE_CHECKING:
@@ -26,16 +25,7 @@ def train(
         bool, typer.Option("--resume", help="Continue the run in --out; start it if there is none.")
     ] = False,
     overrides: Overrides = None,
-    slurm: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            metavar="N",
-            help="Write OUT.slurm.sh, a job on N GPUs of a node; no training.",
-        ),
-    ] = None,
     threads: Threads = None,
-    no_poses: NoPoses = False,
     device: Device = "auto",
 ) -> None:
     """Train a model, then evaluate it on views it never saw.
@@ -57,15 +47,6 @@ def train(
     console = Console()
     resolved = with_absolute_path(resolve(recipe, overrides or ()))
     index_of(resolved)  # a missing index raises now, not after the training
-    if slurm:
-        resolved.training.scenes_per_batch(slurm)
-        words = [str(recipe), "--out", str(out), "--device", device]
-        words += [word for text in overrides or () for word in ("--set", text)]
-        words += ["--threads", str(threads)] if threads else []
-        cpus = (threads or 1) + resolved.training.workers
-        script = function("qgs.jobs", "slurm")(out, words, slurm, cpus, device != "cpu")
-        console.print(f"wrote {script}; submit it with: sbatch {script}", soft_wrap=True)
-        return
     try:
         result = train_model(resolved, out, console=console, device=device, resume=resume)
     except TrainingError as error:

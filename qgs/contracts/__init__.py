@@ -16,6 +16,8 @@ from qgs.contracts.component import (
 )
 from qgs.contracts.data import Frames, Scene, SceneSource, SceneSourceConfig, Split, ViewSampler
 from qgs.contracts.decoder import (
+    LAYER_SLOTS,
+    SUBLAYER_SLOTS,
     AttentionWeights,
     CrossAttention,
     DecoderLayer,
@@ -40,7 +42,9 @@ from qgs.contracts.weights import LayoutError, Rename, WeightLayout
 __all__ = [
     "CONTRACT_VERSION",
     "GAUSSIAN_FIELDS",
+    "LAYER_SLOTS",
     "MEMORY_FIELDS",
+    "SUBLAYER_SLOTS",
     "AttentionWeights",
     "Centers",
     "Column",

@@ -14,6 +14,10 @@ from torch import Tensor
 from qgs.contracts.component import ComponentConfig, ModelComponent, ModelDims
 from qgs.types import ImageMemory, QueryState, Rendering, Views
 
+SUBLAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward")
+LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
+"""Slots of the decoder that one of its layers may fill otherwise than the others."""
+
 
 @dataclass(frozen=True)
 class AttentionWeights:

@@ -46,7 +46,7 @@ def choose_windows(
         besides = f" beside {len(held)} held-out ones" if held else ""
         raise ValueError(
             f"there are {len(usable)} photos{besides}, too few for {inputs} input views: add "
-            "photos, or let qgs reconstruct take fewer (--inputs) or hold none out (--holdout none)"
+            "photos, take fewer inputs, or hold no photos out"
         )
     targets = held or (usable if len(usable) > inputs else [])
     if not targets:

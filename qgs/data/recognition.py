@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from upath import UPath
 
 from qgs.contracts import Component, SceneSource, SceneSourceConfig, component_of
+from qgs.data.photos import with_cameras
 from qgs.paths import opened_path
 from qgs.wording import one_line, warn_once
 
@@ -24,7 +25,7 @@ def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
     if len(found) > 1:
         warn_once(
             f"{path} looks like data of {' and of '.join(found)}, and is read as {found[0]}; to "
-            "choose another, name it as `data.type` of a recipe, or as --format of `qgs data check`"
+            "choose another, name it as `data.type` of a recipe"
         )
     return found[0] if found else "qgs/photos"  # whose errors say best what a folder lacks
 
@@ -58,7 +59,8 @@ def open_for(
 ) -> tuple[SceneSource, bool]:
     """The data at `path`, and whether a model with the data `trained` was trained on it.
 
-    Then it has the same options, held-out frames included; else it is opened as `recognised`.
+    Then it has the same options, held-out frames included; else it is opened as `recognised`, and
+    photos without cameras get some (`with_cameras`).
     image_size: (H, W), by default that of `trained`. Raises as `recognised` and the source do.
     """
     size = image_size or (trained or SceneSourceConfig()).image_size
@@ -66,6 +68,9 @@ def open_for(
         source = component_of(trained)
         assert issubclass(source, SceneSource)
         return source(trained.model_copy(update={"path": path, "image_size": size})), True
-    source = sources[recognised(opened_path(path), sources)]
+    kind = recognised(opened_path(path), sources)
+    if kind == "qgs/photos":
+        path = str(with_cameras(opened_path(path)))
+    source = sources[kind]
     assert issubclass(source, SceneSource)
     return source(source.config_for(path, size, trained)), False

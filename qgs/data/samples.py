@@ -115,8 +115,7 @@ def refuse_too_many(frames: int, scene: Scene) -> None:
     refuse_more_than_memory(
         f"a sample of {frames} images of {height} x {width}",
         {"images": frames * 3 * height * width * torch.float32.itemsize},
-        "Ask for fewer views (views.inputs, views.targets, --inputs, --holdout) or smaller images "
-        "(data.image_size, --size).",
+        "Ask for fewer views (views.inputs, views.targets) or smaller images (data.image_size).",
     )
 
 
@@ -281,7 +280,7 @@ def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[T
     if views.scale == "search":
         raise ValueError(
             "views.scale: search finds the scale at which a trained model renders photos best, so "
-            "it is for qgs reconstruct, view, demo and report --photos alone; write auto, distance "
+            "it is for photos of a user alone; write auto, distance "
             "or constant"
         )
     c2w = scene.cameras.c2w[list(input_frames)]

@@ -10,11 +10,11 @@ import torch
 
 from qgs.contracts import Column, Metric, MetricInput, SceneSource, ViewSampler
 from qgs.data.samples import Sample, stack_views
-from qgs.domain import OF_RECIPES, SEARCHED, Domain, remedies, verdict
+from qgs.domain import Domain, remedies, verdict
 from qgs.evaluate.plan import EvaluationPlan, SceneFailure, ViewsOf
 from qgs.evaluate.protocol import index_of, protocol_of
 from qgs.evaluate.results import TUNING, Evaluation, SceneScore
-from qgs.extensions import function
+from qgs.evaluate.tuning import tuner
 from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.dispersion import OPACITY_USED
 from qgs.model import QueryGaussianModel
@@ -34,7 +34,6 @@ def evaluate(
     batch: int = 1,
     observe: Callable[[int, int], None] | None = None,
     trained_on: Domain | None = None,
-    options: Mapping[str, str] = OF_RECIPES,
     views_of: ViewsOf | None = None,
     sampler: ViewSampler | None = None,
 ) -> Evaluation:
@@ -43,9 +42,8 @@ def evaluate(
     A scene that fails is named in the result with the reason, and the others go on. Restores the
     model's mode. step: optimiser steps behind the weights. batch: scenes in one forward pass; with
     tuning each passes alone. observe: called with (scenes done, all scenes). trained_on: the domain
-    of the model, empty where it is unknown; None leaves out the remark on it. options: what remarks
-    call those of `qgs.domain.REMEDIES`. views_of: see `EvaluationPlan`.
-    sampler: of views, by default the recipe's.
+    of the model, empty where it is unknown; None leaves out the remark on it. views_of: see
+    `EvaluationPlan`. sampler: of views, by default the recipe's.
 
     Raises what opening the data source or the index and `Measures` raise, and ValueError when no
     scene could be scored or `batch` is less than 1.
@@ -83,10 +81,10 @@ def evaluate(
         held_out=None if index else _held_out(source, scores),
         step=step,
     )
-    options = {**options, **(SEARCHED if recipe.views.scale == "search" else {})}
-    likeness = "" if trained_on is None else verdict(trained_on, scorer.seen, options)
+    fixed = ["scale"] if recipe.views.scale == "search" else []
+    likeness = "" if trained_on is None else verdict(trained_on, scorer.seen, fixed)
     own = recipe.tree["data"] == (model.recipe or {}).get("data")
-    remedy = "train for longer" if own else remedies(("baseline", "depth"), options)
+    remedy = "train for longer" if own else remedies(("baseline", "depth"), fixed)
     remarks = likeness, plan.framing, _worse(evaluation, remedy)
     return replace(evaluation, remarks=[*filter(None, remarks)])
 
@@ -178,7 +176,7 @@ class _Scorer:
             metric.to(self._device)
         self._tune = None
         if recipe.evaluation.tuning_steps:
-            self._tune = function("qgs.refiners", "tuner")(model, recipe)
+            self._tune = tuner(model, recipe)
 
     def scores(
         self, samples: Iterable[Sample | SceneFailure], batch: int

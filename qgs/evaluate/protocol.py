@@ -10,7 +10,7 @@ from qgs.contracts import Metric, SceneSource, SceneSourceConfig
 from qgs.contracts.schedule import END, at_step
 from qgs.data.view_samplers import Span
 from qgs.evaluate.plan import EvaluationIndex, read_index
-from qgs.extensions import function
+from qgs.evaluate.tuning import tuning_loss
 from qgs.recipe import Recipe
 
 
@@ -92,7 +92,7 @@ def protocol_of(
             "steps": evaluation.tuning_steps,
             "rate": evaluation.rate,
             "optimizer": "Adam",
-            "loss": function("qgs.refiners", "tuning_loss")(recipe).config.model_dump(mode="json"),
+            "loss": tuning_loss(recipe).config.model_dump(mode="json"),
         }
     for path, chosen in recipe.parts.items():
         metric = chosen.component

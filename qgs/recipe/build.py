@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from qgs.contracts import (
+    SUBLAYER_SLOTS,
     Component,
     LayerParts,
     ModelComponent,
@@ -27,7 +28,7 @@ from qgs.recipe.decode import Chosen
 from qgs.recipe.errors import Problems, RecipeError, RecipeProblem
 from qgs.recipe.places import near_pattern
 from qgs.recipe.registry import BUILTIN, component_failure
-from qgs.recipe.slots import AFTER_LAYERS, SUBLAYER_SLOTS
+from qgs.recipe.slots import AFTER_LAYERS
 from qgs.recipe.yaml_text import KeyPath, MapNode, find
 
 

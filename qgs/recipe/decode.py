@@ -12,6 +12,7 @@ from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails, PydanticUndefinedType, to_jsonable_python
 
 from qgs.contracts import (
+    LAYER_SLOTS,
     Component,
     ComponentConfig,
     EvaluationConfig,
@@ -23,7 +24,7 @@ from qgs.contracts.schedule import Schedule, at_step, number_kinds
 from qgs.recipe.errors import Problems, did_you_mean, nearest
 from qgs.recipe.places import Place
 from qgs.recipe.registry import InstalledPlugin, Registry, available_plugins, component_failure
-from qgs.recipe.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, SLOTS, type_at
+from qgs.recipe.slots import MODEL_SLOTS, SECTIONS, SLOTS, type_at
 from qgs.recipe.yaml_text import KeyPath, ListNode, MapNode, find, inline, kind_of
 from qgs.tokengs.schedules import SCHEDULES
 

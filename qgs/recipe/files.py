@@ -6,7 +6,6 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
-import qgs
 from qgs.paths import open_file
 from qgs.recipe.errors import Origin, Problems, nearest
 from qgs.recipe.slots import type_at
@@ -52,7 +51,7 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
 
 def recipe_folder() -> Path:
     """The recipes that come with qgs: in its wheel, else in the repository that it runs from."""
-    package = Path(qgs.__file__).parent
+    package = Path(__file__).parents[1]
     inside = package / "recipes"
     return inside if inside.is_dir() else package.parent / "recipes"
 

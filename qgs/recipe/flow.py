@@ -4,12 +4,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, TypeAlias
 
-from qgs.contracts import Refinement, Supervision
+from qgs.contracts import LAYER_SLOTS, SUBLAYER_SLOTS, Refinement, Supervision
 from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpec, RecipeContext
 from qgs.recipe.decode import Chosen
 from qgs.recipe.errors import Problems
 from qgs.recipe.registry import Registry, component_failure, default_config
-from qgs.recipe.slots import AFTER_LAYERS, LAYER_SLOTS, SUBLAYER_SLOTS
+from qgs.recipe.slots import AFTER_LAYERS
 from qgs.recipe.yaml_text import KeyPath, MapNode, find
 
 Parts: TypeAlias = Mapping[KeyPath, Chosen | None]

@@ -4,9 +4,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
+from qgs.contracts import LAYER_SLOTS
 from qgs.recipe.errors import Origin, Problems, nearest
 from qgs.recipe.files import merge
-from qgs.recipe.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS, Slot, slot_at
+from qgs.recipe.slots import MODEL_SLOTS, SECTIONS, Slot, slot_at
 from qgs.recipe.yaml_text import KeyPath, MapNode, Node, kind_of
 
 

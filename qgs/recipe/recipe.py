@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from qgs import contracts
+from qgs.contracts import LAYER_SLOTS
 from qgs.contracts.schedule import Schedule
 from qgs.machine import refuse_more_than_memory
 from qgs.model import QueryGaussianModel
@@ -27,7 +28,7 @@ from qgs.recipe.flow import (
 )
 from qgs.recipe.places import apply_swaps, expand
 from qgs.recipe.registry import Registry, load_plugins
-from qgs.recipe.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
+from qgs.recipe.slots import MODEL_SLOTS, SECTIONS
 from qgs.recipe.yaml_text import KeyPath, ListNode, MapNode, from_plain, inline
 
 

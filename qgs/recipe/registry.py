@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
-import qgs
 import qgs.data
 import qgs.losses
 import qgs.metrics
@@ -18,6 +17,7 @@ from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
 from qgs.recipe.errors import Origin, Problems
 from qgs.recipe.slots import SLOTS
 from qgs.recipe.yaml_text import ListNode, MapNode, kind_of
+from qgs.version import __version__
 
 BUILTIN = Plugin(
     name="qgs",
@@ -80,7 +80,7 @@ class Registry:
 
 def builtin() -> InstalledPlugin:
     """The plugin `qgs`."""
-    return InstalledPlugin(BUILTIN, "query-gaussians", qgs.__version__)
+    return InstalledPlugin(BUILTIN, "query-gaussians", __version__)
 
 
 def available_plugins() -> dict[str, list[EntryPoint]]:
@@ -143,7 +143,7 @@ def load_plugin(name: str) -> InstalledPlugin:
     available = available_plugins()
     if not (entries := available.get(name)):
         installed = ", ".join(sorted(available)) or "none"
-        fix = f"install the one that does, or {extensions.INSTALL_ALL}; installed plugins: {installed}"
+        fix = f"{extensions.INSTALL_ALL}; installed plugins: {installed}"
         raise PluginError(f"no installed distribution offers a plugin `{name}`", fix)
     if len(entries) > 1:
         releases = ", ".join(sorted(map(_release, entries)))

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from qgs import contracts
+from qgs.contracts import LAYER_SLOTS
 from qgs.recipe.yaml_text import KeyPath, MapNode
 
 
@@ -57,8 +58,6 @@ SLOTS = {
 }
 AFTER_LAYERS = ("feedback", "head", "centers", "supervision", "renderer")
 MODEL_SLOTS = ("encoder", "queries", *AFTER_LAYERS)
-SUBLAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward")
-LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
 _SECTIONS = ("losses", "objective", "data", "view_sampler", "metrics", "optimizer")
 SECTIONS = {name: SLOTS[name] for name in _SECTIONS}
 """Slots that are top-level sections of a recipe."""

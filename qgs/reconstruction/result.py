@@ -12,7 +12,7 @@ from torch import Tensor
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.inputs import NOVEL, Frusta, Window, choose_windows
 from qgs.data.samples import Sample, evenly, make_sample, moments, own_world, spread
-from qgs.domain import SEARCHED, Domain, remedies
+from qgs.domain import Domain, remedies
 from qgs.evaluate.plan import ViewsOf
 from qgs.geometry.poses import relative_to, scaled
 from qgs.geometry.transforms import moved
@@ -125,8 +125,8 @@ class Reconstruction:
         if not rows:
             return ""
         model, nearest = (sum(values) / len(rows) for values in zip(*rows, strict=True))
-        tries = remedies(("baseline", "depth"), SEARCHED if self.scale else {})
-        remedy = f"{tries}; --refine SECONDS fits the result to its photos"
+        tries = remedies(("baseline", "depth"), ["scale"] if self.scale else [])
+        remedy = f"{tries}; `qgs refine` fits the result to its photos"
         remedy = "refine for longer, or on more photos" if self.refinement else remedy
         return worse_than_nearest(Psnr.column, model, nearest, remedy)
 
@@ -146,7 +146,7 @@ class Reconstruction:
         return replace(seen, depth=seen.depth / float(scale))
 
     def save(self, out: str | PathLike[str]) -> list[Path]:
-        """Write the files of `qgs reconstruct`; returns their paths. See `qgs.reconstruction.saving`."""
+        """Write the files of `qgs reconstruct` and return their paths."""
         from qgs.reconstruction.saving import write_reconstruction  # Matplotlib is slow to import
 
         return write_reconstruction(self, Path(out))

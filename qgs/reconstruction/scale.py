@@ -60,9 +60,9 @@ class FoundScale:
         if not self.psnr >= POOR:  # NaN is poor too
             return (
                 f"no scale fits, at the best the photos are rendered at {self.psnr:.1f} dB: choose "
-                "inputs that overlap more (--frames), or give the scale (--scale)"
+                "inputs that overlap more (frames), or give the scale"
             )
-        alone = "inputs alone can mislead the search: add photos between them, or give --scale"
+        alone = "inputs alone can mislead the search: add photos between them, or give the scale"
         return "" if self.further else alone
 
     @property

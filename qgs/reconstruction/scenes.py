@@ -1,10 +1,10 @@
 """Photos of a user as one scene, and its reconstruction in one call."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from os import PathLike, fspath
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -13,20 +13,20 @@ from qgs.contracts import Component, Encoder, Scene, SceneSource, SceneSourceCon
 from qgs.data.images import framing
 from qgs.data.recognition import is_training_data, open_for
 from qgs.data.samples import Sample, training_frames, views_in
-from qgs.domain import SEARCHED, Domain, value_range_problem, verdict
+from qgs.domain import Domain, value_range_problem, verdict
+from qgs.evaluate.tuning import tuned_gaussians, tuning_settings
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.recipe.registry import load_usable_plugins
 from qgs.reconstruction.result import Reconstruction, choose_sample, reconstruct_sample
 from qgs.reconstruction.scale import ScaleSearch, photo_settings
-from qgs.types import Cameras, Gaussians, Views
+from qgs.types import Cameras, Views
 from qgs.wording import counted, listed, warn_once
 
 HOLDOUT = 8
 """Every n-th photo of a user's scene is held out, as papers on novel views do (Mip-NeRF 360)."""
 Frames: TypeAlias = str | Sequence[int | str]
 Size: TypeAlias = tuple[int, int]
-Tuning: TypeAlias = Callable[[Views], tuple[Gaussians, Mapping[str, Any]]]
 
 
 def read_photos(
@@ -61,7 +61,7 @@ def reconstruct(
     size: Size | None = None,
     scene: str | None = None,
     overrides: Sequence[str] = (),
-    tune: Tuning | None = None,
+    tune: str | None = None,
 ) -> Reconstruction:
     """Reconstruct one scene as `qgs reconstruct` does, in the frame of the recipe.
 
@@ -77,7 +77,7 @@ def reconstruct(
     size: (H, W) of the photos of a folder; by default see `chosen_scene`.
     scene: name, where a folder holds several.
     overrides: of the recipe's `views`, such as "views.scale=auto".
-    tune: from the inputs to Gaussians and a record of their tuning, in place of the forward pass.
+    tune: fit queries or latents to the inputs first, see `qgs.evaluate.tuning.tuning_settings`.
 
     Raises ValueError for a model without a recipe, several scenes, and images out of range, and as
     the data do.
@@ -89,7 +89,7 @@ def reconstruct(
         )
     if foreign := [text for text in overrides if not text.startswith("views.")]:
         raise ValueError(f"only options of `views` can be set here, got {listed(foreign)}")
-    recipe = resolve(model.recipe, overrides)
+    recipe = resolve(model.recipe, [*overrides, *tuning_settings(tune)])
     if isinstance(photos, Views):
         if size is not None or scene is not None:
             raise ValueError("`size` and `scene` are for folders: Views have one scene and size")
@@ -106,8 +106,10 @@ def reconstruct(
     sample, world = choose_sample(found, recipe.views, inputs, wanted, against, domain, search)
     training = model.training
     try:
-        tuned, record = tune(sample.inputs) if tune else (None, None)
-        result = reconstruct_sample(model.eval(), sample, world, seen, tuned, record)
+        model.eval()
+        steps = recipe.evaluation.tuning_steps if tune else 0
+        tuned, record = tuned_gaussians(model, recipe, sample.inputs) if steps else (None, None)
+        result = reconstruct_sample(model, sample, world, seen, tuned, record)
     finally:
         model.train(training)
     result = replace(result, scale=next(iter(search.found.values()), None))
@@ -118,8 +120,8 @@ def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
     """What a user must know of photos and result."""
     sample, found = result.sample, Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)
-    options = SEARCHED if result.scale else {}
-    likeness = verdict(result.model.trained_on or Domain(), found, options)
+    fixed = ["scale"] if result.scale else []
+    likeness = verdict(result.model.trained_on or Domain(), found, fixed)
     poor = result.scale.poor if result.scale else ""
     kept = framing(scene, sample.input_frames[0])
     remarks = choice(sample, scene), likeness, poor, kept, result.worse_than_nearest
@@ -134,7 +136,7 @@ def choice(sample: Sample, scene: Scene, compares: bool = True) -> str:
         return text
     text += f", compared with {listed(names[1])}" if names[1] else ""
     held = f"{len(scene.held_out)} of {counted(len(scene), 'photo')} held out"
-    return f"{text}; {held}, --holdout none holds none" if scene.held_out else text
+    return f"{text}; {held}" if scene.held_out else text
 
 
 class GivenScene(Scene):
@@ -191,8 +193,8 @@ def chosen_scene(
     """
     if recipe.data_config is None and size is None:
         raise ValueError(
-            "the checkpoint's recipe has no data, so its image size is not known; give it, "
-            "such as --size 256x256 (in Python size=(256, 256))"
+            "the checkpoint's recipe has no data, so its image size is not known: give `size`, "
+            "such as 256x256"
         )
     source, is_training_data = open_for(path, size, recipe.data_config, installed_sources())
     scene = named_scene(source, path, name)
@@ -250,7 +252,7 @@ def named_scene(source: SceneSource, path: str, name: str | None) -> Scene:
         (name,) = places
     if name not in places:
         found = f"no scene {name!r}, but" if name is not None else f"{len(places)} scenes:"
-        raise ValueError(f"{path} holds {found} {listed(places)}: name one of them with --scene")
+        raise ValueError(f"{path} holds {found} {listed(places)}: name one of them (scene)")
     split, place = places[name]
     return source.scenes(split)[place]
 

@@ -8,12 +8,13 @@ import numpy as np
 import torch
 from commands import run_qgs
 from numpy.lib.recfunctions import repack_fields
+from numpy.testing import assert_allclose, assert_array_equal
 from plyfile import PlyData, PlyElement
 from tables import must_refuse
 from torch.testing import assert_close
 
 import qgs
-from qgs.checkpoint.gaussians import PROPERTIES, load_ply, save_gaussians, save_ply
+from qgs.checkpoint.gaussians import PROPERTIES, SPLAT, load_ply, save_gaussians, save_ply
 from qgs.extensions import ExtensionError
 from qgs.types import Gaussians, named_tensors
 
@@ -205,3 +206,17 @@ def test_a_format_that_cannot_be_imported_is_refused_before_the_work(install, tm
     missing = tmp_path / "missing.safetensors"  # not even read
     error = run_qgs("reconstruct", missing, tmp_path, "--out", tmp_path / "a.xyz").exception
     assert isinstance(error, ExtensionError)
+
+
+def test_the_bytes_of_a_splat_file(tmp_path):
+    given = random_gaussians(1, 300)
+    qgs.save_ply(given, tmp_path / "scene.ply")
+    run_qgs("convert", tmp_path / "scene.ply", tmp_path / "scene.splat")
+    read = np.frombuffer((tmp_path / "scene.splat").read_bytes(), SPLAT)
+    assert SPLAT.itemsize == 32
+    given = given[0][(given.scales.prod(-1) * given.opacities)[0].argsort(descending=True)]
+    assert_array_equal(read["mean"], given.means)
+    assert_allclose(read["scale"], given.scales, rtol=1e-6)
+    rgba = torch.cat([given.colors, given.opacities[:, None]], 1)
+    assert_allclose(read["rgba"] / 255, rgba, atol=0.002)
+    assert_allclose((read["quat"].astype(float) - 128) / 128, given.quats, atol=0.008)

@@ -13,7 +13,7 @@ from training_runs import run as train
 
 import qgs
 from qgs.cli.evaluate import evaluation_folder
-from qgs.cli.options import tuning_settings
+from qgs.evaluate.tuning import tuning_settings
 from qgs.recipe import resolve
 
 

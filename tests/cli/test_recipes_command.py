@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 from commands import done
 
-import qgs
-from qgs.recipe import RecipeError, resolve
+from qgs.recipe import RecipeError, files, resolve
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 
@@ -63,5 +62,5 @@ def test_the_recipes_of_a_wheel_come_first(tmp_path, monkeypatch):
     inside = tmp_path / "qgs" / "recipes" / "tiny"
     inside.mkdir(parents=True)
     (inside / "locus.yaml").write_text("recipe: 1\nseed: 9\n")
-    monkeypatch.setattr(qgs, "__file__", str(tmp_path / "qgs" / "__init__.py"))
+    monkeypatch.setattr(files, "__file__", str(tmp_path / "qgs/recipe/files.py"))
     assert resolve("tiny/locus.yaml").tree["seed"] == 9

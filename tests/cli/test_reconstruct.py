@@ -114,7 +114,7 @@ def test_a_call_gives_what_the_command_gives(checkpoint, photos, tmp_path, small
     record = written(checkpoint, photos, *words, out=tmp_path / "command")
     assert [view["photo"] for view in record["views"]] == [f"images/{i}.png" for i in (0, 4, 1, 3)]
     chosen = {"frames": [0, "4.png"], "compare": [1, "3.png"], "overrides": ["views.scale=auto"]}
-    result = qgs.load(checkpoint).reconstruct(photos, **chosen)
+    result = qgs.reconstruct(qgs.load(checkpoint), photos, **chosen)
     for file in result.save(tmp_path / "call"):
         by_command = tmp_path / "command" / file.name
         assert file.is_dir() or file.read_bytes() == by_command.read_bytes(), file
@@ -168,7 +168,7 @@ def test_tuned_tokens_meet_the_inputs_better_and_are_told(
     tuning = written(checkpoint, photos, "--tune", 3, "--scale", 0.15, out=tmp_path)["tuning"]
     assert tuning["steps"] == 3
     assert tuning["loss_after"] < tuning["loss_before"]
-    plain = qgs.load(checkpoint).reconstruct(photos, overrides=["views.scale_factor=0.15"])
+    plain = qgs.reconstruct(qgs.load(checkpoint), photos, overrides=["views.scale_factor=0.15"])
     assert plain.tuning is None
     assert not torch.allclose(qgs.load_ply(tmp_path / "gaussians.ply").means, plain.gaussians.means)
 

@@ -95,7 +95,7 @@ def test_one_scene_of_chunks(folders, tmp_path):
 
 
 def test_a_scene_that_is_not_named_or_not_there(folders, tmp_path):
-    with pytest.raises(ValueError, match="holds 2 scenes: a, b: name one of them with --scene"):
+    with pytest.raises(ValueError, match=r"holds 2 scenes: a, b: name one of them \(scene\)"):
         chosen(ROOMS, folders)
     with pytest.raises(ValueError, match="holds no scene 'c', but a, b: name one"):
         chosen(ROOMS, folders, name="c")
@@ -106,7 +106,7 @@ def test_a_scene_that_is_not_named_or_not_there(folders, tmp_path):
 
 
 def test_a_recipe_without_data_takes_the_size_that_is_given(folders):
-    with pytest.raises(ValueError, match="such as --size 256x256"):
+    with pytest.raises(ValueError, match="give `size`, such as 256x256"):
         chosen(NO_DATA, folders / "a")
     for trained in (NO_DATA, recipe("qgs/photos", path=str(folders / "a"))):
         assert chosen(trained, folders / "a", (8, 24))[2] == (8, 24)

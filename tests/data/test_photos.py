@@ -84,11 +84,10 @@ def test_what_cannot_be_meant_is_refused(tmp_path):
         must_refuse(word, opened, folder(tmp_path, **json.loads(text)))
 
 
-def test_folders_and_files_that_are_not_there(tmp_path, monkeypatch):
+def test_folders_and_files_that_are_not_there(tmp_path):
     must_refuse("does not exist", opened, tmp_path / "nothing", kind=FileNotFoundError)
     Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
-    monkeypatch.setenv("QGS_NO_POSES", "1")
-    must_refuse("no camera poses", opened, tmp_path)
+    must_refuse("qgs poses", opened, tmp_path, kind=FileNotFoundError)
     (tmp_path / "transforms.json").write_text("{")
     must_refuse("not valid JSON", opened, tmp_path)
 

@@ -50,7 +50,7 @@ def far(views):
 
 
 def test_views_in_any_world_give_the_same_scene(model, views, far, caplog):
-    result = model.train().reconstruct(far)
+    result = qgs.reconstruct(model.train(), far)
     assert model.training  # as before
     model.eval()
     inputs = result.sample.inputs
@@ -59,14 +59,14 @@ def test_views_in_any_world_give_the_same_scene(model, views, far, caplog):
     assert float(inputs.cameras.c2w[0, 1, :3, 3].norm()) == pytest.approx(0.5, rel=1e-4)
     assert not caplog.text
     torch.testing.assert_close(result.prediction.gaussians.means, model(inputs).gaussians.means)
-    again = model.reconstruct(views)
+    again = qgs.reconstruct(model, views)
     torch.testing.assert_close(again.gaussians.means, result.gaussians.means, atol=1e-3, rtol=1e-3)
     assert result._repr_png_().startswith(b"\x89PNG")
 
 
 def test_gaussians_with_harmonics_lie_in_the_world_of_the_photos(model, far, tmp_path, monkeypatch):
     monkeypatch.setattr(model, "head", VaryingHead(model.head).eval())
-    result = model.reconstruct(far)
+    result = qgs.reconstruct(model, far)
     inputs = result.sample.inputs.cameras
     own = model.render(result.gaussians, inputs)
     plain = model.render(result.gaussians.replace(sh=None), inputs)
@@ -93,7 +93,7 @@ def test_what_cannot_be_reconstructed_is_refused(model, views, photos):
         (by_hand, views, {}, "recipe"),
     ):
         with pytest.raises(ValueError, match=word):
-            chosen.reconstruct(given, **options)
+            qgs.reconstruct(chosen, given, **options)
 
 
 def test_photos_are_read_in_their_own_world_and_size(photos):
@@ -121,7 +121,7 @@ def test_a_loaded_model_checks_the_first_views_that_it_reconstructs(tmp_path, fa
     model(far)
     assert caplog.text.count("not at the origin of the model's world") == 1
     caplog.clear()
-    own = qgs.load(file).reconstruct(far).sample.inputs
+    own = qgs.reconstruct(qgs.load(file), far).sample.inputs
     qgs.load(file)(own)
     assert not caplog.text
     c2w = own.cameras.c2w

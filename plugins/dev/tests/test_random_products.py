@@ -10,9 +10,9 @@ from qgs_dev import Case
 from qgs_dev.inputs import Maker, Sizes
 from qgs_dev.plugins import cases_of
 
-from qgs.contracts import Component
+from qgs.contracts import SUBLAYER_SLOTS, Component
 from qgs.recipe import Recipe, RecipeError, registry, resolve
-from qgs.recipe.slots import SLOTS, SUBLAYER_SLOTS
+from qgs.recipe.slots import SLOTS
 from qgs.recipe.yaml_text import inline
 from qgs.tokengs import LatentQueries
 from qgs.train.training_pass import TrainingPass

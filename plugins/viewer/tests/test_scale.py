@@ -62,7 +62,7 @@ def test_all_commands_choose_the_same_inputs_of_photos_that_the_model_knows(room
     name = str(tmp_path / "own.safetensors")
     data = f"data={{type: qgs/photos, path: {room}, holdout: 4}}"
     qgs.save(qgs.compose(qgs.load(MODEL).recipe, [data]), name)
-    sample = qgs.load(name).reconstruct(room).sample
+    sample = qgs.reconstruct(qgs.load(name), room).sample
     opened = open_source(name, Wanted(photos=str(room)))
     (entry,) = judge(checkpoints([name]), str(room), "cpu")
     inputs, compared = entry.evaluation.scores[0].views[0]

@@ -9,6 +9,7 @@ from qgs.data.photos.colmap import Colmap
 from qgs.data.photos.nerfstudio import Nerfstudio
 from qgs.data.photos.reader import Listing, PhotoReader
 from qgs.extensions import ExtensionError, installed, load
+from qgs.paths import is_local, listing
 from qgs.wording import listed, warn_once
 
 READERS: tuple[type[PhotoReader], ...] = (Nerfstudio, Colmap)
@@ -41,6 +42,16 @@ def readers() -> dict[str, type[PhotoReader]]:
 def formats_of(folder: UPath) -> list[str]:
     """The formats whose listings `folder` holds, in the order of `readers`."""
     return [name for name, reader in readers().items() if reader.recognises(folder)]
+
+
+def with_cameras(path: UPath) -> UPath:
+    """Return `path`, or the folder with cameras that a reader makes of photos without cameras."""
+    folders = [path, *(item for item in listing(path) if item.is_dir())]
+    # A folder of scenes may hold other pictures too.
+    if not is_local(path) or any(map(formats_of, folders)):
+        return path
+    made = (reader.posed(path) for reader in readers().values())
+    return next(filter(None, made), path)
 
 
 def read_listing(folder: UPath, format: str = "auto", images: str | None = None) -> Listing:

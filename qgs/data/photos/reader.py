@@ -89,6 +89,15 @@ class PhotoReader(ABC):
         return (folder / cls.listing).is_file()
 
     @classmethod
+    def posed(cls, path: UPath) -> UPath | None:
+        """Return a folder with cameras for `path`, photos without cameras or a video.
+
+        It is made if need be; None where this format makes no cameras. Commands that open a user's
+        photos ask for it, a training never does.
+        """
+        return None
+
+    @classmethod
     @abstractmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
         """The photos that `folder` lists; neighbours in the list should be neighbours in space.

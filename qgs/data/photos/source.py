@@ -31,7 +31,6 @@ from qgs.data.images import (
 from qgs.data.lenses import Mode, Size, undistorted, whole_zoom
 from qgs.data.photos import formats_of, read_listing, readers
 from qgs.data.photos.checks import refuse_fatal_problems, refuse_outside, size_problems
-from qgs.data.photos.posing import VIDEOS, posed
 from qgs.data.photos.reader import PhotoFrame, existing
 from qgs.data.photos.turning import turned, turned_size, upright
 from qgs.data.samples import held_out_frames
@@ -46,8 +45,8 @@ class PhotosConfig(SceneSource.Config):
 
     path: str
     """Folder of one scene, of folders of scenes, or with such folders in train and test: absolute,
-    relative to the working directory, or an fsspec URL. Photos without cameras, and a video, get
-    poses first."""
+    relative to the working directory, or an fsspec URL. Photos without cameras and videos need
+    `qgs poses` first."""
     format: str = "auto"
     """How cameras are listed: nerfstudio, colmap, or a format of a plug-in; auto is the first that
     a folder holds."""
@@ -239,15 +238,12 @@ class PhotosSource(LazySource):
 
     def __init__(self, config: PhotosConfig) -> None:
         super().__init__(config)
-        root, auto = opened_path(config.path), (config.format, config.images) == ("auto", None)
+        root = opened_path(config.path)
         train = test = {folder_name(root): root}
         if root.is_dir() and not formats_of(root):
             train, test = (_folders(root / part, config) for part in ("train", "test"))
             if not (train and test):
-                place = posed(root) if auto and not _folders(root, config) else root
-                train = test = _folders(root, config) or {folder_name(root): place}
-        elif root.suffix.lower() in VIDEOS:
-            train = test = {folder_name(root): posed(root)}
+                train = test = _folders(root, config) or {folder_name(root): root}
         scenes = LazyScenes(train, partial(PhotoScene, config=config, cache=image_cache()))
         self.splits = {"train": scenes, "test": scenes}
         if train is not test:

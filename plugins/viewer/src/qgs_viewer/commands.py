@@ -15,7 +15,6 @@ from qgs.cli.options import (
     Device,
     Frames,
     Inputs,
-    NoPoses,
     Scale,
     SceneName,
     Size,
@@ -74,7 +73,6 @@ def view(
         bool, typer.Option("--open/--no-open", help="Open it in the browser of this machine.")
     ] = True,
     threads: Threads = None,
-    no_poses: NoPoses = False,
     device: Device = "auto",
 ) -> None:
     """Turn a reconstruction in the browser, pick a query, see its anchor and what it reads.

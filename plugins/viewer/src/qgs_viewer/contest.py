@@ -21,7 +21,7 @@ from qgs.contracts import Scene, ViewsConfig
 from qgs.data.inputs import Window, choose_windows
 from qgs.data.recognition import is_training_data, open_for
 from qgs.data.view_samplers import Span
-from qgs.domain import OF_RECIPES, Domain
+from qgs.domain import Domain
 from qgs.evaluate.evaluation import evaluate
 from qgs.evaluate.plan import evaluation_samples
 from qgs.evaluate.results import Evaluation
@@ -41,7 +41,7 @@ from qgs.train.training import train
 from qgs.wording import counted, listed, short_names
 from qgs_viewer.curves import Curves, curves_of
 from qgs_viewer.report import Contender, Report
-from qgs_viewer.scales import OF_SHOWN, summary
+from qgs_viewer.scales import summary
 
 PICTURED_SCENES = 6
 WINDOWS = 6  # scenes, and windows of a scene, that are judged of a user's photos
@@ -157,7 +157,7 @@ def judge(
             training = file.recipe.training
         of = "" if training.seconds else f" of {training.steps:,}"
         progress = "not known" if step is None else f"step {step:,}{of}"
-        recipe, options = recipes[name], OF_RECIPES if photos is None else OF_SHOWN
+        recipe = recipes[name]
         search, domain = ScaleSearch(model, recipe.views), model.trained_on
         # those of the first model for all, so that one protocol judges them
         if not entries and photos is not None:
@@ -166,7 +166,6 @@ def judge(
             model,
             recipe,
             trained_on=domain,
-            options=options,
             views_of=search,
             sampler=windows,
         )

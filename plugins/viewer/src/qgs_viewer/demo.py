@@ -14,7 +14,6 @@ from rich.console import Console
 
 from qgs.cli.options import (
     Device,
-    NoPoses,
     Scale,
     Size,
     Threads,
@@ -68,7 +67,6 @@ def demo(
     size: Size = None,
     scale: Scale = None,
     threads: Threads = None,
-    no_poses: NoPoses = False,
     device: Device = "auto",
 ) -> None:
     """Trained models on rooms unseen in training, or on your photos; writes report.html.
@@ -104,7 +102,6 @@ def report(
     size: Size = None,
     scale: Scale = None,
     threads: Threads = None,
-    no_poses: NoPoses = False,
     device: Device = "auto",
 ) -> None:
     """Evaluate trained models and show their scenes side by side; writes report.html."""

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from qgs.contracts import AttentionWeights, RendererConfig
 from qgs.model import QueryGaussianModel
+from qgs.reconstruction.trace import Trace, trace
 from qgs.types import Gaussians, ImageMemory, QueryState, SpatialSupport, Views
 from qgs_viewer.placement import Placement, Splats, on_photo, patch_centers, splats
-from qgs_viewer.trace import Trace, trace
 
 Background = tuple[float, float, float]
 NEUTRAL: Background = RendererConfig().background  # of models, unless their recipe changes it

@@ -8,7 +8,7 @@ import torch
 from qgs.contracts import LearnedQueries
 from qgs.drawing.images import depth_picture, depth_range, png_bytes, rgb_picture, side_by_side
 from qgs.model import QueryGaussianModel
-from qgs.reconstruction.shown import heading, parameter_counts, slot_rows
+from qgs.model_text import heading, parameter_counts, slot_rows
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Prediction
 

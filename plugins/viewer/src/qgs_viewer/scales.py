@@ -5,12 +5,6 @@ from collections.abc import Collection
 from qgs.reconstruction.scale import FoundScale
 from qgs.wording import counted
 
-OF_SHOWN = {
-    "--scale": "--scale",
-    **{n: f"{n} of qgs reconstruct" for n in ("--frames", "--inputs")},
-}
-"""Names of `qgs.domain.REMEDIES` for commands that choose the input views themselves."""
-
 
 def summary(found: Collection[FoundScale], option: str = "--scale FACTOR") -> str:
     """One line on the scales of one or several windows, and the option that sets another."""

@@ -18,7 +18,7 @@ from qgs.contracts import Scene, ViewsConfig
 from qgs.data.images import framing
 from qgs.data.recognition import is_training_data
 from qgs.data.samples import make_sample, own_world, views_in
-from qgs.domain import SEARCHED, Domain, verdict
+from qgs.domain import Domain, verdict
 from qgs.geometry.poses import relative_to, scaled
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
@@ -271,7 +271,7 @@ def _of_model(name: str, wanted: Wanted) -> Source:
     notes = [
         *([summary(scales)] if scales else []),
         *([choice(sample, scene, compares=False)] if wanted.photos else []),
-        verdict(trained, found, SEARCHED if scales else {}),
+        verdict(trained, found, ["scale"] if scales else []),
         *(scale.poor for scale in scales),
         framing(scene, frames[0]),
     ]

@@ -64,7 +64,7 @@ def test_a_published_file_gives_the_released_gaussians(name, monkeypatch):
     # near and far of the files differ from view to view
     near, far, own = golden.input("near"), golden.input("far"), model.encoder.predict
     monkeypatch.setattr(model.encoder, "predict", lambda given, *_: own(given, near, far))
-    done = model.reconstruct(views, overrides=["views.scale=constant"])
+    done = qgs.reconstruct(model, views, overrides=["views.scale=constant"])
     assert torch.equal(done.sample.inputs.cameras.c2w, views.cameras.c2w)
     ours, theirs = done.gaussians, golden.tensors
     factors = quat_to_matrix(ours.quats) * ours.scales[..., None, :]

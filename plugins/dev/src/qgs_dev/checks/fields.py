@@ -10,6 +10,7 @@ from torch import Tensor
 from qgs.contracts import (
     CONTRACT_VERSION,
     GAUSSIAN_FIELDS,
+    LAYER_SLOTS,
     MEMORY_FIELDS,
     Component,
     ComponentConfig,
@@ -21,7 +22,7 @@ from qgs.contracts import (
 )
 from qgs.recipe import RecipeError
 from qgs.recipe.recipe import Recipe, resolve
-from qgs.recipe.slots import LAYER_SLOTS, MODEL_SLOTS, SECTIONS
+from qgs.recipe.slots import MODEL_SLOTS, SECTIONS
 from qgs.tokengs import GaussianHead, LatentQueries, MultiViewViT
 from qgs.types import (
     GaussianAttributes,

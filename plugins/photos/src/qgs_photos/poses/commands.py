@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from qgs.cli.options import NoPoses, SceneName, Threads, parse_size, use_threads
+from qgs.cli.options import SceneName, Threads, parse_size, use_threads
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -127,7 +127,6 @@ def video(
         typer.Option(min=1, max=170, help="Vertical angle of view, degrees; default: the photos'."),
     ] = None,
     scene: SceneName = None,
-    no_poses: NoPoses = False,
     threads: Threads = None,
 ) -> None:
     """A camera path through Gaussians, as mp4 or webp."""

@@ -1,11 +1,13 @@
-"""What qgs asks for where photos have no cameras, or a video is given: a folder with poses."""
+"""Photos without cameras and videos that a command opens: COLMAP makes their poses first."""
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from upath import UPath
 
+from qgs.data.photos.reader import Listing, PhotoReader, image_files
 from qgs_photos.poses.making import (
     Options,
     fingerprint,
@@ -15,6 +17,34 @@ from qgs_photos.poses.making import (
     refuse_foreign,
 )
 from qgs_photos.poses.photos import PosesError
+
+VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+
+
+class Unposed(PhotoReader):
+    """Photos without cameras, and videos: they hold no listing, `posed` makes one."""
+
+    name = "unposed"
+    listing = "photos or a video for `qgs poses`"
+    poses = "opencv"
+
+    @classmethod
+    def recognises(cls, folder: UPath) -> bool:
+        """Return False: there is no listing to read."""
+        return False
+
+    @classmethod
+    def read(cls, folder: UPath, images: str | None) -> Listing:
+        """Raise ValueError: there is no listing to read."""
+        raise ValueError(f"{folder} has no camera poses: run `qgs poses {folder}`")
+
+    @classmethod
+    def posed(cls, path: UPath) -> UPath | None:
+        """Return the folder with the poses of `path`, made if need be, beside it in NAME_poses."""
+        is_video = path.suffix.lower() in VIDEOS and path.is_file()
+        if is_video or any(map(image_files, (path, path / "images"))):
+            return UPath(posed_folder(Path(str(path))))
+        return None
 
 
 def posed_folder(source: Path) -> Path:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from qgs.cli.options import Device, Frames, NoPoses, Scale, SceneName, parse_size
+from qgs.cli.options import Device, Frames, Scale, SceneName, parse_size
 
 app = typer.Typer(help="The best scene of photos in a given time.")
 
@@ -56,7 +56,6 @@ def scene(
         bool, typer.Option("--masks", help="What the photos' masks leave out is background.")
     ] = False,
     scene_name: SceneName = None,
-    no_poses: NoPoses = False,
     device: Device = "auto",
 ) -> None:
     """The best scene of photos in a given time: scene.ply, scene.splat, a page, held-out scores.

@@ -1,20 +1,16 @@
-"""`--refine` and `--tune` of `qgs reconstruct`: Gaussians fitted to the photos of their scene."""
+"""A reconstruction refined on the photos of its scene."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from typing import Any
 
 from rich.console import Console
 
 from qgs.contracts import Scene
 from qgs.data.samples import Sample, training_frames, views_in
 from qgs.metrics.images import Psnr
-from qgs.model import QueryGaussianModel
-from qgs.recipe import Recipe
 from qgs.reconstruction.result import Reconstruction, reconstruct_sample
-from qgs.types import Gaussians, Views
+from qgs.types import Views
 from qgs_photos.refine.refining import refine
-from qgs_photos.refine.tuning import tuner
 
 
 def refine_reconstruction(
@@ -100,17 +96,3 @@ def _photos(
     names = {frame: scene.frame_name(frame) for frame in (*inputs, *targets)}
     parts = {"inputs": own, "targets": compared, "target_frames": targets, "names": names}
     return replace(start.sample, **parts), photos, frames
-
-
-def tuned(
-    model: QueryGaussianModel, recipe: Recipe, console: Console, inputs: Views
-) -> tuple[Gaussians, dict[str, Any]]:
-    """Gaussians of queries or latents tuned on `inputs`, and a record of that."""
-    settings = recipe.evaluation
-    what, steps = settings.tuning, settings.tuning_steps
-    tuning = tuner(model, recipe)(inputs.to(next(model.parameters()).device))
-    before, after = tuning.losses[0], tuning.losses[-1]
-    losses = f"photometric loss of the inputs {before:.5f} -> {after:.5f}"
-    console.print(f"{steps} steps of tuning the {what}: {losses}", highlight=False)
-    record = {"what": what, "steps": steps, "rate": settings.rate}
-    return tuning.prediction.gaussians, {**record, "loss_before": before, "loss_after": after}

@@ -11,7 +11,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from qgs.checkpoint.gaussians import save_ply
+from qgs.checkpoint.gaussians import save_ply, save_splat
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.depth import scene_depth
 from qgs.data.photos.source import PhotoScene
@@ -19,7 +19,7 @@ from qgs.data.samples import own_world, views_in
 from qgs.drawing import images
 from qgs.drawing.figures import figure_picture, grid_figure
 from qgs.drawing.images import rgb_picture
-from qgs.extensions import ExtensionError, function
+from qgs.extensions import INSTALL_ALL
 from qgs.files import replacing_entries, write_text
 from qgs.geometry.transforms import moved
 from qgs.metrics.baselines import nearest_input
@@ -39,7 +39,6 @@ from qgs_photos.refine.planning import (
 )
 from qgs_photos.refine.points import from_points, sparse_points
 from qgs_photos.refine.refining import NO_EXTRAS, Extras, RefinedScene, refine, seconds_of_step
-from qgs_photos.refine.splat import save_splat
 from qgs_photos.refine.sweeping import swept
 
 END, PART_OF_END = 4.0, 0.03
@@ -287,8 +286,10 @@ def held_out_picture(made: Made, rows: Sequence[Mapping[str, Any]]) -> images.Pi
 def _page_writer(console: Console) -> Any:
     """The viewer's function that makes a page, imported now; None, with a remark, without it."""
     try:
-        return function("qgs.pages", "gaussians")
-    except ExtensionError as error:
-        text = f"no page to turn the scene on: {error}"
+        from qgs_viewer.page import gaussians_html
+
+        return gaussians_html
+    except ImportError:
+        text = f"no page to turn the scene on, it needs query-gaussians-viewer: {INSTALL_ALL}"
         console.print(text, soft_wrap=True, highlight=False, markup=False)
         return None

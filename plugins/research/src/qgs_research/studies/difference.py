@@ -9,9 +9,9 @@ from rich.table import Table
 
 from qgs.cli.inspect import RecipeFile
 from qgs.cli.tables import folded_table
+from qgs.model_text import parameter_counts
 from qgs.recipe import Recipe, resolve
 from qgs.recipe.recipe import differing_options
-from qgs.reconstruction.shown import parameter_counts
 from qgs.wording import short_names
 
 app = typer.Typer(help="Compare recipes.")

@@ -8,8 +8,8 @@ from qgs.drawing import page_environment
 from qgs.drawing.figures import figure_picture
 from qgs.drawing.images import data_uri
 from qgs.files import write_text
+from qgs.model_text import parameter_counts
 from qgs.recipe import Recipe
-from qgs.reconstruction.shown import parameter_counts
 from qgs_research.studies.figures import curves_figure, values_figure, write_figures
 from qgs_research.studies.output import hypothesis_rows, table_rows, write_files
 from qgs_research.studies.plan import differences

@@ -1,9 +1,8 @@
 """What the runs of a study amount to: means, spread over seeds, differences, verdicts.
 
 An interval takes trainings and scenes as random, both: it is for other seeds and other scenes of
-the kind (`qgs_research.studies.intervals.crossed_interval`). Differences are paired: a seed of a variant is
-held against the same seed of the reference, which saw the same data in the same order, and a scene
-against the same scene.
+the kind (`crossed_interval`). Differences are paired: a seed of a variant is held against the same
+seed of the reference, which saw the same data in the same order, and each scene against itself.
 """
 
 from collections import Counter

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from qgs.checkpoint.model_file import load
-from qgs.domain import SEARCHED, Domain, verdict
+from qgs.domain import Domain, verdict
 from qgs.evaluate.plan import evaluation_samples
 from qgs.files import write_text
 from qgs.reconstruction.scale import ScaleSearch
@@ -14,7 +14,7 @@ from qgs_viewer.curves import curves_figure, curves_of
 from qgs_viewer.figures import anchors, attention, dispersion, global_gaussians, novel_views
 from qgs_viewer.figures.exhibits import Exhibition, NothingToShowError, exhibit
 from qgs_viewer.figures.paper import WIDTH, Made, paper_style, write_figure
-from qgs_viewer.scales import OF_SHOWN, summary
+from qgs_viewer.scales import summary
 
 
 @paper_style()
@@ -78,7 +78,7 @@ def open_exhibition(
     samples = sorted(samples, key=lambda sample: sample.scene != scene)
     exhibits, found, notes = [], Domain(), dict[str, list[str]]()
     found.see(samples[0].inputs.cameras, samples[0].targets.cameras)
-    options = {**OF_SHOWN, **(SEARCHED if search.found else {})}
+    options = ["scale"] if search.found else []
     for name, model in models.items():
         exhibits.append(exhibit(name, model, samples[0], curves_of(files[name])))
         if photos is not None and (remark := verdict(model.trained_on or Domain(), found, options)):

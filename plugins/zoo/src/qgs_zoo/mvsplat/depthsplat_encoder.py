@@ -21,8 +21,8 @@ class DepthSplatEncoder(SweepEncoder):
     """Every pixel's depth and raw Gaussian, from a plane sweep and a pretrained ViT.
 
     The memory has a token for each pixel. Its D numbers, the model's width, are those of
-    `qgs_zoo.mvsplat.pixels.CHANNELS` and harmonics, to whose constant the pixel's colour is added: 38
-    for degree 2 (published). A wider model has zeros behind them.
+    `CHANNELS` of `pixels.py` and harmonics, to whose constant the pixel's colour is added: 38 for
+    degree 2 (published). A wider model has zeros behind them.
     """
 
     name = "depthsplat"

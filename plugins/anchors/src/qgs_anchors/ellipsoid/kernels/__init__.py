@@ -1,1 +1,1 @@
-"""`EllipsoidBias` compiled, for CPUs and GPUs. The formula is in `qgs_anchors.ellipsoid.ray_bias`."""
+"""`EllipsoidBias` compiled, for CPUs and GPUs; the formula is in its module."""

@@ -1,12 +1,13 @@
-"""What models look like when they are printed: sizes, and a line for each slot."""
+"""Models as text: sizes, and a line for each slot."""
+
+from typing import Any
 
 from torch import nn
 
-from qgs.model import QueryGaussianModel
-from qgs.recipe.slots import LAYER_SLOTS, SUBLAYER_SLOTS
+from qgs.contracts import LAYER_SLOTS, SUBLAYER_SLOTS
 
 
-def parameter_counts(model: QueryGaussianModel) -> dict[str, int]:
+def parameter_counts(model: Any) -> dict[str, int]:
     """Component to its number of parameters, decoder layers summed by slot.
 
     `decoder.layer` has what is not of its sublayers.
@@ -32,15 +33,15 @@ def _count(module: nn.Module) -> int:
     return sum(parameter.numel() for parameter in module.parameters())
 
 
-def model_text(self: QueryGaussianModel) -> str:
+def model_text(model: Any) -> str:
     """Sizes, then a line for each slot: its component and number of parameters."""
-    rows = slot_rows(self)
+    rows = slot_rows(model)
     wide = [max(len(row[column]) for row in rows) for column in range(3)]
     lines = [f"  {slot:<{wide[0]}}  {kind:<{wide[1]}}  {n:>{wide[2]}}" for slot, kind, n in rows]
-    return "\n".join([heading(self), *(line.rstrip() for line in lines)])
+    return "\n".join([heading(model), *(line.rstrip() for line in lines)])
 
 
-def heading(model: QueryGaussianModel) -> str:
+def heading(model: Any) -> str:
     """Class, parameters, decoder layers, queries and device."""
     tree = (model.recipe or {}).get("model", {})
     options = {**tree.get("queries", {}), **tree.get("head", {})}
@@ -51,7 +52,7 @@ def heading(model: QueryGaussianModel) -> str:
     return f"{type(model).__name__}: {', '.join(parts)}, on {device}"
 
 
-def slot_rows(model: QueryGaussianModel) -> list[tuple[str, str, str]]:
+def slot_rows(model: Any) -> list[tuple[str, str, str]]:
     """Slot, types of its components (without a recipe their classes) and parameters."""
     counts = {name: f"{count:,}" for name, count in parameter_counts(model).items()}
     counts |= {"supervision": "", "renderer": ""}
@@ -59,7 +60,7 @@ def slot_rows(model: QueryGaussianModel) -> list[tuple[str, str, str]]:
     return [(name, ", ".join(dict.fromkeys(kinds[name])), count) for name, count in counts.items()]
 
 
-def _types(model: QueryGaussianModel, slot: str) -> list[str]:
+def _types(model: Any, slot: str) -> list[str]:
     """What stands in a slot, in one of the decoder by layer."""
     tree = model.recipe["model"] if model.recipe else None
     if slot not in LAYER_SLOTS:

@@ -4,10 +4,10 @@ import copy
 
 import pytest
 import torch
-from qgs_photos.refine.tuning import tune, tuning_loss
 from training_runs import tiny
 
 from qgs.evaluate.plan import evaluation_samples
+from qgs.evaluate.tuning import tune, tuning_loss
 from qgs.types import map_tensors
 
 MSE = "losses.photometric.ssim_weight=0.0"

@@ -1,8 +1,10 @@
 """Tuning at test time: the queries or latents of a scene, fitted to its input views (TokenGS)."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,7 +14,7 @@ from qgs.contracts.settings import Tuned
 from qgs.losses import Photometric
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
-from qgs.types import Prediction, Views, map_tensors, named_tensors
+from qgs.types import Gaussians, Prediction, Views, map_tensors, named_tensors
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,21 @@ class Tuning:
 
     prediction: Prediction
     losses: Sequence[float]
+
+
+def tuning_settings(tune: str | None) -> list[str]:
+    """Return the settings of "STEPS", "WHAT:STEPS" or "WHAT", which takes 50 steps (TokenGS).
+
+    WHAT: queries or latents. Raises ValueError for any other text.
+    """
+    if tune is None:
+        return []
+    match = re.fullmatch(r"(?:(queries|latents):)?(\d+)|(queries|latents)", tune)
+    if match is None:
+        raise ValueError(f"tuning is STEPS, queries[:STEPS] or latents[:STEPS], got {tune!r}")
+    what, steps = match[1] or match[3], match[2]
+    settings = [f"evaluation.tuning_steps={steps or 50}"]
+    return [*settings, *([f"evaluation.tuning={what}"] if what else [])]
 
 
 def tuning_loss(recipe: Recipe) -> Photometric:
@@ -40,6 +57,23 @@ def tuner(model: QueryGaussianModel, recipe: Recipe) -> Callable[[Views], Tuning
     settings = recipe.evaluation
     what, steps, rate = settings.tuning, settings.tuning_steps, settings.rate
     return partial(tune, model, loss=tuning_loss(recipe), steps=steps, rate=rate, what=what)
+
+
+def tuned_gaussians(
+    model: QueryGaussianModel, recipe: Recipe, inputs: Views
+) -> tuple[Gaussians, dict[str, Any]]:
+    """Return the Gaussians of what was tuned on `inputs`, and a record of the tuning."""
+    settings = recipe.evaluation
+    device = next(model.parameters()).device
+    tuning = tuner(model, recipe)(inputs.to(device))
+    record = {
+        "what": settings.tuning,
+        "steps": settings.tuning_steps,
+        "rate": settings.rate,
+        "loss_before": tuning.losses[0],
+        "loss_after": tuning.losses[-1],
+    }
+    return tuning.prediction.gaussians, record
 
 
 def tune(
@@ -63,7 +97,7 @@ def tune(
     if what == "latents" and not model.encoder.tunable:
         raise ValueError(
             f"there are no latents to tune: the encoder, {type(model.encoder).__name__}, makes no "
-            "memory of other features; tune the queries instead (--tune queries)"
+            "memory of other features; tune the queries instead"
         )
     # Encoded once: weights and photos stay, so the memory does too.
     with torch.no_grad():

@@ -5,13 +5,7 @@ from typing import Annotated
 
 import typer
 
-from qgs.checkpoint.gaussians import load_ply, save_gaussians
-from qgs.files import refuse_existing
 
-app = typer.Typer(help="Gaussians, written in another form.")
-
-
-@app.command()
 def convert(
     source: Annotated[
         Path, typer.Argument(metavar="IN", help="PLY of qgs or of any 3DGS program.")
@@ -30,6 +24,9 @@ def convert(
 
     With --count the most opaque ones alone.
     """
+    from qgs.checkpoint.gaussians import load_ply, save_gaussians
+    from qgs.files import refuse_existing
+
     refuse_existing(out)
     gaussians = load_ply(source)
     kept = gaussians if count is None else gaussians.most_opaque(count)
