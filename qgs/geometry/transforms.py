@@ -1,9 +1,8 @@
-"""Points into cameras and pixels, quaternions to rotation matrices and back, worlds to worlds."""
+"""Points into cameras and pixels, quaternions to rotation matrices, worlds to worlds."""
 
 from dataclasses import replace
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.geometry.harmonics import rotated
@@ -13,7 +12,8 @@ from qgs.types import Cameras, Gaussians
 
 @full_precision
 def quat_to_matrix(quats: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4), w x y z."""
+    """Return rotation matrices (..., 3, 3) of unit quaternions (..., 4), w x y z."""
+    # kornia has the same function, which takes half as long again: this one runs in every step.
     w, x, y, z = quats.unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -43,35 +43,16 @@ def to_pixels(camera_points: Tensor, intrinsics: Tensor) -> Tensor:
 @full_precision
 def moved(gaussians: Gaussians, pose: Tensor, factor: float) -> Gaussians:
     """The Gaussians enlarged by `factor` about the origin, then placed by the rigid pose (4, 4)."""
+    from kornia.geometry.conversions import rotation_matrix_to_quaternion
+    from kornia.geometry.quaternion import Quaternion
+
     pose = pose.to(gaussians.means)
-    turn = matrix_to_quat(pose[:3, :3])
+    rotation = pose[:3, :3]
+    turn = rotation_matrix_to_quaternion(rotation).expand_as(gaussians.quats)
     return replace(
         gaussians,
-        means=gaussians.means * factor @ pose[:3, :3].T + pose[:3, 3],
+        means=gaussians.means * factor @ rotation.T + pose[:3, 3],
         scales=gaussians.scales * factor,
-        quats=_product(turn, gaussians.quats),
-        sh=None if gaussians.sh is None else rotated(gaussians.sh, pose[:3, :3]),
+        quats=(Quaternion(turn) * Quaternion(gaussians.quats)).data,
+        sh=None if gaussians.sh is None else rotated(gaussians.sh, rotation),
     )
-
-
-def matrix_to_quat(rotation: Tensor) -> Tensor:
-    """The unit quaternion (4,), w x y z, w not negative, of a rotation matrix (3, 3)."""
-    m = rotation
-    # K of Bar-Itzhack (2000), whose largest eigenvalue has the quaternion x y z w as its vector:
-    # it needs no case for a small trace.
-    symmetric = m + m.T - torch.eye(3).to(m) * m.trace()
-    axis = torch.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
-    k = torch.cat(
-        [torch.cat([symmetric, axis[:, None]], 1), torch.cat([axis, m.trace()[None]])[None]]
-    )
-    x, y, z, w = torch.linalg.eigh(k.double()).eigenvectors[:, -1].to(m)
-    quat = F.normalize(torch.stack([w, x, y, z]), dim=0)
-    return torch.where(w < 0, -quat, quat)
-
-
-def _product(a: Tensor, b: Tensor) -> Tensor:
-    """Quaternion products (..., 4)."""
-    w, vector = a[..., :1], a[..., 1:].expand_as(b[..., 1:])
-    real = w * b[..., :1] - (vector * b[..., 1:]).sum(-1, keepdim=True)
-    cross = torch.linalg.cross(vector, b[..., 1:], dim=-1)
-    return torch.cat([real, w * b[..., 1:] + b[..., :1] * vector + cross], -1)
