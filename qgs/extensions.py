@@ -36,7 +36,8 @@ def imported(entry: EntryPoint) -> Any:
     """What `entry` names. Raises ExtensionError with its distribution."""
     try:
         return entry.load()
-    except Exception as error:  # importing runs the distribution's code
+    except Exception as error:
+        # Importing runs the distribution's code.
         reason = f"{type(error).__name__}: {error}"
         raise ExtensionError(f"{_where(entry)} cannot be imported ({reason}): update it") from error
 

@@ -40,8 +40,10 @@ def available_bytes() -> int:
     with suppress(OSError, ValueError, KeyError):  # no Linux
         sizes = _numbers(Path("/proc/meminfo"))
         limits.append(1024 * (sizes["MemAvailable:"] + sizes["SwapFree:"]))
-    group = Path("/sys/fs/cgroup")  # a container sees its own group there
-    with suppress(OSError, ValueError, KeyError):  # no group, or none with a limit
+    # A container sees its own group there.
+    group = Path("/sys/fs/cgroup")
+    # No group, or none with a limit.
+    with suppress(OSError, ValueError, KeyError):
         limit, used = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
         # the system frees cached files on demand
         limits.append(limit - used + _numbers(group / "memory.stat")["inactive_file"])
@@ -82,7 +84,8 @@ def in_threads(unit: Callable[..., None], work: Iterable[tuple[Any, ...]]) -> No
         unit(*items[0])
     else:
         futures = [_threads(torch.get_num_threads()).submit(unit, *item) for item in items]
-        wait(futures)  # all of them, also where one fails: nobody writes when this returns
+        # All of them, also where one fails: nobody writes when this returns.
+        wait(futures)
         for future in futures:
             future.result()
 
@@ -92,5 +95,6 @@ def _threads(count: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(count, thread_name_prefix="qgs-kernel")
 
 
-if hasattr(os, "register_at_fork"):  # threads do not survive a fork
+# Threads do not survive a fork.
+if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_threads.cache_clear)

@@ -109,7 +109,8 @@ class QueryGaussianModel(nn.Module):
                 f"{' and '.join(readers)} of this model read cameras, and these photos have none; "
                 "give Views with cameras, or take an encoder that does without (reads_cameras)"
             )
-        return cast(Views, photos)  # it has the same images and masks
+        # It has the same images and masks.
+        return cast(Views, photos)
 
     def predict(
         self,
@@ -129,7 +130,8 @@ class QueryGaussianModel(nn.Module):
         """
         if layers is None:
             layers = self.supervision.weights().keys() if self.training else ()
-        last, again = len(self.decoder), len(self.decoder) - self.feedback.layers
+        last = len(self.decoder)
+        again = len(self.decoder) - self.feedback.layers
         rounds = self.feedback.drawn() if self.training else self.feedback.rounds
         order = [*range(last), *(rounds * [*range(again, last)])]
         known = range(min(1, last), len(order) + 1)
@@ -138,7 +140,8 @@ class QueryGaussianModel(nn.Module):
             raise ValueError(
                 f"layers {unknown} do not exist; this model has layers {known[0]}..{len(order)}"
             )
-        scenes, given = memory.features.shape[0], state.features.shape[0]
+        scenes = memory.features.shape[0]
+        given = state.features.shape[0]
         if scenes != given:
             raise ValueError(f"the memory is of {scenes} scenes, the initial state of {given}")
         decoded = {} if last else {0: LayerPrediction(self.decode(state), state)}
@@ -160,7 +163,8 @@ class QueryGaussianModel(nn.Module):
     ) -> tuple[QueryState, ImageMemory]:
         """What a round starts with."""
         photos = self.feedback.compared(views)
-        with torch.no_grad():  # what looks wrong is an input of the round, no loss
+        # What looks wrong is an input of the round, no loss.
+        with torch.no_grad():
             rendering = self.render(before.gaussians, photos.cameras)
         return self.feedback(before.state, memory, rendering, photos)
 
@@ -168,7 +172,8 @@ class QueryGaussianModel(nn.Module):
         """The Gaussians of a state, ordered query by query."""
         attributes = self.head(state)
         means = self.centers(attributes.offsets, state)
-        flat = map_tensors(lambda x: x.flatten(1, 2), attributes)  # N, K -> G
+        # N, K -> G.
+        flat = map_tensors(lambda x: x.flatten(1, 2), attributes)
         opacities = flat.opacities
         if state.mask is not None:
             opacities = (attributes.opacities * state.mask[..., None]).flatten(1, 2)

@@ -13,7 +13,9 @@ from qgs.machine import can_compile, in_threads
 WINDOW = 11
 _BELL = np.exp(-0.5 * (np.arange(-(WINDOW // 2), WINDOW // 2 + 1) / 1.5) ** 2)
 _WEIGHTS = torch.from_numpy(_BELL / _BELL.sum())
-_C1, _C2 = 0.01**2, 0.03**2  # for a data range of 1
+# for a data range of 1
+_C1 = 0.01**2
+_C2 = 0.03**2
 
 Padding: TypeAlias = Literal["same", "valid"]
 
@@ -29,9 +31,11 @@ def similarity_map(x: Tensor, y: Tensor, padding: Padding, correction: float = 1
         size = f"at least {WINDOW} pixels a side, got {height} x {width}"
         raise ValueError(f"SSIM of whole windows needs images of {size}: raise data.image_size")
     moments = torch.stack([x, y, x * x + y * y, x * y])
-    planes, edge = moments.reshape(1, -1, height, width), WINDOW // 2 * (padding == "same")
+    planes = moments.reshape(1, -1, height, width)
+    edge = WINDOW // 2 * (padding == "same")
     # One group a plane: on a CPU a tenth of the time of planes as a batch.
-    kernel, groups = _WEIGHTS.to(planes).expand(planes.shape[1], 1, 1, -1), planes.shape[1]
+    kernel = _WEIGHTS.to(planes).expand(planes.shape[1], 1, 1, -1)
+    groups = planes.shape[1]
     planes = F.conv2d(planes, kernel, padding=(0, edge), groups=groups)
     planes = F.conv2d(planes, kernel.mT, padding=(edge, 0), groups=groups)
     mean_x, mean_y, squares, product = planes.view(*moments.shape[:-2], *planes.shape[-2:])
@@ -61,7 +65,8 @@ class _Mean(torch.autograd.Function):
 
         x, y = (t.detach().reshape(-1, *t.shape[-2:]).numpy() for t in (images, truth))
         moments = np.stack([x, y, x * x + y * y, x * y], 1)
-        sums, slopes = np.empty(len(x)), np.empty_like(x, order="C")
+        sums = np.empty(len(x))
+        slopes = np.empty_like(x, order="C")
         options = _WEIGHTS[WINDOW // 2 :].float().numpy(), (np.float32(_C1), np.float32(_C2))
 
         def measure(plane: int) -> None:

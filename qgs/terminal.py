@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from typing import Any, TextIO
 
 _RAW = "[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
-_USER = r"(?<=://)(?:[^\s/?#@:]{0,99}:\S{0,300}|[^\s/?#]{0,300})@"  # a password may hold / ? #
+# A password may hold / ? #.
+_USER = r"(?<=://)(?:[^\s/?#@:]{0,99}:\S{0,300}|[^\s/?#]{0,300})@"
 _TOKEN = (
     r"(?i)([?&#][^\s=&?#]{0,40}(?:token|key|sig|secret|pass|auth|cred)[^\s=&?#]{0,40}=)[^\s&#]+"
 )
@@ -45,7 +46,9 @@ def show_safely() -> None:
     """From here on, whatever this process prints is `shown`; Rich still colours and draws."""
     import rich.text
 
-    rich.text.__dict__["strip_control_codes"] = shown  # of all texts that it draws
+    # Of all texts that it draws.
+    rich.text.__dict__["strip_control_codes"] = shown
     for name in ("stdout", "stderr"):
-        if stream := getattr(sys, name):  # None where the system gave none
+        # None where the system gave none.
+        if stream := getattr(sys, name):
             setattr(sys, name, _Shown(stream))

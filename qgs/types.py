@@ -91,7 +91,8 @@ def _described(item: Any) -> str:
         unusual = [str(item.dtype).removeprefix("torch.")] * (item.dtype != torch.float32)
         unusual += [str(item.device)] * (item.device.type != "cpu")
         return " ".join([str(tuple(item.shape)), *unusual])
-    if isinstance(item, Mapping):  # of containers the name alone: their own lines would be many
+    # Of containers the name alone: their own lines would be many.
+    if isinstance(item, Mapping):
         named = isinstance(next(iter(item.values()), None), TensorContainer)
         parts = (f"{k}: {type(x).__name__ if named else _described(x)}" for k, x in item.items())
         return f"{{{', '.join(parts)}}}"
@@ -115,11 +116,13 @@ def _check_shapes(
     """
     sizes: dict[str, Any] = dict(known or {})
     for name, spec in shapes.items():
-        tensor, axes = getattr(container, name), spec.split()
+        tensor = getattr(container, name)
+        axes = spec.split()
         if tensor is None:
             continue
         given = shape = tuple(tensor.shape)
-        if axes[0] == "...":  # counts as one axis, whose size is a tuple
+        # Counts as one axis, whose size is a tuple.
+        if axes[0] == "...":
             leading = max(len(shape) - len(axes) + 1, 0)
             given = (shape[:leading], *shape[leading:])
         wanted = [int(axis) if axis.isdigit() else sizes.get(axis, axis) for axis in axes]

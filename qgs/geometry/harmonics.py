@@ -23,7 +23,9 @@ _C3_INNER = (0.3731763325901154, 1.445305721320277)
 def harmonics(directions: Tensor, count: int) -> Tensor:
     """The first `count` (3, 8 or 15) functions (..., count) at unit `directions` (..., 3)."""
     x, y, z = directions.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
+    xx = x * x
+    yy = y * y
+    zz = z * z
     values = [-_C1 * y, _C1 * z, -_C1 * x]
     if count > SH_COUNTS[0]:
         a, b, c = _C2
@@ -59,6 +61,7 @@ def rotated(sh: Tensor, rotation: Tensor) -> Tensor:
     from values at directions all around.
     """
     directions = torch.randn(64, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    directions, count = F.normalize(directions, dim=-1), sh.shape[-2]
+    directions = F.normalize(directions, dim=-1)
+    count = sh.shape[-2]
     before = harmonics(directions @ rotation.cpu().double(), count)
     return (torch.linalg.pinv(harmonics(directions, count)) @ before).to(sh) @ sh

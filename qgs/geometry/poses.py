@@ -9,7 +9,8 @@ from torch import Tensor
 from qgs.geometry.constants import constant
 from qgs.geometry.precision import full_precision
 
-_PARALLEL = 3e-4  # mean squared sine of the axes' angles to their mean; 1 degree
+# Mean squared sine of the axes' angles to their mean; 1 degree.
+_PARALLEL = 3e-4
 
 
 @full_precision
@@ -71,10 +72,12 @@ def look_at_depth(c2w: Tensor) -> Tensor:
     within about a degree, or for more than every fourth camera the point lies behind it or more
     than 30 degrees off its axis. 0-d.
     """
-    axes, centres = c2w[:, :3, 2], c2w[:, :3, 3]
+    axes = c2w[:, :3, 2]
+    centres = c2w[:, :3, 3]
     across = torch.eye(3).to(c2w) - axes[:, :, None] * axes[:, None]
     middle = centres.mean(0)
-    normal, right = across.mean(0), (across @ (centres - middle)[..., None]).mean(0)[:, 0]
+    normal = across.mean(0)
+    right = (across @ (centres - middle)[..., None]).mean(0)[:, 0]
     if torch.linalg.eigvalsh(normal)[0] < _PARALLEL:
         return c2w.new_zeros(())
     point = middle + torch.linalg.solve(normal, right)

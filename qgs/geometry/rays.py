@@ -20,7 +20,8 @@ def pixel_directions(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
         torch.arange(height, **options) + 0.5, torch.arange(width, **options) + 0.5, indexing="ij"
     )
     fx, fy, cx, cy = (intrinsics[..., i, None, None] for i in range(4))
-    x, y = (u - cx) / fx, (v - cy) / fy
+    x = (u - cx) / fx
+    y = (v - cy) / fy
     return torch.stack([x, y, torch.ones_like(x)], -1)
 
 

@@ -36,7 +36,8 @@ def to_pixels(camera_points: Tensor, intrinsics: Tensor) -> Tensor:
 
     The division by z is unguarded: a point at z = 0 gives inf or NaN.
     """
-    focal, principal = intrinsics[..., None, :2], intrinsics[..., None, 2:]
+    focal = intrinsics[..., None, :2]
+    principal = intrinsics[..., None, 2:]
     return torch.addcmul(principal, focal, camera_points[..., :2] / camera_points[..., 2:])
 
 

@@ -14,12 +14,14 @@ def kernel(function: Callable[..., Any]) -> Any:
 
     options = {
         "nogil": True,
-        "error_model": "numpy",  # no branch on a division by zero
+        # No branch on a division by zero.
+        "error_model": "numpy",
         "fastmath": {"contract", "reassoc", "arcp", "nsz"},
         # kernels from the cache share what they call, and may run another's build of it
         "forceinline": True,
     }
     try:
         return njit(cache=True, **options)(function)
-    except RuntimeError:  # numba found no such place
+    except RuntimeError:
+        # Numba found no such place.
         return njit(**options)(function)

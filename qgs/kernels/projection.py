@@ -12,13 +12,20 @@ import numpy as np
 
 from qgs.kernels import kernel
 
-CAMERA_GRADIENTS = 16  # of C by rows, p, fx, fy, cx, cy
+# Of C by rows, p, fx, fy, cx, cy.
+CAMERA_GRADIENTS = 16
 
-_ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-_SHORTEST = np.float32(1e-12)  # a quaternion's norm is at least this, as in F.normalize
+_ZERO = np.float32(0)
+_HALF = np.float32(0.5)
+_ONE = np.float32(1)
+_TWO = np.float32(2)
+# A quaternion's norm is at least this, as in F.normalize.
+_SHORTEST = np.float32(1e-12)
 _LOG2_E = np.float32(1.4426950408889634)
-_SLACK = np.float32(0.05)  # of a power of 2
-_LARGEST = np.float32(1e9)  # half extent in pixels that still converts to an integer
+# Of a power of 2.
+_SLACK = np.float32(0.05)
+# Half extent in pixels that still converts to an integer.
+_LARGEST = np.float32(1e9)
 
 
 @kernel
@@ -63,9 +70,15 @@ def _vector(array):
 @kernel
 def _rotation(quat):
     """Rows of the rotation matrix, the unit quaternion and the norm it was divided by."""
-    w, x, y, z = quat[0], quat[1], quat[2], quat[3]
+    w = quat[0]
+    x = quat[1]
+    y = quat[2]
+    z = quat[3]
     norm = max(np.sqrt(w * w + x * x + y * y + z * z), _SHORTEST)
-    w, x, y, z = w / norm, x / norm, y / norm, z / norm
+    w = w / norm
+    x = x / norm
+    y = y / norm
+    z = z / norm
     rows = (
         (_ONE - _TWO * (y * y + z * z), _TWO * (x * y - w * z), _TWO * (x * z + w * y)),
         (_TWO * (x * y + w * z), _ONE - _TWO * (x * x + z * z), _TWO * (y * z - w * x)),
@@ -125,11 +138,15 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, size, lim
         factor = _scaled_columns(rows, _vector(scales[g]))
         opacity = opacities[g]
         fall = max(np.log(opacity / alpha_min), _ZERO)
-        reach, lowest = np.sqrt(_TWO * fall), -_LOG2_E * fall - _SLACK
+        reach = np.sqrt(_TWO * fall)
+        lowest = -_LOG2_E * fall - _SLACK
         for v in range(c2w.shape[0]):
             pose = (_vector(c2w[v, 0]), _vector(c2w[v, 1]), _vector(c2w[v, 2]))
             position = (c2w[v, 0, 3], c2w[v, 1, 3], c2w[v, 2, 3])
-            fx, fy, cx, cy = lenses[v, 0], lenses[v, 1], lenses[v, 2], lenses[v, 3]
+            fx = lenses[v, 0]
+            fy = lenses[v, 1]
+            cx = lenses[v, 2]
+            cy = lenses[v, 3]
             seen = _combine(_plus(_vector(means[g]), -_ONE, position), pose)
             z = seen[2]
             out = splats[v, g]
@@ -139,13 +156,16 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, size, lim
             if not (opacity >= alpha_min and z >= near and z <= far):
                 out[5] = _ONE
                 continue
-            x, y = seen[0] / z, seen[1] / z
+            x = seen[0] / z
+            y = seen[1] / z
             turned = _turn(pose, factor)
             held_x, _ = _clamp(x, fx, cx, size[1], margin)
             held_y, _ = _clamp(y, fy, cy, size[0], margin)
             row_x = _image_factor(turned, 0, held_x, fx, z)
             row_y = _image_factor(turned, 1, held_y, fy, z)
-            xx, xy, yy = _dot(row_x, row_x), _dot(row_x, row_y), _dot(row_y, row_y)
+            xx = _dot(row_x, row_x)
+            xy = _dot(row_x, row_y)
+            yy = _dot(row_y, row_y)
             minors = _cross(row_x, row_y)
             # Cauchy-Binet: unlike xx * yy - xy^2 this does not cancel for needles.
             determinant = _dot(minors, minors) + dilation * (xx + yy) + dilation * dilation
@@ -165,7 +185,8 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, size, lim
 @kernel
 def _covariance_slopes(row_x, row_y, splat, given, dilation):
     """dL/drow_x and dL/drow_y from dL/dconic = given[2:5]."""
-    xx, yy = _dot(row_x, row_x), _dot(row_y, row_y)
+    xx = _dot(row_x, row_x)
+    yy = _dot(row_y, row_y)
     minors = _cross(row_x, row_y)
     inverse = _ONE / (_dot(minors, minors) + dilation * (xx + yy) + dilation * dilation)
     of_determinant = -inverse * (given[2] * splat[2] + given[3] * splat[3] + given[4] * splat[4])
@@ -192,7 +213,8 @@ def _axis_slopes(slope, held, is_held, focal, z, row, of_row, turned_z, of_pixel
     of_focal = of_gain / focal + of_pixel * slope
     of_principal = of_pixel
     of_slope = focal * of_pixel
-    if is_held:  # at (border - principal) / focal
+    # At (border - principal) / focal.
+    if is_held:
         of_focal -= of_held * held / focal
         of_principal -= of_held / focal
     else:
@@ -206,8 +228,12 @@ def _axis_slopes(slope, held, is_held, focal, z, row, of_row, turned_z, of_pixel
 def _quat_slopes(quat, norm, m, out):
     """Write dL/dquat of the raw quaternion, with m = dL/dR."""
     w, x, y, z = quat
-    yz, zx, xy = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
-    s_yz, s_zx, s_xy = m[2][1] + m[1][2], m[0][2] + m[2][0], m[1][0] + m[0][1]
+    yz = m[2][1] - m[1][2]
+    zx = m[0][2] - m[2][0]
+    xy = m[1][0] - m[0][1]
+    s_yz = m[2][1] + m[1][2]
+    s_zx = m[0][2] + m[2][0]
+    s_xy = m[1][0] + m[0][1]
     of_w = _TWO * (x * yz + y * zx + z * xy)
     of_x = _TWO * (w * yz + y * s_xy + z * s_zx - _TWO * x * (m[1][1] + m[2][2]))
     of_y = _TWO * (w * zx + x * s_xy + z * s_yz - _TWO * y * (m[0][0] + m[2][2]))
@@ -248,7 +274,9 @@ def project_backward_unit(
         rows, quat, norm = _rotation(quats[g])
         scale = _vector(scales[g])
         factor = _scaled_columns(rows, scale)
-        of_mean, of_color, of_opacity = zeros, zeros, _ZERO
+        of_mean = zeros
+        of_color = zeros
+        of_opacity = _ZERO
         of_factor = (zeros, zeros, zeros)
         for v in range(c2w.shape[0]):
             splat = splats[v, g]
@@ -262,11 +290,15 @@ def project_backward_unit(
             of_color = _plus(of_color, _ONE, _vector(slopes[7:]))
             pose = (_vector(c2w[v, 0]), _vector(c2w[v, 1]), _vector(c2w[v, 2]))
             position = (c2w[v, 0, 3], c2w[v, 1, 3], c2w[v, 2, 3])
-            fx, fy, cx, cy = lenses[v, 0], lenses[v, 1], lenses[v, 2], lenses[v, 3]
+            fx = lenses[v, 0]
+            fy = lenses[v, 1]
+            cx = lenses[v, 2]
+            cy = lenses[v, 3]
             offset = _plus(_vector(means[g]), -_ONE, position)
             seen = _combine(offset, pose)
             z = seen[2]
-            x, y = seen[0] / z, seen[1] / z
+            x = seen[0] / z
+            y = seen[1] / z
             turned = _turn(pose, factor)
             held_x, is_held_x = _clamp(x, fx, cx, size[1], margin)
             held_y, is_held_y = _clamp(y, fy, cy, size[0], margin)
@@ -294,7 +326,8 @@ def project_backward_unit(
                     (of_fx, of_fy, of_cx, of_cy),
                 )  # fmt: skip
         of_opacities[g] = of_opacity
-        of_columns, axes = _columns(of_factor), _columns(rows)
+        of_columns = _columns(of_factor)
+        axes = _columns(rows)
         for i in range(3):
             of_means[g, i] = of_mean[i]
             of_colors[g, i] = of_color[i]

@@ -22,15 +22,20 @@ from qgs.kernels import kernel
 TILE = 16
 SPLAT_FIELDS = 9
 SUMS = 5
-GRADIENTS = 10  # of u, v, xx, xy, yy, depth, opacity, r, g, b
+# Of u, v, xx, xy, yy, depth, opacity, r, g, b.
+GRADIENTS = 10
 
 _LANES = np.uint64(TILE)
-_ROW = 9 * TILE  # floats per row of a tile
+# Floats per row of a tile.
+_ROW = 9 * TILE
 _STATE = np.uint64(_ROW)
 _LAST_LANE = np.float32(TILE - 1)
-_CHECK_EVERY = 16  # splats between two looks at which rows are still open
+# Splats between two looks at which rows are still open.
+_CHECK_EVERY = 16
 
-_ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
+_ZERO = np.float32(0)
+_HALF = np.float32(0.5)
+_ONE = np.float32(1)
 _LOG2_E = np.float32(1.4426950408889634)
 _LOWEST = np.float32(-126)
 # 2^f on [0, 1]: least-squares fit of degree 5, relative error 8e-8.
@@ -56,11 +61,15 @@ def _by_depth(splats, top, bottom, width):
     A stable radix sort: positive floats sort like their bits.
     """
     count = splats.shape[0]
-    order, other = np.empty(count, np.int32), np.empty(count, np.int32)
+    order = np.empty(count, np.int32)
+    other = np.empty(count, np.int32)
     depths = np.empty(count, np.float32)
     n = 0
     for g in range(count):
-        u, v, ex, ey = splats[g, 0], splats[g, 1], splats[g, 6], splats[g, 7]
+        u = splats[g, 0]
+        v = splats[g, 1]
+        ex = splats[g, 6]
+        ey = splats[g, 7]
         if ex > 0 and v + ey > top and v - ey < bottom and u + ex > 0 and u - ex < width:
             order[n] = g
             n += 1
@@ -90,7 +99,8 @@ def _touching_rows(order, splats, top, bottom, out):
     n = 0
     for i in range(order.shape[0]):
         g = order[i]
-        v, ey = splats[g, 1], splats[g, 7]
+        v = splats[g, 1]
+        ey = splats[g, 7]
         out[n] = g
         # no branch: where splats are cut off follows no pattern that a processor could guess
         n += 1 if v + ey > top and v - ey < bottom else 0
@@ -133,7 +143,8 @@ def _blend_row(state, base, dx0, power_of, look, options):
         dx = dx0 + np.float32(lane)
         power = max(min((quadratic * dx + linear) * dx + constant, _ZERO), _LOWEST)
         alpha = opacity * _exp2(power)
-        before, live = state[i], state[i + _LANES]
+        before = state[i]
+        live = state[i + _LANES]
         alpha = min(alpha, alpha_cap) if alpha >= alpha_min else _ZERO
         live = live if before - before * alpha > transmittance_min else _ZERO
         weight = before * alpha * live
@@ -160,22 +171,26 @@ def _backward_row(state, base, totals, dx0, dy, power_of, look, options):
         dx = dx0 + np.float32(lane)
         power = max(min((quadratic * dx + linear) * dx + constant, _ZERO), _LOWEST)
         full = opacity * _exp2(power)
-        before, live = state[i], state[i + _LANES]
+        before = state[i]
+        live = state[i + _LANES]
         alpha = min(full, alpha_cap) if full >= alpha_min else _ZERO
         live = live if before - before * alpha > transmittance_min else _ZERO
         alpha = alpha * live
         weight = before * alpha
         state[i] = before - weight
         state[i + _LANES] = live
-        g_r, g_g = state[i + np.uint64(3) * _LANES], state[i + np.uint64(4) * _LANES]
-        g_b, g_z = state[i + np.uint64(5) * _LANES], state[i + np.uint64(6) * _LANES]
+        g_r = state[i + np.uint64(3) * _LANES]
+        g_g = state[i + np.uint64(4) * _LANES]
+        g_b = state[i + np.uint64(5) * _LANES]
+        g_z = state[i + np.uint64(6) * _LANES]
         z_here = z - state[i + np.uint64(8) * _LANES]
         value = g_r * r + g_g * g + g_b * b + g_z * z_here + state[i + np.uint64(7) * _LANES]
         rest = state[i + np.uint64(2) * _LANES] - weight * value
         state[i + np.uint64(2) * _LANES] = rest
         slope = before * value - rest / (_ONE - alpha)
         h = slope * alpha if full <= alpha_cap else _ZERO
-        hx, hy = h * dx, h * dy
+        hx = h * dx
+        hy = h * dy
         totals[lane] += h
         totals[lane + _LANES] += hx
         totals[lane + np.uint64(2) * _LANES] += hy
@@ -217,7 +232,9 @@ def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
     """
     for row in range(rows):
         for lane in range(columns):
-            y, x, base = y0 + row, x0 + lane, row * _ROW + lane
+            y = y0 + row
+            x = x0 + lane
+            base = row * _ROW + lane
             weight = sums[4, y, x]
             depth = sums[3, y, x] / weight if weight > _ZERO else _ZERO
             for channel in range(4):
@@ -235,7 +252,8 @@ def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
 def _unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, backward):
     """Walk the tile rows [first, last) of one image; `backward` is a constant of either caller."""
     height, width = sums.shape[1:]
-    top, bottom = tile_rows[0] * TILE, min(tile_rows[1] * TILE, height)
+    top = tile_rows[0] * TILE
+    bottom = min(tile_rows[1] * TILE, height)
     order = _by_depth(splats, top, bottom, width)
     row_order = np.empty(order.shape[0] + 1, np.int32)
     state = np.empty(TILE * _ROW, np.float32)
@@ -252,28 +270,37 @@ def _unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, back
             since_check = 0
             for i in range(n):
                 g = row_order[i]
-                u, v, ex = splats[g, 0], splats[g, 1], splats[g, 6]
+                u = splats[g, 0]
+                v = splats[g, 1]
+                ex = splats[g, 6]
                 if u + ex <= x0 or u - ex >= x0 + columns:
                     continue
-                xx, xy, yy = splats[g, 2], splats[g, 3], splats[g, 4]
+                xx = splats[g, 2]
+                xy = splats[g, 3]
+                yy = splats[g, 4]
                 look = opacities[g], colors[g, 0], colors[g, 1], colors[g, 2], splats[g, 5]
-                above = v - np.float32(y0) - _HALF  # rows whose pixel centres lie within ey of v
+                # Rows whose pixel centres lie within ey of v.
+                above = v - np.float32(y0) - _HALF
                 first = max(0, int(np.ceil(above - splats[g, 7])))
                 last = min(TILE - 1, int(np.floor(above + splats[g, 7])))
                 dx0 = np.float32(x0) + _HALF - u
                 quadratic = -_HALF * _LOG2_E * xx
-                lean, lowest = -xy / xx, splats[g, 8]  # the peak of a row moves by lean dy
+                # the peak of a row moves by lean dy
+                lean = -xy / xx
+                lowest = splats[g, 8]
                 touched = False
                 for row in range(first, last + 1):
                     if not live[row]:
                         continue
                     dy = np.float32(y0 + row) + _HALF - v
-                    linear, constant = -_LOG2_E * xy * dy, -_HALF * _LOG2_E * yy * dy * dy
+                    linear = -_LOG2_E * xy * dy
+                    constant = -_HALF * _LOG2_E * yy * dy * dy
                     # power is below `lowest` in all lanes if at its peak on their real interval
                     peak = min(max(lean * dy, dx0), dx0 + _LAST_LANE)
                     if (quadratic * peak + linear) * peak + constant < lowest:
                         continue
-                    base, power = np.uint64(row) * _STATE, (linear, quadratic, constant)
+                    base = np.uint64(row) * _STATE
+                    power = (linear, quadratic, constant)
                     if not backward:
                         _blend_row(state, base, dx0, power, look, options)
                         continue

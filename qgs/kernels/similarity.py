@@ -8,7 +8,9 @@ import numpy as np
 from qgs.kernels import kernel
 
 _REACH = 5
-_ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
+_ZERO = np.float32(0)
+_ONE = np.float32(1)
+_TWO = np.float32(2)
 
 
 @kernel
@@ -41,15 +43,19 @@ def similarity_sum(moments, weights, stabilisers, slope):
     (_, height, width), (c1, c2), total = moments.shape, stabilisers, 0.0
     framed = np.empty((4, width + 2 * _REACH), np.float32)
     means = np.empty((4, width), np.float32)
-    slopes = np.empty((3, height, width), np.float32)  # by the means of x, of squares, of x y
+    # By the means of x, of squares, of x y.
+    slopes = np.empty((3, height, width), np.float32)
     for row in range(height):
         _windowed(moments, row, weights, framed, means)
         of_row = _ZERO
         for column in range(width):
-            a, b = means[0, column], means[1, column]
+            a = means[0, column]
+            b = means[1, column]
             energy = a * a + b * b
-            luminance, structure = _TWO * a * b + c1, _TWO * (means[3, column] - a * b) + c2
-            bright, spread = energy + c1, means[2, column] - energy + c2
+            luminance = _TWO * a * b + c1
+            structure = _TWO * (means[3, column] - a * b) + c2
+            bright = energy + c1
+            spread = means[2, column] - energy + c2
             inverse = _ONE / (bright * spread)
             value = luminance * structure * inverse
             of_mean = b * (structure - luminance) * inverse

@@ -41,7 +41,8 @@ class DepthSurface(Loss):
         """See `Loss`."""
         views = [target, inputs] if self.config.inputs else [target]
         measured = [view for view in views if view.depths is not None]
-        means, mask = prediction.gaussians.means, prediction.state.mask
+        means = prediction.gaussians.means
+        mask = prediction.state.mask
         if not measured:
             warn_once(
                 "a batch has no depth maps, so the loss qgs/depth_surface is 0 for it: where no "
@@ -52,7 +53,8 @@ class DepthSurface(Loss):
             surface_errors(means, view, self.config.beta, self.config.near) for view in measured
         ]
         errors, seen = (torch.cat(parts, 1) for parts in zip(*found, strict=True))  # (B, V, G)
-        if mask is not None:  # places without a query have Gaussians that nobody sees
+        # Places without a query have Gaussians that nobody sees.
+        if mask is not None:
             seen = seen & mask.repeat_interleave(means.shape[1] // mask.shape[1], 1)[:, None]
         nearest = (errors + torch.where(seen, 0.0, torch.inf)).amin(1)  # (B, G), inf where unseen
         # a scene in which no centre meets a measured pixel has the loss 0, with a gradient of 0
@@ -78,11 +80,13 @@ def surface_errors(
     z, (height, width) = local[..., 2], views.cameras.size
     with torch.no_grad():
         focal, centre = views.cameras.intrinsics[:, :, None].split(2, -1)
-        safe = z.clamp_min(near)[..., None]  # points behind are left out below
+        # Points behind are left out below.
+        safe = z.clamp_min(near)[..., None]
         # nearest pixel, as depths of both sides of an edge have no meaningful mean
         column, row = (focal * local[..., :2] / safe + centre).floor().unbind(-1)
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (z > near)
-        place = torch.where(inside, row * width + column, 0)  # also where a centre is NaN
+        # Also where a centre is NaN.
+        place = torch.where(inside, row * width + column, 0)
         depth = views.depths.flatten(2).gather(2, place.long())  # (B, V, G)
         seen = inside & (depth > 0)
     error = F.smooth_l1_loss(z, torch.where(seen, depth, z), beta=beta, reduction="none")

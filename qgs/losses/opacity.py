@@ -56,7 +56,8 @@ class Mask(Loss):
 
 def mean_of_gaussians(values: Tensor, prediction: LayerPrediction) -> Tensor:
     """Values (B, G), averaged over the Gaussians of queries that exist, then over scenes; 0-d."""
-    values, mask = at_least_float32(values), prediction.state.mask
+    values = at_least_float32(values)
+    mask = prediction.state.mask
     if mask is None:
         return values.mean()
     there = mask.repeat_interleave(values.shape[1] // mask.shape[1], 1)

@@ -107,7 +107,8 @@ def view_visibility(
     with the views. Values and gradients are finite if `clamp` is set whenever `behind` is.
     """
     options = (behind, z_guard, infinite_pixel)
-    with torch.no_grad():  # find the nearest view first, so that only its graph is kept
+    # Find the nearest view first, so that only its graph is kept.
+    with torch.no_grad():
         views = [cameras[:, view, None] for view in range(cameras.shape[1])]
         excess = torch.stack([_image_excess(points, view, *options) for view in views], 1)
         nearest = excess.argmin(1)
@@ -129,12 +130,14 @@ def _image_excess(
     """
     from_camera = points - cameras.c2w[..., :3, 3]
     camera_points = (from_camera[..., None] * cameras.c2w[..., :3, :3]).sum(-2)
-    xy, z = camera_points[..., :2], camera_points[..., 2:]
+    xy = camera_points[..., :2]
+    z = camera_points[..., 2:]
     if z_guard is not None:
         z = torch.where(z.abs() < z_guard, z_guard, z)
     # Divide by 1 there and put the value in after: where() alone would pass on NaN gradients.
     at_zero = z.abs() < _TINY_Z
-    focal, principal = cameras.intrinsics[..., :2], cameras.intrinsics[..., 2:]
+    focal = cameras.intrinsics[..., :2]
+    principal = cameras.intrinsics[..., 2:]
     pixels = focal * xy / torch.where(at_zero, 1.0, z) + principal
     pixels = torch.where(at_zero, torch.where(xy == 0, 0.0, infinite_pixel * xy.sign()), pixels)
     height, width = cameras.size

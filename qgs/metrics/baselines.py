@@ -44,7 +44,8 @@ def worse_than_nearest(
 @full_precision
 def _distance(inputs: Tensor, targets: Tensor) -> Tensor:
     """Distances (B, T, V) of poses inputs (B, V, 4, 4) and targets (B, T, 4, 4)."""
-    centres, seen_from = inputs[..., :3, 3], targets[..., :3, 3]
+    centres = inputs[..., :3, 3]
+    seen_from = targets[..., :3, 3]
     extent = torch.cdist(centres, centres).amax((-1, -2), keepdim=True)
     distance = torch.cdist(seen_from, centres) / torch.where(extent > 0, extent, 1.0)
     cosine = targets[..., :3, 2] @ inputs[..., :3, 2].transpose(-1, -2)

@@ -11,7 +11,8 @@ from qgs.similarity import WINDOW, similarity_map
 
 SsimCovariance: TypeAlias = Literal["population", "sample"]
 
-_MSE_FLOOR = 1e-10  # identical images get 100 dB
+# Identical images get 100 dB.
+_MSE_FLOOR = 1e-10
 
 
 class Psnr(Metric):

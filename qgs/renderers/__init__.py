@@ -30,7 +30,8 @@ class AutoRenderer(Renderer):
     ) -> Rendering:
         """See `Renderer`. Raises RuntimeError when the package it needs is not installed."""
         renderer = self._on_cuda if gaussians.means.is_cuda else self._on_cpu
-        renderer.config = self.config  # options may follow a schedule
+        # Options may follow a schedule.
+        renderer.config = self.config
         return renderer(gaussians, cameras, background)
 
     @cached_property

@@ -16,8 +16,10 @@ from qgs.renderers.reference import CLAMP_MARGIN, resolve
 from qgs.types import Cameras, Gaussians, Rendering
 
 _TILE = 16
-_CHUNK = 512  # Gaussians per unit of the projection
-_MIN_UNITS = 8  # units of work per call, so that a few large images still fill a few cores
+# Gaussians per unit of the projection.
+_CHUNK = 512
+# Units of work per call, so that a few large images still fill a few cores.
+_MIN_UNITS = 8
 
 
 class CpuRenderer(Renderer):
@@ -50,7 +52,8 @@ class CpuRenderer(Renderer):
                 "them with .to('cpu') or choose `renderer: {type: qgs/auto}`"
             )
         config = self.config
-        with torch.autocast("cpu", enabled=False):  # half precision has no digits for pixels
+        # Half precision has no digits for pixels.
+        with torch.autocast("cpu", enabled=False):
             gaussians, cameras = raise_precision(gaussians, cameras)
             backdrop = background_of(background, config.background, gaussians.means)
             sums = self._sums(gaussians, colors_of(gaussians, cameras), cameras)
@@ -121,7 +124,8 @@ class _Splat(torch.autograd.Function):
         saved = ctx.saved_tensors
         means, scales, quats, opacities, colors, c2w, lenses, rows, sums = _arrays(*saved)
         (batch, views, count), size = rows.shape[:3], sums.shape[-2:]
-        stripes, units = _image_units(batch, views, size[0]), _scene_units(batch, count)
+        stripes = _image_units(batch, views, size[0])
+        units = _scene_units(batch, count)
         parts = 1 + max((part for *_, part in stripes), default=0)
         chunks = 1 + max((part for *_, part in units), default=0)
         # Each stripe adds up gradients of its own, in a fixed order whatever the threads.
@@ -131,7 +135,8 @@ class _Splat(torch.autograd.Function):
         of_means, of_scales, of_quats, of_opacities, of_colors = _arrays(*of_inputs)
         # In float64: thousands of splats of either sign nearly cancel in a camera's gradient.
         of_cameras = torch.zeros((batch, chunks, views, CAMERA_GRADIENTS), dtype=torch.float64)
-        camera_parts, wants_cameras = of_cameras.numpy(), any(ctx.needs_input_grad[5:7])
+        camera_parts = of_cameras.numpy()
+        wants_cameras = any(ctx.needs_input_grad[5:7])
         projection, blending = _limits(ctx.config)
 
         def blend(image: tuple[int, int], stripe: tuple[int, int], part: int) -> None:
@@ -150,7 +155,8 @@ class _Splat(torch.autograd.Function):
 
         in_threads(blend, stripes)
         in_threads(project, units)
-        if colors.ndim == 4:  # not to be added up over the views
+        # Not to be added up over the views.
+        if colors.ndim == 4:
             of_inputs[4] = torch.from_numpy(grads[..., -3:].sum(2))
         if not wants_cameras:
             return *of_inputs, None, None, None, None

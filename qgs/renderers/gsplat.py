@@ -42,21 +42,27 @@ class GsplatRenderer(Renderer):
         """See `Renderer`; ValueError for tensors not on CUDA, RuntimeError without gsplat."""
         check_inputs(gaussians, cameras)
         _check_supported(gaussians, cameras)
-        if not gaussians.means.shape[1]:  # gsplat's kernels divide by their number
+        # gsplat's kernels divide by their number.
+        if not gaussians.means.shape[1]:
             return TorchRenderer(self.config)(gaussians, cameras, background)
-        rasterization = import_module("gsplat").rasterization  # imported late: it needs CUDA
+        # Imported late: it needs CUDA.
+        rasterization = import_module("gsplat").rasterization
 
         with torch.autocast("cuda", enabled=False):
-            gaussians, cameras = gaussians.to(torch.float32), cameras.to(torch.float32)
+            gaussians = gaussians.to(torch.float32)
+            cameras = cameras.to(torch.float32)
             backdrop = background_of(background, self.config.background, gaussians.means)
-            colors, features = colors_of(gaussians, cameras), gaussians.features
-            if features is not None:  # further channels, over 0
+            colors = colors_of(gaussians, cameras)
+            features = gaussians.features
+            # Further channels, over 0.
+            if features is not None:
                 backdrop = F.pad(backdrop, (0, features.shape[-1]))
                 features = features[:, None] if colors.ndim == 4 else features
                 colors = torch.cat([colors, features.expand(*colors.shape[:-1], -1)], -1)
             height, width = cameras.size
             fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
-            o, one = torch.zeros_like(fx), torch.ones_like(fx)
+            o = torch.zeros_like(fx)
+            one = torch.ones_like(fx)
             calibration = torch.stack([fx, o, cx, o, fy, cy, o, o, one], -1)
             # The packed path asserts with backgrounds and can mix gradients between scenes.
             rgbd, alpha, _ = rasterization(

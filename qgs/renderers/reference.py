@@ -15,7 +15,8 @@ from qgs.contracts.renderer import background_of, check_inputs, colors_of, raise
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Cameras, Gaussians, Rendering
 
-CLAMP_MARGIN = 0.15  # of the image's width or height: beyond it the Jacobian is held constant
+# Of the image's width or height: beyond it the Jacobian is held constant.
+CLAMP_MARGIN = 0.15
 
 
 @dataclass(frozen=True)
@@ -57,13 +58,16 @@ def project(
     height, width = cameras.size
     means = torch.stack([torch.addcmul(cx, fx, x), torch.addcmul(cy, fy, y)], -1)
     # Far off screen the linear Jacobian would blow a Gaussian up over the whole image.
-    x, y = _clamped(x, fx, cx, width), _clamped(y, fy, cy, height)
+    x = _clamped(x, fx, cx, width)
+    y = _clamped(y, fy, cy, height)
 
     turned = w2c[..., :3, :3] @ factors.permute(0, 2, 1, 3).flatten(2)[:, None]
     rows = turned.unflatten(-1, (-1, 3))  # (B, V, 3, G, 3): rows of W R S
     row_x = (fx / z)[..., None] * (rows[:, :, 0] - x[..., None] * rows[:, :, 2])
     row_y = (fy / z)[..., None] * (rows[:, :, 1] - y[..., None] * rows[:, :, 2])
-    xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
+    xx = (row_x * row_x).sum(-1)
+    xy = (row_x * row_y).sum(-1)
+    yy = (row_y * row_y).sum(-1)
     minors = torch.linalg.cross(row_x, row_y, dim=-1)
     # Cauchy-Binet: unlike xx * yy - xy^2 this does not cancel for needles.
     determinant = (minors * minors).sum(-1) + dilation * (xx + yy) + dilation * dilation
@@ -80,7 +84,8 @@ def project(
 
 def _clamped(slope: Tensor, focal: Tensor, principal: Tensor, size: int) -> Tensor:
     margin = CLAMP_MARGIN * size
-    low, high = (-margin - principal) / focal, (size + margin - principal) / focal
+    low = (-margin - principal) / focal
+    high = (size + margin - principal) / focal
     return torch.minimum(torch.maximum(slope, low), high)
 
 
@@ -115,7 +120,8 @@ class TorchRenderer(Renderer):
 def resolve(sums: Tensor, background: Tensor, features: Tensor | None = None) -> Rendering:
     """Sums (B, V, 5, H, W) of w r, w g, w b, w z, w, and those of features -> Rendering."""
     rgb, depth, alpha = sums.split([3, 1, 1], dim=2)
-    hit = torch.where(alpha > 0, alpha, 1.0)  # depth is 0, not NaN, where nothing was hit
+    # Depth is 0, not NaN, where nothing was hit.
+    hit = torch.where(alpha > 0, alpha, 1.0)
     rgb = rgb + (1 - alpha) * background[:, None, None]
     return Rendering(rgb=rgb, alpha=alpha, depth=depth / hit, features=features)
 
@@ -133,7 +139,8 @@ def _composite(
     colors: (B, G, 3) or (B, V, G, 3).
     """
     height, width = size
-    order = splats.depths[image].argsort(stable=True)  # front to back; equal depths stay in order
+    # Front to back; equal depths stay in order.
+    order = splats.depths[image].argsort(stable=True)
     order = order[splats.visible[image][order]]
     means, conics, depths = (
         field[image][order] for field in (splats.means, splats.conics, splats.depths)
@@ -142,7 +149,9 @@ def _composite(
     # Pixel centres are at .5: (0, 0) is the corner of the image.
     u = torch.arange(width, dtype=means.dtype, device=means.device) + 0.5
     v = torch.arange(height, dtype=means.dtype, device=means.device) + 0.5
-    dx, dy = u - means[:, None, :1], v[:, None] - means[:, 1:, None]  # (G, 1, W), (G, H, 1)
+    # (G, 1, W), (G, H, 1)
+    dx = u - means[:, None, :1]
+    dy = v[:, None] - means[:, 1:, None]
     xx, xy, yy = conics[..., None, None].unbind(1)
     power = -0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy
     alphas = opacities[:, None, None] * power.clamp(max=0).exp()
@@ -152,7 +161,8 @@ def _composite(
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])[: len(order)]
     # `after`, not `before`: a Gaussian that would close the pixel is left out, as in gsplat.
     weights = torch.where(after > config.transmittance_min, alphas * before, 0.0)
-    colors, z = colors[image[: colors.ndim - 2]][order], depths[:, None]
+    colors = colors[image[: colors.ndim - 2]][order]
+    z = depths[:, None]
     summed = [colors, z, torch.ones_like(z)]
     if gaussians.features is not None:
         summed.append(gaussians.features[image[0]][order])

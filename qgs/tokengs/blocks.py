@@ -50,7 +50,8 @@ def merge_heads(x_BhTd: Tensor) -> Tensor:
 
 def attention_weights(q_BhQd: Tensor, k_BhTd: Tensor, bias_BhQT: Tensor | None) -> AttentionWeights:
     """The parts of scaled dot-product attention, computed in float32. bias: for one head or all."""
-    scale = q_BhQd.shape[-1] ** -0.5  # so that logits keep their spread for any width of a head
+    # So that logits keep their spread for any width of a head.
+    scale = q_BhQd.shape[-1] ** -0.5
     content_BhQT = torch.einsum("bhqd,bhtd->bhqt", q_BhQd.float(), k_BhTd.float()) * scale
     logits_BhQT = content_BhQT if bias_BhQT is None else content_BhQT + bias_BhQT
     weights_BhQT = logits_BhQT.softmax(-1)
@@ -60,7 +61,8 @@ def attention_weights(q_BhQd: Tensor, k_BhTd: Tensor, bias_BhQT: Tensor | None) 
 class SelfAttentionCore(nn.Module):
     """Multi-head self-attention with fused qkv and per-head LayerNorm on queries and keys."""
 
-    unlearned = ("k_norm.bias",)  # the same for all logits of a query; TokenGS has it
+    # The same for all logits of a query; TokenGS has it.
+    unlearned = ("k_norm.bias",)
 
     def __init__(self, width: int, heads: int, norm_eps: float = NORM_EPS) -> None:
         super().__init__()
@@ -118,7 +120,8 @@ class CrossAttentionCore(nn.Module):
     ) -> Tensor:
         """(B, N, D). bias: (B, N, M) for all heads, or (B, h, N, M), -inf hides a token."""
         # Keys are normalised by their encoder, in float32 under autocast, as these queries are.
-        q_BhNd, k_BhMd = self.project(x_BND).to(v_BhMd.dtype), k_BhMd.to(v_BhMd.dtype)
+        q_BhNd = self.project(x_BND).to(v_BhMd.dtype)
+        k_BhMd = k_BhMd.to(v_BhMd.dtype)
         bias_BhNM = None if bias is None else _by_head(bias).to(v_BhMd.dtype)
         read_BhNd = F.scaled_dot_product_attention(q_BhNd, k_BhMd, v_BhMd, attn_mask=bias_BhNM)
         return self.out_proj(merge_heads(read_BhNd))

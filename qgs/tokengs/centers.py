@@ -22,10 +22,12 @@ def posact(
     and 1000; TokenGS: none). The slope is 1 at 0, so that a head which starts at zero can learn,
     and 0 outside a limit.
     """
-    if input_limit is not None:  # exp of a stray output would be infinite
+    # Exp of a stray output would be infinite.
+    if input_limit is not None:
         t = t.clamp(-input_limit, input_limit)
     if output_limit is not None:
-        end = math.log1p(output_limit) + 1  # an exponential that overflows has slope 0 * inf
+        # An exponential that overflows has slope 0 * inf.
+        end = math.log1p(output_limit) + 1
         t = t.clamp(-end, end)
     # expm1, not exp - 1, which has no digits left where t is near 0.
     result = torch.where(t >= 0, torch.expm1(t), -torch.expm1(-t))

@@ -28,7 +28,8 @@ class CrossSelfMlp(DecoderLayer):
 
     def __init__(self, config: ComponentConfig, parts: LayerParts) -> None:
         super().__init__(config, parts)
-        width, layer_scale = parts.dims.width, parts.layer_scale
+        width = parts.dims.width
+        layer_scale = parts.layer_scale
         self.cross_attention = parts.sublayers["cross_attention"]
         self.cross_scale = LayerScale(width, layer_scale)
         self.self_attention = parts.sublayers["self_attention"]
@@ -39,7 +40,8 @@ class CrossSelfMlp(DecoderLayer):
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
         # Each part reads what the part before it wrote: first the photos, then the other queries.
         x_BND = state.features + self.cross_scale(self.cross_attention(state, memory))
-        state = state.replace(features=x_BND)  # self-attention reads fields too
+        # self-attention reads fields too.
+        state = state.replace(features=x_BND)
         x_BND = x_BND + self.self_scale(self.self_attention(state))
         x_BND = x_BND + self.feed_forward_scale(self.feed_forward(x_BND))
         return state.replace(features=x_BND), memory
@@ -105,7 +107,8 @@ class MlpFeedForward(FeedForward):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.norm = nn.LayerNorm(dims.width, config.norm_eps)  # pre-norm: the stream stays as it is
+        # pre-norm: the stream stays as it is.
+        self.norm = nn.LayerNorm(dims.width, config.norm_eps)
         self.mlp = Mlp(dims.width, int(config.ratio * dims.width), dims.width)
 
     def forward(self, features: Tensor) -> Tensor:  # (B, N, D)

@@ -70,7 +70,8 @@ class PatchViT(PatchEncoder):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        patch, eps = config.patch_size, config.norm_eps
+        patch = config.patch_size
+        eps = config.norm_eps
         # Each with its own norm: colours and rays have different scales.
         self.rgb_embedding = PatchEmbedding(3, dims.width, patch, eps)
         self.ray_embedding = PatchEmbedding(6, dims.width, patch, eps)
@@ -84,7 +85,8 @@ class PatchViT(PatchEncoder):
 
         A patch of f x f times the pixels then gives the token of the small one on means of f x f.
         """
-        own = self.state_dict()  # its shapes give the size of our patches
+        # Its shapes give the size of our patches.
+        own = self.state_dict()
         return {
             name: _larger(kernel, own[name].shape[-1]) if name.endswith(_KERNEL) else kernel
             for name, kernel in learned.items()
@@ -109,7 +111,8 @@ class MultiViewViT(PatchViT):
         self.k_norm = nn.LayerNorm(dims.width // dims.heads, config.norm_eps)
 
     def forward(self, views: Views) -> ImageMemory:
-        grid, plucker_BV6HW = self.grid(views), plucker_rays(views.cameras)
+        grid = self.grid(views)
+        plucker_BV6HW = plucker_rays(views.cameras)
         x_BMD = self.embed(views, plucker_BV6HW)
         for block in self.blocks:
             x_BMD = block(x_BMD)

@@ -56,7 +56,8 @@ class GaussianHead(Head):
         # Small weights: all Gaussians of a query start at one place, near one size and grey.
         nn.init.zeros_(self.linear.bias)
         nn.init.trunc_normal_(self.linear.weight, std=config.init_std)
-        if config.position_std is not None:  # spread initial positions divide the scene sooner
+        # Spread initial positions divide the scene sooner.
+        if config.position_std is not None:
             rows_K3D = torch.empty(config.gaussians_per_query, CHANNELS[0], dims.width)
             nn.init.trunc_normal_(rows_K3D, std=config.position_std)
             with torch.no_grad():
@@ -76,8 +77,10 @@ class GaussianHead(Head):
     def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
         """Raw channels (B, N, K, 14) to attributes, in float32 or better."""
         offsets, rgb, scale, rotation, opacity = at_least_float32(raw_BNKC).split(CHANNELS, -1)
-        cap, limit = self.config.scale_cap, self.config.scale_input_limit
-        if limit is not None:  # exp of a stray output would be infinite, its gradient NaN
+        cap = self.config.scale_cap
+        limit = self.config.scale_input_limit
+        # Exp of a stray output would be infinite, its gradient NaN.
+        if limit is not None:
             scale = scale.clamp(-limit, limit)
         return GaussianAttributes(
             offsets=offsets,

@@ -56,7 +56,8 @@ class OneCycleAdamW(Optimizer):
 
     def check(self) -> None:
         """Raise ValueError when the warm-up fills all steps and no time budget shortens it."""
-        warmup, steps = self.options.warmup, self.training.steps
+        warmup = self.options.warmup
+        steps = self.training.steps
         if not self.follows_schedule and self.training.seconds is None and warmup >= steps:
             raise ValueError(
                 f"optimizer.warmup is {warmup}, but training.steps is {steps}: the learning rate "
@@ -74,7 +75,8 @@ class OneCycleAdamW(Optimizer):
         if self.follows_schedule:
             return super().learning_rate(step, seconds)
         # steps - 1: the last step has the last rate, as in torch's OneCycleLR.
-        of_steps, of_seconds = step / max(self.training.steps - 1, 1), seconds / self.budget
+        of_steps = step / max(self.training.steps - 1, 1)
+        of_seconds = seconds / self.budget
         used = min(max(of_steps, of_seconds), 1.0)
         if self._descent_starts is None:
             top = self.options.warmup - 1

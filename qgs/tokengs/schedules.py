@@ -38,7 +38,8 @@ class Steps(Schedule):
 
     @model_validator(mode="after")
     def _one_value_more(self) -> Self:
-        steps, count = _ascending(self.at), len(self.values)
+        steps = _ascending(self.at)
+        count = len(self.values)
         if count != len(steps) + 1:
             reason = f"{len(steps)} steps in `at` part {len(steps) + 1} values, got {count}"
             raise OptionError(reason, "give one value more than steps; the first holds from 0")
@@ -66,7 +67,8 @@ class Linear(Schedule):
 
     @model_validator(mode="after")
     def _one_step_each(self) -> Self:
-        steps, count = _ascending(self.at), len(self.values)
+        steps = _ascending(self.at)
+        count = len(self.values)
         if count != len(steps):
             reason = f"{count} values need {count} steps in `at`, got {len(steps)}"
             raise OptionError(reason, "give a step for each value; for jumps, `schedule: steps`")

@@ -45,7 +45,8 @@ def backbone(shapes: Shapes, queries: str) -> dict[str, Any]:
 
     queries: the `type` of its queries.
     """
-    count, width = size_at(shapes, "gs_tokens", 0), size_at(shapes, "gs_tokens", 1)
+    count = size_at(shapes, "gs_tokens", 0)
+    width = size_at(shapes, "gs_tokens", 1)
     head_width = size_at(shapes, "enc_dec_backbone.k_proj_norm.weight", 0)
     channels = size_at(shapes, "activation_head.deconv.weight", 0)
     encoder = {

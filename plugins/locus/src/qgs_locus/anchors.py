@@ -69,7 +69,8 @@ class FrustumCenters(ComponentConfig):
     def sample(self, count: int) -> Tensor:
         """Centres (count, 3)."""
         near, far = self.depth
-        z = near * (far / near) ** torch.rand(count, 1)  # equal steps of parallax, not of depth
+        # Equal steps of parallax, not of depth.
+        z = near * (far / near) ** torch.rand(count, 1)
         return torch.cat([(2 * torch.rand(count, 2) - 1) * self.slope * z, z], -1)
 
 

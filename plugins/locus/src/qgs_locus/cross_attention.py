@@ -99,17 +99,21 @@ class RayBiasedCrossAttention(CrossAttention):
 
     def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias:
         """gamma b, of the state before this layer."""
-        config, eps = self.config, self.config.direction_eps
-        rays_B6M = memory.once(  # the rays of a scene are the same in all layers
+        config = self.config
+        eps = self.config.direction_eps
+        # The rays of a scene are the same in all layers.
+        rays_B6M = memory.once(
             f"locus.ray_tokens.{eps:g}", lambda: ray_tokens(memory["patch_rays"], eps)
         )
         sigma_sq = self.sigma_sq(state)
         return RayBias.of(state[CENTER], sigma_sq, rays_B6M, config.bias_min, self.gamma)
 
     def forward(self, state: QueryState, memory: ImageMemory) -> Tensor:
-        q_BhNd, v_BhMd = self.core.project(state.features), memory["values"]
+        q_BhNd = self.core.project(state.features)
+        v_BhMd = memory["values"]
         # As in `CrossAttentionCore`: norms give float32 under autocast.
-        q_BhNd, k_BhMd = q_BhNd.to(v_BhMd.dtype), memory["keys"].to(v_BhMd.dtype)
+        q_BhNd = q_BhNd.to(v_BhMd.dtype)
+        k_BhMd = memory["keys"].to(v_BhMd.dtype)
         read_BhNd = biased_attention(q_BhNd, k_BhMd, v_BhMd, self.bias(state, memory))
         return self.core.out_proj(merge_heads(read_BhNd))
 
@@ -120,7 +124,9 @@ class RayBiasedCrossAttention(CrossAttention):
 
     def explained_bias(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> Tensor:
         """gamma b (B, Q, M) of some queries, by the formula as it is written."""
-        sigma_sq, config = self.sigma_sq(state), self.config
+        sigma_sq = self.sigma_sq(state)
+        config = self.config
         chosen = sigma_sq[:, queries] if isinstance(sigma_sq, Tensor) else sigma_sq
-        rays, limits = memory["patch_rays"], (config.bias_min, config.direction_eps)
+        rays = memory["patch_rays"]
+        limits = (config.bias_min, config.direction_eps)
         return self.gamma * dense_bias(state[CENTER][:, queries], chosen, rays, *limits)

@@ -45,7 +45,8 @@ def radius_field(options: RadiusOptions) -> Fields:
 def support_radius(raw_radius: Tensor, options: RadiusOptions) -> Tensor:
     """Support radii r > 0, world units, of raw radii of any shape: equation (1)."""
     radius = F.softplus(raw_radius)
-    if options.radius_bound == "floor":  # softplus comes near 0, and r divides in equation (3)
+    # Softplus comes near 0, and r divides in equation (3)
+    if options.radius_bound == "floor":
         return radius.clamp_min(options.radius_min)
     return radius + options.radius_min
 

@@ -84,7 +84,8 @@ class RayBias(AttentionBias):
         product could take, it would be off by several logits far from the cameras.
         """
         center_n3, factor_n1, lower_n1 = queries_nF.split([3, 1, 1], -1)
-        m_M3, d_M3 = tokens_GM[:3].mT, tokens_GM[3:6].mT
+        m_M3 = tokens_GM[:3].mT
+        d_M3 = tokens_GM[3:6].mT
         moment_nM3 = torch.linalg.cross(center_n3[:, None], d_M3[None], dim=-1) - m_M3
         return clamped(-factor_n1 * moment_nM3.square().sum(-1), lower_n1)
 
@@ -101,4 +102,5 @@ class RayBias(AttentionBias):
 
 def clamped(bias_nM: Tensor, lower_n1: Tensor) -> Tensor:
     """At least `lower_n1`, to which the gradient goes where it is reached."""
-    return torch.where(bias_nM <= lower_n1, lower_n1, bias_nM)  # so that NaN stays
+    # So that NaN stays.
+    return torch.where(bias_nM <= lower_n1, lower_n1, bias_nM)

@@ -60,8 +60,10 @@ class AnchorAwareSelfAttention(SelfAttention):
 
     def position_embedding(self, state: QueryState) -> Tensor:
         """p (B, N, D)."""
-        position_BN3, c = state[CENTER], self.config
-        if c.position == "tanh":  # the sines are made for [-1, 1], and centres are unbounded
+        position_BN3 = state[CENTER]
+        c = self.config
+        # The sines are made for [-1, 1], and centres are unbounded.
+        if c.position == "tanh":
             position_BN3 = torch.tanh(position_BN3)
         return self.position_mlp(
             sine_embedding(position_BN3, c.features, c.temperature, c.divisor_eps)

@@ -27,7 +27,8 @@ class EllipsoidCrossAttention(RayBiasedCrossAttention):
 
     def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias:
         """gamma b, of the state before this layer."""
-        config, sigma_sq_BN3 = self.config, self.sigma_sq(state)
+        config = self.config
+        sigma_sq_BN3 = self.sigma_sq(state)
         if not isinstance(sigma_sq_BN3, Tensor):
             return super().bias(state, memory)
         tokens_B9M = memory.once(

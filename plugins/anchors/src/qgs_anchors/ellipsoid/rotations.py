@@ -25,8 +25,10 @@ def unit_quats(quats: Tensor) -> Tensor:
 @full_precision
 def quat_product(left: Tensor, right: Tensor) -> Tensor:
     """Hamilton product (..., 4): the rotation `right`, then the rotation `left`."""
-    w, v = left[..., :1], left[..., 1:]
-    w2, v2 = right[..., :1], right[..., 1:]
+    w = left[..., :1]
+    v = left[..., 1:]
+    w2 = right[..., :1]
+    v2 = right[..., 1:]
     real = w * w2 - (v * v2).sum(-1, keepdim=True)
     return torch.cat([real, w * v2 + w2 * v + torch.linalg.cross(v, v2, dim=-1)], -1)
 

@@ -27,7 +27,8 @@ class NeighbourAttention(SelfAttention):
 
     name = "neighbours"
     reads = CENTER_FIELD
-    unlearned = ("place_mlp.fc2.bias",)  # adds the same to all logits of an anchor
+    # Adds the same to all logits of an anchor.
+    unlearned = ("place_mlp.fc2.bias",)
 
     class Config(ComponentConfig):
         count: int = Field(default=16, ge=1)
@@ -89,7 +90,8 @@ def nearest(center_BN3: Tensor, count: int, mask_BN: Tensor | None) -> tuple[Ten
     scenes, anchors, _ = center_BN3.shape
     # One part where all distances fit: torch.compile makes a graph for each number of parts.
     rows = anchors if scenes * anchors**2 <= MAX_PAIRS else max(1, MAX_PAIRS // (scenes * anchors))
-    found, own_N = [], torch.arange(anchors, device=center_BN3.device)
+    found = []
+    own_N = torch.arange(anchors, device=center_BN3.device)
     for part_BR3, own_R in zip(center_BN3.split(rows, 1), own_N.split(rows), strict=True):
         # Not as |a|^2 + |b|^2 - 2 ab, which has no digits left between close anchors far away.
         distance = torch.cdist(part_BR3, center_BN3, compute_mode="donot_use_mm_for_euclid_dist")
@@ -101,7 +103,8 @@ def nearest(center_BN3: Tensor, count: int, mask_BN: Tensor | None) -> tuple[Ten
     if mask_BN is None:
         return index_BNk, None
     seen_BNk = mask_BN[:, None].expand(-1, anchors, -1).gather(2, index_BNk)
-    return index_BNk, seen_BNk | (index_BNk == index_BNk[..., :1])  # itself, or all is NaN
+    # itself, or all is NaN.
+    return index_BNk, seen_BNk | (index_BNk == index_BNk[..., :1])
 
 
 @full_precision

@@ -147,13 +147,16 @@ class ObservedQueries(Queries):
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         """Features (B, N, D), fields of anchors (B, N, ...), those of footprints with `cells`."""
         assert memory.grid is not None
-        config, device, size = self.config, memory.features.device, views.cameras.size
+        config = self.config
+        device = memory.features.device
+        size = views.cameras.size
         if config.count is None:
             view_N, place_N2, share_2 = patches(memory.grid, config.per_token, size, device)
             x_BND = (memory.features[:, :, None] + self.slots).flatten(1, 2)
             x_BND, nearness_BN1 = self._swept(x_BND, views, view_N, place_N2)
         else:
-            photos, aspect = memory.grid[0], aspect_of(config.cells or 1)
+            photos = memory.grid[0]
+            aspect = aspect_of(config.cells or 1)
             view_N, place_N2, share_2 = spread(config.count, photos, size, aspect, device)
             middle_S2 = cells(config.tokens, rows_in_tile(config.tokens), place_N2)
             view_X, place_X2 = _divided(view_N, place_N2, share_2 * middle_S2)
@@ -182,7 +185,8 @@ class ObservedQueries(Queries):
             return x_BXD, nearness_BX1
         x_BNSD, nearness_BNS1 = (x.unflatten(1, (-1, tokens)) for x in (x_BXD, nearness_BX1))
         mean_BND = x_BNSD.mean(2)
-        apart_BNSD = x_BNSD[:, :, 1:] - mean_BND[:, :, None]  # the first is minus the others
+        # The first is minus the others.
+        apart_BNSD = x_BNSD[:, :, 1:] - mean_BND[:, :, None]
         return mean_BND + self.apart_proj(apart_BNSD.flatten(2)), nearness_BNS1.mean(2)
 
     def _match(self, views: Views, view_N: Tensor, place_BN2: Tensor) -> Tensor:
@@ -207,7 +211,9 @@ class ObservedQueries(Queries):
         share_2: Tensor,
     ) -> dict[str, Tensor]:
         """share_2: width and height of footprints, as shares of the photo's."""
-        config, cameras, z_BN1 = self.config, views.cameras, self._depth(nearness_BN1)
+        config = self.config
+        cameras = views.cameras
+        z_BN1 = self._depth(nearness_BN1)
         place_BN2 = place_N2.expand(len(z_BN1), -1, -1)
         origin_BN3, direction_BN3 = rays_at(cameras, view_N, place_BN2)
         (height, width), (_, photos) = cameras.size, cameras.shape

@@ -47,15 +47,19 @@ def spread(
     their parts count as squares. Both are as even as a low-discrepancy sequence. Where points are
     fewer than photos, some photos have none.
     """
-    index_N, of_photo = torch.arange(count, device=device), size[0] / size[1]
+    index_N = torch.arange(count, device=device)
+    of_photo = size[0] / size[1]
     view_N = index_N % views
     held_N = (count - 1 - view_N) // views + 1
     # Tensors, since torch.compile would make a graph for each number that Python compares.
-    each, rows_R = held_N.amin(), index_N + 1
+    each = held_N.amin()
+    rows_R = index_N + 1
     off_R = (each * of_photo / rows_R**2 / aspect).log().abs()
     fit_R = (each % rows_R == 0) & (off_R < MOST_OFF) & (each * views == count)
-    wider_R = off_R - EPS * rows_R.log()  # of two that are as far off, the wider one
-    rows, tiled = torch.where(fit_R, wider_R, torch.inf).argmin() + 1, fit_R.any()
+    # Of two that are as far off, the wider one.
+    wider_R = off_R - EPS * rows_R.log()
+    rows = torch.where(fit_R, wider_R, torch.inf).argmin() + 1
+    tiled = fit_R.any()
     in_rows_N = torch.minimum((held_N * of_photo).sqrt().round().clamp_min(1).long(), held_N)
     place_N2 = parts(index_N // views, held_N, torch.where(tiled, rows, in_rows_N))
     tile_2 = torch.stack([rows / each, 1 / rows])
@@ -106,7 +110,8 @@ def parts(index_N: Tensor, count: Tensor, rows: Tensor | int) -> Tensor:
     row_N = ((index_N + 1) * rows - 1) // count
     first_N = row_N * count // rows
     held_N = (row_N + 1) * count // rows - first_N
-    x_N, y_N = (index_N - first_N + 0.5) / held_N, (row_N + 0.5) / rows
+    x_N = (index_N - first_N + 0.5) / held_N
+    y_N = (row_N + 0.5) / rows
     return torch.stack([x_N, y_N], -1)
 
 
@@ -128,7 +133,8 @@ def bilinear(maps_BVCHW: Tensor, view_N: Tensor, place_BNX2: Tensor) -> Tensor:
     edge_2 = constant([0.5 / width, 0.5 / height], place_BNX2)
     x_BNX, y_BNX = place_BNX2.maximum(edge_2).minimum(1 - edge_2).unbind(-1)
     y_BNX = (y_BNX + view_N[:, None]) / photos
-    column, grid = maps_BVCHW.transpose(1, 2).flatten(2, 3), torch.stack([x_BNX, y_BNX], -1)
+    column = maps_BVCHW.transpose(1, 2).flatten(2, 3)
+    grid = torch.stack([x_BNX, y_BNX], -1)
     # Places have no digits in half precision, and features of float64 keep theirs.
     kind = torch.promote_types(column.dtype, grid.dtype)
     found = F.grid_sample(column.to(kind), 2 * grid.to(kind) - 1, align_corners=False)
@@ -142,7 +148,8 @@ def colors_at(images_BV3HW: Tensor, side: float, view_N: Tensor, place_BN2: Tens
     Those of whole sides are exact. Beyond an edge, its pixels repeat.
     """
     height, width = images_BV3HW.shape[-2:]
-    place_BN2, samples = place_BN2.to(images_BV3HW), max(1, math.ceil(side - EPS))
+    place_BN2 = place_BN2.to(images_BV3HW)
+    samples = max(1, math.ceil(side - EPS))
     step_P2 = side * cells(samples**2, samples, place_BN2) / constant([width, height], place_BN2)
     return bilinear(images_BV3HW, view_N, place_BN2[:, :, None] + step_P2).mean(-1).mT
 
@@ -153,7 +160,8 @@ def rays_at(cameras: Cameras, view_N: Tensor, place_BN2: Tensor) -> tuple[Tensor
     Directions have length 1 along the axis of their camera.
     """
     height, width = cameras.size
-    c2w_BN44, lens_BN4 = cameras.c2w[:, view_N], cameras.intrinsics[:, view_N]
+    c2w_BN44 = cameras.c2w[:, view_N]
+    lens_BN4 = cameras.intrinsics[:, view_N]
     pixel_BN2 = place_BN2.to(lens_BN4) * constant([width, height], lens_BN4)
     slope_BN2 = (pixel_BN2 - lens_BN4[..., 2:]) / lens_BN4[..., :2]
     local_BN3 = F.pad(slope_BN2, (0, 1), value=1.0)

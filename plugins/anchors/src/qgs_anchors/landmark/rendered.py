@@ -53,7 +53,8 @@ class RenderedFeedback(Feedback):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        self.rounds, self.layers = config.rounds, config.layers
+        self.rounds = config.rounds
+        self.layers = config.layers
         self.marker = nn.Parameter(torch.zeros(dims.width))
         self.embedding = nn.Conv2d(CHANNELS * config.cells**2, dims.width, 3, padding=1)
         self.kv_proj = nn.Linear(dims.width, 2 * dims.width)
@@ -61,7 +62,8 @@ class RenderedFeedback(Feedback):
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         """More layers than there are, fewer rounds than the fewest, a size that does not divide."""
-        depth, size = context.dims.depth, context.image_size
+        depth = context.dims.depth
+        size = context.image_size
         if config.layers > depth:
             reason = f"a round repeats {config.layers} layers of a decoder of depth {depth}"
             yield Problem("layers", reason, f"write at most {depth}, or raise model.decoder.depth")
@@ -85,7 +87,8 @@ class RenderedFeedback(Feedback):
 
     def compared(self, views: Views) -> Views:
         """Photos of 1/`shrink` of the size, each pixel the mean of those that it covers."""
-        by, cameras = self.config.shrink, views.cameras
+        by = self.config.shrink
+        cameras = views.cameras
         size = (cameras.size[0] // by, cameras.size[1] // by)
         images = F.avg_pool2d(views.images.flatten(0, 1), by).unflatten(0, views.images.shape[:2])
         return Views(images, Cameras(cameras.c2w, cameras.intrinsics / by, size))
@@ -97,7 +100,8 @@ class RenderedFeedback(Feedback):
         _, rows, columns = memory.grid
         error = ERROR_GAIN * (photos.images - rendering.rgb)
         maps_BVCHW = torch.cat([error, rendering.rgb, rendering.alpha], 2)
-        cells, keys = self.config.cells, memory["keys"]
+        cells = self.config.cells
+        keys = memory["keys"]
         fine = F.adaptive_avg_pool2d(maps_BVCHW.flatten(0, 1), (rows * cells, columns * cells))
         x_XDhw = F.gelu(self.embedding(F.pixel_unshuffle(fine, cells)))
         x_BMD = x_XDhw.flatten(2).mT.unflatten(0, photos.images.shape[:2]).flatten(1, 2)

@@ -30,9 +30,11 @@ def mismatch(
     place_BNP2 = place_BN2[:, :, None] + step_P2
     color_B3NP = bilinear(views.images, view_N, place_BNP2)
     # All other photos at once: torch.compile would make a graph for each length of a loop.
-    photos, count = views.cameras.shape[1], len(view_N)
+    photos = views.cameras.shape[1]
+    count = len(view_N)
     other_X = (view_N + torch.arange(1, photos, device=view_N.device)[:, None]).flatten() % photos
-    view_X, place_BXP2 = view_N.repeat(photos - 1), place_BNP2.repeat(1, photos - 1, 1, 1)
+    view_X = view_N.repeat(photos - 1)
+    place_BXP2 = place_BNP2.repeat(1, photos - 1, 1, 1)
     at_BXDP2, seen_BXDP = reprojected(views.cameras, view_X, other_X, place_BXP2, depth_D)
     found_B3XDP = bilinear(views.images, other_X, at_BXDP2.flatten(2, 3))
     found_B3ANDP = found_B3XDP.unflatten(3, (-1, points**2)).unflatten(2, (photos - 1, count))
@@ -52,8 +54,10 @@ def reprojected(
     points = place_BNP2.shape[2]
     view_X = view_N.repeat_interleave(points)
     origin_BX3, direction_BX3 = rays_at(cameras, view_X, place_BNP2.flatten(1, 2))
-    origin_BN3, direction_BNP3 = origin_BX3[:, ::points], direction_BX3.unflatten(1, (-1, points))
-    c2w_BN44, lens_BN4 = cameras.c2w[:, other_N], cameras.intrinsics[:, other_N]
+    origin_BN3 = origin_BX3[:, ::points]
+    direction_BNP3 = direction_BX3.unflatten(1, (-1, points))
+    c2w_BN44 = cameras.c2w[:, other_N]
+    lens_BN4 = cameras.intrinsics[:, other_N]
     turn_BN33 = c2w_BN44[..., :3, :3]
     # Of a point at depth z, divided by z: the ray's direction + the step between cameras / z.
     ray_BNP3 = direction_BNP3 @ turn_BN33

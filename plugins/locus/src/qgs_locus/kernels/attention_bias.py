@@ -35,8 +35,10 @@ enough to fill a GPU."""
 
 _kept = threading.local()
 
-_UNIT = 2**20  # pairs that are worth a thread: some 0.1 ms
-_PART = 2**21  # pairs whose `value` is computed at a time, as it may take ten times the memory
+# Pairs that are worth a thread: some 0.1 ms.
+_UNIT = 2**20
+# Pairs whose `value` is computed at a time, as it may take ten times the memory.
+_PART = 2**21
 
 
 class AttentionBias(ABC):
@@ -47,7 +49,8 @@ class AttentionBias(ABC):
     """
 
     def __init__(self, queries: Tensor, tokens: Tensor) -> None:
-        self.queries, self.tokens = queries, tokens
+        self.queries = queries
+        self.tokens = tokens
 
     @abstractmethod
     def value(self, queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
@@ -70,7 +73,8 @@ class AttentionBias(ABC):
     def write(self, queries_nF: Tensor, tokens_GM: Tensor, out_nM: Tensor) -> None:
         """Write `value` into `out_nM`."""
         kernels = self._kernels(queries_nF)
-        if kernels is not None:  # one pass in registers, without (n, M, 3) tensors
+        # One pass in registers, without (n, M, 3) tensors.
+        if kernels is not None:
             return _in_rows(kernels[0], tokens_GM, queries_nF, out_nM)
         for part_nF, out in zip(*_parts(queries_nF, out_nM), strict=True):
             out.copy_(self.value(part_nF, tokens_GM))
@@ -83,7 +87,8 @@ class AttentionBias(ABC):
 
         None for `self.queries` or `self.tokens` that require none; one of the two does.
         """
-        of_queries, of_tokens = self.queries.requires_grad, self.tokens.requires_grad
+        of_queries = self.queries.requires_grad
+        of_tokens = self.tokens.requires_grad
         # Kernels give no gradient of tokens: rays are data, unless poses are optimised.
         kernels = None if of_tokens else self._kernels(queries_nF)
         if kernels is not None:
@@ -92,7 +97,8 @@ class AttentionBias(ABC):
             return out_nF, None
         found: list[tuple[Tensor, ...]] = []
         for part_nF, part_nM in zip(*_parts(queries_nF, gradient_nM), strict=True):
-            with torch.enable_grad():  # a backward pass runs without
+            # A backward pass runs without.
+            with torch.enable_grad():
                 leaves = part_nF.detach(), tokens_GM.detach()
                 leaves = leaves[0].requires_grad_(of_queries), leaves[1].requires_grad_(of_tokens)
                 value_nM = self.value(*leaves)
@@ -117,7 +123,8 @@ class AttentionBias(ABC):
     def blocks(self, buffers: int, dtype: torch.dtype) -> Iterator[Block]:
         """All queries, block by block, with memory for `buffers` tensors of a block's shape."""
         scenes, count, _ = self.queries.shape
-        tokens, device = self.tokens.shape[2], self.queries.device
+        tokens = self.tokens.shape[2]
+        device = self.queries.device
         numbers = BLOCK.get(device.type, BLOCK["cuda"])
         rows = min(max(numbers // max(buffers * tokens, tokens, 1), 1), max(count, 1))
         memory = _scratch(buffers * rows * tokens, device, dtype).view(buffers, rows, tokens)
@@ -150,7 +157,8 @@ def _scratch(size: int, device: torch.device, dtype: torch.dtype) -> Tensor:
     # It is kept: the first touch of new memory takes as long as computing the bias.
     memory = getattr(_kept, "memory", None)
     if memory is None or memory.dtype != dtype or len(memory) < size:
-        with torch.inference_mode(False):  # a later pass may need gradients
+        # A later pass may need gradients.
+        with torch.inference_mode(False):
             memory = _kept.memory = torch.empty(size, dtype=dtype)
     return memory[:size]
 
@@ -163,7 +171,8 @@ def biased_attention(
     kernel: AttentionKernel = "auto",
 ) -> Tensor:
     """softmax(q k / sqrt(d) + b) v, (B, h, N, d). ValueError where `kernel` cannot compute it."""
-    qkv, of_bias = (q_BhNd, k_BhMd, v_BhMd), (bias.queries, bias.tokens)
+    qkv = (q_BhNd, k_BhMd, v_BhMd)
+    of_bias = (bias.queries, bias.tokens)
     chosen = _outside_graphs(chosen_kernel)(q_BhNd, bias, kernel)
     if chosen == "plain":
         mask_B1NM = bias.dense()[:, None].to(q_BhNd.dtype)
@@ -193,7 +202,8 @@ class _Dense(torch.autograd.Function):
         out_BNM = queries.new_empty(*queries.shape[:2], tokens.shape[2])
         for scene, rows, _ in bias.blocks(0, out_BNM.dtype):
             bias.write(queries[scene, rows], tokens[scene], out_BNM[scene, rows])
-        ctx.save_for_backward(queries, tokens)  # not the bias, which is made again
+        # Not the bias, which is made again.
+        ctx.save_for_backward(queries, tokens)
         ctx.bias = bias
         return out_BNM
 
@@ -211,7 +221,8 @@ class _BiasGradients:
     """Gradients of what a bias reads, summed over blocks. queries, tokens: as `AttentionBias`'s."""
 
     def __init__(self, queries: Tensor, tokens: Tensor, bias: AttentionBias) -> None:
-        self._read, self._bias = (queries, tokens), bias
+        self._read = (queries, tokens)
+        self._bias = bias
         self.queries = torch.empty_like(queries) if bias.queries.requires_grad else None
         self.tokens = torch.zeros_like(tokens) if bias.tokens.requires_grad else None
         self.wanted = bias.queries.requires_grad or bias.tokens.requires_grad
@@ -233,8 +244,10 @@ class _BiasedAttention(torch.autograd.Function):
     def forward(
         ctx: Any, q: Tensor, k: Tensor, v: Tensor, queries: Tensor, tokens: Tensor, bias: Any
     ) -> Tensor:
-        exact = torch.promote_types(q.dtype, torch.float32)  # a log-sum-exp in bfloat16 is no sum
-        out, lse = torch.empty_like(q), q.new_empty(q.shape[:3], dtype=exact)
+        # A log-sum-exp in bfloat16 is no sum.
+        exact = torch.promote_types(q.dtype, torch.float32)
+        out = torch.empty_like(q)
+        lse = q.new_empty(q.shape[:3], dtype=exact)
         # `_attend` makes the logits of all heads at once, but for the fused kernel of a CPU.
         heads = 0 if q.device.type == "cpu" else q.shape[1]
         for scene, rows, (bias_nM, *_) in bias.blocks(1 + heads, lse.dtype):
@@ -302,7 +315,8 @@ def _attention_gradients(
     dq, dk, dv = (torch.zeros_like(x) if needs[n] else None for n, x in enumerate(saved[:3]))
     of_bias = _BiasGradients(queries, tokens, bias)
     q = q * scale
-    rowsum = (gradient * out).sum(-1, keepdim=True)  # that of P * dP, without either
+    # That of P * dP, without either.
+    rowsum = (gradient * out).sum(-1, keepdim=True)
     for scene, rows, (b, total, p, ds) in bias.blocks(4, lse.dtype):
         bias.write(queries[scene, rows], tokens[scene], b)
         of_queries = (x[scene, :, rows] for x in (q, gradient, lse[..., None], rowsum))

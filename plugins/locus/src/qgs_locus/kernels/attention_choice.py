@@ -72,13 +72,14 @@ def plain_bytes(q_BhNd: Tensor, bias: "AttentionBias") -> int:
 def fits_triton(q_BhNd: Tensor, bias: "AttentionBias") -> bool:
     """Whether the Triton kernels are installed and can compute this."""
     there = q_BhNd.device.type == "cuda" or os.environ.get("TRITON_INTERPRET") == "1"
+    # Blocks of wider heads fit into no registers.
     return (
         there
         and triton_version() >= (3, 5)
         and bias.triton_functions() is not None
         and not (bias.tokens.requires_grad and torch.is_grad_enabled())
         and q_BhNd.dtype in (torch.float32, torch.bfloat16, torch.float16)
-        and q_BhNd.shape[-1] <= 256  # blocks of wider heads fit into no registers
+        and q_BhNd.shape[-1] <= 256
     )
 
 

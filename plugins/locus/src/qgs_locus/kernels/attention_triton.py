@@ -65,8 +65,10 @@ def _forward(
     WIDTH: tl.constexpr,
 ):  # fmt: skip
     """The result, and the log-sum-exp of each query (B, h, N)."""
-    each = tl.program_id(1).to(tl.int64)  # offsets exceed 2^31 for large batches
-    scene, head = each // heads, each % heads
+    # Offsets exceed 2^31 for large batches.
+    each = tl.program_id(1).to(tl.int64)
+    scene = each // heads
+    head = each % heads
     n = tl.program_id(0) * BLOCK_N + tl.arange(0, BLOCK_N)
     of_q = _load(q, scene, head, n, N, width, WIDTH)
     queries = read_q + (scene * N + tl.minimum(n, N - 1))[:, None] * F
@@ -98,7 +100,8 @@ def _backward_queries(
 ):  # fmt: skip
     """Gradients of q, and of what the bias reads of queries by heads, (B, h, N, F); or None."""
     each = tl.program_id(1).to(tl.int64)
-    scene, head = each // heads, each % heads
+    scene = each // heads
+    head = each % heads
     n = tl.program_id(0) * BLOCK_N + tl.arange(0, BLOCK_N)
     of_q = _load(q, scene, head, n, N, width, WIDTH)
     of_g = _load(g, scene, head, n, N, width, WIDTH)
@@ -133,7 +136,8 @@ def _backward_tokens(
 ):  # fmt: skip
     """Gradients of k and v, or None. Queries outside have log-sum-exp inf, so weights of 0."""
     each = tl.program_id(1).to(tl.int64)
-    scene, head = each // heads, each % heads
+    scene = each // heads
+    head = each % heads
     m = tl.program_id(0) * BLOCK_M + tl.arange(0, BLOCK_M)
     of_k = _load(k, scene, head, m, M, width, WIDTH)
     of_v = _load(v, scene, head, m, M, width, WIDTH)
@@ -167,7 +171,8 @@ class TritonAttention(torch.autograd.Function):
     def forward(
         ctx: Any, q: Tensor, k: Tensor, v: Tensor, queries: Tensor, tokens: Tensor, functions: Any
     ) -> Tensor:
-        out, lse = torch.empty_like(q), q.new_empty(q.shape[:3], dtype=torch.float32)
+        out = torch.empty_like(q)
+        lse = q.new_empty(q.shape[:3], dtype=torch.float32)
         saved = q, k, v, queries.contiguous(), tokens.contiguous()
         _launch(_forward, *saved, out, lse, VALUE=functions[0])
         ctx.save_for_backward(*saved, out, lse)
@@ -179,7 +184,8 @@ class TritonAttention(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         *saved, out, lse = ctx.saved_tensors
         (q, k, v, queries, _), (value, of_bias) = saved, ctx.functions
-        needs, shape = ctx.needs_input_grad, (q.shape[0] * q.shape[1], *queries.shape[1:])
+        needs = ctx.needs_input_grad
+        shape = (q.shape[0] * q.shape[1], *queries.shape[1:])
         dq, dk, dv = (torch.empty_like(x) if needs[n] else None for n, x in enumerate((q, k, v)))
         by_head = queries.new_empty(shape) if needs[3] else None
         given = *saved, gradients[0], lse, (gradients[0].float() * out.float()).sum(-1)
@@ -209,12 +215,15 @@ def _blocks(kernel: Any, q: Tensor, numbers: int) -> dict[str, int]:
 
     Products in float32 run outside the matrix units, where loading ahead takes registers.
     """
-    width = max(triton.next_power_of_2(q.shape[-1]), 16)  # the least that `tl.dot` takes
-    exact, wide = q.dtype == torch.float32, width > 128
+    # The least that `tl.dot` takes.
+    width = max(triton.next_power_of_2(q.shape[-1]), 16)
+    exact = q.dtype == torch.float32
+    wide = width > 128
     rows = 16 if exact and wide else 32 if exact or width > 64 else 64
     sizes = {"BLOCK_N": rows, "BLOCK_M": min(rows, 32), "WIDTH": width}
     if kernel is _backward_queries and numbers > 8:
-        sizes["BLOCK_N"] = 16  # sums of all numbers of each query stay in registers
+        # Sums of all numbers of each query stay in registers.
+        sizes["BLOCK_N"] = 16
     return {
         **sizes,
         "num_warps": 8 if exact or wide else 4,

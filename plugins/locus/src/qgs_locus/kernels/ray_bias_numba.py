@@ -7,17 +7,25 @@ import numpy as np
 
 from qgs.kernels import kernel
 
-_ZERO, _TWO = np.float32(0), np.float32(2)
+_ZERO = np.float32(0)
+_TWO = np.float32(2)
 
 
 @kernel
 def write(queries, tokens, out):
     """max(-factor |mu x d - m|^2, lower)."""
-    m0, m1, m2 = tokens[0], tokens[1], tokens[2]
-    d0, d1, d2 = tokens[3], tokens[4], tokens[5]
+    m0 = tokens[0]
+    m1 = tokens[1]
+    m2 = tokens[2]
+    d0 = tokens[3]
+    d1 = tokens[4]
+    d2 = tokens[5]
     for n in range(queries.shape[0]):
-        x, y, z = queries[n, 0], queries[n, 1], queries[n, 2]
-        factor, lower = queries[n, 3], queries[n, 4]
+        x = queries[n, 0]
+        y = queries[n, 1]
+        z = queries[n, 2]
+        factor = queries[n, 3]
+        lower = queries[n, 4]
         row = out[n]
         for j in range(row.shape[0]):
             e0 = y * d2[j] - z * d1[j] - m0[j]
@@ -30,11 +38,18 @@ def write(queries, tokens, out):
 @kernel
 def gradients(queries, tokens, gradient, out):
     """Gradients of the queries: with e = mu x d - m, that of |e|^2 to mu is 2 d x e."""
-    m0, m1, m2 = tokens[0], tokens[1], tokens[2]
-    d0, d1, d2 = tokens[3], tokens[4], tokens[5]
+    m0 = tokens[0]
+    m1 = tokens[1]
+    m2 = tokens[2]
+    d0 = tokens[3]
+    d1 = tokens[4]
+    d2 = tokens[5]
     for n in range(queries.shape[0]):
-        x, y, z = queries[n, 0], queries[n, 1], queries[n, 2]
-        factor, lower = queries[n, 3], queries[n, 4]
+        x = queries[n, 0]
+        y = queries[n, 1]
+        z = queries[n, 2]
+        factor = queries[n, 3]
+        lower = queries[n, 4]
         row = gradient[n]
         of_x = of_y = of_z = of_factor = of_lower = _ZERO
         for j in range(row.shape[0]):

@@ -21,8 +21,11 @@ def value(queries, tokens, step):
 def gradients(queries, tokens, step, gradient, sums):
     """With e = mu x d - m, the gradient of |e|^2 to mu is 2 d x e."""
     e0, e1, e2 = _moment(queries, tokens, step)
-    d0, d1, d2 = tl.load(tokens + 3 * step), tl.load(tokens + 4 * step), tl.load(tokens + 5 * step)
-    factor, lower = tl.load(queries + 3), tl.load(queries + 4)
+    d0 = tl.load(tokens + 3 * step)
+    d1 = tl.load(tokens + 4 * step)
+    d2 = tl.load(tokens + 5 * step)
+    factor = tl.load(queries + 3)
+    lower = tl.load(queries + 4)
     distance_sq = e0 * e0 + e1 * e1 + e2 * e2
     at_bound = -factor * distance_sq <= lower
     inside = tl.where(at_bound, 0.0, gradient)
@@ -41,7 +44,13 @@ def gradients(queries, tokens, step, gradient, sums):
 @jit
 def _moment(queries, tokens, step):
     """mu x d - m, (n, m) each."""
-    x, y, z = tl.load(queries), tl.load(queries + 1), tl.load(queries + 2)
-    m0, m1, m2 = tl.load(tokens), tl.load(tokens + step), tl.load(tokens + 2 * step)
-    d0, d1, d2 = tl.load(tokens + 3 * step), tl.load(tokens + 4 * step), tl.load(tokens + 5 * step)
+    x = tl.load(queries)
+    y = tl.load(queries + 1)
+    z = tl.load(queries + 2)
+    m0 = tl.load(tokens)
+    m1 = tl.load(tokens + step)
+    m2 = tl.load(tokens + 2 * step)
+    d0 = tl.load(tokens + 3 * step)
+    d1 = tl.load(tokens + 4 * step)
+    d2 = tl.load(tokens + 5 * step)
     return y * d2 - z * d1 - m0, z * d0 - x * d2 - m1, x * d1 - y * d0 - m2

@@ -52,7 +52,8 @@ class JointLayer(DecoderLayer):
         x_BTD = torch.cat([memory.features, state.features], 1)
         x_BTD = x_BTD + self.attention(self.norm(x_BTD), state.mask)
         x_BTD = x_BTD + self.mlp(self.mlp_norm(x_BTD))
-        queries_BND, tokens_BMD = x_BTD[:, tokens:], x_BTD[:, :tokens]
+        queries_BND = x_BTD[:, tokens:]
+        tokens_BMD = x_BTD[:, :tokens]
         return state.replace(features=queries_BND), memory.replace(features=tokens_BMD)
 
     def attention(self, x_BTD: Tensor, mask_BN: Tensor | None) -> Tensor:

@@ -42,7 +42,8 @@ class VggtFeatures(PatchEncoder):
 
     name = "vggt_features"
     writes = memory_fields("features", "grid")
-    ordered_views = True  # VGGT marks the first one
+    # VGGT marks the first one.
+    ordered_views = True
     reads_cameras = False
 
     class Config(PatchEncoder.Config):
@@ -81,13 +82,15 @@ class VggtFeatures(PatchEncoder):
                 "licence is not ours to give, and name it in the option `weights`"
             )
         try:
+            # The file holds all of VGGT.
             own = {
                 n.removeprefix(PREFIX): x
                 for n, x in SUFFIXES[file.suffix](file).items()
                 if n.startswith(PREFIX)
-            }  # the file holds all of VGGT
+            }
             self.aggregator.load_state_dict(own)
-        except Exception as error:  # whatever torch and safetensors raise about a damaged file
+        except Exception as error:
+            # Whatever torch and safetensors raise about a damaged file.
             what = f"{file.name} does not hold VGGT's weights ({type(error).__name__}: {error})"
             raise MissingExtraError(what) from error
 

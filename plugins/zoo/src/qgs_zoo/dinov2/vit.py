@@ -127,7 +127,8 @@ class DinoV2(nn.Module):
         for index, block in enumerate(self.blocks[: max(blocks) + 1]):
             x_XTC = block(x_XTC)
             if index in blocks:
-                found.append(self.norm(x_XTC)[:, 1:])  # without the class token
+                # Without the class token.
+                found.append(self.norm(x_XTC)[:, 1:])
         return found
 
     def positions(self, rows: int, columns: int) -> Tensor:

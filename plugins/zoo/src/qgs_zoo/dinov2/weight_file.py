@@ -25,7 +25,8 @@ def load_weights(vit: DinoV2, weights: str) -> None:
         )
     try:
         vit.load_published(_read(file))
-    except Exception as error:  # whatever torch and safetensors raise about a damaged file
+    except Exception as error:
+        # Whatever torch and safetensors raise about a damaged file.
         raise MissingExtraError(
             f"{file} does not hold the weights of a DINOv2 of width {vit.norm.weight.shape[0]} "
             f"and {len(vit.blocks)} blocks ({type(error).__name__}: {error}); give another file, "
@@ -36,7 +37,8 @@ def load_weights(vit: DinoV2, weights: str) -> None:
 def _read(file: Path) -> Mapping[str, Tensor]:
     if file.suffix == ".safetensors":
         return load_file(file)
-    content = torch.load(file, map_location="cpu", weights_only=True)  # no code of strangers
+    # No code of strangers.
+    content = torch.load(file, map_location="cpu", weights_only=True)
     for key in ("model", "state_dict"):
         content = content.get(key, content)
     return content

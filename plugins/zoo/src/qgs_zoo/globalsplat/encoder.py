@@ -46,7 +46,8 @@ class PosedPatches(PatchEncoder):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        rgb, ray = config.rgb_width, config.ray_width
+        rgb = config.rgb_width
+        ray = config.ray_width
         side: Any = {"kernel_size": config.patch_size, "stride": config.patch_size, "bias": False}
         self.rgb_embedding = nn.Conv2d(3, rgb, **side)
         self.ray_embedding = nn.Conv2d(6, ray, **side)

@@ -131,7 +131,8 @@ class MergingHead(Head):
         """Raw candidates (..., 13), with what is merged: log scales and logs of transmittance."""
         place, log_scale, rotation, opacity = raw.split(CHANNELS, -1)
         config = self.config
-        low, high = math.log(config.scale_min) - 1, math.log(config.scale_max) + 2
+        low = math.log(config.scale_min) - 1
+        high = math.log(config.scale_max) + 2
         log_scale = (log_scale + config.scale_bias).clamp(low, high)
         # Zeros would be no rotation; this starts every candidate at the identity.
         rotation = rotation + constant([1, 0, 0, 0, 1, 0], rotation)

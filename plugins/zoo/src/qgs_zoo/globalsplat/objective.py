@@ -54,7 +54,8 @@ class TwoPasses(Objective):
         count = inputs.images.shape[1]
         if count < LEAST_VIEWS:
             raise ValueError(f"{_too_few(count)}; {FIX}")
-        outcomes, renderings = list[Outcome](), list[Rendering]()
+        outcomes = list[Outcome]()
+        renderings = list[Rendering]()
         for part in (0, 1):
             some = inputs.select(subset(count, part))
             prediction = passes.predict(some)

@@ -107,7 +107,8 @@ class Round(DecoderLayer):
 
     def __init__(self, config: Config, parts: LayerParts) -> None:
         super().__init__(config, parts)
-        dims, layer_scale = parts.dims, parts.layer_scale
+        dims = parts.dims
+        layer_scale = parts.layer_scale
         self.geometry = Stream(config, dims, layer_scale)
         self.texture = Stream(config, dims, layer_scale)
         self.geometry_norm = nn.LayerNorm(dims.width)
@@ -134,11 +135,13 @@ class Round(DecoderLayer):
 class Stream(nn.Module):
     """(x (B, N, D), memory (B, M, C)) -> x: pre-norm, each update scaled and added."""
 
-    unlearned = ("k_norm.bias",)  # adds the same to all logits of a query
+    # Adds the same to all logits of a query.
+    unlearned = ("k_norm.bias",)
 
     def __init__(self, config: Round.Config, dims: ModelDims, layer_scale: float) -> None:
         super().__init__()
-        width, memory_width = dims.width, config.memory_width or dims.width
+        width = dims.width
+        memory_width = config.memory_width or dims.width
         self.memory_norm = nn.LayerNorm(memory_width)
         self.kv_proj = nn.Linear(memory_width, 2 * width)
         self.k_norm = nn.LayerNorm(width // dims.heads)

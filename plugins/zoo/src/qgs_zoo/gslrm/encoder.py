@@ -74,7 +74,8 @@ class Transformer(PatchEncoder):
 
         Raises ValueError when the patch does not divide the images.
         """
-        patch, grid = self.config.patch_size, self.grid(views)
+        patch = self.config.patch_size
+        grid = self.grid(views)
         plucker_BV6HW = plucker_rays(views.cameras)
         pixels_BV9HW = torch.cat([2 * views.images - 1, plucker_BV6HW], 2)
         x_BMC = rearrange(pixels_BV9HW, "b v c (h p) (w q) -> b (v h w) (p q c)", p=patch, q=patch)

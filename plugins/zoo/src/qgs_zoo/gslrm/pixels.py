@@ -65,8 +65,10 @@ def patches(cameras: Cameras, rows: int, columns: int) -> Tensor:
     fx, fy, cx, cy = (x_BV[..., None] for x_BV in cameras.intrinsics.unbind(-1))
     x_BVRC = repeat((left - cx) / fx, "b v c -> b v r c", r=rows)
     y_BVRC = repeat((upper - cy) / fy, "b v r -> b v r c", c=columns)
-    zero, one = torch.zeros_like(x_BVRC), torch.ones_like(x_BVRC)
-    across, down = (width / columns / fx)[..., None], (height / rows / fy)[..., None]
+    zero = torch.zeros_like(x_BVRC)
+    one = torch.ones_like(x_BVRC)
+    across = (width / columns / fx)[..., None]
+    down = (height / rows / fy)[..., None]
     parts = ((x_BVRC, y_BVRC, one), (across + zero, zero, zero), (zero, down + zero, zero))
     local_BVRC33 = torch.stack([torch.stack(part, -1) for part in parts], -2)
     world_BVRC33 = torch.einsum("bvij,bvrckj->bvrcki", c2w[..., :3, :3], local_BVRC33)

@@ -41,5 +41,6 @@ class LpipsLoss(Loss):
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> Tensor:
         """Raises ValueError for images below 16 pixels a side."""
-        images, truth = rendering.rgb.flatten(0, 1), target.images.flatten(0, 1)
+        images = rendering.rgb.flatten(0, 1)
+        truth = target.images.flatten(0, 1)
         return self.network(images, truth).mean()

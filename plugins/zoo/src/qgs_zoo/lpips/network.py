@@ -17,7 +17,8 @@ from torch import Tensor, nn
 from qgs.contracts import MissingExtraError
 from qgs.geometry.precision import full_precision
 
-_VGG_FILE = "vgg16-397923af.pth"  # torchvision's VGG-16 in torch's cache
+# torchvision's VGG-16 in torch's cache.
+_VGG_FILE = "vgg16-397923af.pth"
 _BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
 """Convolutions of VGG-16 by torchvision's numbers; a 2x2 max pooling stands between blocks."""
 _SHIFT = (-0.030, -0.088, -0.188)
@@ -51,7 +52,8 @@ class PerceptualDistance(nn.Module):
         """The outputs of the blocks, each pixel's channels of length 1."""
         x = images * 2 - 1
         shift, scale = (x.new_tensor(values)[:, None, None] for values in (_SHIFT, _SCALE))
-        x, found = (x - shift) / scale, []
+        x = (x - shift) / scale
+        found = []
         for index, block in enumerate(self.blocks):
             x = block(F.max_pool2d(x, 2) if index else x)
             found.append(x / (x.norm(dim=1, keepdim=True) + _EPS))
@@ -79,7 +81,8 @@ class PerceptualDistance(nn.Module):
             )
         try:
             read = load_file if vgg.suffix == ".safetensors" else _load_pickled
-            tensors, factors = read(vgg), _load_pickled(linear)
+            tensors = read(vgg)
+            factors = _load_pickled(linear)
             self.blocks = nn.ModuleList(
                 nn.Sequential(*(layer for number in block for layer in _layers(tensors, number)))
                 for block in _BLOCKS
@@ -95,7 +98,8 @@ class PerceptualDistance(nn.Module):
 
 
 def _layers(vgg: Mapping[str, Tensor], number: int) -> tuple[nn.Conv2d, nn.ReLU]:
-    weight, bias = vgg[f"features.{number}.weight"], vgg[f"features.{number}.bias"]
+    weight = vgg[f"features.{number}.weight"]
+    bias = vgg[f"features.{number}.bias"]
     convolution = nn.Conv2d(weight.shape[1], weight.shape[0], 3, padding=1)
     convolution.load_state_dict({"weight": weight, "bias": bias})
     return convolution, nn.ReLU(inplace=True)

@@ -28,10 +28,14 @@ def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
     from z to x, so that degree 1 is (x, y, z); orthonormal but for a factor for all.
     """
     x, y, z = directions.unbind(-1)
-    cosine, sine = [torch.ones_like(x)], [torch.zeros_like(x)]
-    for _ in range(degree):  # of m times the azimuth, times sin^m of the angle to the pole
-        c, s = cosine[-1], sine[-1]
-        cosine, sine = [*cosine, z * c - x * s], [*sine, z * s + x * c]
+    cosine = [torch.ones_like(x)]
+    sine = [torch.zeros_like(x)]
+    # Of m times the azimuth, times sin^m of the angle to the pole.
+    for _ in range(degree):
+        c = cosine[-1]
+        s = sine[-1]
+        cosine = [*cosine, z * c - x * s]
+        sine = [*sine, z * s + x * c]
     found: dict[tuple[int, int], Tensor] = {}
     for m in range(degree + 1):
         # Associated Legendre functions over sin^m, by their recurrence in l.
@@ -126,8 +130,10 @@ def quaternions(rotation: Tensor) -> Tensor:
 
 def quat_product(left: Tensor, right: Tensor) -> Tensor:
     """Quaternion products (..., 4), w x y z."""
-    w, v = left[..., :1], left[..., 1:]
-    w2, v2 = right[..., :1], right[..., 1:]
+    w = left[..., :1]
+    v = left[..., 1:]
+    w2 = right[..., :1]
+    v2 = right[..., 1:]
     real = w * w2 - (v * v2).sum(-1, keepdim=True)
     return torch.cat([real, w * v2 + w2 * v + torch.linalg.cross(v, v2, dim=-1)], -1)
 

@@ -167,17 +167,22 @@ class DepthPredictor(nn.Module):
 
     def __init__(self, sizes: DepthSplatConfig) -> None:
         super().__init__()
-        self.sizes, width, vit = sizes, sizes.features, sizes.vit
+        self.sizes = sizes
+        width = sizes.features
+        vit = sizes.vit
         strides = (1, 2) if sizes.stride == 4 else (2, 2)
         self.backbone = CNN(width, strides, sizes.cnn)
         self.transformer = WindowTransformer(width)
         self.pretrained = DinoV2(vit.width, vit.depth, vit.heads)
         if sizes.scales > 1:
-            self.mv_pyramid, self.mono_pyramid = Pyramid(width), Pyramid(vit.width)
-        self.regressor, self.regressor_residual = nn.ModuleList(), nn.ModuleList()
+            self.mv_pyramid = Pyramid(width)
+            self.mono_pyramid = Pyramid(vit.width)
+        self.regressor = nn.ModuleList()
+        self.regressor_residual = nn.ModuleList()
         self.depth_head = nn.ModuleList()
         for scale in range(sizes.scales):
-            count, own = self.candidates(scale), width // 2**scale
+            count = self.candidates(scale)
+            own = width // 2**scale
             cnn = width if scale == 0 else sizes.cnn[1]
             inputs = count + cnn + own + vit.width // 2**scale
             unet = UNet(own, 3 + scale, pre_norm=True)
@@ -196,7 +201,8 @@ class DepthPredictor(nn.Module):
         self, images_BV3HW: Tensor, cameras: Cameras, near_BV: Tensor, far_BV: Tensor
     ) -> Depths:
         """near, far: camera-frame z in world units."""
-        size, shape = images_BV3HW.shape[-2:], images_BV3HW.shape[:2]
+        size = images_BV3HW.shape[-2:]
+        shape = images_BV3HW.shape[:2]
         normalized_N3HW = imagenet_normalised(images_BV3HW).flatten(0, 1)
         neighbours_BVJ = nearest_neighbours(cameras.c2w, self.sizes.neighbours)
         sweep = Sweep(cameras, neighbours_BVJ, near_BV, far_BV)
@@ -224,8 +230,10 @@ class DepthPredictor(nn.Module):
         self, cnn: Stages, multi: Sequence[Tensor], mono: Sequence[Tensor], sweep: Sweep
     ) -> tuple[list[Tensor], Tensor]:
         """Inverse depth (B V, 1, h, w) of each scale, largest probability of the last."""
-        found: list[Tensor] = []  # `list[Tensor]()` would break the graph of torch.compile
-        views, confidence = sweep.near.shape[1], multi[0]
+        # `list[Tensor]()` would break the graph of torch.compile.
+        found: list[Tensor] = []
+        views = sweep.near.shape[1]
+        confidence = multi[0]
         poses_BVJ44 = relative_poses(sweep.cameras.c2w, sweep.neighbours)
         for scale, (own, features) in enumerate(zip(multi, mono, strict=True)):
             count = self.candidates(scale)
@@ -269,7 +277,8 @@ class DepthPredictor(nn.Module):
             found[level][0].append(x)
         levels = [*map(self.sizes.level, range(len(multi))), self.sizes.finest]
         for x, level in zip([*multi, depth], levels, strict=True):
-            if x is not None:  # at 1/2 the release has the ViT's own map last instead
+            # At 1/2 the release has the ViT's own map last instead.
+            if x is not None:
                 found[level][level > 0].append(x)
         return found
 
@@ -296,11 +305,13 @@ class DepthSplat(nn.Module):
         super().__init__()
         self.depth_predictor = DepthPredictor(sizes)
         self.feature_upsampler = dpt_head(sizes, depth=False)
-        features, hidden = sizes.full_features, sizes.regressor
+        features = sizes.full_features
+        hidden = sizes.regressor
         self.gaussian_regressor = two_convolutions(features + 5, hidden, hidden, "zeros")
         raw = GAUSSIAN_CHANNELS + 3 * harmonics
         self.gaussian_head = two_convolutions(hidden + features + 4, raw, raw, "replicate")
-        with torch.no_grad():  # scales and harmonics start from their offsets alone
+        # Scales and harmonics start from their offsets alone.
+        with torch.no_grad():
             for parameter in self.gaussian_head[2].parameters():
                 parameter[3:6] = 0
                 parameter[GAUSSIAN_CHANNELS:] = 0

@@ -51,7 +51,8 @@ class DepthSplatEncoder(SweepEncoder):
 
     @classmethod
     def multiple(cls, config: Config) -> int:
-        return 4 * config.stride  # the U-Nets halve the features of each sweep
+        # The U-Nets halve the features of each sweep.
+        return 4 * config.stride
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
@@ -69,7 +70,8 @@ class DepthSplatEncoder(SweepEncoder):
         depths, raw_BVCHW = self.network(views.images, views.cameras, near_BV, far_BV)
         raw_BVCHW = at_least_float32(raw_BVCHW)
         first = GAUSSIAN_CHANNELS
-        gaussian, sh_BV3KHW = raw_BVCHW[:, :, :first], raw_BVCHW[:, :, first:].unflatten(2, (3, -1))
+        gaussian = raw_BVCHW[:, :, :first]
+        sh_BV3KHW = raw_BVCHW[:, :, first:].unflatten(2, (3, -1))
         constant = sh_BV3KHW[:, :, :, :1] + ((views.images - 0.5) / SH_C0)[:, :, :, None]
         sh_BV3KHW = torch.cat([constant, sh_BV3KHW[:, :, :, 1:]], 3)
         logs = [depth[:, :, None].log() for depth in depths]

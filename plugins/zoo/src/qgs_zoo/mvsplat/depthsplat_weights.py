@@ -27,7 +27,8 @@ _EMPTY = dict.fromkeys(("cross_attention", "self_attention", "feed_forward", "re
 
 def _encoder(shapes: Shapes) -> dict[str, Any]:
     scales = layer_count(shapes, _PREDICTOR + "regressor.")
-    width, depth = size_at(shapes, _VIT + "norm.weight", 0), layer_count(shapes, _VIT + "blocks.")
+    width = size_at(shapes, _VIT + "norm.weight", 0)
+    depth = layer_count(shapes, _VIT + "blocks.")
     if scales not in (1, 2) or depth not in BLOCKS:
         raise LayoutError(f"{scales} scales and a ViT of {depth} blocks are not published")
     dpt = [size_at(shapes, f"{_UPSAMPLER}projects.{n}.weight", 0) for n in range(4)]
@@ -57,8 +58,11 @@ def _encoder(shapes: Shapes) -> dict[str, Any]:
 
 
 def _read(shapes: Shapes) -> dict[str, Any]:
-    encoder, raw = _encoder(shapes), size_at(shapes, _HEAD, 0)
-    two, numbers = encoder["scales"] == 2, raw + 1  # the depth stands in front
+    encoder = _encoder(shapes)
+    raw = size_at(shapes, _HEAD, 0)
+    # the depth stands in front
+    two = encoder["scales"] == 2
+    numbers = raw + 1
     if numbers not in WIDTHS:
         raise LayoutError(f"{_HEAD}: {raw} is not {GAUSSIAN_CHANNELS} and harmonics of a degree")
     decoder = {"depth": 2, "layer": {"type": "mvsplat/exchange"}} if two else {"depth": 0}

@@ -62,7 +62,8 @@ class SweepEncoder(Encoder):
     @classmethod
     def problems(cls, config: DepthRange, context: RecipeContext) -> Iterable[Problem]:
         yield from width_problems(context)
-        size, multiple = context.image_size, cls.multiple(config)
+        size = context.image_size
+        multiple = cls.multiple(config)
         if size and any(side % multiple for side in size):
             nearest = [max(round(side / multiple), 1) * multiple for side in size]
             reason = (

@@ -86,7 +86,8 @@ def _decoded(
 
 def harmonics_of(features_BND: Tensor) -> Tensor:
     """Coefficients (B, N, K, 3) in the numbers of pixels, of degrees that are rendered."""
-    degree, first = degree_of(features_BND.shape[-1]), sum(CHANNELS)
+    degree = degree_of(features_BND.shape[-1])
+    first = sum(CHANNELS)
     sh_BNC = numbers_of(features_BND)[..., first : first + 3 * coefficients(degree)]
     sh_BNK3 = rearrange(sh_BNC, "b n (x k) -> b n k x", x=3)
     return sh_BNK3[..., : coefficients(min(degree, SH_DEGREE)), :]
@@ -98,7 +99,8 @@ def mapped_opacity(p: Tensor, exponent: float) -> Tensor:
         return p
     # The mean of two curves, which is p for an exponent of 0, that of the published weights. The
     # released code has the map from pixelSplat, where it sharpens opacities while training.
-    power, inside = 2.0**exponent, (p > 0) & (p < 1)
+    power = 2.0**exponent
+    inside = (p > 0) & (p < 1)
     # 0 and 1 stay as they are; there the slope of the map may be infinite.
     q = torch.where(inside, p, 0.5)
     return torch.where(inside, 0.5 * (1 - (1 - q) ** power + q ** (1 / power)), p)

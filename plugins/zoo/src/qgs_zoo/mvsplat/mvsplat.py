@@ -109,8 +109,11 @@ class DepthPredictor(nn.Module):
 
     def __init__(self, config: MVSplatEncoder.Config, numbers: int) -> None:
         super().__init__()
-        count, cost, fine = config.candidates, config.cost_width, config.depth_width
-        width, gaussian = config.features, numbers - 2
+        count = config.candidates
+        cost = config.cost_width
+        fine = config.depth_width
+        width = config.features
+        gaussian = numbers - 2
         matched = count + width
         self.corr_refine_net = OverViews(
             *(conv3(matched, cost), group_norm(cost), nn.GELU()),
@@ -119,7 +122,8 @@ class DepthPredictor(nn.Module):
         self.compares = config.cost_volume
         self.regressor_residual = nn.Conv2d(matched, count, 1)
         self.depth_head_lowres = two_convolutions(count, 2 * count, count)
-        self.stride, scale = config.stride, FACTOR // config.stride
+        self.stride = config.stride
+        scale = FACTOR // config.stride
         upscale = nn.Upsample(scale_factor=scale, mode="bilinear", align_corners=True)
         # GELU comes behind the resizing, not in front of it.
         self.upsampler = nn.Sequential(conv3(2 * width, width), upscale, nn.GELU())
@@ -137,7 +141,8 @@ class DepthPredictor(nn.Module):
         """(B, V, C, H, W): logarithm of the depth, opacity logit, raw Gaussian."""
         views = images_BV3HW.shape[1]
         # These networks see images in [0, 1]; only the CNN's are normalised.
-        images_N3HW, cnn_NDhw = images_BV3HW.flatten(0, 1), cnn_BVDhw.flatten(0, 1)
+        images_N3HW = images_BV3HW.flatten(0, 1)
+        cnn_NDhw = cnn_BVDhw.flatten(0, 1)
         features_NDhw = features_BVDhw.flatten(0, 1)
         disparity_N1hw, confidence_N1hw = self.match(features_BVDhw, sweep)
         if self.stride > 1:

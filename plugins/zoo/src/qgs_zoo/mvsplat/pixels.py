@@ -22,7 +22,8 @@ from qgs.geometry.precision import full_precision
 from qgs.types import Cameras, ImageMemory, QueryState, Views
 from qgs_zoo.mvsplat.adapter import coefficients, quaternions, world_harmonics
 
-PIXEL, TURN = "mvsplat.pixel", "mvsplat.turn"
+PIXEL = "mvsplat.pixel"
+TURN = "mvsplat.turn"
 PIXEL_FIELDS: Fields = {
     PIXEL: FieldSpec(
         (4, 3),
@@ -88,9 +89,11 @@ class PixelQueries(Queries):
 @full_precision
 def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
     """Numbers of pixels, ordered by view, with their harmonics turned into the world."""
-    numbers_BMC, degree = numbers_of(features_BMD), degree_of(features_BMD.shape[-1])
+    numbers_BMC = numbers_of(features_BMD)
+    degree = degree_of(features_BMD.shape[-1])
     views = rotation_BV33.shape[1]
-    first, last = sum(CHANNELS), sum(CHANNELS) + 3 * coefficients(degree)
+    first = sum(CHANNELS)
+    last = sum(CHANNELS) + 3 * coefficients(degree)
     sh_BVPXK = numbers_BMC[..., first:last].unflatten(1, (views, -1)).unflatten(-1, (3, -1))
     world = torch.einsum("bvkl,bvpxl->bvpxk", world_harmonics(rotation_BV33, degree), sh_BVPXK)
     world = world.flatten(1, 2).flatten(2)
@@ -114,7 +117,8 @@ def pixel_fields(cameras: Cameras, rows: int, columns: int) -> dict[str, Tensor]
 
     corner = x_BVRC[..., None] * each(right_BV3) + y_BVRC[..., None] * each(down_BV3)
     corner = corner + each(ahead_BV3)
-    across, below = right_BV3 * (width / columns / fx), down_BV3 * (height / rows / fy)
+    across = right_BV3 * (width / columns / fx)
+    below = down_BV3 * (height / rows / fy)
     others = (each(x).expand_as(corner) for x in (c2w[..., :3, 3], across, below))
     origin, across, below = others
     pixel = torch.stack([origin, corner, across, below], -2).flatten(1, 3)

@@ -95,7 +95,8 @@ def cost_volume(
     scenes, views, channels, height, width = features_BVChw.shape
     depth_NDhw = (1 / inverse_depth_BVDhw.detach()).flatten(0, 1)
     depth_NDhw = depth_NDhw.expand(-1, -1, height, width)
-    own_NChw, lens_N4 = features_BVChw.flatten(0, 1), lens_BV4.flatten(0, 1)
+    own_NChw = features_BVChw.flatten(0, 1)
+    lens_N4 = lens_BV4.flatten(0, 1)
     batch = torch.arange(scenes, device=features_BVChw.device)[:, None]
     correlate = _of_all_pairs if height * width <= PAIRS * depth_NDhw.shape[1] else _of_warped
     total_NDhw = depth_NDhw.new_zeros(())
@@ -129,7 +130,8 @@ def _of_all_pairs(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose:
     """
     count, _, height, width = own.shape
     grid_NPD2 = warp_grid(depth, lens, pose).permute(0, 2, 3, 1, 4).flatten(1, 2)
-    own_NPC, other_NCQ = own.flatten(2).mT, other.flatten(2)
+    own_NPC = own.flatten(2).mT
+    other_NCQ = other.flatten(2)
 
     def part(own_NpC: Tensor, other_NCQ: Tensor, grid_NpD2: Tensor) -> Tensor:
         maps_X1hw = (own_NpC @ other_NCQ).reshape(-1, 1, height, width)

@@ -32,7 +32,8 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, pre_norm: bool) -> None:
         super().__init__()
-        first, second = conv3(inputs, outputs), conv3(outputs, outputs)
+        first = conv3(inputs, outputs)
+        second = conv3(outputs, outputs)
         if pre_norm:
             self.in_layers = nn.Sequential(group_norm(inputs), nn.SiLU(), first)
             # The identity stands where the release has a dropout of 0, which counts in the names.

@@ -101,7 +101,9 @@ class Attention(nn.Module):
         mask: Tensor | None,
     ) -> Tensor:
         """x (B, V, 4, L, C), each view reading `source` of itself or of its neighbours."""
-        q, k, v = self.q_proj(x_BVWLC), self.k_proj(source_BVWLC), self.v_proj(source_BVWLC)
+        q = self.q_proj(x_BVWLC)
+        k = self.k_proj(source_BVWLC)
+        v = self.v_proj(source_BVWLC)
         if neighbours_BVJ is not None:
             k, v = (_of_neighbours(x, neighbours_BVJ) for x in (k, v))
             # Published weights expect this: keys are ordered by pixels, then views, but the mask is

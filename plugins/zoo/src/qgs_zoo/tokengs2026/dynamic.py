@@ -57,7 +57,8 @@ class DynamicQueries(Queries):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        fixed, moving = config.count - config.dynamic, config.dynamic
+        fixed = config.count - config.dynamic
+        moving = config.dynamic
         self.features = nn.Parameter(torch.randn(fixed, dims.width) * config.std)
         if moving:
             self.dynamic = nn.Parameter(torch.randn(moving, dims.width) * config.std)
@@ -83,7 +84,8 @@ class DynamicQueries(Queries):
 
         Raises ValueError for views without a target time.
         """
-        config, batch = self.config, len(memory.features)
+        config = self.config
+        batch = len(memory.features)
         parts: list[Tensor] = [self.features, *([self.dynamic] if config.dynamic else [])]
         x_BND = torch.cat(parts).expand(batch, -1, -1)
         first = len(self.features) if config.dynamic else 0
@@ -118,7 +120,8 @@ class DynamicObjective(Objective):
     name = "dynamic"
     reads = _FIELDS
     scheduled = frozenset({"weight"})
-    judges_inputs = False  # input photos show other moments than the reconstructed one
+    # Input photos show other moments than the reconstructed one.
+    judges_inputs = False
 
     class Config(ComponentConfig):
         weight: float = Field(default=0.3, ge=0)

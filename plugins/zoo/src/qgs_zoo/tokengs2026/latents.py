@@ -46,7 +46,8 @@ class LatentBottleneck(MultiscaleReadout):
     name = "latent_bottleneck"
     tunable = True
     writes = memory_fields("features", "keys", "values")
-    unlearned = ("feature_k_norm.bias",)  # adds the same to all logits of a latent
+    # Adds the same to all logits of a latent.
+    unlearned = ("feature_k_norm.bias",)
 
     class Config(MultiscaleReadout.Config):
         depth: int = Field(default=12, ge=1, le=256)
@@ -62,7 +63,8 @@ class LatentBottleneck(MultiscaleReadout):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        width, eps = dims.width, config.norm_eps
+        width = dims.width
+        eps = config.norm_eps
         self.latents = nn.Parameter(torch.randn(config.latents, width) * config.latent_std)
         self.feature_kv_proj = nn.Linear(self.feature_width, 2 * width)
         self.feature_k_norm = nn.LayerNorm(width // dims.heads, eps)

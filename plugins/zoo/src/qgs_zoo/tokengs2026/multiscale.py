@@ -52,7 +52,8 @@ class MultiscaleReadout(PatchViT):
         self.norms = nn.ModuleList(nn.LayerNorm(dims.width, config.norm_eps) for _ in config.blocks)
         self.feature_width = len(config.blocks) * dims.width
         if config.time_channels:
-            channels, patch = config.time_channels, config.patch_size
+            channels = config.time_channels
+            patch = config.patch_size
             self.time_embedding = TimeEmbedding(channels, dims.width, patch)
 
     @classmethod
@@ -87,7 +88,8 @@ class MultiscaleReadout(PatchViT):
 
     def features(self, views: Views, plucker: Tensor) -> Tensor:
         """Views and Plücker maps as in `embed` -> (B, M, S D), the first chosen block first."""
-        x_BMD, outputs = self.embed(views, plucker), []
+        x_BMD = self.embed(views, plucker)
+        outputs = []
         for number, block in enumerate(self.blocks, start=1):
             x_BMD = block(x_BMD)
             if number in self.read:
@@ -114,7 +116,8 @@ class MultiscaleViT(MultiscaleReadout):
 
     def forward(self, views: Views) -> ImageMemory:
         """Features (B, M, S D); raises ValueError when the patch does not divide the images."""
-        grid, plucker_BV6HW = self.grid(views), plucker_rays(views.cameras)
+        grid = self.grid(views)
+        plucker_BV6HW = plucker_rays(views.cameras)
         x_BMC = self.features(views, plucker_BV6HW)
         keys, values = keys_and_values(x_BMC, self.kv_proj, self.k_norm)
         rays = patch_rays(plucker_BV6HW, self.config.patch_size)

@@ -18,7 +18,9 @@ from qgs.tokengs.weights import (
 )
 
 READOUT = "enc_dec_backbone.multiscale_norms."
-DYNAMIC, TIME, TARGET_TIME = "gs_tokens_dynamic", "patch_time_embed", "patch_time_embed_tgt"
+DYNAMIC = "gs_tokens_dynamic"
+TIME = "patch_time_embed"
+TARGET_TIME = "patch_time_embed_tgt"
 LATENTS = "enc_dec_backbone.latents"
 LATENT_BLOCK = "enc_dec_backbone.latent_blocks."
 
@@ -53,7 +55,8 @@ def _read(shapes: Shapes) -> dict[str, Any]:
     model = tree["model"]
     model["encoder"] |= _encoder(shapes, model["encoder"]["depth"])
     model["encoder"]["time_channels"] = _channels(shapes, TIME)
-    dynamic, timed = DYNAMIC in shapes, _channels(shapes, TARGET_TIME)
+    dynamic = DYNAMIC in shapes
+    timed = _channels(shapes, TARGET_TIME)
     if dynamic:
         model["decoder"]["self_attention"] = {"type": "tokengs2026/block_causal"}
     if dynamic or timed:

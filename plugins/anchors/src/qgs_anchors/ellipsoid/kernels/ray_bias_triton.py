@@ -21,7 +21,9 @@ def value(queries, tokens, step):
 def gradients(queries, tokens, step, gradient, sums):
     """A gradient g of e = m - mu x d is g x d of mu, and that of e is cof(W)' times that of a."""
     a, b, e, u = _parts(queries, tokens, step)
-    below, factor, lower = _squared(b), tl.load(queries + 21), tl.load(queries + 22)
+    below = _squared(b)
+    factor = tl.load(queries + 21)
+    lower = tl.load(queries + 22)
     ratio = _squared(a) / below
     at_bound = -factor * ratio <= lower
     inside = tl.where(at_bound, 0.0, gradient)
@@ -29,8 +31,12 @@ def gradients(queries, tokens, step, gradient, sums):
     to_bound = tl.where(at_bound, gradient, 0.0)
     up = -2 * factor * inside / below
     down = -up * ratio
-    a0, a1, a2 = up * a[0], up * a[1], up * a[2]
-    b0, b1, b2 = down * b[0], down * b[1], down * b[2]
+    a0 = up * a[0]
+    a1 = up * a[1]
+    a2 = up * a[2]
+    b0 = down * b[0]
+    b1 = down * b[1]
+    b2 = down * b[2]
     d0, d1, d2 = _three(tokens + 3 * step, step)
     c0, c1, c2 = _three(queries + 3, 1)
     c3, c4, c5 = _three(queries + 6, 1)
