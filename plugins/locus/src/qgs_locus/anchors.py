@@ -98,8 +98,10 @@ class AnchoredQueries(LearnedQueries):
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         self.features = nn.Parameter(torch.randn(config.count, dims.width) * config.std)
+        # Places are learned as features are: the same anchors start every scene.
         self.center = nn.Parameter(config.center_init.sample(config.count))
         if config.radius:
+            # Stored before softplus, so that no step of the optimiser makes a radius negative.
             raw = raw_radius_of(config.init_radius)
             self.raw_radius = nn.Parameter(torch.full((config.count, 1), raw))
 
@@ -126,6 +128,7 @@ class AnchoredQueries(LearnedQueries):
     def support(self, state: QueryState) -> SpatialSupport:
         """Balls of the support radius, points for anchors without one."""
         center_BN3 = state[CENTER]
+        # Anchors without a radius are shown as points.
         r_BN1 = torch.zeros_like(center_BN3[..., :1])
         if self.config.radius:
             r_BN1 = support_radius(state[RAW_RADIUS], self.config)

@@ -65,6 +65,7 @@ class RayBiasedCrossAttention(CrossAttention):
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         self.core = CrossAttentionCore(dims.width, dims.heads, config.norm_eps)
+        # Before softplus, as the radius: the bias may be turned down, never into a repulsion.
         self.raw_gamma = nn.Parameter(torch.tensor(config.gamma_init))
 
     @classmethod
@@ -118,6 +119,7 @@ class RayBiasedCrossAttention(CrossAttention):
         return self.core.out_proj(merge_heads(read_BhNd))
 
     def explain(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> AttentionWeights:
+        # Norms are over channels, so choosing queries after the projection is exact.
         q_BhQd = self.core.project(state.features)[:, :, queries]
         bias_BQM = self.explained_bias(state, memory, queries)
         return attention_weights(q_BhQd, memory["keys"], bias_BQM[:, None])
@@ -127,6 +129,7 @@ class RayBiasedCrossAttention(CrossAttention):
         sigma_sq = self.sigma_sq(state)
         config = self.config
         chosen = sigma_sq[:, queries] if isinstance(sigma_sq, Tensor) else sigma_sq
+        # Dense: pictures ask for few queries, and the text of the formula is easiest to trust.
         rays = memory["patch_rays"]
         limits = (config.bias_min, config.direction_eps)
         return self.gamma * dense_bias(state[CENTER][:, queries], chosen, rays, *limits)

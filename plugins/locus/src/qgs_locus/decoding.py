@@ -77,5 +77,6 @@ class RadiusScaledCenters(AnchorOffsetCenters):
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """(B, N, K, 3) -> (B, N, K, 3)."""
+        # Offsets count in radii: a query of a large support spreads its Gaussians as far.
         r_BN1 = support_radius(state[RAW_RADIUS], self.config)
         return state[CENTER][:, :, None] + r_BN1[:, :, None] * self.config.displacement(offsets)

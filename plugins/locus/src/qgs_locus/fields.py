@@ -60,6 +60,7 @@ def raw_radius_of(radius: float) -> float:
 def raw_radii(radii: Tensor, options: RadiusOptions) -> Tensor:
     """The raw radii of which `support_radius` makes `radii`, which are raised to the least one."""
     least = options.radius_min if options.radius_bound == "offset" else 0.0
+    # softplus^-1(y) = y + log(1 - exp(-y)), which stays exact for large y.
     softplus = (radii - least).clamp_min(RAW_LEAST)
     return softplus + (-torch.expm1(-softplus)).log()
 

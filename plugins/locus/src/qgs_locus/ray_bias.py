@@ -73,6 +73,7 @@ class RayBias(AttentionBias):
 
         gamma: 0-d, positive.
         """
+        # Kernels read one row of numbers for each query, also where all queries share a number.
         each_BN1 = torch.ones_like(center_BN3[..., :1])
         parts = [center_BN3, each_BN1 * (gamma / (2 * sigma_sq)), each_BN1 * (gamma * bias_min)]
         return cls(torch.cat(parts, -1), tokens_B6M)

@@ -37,14 +37,17 @@ class AnchorRefinement(Refinement):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
+        # One pair of heads serves all layers: the composer shares modules of equal options.
         if config.center:
             self.center_mlp = self._head(3)
         if config.radius:
+            # A subclass may refine another field, such as three radii: its spec has the channels.
             ((self.raw_radius, spec),) = self.radius_field(config).items()
             self.radius_mlp = self._head(int(spec.shape[0]))
 
     def _head(self, channels: int) -> Mlp:
         mlp = Mlp(self.dims.width, self.dims.width, channels)
+        # The first layer stays random: with both at zero neither would get a gradient.
         if self.config.zero_init:
             nn.init.zeros_(mlp.fc2.weight)
             nn.init.zeros_(mlp.fc2.bias)
@@ -89,6 +92,7 @@ class AnchorRefinement(Refinement):
         if self.config.center:
             refined[CENTER] = state[CENTER] + self.center_step(state)
         if self.config.radius:
+            # The raw radius takes the step as it is: softplus keeps the radius positive.
             step = at_least_float32(self.radius_mlp(state.features))
             refined[self.raw_radius] = state[self.raw_radius] + step
         return state.replace(fields=refined)

@@ -23,6 +23,7 @@ def sine_embedding(
     Each axis is mapped to [0, 2 pi] and divided by temperature^(2i / features) + divisor_eps; sine
     and cosine interleave (LocusGS release).
     """
+    # A sine and a cosine share a frequency.
     half = torch.arange(features // 2, dtype=position.dtype, device=position.device)
     divisor = temperature ** (2 * half / features) + divisor_eps
     angle = ((position + 1) * math.pi)[..., None] / divisor

@@ -34,6 +34,7 @@ class AnchorVisibility(Loss):
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> Tensor:
+        # The centres alone: an anchor outside of all targets gets no gradient from any image.
         per_anchor = view_visibility(
             prediction.state[CENTER],
             target.cameras,

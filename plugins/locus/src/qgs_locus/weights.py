@@ -10,6 +10,7 @@ _UNUSED_NORMS = ("anchor_norm.", "plucker_norm.", "q_pos_norm.", "k_pos_norm.")
 
 
 def _read(shapes: Shapes) -> dict[str, Any]:
+    # The ablations of the paper leave parts out, so the names that are there tell the variant.
     radius = "gs_anchor_radius_raw" in shapes
     ray_biased = DECODER + "0.gs_cross_attn.geo_scale" in shapes
     anchor_aware = DECODER + "0.anchor_head_self_attn.fc1.weight" in shapes
@@ -23,6 +24,7 @@ def _read(shapes: Shapes) -> dict[str, Any]:
         "refinement": {"type": "locus/refine", "radius": "radius_embed.fc1.weight" in shapes},
     }
     model["centers"] = {"type": "locus/radius_scaled" if radius else "locus/anchor_offset"}
+    # No tensor tells which layers were supervised: the paper takes the middle one and the last.
     depth = model["decoder"]["depth"]
     model["supervision"] = {"type": "qgs/layers", "layers": sorted({(depth + 1) // 2, depth})}
     losses = {
@@ -58,6 +60,7 @@ LOCUSGS = WeightLayout(
     ),
     marks=(DECODER + "0.gs_cross_attn.q_content_proj.weight",),
     read=_read,
+    # Norms that the release builds and never calls, so that its files load whole.
     unused=(
         *(Rename(_CROSS + "q_norm.", _CROSS + name) for name in _UNUSED_NORMS),
         Rename(_CROSS + "geo_scale", _CROSS + "tau_sample"),

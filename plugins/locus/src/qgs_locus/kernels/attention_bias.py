@@ -125,6 +125,7 @@ class AttentionBias(ABC):
         scenes, count, _ = self.queries.shape
         tokens = self.tokens.shape[2]
         device = self.queries.device
+        # At least one query a block, however many tokens there are.
         numbers = BLOCK.get(device.type, BLOCK["cuda"])
         rows = min(max(numbers // max(buffers * tokens, tokens, 1), 1), max(count, 1))
         memory = _scratch(buffers * rows * tokens, device, dtype).view(buffers, rows, tokens)
@@ -211,6 +212,7 @@ class _Dense(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         queries, tokens = ctx.saved_tensors
+        # The bias is made again block by block: its values never wait for the backward pass.
         sums = _BiasGradients(queries, tokens, ctx.bias)
         for scene, rows, _ in ctx.bias.blocks(0, gradients[0].dtype):
             sums.add(scene, rows, gradients[0][scene, rows])
@@ -314,6 +316,7 @@ def _attention_gradients(
     scale = q.shape[-1] ** -0.5
     dq, dk, dv = (torch.zeros_like(x) if needs[n] else None for n, x in enumerate(saved[:3]))
     of_bias = _BiasGradients(queries, tokens, bias)
+    # Scaled once here instead of for every pair.
     q = q * scale
     # That of P * dP, without either.
     rowsum = (gradient * out).sum(-1, keepdim=True)
@@ -326,6 +329,7 @@ def _attention_gradients(
             # p = exp(q k + b - lse), each step into memory that is there already
             torch.sub(b, lse_n1, out=p)
             p.addmm_(q_nd, k_Md.mT).exp_()
+            # Frozen parts of a model need no gradient.
             if dv is not None:
                 dv[scene, head].addmm_(p.mT, do_nd)
             torch.mm(do_nd, v_Md.mT, out=ds)
@@ -335,6 +339,7 @@ def _attention_gradients(
             if dk is not None:
                 dk[scene, head].addmm_(ds.mT, q_nd)
             if of_bias.wanted:
+                # All heads share the bias, so its gradient is their sum.
                 total.copy_(ds) if head == 0 else total.add_(ds)
         if of_bias.wanted:
             of_bias.add(scene, rows, total)

@@ -43,6 +43,7 @@ def chosen_kernel(
     q_BhNd: Tensor, bias: "AttentionBias", kernel: AttentionKernel
 ) -> AttentionKernel:
     """One that is not "auto". ValueError for "triton" where it cannot compute this."""
+    # Measurements force a kernel from outside, so that models need no option for it.
     kernel = _forced[-1] if kernel == "auto" and _forced else kernel
     if kernel == "triton" and not fits_triton(q_BhNd, bias):
         raise ValueError(
@@ -64,6 +65,7 @@ def plain_bytes(q_BhNd: Tensor, bias: "AttentionBias") -> int:
     """Memory of the plain way without q, k and v: the bias, and its gradient for each head."""
     (scenes, heads, queries, _), read = q_BhNd.shape, q_BhNd.element_size()
     each = bias.queries.element_size() + (read if q_BhNd.dtype != bias.queries.dtype else 0)
+    # Torch makes the gradient of the mask for each head.
     if torch.is_grad_enabled() and (bias.queries.requires_grad or bias.tokens.requires_grad):
         each += heads * read
     return scenes * queries * bias.tokens.shape[2] * each
@@ -71,6 +73,7 @@ def plain_bytes(q_BhNd: Tensor, bias: "AttentionBias") -> int:
 
 def fits_triton(q_BhNd: Tensor, bias: "AttentionBias") -> bool:
     """Whether the Triton kernels are installed and can compute this."""
+    # The interpreter runs the kernels on a CPU, which tests do.
     there = q_BhNd.device.type == "cuda" or os.environ.get("TRITON_INTERPRET") == "1"
     # Blocks of wider heads fit into no registers.
     return (

@@ -105,6 +105,7 @@ def _backward_queries(
     n = tl.program_id(0) * BLOCK_N + tl.arange(0, BLOCK_N)
     of_q = _load(q, scene, head, n, N, width, WIDTH)
     of_g = _load(g, scene, head, n, N, width, WIDTH)
+    # Rows outside get weights exp(-inf) = 0.
     of_lse = tl.load(lse + each * N + n, mask=n < N, other=float("inf"))
     of_rowsum = tl.load(rowsum + each * N + n, mask=n < N, other=0.0)
     queries = read_q + (scene * N + tl.minimum(n, N - 1))[:, None] * F
@@ -173,6 +174,7 @@ class TritonAttention(torch.autograd.Function):
     ) -> Tensor:
         out = torch.empty_like(q)
         lse = q.new_empty(q.shape[:3], dtype=torch.float32)
+        # Kernels step through rows of these without strides.
         saved = q, k, v, queries.contiguous(), tokens.contiguous()
         _launch(_forward, *saved, out, lse, VALUE=functions[0])
         ctx.save_for_backward(*saved, out, lse)
@@ -204,6 +206,7 @@ def _launch(kernel: Any, *tensors: Any, **functions: Any) -> None:
     (scenes, heads, N, width), M = q.shape, k.shape[2]
     sizes = {"F": queries.shape[2], "G": tokens.shape[1], **_blocks(kernel, q, queries.shape[2])}
     over = (M, "BLOCK_M") if kernel is _backward_tokens else (N, "BLOCK_N")
+    # One program a block and head; the tokens' kernel divides the tokens instead.
     grid = -(-over[0] // sizes[over[1]]), scenes * heads
     arguments = [(x, x.stride()) if x is not None and x.ndim == 4 else x for x in tensors]
     with torch.cuda.device_of(q):

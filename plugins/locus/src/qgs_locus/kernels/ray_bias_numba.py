@@ -32,6 +32,7 @@ def write(queries, tokens, out):
             e1 = z * d0[j] - x * d2[j] - m1[j]
             e2 = x * d1[j] - y * d0[j] - m2[j]
             bias = -factor * (e0 * e0 + e1 * e1 + e2 * e2)
+            # Not max(): where the bias is NaN it must stay, so that training sees it.
             row[j] = lower if bias <= lower else bias
 
 
@@ -57,6 +58,7 @@ def gradients(queries, tokens, gradient, out):
             e1 = z * d0[j] - x * d2[j] - m1[j]
             e2 = x * d1[j] - y * d0[j] - m2[j]
             distance_sq = e0 * e0 + e1 * e1 + e2 * e2
+            # At the clamp the gradient goes to the bound, which holds gamma.
             inside = _ZERO if -factor * distance_sq <= lower else row[j]
             of_x += inside * (d1[j] * e2 - d2[j] * e1)
             of_y += inside * (d2[j] * e0 - d0[j] * e2)
