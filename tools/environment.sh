@@ -69,9 +69,11 @@ install() {
     fi
     echo "qgs: installing query-gaussians[$extras] into $environment, with $((${#packages[@]} / 2 - 1))" \
         "plugins; the first time takes some minutes" >&2
-    # Modules are compiled when first imported: most of them never are.
-    "$environment/bin/python" -m pip install --disable-pip-version-check --no-compile \
-        --constraint "$root/constraints.txt" "${packages[@]}" >&2 ||
+    # One build backend for all distributions, where pip would make an environment for each. Modules
+    # are compiled when first imported: most of them never are.
+    local pip=("$environment/bin/python" -m pip install --disable-pip-version-check --no-compile
+        --constraint "$root/constraints.txt")
+    { "${pip[@]}" --quiet hatchling editables && "${pip[@]}" --no-build-isolation "${packages[@]}"; } >&2 ||
         die "the installation failed (see above); run the command again to retry."
     for extra in ${extras//,/ } plugins; do
         echo "$wanted" >"$environment/.qgs-$extra"
