@@ -39,6 +39,7 @@ class EllipsoidQueries(LearnedQueries):
         super().__init__(config, dims)
         self.features = nn.Parameter(torch.randn(config.count, dims.width) * config.std)
         self.center = nn.Parameter(config.center_init.sample(config.count))
+        # Unturned at first, so that equal radii start as LocusGS does.
         identity = [torch.ones(config.count, 1), torch.zeros(config.count, 3)]
         self.rotation = nn.Parameter(torch.cat(identity, -1))
         raw = [torch.full((config.count, 1), raw_radius_of(r)) for r in config.init_radii]
@@ -55,6 +56,7 @@ class EllipsoidQueries(LearnedQueries):
 
     def start(self, batch_size: int) -> QueryState:
         """Features (B, N, D); fields centre (B, N, 3), rotation (B, N, 4), raw radii (B, N, 3)."""
+        # The optimiser changes lengths, which mean nothing; components get unit ones.
         quats = F.normalize(self.rotation, dim=-1)
         fields = {CENTER: self.center, ROTATION: quats, RAW_RADII: self.raw_radii}
         fields = {name: x.expand(batch_size, -1, -1) for name, x in fields.items()}

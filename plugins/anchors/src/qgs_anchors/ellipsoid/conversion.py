@@ -21,6 +21,7 @@ def from_locus(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
         )
     converted = {name: _tripled(name, values) for name, values in weights.items()}
     converted["queries.raw_radii"] = converted.pop("queries.raw_radius")
+    # A ball has no orientation, so any rotation would do.
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0]).to(weights["queries.raw_radius"])
     converted["queries.rotation"] = identity.repeat(len(weights["queries.raw_radius"]), 1)
     return converted
@@ -29,6 +30,7 @@ def from_locus(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def _tripled(name: str, values: Tensor) -> Tensor:
     if name == "queries.raw_radius":
         return values.repeat(1, 3)
+    # Rows of the last layer are the radii: three equal ones step together.
     if name.startswith("refinements.0.radius_mlp.fc2."):
         return values.repeat(3, *(1 for _ in values.shape[1:]))
     return values.clone()

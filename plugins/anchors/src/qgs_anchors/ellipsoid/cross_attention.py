@@ -29,8 +29,10 @@ class EllipsoidCrossAttention(RayBiasedCrossAttention):
         """gamma b, of the state before this layer."""
         config = self.config
         sigma_sq_BN3 = self.sigma_sq(state)
+        # One bandwidth for all anchors is that of a ball: LocusGS's kernels are shorter.
         if not isinstance(sigma_sq_BN3, Tensor):
             return super().bias(state, memory)
+        # Made once a pass: all layers read the same rays.
         tokens_B9M = memory.once(
             f"ellipsoid.ray_tokens.{config.direction_eps:g}",
             lambda: ray_tokens(memory["patch_rays"], config.direction_eps),

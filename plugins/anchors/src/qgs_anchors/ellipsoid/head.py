@@ -36,6 +36,7 @@ class EllipsoidHead(GaussianHead):
         """(B, N, D) and the anchors' shapes -> attributes of (B, N, K) Gaussians."""
         local = super().forward(state)
         quats = unit_quats(local.quats)
+        # The anchor's rotation comes after the Gaussian's own.
         turn = unit_quats(state[ROTATION])[:, :, None].expand_as(quats)
         scales = local.scales * radii_along(support_radius(state[RAW_RADII], self.config), quats)
         return local.replace(quats=quat_product(turn, quats), scales=scales)
@@ -62,6 +63,7 @@ class AxisScaledCenters(RadiusScaledCenters):
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """(B, N, K, 3) -> (B, N, K, 3)."""
+        # Offsets are along the axes of the ellipsoid, in its radii.
         displaced = self.config.displacement(offsets)
         return _placed(state[CENTER], anchor_axes(state, self.config), displaced)
 

@@ -58,6 +58,7 @@ class EllipsoidBias(AttentionBias):
         weights_BN3 = sigma_BN3 / sigma_BN3.prod(-1, keepdim=True)
         # A rotation is its own cofactor matrix but for rounding, which this keeps out of the ratio.
         cofactors_BN9 = (_cofactors(rotation_BN33) * weights_BN3[..., None, :]).mT.flatten(2)
+        # Kernels read all numbers of a query from one row.
         rest_BN2 = torch.stack([gamma / 2, gamma * bias_min]).expand(*center_BN3.shape[:2], 2)
         parts = [center_BN3, cofactors_BN9, ball_BN9, rest_BN2]
         return cls(torch.cat(parts, -1), tokens_B9M)
@@ -67,6 +68,7 @@ class EllipsoidBias(AttentionBias):
         center_n3, *matrices, factor_n1, lower_n1 = queries_nF.split([3, 9, 9, 1, 1], -1)
         cofactors_n33, ball_n33 = (matrix.unflatten(-1, (3, 3)) for matrix in matrices)
         m_M3, d_M3, unit_M3 = (tokens_GM[rows : rows + 3].mT for rows in (0, 3, 6))
+        # Not expanded into products: far from the cameras m and mu x d nearly cancel.
         e_nM3 = m_M3 - torch.linalg.cross(center_n3[:, None], d_M3[None], dim=-1)
         moment_nM = _times(cofactors_n33, e_nM3).square().sum(-1)
         along_nM = _times(ball_n33, unit_M3[None]).square().sum(-1)

@@ -39,6 +39,7 @@ class EllipsoidRefinement(AnchorRefinement):
         """A state with moved centres, turned rotations and changed raw radii."""
         refined = super().forward(state)
         if self.config.rotation:
+            # A small turn multiplied to the left: its axes are those of the world.
             rotation_BN4 = turned(state[ROTATION], self.rotation_mlp(state.features))
             refined = refined.replace(fields={ROTATION: rotation_BN4})
         return refined

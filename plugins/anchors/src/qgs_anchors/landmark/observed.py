@@ -118,13 +118,17 @@ class ObservedQueries(Queries):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
+        # Queries at one place differ by these alone.
         self.slots = nn.Parameter(torch.randn(config.per_token, dims.width) * config.std)
         self.depth_mlp = Mlp(dims.width, dims.width, config.sweep or 1)
+        # Zero logits: every depth starts in the middle, or where the photos agree best.
         nn.init.zeros_(self.depth_mlp.fc2.weight)
         nn.init.zeros_(self.depth_mlp.fc2.bias)
         if config.sweep is not None:
+            # As a logarithm, so that it stays positive.
             self.sharpness = nn.Parameter(torch.tensor(math.log(SHARPNESS)))
             self.unseen = nn.Parameter(torch.tensor(UNSEEN))
+            # The curve of agreement says how sure a depth is, which later layers can use.
             self.match_proj = nn.Linear(config.sweep, dims.width)
         if config.tokens > 1:
             self.apart_proj = nn.Linear((config.tokens - 1) * dims.width, dims.width, bias=False)
@@ -152,12 +156,14 @@ class ObservedQueries(Queries):
         size = views.cameras.size
         if config.count is None:
             view_N, place_N2, share_2 = patches(memory.grid, config.per_token, size, device)
+            # A token and its place are one: nothing has to be interpolated.
             x_BND = (memory.features[:, :, None] + self.slots).flatten(1, 2)
             x_BND, nearness_BN1 = self._swept(x_BND, views, view_N, place_N2)
         else:
             photos = memory.grid[0]
             aspect = aspect_of(config.cells or 1)
             view_N, place_N2, share_2 = spread(config.count, photos, size, aspect, device)
+            # Several tokens of a tile start one query, so it knows more than its middle.
             middle_S2 = cells(config.tokens, rows_in_tile(config.tokens), place_N2)
             view_X, place_X2 = _divided(view_N, place_N2, share_2 * middle_S2)
             place_BX2 = place_X2.expand(len(memory.features), -1, -1)
@@ -173,6 +179,7 @@ class ObservedQueries(Queries):
             return x_BND, at_least_float32(self.depth_mlp(x_BND)).sigmoid()
         match_BND = self._match(views, view_N, place_N2.expand(len(x_BND), -1, -1))
         x_BND = x_BND + self.match_proj(match_BND.softmax(-1))
+        # Logits add up: the network corrects what the photos say, and need not repeat it.
         share_BND = (at_least_float32(self.depth_mlp(x_BND)) + match_BND).softmax(-1)
         # Not as a matrix product, which autocast makes in half precision.
         nearness_D = _nearness(self.config.sweep, x_BND.device)
@@ -199,6 +206,7 @@ class ObservedQueries(Queries):
 
     def _depth(self, nearness: Tensor) -> Tensor:
         """World units."""
+        # Even steps of w are even steps of log depth.
         return self.config.far * (self.config.near / self.config.far) ** nearness
 
     @full_precision
@@ -218,6 +226,7 @@ class ObservedQueries(Queries):
         origin_BN3, direction_BN3 = rays_at(cameras, view_N, place_BN2)
         (height, width), (_, photos) = cameras.size, cameras.shape
         side = side_of(len(view_N), photos, cameras.size)
+        # A footprint of s pixels is s z / f wide at depth z.
         focal_BN1 = cameras.intrinsics[:, view_N, :2].mean(-1, keepdim=True)
         radii_BN1 = config.radius * side * z_BN1 / focal_BN1
         rows = 0 if config.cells is None else self._rows_of_cells(config.cells)
@@ -225,6 +234,7 @@ class ObservedQueries(Queries):
             share_2.to(z_BN1) * constant([width, height], z_BN1) / side, (0, 1), value=rows
         )
         anchors = {
+            # The direction has z = 1 in the camera, so that z is a depth and no distance.
             CENTER: origin_BN3 + z_BN1 * direction_BN3,
             RAW_RADIUS: raw_radii(radii_BN1, config),
             FRAME: cameras.c2w[:, view_N, :3, :3].mT,
@@ -235,6 +245,7 @@ class ObservedQueries(Queries):
         cell_K2 = share_2 * cells(config.cells, rows, share_2)
         view_X, place_X2 = _divided(view_N, place_N2, cell_K2)
         place_BX2 = place_X2.expand(len(z_BN1), -1, -1)
+        # Each cell is averaged over its own area, as its Gaussian covers it.
         colors = colors_at(views.images, side / math.sqrt(config.cells), view_X, place_BX2)
         return anchors | {COLORS: colors.unflatten(1, (-1, config.cells))}
 

@@ -55,11 +55,13 @@ def spread(
     each = held_N.amin()
     rows_R = index_N + 1
     off_R = (each * of_photo / rows_R**2 / aspect).log().abs()
+    # Tiles must be full rows of as many columns, the same in every photo.
     fit_R = (each % rows_R == 0) & (off_R < MOST_OFF) & (each * views == count)
     # Of two that are as far off, the wider one.
     wider_R = off_R - EPS * rows_R.log()
     rows = torch.where(fit_R, wider_R, torch.inf).argmin() + 1
     tiled = fit_R.any()
+    # Otherwise rows and columns follow the aspect of the photo.
     in_rows_N = torch.minimum((held_N * of_photo).sqrt().round().clamp_min(1).long(), held_N)
     place_N2 = parts(index_N // views, held_N, torch.where(tiled, rows, in_rows_N))
     tile_2 = torch.stack([rows / each, 1 / rows])

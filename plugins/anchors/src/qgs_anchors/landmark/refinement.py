@@ -36,5 +36,6 @@ class FramedRefinement(AnchorRefinement):
 
     def center_step(self, state: QueryState) -> Tensor:
         """(B, N, 3), world frame."""
+        # Steps in radii: what is far away may move further.
         r_BN1 = support_radius(state[RAW_RADIUS], self.config)
         return in_world(r_BN1 * super().center_step(state), state[FRAME])

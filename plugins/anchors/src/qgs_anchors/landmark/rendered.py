@@ -55,6 +55,7 @@ class RenderedFeedback(Feedback):
         super().__init__(config, dims)
         self.rounds = config.rounds
         self.layers = config.layers
+        # It tells a layer whether it runs in a round, with the weights of the first pass.
         self.marker = nn.Parameter(torch.zeros(dims.width))
         self.embedding = nn.Conv2d(CHANNELS * config.cells**2, dims.width, 3, padding=1)
         self.kv_proj = nn.Linear(dims.width, 2 * dims.width)
@@ -76,6 +77,7 @@ class RenderedFeedback(Feedback):
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """As learned; without any, from a model without rounds, errors change nothing at first."""
+        # Only a checkpoint of a model with rounds has these names.
         if learned:
             return dict(learned)
         own = self.state_dict()
@@ -90,6 +92,7 @@ class RenderedFeedback(Feedback):
         by = self.config.shrink
         cameras = views.cameras
         size = (cameras.size[0] // by, cameras.size[1] // by)
+        # Fewer pixels are cheaper to render, and errors are smooth.
         images = F.avg_pool2d(views.images.flatten(0, 1), by).unflatten(0, views.images.shape[:2])
         return Views(images, Cameras(cameras.c2w, cameras.intrinsics / by, size))
 
@@ -98,11 +101,13 @@ class RenderedFeedback(Feedback):
     ) -> tuple[QueryState, ImageMemory]:
         assert memory.grid is not None
         _, rows, columns = memory.grid
+        # The rendering goes along: an error means another thing where nothing was drawn.
         error = ERROR_GAIN * (photos.images - rendering.rgb)
         maps_BVCHW = torch.cat([error, rendering.rgb, rendering.alpha], 2)
         cells = self.config.cells
         keys = memory["keys"]
         fine = F.adaptive_avg_pool2d(maps_BVCHW.flatten(0, 1), (rows * cells, columns * cells))
+        # The cells of a token become its channels.
         x_XDhw = F.gelu(self.embedding(F.pixel_unshuffle(fine, cells)))
         x_BMD = x_XDhw.flatten(2).mT.unflatten(0, photos.images.shape[:2]).flatten(1, 2)
         k_BhMd, v_BhMd = (split_heads(x, keys.shape[1]) for x in self.kv_proj(x_BMD).chunk(2, -1))

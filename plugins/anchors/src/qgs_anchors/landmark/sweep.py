@@ -26,6 +26,7 @@ def mismatch(
     """
     height, width = views.cameras.size
     place_BN2 = place_BN2.to(views.images)
+    # A window, not a pixel: one colour agrees with too many places.
     step_P2 = side * cells(points**2, points, place_BN2) / constant([width, height], place_BN2)
     place_BNP2 = place_BN2[:, :, None] + step_P2
     color_B3NP = bilinear(views.images, view_N, place_BNP2)
@@ -38,10 +39,12 @@ def mismatch(
     at_BXDP2, seen_BXDP = reprojected(views.cameras, view_X, other_X, place_BXP2, depth_D)
     found_B3XDP = bilinear(views.images, other_X, at_BXDP2.flatten(2, 3))
     found_B3ANDP = found_B3XDP.unflatten(3, (-1, points**2)).unflatten(2, (photos - 1, count))
+    # Samples that fall outside of the other photo say nothing.
     seen_BANDP = seen_BXDP.unflatten(1, (photos - 1, count))
     error_BANDP = (found_B3ANDP - color_B3NP[:, :, None, :, None]).abs().mean(1)
     error_BAND = (error_BANDP * seen_BANDP).sum(-1) / seen_BANDP.sum(-1).clamp_min(1)
     counts_BAND = seen_BANDP.to(error_BAND).mean(-1) >= LEAST_SEEN
+    # A photo of which most of the window is outside does not count either.
     count_BND = counts_BAND.sum(1)
     return (error_BAND * counts_BAND).sum(1) / count_BND.clamp_min(1), count_BND > 0
 

@@ -58,6 +58,7 @@ def write(queries, tokens, out):
             above = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
             below = b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
             bias = -factor * above / below
+            # Not max(): NaN must stay NaN.
             row[j] = lower if bias <= lower else bias
 
 
@@ -74,6 +75,7 @@ def gradients(queries, tokens, gradient, out):
         factor = q[21]
         lower = q[22]
         of_x = of_y = of_z = of_factor = of_lower = _ZERO
+        # Eighteen sums as scalars, which the compiler keeps in registers; an array it would not.
         c0 = c1 = c2 = c3 = c4 = c5 = c6 = c7 = c8 = _ZERO
         w0 = w1 = w2 = w3 = w4 = w5 = w6 = w7 = w8 = _ZERO
         for j in range(row.shape[0]):
@@ -86,6 +88,7 @@ def gradients(queries, tokens, gradient, out):
             above = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
             below = b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
             ratio = above / below
+            # At the clamp the gradient goes to the bound.
             inside = _ZERO if -factor * ratio <= lower else row[j]
             of_lower += row[j] - inside
             of_factor -= inside * ratio
@@ -102,12 +105,14 @@ def gradients(queries, tokens, gradient, out):
             c6 += a2 * e[0]
             c7 += a2 * e[1]
             c8 += a2 * e[2]
+            # cof(W)' takes a gradient of a to one of e.
             e0 = a0 * c[0] + a1 * c[3] + a2 * c[6]
             e1 = a0 * c[1] + a1 * c[4] + a2 * c[7]
             e2 = a0 * c[2] + a1 * c[5] + a2 * c[8]
             of_x += e1 * tokens[5, j] - e2 * tokens[4, j]
             of_y += e2 * tokens[3, j] - e0 * tokens[5, j]
             of_z += e0 * tokens[4, j] - e1 * tokens[3, j]
+            # d ratio = d above / below - ratio d below / below.
             down = -up * ratio
             b0 = down * b[0]
             b1 = down * b[1]
