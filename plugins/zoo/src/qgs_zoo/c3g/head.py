@@ -45,6 +45,7 @@ class C3GHead(Head):
     def forward(self, state: QueryState) -> GaussianAttributes:
         """(B, N, D) -> attributes of (B, N, K) Gaussians."""
         raw_BNC = self.linear(self.norm(state.features))
+        # All K Gaussians of a query come from one linear layer, channel by channel.
         return self.activate(rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(CHANNELS)))
 
     def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
@@ -55,5 +56,6 @@ class C3GHead(Head):
             scales=self.config.scale_unit * F.softplus(scale),
             quats=F.normalize(rotation, dim=-1, eps=self.config.quat_eps),
             opacities=torch.sigmoid(opacity[..., 0]),
+            # The release renders a harmonic of degree 0 and clips what it shows.
             colors=(0.5 + SH_C0 * sh).clamp(0, 1),
         )

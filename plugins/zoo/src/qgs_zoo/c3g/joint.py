@@ -48,6 +48,7 @@ class JointLayer(DecoderLayer):
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
         """Queries and image tokens that have read each other; nobody reads a masked query."""
+        # Image tokens stand first, so that slices tell them from queries.
         tokens = memory.features.shape[1]
         x_BTD = torch.cat([memory.features, state.features], 1)
         x_BTD = x_BTD + self.attention(self.norm(x_BTD), state.mask)
@@ -61,9 +62,11 @@ class JointLayer(DecoderLayer):
         q_BhTd, k_BhTd, v_BhTd = (
             split_heads(part_BTD, self.dims.heads) for part_BTD in self.qkv(x_BTD).chunk(3, -1)
         )
+        # Without a mask torch takes its fastest kernel.
         mask_B11T = None
         if mask_BN is not None:
             images = x_BTD.shape[1] - mask_BN.shape[1]
             mask_B11T = F.pad(mask_BN, (images, 0), value=True)[:, None, None]
         read_BhTd = F.scaled_dot_product_attention(q_BhTd, k_BhTd, v_BhTd, attn_mask=mask_B11T)
+        # Queries that the mask leaves out still read: only nobody reads them.
         return self.proj(merge_heads(read_BhTd))

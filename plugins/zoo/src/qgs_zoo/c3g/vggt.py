@@ -60,6 +60,7 @@ class VggtFeatures(PatchEncoder):
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         self.aggregator = _aggregator_class()()
+        # No layer in between where the width is VGGT's, so that its tokens are seen unchanged.
         own = dims.width == WIDTH
         self.proj = nn.Identity() if own else nn.Linear(WIDTH, dims.width)
 
@@ -68,6 +69,7 @@ class VggtFeatures(PatchEncoder):
         grid = self.grid(views)
         images = views.images * 2 - 1 if self.config.images == "signed" else views.images
         outputs, first = self.aggregator(images)
+        # What stands before `first` are tokens of cameras and registers.
         tokens_BMC = rearrange(outputs[-1][:, :, first:], "b v p c -> b (v p) c")
         return ImageMemory(features=self.proj(tokens_BMC), grid=grid)
 

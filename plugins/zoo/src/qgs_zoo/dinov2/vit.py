@@ -108,6 +108,7 @@ class DinoV2(nn.Module):
         self.norm = nn.LayerNorm(width, EPS)
         nn.init.normal_(self.cls_token, std=1e-6)
         nn.init.trunc_normal_(self.pos_embed, std=0.02)
+        # As the release starts; a checkpoint or the file of weights replaces all of it.
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.trunc_normal_(module.weight, std=0.02)
@@ -135,6 +136,7 @@ class DinoV2(nn.Module):
         """Embeddings (1, 1 + rows*columns, C), class token first, of a grid of another size."""
         if rows == columns == GRID:
             return self.pos_embed
+        # The class token has a position of its own, which is no place.
         own_1PC = self.pos_embed[:, 1:]
         map_1CGG = rearrange(own_1PC.float(), "x (g k) c -> x c g k", g=GRID)
         # The release gives the factor, not the size: source coordinates step by 37 / (n + 0.1),
@@ -155,5 +157,6 @@ class DinoV2(nn.Module):
         prefix = next((n.removesuffix(mark) for n in weights if n.endswith(mark)), None)
         if prefix is None:
             raise ValueError(f"there is no {mark}")
+        # The mask token and registers of a file have no place here.
         found: dict[str, Any] = {n: weights[prefix + n] for n in own if prefix + n in weights}
         self.load_state_dict(found)

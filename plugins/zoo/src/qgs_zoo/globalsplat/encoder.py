@@ -48,6 +48,7 @@ class PosedPatches(PatchEncoder):
         super().__init__(config, dims)
         rgb = config.rgb_width
         ray = config.ray_width
+        # Without biases, as LayerNorm follows in every stream.
         side: Any = {"kernel_size": config.patch_size, "stride": config.patch_size, "bias": False}
         self.rgb_embedding = nn.Conv2d(3, rgb, **side)
         self.ray_embedding = nn.Conv2d(6, ray, **side)
@@ -67,6 +68,7 @@ class PosedPatches(PatchEncoder):
         grid = self.grid(views)
         rgb_BVPC = _tokens(self.rgb_embedding, 2 * views.images - 1)
         ray_BVPC = _tokens(self.ray_embedding, plucker_rays(views.cameras))
+        # A camera is the same for all its patches: added once for each view.
         camera_BVC = torch.cat(
             [self.lens_mlp(lens(views.cameras)), place(views.cameras, self.config.bands)], -1
         )
@@ -90,6 +92,7 @@ def lens(cameras: Cameras) -> Tensor:
     height, width = cameras.size
     sides = constant([width, height], cameras.intrinsics)
     focal, principal = (cameras.intrinsics / sides.repeat(2)).chunk(2, -1)
+    # Logarithms: focal lengths of phones and telephotos differ by factors.
     return torch.cat([focal.log(), principal], -1)
 
 

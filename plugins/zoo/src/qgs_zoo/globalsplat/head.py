@@ -72,10 +72,12 @@ class MergingHead(Head):
         self.geometry = nn.Linear(dims.width, config.candidates * (sum(CHANNELS) + 1))
         self.texture_norm = nn.LayerNorm(dims.width)
         self.texture = nn.Linear(dims.width, config.candidates * self.coefficients * 3)
+        # Small weights: at first all candidates of a token are nearly one Gaussian.
         for linear in (self.geometry, self.texture):
             nn.init.zeros_(linear.bias)
             nn.init.trunc_normal_(linear.weight, std=config.init_std)
         if config.position_std is not None:
+            # Positions may start wider apart than scales and opacities do.
             rows_C3D = torch.empty(config.candidates, CHANNELS[0], dims.width)
             nn.init.trunc_normal_(rows_C3D, std=config.position_std)
             with torch.no_grad():
@@ -118,6 +120,7 @@ class MergingHead(Head):
         gates = geometry[..., -1]
         candidates = torch.cat([self.bounded(geometry[..., :-1]), texture], -1)
         parts = []
+        # Both levels of a blend are decoded from the same candidates.
         for count, share in stages(self.config.level):
             x = merged(candidates, gates, count)
             *place, log_scale, rotation, clear, texture = x.split(
@@ -166,6 +169,7 @@ def merged(candidates: Tensor, gates: Tensor, count: int) -> Tensor:
 
     candidates: (..., C, X). gates: (..., C). Returns (..., count, X).
     """
+    # Gates compete within their block alone, so that blocks stay independent.
     weights = gates.unflatten(-1, (count, -1)).softmax(-1)
     return (weights[..., None] * candidates.unflatten(-2, (count, -1))).sum(-2)
 
@@ -194,6 +198,7 @@ def rotation_6d(vectors: Tensor) -> Tensor:
     """
     first, second = vectors.split(3, -1)
     first = F.normalize(first, dim=-1, eps=LEAST_LENGTH)
+    # Gram-Schmidt: the first column keeps its direction.
     second = second - (first * second).sum(-1, keepdim=True) * first
     second = F.normalize(second, dim=-1, eps=LEAST_LENGTH)
     third = torch.linalg.cross(first, second, dim=-1)

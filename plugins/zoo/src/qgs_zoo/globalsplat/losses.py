@@ -58,6 +58,7 @@ class Regularisers(Loss):
     ) -> dict[str, Tensor]:
         """Terms `mean_opacity`, `mean_scale`."""
         gaussians = prediction.gaussians
+        # Means, not sums: the number of Gaussians changes with the level.
         opacity = mean_of_gaussians(gaussians.opacities, prediction)
         scale = mean_of_gaussians(gaussians.scales.mean(-1), prediction)
         return {
@@ -77,6 +78,7 @@ def beyond_frusta(points: Tensor, cameras: Cameras, softness: float, near: float
     x, y, z = to_camera(points, cameras).unbind(-1)
     fx, fy, cx, cy = cameras.intrinsics[..., None, :].unbind(-1)
     height, width = cameras.size
+    # Signed distances to planes through the camera's centre, so that nothing is divided by depth.
     borders = [(x, fx, cx), (-x, fx, width - cx), (y, fy, cy), (-y, fy, height - cy)]
     inside = [(focal * side + c * z) / torch.hypot(focal, c) for side, focal, c in borders]
     depths = torch.stack([*inside, z - near])  # positive inside

@@ -60,6 +60,7 @@ class TwoPasses(Objective):
             some = inputs.select(subset(count, part))
             prediction = passes.predict(some)
             outcomes.append(passes.judge(prediction, targets, some))
+            # Both are drawn from the target cameras, which neither pass has seen.
             renderings.append(passes.render(prediction.gaussians, targets.cameras))
         one, other = renderings
         return Outcome.mean(
@@ -87,5 +88,6 @@ def disagreement(one: Tensor, other: Tensor) -> Tensor:
 
     The symmetric stop-gradient of the paper, averaged; a sum would give the whole gradient.
     """
+    # Without holding one side both would drift to the blurred mean.
     held = (one - other.detach()).abs().mean(), (other - one.detach()).abs().mean()
     return (held[0] + held[1]) / 2

@@ -69,6 +69,7 @@ class SlotQueries(LearnedQueries):
     def start(self, batch_size: int) -> QueryState:
         """The two streams of all tokens, the same in every scene."""
         tokens_ND = self.slots if self.extra is None else torch.cat([self.slots, self.extra])
+        # A state field stays float32 under autocast, as features need not.
         streams = (self.geometry(tokens_ND), at_least_float32(self.texture(tokens_ND)))
         geometry_BND, texture_BND = (x.expand(batch_size, -1, -1) for x in streams)
         return QueryState(
@@ -109,6 +110,7 @@ class Round(DecoderLayer):
         super().__init__(config, parts)
         dims = parts.dims
         layer_scale = parts.layer_scale
+        # Two sets of weights: shape and colour look for different things in the photos.
         self.geometry = Stream(config, dims, layer_scale)
         self.texture = Stream(config, dims, layer_scale)
         self.geometry_norm = nn.LayerNorm(dims.width)
@@ -125,6 +127,7 @@ class Round(DecoderLayer):
         """One round; the memory is passed on."""
         geometry_BND = self.geometry(state.features, memory.features)
         texture_BND = self.texture(state[TEXTURE], memory.features)
+        # The mixer alone lets the streams see each other.
         both = [self.geometry_norm(geometry_BND), self.texture_norm(texture_BND)]
         update = self.mixer_scale(self.mixer(torch.cat(both, -1)))
         to_geometry_BND, to_texture_BND = update.chunk(2, -1)

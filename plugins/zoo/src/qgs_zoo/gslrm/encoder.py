@@ -65,6 +65,7 @@ class Transformer(PatchEncoder):
         self.blocks = nn.ModuleList(
             Block(dims.width, dims.heads, config.mlp_ratio) for _ in range(config.depth)
         )
+        # The paper starts all linear layers alike, without a scale for the depth.
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.normal_(module.weight, std=config.init_std)

@@ -67,6 +67,7 @@ def patches(cameras: Cameras, rows: int, columns: int) -> Tensor:
     y_BVRC = repeat((upper - cy) / fy, "b v r -> b v r c", c=columns)
     zero = torch.zeros_like(x_BVRC)
     one = torch.ones_like(x_BVRC)
+    # Steps for one patch: its rays are affine in the place on it.
     across = (width / columns / fx)[..., None]
     down = (height / rows / fy)[..., None]
     parts = ((x_BVRC, y_BVRC, one), (across + zero, zero, zero), (zero, down + zero, zero))
@@ -183,6 +184,7 @@ class PixelHead(Head):
         """(B, N, D) -> attributes of (B, N, K) Gaussians, float32 or better."""
         raw_BNC = at_least_float32(self.linear(self.norm(state.features)))
         raw_BNKC = rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(self.channels))
+        # Gaussian by Gaussian, as the weights of the public code are ordered.
         position, rgb, scale, rotation, opacity = raw_BNKC.split(self.channels, -1)
         scale = scale + self.config.scale_bias
         if self.config.scale_limit is not None:

@@ -41,6 +41,7 @@ class PerceptualDistance(nn.Module):
                 f"LPIPS needs images of at least {SMALLEST_SIDE} pixels a side, got "
                 f"{images.shape[-2]}x{images.shape[-1]}"
             )
+        # The photos are given: half of the network's gradients are never needed.
         with torch.no_grad():
             wanted = self._features(truth)
         total = images.new_zeros(len(images))
@@ -56,6 +57,7 @@ class PerceptualDistance(nn.Module):
         found = []
         for index, block in enumerate(self.blocks):
             x = block(F.max_pool2d(x, 2) if index else x)
+            # Unit length for each pixel, so that no channel counts for its size.
             found.append(x / (x.norm(dim=1, keepdim=True) + _EPS))
         return found
 
@@ -65,6 +67,7 @@ class PerceptualDistance(nn.Module):
         weights: file of VGG-16 (safetensors, or torchvision's); None for the one in torch's cache.
         Raises MissingExtraError where they are not there or do not fit.
         """
+        # Found, not imported: the package imports torchvision.
         package = find_spec("lpips")
         if package is None or not package.submodule_search_locations:
             raise MissingExtraError(

@@ -28,6 +28,7 @@ def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
     from z to x, so that degree 1 is (x, y, z); orthonormal but for a factor for all.
     """
     x, y, z = directions.unbind(-1)
+    # cos and sin of m times the azimuth by the angle sum, without an angle.
     cosine = [torch.ones_like(x)]
     sine = [torch.zeros_like(x)]
     # Of m times the azimuth, times sin^m of the angle to the pole.
@@ -95,6 +96,7 @@ def turn_of_harmonics(rotation: Tensor, degree: int) -> Tensor:
 
 def band_mask(degree: int, like: Tensor) -> Tensor:
     """What the family multiplies raw coefficients (K) with: 1, then .1 / 4^l in degree l."""
+    # Higher degrees start small (pixelSplat), so that colours begin without direction.
     each = [1.0, *(0.1 * 0.25**n for n in range(1, degree + 1))]
     return constant([x for n, x in enumerate(each) for _ in range(2 * n + 1)], like)
 

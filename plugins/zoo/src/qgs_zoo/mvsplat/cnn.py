@@ -64,6 +64,7 @@ class CNN(nn.Module):
 
     def forward(self, images_N3HW: Tensor) -> Stages:
         """The maps of images that are normalised."""
+        # All stages are returned: the upsamplers take the finer ones.
         first = self.layer1(F.relu(F.instance_norm(self.conv1(images_N3HW))))
         second = self.layer2(first)
         third = self.layer3(second)

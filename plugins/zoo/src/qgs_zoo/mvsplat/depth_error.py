@@ -17,6 +17,7 @@ class DepthError(Metric):
         """One number for each pixel with a true depth; where nothing is rendered it is 1."""
         assert given.depth is not None
         assert given.true_depth is not None
+        # Zero stands for no measurement.
         known = given.true_depth > 0
         true = given.true_depth[known]
         return (given.depth[known] - true).abs() / true

@@ -204,6 +204,7 @@ class DepthPredictor(nn.Module):
         size = images_BV3HW.shape[-2:]
         shape = images_BV3HW.shape[:2]
         normalized_N3HW = imagenet_normalised(images_BV3HW).flatten(0, 1)
+        # Chosen once: both scales and the transformer read the same views.
         neighbours_BVJ = nearest_neighbours(cameras.c2w, self.sizes.neighbours)
         sweep = Sweep(cameras, neighbours_BVJ, near_BV, far_BV)
         cnn = self.backbone(normalized_N3HW)
@@ -211,6 +212,7 @@ class DepthPredictor(nn.Module):
         x_NChw = self.transformer(x_BVChw, neighbours_BVJ).flatten(0, 1)
         maps = self.vit_maps(normalized_N3HW)
         mono_NChw = maps[-1]
+        # The ViT's maps have 1/8 of the size; features for matching may have 1/4.
         if self.sizes.stride == 4:
             mono_NChw = resized(mono_NChw, x_NChw.shape[-2:])
         several = self.sizes.scales > 1
@@ -219,6 +221,7 @@ class DepthPredictor(nn.Module):
         coarse, confidence_N1hw = self.match(cnn, multi, mono, sweep)
         # Inverse depth joins here, depth itself where Gaussians are predicted (released code).
         joined = self.beside(cnn, multi, coarse[-1])
+        # Inverse depths of far things differ by less than half precision tells.
         correction_N1HW = at_least_float32(self.upsampler(maps, joined))
         full = [resized(x, size) for x in coarse]
         full[-1] = (full[-1] + correction_N1HW).clamp(*(x[:, None] for x in bounds(sweep)))
@@ -249,6 +252,7 @@ class DepthPredictor(nn.Module):
                 poses_BVJ44,
                 sweep.neighbours,
             )
+            # The order is that of the published weights.
             seen = [cost_BVDhw.flatten(0, 1), cnn.second if scale else cnn.features, own, features]
             seen = torch.cat(seen, 1)
             refined = self.regressor[scale](seen, views) + self.regressor_residual[scale](seen)
@@ -260,6 +264,7 @@ class DepthPredictor(nn.Module):
         """Tokens of the chosen blocks as maps (N, C, H/8, W/8)."""
         height, width = images_N3HW.shape[-2:]
         grid = (height // PATCH, width // PATCH)
+        # The ViT takes patches of 14: the image shrinks to as many as are whole.
         small = resized(images_N3HW, (grid[0] * PATCH, grid[1] * PATCH))
         tokens = self.pretrained(small, self.sizes.blocks)
         maps = (x_NPC.mT.unflatten(2, grid) for x_NPC in tokens)
@@ -285,6 +290,7 @@ class DepthPredictor(nn.Module):
 
 def dpt_head(sizes: DepthSplatConfig, depth: bool) -> DptHead:
     """A head that reads CNN, transformer and ViT; with `depth` one that also gets and gives it."""
+    # Channels that join at each level, to size the projections.
     others = [0] * LEVELS
     for width, level in zip((*sizes.cnn[:2], sizes.features), sizes.cnn_levels, strict=True):
         others[level] += width

@@ -72,10 +72,13 @@ class DepthSplatEncoder(SweepEncoder):
         first = GAUSSIAN_CHANNELS
         gaussian = raw_BVCHW[:, :, :first]
         sh_BV3KHW = raw_BVCHW[:, :, first:].unflatten(2, (3, -1))
+        # The colour of the pixel goes into the constant: an untrained network copies the photo.
         constant = sh_BV3KHW[:, :, :, :1] + ((views.images - 0.5) / SH_C0)[:, :, :, None]
         sh_BV3KHW = torch.cat([constant, sh_BV3KHW[:, :, :, 1:]], 3)
+        # As logarithms, the range of depths fits the range of features.
         logs = [depth[:, :, None].log() for depth in depths]
         numbers = torch.cat([logs[-1], gaussian, sh_BV3KHW.flatten(2, 3)], 2)
+        # At the end of the numbers, where `mvsplat/exchange` finds it.
         coarse = logs[:1] if self.config.coarse_depth else []
         left = self.dims.width - numbers.shape[2] - len(coarse)
         return torch.cat([F.pad(numbers, (0, 0, 0, 0, 0, left)), *coarse], 2)

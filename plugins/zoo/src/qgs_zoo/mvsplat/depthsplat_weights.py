@@ -33,6 +33,7 @@ def _encoder(shapes: Shapes) -> dict[str, Any]:
         raise LayoutError(f"{scales} scales and a ViT of {depth} blocks are not published")
     dpt = [size_at(shapes, f"{_UPSAMPLER}projects.{n}.weight", 0) for n in range(4)]
     joined = size_at(shapes, _UPSAMPLER + "concat_projects.2.weight", 1)
+    # Sizes are read off the weights: the releases differ in them alone.
     stages = (f"{_PREDICTOR}backbone.layer{n}.0.conv1.weight" for n in (1, 2, 3))
     return {
         "type": "mvsplat/depthsplat",
@@ -65,6 +66,7 @@ def _read(shapes: Shapes) -> dict[str, Any]:
     numbers = raw + 1
     if numbers not in WIDTHS:
         raise LayoutError(f"{_HEAD}: {raw} is not {GAUSSIAN_CHANNELS} and harmonics of a degree")
+    # A layer for each depth, so that both can be supervised.
     decoder = {"depth": 2, "layer": {"type": "mvsplat/exchange"}} if two else {"depth": 0}
     supervision = {"type": "mvsplat/decayed", "layers": [1, 2]}
     model = {

@@ -60,6 +60,7 @@ class Scratch(nn.Module):
     def forward(self, maps: Sequence[Tensor]) -> Tensor:
         """Maps of 1/2 to 1/16, fine ones first, to a full-size map (X, F or 1, H, W)."""
         path = None
+        # From coarse to fine: each fusion doubles the size.
         for number in range(len(maps), 0, -1):
             skip = self.get_submodule(f"layer{number}_rn")(maps[number - 1])
             full = [2 * side for side in maps[0].shape[-2:]]

@@ -79,6 +79,7 @@ class SweepEncoder(Encoder):
                 f"images of {height} x {width} (H x W) are no multiples of {multiple} pixels; "
                 "resize or crop the views"
             )
+        # One range for all views: data do not say one.
         ends = (self.config.near, self.config.far)
         near_BV, far_BV = (views.cameras.c2w.new_full(views.cameras.shape, end) for end in ends)
         numbers_BVCHW = self.predict(views, near_BV, far_BV)

@@ -71,7 +71,9 @@ def _decoded(
     raw_BN1C = numbers_of(features_BND)[:, :, None, : sum(CHANNELS)]
     sh = harmonics_of(features_BND)[:, :, None]
     log_depth, logit, place, scale, rotation = raw_BN1C.split(CHANNELS, -1)
+    # Between scale_min and scale_max pixels at the Gaussian's own depth.
     factor = config.scale_min + (config.scale_max - config.scale_min) * scale.sigmoid()
+    # The lengths of the steps across and down a pixel, at depth 1.
     size = SCALE_FACTOR * pixel_BN43[:, :, 2:].norm(dim=-1).sum(-1)[..., None, None]
     return GaussianAttributes(
         offsets=torch.cat([place, log_depth], -1),

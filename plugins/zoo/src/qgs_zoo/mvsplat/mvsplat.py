@@ -145,6 +145,7 @@ class DepthPredictor(nn.Module):
         cnn_NDhw = cnn_BVDhw.flatten(0, 1)
         features_NDhw = features_BVDhw.flatten(0, 1)
         disparity_N1hw, confidence_N1hw = self.match(features_BVDhw, sweep)
+        # Fewer Gaussians than pixels: colours are means over their squares.
         if self.stride > 1:
             images_N3HW = F.avg_pool2d(images_N3HW, self.stride)
         size = images_N3HW.shape[2:]
@@ -175,6 +176,7 @@ class DepthPredictor(nn.Module):
             )
         matched = torch.cat([volume_BVDhw, features_BVDhw], 2).flatten(0, 1)
         refined = self.corr_refine_net(matched, features_BVDhw.shape[1])
+        # The network corrects the volume, so that matches survive an untrained U-Net.
         refined = refined + self.regressor_residual(matched)
         logits_NDhw = self.depth_head_lowres(refined)
         return expected_disparity(logits_NDhw, candidates_BVD.flatten(0, 1)[..., None, None])
@@ -184,6 +186,7 @@ class DepthPredictor(nn.Module):
 def expected_disparity(logits_NDhw: Tensor, candidates_NDhw: Tensor) -> tuple[Tensor, Tensor]:
     """Mean of candidates under the softmax of logits, and its largest probability."""
     probability = logits_NDhw.softmax(1)
+    # A mean over candidates, not the best one: it has a gradient, and lies between them.
     disparity = (probability * candidates_NDhw).sum(1, keepdim=True)
     return disparity, probability.amax(1, keepdim=True)
 
@@ -193,6 +196,7 @@ def refined_log_depth(
     disparity_N1HW: Tensor, change_N1HW: Tensor, near_BV: Tensor, far_BV: Tensor
 ) -> Tensor:
     """Logarithm of the depth (B V, 1, H, W), between near and far."""
+    # Inverse depth grows towards the camera.
     least, most = (1 / x.flatten()[:, None, None, None] for x in (far_BV, near_BV))
     fine = (disparity_N1HW + change_N1HW).clamp(least, most)
     return -fine.log()

@@ -81,6 +81,7 @@ class PixelQueries(Queries):
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         assert memory.grid is not None
+        # Harmonics are predicted in the camera's axes and painted in the world's.
         features = in_world(memory.features, views.cameras.c2w[..., :3, :3])
         _, rows, columns = memory.grid
         return QueryState(features, pixel_fields(views.cameras, rows, columns))
@@ -156,6 +157,7 @@ def _placed(offsets_BNK3: Tensor, pixel_BN43: Tensor, distance: bool) -> Tensor:
 def ray_directions(place_BNK2: Tensor, pixel_BN43: Tensor, unit: bool) -> Tensor:
     """Of rays through raw places in pixels (B, N, K, 3): of length 1, or of z = 1."""
     _, corner, across, down = pixel_BN43[:, :, None].unbind(-2)
+    # Inside its own pixel, wherever the raw numbers lie.
     u, v = place_BNK2.sigmoid()[..., None].unbind(-2)
     directions = corner + u * across + v * down
     return F.normalize(directions, dim=-1) if unit else directions

@@ -23,6 +23,7 @@ PAIRS = 40
 def cyclic_neighbours(scenes: int, views: int, device: torch.device) -> Tensor:
     """The views (B, V, V - 1) that follow each view, around; a single view is its own neighbour."""
     view = torch.arange(views, device=device)
+    # A single view is compared with itself.
     step = torch.arange(1, max(views, 2), device=device)
     return ((view[:, None] + step) % views).expand(scenes, -1, -1)
 
@@ -98,6 +99,7 @@ def cost_volume(
     own_NChw = features_BVChw.flatten(0, 1)
     lens_N4 = lens_BV4.flatten(0, 1)
     batch = torch.arange(scenes, device=features_BVChw.device)[:, None]
+    # Two ways with one result: which is faster depends on pixels and candidates.
     correlate = _of_all_pairs if height * width <= PAIRS * depth_NDhw.shape[1] else _of_warped
     total_NDhw = depth_NDhw.new_zeros(())
     for index in range(neighbours_BVJ.shape[-1]):
@@ -118,6 +120,7 @@ def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Te
         sampled_NCkhw = warped(other, warp_grid(depth_Nkhw, lens, pose))
         return torch.einsum("nchw,nckhw->nkhw", own, sampled_NCkhw)
 
+    # Parts keep the memory of sampled features bounded.
     parts = depth.split(max(1, MAX_SAMPLES // own.numel()), 1)
     return torch.cat(_each(part, [(own, other, depth_Nkhw) for depth_Nkhw in parts]), 1)
 

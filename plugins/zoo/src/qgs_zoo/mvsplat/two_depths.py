@@ -25,6 +25,7 @@ class Exchange(DecoderLayer):
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
         """The memory is passed on."""
+        # The depth in use stands first, the other one last.
         own, rest, other = state.features.tensor_split([1, state.features.shape[-1] - 1], -1)
         return state.replace(features=torch.cat([other, rest, own], -1)), memory
 

@@ -36,6 +36,7 @@ def positions(width: int, rows: int, columns: int, device: torch.device) -> Tens
 def with_positions(x_BVCHW: Tensor) -> Tensor:
     """Features plus `positions`, which count inside each of the windows."""
     width, height, columns = x_BVCHW.shape[2:]
+    # Positions repeat in each window: attention sees no more than one.
     window = positions(width, height // SPLIT, columns // SPLIT, x_BVCHW.device).to(x_BVCHW)
     return x_BVCHW + window.repeat(1, SPLIT, SPLIT)
 
@@ -52,6 +53,7 @@ def shift_mask(height: int, width: int, device: torch.device) -> Tensor:
         return (index >= size - window).long() + (index >= size - window // 2).long()
 
     piece_HW = 3 * pieces(height)[:, None] + pieces(width)
+    # Pixels of a window that come from different edges must not see each other.
     piece_WL = rearrange(piece_HW, "(a h) (b w) -> (a b) (h w)", a=SPLIT, b=SPLIT)
     return torch.where(piece_WL[:, :, None] == piece_WL[:, None], 0.0, MASKED)
 

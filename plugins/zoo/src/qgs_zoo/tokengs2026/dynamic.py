@@ -88,6 +88,7 @@ class DynamicQueries(Queries):
         batch = len(memory.features)
         parts: list[Tensor] = [self.features, *([self.dynamic] if config.dynamic else [])]
         x_BND = torch.cat(parts).expand(batch, -1, -1)
+        # Moving queries stand last, as in the released weights.
         first = len(self.features) if config.dynamic else 0
         moves_N = torch.arange(config.count, device=x_BND.device) >= first
         if config.time_channels:
@@ -136,6 +137,7 @@ class DynamicObjective(Objective):
         added = torch.zeros_like(whole.total)
         if self.config.weight:
             layers = {number: _alone(layer) for number, layer in prediction.layers.items()}
+            # The static scene is judged by the whole, the moving part once more alone.
             last = layers[max(layers)]
             alone = Prediction(last.gaussians, last.state, layers)
             added = self.config.weight * passes.judge(alone, targets, inputs).total
@@ -156,5 +158,6 @@ def _alone(layer: LayerPrediction) -> LayerPrediction:
 def _readable(state: QueryState) -> Tensor:
     """(B, N, N): True where the query of the row may read that of the column."""
     moves_BN = state[MOVES]
+    # Static queries read static ones alone, so that they are the same at all times.
     readable_BNN = moves_BN[:, :, None] | ~moves_BN[:, None]
     return readable_BNN if state.mask is None else readable_BNN & state.mask[:, None]

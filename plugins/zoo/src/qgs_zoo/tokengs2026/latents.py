@@ -84,6 +84,7 @@ class LatentBottleneck(MultiscaleReadout):
 
         Raises ValueError when the patch does not divide the images.
         """
+        # It refuses images that the patch does not divide.
         self.grid(views)
         x_BMC = self.features(views, plucker_rays(views.cameras))
         k_BhMd, v_BhMd = keys_and_values(x_BMC, self.feature_kv_proj, self.feature_k_norm)
@@ -94,6 +95,7 @@ class LatentBottleneck(MultiscaleReadout):
 
     def project(self, features: Tensor, memory: ImageMemory) -> ImageMemory:
         """The memory of other latents (B, L, D)."""
+        # Tuning at test time changes the latents and makes keys of them anew.
         return self._memory(features)
 
     def _memory(self, latents: Tensor) -> ImageMemory:

@@ -61,6 +61,7 @@ class MultiscaleReadout(PatchViT):
         yield from super().problems(config, context)
         yield from without_times(config.time_channels, context)
         last = config.blocks[-1]
+        # Blocks behind the last one that is read would learn nothing.
         if last != config.depth:
             what = "does not exist" if last > config.depth else "leaves the blocks after it unread"
             yield Problem(
@@ -93,6 +94,7 @@ class MultiscaleReadout(PatchViT):
         for number, block in enumerate(self.blocks, start=1):
             x_BMD = block(x_BMD)
             if number in self.read:
+                # Each depth has a norm of its own: their sizes differ.
                 outputs.append(self.norms[len(outputs)](x_BMD))
         return torch.cat(outputs, -1)
 
