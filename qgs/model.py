@@ -6,6 +6,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
+from qgs.containers import map_tensors
 from qgs.contracts import (
     Centers,
     DecoderLayer,
@@ -29,7 +30,6 @@ from qgs.types import (
     QueryState,
     Rendering,
     Views,
-    map_tensors,
 )
 
 

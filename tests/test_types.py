@@ -6,6 +6,7 @@ import pytest
 import torch
 from tables import fault
 
+from qgs.containers import concatenated, map_tensors, named_tensors
 from qgs.types import (
     Cameras,
     GaussianAttributes,
@@ -15,9 +16,6 @@ from qgs.types import (
     Rendering,
     SpatialSupport,
     Views,
-    concatenated,
-    map_tensors,
-    named_tensors,
 )
 
 CAMERA = Cameras(torch.eye(4)[None, None], torch.ones(1, 1, 4), (8, 8))

@@ -11,10 +11,11 @@ import torch.nn.functional as F
 from plyfile import PlyData, PlyElement, PlyElementParseError, PlyHeaderParseError
 from torch import Tensor
 
+from qgs.containers import map_tensors, named_tensors
 from qgs.extensions import imported, installed
 from qgs.files import replacing
 from qgs.geometry.harmonics import SH_C0
-from qgs.types import SH_COUNTS, Gaussians, map_tensors, named_tensors
+from qgs.types import SH_COUNTS, Gaussians
 from qgs.wording import listed, warn_once
 
 WRITER_GROUP = "qgs.scene_writers"

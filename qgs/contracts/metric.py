@@ -8,8 +8,9 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
+from qgs.containers import TensorContainer
 from qgs.contracts.component import Component
-from qgs.types import Gaussians, TensorContainer, Views
+from qgs.types import Gaussians, Views
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from qgs.containers import concatenated, map_tensors
 from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.geometry.poses import (
     largest_distance,
@@ -25,7 +26,7 @@ from qgs.geometry.poses import (
     scaled,
 )
 from qgs.machine import refuse_more_than_memory
-from qgs.types import Cameras, Views, concatenated, map_tensors
+from qgs.types import Cameras, Views
 from qgs.wording import listed, numbered, warn_once
 
 _T = TypeVar("_T")

@@ -20,13 +20,14 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
+from qgs.containers import concatenated
 from qgs.contracts import Frames, Scene, SceneSource, ViewSampler, ViewsConfig
 from qgs.data.samples import Batch, Sample, cameras_in, collate, make_sample, own_world, with_noise
 from qgs.data.view_samplers import Span
 from qgs.domain import Domain
 from qgs.machine import is_out_of_memory
 from qgs.terminal import show_safely
-from qgs.types import Cameras, concatenated
+from qgs.types import Cameras
 from qgs.wording import one_line
 
 

@@ -9,12 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from qgs.containers import map_tensors, named_tensors
 from qgs.contracts.schedule import END, follow
 from qgs.contracts.settings import Tuned
 from qgs.losses import Photometric
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
-from qgs.types import Gaussians, Prediction, Views, map_tensors, named_tensors
+from qgs.types import Gaussians, Prediction, Views
 
 
 @dataclass(frozen=True)

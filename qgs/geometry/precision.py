@@ -8,7 +8,7 @@ from typing import Any, TypeVar, cast
 import torch
 from torch import Tensor
 
-from qgs.types import map_tensors, named_tensors
+from qgs.containers import map_tensors, named_tensors
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -23,7 +23,7 @@ def at_least_float32(x: Tensor) -> Tensor:
 def full_precision(function: F) -> F:
     """Run `function` outside autocast, with half-precision tensor arguments raised to float32.
 
-    Tensors are found wherever `qgs.types.map_tensors` finds them; what holds no half-precision
+    Tensors are found wherever `qgs.containers.map_tensors` finds them; what holds no half-precision
     tensor is passed on itself. A raised ImageMemory is a copy, whose `once` starts empty. float64
     stays float64, so that gradient checks work.
     """

@@ -14,13 +14,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from qgs.containers import map_tensors
 from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.data.samples import Sample, make_sample
 from qgs.domain import TOLERANCE, Domain
 from qgs.geometry.poses import look_at_depth, scaled
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
-from qgs.types import Views, map_tensors
+from qgs.types import Views
 from qgs.wording import listed
 
 FURTHER = 2

@@ -14,9 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from qgs.containers import map_tensors
 from qgs.contracts import AttentionWeights
 from qgs.model import QueryGaussianModel
-from qgs.types import ImageMemory, QueryState, map_tensors
+from qgs.types import ImageMemory, QueryState
 
 ATTENTIONS = ("cross_attention", "self_attention")
 

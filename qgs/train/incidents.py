@@ -13,11 +13,11 @@ from torch import Tensor, nn
 
 from qgs.checkpoint.model_file import save, unique_tensors
 from qgs.checkpoint.tensors import write_tensors
+from qgs.containers import named_tensors
 from qgs.data.samples import Batch
 from qgs.files import write_text
 from qgs.model import QueryGaussianModel
 from qgs.train.training_pass import TrainingPass
-from qgs.types import named_tensors
 
 FRAMES = ("scenes", "input_frames", "target_frames")
 

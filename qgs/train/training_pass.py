@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
+from qgs.containers import concatenated, map_tensors, named_tensors
 from qgs.contracts import Loss, Objective, Outcome
 from qgs.contracts.schedule import follow
 from qgs.geometry.constants import constant
@@ -15,17 +16,7 @@ from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
 from qgs.tokengs import OnePass
 from qgs.train.precision import no_autocast
-from qgs.types import (
-    Cameras,
-    Gaussians,
-    LayerPrediction,
-    Prediction,
-    Rendering,
-    Views,
-    concatenated,
-    map_tensors,
-    named_tensors,
-)
+from qgs.types import Cameras, Gaussians, LayerPrediction, Prediction, Rendering, Views
 
 RECORDED = {"step", "seconds", "lr", "loss", "psnr", "alpha", "deviation", "gradient", "skipped"}
 """Names of a record of history.jsonl that no term may have."""

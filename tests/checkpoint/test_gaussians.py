@@ -15,8 +15,9 @@ from torch.testing import assert_close
 
 import qgs
 from qgs.checkpoint.gaussians import PROPERTIES, SPLAT, load_ply, save_gaussians, save_ply
+from qgs.containers import named_tensors
 from qgs.extensions import ExtensionError
-from qgs.types import Gaussians, named_tensors
+from qgs.types import Gaussians
 
 
 def random_gaussians(*batch, harmonics=0):

@@ -11,10 +11,10 @@ from line_scenes import Line, Lines
 from photo_formats import synthetic, write_nerfstudio
 from tables import must_refuse
 
+from qgs.containers import named_tensors
 from qgs.contracts import ViewsConfig
 from qgs.data.stream import SampleError, Share, scenes_fingerprint, training_batches
 from qgs.recipe import resolve
-from qgs.types import named_tensors
 
 TINY = Path(__file__).parents[2] / "recipes/tiny/tokengs.yaml"
 ROOMS = resolve(TINY, ["data.image_size=[16, 16]", "data.scenes=5", "data.samples=1"])

@@ -6,9 +6,9 @@ import pytest
 import torch
 from training_runs import tiny
 
+from qgs.containers import map_tensors
 from qgs.evaluate.plan import evaluation_samples
 from qgs.evaluate.tuning import tune, tuning_loss
-from qgs.types import map_tensors
 
 MSE = "losses.photometric.ssim_weight=0.0"
 LATENTS = (

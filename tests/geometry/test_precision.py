@@ -9,8 +9,9 @@ from odd_views import odd_views
 from torch import Tensor, nn
 from torch.testing import assert_close
 
+from qgs.containers import named_tensors
 from qgs.geometry.precision import full_precision
-from qgs.types import QueryState, named_tensors
+from qgs.types import QueryState
 
 
 class Pair(NamedTuple):

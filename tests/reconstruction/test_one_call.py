@@ -10,9 +10,10 @@ from photo_formats import noisy_photos, scene
 from varying_head import VaryingHead
 
 import qgs
+from qgs.containers import map_tensors
 from qgs.geometry.poses import look_at
 from qgs.renderers import AutoRenderer
-from qgs.types import Views, map_tensors
+from qgs.types import Views
 
 REST = """
 recipe: 1

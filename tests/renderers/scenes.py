@@ -5,8 +5,9 @@ from functools import partial
 import torch
 from torch.nn.functional import normalize
 
+from qgs.containers import named_tensors
 from qgs.geometry.transforms import quat_to_matrix
-from qgs.types import Cameras, Gaussians, named_tensors
+from qgs.types import Cameras, Gaussians
 
 
 def make_scene(

@@ -5,9 +5,10 @@ from renderers.scenes import differentiate, make_scene
 from tables import fault
 from torch.testing import assert_close
 
+from qgs.containers import concatenated, named_tensors
 from qgs.contracts import RendererConfig
 from qgs.renderers import TorchRenderer
-from qgs.types import Cameras, concatenated, named_tensors
+from qgs.types import Cameras
 
 
 def compared(renderer, scene, of_images=2e-5, of_gradients=2e-5, **options):

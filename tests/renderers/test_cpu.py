@@ -10,10 +10,10 @@ from renderers.scenes import differentiate, make_scene
 from torch.testing import assert_close
 
 import qgs.renderers.cpu
+from qgs.containers import concatenated, named_tensors
 from qgs.contracts import RendererConfig
 from qgs.kernels import kernel
 from qgs.renderers import CpuRenderer
-from qgs.types import concatenated, named_tensors
 
 RENDER = CpuRenderer(RendererConfig())
 

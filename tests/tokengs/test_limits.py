@@ -12,11 +12,11 @@ from losses.judging import CAMERAS, GOLDEN, TRUTH, judged
 from qgs_locus import plugin
 
 from qgs import Views
+from qgs.containers import named_tensors
 from qgs.losses import COMPONENTS as LOSSES
 from qgs.recipe import resolve
 from qgs.recipe.recipe import flat
 from qgs.tokengs import COMPONENTS
-from qgs.types import named_tensors
 
 TABLE = yaml.safe_load((Path(__file__).parent / "limits.yaml").read_text())
 

@@ -13,6 +13,7 @@ from torch.testing import assert_close
 from training_runs import same, tiny
 
 import qgs
+from qgs.containers import named_tensors
 from qgs.data.stream import training_batches
 from qgs.domain import Domain
 from qgs.train.distributed import make_accelerator
@@ -21,7 +22,6 @@ from qgs.train.guard import Guard
 from qgs.train.incidents import BadTensor, first_bad_tensor
 from qgs.train.training import compute_gradients
 from qgs.train.training_pass import TrainingPass
-from qgs.types import named_tensors
 
 GUIDE = Path(__file__).parents[2] / "docs/training.md"
 NAN, INF = float("nan"), float("inf")

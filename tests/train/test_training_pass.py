@@ -11,11 +11,11 @@ from torch import nn
 from training_runs import TWO, first_batch, tiny
 from varying_head import VaryingHead
 
+from qgs.containers import map_tensors
 from qgs.contracts import Loss
 from qgs.losses import Photometric
 from qgs.metrics.images import psnr
 from qgs.train.training_pass import TrainingPass, measure
-from qgs.types import map_tensors
 
 TARGETS = 3
 

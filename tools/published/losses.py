@@ -15,20 +15,12 @@ from torch import Tensor
 
 from published.files import EXPECTED, GoldenFile, GoldenFileError
 from published.options import ReleasedOptions
+from qgs.containers import TensorContainer, map_tensors
 from qgs.contracts import Loss
 from qgs.geometry.transforms import to_pixels
 from qgs.losses import Mask, Opacity, Photometric, Visibility, view_visibility
 from qgs.metrics.images import psnr
-from qgs.types import (
-    Cameras,
-    Gaussians,
-    LayerPrediction,
-    QueryState,
-    Rendering,
-    TensorContainer,
-    Views,
-    map_tensors,
-)
+from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering, Views
 
 RGB_TERM = {"tokengs": "loss_rgb", "locusgs": "loss_mse"}
 

@@ -10,7 +10,7 @@ from qgs_locus.fields import CENTER, RAW_RADIUS
 from torch.testing import assert_close
 
 from qgs import compose
-from qgs.types import named_tensors
+from qgs.containers import named_tensors
 
 ELLIPSOID = """
 recipe: 1

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from qgs.types import map_tensors, named_tensors
+from qgs.containers import map_tensors, named_tensors
 
 
 def leaves(tree: Any) -> dict[str, Tensor]:

@@ -8,9 +8,9 @@ from qgs_dev.checks.fields import run_training_step
 from qgs_zoo.c3g.joint import JointLayer
 from refusals import refused
 
+from qgs.containers import named_tensors
 from qgs.contracts.schedule import follow
 from qgs.recipe import resolve
-from qgs.types import named_tensors
 
 TINY = "tiny/c3g.yaml"
 NARROW = ("model.width=16", "model.heads=2", "model.queries.count=6")

@@ -7,7 +7,8 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
-from qgs.types import GaussianAttributes, ImageMemory, QueryState, Rendering, map_tensors
+from qgs.containers import map_tensors
+from qgs.types import GaussianAttributes, ImageMemory, QueryState, Rendering
 from qgs_dev.case import Case, ContractError, expect
 from qgs_dev.inputs import Inputs, Maker, Sizes, inputs_of, sizes_of, tracked_inputs
 from qgs_dev.modules import each_mode, seeded

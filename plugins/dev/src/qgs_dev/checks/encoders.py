@@ -6,17 +6,13 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from qgs.containers import map_tensors
 from qgs.contracts import (
     Encoder,
     Queries,
 )
 from qgs.geometry.rays import patch_rays, plucker_rays
-from qgs.types import (
-    ImageMemory,
-    Photos,
-    Views,
-    map_tensors,
-)
+from qgs.types import ImageMemory, Photos, Views
 from qgs_dev.case import CannotCheck, Case, expect
 from qgs_dev.inputs import Sizes, inputs_of
 from qgs_dev.registry import check

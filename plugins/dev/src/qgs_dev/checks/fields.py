@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from qgs.containers import map_tensors
 from qgs.contracts import (
     CONTRACT_VERSION,
     GAUSSIAN_FIELDS,
@@ -24,14 +25,7 @@ from qgs.recipe import RecipeError
 from qgs.recipe.recipe import Recipe, resolve
 from qgs.recipe.slots import MODEL_SLOTS, SECTIONS
 from qgs.tokengs import GaussianHead, LatentQueries, MultiViewViT
-from qgs.types import (
-    GaussianAttributes,
-    ImageMemory,
-    LayerPrediction,
-    QueryState,
-    Views,
-    map_tensors,
-)
+from qgs.types import GaussianAttributes, ImageMemory, LayerPrediction, QueryState, Views
 from qgs_dev.case import Case, expect
 from qgs_dev.inputs import Inputs, Maker, Sizes, inputs_of, memory_width, required_fields
 from qgs_dev.modules import each_mode, seeded

@@ -6,15 +6,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from qgs.containers import map_tensors
 from qgs.contracts import (
     Loss,
     Metric,
     MetricInput,
 )
-from qgs.types import (
-    LayerPrediction,
-    map_tensors,
-)
+from qgs.types import LayerPrediction
 from qgs_dev.case import CannotCheck, Case, expect
 from qgs_dev.inputs import Maker, Sizes, inputs_of
 from qgs_dev.registry import check

@@ -5,9 +5,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from qgs.containers import map_tensors
 from qgs.contracts import Outcome
 from qgs.renderers import TorchRenderer
-from qgs.types import Cameras, Gaussians, LayerPrediction, Prediction, Rendering, Views, map_tensors
+from qgs.types import Cameras, Gaussians, LayerPrediction, Prediction, Rendering, Views
 from qgs_dev.case import Case, expect
 from qgs_dev.inputs import Maker, Sizes
 from qgs_dev.modules import seeded

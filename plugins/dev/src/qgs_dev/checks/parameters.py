@@ -11,8 +11,8 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
+from qgs.containers import map_tensors
 from qgs.recipe.build import OnMeta
-from qgs.types import map_tensors
 from qgs_dev.case import Case, expect
 from qgs_dev.inputs import inputs_of
 from qgs_dev.modules import seeded

@@ -6,9 +6,9 @@ from typing import Any
 import torch
 from torch.overrides import TorchFunctionMode
 
+from qgs.containers import map_tensors, named_tensors
 from qgs.contracts import CrossAttention, SelfAttention
 from qgs.geometry.precision import at_least_float32
-from qgs.types import map_tensors, named_tensors
 from qgs_dev.case import CannotCheck, Case, expect
 from qgs_dev.inputs import Inputs, inputs_of
 from qgs_dev.modules import each_mode, seeded

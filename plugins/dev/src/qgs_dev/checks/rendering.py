@@ -12,9 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from qgs.containers import map_tensors, named_tensors
 from qgs.contracts import Renderer
 from qgs.geometry.harmonics import seen_colors
-from qgs.types import SH_COUNTS, map_tensors, named_tensors
+from qgs.types import SH_COUNTS
 from qgs_dev.case import Case, expect
 from qgs_dev.inputs import Inputs, Sizes, inputs_of, tracked_inputs
 from qgs_dev.registry import check

@@ -9,16 +9,14 @@ from typing import get_args
 import torch
 from torch import nn
 
+from qgs.containers import map_tensors
 from qgs.contracts import (
     LearnedQueries,
     Optimizer,
     ParameterGroup,
     Split,
 )
-from qgs.types import (
-    GaussianAttributes,
-    map_tensors,
-)
+from qgs.types import GaussianAttributes
 from qgs.wording import listed
 from qgs_dev.case import CannotCheck, Case, expect
 from qgs_dev.inputs import Sizes, inputs_of

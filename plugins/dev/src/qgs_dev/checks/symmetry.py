@@ -5,10 +5,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from qgs.containers import map_tensors
 from qgs.contracts import CrossAttention, Encoder
 from qgs.geometry.harmonics import rotated
 from qgs.geometry.transforms import quat_to_matrix
-from qgs.types import ImageMemory, map_tensors
+from qgs.types import ImageMemory
 from qgs_dev.case import Case, expect
 from qgs_dev.inputs import (
     QUERY_INPUTS,

@@ -15,21 +15,14 @@ import torch.nn.functional as F
 from rich.console import Console
 from torch import Tensor, nn
 
+from qgs.containers import concatenated, map_tensors, named_tensors
 from qgs.losses.photometric import mean_squared_error
 from qgs.metrics.images import psnr
 from qgs.renderers import AutoRenderer
 from qgs.similarity import mean_ssim
 from qgs.train.distributed import StopRequest, stop_requests
 from qgs.train.tracking import TrainingProgress
-from qgs.types import (
-    SH_COUNTS,
-    Cameras,
-    Gaussians,
-    Views,
-    concatenated,
-    map_tensors,
-    named_tensors,
-)
+from qgs.types import SH_COUNTS, Cameras, Gaussians, Views
 from qgs_photos.refine.adjusting import Adjustments
 from qgs_photos.refine.growth import FreeGaussians
 from qgs_photos.refine.sweeping import swept

@@ -12,6 +12,7 @@ from rich.console import Console
 from torch import Tensor
 
 from qgs.checkpoint.gaussians import save_ply, save_splat
+from qgs.containers import concatenated
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.depth import scene_depth
 from qgs.data.photos.source import PhotoScene
@@ -26,7 +27,7 @@ from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.reconstruction.scenes import Size
 from qgs.renderers import AutoRenderer
-from qgs.types import Gaussians, Views, concatenated
+from qgs.types import Gaussians, Views
 from qgs_photos.refine.plain import plain
 from qgs_photos.refine.planning import (
     NONE,

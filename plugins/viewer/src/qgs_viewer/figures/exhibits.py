@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from qgs.containers import map_tensors
 from qgs.data.samples import Sample
 from qgs.drawing.images import Picture, enlarged, rgb_picture
 from qgs.model import QueryGaussianModel
-from qgs.types import Cameras, Gaussians, SpatialSupport, map_tensors
+from qgs.types import Cameras, Gaussians, SpatialSupport
 from qgs_viewer.curves import Curves
 from qgs_viewer.look import Look, look_inside
 from qgs_viewer.queries import DrawnQuery, colored_queries, notable_queries, support_picture

@@ -6,6 +6,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from qgs.containers import map_tensors
 from qgs.contracts import (
     AttentionWeights,
     ComponentConfig,
@@ -20,14 +21,7 @@ from qgs.contracts import (
     RecipeContext,
 )
 from qgs.tokengs.decoder import ContentSelfAttention
-from qgs.types import (
-    ImageMemory,
-    LayerPrediction,
-    Prediction,
-    QueryState,
-    Views,
-    map_tensors,
-)
+from qgs.types import ImageMemory, LayerPrediction, Prediction, QueryState, Views
 from qgs_zoo.tokengs2026.times import TimeEmbedding, without_times
 
 MOVES = "dynamic.moves"

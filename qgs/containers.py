@@ -1,0 +1,126 @@
+"""What containers of tensors share: shapes that are checked, tensors found and mapped."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields, replace
+from typing import Any, Self, TypeVar, cast
+
+import torch
+from torch import Tensor
+
+_C = TypeVar("_C")
+
+
+class TensorContainer:
+    """A frozen dataclass of tensors, containers and mappings of them."""
+
+    def __init_subclass__(cls) -> None:
+        """Give every class this `__repr__`, which `dataclass` then leaves as it is."""
+        cls.__repr__ = TensorContainer.__repr__
+
+    def __repr__(self) -> str:
+        """Shapes, and types and devices that are not float32 on the CPU; no numbers."""
+        parts = [f"{name}: {_described(item)}" for name, item in _items(self)]
+        several = any(isinstance(item, TensorContainer) for _, item in _items(self))
+        lines = "\n  ".join(["", *(part.replace("\n", "\n  ") for part in parts)]) + "\n"
+        return f"{type(self).__name__}({lines if several else ', '.join(parts)})"
+
+    def replace(self, **changes: Any) -> Self:
+        """A new container with other values in some fields."""
+        return replace(cast(Any, self), **changes)
+
+    def to(self, *args: Any, **kwargs: Any) -> Self:
+        """The container with every tensor moved as by `Tensor.to`; a dtype moves geometry too."""
+        return map_tensors(lambda x: x.to(*args, **kwargs), self)
+
+
+def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
+    """`value` with `function(tensor)` for each tensor in containers, mappings, lists and tuples.
+
+    A part in which no tensor changes is returned itself, not copied.
+    """
+    if isinstance(value, Tensor):
+        return function(value)
+    if not isinstance(value, TensorContainer | Mapping | list | tuple):
+        return value
+    items = list(_items(value))
+    mapped = [(name, map_tensors(function, item)) for name, item in items]
+    if all(new is old for (_, new), (_, old) in zip(mapped, items, strict=True)):
+        return value
+    if isinstance(value, TensorContainer):
+        return value.replace(**dict(mapped))
+    if isinstance(value, Mapping):
+        return dict(mapped)
+    return getattr(value, "_make", type(value))([item for _, item in mapped])  # _make: namedtuple
+
+
+def concatenated(parts: Sequence[_C], dim: int) -> _C:
+    """One container, or tuple of them, with the tensors of all `parts` along `dim`.
+
+    Raises ValueError where one has a tensor that another one lacks.
+    """
+    found = [dict(named_tensors(part)) for part in parts]
+    if some := sorted({name for other in found for name in other.keys() ^ found[0].keys()}):
+        raise ValueError(f"all or none must have {', '.join(some)}")
+    joined = iter([torch.cat([x[name] for x in found], dim) for name in found[0]])
+    return map_tensors(lambda _: next(joined), parts[0])
+
+
+def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
+    """Every tensor that `map_tensors` finds, with its dotted name; `name` is that of `value`."""
+    if isinstance(value, Tensor):
+        yield name, value
+    elif isinstance(value, TensorContainer | Mapping | list | tuple):
+        for key, item in _items(value):
+            yield from named_tensors(item, f"{name}.{key}" if name else str(key))
+
+
+def _described(item: Any) -> str:
+    if isinstance(item, Tensor):
+        unusual = [str(item.dtype).removeprefix("torch.")] * (item.dtype != torch.float32)
+        unusual += [str(item.device)] * (item.device.type != "cpu")
+        return " ".join([str(tuple(item.shape)), *unusual])
+    # Of containers the name alone: their own lines would be many.
+    if isinstance(item, Mapping):
+        named = isinstance(next(iter(item.values()), None), TensorContainer)
+        parts = (f"{k}: {type(x).__name__ if named else _described(x)}" for k, x in item.items())
+        return f"{{{', '.join(parts)}}}"
+    return repr(item)
+
+
+def _items(value: Any) -> Iterator[tuple[Any, Any]]:
+    if isinstance(value, TensorContainer):
+        yield from ((f.name, getattr(value, f.name)) for f in fields(cast(Any, value)) if f.init)
+    else:
+        yield from value.items() if isinstance(value, Mapping) else enumerate(value)
+
+
+def check_shapes(
+    container: TensorContainer, known: Mapping[str, int] | None = None, /, **shapes: str
+) -> None:
+    """Raise ValueError unless the fields of `container` have `shapes`, such as "B N 3".
+
+    A letter is one size wherever it occurs, "..." the same leading axes; `known` gives the sizes of
+    some letters. Fields that are None pass.
+    """
+    sizes: dict[str, Any] = dict(known or {})
+    for name, spec in shapes.items():
+        tensor = getattr(container, name)
+        axes = spec.split()
+        if tensor is None:
+            continue
+        given = shape = tuple(tensor.shape)
+        # Counts as one axis, whose size is a tuple.
+        if axes[0] == "...":
+            leading = max(len(shape) - len(axes) + 1, 0)
+            given = (shape[:leading], *shape[leading:])
+        wanted = [int(axis) if axis.isdigit() else sizes.get(axis, axis) for axis in axes]
+        if len(given) != len(wanted) or any(
+            not isinstance(want, str) and want != size
+            for want, size in zip(wanted, given, strict=True)
+        ):
+            flat = [n for want in wanted for n in (want if isinstance(want, tuple) else [want])]
+            message = f"must have shape ({', '.join(map(str, flat))}), got {shape}"
+            if axes[0] == "B" and len(shape) == len(axes) - 1:
+                message += "; add a leading dimension for a single scene"
+            raise ValueError(f"{type(container).__name__}.{name} {message}")
+        sizes.update(zip(axes, given, strict=True))
