@@ -1,16 +1,9 @@
 """Scenes that move: times in transforms files and chunks, what is drawn of them, a training."""
 
-import json
-import sys
-import tarfile
-
-import kubric_to_photos
 import numpy as np
-import pytest
 import torch
 from line_scenes import Line, Lines
 from photo_formats import scene, synthetic, write_blender
-from PIL import Image
 from tables import must_refuse
 from torch.testing import assert_close
 from training_runs import run
@@ -114,40 +107,3 @@ def test_a_dynamic_model_trains_on_photos_with_times(tmp_path):
     data = f"data={{type: qgs/photos, path: '{folder}', image_size: [16, 16]}}"
     assert run(resolve("tiny/tokengs.yaml", [*DYNAMIC, data]), tmp_path / "run").steps == 2
     must_refuse("times", resolve, "tiny/tokengs.yaml", DYNAMIC, kind=RecipeError)
-
-
-def kubric_tar(file, camera, times):
-    """One camera of a scene, in the layout that TokenGS 2026.6 reads."""
-    half = 0.5**0.5
-    metadata = {
-        "focal_length": 35.0,
-        "sensor_width": 32.0,
-        "positions": [[camera, 0.1 * time, 2] for time in range(times)],
-        "quaternions": [[half, 0, 0, half]] * times,  # w first; 90 degrees about z
-    }
-    folder = file.with_suffix("")
-    folder.mkdir(parents=True)
-    (folder / "metadata.json").write_text(json.dumps({"camera": metadata}))
-    for time in range(times):
-        image = Image.new("RGBA", (16, 16), (10 * time, 20, 30, 0))
-        image.save(folder / f"rgba_{time:05d}.png")
-    with tarfile.open(file, "w") as archive:
-        archive.add(folder, ".")
-
-
-def test_kubric_becomes_photos_with_times(tmp_path, monkeypatch):
-    scenes, photos = tmp_path / "v0", tmp_path / "photos"
-    for camera in range(3):
-        kubric_tar(scenes / f"scn0/output_{camera:03d}.tar", camera, 4)
-    monkeypatch.setattr(sys, "argv", ["kubric", str(scenes), str(photos)])
-    kubric_to_photos.main()
-    read = scene(photos, (16, 16))
-    assert read.times.tolist() == [0, 1, 2, 3] * 3
-    assert read.cameras.intrinsics[0].tolist() == pytest.approx([17.5, 17.5, 8, 8])
-    c2w = torch.tensor([[0.0, 1, 0, 2], [1, 0, 0, 0.1], [0, 0, -1, 2], [0, 0, 0, 1]]).double()
-    assert_close(read.cameras.c2w[9], c2w)
-    image = read.images([6])[0, :, 8, 8].mul(255).round()
-    assert image.tolist() == [20, 20, 30], "what is transparent stays as it is"
-    (scenes / "scn1").mkdir()
-    tarfile.open(scenes / "scn1/output_000.tar", "w").close()
-    must_refuse(r"output_000\.tar", kubric_to_photos.main, kind=SystemExit)
