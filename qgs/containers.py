@@ -19,6 +19,7 @@ class TensorContainer:
 
     def __repr__(self) -> str:
         """Shapes, and types and devices that are not float32 on the CPU; no numbers."""
+        # Numbers of a million Gaussians help nobody.
         parts = [f"{name}: {_described(item)}" for name, item in _items(self)]
         several = any(isinstance(item, TensorContainer) for _, item in _items(self))
         lines = "\n  ".join(["", *(part.replace("\n", "\n  ") for part in parts)]) + "\n"
@@ -43,6 +44,7 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
     if not isinstance(value, TensorContainer | Mapping | list | tuple):
         return value
     items = list(_items(value))
+    # A part that stays itself keeps what it caches.
     mapped = [(name, map_tensors(function, item)) for name, item in items]
     if all(new is old for (_, new), (_, old) in zip(mapped, items, strict=True)):
         return value

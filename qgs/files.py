@@ -33,6 +33,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
+    # Beside the target: only a file of the same disk can replace it at once.
     temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     with naming_full_disk(target):
         try:
@@ -40,6 +41,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
             mode = temporary.stat().st_mode
             yield temporary
             temporary.chmod(mode)
+            # Otherwise a crash could leave the new name with old or no content.
             _synchronise(temporary)
             os.replace(temporary, target)
             _synchronise(target.parent)
@@ -104,6 +106,7 @@ def replacing_entries(folder: str | os.PathLike[str], mark: str) -> Iterator[Pat
                     (target / name).rename(old / name)
                 (fresh / name).rename(target / name)
         except BaseException:
+            # What was moved aside comes back, so that a failure changes nothing.
             for entry in old.iterdir():
                 if (target / entry.name).exists():
                     (target / entry.name).rename(fresh / entry.name)

@@ -63,6 +63,7 @@ class QueryGaussianModel(nn.Module):
         self.queries = queries
         self.decoder = nn.ModuleList(decoder)
         self.refinements = nn.ModuleList(dict.fromkeys(refinements))
+        # One module may refine after several layers: its weights count once.
         shared = {id(module): index for index, module in enumerate(self.refinements)}
         self.refinement_of = [shared[id(module)] for module in refinements]
         self.feedback = feedback
@@ -97,6 +98,7 @@ class QueryGaussianModel(nn.Module):
         if isinstance(views, Photos):
             views = self._without_cameras(views)
         memory = self.encoder(views)
+        # Tuning at test time brings its own state.
         initial = self.queries(memory, views) if state is None else state
         return self.predict(views, memory, initial, layers)
 
@@ -175,6 +177,7 @@ class QueryGaussianModel(nn.Module):
         # N, K -> G.
         flat = map_tensors(lambda x: x.flatten(1, 2), attributes)
         opacities = flat.opacities
+        # Places without a query decode Gaussians that nobody sees.
         if state.mask is not None:
             opacities = (attributes.opacities * state.mask[..., None]).flatten(1, 2)
         return Gaussians(

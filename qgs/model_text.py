@@ -56,6 +56,7 @@ def slot_rows(model: Any) -> list[tuple[str, str, str]]:
     """Slot, types of its components (without a recipe their classes) and parameters."""
     counts = {name: f"{count:,}" for name, count in parameter_counts(model).items()}
     counts |= {"supervision": "", "renderer": ""}
+    # The recipe knows types; a model built by hand only classes.
     kinds = {name: _types(model, name.removeprefix("decoder.")) for name in counts}
     return [(name, ", ".join(dict.fromkeys(kinds[name])), count) for name, count in counts.items()]
 

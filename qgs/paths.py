@@ -59,6 +59,7 @@ def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
     """The bytes of `path`. Raises OSError for more than `most`, and for a damaged archive."""
     try:
         with open_file(path) if is_local(path) else path.open("rb") as file:
+            # One more than allowed tells whether there is more.
             content: bytes = file.read(most + 1)  # of an archive, whose header may promise less
     except _DAMAGED as error:
         raise OSError(f"{path} is damaged: {error}") from error

@@ -55,6 +55,7 @@ class Cameras(TensorContainer):
     @property
     def w2c(self) -> Tensor:
         """(..., 4, 4) world-to-camera: the rigid inverse of `c2w`, differentiable."""
+        # Rigid, so the inverse needs no solver, and its gradient stays exact.
         rotation = self.c2w[..., :3, :3].transpose(-1, -2)
         translation = -rotation @ self.c2w[..., :3, 3:]
         return torch.cat([torch.cat([rotation, translation], -1), self.c2w[..., 3:, :]], -2)
@@ -110,6 +111,7 @@ class Views(TensorContainer):
 
     def select(self, index: Any) -> Self:
         """The views at `index` of every scene (a slice or a list of ints), of the same time."""
+        # All parts but the time have the views as their second axis.
         chosen = map_tensors(lambda x: x[:, index], self.replace(target_time=None))
         return chosen.replace(target_time=self.target_time)
 
@@ -169,6 +171,7 @@ class ImageMemory(TensorContainer):
         memory start with nothing kept. What was computed without gradients, or in inference mode,
         is computed again where gradients are wanted.
         """
+        # What was made without gradients is of no use to a pass that needs them.
         key = (name, torch.is_grad_enabled(), torch.is_inference_mode_enabled())
         if key not in self._derived:
             self._derived[key] = compute()
@@ -285,6 +288,7 @@ class Gaussians(TensorContainer):
 
     def most_opaque(self, count: int) -> Self:
         """The `count` most opaque of each scene, all where there are fewer, in their order."""
+        # Sorted again, so that files keep the order of the queries.
         chosen = self.opacities.topk(min(count, self.count), -1).indices.sort(-1).values
 
         def kept(x: Tensor) -> Tensor:

@@ -35,6 +35,7 @@ def short_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
     One that comes again is numbered: `a/x.yaml`, `b/x.yaml` and that again are a/x, b/x, b/x (2).
     """
     files = [os.path.abspath(path) for path in paths]
+    # Runs of one study share most of their path.
     shared = os.path.commonpath([os.path.dirname(file) for file in files])
     suffix = r"\.(ya?ml|safetensors)$"
     names = [re.sub(suffix, "", os.path.relpath(file, shared)) for file in files]

@@ -48,6 +48,7 @@ def seen_colors(gaussians: Gaussians, cameras: Cameras) -> Tensor:
     if gaussians.sh is None:
         raise ValueError("these Gaussians have no spherical harmonics: `colors` are what is seen")
     directions = F.normalize(gaussians.means[:, None] - cameras.c2w[..., None, :3, 3], dim=-1)
+    # Directions from the camera to the Gaussian, as the 3DGS release has them.
     values = harmonics(directions, gaussians.sh.shape[-2])
     varying = torch.einsum("bvgc,bgcx->bvgx", values, gaussians.sh)
     return (gaussians.colors[:, None] + varying).clamp_min(0)

@@ -36,6 +36,7 @@ def look_at(eye: Tensor, forward: Tensor, down: Tensor) -> Tensor:
     """OpenCV poses c2w (..., 4, 4) at eye (..., 3), looking along `forward`, upright by `down`."""
     forward = F.normalize(forward, dim=-1)
     down = F.normalize(down - (down * forward).sum(-1, keepdim=True) * forward, dim=-1)
+    # Down is made orthogonal first, so that the view direction stays exact.
     right = torch.linalg.cross(down, forward)
     top = torch.stack([right, down, forward, eye], -1)
     bottom = constant([0.0, 0.0, 0.0, 1.0], top).expand(*top.shape[:-2], 1, 4)
@@ -74,6 +75,7 @@ def look_at_depth(c2w: Tensor) -> Tensor:
     """
     axes = c2w[:, :3, 2]
     centres = c2w[:, :3, 3]
+    # The squared distance of a point to a line is its part across the line.
     across = torch.eye(3).to(c2w) - axes[:, :, None] * axes[:, None]
     middle = centres.mean(0)
     normal = across.mean(0)
@@ -90,5 +92,6 @@ def look_at_depth(c2w: Tensor) -> Tensor:
 @full_precision
 def mirrored(c2w: Tensor) -> Tensor:
     """Poses of the scene mirrored in x: R' = F R F, t' = F t with F = diag(-1, 1, 1)."""
+    # Both sides: a mirrored rotation alone would be no rotation.
     flip = torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0], dtype=c2w.dtype, device=c2w.device))
     return flip @ c2w @ flip

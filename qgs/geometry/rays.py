@@ -20,6 +20,7 @@ def pixel_directions(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
         torch.arange(height, **options) + 0.5, torch.arange(width, **options) + 0.5, indexing="ij"
     )
     fx, fy, cx, cy = (intrinsics[..., i, None, None] for i in range(4))
+    # z = 1, not unit length: a depth times the direction is then a point.
     x = (u - cx) / fx
     y = (v - cy) / fy
     return torch.stack([x, y, torch.ones_like(x)], -1)
@@ -47,5 +48,6 @@ def patch_rays(plucker: Tensor, patch_size: int) -> Tensor:
 
     plucker (B, V, 6, H, W) -> (B, V*H/P*W/P, 6), ordered view, row, column.
     """
+    # The mean of moments and directions is a ray through the middle, a little too short.
     pooled = F.avg_pool2d(plucker.flatten(0, 1), patch_size)
     return pooled.flatten(2).transpose(1, 2).reshape(plucker.shape[0], -1, 6)

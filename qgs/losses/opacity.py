@@ -26,6 +26,7 @@ class Opacity(Loss):
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> Tensor:
+        # The logarithm of a half precision number near 0 jumps.
         opacities = at_least_float32(prediction.gaussians.opacities)
         return -mean_of_gaussians((opacities + self.config.eps).log(), prediction)
 
@@ -60,5 +61,6 @@ def mean_of_gaussians(values: Tensor, prediction: LayerPrediction) -> Tensor:
     mask = prediction.state.mask
     if mask is None:
         return values.mean()
+    # Scenes count alike, however many queries they have.
     there = mask.repeat_interleave(values.shape[1] // mask.shape[1], 1)
     return ((values * there).sum(1) / there.sum(1).clamp_min(1)).mean()

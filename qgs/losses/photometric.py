@@ -51,6 +51,7 @@ class Photometric(Loss):
         if self.config.l1_weight:
             terms["l1"] = self.config.l1_weight * F.l1_loss(rendering.rgb, target.images)
         if self.config.ssim_weight:
+            # SSIM lies between -1 and 1, so this term lies between 0 and its weight.
             similarity = mean_ssim(rendering.rgb, target.images, self.config.padding)
             terms["ssim"] = self.config.ssim_weight * (1 - similarity) / 2
         return terms

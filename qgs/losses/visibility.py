@@ -112,6 +112,7 @@ def view_visibility(
         views = [cameras[:, view, None] for view in range(cameras.shape[1])]
         excess = torch.stack([_image_excess(points, view, *options) for view in views], 1)
         nearest = excess.argmin(1)
+    # A second pass for the nearest view alone is the one with a graph.
     scene = torch.arange(len(nearest), device=nearest.device)[:, None]
     excess = _image_excess(points, cameras[scene, nearest], *options)
     return excess if clamp is None else excess.clamp_max(clamp)
@@ -128,10 +129,12 @@ def _image_excess(
 
     cameras: (B, P), one for each point, or (B, 1); both give the same bits.
     """
+    # By sums, not a matrix product: one point and many must give the same bits.
     from_camera = points - cameras.c2w[..., :3, 3]
     camera_points = (from_camera[..., None] * cameras.c2w[..., :3, :3]).sum(-2)
     xy = camera_points[..., :2]
     z = camera_points[..., 2:]
+    # LocusGS replaces small z of either sign by a positive one: a release's choice.
     if z_guard is not None:
         z = torch.where(z.abs() < z_guard, z_guard, z)
     # Divide by 1 there and put the value in after: where() alone would pass on NaN gradients.

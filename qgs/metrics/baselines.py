@@ -46,7 +46,9 @@ def _distance(inputs: Tensor, targets: Tensor) -> Tensor:
     """Distances (B, T, V) of poses inputs (B, V, 4, 4) and targets (B, T, 4, 4)."""
     centres = inputs[..., :3, 3]
     seen_from = targets[..., :3, 3]
+    # In units of the inputs' spread, so that a distance counts in any world.
     extent = torch.cdist(centres, centres).amax((-1, -2), keepdim=True)
     distance = torch.cdist(seen_from, centres) / torch.where(extent > 0, extent, 1.0)
     cosine = targets[..., :3, 2] @ inputs[..., :3, 2].transpose(-1, -2)
+    # Metres and radians add up: both are about 1 for a view of another place.
     return distance + cosine.clamp(-1, 1).acos()

@@ -56,6 +56,7 @@ class Ssim(Metric):
 @full_precision
 def psnr(images: Tensor, truth: Tensor) -> Tensor:
     """Peak signal-to-noise ratio in dB of images (..., 3, H, W), clipped to [0, 1] -> (...)."""
+    # Clipped, as a saved picture would be.
     error = (images.clamp(0, 1) - truth.clamp(0, 1)).square().mean((-3, -2, -1))
     return -10 * error.clamp_min(_MSE_FLOOR).log10()
 
@@ -72,5 +73,6 @@ def ssim(images: Tensor, truth: Tensor, covariance: SsimCovariance = "population
     """
     x, y = (image.clamp(0, 1).double() for image in (images, truth))
     samples = WINDOW**2
+    # Sample variances divide by N - 1, population variances by N.
     correction = samples / (samples - 1) if covariance == "sample" else 1.0
     return similarity_map(x, y, "valid", correction).mean((-3, -2, -1)).to(images.dtype)
