@@ -87,9 +87,13 @@ def checks(out: Path) -> Iterator[list[Step]]:
             file = ("--warmup", "5", "--json", f"{name.replace(' ', '-')}-{precision}.json")
             command = ["qgs", "bench", *pair, *changes, *options, *file]
             yield [Step(f"latency {name}, {precision}", command)]
-    sweep = ("--sweep", "views=2..32", "--sweep", "queries=256..16384", "--json", "sweep.json")
-    options = ("--device", "cuda", "--rounds", "5")
-    yield [Step("growth with views and queries", ["qgs", "bench", *PAIR, *sweep, *options], 1800)]
+    options = ("--device", "cuda", "--rounds", "5", "--memory")
+    views = [("--views", str(count)) for count in (2, 8, 32)]
+    queries = [("--set", f"model.queries.count={count}") for count in (256, 2048, 16384)]
+    yield [
+        Step(f"latency, {' '.join(point)}", ["qgs", "bench", *PAIR, *point, *options], 900)
+        for point in (*views, *queries)
+    ]
 
 
 def training(out: Path, name: str, precision: str) -> Step:

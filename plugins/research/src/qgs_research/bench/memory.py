@@ -1,9 +1,10 @@
-"""Peak memory of one operation, in a process that does nothing else: this module, run by itself."""
+"""Peak memory of one operation, in a process that does nothing else."""
 
-import json
-import subprocess
 import sys
-from dataclasses import asdict, dataclass
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -25,37 +26,29 @@ class Peak:
 def peak_memory(recipe: Recipe, operation: Operation, workload: Workload, threads: int) -> Peak:
     """Build the model in a fresh process, run `operation` there, and return the peak.
 
-    Raises ChildProcessError, with the last output of the process, when it failed or was killed.
+    Raises ChildProcessError when the process was killed, and what the model raises in it.
     """
-    order = json.dumps([dict(recipe.tree), operation, asdict(workload), threads])
-    command = [sys.executable, "-m", "qgs_research.bench.memory"]
-    done = subprocess.run(command, input=order, capture_output=True, text=True)
-    if not done.returncode:
-        return Peak(**json.loads(done.stdout))
-    what = f"the process that measured the memory of the {operation}"
-    if done.returncode == -9:
-        raise ChildProcessError(
-            f"{what} was killed (SIGKILL), most likely because the machine has too little: choose "
-            "fewer or smaller views, or a smaller batch or model"
-        )
-    last = done.stderr.strip().splitlines()[-1:] or ["nothing"]
-    raise ChildProcessError(
-        f"{what} ended with {done.returncode}: {last[0]}; without --memory the error has its "
-        "traceback"
-    )
+    # Spawned: a forked process would begin with the memory of this one.
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        try:
+            return pool.submit(measure, dict(recipe.tree), operation, workload, threads).result()
+        except BrokenProcessPool:
+            raise ChildProcessError(
+                f"the process that measured the memory of the {operation} was killed, most likely "
+                "because the machine has too little: choose fewer or smaller views, or a smaller "
+                "batch or model"
+            ) from None
 
 
-def measure(
-    tree: dict[str, Any], operation: Operation, workload: dict[str, Any], threads: int
-) -> Peak:
-    """The peak of this process; see `peak_memory`."""
+def measure(tree: dict[str, Any], operation: Operation, workload: Workload, threads: int) -> Peak:
+    """Return the peak of this process; see `peak_memory`."""
     torch.set_num_threads(threads)
-    work = Workload(**{**workload, "size": tuple(workload["size"])})
     recipe = resolve(tree)
-    on_gpu = work.device == "cuda"
+    on_gpu = workload.device == "cuda"
     idle = 0 if on_gpu else resident_bytes("VmRSS")
-    task = make_task(operation, recipe, recipe.build_model(work.device), work)
-    if operation == "step":  # the first one makes the optimiser's moments and compiles kernels
+    task = make_task(operation, recipe, recipe.build_model(workload.device), workload)
+    if operation == "step":
+        # The first step makes the optimiser's moments and compiles kernels: count from the second.
         task()
         restart = Path("/proc/self/clear_refs")
         if on_gpu:
@@ -63,7 +56,8 @@ def measure(
         elif restart.exists():  # on Linux
             restart.write_text("5")
     task()
-    return Peak(torch.cuda.max_memory_allocated() if on_gpu else resident_bytes("VmHWM"), idle)
+    peak = torch.cuda.max_memory_allocated() if on_gpu else resident_bytes("VmHWM")
+    return Peak(peak_bytes=peak, idle_bytes=idle)
 
 
 def resident_bytes(field: str) -> int:
@@ -73,11 +67,8 @@ def resident_bytes(field: str) -> int:
         lines = status.read_text().splitlines()
         (kibibytes,) = (line.split()[1] for line in lines if line.startswith(f"{field}:"))
         return int(kibibytes) * 1024
-    import resource  # Windows has none; on Linux it would count the parent of a spawned process
+    # Imported here: Windows has none, and on Linux it would count the parent of the process.
+    import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
-
-
-if __name__ == "__main__":
-    json.dump(asdict(measure(*json.load(sys.stdin))), sys.stdout)

@@ -4,18 +4,26 @@ import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from operator import truediv
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch.utils.benchmark import timer
+from torch.utils.flop_counter import FlopCounterMode
 
 import qgs
-from qgs.recipe import resolve
-from qgs_research.bench.memory import Peak, peak_memory
-from qgs_research.bench.work import Operation, Task, make_task, workload_of
+from qgs.model import QueryGaussianModel
+from qgs.recipe import Recipe, resolve
+from qgs_research.bench.memory import peak_memory
+from qgs_research.bench.work import (
+    Operation,
+    Task,
+    Workload,
+    make_task,
+    posed_photos,
+    workload_of,
+)
 
 KIND = "qgs bench"
 
@@ -55,54 +63,62 @@ def measure_recipes(
     recipes = [resolve(name, overrides) for name in names]
     works = [workload_of(recipe, **work) for recipe in recipes]
     operations: list[Operation] = ["forward", "step"] if step else ["forward"]
-    peaks: list[dict[Operation, Peak]] = [{} for _ in names]
-    for name, recipe, workload, found in zip(names, recipes, works, peaks, strict=True):
+    entries: list[dict[str, Any]] = []
+    for name, recipe, workload in zip(names, recipes, works, strict=True):
+        entry: dict[str, Any] = {"recipe": name, **asdict(workload), "memory": {}, "seconds": {}}
+        entries.append(entry)
         for operation in operations if memory else ():
             say(f"{name}: memory of the {operation}")
-            found[operation] = peak_memory(recipe, operation, workload, torch.get_num_threads())
+            peak = peak_memory(recipe, operation, workload, torch.get_num_threads())
+            first = entries[0]["memory"].get(operation, asdict(peak))
+            ratio = peak.peak_bytes / first["peak_bytes"]
+            entry["memory"][operation] = {**asdict(peak), "ratio": ratio}
     if renderer:
-        operations.insert(1, "render")  # the step is last, because it changes weights
+        # The step comes last, because it changes the weights.
+        operations.insert(1, "render")
     models = [recipe.build_model(work["device"]) for recipe in recipes]
-    times: list[dict[Operation, list[float]]] = [{} for _ in names]
+    for entry, recipe, workload, model in zip(entries, recipes, works, models, strict=True):
+        entry |= _sizes(model)
+        entry["flops"] = forward_flops(recipe, workload)
+        first = entries[0]["parameters"]
+        entry["parameters"]["ratio"] = entry["parameters"]["count"] / first["count"]
     for operation in operations:
         tasks = [make_task(operation, *given) for given in zip(recipes, models, works, strict=True)]
         columns = in_turn(tasks, rounds, warmup, say, f"{operation}: ")
-        for found, column in zip(times, columns, strict=True):
-            found[operation] = column
-    entries = []
-    for name, workload, model, seconds, found in zip(
-        names, works, models, times, peaks, strict=True
-    ):
-        entry: dict[str, Any] = {"recipe": name, **asdict(workload)}
-        queries = model.queries.count
-        entry |= {"queries": queries, "gaussians": None}
-        if queries:  # otherwise the views decide
-            entry["gaussians"] = queries * model.head.gaussians_per_query
-        entry["parameters"] = {
-            "count": sum(p.numel() for p in model.parameters()),
-            "weight_bytes": sum(t.nbytes for t in model.state_dict().values()),
-        }
-        entry["seconds"] = {
-            operation: {
-                **quartiles(samples),
-                "samples": samples,
-                "ratio": quartiles(list(map(truediv, samples, times[0][operation]))),
-            }
-            for operation, samples in seconds.items()
-        }
-        entry["memory"] = {
-            operation: {
-                **asdict(peak),
-                "ratio": peak.peak_bytes / peaks[0][operation].peak_bytes,
-            }
-            for operation, peak in found.items()
-        }
-        entries.append(entry)
-    for entry in entries:
-        parameters = entry["parameters"]
-        parameters["ratio"] = parameters["count"] / entries[0]["parameters"]["count"]
+        for entry, samples in zip(entries, columns, strict=True):
+            ratios = [own / first for own, first in zip(samples, columns[0], strict=True)]
+            found = {**quartiles(samples), "samples": samples, "ratio": quartiles(ratios)}
+            entry["seconds"][operation] = found
     settings = {"overrides": list(overrides), "rounds": rounds, "warmup": warmup}
     return {"report": KIND, "machine": machine(work["device"]), **settings, "recipes": entries}
+
+
+def _sizes(model: QueryGaussianModel) -> dict[str, Any]:
+    """Queries, Gaussians (None where the views decide), parameters and bytes of weights."""
+    queries = model.queries.count
+    return {
+        "queries": queries,
+        "gaussians": queries * model.head.gaussians_per_query if queries else None,
+        "parameters": {
+            "count": sum(parameter.numel() for parameter in model.parameters()),
+            "weight_bytes": sum(tensor.nbytes for tensor in model.state_dict().values()),
+        },
+    }
+
+
+def forward_flops(recipe: Recipe, workload: Workload) -> int:
+    """Return the floating-point operations of a forward pass: matrix products and convolutions.
+
+    Counted from shapes, a multiplication and an addition as two.
+    """
+    # On the meta device nothing is computed, and attention is matrix products, which are counted;
+    # kernels of our own would not be. The counter hooks into modules, which needs gradients to be
+    # off in the parameters themselves: torch.no_grad is not enough.
+    model = recipe.build_model("meta").eval().requires_grad_(False)
+    photos = posed_photos(workload.batch, workload.views, workload.size, seed=0).to("meta")
+    with FlopCounterMode(display=False) as counter:
+        model(photos)
+    return counter.get_total_flops()
 
 
 def machine(device: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What is measured: inputs of a size, and operations ready to be called again and again."""
+"""Inputs of a size, and operations that are ready to be called again and again."""
 
 import math
 from collections.abc import Callable
@@ -60,10 +60,13 @@ def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Vi
     images = torch.rand(batch, count, 3, *size, generator=generator)
     c2w = torch.eye(4).repeat(batch, count, 1, 1)
     for index in range(count):
-        sine, cosine = math.sin(math.radians(10 * index)), math.cos(math.radians(10 * index))
+        angle = math.radians(10 * index)
+        sine = math.sin(angle)
+        cosine = math.cos(angle)
         turn = [[cosine, 0, sine, -sine], [0, 1, 0, 0], [-sine, 0, cosine, 1 - cosine]]
         c2w[:, index, :3] = torch.tensor(turn)
-    (height, width), focal = size, float(max(size))
+    height, width = size
+    focal = float(max(size))
     intrinsics = torch.tensor([focal, focal, width / 2, height / 2]).expand(batch, count, 4)
     times = torch.linspace(0, 1, count).expand(batch, count)
     return Views(images, Cameras(c2w, intrinsics, size), None, times, times[:, :1])

@@ -65,7 +65,7 @@ def _fitted(degree: int) -> tuple[Tensor, Tensor, Tensor]:
     return around, torch.linalg.pinv(e3nn_harmonics(around, degree)), change
 
 
-# Made at import: a first pass may be one on shapes alone (`qgs bench --predict`) or in inference
+# Made at import: a first pass may be one on shapes alone (the FLOPs of `qgs bench`) or in inference
 # mode, and tensors of it must not stay for others.
 with torch.inference_mode(False):
     _FITTED = {degree: _fitted(degree) for degree in (1, 2, 3, 4)}
