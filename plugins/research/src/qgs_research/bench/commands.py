@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import typer
 
@@ -11,16 +11,19 @@ from qgs.cli.options import Device, Overrides, Size, Threads, parse_size, use_th
 
 app = typer.Typer(help="How fast and how large models are.")
 
+InputViews: TypeAlias = Annotated[
+    int | None, typer.Option(min=1, help="Input views; default: the recipe's.")
+]
+Report: TypeAlias = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Write a report with every sample.")
+]
+
 
 @app.command()
 def bench(
-    recipes: Annotated[
-        list[Path], typer.Argument(help="Recipe files; ratios are to the first one.")
-    ],
+    recipes: Annotated[list[Path], typer.Argument(help="Recipe files; the first is the measure.")],
     overrides: Overrides = None,
-    views: Annotated[
-        int | None, typer.Option(min=1, help="Input views; default: the recipe's.")
-    ] = None,
+    views: InputViews = None,
     size: Size = None,
     batch: Annotated[int, typer.Option(min=1, help="Scenes at once.")] = 1,
     precision: Annotated[str, typer.Option(help="float32 or bf16 (autocast).")] = "float32",
@@ -31,18 +34,15 @@ def bench(
     renderer: Annotated[bool, typer.Option("--renderer", help="The renderer too.")] = False,
     rounds: Annotated[int, typer.Option(min=1, help="Samples of each latency.")] = 10,
     warmup: Annotated[int, typer.Option(min=0, help="Calls before the first sample.")] = 2,
-    json: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write a report with every sample.")
-    ] = None,
+    json: Report = None,
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
     """Size, latency and memory of models: any number of recipes in turn.
 
     Ratios are to the first. Models have their initial weights, photos and poses
-    are random: no data is needed. Latency is from photos to Gaussians, batch by
-    batch. FLOPs are those of a forward pass. With --memory: on a CPU the peak
-    resident set of a process, on a GPU what torch allocated at most.
+    are random: no data is needed. Latency and FLOPs are from photos to Gaussians.
+    Memory: on a CPU a process's peak, on a GPU what torch allocated at most.
     """
     from rich.console import Console
 

@@ -96,6 +96,7 @@ def refuse_other_file(path: Path) -> None:
     """Raise FileExistsError when `path` holds anything but an earlier report."""
     if not path.exists():
         return
+    # The name is also that of a user's own data: nothing but an earlier report is overwritten.
     try:
         is_report = json.loads(path.read_text(encoding="utf-8"))["report"] == KIND
     except (OSError, ValueError, TypeError, KeyError):

@@ -4,6 +4,7 @@ import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from operator import truediv
 from pathlib import Path
 from typing import Any
 
@@ -52,27 +53,23 @@ def measure_recipes(
         overrides: of all recipes.
         say: called with what is measured next.
 
-    Returns:
-        The report, plain values for JSON: seconds with every sample, bytes, and ratios to the first
-        recipe, those of latencies round by round.
-
-    Raises:
-        ValueError: as the models, losses and renderers do.
-        ChildProcessError: as `peak_memory` does.
+    Returns the report, plain values for JSON: seconds with every sample, bytes, and ratios to the
+    first recipe, those of latencies round by round. Raises as the models and `peak_memory` do.
     """
     recipes = [resolve(name, overrides) for name in names]
     works = [workload_of(recipe, **work) for recipe in recipes]
+    entries: list[dict[str, Any]] = [
+        {"recipe": name, **asdict(workload), "memory": {}, "seconds": {}}
+        for name, workload in zip(names, works, strict=True)
+    ]
     operations: list[Operation] = ["forward", "step"] if step else ["forward"]
-    entries: list[dict[str, Any]] = []
-    for name, recipe, workload in zip(names, recipes, works, strict=True):
-        entry: dict[str, Any] = {"recipe": name, **asdict(workload), "memory": {}, "seconds": {}}
-        entries.append(entry)
-        for operation in operations if memory else ():
-            say(f"{name}: memory of the {operation}")
-            peak = peak_memory(recipe, operation, workload, torch.get_num_threads())
-            first = entries[0]["memory"].get(operation, asdict(peak))
-            ratio = peak.peak_bytes / first["peak_bytes"]
-            entry["memory"][operation] = {**asdict(peak), "ratio": ratio}
+    for operation in operations if memory else ():
+        for entry, recipe, workload in zip(entries, recipes, works, strict=True):
+            say(f"{entry['recipe']}: memory of the {operation}")
+            peak = asdict(peak_memory(recipe, operation, workload, torch.get_num_threads()))
+            entry["memory"][operation] = peak
+            first = entries[0]["memory"][operation]
+            peak["ratio"] = peak["peak_bytes"] / first["peak_bytes"]
     if renderer:
         # The step comes last, because it changes the weights.
         operations.insert(1, "render")
@@ -86,7 +83,7 @@ def measure_recipes(
         tasks = [make_task(operation, *given) for given in zip(recipes, models, works, strict=True)]
         columns = in_turn(tasks, rounds, warmup, say, f"{operation}: ")
         for entry, samples in zip(entries, columns, strict=True):
-            ratios = [own / first for own, first in zip(samples, columns[0], strict=True)]
+            ratios = list(map(truediv, samples, columns[0]))
             found = {**quartiles(samples), "samples": samples, "ratio": quartiles(ratios)}
             entry["seconds"][operation] = found
     settings = {"overrides": list(overrides), "rounds": rounds, "warmup": warmup}
@@ -156,6 +153,7 @@ def in_turn(
     for what, count in (("warm-up", warmup), ("round", rounds)):
         for number in range(count):
             say(f"{label}{what} {number + 1} of {count}")
+            # All tasks in each round: a slow moment of the machine meets every recipe.
             for task, column in zip(tasks, columns, strict=True):
                 start = timer()
                 task()

@@ -89,6 +89,7 @@ def make_task(
         for seed, count in enumerate((workload.views, workload.targets))
     )
     if operation == "step":
+        # A whole step as `qgs train` makes it, so that losses and renderer are in its time.
         objective = TrainingPass.of(recipe, model.train()).to(workload.device)
         factors = recipe.rate_factors(objective)
         optimizer = make_optimizer(objective, recipe.build_optimizer(), factors)
@@ -111,5 +112,6 @@ def make_task(
 
     if operation == "forward":
         return forward
+    # Made once, outside of what is timed.
     gaussians = forward()
     return torch.inference_mode()(lambda: model.render(gaussians, targets.cameras))
