@@ -15,7 +15,8 @@ import pytest
 import yaml
 from published.files import read_golden
 from published.models import recipe_of
-from qgs_research.studies.plan import composed, differences, planned
+from qgs_research.studies.plan import composed, planned
+from qgs_research.studies.runs import differences
 from qgs_research.studies.study import read_study
 
 import qgs

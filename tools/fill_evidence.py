@@ -10,7 +10,8 @@ A study without a folder keeps what the page has, and a line says so.
 """
 
 import argparse
-import csv
+import json
+import math
 import re
 from io import BytesIO
 from pathlib import Path
@@ -50,11 +51,11 @@ def table(text: str) -> str:
 def means(study: Path) -> dict[str, dict[str, tuple[float, float]]]:
     """PSNR, mean and standard deviation over seeds (nan of one), by evaluation and variant."""
     found: dict[str, dict[str, tuple[float, float]]] = {}
-    with (study / "table.csv").open(encoding="utf-8") as lines:
-        for row in csv.DictReader(lines):
-            if row["metric"] == "psnr" and row["evaluation"]:
-                of_all = found.setdefault(row["evaluation"], {})
-                of_all[row["variant"]] = float(row["mean"]), float(row["sd"] or "nan")
+    record = json.loads((study / "results.json").read_text(encoding="utf-8"))
+    for row in record["table"]:
+        if row["metric"] == "psnr" and row["evaluation"]:
+            of_all = found.setdefault(row["evaluation"], {})
+            of_all[row["variant"]] = row["mean"], row["sd"] or math.nan
     return found
 
 

@@ -3,20 +3,23 @@
 import io
 import json
 import multiprocessing
+import os
 import re
 import signal
-import subprocess
 import time
+from concurrent.futures import Future
 from pathlib import Path
 
 import kill
 import pytest
 from commands import done
-from qgs_research.studies.plan import planned, run_of
-from qgs_research.studies.queue import Queue, _end, _signal, last_record
+from qgs_research.studies import queue as queue_module
+from qgs_research.studies.plan import planned
+from qgs_research.studies.queue import Queue, last_record
 from qgs_research.studies.results import Results
+from qgs_research.studies.runs import run_of
 from qgs_research.studies.study import read_study
-from qgs_research.studies.work import is_free, locked
+from qgs_research.studies.work import Outcome, is_free, lock_of, work
 from rich.console import Console
 
 RECIPES = Path(__file__).parents[4] / "recipes"
@@ -64,6 +67,11 @@ def test_two_queues_share_a_folder_and_additions_run_alone(study):
         done("study", study, "--out", out, "--workers", 0)
 
 
+def queue_of(plan, workers=1, runs=None):
+    console = Console(file=io.StringIO())
+    return Queue(plan, runs or plan.runs, workers, threads=1, device="cpu", console=console)
+
+
 def test_what_failed_comes_last_and_a_collapse_is_final(study, plan, monkeypatch):
     first, second, third, fourth = plan.runs
     first.failure.parent.mkdir(parents=True)
@@ -76,31 +84,50 @@ def test_what_failed_comes_last_and_a_collapse_is_final(study, plan, monkeypatch
         started.append(run)
         if len(started) == 3:
             queue._stop(signal.SIGTERM, None)
+        return Future()
 
     monkeypatch.setattr(Queue, "_start", start)
-    monkeypatch.setattr("qgs_research.studies.queue._POLL_SECONDS", 0.01)
-    queue = Queue(plan, 4, 1, "cpu", Console(file=(shown := io.StringIO())))
+    queue = queue_of(plan, workers=4)
     assert queue.work() == "SIGTERM"
     assert started == [third, fourth, second]
     assert not queue.failures  # what failed before is no failure of this call
-    assert str(first.failure) in shown.getvalue()
-    done("study", study, "--out", plan.folder, "--slurm")
+    assert str(first.failure) in queue.console.file.getvalue()
+    done("slurm", "study", study, "--out", plan.folder)
     assert "#SBATCH --array=1,2,3" in (plan.folder / "slurm.sh").read_text()
 
 
-def test_a_run_that_is_killed_again_and_again_says_so_in_the_results(plan, monkeypatch):
-    def start(queue, run):
-        run.failure.parent.mkdir(parents=True, exist_ok=True)
-        queue._processes[run] = subprocess.Popen(["sh", "-c", "kill -9 $$"]), 0
+def die(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
 
-    monkeypatch.setattr(Queue, "_start", start)
+
+def test_a_run_that_is_killed_again_and_again_says_so_in_the_results(plan, monkeypatch):
+    monkeypatch.setattr(queue_module, "work", die)
     killed = plan.runs[0]
-    queue = Queue(plan, 1, 1, "cpu", Console(file=io.StringIO()), runs=[killed])
+    queue = queue_of(plan, runs=[killed])
     assert queue.work() is None
-    assert [*queue.failures] == [killed]
-    assert "SIGKILL 3 times without a save between" in killed.failed
+    assert queue.failures == [killed]
+    assert "ended 3 times without a save between" in killed.failed
     assert not killed.ended
     assert Results(plan).failed == [killed]
+
+
+def outcome_of(*given):
+    """What a process of a run does, as far as it prepares for it."""
+    print(f"threads {os.environ['OMP_NUM_THREADS']}, {given}", flush=True)
+    os.write(1, b"and a library\n")
+    return Outcome.TAKEN
+
+
+def test_a_process_has_its_threads_and_prints_into_the_log(plan, monkeypatch):
+    monkeypatch.setattr(queue_module, "work", outcome_of)
+    run = plan.runs[0]
+    queue = queue_of(plan, runs=[run])
+    queue._gpu_of[run] = ""
+    assert queue._start(run).result() is Outcome.TAKEN
+    text = run.log.read_text()
+    assert "threads 1" in text
+    assert str((plan.folder.absolute(), run.variant, run.seed, ["", "more"], "cpu", 1)) in text
+    assert text.endswith("and a library\n")
 
 
 @pytest.mark.slow
@@ -110,9 +137,9 @@ def test_a_killed_study_has_the_table_of_a_quiet_one(monkeypatch):
 
 
 def hold(run, pipe):
-    lock = locked(run)
-    pipe.send(lock is not None)
-    time.sleep(600)
+    with lock_of(run):
+        pipe.send(True)
+        time.sleep(600)
 
 
 def test_one_process_has_a_run_until_it_dies(tmp_path):
@@ -122,13 +149,10 @@ def test_one_process_has_a_run_until_it_dies(tmp_path):
     holder = fork.Process(target=hold, args=(run, there))
     holder.start()
     assert here.recv()
-    assert locked(run) is None
+    assert not is_free(run)
+    assert work(tmp_path, run.variant, run.seed, [""], "cpu", 1) is Outcome.TAKEN
     holder.kill()
     holder.join()
-    lock = locked(run)
-    assert lock
-    assert not is_free(run)
-    lock.close()
     assert is_free(run)
 
 
@@ -139,8 +163,3 @@ def test_the_last_whole_record_tells_how_far_a_run_is(tmp_path):
     for damaged in ('{"step": 90, "sec', '{"step": 90, "sec\n'):
         history.write_text("\n".join([*lines, damaged]))
         assert last_record(history) == (89, 44.5)
-
-
-def test_an_exit_code_of_no_signal_ends_no_study():
-    assert (_end(255), _end(-9)) == ("ended with exit code 255", "was ended by SIGKILL")
-    assert [_signal(code) for code in (255, 137, -9, 1)] == [0, 9, 9, 0]  # others go on

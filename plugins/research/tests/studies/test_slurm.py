@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
-from commands import done, sets
+from commands import done, run_qgs, sets
 
 RECIPE = Path(__file__).parents[4] / "recipes/tiny/locus.yaml"
 
@@ -17,14 +17,17 @@ def test_a_slurm_job_is_that_of_the_example(tmp_path, monkeypatch):
     index = tmp_path / "datasets/re10k/evaluation_2views.json"
     index.parent.mkdir(parents=True)
     index.write_text('{"a": {"context": [0, 2], "target": [1]}}')
-    words = ("train", "locus/re10k.yaml", "--out", "runs/locus", "--set", "training.workers=7")
-    done(*words, "--slurm", "8")
+    words = ("locus/re10k.yaml", "--out", "runs/locus", "--set", "training.workers=7")
+    done("slurm", "train", *words, "--gpus", "8")
     script = (tmp_path / "runs/locus.slurm.sh").read_text()
     shown = script.replace(sys.executable, "python").replace(str(tmp_path), ".")
     assert shown == (RECIPE.parents[2] / "docs/examples/train_8_gpus.sh").read_text()
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["locus.slurm.sh"]
     with pytest.raises(ValueError, match=r"training\.batch_size"):
-        done(*words, "--slurm", "5")
+        done("slurm", "train", *words, "--gpus", "5")
+    mistaken = run_qgs("slurm", "train", *words, "--gpu", "8")
+    assert mistaken.exit_code == 2
+    assert "No such option: --gpu" in mistaken.output
 
 
 @pytest.mark.slow
@@ -38,7 +41,7 @@ def test_a_slurm_job_saves_at_the_signal_and_goes_on(tmp_path):
         "training={seconds: null, steps: 300, save_every: 0, batch_size: 2}",
         "optimizer.warmup=1",
     )
-    done("train", RECIPE, "--out", out, "--slurm", "2", "--device", "cpu", *words)
+    done("slurm", "train", RECIPE, "--out", out, "--gpus", "2", "--device", "cpu", *words)
     stub = tmp_path / "bin/scontrol"
     stub.parent.mkdir()
     stub.write_text(f'#!/bin/sh\necho "$@" >> {asked}\n')

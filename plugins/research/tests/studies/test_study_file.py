@@ -10,14 +10,8 @@ from pathlib import Path
 import pytest
 from commands import done
 from qgs_research.studies.hypotheses import parsed
-from qgs_research.studies.plan import (
-    composed,
-    evaluation_file,
-    planned,
-    recipe_file,
-    run_of,
-    write_plan,
-)
+from qgs_research.studies.plan import composed, planned
+from qgs_research.studies.runs import evaluation_file, recipe_file, run_of, write_plan
 from qgs_research.studies.study import read_study
 
 from qgs.contracts import OptionError

@@ -59,18 +59,14 @@ def study(
     only: Annotated[
         int | None, typer.Option(min=0, help="Train the run of this number, from 0, alone.")
     ] = None,
-    slurm: Annotated[
-        bool,
-        typer.Option("--slurm", help="Write OUT/slurm.sh, an array of runs; train nothing."),
-    ] = False,
     device: Device = "auto",
 ) -> None:
     """Train every variant with every seed, evaluate all by one protocol, and compare the scores.
 
     It is checked as a whole before anything trains. Give the same command
     again at any time: each run is trained once, a killed one continues,
-    and only missing ones run. OUT/study.html has the answer, OUT/table.*
-    the numbers.
+    and only missing ones run. OUT/study.html has the answer, and
+    OUT/results.json the numbers.
 
     \b
         study: 1
@@ -94,8 +90,9 @@ def study(
     from qgs.wording import counted
     from qgs_research.studies.output import show
     from qgs_research.studies.page import write_all
-    from qgs_research.studies.plan import planned, write_plan
+    from qgs_research.studies.plan import planned
     from qgs_research.studies.results import Results
+    from qgs_research.studies.runs import write_plan
     from qgs_research.studies.study import read_study
 
     console = Console()
@@ -108,20 +105,24 @@ def study(
     missing = [run for run in plan.runs if not plan.done(run)]
     count = f"{counted(len(plan.runs), 'run')}, {len(missing)} of them missing"
     console.print(f"{plan.size}: {count}", highlight=False)
-    if slurm:
-        from qgs_research.studies.slurm import write_script
-
-        script = write_script(plan, file, threads or 1, device)
-        console.print(f"wrote {script}; submit it with: sbatch {script}", soft_wrap=True)
-        return
-    stopped, failed = None, 0
+    stopped = None
+    failed = False
     if workers and missing:
         from qgs_research.studies.queue import Queue
 
         threads = threads or max(_usable_cores() // workers, 1)
         chosen = plan.runs if only is None else [plan.runs[only]]
-        queue = Queue(plan, workers, threads, device, console, _gpus(device), chosen)
-        stopped, failed = queue.work(), len(queue.failures)
+        queue = Queue(
+            plan=plan,
+            runs=chosen,
+            workers=workers,
+            threads=threads,
+            device=device,
+            console=console,
+            gpus=_gpus(device),
+        )
+        stopped = queue.work()
+        failed = bool(queue.failures)
     results = Results(plan)
     if results.columns:
         page = write_all(results)

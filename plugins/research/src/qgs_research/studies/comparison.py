@@ -17,7 +17,9 @@ from qgs.evaluate.results import as_json, bullets, markdown_table, print_lines, 
 from qgs.files import write_text
 from qgs.wording import counted, listed, short_names
 from qgs_research.studies.intervals import CONFIDENCE, CROSSED, RESAMPLES, SEED, interval
-from qgs_research.studies.stored import COMPACT, StoredResults
+from qgs_research.studies.stored import COMPACT, StoredResults, scenes_with
+
+Pairs = Sequence[tuple[StoredResults, StoredResults]]
 
 
 @dataclass(frozen=True)
@@ -41,27 +43,48 @@ class Difference:
     wins: int
     losses: int
 
+    def cells(self) -> list[str]:
+        """A row of the table, one digit finer than an evaluation's."""
+        digits = self.column.digits + 1
+        interval = "–"
+        if self.low is not None:
+            interval = f"[{self.low:+.{digits}f}, {self.high:+.{digits}f}]"
+        return [
+            self.column.title,
+            f"{self.first:.{digits}f}",
+            f"{self.second:.{digits}f}",
+            f"{self.difference:+.{digits}f}",
+            interval,
+            f"{self.wins} : {self.losses}",
+        ]
+
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two results. shared: the scenes that both judged. moved: those on different frames."""
+    """Two results. shared: the scenes that both judged. moved: those on different frames.
+
+    pairs: the trainings that are held against each other, see `paired_trainings`.
+    """
 
     first: StoredResults
     second: StoredResults
     shared: Sequence[str]
     moved: Sequence[str]
+    pairs: Pairs
     differences: Sequence[Difference]
 
     @property
     def title(self) -> str:
         """Who is compared, over how many scenes."""
-        wanted, count = max(self.first.wanted, self.second.wanted), len(self.shared)
+        wanted = max(self.first.wanted, self.second.wanted)
+        count = len(self.shared)
         scenes = counted(count, "scene") if count >= wanted else f"{count} of {wanted} scenes"
         return f"{self.first.name} against {self.second.name}, {scenes}"
 
     def record(self) -> dict[str, Any]:
         """Plain values for JSON."""
-        first, second = self.first, self.second
+        first = self.first
+        second = self.second
         return {
             "first": first.name,
             "second": second.name,
@@ -78,60 +101,56 @@ class Comparison:
         }
 
     def rows(self) -> list[list[str]]:
-        """The table, headers first; one digit finer than an evaluation's."""
+        """The table, headers first."""
         names = short_names([self.first.name, self.second.name])
-        rows = [["metric", *names, "difference", "95 % interval", "won : lost"]]
-        for d in self.differences:
-            digits = d.column.digits + 1
-            means = [f"{d.first:.{digits}f}", f"{d.second:.{digits}f}"]
-            change = f"{d.difference:+.{digits}f}"
-            ends = "–" if d.low is None else f"[{d.low:+.{digits}f}, {d.high:+.{digits}f}]"
-            rows.append([d.column.title, *means, change, ends, f"{d.wins} : {d.losses}"])
-        return rows
+        head = ["metric", *names, "difference", "95 % interval", "won : lost"]
+        return [head, *(difference.cells() for difference in self.differences)]
 
     def notes(self) -> Iterator[str]:
         """What is to be known beside the table, one line each."""
-        first, second, facts = self.first, self.second, self.record()
-        pairs, steps = _trainings(first, second), list[float]()
-        covered = f"{len(pairs)} trainings a side and scenes, both random ({CROSSED})"
-        if len(pairs) == 1:
-            counts = len(first.trainings), len(second.trainings)
-            sides = "{} against {} trainings".format(*counts)
-            covered = (
-                f"scenes alone (percentile bootstrap, {RESAMPLES:,} resamples); "
-                f"{'one training a side' if sum(counts) == 2 else sides}: says nothing of training"
-            )
-        yield f"difference: {first.name} minus {second.name}, mean over scenes; interval: {covered}"
-        for side in (first, second):
+        yield f"difference: {self.first.name} minus {self.second.name}; interval: {self._covers()}"
+        steps = []
+        facts = self.record()
+        for place, side in enumerate((self.first, self.second)):
             steps.append(float(np.mean([run.step for run in side.trainings if run.step] or [0])))
             seeds = listed(run.seed for run in side.trainings if run.seed is not None)
-            of = f" of a budget of {side.budget}, seed {seeds}" if side.budget else ""
+            budget = f" of a budget of {side.budget}, seed {seeds}" if side.budget else ""
             known = f"{steps[-1]:,.0f} steps" if steps[-1] else "steps not known"
-            yield f"{side.name}: {known}{of}"
-        for side, paired in zip((first, second), zip(*pairs, strict=True), strict=True):
-            left = [run.seed for run in side.runs if all(run is not other for other in paired)]
-            if len(pairs) > 1 and left:
+            yield f"{side.name}: {known}{budget}"
+            paired = {pair[place].seed for pair in self.pairs}
+            left = [run.seed for run in side.runs if run.seed not in paired]
+            if len(self.pairs) > 1 and left:
                 yield f"{side.name}: seed {listed(left)} left out, nothing to pair with"
+            if side.missing:
+                yield f"{side.name} is incomplete: no score of {listed(side.missing)}"
+            if only := facts[("only_first", "only_second")[place]]:
+                yield f"{len(only)} scenes only in {side.name}, left out: {listed(only)}"
+        # Two runs of one budget in seconds differ by a little.
         if min(steps) and max(steps) > 1.02 * min(steps):
             yield f"unequal training: {max(steps) / min(steps):.2f} times the steps of the other"
         if len(self.shared) == 1:
             yield "one scene is too few for an interval"
         if null := facts["null"]:
             yield f"null entries of the index, not judged ({len(null)}): {listed(null)}"
-        for result, only in ((first, facts["only_first"]), (second, facts["only_second"])):
-            if result.missing:
-                yield f"{result.name} is incomplete: no score of {listed(result.missing)}"
-            if only:
-                yield f"{len(only)} scenes only in {result.name}, left out: {listed(only)}"
-        for d in self.differences:
-            if d.scenes < len(self.shared):
-                yield f"{d.column.heading}: over the {d.scenes} scenes that have it in both"
-        if alone := first.columns.keys() ^ second.columns.keys():
+        for difference in self.differences:
+            if difference.scenes < len(self.shared):
+                heading = difference.column.heading
+                yield f"{heading}: over the {difference.scenes} scenes that have it in both"
+        if alone := self.first.columns.keys() ^ self.second.columns.keys():
             yield f"not in both, left out: {listed(sorted(alone))}"
         if not facts["same_protocol"]:
             yield "the protocols differ: the scores do not measure the same"
         if self.moved:
             yield f"{len(self.moved)} scenes judged on different frames: {listed(self.moved)}"
+
+    def _covers(self) -> str:
+        """What the intervals are over."""
+        if len(self.pairs) > 1:
+            return f"{len(self.pairs)} trainings a side and scenes, both random ({CROSSED})"
+        counts = (len(self.first.trainings), len(self.second.trainings))
+        sides = "one training a side" if max(counts) == 1 else "{} against {} trainings"
+        bootstrap = f"scenes alone (percentile bootstrap, {RESAMPLES:,} resamples)"
+        return f"{bootstrap}; {sides.format(*counts)}: says nothing of training"
 
 
 @dataclass(frozen=True)
@@ -187,31 +206,65 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
     if len(names) < 2 or len(set(names)) < len(names):
         raise ValueError(f"a comparison takes two or more different results, got {names}")
     first, *others = results
-    pairs = []
-    for other in others:
-        if other.protocol.sha256 != first.protocol.sha256 and not across_protocols:
-            ours, theirs = first.protocol.content, other.protocol.content
-            unequal = sorted(k for k in {*ours, *theirs} if ours.get(k) != theirs.get(k))
-            raise ValueError(
-                f"{first.name} was judged by {first.protocol}, {other.name} by {other.protocol}, "
-                f"which differ in {', '.join(unequal)}: evaluate both by one protocol, or add "
-                "--across-protocols to compare them all the same"
-            )
-        shared = [name for name in first.scenes if name in other.scenes]
-        if not shared:
-            raise ValueError(f"{first.name} and {other.name} have no scene in common")
-        every = [*first.trainings, *other.trainings]
-        moved = [name for name in shared if len({run.frames[name] for run in every}) > 1]
-        if moved and not across_protocols:
-            raise ValueError(
-                f"{first.name} and {other.name} judged {len(moved)} scenes on different frames, "
-                f"although their protocols agree: {listed(moved)}. The data, or how views are "
-                "drawn, changed between them: evaluate both again, or add --across-protocols"
-            )
-        metrics = [name for name in first.columns if name in other.columns]
-        found = (_difference(metric, first, other, shared) for metric in metrics)
-        pairs.append(Comparison(first, other, shared, moved, [d for d in found if d]))
-    return Comparisons(pairs)
+    return Comparisons([_compared(first, other, across_protocols) for other in others])
+
+
+def _compared(first: StoredResults, second: StoredResults, across_protocols: bool) -> Comparison:
+    if second.protocol.sha256 != first.protocol.sha256 and not across_protocols:
+        ours = first.protocol.content
+        theirs = second.protocol.content
+        unequal = sorted(k for k in {*ours, *theirs} if ours.get(k) != theirs.get(k))
+        raise ValueError(
+            f"{first.name} was judged by {first.protocol}, {second.name} by {second.protocol}, "
+            f"which differ in {', '.join(unequal)}: evaluate both by one protocol, or add "
+            "--across-protocols to compare them all the same"
+        )
+    shared = [name for name in first.scenes if name in second.scenes]
+    if not shared:
+        raise ValueError(f"{first.name} and {second.name} have no scene in common")
+    every = [*first.trainings, *second.trainings]
+    moved = [name for name in shared if len({run.frames[name] for run in every}) > 1]
+    if moved and not across_protocols:
+        raise ValueError(
+            f"{first.name} and {second.name} judged {len(moved)} scenes on different frames, "
+            f"although their protocols agree: {listed(moved)}. The data, or how views are "
+            "drawn, changed between them: evaluate both again, or add --across-protocols"
+        )
+    pairs = paired_trainings(first, second)
+    differences = []
+    for metric in first.columns:
+        scenes = scenes_with(metric, [run for pair in pairs for run in pair])
+        if metric in second.columns and scenes:
+            differences.append(_difference(metric, first.columns[metric], pairs, scenes))
+    return Comparison(
+        first=first,
+        second=second,
+        shared=shared,
+        moved=moved,
+        pairs=pairs,
+        differences=differences,
+    )
+
+
+def _difference(metric: str, column: Column, pairs: Pairs, scenes: Sequence[str]) -> Difference:
+    first = np.array([ours.scores(metric, scenes) for ours, _ in pairs])
+    second = np.array([theirs.scores(metric, scenes) for _, theirs in pairs])
+    apart = first - second
+    better = apart.mean(0) if column.better == "higher" else -apart.mean(0)
+    low, high = interval(apart)
+    return Difference(
+        metric=metric,
+        column=column,
+        scenes=len(scenes),
+        trainings=len(pairs),
+        first=float(first.mean()),
+        second=float(second.mean()),
+        difference=float(apart.mean()),
+        low=low,
+        high=high,
+        wins=int((better > 0).sum()),
+        losses=int((better < 0).sum()),
+    )
 
 
 def grouped(results: Sequence[StoredResults]) -> Sequence[StoredResults]:
@@ -223,13 +276,15 @@ def grouped(results: Sequence[StoredResults]) -> Sequence[StoredResults]:
     for number, result in enumerate(results):
         key = (result.recipe, result.protocol.sha256) if result.recipe else number
         groups.setdefault(key, []).append(result)
+    # Alone, the seeds of one recipe are what is compared.
     if len(groups) < 2:
         return results
-    sides = list[StoredResults]()
+    sides: list[StoredResults] = []
     for runs in groups.values():
         several = len({run.seed for run in runs}) == len(runs) > 1
         sides += [_mean(runs)] if several else runs
-    names = [side.name for side in sides]  # of several in one folder, all of their runs
+    # Sides whose runs lie in one folder have all of their runs as a name.
+    names = [side.name for side in sides]
     return [
         replace(side, name=", ".join(run.name for run in side.trainings))
         if names.count(side.name) > 1
@@ -239,56 +294,23 @@ def grouped(results: Sequence[StoredResults]) -> Sequence[StoredResults]:
 
 
 def _mean(runs: Sequence[StoredResults]) -> StoredResults:
-    first, names = runs[0], [run.name for run in runs]
-    scenes = {
-        scene: {
-            key: float(np.mean([run.scenes[scene][key] for run in runs]))
-            for key in values
-            if all(key in run.scenes[scene] for run in runs)
-        }
-        for scene, values in first.scenes.items()
-        if all(scene in run.scenes for run in runs)
-    }
+    first = runs[0]
+    scenes: dict[str, dict[str, float]] = {}
+    for scene, values in first.scenes.items():
+        every = [run.scenes[scene] for run in runs if scene in run.scenes]
+        if len(every) == len(runs):
+            keys = [key for key in values if all(key in one for one in every)]
+            scenes[scene] = {key: float(np.mean([one[key] for one in every])) for key in keys}
+    names = [run.name for run in runs]
+    # Absolute and relative paths have no common folder.
     folder = os.path.commonpath(names) if len({*map(os.path.isabs, names)}) == 1 else ""
     return replace(first, name=folder or ", ".join(names), scenes=scenes, runs=tuple(runs))
 
 
-def _difference(
-    metric: str, first: StoredResults, second: StoredResults, shared: Sequence[str]
-) -> Difference | None:
-    """None where no scene has the metric in both."""
-    column, value = first.columns[metric], f"model_{metric}"
-    pairs = _trainings(first, second)
-    every = [run for pair in pairs for run in pair]
-    scenes = [name for name in shared if all(value in run.scenes.get(name, ()) for run in every)]
-    if not scenes:
-        return None
-    values = np.array(
-        [[[run.scenes[name][value] for name in scenes] for run in pair] for pair in pairs]
-    )
-    apart = values[:, 0] - values[:, 1]
-    better = apart.mean(0) if column.better == "higher" else -apart.mean(0)
-    low, high = interval(apart)
-    return Difference(
-        metric=metric,
-        column=column,
-        scenes=len(scenes),
-        trainings=len(pairs),
-        first=float(values[:, 0].mean()),
-        second=float(values[:, 1].mean()),
-        difference=float(apart.mean()),
-        low=low,
-        high=high,
-        wins=int((better > 0).sum()),
-        losses=int((better < 0).sum()),
-    )
-
-
-def _trainings(
-    first: StoredResults, second: StoredResults
-) -> Sequence[tuple[StoredResults, StoredResults]]:
+def paired_trainings(first: StoredResults, second: StoredResults) -> Pairs:
     """Pairs of equal seeds, else in their order; the means where a side has a single training."""
-    ours, theirs = ({run.seed: run for run in side.runs} for side in (first, second))
+    ours = {run.seed: run for run in first.runs}
+    theirs = {run.seed: run for run in second.runs}
     if len(common := [seed for seed in ours if seed in theirs]) > 1:
         return [(ours[seed], theirs[seed]) for seed in common]
     if min(len(ours), len(theirs)) > 1:

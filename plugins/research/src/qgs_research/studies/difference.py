@@ -1,18 +1,17 @@
 """`qgs diff`: where two recipes differ."""
 
-from typing import Annotated
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from qgs.cli.inspect import RecipeFile
-from qgs.cli.tables import folded_table
-from qgs.model_text import parameter_counts
-from qgs.recipe import Recipe, resolve
-from qgs.recipe.recipe import differing_options
-from qgs.wording import short_names
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from qgs.recipe import Recipe
 
 app = typer.Typer(help="Compare recipes.")
 
@@ -28,9 +27,15 @@ def diff(
         list[str] | None, typer.Option("--set-b", help="Override of the second; repeatable.")
     ] = None,
 ) -> None:
-    """Which slots and options of two recipes differ, and what that costs in parameters."""
-    resolved = resolve(first, set_a or ()), resolve(second, set_b or ())
-    for table in difference_tables(*resolved, *short_names([first, second])):
+    """Show which slots and options of two recipes differ, and what that costs in parameters."""
+    from rich.console import Console
+
+    from qgs.recipe import resolve
+    from qgs.wording import short_names
+
+    ours = resolve(first, set_a or ())
+    theirs = resolve(second, set_b or ())
+    for table in difference_tables(ours, theirs, *short_names([first, second])):
         Console().print(table)
 
 
@@ -39,6 +44,12 @@ def difference_tables(first: Recipe, second: Recipe, a: str, b: str) -> list[Tab
 
     "-" stands for an option that a recipe's component does not have.
     """
+    from rich.markup import escape
+
+    from qgs.cli.tables import folded_table
+    from qgs.recipe.recipe import differing_options
+    from qgs.model_text import parameter_counts
+
     slots = folded_table("slots that differ", "slot", a, b)
     options = folded_table("options that differ", "option", a, b)
     parameters = folded_table("parameters", "component", a, b, "difference", right=3)
@@ -46,7 +57,8 @@ def difference_tables(first: Recipe, second: Recipe, a: str, b: str) -> list[Tab
         table = slots if path.endswith(".type") else options
         cells = [escape("-" if value is None else value) for value in values]
         table.add_row(path.removesuffix(".type"), *cells)
-    ours, theirs = (parameter_counts(r.build_model("meta")) for r in (first, second))
+    ours = parameter_counts(first.build_model("meta"))
+    theirs = parameter_counts(second.build_model("meta"))
     rows = [(name, count, theirs[name]) for name, count in ours.items()]
     for name, x, y in [*rows, ("total", sum(ours.values()), sum(theirs.values()))]:
         if name == "total":

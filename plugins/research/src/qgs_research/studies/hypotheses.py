@@ -1,7 +1,7 @@
 """Hypotheses: from `A@noisy - A < B@noisy - B` to coefficients of means."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from qgs.contracts import OptionError
@@ -14,6 +14,7 @@ MAIN = ""
 """The evaluation that recipes have themselves."""
 
 _FORM = "write `A < B` or `A > B`, each side a variant or a sum such as `A@noisy - A`"
+_TERM = re.compile(rf"\s*([+-]?)\s*({NAME})(?:@({NAME}))?\s*")
 
 
 @dataclass(frozen=True)
@@ -28,35 +29,39 @@ class Contrast:
     sign: int
 
 
-def parsed(text: str, variants: Iterable[str], evaluations: Iterable[str]) -> Contrast:
-    """The contrast that `text` writes. Raises OptionError for another form and unknown names."""
-    variants, evaluations = [*variants], [*evaluations]
+def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -> Contrast:
+    """Return the contrast that `text` writes.
+
+    Raises OptionError for another form and unknown names.
+    """
     sides = re.split(r"\s*([<>])\s*", text.strip())
     if len(sides) != 3:
         raise OptionError(f"`{text}` has not one `<` or `>`", _FORM)
+    left, comparison, right = sides
     terms: dict[tuple[str, str], int] = {}
-    for side, factor in ((sides[0], 1), (sides[2], -1)):
-        pattern = rf"\s*([+-]?)\s*({NAME})(?:@({NAME}))?\s*"
-        matches = [*re.finditer(pattern, side)]
+    for side, factor in ((left, 1), (right, -1)):
+        matches = [*_TERM.finditer(side)]
         whole = "".join(match[0] for match in matches) == side and side
         if not whole or any(not match[1] for match in matches[1:]):
             raise OptionError(f"`{side}` in `{text}` is no sum of variants", _FORM)
         for sign, variant, evaluation in (match.groups() for match in matches):
-            for noun, name, known in (
-                ("variant", variant, variants),
-                ("evaluation", evaluation, evaluations),
-            ):
-                if name and name not in known:
-                    fix = did_you_mean(name, known, f"{noun}s")
-                    raise OptionError(f"there is no {noun} `{name}` in `{text}`", fix)
-            term = variant, evaluation or MAIN
-            terms[term] = terms.get(term, 0) + factor * (-1 if sign == "-" else 1)
-    terms = {term: coefficient for term, coefficient in terms.items() if coefficient}
+            _check_known("variant", variant, variants, text)
+            if evaluation:
+                _check_known("evaluation", evaluation, evaluations, text)
+            term = (variant, evaluation or MAIN)
+            terms[term] = terms.get(term, 0) + (-factor if sign == "-" else factor)
     if sum(terms.values()):
         raise OptionError(
             f"the two sides of `{text}` weigh unlike: it compares no like with like",
             "write differences on both sides, such as `A@noisy - A < B@noisy - B`",
         )
+    terms = {term: coefficient for term, coefficient in terms.items() if coefficient}
     if not terms:
         raise OptionError(f"both sides of `{text}` are the same", _FORM)
-    return Contrast(text, terms, -1 if sides[1] == "<" else 1)
+    return Contrast(text, terms, -1 if comparison == "<" else 1)
+
+
+def _check_known(noun: str, name: str, known: Collection[str], text: str) -> None:
+    if name not in known:
+        fix = did_you_mean(name, known, f"{noun}s")
+        raise OptionError(f"there is no {noun} `{name}` in `{text}`", fix)

@@ -26,12 +26,15 @@ def crossed_interval(
     return float(values.mean() - half), float(values.mean() + half)
 
 
-def interval(values: np.ndarray) -> tuple[float, float] | tuple[None, None]:
-    """95 % interval of the mean of differences (S, C) of S trainings on C scenes.
+def interval(
+    values: np.ndarray, confidence: float = CONFIDENCE
+) -> tuple[float, float] | tuple[None, None]:
+    """Interval of the mean of differences (S, C) of S trainings on C scenes.
 
-    Of one training it covers scenes alone; without an interval (None, None), as of one scene.
+    Of one training it covers scenes alone, at 95 %; without an interval (None, None), as of one
+    scene.
     """
-    return crossed_interval(values) or paired_interval(values[0]) or (None, None)
+    return crossed_interval(values, confidence) or paired_interval(values[0]) or (None, None)
 
 
 def crossed_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -42,12 +45,14 @@ def crossed_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     side. Without the scenes' own (Hillis 2007, doi.org/10.1002/sim.2532) it is too narrow for few.
     """
     *_, trainings, scenes = values.shape
-    of_training, of_scene = values.mean(-1, keepdims=True), values.mean(-2, keepdims=True)
+    of_training = values.mean(-1, keepdims=True)
+    of_scene = values.mean(-2, keepdims=True)
     rest = values - of_training - of_scene + values.mean((-2, -1), keepdims=True)
     noise = (rest**2).sum((-2, -1)) / ((trainings - 1) * (scenes - 1))
     first = scenes * of_training.var((-2, -1), ddof=1)
     second = trainings * of_scene.var((-2, -1), ddof=1)
-    own = second > noise  # else scenes add no variance of their own
+    # Otherwise the scenes add no variance of their own, and the difference would be negative.
+    own = second > noise
     whole = first + own * (second - noise)
     spread = first**2 + own * (second**2 * (trainings - 1) + noise**2) / (scenes - 1)
     freedom = (trainings - 1) * whole**2 / np.where(spread, spread, 1.0)
@@ -65,8 +70,10 @@ def paired_interval(differences: np.ndarray) -> tuple[float, float] | None:
         return None
     rng = np.random.default_rng(SEED)
     step = max(_AT_A_TIME // count, 1)
-    sizes = [min(step, RESAMPLES - start) for start in range(0, RESAMPLES, step)]
-    drawn = [differences[rng.integers(0, count, (size, count))].mean(1) for size in sizes]
+    means = []
+    for start in range(0, RESAMPLES, step):
+        drawn = rng.integers(0, count, (min(step, RESAMPLES - start), count))
+        means.append(differences[drawn].mean(1))
     tail = (1 - CONFIDENCE) / 2
-    low, high = np.quantile(np.concatenate(drawn), [tail, 1 - tail])
+    low, high = np.quantile(np.concatenate(means), [tail, 1 - tail])
     return float(low), float(high)

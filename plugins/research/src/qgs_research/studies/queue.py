@@ -3,23 +3,23 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import timedelta
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from types import FrameType
 
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from qgs.files import write_text
 from qgs.train.guard import CollapseError
 from qgs.wording import listed
-from qgs_research.studies.plan import Plan, Run
-from qgs_research.studies.work import FAILED, TAKEN, is_free
+from qgs_research.studies.runs import Plan, Run
+from qgs_research.studies.work import Outcome, begin, is_free, work
 
 _POLL_SECONDS = 0.3
 _TAIL = 4096  # bytes of a history that hold its last record
@@ -31,186 +31,156 @@ _PATIENCE = 120.0  # seconds that stopped runs have to save
 
 @dataclass
 class Queue:
-    """Trains the missing ones of `runs`, all of the plan by default; see `work`.
+    """Trains the missing ones of `runs`; see `work`.
 
-    threads: of each run. gpus: one for each worker in turn.
-    failures: runs that failed in this call, and why.
+    threads: of each run. gpus: shared by the workers. failures: runs that failed in this call.
     """
 
     plan: Plan
+    runs: Sequence[Run]
     workers: int
     threads: int
     device: str
     console: Console
     gpus: Sequence[str] = ()
-    runs: Sequence[Run] = ()
-    failures: dict[Run, str] = field(default_factory=dict)
-    _processes: dict[Run, tuple[subprocess.Popen[bytes], int]] = field(default_factory=dict)
-    _deaths: dict[Run, tuple[int, int]] = field(default_factory=dict)
+    failures: list[Run] = field(default_factory=list)
+    _futures: dict[Run, Future[Outcome]] = field(default_factory=dict)
+    _gpu_of: dict[Run, str] = field(default_factory=dict)
+    _deaths: dict[Run, tuple[float, int]] = field(default_factory=dict)
     _stopping: str | None = None
 
-    def __post_init__(self) -> None:
-        self.runs = self.runs or self.plan.runs
-
     def work(self) -> str | None:
-        """Run until nothing is missing; the signal that ended it, if any.
+        """Run until nothing is missing; return the signal that ended it, if any.
 
         Waits for runs that another queue of this machine has, and continues them if it dies. A run
         that fails is reported, and not tried again by this call.
         """
-        before = {s: signal.signal(s, self._stop) for s in (signal.SIGINT, signal.SIGTERM)}
         for run in self.runs:
-            if run.ended and not self.plan.done(run):
+            if run in self.plan.ended:
+                # A collapsed training does not continue from its last save.
+                and_folder = f" and {run.folder}" * run.failed.startswith(CollapseError.__name__)
                 why = f"{run} is not trained again, it would end so each time: {run.failed}"
-                self._say(f"{why}; to train it again, delete {run.failure}{_and_folder(run)}")
-        done = set(filter(self.plan.done, self.runs))
+                self._say(f"{why}; to train it again, delete {run.failure}{and_folder}")
+        before = {s: signal.signal(s, self._stop) for s in (signal.SIGINT, signal.SIGTERM)}
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+        silent = not self.console.is_terminal
+        # Runs take minutes to days: the time that is left comes from the last ten minutes.
+        bar = Progress(*columns, console=self.console, disable=silent, speed_estimate_period=600)
+        task = bar.add_task("", total=len(self.runs))
         try:
-            with self.console.status(self._left()) as status:
-                waiting = True
-                while waiting:
-                    waiting = self._step()
-                    for run in self.runs:
-                        if run not in done and self.plan.done(run):
-                            done.add(run)
-                            self._say(f"{run} is done, {self._left()}")
-                    if self.console.is_terminal:
-                        status.update(self._left())
+            with bar:
+                while self._step():
+                    shares = {run: self._share(run) for run in self.runs}
+                    here = listed(f"{run} {shares[run]:.0%}" for run in self._futures)
+                    bar.update(task, completed=sum(shares.values()), description=here)
                     time.sleep(_POLL_SECONDS)
         finally:
-            for process, _ in self._processes.values():
-                process.terminate()
-            end = time.monotonic() + _PATIENCE
-            for process, _ in self._processes.values():
-                try:
-                    process.wait(max(end - time.monotonic(), 0.1))
-                except subprocess.TimeoutExpired:
-                    process.kill()
+            self._end_processes()
             for number, handler in before.items():
                 signal.signal(number, handler)
         return self._stopping
 
-    def _step(self) -> bool:
-        """Collect what has ended, start what is missing; True while there is work to wait for."""
-        for run, (process, _) in [*self._processes.items()]:
-            code = process.poll()
-            if code is None:
-                continue
-            del self._processes[run]
-            ended = code in (0, TAKEN)
-            if not ended and not self._stopping and not self._goes_on(run, code):
-                self._fail(run, code)
-        if self._stopping:
-            return False
-        over = {*self.failures, *self.plan.ended}
-        missing = [run for run in self.runs if run not in over and not self.plan.done(run)]
-        for run in sorted(missing, key=lambda run: run.failure.is_file()):  # failed ones last
-            if len(self._processes) >= self.workers:
-                break
-            if run not in self._processes and is_free(run):
-                self._start(run)
-        return bool(missing)
-
-    def _start(self, run: Run) -> None:
-        used = {slot for _, slot in self._processes.values()}
-        slot = next(n for n in range(self.workers) if n not in used)
-        threads = str(self.threads)
-        counts = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")
-        environment = {**os.environ, **dict.fromkeys(counts, threads)}
-        if self.gpus:
-            environment["CUDA_VISIBLE_DEVICES"] = self.gpus[slot % len(self.gpus)]
-        where = [str(self.plan.folder), run.variant, str(run.seed)]
-        options = ["--threads", threads, "--device", self.device, "--parent", str(os.getpid())]
-        options += ["--evaluations", *self.plan.study.evaluations]
-        run.log.parent.mkdir(parents=True, exist_ok=True)
-        with run.log.open("ab") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "qgs_research.studies.work", *where, *options],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                env=environment,
-                process_group=0,  # a Ctrl-C reaches the queue alone, which stops its runs once
-            )
-        self._processes[run] = process, slot
-
-    def _goes_on(self, run: Run, code: int) -> bool:
-        """True to continue a run whose process was killed, unless DEATHS in a row saved nothing."""
-        if not _signal(code):
-            return False
-        state = run.folder / "state.safetensors"
-        saved = state.stat().st_mtime_ns if state.is_file() else 0
-        before, times = self._deaths.get(run, (saved, 0))
-        self._deaths[run] = saved, (times + 1 if saved == before else 1)
-        if self._deaths[run][1] >= DEATHS:
-            return False
-        self._say(f"{run}: its process {_end(code)}; it continues from its last save")
-        return True
-
-    def _fail(self, run: Run, code: int) -> None:
-        why = f"its process {_end(code)}"
-        if code == FAILED and run.failure.is_file():
-            why = run.failed
-        elif _signal(code):
-            why += f" {DEATHS} times without a save between; memory may be short"
-            write_text(run.failure, f"{why}\n")  # the killed process could not
-        self.failures[run] = why
-        self._say(f"{run} failed: {why} (see {run.log})")
-
     def _stop(self, number: int, frame: FrameType | None) -> None:
         self._stopping = signal.Signals(number).name
+
+    def _end_processes(self) -> None:
+        """Let the processes save, and kill those that take too long."""
+        for process in active_children():
+            process.terminate()
+        end = time.monotonic() + _PATIENCE
+        for process in active_children():
+            process.join(max(end - time.monotonic(), 0.1))
+            process.kill()
+
+    def _step(self) -> bool:
+        """Collect what has ended, start what is missing; True while there is work to wait for."""
+        if self._stopping:
+            return False
+        for run, future in [*self._futures.items()]:
+            if future.done():
+                del self._futures[run]
+                del self._gpu_of[run]
+                self._collect(run, future)
+        over = {*self.failures, *self.plan.ended}
+        missing = [run for run in self.runs if run not in over and not self.plan.done(run)]
+        # Those that failed before come last: they may fail again.
+        for run in sorted(missing, key=lambda run: run.failure.is_file()):
+            if len(self._futures) == self.workers:
+                break
+            if run not in self._futures and is_free(run):
+                used = [*self._gpu_of.values()]
+                self._gpu_of[run] = min(self.gpus, key=used.count, default="")
+                self._futures[run] = self._start(run)
+        return bool(missing)
+
+    def _start(self, run: Run) -> Future[Outcome]:
+        """Train `run` in a process of a pool of its own.
+
+        A pool for each run: a process that is killed breaks its pool, and takes no other run along.
+        """
+        run.log.parent.mkdir(parents=True, exist_ok=True)
+        pool = ProcessPoolExecutor(
+            max_workers=1,
+            mp_context=get_context("spawn"),
+            initializer=begin,
+            initargs=(run.log.absolute(), self.threads, self._gpu_of[run], os.getpid()),
+        )
+        folder = self.plan.folder.absolute()
+        settings = (self.plan.evaluations, self.device, self.threads)
+        future = pool.submit(work, folder, run.variant, run.seed, *settings)
+        # The process ends after this run.
+        pool.shutdown(wait=False)
+        return future
+
+    def _collect(self, run: Run, future: Future[Outcome]) -> None:
+        """Report how a run ended; one whose process was killed may go on."""
+        outcome = None if future.exception() else future.result()
+        if outcome is Outcome.TAKEN:
+            return
+        if outcome is Outcome.DONE:
+            done = [run for run in self.runs if self.plan.done(run)]
+            self._say(f"{run} is done, {len(done)} of {len(self.runs)} runs")
+            return
+        if outcome is not Outcome.FAILED:
+            if self._count_death(run) < DEATHS:
+                self._say(f"{run}: its process was ended; it continues from its last save")
+                return
+            # The killed process could not write it.
+            why = f"its process was ended {DEATHS} times without a save between"
+            write_text(run.failure, f"{why}; memory may be short\n")
+        self.failures.append(run)
+        self._say(f"{run} failed: {run.failed} (see {run.log})")
+
+    def _count_death(self, run: Run) -> int:
+        """Return how often the process of `run` was ended in a row without a save between."""
+        state = run.folder / "state.safetensors"
+        saved = state.stat().st_mtime if state.is_file() else 0.0
+        before, count = self._deaths.get(run, (saved, 0))
+        count = count + 1 if saved == before else 1
+        self._deaths[run] = (saved, count)
+        return count
 
     def _say(self, text: str) -> None:
         self.console.print(text, highlight=False, soft_wrap=True, markup=False)
 
-    def _left(self) -> str:
-        """Number of runs that are done, how far those here are, and about how long all take."""
-        missing = [run for run in self.runs if not self.plan.done(run)]
-        text = f"{len(self.runs) - len(missing)} of {len(self.runs)} runs"
-        used, seconds = dict[Run, float](), dict[Run, float]()
-        for run in self.runs:
-            step, seconds[run] = last_record(run.folder / "history.jsonl")
-            training = self.plan.recipes[run.variant].training
-            of_seconds = seconds[run] / training.seconds if training.seconds else 0.0
-            used[run] = min(max(step / training.steps, of_seconds), 1.0)
-        here = listed(f"{run} {used[run]:.0%}" for run in self._processes)
-        text += f", {here}" * bool(here)
-        measured = [run for run in self.runs if used[run] > 0.02 and seconds[run]]
-        open_ = [run for run in missing if run not in {*self.failures, *self.plan.ended}]
-        if not measured or not open_:
-            return text
-        whole = sum(seconds[run] for run in measured) / sum(used[run] for run in measured)
-        at_once = min(max(len(self._processes), 1), len(open_))
-        left = whole * sum(1 - used[run] for run in open_) / at_once
-        return f"{text}, about {timedelta(seconds=round(left))} left"
-
-
-def _and_folder(run: Run) -> str:
-    """What else to delete: a collapsed training does not continue from its last save."""
-    return f" and {run.folder}" * run.failed.startswith(CollapseError.__name__)
-
-
-def _end(code: int) -> str:
-    """How a process ended, by its exit code."""
-    if number := _signal(code):
-        return f"was ended by {signal.Signals(number).name}"
-    return f"ended with exit code {code}"
-
-
-def _signal(code: int) -> int:
-    """The signal that ended a process; 0 for another end, such as the exit code 255."""
-    number = -code if code < 0 else code - 128
-    return number if number in set(signal.Signals) else 0
+    def _share(self, run: Run) -> float:
+        """How much of a run's training is done, from 0 to 1."""
+        step, seconds = last_record(run.folder / "history.jsonl")
+        training = self.plan.recipes[run.variant].training
+        of_seconds = seconds / training.seconds if training.seconds else 0.0
+        return min(max(step / training.steps, of_seconds), 1.0)
 
 
 def last_record(history: Path) -> tuple[int, float]:
-    """Step and seconds of the last whole record of a history; zeros without one."""
+    """Return step and seconds of the last whole record of a history; zeros without one."""
     if not history.is_file():
         return 0, 0.0
     with history.open("rb") as file:
         file.seek(max(history.stat().st_size - _TAIL, 0))
         lines = file.read().decode(errors="replace").split("\n")[:-1]
     for line in reversed(lines):
-        with suppress(ValueError, TypeError, KeyError, RecursionError):  # a damaged line
-            record: Mapping[str, float] = json.loads(line)
+        # A killed process leaves a damaged line.
+        with suppress(ValueError, TypeError, KeyError, RecursionError):
+            record = json.loads(line)
             return int(record["step"]), float(record["seconds"])
     return 0, 0.0

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,9 +48,20 @@ class StoredResults:
         """`runs`, or the single one that this is."""
         return self.runs or [self]
 
+    def scores(self, metric: str, scenes: Iterable[str]) -> list[float]:
+        """Values of the model in these scenes; raises KeyError where one has none."""
+        return [self.scenes[scene][f"model_{metric}"] for scene in scenes]
+
+
+def scenes_with(metric: str, results: Sequence[StoredResults]) -> list[str]:
+    """Return the scenes in which all of `results` have the metric, in the order of the first."""
+    value = f"model_{metric}"
+    first = results[0].scenes if results else {}
+    return [scene for scene in first if all(value in one.scenes.get(scene, ()) for one in results)]
+
 
 def read_results(path: str | Path) -> StoredResults:
-    """Results in `path`: a folder that `qgs eval` wrote, or a run folder with an evaluation/.
+    """Return the results in `path`: a folder that `qgs eval` wrote, or a run folder with one.
 
     Raises FileNotFoundError when there are none, ValueError when they cannot be read.
     """
@@ -62,28 +73,7 @@ def read_results(path: str | Path) -> StoredResults:
             "evaluation/ in it"
         )
     try:
-        summary, content = (
-            json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-            for name in ("summary", "protocol")
-        )
-        with (folder / "scenes.csv").open(encoding="utf-8", newline="") as file:
-            rows = {row["scene"]: row for row in csv.DictReader(file) if not row["problem"]}
-        no_values = (*FRAME_COLUMNS, *NAME_COLUMNS)
-        return StoredResults(
-            name=str(path),
-            protocol=Protocol(summary["protocol"]["name"], content),
-            columns={name: Column(**column) for name, column in summary["columns"].items()},
-            scenes={
-                scene: {k: float(v) for k, v in row.items() if k not in no_values and v}
-                for scene, row in rows.items()
-            },
-            frames={s: (row["input_frames"], row["target_frames"]) for s, row in rows.items()},
-            wanted=summary["scenes_in_protocol"],
-            missing=list(summary["missing"]),
-            null=summary["null_entries"],
-            step=summary["step"],
-            **_training(folder.parent / "recipe.yaml"),
-        )
+        return _read(folder, str(path))
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise ValueError(
             f"the results in {folder} cannot be read ({type(error).__name__}: {error}); evaluate "
@@ -91,12 +81,43 @@ def read_results(path: str | Path) -> StoredResults:
         ) from error
 
 
+def _read(folder: Path, name: str) -> StoredResults:
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    protocol = json.loads((folder / "protocol.json").read_text(encoding="utf-8"))
+    scenes: dict[str, dict[str, float]] = {}
+    frames: dict[str, tuple[str, str]] = {}
+    with (folder / "scenes.csv").open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            # A scene without a score has a row too.
+            if row.pop("problem"):
+                continue
+            scene = row["scene"]
+            frames[scene] = (row["input_frames"], row["target_frames"])
+            texts = (*FRAME_COLUMNS, *NAME_COLUMNS)
+            scenes[scene] = {k: float(v) for k, v in row.items() if k not in texts and v}
+    return StoredResults(
+        name=name,
+        protocol=Protocol(summary["protocol"]["name"], protocol),
+        columns={column: Column(**facts) for column, facts in summary["columns"].items()},
+        scenes=scenes,
+        frames=frames,
+        wanted=summary["scenes_in_protocol"],
+        missing=list(summary["missing"]),
+        null=summary["null_entries"],
+        step=summary["step"],
+        **_training(folder.parent / "recipe.yaml"),
+    )
+
+
 def _training(recipe: Path) -> dict[str, Any]:
     """Recipe, seed and budget of the run whose resolved recipe is in the file; {} without it."""
     if not recipe.is_file():
         return {}
     tree = load_mapping(recipe.read_text(encoding="utf-8"), str(recipe), Problems())
-    seed, training, _ = tree.pop("seed"), tree["training"], tree.pop("evaluation")
+    # Trainings that differ in nothing but these are one side of a comparison.
+    seed = tree.pop("seed")
+    del tree["evaluation"]
+    training = tree["training"]
     seconds = training["seconds"]
     budget = f"{seconds:g} s" if seconds else f"{training['steps']:,} steps"
     return {"recipe": json.dumps(tree), "seed": seed, "budget": budget}

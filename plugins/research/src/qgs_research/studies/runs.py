@@ -1,0 +1,161 @@
+"""The runs of a study, and the files of its folder."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from qgs.files import write_text
+from qgs.recipe import Recipe, resolve
+from qgs.recipe.errors import Origin, Problems
+from qgs.recipe.files import merge
+from qgs.recipe.recipe import annotated, flat
+from qgs.recipe.yaml_text import MapNode, dump, from_plain, load_mapping
+from qgs.train.guard import CollapseError, NonFiniteError
+from qgs.wording import counted
+from qgs_research.studies.hypotheses import MAIN
+from qgs_research.studies.study import Study
+
+BESIDE = ("seed", "plugins")
+"""What does not make a recipe another model."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training of a variant. folder: where it is, as `qgs train` leaves it."""
+
+    variant: str
+    seed: int
+    folder: Path
+
+    def __str__(self) -> str:
+        return f"{self.variant} seed {self.seed}"
+
+    def beside(self, suffix: str) -> Path:
+        """A file beside the folder, such as the lock."""
+        return self.folder.with_name(f"{self.folder.name}.{suffix}")
+
+    @property
+    def log(self) -> Path:
+        """The output of its processes."""
+        return self.beside("log")
+
+    @property
+    def failure(self) -> Path:
+        """The reason why it failed, where it did."""
+        return self.beside("failed")
+
+    @property
+    def failed(self) -> str:
+        """Why it failed, the first sentence; "" where it did not."""
+        if not self.failure.is_file():
+            return ""
+        first_line = self.failure.read_text(encoding="utf-8").strip().split("\n")[0]
+        return first_line.partition(". ")[0]
+
+    @property
+    def ended(self) -> bool:
+        """True if the training itself went wrong, as it would each time: it is not tried again."""
+        return self.failed.startswith((CollapseError.__name__, NonFiniteError.__name__))
+
+    def evaluation(self, name: str) -> Path:
+        """The folder of its results by one evaluation."""
+        return self.folder / (f"evaluation-{name}" if name else "evaluation")
+
+    def evaluated(self, name: str) -> bool:
+        """True if that evaluation is there, as a whole."""
+        # The last file that an evaluation writes.
+        return (self.evaluation(name) / "protocol.json").is_file()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be trained and evaluated in `folder`. recipes: by variant, with the first seed."""
+
+    study: Study
+    folder: Path
+    recipes: Mapping[str, Recipe]
+
+    @property
+    def evaluations(self) -> list[str]:
+        """Names of all evaluations, the recipes' own first."""
+        return [MAIN, *self.study.evaluations]
+
+    @property
+    def runs(self) -> list[Run]:
+        """All runs, every variant with the first seed, then with the next."""
+        seeds = self.study.settings.seeds
+        return [run_of(self.folder, name, seed) for seed in seeds for name in self.recipes]
+
+    @property
+    def size(self) -> str:
+        """Such as "4 variants x 3 seeds"."""
+        variants = counted(len(self.recipes), "variant")
+        return f"{variants} x {counted(len(self.study.settings.seeds), 'seed')}"
+
+    @property
+    def ended(self) -> list[Run]:
+        """Runs that are not tried again, without results."""
+        return [run for run in self.runs if run.ended and not self.done(run)]
+
+    def evaluation_recipe(self, variant: str, evaluation: str) -> Recipe:
+        """The recipe of a variant as an evaluation changes it."""
+        recipe = self.recipes[variant]
+        node = self.study.evaluations.get(evaluation)
+        return changed_recipe(recipe, node) if node else recipe
+
+    def done(self, run: Run) -> bool:
+        """True if nothing of `run` is missing."""
+        return all(map(run.evaluated, self.evaluations))
+
+
+def run_of(folder: Path, variant: str, seed: int) -> Run:
+    """Return the run of a variant with a seed, of the study in `folder`."""
+    return Run(variant, seed, folder / "runs" / variant / f"seed-{seed}")
+
+
+def recipe_file(folder: Path, variant: str) -> Path:
+    """The resolved recipe that the runs of a variant train."""
+    return folder / "variants" / f"{variant}.yaml"
+
+
+def evaluation_file(folder: Path, name: str) -> Path:
+    """The changes that an evaluation makes."""
+    return folder / "evaluations" / f"{name}.yaml"
+
+
+def changed_recipe(recipe: Recipe, node: MapNode) -> Recipe:
+    """Return `recipe` as an evaluation changes it; raises RecipeError."""
+    tree = from_plain(recipe.tree, Origin("the variant"))
+    assert isinstance(tree, MapNode)
+    return resolve(merge(tree, node))
+
+
+def write_plan(plan: Plan) -> None:
+    """Write the recipes and evaluations that the runs' processes read, where they changed."""
+    for name, recipe in plan.recipes.items():
+        file = recipe_file(plan.folder, name)
+        if not file.is_file() or differences(resolve(file), recipe):
+            write_text(file, annotated(recipe) + "\n")
+    for name, node in plan.study.evaluations.items():
+        file = evaluation_file(plan.folder, name)
+        if not file.is_file() or read_evaluation(file) != node:
+            # Plain values: a node's own types are no YAML.
+            write_text(file, dump(json.loads(json.dumps(node))))
+
+
+def read_evaluation(file: Path) -> MapNode:
+    """Return what `write_plan` wrote of an evaluation; raises RecipeError."""
+    problems = Problems("evaluation")
+    node = load_mapping(file.read_text(encoding="utf-8"), str(file), problems)
+    problems.raise_any()
+    return node
+
+
+def differences(ours: Recipe, theirs: Recipe) -> dict[str, tuple[Any, Any]]:
+    """Return options in which two recipes differ, seeds and names of plugins aside."""
+    a = flat(ours.tree)
+    b = flat(theirs.tree)
+    paths = [p for p in {**a, **b} if p not in BESIDE and a.get(p) != b.get(p)]
+    return {path: (a.get(path), b.get(path)) for path in paths}
