@@ -11,7 +11,7 @@ import pytest
 from commands import done
 from qgs_research.studies.hypotheses import parsed
 from qgs_research.studies.plan import composed, planned
-from qgs_research.studies.runs import evaluation_file, recipe_file, run_of, write_plan
+from qgs_research.studies.runs import recipe_file, run_of, write_plan
 from qgs_research.studies.study import read_study
 
 from qgs.contracts import OptionError
@@ -128,7 +128,7 @@ def test_a_study_that_was_moved_knows_its_runs_by_what_the_index_holds(tmp_path)
     study = study_with_indices(new)
     write_plan(planned(study, out))
     assert resolve(recipe_file(out, "flat")).evaluation.index == str(new / "2views.json")
-    assert str(new / "3views.json") in evaluation_file(out, "more").read_text()
+    assert str(new / "3views.json") in recipe_file(out, "flat", "more").read_text()
     for file, remedy in (("2views.json", "another --out"), ("3views.json", "`more` another name")):
         text = (new / file).read_text()
         index = json.loads(text)

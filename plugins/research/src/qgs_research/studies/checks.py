@@ -4,7 +4,6 @@ import json
 from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 from pydantic import TypeAdapter
 
@@ -14,18 +13,10 @@ from qgs.evaluate.plan import EvaluationIndex, EvaluationPlan, IndexEntry
 from qgs.evaluate.protocol import index_of
 from qgs.recipe import Recipe, resolve
 from qgs.recipe.errors import Origin, Problems
-from qgs.recipe.recipe import flat
-from qgs.recipe.yaml_text import MapNode, dump
+from qgs.recipe.yaml_text import dump
 from qgs.train.folder import RunFolder
 from qgs.wording import listed
-from qgs_research.studies.runs import (
-    BESIDE,
-    Plan,
-    differences,
-    evaluation_file,
-    read_evaluation,
-    recipe_file,
-)
+from qgs_research.studies.runs import BESIDE, Plan, Run, differences, recipe_file
 from qgs_research.studies.study import Study
 
 EQUAL = (
@@ -112,51 +103,34 @@ def check_data(plan: Plan) -> None:
 
 
 def refuse_changed(plan: Plan) -> None:
-    """Raise ValueError where runs or results in the folder were made of something else.
-
-    Where the evaluation index lies is no matter; which scenes and frames it names is.
-    """
-    for name, recipe in plan.recipes.items():
-        file = recipe_file(plan.folder, name)
-        folders = (plan.folder / "runs" / name).glob("seed-*")
-        runs = [run for run in folders if run.is_dir() and not RunFolder(run).is_new]
-        if not runs or not file.is_file():
-            continue
-        changed = differences(resolve(file), recipe)
+    """Raise ValueError where runs or results in the folder were made of something else."""
+    for variant, name in product(plan.recipes, plan.evaluations):
+        recipe = plan.evaluation_recipe(variant, name)
+        file = recipe_file(plan.folder, variant, name)
+        what = f"the evaluation `{name}`" if name else f"the variant `{variant}`"
+        remedy = f"give {what} another name, or another --out"
+        # Runs of seeds that the study no longer names count too: it may name them again.
+        folders = (plan.folder / "runs" / variant).glob("seed-*")
+        runs = [Run(variant, 0, folder) for folder in folders if folder.is_dir()]
+        evaluated = [run.evaluation(name) for run in runs if run.evaluated(name)]
+        begun = [run.folder for run in runs if not RunFolder(run.folder).is_new]
+        made = evaluated if name else begun
+        changed = differences(resolve(file), recipe) if made and file.is_file() else {}
+        # Where the index lies is no matter; which scenes and frames it names is, below.
         changed.pop(INDEX, None)
         if changed:
             shown = [f"{path}: {old!r} then, {new!r} now" for path, (old, new) in changed.items()]
             raise ValueError(
-                f"{plan.study.file}: the variant `{name}` is not the one that {len(runs)} runs in "
-                f"{plan.folder} were trained with ({listed(shown, between='; ')}); give the new "
-                "one another name, or another --out"
+                f"{plan.study.file}: {what} is not what {len(made)} runs in {plan.folder} were "
+                f"made with ({listed(shown, between='; ')}); {remedy}"
             )
-    for variant, name in product(plan.recipes, plan.evaluations):
-        _refuse_changed_evaluation(plan, variant, name)
-
-
-def _refuse_changed_evaluation(plan: Plan, variant: str, name: str) -> None:
-    runs = [run for run in plan.runs if run.variant == variant and run.evaluated(name)]
-    if not runs:
-        return
-    remedy = f"give the evaluation `{name}` another name" if name else "give another --out"
-    file = evaluation_file(plan.folder, name)
-    if name and file.is_file():
-        before = _without_index(read_evaluation(file))
-        if before != _without_index(plan.study.evaluations[name]):
-            raise ValueError(
-                f"{plan.study.file}: the results in {plan.folder} were judged by another `{name}` "
-                f"({file}); {remedy}"
-            )
-    recipe = plan.evaluation_recipe(variant, name)
-    index = index_of(recipe)
-    for run in runs:
-        if _stored_index(run.evaluation(name)) != index:
-            raise ValueError(
-                f"{plan.study.file}: the results in {run.evaluation(name)} were judged on other "
-                f"scenes or frames than evaluation.index names now ({recipe.evaluation.index}); "
-                f"{remedy}"
-            )
+        index = index_of(recipe)
+        for folder in evaluated:
+            if _stored_index(folder) != index:
+                raise ValueError(
+                    f"{plan.study.file}: the results in {folder} were judged on other scenes or "
+                    f"frames than evaluation.index names now ({recipe.evaluation.index}); {remedy}"
+                )
 
 
 def _stored_index(results: Path) -> EvaluationIndex | None:
@@ -164,8 +138,3 @@ def _stored_index(results: Path) -> EvaluationIndex | None:
     content = json.loads((results / "protocol.json").read_text(encoding="utf-8"))
     index = content.get("views", {}).get("index")
     return index and TypeAdapter(dict[str, IndexEntry | None]).validate_python(index)
-
-
-def _without_index(node: MapNode) -> dict[str, Any]:
-    """The changes of an evaluation, whatever index it names."""
-    return {path: value for path, value in flat(node).items() if path != INDEX}

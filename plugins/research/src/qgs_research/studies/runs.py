@@ -1,17 +1,17 @@
 """The runs of a study, and the files of its folder."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from qgs.files import write_text
 from qgs.recipe import Recipe, resolve
-from qgs.recipe.errors import Origin, Problems
+from qgs.recipe.errors import Origin
 from qgs.recipe.files import merge
 from qgs.recipe.recipe import annotated, flat
-from qgs.recipe.yaml_text import MapNode, dump, from_plain, load_mapping
+from qgs.recipe.yaml_text import MapNode, from_plain
 from qgs.train.guard import CollapseError, NonFiniteError
 from qgs.wording import counted
 from qgs_research.studies.hypotheses import MAIN
@@ -102,8 +102,8 @@ class Plan:
     def evaluation_recipe(self, variant: str, evaluation: str) -> Recipe:
         """The recipe of a variant as an evaluation changes it."""
         recipe = self.recipes[variant]
-        node = self.study.evaluations.get(evaluation)
-        return changed_recipe(recipe, node) if node else recipe
+        changes = self.study.evaluations.get(evaluation)
+        return changed_recipe(recipe, changes) if changes else recipe
 
     def done(self, run: Run) -> bool:
         """True if nothing of `run` is missing."""
@@ -115,42 +115,25 @@ def run_of(folder: Path, variant: str, seed: int) -> Run:
     return Run(variant, seed, folder / "runs" / variant / f"seed-{seed}")
 
 
-def recipe_file(folder: Path, variant: str) -> Path:
-    """The resolved recipe that the runs of a variant train."""
-    return folder / "variants" / f"{variant}.yaml"
+def recipe_file(folder: Path, variant: str, evaluation: str = MAIN) -> Path:
+    """The resolved recipe of the runs of a variant, as they train or as an evaluation changes it."""
+    # No name has an @: hypotheses write it between a variant and an evaluation, too.
+    name = f"{variant}@{evaluation}" if evaluation else variant
+    return folder / "variants" / f"{name}.yaml"
 
 
-def evaluation_file(folder: Path, name: str) -> Path:
-    """The changes that an evaluation makes."""
-    return folder / "evaluations" / f"{name}.yaml"
-
-
-def changed_recipe(recipe: Recipe, node: MapNode) -> Recipe:
+def changed_recipe(recipe: Recipe, changes: MapNode) -> Recipe:
     """Return `recipe` as an evaluation changes it; raises RecipeError."""
     tree = from_plain(recipe.tree, Origin("the variant"))
     assert isinstance(tree, MapNode)
-    return resolve(merge(tree, node))
+    return resolve(merge(tree, changes))
 
 
 def write_plan(plan: Plan) -> None:
-    """Write the recipes and evaluations that the runs' processes read, where they changed."""
-    for name, recipe in plan.recipes.items():
-        file = recipe_file(plan.folder, name)
-        if not file.is_file() or differences(resolve(file), recipe):
-            write_text(file, annotated(recipe) + "\n")
-    for name, node in plan.study.evaluations.items():
-        file = evaluation_file(plan.folder, name)
-        if not file.is_file() or read_evaluation(file) != node:
-            # Plain values: a node's own types are no YAML.
-            write_text(file, dump(json.loads(json.dumps(node))))
-
-
-def read_evaluation(file: Path) -> MapNode:
-    """Return what `write_plan` wrote of an evaluation; raises RecipeError."""
-    problems = Problems("evaluation")
-    node = load_mapping(file.read_text(encoding="utf-8"), str(file), problems)
-    problems.raise_any()
-    return node
+    """Write the recipes that the runs' processes read."""
+    for variant, evaluation in product(plan.recipes, plan.evaluations):
+        text = annotated(plan.evaluation_recipe(variant, evaluation))
+        write_text(recipe_file(plan.folder, variant, evaluation), f"{text}\n")
 
 
 def differences(ours: Recipe, theirs: Recipe) -> dict[str, tuple[Any, Any]]:

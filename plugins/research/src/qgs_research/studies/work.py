@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from qgs_research.studies.runs import Run
 
 _WATCH_SECONDS = 1.0
+_WORKING = threading.Lock()
 
 
 class Outcome(Enum):
@@ -53,6 +54,9 @@ def _end_with(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(_WATCH_SECONDS)
     os.kill(os.getpid(), signal.SIGTERM)
+    # Nobody waits for the outcome, and a pool's process waits for orders for ever.
+    with _WORKING:
+        os._exit(1)
 
 
 def work(
@@ -64,12 +68,11 @@ def work(
     from qgs.files import write_text
     from qgs_research.studies.runs import run_of
 
-    parent = os.getppid()
-    torch.set_num_threads(threads)
     run = run_of(folder, variant, seed)
     try:
         # The kernel releases the lock of a process that dies, so a killed run is free at once.
-        with lock_of(run):
+        with _WORKING, lock_of(run):
+            torch.set_num_threads(threads)
             outcome = _train_and_evaluate(folder, run, evaluations, device)
             run.failure.unlink(missing_ok=True)
             return outcome
@@ -79,11 +82,6 @@ def work(
         traceback.print_exc()
         write_text(run.failure, f"{type(error).__name__}: {error}\n")
         return Outcome.FAILED
-    finally:
-        sys.stdout.flush()
-        if os.getppid() != parent:
-            # Nobody waits for the outcome, and a pool's process waits for orders for ever.
-            os._exit(1)
 
 
 def lock_of(run: "Run") -> FileLock:
@@ -107,29 +105,25 @@ def _train_and_evaluate(folder: Path, run: "Run", evaluations: list[str], device
 
     from qgs.checkpoint.model_file import CheckpointFile
     from qgs.evaluate.evaluation import evaluate
-    from qgs.recipe import resolve
+    from qgs.recipe import Recipe, resolve
     from qgs.train.training import train
-    from qgs_research.studies.runs import (
-        changed_recipe,
-        evaluation_file,
-        read_evaluation,
-        recipe_file,
-    )
+    from qgs_research.studies.hypotheses import MAIN
+    from qgs_research.studies.runs import recipe_file
 
-    recipe = resolve(recipe_file(folder, run.variant), [f"seed={run.seed}"])
+    def recipe_of(evaluation: str) -> Recipe:
+        return resolve(recipe_file(folder, run.variant, evaluation), [f"seed={run.seed}"])
+
     console = Console(file=sys.stdout, width=100)
-    result = train(recipe, run.folder, console=console, device=device, resume=True)
+    result = train(recipe_of(MAIN), run.folder, console=console, device=device, resume=True)
     if result.stopped_by:
         return Outcome.STOPPED
     with CheckpointFile(result.folder.checkpoint) as file:
         trained_on = file.domain
     for name in evaluations:
-        if run.evaluated(name):
-            continue
-        changed = recipe
-        if name:
-            changed = changed_recipe(recipe, read_evaluation(evaluation_file(folder, name)))
-        evaluation = evaluate(result.model, changed, result.steps, trained_on=trained_on)
-        evaluation.write(run.evaluation(name))
-        console.print(f"{name or 'evaluation'}: {evaluation.statement}", highlight=False)
+        if not run.evaluated(name):
+            evaluation = evaluate(
+                result.model, recipe_of(name), result.steps, trained_on=trained_on
+            )
+            evaluation.write(run.evaluation(name))
+            console.print(f"{name or 'evaluation'}: {evaluation.statement}", highlight=False)
     return Outcome.DONE
