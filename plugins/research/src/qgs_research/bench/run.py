@@ -83,6 +83,7 @@ def measure_recipes(
         tasks = [make_task(operation, *given) for given in zip(recipes, models, works, strict=True)]
         columns = in_turn(tasks, rounds, warmup, say, f"{operation}: ")
         for entry, samples in zip(entries, columns, strict=True):
+            # Round by round, so that the machine's load cancels.
             ratios = list(map(truediv, samples, columns[0]))
             found = {**quartiles(samples), "samples": samples, "ratio": quartiles(ratios)}
             entry["seconds"][operation] = found

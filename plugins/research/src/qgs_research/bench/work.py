@@ -56,10 +56,12 @@ def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Vi
 
     The first is the identity; the field of view is some 53 degrees across the longer side.
     """
+    # Equal photos in all recipes and processes.
     generator = torch.Generator().manual_seed(seed)
     images = torch.rand(batch, count, 3, *size, generator=generator)
     c2w = torch.eye(4).repeat(batch, count, 1, 1)
     for index in range(count):
+        # Ten degrees apart, as neighbouring photos of a walk are.
         angle = math.radians(10 * index)
         sine = math.sin(angle)
         cosine = math.cos(angle)

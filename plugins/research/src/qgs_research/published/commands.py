@@ -1,13 +1,14 @@
-"""`qgs import`."""
+"""`qgs import` and `qgs export`."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from qgs.cli.options import Overrides
+from qgs.cli.options import Checkpoint, Overrides
 
 app = typer.Typer(help="Published weights in, checkpoints out.")
+export_app = typer.Typer(help="Checkpoints, written anew.")
 
 
 @app.command()
@@ -49,3 +50,18 @@ def import_(
         lines.append(f"wrote {done.recipe_file}; names and shapes do not determine:")
         lines += [f"  {choice}" for choice in done.layout.undecided]
     typer.echo("\n".join(lines))
+
+
+@export_app.command()
+def export(
+    checkpoint: Checkpoint,
+    out: Annotated[Path, typer.Option(help="New .safetensors file; never overwritten.")],
+    half: Annotated[
+        bool, typer.Option("--half", help="Store half precision; loading gives float32.")
+    ] = False,
+) -> None:
+    """Write a checkpoint as one new file, with --half at half the size."""
+    from qgs_research.published.exporting import export_checkpoint
+
+    export_checkpoint(checkpoint, out, half)
+    typer.echo(f"wrote {out}: {out.stat().st_size / 1e6:.1f} MB")

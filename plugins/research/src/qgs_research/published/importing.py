@@ -64,6 +64,7 @@ def import_weights(
     `overrides`, CheckpointError and PublishedError; nothing is written then.
     """
     out = new_checkpoint_path(out)
+    # A recipe that was given needs no second file.
     recipe_file = out.with_suffix(".yaml") if recipe is None else None
     if recipe_file:
         refuse_existing(recipe_file)
@@ -86,6 +87,7 @@ def import_weights(
     except PublishedError as error:
         raise PublishedError(f"{file.path} does not fit the recipe: {error}") from error
     tensors, converted = _as_float32(file, names, to_float32)
+    # Weights show no activations: tell where the recipe differs from what was published.
     settings = differing_predictions(recipe.tree, resolve(names.layout.read(shapes)).tree)
     imported = f"{names.layout.name} weights {file.path.name}"
     write_checkpoint(out, tensors, recipe.tree, recipe.releases, {"imported": imported})
@@ -93,6 +95,7 @@ def import_weights(
         try:
             write_text(recipe_file, text)
         except BaseException:
+            # A checkpoint of an unknown recipe would be of no use.
             out.unlink()
             raise
     dropped = tuple(name for name in names.unused if name in file.tensors)
@@ -105,6 +108,7 @@ def _without_prefix(file: WeightFile) -> WeightFile:
 
     Training frameworks prepend the attribute that holds the model (`model.`, `module.`).
     """
+    # Any name shows the prefixes that all could have.
     modules = next(iter(file.tensors)).split(".")[:-1]
     for depth in range(1, len(modules) + 1):
         prefix = ".".join(modules[:depth]) + "."
@@ -129,6 +133,7 @@ def _as_float32(
     others = {name: t.dtype for name, t in given.items() if t.dtype != torch.float32}
     kinds = Counter(str(dtype).removeprefix("torch.") for dtype in others.values())
     report = ", ".join(f"{count} of {len(given)} are {kind}" for kind, count in kinds.items())
+    # Quantised weights, for example, whose scales are elsewhere.
     strange = [names.published[n] for n, dtype in others.items() if not dtype.is_floating_point]
     if strange:
         raise PublishedError(

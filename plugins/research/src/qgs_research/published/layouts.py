@@ -59,6 +59,7 @@ def names_of(recipe: Recipe) -> Names:
 
     Raises PublishedError with the components that each layout does not know.
     """
+    # Only plugins of this recipe: others could claim its names.
     registry = load_registry([name for name in recipe.releases if name != "qgs"])
     reasons = []
     for layout in _layouts(registry.plugins.values()):
@@ -70,6 +71,7 @@ def names_of(recipe: Recipe) -> Names:
 
 
 def _layouts(plugins: Iterable[InstalledPlugin]) -> list[WeightLayout]:
+    # The framework's own comes first: it is the most general.
     return [TOKENGS, *(layout for installed in plugins for layout in installed.plugin.layouts)]
 
 
@@ -130,6 +132,7 @@ def fitting_recipe(shapes: Shapes, origin: str) -> tuple[WeightLayout, dict[str,
         )
     try:
         tree = layout.read(shapes)
+        # Shapes may contradict each other, which only the whole recipe shows.
         resolve(tree)
     except (LayoutError, RecipeError) as error:
         raise PublishedError(

@@ -38,6 +38,7 @@ def read_weight_file(path: str | Path) -> WeightFile:
         raise FileNotFoundError(f"no file of weights at {path}")
     if path.suffix.lower() == ".safetensors":
         with TensorFile(path) as file:
+            # Its recipe would be lost on the way.
             if "qgs.recipe" in file.metadata:
                 raise CheckpointError(f"{path} is a qgs checkpoint, no published weights")
             tensors = file.read()
@@ -73,10 +74,12 @@ def _state_dict(content: Any, path: Path, notes: list[str]) -> dict[str, Tensor]
     """The tensors of a state dict, flat or below the keys in NESTING."""
     if not isinstance(content, Mapping):
         raise CheckpointError(f"{path} holds {type(content).__name__}, no state dict")
+    # A training script stores more than weights, as a rule one level above them.
     others = [str(key) for key, value in content.items() if not isinstance(value, Tensor)]
     if not others:
         return {str(name): tensor.detach() for name, tensor in content.items()}
     inner = [key for key in NESTING if isinstance(content.get(key), Mapping)]
+    # Of two state dicts (a moving average, say) the user must choose.
     if len(inner) != 1:
         raise CheckpointError(
             f"{path} holds entries that are no tensors ({listed(others)}); one state dict may lie "

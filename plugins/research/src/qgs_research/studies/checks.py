@@ -40,6 +40,7 @@ def check_equal(study: Study, recipes: Mapping[str, Recipe], problems: Problems)
     for name, recipe in recipes.items():
         reported = set[str]()
         for path, (ours, theirs) in differences(recipe, first).items():
+            # `losses` allows `losses.photometric.weight`, but `loss` does not.
             allowed = [a for a in settings.differs if f"{path}.".startswith(f"{a}.")]
             used.update(allowed)
             section, *names = path.split(".")
@@ -50,6 +51,7 @@ def check_equal(study: Study, recipes: Mapping[str, Recipe], problems: Problems)
             # As many images are as many steps only in equal batches.
             if path == "training.steps" and settings.budget.images is not None:
                 continue
+            # Variants of several files may name one index by different paths.
             if path == INDEX and ours and theirs and index_of(recipe) == index_of(first):
                 continue
             reported.add(option)
@@ -71,6 +73,7 @@ def check_distinct(study: Study, recipes: Mapping[str, Recipe], problems: Proble
     names: dict[str, str] = {}
     for name, recipe in recipes.items():
         tree = {key: part for key, part in recipe.tree.items() if key not in BESIDE}
+        # The whole recipe is the key: two names of one model would count as two tries.
         other = names.setdefault(json.dumps(tree, sort_keys=True), name)
         if other != name:
             reason = f"`{name}` is the same model as `{other}`"
@@ -85,11 +88,13 @@ def check_data(plan: Plan) -> None:
     opened = set[str]()
     for variant, name in product(plan.recipes, plan.evaluations):
         recipe = plan.evaluation_recipe(variant, name)
+        # Most variants share their data: opening it takes seconds.
         key = dump([recipe.tree[section] for section in ("data", "evaluation", "metrics")])
         if key in opened:
             continue
         opened.add(key)
         measures = Measures(recipe)
+        # LPIPS without its weights, for example: after the training would be too late.
         unavailable = dict(measures.incomplete([]))
         available = [metric for metric in measures.columns if metric not in unavailable]
         for metric in metrics:

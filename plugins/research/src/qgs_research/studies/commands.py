@@ -1,14 +1,20 @@
 """`qgs study` and `qgs compare`."""
 
+from __future__ import annotations
+
 import os
 import signal
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 from rich.console import Console
 
 from qgs.cli.options import Device
+from qgs.wording import counted
+
+if TYPE_CHECKING:
+    from qgs_research.studies.runs import Plan, Run
 
 app = typer.Typer(help="Train variants of a model by seeds, and compare them.")
 compare_app = typer.Typer(help="Compare results of evaluations.")
@@ -42,6 +48,17 @@ def compare(
     console.print(end, soft_wrap=True)
 
 
+Workers: TypeAlias = Annotated[
+    int, typer.Option(min=0, help="Runs at a time here; 0 trains nothing, and only reports.")
+]
+RunThreads: TypeAlias = Annotated[
+    int | None, typer.Option(min=1, help="CPU threads of a run; default: cores / workers.")
+]
+Only: TypeAlias = Annotated[
+    int | None, typer.Option(min=0, help="Train the run of this number, from 0, alone.")
+]
+
+
 @app.command()
 def study(
     file: Annotated[
@@ -50,15 +67,9 @@ def study(
     out: Annotated[
         Path, typer.Option(help="Folder of the study; what is there already is not run again.")
     ],
-    workers: Annotated[
-        int, typer.Option(min=0, help="Runs at a time here; 0 trains nothing, and only reports.")
-    ] = 1,
-    threads: Annotated[
-        int | None, typer.Option(min=1, help="CPU threads of a run; default: cores / workers.")
-    ] = None,
-    only: Annotated[
-        int | None, typer.Option(min=0, help="Train the run of this number, from 0, alone.")
-    ] = None,
+    workers: Workers = 1,
+    threads: RunThreads = None,
+    only: Only = None,
     device: Device = "auto",
 ) -> None:
     """Train every variant with every seed, evaluate all by one protocol, and compare the scores.
@@ -87,11 +98,7 @@ def study(
     docs/studies.md has all keys of a study (differs, evaluations, published
     ...). Studies that come with qgs: studies/tiny/structural.yaml and others.
     """
-    from qgs.wording import counted
-    from qgs_research.studies.output import show
-    from qgs_research.studies.page import write_all
     from qgs_research.studies.plan import planned
-    from qgs_research.studies.results import Results
     from qgs_research.studies.runs import write_plan
     from qgs_research.studies.study import read_study
 
@@ -99,30 +106,39 @@ def study(
     with console.status("composing and checking all variants"):
         plan = planned(read_study(file), out)
         write_plan(plan)
+    chosen = plan.runs if only is None else [plan.runs[only]]
+    threads = threads or max(_usable_cores() // max(workers, 1), 1)
+    run_and_report(plan, chosen, workers, threads, device, console)
+
+
+def run_and_report(
+    plan: Plan, runs: list[Run], workers: int, threads: int, device: str, console: Console
+) -> None:
+    """Train what is missing of `runs`, and write what all results of the plan say.
+
+    Raises Exit with 128 + the signal that stopped it, or with 1 where a run failed.
+    """
+    from qgs_research.studies.output import show
+    from qgs_research.studies.page import write_all
+    from qgs_research.studies.queue import Queue
+    from qgs_research.studies.results import Results
+
     for name, recipe in plan.recipes.items():
         for warning in recipe.warnings:
             console.print(f"warning: {name}: {warning}", highlight=False, soft_wrap=True)
     missing = [run for run in plan.runs if not plan.done(run)]
-    count = f"{counted(len(plan.runs), 'run')}, {len(missing)} of them missing"
-    console.print(f"{plan.size}: {count}", highlight=False)
-    stopped = None
-    failed = False
-    if workers and missing:
-        from qgs_research.studies.queue import Queue
-
-        threads = threads or max(_usable_cores() // workers, 1)
-        chosen = plan.runs if only is None else [plan.runs[only]]
-        queue = Queue(
-            plan=plan,
-            runs=chosen,
-            workers=workers,
-            threads=threads,
-            device=device,
-            console=console,
-            gpus=_gpus(device),
-        )
-        stopped = queue.work()
-        failed = bool(queue.failures)
+    count = counted(len(plan.runs), "run")
+    console.print(f"{plan.size}: {count}, {len(missing)} of them missing", highlight=False)
+    queue = Queue(
+        plan=plan,
+        runs=runs,
+        workers=workers,
+        threads=threads,
+        device=device,
+        console=console,
+        gpus=_gpus(device),
+    )
+    stopped = queue.work() if workers and missing else None
     results = Results(plan)
     if results.columns:
         page = write_all(results)
@@ -133,7 +149,7 @@ def study(
     if stopped:
         console.print(f"stopped by {stopped}; the same command goes on", highlight=False)
         raise typer.Exit(128 + signal.Signals[stopped])
-    if failed:
+    if queue.failures:
         raise typer.Exit(1)
 
 
@@ -141,9 +157,11 @@ def _gpus(device: str) -> list[str]:
     """GPUs that may be used, as CUDA_VISIBLE_DEVICES names them."""
     if device == "cpu":
         return []
+    # Set by Slurm, for example: other GPUs belong to others.
     given = os.environ.get("CUDA_VISIBLE_DEVICES")
     if given is not None:
         return [name for name in given.split(",") if name]
+    # Only now: it takes a second, and CPUs do not need it.
     import torch
 
     return [str(number) for number in range(torch.cuda.device_count())]
@@ -151,5 +169,6 @@ def _gpus(device: str) -> list[str]:
 
 def _usable_cores() -> int:
     """CPU cores that this process may use; all of the machine where the system does not say."""
+    # A container or Slurm may leave fewer than the machine has.
     allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ()
     return len(allowed) or os.cpu_count() or 1

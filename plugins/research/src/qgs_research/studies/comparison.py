@@ -45,6 +45,7 @@ class Difference:
 
     def cells(self) -> list[str]:
         """A row of the table, one digit finer than an evaluation's."""
+        # Differences are smaller than what an evaluation rounds to.
         digits = self.column.digits + 1
         interval = "–"
         if self.low is not None:
@@ -76,6 +77,7 @@ class Comparison:
     @property
     def title(self) -> str:
         """Who is compared, over how many scenes."""
+        # An index may have grown between two evaluations.
         wanted = max(self.first.wanted, self.second.wanted)
         count = len(self.shared)
         scenes = counted(count, "scene") if count >= wanted else f"{count} of {wanted} scenes"
@@ -222,6 +224,7 @@ def _compared(first: StoredResults, second: StoredResults, across_protocols: boo
     shared = [name for name in first.scenes if name in second.scenes]
     if not shared:
         raise ValueError(f"{first.name} and {second.name} have no scene in common")
+    # Protocols that draw views name no frames: the data decides.
     every = [*first.trainings, *second.trainings]
     moved = [name for name in shared if len({run.frames[name] for run in every}) > 1]
     if moved and not across_protocols:
@@ -250,6 +253,7 @@ def _difference(metric: str, column: Column, pairs: Pairs, scenes: Sequence[str]
     first = np.array([ours.scores(metric, scenes) for ours, _ in pairs])
     second = np.array([theirs.scores(metric, scenes) for _, theirs in pairs])
     apart = first - second
+    # By scene: of several trainings their mean.
     better = apart.mean(0) if column.better == "higher" else -apart.mean(0)
     low, high = interval(apart)
     return Difference(
@@ -274,6 +278,7 @@ def grouped(results: Sequence[StoredResults]) -> Sequence[StoredResults]:
     """
     groups: dict[Any, list[StoredResults]] = {}
     for number, result in enumerate(results):
+        # Results without a run folder have no recipe: each is a side of its own.
         key = (result.recipe, result.protocol.sha256) if result.recipe else number
         groups.setdefault(key, []).append(result)
     # Alone, the seeds of one recipe are what is compared.
@@ -281,6 +286,7 @@ def grouped(results: Sequence[StoredResults]) -> Sequence[StoredResults]:
         return results
     sides: list[StoredResults] = []
     for runs in groups.values():
+        # A seed twice is no second training.
         several = len({run.seed for run in runs}) == len(runs) > 1
         sides += [_mean(runs)] if several else runs
     # Sides whose runs lie in one folder have all of their runs as a name.
@@ -311,6 +317,7 @@ def paired_trainings(first: StoredResults, second: StoredResults) -> Pairs:
     """Pairs of equal seeds, else in their order; the means where a side has a single training."""
     ours = {run.seed: run for run in first.runs}
     theirs = {run.seed: run for run in second.runs}
+    # Equal seeds saw the same data in the same order.
     if len(common := [seed for seed in ours if seed in theirs]) > 1:
         return [(ours[seed], theirs[seed]) for seed in common]
     if min(len(ours), len(theirs)) > 1:

@@ -47,13 +47,14 @@ def difference_tables(first: Recipe, second: Recipe, a: str, b: str) -> list[Tab
     from rich.markup import escape
 
     from qgs.cli.tables import folded_table
-    from qgs.recipe.recipe import differing_options
     from qgs.model_text import parameter_counts
+    from qgs.recipe.recipe import differing_options
 
     slots = folded_table("slots that differ", "slot", a, b)
     options = folded_table("options that differ", "option", a, b)
     parameters = folded_table("parameters", "component", a, b, "difference", right=3)
     for path, values in differing_options(first.tree, second.tree).items():
+        # Another component has other options: first which one it is.
         table = slots if path.endswith(".type") else options
         cells = [escape("-" if value is None else value) for value in values]
         table.add_row(path.removesuffix(".type"), *cells)

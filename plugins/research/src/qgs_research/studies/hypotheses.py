@@ -41,6 +41,7 @@ def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -
     terms: dict[tuple[str, str], int] = {}
     for side, factor in ((left, 1), (right, -1)):
         matches = [*_TERM.finditer(side)]
+        # Nothing but terms, and a sign before each but the first.
         whole = "".join(match[0] for match in matches) == side and side
         if not whole or any(not match[1] for match in matches[1:]):
             raise OptionError(f"`{side}` in `{text}` is no sum of variants", _FORM)
@@ -50,6 +51,7 @@ def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -
                 _check_known("evaluation", evaluation, evaluations, text)
             term = (variant, evaluation or MAIN)
             terms[term] = terms.get(term, 0) + (-factor if sign == "-" else factor)
+    # A sum that does not cancel would depend on the data set, not on the variants.
     if sum(terms.values()):
         raise OptionError(
             f"the two sides of `{text}` weigh unlike: it compares no like with like",

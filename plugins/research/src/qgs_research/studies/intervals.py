@@ -47,6 +47,7 @@ def crossed_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     *_, trainings, scenes = values.shape
     of_training = values.mean(-1, keepdims=True)
     of_scene = values.mean(-2, keepdims=True)
+    # The interaction, which is also the noise of a single score.
     rest = values - of_training - of_scene + values.mean((-2, -1), keepdims=True)
     noise = (rest**2).sum((-2, -1)) / ((trainings - 1) * (scenes - 1))
     first = scenes * of_training.var((-2, -1), ddof=1)
@@ -68,9 +69,11 @@ def paired_interval(differences: np.ndarray) -> tuple[float, float] | None:
     count = len(differences)
     if count < 2:
         return None
+    # A generator of its own: what the caller draws stays as it was.
     rng = np.random.default_rng(SEED)
     step = max(_AT_A_TIME // count, 1)
     means = []
+    # In parts, because 10,000 resamples of many scenes would fill memory.
     for start in range(0, RESAMPLES, step):
         drawn = rng.integers(0, count, (min(step, RESAMPLES - start), count))
         means.append(differences[drawn].mean(1))

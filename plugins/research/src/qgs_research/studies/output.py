@@ -21,6 +21,7 @@ def table_rows(results: Results, evaluation: str = MAIN) -> Rows:
     """One table, headers first: the study's metric in full, means of the others."""
     metric = results.metric
     published = results.settings.published
+    # The study's metric has five columns, others one each.
     others = [name for name in results.columns if name != metric]
     head = ["variant", results.column.title, "sd", "difference", "95 % interval", "better in"]
     if published:
@@ -45,6 +46,7 @@ def table_rows(results: Results, evaluation: str = MAIN) -> Rows:
             row.append(results.shown(published.get(variant), sign=False))
         runs = results.stored[variant, evaluation].values()
         rows.append([*row, *shown.values(), str(len(runs)), steps_shown(runs)])
+    # Baselines stand below the variants: they were not trained.
     for name, values in results.baselines(evaluation).items():
         first, *rest = [results.shown(values.get(m), m, sign=False) for m in (metric, *others)]
         dashes = ["–"] * (len(head) - 2)
@@ -54,6 +56,7 @@ def table_rows(results: Results, evaluation: str = MAIN) -> Rows:
 
 def steps_shown(runs: Iterable[StoredResults]) -> str:
     """Steps of runs: 2,100, or from the fewest to the most where they differ."""
+    # Budgets in seconds end at different steps.
     steps = sorted({stored.step for stored in runs if stored.step is not None})
     return " to ".join(f"{step:,}" for step in (*steps[:1], *steps[1:][-1:])) or "–"
 
@@ -76,6 +79,7 @@ def hypothesis_rows(results: Results) -> Rows:
             judgement.hypothesis.note,
         ]
         rows.append(row)
+    # An empty column would only widen the table.
     with_notes = any(row[-1] for row in rows[1:])
     return rows if with_notes else [row[:-1] for row in rows]
 
@@ -163,6 +167,7 @@ def _table_records(results: Results) -> Iterator[dict[str, Any]]:
 def _time_records(results: Results) -> Iterator[dict[str, Any]]:
     """Measured times of every run, which no other machine or day repeats."""
     for run in results.plan.runs:
+        # Of the clock of training, which pauses between sessions do not move.
         step, seconds = last_record(run.folder / "history.jsonl")
         milliseconds = 1000 * seconds / step if step else None
         known = {"variant": run.variant, "seed": run.seed, "step": step}

@@ -6,9 +6,9 @@ from qgs.drawing import page_environment
 from qgs.drawing.figures import figure_picture
 from qgs.drawing.images import data_uri
 from qgs.files import write_text
+from qgs.model_text import parameter_counts
 from qgs.recipe import Recipe
 from qgs.recipe.recipe import differing_options
-from qgs.model_text import parameter_counts
 from qgs_research.studies.figures import curves_figure, values_figure, write_figures
 from qgs_research.studies.output import hypothesis_rows, table_rows, write_files
 from qgs_research.studies.results import Results
@@ -30,6 +30,7 @@ def write_all(results: Results) -> Path:
 def study_html(results: Results) -> str:
     """Return the whole page; it needs no other file and no network."""
     sections = []
+    # A section for each evaluation that has results.
     for name in results.plan.evaluations:
         if figure := values_figure(results, name):
             picture = figure_picture(figure, dpi=_DPI)
@@ -53,6 +54,7 @@ def study_html(results: Results) -> str:
 
 def _size(recipe: Recipe) -> str:
     """Parameters of a model, and Gaussians where queries make them, not pixels."""
+    # Without memory: a page needs the shapes alone.
     model = recipe.build_model("meta")
     text = f"{sum(parameter_counts(model).values()) / 1e6:.2f} M parameters"
     if not model.queries.count:

@@ -38,6 +38,7 @@ def composed(study: Study) -> dict[str, Recipe]:
     recipes: dict[str, Recipe] = {}
     for name, node in study.variants.items():
         with _collected(problems, f"variants.{name}", study.origins[name]):
+            # A recipe has one seed; the runs set theirs over it.
             recipe = resolve(node, [f"seed={study.settings.seeds[0]}"])
             recipes[name] = _with_budget(study, with_absolute_path(recipe))
     # What differs from a variant that cannot be composed is not known.
@@ -53,6 +54,7 @@ def composed(study: Study) -> dict[str, Recipe]:
         try:
             _build(recipe)
         except (ValueError, OSError) as error:
+            # What a component raises does not know in which variant it stands.
             error.add_note(f"in the variant `{name}`, {study.origins[name]}")
             raise
     return recipes
@@ -77,9 +79,11 @@ def _with_budget(study: Study, recipe: Recipe) -> Recipe:
     else:
         steps = budget.steps
         if budget.images is not None:
+            # Images that are rendered and judged, not those that are read.
             a_step = training.batch_size * recipe.views.targets
             steps = max(math.ceil(budget.images / a_step), 1)
         changes = {"steps": steps, "seconds": None}
+    # Not an override: `qgs compose` shows who set the budget.
     tree = {**recipe.tree, "training": {**recipe.tree["training"], **changes}}
     origins = {f"training.{name}": "the study's budget" for name in changes}
     return replace(resolve(tree), provenance={**recipe.provenance, **origins})
@@ -88,6 +92,7 @@ def _with_budget(study: Study, recipe: Recipe) -> Recipe:
 def _build(recipe: Recipe) -> None:
     """Make every part of a variant, the model without memory, to see that they fit."""
     recipe.build_optimizer()
+    # On the meta device: published models would not fit a laptop's memory.
     recipe.rate_factors(recipe.build_model("meta"))
     recipe.build_losses()
     recipe.build_objective()

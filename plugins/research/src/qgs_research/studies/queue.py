@@ -89,6 +89,7 @@ class Queue:
             process.terminate()
         end = time.monotonic() + _PATIENCE
         for process in active_children():
+            # All together have _PATIENCE, not each of them.
             process.join(max(end - time.monotonic(), 0.1))
             process.kill()
 
@@ -101,13 +102,16 @@ class Queue:
                 del self._futures[run]
                 del self._gpu_of[run]
                 self._collect(run, future)
+        # One try a call: what failed would most likely fail again at once.
         over = {*self.failures, *self.plan.ended}
         missing = [run for run in self.runs if run not in over and not self.plan.done(run)]
         # Those that failed before come last: they may fail again.
         for run in sorted(missing, key=lambda run: run.failure.is_file()):
             if len(self._futures) == self.workers:
                 break
+            # Asked here, since a process that finds the run taken has imported torch for nothing.
             if run not in self._futures and is_free(run):
+                # The GPU with the fewest runs.
                 used = [*self._gpu_of.values()]
                 self._gpu_of[run] = min(self.gpus, key=used.count, default="")
                 self._futures[run] = self._start(run)
@@ -154,6 +158,7 @@ class Queue:
     def _count_death(self, run: Run) -> int:
         """Return how often the process of `run` was ended in a row without a save between."""
         state = run.folder / "state.safetensors"
+        # A run that saves between two kills gets on, however often it is killed.
         saved = state.stat().st_mtime if state.is_file() else 0.0
         before, count = self._deaths.get(run, (saved, 0))
         count = count + 1 if saved == before else 1
@@ -167,6 +172,7 @@ class Queue:
         """How much of a run's training is done, from 0 to 1."""
         step, seconds = last_record(run.folder / "history.jsonl")
         training = self.plan.recipes[run.variant].training
+        # A run ends with its steps or its seconds, whichever comes first.
         of_seconds = seconds / training.seconds if training.seconds else 0.0
         return min(max(step / training.steps, of_seconds), 1.0)
 
@@ -176,6 +182,7 @@ def last_record(history: Path) -> tuple[int, float]:
     if not history.is_file():
         return 0, 0.0
     with history.open("rb") as file:
+        # The end alone: histories of long trainings have megabytes, and this is asked all the time.
         file.seek(max(history.stat().st_size - _TAIL, 0))
         lines = file.read().decode(errors="replace").split("\n")[:-1]
     for line in reversed(lines):

@@ -56,6 +56,7 @@ class Estimate:
     def deviation(self) -> float | None:
         """Standard deviation over seeds; None of one."""
         values = [*self.by_seed.values()]
+        # Of a sample: the seeds stand for all that could be drawn.
         return float(np.std(values, ddof=1)) if len(values) > 1 else None
 
     @property
@@ -75,6 +76,7 @@ class Estimate:
 
     def clear(self, sign: int) -> bool:
         """True if the interval is over trainings and scenes, and all on the side of `sign`."""
+        # An interval over scenes alone says nothing of other trainings.
         if self.too_small or self.low is None or self.high is None:
             return False
         return min(sign * self.low, sign * self.high) > 0
@@ -106,8 +108,10 @@ class Results:
         self.columns: dict[str, Column] = {}
         for run, name in product(plan.runs, plan.evaluations):
             if run.evaluated(name):
+                # Whole evaluations alone: one that is being written would change the means.
                 found = read_results(run.evaluation(name))
                 self.stored[run.variant, name][run.seed] = found
+                # Variants may have metrics that others lack.
                 self.columns = {**found.columns, **self.columns}
         self.missing: list[Run] = [run for run in plan.runs if not plan.done(run)]
         self.failed: list[Run] = [run for run in self.missing if run.failed]
@@ -125,6 +129,7 @@ class Results:
     @property
     def shared(self) -> str | None:
         """The first evaluation that judged all of its runs by one protocol; None without one."""
+        # In the order of the study, so that the recipes' own comes first.
         return next((n for n in self.plan.evaluations if len(self.protocols(n)) == 1), None)
 
     def variants(self, evaluation: str = MAIN) -> list[str]:
@@ -148,6 +153,7 @@ class Results:
         """
         reference = self.settings.reference
         terms = {(variant, evaluation): 1, (reference, evaluation): -1}
+        # Numbers of two protocols do not measure the same.
         if variant == reference or self.unlike(terms):
             return None
         return self.estimate(terms, metric, confidence)
@@ -163,6 +169,7 @@ class Results:
             return None
         values = np.zeros((len(seeds), len(scenes)))
         for by_seed, weight in zip(parts, terms.values(), strict=True):
+            # Paired before any mean is taken: what a seed or a scene adds to all variants cancels.
             values += weight * np.array([by_seed[s].scores(metric, scenes) for s in seeds])
         low, high = interval(values, confidence)
         by_seed = dict(zip(seeds, map(float, values.mean(1)), strict=True))
@@ -175,6 +182,7 @@ class Results:
         """
         if len(self.protocols(evaluation)) != 1:
             return {}
+        # Any run will do: baselines see the photos, not the model.
         scenes = self._results_of(evaluation)[0].scenes.values()
         found: dict[str, dict[str, float]] = {}
         for name, metric in product(BASELINES, self.columns):
@@ -249,6 +257,7 @@ class Results:
         """A difference or a mean, one digit finer than evaluations show it."""
         if value is None:
             return "–"
+        # Differences are small against the means that an evaluation prints.
         digits = self.columns[metric or self.metric].digits + 1
         return f"{value:{'+' if sign else ''}.{digits}f}"
 

@@ -51,6 +51,7 @@ class Run:
         """Why it failed, the first sentence; "" where it did not."""
         if not self.failure.is_file():
             return ""
+        # The rest of the file is advice, and tables have no room for it.
         first_line = self.failure.read_text(encoding="utf-8").strip().split("\n")[0]
         return first_line.partition(". ")[0]
 
@@ -86,6 +87,7 @@ class Plan:
     def runs(self) -> list[Run]:
         """All runs, every variant with the first seed, then with the next."""
         seeds = self.study.settings.seeds
+        # By seed first: an unfinished study then has whole comparisons.
         return [run_of(self.folder, name, seed) for seed in seeds for name in self.recipes]
 
     @property
@@ -116,7 +118,7 @@ def run_of(folder: Path, variant: str, seed: int) -> Run:
 
 
 def recipe_file(folder: Path, variant: str, evaluation: str = MAIN) -> Path:
-    """The resolved recipe of the runs of a variant, as they train or as an evaluation changes it."""
+    """The resolved recipe of the runs of a variant, in training or as an evaluation changes it."""
     # No name has an @: hypotheses write it between a variant and an evaluation, too.
     name = f"{variant}@{evaluation}" if evaluation else variant
     return folder / "variants" / f"{name}.yaml"
@@ -132,6 +134,7 @@ def changed_recipe(recipe: Recipe, changes: MapNode) -> Recipe:
 def write_plan(plan: Plan) -> None:
     """Write the recipes that the runs' processes read."""
     for variant, evaluation in product(plan.recipes, plan.evaluations):
+        # With the file and line that set each value, for those who read the folder.
         text = annotated(plan.evaluation_recipe(variant, evaluation))
         write_text(recipe_file(plan.folder, variant, evaluation), f"{text}\n")
 
@@ -140,5 +143,6 @@ def differences(ours: Recipe, theirs: Recipe) -> dict[str, tuple[Any, Any]]:
     """Return options in which two recipes differ, seeds and names of plugins aside."""
     a = flat(ours.tree)
     b = flat(theirs.tree)
+    # In the order of the first, then what only the second has.
     paths = [p for p in {**a, **b} if p not in BESIDE and a.get(p) != b.get(p)]
     return {path: (a.get(path), b.get(path)) for path in paths}

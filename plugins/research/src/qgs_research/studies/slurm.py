@@ -33,6 +33,7 @@ def train(
     command = group.get_command(None, "train")
     given = command.make_context("qgs train", [*words]).params
     recipe = resolve(given["recipe"], given["overrides"] or ())
+    # A missing index would end the job only after the training.
     index_of(recipe)
     recipe.training.scenes_per_batch(gpus)
     run = given["out"].absolute()

@@ -38,6 +38,7 @@ def _verdict(results: Results) -> str:
         return max(names, key=lambda name: results.sign * found[name].mean)
 
     where = f" (evaluation `{evaluation}`)" if evaluation else ""
+    # One training a side cannot tell a better model from a better seed.
     tested = [name for name, estimate in found.items() if not estimate.too_small]
     if not tested:
         best = best_of(found)
@@ -51,10 +52,12 @@ def _verdict(results: Results) -> str:
     bonferroni = f" (Bonferroni, {count} variants)" if count > 1 else ""
     better = [name for name in tested if corrected[name].clear(results.sign)]
     worse = [name for name in tested if found[name].clear(-results.sign)]
+    # Each must be worse, so no correction for the number of tries.
     if len(worse) == count:
         best = best_of(worse)
         every = f"all {count} variants are worse than {reference}; the nearest, " * (count > 1)
         return f"No{where}: {every}{_lead(results, best, found[best])}."
+    # Where nothing is better, the best of those that might be.
     best = best_of(better or [name for name in tested if name not in worse])
     word = "Yes" if better else "Undecided"
     text = f"{word}{where}: {_lead(results, best, corrected[best])}{bonferroni}."
@@ -65,6 +68,7 @@ def _verdict(results: Results) -> str:
 
 def _lead(results: Results, name: str, estimate: Estimate) -> str:
     """Such as "wider, -0.014 dB, interval [-0.289, +0.260]"."""
+    # Metrics without a unit are named.
     unit = results.column.unit or results.column.heading
     text = f"{name}, {results.shown(estimate.mean)} {unit}"
     return text if estimate.low is None else f"{text}, interval {results.interval(estimate)}"
@@ -72,6 +76,7 @@ def _lead(results: Results, name: str, estimate: Estimate) -> str:
 
 def _without_shared_protocol(results: Results) -> str:
     settings = results.settings
+    # What the variants evaluate differently is what an evaluation must set for all.
     varied = listed(path for path in settings.differs if path.split(".")[0] in SECTIONS)
     that_sets = f" that sets {varied}" if varied else ""
     text = (
@@ -87,6 +92,7 @@ def _left_out(results: Results) -> Iterator[str]:
     """How many trainings of each variant failed, and how many runs are missing."""
     for variant in results.plan.recipes:
         runs = [run for run in results.plan.runs if run.variant == variant]
+        # The kind of error: its text differs from run to run.
         reasons = [run.failed.split(":")[0] for run in runs if run in results.failed]
         if reasons:
             why = listed(dict.fromkeys(reasons))
@@ -101,6 +107,7 @@ def _below_nearest(results: Results) -> Iterator[str]:
     metric = results.metric
     if evaluation is None or metric not in results.columns:
         return
+    # A model that a copied photo beats has learnt no geometry.
     nearest = results.baselines(evaluation).get("nearest_input", {}).get(metric)
     scores = {
         name: results.score(name, metric, evaluation) for name in results.variants(evaluation)
@@ -115,6 +122,7 @@ def _below_nearest(results: Results) -> Iterator[str]:
 def notes(results: Results) -> list[str]:
     """What is to be known beside the table."""
     metric = results.metric
+    # The table of the recipes' own evaluation is what readers see first.
     differences = [results.difference(name, metric) for name in results.variants()]
     estimates = [estimate for estimate in differences if estimate]
     found = []
@@ -130,6 +138,7 @@ def notes(results: Results) -> list[str]:
         found.append(f"missing runs: {listed(results.missing)}")
     found += [f"{run} failed: {run.failed}" for run in results.failed]
     rank, variants = results.rank_correlation()
+    # The order of variants can be as published where sizes cannot.
     if rank is not None:
         found.append(
             f"rank correlation with the published order ({variants} variants): {rank:+.2f}"

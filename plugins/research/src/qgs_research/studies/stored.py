@@ -55,6 +55,7 @@ class StoredResults:
 
 def scenes_with(metric: str, results: Sequence[StoredResults]) -> list[str]:
     """Return the scenes in which all of `results` have the metric, in the order of the first."""
+    # scenes.csv has the baselines' values too.
     value = f"model_{metric}"
     first = results[0].scenes if results else {}
     return [scene for scene in first if all(value in one.scenes.get(scene, ()) for one in results)]
@@ -65,6 +66,7 @@ def read_results(path: str | Path) -> StoredResults:
 
     Raises FileNotFoundError when there are none, ValueError when they cannot be read.
     """
+    # A folder of `qgs eval` itself, or the one that a training leaves.
     folders = (Path(path), Path(path) / "evaluation")
     folder = next((folder for folder in folders if (folder / "summary.json").is_file()), None)
     if folder is None:

@@ -142,13 +142,14 @@ class Study:
 
 
 def read_study(file: str | Path) -> Study:
-    """The study in `file`, or the one of that name that comes with qgs; nothing is composed yet.
+    """Return the study in `file`, or the one of that name that comes with qgs.
 
-    Raises RecipeError with all that is wrong with it, by file and line.
+    Nothing is composed yet. Raises RecipeError with all that is wrong with it, by file and line.
     """
     problems = Problems("study")
     found = found_recipe(Path(file), str(file))
     tree = _read(found, problems, ())
+    # A file that cannot be read hides what else is wrong.
     problems.raise_if_stopped()
     settings = decode_config(StudySettings, tree, (), problems)
     variants = _variants(tree, problems)
@@ -158,12 +159,18 @@ def read_study(file: str | Path) -> Study:
     contrasts = _contrasts(settings, tree, problems)
     problems.raise_any()
     evaluations: Any = dict(tree.child("evaluations"))
-    origins = {name: tree.child("variants").origins[name] for name in variants}
-    return Study(found, settings, variants, evaluations, contrasts, origins)
+    return Study(
+        file=found,
+        settings=settings,
+        variants=variants,
+        evaluations=evaluations,
+        contrasts=contrasts,
+        origins=tree.child("variants").origins,
+    )
 
 
 def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
-    """The tree of `file` laid over the study that it extends, names of files made absolute."""
+    """The tree of `file` over that of the study that it extends, names of files made absolute."""
     origin = Origin(str(file))
     try:
         with open_file(file) as opened:
@@ -173,6 +180,7 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
         problems.stop(origin, "study", f"{file} cannot be read: {error}", fix)
         return MapNode(origin)
     tree = load_mapping(text, str(file), problems)
+    # Before the files are merged: names are relative to the file that has them.
     _locate_files(tree, file.parent, problems)
     base = tree.get("extends")
     if base is None:
@@ -183,17 +191,17 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
         problems.stop(tree.origins["extends"], "extends", reason, fix)
         return tree
     under = _read(found_recipe(file.parent / base, base), problems, (*chain, file))
-    return _laid(under, tree.without("extends"))
+    return _merged(under, tree.without("extends"))
 
 
-def _laid(base: MapNode, over: MapNode) -> MapNode:
+def _merged(base: MapNode, over: MapNode) -> MapNode:
     """Keys of `over` replace those of `base`; of variants and evaluations each by its name.
 
     A variant or evaluation that is null is left out.
     """
-    merged = MapNode(over.origin, base.entries())
+    entries = {key: (key, value, origin) for key, value, origin in base.entries()}
     for key, value, origin in over.entries():
-        old = merged.get(key)
+        old = base.get(key)
         if isinstance(old, MapNode) and isinstance(value, MapNode):
             if key == "overlay":
                 value = merge(old, value)
@@ -201,8 +209,8 @@ def _laid(base: MapNode, over: MapNode) -> MapNode:
                 dropped = [name for name in value if value[name] is None and name in old]
                 kept = old.without(*value).entries()
                 value = MapNode(origin, [*kept, *value.without(*dropped).entries()])
-        merged[key], merged.origins[key] = value, origin
-    return merged
+        entries[key] = (key, value, origin)
+    return MapNode(over.origin, entries.values())
 
 
 def _locate_files(tree: MapNode, folder: Path, problems: Problems) -> None:
@@ -212,37 +220,40 @@ def _locate_files(tree: MapNode, folder: Path, problems: Problems) -> None:
         if isinstance(written, ListNode):
             names = zip(written, written.origins, strict=True)
             return ListNode(at, [(located(name, origin, option), origin) for name, origin in names])
+        # Other kinds are refused where the recipe is composed.
         if not isinstance(written, str):
-            return written  # refused where the recipe is composed
+            return written
         file = found_recipe(folder / written, written).resolve()
         if not file.exists():
             fix = "check the path, or take one of `qgs recipes`"
             problems.stop(at, option, f"there is no recipe {file}", fix)
         return str(file)
 
+    if "base" in tree:
+        tree["base"] = located(tree["base"], tree.origins["base"], "base")
     variants = tree.child("variants")
     for name, node, origin in variants.entries():
+        # A file name is a recipe that changes nothing of that file.
         if isinstance(node, str):
-            variants[name] = MapNode(origin, [("extends", node, origin)])
-    extending = {"": tree, **{f"variants.{n}": v for n, v in variants.items()}}
-    for name, node in extending.items():
-        key = "extends" if name else "base"
-        if isinstance(node, MapNode) and key in node:
-            option = f"{name}.{key}".lstrip(".")
-            node[key] = located(node[key], node.origins[key], option)
+            node = MapNode(origin, [("extends", node, origin)])
+            variants[name] = node
+        if isinstance(node, MapNode) and "extends" in node:
+            at = node.origins["extends"]
+            node["extends"] = located(node["extends"], at, f"variants.{name}.extends")
     for node in (tree.child("overlay"), *tree.child("evaluations").values()):
         section = node.child("evaluation") if isinstance(node, MapNode) else MapNode(tree.origin)
         index = section.get("index")
-        # else it is relative to the working directory, as in a recipe
+        # Otherwise it is relative to the working directory, as in a recipe.
         if isinstance(index, str) and (folder / index).is_file():
             section["index"] = str((folder / index).resolve())
 
 
 def _variants(tree: MapNode, problems: Problems) -> dict[str, MapNode]:
     """By name: the base or what a variant extends, the variant, the overlay."""
-    found = {}
+    found: dict[str, MapNode] = {}
     for name, written, origin in tree.child("variants").entries():
-        option, node = f"variants.{name}", MapNode(origin) if written is None else written
+        option = f"variants.{name}"
+        node = MapNode(origin) if written is None else written
         if not isinstance(node, MapNode):
             reason = f"a variant is a recipe or the part of one, this is {kind_of(node)}"
             problems.add(origin, option, reason, "write a recipe's file name, or a mapping")
@@ -260,9 +271,9 @@ def _variants(tree: MapNode, problems: Problems) -> dict[str, MapNode]:
 
 def _check_names(settings: StudySettings, tree: MapNode, problems: Problems) -> None:
     """Report names of variants that there are not, and evaluations that change the model."""
-    published = tree.child("published").entries()
     named = [("reference", settings.reference, tree.origins["reference"])]
-    named += [(f"published.{name}", name, at) for name, _, at in published]
+    for name, _, origin in tree.child("published").entries():
+        named.append((f"published.{name}", name, origin))
     for option, name, at in named:
         if name not in settings.variants:
             fix = did_you_mean(name, settings.variants, "variants")

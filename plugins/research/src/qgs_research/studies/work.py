@@ -74,6 +74,7 @@ def work(
         with _WORKING, lock_of(run):
             torch.set_num_threads(threads)
             outcome = _train_and_evaluate(folder, run, evaluations, device)
+            # What an earlier call reported is over.
             run.failure.unlink(missing_ok=True)
             return outcome
     except Timeout:
@@ -113,8 +114,10 @@ def _train_and_evaluate(folder: Path, run: "Run", evaluations: list[str], device
     def recipe_of(evaluation: str) -> Recipe:
         return resolve(recipe_file(folder, run.variant, evaluation), [f"seed={run.seed}"])
 
+    # A log has no width of its own.
     console = Console(file=sys.stdout, width=100)
     result = train(recipe_of(MAIN), run.folder, console=console, device=device, resume=True)
+    # It has saved, and the next call goes on from there.
     if result.stopped_by:
         return Outcome.STOPPED
     with CheckpointFile(result.folder.checkpoint) as file:
