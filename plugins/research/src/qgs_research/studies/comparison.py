@@ -110,7 +110,8 @@ class Comparison:
 
     def notes(self) -> Iterator[str]:
         """What is to be known beside the table, one line each."""
-        yield f"difference: {self.first.name} minus {self.second.name}; interval: {self._covers()}"
+        names = f"{self.first.name} minus {self.second.name}"
+        yield f"difference: {names}, mean over scenes; interval: {self._covers()}"
         steps = []
         facts = self.record()
         for place, side in enumerate((self.first, self.second)):

@@ -39,7 +39,7 @@ def begin(log: Path, threads: int, gpu: str, parent: int) -> None:
     os.setpgrp()
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     # The descriptors, not sys.stdout: compiled libraries print into them too.
-    output = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    output = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
     os.dup2(output, sys.stdout.fileno())
     os.dup2(output, sys.stderr.fileno())
     for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS"):
