@@ -15,7 +15,7 @@ from qgs_research.studies.results import Estimate, Results
 _POINTS = 200  # of a learning curve
 _STYLES = ("-", "--", ":")
 _COLORS = 6
-"""Curves of different colours in one style of line."""
+"""Colours that are told apart: `categorical` repeats them."""
 
 
 def write_figures(results: Results) -> None:
@@ -58,9 +58,10 @@ def values_figure(results: Results, evaluation: str = MAIN) -> Figure | None:
         left.invert_yaxis()
         for axes in (left, right):
             axes.locator_params(axis="x", nbins=5)
-        points, names = left.get_legend_handles_labels()
-        shown = dict(zip(names, points, strict=True))
-        figure.legend([*shown.values()], [*shown], loc="outside lower center", ncols=len(shown))
+        if 1 < len(seeds) <= _COLORS:
+            points, names = left.get_legend_handles_labels()
+            shown = dict(zip(names, points, strict=True))
+            figure.legend([*shown.values()], [*shown], loc="outside lower center", ncols=len(shown))
         column = results.column
         unit = f", {column.unit}" if column.unit else ""
         left.set(title=f"{column.heading}{unit}: one point a seed, mean")
@@ -75,7 +76,8 @@ def _draw(axes: Axes, place: int, estimate: Estimate, seeds: Sequence[int]) -> N
     for seed, value in estimate.by_seed.items():
         number = seeds.index(seed)
         shift = 0.22 * (number / max(len(seeds) - 1, 1) - 0.5)
-        color = hex_color(categorical(number))
+        # All have one colour where there are too many to tell apart.
+        color = hex_color(categorical(number if len(seeds) <= _COLORS else 0))
         axes.plot(value, place + shift, "o", color=color, markersize=3.5, label=f"seed {seed}")
 
 
