@@ -8,7 +8,9 @@ from commands import run_qgs
 from qgs_research.bench import output, run
 from qgs_research.bench.memory import Peak
 
-TOKENGS, LOCUS, GSLRM = "tiny/tokengs.yaml", "tiny/locus.yaml", "tiny/gslrm.yaml"
+TOKENGS = "tiny/tokengs.yaml"
+LOCUS = "tiny/locus.yaml"
+GSLRM = "tiny/gslrm.yaml"
 SETTINGS = ["model.width=16", "model.heads=2", "model.head.gaussians_per_query=2"]
 SMALL = f"--size 16x24 --device cpu --rounds 3 --warmup 0 --set {' --set '.join(SETTINGS)}"
 
@@ -26,7 +28,8 @@ def test_recipes_are_compared_with_the_first(tmp_path, monkeypatch):
     assert report["machine"].keys() >= {"device", "processor", "threads", "torch"}
     assert (report["overrides"], report["rounds"], report["warmup"]) == (SETTINGS, 3, 0)
     recipes = report["recipes"]
-    first, gaussians = recipes[0], {TOKENGS: 512, LOCUS: 512, GSLRM: None}
+    first = recipes[0]
+    gaussians = {TOKENGS: 512, LOCUS: 512, GSLRM: None}
     assert {recipe["recipe"]: recipe["gaussians"] for recipe in recipes} == gaussians
     for recipe in recipes:
         count = recipe["parameters"]["count"]

@@ -31,7 +31,8 @@ def test_quartiles():
 
 
 def test_tasks_take_turns():
-    tasks, heard = Mock(), []
+    tasks = Mock()
+    heard = []
     columns = in_turn([tasks.a, tasks.b, tasks.c], rounds=3, warmup=1, say=heard.append)
     assert tasks.mock_calls == [call.a(), call.b(), call.c()] * 4
     assert [*map(len, columns)] == [3, 3, 3]

@@ -190,7 +190,8 @@ def test_one_prefix_of_all_names_is_removed(tmp_path):
 
 
 def test_the_command_lists_every_tensor_and_setting(tmp_path):
-    weights, out = tmp_path / "locus.safetensors", tmp_path / "c.safetensors"
+    weights = tmp_path / "locus.safetensors"
+    out = tmp_path / "c.safetensors"
     save_file(LOCUS, weights)
     option = "model.head.scale_cap=0.1"
     told = run_qgs("import", weights, "--recipe", "auto", "--out", out, "--set", option).output

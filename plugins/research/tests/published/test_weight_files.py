@@ -20,7 +20,8 @@ def torch_bytes(content, zipped=True):
     return buffer.getvalue()
 
 
-FLAT, OLD = torch_bytes(WEIGHTS), torch_bytes(WEIGHTS, zipped=False)
+FLAT = torch_bytes(WEIGHTS)
+OLD = torch_bytes(WEIGHTS, zipped=False)
 
 
 def read(path, content):
@@ -46,7 +47,8 @@ def test_weights_are_read_and_where_they_lay_is_told(tmp_path):
 
 def test_what_cannot_be_read_is_named(tmp_path):
     checkpoint = save(WEIGHTS, {"qgs.recipe": "{}"})
-    mixed, twice = {"a": torch.zeros(1), "n": 3}, {"model": WEIGHTS, "module": WEIGHTS}
+    mixed = {"a": torch.zeros(1), "n": 3}
+    twice = {"model": WEIGHTS, "module": WEIGHTS}
     endless = {"w": torch.zeros(2)}
     endless["model"] = endless
     objects = (torch.nn.Linear(2, 2), torch.zeros(2), {}, mixed, twice, endless)

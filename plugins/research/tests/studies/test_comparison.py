@@ -59,7 +59,8 @@ def test_the_first_is_compared_with_each_of_the_others():
 
 
 def test_what_cannot_be_compared_is_refused():
-    first, second = results("x", a=1.0, b=2.0), results("y", a=1.0, b=2.0)
+    first = results("x", a=1.0, b=2.0)
+    second = results("y", a=1.0, b=2.0)
     for pair in ([first, first], [first, results("y", c=1.0)], [first]):
         with pytest.raises(ValueError, match="x"):
             compare(pair)
@@ -101,7 +102,8 @@ def test_the_interval_over_trainings_and_scenes_holds_the_truth():
     """In 95 of 100 cases, whichever varies more, also for few scenes; and no wider than needed."""
     deviations = ((0.1, 1.0, 0.1), (1.0, 0.1, 0.1), (0, 0, 1.0))
     for case in product(deviations, ((3, 3), (3, 5), (3, 32), (5, 5))):
-        rng, count = np.random.default_rng(0), 4000
+        rng = np.random.default_rng(0)
+        count = 4000
         (of_training, of_scene, rest), (trainings, scenes) = case
         values = rng.normal(0, of_training, (count, trainings, 1))
         values = values + rng.normal(0, of_scene, (count, 1, scenes))
@@ -120,5 +122,6 @@ def test_an_interval_needs_two_of_each_and_widens_with_confidence():
     assert crossed_interval(np.full((3, 4), 2.0)) == (2.0, 2.0)
     assert crossed_interval(np.ones((1, 4))) is crossed_interval(np.ones((4, 1))) is None
     values = np.random.default_rng(0).normal(size=(3, 8))
-    usual, sure = crossed_interval(values), crossed_interval(values, 0.99)
+    usual = crossed_interval(values)
+    sure = crossed_interval(values, 0.99)
     assert sure[0] < usual[0] < usual[1] < sure[1]

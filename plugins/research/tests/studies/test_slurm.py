@@ -33,7 +33,8 @@ def test_a_slurm_job_is_that_of_the_example(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_slurm_job_saves_at_the_signal_and_goes_on(tmp_path):
     """Two processes by torchrun; the script needs of Slurm no more than `scontrol`."""
-    out, asked = tmp_path / "run", tmp_path / "asked"
+    out = tmp_path / "run"
+    asked = tmp_path / "asked"
     words = sets(
         "data.image_size=[32, 32]",
         "views.targets=2",
@@ -48,7 +49,8 @@ def test_a_slurm_job_saves_at_the_signal_and_goes_on(tmp_path):
     stub.chmod(0o755)
     paths = f"{stub.parent}:{os.environ['PATH']}"
     environment = {**os.environ, "PATH": paths, "SLURM_JOB_ID": "7", "OMP_NUM_THREADS": "1"}
-    command, history = ["bash", str(tmp_path / "run.slurm.sh")], out / "history.jsonl"
+    command = ["bash", str(tmp_path / "run.slurm.sh")]
+    history = out / "history.jsonl"
     job = subprocess.Popen(command, env=environment)
     while not history.exists() or len(history.read_bytes().splitlines()) < 3:
         assert job.poll() is None  # the training ended too early
