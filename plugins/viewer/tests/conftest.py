@@ -1,11 +1,10 @@
 import numpy as np
 import pytest
 from hand_made_model import cameras, gaussians, model
-from installing import install
 
 pytest.importorskip("viser", reason="viser is not installed: pip install query-gaussians-viewer")
 
-__all__ = ["cameras", "gaussians", "install", "model"]
+__all__ = ["cameras", "gaussians", "model"]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -16,5 +15,5 @@ def _short_loops():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(saving.orbit_path, "__defaults__", (2, 32))
         patch.setattr(saving, "overview", lambda result: np.zeros((8, 8, 3), np.uint8))
-        patch.setattr("qgs_viewer.report.ORBIT_FRAMES", 2)
+        patch.setattr("qgs_viewer.sections.ORBIT_FRAMES", 2)
         yield

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 import yaml
 from commands import MODEL
-from qgs_viewer.figures.exhibits import Exhibition, exhibit
+from qgs_viewer.scenes import scenes_of
 from qgs_viewer.sources import ModelSource
 
 import qgs
@@ -18,7 +18,9 @@ from qgs.geometry.poses import look_at
 from qgs.recipe import resolve
 from qgs.types import Cameras, Gaussians
 
-QUERIES, FRAMES, SIDE = 12, 6, 64
+QUERIES = 12
+FRAMES = 6
+SIDE = 64
 VIEWS = ViewsConfig(inputs=2, gap=(1, 5), scale="auto")
 BY_DISTANCE = VIEWS.model_copy(update={"scale": "distance", "scale_factor": 0.7})
 KINDS = ("tokengs", "locus", "ellipsoid")
@@ -93,18 +95,14 @@ def sample_of(inputs=(1, 4), targets=(2, 3)):
 
 
 @cache
-def exhibit_of(kind):
-    """Of the small model with refinements that move anchors, as trained ones do."""
+def model_scenes_of(kind):
+    """The walk by the small model, with refinements that move anchors, as trained ones do."""
     model = deepcopy(model_of(kind))
     random = torch.Generator().manual_seed(2)
     for parameter in model.refinements.parameters():
         parameter.data += 0.03 * torch.randn(parameter.shape, generator=random)
-    return exhibit(kind, model, sample_of())
+    return scenes_of(kind, model, [sample_of(), sample_of((0, 5))])
 
 
 def source_of(kind, views=VIEWS):
-    return ModelSource(exhibit_of(kind).model, Walk(), views, (1, 4), f"{kind}: walk")
-
-
-def exhibition_of(*kinds, query=None):
-    return Exhibition([exhibit_of(kind) for kind in kinds], [sample_of(), sample_of((0, 5))], query)
+    return ModelSource(model_scenes_of(kind).network, Walk(), views, (1, 4), f"{kind}: walk")

@@ -6,14 +6,14 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from browser import CHROMIUM, chromium
+from qgs_viewer.comparison import checkpoints, judge, open_models
+from qgs_viewer.opening import ViewOptions, open_source
 from qgs_viewer.page import scene_html
 from qgs_viewer.panel import Panel
-from qgs_viewer.report import Contender, Report, report_html
+from qgs_viewer.report import Comparison, report_html
+from qgs_viewer.scenes import model_scenes
 from qgs_viewer.server import quiet_server
-from qgs_viewer.sources import Wanted, open_source
-from small import PAIR, model_of, sample_of
-
-from qgs.contracts import Column
+from small import PAIR, stand_in
 
 pytestmark = [
     pytest.mark.slow,
@@ -45,7 +45,7 @@ def drawn(page, unlike=None):
 
 
 def test_the_viewer(page):
-    source = open_source(MODEL, Wanted())
+    source = open_source(MODEL, ViewOptions())
     source.title = "<b id=named>*name*</b> 1. [x](y)"
     with quiet_server() as server:
         panel = Panel(server, source)
@@ -76,9 +76,9 @@ def test_the_viewer(page):
 
 
 def test_a_page_draws_and_asks_for_nothing(page, tmp_path):
-    source = open_source(MODEL, Wanted())
+    source = open_source(MODEL, ViewOptions())
     file = tmp_path / "scene.html"
-    file.write_text(scene_html(source.look(source.frames)))
+    file.write_text(scene_html(source.scene_of(source.frames)))
     page.open(file.as_uri())
     page.until("the canvas", "!!document.querySelector('canvas')")
     drawn(page)
@@ -114,18 +114,15 @@ def assert_alone(page, file):
     assert [r for r in page.requests if r.startswith("file:")] == [file.as_uri()]
 
 
-def page_of_two_scenes():
-    samples = [sample_of((0, 5), targets) for targets in ((1, 2), (3, 4))]
-    contenders = [
-        Contender(kind, model_of(kind), {"psnr": 9.0}, 96, 1000, "recipe: 1") for kind in PAIR
-    ]
-    columns = {"psnr": Column("PSNR", "higher", 2, "dB")}
-    return report_html(Report(columns, "A title", contenders, {}, samples, {}))
+def page_of_two_scenes(folder):
+    names = [stand_in(folder / f"{kind}.safetensors") for kind in PAIR]
+    results = judge(open_models(checkpoints(names), None, "cpu"))
+    return report_html(Comparison(results, "", {}, {}), model_scenes(results, 2))
 
 
 def test_a_report(page, tmp_path):
     file = tmp_path / "report.html"
-    file.write_text(page_of_two_scenes())
+    file.write_text(page_of_two_scenes(tmp_path))
     page.open(file.as_uri())
     page.until("the script", "document.readyState == 'complete' && !!window.theme.textContent")
     _choose(page)

@@ -12,9 +12,12 @@ import pytest
 import yaml
 from commands import done
 from photo_formats import noisy_photos
-from qgs_viewer.contest import checkpoints, judge, report_of, resolve_fairly
+from qgs_viewer.commands import new_folder
+from qgs_viewer.compare import compare_models
+from qgs_viewer.comparison import checkpoints, judge, open_models, resolve_fairly
 from qgs_viewer.curves import curves_of
-from qgs_viewer.demo import ON_PHOTOS, RECIPES, new_folder, show_trained
+from qgs_viewer.options import ON_PHOTOS, RECIPES
+from qgs_viewer.scenes import model_scenes
 from small import RECIPE, stand_in
 
 import qgs
@@ -24,8 +27,8 @@ import qgs
 def test_recipes_are_trained_compared_and_reported(tmp_path):
     done("demo", "--train", *RECIPES, "--seconds", 1, "--out", tmp_path)
     for name in ("tokengs", "locus"):
-        assert (tmp_path / name / "checkpoint.safetensors").is_file()
-        assert (tmp_path / name / "example.ply").is_file()
+        for file in ("checkpoint.safetensors", "example.ply", "evaluation/summary.json"):
+            assert (tmp_path / name / file).is_file()
     assert "type: locus/" in (tmp_path / "report.html").read_text()
 
 
@@ -51,6 +54,10 @@ def models(tmp_path_factory):
     return [stand_in(folder / f"{name}.safetensors") for name in ("few", "more")]
 
 
+def judged(names, photos):
+    return judge(open_models(checkpoints(names), str(photos), "cpu"))
+
+
 def test_a_report_on_photos_says_what_was_printed_and_what_to_do_next(
     models, tmp_path, monkeypatch, caplog
 ):
@@ -67,16 +74,17 @@ def test_a_report_on_photos_says_what_was_printed_and_what_to_do_next(
     assert "my photos" in page.partition("Next:")[2].partition("</p>")[0]
 
     lines = shown.partition("Next:\n")[2].splitlines()
-    commands = [shlex.split(line, comments=True) for line in lines]  # as a shell would
-    assert [command[:2] for command in commands] == [["qgs", "reconstruct"], ["qgs", "view"]]
-    for _, name, model, place, *options in commands:
+    # as a shell would
+    commands = [shlex.split(line, comments=True) for line in lines]
+    assert [command[1] for command in commands] == ["reconstruct", "refine", "view"]
+    reconstruct, refine, view = commands
+    for _, name, model, place, *options in (reconstruct, view):
         assert model in models
         assert (place, options[:2]) == (str(photos), ["--scale", "0.5"])
         known = done(name, "--help").output
         assert all(word in known for word in options if word.startswith("--"))
-    *words, refine, seconds = commands[0][1:]
-    assert (refine, seconds) == ("--refine", "30")
-    done(*words)
+    assert refine[2:] == ["report/scene", str(photos)]
+    done(*reconstruct[1:])
     record = json.loads(Path("report/scene/cameras.json").read_text())["to_photos"]
     assert (record["scale"], record["search"]) == (0.5, None)
 
@@ -93,13 +101,13 @@ def test_a_checkpoint_has_a_history_of_its_own_or_of_its_run(tmp_path):
 def test_small_scenes_keep_their_photos_and_others_every_eighth(models, tmp_path):
     for name, count in (("large", 20), ("small", 3), ("tiny", 2)):
         noisy_photos(tmp_path / name, count)
-    (entry,) = judge(checkpoints(models[:1]), str(tmp_path), "cpu")
-    judged = {
-        score.scene: {frame for _, compared in score.views for frame in compared}
-        for score in entry.evaluation.scores
+    (result,) = judged(models[:1], tmp_path)
+    compared = {
+        score.scene: {frame for _, frames in score.views for frame in frames}
+        for score in result.evaluation.scores
     }
-    assert judged == {"large": {4, 12}, "small": {1}}
-    assert [missing.scene for missing in entry.evaluation.missing] == ["tiny"]
+    assert compared == {"large": {4, 12}, "small": {1}}
+    assert [missing.scene for missing in result.evaluation.missing] == ["tiny"]
 
 
 def test_two_photos_leave_nothing_to_compare_with(models, tmp_path):
@@ -115,30 +123,30 @@ def test_a_model_tuned_on_the_photos_is_compared_on_those_it_never_saw(models, t
     data = f"data={{type: qgs/photos, path: {photos}, image_size: [16, 16], holdout: 5}}"
     tuned = str(tmp_path / "tuned.safetensors")
     qgs.save(qgs.compose(RECIPE, [data, "views.gap=[1, 3]", "views.scale=auto"]), tuned)
-    entries = judge(checkpoints([models[0], tuned]), photos, "cpu")
-    assert [entry.recipe.views.scale for entry in entries] == ["search", "auto"]
-    before, after = ([score.views for score in entry.evaluation.scores] for entry in entries)
+    results = judged([models[0], tuned], photos)
+    assert [result.recipe.views.scale for result in results] == ["search", "auto"]
+    before, after = ([score.views for score in r.evaluation.scores] for r in results)
     assert before == after
     assert {frame for views in before for _, frames in views for frame in frames} <= {2, 7, 12, 17}
-    contenders = report_of(entries, "", {}, {}).contenders
-    ends = {float(own.samples[0].inputs.cameras.c2w[0, -1, :3, 3].norm()) for own in contenders}
+    shown = model_scenes(results, 2)
+    ends = {float(own.samples[0].inputs.cameras.c2w[0, -1, :3, 3].norm()) for own in shown}
     assert len(ends) == 2
 
 
 def test_photos_meet_models_of_their_size(tmp_path, monkeypatch):
     refusing = Mock(side_effect=FileNotFoundError)
-    monkeypatch.setattr("qgs_viewer.contest.checkpoints", refusing)
+    monkeypatch.setattr("qgs_viewer.compare.checkpoints", refusing)
     for size, side in ((None, 128), ("128x192", 128), ("64x64", 64)):
         with pytest.raises(FileNotFoundError):
-            show_trained(None, str(tmp_path), tmp_path, "cpu", size)
+            compare_models(None, str(tmp_path), tmp_path, "cpu", size)
         refusing.assert_called_with(ON_PHOTOS[side])
 
 
 def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert new_folder(None).name == "demo"
+    assert new_folder(None, "demo").name == "demo"
     (tmp_path / "demo").mkdir()
-    assert new_folder(None).name == "demo-2"
+    assert new_folder(None, "demo").name == "demo-2"
     (tmp_path / "demo/report.html").touch()
     with pytest.raises(FileExistsError, match="not empty"):
-        new_folder(tmp_path / "demo")
+        new_folder(tmp_path / "demo", "demo")

@@ -3,18 +3,15 @@
 import html
 import json
 import re
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from commands import done
 from plyfile import PlyData
-from qgs_viewer.report import GROUP, offered_sections
-from qgs_viewer.section import scene_section
-from small import PAIR, exhibit_of, stand_in
+from qgs_viewer.sections import scene_to_turn
+from small import PAIR, model_scenes_of, stand_in
 
 from qgs.drawing.images import EXACT, data_uri
-from qgs.wording import warn_once
 
 RUN = "<script>alert(1)"
 
@@ -86,43 +83,11 @@ def test_the_page_needs_nothing_else(page):
     assert ["&lt;script" in page for page in pages] == [True]
 
 
-OFFERED = """
-import numpy as np
-from qgs_viewer.report import ReportSection, Tile
-
-GREY = np.full((4, 6, 3), 128, np.uint8)
-
-def plugin(shown, samples):
-    names = [f"{c.name}: {p[0].gaussians.count} of {samples[0].scene}" for c, p in shown]
-    return ReportSection("Mine", "", {"": [Tile(GREY, names[0])]})
-"""
-BROKEN = (
-    "import nothing_of_this_name",
-    "def plugin(shown, samples):\n    return 'text'",
-    OFFERED.replace("Tile(GREY,", "Tile(GREY / 2,"),
-    "def plugin(shown, samples):\n    raise SystemExit('gone')",
-)
-
-
-def test_distributions_add_sections_and_those_that_fail_are_named(install, caplog):
-    install("qgs-mine", "mine", OFFERED, group=GROUP)
-    for number, source in enumerate(BROKEN):
-        install(f"qgs-broken-{number}", f"broken{number}", source, group=GROUP)
-    warn_once.cache_clear()
-    prediction = SimpleNamespace(gaussians=SimpleNamespace(count=32))
-    sample = SimpleNamespace(scene="test/000000")
-    shown = [(SimpleNamespace(name="plain"), [prediction])]
-    sections = {section.title: section for section in offered_sections(shown, [sample])}
-    assert [*sections] == ["Mine"]
-    assert sections["Mine"].figures[""][0].caption == "plain: 32 of test/000000"
-    assert re.findall(r"`broken(\d)` of qgs-broken-\d 1.2", caplog.text) == ["0", "1", "2", "3"]
-
-
 def test_the_section_has_all_models_and_the_code_of_the_viewer_once():
-    both = [exhibit_of(kind) for kind in PAIR]
-    (tile,), (one,) = (scene_section(shown).figures[""] for shown in (both, both[:1]))
+    both = [model_scenes_of(kind) for kind in PAIR]
+    (tile,), (one,) = (scene_to_turn(shown).rows[""] for shown in (both, both[:1]))
     assert tile.caption == "tokengs, locus"
-    assert tile.image.shape == (240, 2 * 320 + 4, 3)
+    assert tile.image.shape == (256, 2 * 256 + 4, 3)
     assert len(tile.page) - len(one.page) < 100_000 < len(one.page)
     assert tile.page.index('["tokengs"') < tile.page.index('["locus"')
     assert not re.search(r"(src|href)=.?http", tile.page)

@@ -5,8 +5,9 @@ import shutil
 
 import pytest
 import torch
-from qgs_viewer.look import NEUTRAL
-from qgs_viewer.sources import ModelSource, Wanted, open_source
+from qgs_viewer.opening import ViewOptions, open_source
+from qgs_viewer.query_scene import NEUTRAL
+from qgs_viewer.sources import ModelSource
 from small import BY_DISTANCE, VIEWS, Walk, model_of
 
 import qgs
@@ -39,22 +40,22 @@ def opened(finished, tmp_path):
     def opened(*names, **changes):
         record = {name: told[name] for name in names} if names else {**told, **changes}
         (folder / "cameras.json").write_text(json.dumps(record))
-        return open_source(str(folder), Wanted())
+        return open_source(str(folder), ViewOptions())
 
     return opened
 
 
 def test_a_finished_reconstruction_has_its_queries(finished):
-    source = open_source(str(finished), Wanted())
+    source = open_source(str(finished), ViewOptions())
     assert isinstance(source, ModelSource)
     assert ([*source.frames], [*source.notes]) == ([0, 1], [])
     assert source.labels == [f"photos/0{frame}.png" for frame in (1, 4, 0, 2, 3, 5)]
-    look = source.look(source.frames)
+    scene = source.scene_of(source.frames)
     ply = load_ply(finished / "gaussians.ply")
-    assert look.support(1) is not None
-    far = (look.gaussians.means - ply.means).norm(dim=-1).median()
+    assert scene.support(1) is not None
+    far = (scene.gaussians.means - ply.means).norm(dim=-1).median()
     assert far < 0.01 * ply.means.std()  # its photos lost what 8 bits lose
-    assert len(source.look((0, 1, 2)).labels) == 3
+    assert len(source.scene_of((0, 1, 2)).labels) == 3
 
 
 def test_without_its_model_it_is_shown_as_it_is(opened):
@@ -68,29 +69,29 @@ def test_without_its_model_it_is_shown_as_it_is(opened):
         ({"model": url}, f"`qgs view {url} PHOTOS`"),
     ):
         source = opened(**record)
-        look = source.look(source.frames)
+        scene = source.scene_of(source.frames)
         assert said in source.notes[0]
-        assert (look.queries, look.support(0), len(look.views.images[0])) == (0, None, 2), said
+        assert (scene.queries, scene.support(0), len(scene.views.images[0])) == (0, None, 2), said
 
 
 def test_a_reconstruction_keeps_its_background(opened):
-    assert opened(model="", background=[0.0, 0.5, 1.0]).look(()).background == (0.0, 0.5, 1.0)
-    assert opened("scene", "views").look(()).background == NEUTRAL
+    assert opened(model="", background=[0.0, 0.5, 1.0]).scene_of(()).background == (0.0, 0.5, 1.0)
+    assert opened("scene", "views").scene_of(()).background == NEUTRAL
     with pytest.raises(ValueError, match=r"cameras\.json is no record"):
         opened(background=[0.5])
 
 
 def test_a_ply_shows_gaussians_alone(finished):
     file = finished / "gaussians.ply"
-    found = open_source(str(file), Wanted()).look(())
+    found = open_source(str(file), ViewOptions()).scene_of(())
     assert (found.queries, found.views) == (0, None)
     assert found.gaussians.count == load_ply(file).count
 
 
 def test_changed_inputs_have_the_scale_of_their_own_distance(tmp_path):
     model = finish(tmp_path, BY_DISTANCE, "views.scale=distance", "views.scale_factor=0.7")
-    source = open_source(str(tmp_path / "scene"), Wanted())
+    source = open_source(str(tmp_path / "scene"), ViewOptions())
     frames = [source.labels.index(f"photos/0{frame}.png") for frame in (1, 2)]
     own = ModelSource(model, Walk(), BY_DISTANCE, (1, 4), "of the photos")
-    seen, true = (s.look(f).views.cameras.c2w for s, f in ((source, frames), (own, (1, 2))))
+    seen, true = (s.scene_of(f).views.cameras.c2w for s, f in ((source, frames), (own, (1, 2))))
     torch.testing.assert_close(seen, true, atol=1e-4, rtol=1e-4)

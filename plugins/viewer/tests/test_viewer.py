@@ -12,12 +12,13 @@ import torch
 import viser
 from PIL import Image
 from qgs_viewer.choice import Choice
-from qgs_viewer.look import Look
+from qgs_viewer.drawing import Drawing
 from qgs_viewer.page import scene_html
 from qgs_viewer.panel import Panel, plain
+from qgs_viewer.query_scene import QueryScene
 from qgs_viewer.server import quiet_server
-from qgs_viewer.stage import Stage
-from small import FRAMES, cloud, exhibit_of, source_of
+from small import FRAMES, cloud, model_scenes_of, source_of
+from viser.transforms import SO3
 
 
 @pytest.fixture(scope="module")
@@ -58,15 +59,21 @@ def test_a_query_is_picked_and_followed_through_the_layers(server, panel):
     assert nodes(panel) == BASE | {"anchors", "support", "path", "reading"}
     assert panel.number.value == 3
     assert all(picture.visible for picture in panel.pictures.values())
-    for layer in range(panel.look.depth, -1, -1):
+    for layer in range(panel.scene.depth, -1, -1):
         panel.layer.value = layer
         assert panel.choice.layer == layer
-        ball = server.scene.get_handle_by_name("/support").vertices
-        assert abs(ball.mean(0) - panel.look.support(layer).centers[0, 3].numpy()).max() < 1e-4
+        assert_placed(server.scene.get_handle_by_name("/support"), panel.scene.support(layer), 3)
     assert nodes(panel) == BASE | {"anchors", "support"}
     assert not any(picture.visible for picture in panel.pictures.values())
     panel.number.value = -1
     assert nodes(panel) == BASE | {"anchors"}
+
+
+def assert_placed(ball, support, query):
+    """The unit ball, scaled, turned and moved, has the semi-axes of the support as columns."""
+    assert ball.position == pytest.approx(support.centers[0, query].numpy(), abs=1e-4)
+    axes = SO3(np.array(ball.wxyz)).as_matrix() * np.array(ball.scale)
+    assert axes == pytest.approx(support.axes[0, query].numpy(), abs=1e-4)
 
 
 def test_text_is_shown_as_it_is(server):
@@ -103,7 +110,9 @@ def test_a_picked_query_is_let_go(server, panel):
 def test_gaussians_stand_before_the_background_of_their_model(server):
     """In a browser and in pages alike: what a scene serialises is what a page draws."""
     background = (0.0, 0.25, 1.0)
-    Stage(server.scene).put(replace(exhibit_of("locus").look, background=background), Choice())
+    Drawing(server.scene).put(
+        replace(model_scenes_of("locus").scene, background=background), Choice()
+    )
     messages = server._websock_server._broadcast_buffer.message_from_id.values()
     (sent,) = [m for m in messages if type(m).__name__ == "BackgroundImageMessage"]
     assert sent.format == "png"
@@ -119,15 +128,15 @@ def test_a_model_without_anchors_has_the_rest(server):
 
 
 def test_other_inputs_make_another_scene_at_once(panel):
-    before = panel.look.gaussians.means.clone()
+    before = panel.scene.gaussians.means.clone()
     panel.pick(3)
     panel.boxes[0].value = True
-    assert panel.look.frames == (0, 1, 4)
+    assert panel.scene.frames == (0, 1, 4)
     assert nodes(panel) >= {"views/2", "support", "reading"}
-    assert not torch.equal(panel.look.gaussians.means, before)
+    assert not torch.equal(panel.scene.gaussians.means, before)
     for box in panel.boxes:
         box.value = False
-    assert panel.look.frames == (4,)  # none at all is refused: the last scene stays
+    assert panel.scene.frames == (4,)  # none at all is refused: the last scene stays
     assert [box.value for box in panel.boxes] == [frame == 4 for frame in range(FRAMES)]
     assert "views/1" not in nodes(panel)
 
@@ -138,19 +147,19 @@ def ray_to(place):
 
 
 def test_a_click_picks_by_anchor_or_by_gaussian(panel):
-    centers = panel.look.support(panel.look.depth).centers[0].numpy()
+    centers = panel.scene.support(panel.scene.depth).centers[0].numpy()
     for center in centers:
         eye, way = ray_to(center)
         near = centers[panel.under(eye, way)] - center
-        assert np.linalg.norm(near - near @ way * way) <= panel.stage.anchor_radius * 1.01
+        assert np.linalg.norm(near - near @ way * way) <= panel.drawing.anchor_radius * 1.01
     panel.choose(anchors=False)
-    gaussian = panel.look.gaussians.opacities[0].argmax()
-    assert panel.under(*ray_to(panel.look.splats.centers[gaussian])) is not None
+    gaussian = panel.scene.gaussians.opacities[0].argmax()
+    assert panel.under(*ray_to(panel.scene.splats.centers[gaussian])) is not None
     assert panel.under(*ray_to([0, 0, -4])) is None
 
 
 def test_a_page_is_small_and_asks_for_nothing():
-    page = scene_html(Look(cloud(4096)))
+    page = scene_html(QueryScene(cloud(4096)))
     without_data = re.sub(r'__VISER_EMBED_DATA__="[^"]*"', "", page)
     assert len(without_data) < len(page) < 2_000_000
     outside = r"""(?:src|href)\s*=\s*["']?(https?:)?//|<link rel="stylesheet"""

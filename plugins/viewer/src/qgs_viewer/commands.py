@@ -1,12 +1,13 @@
-"""`qgs view`."""
+"""`qgs view`, `qgs demo`, `qgs report` and `qgs figures`; their help waits for no torch."""
 
 from __future__ import annotations
 
 import socket
 import webbrowser
 from contextlib import suppress
+from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 from rich.console import Console
@@ -25,53 +26,33 @@ from qgs.cli.options import (
     use_threads,
 )
 from qgs.wording import listed
+from qgs_viewer import options
+from qgs_viewer.options import RECIPES
 
 if TYPE_CHECKING:
-    from qgs_viewer.look import Look
+    from qgs_viewer.sources import Source
 
-app = typer.Typer(help="See a reconstruction in the browser.")
+view_app = typer.Typer(help="See a reconstruction in the browser.")
+demo_app = typer.Typer(help="Trained models on unseen rooms, or on your photos.")
+report_app = typer.Typer(help="The report page of trained models.")
+figures_app = typer.Typer(help="Figures for a paper.")
 
 
-@app.command()
+@view_app.command()
 def view(
-    source: Annotated[
-        str,
-        typer.Argument(
-            help="Run folder, checkpoint, PLUGIN/NAME, PLY, or what qgs reconstruct wrote."
-        ),
-    ],
-    photos: Annotated[
-        str | None,
-        typer.Argument(
-            help="Photos or a video for a model; default: its recipe's data, of shipped models an "
-            "unseen room."
-        ),
-    ] = None,
+    source: options.Source,
+    photos: options.ModelPhotos = None,
     scene: SceneName = None,
     inputs: Inputs = None,
     frames: Frames = None,
     size: Size = None,
     scale: Scale = None,
     overrides: ViewsSettings = None,
-    query: Annotated[
-        int | None, typer.Option(min=0, help="Query that is picked at first; default: none.")
-    ] = None,
-    html: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write the scene as one new HTML page to turn; serve nothing. Queries cannot be "
-            "picked in it: --query chooses one."
-        ),
-    ] = None,
-    host: Annotated[
-        str, typer.Option(help="Address to serve at; 0.0.0.0 lets other machines see it.")
-    ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port, or the next free one.")] = (
-        8080
-    ),
-    show: Annotated[
-        bool, typer.Option("--open/--no-open", help="Open it in the browser of this machine.")
-    ] = True,
+    query: options.Query = None,
+    html: options.Page = None,
+    host: options.Host = "127.0.0.1",
+    port: options.Port = 8080,
+    show: options.Open = True,
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
@@ -83,53 +64,170 @@ def view(
         raise ValueError(f"--set changes `views` alone here, got {listed(foreign)}: leave it out")
     pixels = parse_size(size)
 
-    from qgs.files import refuse_existing, write_text
+    from qgs.evaluate.results import print_lines
+    from qgs.files import refuse_existing
     from qgs.train.distributed import choose_device
-    from qgs_viewer.sources import Wanted, open_source
+    from qgs_viewer.opening import ViewOptions, open_source
 
     if html is not None:
         refuse_existing(html)
     use_threads(threads)
+    opened = open_source(
+        source,
+        ViewOptions(
+            photos=photos,
+            scene=scene,
+            frames=frames,
+            inputs=inputs,
+            size=pixels,
+            overrides=[*(overrides or ()), *scale_settings(scale)],
+            device=choose_device(device),
+        ),
+    )
     console = Console()
-    settings = [*(overrides or ()), *scale_settings(scale)]
-    wanted = Wanted(photos, scene, frames, inputs, pixels, settings, choose_device(device))
-    opened = open_source(source, wanted)
-    for note in opened.notes:
-        console.print(note, soft_wrap=True, highlight=False, markup=False)
+    print_lines(console, opened.notes)
     if html is not None:
-        from qgs_viewer.choice import Choice
-        from qgs_viewer.page import scene_html
+        _write_page(opened, query, html, console)
+    else:
+        _serve(opened, query, host, port, show, console)
 
-        look = opened.look(opened.frames)
-        refuse_missing(query, look)
-        page = scene_html(look, Choice(query=query, layer=look.depth))
-        refuse_existing(html)
-        write_text(html, page)
-        console.print(f"wrote {html}", soft_wrap=True)
-        if look.queries:
-            console.print("--query picks a query in it; without --html the viewer does.")
-        return
 
+def _write_page(source: Source, query: int | None, file: Path, console: Console) -> None:
+    from qgs.files import refuse_existing, write_text
+    from qgs_viewer.choice import Choice
+    from qgs_viewer.page import scene_html
+
+    scene = source.scene_of(source.frames)
+    scene.refuse_missing(query)
+    page = scene_html(scene, Choice(query=query, layer=scene.depth))
+    # it may have come into being since the command began
+    refuse_existing(file)
+    write_text(file, page)
+    console.print(f"wrote {file}", soft_wrap=True)
+    if scene.queries:
+        console.print("--query picks a query in it; without --html the viewer does.")
+
+
+def _serve(
+    source: Source, query: int | None, host: str, port: int, show: bool, console: Console
+) -> None:
+    from qgs.evaluate.results import print_lines
     from qgs_viewer.panel import Panel
     from qgs_viewer.server import quiet_server
 
-    with quiet_server(host, port, opened.title) as server:
-        panel = Panel(server, opened)
-        refuse_missing(query, panel.look)
+    with quiet_server(host, port, source.title) as server:
+        panel = Panel(server, source)
+        panel.scene.refuse_missing(query)
         if query is not None:
             panel.pick(query)
-        name, port = {"127.0.0.1": "localhost"}.get(host, host), server.get_port()
-        where = f"http://{socket.gethostname() if host == '0.0.0.0' else name}:{port}"
-        text = f"{opened.title}: {where} (Ctrl-C ends it)"
-        console.print(text, soft_wrap=True, highlight=False, markup=False)
+        # others reach this machine by its name, not by the address that stands for all
+        names = {"127.0.0.1": "localhost", "0.0.0.0": socket.gethostname()}
+        address = f"http://{names.get(host, host)}:{server.get_port()}"
+        print_lines(console, [f"{source.title}: {address} (Ctrl-C ends it)"])
         if show:
-            webbrowser.open(where)
+            webbrowser.open(address)
         with suppress(KeyboardInterrupt):
             server.sleep_forever()
 
 
-def refuse_missing(query: int | None, look: Look) -> None:
-    """Raise ValueError for a query that `look` does not have."""
-    if query is not None and query >= look.queries:
-        there = f"there are 0 to {look.queries - 1}" if look.queries else "no query is known of it"
-        raise ValueError(f"--query {query} cannot be picked: {there}")
+@demo_app.command()
+def demo(
+    given: options.PhotosOrRecipes = None,
+    models: options.Models = None,
+    train: options.Train = False,
+    seconds: options.Seconds = None,
+    seed: options.Seed = None,
+    out: options.NewFolder = None,
+    size: Size = None,
+    scale: Scale = None,
+    threads: Threads = None,
+    device: Device = "auto",
+) -> None:
+    """Trained models on rooms unseen in training, or on your photos; writes report.html.
+
+    Photos without camera poses, and videos, get them first (qgs poses). With --train the
+    tiny TokenGS and LocusGS, or the named recipes, are trained on the same rooms and compared.
+    """
+    if train and models:
+        raise ValueError("--model names trained models; leave out --train, or name recipes")
+    if not train and (seconds is not None or seed is not None):
+        raise ValueError("--seconds and --seed are for training: add --train")
+    if not train and given and given[0].endswith((".yaml", ".yml")):
+        raise ValueError(f"{given[0]} is a recipe, no folder of photos: add --train to train it")
+    if not train and len(given or ()) > 1:
+        raise ValueError(f"one folder of photos is shown at a time, got {', '.join(given or ())}")
+    if (size, scale) != (None, None) and (train or not given):
+        raise ValueError("--size and --scale are for photos: name a folder, or leave them out")
+    from qgs_viewer.compare import compare_models, compare_trainings
+
+    use_threads(threads)
+    target = new_folder(out, "demo")
+    if train:
+        compare_trainings(given or RECIPES, seconds or 120, seed or 0, target, device)
+    else:
+        compare_models(models, given[0] if given else None, target, device, size, scale)
+
+
+@report_app.command()
+def report(
+    runs: options.Runs,
+    photos: options.Photos = None,
+    out: options.NewFolder = None,
+    size: Size = None,
+    scale: Scale = None,
+    threads: Threads = None,
+    device: Device = "auto",
+) -> None:
+    """Evaluate trained models and show their scenes side by side; writes report.html."""
+    if (size, scale) != (None, None) and photos is None:
+        raise ValueError("--size and --scale are for photos: give --photos, or leave them out")
+    from qgs_viewer.compare import compare_models
+
+    use_threads(threads)
+    compare_models(runs, photos, new_folder(out, "report"), device, size, scale)
+
+
+@figures_app.command()
+def figures(
+    runs: options.Runs,
+    photos: options.Photos = None,
+    scene: SceneName = None,
+    query: options.Query = None,
+    only: options.Only = None,
+    out: options.NewFolder = None,
+    device: Device = "auto",
+) -> None:
+    """Draw figures of trained models for a paper, as PDF and PNG.
+
+    Models stand side by side; figures.md explains each figure.
+    """
+    from qgs.evaluate.results import print_lines
+    from qgs.train.distributed import choose_device
+    from qgs_viewer.comparison import checkpoints, open_models
+    from qgs_viewer.figures import refuse_unknown, write_figures
+    from qgs_viewer.remarks import domain_remarks, scale_remarks
+    from qgs_viewer.scenes import model_scenes
+
+    refuse_unknown(only or ())
+    folder = new_folder(out, "figures")
+    models = open_models(checkpoints(runs), photos, choose_device(device))
+    shown = model_scenes(models, scene=scene)
+    for model in shown:
+        model.scene.refuse_missing(query)
+    console = Console()
+    notes = [*domain_remarks(models, shown), *scale_remarks(models)]
+    print_lines(console, notes)
+    print_lines(console, write_figures(shown, folder, only or (), query, notes))
+
+
+def new_folder(out: Path | None, name: str) -> Path:
+    """Return `out`, or the first of NAME, NAME-2, ... that does not exist.
+
+    Raises FileExistsError where `out` holds anything.
+    """
+    if out is None:
+        names = map(Path, chain([name], (f"{name}-{number}" for number in count(2))))
+        return next(name for name in names if not name.exists())
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FileExistsError(f"{out} is not empty; choose another --out, or delete it yourself")
+    return out

@@ -13,7 +13,7 @@ from qgs.metrics.images import Psnr
 
 @dataclass(frozen=True)
 class Curves:
-    """What training reported: seconds since its start, loss, PSNR of supervised views, steps."""
+    """Records of a training: seconds since its start, loss, PSNR of supervised views, steps."""
 
     seconds: Sequence[float]
     loss: Sequence[float]
@@ -22,13 +22,15 @@ class Curves:
 
 
 def curves_figure(curves: Mapping[str, Curves]) -> Figure:
-    """Loss and PSNR by time, by steps where one took over two hours; running means are strong."""
-    long = max(max(run.seconds) for run in curves.values()) > 7200  # with pauses, other work
+    """Draw loss and PSNR by seconds, by steps where one took over two hours; means are strong."""
+    # the clock of a training of hours may hold pauses and other work
+    long = max(max(run.seconds) for run in curves.values()) > 7200
     with figure_style():
-        figure = Figure(figsize=(8.4, 2.9), layout="constrained")
+        figure = Figure(figsize=(7, 2.6), layout="constrained")
         loss_axis, psnr_axis = figure.subplots(1, 2)
         for index, (name, run) in enumerate(curves.items()):
-            color, place = hex_color(categorical(index)), run.steps if long else run.seconds
+            color = hex_color(categorical(index))
+            place = run.steps if long else run.seconds
             for axis, values in ((loss_axis, run.loss), (psnr_axis, run.psnr)):
                 axis.plot(place, values, color=color, alpha=0.18, linewidth=0.7)
                 axis.plot(place, running_mean(values), color=color, label=name)
@@ -43,8 +45,19 @@ def curves_figure(curves: Mapping[str, Curves]) -> Figure:
 
 
 def curves_of(file: Path) -> Curves | None:
-    """Of NAME.history.jsonl beside NAME.safetensors, or of its run; without skipped steps."""
-    own, names = file.with_suffix(".history.jsonl"), ("seconds", "loss", "psnr", "step")
+    """Read NAME.history.jsonl beside NAME.safetensors, or history.jsonl of its run.
+
+    None without records; skipped steps are left out.
+    """
+    own = file.with_suffix(".history.jsonl")
     records = read_records(own if own.is_file() else file.with_name("history.jsonl"))
-    steps = [r for r in records if not r.get("skipped") and r.keys() >= set(names)]
-    return Curves(*([step[name] for step in steps] for name in names)) if steps else None
+    names = {"seconds", "loss", "psnr", "step"}
+    steps = [r for r in records if not r.get("skipped") and r.keys() >= names]
+    if not steps:
+        return None
+    return Curves(
+        seconds=[step["seconds"] for step in steps],
+        loss=[step["loss"] for step in steps],
+        psnr=[step["psnr"] for step in steps],
+        steps=[step["step"] for step in steps],
+    )

@@ -12,156 +12,155 @@ import viser
 
 from qgs.reconstruction.scenes import frame_list
 from qgs_viewer.choice import Choice, Others, anchor_colors, painted
-from qgs_viewer.look import Look
+from qgs_viewer.drawing import Drawing
 from qgs_viewer.pictures import PARTS, attention_pictures_of, sheet
 from qgs_viewer.placement import hit, near_ray
+from qgs_viewer.query_scene import QueryScene
 from qgs_viewer.server import stand
 from qgs_viewer.sources import ModelSource, Source
-from qgs_viewer.stage import Stage
 
-MOST_BOXES = 24  # photos that each have a check box; more are named in a line of text
-PHOTO_SIDE = 192  # pixels on the longer side of photos that show attention
-NONE = -1  # in the field `query` while none is picked
-_CAPTIONS = {
-    "content": "content: logits of what patches show",
-    "geometry": "geometry: what rays and anchor add",
-    "result": "result: softmax of the sum",
-}
+MOST_BOXES = 24
+"""Photos that each have a check box; more are named in a line of text."""
+PHOTO_SIDE = 192
+"""Pixels on the longer side of photos that show attention."""
+NONE = -1
+"""In the field `query` while none is picked."""
 
 
 class Panel:
     """The viewer of one source: its scene, its controls, and what is chosen in them."""
 
     def __init__(self, server: viser.ViserServer, source: Source) -> None:
-        self.server, self.source = server, source
-        self.stage = Stage(server.scene)
-        self.look: Look = source.look(source.frames)
-        self.choice = Choice(layer=self.look.depth)
-        self._lock, self._resetting = RLock(), False
+        self.server = server
+        self.source = source
+        self.drawing = Drawing(server.scene)
+        self.scene: QueryScene = source.scene_of(source.frames)
+        self.choice = Choice(layer=self.scene.depth)
+        # viser calls back from several threads, also while a control is set here
+        self._lock = RLock()
+        self._resetting = False
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
-        stand(server, self.look)
-        self._head()
-        if self.look.queries:
-            self._query()
+        stand(server, self.scene)
+        self._add_head()
+        if self.scene.queries:
+            self._add_query()
         if source.labels:
-            self._inputs()
+            self._add_inputs()
         if source.notes:
             with server.gui.add_folder("remarks", expand_by_default=False):
                 server.gui.add_markdown("\n\n".join(map(plain, source.notes)))
-        self.stage.put(self.look, self.choice, source.cameras())
-        if self.look.queries:
+        self.drawing.put(self.scene, self.choice, source.cameras())
+        if self.scene.queries:
             server.scene.on_click()(self._clicked)
 
-    def _head(self) -> None:
-        gui, queries = self.server.gui, self.look.queries
-        text = f"**{plain(self.source.title)}**\n\n{self.look.gaussians.count:,} Gaussians"
+    def _add_head(self) -> None:
+        gui = self.server.gui
+        queries = self.scene.queries
+        text = f"**{plain(self.source.title)}**\n\n{self.scene.gaussians.count:,} Gaussians"
         if queries:
             text += f" of {queries:,} queries. Click on one (or on an anchor), or type its number; "
             text += "Esc, or a click beside everything, shows all again."
         gui.add_markdown(text)
         if queries:
-            names = ("of the scene", "by query")
-            self.colors = gui.add_dropdown("colours", names, initial_value=names[0])
-            self._on(self.colors, lambda: {"by_query": self.colors.value == names[1]})
-        if self.look.views is not None:
-            self.photos = gui.add_checkbox("cameras", True)
-            self._on(self.photos, lambda: {"photos": self.photos.value})
+            self._bind("by_query", gui.add_checkbox("colours by query", False))
+        if self.scene.views is not None:
+            self._bind("photos", gui.add_checkbox("cameras", True))
 
-    def _query(self) -> None:
-        gui, depth = self.server.gui, self.look.depth
+    def _add_query(self) -> None:
+        gui = self.server.gui
+        depth = self.scene.depth
         with gui.add_folder("query"):
-            last = self.look.queries - 1
+            last = self.scene.queries - 1
             hint = f"0 to {last}, or {NONE} for all"
             self.number = gui.add_number("query", NONE, min=NONE, max=last, step=1, hint=hint)
-            self._on(self.number, self._picked)
+            self.number.on_update(self._typed)
             self.everything = gui.add_button("Show all (Esc)", visible=False)
             self.everything.on_click(lambda _: self.pick(None))
             escape = gui.add_command("Show all queries", hotkey="escape")
             escape.on_trigger(lambda _: self.pick(None))
-            self.others = gui.add_dropdown("other queries", get_args(Others), initial_value="faint")
-            self._on(self.others, lambda: {"others": self.others.value})
+            self._bind(
+                "others",
+                gui.add_dropdown("other queries", get_args(Others), initial_value="faint"),
+            )
             hint = "Supports are those after this layer; 0 is the start."
             self.layer = gui.add_slider("layer", 0, depth, 1, depth, hint=hint)
-            self._on(self.layer, lambda: {"layer": int(self.layer.value)})
+            self._bind("layer", self.layer)
             hint = "Lines to the patches that the query attends to most; broad and strong is much."
-            self.patches = gui.add_slider("patches", 0, 96, 1, self.choice.patches, hint=hint)
-            self._on(self.patches, lambda: {"patches": int(self.patches.value)})
-            if self.look.support(0) is not None:
-                self.anchors = gui.add_checkbox("all anchors", True)
-                self._on(self.anchors, lambda: {"anchors": self.anchors.value})
+            patches = gui.add_slider("patches", 0, 96, 1, self.choice.patches, hint=hint)
+            self._bind("patches", patches)
+            if self.scene.has_anchors:
+                self._bind("anchors", gui.add_checkbox("all anchors", True))
             self._text = gui.add_markdown("")
             blank = np.full((8, 8, 3), 255, np.uint8)
             add = partial(gui.add_image, blank, visible=False, format="png")
-            self.pictures = {part: add(label=_CAPTIONS[part]) for part in PARTS}
+            self.pictures = {part: add(label=label) for part, label in PARTS.items()}
 
-    def _picked(self) -> dict[str, Any]:
-        """What is typed arrives key by key: numbers that no query has change nothing."""
-        number = int(self.number.value)
-        if number == NONE:
-            return {"query": None}
-        return {"query": number} if 0 <= number < self.look.queries else {}
-
-    def _inputs(self) -> None:
-        gui, labels = self.server.gui, self.source.labels
+    def _add_inputs(self) -> None:
+        gui = self.server.gui
+        labels = self.source.labels
         self.boxes: list[Any] = []
         with gui.add_folder("reconstructed from"):
             if len(labels) <= MOST_BOXES:
                 gui.add_markdown("Ticked photos are the inputs. Tick others to change them.")
-                chosen = set(self.source.frames)
-                self.boxes = [gui.add_checkbox(x, f in chosen) for f, x in enumerate(labels)]
-                for box in self.boxes:
+                for frame, label in enumerate(labels):
+                    box = gui.add_checkbox(label, frame in self.source.frames)
                     box.on_update(self._reframed)
+                    self.boxes.append(box)
             else:
                 text = ",".join(map(str, self.source.frames))
                 hint = f"Numbers or file names, commas between; 0 to {len(labels) - 1}."
                 self.frames = gui.add_text("input photos", text, hint=hint)
                 gui.add_button("Reconstruct").on_click(self._reframed)
 
-    def _on(self, control: Any, change: Callable[[], dict[str, Any]]) -> None:
-        @control.on_update
-        def _(event: Any) -> None:
-            with self._lock:
-                self.choose(**change())
+    def _bind(self, name: str, control: Any) -> None:
+        """Have `control` set a field of the choice."""
+        control.on_update(lambda _: self.choose(**{name: control.value}))
+
+    def _typed(self, event: Any) -> None:
+        number = self.number.value
+        if number == NONE:
+            self.choose(query=None)
+        # what is typed arrives key by key: numbers that no query has change nothing
+        elif 0 <= number < self.scene.queries:
+            self.choose(query=number)
 
     def choose(self, **changes: Any) -> None:
         """Change the choice (see `Choice`) and draw it."""
         with self._lock:
             choice = replace(self.choice, **changes)
-            if choice == self.choice:
-                return
-            with self.server.atomic():
-                self.stage.update(self.look, choice)
-                self._read(self.look, choice)
-            self.choice = choice
+            if choice != self.choice:
+                self._show(self.drawing.update, self.scene, choice)
 
     def pick(self, query: int | None) -> None:
         """Pick a query, or none: then all are shown."""
-        self.number.value = NONE if query is None else query  # calls back
+        # setting the field calls `_typed`
+        self.number.value = NONE if query is None else query
 
     def take(self, frames: Sequence[int]) -> None:
         """Reconstruct from these frames. Raises ValueError where they do not fit, and OSError."""
         with self._lock:
-            if tuple(frames) == tuple(self.look.frames):
-                return
-            look = self.source.look(frames)
-            with self.server.atomic():
-                self.stage.put(look, self.choice, self.source.cameras())
-                self._read(look, self.choice)
-            self.look = look
+            if tuple(frames) != tuple(self.scene.frames):
+                put = partial(self.drawing.put, every=self.source.cameras())
+                self._show(put, self.source.scene_of(frames), self.choice)
 
-    def _read(self, look: Look, choice: Choice) -> None:
-        """The attention of the picked query, and where it stands."""
-        if not look.queries:
-            return
-        query, layer = choice.query, choice.layer
-        found = {} if query is None else attention_pictures_of(look, query, layer, PHOTO_SIDE)
+    def _show(self, draw: Callable[..., None], scene: QueryScene, choice: Choice) -> None:
+        """Draw by `draw`, and describe the picked query; a failure leaves all as it was."""
+        with self.server.atomic():
+            draw(scene, choice)
+            if scene.queries:
+                self._describe(scene, choice.query, choice.layer)
+        self.scene = scene
+        self.choice = choice
+
+    def _describe(self, scene: QueryScene, query: int | None, layer: int) -> None:
+        found = {} if query is None else attention_pictures_of(scene, query, layer, PHOTO_SIDE)
         for part, handle in self.pictures.items():
             handle.visible = part in found
             if part in found:
                 handle.image = sheet(found[part])
         self.everything.visible = query is not None
-        self._text.content = "" if query is None else description(look, query, layer)
+        self._text.content = "" if query is None else description(scene, query, layer)
 
     def _reframed(self, event: Any) -> None:
         """Reconstruct from the chosen photos; if they do not fit, reset the boxes, not the text."""
@@ -177,7 +176,7 @@ class Panel:
             except (ValueError, OSError) as error:
                 self._resetting = True
                 for frame, box in enumerate(self.boxes):
-                    box.value = frame in self.look.frames
+                    box.value = frame in self.scene.frames
                 self._resetting = False
                 if event.client is not None:
                     event.client.add_notification("Not reconstructed", str(error), color="red")
@@ -188,28 +187,29 @@ class Panel:
             self.pick(query)
 
     def under(self, origin: np.ndarray, direction: np.ndarray) -> int | None:
-        """The query under a ray of what is shown: by its anchor, or by its Gaussians."""
-        found = self.look.support(self.choice.layer) if self.choice.anchors else None
+        """Return the query under a ray of what is shown: by its anchor, or by its Gaussians."""
+        found = self.scene.support(self.choice.layer) if self.choice.anchors else None
         if found is not None:
-            numbers, _ = anchor_colors(self.look, self.choice)
+            numbers, _ = anchor_colors(self.scene, self.choice)
             centers = found.centers[0].numpy()[numbers]
-            anchor = near_ray(centers, origin, direction, self.stage.anchor_radius)
+            anchor = near_ray(centers, origin, direction, self.drawing.anchor_radius)
             if anchor is not None:
                 return int(numbers[anchor])
-        gaussian = hit(painted(self.look, self.choice), origin, direction)
-        return None if gaussian is None else self.look.query_of(gaussian)
+        gaussian = hit(painted(self.scene, self.choice), origin, direction)
+        return None if gaussian is None else self.scene.query_of(gaussian)
 
 
 def plain(text: str) -> str:
-    """`text` as Markdown that shows it as it is: no HTML, no formats, one line."""
+    """Return Markdown that shows `text` as it is: no HTML, no formats, one line."""
     return re.sub(r"[^\w\s]|_", lambda sign: f"&#{ord(sign[0])};", " ".join(text.split()))
 
 
-def description(look: Look, query: int, layer: int) -> str:
-    """A query's Gaussians, its anchor after a layer, and why no attention is shown, as Markdown."""
-    members, lines = look.members(query), [f"**query {query}**, layer {layer}"]
+def description(scene: QueryScene, query: int, layer: int) -> str:
+    """Describe a query's Gaussians, its anchor, and why no attention is shown, as Markdown."""
+    members = scene.members(query)
+    lines = [f"**query {query}**, layer {layer}"]
     lines.append(f"Gaussians {members.start} to {members.stop - 1}")
-    found = look.support(layer)
+    found = scene.support(layer)
     if found is not None:
         x, y, z = found.centers[0, query].tolist()
         sizes = found.axes[0, query].norm(dim=0).tolist()
@@ -217,11 +217,11 @@ def description(look: Look, query: int, layer: int) -> str:
         if max(sizes) > 1.001 * min(sizes):
             shape = "semi-axes " + ", ".join(f"{size:.3f}" for size in sizes)
         lines.append(f"anchor at {x:.3f}, {y:.3f}, {z:.3f}; {shape}")
-        if layer and (before := look.support(layer - 1)) is not None:
+        if layer and (before := scene.support(layer - 1)) is not None:
             moved = (found.centers[0, query] - before.centers[0, query]).norm()
             lines.append(f"moved by {float(moved):.3f} in this layer")
-    if layer and look.attention(query, layer) is None:
-        patches = look.inside is None or look.inside.memory.grid is not None
+    if layer and scene.attention(query, layer) is None:
+        patches = scene.inside is None or scene.inside.memory.grid is not None
         silent = "this component does not report its attention"
         lines.append(silent if patches else "it reads latents, not patches of the photos")
     return "\n\n".join(lines)

@@ -1,4 +1,4 @@
-"""Where things are in the shown world: similarity maps, splats, frusta, picking by a ray."""
+"""Places in the shown world: similarity maps, splats, frusta, picking by a ray."""
 
 from dataclasses import dataclass
 
@@ -11,9 +11,10 @@ from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Cameras, Gaussians
 from qgs.wording import warn_once
 
-LEAST_WEIGHT = 0.02  # blending weight on a clicked ray below which a Gaussian is not hit
-
-_FLOAT16 = 2.0**15
+LEAST_WEIGHT = 0.02
+"""Blending weight on a clicked ray below which a Gaussian is not hit."""
+FLOAT16 = 2.0**15
+"""A half of the largest number of float16, which viewers get covariances in."""
 
 
 @dataclass(frozen=True)
@@ -26,23 +27,24 @@ class Placement:
 
     @staticmethod
     def identity() -> "Placement":
-        """The map that changes nothing."""
+        """Return the map that changes nothing."""
         return Placement(torch.eye(3).double(), torch.zeros(3).double(), 1.0)
 
     @staticmethod
     def between(world: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]) -> "Placement":
-        """From a model's `world`, as of `qgs.data.samples.own_world`, into the `other` one."""
-        (pose, scale), (other_pose, other_scale) = world, other
+        """Return the map from a model's `world`, see `own_world`, into the `other` one."""
+        pose, scale = world
+        other_pose, other_scale = other
         both = torch.linalg.inv(other_pose.double()) @ pose.double()
         factor = float(other_scale) / float(scale)
         return Placement(both[:3, :3], both[:3, 3] * float(other_scale), factor)
 
     def points(self, points: Tensor) -> Tensor:
-        """Points (..., 3)."""
+        """Place points (..., 3)."""
         return self.scale * points.detach().cpu().double() @ self.rotation.mT + self.translation
 
     def vectors(self, columns: Tensor) -> Tensor:
-        """Directions as columns (..., 3, n), with their lengths."""
+        """Place directions as columns (..., 3, n), with their lengths."""
         return self.scale * self.rotation @ columns.detach().cpu().double()
 
 
@@ -57,33 +59,39 @@ class Splats:
 
     @property
     def magnification(self) -> float:
-        """By what lengths are multiplied so that float16, which viewers get covariances in, holds
-        the largest covariance and, with it, standard deviations 10,000 times smaller."""
-        return float(np.sqrt(_FLOAT16 / max(np.abs(self.covariances).max(), 1e-30)))
+        """Factor of lengths for which float16 holds the largest covariance.
+
+        It then holds standard deviations 10,000 times smaller beside it.
+        """
+        return float(np.sqrt(FLOAT16 / max(np.abs(self.covariances).max(), 1e-30)))
 
 
 @full_precision
 def splats(gaussians: Gaussians, placement: Placement) -> Splats:
-    """The Gaussians (1, G) of one scene, placed; a warning where `sh` is not shown."""
+    """Place the Gaussians (1, G) of one scene; a warning where `sh` is not shown."""
     if gaussians.sh is not None:
         warn_once("colours of these Gaussians depend on the direction; those of degree 0 are shown")
     rotated = placement.vectors(quat_to_matrix(gaussians.quats[0]))
     axes_G33 = rotated * gaussians.scales[0].detach().cpu().double()[:, None, :]
-    parts = (
-        placement.points(gaussians.means[0]),
-        axes_G33 @ axes_G33.mT,
-        gaussians.opacities[0, :, None],
-        gaussians.colors[0].clamp(0, 1),
+    return Splats(
+        centers=_array(placement.points(gaussians.means[0])),
+        covariances=_array(axes_G33 @ axes_G33.mT),
+        opacities=_array(gaussians.opacities[0, :, None]),
+        colors=_array(gaussians.colors[0].clamp(0, 1)),
     )
-    return Splats(*(part.detach().cpu().numpy().astype(np.float32) for part in parts))
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().float().cpu().numpy()
 
 
 def hit(found: Splats, origin: np.ndarray, direction: np.ndarray) -> int | None:
-    """The Gaussian that weighs most in the colour of a ray; None where all are nearly clear.
+    """Return the Gaussian that weighs most in the colour of a ray; None where all are nearly clear.
 
     Each counts with its greatest value on the ray, the nearest first, as alpha is blended.
     """
     offsets = origin - found.centers.astype(np.float64)
+    # flat Gaussians have no inverse
     least = 1e-12 * np.eye(3)
     precision = np.linalg.inv(found.covariances.astype(np.float64) + least)
     across = np.einsum("gij,j->gi", precision, direction)
@@ -101,31 +109,32 @@ def hit(found: Splats, origin: np.ndarray, direction: np.ndarray) -> int | None:
 
 @full_precision
 def on_photo(cameras: Cameras, pixels: Tensor, depth: float) -> Tensor:
-    """World points (V, P, 3) at camera-frame z `depth` behind pixels (P, 2) of cameras (V,)."""
-    focal, principal = cameras.intrinsics[:, None, :2], cameras.intrinsics[:, None, 2:]
+    """Return world points (V, P, 3) at z `depth` behind pixels (P, 2) of cameras (V,)."""
+    focal = cameras.intrinsics[:, None, :2]
+    principal = cameras.intrinsics[:, None, 2:]
     flat = (pixels.to(focal) - principal) / focal * depth
     local = torch.cat([flat, torch.full_like(flat[..., :1], depth)], -1)
     return local @ cameras.c2w[:, :3, :3].to(local).mT + cameras.c2w[:, None, :3, 3].to(local)
 
 
 def corners(size: tuple[int, int]) -> Tensor:
-    """Pixels (4, 2) of a picture's corners, in order around it. size: H, W."""
+    """Return pixels (4, 2) of a picture's corners, in order around it. size: H, W."""
     height, width = size
     return torch.tensor([[0, 0], [width, 0], [width, height], [0, height]]).double()
 
 
 def patch_centers(grid: tuple[int, int, int], size: tuple[int, int]) -> Tensor:
-    """Pixels (rows * columns, 2) of the patches of one view. grid: views, rows, columns."""
+    """Return pixels (rows * columns, 2) of the patches of one view. grid: views, rows, columns."""
     _, rows, columns = grid
     height, width = size
-    y, x = torch.meshgrid(torch.arange(rows) + 0.5, torch.arange(columns) + 0.5, indexing="ij")
-    return torch.stack([x * width / columns, y * height / rows], -1).reshape(-1, 2).double()
+    places = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).double() + 0.5
+    return places.flip(-1) * torch.tensor([width / columns, height / rows])
 
 
 def near_ray(
     points: np.ndarray, origin: np.ndarray, direction: np.ndarray, radius: float
 ) -> int | None:
-    """The first of the points (N, 3) before a ray's origin within `radius` of it; None without."""
+    """Return the first of points (N, 3) that a ray passes within `radius`; None without."""
     offsets = points - origin
     depths = offsets @ direction
     distances = np.linalg.norm(offsets - depths[:, None] * direction, axis=1)

@@ -18,66 +18,57 @@ from qgs.types import Cameras, Gaussians, SpatialSupport
 
 ATTENTION_COLOR = categorical(0)
 OVERSAMPLING = 3
-MARGIN = 0.15  # of a picture along its border, where no query is chosen to be shown
+"""Lines are drawn on pictures so many times as large, which smooths them."""
+MARGIN = 0.15
+"""Part of a picture along its border, where no query is chosen to be shown."""
 OUTLINE_POINTS = 96
-
-
-@dataclass(frozen=True)
-class Ellipses:
-    """Outlines in one image, pixels: centers (N, 2), semi-axes as columns of axes (N, 2, 2).
-
-    Only rows where `whole` (all in front of the camera) are ellipses. points: (N, 2), the
-    ellipsoids' own centres at camera-frame z `depths` (N,); only positive depths mean something.
-    """
-
-    centers: Tensor
-    axes: Tensor
-    points: Tensor
-    depths: Tensor
-    whole: Tensor
-
-    def outline(self, index: int) -> Tensor:
-        """Points (2, OUTLINE_POINTS) around one ellipse."""
-        angle = torch.linspace(0, 2 * torch.pi, OUTLINE_POINTS)
-        circle = torch.stack([angle.cos(), angle.sin()])
-        return self.centers[index][:, None] + self.axes[index] @ circle
+FARTHEST = 1e4
+"""Pixels from the picture's corner to which lines are drawn; Pillow fails far outside."""
 
 
 @full_precision
-def project_support(support: SpatialSupport, cameras: Cameras) -> Ellipses:
-    """Exact perspective outlines of the first scene's ellipsoids in one camera, cameras (1, 1).
+def outline(support: SpatialSupport, query: int, cameras: Cameras) -> Tensor | None:
+    """Return pixels (OUTLINE_POINTS, 2) around the ellipsoid of a query, in cameras (1, 1).
 
-    An ellipsoid with centre c and axes A (camera frame) has the dual quadric A A^T - c c^T, whose
-    image under K is the dual conic of the outline (Hartley and Zisserman, section 8.3).
+    None where not all of it lies before the camera. Where the ellipsoid is the unit ball, a camera
+    at e sees the circle around e / |e|^2 with radius sqrt(1 - 1 / |e|^2) as its border.
     """
-    centers_N3 = to_camera(support.centers[:1], cameras)[0, 0]
-    axes_N33 = cameras.w2c[0, 0, :3, :3] @ support.axes[0]
-    fx, fy, cx, cy = cameras.intrinsics[0, 0]
-    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    calibration = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).view(3, 3)
-    quadric = axes_N33 @ axes_N33.mT - centers_N3[:, :, None] * centers_N3[:, None, :]
-    conic = calibration @ quadric @ calibration.T
-    depths, scale = centers_N3[:, 2], -conic[:, 2, 2]
-    whole = (scale > 1e-9) & (depths > 0)
-    conic = conic / torch.where(whole, scale, 1)[:, None, None]
-    centers = -conic[:, :2, 2]
-    shape = conic[:, :2, :2] + centers[:, :, None] * centers[:, None, :]
-    lengths, directions = torch.linalg.eigh(torch.where(whole[:, None, None], shape, 0))
-    axes = directions * lengths.clamp_min(0).sqrt()[:, None, :]
-    in_front = torch.where(depths[:, None] > 0, centers_N3, centers_N3.new_tensor([0, 0, 1]))
-    points = to_pixels(in_front, cameras.intrinsics[0, 0])
-    return Ellipses(centers, axes, points, depths, whole)
+    center = support.centers[0, query]
+    axes = support.axes[0, query]
+    depth_row = cameras.w2c[0, 0, 2]
+    nearest = depth_row[:3] @ center + depth_row[3] - (depth_row[:3] @ axes).norm()
+    if nearest <= 0:
+        return None
+    eye = torch.linalg.pinv(axes) @ (cameras.c2w[0, 0, :3, 3] - center)
+    inverse = 1 / eye.square().sum()
+    # the rows after the first are at right angles to the direction of the camera
+    across = torch.linalg.svd(eye[None]).Vh[1:]
+    angles = torch.linspace(0, 2 * torch.pi, OUTLINE_POINTS).to(eye)
+    ring = torch.stack([angles.cos(), angles.sin()], -1) @ across
+    border = inverse * eye + (1 - inverse).clamp_min(0).sqrt() * ring
+    return _pixels(center + border @ axes.mT, cameras)
+
+
+def _pixels(points: Tensor, cameras: Cameras) -> Tensor:
+    """Return pixels (P, 2) of world points (P, 3) in the first of cameras (1, V).
+
+    z is floored at 1 mm.
+    """
+    in_camera = to_camera(points[None], cameras)[0, 0]
+    in_camera = torch.cat([in_camera[:, :2], in_camera[:, 2:].clamp_min(1e-3)], -1)
+    pixels = to_pixels(in_camera, cameras.intrinsics[0, 0])
+    return pixels.clamp(-FARTHEST, FARTHEST).cpu()
 
 
 def washed(picture: Picture, strength: float = 0.6) -> Picture:
-    """Greys, lightened towards white by `strength`: a ground to draw on."""
-    grey = picture.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
-    light = 255 - (255 - grey) * (1 - strength)
-    return np.repeat(light[..., None], 3, -1).round().astype(np.uint8)
+    """Return greys, lightened towards white by `strength`: a ground to draw on."""
+    grey = Image.fromarray(picture).convert("L").convert("RGB")
+    white = Image.new("RGB", grey.size, "white")
+    return np.asarray(Image.blend(grey, white, strength))
 
 
 def _oversampled(picture: Picture) -> Image.Image:
-    """An image OVERSAMPLING times as large, to draw smooth lines on; `_reduced` takes it back."""
+    """Return an image OVERSAMPLING times as large; `_reduced` takes it back."""
     return Image.fromarray(enlarged(picture, OVERSAMPLING * max(picture.shape[:2])))
 
 
@@ -86,31 +77,38 @@ def _reduced(image: Image.Image) -> Picture:
     return np.asarray(image.resize(size, Image.Resampling.LANCZOS))
 
 
+def _tuples(points: Tensor) -> list[tuple[float, ...]]:
+    """Return points (P, 2) as Pillow takes them."""
+    return [tuple(point) for point in points.tolist()]
+
+
 def support_picture(
     photo: Picture, support: SpatialSupport, cameras: Cameras, colors: Mapping[int, Color]
 ) -> Picture:
-    """All centres as dots, queries of `colors` as ellipses, on the view of cameras (1, 1)."""
-    ellipses = project_support(support, cameras)
+    """Draw all centres as dots, queries of `colors` as ellipses, on the view of cameras (1, 1)."""
     scale = OVERSAMPLING * photo.shape[1] / cameras.size[1]
-    farthest_first = torch.argsort(ellipses.depths, descending=True).tolist()
+    depths = to_camera(support.centers[:1], cameras)[0, 0, :, 2]
+    places = _tuples(_pixels(support.centers[0], cameras) * scale)
+    farthest_first = depths.argsort(descending=True).tolist()
     image = _oversampled(washed(photo, 0.45))
     draw = ImageDraw.Draw(image, "RGBA")
-    for index in [i for i in farthest_first if i not in colors] + list(colors):
-        color = colors.get(index)
-        if color and ellipses.whole[index]:
-            outline = (ellipses.outline(index) * scale).T.clamp(-1e5, 1e5)
-            points = [tuple(point) for point in outline.tolist()]
+    for query in [*(q for q in farthest_first if q not in colors), *colors]:
+        color = colors.get(query)
+        border = outline(support, query, cameras) if color else None
+        if color and border is not None:
+            points = _tuples(border * scale)
             draw.polygon(points, fill=(*color, 22))
             draw.line(points, fill=(*color, 255), width=2 * OVERSAMPLING, joint="curve")
-        if ellipses.depths[index] > 0:
-            center = (ellipses.points[index] * scale).clamp(-1e5, 1e5).tolist()
-            size, rim = (4.0, (255, 255, 255, 255)) if color else (1.4, None)
-            draw.circle(center, size * OVERSAMPLING, (*(color or INK), 220), rim, OVERSAMPLING)
+        if depths[query] > 0:
+            size = 4.0 if color else 1.4
+            rim = (255, 255, 255, 255) if color else None
+            fill = (*(color or INK), 220)
+            draw.circle(places[query], size * OVERSAMPLING, fill, rim, OVERSAMPLING)
     return _reduced(image)
 
 
 def patch_maps(rows_hM: Tensor, grid: tuple[int, int, int]) -> np.ndarray:
-    """Scores (h, M) of image tokens as maps (V, H/P, W/P), the mean over heads.
+    """Return scores (h, M) of image tokens as maps (V, H/P, W/P), the mean over heads.
 
     Heads that a mask keeps from a token (-inf) do not count; NaN where none sees it.
     """
@@ -119,19 +117,19 @@ def patch_maps(rows_hM: Tensor, grid: tuple[int, int, int]) -> np.ndarray:
 
 
 def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]:
-    """Each photo in pale grey, coloured by its map on one scale; NaN has the colour of nothing."""
+    """Colour each photo, in pale grey, by its map on one scale; NaN has the colour of nothing."""
     seen = maps[np.isfinite(maps)]
-    low, high = (float(seen.min()), float(seen.max())) if seen.size else (0.0, 1.0)
-    hidden = [~np.isfinite(view) for view in maps]
-    shades = np.nan_to_num((maps - low) / max(high - low, 1e-12))
+    low = float(seen.min()) if seen.size else 0.0
+    high = float(seen.max()) if seen.size else 1.0
+    shades = (maps - low) / max(high - low, 1e-12)
     pictures = []
-    for photo, shade, unseen in zip(photos, shades, hidden, strict=True):
+    for photo, shade in zip(photos, shades, strict=True):
+        # nearest: patches stay squares, and NaN stays NaN
         size = photo.shape[1::-1]
-        patches = Image.fromarray((shade * 255).round().astype(np.uint8))
-        cells = np.asarray(patches.resize(size, Image.Resampling.NEAREST))[..., None]
-        opaque = 0.9 * cells / 255
+        cells = Image.fromarray(shade.astype(np.float32)).resize(size, Image.Resampling.NEAREST)
+        opaque = 0.9 * np.asarray(cells)[..., None]
         mixed = opaque * np.array(ATTENTION_COLOR) + (1 - opaque) * washed(photo, 0.4)
-        mixed[np.asarray(Image.fromarray(unseen).resize(size, Image.Resampling.NEAREST))] = NOTHING
+        mixed = np.where(np.isnan(opaque), NOTHING, mixed)
         pictures.append(mixed.round().astype(np.uint8))
     return pictures
 
@@ -146,14 +144,15 @@ class DrawnQuery:
 
 
 def colored_queries(gaussians: Gaussians, count: int, chosen: Sequence[int]) -> list[DrawnQuery]:
-    """`chosen` of the `count` queries of the first scene, each with a colour by its place."""
+    """Return `chosen` of the `count` queries of the first scene, with a colour by their place."""
     distances = token_dispersion(gaussians.means.detach(), gaussians.count // count)[0]
     mean = distances.view(count, -1).mean(1)
     return [DrawnQuery(q, categorical(place), float(mean[q])) for place, q in enumerate(chosen)]
 
 
 def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Blending weight (B, G) over all pixels: the gradient of a render's sum by the colours."""
+    """Return the blending weight (B, G) of each Gaussian over all pixels."""
+    # it is the gradient of a render's sum by the colours
     colors = gaussians.colors.detach().clone().requires_grad_()
     with torch.enable_grad():
         rgb = model.render(_painted(gaussians, colors), cameras).rgb
@@ -162,14 +161,14 @@ def rendered_weights(model: QueryGaussianModel, gaussians: Gaussians, cameras: C
 
 
 def _painted(gaussians: Gaussians, colors: Tensor) -> Gaussians:
-    """The Gaussians in `colors`, from everywhere."""
+    """Return the Gaussians in `colors`, from everywhere."""
     return replace(gaussians, colors=colors, sh=None, features=None)
 
 
 def notable_queries(
     model: QueryGaussianModel, gaussians: Gaussians, cameras: Cameras, count: int
 ) -> list[DrawnQuery]:
-    """`count` queries to show in cameras (1, V): heavy, well inside the first view, and spread.
+    """Choose `count` queries to show in cameras (1, V): heavy, well inside the first view, apart.
 
     Queries with a Gaussian wider than half the view (2 sigma about its middle) come after others.
     """
@@ -180,23 +179,28 @@ def notable_queries(
     seen_N3 = (means_NK3 * weights_NK[..., None]).sum(1) / weights_N[:, None].clamp_min(1e-12)
     places_N2 = _pixels(seen_N3.to(gaussians.means), cameras) / torch.tensor(cameras.size[::-1])
     small_N = (_widths(gaussians, cameras).view_as(weights_NK) < 0.5).all(1) & (weights_N > 0)
-    chosen = _spread(weights_N.argsort(descending=True).tolist(), places_N2, small_N, count)
+    order = weights_N.argsort(descending=True).tolist()
+    chosen = _spread(order, places_N2, small_N, count)
     return colored_queries(gaussians, len(weights_N), chosen)
 
 
 def _widths(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """4 sigma of each Gaussian (G,) as a share of the first view's longer side; 0 behind it."""
+    """Return 4 sigma of each Gaussian (G,) as a share of the first view's longer side.
+
+    0 behind it.
+    """
     depths = to_camera(gaussians.means[:1], cameras)[0, 0, :, 2]
-    focal, side = cameras.intrinsics[0, 0, :2].mean(), max(cameras.size)
-    widths = 4 * gaussians.scales[0].amax(-1) * focal / depths.clamp_min(1e-3) / side
-    return torch.where(depths > 0, widths, 0).cpu()
+    focal = cameras.intrinsics[0, 0, :2].mean()
+    pixels = 4 * gaussians.scales[0].amax(-1) * focal / depths.clamp_min(1e-3)
+    return torch.where(depths > 0, pixels / max(cameras.size), 0).cpu()
 
 
 def _spread(order: Sequence[int], places_N2: Tensor, small_N: Tensor, count: int) -> list[int]:
-    """The first `count` of `order` inside [0, 1]^2 at a distance; others where they are few."""
+    """Return the first `count` of `order` well inside [0, 1]^2 and apart; others if few are."""
     inside = [i for i in order if ((places_N2[i] - 0.5).abs() < 0.5 - MARGIN).all()]
     small = [i for i in inside if small_N[i]]
-    distance, chosen = 0.6 / count**0.5, list[int]()
+    distance = 0.6 / count**0.5
+    chosen = list[int]()
     tries = ((small, distance), (inside, distance), (inside, distance / 2), (order, 0.0))
     for candidates, least in tries:
         for i in candidates:
@@ -211,14 +215,13 @@ def query_picture(
     gaussians: Gaussians,
     chosen: Sequence[DrawnQuery],
     cameras: Cameras,
-    background: Tensor | None = None,
 ) -> Picture:
-    """The Gaussians of `chosen` in colour with lines to centroids, over a grey scene; (1, 1)."""
-    scene = washed(rgb_picture(model.render(gaussians, cameras, background).rgb[0, 0]))
+    """Paint the Gaussians of `chosen`, with lines to centroids, over a grey scene."""
+    scene = washed(rgb_picture(model.render(gaussians, cameras).rgb[0, 0]))
     per_query = model.head.gaussians_per_query
-    members = [range(q.index * per_query, (q.index + 1) * per_query) for q in chosen]
-    index = [i for member in members for i in member]
-    shown = gaussians[:, torch.tensor(index, dtype=torch.long, device=gaussians.means.device)]
+    indices = torch.tensor([query.index for query in chosen], dtype=torch.long)
+    members = indices[:, None] * per_query + torch.arange(per_query)
+    shown = gaussians[:, members.flatten().to(gaussians.means.device)]
     paint = torch.tensor([q.color for q in chosen]).view(-1, 3).to(shown.colors) / 255
     colors = paint.repeat_interleave(per_query, 0)[None]
     visible = replace(_painted(shown, colors), opacities=shown.opacities.clamp_min(0.5))
@@ -228,21 +231,11 @@ def query_picture(
     picture = (scene * (1 - alpha) + color).clip(0, 255).round().astype(np.uint8)
     image = _oversampled(picture)
     draw = ImageDraw.Draw(image, "RGBA")
-    for member, query in zip(members, chosen, strict=True):
-        means = gaussians.means[0, list(member)]
+    for query, means in zip(chosen, shown.means[0].split(per_query), strict=False):
         front = to_camera(means[None], cameras)[0, 0, :, 2] > 1e-3
         points = torch.cat([means.mean(0, keepdim=True), means[front]])
-        pixels = _pixels(points, cameras).clamp(-1e4, 1e4) * OVERSAMPLING
-        hub, *rays = [tuple(point) for point in pixels.tolist()]
+        hub, *rays = _tuples(_pixels(points, cameras) * OVERSAMPLING)
         for end in rays:
             draw.line([hub, end], fill=(*query.color, 200), width=OVERSAMPLING)
-        for end in rays:
             draw.circle(end, 1.6 * OVERSAMPLING, fill=(*query.color, 255), outline=(*INK, 160))
     return _reduced(image)
-
-
-def _pixels(points: Tensor, cameras: Cameras) -> Tensor:
-    """Pixels (P, 2) of world points (P, 3) in the first of cameras (1, V), z floored at 1 mm."""
-    in_camera = to_camera(points[None], cameras)[0, 0]
-    in_camera = torch.cat([in_camera[:, :2], in_camera[:, 2:].clamp_min(1e-3)], -1)
-    return to_pixels(in_camera, cameras.intrinsics[0, 0]).cpu()

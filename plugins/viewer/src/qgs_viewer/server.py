@@ -1,4 +1,4 @@
-"""A viser server that prints nothing, and where its viewers first stand in a scene."""
+"""A viser server that prints nothing, and the place of its viewers at first."""
 
 import http
 import io
@@ -20,18 +20,20 @@ from websockets.datastructures import Headers
 from websockets.http11 import Response
 
 from qgs.geometry.poses import look_at_depth
-from qgs_viewer.look import Look
-from qgs_viewer.stage import FRUSTUM, distance_to
+from qgs_viewer.drawing import FRUSTUM, distance_to
+from qgs_viewer.query_scene import QueryScene
 
-FIELD_OF_VIEW = 0.95  # of the viewer's window, vertical, radians
-SHORT = 0.3  # length of the mean of unit vectors below which they have no direction in common
+FIELD_OF_VIEW = 0.95
+"""Vertical angle of the viewer's window, radians."""
+SHORT = 0.3
+"""Length of the mean of unit vectors below which they have no direction in common."""
 
 
 @contextmanager
 def quiet_server(
     host: str = "127.0.0.1", port: int = 0, label: str | None = None
 ) -> Iterator[viser.ViserServer]:
-    """A running server, at the next free port from `port` on; 0 takes any.
+    """Run a server, at the next free port from `port` on; 0 takes any.
 
     Only its own page may connect to it, see `foreign`.
     """
@@ -53,13 +55,14 @@ def quiet_server(
 
 
 def foreign(headers: Headers, host: str) -> bool:
-    """Whether a request comes from another page, or by a name that is not the server's.
+    """Return if a request comes from another page, or by a name that is not the server's.
 
     Another page that is open in the browser could read the scene; under a name of its own that
     resolves to this machine (DNS rebinding) it would look like this one. Addresses in digits, the
     names of this machine and `host` are the server's.
     """
-    named, origin = headers.get("Host", ""), headers.get("Origin")
+    named = headers.get("Host", "")
+    origin = headers.get("Origin")
     if origin is not None and urlsplit(origin).netloc != named:
         return True
     name = urlsplit(f"//{named}").hostname or ""
@@ -77,7 +80,8 @@ def _guarded(serve: Any, host: str, *where: Any, process_request: Any, **options
 
     def checked(connection: Any, request: Any) -> Response | None:
         if foreign(request.headers, host):
-            status, text = http.HTTPStatus.FORBIDDEN, b"Open the address that qgs view printed.\n"
+            status = http.HTTPStatus.FORBIDDEN
+            text = b"Open the address that qgs view printed.\n"
             length = Headers({"Content-Length": str(len(text))})
             return Response(status, status.phrase, length, text)
         return process_request(connection, request)
@@ -85,47 +89,54 @@ def _guarded(serve: Any, host: str, *where: Any, process_request: Any, **options
     return serve(*where, process_request=checked, **options)
 
 
-def stand(server: viser.ViserServer, look: Look) -> None:
-    """New viewers stand behind and above the input cameras, or before a scene without cameras."""
-    eye, target = first_eye(look)
-    up = up_of(look).numpy()
+def stand(server: viser.ViserServer, scene: QueryScene) -> None:
+    """Have new viewers stand at `first_eye`."""
+    eye, target = first_eye(scene)
+    up = up_of(scene).numpy()
     server.scene.set_up_direction(up)
-    server.initial_camera.position, server.initial_camera.look_at = eye, target
-    server.initial_camera.up, server.initial_camera.fov = up, FIELD_OF_VIEW
+    camera = server.initial_camera
+    camera.position = eye
+    camera.look_at = target
+    camera.up = up
+    camera.fov = FIELD_OF_VIEW
 
 
-def up_of(look: Look) -> torch.Tensor:
-    """Up for the input cameras together, unit (3,), shown world; -y without cameras."""
-    if look.views is None:
+def up_of(scene: QueryScene) -> torch.Tensor:
+    """Return up for the input cameras together, unit (3,), shown world; -y without cameras."""
+    if scene.views is None:
         return torch.tensor([0.0, -1.0, 0.0]).double()
-    down = look.views.cameras.c2w[0, :, :3, 1].cpu().double()
+    down = scene.views.cameras.c2w[0, :, :3, 1].cpu().double()
     mean = down.mean(0)
-    mean = mean if mean.norm() >= SHORT else down[0]
-    return -(look.placement.rotation @ F.normalize(mean, dim=0))
+    if mean.norm() < SHORT:
+        # cameras on their heads and feet: the first one decides
+        mean = down[0]
+    return -(scene.placement.rotation @ F.normalize(mean, dim=0))
 
 
-def first_eye(look: Look) -> tuple[np.ndarray, np.ndarray]:
-    """Where the viewer stands at first and what it looks at, both (3,), shown world.
+def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the viewer stands at first and what it looks at, both (3,), shown world.
 
     Behind cameras that look the same way; outside of those that surround something; of a walk at
     the camera in its middle, before its photo, since walls may stand behind it.
     """
-    middle = look.placement.points(look.gaussians.means[0]).median(0).values
-    unit = distance_to(look)
-    if look.views is None:
+    middle = scene.placement.points(scene.gaussians.means[0]).median(0).values
+    unit = distance_to(scene)
+    if scene.views is None:
         return (middle - torch.tensor([0.0, 0.0, 2.5 * unit])).numpy(), middle.numpy()
-    c2w, up = look.views.cameras.c2w[0].cpu().double(), up_of(look)
-    eyes = look.placement.points(c2w[:, :3, 3])
-    eye, forward = eyes.mean(0), look.placement.rotation @ c2w[:, :3, 2].mean(0)
+    c2w = scene.views.cameras.c2w[0].cpu().double()
+    up = up_of(scene)
+    eyes = scene.placement.points(c2w[:, :3, 3])
+    ahead = c2w[:, :3, 2] @ scene.placement.rotation.mT
+    eye = eyes.mean(0)
     apart = (eyes - eye).norm(dim=-1)
     if apart.max() > unit and not look_at_depth(c2w):
-        ahead = unit * look.placement.rotation @ c2w[apart.argmin(), :3, 2]
-        eye = eyes[apart.argmin()] + 2 * FRUSTUM * ahead
-        return eye.numpy(), (eye + ahead).numpy()
+        nearest = apart.argmin()
+        target = eyes[nearest] + unit * ahead[nearest]
+        return torch.lerp(eyes[nearest], target, 2 * FRUSTUM).numpy(), target.numpy()
+    forward = ahead.mean(0)
     if forward.norm() < SHORT:
         away = 1.5 * max(float((eyes - middle).norm(dim=-1).max()), unit)
-        ahead = look.placement.rotation @ c2w[0, :3, 2]
-        return (middle + away * (0.3 * up - ahead)).numpy(), middle.numpy()
-    aside = look.placement.rotation @ c2w[0, :3, 0]
+        return (middle + away * (0.3 * up - ahead[0])).numpy(), middle.numpy()
+    aside = scene.placement.rotation @ c2w[0, :3, 0]
     place = eye - 0.3 * unit * forward + 0.2 * unit * aside + 0.2 * unit * up
     return place.numpy(), (eye + unit * forward).numpy()

@@ -1,4 +1,4 @@
-"""A reconstruction as it can be looked at: its queries, their supports, and what they read."""
+"""A reconstructed scene with the queries that it is made of: their supports, what they read."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,7 +14,8 @@ from qgs.types import Gaussians, ImageMemory, QueryState, SpatialSupport, Views
 from qgs_viewer.placement import Placement, Splats, on_photo, patch_centers, splats
 
 Background = tuple[float, float, float]
-NEUTRAL: Background = RendererConfig().background  # of models, unless their recipe changes it
+NEUTRAL: Background = RendererConfig().background
+"""Background of models, unless their recipe changes it."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,16 @@ class Inside:
 
 
 @dataclass(frozen=True)
-class Look:
+class Reading:
+    """Patches: points (k, 3) and width `side` in the shown world, shares (k,) of attention."""
+
+    points: Tensor
+    shares: Tensor
+    side: float
+
+
+@dataclass(frozen=True)
+class QueryScene:
     """Gaussians (1, G), the input views (1, V) with labels, and the placement in the shown world.
 
     inside: None without a model; then there are no queries. frames: numbers of the views in their
@@ -41,7 +51,7 @@ class Look:
     placement: Placement = field(default_factory=Placement.identity)
     inside: Inside | None = None
     background: Background = NEUTRAL
-    _traces: dict[int, tuple[Trace, int]] = field(default_factory=dict, init=False, repr=False)
+    _traces: dict[int, Trace] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def queries(self) -> int:
@@ -53,22 +63,37 @@ class Look:
         """How many decoder layers there are; 0 without a model."""
         return self.inside.model.depth if self.inside else 0
 
+    def refuse_missing(self, query: int | None) -> None:
+        """Raise ValueError for a query that the scene does not have."""
+        if query is not None and query >= self.queries:
+            last = self.queries - 1
+            there = f"there are 0 to {last}" if self.queries else "no query is known of it"
+            raise ValueError(f"--query {query} cannot be picked: {there}")
+
     @cached_property
     def splats(self) -> Splats:
         """All Gaussians in the shown world."""
         return splats(self.gaussians, self.placement)
 
     def query_of(self, gaussian: int) -> int:
-        """The query that a Gaussian belongs to."""
+        """Return the query that a Gaussian belongs to."""
         return gaussian * self.queries // self.gaussians.count
 
     def members(self, query: int) -> slice:
-        """The Gaussians of a query."""
+        """Return the Gaussians of a query."""
         each = self.gaussians.count // self.queries
         return slice(query * each, (query + 1) * each)
 
+    @property
+    def has_anchors(self) -> bool:
+        """Whether the queries have a place in space."""
+        return self.support(0) is not None
+
     def support(self, layer: int) -> SpatialSupport | None:
-        """Supports (1, N) after a layer, 0 the start, in the shown world; None without anchors."""
+        """Return supports (1, N) after a layer, 0 the start, in the shown world, float64.
+
+        None without anchors.
+        """
         if self.inside is None:
             return None
         found = self.inside.model.queries.support(self.inside.states[layer])
@@ -78,13 +103,19 @@ class Look:
         return SpatialSupport(place.points(found.centers), place.vectors(found.axes))
 
     def attention(self, query: int, layer: int) -> AttentionWeights | None:
-        """What a query reads in a layer, (1, h, 1, M), patches of `grid`.
+        """Return what a query reads in a layer, (1, h, 1, M), patches of `grid`.
 
         None where it is not explained, in layer 0, and of tokens that are no patches of photos.
         """
-        if self.inside is None or self.inside.memory.grid is None:
+        inside = self.inside
+        if inside is None or inside.memory.grid is None or self.views is None or not layer:
             return None
-        return self._explained("cross_attention", query, layer)
+        if query not in self._traces:
+            # all layers at once: users walk through them, and one pass costs as much as any
+            with torch.no_grad(), trace(inside.model, queries=[query]) as record:
+                inside.model.predict(self.views, inside.memory, inside.states[0])
+            self._traces[query] = record
+        return self._traces[query].layers[layer].cross_attention
 
     @property
     def grid(self) -> tuple[int, int, int]:
@@ -93,81 +124,50 @@ class Look:
         assert self.inside.memory.grid is not None
         return self.inside.memory.grid
 
-    def self_attention(self, query: int, layer: int) -> AttentionWeights | None:
-        """The queries that a query reads in a layer, (1, h, 1, N); None as for `attention`."""
-        return self._explained("self_attention", query, layer)
-
-    def _explained(self, part: str, query: int, layer: int) -> AttentionWeights | None:
-        if self.inside is None or not layer:
-            return None
-        self.trace([query])
-        record, place = self._traces[query]
-        found: AttentionWeights | None = getattr(record.layers[layer], part)
-        if found is None:
-            return None
-        only = slice(place, place + 1)
-        geometry = None if found.geometry is None else found.geometry[:, :, only]
-        return AttentionWeights(found.content[:, :, only], geometry, found.weights[:, :, only])
-
-    def trace(self, queries: Sequence[int]) -> None:
-        """Have the attention of `queries` at hand, by one pass through the decoder for all."""
-        missing = [query for query in dict.fromkeys(queries) if query not in self._traces]
-        if missing and self.inside is not None and self.views is not None:
-            model, memory = self.inside.model, self.inside.memory
-            state = self.inside.states[0]
-            with torch.no_grad(), trace(model, queries=missing) as record:
-                model.predict(self.views, memory, state)
-            self._traces.update({query: (record, at) for at, query in enumerate(missing)})
-
     def hub(self, query: int, layer: int) -> Tensor:
-        """Where lines of a query start, (3,): its support's centre, or its Gaussians' mean."""
+        """Return where lines of a query start, (3,): its anchor, or its Gaussians' mean."""
         found = self.support(layer)
         if found is not None:
             return found.centers[0, query]
         return self.placement.points(self.gaussians.means[0, self.members(query)]).mean(0)
 
-    def strongest(self, query: int, layer: int, count: int, depth: float) -> "Reading | None":
-        """The `count` patches that a query attends to most, on photos `depth` from their cameras.
+    def strongest(self, query: int, layer: int, count: int, depth: float) -> Reading | None:
+        """Return the `count` patches that a query reads most, on photos `depth` before cameras.
 
         Mean over heads; None as for `attention`.
         """
         weights = self.attention(query, layer)
         if weights is None or self.views is None:
             return None
-        grid, cameras = self.grid, self.views.cameras[0]
-        pixels = patch_centers(grid, cameras.size)
+        cameras = self.views.cameras[0]
+        pixels = patch_centers(self.grid, cameras.size)
         points = on_photo(cameras, pixels, depth / self.placement.scale).flatten(0, 1)
         shares = weights.weights[0, :, 0].float().mean(0).cpu()
         strongest = shares.topk(min(count, len(shares)))
-        side = depth * cameras.size[1] / grid[2] / float(cameras.intrinsics[0, 0])
+        side = depth * cameras.size[1] / self.grid[2] / float(cameras.intrinsics[0, 0])
         read = self.placement.points(points.cpu()[strongest.indices])
         return Reading(read, strongest.values, side)
 
 
-@dataclass(frozen=True)
-class Reading:
-    """Patches: points (k, 3) and width `side` in the shown world, shares (k,) of attention."""
-
-    points: Tensor
-    shares: Tensor
-    side: float
-
-
 @torch.no_grad()
-def look_inside(
+def explained(
     model: QueryGaussianModel,
     views: Views,
     labels: Sequence[str] = (),
     frames: Sequence[int] = (),
     placement: Placement | None = None,
-) -> Look:
-    """What `model` makes of views (1, V), with all that can be asked of it."""
+) -> QueryScene:
+    """Reconstruct views (1, V) by `model`, and keep what can be asked of its queries."""
     memory = model.encoder(views)
     start = model.queries(memory, views)
     prediction = model.predict(views, memory, start, range(1, model.depth + 1))
     states = [start, *(layer.state for layer in prediction.layers.values())]
-    inside = Inside(model, memory, states)
-    placement = placement or Placement.identity()
-    labels = labels or [f"view {view}" for view in range(views.images.shape[1])]
-    background = model.renderer.config.background
-    return Look(prediction.gaussians, views, labels, frames, placement, inside, background)
+    return QueryScene(
+        gaussians=prediction.gaussians,
+        views=views,
+        labels=labels or [f"view {view}" for view in range(views.images.shape[1])],
+        frames=frames,
+        placement=placement or Placement.identity(),
+        inside=Inside(model, memory, states),
+        background=model.renderer.config.background,
+    )

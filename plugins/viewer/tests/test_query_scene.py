@@ -1,15 +1,25 @@
-"""What a look knows of a model, how its Gaussians are painted, and where it is seen from."""
+"""A scene with its queries: supports, attention, colours, and the place it is seen from first."""
 
 import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose
 from qgs_viewer.choice import FAINT, Choice, painted, query_color
-from qgs_viewer.look import NEUTRAL, Look, look_inside
 from qgs_viewer.pictures import attention_pictures_of
 from qgs_viewer.placement import Placement
+from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
 from qgs_viewer.server import first_eye, quiet_server, stand, up_of
-from small import BY_DISTANCE, KINDS, SIDE, arc, cloud, exhibit_of, model_of, pinhole, source_of
+from small import (
+    BY_DISTANCE,
+    KINDS,
+    SIDE,
+    arc,
+    cloud,
+    model_of,
+    model_scenes_of,
+    pinhole,
+    source_of,
+)
 from torch.testing import assert_close
 
 import qgs
@@ -19,39 +29,36 @@ from qgs.types import Views
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_supports_and_attention_are_those_of_a_traced_pass(kind):
-    model, look = exhibit_of(kind).model, source_of(kind).look((1, 4))
+    model = model_scenes_of(kind).network
+    scene = source_of(kind).scene_of((1, 4))
     with torch.no_grad(), qgs.trace(model) as record:
-        assert_close(look.gaussians.means, model(look.views).gaussians.means)
+        assert_close(scene.gaussians.means, model(scene.views).gaussians.means)
     layers = record.layers
     states = [layers[1].before, *(layer.after for layer in layers.values())]
-    look.trace([3, 5])
-    assert look.attention(5, 0) is None
+    assert scene.attention(5, 0) is None
     for layer, state in enumerate(states):
-        found, expected = look.support(layer), model.queries.support(state)
+        found, expected = scene.support(layer), model.queries.support(state)
         assert (found is None) == (expected is None) == (kind == "tokengs")
         if found:
             assert_close(vars(found), vars(expected.to(torch.float64)))
     for layer, traced in layers.items():
-        for found, expected in (
-            (look.attention(5, layer), traced.cross_attention),
-            (look.self_attention(5, layer), traced.self_attention),
-        ):
-            for part, values in vars(expected).items():
-                if values is not None:
-                    assert_close(getattr(found, part), values[:, :, [5]])
+        found = scene.attention(5, layer)
+        for part, values in vars(traced.cross_attention).items():
+            if values is not None:
+                assert_close(getattr(found, part), values[:, :, [5]])
     parts = ["result", "content", "geometry"][: 2 + (kind != "tokengs")]
-    assert [*attention_pictures_of(look, 5, 1, 32)] == parts
+    assert [*attention_pictures_of(scene, 5, 1, 32)] == parts
 
 
 def test_lines_end_on_the_patches_that_are_read_most():
-    look = exhibit_of("locus").look
-    reading = look.strongest(3, 2, 5, 0.4)
-    shares = look.attention(3, 2).weights[0, :, 0].mean(0).topk(5)
+    scene = model_scenes_of("locus").scene
+    reading = scene.strongest(3, 2, 5, 0.4)
+    shares = scene.attention(3, 2).weights[0, :, 0].mean(0).topk(5)
     assert_close(reading.shares, shares.values, rtol=0, atol=0)
     tokens = shares.indices
-    _, rows, columns = look.grid
+    _, rows, columns = scene.grid
     patches = torch.stack([tokens % columns, tokens // columns % rows], -1)
-    views = look.views.cameras.to(torch.float64)
+    views = scene.views.cameras.to(torch.float64)
     seen = to_camera(reading.points[None], views)[0]
     place = tokens // (rows * columns), torch.arange(5)
     pixels = to_pixels(seen, views.intrinsics[0])[place]
@@ -63,52 +70,52 @@ def test_lines_end_on_the_patches_that_are_read_most():
 def test_other_inputs_leave_the_scene_where_it_is():
     source = source_of("locus", BY_DISTANCE)
     for frames in ((1, 4), (4, 1), (0, 2, 5)):
-        look = source.look(frames)
-        c2w = look.views.cameras.c2w[0].double()
+        scene = source.scene_of(frames)
+        c2w = scene.views.cameras.c2w[0].double()
         shown = source.cameras().c2w[list(frames)]
-        turned, places = look.placement.rotation @ c2w[:, :3, :3], c2w[:, :3, 3]
+        turned, places = scene.placement.rotation @ c2w[:, :3, :3], c2w[:, :3, 3]
         assert_close(turned, shown[:, :3, :3], rtol=0, atol=1e-5)
-        assert_close(look.placement.points(places), shown[:, :3, 3], rtol=0, atol=1e-5)
+        assert_close(scene.placement.points(places), shown[:, :3, 3], rtol=0, atol=1e-5)
 
 
 def test_a_picked_query_stands_out():
-    look = exhibit_of("locus").look
-    mine = np.zeros(look.gaussians.count, bool)
-    mine[look.members(4)] = True
-    plain = painted(look, Choice())
+    scene = model_scenes_of("locus").scene
+    mine = np.zeros(scene.gaussians.count, bool)
+    mine[scene.members(4)] = True
+    plain = painted(scene, Choice())
     for others, part in (("faint", FAINT), ("hidden", 0.0), ("shown", 1.0)):
-        shown = painted(look, Choice(query=4, others=others))
+        shown = painted(scene, Choice(query=4, others=others))
         assert_allclose(shown.opacities[~mine], part * plain.opacities[~mine], rtol=1e-6)
         assert (shown.opacities[mine] >= plain.opacities[mine]).all()
         assert (shown.colors[mine] == plain.colors[mine]).all()
-    colored = painted(look, Choice(by_query=True))
+    colored = painted(scene, Choice(by_query=True))
     assert_allclose(colored.colors[mine] * 255, [query_color(4)] * mine.sum(), atol=0.1)
 
 
 def test_the_background_is_that_of_the_model():
-    shown = exhibit_of("locus")
-    assert shown.look.background == NEUTRAL
+    scene = model_scenes_of("locus").scene
+    assert scene.background == NEUTRAL
     model = model_of("locus", "model.renderer.background=[0.1, 0.2, 0.3]")
-    assert look_inside(model, shown.look.views).background == (0.1, 0.2, 0.3)
+    assert explained(model, scene.views).background == (0.1, 0.2, 0.3)
 
 
 TURN = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).double()
 PLACE = Placement(TURN, torch.tensor([0.0, 0, 5]).double(), 2.0)
 
 
-def look_from(c2w):
+def scene_from(c2w):
     """At a cloud around the origin, shown with z up, twice as large, around (0, 0, 5)."""
     images = torch.rand(1, len(c2w), 3, SIDE, SIDE)
-    return Look(cloud(50), Views(images, pinhole(c2w.float())[None]), placement=PLACE)
+    return QueryScene(cloud(50), Views(images, pinhole(c2w.float())[None]), placement=PLACE)
 
 
 CIRCLE = arc(range(0, 360, 45), 3)
 
 
 def test_cameras_around_something_are_seen_from_outside():
-    look = look_from(CIRCLE)
-    eye, target = first_eye(look)
-    middle = PLACE.points(look.gaussians.means[0]).median(0).values.numpy()
+    scene = scene_from(CIRCLE)
+    eye, target = first_eye(scene)
+    middle = PLACE.points(scene.gaussians.means[0]).median(0).values.numpy()
     assert abs(target - middle).max() < 1e-6
     assert np.linalg.norm(eye - middle) > 8
     assert eye[2] > 6  # above them
@@ -117,16 +124,16 @@ def test_cameras_around_something_are_seen_from_outside():
 def test_a_walk_is_seen_from_a_camera_in_its_middle():
     c2w = arc(range(-120, 121, 30), 0)
     c2w[:, 0, 3] = 5 * torch.arange(9)
-    eye, target = first_eye(look_from(c2w))
+    eye, target = first_eye(scene_from(c2w))
     assert eye[[0, 2]] == pytest.approx([40, 5], abs=1e-5)
     assert eye[1] > 0
     assert (target - eye)[1] > 0.99 * np.linalg.norm(target - eye)
 
 
 def test_up_is_that_of_the_cameras():
-    few = look_from(CIRCLE[:3])
-    for look in (few, look_from(CIRCLE)):
-        up = up_of(look)
+    few = scene_from(CIRCLE[:3])
+    for scene in (few, scene_from(CIRCLE)):
+        up = up_of(scene)
         assert up[2] > 0.95
         assert up.norm() == pytest.approx(1)
     with quiet_server() as server:

@@ -1,0 +1,280 @@
+"""Trained models on the same scenes: opened, and judged under one protocol."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from qgs.checkpoint.model_file import CheckpointFile
+from qgs.checkpoint.models import about, checkpoint_path
+from qgs.contracts import Scene, ViewsConfig
+from qgs.data.inputs import Window, choose_windows
+from qgs.data.recognition import is_training_data, open_for
+from qgs.data.view_samplers import Span
+from qgs.domain import Domain
+from qgs.evaluate.evaluation import evaluate
+from qgs.evaluate.results import Evaluation
+from qgs.model import QueryGaussianModel
+from qgs.model_text import heading
+from qgs.recipe import Recipe, resolve
+from qgs.reconstruction.scale import ScaleSearch, photo_settings
+from qgs.reconstruction.scenes import (
+    Size,
+    holding_out,
+    installed_sources,
+    size_multiple,
+    whole_size,
+)
+from qgs.wording import short_names
+
+WINDOWS = 6
+"""Scenes, and windows of a scene, that are judged of a user's photos."""
+JUDGED = ("data", "views", "evaluation", "metrics")
+TRAINED = ("optimizer", "training")
+"""Sections of recipes that must be equal, so that only the models differ."""
+OF_THE_METHOD = (
+    "optimizer.parts",
+    "training.judge_inputs",
+    "evaluation.tuning",
+    "evaluation.tuning_rate",
+    "views.scale",
+    "views.scale_factor",
+)
+"""Options in them that may differ: how a method trains, tuning, which nobody does here, and the
+unit of a model's world, which no score depends on."""
+
+
+class PhotoWindows(Span):
+    """WINDOWS windows of each scene by `choose_windows`, chosen once."""
+
+    def __init__(self, trained_on: Domain) -> None:
+        super().__init__(Span.Config())
+        self._trained_on = trained_on
+        self._known: dict[str, list[Window]] = {}
+
+    def windows(self, scene: Scene, views: ViewsConfig) -> list[Window]:
+        """See `ViewSampler`; scenes that move have none. Raises ValueError without a target."""
+        if scene.times is not None:
+            return []
+        if scene.name not in self._known:
+            windows = choose_windows(scene, views, self._trained_on, WINDOWS)
+            if not any(compared for _, compared in windows):
+                raise ValueError(
+                    f"all {len(scene)} photos are inputs, none is left to compare with: add one "
+                    "between them, or see what a model makes of them by qgs view MODEL PHOTOS"
+                )
+            self._known[scene.name] = windows
+        return self._known[scene.name]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model:
+    """A trained model by its short name.
+
+    recipe: with the compared data in place of the training's. search: the network, and the scales
+    found for it. step: of its training. windows: of a user's photos, else None.
+    """
+
+    name: str
+    file: Path
+    recipe: Recipe
+    search: ScaleSearch
+    step: int | None = None
+    windows: PhotoWindows | None = None
+
+    @property
+    def network(self) -> QueryGaussianModel:
+        """The model itself."""
+        return self.search.model
+
+    @property
+    def training(self) -> str:
+        """How far its training has come."""
+        if self.step is None:
+            return "not known"
+        training = self.recipe.training
+        # where seconds end a training, its number of steps is no goal
+        goal = "" if training.seconds else f" of {training.steps:,}"
+        return f"step {self.step:,}{goal}"
+
+    @property
+    def about(self) -> str:
+        """The first paragraph of its card, or else its sizes."""
+        return about(self.file) or heading(self.network)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result(Model):
+    """A model with its evaluation."""
+
+    evaluation: Evaluation
+
+    @cached_property
+    def scores(self) -> Mapping[str, float | None]:
+        """Means over scenes by column."""
+        return self.evaluation.means()
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters of the model."""
+        return sum(parameter.numel() for parameter in self.network.parameters())
+
+    @property
+    def recipe_text(self) -> str:
+        """The recipe as YAML."""
+        return yaml.safe_dump(dict(self.recipe.tree), sort_keys=False, allow_unicode=True)
+
+
+def checkpoints(names: Sequence[str]) -> dict[str, Path]:
+    """Return the file of each model by short name (see `checkpoint_path`)."""
+    return dict(zip(short_names(names), map(checkpoint_path, names), strict=True))
+
+
+def open_models(
+    files: Mapping[str, Path],
+    photos: str | None,
+    device: str,
+    size: Size | None = None,
+    overrides: Sequence[str] = (),
+) -> list[Model]:
+    """Load the models in `files` for unseen scenes, or for held-out photos.
+
+    Raises as `recipes_alike`.
+    """
+    recipes = recipes_alike(files, photos, size, overrides)
+    windows: PhotoWindows | None = None
+    models = []
+    for name, path in files.items():
+        with CheckpointFile(path) as file:
+            network = file.model(device)
+            step = file.step
+        if photos is not None and windows is None:
+            # those of the first model for all, so that one protocol judges them
+            windows = PhotoWindows(network.trained_on or Domain())
+        search = ScaleSearch(network, recipes[name].views)
+        models.append(
+            Model(
+                name=name,
+                file=path,
+                recipe=recipes[name],
+                search=search,
+                step=step,
+                windows=windows,
+            )
+        )
+    return models
+
+
+def judge(models: Sequence[Model]) -> list[Result]:
+    """Evaluate models on the test views of their recipes; each moves to the CPU afterwards."""
+    results = []
+    for model in models:
+        evaluation = evaluate(
+            model.network,
+            model.recipe,
+            model.step,
+            trained_on=model.network.trained_on,
+            views_of=model.search,
+            sampler=model.windows,
+        )
+        model.network.cpu()
+        results.append(Result(**vars(model), evaluation=evaluation))
+    return results
+
+
+def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:
+    """Resolve recipes, by short name, under one time budget and seed.
+
+    Raises ValueError when two files differ in anything but model, losses and `OF_THE_METHOD`.
+    """
+    overrides = [f"training.seconds={seconds}", "training.steps=1000000000", f"seed={seed}"]
+    names = short_names(files)
+    recipes = {name: resolve(f, overrides) for name, f in zip(names, files, strict=True)}
+    refuse_unequal(recipes, (*JUDGED, *TRAINED))
+    return recipes
+
+
+def refuse_unequal(recipes: Mapping[str, Recipe], sections: Sequence[str]) -> None:
+    """Raise ValueError where two recipes differ in `sections`, except in `OF_THE_METHOD`."""
+
+    def compared(section: str, recipe: Recipe) -> dict[str, Any]:
+        options = recipe.tree[section] or {}
+        return {name: x for name, x in options.items() if f"{section}.{name}" not in OF_THE_METHOD}
+
+    first = next(iter(recipes))
+    for name, recipe in recipes.items():
+        unequal = [s for s in sections if compared(s, recipe) != compared(s, recipes[first])]
+        if unequal:
+            raise ValueError(
+                f"{name} and {first} differ in {', '.join(unequal)}, so their figures could not be "
+                "compared; make these parts equal, or take one at a time"
+            )
+
+
+def recipes_alike(
+    files: Mapping[str, Path],
+    photos: str | None,
+    size: Size | None = None,
+    overrides: Sequence[str] = (),
+) -> dict[str, Recipe]:
+    """Read the recipes of `files`, with the data at `photos` in place of their own.
+
+    size: (H, W) of the photos, by default one that all models take and at which they are whole.
+    overrides: settings of `views`, such as a scale.
+
+    Raises ValueError where their protocols differ, and as `CheckpointFile` and the data do.
+    """
+    recipes = dict[str, Recipe]()
+    for name, path in files.items():
+        with CheckpointFile(path) as file:
+            recipes[name] = file.recipe
+    if photos is not None:
+        data = _data_of(photos, recipes.values(), size)
+        first = next(iter(recipes.values())).tree["views"]
+        for name, recipe in recipes.items():
+            recipes[name] = resolve(_on_photos(recipe, photos, data, first), overrides)
+    refuse_unequal(recipes, JUDGED)
+    return recipes
+
+
+def _data_of(photos: str, recipes: Collection[Recipe], size: Size | None) -> dict[str, Any]:
+    """Return the section `data` of the photos for all `recipes`, some photos held out."""
+    sources = installed_sources()
+    trained = [recipe.data_config for recipe in recipes]
+    # as a model that was trained on them opens them: its held-out photos are no training data
+    config = next((data for data in trained if is_training_data(photos, data)), trained[0])
+    source, own = open_for(photos, size, config, sources)
+    scene = next(chain(source.scenes("test"), source.scenes("train")), None)
+    config = source.config
+    if not own and scene is not None:
+        size = size or whole_size(scene, size_multiple(recipes))
+        config = holding_out(config, scene)
+    kind = next(name for name, component in sources.items() if component is type(source))
+    options = config.model_dump(mode="json")
+    return {"type": kind, **options, "image_size": [*(size or config.image_size)]}
+
+
+def _on_photos(
+    recipe: Recipe, photos: str, data: Mapping[str, Any], first: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the tree of `recipe` on the photos of `data`, which chooses views as `first` does."""
+    plugin = data["type"].split("/")[0]
+    own = is_training_data(photos, recipe.data_config)
+    views = {
+        **recipe.tree["views"],
+        "gap": first["gap"],
+        "targets": first["targets"],
+        # photos that it was not trained on have a unit of their own
+        "scale": photo_settings(recipe.views, own).scale,
+    }
+    return {
+        **recipe.tree,
+        "data": data,
+        "plugins": [*dict.fromkeys([*recipe.tree["plugins"], *{plugin} - {"qgs"}])],
+        "evaluation": {**recipe.tree["evaluation"], "scenes": WINDOWS, "index": None},
+        "views": views,
+    }

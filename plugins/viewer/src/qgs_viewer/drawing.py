@@ -1,0 +1,228 @@
+"""Drawing into a scene of viser: Gaussians, photos, anchors, a query and what it reads."""
+
+from typing import Any
+
+import numpy as np
+import torch
+import viser
+from torch import Tensor
+from viser.transforms import SO3
+
+from qgs.drawing.images import enlarged, rgb_picture
+from qgs.geometry.transforms import to_camera, to_pixels
+from qgs.types import Cameras
+from qgs_viewer.choice import Choice, anchor_colors, faded, ink, painted, query_color
+from qgs_viewer.placement import corners, on_photo
+from qgs_viewer.query_scene import QueryScene
+
+PHOTO_SIDE = 256
+"""Pixels on the longer side of photos: small ones are enlarged, large reduced."""
+FRUSTUM = 0.12
+"""Depth of a camera's frustum, per distance from the input cameras to the scene."""
+WIDER = (0.25, 0.6)
+"""Shares of the most that is read from which lines are broader."""
+STRENGTHS = (0.2, 0.6, 1.0)
+"""Strength of the colour of lines up to these shares and above."""
+SOLID = 0.1
+"""Opacity of the Gaussians that count for the size of a scene."""
+
+
+class Drawing:
+    """Everything drawn in a scene of viser; a part that is drawn again replaces the one before.
+
+    photo_depth: of photos before their cameras. anchor_radius: viser's `point_size`, half a width.
+    """
+
+    def __init__(self, api: viser.SceneApi) -> None:
+        self.api = api
+        self.photo_depth = FRUSTUM
+        self.anchor_radius = 0.01
+        self._gaussians: viser.GaussianSplatHandle | None = None
+        self._painted: tuple[QueryScene, Choice] | None = None
+
+    def put(
+        self,
+        scene: QueryScene,
+        choice: Choice,
+        every: Cameras | None = None,
+        unit: float | None = None,
+    ) -> None:
+        """Draw a new scene. every: cameras of all frames, drawn thin.
+
+        unit: length that sizes photos and anchors, by default `distance_to` the scene.
+        """
+        unit = unit or distance_to(scene)
+        self.photo_depth = FRUSTUM * unit
+        self.anchor_radius = 0.01 * unit
+        plain = np.full((8, 8, 3), 255.0) * scene.background
+        self.api.set_background_image(plain.round().astype(np.uint8), "png")
+        self._draw_photos(scene, every)
+        self.update(scene, choice)
+
+    def update(self, scene: QueryScene, choice: Choice) -> None:
+        """Draw what a choice changes."""
+        self._draw_gaussians(scene, choice)
+        if (views := self.api.get_handle_by_name("/views")) is not None:
+            views.visible = choice.photos
+        self._draw_anchors(scene, choice)
+        for name in ("/support", "/path", "/reading", "/patches"):
+            self.api.remove_by_name(name)
+        if choice.query is not None:
+            self._draw_support(scene, choice.query, choice.layer)
+            self._draw_reading(scene, choice.query, choice)
+
+    def _draw_gaussians(self, scene: QueryScene, choice: Choice) -> None:
+        paint = Choice(by_query=choice.by_query, query=choice.query, others=choice.others)
+        if self._painted is not None:
+            before, painted_as = self._painted
+            # Gaussians are megabytes to send; most choices leave them as they are
+            if before is scene and painted_as == paint:
+                return
+        shown = painted(scene, choice)
+        factor = shown.magnification
+        centers = shown.centers * factor
+        covariances = shown.covariances * factor**2
+        if self._gaussians is None:
+            self._gaussians = self.api.add_gaussian_splats(
+                "/gaussians", centers, covariances, shown.colors, shown.opacities
+            )
+        else:
+            self._gaussians.set_gaussians(centers, covariances, shown.colors, shown.opacities)
+        self._gaussians.scale = 1 / factor
+        self._painted = scene, paint
+
+    def _draw_photos(self, scene: QueryScene, every: Cameras | None) -> None:
+        self.api.remove_by_name("/views")
+        if scene.views is None:
+            return
+        self.api.add_frame("/views", show_axes=False)
+        place = scene.placement
+        cameras = scene.views.cameras[0]
+        ends = on_photo(cameras, corners(cameras.size), self.photo_depth / place.scale)
+        ends = place.points(ends)
+        eyes = place.points(cameras.c2w[:, :3, 3])
+        self._lines("/views/inputs", frustum_lines(eyes, ends), ink(scene), 2.0)
+        for view, image in enumerate(scene.views.images[0]):
+            corner, right, _, left = ends[view]
+            turned = place.rotation @ cameras.c2w[view, :3, :3].cpu().double()
+            # viser's frusta have their principal point in the middle, photos may not
+            self.api.add_image(
+                f"/views/{view}",
+                enlarged(rgb_picture(image), PHOTO_SIDE),
+                float((right - corner).norm()),
+                float((left - corner).norm()),
+                wxyz=SO3.from_matrix(turned.numpy()).wxyz,
+                position=ends[view].mean(0).numpy(),
+            )
+        if every is not None:
+            ends = on_photo(every, corners(every.size), self.photo_depth / 2)
+            lines = frustum_lines(every.c2w[:, :3, 3], ends)
+            self._lines("/views/others", lines, faded(ink(scene), 0.6, scene), 1.0)
+
+    def _draw_anchors(self, scene: QueryScene, choice: Choice) -> None:
+        found = scene.support(choice.layer)
+        if found is None or not choice.anchors:
+            self.api.remove_by_name("/anchors")
+            return
+        numbers, colors = anchor_colors(scene, choice)
+        self.api.add_point_cloud(
+            "/anchors",
+            found.centers[0].float().numpy()[numbers],
+            colors,
+            point_size=self.anchor_radius,
+            point_shape="circle",
+            precision="float32",
+        )
+
+    def _draw_support(self, scene: QueryScene, query: int, layer: int) -> None:
+        """Draw the support of a query, and the path of its anchor from the start to the layer."""
+        supports = [scene.support(number) for number in range(layer + 1)]
+        points = [found.centers[0, query] for found in supports if found is not None]
+        found = supports[-1]
+        if found is None:
+            return
+        axes = found.axes[0, query]
+        lengths = axes.norm(dim=0)
+        x, y, z = lengths.tolist()
+        self.api.add_icosphere(
+            "/support",
+            color=query_color(query),
+            subdivisions=2,
+            scale=(x, y, z),
+            wireframe=True,
+            opacity=0.5,
+            cast_shadow=False,
+            receive_shadow=False,
+            wxyz=SO3.from_matrix((axes / lengths).numpy()).wxyz,
+            position=points[-1].numpy(),
+        )
+        if layer:
+            path = torch.stack(points)
+            self._lines("/path", torch.stack([path[:-1], path[1:]], 1), ink(scene), 3.0)
+
+    def _draw_reading(self, scene: QueryScene, query: int, choice: Choice) -> None:
+        """Draw lines from where the query was when it read to the patches that it read most.
+
+        Colour and width grow with the share of the most that is read. A square of half its width
+        marks each patch.
+        """
+        if not choice.layer or not choice.patches:
+            return
+        # a little nearer to the camera than the photo, which would hide the squares
+        depth = 0.97 * self.photo_depth
+        reading = scene.strongest(query, choice.layer, choice.patches, depth)
+        if reading is None:
+            return
+        hub = scene.hub(query, choice.layer - 1).expand_as(reading.points)
+        lines = torch.stack([hub, reading.points], 1)
+        shares = (reading.shares / reading.shares.max().clamp_min(1e-30)).numpy()
+        color = query_color(query)
+        self.api.add_frame("/reading", show_axes=False)
+        # viser's lines have one width and colour for all segments of a name
+        for step, strength in enumerate(STRENGTHS):
+            among = np.digitize(shares, WIDER) == step
+            if among.any():
+                part = lines[torch.from_numpy(among)]
+                self._lines(f"/reading/{step}", part, faded(color, strength, scene), 1 + 1.5 * step)
+        self.api.add_point_cloud(
+            "/patches",
+            reading.points.float().numpy(),
+            faded(color, shares[:, None], scene),
+            point_size=reading.side / 4,
+            point_shape="square",
+            precision="float32",
+        )
+
+    def _lines(self, name: str, lines: Tensor, color: Any, width: float) -> None:
+        """Draw segments (n, 2, 3), `width` pixels wide. color: uint8 RGB."""
+        points = lines.float().cpu().numpy()
+        self.api.add_line_segments(name, points, color, thickness=width, thickness_units="screen")
+
+
+def frustum_lines(eyes: Tensor, ends: Tensor) -> Tensor:
+    """Return edges (V * 8, 2, 3) of pyramids from eyes (V, 3) to the corners `ends` (V, 4, 3)."""
+    spokes = torch.stack([eyes[:, None].expand_as(ends), ends], 2)
+    rims = torch.stack([ends, ends.roll(-1, 1)], 2)
+    return torch.cat([spokes, rims], 1).flatten(0, 1)
+
+
+def distance_to(scene: QueryScene) -> float:
+    """Return the median depth of the opaque Gaussians that the inputs see, in the shown world.
+
+    Without cameras the median distance of the Gaussians from their middle.
+    """
+    means = scene.gaussians.means[0].detach().cpu()
+    solid = means[(scene.gaussians.opacities[0] > SOLID).cpu()]
+    if not len(solid):
+        solid = means
+    if scene.views is None:
+        found = (solid - solid.median(0).values).norm(dim=-1)
+    else:
+        cameras = scene.views.cameras.to("cpu")
+        points = to_camera(solid[None], cameras)[0]
+        pixels = to_pixels(points, cameras.intrinsics[0])
+        inside = (pixels >= 0) & (pixels <= torch.tensor(cameras.size[::-1]))
+        seen = (points[..., 2] > 0) & inside.all(-1)
+        found = points[..., 2][seen] if seen.any() else points.norm(dim=-1)
+    # a scene of one point has no size, and frusta of none would be invisible
+    return max(float(found.median()) * scene.placement.scale, 1e-6)

@@ -1,0 +1,124 @@
+"""Figures for papers: sections of the report drawn by Matplotlib, as PDF and PNG."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.patches import Patch
+
+from qgs.drawing.figures import figure_style, hex_color
+from qgs.files import replacing, write_text
+from qgs.wording import listed
+from qgs_viewer import sections
+from qgs_viewer.options import FIGURES
+from qgs_viewer.scenes import ModelScenes
+from qgs_viewer.sections import Detail, Section
+
+WIDTH = 7.0
+"""Inches of a figure across a page of two columns."""
+DPI = 220
+SIDE = 512
+"""Pixels on the longer side of pictures that models render."""
+LAYERS = 3
+LISTING = "figures.md"
+DRAWN: Mapping[str, Callable[[Sequence[ModelScenes], Detail], Section]] = dict(
+    zip(
+        FIGURES,
+        (
+            sections.novel_views,
+            sections.queries,
+            sections.anchors,
+            sections.attention,
+            sections.training_curves,
+        ),
+        strict=True,
+    )
+)
+
+
+def refuse_unknown(names: Sequence[str]) -> None:
+    """Raise ValueError for a name that is no figure's."""
+    if unknown := [name for name in names if name not in FIGURES]:
+        raise ValueError(f"--only: no figure {listed(unknown)}; there are {listed(FIGURES)}")
+
+
+@torch.no_grad()
+def write_figures(
+    models: Sequence[ModelScenes],
+    folder: Path,
+    names: Sequence[str] = (),
+    query: int | None = None,
+    notes: Sequence[str] = (),
+) -> Iterator[str]:
+    """Write the figures `names`, all by default, and figures.md; yield a line on each.
+
+    notes: sentences for figures.md.
+    """
+    detail = Detail(SIDE, LAYERS, query)
+    first = models[0].samples[0]
+    scene = (
+        f"Scene of the figures of one scene: {first.scene}, inputs {listed(first.input_frames)}."
+    )
+    texts = [f"# {' and '.join(model.name for model in models)}", *notes, scene]
+    for name in names or FIGURES:
+        section = DRAWN[name](models, detail)
+        if not section.rows:
+            yield f"left out {name}: {section.words['empty']}"
+            texts.append(f"{name} is left out: {section.words['empty']}.")
+            continue
+        write_figure(section.figure or grid(section), folder, name)
+        yield f"{folder / name}.pdf, .png"
+        text = section.words["text"]
+        texts.append(f"## {name}\n\n![{name}]({name}.png)\n\n{text} ([PDF]({name}.pdf))")
+    write_text(folder / LISTING, "\n\n".join(texts) + "\n")
+    yield f"{folder / LISTING}: what each shows"
+
+
+def grid(section: Section) -> Figure:
+    """Return a figure with a panel for each tile of `section`, its pixels as they are."""
+    columns = max(map(len, section.rows.values()))
+    tiles = [tile for tile in next(iter(section.rows.values())) if tile]
+    height, width = np.shape(tiles[0].image)[:2]
+    # each panel has a line of text above it, and room for its legend below
+    lines = 1 + max(len(tile.legend) for tile in tiles)
+    row = WIDTH / columns * height / width + 0.2 * lines
+    with figure_style(), rc_context({"font.size": 8, "axes.titlesize": 7}):
+        layout = ConstrainedLayoutEngine(w_pad=0.02, h_pad=0.02, wspace=0.01, hspace=0.01)
+        figure = Figure(figsize=(WIDTH, row * len(section.rows)), layout=layout)
+        axes = figure.subplots(len(section.rows), columns, squeeze=False)
+        for axis in axes.flat:
+            axis.set(xticks=[], yticks=[], frame_on=False)
+        for line, (label, row_tiles) in zip(axes, section.rows.items(), strict=True):
+            line[0].set_ylabel(label.replace(", ", "\n"))
+            for axis, tile in zip(line, row_tiles, strict=False):
+                if tile is None:
+                    continue
+                axis.imshow(tile.image, interpolation="nearest")
+                axis.set_title(tile.caption)
+                patches = [
+                    Patch(color=hex_color(q.color), label=f"query {q.index}: {q.dispersion:.3f}")
+                    for q in tile.legend
+                ]
+                if patches:
+                    axis.legend(handles=patches, loc="upper left", bbox_to_anchor=(0, 0))
+    return figure
+
+
+def write_figure(figure: Figure, folder: Path, name: str) -> None:
+    """Write NAME.pdf with text as text, and NAME.png; the same figure gives the same bytes."""
+    # each drawing moves panels a little: both files show one layout
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    # a date would change the file at every run; type 42 keeps fonts that journals ask for
+    metadata = {"pdf": {"CreationDate": None}, "png": {}}
+    for kind, entries in metadata.items():
+        with (
+            replacing(folder / f"{name}.{kind}") as temporary,
+            figure_style(),
+            rc_context({"pdf.fonttype": 42}),
+        ):
+            figure.savefig(temporary, format=kind, dpi=DPI, metadata=entries)

@@ -1,1 +1,0 @@
-"""Figures as papers show them: one module each, whose `figure` draws and needs no command."""

@@ -1,0 +1,124 @@
+"""What models make of the scenes that pages and figures show."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from qgs.data.samples import Sample
+from qgs.evaluate.plan import evaluation_samples
+from qgs.geometry.poses import largest_distance
+from qgs.model import QueryGaussianModel
+from qgs.types import Cameras, Gaussians
+from qgs.wording import listed
+from qgs_viewer.comparison import Model
+from qgs_viewer.curves import Curves, curves_of
+from qgs_viewer.queries import DrawnQuery, colored_queries, notable_queries
+from qgs_viewer.query_scene import QueryScene, explained
+
+
+@dataclass(frozen=True)
+class ModelScenes:
+    """A model by name, and the Gaussians that it makes of the inputs of each of `samples`.
+
+    samples: in the scale of this model's world. scene: the first of them with its queries. curves:
+    of the training, where it has a history.
+    """
+
+    name: str
+    network: QueryGaussianModel
+    samples: Sequence[Sample]
+    gaussians: Sequence[Gaussians]
+    scene: QueryScene
+    curves: Curves | None = None
+
+    @property
+    def input_camera(self) -> Cameras:
+        """The camera (1, 1) of the first input of the first scene."""
+        return self.samples[0].inputs.cameras[:, :1]
+
+    @property
+    def target_camera(self) -> Cameras:
+        """The camera (1, 1) of the first target of the first scene."""
+        return self.samples[0].targets.cameras[:, :1]
+
+    def notable(self, count: int, cameras: Cameras, query: int | None = None) -> list[DrawnQuery]:
+        """Return `query`, or the `count` most notable ones in the first of cameras (1, V).
+
+        Raises ValueError for a query that the model does not have.
+        """
+        if query is None:
+            return notable_queries(self.network, self.gaussians[0], cameras, count)
+        self.scene.refuse_missing(query)
+        return colored_queries(self.gaussians[0], self.scene.queries, [query])
+
+
+@torch.no_grad()
+def model_scenes(
+    models: Sequence[Model], most: int | None = None, scene: str | None = None
+) -> list[ModelScenes]:
+    """Reconstruct the scenes of the models' evaluation by each model, on the model's device.
+
+    most: scenes, one sample of each; by default all samples of the evaluation. scene: the one that
+    comes first. Raises ValueError for a scene that is not judged.
+    """
+    first = models[0].recipe
+    evaluation = first.evaluation
+    if most is not None:
+        evaluation = evaluation.model_copy(update={"scenes": most, "samples": 1})
+    source = first.build_data()
+    samples: Sequence[Sample] = ()
+    shown = []
+    for model in models:
+        views = model.recipe.views
+        # models in worlds of one unit share the samples: photos take long to decode
+        if not samples or views.scale == "search" or views != first.views:
+            samples = evaluation_samples(
+                source,
+                views,
+                evaluation,
+                views_of=model.search,
+                sampler=model.windows or model.recipe.build_view_sampler(),
+                depths=not shown,
+            )[:most]
+        shown.append(scenes_of(model.name, model.network, _with_first(samples, scene), model.file))
+    return shown
+
+
+def _with_first(samples: Sequence[Sample], scene: str | None) -> Sequence[Sample]:
+    names = dict.fromkeys(sample.scene for sample in samples)
+    if scene is not None and scene not in names:
+        raise ValueError(f"--scene: {scene!r} is not judged; scenes are {listed(names)}")
+    return sorted(samples, key=lambda sample: sample.scene != scene)
+
+
+@torch.no_grad()
+def scenes_of(
+    name: str, network: QueryGaussianModel, samples: Sequence[Sample], file: Path | None = None
+) -> ModelScenes:
+    """Reconstruct `samples`; `file` is the checkpoint, beside which curves may lie."""
+    network.eval()
+    device = next(network.parameters()).device
+    own = [
+        replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
+        for sample in samples
+    ]
+    frames = own[0].input_frames
+    labels = [own[0].label(frame) for frame in frames]
+    scene = explained(network, own[0].inputs, labels, frames)
+    others = [network(sample.inputs).gaussians for sample in own[1:]]
+    curves = curves_of(file) if file else None
+    return ModelScenes(name, network, own, [scene.gaussians, *others], scene, curves)
+
+
+def ratio(sample: Sample, own: Sample) -> float:
+    """Return the length in the world of `sample` of what has length 1 in that of `own`.
+
+    Both have the same views.
+    """
+    lengths = []
+    for one in (sample, own):
+        c2w = torch.cat([one.inputs.cameras.c2w, one.targets.cameras.c2w], 1)
+        lengths.append(float(largest_distance(c2w)))
+    return lengths[0] / lengths[1] if lengths[1] else 1.0
