@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 from guide_pages import text_of
-from qgs_viewer import contest
+from qgs_viewer.comparison import checkpoints, judge, open_models
 
 from qgs.cli import COMMANDS, GROUP
 from qgs.recipe.slots import SECTIONS, SLOTS
@@ -45,12 +45,12 @@ def test_the_models_score_what_the_readme_says(side):
     of_photo = rf"^\| the nearest photo, {side} .*? \| (\S+) \| (\S+) \|"
     (nearest,) = re.findall(of_photo, README, re.MULTILINE)
     assert len(models) >= 2
-    entries = contest.judge(contest.checkpoints([model[0] for model in models]), None, "cpu")
-    for (_, *own, count, size), entry in zip(models, entries, strict=True):
+    files = checkpoints([model[0] for model in models])
+    results = judge(open_models(files, None, "cpu"))
+    for (_, *own, count, size), result in zip(models, results, strict=True):
         for method, (psnr, ssim) in (("model", own), ("nearest_input", nearest)):
-            found = entry.evaluation.means(method)
+            found = result.evaluation.means(method)
             assert found["psnr"] == pytest.approx(float(psnr), abs=0.02)
             assert found["ssim"] == pytest.approx(float(ssim), abs=0.002)
-        assert entry.evaluation.gaussians == int(count.replace(",", ""))
-        parameters = sum(p.numel() for p in entry.contender.model.parameters())
-        assert f"{parameters / 1e6:.2f}" == size
+        assert result.evaluation.gaussians == int(count.replace(",", ""))
+        assert f"{result.parameters / 1e6:.2f}" == size

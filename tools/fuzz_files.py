@@ -24,7 +24,7 @@ import safetensors.torch
 import torch
 from fuzzing import JUNK, FaultError, Use, fuzz, other_bytes, other_leaf, refused
 from qgs_viewer.choice import Choice, painted
-from qgs_viewer.look import Look
+from qgs_viewer.query_scene import QueryScene
 from qgs_viewer.server import first_eye
 
 import qgs
@@ -155,9 +155,9 @@ def start_from(file: Path) -> bytes:
 
 def show_ply(file: Path) -> None:
     """As the viewer does."""
-    look = Look(qgs.load_ply(file))
-    eye, _ = first_eye(look)
-    shown = painted(look, Choice())
+    scene = QueryScene(qgs.load_ply(file))
+    eye, _ = first_eye(scene)
+    shown = painted(scene, Choice())
     parts = eye, shown.centers, shown.covariances
     if not all(np.isfinite(part).all() for part in parts) or not shown.magnification > 0:
         raise FaultError("the viewer gets numbers that are not finite")

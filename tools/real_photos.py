@@ -25,7 +25,7 @@ import torch
 import torch.nn.functional as F
 from qgs_photos.datasets.overlapping import apart
 from qgs_photos.refine import refine
-from qgs_viewer.contest import checkpoints, recipes_alike
+from qgs_viewer.comparison import checkpoints, recipes_alike
 
 from qgs.checkpoint.model_file import CheckpointFile, load
 from qgs.cli.options import parse_size

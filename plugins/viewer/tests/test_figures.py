@@ -43,7 +43,7 @@ def test_novel_views_show_the_middle_target_with_its_score_error_and_depths_on_o
         assert all(map(np.array_equal, pictures, expected))
         assert len(pictures) == len(expected)
         score = -10 * (render.rgb[0, 0].clamp(0, 1) - truth).square().mean().log10()
-        assert row[3].caption == f"{score:.2f} dB"
+        assert row[3].caption == f"render, {score:.2f} dB"
         # the rows of other models do not repeat what all share
         shared = []
 

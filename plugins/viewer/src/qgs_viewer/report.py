@@ -88,7 +88,8 @@ def show_scores(comparison: Comparison, console: Console) -> None:
         cells = []
         for cell, best in zip(row.cells, row.best, strict=True):
             cells.append(f"[green]{cell}[/green]" if best else cell)
-        rows.append([escape(row.name), *cells])
+        # names keep to one line, which a blank would end
+        rows.append([escape(row.name).replace(" ", "\u00a0"), *cells])
     look = {"caption": "best in green", "box": box.SIMPLE_HEAD}
     print_table(console, comparison.scenes, rows, pad_edge=False, collapse_padding=True, **look)
 

@@ -184,16 +184,25 @@ def novel_views(models: Shown, detail: Detail) -> Section:
     for place, sample in enumerate(models[0].samples[:NOVEL_SCENES]):
         scene = pictured_scene(models, place, [len(sample.target_frames) // 2])
         kinds = scene["kinds"]
+        inputs = scene["inputs"]
+        (truth,) = kinds["Render"]["Truth"]
+        (depth,) = kinds["Depth"].get("Truth", [None])
         for number, model in enumerate(models):
             # what all models share stands in the rows of the first ones
-            shared = [*scene["inputs"][number : number + 1], None][:1]
-            for kind in ("Render", "Depth"):
-                truth = kinds[kind].get("Truth", [None])
-                shared += truth if number == 0 else [None]
-            own = [*kinds["Render"][model.name], *kinds["Error"][model.name]]
-            own += kinds["Depth"][model.name]
-            rows[f"{place + 1}: {scene['name']}, {model.name}"] = [*shared, *own]
+            tiles = {"input": inputs[number] if number < len(inputs) else None}
+            tiles["truth"] = None if number else truth
+            tiles["true depth"] = None if number else depth
+            for kind, columns in kinds.items():
+                (tiles[kind.lower()],) = columns[model.name]
+            row = f"{place + 1}: {scene['name']}, {model.name}"
+            rows[row] = [_titled(tile, title) for title, tile in tiles.items()]
     return Section("novel_views", rows)
+
+
+def _titled(tile: Tile | None, title: str) -> Tile | None:
+    if tile is None:
+        return None
+    return replace(tile, caption=f"{title}, {tile.caption}" if tile.caption else title)
 
 
 def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[str, Any]:
