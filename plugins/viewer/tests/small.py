@@ -1,4 +1,4 @@
-"""A small model of each kind, cameras on arcs, and a scene that a camera walks past."""
+"""A small model of each kind, and what it makes of the walk."""
 
 from copy import deepcopy
 from functools import cache
@@ -9,18 +9,16 @@ import yaml
 from commands import MODEL
 from qgs_viewer.scenes import scenes_of
 from qgs_viewer.sources import ModelSource
+from walk import Walk
 
 import qgs
-from qgs.contracts import Scene, ViewsConfig
+from qgs.contracts import ViewsConfig
 from qgs.data.samples import make_sample
 from qgs.domain import KEY, Domain
-from qgs.geometry.poses import look_at
 from qgs.recipe import resolve
-from qgs.types import Cameras, Gaussians
+from qgs.types import Gaussians
 
 QUERIES = 12
-FRAMES = 6
-SIDE = 64
 VIEWS = ViewsConfig(inputs=2, gap=(1, 5), scale="auto")
 BY_DISTANCE = VIEWS.model_copy(update={"scale": "distance", "scale_factor": 0.7})
 KINDS = ("tokengs", "locus", "ellipsoid")
@@ -45,18 +43,6 @@ def stand_in(file, queries=8):
     return str(file)
 
 
-def arc(degrees, radius, rise=0.0):
-    """Poses (V, 4, 4) of cameras around the origin, which they look at, y down."""
-    angles = torch.as_tensor(degrees).double().deg2rad()
-    axes = torch.stack([angles.sin(), rise * angles, angles.cos()], -1)
-    return look_at(-radius * axes, axes, torch.tensor([0.0, 1.0, 0.0]).expand_as(axes).double())
-
-
-def pinhole(c2w, lens=(64.0, 64.0, 32.0, 32.0), size=(SIDE, SIDE)):
-    """Cameras (V,)."""
-    return Cameras(c2w, torch.tensor(lens).to(c2w).expand(len(c2w), 4), size)
-
-
 def cloud(count):
     """Gaussians (1, G) in a cube of side 2 around the origin."""
     make = torch.Generator().manual_seed(3)
@@ -73,20 +59,6 @@ def model_of(kind, *overrides):
     torch.manual_seed(0)
     settings = [f"model.queries.count={QUERIES}", *overrides]
     return resolve(f"recipes/tiny/{kind}.yaml", settings).build_model().eval()
-
-
-class Walk(Scene):
-    """Photos of noise by cameras on an arc that look at one point, principal point off centre."""
-
-    name = "walk"
-    cameras = pinhole(arc(range(-30, 31, 12), 3, 0.1), (59.0, 65.0, 35.0, 30.0))
-
-    def images(self, frames):
-        every = torch.rand(FRAMES, 3, SIDE, SIDE, generator=torch.Generator().manual_seed(1))
-        return every[list(frames)]
-
-    def frame_name(self, frame):
-        return f"photos/{frame:02d}.png"
 
 
 def sample_of(inputs=(1, 4), targets=(2, 3)):

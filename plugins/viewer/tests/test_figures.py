@@ -7,11 +7,12 @@ import pytest
 import torch
 from commands import done
 from PIL import Image
-from qgs_viewer.figures import DPI, DRAWN, WIDTH, grid, write_figure
-from qgs_viewer.options import FIGURES
+from qgs_viewer.figures import DPI, FIGURES, WIDTH, grid, write_figure
+from qgs_viewer.options import FigureName
 from qgs_viewer.pictures import attention_pictures_of, error_picture
 from qgs_viewer.sections import Detail, anchors, attention, novel_views
-from small import PAIR, QUERIES, SIDE, model_of, model_scenes_of
+from small import PAIR, QUERIES, model_of, model_scenes_of
+from walk import SIDE
 
 import qgs
 from qgs.drawing.images import depth_picture, depth_range, rgb_picture, side_by_side
@@ -97,8 +98,8 @@ def test_figures_are_written_and_explained(tmp_path):
     assert "![queries](queries.png)" in text
     assert "curves is left out" in text
     assert "test/000001" in text
-    assert tuple(DRAWN) == FIGURES
-    for wrong in (["--out", out], ["--scene", "other"], ["--query", QUERIES], ["--only", "other"]):
+    assert [*FIGURES] == [*FigureName]
+    for wrong in (["--out", out], ["--scene", "other"], ["--query", QUERIES]):
         with pytest.raises((ValueError, FileExistsError)):
             done(*words, "--out", tmp_path / "new", *wrong)
     assert not (tmp_path / "new").exists()

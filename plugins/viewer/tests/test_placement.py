@@ -5,7 +5,8 @@ import torch
 from numpy.testing import assert_allclose
 from qgs_viewer.placement import Placement, Splats, hit, near_ray, on_photo, splats
 from scipy.spatial.transform import Rotation
-from small import arc, cloud, pinhole
+from small import cloud
+from walk import arc, pinhole
 
 from qgs.renderers.reference import TorchRenderer
 

@@ -9,18 +9,9 @@ from qgs_viewer.pictures import attention_pictures_of
 from qgs_viewer.placement import Placement
 from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
 from qgs_viewer.server import first_eye, quiet_server, stand, up_of
-from small import (
-    BY_DISTANCE,
-    KINDS,
-    SIDE,
-    arc,
-    cloud,
-    model_of,
-    model_scenes_of,
-    pinhole,
-    source_of,
-)
+from small import BY_DISTANCE, KINDS, cloud, model_of, model_scenes_of, source_of
 from torch.testing import assert_close
+from walk import SIDE, arc, pinhole
 
 import qgs
 from qgs.geometry.transforms import to_camera, to_pixels

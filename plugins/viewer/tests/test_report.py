@@ -4,14 +4,11 @@ import html
 import json
 import re
 
-import numpy as np
 import pytest
 from commands import done
 from plyfile import PlyData
 from qgs_viewer.sections import scene_to_turn
 from small import PAIR, model_scenes_of, stand_in
-
-from qgs.drawing.images import EXACT, data_uri
 
 RUN = "<script>alert(1)"
 
@@ -91,9 +88,3 @@ def test_the_section_has_all_models_and_the_code_of_the_viewer_once():
     assert len(tile.page) - len(one.page) < 100_000 < len(one.page)
     assert tile.page.index('["tokengs"') < tile.page.index('["locus"')
     assert not re.search(r"(src|href)=.?http", tile.page)
-
-
-def test_large_photos_are_compressed_and_small_ones_exact():
-    small, large = (np.zeros((side, 9, 3), np.uint8) for side in (EXACT, EXACT + 1))
-    kinds = [data_uri(small, photo=True), data_uri(large, photo=True), data_uri(large)]
-    assert [uri[11:15] for uri in kinds] == ["png;", "webp", "png;"]

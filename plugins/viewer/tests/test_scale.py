@@ -9,11 +9,8 @@ from photo_formats import PhotoSet, write_nerfstudio
 from qgs_viewer.comparison import checkpoints, judge, open_models
 from qgs_viewer.opening import ViewOptions, open_source
 from qgs_viewer.remarks import summary
-from small import Walk, model_of
 
 import qgs
-from qgs.contracts import ViewsConfig
-from qgs.domain import Domain
 from qgs.drawing.images import rgb_picture, write_png
 from qgs.recipe import resolve
 from qgs.reconstruction import scale
@@ -85,50 +82,6 @@ def test_a_scale_can_be_set(room, tmp_path):
             done(*words, "--scale", "0")
 
 
-def test_settings_search_where_nothing_is_known():
-    views = ViewsConfig(scale="constant")
-    for expected, given in (
-        ("search", (views, False)),
-        ("constant", (views, True)),
-        ("constant", (views, False, ["views.scale_factor=2"])),
-        ("distance", (ViewsConfig(scale="distance"), False)),
-    ):
-        assert scale.photo_settings(*given).scale == expected
-
-
-def test_further_photos_lie_between_and_are_not_compared_with():
-    walk = Walk()
-    assert scale.further_photos(walk, (1, 5), (2, 4)) == (0, 3)
-    assert 2 in scale.further_photos(walk, (0, 4), ())
-    assert scale.further_photos(walk, (0, 4), (2,)) == (1, 3)
-    walk.held_out = (1, 2)
-    assert scale.further_photos(walk, (0, 4), ()) == (3, 5)
-    assert scale.further_photos(walk, (0, 4), (3, 5)) == ()
-
-
-def test_without_further_photos_an_input_is_judged_or_inputs_alone():
-    views, model = ViewsConfig(inputs=2, scale="search"), model_of("tokengs")
-    search = scale.ScaleSearch(model, views)
-    chosen = search(Walk(), (0, 2, 4), (1, 3, 5))
-    (three,) = search.found.values()
-    assert three.further == (2,)
-    assert (chosen.scale, chosen.scale_factor) == ("constant", three.factor)
-    assert search(Walk(), (0, 2, 4), (1, 3, 5)) == chosen
-    two = scale.find_scale(model, Walk(), (1, 4), (0, 2, 3, 5), views)
-    assert two.further == ()
-    assert two.poor
-
-
-def test_the_range_follows_the_unit_and_the_training():
-    trained = Domain({"baseline": [0.1, 0.4], "depth": [0.8, 3.0]}, 4)
-    low, high, nearest = scale.search_range(trained, Walk(), (1, 4))
-    assert low < 0.8 / 3 < high
-    assert nearest == pytest.approx(1.0 / 3, rel=1e-3)  # the cameras of Walk look 3 away
-    still = Walk()
-    still.cameras = Walk.cameras[[2, 2]]
-    assert scale.search_range(Domain(), still, (0, 1)) == (1.0, 1.0, 0.0)
-
-
 def test_words_of_several_windows():
     one = scale.FoundScale(0.4, 20.0, (3,), ["3.png"], [(0.4, 20.0)], 0.5)
     bad = replace(one, factor=0.6, psnr=12.3)
@@ -136,9 +89,3 @@ def test_words_of_several_windows():
     assert "3.png" in summary([one])
     assert "12.3 dB" in bad.poor
     assert not one.poor
-
-
-def test_training_and_evaluation_refuse_a_search(tmp_path):
-    words = ("--set", "views.scale=search", "--set", "training.steps=1")
-    with pytest.raises(ValueError, match=r"views\.scale: search"):
-        done("train", "tiny/tokengs.yaml", "--out", tmp_path / "run", *words)

@@ -17,8 +17,9 @@ from qgs_viewer.page import scene_html
 from qgs_viewer.panel import Panel, plain
 from qgs_viewer.query_scene import QueryScene
 from qgs_viewer.server import quiet_server
-from small import FRAMES, cloud, model_scenes_of, source_of
+from small import cloud, model_scenes_of, source_of
 from viser.transforms import SO3
+from walk import FRAMES
 
 
 @pytest.fixture(scope="module")

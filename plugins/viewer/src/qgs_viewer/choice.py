@@ -11,12 +11,12 @@ from qgs_viewer.placement import Splats
 from qgs_viewer.query_scene import QueryScene
 
 Others = Literal["shown", "faint", "hidden"]
+# Mean of a background below which dark lines could not be seen.
 DARK = 0.3
-"""Mean of a background below which dark lines could not be seen."""
+# Opacity of the Gaussians of other queries, as a part of their own.
 FAINT = 0.12
-"""Opacity of the Gaussians of other queries, as a part of their own."""
+# Part of the background in the colours of Gaussians that are not picked.
 PALE = 0.4
-"""Part of the background in the colours of Gaussians that are not picked."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,7 @@ def anchor_colors(scene: QueryScene, choice: Choice) -> tuple[np.ndarray, np.nda
         return numbers, colors
     if choice.others == "hidden":
         return numbers[[choice.query]], colors[[choice.query]]
+    # anchors of others stay visible, so that they can still be clicked
     paled = faded(colors, 0.3, scene)
     paled[choice.query] = colors[choice.query]
     return numbers, paled
@@ -83,6 +84,7 @@ def painted(scene: QueryScene, choice: Choice) -> Splats:
         return found
     colors = found.colors
     opacities = found.opacities
+    # Gaussians are ordered by query, so colours repeat in blocks
     if choice.by_query:
         each = len(colors) // scene.queries
         colors = query_colors(scene).repeat(each, 0) / 255
@@ -90,6 +92,7 @@ def painted(scene: QueryScene, choice: Choice) -> Splats:
         mine = np.zeros((len(colors), 1), bool)
         mine[scene.members(choice.query)] = True
         part = FAINT if choice.others == "faint" else 0.0
+        # nearly clear Gaussians of the picked query would not be seen
         opacities = np.where(mine, np.maximum(opacities, 0.5), opacities * part)
         greys = colors.mean(1, keepdims=True) * (1 - PALE) + np.array(scene.background) * PALE
         colors = np.where(mine, colors, greys)

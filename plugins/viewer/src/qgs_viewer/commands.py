@@ -62,6 +62,7 @@ def view(
     """
     if foreign := [text for text in overrides or () if not text.startswith("views.")]:
         raise ValueError(f"--set changes `views` alone here, got {listed(foreign)}: leave it out")
+    # a wrong word is refused before torch is loaded, which takes seconds
     pixels = parse_size(size)
 
     from qgs.evaluate.results import print_lines
@@ -126,6 +127,7 @@ def _serve(
         print_lines(console, [f"{source.title}: {address} (Ctrl-C ends it)"])
         if show:
             webbrowser.open(address)
+        # Ctrl-C is how a user ends it, no error
         with suppress(KeyboardInterrupt):
             server.sleep_forever()
 
@@ -156,6 +158,7 @@ def demo(
         raise ValueError(f"{given[0]} is a recipe, no folder of photos: add --train to train it")
     if not train and len(given or ()) > 1:
         raise ValueError(f"one folder of photos is shown at a time, got {', '.join(given or ())}")
+    # an option without effect would look as if it had one
     if (size, scale) != (None, None) and (train or not given):
         raise ValueError("--size and --scale are for photos: name a folder, or leave them out")
     from qgs_viewer.compare import compare_models, compare_trainings
@@ -204,14 +207,14 @@ def figures(
     from qgs.evaluate.results import print_lines
     from qgs.train.distributed import choose_device
     from qgs_viewer.comparison import checkpoints, open_models
-    from qgs_viewer.figures import refuse_unknown, write_figures
+    from qgs_viewer.figures import write_figures
     from qgs_viewer.remarks import domain_remarks, scale_remarks
     from qgs_viewer.scenes import model_scenes
 
-    refuse_unknown(only or ())
     folder = new_folder(out, "figures")
     models = open_models(checkpoints(runs), photos, choose_device(device))
     shown = model_scenes(models, scene=scene)
+    # before the first figure is drawn, which may take minutes
     for model in shown:
         model.scene.refuse_missing(query)
     console = Console()

@@ -32,6 +32,7 @@ def compare_models(
 ) -> None:
     """Judge `models`, by default those that come with qgs, and write their report."""
     pixels = parse_size(size)
+    # models of 128 pixels need photos of that size at least
     side = 64 if pixels and min(pixels) < 128 else 128
     names = models or (MODELS if photos is None else ON_PHOTOS[side])
     try:
@@ -43,6 +44,7 @@ def compare_models(
     console = Console()
     scenes = "Unseen scenes" if photos is None else "Your photos"
     console.print(f"Reconstructing: {scenes.lower()}", style="dim")
+    # warnings about photos concern whoever reads the page, not only the terminal
     with kept_warnings() as warnings:
         opened = open_models(files, photos, choose_device(device), pixels, scale_settings(scale))
         results = judge(opened)
@@ -71,6 +73,7 @@ def compare_trainings(
     for number, (name, recipe) in enumerate(resolved.items(), start=1):
         console.print(f"[bold]{number}/{len(resolved)}  {name}[/bold]  {seconds:g} s of training")
         train_or_exit(recipe, target / name, device)
+        # judged as saved: from files, like all other models
         files[name] = checkpoint_path(target / name)
     results = judge(open_models(files, None, choose_device(device)))
     for result in results:
@@ -90,6 +93,7 @@ def train_or_exit(recipe: Recipe, run: Path, device: str) -> None:
         raise typer.Exit(1) from None
     if result.stopped_by:
         typer.echo(f"stopped by {result.stopped_by}; no report", err=True)
+        # as a shell reports a process that a signal ended
         raise typer.Exit(128 + signal.Signals[result.stopped_by])
 
 

@@ -31,11 +31,11 @@ from qgs.reconstruction.scenes import (
 )
 from qgs.wording import short_names
 
+# Scenes, and windows of a scene, that are judged of a user's photos.
 WINDOWS = 6
-"""Scenes, and windows of a scene, that are judged of a user's photos."""
 JUDGED = ("data", "views", "evaluation", "metrics")
+# Sections of recipes that must be equal, so that only the models differ.
 TRAINED = ("optimizer", "training")
-"""Sections of recipes that must be equal, so that only the models differ."""
 OF_THE_METHOD = (
     "optimizer.parts",
     "training.judge_inputs",
@@ -59,6 +59,7 @@ class PhotoWindows(Span):
     def windows(self, scene: Scene, views: ViewsConfig) -> list[Window]:
         """See `ViewSampler`; scenes that move have none. Raises ValueError without a target."""
         if scene.times is not None:
+            # a moment of a moving scene has few views; the recipe's sampler knows which
             return []
         if scene.name not in self._known:
             windows = choose_windows(scene, views, self._trained_on, WINDOWS)
@@ -181,6 +182,7 @@ def judge(models: Sequence[Model]) -> list[Result]:
             views_of=model.search,
             sampler=model.windows,
         )
+        # the next model needs the memory of the accelerator
         model.network.cpu()
         results.append(Result(**vars(model), evaluation=evaluation))
     return results
@@ -191,6 +193,7 @@ def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str
 
     Raises ValueError when two files differ in anything but model, losses and `OF_THE_METHOD`.
     """
+    # a number of steps that no time budget reaches
     overrides = [f"training.seconds={seconds}", "training.steps=1000000000", f"seed={seed}"]
     names = short_names(files)
     recipes = {name: resolve(f, overrides) for name, f in zip(names, files, strict=True)}
@@ -207,6 +210,7 @@ def refuse_unequal(recipes: Mapping[str, Recipe], sections: Sequence[str]) -> No
 
     first = next(iter(recipes))
     for name, recipe in recipes.items():
+        # one protocol for all, or their scores could not be set side by side
         unequal = [s for s in sections if compared(s, recipe) != compared(s, recipes[first])]
         if unequal:
             raise ValueError(
@@ -251,8 +255,10 @@ def _data_of(photos: str, recipes: Collection[Recipe], size: Size | None) -> dic
     scene = next(chain(source.scenes("test"), source.scenes("train")), None)
     config = source.config
     if not own and scene is not None:
+        # cropped photos would hide part of the user's scene
         size = size or whole_size(scene, size_multiple(recipes))
         config = holding_out(config, scene)
+    # recipes know sources of data by PLUGIN/NAME
     kind = next(name for name, component in sources.items() if component is type(source))
     options = config.model_dump(mode="json")
     return {"type": kind, **options, "image_size": [*(size or config.image_size)]}
@@ -274,7 +280,9 @@ def _on_photos(
     return {
         **recipe.tree,
         "data": data,
+        # photos may need a plug-in that the recipe does not name
         "plugins": [*dict.fromkeys([*recipe.tree["plugins"], *{plugin} - {"qgs"}])],
+        # an index of the recipe's data names none of these photos
         "evaluation": {**recipe.tree["evaluation"], "scenes": WINDOWS, "index": None},
         "views": views,
     }

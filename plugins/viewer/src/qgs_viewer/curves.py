@@ -32,6 +32,7 @@ def curves_figure(curves: Mapping[str, Curves]) -> Figure:
             color = hex_color(categorical(index))
             place = run.steps if long else run.seconds
             for axis, values in ((loss_axis, run.loss), (psnr_axis, run.psnr)):
+                # single steps scatter; the pale line shows how much
                 axis.plot(place, values, color=color, alpha=0.18, linewidth=0.7)
                 axis.plot(place, running_mean(values), color=color, label=name)
         loss_axis.set(title="Training loss", xlabel="steps" if long else "seconds", yscale="log")
@@ -39,6 +40,7 @@ def curves_figure(curves: Mapping[str, Curves]) -> Figure:
         psnr_axis.set(title=title, xlabel=loss_axis.get_xlabel())
         psnr_axis.legend(loc="lower right")
         loss_axis.yaxis.set_major_formatter("{x:g}")
+        # a loss may stay within one power of ten, where major ticks alone say nothing
         loss_axis.yaxis.set_minor_formatter("{x:g}")
         loss_axis.tick_params(which="minor", color=hex_color(MUTED), labelsize=7)
     return figure

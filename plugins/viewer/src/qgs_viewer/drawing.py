@@ -15,16 +15,16 @@ from qgs_viewer.choice import Choice, anchor_colors, faded, ink, painted, query_
 from qgs_viewer.placement import corners, on_photo
 from qgs_viewer.query_scene import QueryScene
 
+# Pixels on the longer side of photos: small ones are enlarged, large reduced.
 PHOTO_SIDE = 256
-"""Pixels on the longer side of photos: small ones are enlarged, large reduced."""
+# Depth of a camera's frustum, per distance from the input cameras to the scene.
 FRUSTUM = 0.12
-"""Depth of a camera's frustum, per distance from the input cameras to the scene."""
+# Shares of the most that is read from which lines are broader.
 WIDER = (0.25, 0.6)
-"""Shares of the most that is read from which lines are broader."""
+# Strength of the colour of lines up to these shares and above.
 STRENGTHS = (0.2, 0.6, 1.0)
-"""Strength of the colour of lines up to these shares and above."""
+# Opacity of the Gaussians that count for the size of a scene.
 SOLID = 0.1
-"""Opacity of the Gaussians that count for the size of a scene."""
 
 
 class Drawing:
@@ -54,6 +54,7 @@ class Drawing:
         unit = unit or distance_to(scene)
         self.photo_depth = FRUSTUM * unit
         self.anchor_radius = 0.01 * unit
+        # viser has a background picture, and no background colour
         plain = np.full((8, 8, 3), 255.0) * scene.background
         self.api.set_background_image(plain.round().astype(np.uint8), "png")
         self._draw_photos(scene, every)
@@ -65,6 +66,7 @@ class Drawing:
         if (views := self.api.get_handle_by_name("/views")) is not None:
             views.visible = choice.photos
         self._draw_anchors(scene, choice)
+        # another query may have none of them
         for name in ("/support", "/path", "/reading", "/patches"):
             self.api.remove_by_name(name)
         if choice.query is not None:
@@ -88,6 +90,7 @@ class Drawing:
             )
         else:
             self._gaussians.set_gaussians(centers, covariances, shown.colors, shown.opacities)
+        # centres and covariances are magnified, see `Splats.magnification`
         self._gaussians.scale = 1 / factor
         self._painted = scene, paint
 
@@ -95,6 +98,7 @@ class Drawing:
         self.api.remove_by_name("/views")
         if scene.views is None:
             return
+        # one switch shows and hides all below it
         self.api.add_frame("/views", show_axes=False)
         place = scene.placement
         cameras = scene.views.cameras[0]
@@ -104,6 +108,7 @@ class Drawing:
         self._lines("/views/inputs", frustum_lines(eyes, ends), ink(scene), 2.0)
         for view, image in enumerate(scene.views.images[0]):
             corner, right, _, left = ends[view]
+            # viser's pictures lie in the plane of x and y, as those of cameras do
             turned = place.rotation @ cameras.c2w[view, :3, :3].cpu().double()
             # viser's frusta have their principal point in the middle, photos may not
             self.api.add_image(
@@ -142,6 +147,7 @@ class Drawing:
         if found is None:
             return
         axes = found.axes[0, query]
+        # viser's ball takes lengths and a rotation for the semi-axes
         lengths = axes.norm(dim=0)
         x, y, z = lengths.tolist()
         self.api.add_icosphere(
@@ -212,6 +218,7 @@ def distance_to(scene: QueryScene) -> float:
     Without cameras the median distance of the Gaussians from their middle.
     """
     means = scene.gaussians.means[0].detach().cpu()
+    # Gaussians that nobody sees may lie anywhere
     solid = means[(scene.gaussians.opacities[0] > SOLID).cpu()]
     if not len(solid):
         solid = means

@@ -14,43 +14,31 @@ from qgs.drawing.figures import figure_style, hex_color
 from qgs.files import replacing, write_text
 from qgs.wording import listed
 from qgs_viewer import sections
-from qgs_viewer.options import FIGURES
+from qgs_viewer.options import FigureName
 from qgs_viewer.scenes import ModelScenes
 from qgs_viewer.sections import Detail, Section
 
+# Inches of a figure across a page of two columns.
 WIDTH = 7.0
-"""Inches of a figure across a page of two columns."""
 DPI = 220
+# Pixels on the longer side of pictures that models render.
 SIDE = 512
-"""Pixels on the longer side of pictures that models render."""
 LAYERS = 3
 LISTING = "figures.md"
-DRAWN: Mapping[str, Callable[[Sequence[ModelScenes], Detail], Section]] = dict(
-    zip(
-        FIGURES,
-        (
-            sections.novel_views,
-            sections.queries,
-            sections.anchors,
-            sections.attention,
-            sections.training_curves,
-        ),
-        strict=True,
-    )
-)
-
-
-def refuse_unknown(names: Sequence[str]) -> None:
-    """Raise ValueError for a name that is no figure's."""
-    if unknown := [name for name in names if name not in FIGURES]:
-        raise ValueError(f"--only: no figure {listed(unknown)}; there are {listed(FIGURES)}")
+FIGURES: Mapping[FigureName, Callable[[Sequence[ModelScenes], Detail], Section]] = {
+    FigureName.NOVEL_VIEWS: sections.novel_views,
+    FigureName.QUERIES: sections.queries,
+    FigureName.ANCHORS: sections.anchors,
+    FigureName.CROSS_ATTENTION: sections.attention,
+    FigureName.CURVES: sections.training_curves,
+}
 
 
 @torch.no_grad()
 def write_figures(
     models: Sequence[ModelScenes],
     folder: Path,
-    names: Sequence[str] = (),
+    names: Sequence[FigureName] = (),
     query: int | None = None,
     notes: Sequence[str] = (),
 ) -> Iterator[str]:
@@ -65,7 +53,7 @@ def write_figures(
     )
     texts = [f"# {' and '.join(model.name for model in models)}", *notes, scene]
     for name in names or FIGURES:
-        section = DRAWN[name](models, detail)
+        section = FIGURES[name](models, detail)
         if not section.rows:
             yield f"left out {name}: {section.words['empty']}"
             texts.append(f"{name} is left out: {section.words['empty']}.")
@@ -82,6 +70,7 @@ def grid(section: Section) -> Figure:
     """Return a figure with a panel for each tile of `section`, its pixels as they are."""
     columns = max(map(len, section.rows.values()))
     tiles = [tile for tile in next(iter(section.rows.values())) if tile]
+    # all pictures of a section have the shape of its first
     height, width = np.shape(tiles[0].image)[:2]
     # each panel has a line of text above it, and room for its legend below
     lines = 1 + max(len(tile.legend) for tile in tiles)
@@ -93,6 +82,7 @@ def grid(section: Section) -> Figure:
         for axis in axes.flat:
             axis.set(xticks=[], yticks=[], frame_on=False)
         for line, (label, row_tiles) in zip(axes, section.rows.items(), strict=True):
+            # labels are turned by a right angle, where a long line has no room
             line[0].set_ylabel(label.replace(", ", "\n"))
             for axis, tile in zip(line, row_tiles, strict=False):
                 if tile is None:

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from qgs.checkpoint.gaussians import load_ply
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.contracts import Scene, ViewsConfig
+from qgs.data.images import open_rgb, to_tensor
 from qgs.data.samples import own_world, views_in
 from qgs.types import Cameras
 from qgs_viewer.query_scene import NEUTRAL, QueryScene
@@ -24,10 +24,10 @@ CAMERAS = "cameras.json"
 """Files in the folder of a finished reconstruction."""
 REFINED = "refined"
 """The folder in it with the result of `--refine`."""
+# Median distance of means, per spread of the scene, up to which a model made a PLY's Gaussians.
+#
+# A finished reconstruction keeps its photos in 8 bits, which moves means by some thousandths.
 SAME = 0.02
-"""Median distance of means, per spread of the scene, up to which a model made a PLY's Gaussians.
-
-A finished reconstruction keeps its photos in 8 bits, which moves means by some thousandths."""
 
 
 def is_finished(folder: Path) -> bool:
@@ -57,10 +57,10 @@ class FinishedScene(Scene):
         pictures = []
         for view in (self._views[frame] for frame in frames):
             name = f"{view['frame']:05d}_{view['kind'].split()[0]}.png"
-            with Image.open(self._folder / "views" / name) as image:
-                pixels = np.array(image.convert("RGB"))[:height, :width]
-            pictures.append(torch.from_numpy(pixels).permute(2, 0, 1).float() / 255)
-        return torch.stack(pictures)
+            image = open_rgb(self._folder / "views" / name, NEUTRAL)
+            # the render stands to the right of the photo
+            pictures.append(np.asarray(image)[:height, :width])
+        return to_tensor(np.stack(pictures))
 
     def label(self, frame: int) -> str:
         """The photo's file, or its number in the scene, not its place in cameras.json."""
@@ -93,8 +93,7 @@ def read_finished(folder: Path) -> tuple[QueryScene, FinishedScene, Mapping[str,
             f"{path} is no record of a reconstruction ({type(error).__name__}: {error}); make it "
             "again with `qgs reconstruct`, or view the PLY alone"
         ) from error
-    labels = [scene.label(frame) for frame in inputs]
-    plain = QueryScene(gaussians, photos, labels, inputs, background=(red, green, blue))
+    plain = QueryScene(gaussians, photos, inputs, background=(red, green, blue))
     return plain, scene, record
 
 
@@ -112,8 +111,10 @@ def open_finished(folder: Path, device: str) -> Source:
         with CheckpointFile(name) as file:
             model = file.model(device)
             recipe = file.recipe
+        # the stored cameras are in the model's world already
         views = _finished_views(scene, plain.frames, recipe.views)
         source = ModelSource(model, scene, views, plain.frames, title, notes)
+        # a model file may have changed since, so what it makes is compared
         means = source.scene_of(plain.frames).gaussians.means
     except (ValueError, OSError) as error:
         note = f"Its model cannot be used, so its queries are not shown: {error}"
@@ -128,6 +129,7 @@ def _no_queries(record: Mapping[str, Any], model: str, folder: Path) -> str:
     """Say why the queries of a reconstruction are not shown; "" where they are."""
     if record.get("refinement"):
         folder = folder.resolve()
+        # the prediction lies one folder up
         beside = folder.name == REFINED and is_finished(folder.parent)
         where = f": `qgs view {folder.parent}`" if beside else ""
         return f"It was refined; only the prediction of the model has queries{where}."
@@ -160,6 +162,7 @@ def _difference(means: Tensor, others: Tensor) -> str:
         return f"{means.shape[1]:,} instead of {others.shape[1]:,}"
     means = means.cpu().double()
     others = others.cpu().double()
+    # a median: a few far Gaussians would hide any difference
     spread = (others - others.median(1, keepdim=True).values).norm(dim=-1).median()
     far = float((means - others).norm(dim=-1).median() / spread.clamp_min(1e-12))
     return "" if far <= SAME else f"means differ by {far:.0%} of the scene"

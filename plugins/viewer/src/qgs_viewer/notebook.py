@@ -10,12 +10,12 @@ from qgs.model_text import heading, parameter_counts, slot_rows
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Prediction
 
+# Pixels of the picture of a prediction.
 SIDE = 192
-"""Pixels of the picture of a prediction."""
+# Share of the Gaussians that it may leave out at its sides.
 OUTSIDE = 0.04
-"""Share of the Gaussians that it may leave out at its sides."""
+# Tangent of half the widest view.
 WIDEST = 1.2
-"""Tangent of half the widest view."""
 
 
 def model_html(model: QueryGaussianModel) -> str:
@@ -62,6 +62,7 @@ def prediction_png(prediction: Prediction) -> bytes | None:
     before = means[(means[:, 2] > 0) & (gaussians.opacities[0] > 0.05)]
     if len(before) == 0:
         return None
+    # the view is as wide as what lies before the origin, less outliers
     slopes = (before[:, :2] / before[:, 2:]).abs().amax(-1)
     focal = SIDE / 2 / float(slopes.quantile(1 - OUTSIDE).clamp(0.1, WIDEST))
     lens = means.new_tensor([[[focal, focal, SIDE / 2, SIDE / 2]]])

@@ -64,10 +64,12 @@ def open_model(name: str, options: ViewOptions) -> Source:
     chosen = None if options.frames is None else frame_list(options.frames, "--frames", scene)
     trained = model.trained_on or Domain()
     own = options.photos is None or is_training_data(options.photos, recipe.data_config)
+    # photos of a user have a unit of their own
     search = ScaleSearch(model, photo_settings(recipe.views, own, options.overrides))
     sample, _ = choose_sample(scene, recipe.views, options.inputs, chosen, None, trained, search)
     frames = sample.input_frames
     scales = list(search.found.values())
+    # users learn if their photos are like those of the training
     seen = Domain()
     seen.see(sample.inputs.cameras, sample.targets.cameras)
     notes = [

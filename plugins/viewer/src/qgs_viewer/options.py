@@ -1,22 +1,31 @@
 """Options of the viewer's commands, and the models that they take; none of it needs torch."""
 
+from enum import StrEnum, auto
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
 import typer
 
-FIGURES = ("novel_views", "queries", "anchors", "cross_attention", "curves")
-"""Names of the figures, in the order of figures.md."""
 
+class FigureName(StrEnum):
+    """Names of the figures, in the order of figures.md."""
+
+    NOVEL_VIEWS = auto()
+    QUERIES = auto()
+    ANCHORS = auto()
+    CROSS_ATTENTION = auto()
+    CURVES = auto()
+
+
+# The shipped models that are compared on unseen rooms.
 MODELS = ("rooms/tokengs-64", "rooms/locus-64", "rooms/landmark-64")
-"""The shipped models that are compared on unseen rooms."""
 ON_PHOTOS = {
     64: ("worlds/landmark-64", "worlds/locus-64", "worlds/tokengs-64"),
     128: ("worlds/landmark-128", "rooms/landmark-128", "rooms/locus-128"),
 }
 """By pixels, on a user's photos; the first's training decides which photos are inputs."""
+# The recipes that `qgs demo --train` trains.
 RECIPES = ("recipes/tiny/tokengs.yaml", "recipes/tiny/locus.yaml")
-"""The recipes that `qgs demo --train` trains."""
 Source: TypeAlias = Annotated[
     str,
     typer.Argument(help="Run folder, checkpoint, PLUGIN/NAME, PLY, or what qgs reconstruct wrote."),
@@ -87,6 +96,5 @@ Seed: TypeAlias = Annotated[
     int | None, typer.Option(min=0, help="With --train: seed of every recipe; default 0.")
 ]
 Only: TypeAlias = Annotated[
-    list[str] | None,
-    typer.Option(metavar="NAME", help=f"Draw this figure: {', '.join(FIGURES)}; repeatable."),
+    list[FigureName] | None, typer.Option(help="Draw this figure; repeatable.")
 ]

@@ -30,6 +30,7 @@ def scene_html(
         Drawing(server.scene).put(scene, choice, unit=distance_to(start))
         page = server.get_scene_serializer().as_html()
     head = files("qgs_viewer") / "template" / "head.html"
+    # before viser's code, which reads what it changes
     return page.replace("<head>", f"<head>{head.read_text(encoding='utf-8')}", 1)
 
 
@@ -56,9 +57,7 @@ def scenes_html(
 
 def gaussians_html(gaussians: Gaussians, views: Views, background: Background = NEUTRAL) -> str:
     """Return a page of Gaussians (1, G) and the cameras of some photos (1, V) in their world."""
-    count = views.images.shape[1]
-    scene = QueryScene(gaussians, views, [""] * count, range(count), background=background)
-    return scene_html(scene)
+    return scene_html(QueryScene(gaussians, views, background=background))
 
 
 def shared_start(scenes: Iterable[QueryScene]) -> QueryScene:

@@ -19,12 +19,12 @@ from qgs_viewer.query_scene import QueryScene
 from qgs_viewer.server import stand
 from qgs_viewer.sources import ModelSource, Source
 
+# Photos that each have a check box; more are named in a line of text.
 MOST_BOXES = 24
-"""Photos that each have a check box; more are named in a line of text."""
+# Pixels on the longer side of photos that show attention.
 PHOTO_SIDE = 192
-"""Pixels on the longer side of photos that show attention."""
+# In the field `query` while none is picked.
 NONE = -1
-"""In the field `query` while none is picked."""
 
 
 class Panel:
@@ -45,6 +45,7 @@ class Panel:
         self._add_head()
         if self.scene.queries:
             self._add_query()
+        # a PLY has no photos to choose from
         if source.labels:
             self._add_inputs()
         if source.notes:
@@ -108,6 +109,7 @@ class Panel:
                     box.on_update(self._reframed)
                     self.boxes.append(box)
             else:
+                # hundreds of boxes would hide the other controls
                 text = ",".join(map(str, self.source.frames))
                 hint = f"Numbers or file names, commas between; 0 to {len(labels) - 1}."
                 self.frames = gui.add_text("input photos", text, hint=hint)
@@ -188,6 +190,7 @@ class Panel:
 
     def under(self, origin: np.ndarray, direction: np.ndarray) -> int | None:
         """Return the query under a ray of what is shown: by its anchor, or by its Gaussians."""
+        # anchors are drawn over Gaussians, so they are hit first
         found = self.scene.support(self.choice.layer) if self.choice.anchors else None
         if found is not None:
             numbers, _ = anchor_colors(self.scene, self.choice)

@@ -11,10 +11,10 @@ from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Cameras, Gaussians
 from qgs.wording import warn_once
 
+# Blending weight on a clicked ray below which a Gaussian is not hit.
 LEAST_WEIGHT = 0.02
-"""Blending weight on a clicked ray below which a Gaussian is not hit."""
+# A half of the largest number of float16, which viewers get covariances in.
 FLOAT16 = 2.0**15
-"""A half of the largest number of float16, which viewers get covariances in."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,7 @@ class Placement:
         """Return the map from a model's `world`, see `own_world`, into the `other` one."""
         pose, scale = world
         other_pose, other_scale = other
+        # out of the model's world into the photos', and into the other one
         both = torch.linalg.inv(other_pose.double()) @ pose.double()
         factor = float(other_scale) / float(scale)
         return Placement(both[:3, :3], both[:3, 3] * float(other_scale), factor)
@@ -101,6 +102,7 @@ def hit(found: Splats, origin: np.ndarray, direction: np.ndarray) -> int | None:
     distances = np.einsum("gi,gij,gj->g", nearest, precision, nearest)
     alphas = np.where(depths > 0, np.exp(-distances / 2), 0) * found.opacities[:, 0]
     order = np.argsort(depths)
+    # light that is left after the Gaussians before
     left = np.cumprod(np.concatenate([[1.0], 1 - alphas[order]]))[:-1]
     weights = alphas[order] * left
     best = int(weights.argmax())

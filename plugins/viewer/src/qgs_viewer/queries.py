@@ -17,13 +17,13 @@ from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, SpatialSupport
 
 ATTENTION_COLOR = categorical(0)
+# Lines are drawn on pictures so many times as large, which smooths them.
 OVERSAMPLING = 3
-"""Lines are drawn on pictures so many times as large, which smooths them."""
+# Part of a picture along its border, where no query is chosen to be shown.
 MARGIN = 0.15
-"""Part of a picture along its border, where no query is chosen to be shown."""
 OUTLINE_POINTS = 96
+# Pixels from the picture's corner to which lines are drawn; Pillow fails far outside.
 FARTHEST = 1e4
-"""Pixels from the picture's corner to which lines are drawn; Pillow fails far outside."""
 
 
 @full_precision
@@ -89,7 +89,9 @@ def support_picture(
     scale = OVERSAMPLING * photo.shape[1] / cameras.size[1]
     depths = to_camera(support.centers[:1], cameras)[0, 0, :, 2]
     places = _tuples(_pixels(support.centers[0], cameras) * scale)
+    # near ones cover far ones, and the chosen ones cover all
     farthest_first = depths.argsort(descending=True).tolist()
+    # colours of the photo would compete with those of the queries
     image = _oversampled(washed(photo, 0.45))
     draw = ImageDraw.Draw(image, "RGBA")
     for query in [*(q for q in farthest_first if q not in colors), *colors]:
@@ -121,6 +123,7 @@ def attention_pictures(photos: list[Picture], maps: np.ndarray) -> list[Picture]
     seen = maps[np.isfinite(maps)]
     low = float(seen.min()) if seen.size else 0.0
     high = float(seen.max()) if seen.size else 1.0
+    # one scale for all photos: a query may read one of them alone
     shades = (maps - low) / max(high - low, 1e-12)
     pictures = []
     for photo, shade in zip(photos, shades, strict=True):
@@ -201,6 +204,7 @@ def _spread(order: Sequence[int], places_N2: Tensor, small_N: Tensor, count: int
     small = [i for i in inside if small_N[i]]
     distance = 0.6 / count**0.5
     chosen = list[int]()
+    # each try asks for less than the one before
     tries = ((small, distance), (inside, distance), (inside, distance / 2), (order, 0.0))
     for candidates, least in tries:
         for i in candidates:
@@ -224,7 +228,9 @@ def query_picture(
     shown = gaussians[:, members.flatten().to(gaussians.means.device)]
     paint = torch.tensor([q.color for q in chosen]).view(-1, 3).to(shown.colors) / 255
     colors = paint.repeat_interleave(per_query, 0)[None]
+    # a query whose Gaussians are nearly clear is still seen
     visible = replace(_painted(shown, colors), opacities=shown.opacities.clamp_min(0.5))
+    # over black, so that its colour and alpha can be mixed with the scene
     painted = model.render(visible, cameras, torch.zeros(3))
     alpha = painted.alpha[0, 0, 0].cpu().numpy()[..., None]
     color = painted.rgb[0, 0].permute(1, 2, 0).cpu().numpy() * 255

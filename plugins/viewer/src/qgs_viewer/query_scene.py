@@ -38,7 +38,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class QueryScene:
-    """Gaussians (1, G), the input views (1, V) with labels, and the placement in the shown world.
+    """Gaussians (1, G), the input views (1, V), and the placement in the shown world.
 
     inside: None without a model; then there are no queries. frames: numbers of the views in their
     scene. background: RGB in [0, 1] behind the Gaussians.
@@ -46,7 +46,6 @@ class QueryScene:
 
     gaussians: Gaussians
     views: Views | None = None
-    labels: Sequence[str] = ()
     frames: Sequence[int] = ()
     placement: Placement = field(default_factory=Placement.identity)
     inside: Inside | None = None
@@ -143,6 +142,7 @@ class QueryScene:
         pixels = patch_centers(self.grid, cameras.size)
         points = on_photo(cameras, pixels, depth / self.placement.scale).flatten(0, 1)
         shares = weights.weights[0, :, 0].float().mean(0).cpu()
+        # heads differ, the mean is what figures of papers show
         strongest = shares.topk(min(count, len(shares)))
         side = depth * cameras.size[1] / self.grid[2] / float(cameras.intrinsics[0, 0])
         read = self.placement.points(points.cpu()[strongest.indices])
@@ -153,7 +153,6 @@ class QueryScene:
 def explained(
     model: QueryGaussianModel,
     views: Views,
-    labels: Sequence[str] = (),
     frames: Sequence[int] = (),
     placement: Placement | None = None,
 ) -> QueryScene:
@@ -161,11 +160,11 @@ def explained(
     memory = model.encoder(views)
     start = model.queries(memory, views)
     prediction = model.predict(views, memory, start, range(1, model.depth + 1))
+    # supports are asked for layer by layer, and the start counts as a layer
     states = [start, *(layer.state for layer in prediction.layers.values())]
     return QueryScene(
         gaussians=prediction.gaussians,
         views=views,
-        labels=labels or [f"view {view}" for view in range(views.images.shape[1])],
         frames=frames,
         placement=placement or Placement.identity(),
         inside=Inside(model, memory, states),

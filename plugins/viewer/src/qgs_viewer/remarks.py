@@ -67,6 +67,7 @@ def remarks(results: Sequence[Result]) -> list[str]:
         evaluation = result.evaluation
         missing = [f"{f.scene} is not judged: {f.reason}" for f in evaluation.missing]
         for remark in (*evaluation.remarks, *missing):
+            # the same remark on three models stands once, with their names
             names.setdefault(remark, []).append(result.name)
     texts = [f"{', '.join(models)}: {remark}." for remark, models in names.items()]
     return [*chosen_windows(results[0]), *texts, *scale_remarks(results)]
@@ -98,7 +99,10 @@ def next_commands(
     names: the models as a command line names them. target: the folder of the report; what the
     commands write goes there, since it is new. options: those of the report for its photos.
     """
-    best = shlex.quote(names[_best(results)])
+    first, column = next(iter(results[0].evaluation.columns.items()))
+    scores = [result.scores[first] for result in results]
+    # of equal ones the first
+    best = shlex.quote(names[scores.index(column.best(scores))])
     scene = shlex.quote(f"{target / 'scene'}")
     if photos is None:
         compare = f"qgs report {shlex.join(names)} --photos PHOTOS"
@@ -112,6 +116,7 @@ def next_commands(
             "qgs recipes": "lists recipes, each a model to train or to change",
         }
     scenes = [*dict.fromkeys(score.scene for score in results[0].evaluation.scores)]
+    # qgs reconstruct and qgs view take one scene
     chosen = ["--scene", scenes[0]] if len(scenes) > 1 else []
     given = f"{best} {shlex.join([photos, *chosen, *options])}"
     return {
@@ -119,10 +124,3 @@ def next_commands(
         f"qgs refine {scene} {shlex.quote(photos)}": REFINED,
         f"qgs view {given}": SCENE,
     }
-
-
-def _best(results: Sequence[Result]) -> int:
-    """Return the place of the best score in the first column; the first of equal ones."""
-    name, column = next(iter(results[0].evaluation.columns.items()))
-    scores = [result.scores[name] for result in results]
-    return scores.index(column.best(scores))

@@ -26,8 +26,8 @@ from qgs_viewer.scenes import ModelScenes, model_scenes
 from qgs_viewer.sections import Detail
 
 PICTURED_SCENES = 6
+# Target views of each scene that are shown.
 TARGETS = 2
-"""Target views of each scene that are shown."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,10 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table of scores. best: for each cell, if no other model has a better value."""
+    """A line of the table of scores: cells, and if no other model has a better value."""
 
     name: str
-    cells: Sequence[str]
-    best: Sequence[bool]
+    cells: Sequence[tuple[str, bool]]
     baseline: bool = False
 
 
@@ -63,20 +62,19 @@ def score_rows(results: Sequence[Result]) -> list[Row]:
     rows = []
     for result in results:
         cells = []
-        leads = []
         for name, column in columns.items():
             cell = column.shown(result.scores[name])
             best = column.best(other.scores[name] for other in results)
-            cells.append(cell)
             # cells that read alike are both best
-            leads.append(best is not None and cell == column.shown(best))
-        sizes = [f"{result.evaluation.gaussians:,}", f"{result.parameters:,}"]
-        rows.append(Row(result.name, [*cells, *sizes], [*leads, False, False]))
+            cells.append((cell, best is not None and cell == column.shown(best)))
+        sizes = (result.evaluation.gaussians, result.parameters)
+        rows.append(Row(result.name, [*cells, *((f"{size:,}", False) for size in sizes)]))
     for baseline in BASELINES:
-        scores = results[0].evaluation.means(baseline)
-        cells = [column.shown(scores[name]) for name, column in columns.items()]
-        name = baseline.replace("_", " ").capitalize()
-        rows.append(Row(name, [*cells, "–", "–"], [False] * (len(cells) + 2), baseline=True))
+        means = results[0].evaluation.means(baseline)
+        shown = [column.shown(means[name]) for name, column in columns.items()]
+        # they have neither Gaussians nor parameters
+        cells = [(cell, False) for cell in (*shown, "–", "–")]
+        rows.append(Row(baseline.replace("_", " ").capitalize(), cells, baseline=True))
     return rows
 
 
@@ -85,9 +83,7 @@ def show_scores(comparison: Comparison, console: Console) -> None:
     columns = comparison.results[0].evaluation.columns.values()
     rows = [["", *(column.title for column in columns), "Gaussians", "parameters"]]
     for row in score_rows(comparison.results):
-        cells = []
-        for cell, best in zip(row.cells, row.best, strict=True):
-            cells.append(f"[green]{cell}[/green]" if best else cell)
+        cells = [f"[green]{cell}[/green]" if best else cell for cell, best in row.cells]
         # names keep to one line, which a blank would end
         rows.append([escape(row.name).replace(" ", "\u00a0"), *cells])
     look = {"caption": "best in green", "box": box.SIMPLE_HEAD}
@@ -104,6 +100,7 @@ def facts_of(results: Sequence[Result]) -> dict[str, str]:
         machine = torch.cuda.get_device_name()
     software = {"torch": torch.__version__}
     for result in results:
+        # versions of plug-ins that these models were built by
         software |= {name: v for name, (_, v) in result.recipe.releases.items()}
     threads = counted(torch.get_num_threads(), "thread")
     return {
@@ -159,6 +156,7 @@ def write_report(comparison: Comparison, folder: Path, console: Console) -> None
     show_scores(comparison, console)
     for name, fact in comparison.facts.items():
         console.print(f"{name}: {fact}", soft_wrap=True, highlight=False, style="dim")
+    # the table first: the page takes longer
     page = folder / "report.html"
     write_text(page, report_html(comparison, models))
     console.print(f"\n[bold]Report:[/bold] {page.resolve()}", soft_wrap=True)

@@ -80,6 +80,7 @@ def model_scenes(
                 evaluation,
                 views_of=model.search,
                 sampler=model.windows or model.recipe.build_view_sampler(),
+                # true depths cost as much as photos to decode, and one copy is enough
                 depths=not shown,
             )[:most]
         shown.append(scenes_of(model.name, model.network, _with_first(samples, scene), model.file))
@@ -90,6 +91,7 @@ def _with_first(samples: Sequence[Sample], scene: str | None) -> Sequence[Sample
     names = dict.fromkeys(sample.scene for sample in samples)
     if scene is not None and scene not in names:
         raise ValueError(f"--scene: {scene!r} is not judged; scenes are {listed(names)}")
+    # sorting is stable: the others keep their order
     return sorted(samples, key=lambda sample: sample.scene != scene)
 
 
@@ -98,15 +100,14 @@ def scenes_of(
     name: str, network: QueryGaussianModel, samples: Sequence[Sample], file: Path | None = None
 ) -> ModelScenes:
     """Reconstruct `samples`; `file` is the checkpoint, beside which curves may lie."""
+    # components draw random numbers in training mode
     network.eval()
     device = next(network.parameters()).device
     own = [
         replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
         for sample in samples
     ]
-    frames = own[0].input_frames
-    labels = [own[0].label(frame) for frame in frames]
-    scene = explained(network, own[0].inputs, labels, frames)
+    scene = explained(network, own[0].inputs, own[0].input_frames)
     others = [network(sample.inputs).gaussians for sample in own[1:]]
     curves = curves_of(file) if file else None
     return ModelScenes(name, network, own, [scene.gaussians, *others], scene, curves)

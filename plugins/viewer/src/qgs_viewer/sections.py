@@ -138,6 +138,7 @@ def anchors(models: Shown, detail: Detail) -> Section:
         drawn = model.notable(ANCHORS, camera, detail.query)
         colors = {query.index: query.color for query in drawn}
         photo = images.enlarged(rgb_picture(model.samples[0].inputs.images[0, 0]), detail.side)
+        # others start from the photos, so their start differs by scene
         learned = isinstance(model.network.queries, LearnedQueries)
         layers = range(model.scene.depth + 1)
         tiles = []
@@ -158,6 +159,7 @@ def attention(models: Shown, detail: Detail) -> Section:
         depth = model.scene.depth
         layers = [depth] if detail.layers is None else evenly(range(1, depth + 1), detail.layers)
         for layer in layers:
+            # half the side: photos stand side by side in one picture
             found = attention_pictures_of(model.scene, query.index, layer, detail.side // 2)
             tiles: list[Tile | None] = []
             for part in ("content", "geometry", "result"):
@@ -228,7 +230,9 @@ def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[st
         quality = [f"{Psnr.column.shown(score)} {Psnr.column.unit}" for score in scores]
         colors[model.name] = _photos(rgb, quality)
         errors[model.name] = color_error(rgb, truth)
+        # models may see the scene in worlds of different units
         depths[model.name] = rendering.depth[0] * ratio(sample, own)
+    # one scale for truth and models, or pictures could not be compared
     near, far = depth_range(torch.cat(list(depths.values())))
     most = depth_range(torch.cat(list(errors.values())))[1]
     kinds: dict[str, dict[str, list[Tile]]] = {"Render": colors, "Error": {}, "Depth": {}}

@@ -23,10 +23,10 @@ from qgs.geometry.poses import look_at_depth
 from qgs_viewer.drawing import FRUSTUM, distance_to
 from qgs_viewer.query_scene import QueryScene
 
+# Vertical angle of the viewer's window, radians.
 FIELD_OF_VIEW = 0.95
-"""Vertical angle of the viewer's window, radians."""
+# Length of the mean of unit vectors below which they have no direction in common.
 SHORT = 0.3
-"""Length of the mean of unit vectors below which they have no direction in common."""
 
 
 @contextmanager
@@ -46,6 +46,7 @@ def quiet_server(
         with redirect_stdout(io.StringIO()):
             server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     finally:
+        # other servers of this process are not to be guarded by this host
         sockets.serve = serve
     try:
         yield server
@@ -63,6 +64,7 @@ def foreign(headers: Headers, host: str) -> bool:
     """
     named = headers.get("Host", "")
     origin = headers.get("Origin")
+    # browsers send it with every request of a page's script
     if origin is not None and urlsplit(origin).netloc != named:
         return True
     name = urlsplit(f"//{named}").hostname or ""
@@ -137,6 +139,7 @@ def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
     if forward.norm() < SHORT:
         away = 1.5 * max(float((eyes - middle).norm(dim=-1).max()), unit)
         return (middle + away * (0.3 * up - ahead[0])).numpy(), middle.numpy()
+    # from a little behind, above and beside, depth is seen
     aside = scene.placement.rotation @ c2w[0, :3, 0]
     place = eye - 0.3 * unit * forward + 0.2 * unit * aside + 0.2 * unit * up
     return place.numpy(), (eye + unit * forward).numpy()

@@ -63,13 +63,14 @@ class ModelSource(Source):
         """Reconstruct from these frames, and place the result in the shown world."""
         if not frames:
             raise ValueError("a reconstruction needs an input photo: choose one at least")
+        # refuses frames that are not there, twice or too many
         picked, _ = checked_window(len(self.scene), frames)
         world = own_world(self.scene, picked, self.views)
         device = next(self.model.parameters()).device
         inputs = make_sample(self.scene, picked, (), self.views, mirror=False).inputs.to(device)
+        # other inputs have another world, while the user's view stays
         place = Placement.between(world, self.world)
-        labels = [self.labels[frame] for frame in picked]
-        return explained(self.model, inputs, labels, picked, place)
+        return explained(self.model, inputs, picked, place)
 
     def cameras(self) -> Cameras | None:
         """Return the cameras of all frames of the scene."""

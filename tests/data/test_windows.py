@@ -4,7 +4,7 @@ import pytest
 import textured_room
 import torch
 import yaml
-from small import arc, pinhole
+from walk import arc, pinhole
 
 from qgs.contracts import ViewsConfig
 from qgs.data.depth import scene_depth

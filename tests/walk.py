@@ -1,0 +1,36 @@
+"""Cameras on arcs, and a scene that a camera walks past."""
+
+import torch
+
+from qgs.contracts import Scene
+from qgs.geometry.poses import look_at
+from qgs.types import Cameras
+
+FRAMES = 6
+SIDE = 64
+
+
+def arc(degrees, radius, rise=0.0):
+    """Poses (V, 4, 4) of cameras around the origin, which they look at, y down."""
+    angles = torch.as_tensor(degrees).double().deg2rad()
+    axes = torch.stack([angles.sin(), rise * angles, angles.cos()], -1)
+    return look_at(-radius * axes, axes, torch.tensor([0.0, 1.0, 0.0]).expand_as(axes).double())
+
+
+def pinhole(c2w, lens=(64.0, 64.0, 32.0, 32.0), size=(SIDE, SIDE)):
+    """Cameras (V,)."""
+    return Cameras(c2w, torch.tensor(lens).to(c2w).expand(len(c2w), 4), size)
+
+
+class Walk(Scene):
+    """Photos of noise by cameras on an arc that look at one point, principal point off centre."""
+
+    name = "walk"
+    cameras = pinhole(arc(range(-30, 31, 12), 3, 0.1), (59.0, 65.0, 35.0, 30.0))
+
+    def images(self, frames):
+        every = torch.rand(FRAMES, 3, SIDE, SIDE, generator=torch.Generator().manual_seed(1))
+        return every[list(frames)]
+
+    def frame_name(self, frame):
+        return f"photos/{frame:02d}.png"
