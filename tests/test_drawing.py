@@ -1,6 +1,7 @@
 """Pictures of tensors keep what they show, and pages hold them."""
 
 import numpy as np
+import pytest
 import torch
 
 from qgs.drawing.images import (

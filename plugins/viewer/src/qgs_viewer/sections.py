@@ -11,6 +11,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from qgs.containers import map_tensors
 from qgs.contracts import LearnedQueries
 from qgs.data.samples import evenly
 from qgs.drawing import images
@@ -18,7 +19,6 @@ from qgs.drawing.figures import figure_picture
 from qgs.drawing.images import Picture, depth_picture, depth_range, rgb_picture, side_by_side
 from qgs.metrics.images import Psnr, psnr
 from qgs.reconstruction.saving import orbit_path
-from qgs.types import map_tensors
 from qgs.wording import listed
 from qgs_viewer.choice import Choice
 from qgs_viewer.curves import curves_figure
