@@ -33,8 +33,8 @@ from qgs.wording import short_names
 
 # Scenes, and windows of a scene, that are judged of a user's photos.
 WINDOWS = 6
-JUDGED = ("data", "views", "evaluation", "metrics")
 # Sections of recipes that must be equal, so that only the models differ.
+JUDGED = ("data", "views", "evaluation", "metrics")
 TRAINED = ("optimizer", "training")
 OF_THE_METHOD = (
     "optimizer.parts",

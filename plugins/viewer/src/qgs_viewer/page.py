@@ -34,20 +34,17 @@ def scene_html(
     return page.replace("<head>", f"<head>{head.read_text(encoding='utf-8')}", 1)
 
 
-def scenes_html(
-    scenes: Mapping[str, QueryScene], choices: Mapping[str, Choice] | None = None
-) -> str:
+def scenes_html(scenes: Mapping[str, QueryScene], choices: Mapping[str, Choice]) -> str:
     """Return a page of scenes side by side, by name, all seen from `shared_start` at first.
 
-    choices: by default as in `scene_html`. The page is dark where the page or the system around it
-    is.
+    choices: for scenes without one as in `scene_html`. The page is dark where the page or the
+    system around it is.
     """
     start = shared_start(scenes.values())
-    chosen = choices or {}
     data = {}
     shell = ("", "")
     for name, scene in scenes.items():
-        before, _, rest = scene_html(scene, chosen.get(name), start=start).partition(DATA)
+        before, _, rest = scene_html(scene, choices.get(name), start=start).partition(DATA)
         data[name], after = rest.split('"', 1)
         # all pages have the same code of viser, so one page holds it once
         shell = (before + DATA, '"' + after)

@@ -44,6 +44,10 @@ def attention_pictures_of(
 def sheet(pictures: list[Picture]) -> Picture:
     """Put all pictures into one, COLUMNS in a row."""
     columns = min(COLUMNS, len(pictures))
-    padded = [*pictures, *[np.full_like(pictures[0], 255)] * (-len(pictures) % columns)]
-    rows = range(0, len(padded), columns)
-    return np.concatenate([side_by_side(padded[row : row + columns]) for row in rows], 0)
+    # the last row may lack some
+    blank = np.full_like(pictures[0], 255)
+    rows = []
+    for first in range(0, len(pictures), columns):
+        row = [*pictures[first : first + columns], *[blank] * columns]
+        rows.append(side_by_side(row[:columns]))
+    return np.concatenate(rows)
