@@ -218,7 +218,7 @@ def figures(
     for model in shown:
         model.scene.refuse_missing(query)
     console = Console()
-    notes = [*domain_remarks(models, shown), *scale_remarks(models)]
+    notes = [*domain_remarks(models, shown), *scale_remarks(models, option="")]
     print_lines(console, notes)
     print_lines(console, write_figures(shown, folder, only or (), query, notes))
 

@@ -39,11 +39,11 @@ def summary(found: Collection[FoundScale], option: str = "--scale FACTOR") -> st
     return f"{text}; {option} sets another" if option else text
 
 
-def scale_remarks(models: Sequence[Model]) -> Iterator[str]:
-    """Yield a sentence for each model whose scales were searched."""
+def scale_remarks(models: Sequence[Model], option: str = "--scale FACTOR") -> Iterator[str]:
+    """Yield a sentence for each model whose scales were searched; `option` sets another scale."""
     for model in models:
         if found := model.search.found.values():
-            yield f"{model.name}: {summary(found)}."
+            yield f"{model.name}: {summary(found, option)}."
     if models[0].recipe.views.scale == "auto":
         yield AUTO_SCALE
 
