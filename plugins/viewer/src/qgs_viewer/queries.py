@@ -77,18 +77,13 @@ def _reduced(image: Image.Image) -> Picture:
     return np.asarray(image.resize(size, Image.Resampling.LANCZOS))
 
 
-def _tuples(points: Tensor) -> list[tuple[float, ...]]:
-    """Return points (P, 2) as Pillow takes them."""
-    return [tuple(point) for point in points.tolist()]
-
-
 def support_picture(
     photo: Picture, support: SpatialSupport, cameras: Cameras, colors: Mapping[int, Color]
 ) -> Picture:
     """Draw all centres as dots, queries of `colors` as ellipses, on the view of cameras (1, 1)."""
     scale = OVERSAMPLING * photo.shape[1] / cameras.size[1]
     depths = to_camera(support.centers[:1], cameras)[0, 0, :, 2]
-    places = _tuples(_pixels(support.centers[0], cameras) * scale)
+    places = (_pixels(support.centers[0], cameras) * scale).tolist()
     # near ones cover far ones, and the chosen ones cover all
     farthest_first = depths.argsort(descending=True).tolist()
     # colours of the photo would compete with those of the queries
@@ -98,7 +93,7 @@ def support_picture(
         color = colors.get(query)
         border = outline(support, query, cameras) if color else None
         if color and border is not None:
-            points = _tuples(border * scale)
+            points = (border * scale).flatten().tolist()
             draw.polygon(points, fill=(*color, 22))
             draw.line(points, fill=(*color, 255), width=2 * OVERSAMPLING, joint="curve")
         if depths[query] > 0:
@@ -240,8 +235,8 @@ def query_picture(
     for query, means in zip(chosen, shown.means[0].split(per_query), strict=False):
         front = to_camera(means[None], cameras)[0, 0, :, 2] > 1e-3
         points = torch.cat([means.mean(0, keepdim=True), means[front]])
-        hub, *rays = _tuples(_pixels(points, cameras) * OVERSAMPLING)
+        hub, *rays = (_pixels(points, cameras) * OVERSAMPLING).tolist()
         for end in rays:
-            draw.line([hub, end], fill=(*query.color, 200), width=OVERSAMPLING)
+            draw.line([*hub, *end], fill=(*query.color, 200), width=OVERSAMPLING)
             draw.circle(end, 1.6 * OVERSAMPLING, fill=(*query.color, 255), outline=(*INK, 160))
     return _reduced(image)

@@ -1,6 +1,7 @@
 """Sources of scenes to look at: Gaussians alone, or a model that reconstructs any photos."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.samples import make_sample, own_world
@@ -12,6 +13,7 @@ from qgs_viewer.placement import Placement
 from qgs_viewer.query_scene import QueryScene, explained
 
 
+@dataclass
 class Source:
     """Gaussians of no known model, whose inputs cannot be changed.
 
@@ -19,15 +21,11 @@ class Source:
     the inputs cannot be changed.
     """
 
+    title: str
+    notes: Sequence[str] = ()
+    fixed: QueryScene | None = None
     frames: Sequence[int] = ()
     labels: Sequence[str] = ()
-
-    def __init__(
-        self, title: str, notes: Sequence[str] = (), fixed: QueryScene | None = None
-    ) -> None:
-        self.title = title
-        self.notes = notes
-        self.fixed = fixed
 
     def scene_of(self, frames: Sequence[int]) -> QueryScene:
         """Return the scene as made of these frames. Raises ValueError where they do not fit."""
@@ -51,13 +49,12 @@ class ModelSource(Source):
         title: str,
         notes: Sequence[str] = (),
     ) -> None:
-        super().__init__(title, notes)
+        labels = [scene.label(frame) for frame in range(len(scene))]
+        super().__init__(title, notes, frames=tuple(frames), labels=labels)
         self.model = model
         self.scene = scene
         self.views = views
-        self.frames = tuple(frames)
-        self.labels = [scene.label(frame) for frame in range(len(scene))]
-        self.world = own_world(scene, self.frames, views)
+        self.world = own_world(scene, tuple(frames), views)
 
     def scene_of(self, frames: Sequence[int]) -> QueryScene:
         """Reconstruct from these frames, and place the result in the shown world."""
