@@ -10,11 +10,12 @@ import torch
 from rich import box
 from rich.console import Console
 from rich.markup import escape
+from rich.table import Table
 
 from qgs.checkpoint.gaussians import save_ply
 from qgs.drawing import images, page_environment
 from qgs.drawing.figures import hex_color
-from qgs.evaluate.results import print_lines, print_table
+from qgs.evaluate.results import print_lines
 from qgs.files import write_text
 from qgs.metrics.baselines import BASELINES
 from qgs.recipe.schema import summary_of
@@ -80,14 +81,17 @@ def score_rows(results: Sequence[Result]) -> list[Row]:
 
 def show_scores(comparison: Comparison, console: Console) -> None:
     """Print the table of scores."""
+    look = {"box": box.SIMPLE_HEAD, "pad_edge": False, "collapse_padding": True}
+    table = Table(title=comparison.scenes, caption="best in green", **look)
+    # headings may wrap where a terminal is narrow, names may not
+    table.add_column("", no_wrap=True)
     columns = comparison.results[0].evaluation.columns.values()
-    rows = [["", *(column.title for column in columns), "Gaussians", "parameters"]]
+    for heading in (*(column.title for column in columns), "Gaussians", "parameters"):
+        table.add_column(heading, justify="right")
     for row in score_rows(comparison.results):
         cells = [f"[green]{cell}[/green]" if best else cell for cell, best in row.cells]
-        # names keep to one line, which a blank would end
-        rows.append([escape(row.name).replace(" ", "\u00a0"), *cells])
-    look = {"caption": "best in green", "box": box.SIMPLE_HEAD}
-    print_table(console, comparison.scenes, rows, pad_edge=False, collapse_padding=True, **look)
+        table.add_row(escape(row.name), *cells, style="dim" if row.baseline else None)
+    console.print(table)
 
 
 def facts_of(results: Sequence[Result]) -> dict[str, str]:
