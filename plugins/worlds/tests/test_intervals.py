@@ -5,11 +5,11 @@ from random import Random
 
 import numpy as np
 import pytest
-from qgs_worlds import rows as r
-from qgs_worlds.intervals import clearances
-from qgs_worlds.materials import height_maps
-from qgs_worlds.raycast import trace
-from qgs_worlds.shapes import Primitive, Shape, any_turn, packed, rod
+from qgs_worlds.caster import tables as s
+from qgs_worlds.caster.intervals import clearances
+from qgs_worlds.caster.raycast import trace
+from qgs_worlds.worlds.materials import height_maps
+from qgs_worlds.worlds.shapes import Primitive, Shape, any_turn, packed, rod
 from scipy.ndimage import map_coordinates
 
 MAPS = height_maps(3, 2)
@@ -35,12 +35,12 @@ def inside(primitive, points):
     places = (np.stack([x, y]) + 1) / 2 * (len(field) - 1)
     relief = map_coordinates(field, places, order=1, mode="nearest")
     return {
-        r.ELLIPSOID: x * x + y * y + z * z - 1,
-        r.BOX: cube,
-        r.FRUSTUM: np.maximum(abs(z) - 1, flat - (1 + extra + (extra - 1) * z) / 2),
-        r.CAPSULE: np.hypot(flat, z - np.clip(z, -extra, extra)) - 1,
-        r.TORUS: np.hypot(flat - 1 + extra, z) - extra,
-        r.HEIGHT: np.maximum(cube, z - relief),
+        s.ELLIPSOID: x * x + y * y + z * z - 1,
+        s.BOX: cube,
+        s.FRUSTUM: np.maximum(abs(z) - 1, flat - (1 + extra + (extra - 1) * z) / 2),
+        s.CAPSULE: np.hypot(flat, z - np.clip(z, -extra, extra)) - 1,
+        s.TORUS: np.hypot(flat - 1 + extra, z) - extra,
+        s.HEIGHT: np.maximum(cube, z - relief),
     }[primitive.kind]
 
 
@@ -55,13 +55,13 @@ def first(shape, origin, way):
 
 def drawn(kind, rng, middle):
     half = [rng.uniform(0.3, 1) for _ in range(3)]
-    if kind in (r.CAPSULE, r.TORUS):
+    if kind in (s.CAPSULE, s.TORUS):
         half = [half[0]] * 3
     extra = {
-        r.FRUSTUM: rng.choice((0.001, 0.4, 1.0)),
-        r.CAPSULE: rng.uniform(0.3, 1),
-        r.TORUS: rng.uniform(0.1, 0.4),
-        r.HEIGHT: float(rng.randrange(2)),
+        s.FRUSTUM: rng.choice((0.001, 0.4, 1.0)),
+        s.CAPSULE: rng.uniform(0.3, 1),
+        s.TORUS: rng.uniform(0.1, 0.4),
+        s.HEIGHT: float(rng.randrange(2)),
     }.get(kind, 0.0)
     return Primitive(kind, middle, half, any_turn(rng), extra)
 
@@ -108,7 +108,7 @@ def test_reach_is_that_of_the_lowest_point(kind):
 
 def test_clearances_are_distances_to_boxes():
     along_x = (0.0, 0.0, 1.0, 0.0, 1.0, 0.0, -1.0, 0.0, 0.0)
-    body = Primitive(r.CAPSULE, (1.0, 0.0, 0.0), (0.5, 0.5, 0.5), along_x, extra=1.0)
+    body = Primitive(s.CAPSULE, (1.0, 0.0, 0.0), (0.5, 0.5, 0.5), along_x, extra=1.0)
     points = np.array([[1.0, 0.0, 2.0], [3.0, 0.0, 0.5], [1.9, 0.1, 0.4], [3.0, 0.0, 1.5]])
     expected = [1.5, 1.0, 0.0, np.hypot(1, 1)]
     assert clearances(packed([Shape(body)]), points)[:, 0] == pytest.approx(expected, abs=1e-6)

@@ -3,20 +3,20 @@
 import numpy as np
 import pytest
 from numba import njit
-from qgs_worlds import rows as r
-from qgs_worlds.cameras import Rig
-from qgs_worlds.casting import cast_light
-from qgs_worlds.rows import World
-from qgs_worlds.shadows import shadow_maps
-from qgs_worlds.shapes import Primitive, Shape, packed
-from qgs_worlds.textures import color
+from qgs_worlds.caster import tables as s
+from qgs_worlds.caster.casting import cast
+from qgs_worlds.caster.shading import paint
+from qgs_worlds.caster.shadows import shadow_maps
+from qgs_worlds.caster.textures import color
+from qgs_worlds.worlds.cameras import Rig
+from qgs_worlds.worlds.shapes import Primitive, Shape, packed
 
-GROUND = Shape(Primitive(r.BOX, (0.0, 0.0, -1.0), (50.0, 50.0, 1.0)))
-WALL = Primitive(r.BOX, (1.0, 0.0, 1.0), (0.1, 5.0, 2.0))
-DOOR = Primitive(r.BOX, (1.0, 0.0, 1.0), (0.4, 0.8, 2.5))
-RING = Primitive(r.TORUS, (0.0, 0.0, 0.1), (1.0, 1.0, 1.0), extra=0.1)
-TERRAIN = Primitive(r.HEIGHT, (0.0, 0.0, 0.0), (5.0, 5.0, 0.5))
-THING = Shape(Primitive(r.BOX, (0.0, 0.0, 0.1), (0.2, 0.2, 0.1)))
+GROUND = Shape(Primitive(s.BOX, (0.0, 0.0, -1.0), (50.0, 50.0, 1.0)))
+WALL = Primitive(s.BOX, (1.0, 0.0, 1.0), (0.1, 5.0, 2.0))
+DOOR = Primitive(s.BOX, (1.0, 0.0, 1.0), (0.4, 0.8, 2.5))
+RING = Primitive(s.TORUS, (0.0, 0.0, 0.1), (1.0, 1.0, 1.0), extra=0.1)
+TERRAIN = Primitive(s.HEIGHT, (0.0, 0.0, 0.0), (5.0, 5.0, 0.5))
+THING = Shape(Primitive(s.BOX, (0.0, 0.0, 0.1), (0.2, 0.2, 0.1)))
 LIGHT = 1.5
 
 
@@ -24,23 +24,28 @@ def seen_from_above(shapes, points, sun=(), ambient=0.0):
     """Light that comes from white shapes below points, to a camera 1 m high."""
     heights = np.zeros((1, 9, 9), np.float32)
     heights[0, 0, 0] = 1.0  # a peak far away
-    textures = np.zeros((1, r.TEXTURE_FIELDS))
-    textures[0, [r.PERIOD, r.STRETCH]] = textures[0, r.COLORS :] = 1.0
-    air = np.zeros(r.AIR_FIELDS)
-    air[: r.ZENITH], air[r.OCCLUSION], air[r.REACH] = ambient, 1.0, 0.3
-    lights = np.array([[0.0, *sun, LIGHT, LIGHT, LIGHT, 1.0]] if sun else []).reshape(-1, 8)
+    textures = np.zeros(1, s.TEXTURE)
+    for field in ("period", "stretch", "colors"):
+        textures[field] = 1.0
+    air = np.zeros(1, s.AIR)
+    air["above"] = air["below"] = ambient
+    air["occlusion"] = 1.0
+    air["reach"] = 0.3
+    lights = np.array([(0.0, sun, [LIGHT] * 3, 1)] if sun else [], s.LIGHT)
     table = packed(shapes)
-    lights, *maps = shadow_maps(table, heights, lights, np.zeros(3), 6.0)
-    world = World(table, heights, textures, lights, air, *maps)
+    lights, shadows = shadow_maps(table, heights, lights, np.zeros(3), 6.0)
+    world = s.World(table, heights, textures, lights, air, shadows)
     c2w = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (len(points), 1, 1))
     c2w[:, :3, 3] = [(x, y, 1.0) for x, y in points]
     lens = np.array([100.0, 100.0, 0.5, 0.5])
-    return cast_light(world, c2w, lens, (1, 1), 1)[:, 0, 0, 0].tolist()
+    images = np.empty((len(points), 1, 1, 3), np.float32)
+    cast(world, paint, images, c2w, lens, 1)
+    return images[:, 0, 0, 0].tolist()
 
 
 @pytest.mark.parametrize("height", [0.8, 0.03])
 def test_a_box_throws_its_shadow_away_from_the_sun(height):
-    box = Shape(Primitive(r.BOX, (0.0, 0.0, height / 2), (0.5, 0.5, height / 2)))
+    box = Shape(Primitive(s.BOX, (0.0, 0.0, height / 2), (0.5, 0.5, height / 2)))
     sun = (0.5**0.5, 0.0, 0.5**0.5)  # the shadow is as long as the box is high
     points = [(-0.5 - 0.1 * height, 0.0), (-0.6 - height, 0.0), (0.6, 0.0), (-0.53, 0.6)]
     shaded, *others = seen_from_above([GROUND, box], points, sun)
@@ -66,16 +71,19 @@ def mean(textures, footprint):
     total = 0.0
     for i in range(200):
         for j in range(200):
-            total += color(textures, 0, 0.3041 * i, 0.2927 * j, footprint)[0]
+            total += color(textures[0], 0.3041 * i, 0.2927 * j, footprint)[0]
     return total / 40_000
 
 
-@pytest.mark.parametrize("kind", range(r.STRIPES, r.RINGS + 1))
+@pytest.mark.parametrize("kind", range(s.STRIPES, s.RINGS + 1))
 def test_patterns_keep_their_mean_from_afar(kind):
     for width in (0.15, 0.4, 0.7):
-        texture = np.zeros((1, r.TEXTURE_FIELDS))
-        texture[0, [r.PERIOD, r.STRETCH, r.PATTERN_PERIOD, r.ASPECT, r.STRENGTH]] = 1.0
-        texture[0, r.PATTERN], texture[0, r.WIDTH], texture[0, r.COLORS + 9] = kind, width, 1.0
+        texture = np.zeros(1, s.TEXTURE)
+        for field in ("period", "stretch", "pattern_period", "aspect", "strength"):
+            texture[field] = 1.0
+        texture["pattern"] = kind
+        texture["width"] = width
+        texture["colors"][0, 3, 0] = 1.0
         assert mean(texture, 1e-3) == pytest.approx(mean(texture, 10.0), abs=0.05)
 
 

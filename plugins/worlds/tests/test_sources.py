@@ -5,7 +5,7 @@ import torch
 import yaml
 from pydantic import ValidationError
 from qgs_worlds.rooms.source import RoomsSource
-from qgs_worlds.source import WorldsSource
+from qgs_worlds.worlds.source import WorldsSource
 
 SIZE = 16, 24
 

@@ -1,15 +1,16 @@
 """Scenes as they are drawn: what their seed, their options and their views say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
-from qgs_worlds import rows as r
-from qgs_worlds.effects import develop
-from qgs_worlds.intervals import clearances
-from qgs_worlds.places import KINDS
+from qgs_worlds.caster import tables as s
+from qgs_worlds.caster.intervals import clearances
 from qgs_worlds.rooms.source import RoomScene, RoomsConfig, RoomsSource
-from qgs_worlds.shapes import packed
-from qgs_worlds.source import WorldsSource
+from qgs_worlds.worlds.places import KINDS
+from qgs_worlds.worlds.shapes import packed
+from qgs_worlds.worlds.source import WorldsSource
 from test_intervals import met
 from torch.testing import assert_close
 
@@ -37,7 +38,7 @@ def test_depth_is_that_of_the_nearest_shape(scenes):
         ways = pixel_directions(camera.intrinsics, SIZE).double().numpy()
         for i, j in random.integers(SIZE, size=(10, 2)):
             ray = c2w[:3, 3] / scale, c2w[:3, :3] @ ways[i, j]
-            nearest = min(met(shape[None], world.heights, *ray) for shape in world.shapes)
+            nearest = min(met(shape, world.heights, *ray) for shape in world.shapes[:, None])
             true = nearest * scale if np.isfinite(nearest) else 0
             assert depth[i, j] == pytest.approx(true, rel=2e-3)
 
@@ -86,8 +87,8 @@ def test_what_is_drawn_is_spread(scenes):
     kinds = [scene.drawn.place.kind for scene in scenes]
     assert all(kinds.count(kind) > 10 for kind in KINDS)
     shapes = np.concatenate([scene.drawn.world.shapes for scene in scenes])
-    assert {*shapes[:, r.KIND]} == {*range(6)}
-    assert (shapes[:, r.PRIMITIVE_FIELDS] >= 0).mean() > 0.05
+    assert {*shapes["body"]["kind"]} == {*range(6)}
+    assert (shapes["cut"]["kind"] >= 0).mean() > 0.05
     roll = np.degrees(np.arcsin(c2w[..., 2, 0]))
     assert 3 < np.abs(roll).max() < 20
 
@@ -122,31 +123,33 @@ def test_plain_parts(plain):
         assert np.abs(drawn.rig.c2w[:, 2, 0]).max() < 1e-9, "no roll"
     for drawn in plain["shapes"]:
         assert drawn.place.kind == "indoors"
-        inner = drawn.world.shapes[drawn.place.fixed :]
-        assert {*inner[:, r.KIND]} <= {r.BOX, r.ELLIPSOID, r.FRUSTUM}
-        assert (drawn.world.shapes[:, r.PRIMITIVE_FIELDS] == r.NOTHING).all(), "closed"
-        assert not inner[:, [r.MATRIX + k for k in (2, 5, 6, 7)]].any(), "upright"
+        inner = drawn.world.shapes["body"][drawn.place.fixed :]
+        assert {*inner["kind"]} <= {s.BOX, s.ELLIPSOID, s.FRUSTUM}
+        assert (drawn.world.shapes["cut"]["kind"] == s.NOTHING).all(), "closed"
+        assert not inner["axes"][:, [0, 1, 2, 2], [2, 2, 0, 1]].any(), "upright"
     for drawn in plain["textures"]:
-        assert drawn.world.textures[:, r.OCTAVES].max() <= 1
-        assert r.GLYPHS not in drawn.world.textures[:, r.PATTERN]
+        assert drawn.world.textures["octaves"].max() <= 1
+        assert s.GLYPHS not in drawn.world.textures["pattern"]
     for drawn in plain["light"]:
-        assert drawn.world.lights.shape == (1, r.LIGHT_FIELDS)
-        assert drawn.world.lights[0, r.SHADOWS] == 0
+        assert drawn.world.lights["shadows"].tolist() == [0]
     for drawn in plain["effects"]:
-        assert drawn.quality == 0
-        assert np.ptp(drawn.effects[:3]) == 0
+        assert drawn.effects.quality == 0
+        assert np.ptp(drawn.effects.gains) == 0
 
 
 def parts(drawn):
     """What is drawn for a scene; its cameras decide which shapes stay."""
+    textures = drawn.world.textures
+    gloss = ["specular", "shine"]
+    effects = drawn.effects
     return {
         "shapes": packed(drawn.place.shapes),
         "c2w": drawn.rig.c2w,
-        "colours": np.delete(drawn.world.textures, [r.SPECULAR, r.SHINE], 1),
-        "gloss": drawn.world.textures[:, [r.SPECULAR, r.SHINE]],
+        "colours": textures[[name for name in s.TEXTURE.names if name not in gloss]],
+        "gloss": textures[gloss],
         "lights": drawn.world.lights,
         "air": drawn.world.air,
-        "grain": drawn.effects[r.GAMMA :],
+        "grain": (effects.gamma, effects.vignette, effects.noise, effects.seed),
     }
 
 
@@ -165,9 +168,6 @@ def test_an_option_changes_its_own_part_alone(plain, scenes):
 def test_all_views_of_a_scene_are_developed_alike(scenes):
     light = np.random.default_rng(0).random((16, 16, 3)).astype(np.float32)
     for scene in scenes[:20]:
-        effects = scene.drawn.effects
-        images = np.empty((2, 16, 16, 3), np.uint8)
-        for frame in range(2):
-            develop(images[frame], light, effects, frame)
-        apart = np.ptp(images.astype(float), 0)
-        assert apart.mean() <= 255 * 2 * effects[r.NOISE]
+        effects = replace(scene.drawn.effects, quality=0)
+        images = np.array([effects.photo(light, frame) for frame in range(2)], float)
+        assert np.ptp(images, 0).mean() <= 255 * 2 * effects.noise

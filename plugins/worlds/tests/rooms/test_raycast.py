@@ -1,14 +1,16 @@
 import numpy as np
 import pytest
-from qgs_worlds.rooms.casting import cast_depths
-from qgs_worlds.rooms.intersections import hit
-from qgs_worlds.rooms.shapes import TEXTURE_FIELDS, Room, box, cylinder, sphere
+from qgs_worlds.caster.casting import cast_depths
+from qgs_worlds.caster.intervals import hit
+from qgs_worlds.caster.tables import LIGHT, TEXTURE, Room
+from qgs_worlds.rooms.plan import NO_HEIGHTS
+from qgs_worlds.rooms.shapes import box, cylinder, packed, sphere
 
 
 def hits(shape, x, y):
-    """How far along the x axis a ray from (x, y, 1) meets a shape."""
+    """Return how far along the x axis a ray from (x, y, 1) meets a shape."""
     origin, forward = (tuple(map(np.float32, place)) for place in ((x, y, 1), (1, 0, 0)))
-    return hit(np.array([shape.row()], np.float32), 0, origin, forward)
+    return hit(packed((1.0, 1.0, 1.0), [shape])["body"][1], origin, forward)
 
 
 def test_hits_are_where_geometry_puts_them():
@@ -26,7 +28,9 @@ def test_hits_are_where_geometry_puts_them():
 def test_depth_is_z_along_the_camera():
     c2w = np.eye(4)
     c2w[:3] = [0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1]
-    shapes = np.array([box(1.75, 0, 0.9, (0.5, 0.2, 0.2), 0).row()], np.float32)
-    room = Room(shapes, np.zeros((6, TEXTURE_FIELDS)), (8.0, 40.0, 40.0), np.zeros((2, 4)))
+    size = (8.0, 40.0, 40.0)
+    shapes = packed(size, [box(1.75, 0, 0.9, (0.5, 0.2, 0.2), 0)])
+    nothing = np.zeros((2, 2))
+    room = Room(shapes, NO_HEIGHTS, np.zeros(7, TEXTURE), size, np.zeros(2, LIGHT), nothing)
     (depth,) = cast_depths(room, c2w[None], np.array([20.0, 20.0, 10.5, 10.5]), (21, 21))
     assert depth[[10, 4, 4], [10, 3, 17]] == pytest.approx([1.5, 4, 4])

@@ -1,8 +1,8 @@
-import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 from qgs_viewer.curves import curves_of
+from qgs_worlds.caster.intervals import clearances
 from qgs_worlds.rooms.source import RoomsSource
 
 from qgs.checkpoint.models import checkpoint_path
@@ -43,16 +43,6 @@ def test_colours_reproject_through_depth(mirror):
     assert aligned < 0.5 * unaligned
 
 
-def distances(shapes, eyes):
-    """Metres (F, S) from points to the boxes around shapes, 0 inside."""
-    offset = eyes[:, None] - shapes[None, :, 1:4]
-    cos, sin = shapes[:, 7], shapes[:, 8]
-    along = cos * offset[..., 0] + sin * offset[..., 1]
-    across = cos * offset[..., 1] - sin * offset[..., 0]
-    local = np.stack([along, across, offset[..., 2]], -1)
-    return np.linalg.norm(np.maximum(np.abs(local) - shapes[:, 4:7], 0), axis=-1)
-
-
 def test_cameras_are_rigid_and_keep_clear_of_every_surface():
     for scene in scenes()[:40]:
         turn, eyes = scene.cameras.c2w[:, :3, :3], scene.cameras.c2w[:, :3, 3]
@@ -60,7 +50,7 @@ def test_cameras_are_rigid_and_keep_clear_of_every_surface():
         assert torch.linalg.det(turn).min() > 0.99
         assert turn[:, 2, 1].max() < 0  # the image's y axis points down
         assert (torch.tensor(scene.size[:2]) / 2 - eyes[:, :2].abs()).min() > 0.2
-        assert distances(scene.room.shapes, eyes.numpy()).min() > 0.2
+        assert clearances(scene.room.shapes[1:], eyes.double().numpy()).min() > 0.2
 
 
 @pytest.mark.parametrize("name", ["locus-64", "tokengs-64"])

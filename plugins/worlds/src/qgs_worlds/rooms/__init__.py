@@ -1,4 +1,4 @@
-"""Procedural rooms for qgs: plan, furniture, materials, ray casting, camera paths."""
+"""Procedural rooms for qgs: plan, furniture, materials, camera paths."""
 
 from qgs.contracts import Plugin
 from qgs_worlds.rooms.source import RoomsSource
@@ -8,10 +8,7 @@ plugin = Plugin(
     contract_version=1,
     components=(RoomsSource,),
     models={
-        "landmark-128": "models/landmark-128.safetensors",
-        "landmark-64": "models/landmark-64.safetensors",
-        "locus-128": "models/locus-128.safetensors",
-        "locus-64": "models/locus-64.safetensors",
-        "tokengs-64": "models/tokengs-64.safetensors",
+        name: f"models/{name}.safetensors"
+        for name in ("landmark-128", "landmark-64", "locus-128", "locus-64", "tokengs-64")
     },
 )

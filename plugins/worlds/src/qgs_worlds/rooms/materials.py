@@ -4,7 +4,10 @@ import colorsys
 from collections.abc import Sequence
 from random import Random
 
-from qgs_worlds.rooms import shapes as s
+import numpy as np
+
+from qgs_worlds.caster import patterns as s
+from qgs_worlds.caster.tables import TEXTURE
 from qgs_worlds.rooms.shapes import Color
 
 WHITE: Color = (0.95, 0.94, 0.91)
@@ -30,17 +33,28 @@ class Materials:
 
     def __init__(self, rng: Random) -> None:
         self.rng = rng
-        self.rows: list[tuple[float, ...]] = []
+        self.rows: list[tuple[int, float, int, float, Sequence[Color]]] = []
         base = rng.random()
         self._hues = [(base + step + 0.04 * rng.gauss(0, 1)) % 1 for step in (0.0, 0.08, 0.5, 0.35)]
         self.wood = rng.choice(WOODS)
 
     def add(self, kind: int, period: float, colors: Sequence[Color], emission: float = 0.0) -> int:
         """Register a texture of three colours and return its index."""
-        a, b, c = colors
-        seed = float(int(self.rng.random() * 65536))
-        self.rows.append((kind, period, seed, emission, *a, *b, *c))
+        seed = int(self.rng.random() * 65536)
+        self.rows.append((kind, period, seed, emission, colors))
         return len(self.rows) - 1
+
+    def table(self, first: Sequence[int]) -> np.ndarray:
+        """Return the table of TEXTURE of the ray caster: `first` of them, then all."""
+        rows = [self.rows[i] for i in first] + self.rows
+        table = np.zeros(len(rows), TEXTURE)
+        kind, period, seed, emission, colors = zip(*rows, strict=True)
+        table["pattern"] = kind
+        table["period"] = period
+        table["seed"] = seed
+        table["emission"] = emission
+        table["colors"][:, :3] = colors
+        return table
 
     def color(self, saturation: tuple[float, float], value: tuple[float, float]) -> Color:
         """One of the room's hues at a random saturation and value."""

@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 
+from qgs_worlds.caster.lens import look_along
+
 EYE = (1.25, 1.65)  # metres above the floor
 WALL = 0.45  # least distance from a camera to a wall
 TRAVEL = (0.65, 1.2)  # metres from the first to the last camera
@@ -43,14 +45,4 @@ def camera_path(
         eyes, target = eyes[::-1], target[::-1]
     cos, sin = math.cos(side * math.pi / 2), math.sin(side * math.pi / 2)
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    return _look_at(eyes @ turn.T, target @ turn.T)
-
-
-def _look_at(eyes: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    forward = targets - eyes
-    forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    c2w = np.tile(np.eye(4), (len(eyes), 1, 1))
-    c2w[:, :3] = np.stack([right, np.cross(forward, right), forward, eyes], -1)
-    return c2w
+    return look_along(eyes @ turn.T, (target - eyes) @ turn.T)

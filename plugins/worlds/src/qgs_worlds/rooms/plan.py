@@ -5,12 +5,17 @@ from random import Random
 
 import numpy as np
 
+from qgs_worlds.caster.interiors import floor_shadows
+from qgs_worlds.caster.tables import LIGHT, Room
 from qgs_worlds.rooms.furniture import AGAINST_WALLS, CENTRAL, LOOSE, Piece
 from qgs_worlds.rooms.materials import Materials
-from qgs_worlds.rooms.shapes import Room, Shape, box, cylinder
+from qgs_worlds.rooms.shapes import Shape, box, cylinder, packed
 
 CLEARANCE = 0.4  # metres between a camera and the nearest shape
 _GAP = 0.05  # metres between pieces
+
+# Rooms have no height fields.
+NO_HEIGHTS = np.zeros((1, 2, 2), np.float32)
 
 Size = tuple[float, float, float]
 Point = tuple[float, float, float]
@@ -19,7 +24,7 @@ _SMALLEST: tuple[Point, Point] = ((-0.15, -0.15, 0.0), (0.15, 0.15, 0.3))
 
 
 def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
-    """A room of `size` whose furniture leaves the camera centres `eyes` (F, 3) free."""
+    """Return a room of `size` whose furniture leaves the camera centres `eyes` (F, 3) free."""
     m = Materials(rng)
     wall = m.wall()
     walls = [wall] + [m.wall() if rng.random() < 0.4 else wall for _ in range(3)]
@@ -33,10 +38,12 @@ def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
         x, y = (rng.uniform(-0.4, 0.4) * extent for extent in size[:2])
         furnisher.place(maker(rng, m), x, y, rng.uniform(0, 2 * math.pi))
     window_side = rng.randrange(4)
-    shapes = furnisher.shapes + _on_walls(rng, m, size, window_side) + _fixed(rng, m, size)
-    head = [m.rows[i] for i in surfaces]
-    rows = np.array([(*shape.row()[:9], shape.texture + 6) for shape in shapes], np.float32)
-    return Room(rows, np.array(head + m.rows), size, _lights(rng, size, window_side))
+    furnisher.shapes += _on_walls(rng, m, size, window_side)
+    furnisher.shapes += _fixed(rng, m, size)
+    shapes = packed(size, furnisher.shapes)
+    lights = _lights(rng, size, window_side)
+    floor = floor_shadows(shapes, size, lights["place"][0])
+    return Room(shapes, NO_HEIGHTS, m.table(surfaces), size, lights, floor)
 
 
 class Furnisher:
@@ -75,9 +82,10 @@ class Furnisher:
 
 def bounds(shapes: list[Shape]) -> tuple[Point, Point]:
     """Lowest and highest corner of the box around `shapes`."""
-    corners = [shape.bounds() for shape in shapes]
-    x0, y0, z0, x1, y1, z1 = zip(*corners, strict=True)
-    return (min(x0), min(y0), min(z0)), (max(x1), max(y1), max(z1))
+    lows, highs = zip(*[shape.bounds() for shape in shapes], strict=True)
+    x0, y0, z0 = map(min, zip(*lows, strict=True))
+    x1, y1, z1 = map(max, zip(*highs, strict=True))
+    return (x0, y0, z0), (x1, y1, z1)
 
 
 def turned(low: Point, high: Point, x: float, y: float, turn: float) -> tuple[Point, Point]:
@@ -166,6 +174,11 @@ def _fixed(rng: Random, m: Materials, size: Size) -> list[Shape]:
 
 
 def _lights(rng: Random, size: Size, window_side: int) -> np.ndarray:
+    """Return the table of a warm lamp below the ceiling and a cool window."""
     x, y = _from_wall(window_side, size[window_side % 2] / 2 - 0.1, 0.0)
-    lamp = (0.0, 0.0, size[2] - 0.2, rng.uniform(0.55, 0.95))
-    return np.array([lamp, (x, y, 1.6, rng.uniform(0.45, 1.2))])
+    lights = np.zeros(2, LIGHT)
+    lights["place"] = (0.0, 0.0, size[2] - 0.2), (x, y, 1.6)
+    lamp = rng.uniform(0.55, 0.95)
+    window = rng.uniform(0.45, 1.2)
+    lights["color"] = (1.06 * lamp, lamp, 0.86 * lamp), (0.96 * window, window, 1.08 * window)
+    return lights

@@ -1,81 +1,83 @@
-"""Rows of numbers that describe shapes and textures to the ray caster.
+"""Shapes of a furnished room.
 
 World frame: metres, x and y along the walls, z up, the floor at z = 0, the room centred on the
 z axis. A shape is upright; it may be turned about z.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-BOX, SPHERE, CYLINDER = range(3)
-SHAPE_FIELDS = 10  # kind, centre x y z, half sizes x y z, cos and sin of the turn, texture
-TEXTURE_FIELDS = 13  # kind, period, seed, emission, RGB of three colours
-(PLAIN, CHECKER, STRIPES, PLANKS, TILES, BRICKS, CLOUDS, GRADIENT, PICTURE, RUG, WINDOW, DOTS,
- BOOKS) = range(13)  # fmt: skip
+from qgs_worlds.caster import tables as s
 
 Color = tuple[float, float, float]
+Point = tuple[float, float, float]
+
+# Surfaces of a room: -x, +x, -y, +y, floor and ceiling.
+WALLS = 6
 
 
 class Shape(NamedTuple):
     """One shape; `half` is the half size along each axis, radii for round ones."""
 
     kind: int
-    center: tuple[float, float, float]
-    half: tuple[float, float, float]
+    center: Point
+    half: Point
     turn: float
     texture: int
 
     def moved(self, x: float, y: float, turn: float) -> "Shape":
-        """The shape turned by `turn` radians about the origin, then moved by (x, y)."""
-        cos, sin = math.cos(turn), math.sin(turn)
+        """Return the shape turned by `turn` radians about the origin, then moved by (x, y)."""
+        cos = math.cos(turn)
+        sin = math.sin(turn)
         cx, cy, cz = self.center
         center = (x + cos * cx - sin * cy, y + sin * cx + cos * cy, cz)
         return Shape(self.kind, center, self.half, self.turn + turn, self.texture)
 
-    def bounds(self) -> tuple[float, float, float, float, float, float]:
-        """Lowest x, y, z and highest x, y, z."""
-        (x, y, z), (a, b, c) = self.center, self.half
+    def bounds(self) -> tuple[Point, Point]:
+        """Return the lowest and the highest corner of the box around it."""
+        x, y, z = self.center
+        a, b, c = self.half
         if self.turn:
-            cos, sin = abs(math.cos(self.turn)), abs(math.sin(self.turn))
+            cos = abs(math.cos(self.turn))
+            sin = abs(math.sin(self.turn))
             a, b = cos * a + sin * b, sin * a + cos * b
-        return x - a, y - b, z - c, x + a, y + b, z + c
-
-    def row(self) -> tuple[float, ...]:
-        """The `SHAPE_FIELDS` numbers of the ray caster."""
-        turned = (math.cos(self.turn), math.sin(self.turn))
-        return (self.kind, *self.center, *self.half, *turned, self.texture)
+        return (x - a, y - b, z - c), (x + a, y + b, z + c)
 
 
-def box(x: float, y: float, z: float, size: tuple[float, float, float], texture: int) -> Shape:
-    """A box whose bottom centre is (x, y, z), of full `size`."""
+def box(x: float, y: float, z: float, size: Point, texture: int) -> Shape:
+    """Return a box whose bottom centre is (x, y, z), of full `size`."""
     w, d, h = size
-    return Shape(BOX, (x, y, z + h / 2), (w / 2, d / 2, h / 2), 0.0, texture)
+    return Shape(s.BLOCK, (x, y, z + h / 2), (w / 2, d / 2, h / 2), 0.0, texture)
 
 
 def cylinder(x: float, y: float, z: float, radius: float, height: float, texture: int) -> Shape:
-    """An upright cylinder whose bottom centre is (x, y, z)."""
+    """Return an upright cylinder whose bottom centre is (x, y, z)."""
     half = (radius, radius, height / 2)
-    return Shape(CYLINDER, (x, y, z + height / 2), half, 0.0, texture)
+    return Shape(s.CYLINDER, (x, y, z + height / 2), half, 0.0, texture)
 
 
 def sphere(x: float, y: float, z: float, radius: float, texture: int) -> Shape:
-    """A sphere whose lowest point is (x, y, z)."""
-    return Shape(SPHERE, (x, y, z + radius), (radius, radius, radius), 0.0, texture)
+    """Return a sphere whose lowest point is (x, y, z)."""
+    return Shape(s.BALL, (x, y, z + radius), (radius, radius, radius), 0.0, texture)
 
 
-@dataclass(frozen=True)
-class Room:
-    """A furnished room, ready to be cast.
+def packed(size: Point, shapes: Sequence[Shape]) -> np.ndarray:
+    """Return the table of SHAPE of the ray caster for a room of a size and what is in it.
 
-    shapes: (S, SHAPE_FIELDS) float32. textures: (T, TEXTURE_FIELDS) float64; the first six are
-    those of the walls -x, +x, -y, +y, the floor and the ceiling. size: x, y, z extent in metres.
-    lights: (2, 4) position and strength of the lamp and of the window.
+    Textures of its walls, floor and ceiling come first, those of the shapes after them.
     """
-
-    shapes: np.ndarray
-    textures: np.ndarray
-    size: tuple[float, float, float]
-    lights: np.ndarray
+    walls = Shape(s.INTERIOR, (0.0, 0.0, 0.0), (size[0] / 2, size[1] / 2, size[2]), 0.0, -WALLS)
+    kind, center, half, angle, texture = map(np.array, zip(walls, *shapes, strict=True))
+    turn = np.zeros((len(kind), 3, 3))
+    turn[:, 0, 0] = turn[:, 1, 1] = [math.cos(a) for a in angle]
+    turn[:, 1, 0] = [math.sin(a) for a in angle]
+    turn[:, 0, 1] = -turn[:, 1, 0]
+    turn[:, 2, 2] = 1
+    table = np.zeros(len(kind), s.SHAPE)
+    table["body"] = s.primitives(kind, np.zeros(len(kind)), center, half, turn)
+    table["cut"]["kind"] = s.NOTHING
+    table["texture"] = texture + WALLS
+    return table

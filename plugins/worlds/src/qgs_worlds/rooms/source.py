@@ -6,6 +6,7 @@ Kernels are imported when the first room is drawn: numba takes longer to load th
 from collections.abc import Sequence
 from functools import cached_property
 from random import Random
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -14,12 +15,12 @@ from torch import Tensor
 
 from qgs.contracts import Split
 from qgs.types import Cameras
+from qgs_worlds.caster.lens import lens
+from qgs_worlds.drawn import DrawnConfig, DrawnScene, DrawnSource, ImageCache
 from qgs_worlds.rooms.path import camera_path
-from qgs_worlds.rooms.plan import furnish
-from qgs_worlds.rooms.procedural import DrawnConfig, DrawnScene, DrawnSource, ImageCache, lens
-from qgs_worlds.rooms.shapes import Room
 
-_SHADOW_CELLS = 80
+if TYPE_CHECKING:
+    from qgs_worlds.caster.tables import Room
 
 
 class RoomsConfig(DrawnConfig):
@@ -59,26 +60,25 @@ class RoomScene(DrawnScene):
         return Cameras(torch.from_numpy(self._c2w).float(), intrinsics, self._config.image_size)
 
     @cached_property
-    def room(self) -> Room:
+    def room(self) -> "Room":
         """The furnished room."""
+        from qgs_worlds.rooms.plan import furnish
+
         return furnish(Random(self._plan_seed), self.size, self._c2w[:, :3, 3])
-
-    @cached_property
-    def _floor(self) -> np.ndarray:
-        from qgs_worlds.rooms.shading import floor_shadows
-
-        return floor_shadows(self.room.shapes, self.size, self.room.lights[0], _SHADOW_CELLS)
 
     def cast(self, frames: list[int]) -> np.ndarray:
         """See `DrawnScene`."""
-        from qgs_worlds.rooms.casting import cast_images
+        from qgs_worlds.caster.casting import cast
+        from qgs_worlds.caster.interiors import paint_room
 
-        config, cameras = self._config, (self._c2w[frames], self._intrinsics)
-        return cast_images(self.room, self._floor, *cameras, config.image_size, config.samples)
+        config = self._config
+        images = np.empty((len(frames), *config.image_size, 3), np.uint8)
+        cast(self.room, paint_room, images, self._c2w[frames], self._intrinsics, config.samples)
+        return images
 
     def depths(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`: z along the ray through the pixel's centre."""
-        from qgs_worlds.rooms.casting import cast_depths
+        from qgs_worlds.caster.casting import cast_depths
 
         cameras = (self._c2w[list(frames)], self._intrinsics)
         return torch.from_numpy(cast_depths(self.room, *cameras, self._config.image_size))[:, None]

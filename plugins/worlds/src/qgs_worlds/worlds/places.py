@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from qgs_worlds import rows as r
-from qgs_worlds.intervals import height_of
-from qgs_worlds.shapes import Point, Primitive, Shape, about_z, rod
-from qgs_worlds.things import Thing, Things, placed, spread
+from qgs_worlds.caster import tables as s
+from qgs_worlds.caster.intervals import height_of
+from qgs_worlds.worlds.shapes import Point, Primitive, Shape, about_z, rod
+from qgs_worlds.worlds.things import Thing, Things, placed, spread
 
 Kind = Literal["indoors", "outdoors", "objects"]
 KINDS: tuple[Kind, ...] = ("indoors", "outdoors", "objects")
@@ -56,7 +56,7 @@ def _level(x: float, y: float) -> float:
 
 
 def _box(center: Point, half: Point) -> Primitive:
-    return Primitive(r.BOX, center, half)
+    return Primitive(s.BOX, center, half)
 
 
 def _ground(things: Things, scale: float, height: float = 0.0) -> Shape:
@@ -155,7 +155,7 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
         amplitude, index = spread(rng, 0.15, 1.5), rng.randrange(len(maps))
         shapes[0] = _ground(things, spread(rng, 1, 4), -0.7 * amplitude)
         half = (_TERRAIN, _TERRAIN, amplitude)
-        body = Primitive(r.HEIGHT, (0.0, 0.0, 0.0), half, extra=float(index))
+        body = Primitive(s.HEIGHT, (0.0, 0.0, 0.0), half, extra=float(index))
         shapes.append(things.skinned(body, spread(rng, 1, 4))._replace(faces=1))
         ground = _on(maps[index], amplitude)
         middle = len(maps[index]) // 4  # cameras stay on the middle half
@@ -189,24 +189,24 @@ def _far(rng: Random, things: Things, angle: float) -> Thing:
         away, size = rng.uniform(60, 220), rng.uniform(15, 60)
         at = (away * math.cos(angle), away * math.sin(angle), 0.0)
         half = (size, size * rng.uniform(0.6, 1.8), size * rng.uniform(0.2, 0.6))
-        body = Primitive(r.ELLIPSOID, at, half, about_z(rng.uniform(0, math.tau)))
+        body = Primitive(s.ELLIPSOID, at, half, about_z(rng.uniform(0, math.tau)))
         return [things.skinned(body, size / 2)]
     away = spread(rng, 11, 70)
     at = (away * math.cos(angle), away * math.sin(angle), 0.0)
     if pick < 0.65:
         wide, deep, high = rng.uniform(2, 7), rng.uniform(2, 7), spread(rng, 2, 14)
         body = Primitive(
-            r.BOX, (*at[:2], high - 1), (wide, deep, high + 1), about_z(rng.uniform(0, math.tau))
+            s.BOX, (*at[:2], high - 1), (wide, deep, high + 1), about_z(rng.uniform(0, math.tau))
         )
         return [things.skinned(body, spread(rng, 2, 9))]
     high, crown = rng.uniform(1, 3), things.texture()[0]
     half = (0.12 * high, 0.12 * high, high + 1)
-    trunk = Primitive(r.FRUSTUM, (*at[:2], high - 1), half, extra=0.6)
+    trunk = Primitive(s.FRUSTUM, (*at[:2], high - 1), half, extra=0.6)
     tree = [things.skinned(trunk)]
     for _ in range(rng.randint(1, 4)):
         x, y = (rng.uniform(-0.5, 0.5) * high for _ in range(2))
         half = tuple(rng.uniform(0.35, 0.9) * high for _ in range(3))
-        leaves = Primitive(r.ELLIPSOID, (at[0] + x, at[1] + y, rng.uniform(1.7, 2.6) * high), half)  # type: ignore[arg-type]
+        leaves = Primitive(s.ELLIPSOID, (at[0] + x, at[1] + y, rng.uniform(1.7, 2.6) * high), half)  # type: ignore[arg-type]
         tree.append(Shape(leaves, None, crown, 1, 0, rng.uniform(0.5, 2)))
     return tree
 
@@ -220,7 +220,7 @@ def _objects(rng: Random, things: Things, count: int) -> Place:
     level = wide = 0.0
     if rng.random() < 0.4:
         level, wide = rng.uniform(0.02, 0.8), rng.uniform(0.5, 1.1)
-        kind = rng.choice((r.BOX, r.FRUSTUM))
+        kind = rng.choice((s.BOX, s.FRUSTUM))
         table = Primitive(kind, (0.0, 0.0, level / 2), (wide, wide, level / 2), extra=1.0)
         shapes.append(things.skinned(table, 0.7))
     fixed = len(shapes)

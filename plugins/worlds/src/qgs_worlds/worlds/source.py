@@ -16,11 +16,11 @@ from torch import Tensor
 
 from qgs.contracts import Split
 from qgs.types import Cameras
-from qgs_worlds.rooms.procedural import DrawnConfig, DrawnScene, DrawnSource, ImageCache
+from qgs_worlds.drawn import DrawnConfig, DrawnScene, DrawnSource, ImageCache
 from qgs_worlds.rooms.source import RoomScene, RoomsConfig
 
 if TYPE_CHECKING:
-    from qgs_worlds.drawing import Drawn
+    from qgs_worlds.worlds.drawing import Drawn
 
 Variety: TypeAlias = Literal["plain", "varied"]
 
@@ -76,7 +76,7 @@ class WorldScene(DrawnScene):
     @cached_property
     def drawn(self) -> "Drawn":
         """What is there, and how it is seen."""
-        from qgs_worlds.drawing import draw
+        from qgs_worlds.worlds.drawing import draw
 
         return draw(self.key, self._config)
 

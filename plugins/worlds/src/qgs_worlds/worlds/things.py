@@ -5,8 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from random import Random
 
-from qgs_worlds import rows as r
-from qgs_worlds.shapes import (
+from qgs_worlds.caster import tables as s
+from qgs_worlds.worlds.shapes import (
     UPRIGHT,
     Point,
     Primitive,
@@ -44,10 +44,10 @@ class Style:
     most: int
 
 
-PLAIN = Style((r.BOX, r.BOX, r.ELLIPSOID, r.FRUSTUM), 0.0, 0.0, 0.0, 0.0, True, 5)
+PLAIN = Style((s.BOX, s.BOX, s.ELLIPSOID, s.FRUSTUM), 0.0, 0.0, 0.0, 0.0, True, 5)
 VARIED = Style(
-    (r.BOX, r.BOX, r.BOX, r.ELLIPSOID, r.ELLIPSOID, r.FRUSTUM, r.FRUSTUM, r.CAPSULE, r.TORUS,
-     r.HEIGHT),
+    (s.BOX, s.BOX, s.BOX, s.ELLIPSOID, s.ELLIPSOID, s.FRUSTUM, s.FRUSTUM, s.CAPSULE, s.TORUS,
+     s.HEIGHT),
     0.45, 0.35, 0.15, 0.12, False, 8,
 )  # fmt: skip
 
@@ -90,30 +90,30 @@ class Things:
         rng = self.rng
         kind = rng.choice(self.style.kinds)
         a, b, c = (size * spread(rng, 0.25, 1.0) for _ in range(3))
-        if self.style.even and kind != r.BOX:
+        if self.style.even and kind != s.BOX:
             a = b = min(a, b)
-            c = a if kind == r.ELLIPSOID else c
+            c = a if kind == s.ELLIPSOID else c
         extra = 1.0
-        if kind == r.FRUSTUM and not self.style.even:
+        if kind == s.FRUSTUM and not self.style.even:
             extra = rng.choice((0.001, 1.0, rng.random()))
-        if kind == r.CAPSULE:
+        if kind == s.CAPSULE:
             a = b = c = 0.6 * min(a, b)
             extra = rng.uniform(0.3, 3)
-        if kind == r.TORUS:
+        if kind == s.TORUS:
             b = c = a
             extra = rng.uniform(0.1, 0.4)
-        if kind == r.HEIGHT:
+        if kind == s.HEIGHT:
             extra = rng.randrange(self.maps)
         return Primitive(kind, center, (a, b, c), self._turn(), extra)
 
     def _cut(self, body: Primitive) -> Primitive | None:
         """What is taken away from a primitive, at its surface or through it."""
-        if body.kind in (r.TORUS, r.HEIGHT):
+        if body.kind in (s.TORUS, s.HEIGHT):
             return None
         rng = self.rng
         way = rotated(body.turn, tuple(rng.uniform(-0.8, 0.8) * h for h in body.half))  # type: ignore[arg-type]
         center = tuple(a + b for a, b in zip(body.center, way, strict=True))
-        kind = rng.choice((r.BOX, r.ELLIPSOID, r.FRUSTUM))
+        kind = rng.choice((s.BOX, s.ELLIPSOID, s.FRUSTUM))
         half = tuple(h * rng.uniform(0.35, 0.9) for h in body.half)
         turn = body.turn if rng.random() < 0.5 else any_turn(rng)
         return Primitive(kind, center, half, turn, rng.uniform(0.2, 1))  # type: ignore[arg-type]

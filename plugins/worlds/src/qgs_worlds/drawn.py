@@ -1,6 +1,5 @@
 """Scenes that are drawn from a seed, and whose images are cast on demand and kept."""
 
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -92,10 +91,3 @@ class DrawnSource(LazySource):
             )
             for split, count in counts.items()
         }
-
-
-def lens(fov: float, size: tuple[int, int]) -> np.ndarray:
-    """fx, fy, cx, cy in pixels of a horizontal field of view in degrees, for (H, W)."""
-    height, width = size
-    focal = width / 2 / math.tan(math.radians(fov) / 2)
-    return np.array([focal, focal, width / 2, height / 2])

@@ -6,10 +6,10 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from qgs_worlds.intervals import clearances
-from qgs_worlds.places import Place
-from qgs_worlds.raycast import trace
-from qgs_worlds.rooms.procedural import lens
+from qgs_worlds.caster.intervals import clearances
+from qgs_worlds.caster.lens import lens, look_along
+from qgs_worlds.caster.raycast import trace
+from qgs_worlds.worlds.places import Place
 
 CLEARANCE = 0.2  # metres from a camera to the box around any shape, at least, before scaling
 FOV = (18.0, 90.0)  # across the longer side of an image, degrees: from a long lens to a wide one
@@ -214,11 +214,4 @@ def _look_at(eyes: np.ndarray, targets: np.ndarray, roll: np.ndarray) -> np.ndar
     # never straight up or down, where nothing says which way is right
     forward[:, 2] = np.clip(forward[:, 2], -4 * flat, 4 * flat)
     forward[flat < 1e-6] = (1.0, 0.0, 0.0)
-    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    down = np.cross(forward, right)
-    cos, sin = np.cos(roll)[:, None], np.sin(roll)[:, None]
-    c2w = np.tile(np.eye(4), (len(eyes), 1, 1))
-    c2w[:, :3] = np.stack([cos * right + sin * down, cos * down - sin * right, forward, eyes], -1)
-    return c2w
+    return look_along(eyes, forward, roll)

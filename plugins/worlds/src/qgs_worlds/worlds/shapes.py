@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qgs_worlds import rows as r
+from qgs_worlds.caster import tables as s
 
 Point = tuple[float, float, float]
 Turn = tuple[float, float, float, float, float, float, float, float, float]
 UPRIGHT: Turn = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-ROUND = (r.ELLIPSOID, r.CAPSULE, r.TORUS)
+ROUND = (s.ELLIPSOID, s.CAPSULE, s.TORUS)
 
 
 class Primitive(NamedTuple):
@@ -35,14 +35,14 @@ class Primitive(NamedTuple):
     def reach(self) -> float:
         """How far it extends up and down from its centre, metres, at most."""
         size, up = self.half[2], abs(self.turn[8])
-        if self.kind == r.CAPSULE:
+        if self.kind == s.CAPSULE:
             return size * (1 + up * self.extra)
-        if self.kind == r.TORUS:
+        if self.kind == s.TORUS:
             return size * ((1 - self.extra) * math.sqrt(max(1 - up * up, 0.0)) + self.extra)
         a, b, c = (t * half for t, half in zip(self.turn[6:], self.half, strict=True))
-        if self.kind == r.ELLIPSOID:
+        if self.kind == s.ELLIPSOID:
             return math.hypot(a, b, c)
-        return abs(c) + (math.hypot(a, b) if self.kind == r.FRUSTUM else abs(a) + abs(b))
+        return abs(c) + (math.hypot(a, b) if self.kind == s.FRUSTUM else abs(a) + abs(b))
 
 
 class Shape(NamedTuple):
@@ -86,11 +86,11 @@ def about_z(angle: float) -> Turn:
 def any_turn(rng: Random) -> Turn:
     """A rotation drawn evenly from all (a random unit quaternion)."""
     w, x, y, z = (rng.gauss(0, 1) for _ in range(4))
-    s = 2 / (w * w + x * x + y * y + z * z)
+    f = 2 / (w * w + x * x + y * y + z * z)
     return (
-        1 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
-        s * (x * y + w * z), 1 - s * (x * x + z * z), s * (y * z - w * x),
-        s * (x * z - w * y), s * (y * z + w * x), 1 - s * (x * x + y * y),
+        1 - f * (y * y + z * z), f * (x * y - w * z), f * (x * z + w * y),
+        f * (x * y + w * z), 1 - f * (x * x + z * z), f * (y * z - w * x),
+        f * (x * z - w * y), f * (y * z + w * x), 1 - f * (x * x + y * y),
     )  # fmt: skip
 
 
@@ -105,40 +105,27 @@ def rod(start: Point, end: Point, radius: float, square: bool = False) -> Primit
     turn = (u, -v * z, x, v, u * z, y, 0.0, v * x - u * y, z)
     middle = tuple(0.5 * (a + b) for a, b in zip(start, end, strict=True))
     half = (radius, radius, 0.5 * length if square else radius)
-    kind = r.BOX if square else r.CAPSULE
+    kind = s.BOX if square else s.CAPSULE
     return Primitive(kind, middle, half, turn, 0.0 if square else 0.5 * length / radius)  # type: ignore[arg-type]
 
 
 def packed(shapes: Sequence[Shape]) -> np.ndarray:
-    """(S, SHAPE_FIELDS) float32."""
-    table = np.zeros((len(shapes), r.SHAPE_FIELDS))
-    _fill(table[:, : r.PRIMITIVE_FIELDS], [shape.body for shape in shapes])
-    second = table[:, r.PRIMITIVE_FIELDS : 2 * r.PRIMITIVE_FIELDS]
-    second[:, r.KIND] = r.NOTHING
-    cut = [i for i, shape in enumerate(shapes) if shape.cut]
-    holes = np.zeros((len(cut), r.PRIMITIVE_FIELDS))
-    _fill(holes, [shape.cut for shape in shapes if shape.cut])
-    second[cut] = holes
-    kind, extra = table[:, r.KIND], table[:, r.EXTRA]
-    extent = np.ones((len(shapes), 3))
-    extent[kind == r.CAPSULE, 2] += extra[kind == r.CAPSULE]
-    extent[kind == r.TORUS, 2] = extra[kind == r.TORUS]
-    table[:, r.EXTENT : r.EXTENT + 3] = extent
-    sizes = extent * table[:, r.HALF : r.HALF + 3]
-    around = np.where(np.isin(kind, ROUND), sizes.max(1), np.linalg.norm(sizes, axis=1))
-    table[:, r.SPHERE : r.SPHERE + 3] = table[:, r.CENTER : r.CENTER + 3]
-    table[:, r.SPHERE + 3] = around
-    table[:, r.TEXTURE :] = [
-        (s.texture, s.faces, s.cut_texture, s.scale) for s in shapes
-    ] or np.zeros((0, 4))
-    return table.astype(np.float32)
+    """Return the table of SHAPE of the ray caster."""
+    table = np.zeros(len(shapes), s.SHAPE)
+    body = _primitives([shape.body for shape in shapes])
+    table["body"] = body
+    table["cut"]["kind"] = s.NOTHING
+    holes = [shape.cut for shape in shapes if shape.cut]
+    if holes:
+        table["cut"][[shape.cut is not None for shape in shapes]] = _primitives(holes)
+    sizes = body["extent"] * body["unit"]
+    is_round = np.isin(body["kind"], ROUND)
+    table["radius"] = np.where(is_round, sizes.max(1), np.linalg.norm(sizes, axis=1))
+    for field in ("texture", "faces", "cut_texture", "scale"):
+        table[field] = [getattr(shape, field) for shape in shapes]
+    return table
 
 
-def _fill(table: np.ndarray, primitives: Sequence[Primitive]) -> None:
-    if primitives:
-        half = np.array([p.half for p in primitives])
-        turn = np.array([p.turn for p in primitives]).reshape(-1, 3, 3)
-        table[:, : r.MATRIX] = [(p.kind, p.extra) for p in primitives]
-        table[:, r.MATRIX : r.CENTER] = (turn.transpose(0, 2, 1) / half[:, :, None]).reshape(-1, 9)
-        table[:, r.CENTER : r.HALF] = [p.center for p in primitives]
-        table[:, r.HALF : r.PRIMITIVE_FIELDS] = half
+def _primitives(primitives: Sequence[Primitive]) -> np.ndarray:
+    kind, center, half, turn, extra = map(np.array, zip(*primitives, strict=True))
+    return s.primitives(kind, extra, center, half, turn.reshape(-1, 3, 3))

@@ -1,0 +1,89 @@
+"""What a camera makes of light: exposure, white balance, tone curve, vignette, noise, JPEG."""
+
+import io
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from PIL import Image
+
+from qgs_worlds.caster.kernels import INNER, OPTIONS
+
+# Of full brightness, from where on highlights are compressed.
+_SHOULDER = 0.6
+# Of the table of the tone curve, over the square root of light, which spends it on dark tones.
+_STEP = 1 / 512
+_ENTRIES = 2048
+
+
+@njit(**INNER)
+def _scrambled(i, j, seed):
+    """Return 32 random bits for each pixel i of frame j."""
+    h = (i * 374761393 + j * 668265263 + seed * 974634777) & 0xFFFFFFFF
+    h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
+    h = ((h ^ (h >> 15)) * 739982445) & 0xFFFFFFFF
+    return h ^ (h >> 16)
+
+
+@njit(**OPTIONS)
+def _curve(gamma):
+    """Return what becomes of the square root of light, from 0 on in steps of `_STEP`."""
+    table = np.empty(_ENTRIES)
+    for i in range(_ENTRIES):
+        value = (i * _STEP) ** (2.0 / gamma)
+        if value > _SHOULDER:
+            over = (value - _SHOULDER) / (1 - _SHOULDER)
+            value = _SHOULDER + (1 - _SHOULDER) * over / math.sqrt(1 + over * over)
+        table[i] = value
+    return table
+
+
+@njit(**OPTIONS)
+def _develop(image, light, gains, gamma, vignette, grain, seed, frame):
+    height, width, _ = light.shape
+    reach = 1.0 / (height * height + width * width)
+    curve = _curve(gamma)
+    for i in range(height):
+        for j in range(width):
+            y = 2 * i + 1 - height
+            x = 2 * j + 1 - width
+            edge = 1.0 - vignette * (x * x + y * y) * reach
+            h = _scrambled(i * width + j, frame, seed)
+            for c in range(3):
+                value = math.sqrt(max(light[i, j, c] * gains[c] * edge, 0.0))
+                value = 255 * curve[min(int(value * (1 / _STEP) + 0.5), _ENTRIES - 1)]
+                # two uniform numbers for each colour: near enough to a normal one
+                value += grain * (((h >> 10 * c) & 31) + ((h >> (10 * c + 5)) & 31) - 31)
+                image[i, j, c] = int(min(max(value, 0.0), 255.0) + 0.5)
+
+
+@dataclass(frozen=True)
+class Effects:
+    """A camera: how it makes a photo of light.
+
+    gains: (3,) of R, G and B. gamma: exponent of the tone curve. vignette: darkening towards the
+    corners. noise: standard deviation. seed: of the noise. quality: of a JPEG file, 0 for none.
+    """
+
+    gains: np.ndarray
+    gamma: float
+    vignette: float = 0.0
+    noise: float = 0.0
+    seed: int = 0
+    quality: int = 0
+
+    def photo(self, light: np.ndarray, frame: int) -> np.ndarray:
+        """Return the image (H, W, 3) uint8 of linear light (H, W, 3). frame: draws the noise."""
+        image = np.empty(light.shape, np.uint8)
+        # the sum of two numbers of 0 to 31 has a standard deviation of 13.06
+        grain = 255 / 13.06 * self.noise
+        _develop(image, light, self.gains, self.gamma, self.vignette, grain, self.seed, frame)
+        return _through_jpeg(image, self.quality) if self.quality else image
+
+
+def _through_jpeg(image: np.ndarray, quality: int) -> np.ndarray:
+    """Return the image (H, W, 3) uint8 as a JPEG file of that quality keeps it."""
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "JPEG", quality=quality)
+    return np.asarray(Image.open(file))

@@ -1,0 +1,270 @@
+"""Colours of what rays meet in furnished rooms: even light, a lamp, a window, soft shadows."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from qgs_worlds.caster import tables as s
+from qgs_worlds.caster.intervals import hit
+from qgs_worlds.caster.kernels import INNER, OPTIONS
+from qgs_worlds.caster.patterns import mixture, smooth
+from qgs_worlds.caster.shading import TAKEN
+from qgs_worlds.caster.surfaces import on_axis, to_world
+from qgs_worlds.caster.vectors import along, dot, minus, mix, times, triple
+
+# How much of the light the lamp's shadow takes.
+_SHADOW = 0.36
+_SHADOW_CELLS = 80
+# Where rays that look for what is above a point of the floor begin, and their direction.
+_UNDER = np.float32(-1)
+_UP = (np.float32(0), np.float32(0), np.float32(10))
+_FLOOR = 4
+# What lies on the floor and is lower than this shows the floor's shadows.
+_FLAT = 0.03
+
+
+@njit(**INNER)
+def _range(low, high, lamp, reach, extent, cells):
+    """Return the cells of the floor's map, along an axis, that a shape or its shadow may cover."""
+    start = min(low, lamp + (low - lamp) * reach)
+    end = max(high, lamp + (high - lamp) * reach)
+    first = math.floor((start / extent + 0.5) * (cells - 1))
+    last = math.ceil((end / extent + 0.5) * (cells - 1)) + 1
+    return max(first, 0), min(last, cells)
+
+
+@njit(**INNER)
+def _darken(darkness, body, size, lamp):
+    """Add the shadow that a shape throws from the lamp, and the dimness right below it."""
+    cells = darkness.shape[0]
+    x, y, z = triple(body.center)
+    bottom = z - body.extent[2]
+    top = z + body.extent[2]
+    # what hangs high and what lies flat throws no shadow that is seen
+    if bottom > 1.2 or top < 0.03 or top > lamp[2] - 0.2:
+        return
+    ex = abs(body.axes[0, 0]) * body.extent[0] + abs(body.axes[0, 1]) * body.extent[1]
+    ey = abs(body.axes[0, 1]) * body.extent[0] + abs(body.axes[0, 0]) * body.extent[1]
+    reach = lamp[2] / (lamp[2] - top)
+    i0, i1 = _range(x - ex, x + ex, lamp[0], reach, size[0], cells)
+    j0, j1 = _range(y - ey, y + ey, lamp[1], reach, size[1], cells)
+    source = (np.float32(lamp[0]), np.float32(lamp[1]), np.float32(lamp[2]))
+    below = 0.55 * math.exp(-3 * bottom)
+    for i in range(i0, i1):
+        x = (i / (cells - 1) - 0.5) * size[0]
+        for j in range(j0, j1):
+            y = (j / (cells - 1) - 0.5) * size[1]
+            dark = 0.0
+            if hit(body, (np.float32(x), np.float32(y), _UNDER), _UP) < 1:
+                dark = below
+            ray = (np.float32(x - lamp[0]), np.float32(y - lamp[1]), np.float32(-lamp[2]))
+            if hit(body, source, ray) < 1:
+                dark = max(dark, _SHADOW)
+            darkness[i, j] = max(darkness[i, j], dark)
+
+
+@njit(**OPTIONS)
+def _blurred(values):
+    """Return the mean over 3 x 3 cells."""
+    last = values.shape[0] - 1
+    result = np.empty(values.shape)
+    for i in range(values.shape[0]):
+        for j in range(values.shape[0]):
+            total = 0.0
+            for a in range(-1, 2):
+                for b in range(-1, 2):
+                    total += values[min(max(i + a, 0), last), min(max(j + b, 0), last)]
+            result[i, j] = total / 9
+    return result
+
+
+@njit(**OPTIONS)
+def floor_shadows(shapes, size, lamp):
+    """Return the factor (C, C) of the light that reaches the floor, indexed by x, then y."""
+    darkness = np.zeros((_SHADOW_CELLS, _SHADOW_CELLS))
+    # the first shape is the room
+    for i in range(1, shapes.shape[0]):
+        _darken(darkness, shapes[i].body, size, lamp)
+    return 1 - _blurred(_blurred(darkness))
+
+
+@njit(**INNER)
+def _local_point(body, p):
+    """Return a point in the frame of a shape that stands upright, sooner than for any turn."""
+    cos = body.axes[0, 0]
+    sin = body.axes[0, 1]
+    x, y, z = minus(p, body.center)
+    return cos * x + sin * y, cos * y - sin * x, z
+
+
+@njit(**INNER)
+def _on_round(body, part, p):
+    """Return what `_surface` does of a ball or a cylinder, in its own frame; part 1 is a cap."""
+    x, y, z = p
+    radius = float(body.extent[0])
+    if part == 1:
+        return (0.0, 0.0, math.copysign(1.0, z)), x, y, x / radius, y / radius
+    angle = math.atan2(y, x)
+    normal = (x / radius, y / radius, z / radius if body.kind == s.BALL else 0.0)
+    return normal, angle * radius, z, angle / math.pi, z / body.extent[2]
+
+
+@njit(**INNER)
+def _surface(shape, part, place):
+    """Return the index of the texture, world normal and texture coordinates of a point.
+
+    The coordinates are in metres, then in [-1, 1] across the surface.
+    """
+    body = shape.body
+    inside = body.kind == s.INTERIOR
+    # the frame of the room is the world's
+    p = place if inside else _local_point(body, place)
+    if body.kind == s.BALL or body.kind == s.CYLINDER:
+        normal, u, v, across, up = _on_round(body, part, p)
+        return shape.texture, to_world(body, normal), u, v, across, up
+    axis = part >> 1 if inside else part
+    normal, u, v, _ = on_axis(axis, p, (1.0, 1.0, 1.0))
+    across = u / body.extent[1 if axis == 0 else 0]
+    up = v / body.extent[1 if axis == 2 else 2]
+    if inside:
+        # the sign of z says nothing on the floor, which is at 0
+        inward = 1.0 - 2.0 * (part & 1)
+        normal = (inward * abs(normal[0]), inward * abs(normal[1]), inward * abs(normal[2]))
+        return shape.texture + part, normal, u, v, across, up
+    return shape.texture, to_world(body, normal), u, v, across, up
+
+
+@njit(**INNER)
+def _edge(distance):
+    return 1 - 0.30 / (1 + 6 * distance) ** 2
+
+
+@njit(**INNER)
+def _wall_shadow(place, size, face):
+    """Return the darkening of walls towards the room's edges."""
+    x, y, z = place
+    a = 1.0 if face < 2 else _edge(0.5 * size[0] - abs(x))
+    b = 1.0 if face == 2 or face == 3 else _edge(0.5 * size[1] - abs(y))
+    c = 1.0 if face >= 4 else _edge(z) * _edge(size[2] - z)
+    return a * b * c
+
+
+@njit(**INNER)
+def _floor_shadow(floor, place, size):
+    """Look up the floor's map of shadows, between its cells."""
+    last = floor.shape[0] - 1
+    a = min(max((place[0] / size[0] + 0.5) * last, 0.0), last - 1e-6)
+    b = min(max((place[1] / size[1] + 0.5) * last, 0.0), last - 1e-6)
+    i = int(a)
+    j = int(b)
+    a = a - i
+    b = b - j
+    low = floor[i, j] * (1 - b) + floor[i, j + 1] * b
+    high = floor[i + 1, j] * (1 - b) + floor[i + 1, j + 1] * b
+    return low * (1 - a) + high * a
+
+
+@njit(**INNER)
+def _shadow(room, code, place, normal):
+    if code < 8:
+        shadow = _wall_shadow(place, room.size, code)
+        return shadow * _floor_shadow(room.floor, place, room.size) if code == _FLOOR else shadow
+    if place[2] < _FLAT and normal[2] > 0.5:
+        return _floor_shadow(room.floor, place, room.size)
+    return 1 - 0.4 / (1 + 3 * place[2]) ** 2
+
+
+@njit(**INNER)
+def _light(room, code, place, normal):
+    """Return RGB of the light at a point: a bright ceiling above, and what lamps add by Lambert."""
+    even = 0.56 - 0.12 * normal[2]
+    total = (even, even, even)
+    for k in range(room.lights.shape[0]):
+        light = room.lights[k]
+        toward = minus(light.place, place)
+        square = dot(toward, toward)
+        cosine = max(dot(normal, toward) / math.sqrt(square), 0.0)
+        # gentler than the square, as walls throw light back
+        total = along(total, cosine / (1 + 0.12 * square), light.color)
+    return times(_shadow(room, code, place, normal), total)
+
+
+@njit(**INNER)
+def _gather(t, code, i, j, own, samples, top, o, rays, points):
+    """Write where rays of the pixel at (i, j) hit surface `own`, the mean in row 0; count them."""
+    n = 0
+    step = 1.0 / samples
+    total = (0.0, 0.0, 0.0)
+    for a in range(samples):
+        for b in range(samples):
+            if code[i + a, j + b] == own:
+                code[i + a, j + b] = TAKEN
+                n += 1
+                u = (j + b + 0.5) * step
+                v = top + (i + a + 0.5) * step
+                d = along(along(rays[0], u, rays[1]), v, rays[2])
+                place = along(o, t[i + a, j + b], d)
+                total = along(total, 1.0, place)
+                points[n, 0], points[n, 1], points[n, 2] = place
+    points[0, 0], points[0, 1], points[0, 2] = times(1 / n, total)
+    return n
+
+
+@njit(**INNER)
+def _albedo(texture, shape, part, points, n, footprint):
+    """Return the mean RGB of a texture at rows 1 to n of `points`; at row 0 of a smooth one."""
+    first = 0 if smooth(texture.pattern) else 1
+    last = 1 if smooth(texture.pattern) else n + 1
+    second = third = 0.0
+    for k in range(first, last):
+        _, _, u, v, across, up = _surface(shape, part, triple(points[k]))
+        b, c = mixture(texture, u, v, across, up, footprint)
+        second += b * (1 - c)
+        third += c
+    base = triple(texture.colors[0])
+    rgb = along(base, second / (last - first), minus(texture.colors[1], base))
+    return along(rgb, third / (last - first), minus(texture.colors[2], base))
+
+
+@njit(**INNER)
+def _shade(room, code, points, n, footprint):
+    """Return the RGB in [0, 1] of a surface seen at rows 1 to n of `points`."""
+    shape = room.shapes[code >> 3]
+    place = triple(points[0])
+    row, normal, _, _, _, _ = _surface(shape, code & 7, place)
+    texture = room.textures[row]
+    albedo = _albedo(texture, shape, code & 7, points, n, footprint)
+    light = _light(room, code, place, normal)
+    red, green, blue = mix(light, (1.0, 1.0, 1.0), texture.emission)
+    return min(albedo[0] * red, 1.0), min(albedo[1] * green, 1.0), min(albedo[2] * blue, 1.0)
+
+
+@njit(**OPTIONS)
+def paint_room(image, t, code, top, samples, room, c2w, rays):
+    """Write image (rows, W, 3) uint8, a band that begins at row `top`, and use `code` up.
+
+    Rays of a pixel that meet one surface share their light, and their texture if it is smooth.
+    """
+    eye = triple(c2w[:, 3])
+    points = np.empty((samples * samples + 1, 3))
+    step = 1.0 / samples
+    gain = 255.0 * step * step
+    spread = step * math.sqrt(dot(rays[1], rays[1]))
+    for row in range(image.shape[0]):
+        for column in range(image.shape[1]):
+            total = (0.0, 0.0, 0.0)
+            i = row * samples
+            j = column * samples
+            for a in range(samples):
+                for b in range(samples):
+                    own = code[i + a, j + b]
+                    if own == TAKEN:
+                        continue
+                    n = _gather(t, code, i, j, own, samples, top, eye, rays, points)
+                    seen = _shade(room, int(own), points, n, spread * t[i + a, j + b])
+                    total = along(total, n, seen)
+            red, green, blue = times(gain, total)
+            image[row, column, 0] = int(red + 0.5)
+            image[row, column, 1] = int(green + 0.5)
+            image[row, column, 2] = int(blue + 0.5)

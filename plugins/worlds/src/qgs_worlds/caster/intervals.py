@@ -1,0 +1,342 @@
+"""Where a ray o + t d is inside a primitive: entry, exit, and by which face of each.
+
+Numbers are float32, constants too, as a wider one would widen the loops that LLVM vectorises. They
+are in the primitive's own frame. A ray that misses enters at inf and leaves at -inf.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from qgs_worlds.caster import tables as s
+from qgs_worlds.caster.kernels import INNER, OPTIONS
+from qgs_worlds.caster.vectors import along, dot, minus
+
+NEAR = np.float32(0.01)
+NONE = np.float32(np.inf)
+TINY = np.float32(1e-9)
+ZERO = np.float32(0)
+ONE = np.float32(1)
+_HALF = np.float32(0.5)
+_TWO = np.float32(2)
+_FOUR = np.float32(4)
+# of the search for a torus
+_STEPS = 48
+_TOUCH = np.float32(2e-4)
+# of a height map's side, so that a point on the last line is in the last cell
+_INSIDE = np.float32(0.99999)
+# a step of the search in a height map goes at least this far, or rounding would stop it
+_ADVANCE = np.float32(1e-6)
+_NUDGE = np.float32(1e-3)
+
+
+@njit(**INNER)
+def reciprocal(x):
+    """Return 1 / x, large where x is 0."""
+    return ONE / (x if abs(x) > TINY else TINY)
+
+
+@njit(**INNER)
+def slab(o, inverse, h):
+    """Return where a ray is between -h and h along one axis; inverse is 1 / d."""
+    a = (-h - o) * inverse
+    b = (h - o) * inverse
+    return min(a, b), max(a, b)
+
+
+@njit(**INNER)
+def nearest(o, d):
+    """Return the point of a ray that is nearest to the origin, and its t."""
+    t = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    return along(o, t, d), t
+
+
+@njit(**INNER)
+def ellipsoid(o, d):
+    """Cross the unit sphere. o: see `nearest`."""
+    inside = ONE - (o[0] * o[0] + o[1] * o[1] + o[2] * o[2])
+    root = math.sqrt(max(inside, ZERO) / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
+    met = inside > ZERO
+    return (-root if met else NONE), (root if met else -NONE), ZERO, ZERO
+
+
+@njit(**INNER)
+def ball(o, d, radius):
+    """Enter a sphere around the origin; the exit is not needed, as balls have no cuts."""
+    inverse = ONE / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) * inverse
+    x, y, z = along(o, middle, d)
+    inside = radius * radius - (x * x + y * y + z * z)
+    root = math.sqrt(max(inside, ZERO) * inverse)
+    met = inside > ZERO
+    return (middle - root if met else NONE), NONE, ZERO, ZERO
+
+
+@njit(**INNER)
+def _last_and_first(x, y, z):
+    """Return where all three intervals overlap, and whose ends those are."""
+    near = max(x[0], y[0], z[0])
+    far = min(x[1], y[1], z[1])
+    entry = ZERO if near == x[0] else (ONE if near == y[0] else _TWO)
+    leave = ZERO if far == x[1] else (ONE if far == y[1] else _TWO)
+    return near, far, entry, leave
+
+
+@njit(**INNER)
+def box(o, d):
+    """Cross the cube; faces are numbered by axis."""
+    x = slab(o[0], reciprocal(d[0]), ONE)
+    y = slab(o[1], reciprocal(d[1]), ONE)
+    z = slab(o[2], reciprocal(d[2]), ONE)
+    return _last_and_first(x, y, z)
+
+
+@njit(**INNER)
+def block(o, d, h):
+    """Cross a box of half sizes h, as `box`."""
+    x = slab(o[0], reciprocal(d[0]), h[0])
+    y = slab(o[1], reciprocal(d[1]), h[1])
+    z = slab(o[2], reciprocal(d[2]), h[2])
+    return _last_and_first(x, y, z)
+
+
+@njit(**INNER)
+def interior(o, d, h):
+    """Leave a room from within, which stands on z = 0: its far side hides what is behind.
+
+    Faces -x, +x, -y, +y, floor and ceiling are 0 to 5. h: half of x and y, all of z.
+    """
+    tx = (math.copysign(h[0], d[0]) - o[0]) / d[0]
+    ty = (math.copysign(h[1], d[1]) - o[1]) / d[1]
+    tz = ((h[2] if d[2] > ZERO else ZERO) - o[2]) / d[2]
+    first_x = (tx <= ty) & (tx <= tz)
+    first_y = ty <= tz
+    t = tx if first_x else (ty if first_y else tz)
+    toward = d[0] if first_x else (d[1] if first_y else d[2])
+    face = ZERO if first_x else (_TWO if first_y else _FOUR)
+    return t, NONE, face + (ONE if toward > ZERO else ZERO), ZERO
+
+
+@njit(**INNER)
+def _shaft(o, d, radius, half):
+    """Cross an upright cylinder; also where it would be entered and left by its caps."""
+    low, high = slab(o[2], reciprocal(d[2]), half)
+    inverse = reciprocal(d[0] * d[0] + d[1] * d[1])
+    middle = -(o[0] * d[0] + o[1] * d[1]) * inverse
+    x = o[0] + middle * d[0]
+    y = o[1] + middle * d[1]
+    inside = radius * radius - (x * x + y * y)
+    root = math.sqrt(max(inside, ZERO) * inverse)
+    near = max(low, middle - root)
+    far = min(high, middle + root)
+    met = (inside > ZERO) & (near <= far)
+    return (near if met else NONE), (far if met else -NONE), low, high
+
+
+@njit(**INNER)
+def cylinder(o, d, h):
+    """Cross an upright cylinder of radius h[0] and half height h[2]. Face 1 is a cap."""
+    near, far, low, high = _shaft(o, d, h[0], h[2])
+    return near, far, (ONE if near == low else ZERO), (ONE if far == high else ZERO)
+
+
+@njit(**INNER)
+def capsule(o, d, half):
+    """Cross what is up to 1 from the segment between z = -half and half."""
+    near, far, _, _ = _shaft(o, d, ONE, half)
+    for end in (-half, half):
+        p, shift = nearest((o[0], o[1], o[2] - end), d)
+        first, last, _, _ = ellipsoid(p, d)
+        near = min(near, first + shift)
+        far = max(far, last + shift)
+    return near, far, ZERO, ZERO
+
+
+@njit(**INNER)
+def frustum(o, d, top):
+    """Cross a cone of radius 1 at z = -1, `top` <= 1 at z = 1. Face 0 is the side, 1 a cap."""
+    low, high = slab(o[2], reciprocal(d[2]), ONE)
+    slope = _HALF * (top - ONE)
+    radius = _HALF * (top + ONE) + slope * o[2]
+    change = slope * d[2]
+    a = d[0] * d[0] + d[1] * d[1] - change * change
+    b = o[0] * d[0] + o[1] * d[1] - change * radius
+    c = o[0] * o[0] + o[1] * o[1] - radius * radius
+    a = a if abs(a) > TINY else TINY
+    square = b * b - a * c
+    root = math.sqrt(max(square, ZERO))
+    # roots without a difference of like numbers
+    q = -(b + math.copysign(root, b))
+    one = q / a
+    other = c / (q if abs(q) > TINY else TINY)
+    first = min(one, other)
+    second = max(one, other)
+    # a steep ray is inside both halves of the double cone: on the side below the tip
+    down = d[2] < ZERO
+    side_near = first if a > ZERO else (second if down else -NONE)
+    side_far = second if a > ZERO else (NONE if down else first)
+    near = max(low, side_near)
+    far = min(high, side_far)
+    met = square > ZERO
+    entry = ONE if near == low else ZERO
+    leave = ONE if far == high else ZERO
+    return (near if met else NONE), (far if met else -NONE), entry, leave
+
+
+@njit(**INNER)
+def torus(o, d, thickness, start):
+    """Enter a ring of outer radius 1 about z, from t `start` on; the exit is the entry.
+
+    By sphere tracing, as roots of its quartic lose thin rings in float32.
+    """
+    step = ONE / math.sqrt(dot(d, d))
+    t, end, _, _ = ellipsoid(o, d)
+    low, high = slab(o[2], reciprocal(d[2]), thickness)
+    t = max(t, low, start)
+    end = min(end, high)
+    ring = ONE - thickness
+    for _ in range(_STEPS):
+        if t > end:
+            break
+        x, y, z = along(o, t, d)
+        across = math.sqrt(x * x + y * y) - ring
+        away = math.sqrt(across * across + z * z) - thickness
+        if away < _TOUCH:
+            return t, t, ZERO, ZERO
+        t += away * step
+    return NONE, -NONE, ZERO, ZERO
+
+
+@njit(**INNER)
+def height_at(heights, x, y):
+    """Return the bilinear height at x, y in [-1, 1]."""
+    last = heights.shape[0] - 1
+    a = min(max((x + ONE) * _HALF, ZERO), _INSIDE) * np.float32(last)
+    b = min(max((y + ONE) * _HALF, ZERO), _INSIDE) * np.float32(last)
+    i = int(a)
+    j = int(b)
+    a = a - np.float32(i)
+    b = b - np.float32(j)
+    low = heights[i, j] + b * (heights[i, j + 1] - heights[i, j])
+    high = heights[i + 1, j] + b * (heights[i + 1, j + 1] - heights[i + 1, j])
+    return low + a * (high - low)
+
+
+@njit(**INNER)
+def _above(heights, o, d, t):
+    x, y, z = along(o, t, d)
+    return z - height_at(heights, x, y)
+
+
+@njit(**INNER)
+def _next_line(o, d, t, cells):
+    """Return the t at which a ray crosses the next line between cells along one axis."""
+    if abs(d) < TINY:
+        return NONE
+    place = (o + t * d + ONE) * _HALF * cells
+    line = math.floor(place + _NUDGE) + 1 if d > ZERO else math.ceil(place - _NUDGE) - 1
+    return (np.float32(line) / cells * _TWO - ONE - o) / d
+
+
+@njit(**INNER)
+def _surface_between(heights, o, d, t, above, line, below):
+    """Return where a ray meets the map between `above` it at t and `below` it at `line`."""
+    # regula falsi: heights along a ray in one cell are a parabola
+    for _ in range(3):
+        middle = t + (line - t) * above / (above - below)
+        height = _above(heights, o, d, middle)
+        if height < ZERO:
+            line = middle
+            below = height
+        else:
+            t = middle
+            above = height
+    return t + (line - t) * above / (above - below)
+
+
+@njit(**INNER)
+def relief(o, d, heights, start):
+    """Enter what is below the height map, in the cube, as `torus`. Face 0 is its top, 1 a side."""
+    t, end, _, _ = box(o, d)
+    t = max(t, start)
+    if t > end:
+        return NONE, -NONE, ZERO, ZERO
+    cells = np.float32(heights.shape[0] - 1)
+    above = _above(heights, o, d, t)
+    if above < ZERO:
+        return t, t, ONE, ONE
+    while t < end:
+        line = min(_next_line(o[0], d[0], t, cells), _next_line(o[1], d[1], t, cells))
+        line = min(max(line, t + _ADVANCE), end)
+        below = _above(heights, o, d, line)
+        if below < ZERO:
+            t = _surface_between(heights, o, d, t, above, line, below)
+            return t, t, ZERO, ZERO
+        t = line
+        above = below
+    return NONE, -NONE, ZERO, ZERO
+
+
+@njit(**INNER)
+def less(near, far, entry, cut_near, cut_far, cut_leave):
+    """Return the entry into the first interval without the second, and its face, 3 more there."""
+    outer = (near > NEAR) & (near <= far) & ((near < cut_near) | (near > cut_far))
+    inner = (cut_far > NEAR) & (cut_far > near) & (cut_far < far) & (cut_near <= cut_far)
+    t = near if outer else (cut_far if inner else NONE)
+    return t, (entry if outer else cut_leave + np.float32(3))
+
+
+@njit(**INNER)
+def local(primitive, v):
+    """Return a direction in the frame of a primitive."""
+    axes = primitive.axes
+    return dot(axes[0], v), dot(axes[1], v), dot(axes[2], v)
+
+
+@njit(**INNER)
+def local_point(primitive, p):
+    """Return a point in the frame of a primitive."""
+    return local(primitive, minus(p, primitive.center))
+
+
+@njit(**INNER)
+def hollow(shape):
+    """Return whether a shape is bent or cut: it may shade itself, and fills little of its box."""
+    return shape.body.kind >= s.TORUS or shape.cut.kind != s.NOTHING
+
+
+@njit(**OPTIONS)
+def hit(body, o, d):
+    """Return the t at which a ray enters a BLOCK, a BALL or a CYLINDER, or inf."""
+    p = local_point(body, o)
+    way = local(body, d)
+    if body.kind == s.BALL:
+        near, far, _, _ = ball(p, way, body.extent[0])
+    elif body.kind == s.BLOCK:
+        near, far, _, _ = block(p, way, body.extent)
+    else:
+        near, far, _, _ = cylinder(p, way, body.extent)
+    return near if (near > NEAR) & (near <= far) else NONE
+
+
+@njit(**OPTIONS)
+def height_of(heights, x, y):
+    """Return `height_at`, to be called from Python."""
+    return height_at(heights, x, y)
+
+
+@njit(**OPTIONS)
+def clearances(shapes, points):
+    """Return metres (F, S) from points (F, 3) to the boxes around shapes, 0 inside."""
+    distances = np.empty((points.shape[0], shapes.shape[0]))
+    for f in range(points.shape[0]):
+        for i in range(shapes.shape[0]):
+            body = shapes[i].body
+            place = local_point(body, points[f])
+            square = 0.0
+            for a in range(3):
+                away = max(abs(place[a]) - body.extent[a], 0.0) * body.unit[a]
+                square += away * away
+            distances[f, i] = math.sqrt(square)
+    return distances

@@ -1,0 +1,30 @@
+"""Lenses and poses of cameras."""
+
+import math
+
+import numpy as np
+
+
+def lens(fov: float, size: tuple[int, int]) -> np.ndarray:
+    """Return fx, fy, cx, cy in pixels of a horizontal field of view in degrees, for (H, W)."""
+    height, width = size
+    focal = width / 2 / math.tan(math.radians(fov) / 2)
+    return np.array([focal, focal, width / 2, height / 2])
+
+
+def look_along(eyes: np.ndarray, forward: np.ndarray, roll: np.ndarray | None = None) -> np.ndarray:
+    """Return OpenCV c2w (F, 4, 4) of cameras at `eyes` that look `forward`, both (F, 3).
+
+    roll: (F,) radians about the axis; level without it.
+    """
+    forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    down = np.cross(forward, right)
+    if roll is not None:
+        cos = np.cos(roll)[:, None]
+        sin = np.sin(roll)[:, None]
+        right, down = cos * right + sin * down, cos * down - sin * right
+    c2w = np.tile(np.eye(4), (len(eyes), 1, 1))
+    c2w[:, :3] = np.stack([right, down, forward, eyes], -1)
+    return c2w

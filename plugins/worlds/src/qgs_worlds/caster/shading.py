@@ -1,0 +1,176 @@
+"""Colours of what rays meet in worlds: light with shadows and occlusion, highlights, sky, fog."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from qgs_worlds.caster import tables as s
+from qgs_worlds.caster.intervals import ONE, ZERO, hollow
+from qgs_worlds.caster.kernels import INNER, OPTIONS
+from qgs_worlds.caster.occlusion import surroundings, visible
+from qgs_worlds.caster.raycast import SKY
+from qgs_worlds.caster.shadows import lit
+from qgs_worlds.caster.surfaces import surface
+from qgs_worlds.caster.textures import color, noise
+from qgs_worlds.caster.vectors import along, dot, minus, mix, over, product, times, triple, unit
+
+TAKEN = np.float32(-2)
+# Metres above a surface where its light is looked up, so that it does not shade itself.
+_LIFT = 2e-3
+
+
+@njit(**INNER)
+def _clouds(air, x, y, z):
+    """Return how white the sky is in a direction: noise on a plane above."""
+    if air.clouds <= 0 or z <= 0.02:
+        return 0.0
+    # the summand bounds how fine the clouds are at the horizon
+    a = 1.2 * x / (z + 0.15)
+    b = 1.2 * y / (z + 0.15)
+    cloud = 0.0
+    weight = 1.0
+    for octave in range(3):
+        cloud += weight * noise(s.VALUE, a, b, air.seed + octave)
+        a = 2.03 * a + 5.1
+        b = 2.03 * b
+        weight = 0.55 * weight
+    return min(max(2.0 * cloud + air.clouds - 0.5, 0.0), 1.0) * min(8 * z, 1.0)
+
+
+@njit(**INNER)
+def _glow(lights, view):
+    """Return the glow about the sun: the eighth power of a cosine, by squares as `**` is slow."""
+    if lights.shape[0] == 0 or lights[0].lamp > 0:
+        return 0.0
+    near = max(dot(view, lights[0].place), 0.0) ** 2
+    near *= near
+    near *= near
+    return 0.5 * near * near
+
+
+@njit(**INNER)
+def _sky(air, lights, view):
+    """Return RGB of the sky in a direction: a gradient, clouds and a glow about the sun."""
+    x, y, z = view
+    cloud = _clouds(air, x, y, z)
+    glow = _glow(lights, view)
+    white = 1.3 * max(air.horizon[0], air.horizon[1], air.horizon[2])
+    clear = mix(air.horizon, air.zenith, math.sqrt(max(z, 0.0)))
+    # the sun is a little yellow
+    glow = (glow * white, 0.9 * glow * white, 0.7 * glow * white)
+    return along(glow, 1.0, mix(clear, (white, white, white), cloud))
+
+
+@njit(**INNER)
+def _light(light, shadows, own, place, normal, view, open_, shine):
+    """Return how much of a light comes from a point: reflected evenly, and as a highlight."""
+    toward = minus(light.place, times(light.lamp, place))
+    square = dot(toward, toward)
+    near = 1.0 / math.sqrt(square)
+    cosine = dot(normal, toward) * near
+    if cosine <= 0:
+        return 0.0, 0.0
+    # lamps are not points: less than the square near to them
+    strength = 1.0 / (1.0 + light.lamp * 0.25 * square)
+    if light.shadows > 0:
+        strength *= lit(shadows, light, own, along(place, _LIFT, normal))
+    else:
+        strength *= open_
+    if shine <= 0:
+        return strength * cosine, 0.0
+    # Blinn's highlight
+    half = max(dot(unit(minus(times(near, toward), view)), normal), 0.0)
+    return strength * cosine, strength * half**shine
+
+
+@njit(**INNER)
+def _shade(world, around, code, place, view, footprint, distance):
+    """Return RGB of a surface seen at a point from direction `view`."""
+    i = code >> 3
+    shape = world.shapes[i]
+    air = world.air[0]
+    row, normal, u, v = surface(shape, world.heights, code & 7, place)
+    texture = world.textures[row]
+    # bent and cut shapes shade themselves
+    own = -1 if hollow(shape) else i
+    # a pixel covers more of a slanting surface, but not without bound at its outline
+    slant = footprint / math.sqrt(max(-dot(normal, view), 0.06))
+    albedo = color(texture, u, v, slant / shape.scale)
+    open_ = visible(world.shapes, around, i, place, normal, air.occlusion, air.reach, footprint)
+    ambient = mix(air.below, air.above, 0.5 + 0.5 * normal[2])
+    seen = product(times(open_, albedo), ambient)
+    gloss = texture.specular
+    shine = texture.shine if gloss > 0 else 0.0
+    for k in range(world.lights.shape[0]):
+        light = world.lights[k]
+        even, high = _light(light, world.shadows, own, place, normal, view, open_, shine)
+        high *= gloss
+        reflected = along((high, high, high), even, albedo)
+        seen = along(seen, 1.0, product(reflected, light.color))
+    mist = 1.0 - 1.0 / (1.0 + air.fog * distance)
+    return mix(seen, air.horizon, mist)
+
+
+@njit(**INNER)
+def _gather(t, code, i, j, own, samples):
+    """Take the rays of the pixel at (i, j) that hit surface `own`: their number and means.
+
+    Of their t, and of their columns and rows within the pixel, which t weighs.
+    """
+    n = 0
+    t_sum = u_sum = v_sum = ZERO
+    for a in range(samples):
+        for b in range(samples):
+            if code[i + a, j + b] == own:
+                code[i + a, j + b] = TAKEN
+                n += 1
+                distance = t[i + a, j + b] if own != SKY else ONE
+                t_sum += distance
+                u_sum += distance * b
+                v_sum += distance * a
+    return n, t_sum / n, u_sum / t_sum, v_sum / t_sum
+
+
+@njit(**OPTIONS)
+def paint(image, t, code, top, samples, world, c2w, rays):
+    """Write image (rows, W, 3) float32, a band that begins at row `top`, and use `code` up.
+
+    Values are linear in light. Rays of a pixel that meet one surface are shaded at their mean.
+    """
+    around = surroundings(world.shapes)
+    for row in range(image.shape[0]):
+        for column in range(image.shape[1]):
+            rgb = _pixel(t, code, row, column, top, samples, world, around, c2w, rays)
+            for c in range(3):
+                image[row, column, c] = rgb[c]
+
+
+@njit(**INNER)
+def _pixel(t, code, row, column, top, samples, world, around, c2w, rays):
+    """Return the mean light of a pixel's rays."""
+    step = 1.0 / samples
+    eye = triple(c2w[:, 3])
+    spread = math.sqrt(dot(rays[1], rays[1]))
+    total = (0.0, 0.0, 0.0)
+    i = row * samples
+    j = column * samples
+    for a in range(samples):
+        for b in range(samples):
+            own = code[i + a, j + b]
+            if own == TAKEN:
+                continue
+            n, depth, u, v = _gather(t, code, i, j, own, samples)
+            u = column + (u + 0.5) * step
+            v = top + row + (v + 0.5) * step
+            d = along(along(rays[0], u, rays[1]), v, rays[2])
+            long = math.sqrt(dot(d, d))
+            view = over(d, long)
+            if own == SKY:
+                seen = _sky(world.air[0], world.lights, view)
+            else:
+                place = along(eye, depth, d)
+                footprint = spread * depth
+                seen = _shade(world, around, int(own), place, view, footprint, depth * long)
+            total = along(total, n, seen)
+    return times(step * step, total)

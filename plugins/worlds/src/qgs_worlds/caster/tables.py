@@ -1,0 +1,126 @@
+"""Tables of numbers that describe shapes, textures, lights and air to the ray caster.
+
+World frame: metres, z up. A shape is a primitive in a frame of its own, less a second convex
+primitive, if it has one.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+# What fits the cube [-1, 1]^3 of a frame of its own; a capsule is longer.
+ELLIPSOID, BOX, FRUSTUM, CAPSULE, TORUS, HEIGHT = range(6)
+# What is measured in metres and stands upright: shapes of furnished rooms, and a room from within.
+BLOCK, BALL, CYLINDER, INTERIOR = range(6, 10)
+NOTHING = -1  # kind of the second primitive of a shape that has none
+
+VALUE, GRADIENT, CELLS = range(3)  # kinds of noise
+NO_PATTERN, STRIPES, CHECKER, TILES, DOTS, GLYPHS, RINGS = range(7)
+
+PRIMITIVE = np.dtype(
+    [
+        ("kind", "i4"),
+        # a frustum's upper radius, half a capsule's length, both by the radius, the thickness of a
+        # torus by its outer radius, or the index of a height map
+        ("extra", "f4"),
+        ("axes", "f4", (3, 3)),  # from world to local
+        ("center", "f4", 3),
+        ("unit", "f4", 3),  # metres per unit of the local frame
+        ("extent", "f4", 3),  # half sizes in the local frame
+    ]
+)
+SHAPE = np.dtype(
+    [
+        ("body", PRIMITIVE),
+        ("cut", PRIMITIVE),
+        ("radius", "f4"),  # of the bounding sphere
+        ("texture", "i4"),  # first one of `faces`
+        ("faces", "i4"),
+        ("cut_texture", "i4"),
+        ("scale", "f4"),  # metres per unit of a texture
+    ]
+)
+# Periods are in units of the texture. colors: linear RGB, three of the ramp, one of the pattern.
+TEXTURE = np.dtype(
+    [
+        *[(name, "i8") for name in ("seed", "basis", "octaves", "pattern")],
+        *[
+            (name, "f8")
+            for name in (
+                "period", "gain", "contrast", "warp", "stretch", "pattern_period", "aspect",
+                "width", "strength", "tone", "specular", "shine", "emission",
+            )
+        ],
+        ("colors", "f8", (4, 3)),
+    ]
+)  # fmt: skip
+# lamp: 1, or 0 for the sun. place: a lamp's position, or the direction to the sun. shadows: 0 for a
+# light that throws none, or the number of its first map plus 1.
+LIGHT = np.dtype([("lamp", "f8"), ("place", "f8", 3), ("color", "f8", 3), ("shadows", "i8")])
+# Light from above and from below; the sky overhead and at the horizon; fog per metre; clouds;
+# strength and reach of the ambient occlusion.
+AIR = np.dtype(
+    [
+        *[(name, "f8", 3) for name in ("above", "below", "zenith", "horizon")],
+        *[(name, "f8") for name in ("fog", "clouds", "occlusion", "reach")],
+        ("seed", "i8"),
+    ]
+)
+# A map of what a light sees: where its pixels begin, its side and focal length in pixels, its pose.
+MAP = np.dtype([("begin", "i8"), ("side", "i8"), ("focal", "f8"), ("c2w", "f8", (3, 4))])
+
+
+def primitives(
+    kind: np.ndarray, extra: np.ndarray, center: np.ndarray, half: np.ndarray, turn: np.ndarray
+) -> np.ndarray:
+    """Return a table of PRIMITIVE. half: metres (P, 3). turn: rotations to the world (P, 3, 3)."""
+    metric = (kind >= BLOCK)[:, None]
+    unit = np.where(metric, 1.0, half)
+    extent = np.where(metric, half, 1.0)
+    extent[kind == CAPSULE, 2] += extra[kind == CAPSULE]
+    extent[kind == TORUS, 2] = extra[kind == TORUS]
+    table = np.zeros(len(kind), PRIMITIVE)
+    table["kind"] = kind
+    table["extra"] = extra
+    table["axes"] = turn.transpose(0, 2, 1) / unit[:, :, None]
+    table["center"] = center
+    table["unit"] = unit
+    table["extent"] = extent
+    return table
+
+
+class Shadows(NamedTuple):
+    """Shadow maps: a table of MAP, and depths and codes of all their pixels one after the other."""
+
+    maps: np.ndarray
+    depths: np.ndarray
+    codes: np.ndarray
+
+
+class World(NamedTuple):
+    """A scene, ready to be cast: tables of SHAPE, TEXTURE, LIGHT and one row of AIR.
+
+    heights: (K, G, G) float32 in [-1, 1].
+    """
+
+    shapes: np.ndarray
+    heights: np.ndarray
+    textures: np.ndarray
+    lights: np.ndarray
+    air: np.ndarray
+    shadows: Shadows
+
+
+class Room(NamedTuple):
+    """A furnished room, ready to be cast: tables of SHAPE, the room itself first, and of TEXTURE.
+
+    heights: see `World`. size: x, y, z extent in metres. lights: a table of LIGHT. floor: (C, C)
+    factor of the light that reaches the floor, indexed by x, then y.
+    """
+
+    shapes: np.ndarray
+    heights: np.ndarray
+    textures: np.ndarray
+    size: tuple[float, float, float]
+    lights: np.ndarray
+    floor: np.ndarray

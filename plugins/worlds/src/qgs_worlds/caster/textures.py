@@ -1,0 +1,187 @@
+"""Noise and patterns of textures, looked up at a point of a surface."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from qgs_worlds.caster import tables as s
+from qgs_worlds.caster.kernels import INNER
+from qgs_worlds.caster.vectors import mix, times
+
+# Side of the table of random numbers, which noise repeats; a power of two, for `chance`.
+_SIDE = 64
+# Mean of glyphs: words, letters, part of a cell and dots in it.
+_INK = 0.24
+_TABLE = np.random.default_rng(7).random((_SIDE, _SIDE)).astype(np.float32)
+
+
+@njit(**INNER)
+def chance(i, j, seed):
+    """Return a number in [0, 1) for each lattice point."""
+    return float(_TABLE[(i + seed) & (_SIDE - 1), (j + (seed >> 6)) & (_SIDE - 1)])
+
+
+@njit(**INNER)
+def _corner(basis, i, j, seed, x, y):
+    """Return the height at (x, y) of a plane through the lattice point: level, or of any slope."""
+    if basis == s.VALUE:
+        return chance(i, j, seed) - 0.5
+    return (2 * chance(i, j, seed) - 1.0) * x + (2 * chance(j, i, seed + 1371) - 1.0) * y
+
+
+@njit(**INNER)
+def _cells(x, y, i, j, seed):
+    """Return the distance to the nearest of points scattered one to a cell, less its mean."""
+    least = 4.0
+    for a in range(-1, 2):
+        for b in range(-1, 2):
+            u = i + a + chance(i + a, j + b, seed) - x
+            v = j + b + chance(j + b, i + a, seed + 1371) - y
+            least = min(least, u * u + v * v)
+    return 1.4 * (math.sqrt(least) - 0.45)
+
+
+@njit(**INNER)
+def eased(x):
+    """Return x in [0, 1] so that it starts and ends without a slope."""
+    return x * x * (3 - 2 * x)
+
+
+@njit(**INNER)
+def noise(basis, x, y, seed):
+    """Return noise of unit period and a mean of about 0, mostly within -0.5 and 0.5."""
+    i = math.floor(x)
+    j = math.floor(y)
+    if basis == s.CELLS:
+        return _cells(x, y, i, j, seed)
+    a = x - i
+    b = y - j
+    c00 = _corner(basis, i, j, seed, a, b)
+    c10 = _corner(basis, i + 1, j, seed, a - 1, b)
+    c01 = _corner(basis, i, j + 1, seed, a, b - 1)
+    c11 = _corner(basis, i + 1, j + 1, seed, a - 1, b - 1)
+    across = eased(a)
+    low = c00 + across * (c10 - c00)
+    high = c01 + across * (c11 - c01)
+    return low + eased(b) * (high - low)
+
+
+@njit(**INNER)
+def _seen(footprint, period):
+    """Return how much is seen of what has a period: 0 where it is finer than two footprints."""
+    return min(max(2.0 - 4.0 * footprint / period, 0.0), 1.0)
+
+
+@njit(**INNER)
+def _octaves(texture, x, y, footprint):
+    """Return noise in octaves, about 0.5; x, y: in periods, as is the footprint."""
+    total = 0.0
+    weight = texture.contrast
+    for octave in range(texture.octaves):
+        seen = _seen(footprint, 1.0)
+        if seen <= 0:
+            break
+        total += seen * weight * noise(texture.basis, x, y, texture.seed + 389 * octave)
+        # octaves of nearly twice the frequency, so that their lattices do not lie on each other
+        x = 1.97 * x + 7.3
+        y = 1.97 * y
+        footprint = 1.97 * footprint
+        weight = weight * texture.gain
+    return 0.5 + total
+
+
+@njit(**INNER)
+def _step(x, blur):
+    """Return a step at 0, blurred."""
+    return min(max(0.5 + x / blur, 0.0), 1.0)
+
+
+@njit(**INNER)
+def _bar(x, width, blur):
+    """Return 1 within `width` around an integer, 0 elsewhere."""
+    return _step(0.5 * width - abs(x - math.floor(x + 0.5)), blur)
+
+
+@njit(**INNER)
+def _glyphs(x, y, seed):
+    """Draw lines of marks: random dots of 4 x 6 in a cell, words apart, lines of any length."""
+    line = math.floor(y)
+    place = math.floor(x)
+    if chance(place // 3, line, seed + 5) < 0.25 or chance(place, line, seed) < 0.15:
+        return 0.0
+    i = math.floor(5 * (x - place))
+    j = math.floor(7 * (y - line))
+    if i > 3 or j > 5 or chance(4 * place + i, 6 * line + j, seed + 1) < 0.45:
+        return 0.0
+    return 1.0
+
+
+@njit(**INNER)
+def _mean(kind, width):
+    """Return how much of the fourth colour a pattern has."""
+    if kind == s.CHECKER:
+        return 0.5
+    if kind == s.TILES:
+        return 1.0 - (1.0 - 0.25 * width) ** 2
+    if kind == s.DOTS:
+        return math.pi * (0.55 * width) ** 2
+    return _INK if kind == s.GLYPHS else width
+
+
+@njit(**INNER)
+def _pattern(kind, x, y, width, seed, blur):
+    """Return how much of the fourth colour is seen, and the tone of the cell in [0, 1]."""
+    if kind == s.STRIPES or kind == s.RINGS:
+        place = x if kind == s.STRIPES else math.sqrt(x * x + y * y)
+        return _bar(place, width, blur), chance(math.floor(place + 0.5), 0, seed)
+    i = math.floor(x)
+    j = math.floor(y)
+    if kind == s.CHECKER:
+        a = 2 * _bar(0.5 * x, 0.5, blur) - 1
+        b = 2 * _bar(0.5 * y, 0.5, blur) - 1
+        return 0.5 + 0.5 * a * b, chance(i, j, seed)
+    if kind == s.TILES:
+        # every other row is shifted by half a tile, in one of two textures
+        x += 0.5 * (j & 1) * (seed & 1)
+        joint = max(_bar(x, 0.25 * width, blur), _bar(y, 0.25 * width, blur))
+        return joint, chance(math.floor(x), j, seed)
+    if kind == s.DOTS:
+        a = x - i - 0.5
+        b = y - j - 0.5
+        return _step(0.55 * width - math.sqrt(a * a + b * b), blur), chance(i, j, seed)
+    return _INK + _seen(blur, 0.4) * (_glyphs(x, y, seed) - _INK), 0.5
+
+
+@njit(**INNER)
+def _marked(texture, rgb, u, v, warped, footprint):
+    """Lay the pattern of a texture over a colour. warped: u, moved as the noise is."""
+    period = texture.pattern_period
+    blur = footprint / period * max(texture.aspect, 1.0)
+    x = u / period * texture.aspect + 0.2 * (warped - u / texture.period)
+    kind = texture.pattern
+    w, tone = _pattern(kind, x, v / period, texture.width, texture.seed, blur + 1e-6)
+    # from afar a pattern fades to its mean
+    seen = _seen(blur, 1.6)
+    mean = _mean(kind, texture.width)
+    w = texture.strength * (mean + seen * (w - mean))
+    shade = 1 + texture.tone * seen * (tone - 0.5)
+    return mix(times(shade, rgb), texture.colors[3], w)
+
+
+@njit(**INNER)
+def color(texture, u, v, footprint):
+    """Return RGB at u, v; footprint: distance of neighbouring pixels there, in the same unit."""
+    x = u / texture.period
+    y = v / texture.period
+    if texture.warp > 0:
+        shift = texture.warp * noise(s.VALUE, 0.7 * x, 0.7 * y, texture.seed + 31)
+        x = x + shift
+        y = y - shift
+    spread = footprint / texture.period * max(texture.stretch, 1.0)
+    f = min(max(_octaves(texture, texture.stretch * x, y, spread), 0.0), 1.0)
+    first = 0 if f < 0.5 else 1
+    rgb = mix(texture.colors[first], texture.colors[first + 1], 2 * f - first)
+    if texture.pattern != s.NO_PATTERN:
+        rgb = _marked(texture, rgb, u, v, x, footprint)
+    return rgb

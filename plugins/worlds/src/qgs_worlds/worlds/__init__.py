@@ -1,0 +1,14 @@
+"""Procedural worlds for qgs: scenes without meaning, textures, light, cameras."""
+
+from qgs.contracts import Plugin
+from qgs_worlds.worlds.source import WorldsSource
+
+plugin = Plugin(
+    name="worlds",
+    contract_version=1,
+    components=(WorldsSource,),
+    models={
+        name: f"models/{name}.safetensors"
+        for name in ("landmark-64", "landmark-128", "locus-64", "tokengs-64")
+    },
+)

@@ -1,0 +1,148 @@
+"""Textures of a world: noise through ramps of colours that go together, and patterns over it."""
+
+import colorsys
+import math
+from collections.abc import Mapping
+from random import Random
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike
+
+from qgs_worlds.caster import tables as s
+from qgs_worlds.caster.kernels import OPTIONS
+from qgs_worlds.caster.textures import chance, noise
+from qgs_worlds.worlds.things import spread
+
+COUNT = 14  # textures of a world
+_SIDE = 33  # points of a height map along each axis
+_PLAIN_PATTERNS = (s.STRIPES, s.CHECKER, s.TILES, s.DOTS)
+# what is named twice is drawn more often
+_PATTERNS = (*_PLAIN_PATTERNS, s.TILES, s.GLYPHS, s.GLYPHS, s.RINGS)
+
+Color = tuple[float, float, float]
+Texture = Mapping[str, ArrayLike]
+"""Fields of TEXTURE by name."""
+
+
+class Palette:
+    """A few hues and a liking for colour or grey, for one world. Colours are linear."""
+
+    def __init__(self, rng: Random) -> None:
+        self.rng = rng
+        base = rng.random()
+        steps = (0, 0.06, 0.1, 0.5, 0.33)
+        self._hues = [(base + step + 0.05 * rng.gauss(0, 1)) % 1 for step in steps]
+        self._grey = rng.uniform(1.5, 7)
+
+    def color(self) -> Color:
+        """Return a colour: most are dull, few are bright or dark."""
+        rng = self.rng
+        hue = rng.choice(self._hues) if rng.random() < 0.8 else rng.random()
+        saturation = rng.random() ** self._grey
+        red, green, blue = colorsys.hsv_to_rgb(hue, saturation, 0.12 + 0.83 * rng.random())
+        return red**2.2, green**2.2, blue**2.2
+
+    def near(self, color: Color, by: float) -> Color:
+        """Return a colour that differs from another by about `by` stops, and a little in hue."""
+        tone = 2 ** self.rng.gauss(0, by)
+        red, green, blue = (min(tone * c * 2 ** self.rng.gauss(0, 0.25 * by), 0.9) for c in color)
+        return red, green, blue
+
+
+def textures(rng: Random, varied: bool, highlights: bool) -> np.ndarray:
+    """Return a table of TEXTURE, COUNT long. Without highlights all else is drawn alike."""
+    palette = Palette(rng)
+    table = np.zeros(COUNT, s.TEXTURE)
+    for field in ("period", "stretch", "pattern_period", "aspect"):
+        table[field] = 1.0
+    table["gain"] = 0.5
+    for row in table:
+        fields = _varied(rng, palette, highlights) if varied else _plain(rng, palette)
+        for name, value in fields.items():
+            row[name] = value
+    return table
+
+
+def _plain(rng: Random, palette: Palette) -> Texture:
+    """Draw an even surface, or two colours in a simple pattern."""
+    base = palette.color()
+    ramp = [palette.near(base, 0.1), base, palette.near(base, 0.1)]
+    fields = {"octaves": 1, "period": rng.uniform(0.3, 1), "contrast": 0.6}
+    mark = base
+    if rng.random() >= 0.5:
+        mark = palette.color()
+        fields |= _pattern(rng, _PLAIN_PATTERNS)
+    return {**fields, "seed": rng.randrange(1 << 16), "colors": [*ramp, mark]}
+
+
+def _pattern(rng: Random, kinds: tuple[int, ...]) -> dict[str, float]:
+    kind = rng.choice(kinds)
+    long = spread(rng, 0.25, 1) if kind == s.TILES else spread(rng, 0.6, 1.7)
+    # lines of small letters
+    glyphs = kind == s.GLYPHS
+    return {
+        "pattern": kind,
+        "pattern_period": spread(rng, 0.06, 0.5) * (0.7 if glyphs else 1),
+        "aspect": 1.6 if glyphs else long,
+        "width": rng.uniform(0.15, 0.7),
+        "strength": rng.uniform(0.4, 1),
+        "tone": rng.choice((0.0, rng.uniform(0.2, 1.2))),
+    }
+
+
+def _varied(rng: Random, palette: Palette, highlights: bool) -> Texture:
+    """Draw noise with a spectrum near 1/f, half of it with a pattern; some surfaces are even."""
+    base = palette.color()
+    flat = rng.random() < 0.2
+    by = 0.15 if flat else rng.uniform(0.5, 1.6)
+    ramp = [palette.near(base, by), base, palette.near(base, by)]
+    if not flat and rng.random() < 0.3:
+        ramp[rng.randrange(3)] = palette.color()
+    basis = rng.choice((s.VALUE, s.VALUE, s.GRADIENT, s.GRADIENT, s.CELLS))
+    octaves = 2 if basis == s.CELLS else rng.randint(3, 5)
+    gain = rng.uniform(0.5, 0.85)
+    # octaves add up to a like contrast, however many there are
+    norm = math.sqrt(sum(gain ** (2 * k) for k in range(octaves)))
+    fields = {
+        "basis": basis,
+        "period": spread(rng, 0.15, 2),
+        "octaves": octaves,
+        "gain": gain,
+        "contrast": rng.uniform(0.8, 2.2) / norm,
+        "warp": rng.choice((0.0, rng.uniform(0.3, 2))),
+        "stretch": rng.choice((1.0, 1.0, spread(rng, 0.12, 8))),
+    }
+    if rng.random() < 0.4:
+        fields |= _pattern(rng, _PATTERNS)
+    shiny = rng.random() < 0.25
+    gloss = {"specular": spread(rng, 0.05, 0.8), "shine": spread(rng, 5, 150)}
+    if highlights and shiny:
+        fields |= gloss
+    mark = palette.color()
+    return {**fields, "seed": rng.randrange(1 << 16), "colors": [*ramp, mark]}
+
+
+@njit(**OPTIONS)
+def height_maps(seed, count):
+    """Return (count, 33, 33) float32 in [-1, 1]: smooth octaves, each map of its own grain."""
+    maps = np.empty((count, _SIDE, _SIDE), np.float32)
+    for k in range(count):
+        cells = 2.0 + 5.0 * chance(k, 0, seed)
+        gain = 0.3 + 0.3 * chance(k, 1, seed)
+        largest = 0.0
+        for i in range(_SIDE):
+            for j in range(_SIDE):
+                x = cells * i / (_SIDE - 1)
+                y = cells * j / (_SIDE - 1)
+                weight = 1.0
+                height = 0.0
+                for octave in range(3):
+                    height += weight * noise(s.VALUE, x, y, seed + 10 * k + octave)
+                    x = 2 * x
+                    y = 2 * y
+                    weight = gain * weight
+                maps[k, i, j] = height
+                largest = max(largest, abs(height))
+        maps[k] /= max(largest, 1e-6)
+    return maps
