@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from qgs_worlds.caster import tables as s
-from qgs_worlds.caster.intervals import hit
+from qgs_worlds.caster.intervals import hit, upright
 from qgs_worlds.caster.kernels import INNER, OPTIONS
 from qgs_worlds.caster.patterns import mixture, smooth
 from qgs_worlds.caster.shading import TAKEN
@@ -90,15 +90,6 @@ def floor_shadows(shapes, size, lamp):
 
 
 @njit(**INNER)
-def _local_point(body, p):
-    """Return a point in the frame of a shape that stands upright, sooner than for any turn."""
-    cos = body.axes[0, 0]
-    sin = body.axes[0, 1]
-    x, y, z = minus(p, body.center)
-    return cos * x + sin * y, cos * y - sin * x, z
-
-
-@njit(**INNER)
 def _on_round(body, part, p):
     """Return what `_surface` does of a ball or a cylinder, in its own frame; part 1 is a cap."""
     x, y, z = p
@@ -119,7 +110,7 @@ def _surface(shape, part, place):
     body = shape.body
     inside = body.kind == s.INTERIOR
     # the frame of the room is the world's
-    p = place if inside else _local_point(body, place)
+    p = place if inside else upright(body, minus(place, body.center))
     if body.kind == s.BALL or body.kind == s.CYLINDER:
         normal, u, v, across, up = _on_round(body, part, p)
         return shape.texture, to_world(body, normal), u, v, across, up

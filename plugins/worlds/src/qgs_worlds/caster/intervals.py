@@ -306,15 +306,23 @@ def hollow(shape):
     return shape.body.kind >= s.TORUS or shape.cut.kind != s.NOTHING
 
 
+@njit(**INNER)
+def upright(body, v):
+    """Return a direction as `local` does, sooner: of a shape in metres, which is turned about z."""
+    cos = body.axes[0, 0]
+    sin = body.axes[0, 1]
+    return cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2]
+
+
 @njit(**OPTIONS)
 def hit(body, o, d):
     """Return the t at which a ray enters a BLOCK, a BALL or a CYLINDER, or inf."""
-    p = local_point(body, o)
-    way = local(body, d)
-    if body.kind == s.BALL:
-        near, far, _, _ = ball(p, way, body.extent[0])
-    elif body.kind == s.BLOCK:
+    p = upright(body, minus(o, body.center))
+    way = upright(body, d)
+    if body.kind == s.BLOCK:
         near, far, _, _ = block(p, way, body.extent)
+    elif body.kind == s.BALL:
+        near, far, _, _ = ball(p, way, body.extent[0])
     else:
         near, far, _, _ = cylinder(p, way, body.extent)
     return near if (near > NEAR) & (near <= far) else NONE

@@ -26,6 +26,7 @@ from qgs_worlds.caster.intervals import (
     nearest,
     relief,
     torus,
+    upright,
 )
 from qgs_worlds.caster.kernels import INNER, OPTIONS
 from qgs_worlds.caster.vectors import along, dot, minus, over, triple
@@ -227,10 +228,10 @@ def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
     kind = body.kind
     extent = triple(body.extent)
     along_row = steps[first:last]
-    lo = local_point(body, o)
-    ls = local(body, _narrow(rays[1]))
+    lo = upright(body, minus(o, body.center))
+    ls = upright(body, _narrow(rays[1]))
     for row in range(above, below):
-        lb = local(body, _row_base(rays, top + (row + 0.5) / samples))
+        lb = upright(body, _row_base(rays, top + (row + 0.5) / samples))
         depths = t[row, first:last]
         codes = code[row, first:last]
         _cover_row(depths, codes, own, kind, extent, along_row, lo, lb, ls)
