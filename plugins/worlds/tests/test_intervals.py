@@ -29,7 +29,8 @@ def inside(primitive, points):
     """Negative inside of a primitive, positive outside."""
     turn = np.array(primitive.turn).reshape(3, 3)
     x, y, z = ((points - primitive.center) @ turn / primitive.half).T
-    extra, flat = primitive.extra, np.hypot(x, y)
+    extra = primitive.extra
+    flat = np.hypot(x, y)
     cube = abs(np.stack([x, y, z])).max(0) - 1
     field = MAPS[int(extra)]
     places = (np.stack([x, y]) + 1) / 2 * (len(field) - 1)
@@ -72,8 +73,10 @@ PAIRS = [*product(range(6), [None]), *product(range(4), range(3))]
 
 @pytest.mark.parametrize(("kind", "cut"), PAIRS)
 def test_rays_enter_where_implicit_functions_say(kind, cut):
-    rng, draws = Random(7), np.random.default_rng(7)
-    found, expected = [], []
+    rng = Random(7)
+    draws = np.random.default_rng(7)
+    found = []
+    expected = []
     for _ in range(80):
         hole = None if cut is None else drawn(cut, rng, (0.3, -0.2, 0.4))
         shape = Shape(drawn(kind, rng, (0.1, 0.2, 0.3)), hole)
@@ -99,7 +102,8 @@ def test_thin_rods_far_away_are_met():
 
 @pytest.mark.parametrize("kind", range(5))
 def test_reach_is_that_of_the_lowest_point(kind):
-    rng, points = Random(3), np.random.default_rng(3).uniform(-2, 2, (100_000, 3))
+    rng = Random(3)
+    points = np.random.default_rng(3).uniform(-2, 2, (100_000, 3))
     for _ in range(4):
         tilted = drawn(kind, rng, (0.0, 0.0, 0.0))
         lowest = -points[inside(tilted, points) < 0, 2].min()

@@ -32,7 +32,9 @@ def scenes():
 def test_depth_is_that_of_the_nearest_shape(scenes):
     random = np.random.default_rng(0)
     for scene in scenes[:6]:
-        world, camera, scale = scene.drawn.world, scene.cameras[2], scene.drawn.scale
+        world = scene.drawn.world
+        camera = scene.cameras[2]
+        scale = scene.drawn.scale
         c2w = camera.c2w.double().numpy()
         depth = scene.depths([2])[0, 0].numpy()
         ways = pixel_directions(camera.intrinsics, SIZE).double().numpy()
@@ -47,7 +49,8 @@ def test_scenes_are_scaled_to_their_depth(scenes):
     scaled = source(depth=(2.0, 2.0), image_size=(10, 10)).scenes("train")
     drawn = source(depth=None, image_size=(10, 10)).scenes("train")
     for index in range(3):
-        scene, factor = scaled[index], scaled[index].drawn.scale
+        scene = scaled[index]
+        factor = scaled[index].drawn.scale
         depths = scene.depths(range(8))
         assert depths[depths > 0].median() == pytest.approx(2, rel=0.01)
         moved = scene.cameras.c2w[:, :3, 3]

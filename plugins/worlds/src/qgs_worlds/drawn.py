@@ -44,7 +44,8 @@ class DrawnScene(Scene):
         self, name: str, index: int, config: DrawnConfig, split: Split, cache: ImageCache
     ) -> None:
         self.name = name
-        self._config, self._cache = config, cache
+        self._config = config
+        self._cache = cache
         self.key = [config.seed, 0 if split == "train" else 1, index]
 
     def __len__(self) -> int:
@@ -56,7 +57,8 @@ class DrawnScene(Scene):
 
     def images(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`."""
-        config, cache = self._config, self._cache
+        config = self._config
+        cache = self._cache
         images = {frame: cache[self.name, frame] for frame in frames if (self.name, frame) in cache}
         if missing := [frame for frame in dict.fromkeys(frames) if frame not in images]:
             cast = self.cast(missing)

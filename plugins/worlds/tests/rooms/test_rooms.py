@@ -19,15 +19,17 @@ def scenes(size=(16, 24)):
 @pytest.mark.parametrize("mirror", [False, True])
 def test_colours_reproject_through_depth(mirror):
     """Where depth says that two cameras see one point."""
-    scene, frames, size = scenes((96, 96))[1], [2, 4], (96, 96)
-    views, depths = (
-        Views(scene.images(frames)[None], scene.cameras[frames][None]),
-        scene.depths(frames),
-    )
+    scene = scenes((96, 96))[1]
+    frames = [2, 4]
+    size = (96, 96)
+    views = Views(scene.images(frames)[None], scene.cameras[frames][None])
+    depths = scene.depths(frames)
     assert depths.min() > 0  # a room is closed
     if mirror:
-        views, depths = mirrored_views(views), depths.flip(-1)
-    (first, second), (one, other) = views.images[0], views.cameras[0].intrinsics
+        views = mirrored_views(views)
+        depths = depths.flip(-1)
+    (first, second) = views.images[0]
+    (one, other) = views.cameras[0].intrinsics
     points = (pixel_directions(one, size) * depths[0, 0, ..., None]).flatten(0, 1)
     c2w = views.cameras.c2w[0, 0]
     local = to_camera((points @ c2w[:3, :3].T + c2w[:3, 3])[None], views.cameras)[0, 1]
@@ -45,7 +47,8 @@ def test_colours_reproject_through_depth(mirror):
 
 def test_cameras_are_rigid_and_keep_clear_of_every_surface():
     for scene in scenes()[:40]:
-        turn, eyes = scene.cameras.c2w[:, :3, :3], scene.cameras.c2w[:, :3, 3]
+        turn = scene.cameras.c2w[:, :3, :3]
+        eyes = scene.cameras.c2w[:, :3, 3]
         assert (turn @ turn.mT - torch.eye(3)).abs().max() < 1e-5
         assert torch.linalg.det(turn).min() > 0.99
         assert turn[:, 2, 1].max() < 0  # the image's y axis points down

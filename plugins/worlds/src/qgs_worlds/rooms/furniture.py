@@ -12,7 +12,8 @@ Piece = list[Shape]
 
 
 def _legs(w: float, d: float, h: float, thick: float, texture: int) -> Piece:
-    x, y = w / 2 - thick, d / 2 - thick
+    x = w / 2 - thick
+    y = d / 2 - thick
     return [box(a * x, b * y, 0, (thick, thick, h), texture) for a in (-1, 1) for b in (-1, 1)]
 
 
@@ -20,7 +21,8 @@ def _on_top(rng: Random, m: Materials, x: float, y: float, z: float) -> Piece:
     """Something small that stands at (x, y, z)."""
     pick = rng.randrange(5)
     if pick == 0:
-        r, h = rng.uniform(0.05, 0.09), rng.uniform(0.15, 0.3)
+        r = rng.uniform(0.05, 0.09)
+        h = rng.uniform(0.15, 0.3)
         return [
             cylinder(x, y, z, r, h, m.fabric()),
             sphere(x, y, z + h - 0.3 * r, 1.5 * r, m.paint()),
@@ -43,12 +45,15 @@ def _on_top(rng: Random, m: Materials, x: float, y: float, z: float) -> Piece:
 
 def table(rng: Random, m: Materials) -> Piece:
     """A dining table with things on it and chairs around."""
-    w, d, h = rng.uniform(1.0, 1.6), rng.uniform(0.7, 0.95), rng.uniform(0.7, 0.76)
+    w = rng.uniform(1.0, 1.6)
+    d = rng.uniform(0.7, 0.95)
+    h = rng.uniform(0.7, 0.76)
     wood = m.timber()
     piece = [box(0, 0, h - 0.04, (w, d, 0.04), wood), *_legs(w, d, h - 0.04, 0.06, wood)]
     for x in [rng.uniform(-0.38, 0.38) for _ in range(rng.randrange(1, 4))]:
         piece += _on_top(rng, m, x * w, rng.uniform(-0.3, 0.3) * d, h)
-    seat, frame = m.fabric(), m.timber()
+    seat = m.fabric()
+    frame = m.timber()
     for sign, turn in ((1, 0.0), (-1, np.pi)):
         for x in (-w / 4, w / 4):
             if rng.random() < 0.75:
@@ -73,8 +78,10 @@ def chair(rng: Random, m: Materials) -> Piece:
 
 def round_table(rng: Random, m: Materials) -> Piece:
     """A round table on one foot."""
-    r, h = rng.uniform(0.35, 0.55), rng.uniform(0.45, 0.72)
-    wood, metal = m.timber(), m.metal()
+    r = rng.uniform(0.35, 0.55)
+    h = rng.uniform(0.45, 0.72)
+    wood = m.timber()
+    metal = m.metal()
     piece = [
         cylinder(0, 0, 0, 0.6 * r, 0.03, metal),
         cylinder(0, 0, 0.03, 0.04, h - 0.06, metal),
@@ -85,8 +92,10 @@ def round_table(rng: Random, m: Materials) -> Piece:
 
 def sofa(rng: Random, m: Materials) -> Piece:
     """A sofa with arms and cushions."""
-    w, d = rng.uniform(1.4, 2.1), 0.85
-    cloth, feet = m.fabric(), m.metal()
+    w = rng.uniform(1.4, 2.1)
+    d = 0.85
+    cloth = m.fabric()
+    feet = m.metal()
     piece = [
         box(0, 0, 0.1, (w, d, 0.32), cloth),
         box(0, d / 2 - 0.1, 0.42, (w, 0.2, 0.42), cloth),
@@ -101,9 +110,12 @@ def sofa(rng: Random, m: Materials) -> Piece:
 
 def shelf(rng: Random, m: Materials) -> Piece:
     """A bookcase, some boards full of books, others with ornaments."""
-    w, d = rng.uniform(0.8, 1.5), 0.32
-    levels, step = rng.randrange(3, 6), 0.38
-    h, wood = levels * step, m.timber()
+    w = rng.uniform(0.8, 1.5)
+    d = 0.32
+    levels = rng.randrange(3, 6)
+    step = 0.38
+    h = levels * step
+    wood = m.timber()
     piece = [
         *[box(x, 0, 0, (0.04, d, h), wood) for x in (-w / 2, w / 2)],
         box(0, d / 2 - 0.01, 0, (w, 0.02, h), wood),
@@ -125,8 +137,11 @@ def shelf(rng: Random, m: Materials) -> Piece:
 
 def sideboard(rng: Random, m: Materials) -> Piece:
     """A low cupboard with doors and things on it."""
-    w, d, h = rng.uniform(1.0, 1.7), 0.42, rng.uniform(0.6, 0.85)
-    front, knob = m.paint() if rng.random() < 0.4 else m.timber(), m.metal()
+    w = rng.uniform(1.0, 1.7)
+    d = 0.42
+    h = rng.uniform(0.6, 0.85)
+    front = m.paint() if rng.random() < 0.4 else m.timber()
+    knob = m.metal()
     piece = [box(0, 0, 0.08, (w, d, h - 0.08), m.timber()), box(0, 0, 0, (w - 0.1, d, 0.08), knob)]
     doors = rng.randrange(2, 4)
     for i in range(doors):
@@ -141,8 +156,11 @@ def sideboard(rng: Random, m: Materials) -> Piece:
 
 def wardrobe(rng: Random, m: Materials) -> Piece:
     """A tall cupboard."""
-    w, d, h = rng.uniform(0.9, 1.4), 0.55, rng.uniform(1.7, 2.1)
-    front, knob = m.timber(), m.metal()
+    w = rng.uniform(0.9, 1.4)
+    d = 0.55
+    h = rng.uniform(1.7, 2.1)
+    front = m.timber()
+    knob = m.metal()
     piece = [box(0, 0, 0, (w, d, h), m.timber())]
     for side in (-1, 1):
         piece.append(box(side * w / 4, -d / 2, 0.06, (w / 2 - 0.03, 0.03, h - 0.12), front))
@@ -152,7 +170,8 @@ def wardrobe(rng: Random, m: Materials) -> Piece:
 
 def floor_lamp(rng: Random, m: Materials) -> Piece:
     """A lamp on a pole."""
-    metal, h = m.metal(), rng.uniform(1.2, 1.5)
+    metal = m.metal()
+    h = rng.uniform(1.2, 1.5)
     return [
         cylinder(0, 0, 0, 0.16, 0.03, metal),
         cylinder(0, 0, 0.03, 0.018, h, metal),
@@ -185,7 +204,8 @@ def balls(rng: Random, m: Materials) -> Piece:
 
 def crates(rng: Random, m: Materials) -> Piece:
     """A stack of two boxes."""
-    a, b = rng.uniform(0.35, 0.5), rng.uniform(0.22, 0.33)
+    a = rng.uniform(0.35, 0.5)
+    b = rng.uniform(0.22, 0.33)
     upper = box(0, 0, a, (b, b, b), m.fabric()).moved(0.03, 0.02, rng.uniform(0, 1.5))
     return [box(0, 0, 0, (a, a, a), m.fabric()), upper]
 

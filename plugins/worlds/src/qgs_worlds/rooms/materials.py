@@ -60,7 +60,8 @@ class Materials:
         """One of the room's hues at a random saturation and value."""
         pick, s, v = (self.rng.random() for _ in range(3))
         hue = self._hues[int(pick * len(self._hues))]
-        (low_s, high_s), (low_v, high_v) = saturation, value
+        (low_s, high_s) = saturation
+        (low_v, high_v) = value
         return colorsys.hsv_to_rgb(hue, low_s + s * (high_s - low_s), low_v + v * (high_v - low_v))
 
     def paint(self) -> int:
@@ -87,22 +88,26 @@ class Materials:
     def fabric(self) -> int:
         """A patterned cloth or ornament."""
         kind = self.rng.choice(_ACCENT)
-        a, b = self.color((0.25, 0.8), (0.3, 0.9)), self.color((0.1, 0.7), (0.5, 0.98))
+        a = self.color((0.25, 0.8), (0.3, 0.9))
+        b = self.color((0.1, 0.7), (0.5, 0.98))
         return self.add(kind, self.rng.uniform(0.1, 0.3), (a, b, WHITE))
 
     def books(self) -> int:
         """A row of spines."""
-        a, b = self.color((0.4, 0.9), (0.2, 0.5)), self.color((0.2, 0.8), (0.6, 0.95))
+        a = self.color((0.4, 0.9), (0.2, 0.5))
+        b = self.color((0.2, 0.8), (0.6, 0.95))
         return self.add(s.BOOKS, self.rng.uniform(0.03, 0.06), (a, b, WHITE))
 
     def picture(self) -> int:
         """A landscape for a frame."""
-        sky, land = self.color((0.2, 0.6), (0.7, 0.95)), self.color((0.4, 0.9), (0.2, 0.5))
+        sky = self.color((0.2, 0.6), (0.7, 0.95))
+        land = self.color((0.4, 0.9), (0.2, 0.5))
         return self.add(s.PICTURE, 1.0, (sky, (0.98, 0.92, 0.7), land), 0.1)
 
     def rug(self) -> int:
         """A woven rug with borders."""
-        a, b = self.color((0.4, 0.85), (0.3, 0.7)), self.color((0.1, 0.4), (0.75, 0.95))
+        a = self.color((0.4, 0.85), (0.3, 0.7))
+        b = self.color((0.1, 0.4), (0.75, 0.95))
         return self.add(s.RUG, self.rng.uniform(0.15, 0.3), (a, b, toned(a, 0.5)))
 
     def window(self) -> int:

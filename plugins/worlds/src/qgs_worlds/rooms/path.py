@@ -42,7 +42,9 @@ def camera_path(
         -1,
     )
     if rng.random() < 0.5:
-        eyes, target = eyes[::-1], target[::-1]
-    cos, sin = math.cos(side * math.pi / 2), math.sin(side * math.pi / 2)
+        eyes = eyes[::-1]
+        target = target[::-1]
+    cos = math.cos(side * math.pi / 2)
+    sin = math.sin(side * math.pi / 2)
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     return look_along(eyes @ turn.T, (target - eyes) @ turn.T)

@@ -50,7 +50,8 @@ class Furnisher:
     """Places pieces one by one where they hit neither each other nor the cameras."""
 
     def __init__(self, size: Size, eyes: np.ndarray) -> None:
-        self.size, self.eyes = size, eyes.tolist()
+        self.size = size
+        self.eyes = eyes.tolist()
         self.shapes: list[Shape] = []
         self._taken: list[tuple[float, float, float, float]] = []
 
@@ -65,7 +66,8 @@ class Furnisher:
 
     def free(self, low: Point, high: Point) -> bool:
         """Whether the box between two corners is in the room, off other pieces and the cameras."""
-        half_x, half_y = self.size[0] / 2, self.size[1] / 2
+        half_x = self.size[0] / 2
+        half_y = self.size[1] / 2
         if low[0] < -half_x or high[0] > half_x or low[1] < -half_y or high[1] > half_y:
             return False
         for x0, y0, x1, y1 in self._taken:
@@ -82,15 +84,14 @@ class Furnisher:
 
 def bounds(shapes: list[Shape]) -> tuple[Point, Point]:
     """Lowest and highest corner of the box around `shapes`."""
-    lows, highs = zip(*[shape.bounds() for shape in shapes], strict=True)
-    x0, y0, z0 = map(min, zip(*lows, strict=True))
-    x1, y1, z1 = map(max, zip(*highs, strict=True))
-    return (x0, y0, z0), (x1, y1, z1)
+    x0, y0, z0, x1, y1, z1 = zip(*[shape.bounds() for shape in shapes], strict=True)
+    return (min(x0), min(y0), min(z0)), (max(x1), max(y1), max(z1))
 
 
 def turned(low: Point, high: Point, x: float, y: float, turn: float) -> tuple[Point, Point]:
     """Corners of a box that holds the given one after it was turned about z and moved."""
-    cos, sin = math.cos(turn), math.sin(turn)
+    cos = math.cos(turn)
+    sin = math.sin(turn)
     xs = [x + cos * a - sin * b for a in (low[0], high[0]) for b in (low[1], high[1])]
     ys = [y + sin * a + cos * b for a in (low[0], high[0]) for b in (low[1], high[1])]
     return (min(xs), min(ys), low[2]), (max(xs), max(ys), high[2])
@@ -108,7 +109,8 @@ def _centre(rng: Random, m: Materials, furnisher: Furnisher) -> None:
 
 def _against_wall(rng: Random, m: Materials, furnisher: Furnisher, side: int) -> None:
     """Pieces in a row along one wall, backs to it. Side 0 is -x, 1 is -y, 2 is +x, 3 is +y."""
-    across, along = furnisher.size[side % 2], furnisher.size[1 - side % 2]
+    across = furnisher.size[side % 2]
+    along = furnisher.size[1 - side % 2]
     turn = math.pi / 2 + side * math.pi / 2
     position = -along / 2 + rng.uniform(0.1, 0.6)
     while position < along / 2 - 0.4:
@@ -125,7 +127,8 @@ def _against_wall(rng: Random, m: Materials, furnisher: Furnisher, side: int) ->
 def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
     """The point `away` from the centre towards wall `side`, `along` it."""
     angle = math.pi + side * math.pi / 2
-    cos, sin = math.cos(angle), math.sin(angle)
+    cos = math.cos(angle)
+    sin = math.sin(angle)
     return cos * away + sin * along, sin * away - cos * along
 
 
@@ -133,7 +136,8 @@ def _on_walls(rng: Random, m: Materials, size: Size, window_side: int) -> list[S
     """A window on one wall, pictures on the others."""
     shapes: list[Shape] = []
     for side in range(4):
-        across, along = size[side % 2], size[1 - side % 2]
+        across = size[side % 2]
+        along = size[1 - side % 2]
         turn = math.pi / 2 + side * math.pi / 2
         if side == window_side:
             hung = _framed(m.pale(), m.window(), rng.uniform(1.2, 2.0), 1.25, 0.95, 0.07)

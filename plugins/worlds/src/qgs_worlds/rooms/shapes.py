@@ -36,15 +36,15 @@ class Shape(NamedTuple):
         center = (x + cos * cx - sin * cy, y + sin * cx + cos * cy, cz)
         return Shape(self.kind, center, self.half, self.turn + turn, self.texture)
 
-    def bounds(self) -> tuple[Point, Point]:
-        """Return the lowest and the highest corner of the box around it."""
+    def bounds(self) -> tuple[float, ...]:
+        """Return the lowest x, y, z and the highest of the box around it."""
         x, y, z = self.center
         a, b, c = self.half
         if self.turn:
             cos = abs(math.cos(self.turn))
             sin = abs(math.sin(self.turn))
             a, b = cos * a + sin * b, sin * a + cos * b
-        return (x - a, y - b, z - c), (x + a, y + b, z + c)
+        return x - a, y - b, z - c, x + a, y + b, z + c
 
 
 def box(x: float, y: float, z: float, size: Point, texture: int) -> Shape:

@@ -15,7 +15,8 @@ CLEARANCE = 0.2  # metres from a camera to the box around any shape, at least, b
 FOV = (18.0, 90.0)  # across the longer side of an image, degrees: from a long lens to a wide one
 AHEAD_FOV = 60.0  # degrees from which on cameras of a walk may look ahead alone
 BASELINE = (0.04, 1.3)  # length of a path by the distance to what is looked at
-PLAIN_FOV, PLAIN_TRAVEL = (60.0, 75.0), (0.65, 1.2)
+PLAIN_FOV = (60.0, 75.0)
+PLAIN_TRAVEL = (0.65, 1.2)
 _TRIES = 12
 _PROBE = (6, 6)  # pixels of the depth maps by which views are judged
 
@@ -72,14 +73,16 @@ def draw_cameras(
 
     They keep `CLEARANCE` from fixed shapes; others that are nearer are to be taken out.
     """
-    best, least = None, math.inf
+    best = None
+    least = math.inf
     for attempt in range(_TRIES):
         rig = _draw(rng, place, count, varied, 0.7**attempt)
         fault = _outside(rig.c2w[:, :3, 3], place, world[0])
         if fault == 0:
             fault = _view_fault(rig, world)
         if fault < least or best is None:
-            best, least = rig, fault
+            best = rig
+            least = fault
         if least <= 0.3:
             break
     assert best is not None
@@ -164,7 +167,10 @@ def _stand(
 
 def _walk(rng: np.random.Generator, path: Path) -> Motion:
     """Along a bent line; looking ahead or at what is passed, the longer the lens the more."""
-    base, target, length, s = path.base, path.target, path.length, path.s
+    base = path.base
+    target = path.target
+    length = path.length
+    s = path.s
     way = rng.normal(size=3) * (1, 1, 0.3)
     way /= np.linalg.norm(way)
     bend = rng.normal(size=3) * (0.3, 0.3, 0.1)
@@ -175,22 +181,32 @@ def _walk(rng: np.random.Generator, path: Path) -> Motion:
 
 def _orbit(rng: np.random.Generator, path: Path) -> Motion:
     """Around the target, rising and coming nearer a little."""
-    base, target, length, s = path.base, path.target, path.length, path.s
+    base = path.base
+    target = path.target
+    length = path.length
+    s = path.s
     offset = base - target
     flat = max(math.hypot(offset[0], offset[1]), 0.2)
     angles = s * min(length / flat, 2.4)
-    cos, sin = np.cos(angles), np.sin(angles)
-    nearer, rise = 1 + 0.2 * rng.normal() * s, 0.2 * length * rng.normal() * s
-    x, y = cos * offset[0] - sin * offset[1], sin * offset[0] + cos * offset[1]
+    cos = np.cos(angles)
+    sin = np.sin(angles)
+    nearer = 1 + 0.2 * rng.normal() * s
+    rise = 0.2 * length * rng.normal() * s
+    x = cos * offset[0] - sin * offset[1]
+    y = sin * offset[0] + cos * offset[1]
     eyes = target + np.stack([nearer * x, nearer * y, offset[2] + rise], 1)
     return eyes, np.tile(target, (len(s), 1))
 
 
 def _round(rng: np.random.Generator, path: Path) -> Motion:
     """From one place in directions that overlap."""
-    base, target, length, s = path.base, path.target, path.length, path.s
+    base = path.base
+    target = path.target
+    length = path.length
+    s = path.s
     angles = s * math.radians(path.fov) * rng.uniform(0.3, 1.2)
-    cos, sin = np.cos(angles), np.sin(angles)
+    cos = np.cos(angles)
+    sin = np.sin(angles)
     x, y, z = target - base
     way = np.stack([cos * x - sin * y, sin * x + cos * y, np.full(len(s), z)], 1)
     eyes = base + 0.3 * length * rng.normal(size=3) * s[:, None]
@@ -199,7 +215,10 @@ def _round(rng: np.random.Generator, path: Path) -> Motion:
 
 def _gather(rng: np.random.Generator, path: Path) -> Motion:
     """From places scattered around one point, all at the target."""
-    base, target, length, s = path.base, path.target, path.length, path.s
+    base = path.base
+    target = path.target
+    length = path.length
+    s = path.s
     offsets = rng.normal(size=(len(s), 3)) * (1, 1, 0.5)
     offsets *= rng.random((len(s), 1)) ** 0.5 / np.linalg.norm(offsets, axis=1, keepdims=True)
     return base + 0.5 * length * offsets, np.tile(target, (len(s), 1))

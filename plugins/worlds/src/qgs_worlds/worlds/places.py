@@ -77,7 +77,9 @@ def _indoors(rng: Random, things: Things, count: int) -> Place:
         for _ in range(2):
             shapes += _far(rng, things, toward + rng.uniform(-0.6, 0.6))
     fixed = len(shapes)
-    x, y, z = size[0] / 2, size[1] / 2, size[2]
+    x = size[0] / 2
+    y = size[1] / 2
+    z = size[2]
     for _ in range(count):
         extent = min(spread(rng, 0.15, 1.0), 0.3 * min(size))
         at = (rng.uniform(-x, x) * 0.85, rng.uniform(-y, y) * 0.85, 0.0)
@@ -89,14 +91,16 @@ def _indoors(rng: Random, things: Things, count: int) -> Place:
     targets += [
         (rng.uniform(-x, x), rng.uniform(-y, y), rng.uniform(0.4, z - 0.4)) for _ in range(6)
     ]
-    low, high = (0.3 - x, 0.3 - y, 0.35), (x - 0.3, y - 0.3, z - 0.35)
+    low = (0.3 - x, 0.3 - y, 0.35)
+    high = (x - 0.3, y - 0.3, z - 0.35)
     eyes = (0.9, min(1.7, z - 0.4))
     return Place("indoors", shapes, fixed, low, high, eyes, targets, (0.6, 6.0), z)
 
 
 def _put(rng: Random, things: Things, at: Point, size: float, ceiling: float) -> Thing:
     """A thing on the floor, at some height, or under the ceiling."""
-    thing, pick = things.draw(), rng.random()
+    thing = things.draw()
+    pick = rng.random()
     lift = 0.0
     if things.style.tilted and pick < 0.3:
         lift = rng.uniform(0.2, max(ceiling - 2.2 * size, 0.3))
@@ -105,14 +109,17 @@ def _put(rng: Random, things: Things, at: Point, size: float, ceiling: float) ->
 
 def _beam(rng: Random, things: Things, x: float, y: float, z: float) -> Shape:
     """A thin bar, column or cable through the room."""
-    a, b = (rng.uniform(-x, x), rng.uniform(-y, y)), (rng.uniform(-x, x), rng.uniform(-y, y))
+    a = (rng.uniform(-x, x), rng.uniform(-y, y))
+    b = (rng.uniform(-x, x), rng.uniform(-y, y))
     ends = rng.choice((((*a, 0.0), (*a, z)), ((-x, a[1], z * 0.9), (x, b[1], z * 0.9))))
     return things.skinned(rod(*ends, spread(rng, 0.006, 0.12), rng.random() < 0.5))
 
 
 def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
     """Four walls and a ceiling, and windows or doors in up to `most` of them."""
-    half_x, half_y, height = size[0] / 2, size[1] / 2, size[2]
+    half_x = size[0] / 2
+    half_y = size[1] / 2
+    height = size[2]
     scale = spread(rng, 0.5, 2)
     common = things.texture()[0]
     open_sides = set(rng.sample(range(4), rng.randint(0, most)))
@@ -122,7 +129,8 @@ def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
         body = _box((across + _WALL, 0.0, height / 2), (_WALL, along + 2 * _WALL, height / 2))
         hole = None
         if side in open_sides:
-            wide, low = rng.uniform(0.25, 0.8) * along, rng.choice((-0.1, rng.uniform(0.5, 1.1)))
+            wide = rng.uniform(0.25, 0.8) * along
+            low = rng.choice((-0.1, rng.uniform(0.5, 1.1)))
             top = rng.uniform(max(low + 0.6, 1.7), height - 0.1)
             middle = rng.uniform(wide - along, along - wide) * 0.8
             hole = _box(
@@ -139,8 +147,10 @@ def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
 
 def _panes(rng: Random, things: Things, hole: Primitive) -> list[Shape]:
     """Bars in an opening."""
-    (x, y, z), (_, wide, high) = hole.center, hole.half
-    radius, texture = rng.uniform(0.015, 0.05), things.texture()[0]
+    (x, y, z) = hole.center
+    (_, wide, high) = hole.half
+    radius = rng.uniform(0.015, 0.05)
+    texture = things.texture()[0]
     bars = [rod((x, y, z - high), (x, y, z + high), radius, True)]
     if rng.random() < 0.6:
         level = z + rng.uniform(-0.3, 0.4) * high
@@ -149,10 +159,12 @@ def _panes(rng: Random, things: Things, hole: Primitive) -> list[Shape]:
 
 
 def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place:
-    ground, level = _level, 0.0
+    ground = _level
+    level = 0.0
     shapes = [_ground(things, spread(rng, 1, 4))]
     if rng.random() < 0.6:
-        amplitude, index = spread(rng, 0.15, 1.5), rng.randrange(len(maps))
+        amplitude = spread(rng, 0.15, 1.5)
+        index = rng.randrange(len(maps))
         shapes[0] = _ground(things, spread(rng, 1, 4), -0.7 * amplitude)
         half = (_TERRAIN, _TERRAIN, amplitude)
         body = Primitive(s.HEIGHT, (0.0, 0.0, 0.0), half, extra=float(index))
@@ -165,12 +177,14 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
         shapes += _far(rng, things, rng.uniform(0, math.tau))
     near: list[Shape] = []
     for _ in range(count):
-        away, angle = 9 * rng.random() ** 0.7, rng.uniform(0, math.tau)
+        away = 9 * rng.random() ** 0.7
+        angle = rng.uniform(0, math.tau)
         at = (away * math.cos(angle), away * math.sin(angle), 0.0)
         at = at if rng.random() < 0.85 else (at[0], at[1], rng.uniform(0.3, 3))
         near += placed(things.draw(), at, rng.uniform(0, math.tau), spread(rng, 0.25, 2), ground)
     shapes += near
-    low, high = (-12.0, -12.0, level + 0.3), (12.0, 12.0, level + 7)
+    low = (-12.0, -12.0, level + 0.3)
+    high = (12.0, 12.0, level + 7)
     eyes = (level + 0.6, level + 2.2)
     return Place("outdoors", shapes, fixed, low, high, eyes, _middles(near), (1.2, 11.0), level + 4)
 
@@ -186,7 +200,8 @@ def _far(rng: Random, things: Things, angle: float) -> Thing:
     """A hill, a building or a tree in a direction; it begins below any ground."""
     pick = rng.random()
     if pick < 0.3:
-        away, size = rng.uniform(60, 220), rng.uniform(15, 60)
+        away = rng.uniform(60, 220)
+        size = rng.uniform(15, 60)
         at = (away * math.cos(angle), away * math.sin(angle), 0.0)
         half = (size, size * rng.uniform(0.6, 1.8), size * rng.uniform(0.2, 0.6))
         body = Primitive(s.ELLIPSOID, at, half, about_z(rng.uniform(0, math.tau)))
@@ -194,12 +209,15 @@ def _far(rng: Random, things: Things, angle: float) -> Thing:
     away = spread(rng, 11, 70)
     at = (away * math.cos(angle), away * math.sin(angle), 0.0)
     if pick < 0.65:
-        wide, deep, high = rng.uniform(2, 7), rng.uniform(2, 7), spread(rng, 2, 14)
+        wide = rng.uniform(2, 7)
+        deep = rng.uniform(2, 7)
+        high = spread(rng, 2, 14)
         body = Primitive(
             s.BOX, (*at[:2], high - 1), (wide, deep, high + 1), about_z(rng.uniform(0, math.tau))
         )
         return [things.skinned(body, spread(rng, 2, 9))]
-    high, crown = rng.uniform(1, 3), things.texture()[0]
+    high = rng.uniform(1, 3)
+    crown = things.texture()[0]
     half = (0.12 * high, 0.12 * high, high + 1)
     trunk = Primitive(s.FRUSTUM, (*at[:2], high - 1), half, extra=0.6)
     tree = [things.skinned(trunk)]
@@ -219,7 +237,8 @@ def _objects(rng: Random, things: Things, count: int) -> Place:
         shapes.append(wall.moved((0.0, 0.0, 0.0), about_z(rng.uniform(0, math.tau))))
     level = wide = 0.0
     if rng.random() < 0.4:
-        level, wide = rng.uniform(0.02, 0.8), rng.uniform(0.5, 1.1)
+        level = rng.uniform(0.02, 0.8)
+        wide = rng.uniform(0.5, 1.1)
         kind = rng.choice((s.BOX, s.FRUSTUM))
         table = Primitive(kind, (0.0, 0.0, level / 2), (wide, wide, level / 2), extra=1.0)
         shapes.append(things.skinned(table, 0.7))
@@ -227,14 +246,18 @@ def _objects(rng: Random, things: Things, count: int) -> Place:
     spot = (rng.gauss(0, 0.2), rng.gauss(0, 0.2))
     for number in range(count):
         if number % 2:
-            x, y = rng.gauss(0, 0.7), rng.gauss(0, 0.7)
+            x = rng.gauss(0, 0.7)
+            y = rng.gauss(0, 0.7)
         else:
-            away, angle = 0.5 * math.sqrt(rng.random()), rng.uniform(0, math.tau)
-            x, y = spot[0] + away * math.cos(angle), spot[1] + away * math.sin(angle)
+            away = 0.5 * math.sqrt(rng.random())
+            angle = rng.uniform(0, math.tau)
+            x = spot[0] + away * math.cos(angle)
+            y = spot[1] + away * math.sin(angle)
         at = (x, y, level if math.hypot(x, y) < wide else 0.0)
         size = spread(rng, 0.1, 0.5)
         shapes += placed(things.draw(), at, rng.uniform(0, math.tau), size, _level)
-    low, high = (-3.5, -3.5, level + 0.2), (3.5, 3.5, level + 3)
+    low = (-3.5, -3.5, level + 0.2)
+    high = (3.5, 3.5, level + 3)
     eyes = (level + 0.25, level + 1.6)
     targets = _middles(shapes[fixed:])
     return Place("objects", shapes, fixed, low, high, eyes, targets, (0.6, 2.5), level + 2.5)

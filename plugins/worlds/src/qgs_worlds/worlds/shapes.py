@@ -34,7 +34,8 @@ class Primitive(NamedTuple):
 
     def reach(self) -> float:
         """How far it extends up and down from its centre, metres, at most."""
-        size, up = self.half[2], abs(self.turn[8])
+        size = self.half[2]
+        up = abs(self.turn[8])
         if self.kind == s.CAPSULE:
             return size * (1 + up * self.extra)
         if self.kind == s.TORUS:
@@ -79,7 +80,8 @@ def product(a: Turn, b: Turn) -> Turn:
 
 def about_z(angle: float) -> Turn:
     """A rotation about the vertical."""
-    cos, sin = math.cos(angle), math.sin(angle)
+    cos = math.cos(angle)
+    sin = math.sin(angle)
     return cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0
 
 
@@ -98,7 +100,9 @@ def rod(start: Point, end: Point, radius: float, square: bool = False) -> Primit
     """A round or square bar between two points."""
     x, y, z = (b - a for a, b in zip(start, end, strict=True))
     length = math.sqrt(x * x + y * y + z * z) + 1e-9
-    x, y, z = x / length, y / length, z / length
+    x = x / length
+    y = y / length
+    z = z / length
     flat = math.hypot(x, y)
     u, v = (-y / flat, x / flat) if flat > 1e-6 else (1.0, 0.0)
     # columns: level, across both, along the bar

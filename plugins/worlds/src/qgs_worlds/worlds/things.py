@@ -60,7 +60,9 @@ class Things:
     """
 
     def __init__(self, rng: Random, style: Style, textures: int, maps: int) -> None:
-        self.rng, self.style, self.maps = rng, style, maps
+        self.rng = rng
+        self.style = style
+        self.maps = maps
         self._textures = textures
 
     def texture(self) -> tuple[int, int]:
@@ -122,7 +124,8 @@ class Things:
         rng = self.rng
         count = min(int(spread(rng, 1, self.style.most + 1)), self.style.most)
         cut = rng.random() < self.style.cut
-        thing, skin = [], self.texture()
+        thing = []
+        skin = self.texture()
         for _ in range(count):
             reach = 0.6 if count > 1 else 0.0
             center = (
@@ -152,7 +155,8 @@ class Things:
         ]
 
     def _rods(self, points: list[Point], pairs: list[tuple[int, int]], radius: float) -> Thing:
-        square, skin = self.rng.random() < 0.5, self.texture()
+        square = self.rng.random() < 0.5
+        skin = self.texture()
         return [
             Shape(rod(points[a], points[b], radius, square), None, skin[0], 1, 0, 1.0)
             for a, b in pairs
@@ -171,7 +175,8 @@ class Things:
         rng = self.rng
         count = rng.randint(3, 8)
         if rng.random() < 0.5:
-            bend, lift = rng.uniform(1, 6), rng.uniform(-0.3, 0.3)
+            bend = rng.uniform(1, 6)
+            lift = rng.uniform(-0.3, 0.3)
             angles = [bend * k / (count - 1) for k in range(count)]
             points = [(math.cos(t), math.sin(t), lift * t) for t in angles]
         else:
@@ -182,7 +187,8 @@ class Things:
     def _bars(self) -> Thing:
         """Parallel bars between two rails, like a fence or a ladder."""
         rng = self.rng
-        count, high = rng.randint(3, 9), rng.uniform(0.4, 1)
+        count = rng.randint(3, 9)
+        high = rng.uniform(0.4, 1)
         ends = [(-1.0, 0.0, s * high) for s in (-0.8, 0.8)] + [
             (1.0, 0.0, s * high) for s in (-0.8, 0.8)
         ]
