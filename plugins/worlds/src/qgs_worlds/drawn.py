@@ -46,6 +46,7 @@ class DrawnScene(Scene):
         self.name = name
         self._config = config
         self._cache = cache
+        # a list, as numpy's generators are seeded by one
         self.key = [config.seed, 0 if split == "train" else 1, index]
 
     def __len__(self) -> int:
@@ -63,6 +64,7 @@ class DrawnScene(Scene):
         if missing := [frame for frame in dict.fromkeys(frames) if frame not in images]:
             cast = self.cast(missing)
             images.update(zip(missing, cast, strict=True))
+            # the first scenes stay: dropping the oldest would keep none over an epoch
             fitting = config.cache_mb * 2**20 // cast[0].nbytes - len(cache)
             cache.update(
                 {(self.name, frame): images[frame] for frame in missing[: max(fitting, 0)]}

@@ -49,6 +49,7 @@ def _develop(image, light, gains, gamma, vignette, grain, seed, frame):
             y = 2 * i + 1 - height
             x = 2 * j + 1 - width
             edge = 1.0 - vignette * (x * x + y * y) * reach
+            # a hash in place of a generator, so that threads and frames need no order
             h = _scrambled(i * width + j, frame, seed)
             for c in range(3):
                 value = math.sqrt(max(light[i, j, c] * gains[c] * edge, 0.0))

@@ -46,6 +46,7 @@ def _darken(darkness, body, size, lamp):
         return
     ex = abs(body.axes[0, 0]) * body.extent[0] + abs(body.axes[0, 1]) * body.extent[1]
     ey = abs(body.axes[0, 1]) * body.extent[0] + abs(body.axes[0, 0]) * body.extent[1]
+    # how far the shape's top edge is thrown on to the floor
     reach = lamp[2] / (lamp[2] - top)
     i0, i1 = _range(x - ex, x + ex, lamp[0], reach, size[0], cells)
     j0, j1 = _range(y - ey, y + ey, lamp[1], reach, size[1], cells)
@@ -86,6 +87,7 @@ def floor_shadows(shapes, size, lamp):
     # the first shape is the room
     for i in range(1, shapes.shape[0]):
         _darken(darkness, shapes[i].body, size, lamp)
+    # twice, which is nearly a Gaussian: lamps are wide
     return 1 - _blurred(_blurred(darkness))
 
 
@@ -169,6 +171,7 @@ def _shadow(room, code, place, normal):
 @njit(**INNER)
 def _light(room, code, place, normal):
     """Return RGB of the light at a point: a bright ceiling above, and what lamps add by Lambert."""
+    # more on what faces down, or ceilings would be dark
     even = 0.56 - 0.12 * normal[2]
     total = (even, even, even)
     for k in range(room.lights.shape[0]):
@@ -207,6 +210,7 @@ def _albedo(texture, shape, part, points, n, footprint):
     """Return the mean RGB of a texture at rows 1 to n of `points`; at row 0 of a smooth one."""
     first = 0 if smooth(texture.pattern) else 1
     last = 1 if smooth(texture.pattern) else n + 1
+    # edges need all samples of a pixel, gradients do not
     second = third = 0.0
     for k in range(first, last):
         _, _, u, v, across, up = _surface(shape, part, triple(points[k]))

@@ -13,6 +13,7 @@ from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.kernels import INNER, OPTIONS
 from qgs_worlds.caster.vectors import along, dot, minus
 
+# Metres before which nothing is met: a camera never stands so near to a surface.
 NEAR = np.float32(0.01)
 NONE = np.float32(np.inf)
 TINY = np.float32(1e-9)
@@ -145,6 +146,7 @@ def cylinder(o, d, h):
 def capsule(o, d, half):
     """Cross what is up to 1 from the segment between z = -half and half."""
     near, far, _, _ = _shaft(o, d, ONE, half)
+    # the ends are whole spheres, as their inner halves are inside of the shaft
     for end in (-half, half):
         p, shift = nearest((o[0], o[1], o[2] - end), d)
         first, last, _, _ = ellipsoid(p, d)
@@ -156,6 +158,7 @@ def capsule(o, d, half):
 @njit(**INNER)
 def frustum(o, d, top):
     """Cross a cone of radius 1 at z = -1, `top` <= 1 at z = 1. Face 0 is the side, 1 a cap."""
+    # caps first, as the side is cut off by them
     low, high = slab(o[2], reciprocal(d[2]), ONE)
     slope = _HALF * (top - ONE)
     radius = _HALF * (top + ONE) + slope * o[2]
@@ -282,6 +285,7 @@ def relief(o, d, heights, start):
 def less(near, far, entry, cut_near, cut_far, cut_leave):
     """Return the entry into the first interval without the second, and its face, 3 more there."""
     outer = (near > NEAR) & (near <= far) & ((near < cut_near) | (near > cut_far))
+    # a ray that begins in the cut, or enters by it, meets the wall of the cut
     inner = (cut_far > NEAR) & (cut_far > near) & (cut_far < far) & (cut_near <= cut_far)
     t = near if outer else (cut_far if inner else NONE)
     return t, (entry if outer else cut_leave + np.float32(3))

@@ -72,6 +72,7 @@ def visible(shapes, around, own, point, normal, strength, reach, footprint):
     moved = minus(place, point)
     if place[4] == np.inf or dot(moved, moved) > place[4]:
         _find(shapes, around, (x, y, z), reach, 0.3 * reach + 4 * footprint)
+    # float32 as the boxes are, so that the loop stays narrow
     me = np.float32(own)
     first = low * low
     second = high * high
@@ -89,5 +90,6 @@ def visible(shapes, around, own, point, normal, strength, reach, footprint):
         other = near[18, i] != me
         first = min(first, under if other else first)
         second = min(second, over if other else second)
+    # hidden by as much as the nearest shape is nearer than the height itself
     hidden = max(1 - math.sqrt(first) / low, ZERO) + max(1 - math.sqrt(second) / high, ZERO)
     return 1.0 - 0.5 * strength * hidden

@@ -14,6 +14,7 @@ from qgs_worlds.caster.textures import eased
 @njit(**INNER)
 def _hash(i, j, seed):
     """Return a number in [0, 1) for each lattice point."""
+    # primes of xxHash, which spread neighbours over all bits
     h = (i * 374761393 + j * 668265263 + seed * 974634777) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     return (h ^ (h >> 16)) / 4294967296.0
@@ -49,6 +50,7 @@ def _grid(x, y, shift, seed, softness):
     """Draw tiles of unit size: a tone for each, and the joints between them."""
     row = math.floor(y)
     x = x + shift * (row & 1)
+    # no two tiles are quite alike
     tone = 0.6 * _hash(math.floor(x), row, seed) + 0.4 * _noise(3 * x, 3 * y, seed)
     return tone, softness * max(_seam(x, 0.03), _seam(y, 0.03 * (1 + 2 * shift)))
 
@@ -67,6 +69,7 @@ def _planks(x, y, seed, fade):
 def _picture(p, q, seed):
     """Draw a landscape: hills under a sky with a sun."""
     hill = 0.35 * (_noise(1.5 * p + 9, 0.5, seed) + 0.5 * _noise(4 * p, 2.5, seed)) - 0.45
+    # hills farther off are higher and paler
     far = hill + 0.35 * _noise(1.2 * p + 40, 8.5, seed) + 0.1
     if q < hill:
         return 0.2, 1.0

@@ -81,6 +81,7 @@ def _covered(corners, points, intrinsics):
     """
     u0 = v0 = np.inf
     u1 = v1 = -np.inf
+    # a box's outline is that of its corners, where none is behind the camera
     for k in range(_clipped(corners, points)):
         u = intrinsics[0] * points[k, 0] / points[k, 2] + intrinsics[2]
         v = intrinsics[1] * points[k, 1] / points[k, 2] + intrinsics[3]
@@ -271,7 +272,9 @@ def trace(rows, columns, top, samples, shapes, heights, c2w, intrinsics):
     o = _narrow(c2w[:, 3])
     corners = np.empty((8, 3))
     points = np.empty((20, 3))
+    # one for all shapes, as allocating takes longer than small shapes do
     scratch = np.empty((2, 4, columns * samples), np.float32)
+    # shape by shape, not ray by ray: a loop over a row is vectorised
     for i in range(shapes.shape[0]):
         shape = shapes[i]
         _corners(shape.body, c2w, corners)

@@ -108,6 +108,7 @@ def _shade(world, around, code, place, view, footprint, distance):
         high *= gloss
         reflected = along((high, high, high), even, albedo)
         seen = along(seen, 1.0, product(reflected, light.color))
+    # as an exponential near to the camera, and cheaper
     mist = 1.0 - 1.0 / (1.0 + air.fog * distance)
     return mix(seen, air.horizon, mist)
 
@@ -125,6 +126,7 @@ def _gather(t, code, i, j, own, samples):
             if code[i + a, j + b] == own:
                 code[i + a, j + b] = TAKEN
                 n += 1
+                # the sky is at no distance: its rays weigh alike
                 distance = t[i + a, j + b] if own != SKY else ONE
                 t_sum += distance
                 u_sum += distance * b
@@ -138,6 +140,7 @@ def paint(image, t, code, top, samples, world, c2w, rays):
 
     Values are linear in light. Rays of a pixel that meet one surface are shaded at their mean.
     """
+    # kept over the band, as neighbouring points have the same boxes near
     around = surroundings(world.shapes)
     for row in range(image.shape[0]):
         for column in range(image.shape[1]):

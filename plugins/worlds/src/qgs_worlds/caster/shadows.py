@@ -76,6 +76,7 @@ def _seen(shadows, k, own, p):
     scale = view.focal / depth
     a = scale * dot(place, view.c2w[:, 0]) + 0.5 * side - 0.5
     b = scale * dot(place, view.c2w[:, 1]) + 0.5 * side - 0.5
+    # written so that NaN counts as outside
     if not (a > -1 and a < side and b > -1 and b < side):
         return 1.0
     a = min(max(a, 0.0), side - 1.001)
@@ -86,6 +87,7 @@ def _seen(shadows, k, own, p):
     b = b - i
     # within a pixel of the map the depth of what shades itself varies
     bias = np.float32(depth - 0.01 - (1.5 / scale if own < 0 else 0.0))
+    # percentage closer filtering over 2 x 2 pixels softens the edge
     light = 0.0
     for row in range(2):
         for column in range(2):

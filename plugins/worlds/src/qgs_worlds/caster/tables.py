@@ -12,9 +12,11 @@ import numpy as np
 ELLIPSOID, BOX, FRUSTUM, CAPSULE, TORUS, HEIGHT = range(6)
 # What is measured in metres and stands upright: shapes of furnished rooms, and a room from within.
 BLOCK, BALL, CYLINDER, INTERIOR = range(6, 10)
-NOTHING = -1  # kind of the second primitive of a shape that has none
+# kind of the second primitive of a shape that has none
+NOTHING = -1
 
-VALUE, GRADIENT, CELLS = range(3)  # kinds of noise
+# kinds of noise
+VALUE, GRADIENT, CELLS = range(3)
 NO_PATTERN, STRIPES, CHECKER, TILES, DOTS, GLYPHS, RINGS = range(7)
 
 PRIMITIVE = np.dtype(

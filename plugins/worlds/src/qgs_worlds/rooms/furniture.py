@@ -52,6 +52,7 @@ def table(rng: Random, m: Materials) -> Piece:
     piece = [box(0, 0, h - 0.04, (w, d, 0.04), wood), *_legs(w, d, h - 0.04, 0.06, wood)]
     for x in [rng.uniform(-0.38, 0.38) for _ in range(rng.randrange(1, 4))]:
         piece += _on_top(rng, m, x * w, rng.uniform(-0.3, 0.3) * d, h)
+    # chairs around one table are alike
     seat = m.fabric()
     frame = m.timber()
     for sign, turn in ((1, 0.0), (-1, np.pi)):
@@ -148,6 +149,7 @@ def sideboard(rng: Random, m: Materials) -> Piece:
         x = (i + 0.5) * w / doors - w / 2
         piece.append(box(x, -d / 2, 0.12, (w / doors - 0.04, 0.03, h - 0.18), front))
         piece.append(sphere(x + 0.3 * w / doors, -d / 2 - 0.03, h / 2, 0.025, knob))
+    # places apart, so that nothing stands in anything
     for x in (-0.32, 0.05, 0.33):
         if rng.random() < 0.75:
             piece += _on_top(rng, m, x * w, 0, h)
@@ -181,6 +183,7 @@ def floor_lamp(rng: Random, m: Materials) -> Piece:
 
 def plant(rng: Random, m: Materials) -> Piece:
     """A pot with a few round clumps of leaves."""
+    # leaves are green whatever the hues of the room
     green = (0.15 + 0.2 * rng.random(), 0.4 + 0.2 * rng.random(), 0.15)
     leaves = m.add(6, 0.06, ((0.08, 0.22, 0.08), green, green))
     piece = [

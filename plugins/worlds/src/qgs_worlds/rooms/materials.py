@@ -34,6 +34,7 @@ class Materials:
     def __init__(self, rng: Random) -> None:
         self.rng = rng
         self.rows: list[tuple[int, float, int, float, Sequence[Color]]] = []
+        # neighbours, an opposite and a third hue, which go together
         base = rng.random()
         self._hues = [(base + step + 0.04 * rng.gauss(0, 1)) % 1 for step in (0.0, 0.08, 0.5, 0.35)]
         self.wood = rng.choice(WOODS)
@@ -124,6 +125,7 @@ class Materials:
         """Paint, wallpaper or brick."""
         rng = self.rng
         color = self.color((0.04, 0.5), (0.5, 1.0))
+        # bricks are rare, patterns less so
         pick = rng.random()
         if pick < 0.12:
             brick = (rng.uniform(0.5, 0.7), 0.35, 0.27)

@@ -6,15 +6,19 @@ import numpy as np
 
 from qgs_worlds.caster.lens import look_along
 
-EYE = (1.25, 1.65)  # metres above the floor
-WALL = 0.45  # least distance from a camera to a wall
-TRAVEL = (0.65, 1.2)  # metres from the first to the last camera
+# metres above the floor
+EYE = (1.25, 1.65)
+# least distance from a camera to a wall
+WALL = 0.45
+# metres from the first to the last camera
+TRAVEL = (0.65, 1.2)
 
 
 def camera_path(
     rng: np.random.Generator, size: tuple[float, float, float], count: int
 ) -> np.ndarray:
     """OpenCV c2w (count, 4, 4) of cameras that look from one side of the room to the other."""
+    # drawn along one wall, then turned, so that all four are alike
     side = int(rng.integers(4))
     across = size[0] if side % 2 == 0 else size[1]
     along = size[1] if side % 2 == 0 else size[0]
@@ -41,6 +45,7 @@ def camera_path(
         ],
         -1,
     )
+    # walks go both ways
     if rng.random() < 0.5:
         eyes = eyes[::-1]
         target = target[::-1]

@@ -11,8 +11,10 @@ from qgs_worlds.rooms.furniture import AGAINST_WALLS, CENTRAL, LOOSE, Piece
 from qgs_worlds.rooms.materials import Materials
 from qgs_worlds.rooms.shapes import Shape, box, cylinder, packed
 
-CLEARANCE = 0.4  # metres between a camera and the nearest shape
-_GAP = 0.05  # metres between pieces
+# metres between a camera and the nearest shape
+CLEARANCE = 0.4
+# metres between pieces
+_GAP = 0.05
 
 # Rooms have no height fields.
 NO_HEIGHTS = np.zeros((1, 2, 2), np.float32)
@@ -26,10 +28,12 @@ _SMALLEST: tuple[Point, Point] = ((-0.15, -0.15, 0.0), (0.15, 0.15, 0.3))
 def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
     """Return a room of `size` whose furniture leaves the camera centres `eyes` (F, 3) free."""
     m = Materials(rng)
+    # most rooms have four walls of one kind
     wall = m.wall()
     walls = [wall] + [m.wall() if rng.random() < 0.4 else wall for _ in range(3)]
     surfaces = [*walls, m.floor(), m.pale()]
     furnisher = Furnisher(size, eyes)
+    # the table first, as it needs the most room
     _centre(rng, m, furnisher)
     for side in range(4):
         _against_wall(rng, m, furnisher, side)
@@ -101,6 +105,7 @@ def _centre(rng: Random, m: Materials, furnisher: Furnisher) -> None:
     maker = rng.choice(CENTRAL)
     turn = float(rng.randrange(4)) * math.pi / 2 + rng.gauss(0, 0.12)
     piece = maker(rng, m)
+    # a few tries, after which the room stays without
     for _ in range(4):
         x, y = (rng.uniform(-0.18, 0.18) * extent for extent in furnisher.size[:2])
         if furnisher.place(piece, x, y, turn):
@@ -114,6 +119,7 @@ def _against_wall(rng: Random, m: Materials, furnisher: Furnisher, side: int) ->
     turn = math.pi / 2 + side * math.pi / 2
     position = -along / 2 + rng.uniform(0.1, 0.6)
     while position < along / 2 - 0.4:
+        # drawing a piece takes long: first see whether any would fit
         spot = turned(*_SMALLEST, *_from_wall(side, across / 2 - 0.2, position + 0.2), turn)
         if furnisher.free(*spot):
             piece = rng.choice(AGAINST_WALLS)(rng, m)
@@ -141,6 +147,7 @@ def _on_walls(rng: Random, m: Materials, size: Size, window_side: int) -> list[S
         turn = math.pi / 2 + side * math.pi / 2
         if side == window_side:
             hung = _framed(m.pale(), m.window(), rng.uniform(1.2, 2.0), 1.25, 0.95, 0.07)
+            # a window is not in a corner
             places = [rng.uniform(-0.15, 0.15) * along]
         else:
             places = [along * (rng.uniform(-0.06, 0.06) + k) for k in (-0.27, 0.0, 0.27)]

@@ -40,6 +40,7 @@ class Shape(NamedTuple):
         """Return the lowest x, y, z and the highest of the box around it."""
         x, y, z = self.center
         a, b, c = self.half
+        # most shapes are not turned, and bounds are asked for often
         if self.turn:
             cos = abs(math.cos(self.turn))
             sin = abs(math.sin(self.turn))

@@ -47,6 +47,7 @@ class RoomScene(DrawnScene):
     ) -> None:
         super().__init__(name, index, config, split, cache)
         rng = np.random.default_rng(self.key)
+        # drawn first, so that it does not depend on how many numbers the path takes
         self._plan_seed = int(rng.integers(1 << 62))
         sizes = rng.uniform((4.2, 4.2, 2.45), (5.8, 5.8, 2.9))
         self.size: tuple[float, float, float] = tuple(map(float, sizes))  # type: ignore[assignment]

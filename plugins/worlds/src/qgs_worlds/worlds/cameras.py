@@ -11,14 +11,19 @@ from qgs_worlds.caster.lens import lens, look_along
 from qgs_worlds.caster.raycast import trace
 from qgs_worlds.worlds.places import Place
 
-CLEARANCE = 0.2  # metres from a camera to the box around any shape, at least, before scaling
-FOV = (18.0, 90.0)  # across the longer side of an image, degrees: from a long lens to a wide one
-AHEAD_FOV = 60.0  # degrees from which on cameras of a walk may look ahead alone
-BASELINE = (0.04, 1.3)  # length of a path by the distance to what is looked at
+# metres from a camera to the box around any shape, at least, before scaling
+CLEARANCE = 0.2
+# across the longer side of an image, degrees: from a long lens to a wide one
+FOV = (18.0, 90.0)
+# degrees from which on cameras of a walk may look ahead alone
+AHEAD_FOV = 60.0
+# length of a path by the distance to what is looked at
+BASELINE = (0.04, 1.3)
 PLAIN_FOV = (60.0, 75.0)
 PLAIN_TRAVEL = (0.65, 1.2)
 _TRIES = 12
-_PROBE = (6, 6)  # pixels of the depth maps by which views are judged
+# pixels of the depth maps by which views are judged
+_PROBE = (6, 6)
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,7 @@ def draw_cameras(
     """
     best = None
     least = math.inf
+    # paths shrink from try to try, as short ones fit anywhere
     for attempt in range(_TRIES):
         rig = _draw(rng, place, count, varied, 0.7**attempt)
         fault = _outside(rig.c2w[:, :3, 3], place, world[0])
@@ -83,6 +89,7 @@ def draw_cameras(
         if fault < least or best is None:
             best = rig
             least = fault
+        # good enough: each try casts all views
         if least <= 0.3:
             break
     assert best is not None
@@ -108,6 +115,7 @@ def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
 
 def _still(rng: np.random.Generator, place: Place, shapes: np.ndarray, count: int, rig: Rig) -> Rig:
     """Cameras a few millimetres apart at the freest of some points, if nothing else was found."""
+    # any point is better than a camera inside of a wall
     points = rng.uniform(place.low, place.high, (64, 3))
     base = points[clearances(shapes[: place.fixed], points).min(1).argmax()]
     eyes = base + 0.01 * rng.uniform(-1, 1, (count, 3))
@@ -133,11 +141,13 @@ def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shri
     motion = ("walk", "orbit", "round", "gather")[rng.choice(4, p=(0.35, 0.3, 0.1, 0.25))]
     fov = float(rng.uniform(*FOV))
     eyes, targets = _MOTIONS[motion](rng, Path(base, target, length, s, fov))
+    # hands are not steady
     eyes = eyes + 0.03 * length * rng.normal(size=eyes.shape)
     targets = targets + 0.05 * distance * rng.normal(size=3)
     targets = targets + 0.02 * distance * rng.normal(size=eyes.shape)
     roll = np.clip(rng.normal(0, 5) + rng.normal(0, 1, count), -15, 15)
     c2w = _look_at(eyes, targets, np.radians(roll))
+    # walks and orbits go both ways
     order = -1 if rng.random() < 0.5 else 1
     return Rig(np.ascontiguousarray(c2w[::order]), fov, distance, motion)
 
@@ -155,6 +165,7 @@ def _stand(
             height = rng.uniform(
                 place.low[2], max(min(place.high[2], target[2] + 0.8 * distance), place.low[2])
             )
+        # not steeper than 60 degrees
         flat = math.sqrt(max(distance**2 - (height - target[2]) ** 2, (0.5 * distance) ** 2))
         base = np.array(
             [target[0] + flat * math.cos(angle), target[1] + flat * math.sin(angle), height]
@@ -171,6 +182,7 @@ def _walk(rng: np.random.Generator, path: Path) -> Motion:
     target = path.target
     length = path.length
     s = path.s
+    # people walk more along than up
     way = rng.normal(size=3) * (1, 1, 0.3)
     way /= np.linalg.norm(way)
     bend = rng.normal(size=3) * (0.3, 0.3, 0.1)
@@ -187,6 +199,7 @@ def _orbit(rng: np.random.Generator, path: Path) -> Motion:
     s = path.s
     offset = base - target
     flat = max(math.hypot(offset[0], offset[1]), 0.2)
+    # less than half of a circle, or views share too little
     angles = s * min(length / flat, 2.4)
     cos = np.cos(angles)
     sin = np.sin(angles)
@@ -220,6 +233,7 @@ def _gather(rng: np.random.Generator, path: Path) -> Motion:
     length = path.length
     s = path.s
     offsets = rng.normal(size=(len(s), 3)) * (1, 1, 0.5)
+    # the square root spreads them nearly evenly over the disc
     offsets *= rng.random((len(s), 1)) ** 0.5 / np.linalg.norm(offsets, axis=1, keepdims=True)
     return base + 0.5 * length * offsets, np.tile(target, (len(s), 1))
 

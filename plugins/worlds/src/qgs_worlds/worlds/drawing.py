@@ -57,6 +57,7 @@ class Drawn:
 def draw(key: list[int], config: "WorldsConfig") -> Drawn:
     """Return the scene of a key (seed, split, index); each option has random numbers of its own."""
     numbers = np.random.default_rng(key)
+    # four generators, so that an option changes its own part alone
     plan, skin, shine, camera = (Random(int(numbers.integers(1 << 62))) for _ in range(4))
     maps = materials.height_maps(int(numbers.integers(1 << 31)), _MAPS)
     varied = config.shapes == "varied"
@@ -83,6 +84,7 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
     scale = 1.0
     if config.depth is not None:
         seen = depths[np.isfinite(depths)]
+        # a view of the sky alone has no depth
         median = float(np.median(seen)) if len(seen) else rig.distance
         scale = spread(Random(str(key)), *config.depth) / median
     return Drawn(place, world, rig, effects, scale)

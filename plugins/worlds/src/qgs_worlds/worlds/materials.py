@@ -14,8 +14,10 @@ from qgs_worlds.caster.kernels import OPTIONS
 from qgs_worlds.caster.textures import chance, noise
 from qgs_worlds.worlds.things import spread
 
-COUNT = 14  # textures of a world
-_SIDE = 33  # points of a height map along each axis
+# textures of a world
+COUNT = 14
+# points of a height map along each axis
+_SIDE = 33
 _PLAIN_PATTERNS = (s.STRIPES, s.CHECKER, s.TILES, s.DOTS)
 # what is named twice is drawn more often
 _PATTERNS = (*_PLAIN_PATTERNS, s.TILES, s.GLYPHS, s.GLYPHS, s.RINGS)
@@ -41,6 +43,7 @@ class Palette:
         hue = rng.choice(self._hues) if rng.random() < 0.8 else rng.random()
         saturation = rng.random() ** self._grey
         red, green, blue = colorsys.hsv_to_rgb(hue, saturation, 0.12 + 0.83 * rng.random())
+        # from display to light
         return red**2.2, green**2.2, blue**2.2
 
     def near(self, color: Color, by: float) -> Color:
@@ -99,6 +102,7 @@ def _varied(rng: Random, palette: Palette, highlights: bool) -> Texture:
     ramp = [palette.near(base, by), base, palette.near(base, by)]
     if not flat and rng.random() < 0.3:
         ramp[rng.randrange(3)] = palette.color()
+    # cells are conspicuous, so rare
     basis = rng.choice((s.VALUE, s.VALUE, s.GRADIENT, s.GRADIENT, s.CELLS))
     octaves = 2 if basis == s.CELLS else rng.randint(3, 5)
     gain = rng.uniform(0.5, 0.85)
@@ -144,5 +148,6 @@ def height_maps(seed, count):
                     weight = gain * weight
                 maps[k, i, j] = height
                 largest = max(largest, abs(height))
+        # all maps use the whole range, for which terrains are scaled
         maps[k] /= max(largest, 1e-6)
     return maps

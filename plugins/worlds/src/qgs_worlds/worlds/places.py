@@ -17,9 +17,12 @@ Kind = Literal["indoors", "outdoors", "objects"]
 KINDS: tuple[Kind, ...] = ("indoors", "outdoors", "objects")
 SHARES = (0.45, 0.3, 0.25)
 
-_WALL = 0.1  # half of a wall's thickness, metres
-_FAR = 600.0  # half of the ground's width
-_TERRAIN = 24.0  # half of a terrain's width
+# half of a wall's thickness, metres
+_WALL = 0.1
+# half of the ground's width
+_FAR = 600.0
+# half of a terrain's width
+_TERRAIN = 24.0
 
 
 @dataclass
@@ -72,6 +75,7 @@ def _indoors(rng: Random, things: Things, count: int) -> Place:
     size = (rng.uniform(2.6, 7.5), rng.uniform(2.6, 7.5), rng.uniform(2.2, 3.8))
     plain = things.style.tilted == 0
     shapes = [_ground(things, spread(rng, 0.4, 1.5)), *_walls(rng, things, size, 0 if plain else 3)]
+    # what is seen through the openings
     for wall in [shape for shape in shapes if shape.cut]:
         toward = math.atan2(wall.body.center[1], wall.body.center[0])
         for _ in range(2):
@@ -81,6 +85,7 @@ def _indoors(rng: Random, things: Things, count: int) -> Place:
     y = size[1] / 2
     z = size[2]
     for _ in range(count):
+        # things leave way for cameras
         extent = min(spread(rng, 0.15, 1.0), 0.3 * min(size))
         at = (rng.uniform(-x, x) * 0.85, rng.uniform(-y, y) * 0.85, 0.0)
         shapes += _put(rng, things, at, extent, z)
@@ -125,6 +130,7 @@ def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
     open_sides = set(rng.sample(range(4), rng.randint(0, most)))
     shapes = []
     for side in range(4):
+        # walls are drawn at +x, then turned
         across, along = (half_x, half_y) if side % 2 == 0 else (half_y, half_x)
         body = _box((across + _WALL, 0.0, height / 2), (_WALL, along + 2 * _WALL, height / 2))
         hole = None
@@ -170,13 +176,16 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
         body = Primitive(s.HEIGHT, (0.0, 0.0, 0.0), half, extra=float(index))
         shapes.append(things.skinned(body, spread(rng, 1, 4))._replace(faces=1))
         ground = _on(maps[index], amplitude)
-        middle = len(maps[index]) // 4  # cameras stay on the middle half
+        # cameras stay on the middle half
+        middle = len(maps[index]) // 4
         level = amplitude * float(maps[index][middle:-middle, middle:-middle].max())
     fixed = len(shapes)
+    # far things give the horizon an outline
     for _ in range(2 + count // 4):
         shapes += _far(rng, things, rng.uniform(0, math.tau))
     near: list[Shape] = []
     for _ in range(count):
+        # denser in the middle, where cameras look
         away = 9 * rng.random() ** 0.7
         angle = rng.uniform(0, math.tau)
         at = (away * math.cos(angle), away * math.sin(angle), 0.0)
@@ -245,6 +254,7 @@ def _objects(rng: Random, things: Things, count: int) -> Place:
     fixed = len(shapes)
     spot = (rng.gauss(0, 0.2), rng.gauss(0, 0.2))
     for number in range(count):
+        # every other thing stands in a heap, where things hide each other
         if number % 2:
             x = rng.gauss(0, 0.7)
             y = rng.gauss(0, 0.7)

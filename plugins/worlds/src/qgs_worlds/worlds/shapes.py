@@ -87,6 +87,7 @@ def about_z(angle: float) -> Turn:
 
 def any_turn(rng: Random) -> Turn:
     """A rotation drawn evenly from all (a random unit quaternion)."""
+    # Gaussians have no direction that they prefer
     w, x, y, z = (rng.gauss(0, 1) for _ in range(4))
     f = 2 / (w * w + x * x + y * y + z * z)
     return (

@@ -106,6 +106,7 @@ def world_or_room(
     name: str, index: int, config: WorldsConfig, split: Split, cache: ImageCache
 ) -> DrawnScene:
     """Scene `index` of a split: a world, or a room by the share of `rooms`."""
+    # a generator of its own, so that the share changes no scene
     if Random(f"{config.seed} {split} {index}").random() >= config.rooms:
         return WorldScene(name, index, config, split, cache)
     return RoomScene(name, index, config.of_rooms, split, cache)

@@ -77,6 +77,7 @@ class Things:
 
     def draw(self) -> Thing:
         """A thing."""
+        # one number for both shares
         pick = self.rng.random() - self.style.wired
         if pick < 0:
             return self.rng.choice((self._frame, self._wire, self._bars))()
@@ -110,6 +111,7 @@ class Things:
 
     def _cut(self, body: Primitive) -> Primitive | None:
         """What is taken away from a primitive, at its surface or through it."""
+        # their exits are not known, which cuts need
         if body.kind in (s.TORUS, s.HEIGHT):
             return None
         rng = self.rng
@@ -134,6 +136,7 @@ class Things:
                 rng.uniform(-reach, reach),
             )
             body = self._primitive(center, 1.0 if count == 1 else rng.uniform(0.4, 0.9))
+            # parts of a thing often share a texture
             skin = skin if rng.random() < 0.4 else self.texture()
             hole = self._cut(body) if cut else None
             inner = skin[0] if rng.random() < 0.5 else rng.randrange(self._textures)
