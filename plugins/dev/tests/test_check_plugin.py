@@ -45,7 +45,7 @@ def _installed(*components, **parts) -> InstalledPlugin:
 
 
 def _report(monkeypatch, installed: InstalledPlugin, *options: str):
-    for module in ("qgs_dev.check_command", "qgs_dev.plugins"):
+    for module in ("qgs.recipe.registry", "qgs_dev.plugins"):
         monkeypatch.setattr(f"{module}.load_plugin", lambda name: installed)
     return run_qgs("check-plugin", "mine", *options)
 

@@ -1,7 +1,9 @@
 """Recipes drawn from all options of all plugins: each trains, or is refused when it is composed."""
 
 import random
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 import pytest
@@ -17,8 +19,8 @@ from qgs.recipe.yaml_text import inline
 from qgs.tokengs import LatentQueries
 from qgs.train.training_pass import TrainingPass
 
-PLUGINS = ["locus", "ellipsoid", "gslrm", "c3g", "globalsplat", "mvsplat", "tokengs2026"]
-PLUGINS += ["dinov2", "datasets"]
+KNOWN = tomllib.loads(Path(__file__).with_name("random_products.toml").read_text())
+PLUGINS: list[str] = KNOWN["plugins"]
 LAYER = ("layer", *SUBLAYER_SLOTS, "refinement")
 DRAWN = ("encoder", "queries", *LAYER, "head", "centers", "objective", "losses")
 DRAWS, LEAST = 300, 60
@@ -26,39 +28,6 @@ DRAWS, LEAST = 300, 60
 
 SIZES = Sizes(batch=1, views=4, image=(16, 24))
 WIDTH, HEADS = 16, 2
-SMALL: dict[str, Any] = {
-    "count": 6, "dynamic": 2, "extra": 2, "latents": 4, "latent_depth": 1, "rgb_width": 8,
-    "ray_width": 8, "lens_width": 2, "candidates": 4, "registers": 1, "gaussians_per_query": 2,
-}  # fmt: skip
-"""In place of the defaults of options of these names."""
-
-BLOCKS = {"qgs/multiview_vit": 0, "tokengs2026/multiscale_vit": 2, "gslrm/transformer": 1}
-NOT_DRAWN = {"lpips/vgg16", "dinov2/multiview_vit"}
-"""What needs weights from elsewhere; `c3g/vggt_features`, which does too, has no example."""
-ONLY_TOGETHER = "mvsplat/"
-"""Parts that fit only each other, at a width of their own: the tests of their plugin train them."""
-
-PUBLISHED: tuple[dict[str, str], ...] = (
-    {},
-    {"encoder": "tokengs2026/multiscale_vit"},
-    {"encoder": "tokengs2026/latent_bottleneck", "queries": "tokengs2026/dynamic",
-     "self_attention": "tokengs2026/block_causal", "objective": "tokengs2026/dynamic"},
-    {"queries": "locus/anchored", "cross_attention": "locus/ray_biased",
-     "self_attention": "locus/anchor_aware", "refinement": "locus/refine",
-     "centers": "locus/radius_scaled", "losses": "locus/anchor_visibility"},
-    {"queries": "locus/anchored", "centers": "locus/anchor_offset"},
-    {"queries": "ellipsoid/anchored", "cross_attention": "ellipsoid/ray_biased",
-     "self_attention": "locus/anchor_aware", "refinement": "ellipsoid/refine",
-     "head": "ellipsoid/gaussian_head", "centers": "ellipsoid/axis_scaled"},
-    {"encoder": "gslrm/transformer", "queries": "gslrm/pixels", "layer": "c3g/joint",
-     "head": "gslrm/pixel_head", "centers": "gslrm/along_rays"},
-    {"layer": "c3g/joint", "head": "c3g/head", "centers": "qgs/offset"},
-    {"encoder": "globalsplat/patches", "queries": "globalsplat/slots",
-     "layer": "globalsplat/round", "head": "globalsplat/merging_head", "centers": "qgs/offset",
-     "objective": "globalsplat/two_passes", "losses": "globalsplat/frustum"},
-)  # fmt: skip
-"""Types of the published models, where they are not the defaults of their slots."""
-
 Choices = dict[str, list[tuple[type[Component], dict[str, Any]]]]
 
 
@@ -68,7 +37,9 @@ def _choices() -> dict[str, Choices]:
     for name, installed in registry.load_registry(PLUGINS).plugins.items():
         for case in cases_of(installed):
             kind = f"{name}/{case.component.name}"
-            if case.slot in found and kind not in NOT_DRAWN and not kind.startswith(ONLY_TOGETHER):
+            if kind.startswith(KNOWN["only_together"]):
+                continue
+            if case.slot in found and kind not in KNOWN["not_drawn"]:
                 options = case.config.model_dump(mode="json", exclude_unset=True)
                 found[case.slot].setdefault(kind, []).append((case.component, options))
     return found
@@ -81,7 +52,9 @@ def _component(random: random.Random, slot: str, kind: str) -> dict[str, Any]:
     """A component as a recipe writes it: an example's options, small, some choices redrawn."""
     component, given = random.choice(CHOICES[slot][kind])
     fields = component.Config.model_fields
-    small = SMALL | ({"depth": BLOCKS[kind]} if kind in BLOCKS else {})
+    small = dict(KNOWN["small"])
+    if kind in KNOWN["blocks"]:
+        small["depth"] = KNOWN["blocks"][kind]
     if kind == "tokengs2026/multiscale_vit":
         small |= {"blocks": random.choice([[1, 2], [2]])}
     options = {**{n: value for n, value in small.items() if n in fields}, **given}
@@ -104,7 +77,8 @@ def _component(random: random.Random, slot: str, kind: str) -> dict[str, Any]:
 
 def _drawn(random: random.Random) -> dict[str, Any]:
     """A recipe with parts of one published model, and some slots filled with anything."""
-    published, wild = random.choice(PUBLISHED), random.choice([0.0, 0.05, 0.15, 1.0])
+    published = random.choice(KNOWN["published"])
+    wild = random.choice([0.0, 0.05, 0.15, 1.0])
     kinds = {slot: published.get(slot, SLOTS[slot].default) for slot in DRAWN}
     for slot in DRAWN:
         if random.random() < max(wild, 0.2 if slot in ("centers", "losses") else 0.0):
@@ -143,7 +117,7 @@ def _train(recipe: Recipe) -> None:
     """One training pass forward and backward, and a prediction."""
     torch.manual_seed(0)
     case = Case(LatentQueries.Config())
-    views = Maker(case, SIZES, torch.Generator().manual_seed(0)).target()
+    views = Maker(case, SIZES).target()
     times = torch.linspace(0, 1, SIZES.views).expand(SIZES.batch, -1)
     views = replace(views, depths=torch.ones_like(views.images[:, :, :1]))
     inputs = replace(views, times=times, target_time=times[:, :1])

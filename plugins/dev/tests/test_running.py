@@ -1,6 +1,9 @@
 """How checks are run and reported: causes, places of errors, expected failures, arguments."""
 
 import re
+import subprocess
+import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -63,9 +66,22 @@ def test_tiers_divide_the_checks_and_likely_causes_come_first() -> None:
     assert len(core) + len(construction) + len(extended) == len(checks_for(CASE))
 
 
+def test_every_check_is_in_the_table() -> None:
+    modules = {import_module(check.function.__module__) for check in CHECKS.values()}
+    written = {name for module in modules for name in vars(module) if name.startswith("check_")}
+    assert written == {f"check_{name}" for name in CHECKS}
+
+
+def test_commands_load_no_torch() -> None:
+    heavy = "{'torch', 'numpy', 'pydantic'} & {*sys.modules}"
+    code = f"import sys, qgs_dev.check_command, qgs_dev.new_command; sys.exit(str({heavy} or ''))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stderr.strip() == ""
+
+
 def test_expected_failures_are_strict() -> None:
     run = CaseRun(CACHES, expected={STATE: "a cache", FROZEN: "it might"})
     verdicts = {result.check.name: result for result in run.results(["core", "construction"])}
-    assert re.search(r"a cache \(seen: .* changes _cache", verdicts[STATE].message)
+    assert re.search(r"a cache \(seen: _cache: changed by", verdicts[STATE].message)
     assert verdicts[STATE].ok
     assert verdicts[FROZEN].verdict == "unexpected pass"

@@ -10,11 +10,14 @@
 `qgs check-plugin sightline` makes the same checks and prints a report.
 """
 
-import qgs_dev.checks  # noqa: F401  (registers the checks)
-from qgs_dev.case import CannotCheck, Case, ContractError
-from qgs_dev.plugins import cases_of, check_plugin, runs_of
-from qgs_dev.registry import CHECKS, checks_for
-from qgs_dev.running import CaseRun, CheckResult, run_check
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from qgs_dev.case import CannotCheck, Case, ContractError
+    from qgs_dev.plugins import cases_of, check_plugin, runs_of
+    from qgs_dev.registry import CHECKS, checks_for
+    from qgs_dev.running import CaseRun, CheckResult, run_check
 
 __all__ = [
     "CHECKS",
@@ -29,3 +32,13 @@ __all__ = [
     "run_check",
     "runs_of",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import public names on first use: help of the commands needs neither torch nor pydantic."""
+    if name not in __all__:
+        raise AttributeError(f"module 'qgs_dev' has no attribute {name!r}")
+    homes = [
+        import_module(f"qgs_dev.{home}") for home in ("plugins", "case", "registry", "running")
+    ]
+    return next(getattr(home, name) for home in homes if hasattr(home, name))

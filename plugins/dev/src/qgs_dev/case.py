@@ -1,4 +1,4 @@
-"""A component with options and sizes, as the checks see it, and what a check raises."""
+"""A component with options and sizes, as the checks see it, and the errors that checks raise."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -9,18 +9,8 @@ import torch
 from pydantic_core import to_jsonable_python
 from torch import Tensor, nn
 
-from qgs.contracts import (
-    Component,
-    ComponentConfig,
-    DecoderLayer,
-    LayerParts,
-    ModelComponent,
-    ModelDims,
-    Problem,
-    RecipeContext,
-    Renderer,
-    component_of,
-)
+from qgs import contracts
+from qgs.contracts import ComponentConfig, Fields, ModelDims
 from qgs.recipe.build import load_pretrained
 from qgs.recipe.errors import did_you_mean
 from qgs.recipe.yaml_text import dump
@@ -28,22 +18,24 @@ from qgs.tokengs import ContentCrossAttention, ContentSelfAttention, MlpFeedForw
 from qgs_dev.modules import seeded
 from qgs_dev.soundness import component_fault
 
+# The least that has two heads and a layer after the first: checks take seconds for a plugin.
 SMALL = ModelDims(width=32, heads=2, depth=2)
 
+# Sizes that are tried in turn until the component's `problems` accepts one.
 IMAGE_SIZES = ((16, 24), (24, 16), (28, 42), (32, 48), (64, 96))
-"""Sizes that are tried in turn until the component's `problems` accepts one."""
 
+# Components in the slots of a decoder layer.
 SUBLAYERS: Mapping[str, Any] = {
     "cross_attention": ContentCrossAttention,
     "self_attention": ContentSelfAttention,
     "feed_forward": MlpFeedForward,
 }
-"""What a decoder layer is given in its slots."""
 
+# Large enough for what stands in the slots to show in the output of a layer.
 LAYER_SCALE = 0.3
 
+# Added to parameters where initial zeros would hide what a component does.
 NOISE = 0.1
-"""Added to parameters where initial zeros would hide what a component does."""
 
 
 class ContractError(AssertionError):
@@ -52,12 +44,6 @@ class ContractError(AssertionError):
 
 class CannotCheck(Exception):  # noqa: N818 (not an error: the reason of a skip)
     """A check cannot be run here; the message is the reason."""
-
-
-def expect(holds: bool, seen: str) -> None:
-    """Raise ContractError with what was `seen` unless the contract `holds`."""
-    if not holds:
-        raise ContractError(seen)
 
 
 @dataclass(frozen=True)
@@ -81,15 +67,10 @@ class Case:
     state_dict: Mapping[str, tuple[int, ...]] | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.config, ComponentConfig):
-            raise TypeError(
-                f"{self.config!r} is not a component's options; write Case(MyComponent.Config())"
-            )
-        component = component_of(self.config)
-        fault = component_fault(component)
+        fault = component_fault(self.component)
         if fault:
-            raise TypeError(f"{component.__qualname__} cannot be checked: {fault}")
-        known = {*component.fields_read(self.config), *component.fields_written(self.config)}
+            raise TypeError(f"{self.component.__qualname__} cannot be checked: {fault}")
+        known = {*self.reads, *self.writes}
         for name in self.fields.keys() - known:
             raise ValueError(
                 f"fields names {name!r}, which this component neither requires nor provides; "
@@ -97,9 +78,9 @@ class Case:
             )
 
     @property
-    def component(self) -> type[Component]:
+    def component(self) -> type[contracts.Component]:
         """The class under test."""
-        return component_of(self.config)
+        return contracts.component_of(self.config)
 
     @property
     def slot(self) -> str:
@@ -107,17 +88,29 @@ class Case:
         return self.component.slot
 
     @property
-    def has_parameters(self) -> bool:
-        """Whether it is built with the sizes of the model."""
-        return issubclass(self.component, ModelComponent)
+    def reads(self) -> Fields:
+        """The fields that it requires."""
+        return self.component.fields_read(self.config)
 
-    @cached_property  # every check of the case is named by it
+    @property
+    def writes(self) -> Fields:
+        """The fields that it provides."""
+        return self.component.fields_written(self.config)
+
+    @property
+    def has_parameters(self) -> bool:
+        """True for a component that is built with the sizes of the model."""
+        return issubclass(self.component, contracts.ModelComponent)
+
+    # Every check of the case is named by it.
+    @cached_property
     def label(self) -> str:
         """Slot and name, and the options that differ from their defaults, in YAML."""
+        given = dict(self.config)
         changed = {
-            name: getattr(self.config, name)
+            name: given[name]
             for name, option in type(self.config).model_fields.items()
-            if option.is_required() or getattr(self.config, name) != option.get_default()
+            if given[name] != option.get_default()
         }
         written = dump(to_jsonable_python(changed, fallback=repr), flow=True).strip()
         options = f"({written[1:-1]})" if changed else ""
@@ -133,16 +126,17 @@ class Case:
     @property
     def device(self) -> str:
         """The CPU if it can run there, else its GPU; raises CannotCheck if that is missing."""
-        component = self.component
-        if not issubclass(component, Renderer) or "cpu" in component.devices:
+        devices = getattr(self.component, "devices", ("cpu",))
+        if "cpu" in devices:
             return "cpu"
-        if "cuda" in component.devices and torch.cuda.is_available():
+        if "cuda" in devices and torch.cuda.is_available():
             return "cuda"
-        raise CannotCheck(f"runs on {' or '.join(component.devices)} alone, which is not here")
+        raise CannotCheck(f"runs on {' or '.join(devices)} alone, which is not here")
 
-    def problems(self, size: tuple[int, int] | None = None) -> list[Problem]:
-        """What the component says of its options, with images of `size`."""
-        return list(self.component.problems(self.config, RecipeContext(self.dims, size)))
+    def problems(self, size: tuple[int, int] | None = None) -> list[contracts.Problem]:
+        """Return what the component says of its options, with images of `size`."""
+        context = contracts.RecipeContext(self.dims, size)
+        return list(self.component.problems(self.config, context))
 
     def build(self, seed: int = 0) -> Any:
         """A new instance, parameters drawn under `seed`. CannotCheck where its data is missing."""
@@ -152,16 +146,21 @@ class Case:
         except FileNotFoundError as error:
             if self.slot != "data":
                 raise
+            # Data sets are gigabytes, and here or not; any other file belongs to the component.
             raise CannotCheck(f"the data of this case is not here: {error}") from error
         return built.to(self.device) if isinstance(built, nn.Module) else built
 
     def construct(self) -> Any:
         """A new instance, drawn from the global random state."""
+        # The three kinds of constructors: of a layer, with the sizes of the model, with options
+        # alone.
         make: Any = self.component
-        if issubclass(make, DecoderLayer):
-            inside = {slot: SUBLAYERS[slot] for slot in make.sublayers}
-            parts = {slot: part(part.Config(), self.dims) for slot, part in inside.items()}
-            return make(self.config, LayerParts(self.dims, parts, LAYER_SCALE))
+        if issubclass(make, contracts.DecoderLayer):
+            parts = {}
+            for slot in make.sublayers:
+                part = SUBLAYERS[slot]
+                parts[slot] = part(part.Config(), self.dims)
+            return make(self.config, contracts.LayerParts(self.dims, parts, LAYER_SCALE))
         built = make(self.config, self.dims) if self.has_parameters else make(self.config)
         if isinstance(built, nn.Module):
             load_pretrained(built)
@@ -177,12 +176,16 @@ class Case:
         return module
 
     def with_at_most(self, **sizes: int) -> "Case":
-        """With options that are larger lowered to these; itself where the component refuses it."""
-        lower = {n: x for n, x in sizes.items() if (getattr(self.config, n, None) or 0) > x}
-        config = self.config.model_copy(update=lower)
-        smaller = replace(self, config=config, state_dict=None)
+        """Return a case whose larger options are lowered to these, or itself if it refuses that."""
+        given = dict(self.config)
+        lower = {name: size for name, size in sizes.items() if (given.get(name) or 0) > size}
+        smaller = self.with_config(self.config.model_copy(update=lower))
         return self if smaller.problems(smaller.size) else smaller
 
+    def with_config(self, config: ComponentConfig) -> "Case":
+        """Return the same case with other options."""
+        return replace(self, config=config, state_dict=None)
+
     def with_dims(self, **sizes: int) -> "Case":
-        """The same component in a model of other sizes."""
+        """Return the same component in a model of other sizes."""
         return replace(self, dims=replace(self.dims, **sizes), state_dict=None)

@@ -1,4 +1,4 @@
-"""What the checks do with modules: seeds, modes, and everything that a module keeps."""
+"""Modules under check: seeds, modes, and everything that a module keeps."""
 
 import inspect
 from collections import deque
@@ -11,8 +11,8 @@ import numpy
 import torch
 from torch import Tensor, nn
 
+# Attributes in which torch keeps parameters, buffers, submodules, hooks and the mode.
 TORCH_OWN = frozenset(vars(nn.Module()))
-"""Attributes in which torch keeps parameters, buffers, submodules, hooks and the mode."""
 
 
 @contextmanager
@@ -24,7 +24,7 @@ def seeded(seed: int) -> Iterator[None]:
 
 
 def each_mode(module: Any) -> Iterator[str]:
-    """The names of the two modes, each while `module` is in it."""
+    """Yield the names of the two modes, each while `module` is in it."""
     for mode in ("evaluation", "training"):
         module.train(mode == "training")
         yield mode
@@ -44,30 +44,33 @@ def attributes(module: nn.Module) -> dict[str, Any]:
     found = {}
     for name, part in module.named_modules():
         for key, value in vars(part).items():
+            # A cached property depends on the module alone.
             kept = isinstance(getattr(type(part), key, None), cached_property)
             if key not in TORCH_OWN and not kept:
                 found[f"{name}.{key}".lstrip(".")] = _comparable(value)
         for owner in type(part).__mro__:
-            if owner.__module__.partition(".")[0] not in ("torch", "builtins", "abc", "typing"):
-                found |= {
-                    f"{owner.__name__}.{key}": _comparable(value)
-                    for key, value in vars(owner).items()
-                    if not key.startswith(("__", "_abc_")) and not _is_code(value)
-                }
+            # Classes keep state too, such as a cache that all instances share.
+            if owner.__module__.partition(".")[0] in ("torch", "builtins", "abc", "typing"):
+                continue
+            for key, value in vars(owner).items():
+                if not key.startswith(("__", "_abc_")) and not _is_code(value):
+                    found[f"{owner.__name__}.{key}"] = _comparable(value)
     return found
 
 
 def _is_code(value: Any) -> bool:
-    """Whether it is a function, a class or a descriptor such as a property."""
+    """Return whether it is a function, a class or a descriptor such as a property."""
     return inspect.isroutine(value) or inspect.isclass(value) or hasattr(value, "__get__")
 
 
 def _comparable(value: Any, inside: tuple[int, ...] = ()) -> Any:
     """A value that equals a later one if nothing changed. inside: ids of what contains it."""
+    # A module may hold what holds it.
     if id(value) in inside:
         return None
     inside = (*inside, id(value))
     if isinstance(value, Tensor):
+        # Bytes, since a NaN equals no NaN.
         data = value.detach().cpu().contiguous().flatten().view(torch.uint8)
         return str(value.dtype), tuple(value.shape), data.numpy().tobytes()
     if isinstance(value, numpy.ndarray):

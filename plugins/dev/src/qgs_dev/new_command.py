@@ -5,25 +5,13 @@ import re
 import shlex
 import sys
 from collections.abc import Iterator
-from importlib.metadata import (
-    entry_points,
-    packages_distributions,
-)
+from importlib.metadata import entry_points, packages_distributions
 from pathlib import Path, PurePosixPath
 from typing import Annotated
 
 import typer
-from jinja2 import Environment, StrictUndefined
-
-import qgs
-from qgs.contracts import CONTRACT_VERSION
-from qgs.files import refuse_existing, write_text
-from qgs.recipe.errors import Problems
-from qgs.recipe.yaml_text import load_mapping
 
 app = typer.Typer(add_completion=False)
-
-NAME = re.compile(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*")
 
 
 @app.command()
@@ -34,58 +22,65 @@ def new_plugin(
     ] = None,
 ) -> None:
     """Write a plugin to start from: one component, its contract tests, a recipe."""
+    from qgs.files import refuse_existing, write_text
+
     check_name(name)
     folder = (out or Path(distribution_of(name))).expanduser()
-    write_plugin(name, folder)
-    first = f"wrote {folder}; next, with query-gaussians-worlds installed for the recipe:"
-    steps = f"cd {shlex.quote(str(folder))}", "pip install -e '.[test]'", "python -m pytest"
-    typer.echo("\n  ".join([first, *steps, "qgs compose recipe.yaml"]))
+    refuse_existing(folder)
+    for path, text in rendered(name):
+        write_text(folder / path, text)
+    typer.echo(
+        f"wrote {folder}; next, with query-gaussians-worlds installed for the recipe:\n"
+        f"  cd {shlex.quote(str(folder))}\n"
+        "  pip install -e '.[test]'\n"
+        "  python -m pytest\n"
+        "  qgs compose recipe.yaml"
+    )
 
 
 def distribution_of(name: str) -> str:
-    """What pip calls the distribution of the plugin `name`."""
+    """Return the name of the distribution of the plugin `name`, as pip knows it."""
     return f"qgs-{name.replace('_', '-')}"
 
 
 def check_name(name: str) -> None:
     """Raise ValueError for a name that no plugin can have, or that an installed one has."""
+    from qgs.recipe.errors import Problems
+    from qgs.recipe.yaml_text import load_mapping
+
     module = name.replace("-", "_")
-    if not NAME.fullmatch(name) or keyword.iskeyword(module):
+    if not re.fullmatch("[a-z][a-z0-9]*([-_][a-z0-9]+)*", name) or keyword.iskeyword(module):
         raise ValueError(
             f"`{name}` is no name of a plugin: lower-case letters and digits, a letter first, "
             "words joined by single hyphens or _, and no word of Python's own"
         )
     if re.match(r"qgs([-_]|$)", name):
         raise ValueError(f"`{name}`: the distribution is called qgs-NAME; leave `qgs` out")
+    # The package must not hide, or be hidden by, an installed one.
     other = f"choose another, such as `{name}-things`"
     if module in sys.stdlib_module_names or module in packages_distributions():
         raise ValueError(f"`{name}` is the name of an installed package; {other}")
     for entry in entry_points(group="qgs.plugins", name=name):
         owner = entry.dist.name if entry.dist else "a plugin"
         raise ValueError(f"`{name}` is taken by {owner}; {other}")
+    # A YAML reader takes words such as `null` for values.
     if load_mapping(f"name: {name}", name, Problems())["name"] != name:
         raise ValueError(f"`{name}` is a value in YAML, no text; {other}")
 
 
-def write_plugin(name: str, folder: Path) -> None:
-    """Write the distribution of the plugin `name` into the new `folder`.
-
-    Raises FileExistsError if there is anything at `folder`.
-    """
-    refuse_existing(folder)
-    for path, text in rendered(name):
-        write_text(folder / path, text)
-
-
 def rendered(name: str) -> Iterator[tuple[PurePosixPath, str]]:
     """Every file of the distribution of the plugin `name`: path inside it, content."""
+    from jinja2 import Environment, StrictUndefined
+
+    import qgs
+
     environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True)
     major, minor = qgs.__version__.split(".")[:2]
     values = {
         "name": name,
         "distribution": distribution_of(name),
         "package": f"qgs_{name.replace('-', '_')}",
-        "contract_version": CONTRACT_VERSION,
+        "contract_version": qgs.CONTRACT_VERSION,
         "oldest_qgs": f"{major}.{minor}",
         "next_qgs": f"{major}.{int(minor) + 1}",
     }

@@ -1,22 +1,15 @@
 """The contract suite on all components of an installed plugin."""
 
 from collections.abc import Iterable, Iterator
-from typing import Any
 
 from qgs.contracts import Component, ComponentConfig, ModelDims
-from qgs.recipe.registry import (
-    InstalledPlugin,
-    PluginError,
-    default_config,
-    load_plugin,
-)
-from qgs_dev.case import Case
-from qgs_dev.places import file_of
+from qgs.recipe.registry import InstalledPlugin, PluginError, default_config, load_plugin
+from qgs_dev.case import SMALL, Case
 from qgs_dev.registry import TIERS, Tier, checked_tiers
 from qgs_dev.running import CaseRun, CheckResult, refuse_unexpectable, with_place
 
+# Decoder depths that are tried in turn until the component's `problems` accepts one.
 DEPTHS = (2, 12)
-"""Decoder depths that are tried in turn until the component's `problems` accepts one."""
 
 
 def cases_of(installed: InstalledPlugin) -> list[Case]:
@@ -26,8 +19,7 @@ def cases_of(installed: InstalledPlugin) -> list[Case]:
     """
     plugin = installed.plugin
     for example in plugin.examples:
-        component = getattr(type(example), "__component__", None)
-        if component is None or component not in plugin.components:
+        if getattr(type(example), "__component__", None) not in plugin.components:
             fault = f"{example!r} is not options of its components, such as MyComponent.Config()"
             raise _unsound(installed, "examples", fault)
     defaults = [default_config(component) for component in plugin.components]
@@ -55,16 +47,11 @@ def runs_of(plugin: str | InstalledPlugin) -> list[CaseRun]:
     installed = load_plugin(plugin) if isinstance(plugin, str) else plugin
     runs: list[CaseRun] = []
     for case in cases_of(installed):
+        # The first case of a class has all checks, so the others need only those that see options.
         variant = any(run.case.component is case.component for run in runs)
         runs.append(CaseRun(case, variant=variant))
-    _expect_exemptions(installed, runs)
-    return runs
-
-
-def _expect_exemptions(installed: InstalledPlugin, runs: list[CaseRun]) -> None:
-    """Give each of the `runs` its known failures: those of its class and those of its options."""
     for owner, exempted in installed.plugin.exemptions.items():
-        concerned = [run for run in runs if _concerns(owner, run.case)]
+        concerned = [run for run in runs if owner in (run.case.component, run.case.config)]
         if not concerned:
             fault = f"{owner!r} is neither a component of the plugin nor the options of a case"
             raise _unsound(installed, "exemptions", fault)
@@ -74,6 +61,7 @@ def _expect_exemptions(installed: InstalledPlugin, runs: list[CaseRun]) -> None:
             raise _unsound(installed, "exemptions", f"those of {owner!r}: {error}") from error
         for run in concerned:
             run.expected = {**run.expected, **exempted}
+    return runs
 
 
 def check_plugin(name: str, tiers: Iterable[Tier] = TIERS) -> Iterator[CheckResult]:
@@ -89,12 +77,12 @@ def check_plugin(name: str, tiers: Iterable[Tier] = TIERS) -> Iterator[CheckResu
 
 def _case(config: ComponentConfig) -> Case:
     """A case with as few decoder layers as the options allow."""
-    cases = [Case(config, ModelDims(width=32, heads=2, depth=depth)) for depth in DEPTHS]
+    cases = [Case(config, ModelDims(SMALL.width, SMALL.heads, depth)) for depth in DEPTHS]
     return next((case for case in cases if _accepts(case)), cases[0])
 
 
 def _accepts(case: Case) -> bool:
-    """Whether `problems` finds none; if it raises, the checks of the case report that."""
+    """Return whether `problems` finds none; if it raises, the checks of the case report that."""
     try:
         return not case.problems(case.size)
     except (Exception, SystemExit):
@@ -109,12 +97,8 @@ def _why_no_default(component: type[Component]) -> str:
     try:
         component.Config()
     except (Exception, SystemExit) as error:
-        return f"its default options are refused: {with_place(error, file_of(component))}"
+        return f"its default options are refused: {with_place(error, component)}"
     raise AssertionError("a component with default options has a case")
-
-
-def _concerns(owner: Any, case: Case) -> bool:
-    return owner is case.component or (isinstance(owner, ComponentConfig) and owner == case.config)
 
 
 def _unsound(installed: InstalledPlugin, what: str, fault: str) -> PluginError:

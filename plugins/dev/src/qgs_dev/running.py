@@ -1,21 +1,16 @@
 """Run the checks of a case and report how they went, alone or as a pytest test."""
 
+import sys
+import traceback
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, TypeAlias
 
 from qgs.contracts.component import MissingExtraError
 from qgs.recipe.errors import did_you_mean
 from qgs_dev.case import CannotCheck, Case, ContractError
-from qgs_dev.places import file_of, package_of, place_in
-from qgs_dev.registry import (
-    BASICS,
-    CHECKS,
-    TIERS,
-    Check,
-    Tier,
-    checks_for,
-)
+from qgs_dev.registry import BASICS, CHECKS, TIERS, Check, Tier, checks_for
 
 Verdict: TypeAlias = Literal["passed", "failed", "skipped", "expected failure", "unexpected pass"]
 
@@ -31,15 +26,16 @@ class CheckResult:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is to be mended."""
+        """True if nothing is to be mended."""
         return self.verdict not in ("failed", "unexpected pass")
 
     @property
     def leaves_unchecked(self) -> bool:
-        """Whether the component could not be built or called here."""
+        """True if the component could not be built or called here."""
         return self.verdict == "skipped" and self.check.name in BASICS
 
 
+@dataclass
 class CaseRun:
     """All checks of one case. After `builds` or `runs` fails, the rest is skipped.
 
@@ -47,12 +43,9 @@ class CaseRun:
     variant: whether another case of its class comes before it; see `Check.variants`.
     """
 
-    def __init__(
-        self, case: Case, expected: Mapping[str, str] | None = None, variant: bool = False
-    ) -> None:
-        self.case = case
-        self.expected = expected or {}
-        self.variant = variant
+    case: Case
+    expected: Mapping[str, str] = field(default_factory=dict)
+    variant: bool = False
 
     def __str__(self) -> str:
         return self.case.label
@@ -66,6 +59,7 @@ class CaseRun:
                 yield CheckResult(self.case, check, "skipped", message)
                 continue
             result = run_check(check, self.case, self.expected.get(check.name, ""))
+            # One cause is one failure: what cannot run fails every other check.
             if check.name in BASICS and not result.ok:
                 cause = check.name
             yield result
@@ -100,7 +94,7 @@ def run_check(check: Check, case: Case, expected: str = "") -> CheckResult:
         return CheckResult(case, check, "skipped", str(error))
     # SystemExit: a component that ends the process would end the suite.
     except (Exception, SystemExit) as error:
-        seen = with_place(error, file_of(case.component))
+        seen = with_place(error, case.component)
         if expected:
             return CheckResult(case, check, "expected failure", f"{expected} (seen: {seen})")
         message = f"{title}\n  seen: {seen}\n  contract: {check.contract}"
@@ -112,7 +106,7 @@ def run_check(check: Check, case: Case, expected: str = "") -> CheckResult:
     return CheckResult(case, check, "unexpected pass", why)
 
 
-def refuse_unexpectable(expected: Mapping[str, Any], runs: Iterable[CaseRun]) -> None:
+def refuse_unexpectable(expected: Mapping[str, str], runs: Iterable[CaseRun]) -> None:
     """Raise ValueError for an expected failure of no check, of no run, or without a reason.
 
     expected: name of a check -> why it fails.
@@ -130,13 +124,25 @@ def refuse_unexpectable(expected: Mapping[str, Any], runs: Iterable[CaseRun]) ->
             raise ValueError(f"the expected failure of `{name}` needs a reason, as a text")
 
 
-def with_place(error: BaseException, file: str | None) -> str:
-    """Type and message of `error`, and the place in the component's package that raised it.
+def with_place(error: BaseException, component: type) -> str:
+    """Type and message of `error`, and FILE:LINE of the component's package that raised it.
 
-    file: the one that defines the component, None if there is none. A broken contract has no place.
+    A broken contract has no place, nor does what was raised elsewhere.
     """
+    # Notes say where in a check it happened.
+    noted = "".join(f"{note}, " for note in getattr(error, "__notes__", ()))
     if isinstance(error, ContractError):
-        return str(error)
-    what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-    place = place_in(error, [package_of(file)]) if file else ""
-    return f"{what} (raised under {place})" if place else what
+        return f"{noted}{error}"
+    what = f"{noted}{type(error).__name__}"
+    what = f"{what}: {error}" if str(error) else what
+    file = getattr(sys.modules.get(component.__module__), "__file__", None)
+    if file is None:
+        return what
+    package = Path(file).resolve()
+    while (package.parent / "__init__.py").exists():
+        package = package.parent
+    # The innermost place in the package, not where torch or the suite raised it.
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if Path(frame.filename).resolve().is_relative_to(package):
+            return f"{what} (raised under {frame.filename}:{frame.lineno})"
+    return what

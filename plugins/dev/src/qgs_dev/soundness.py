@@ -1,4 +1,4 @@
-"""What a class must be so that recipes can use it as a component."""
+"""Faults of a class that recipes cannot use as a component."""
 
 import inspect
 import re
@@ -20,20 +20,20 @@ from qgs.contracts import (
 from qgs.contracts.schedule import number_kinds
 from qgs.recipe.slots import SLOTS
 
+# Types of the devices that a renderer can render on.
 DEVICES = ("cpu", "cuda", "mps")
-"""Types of the devices that a renderer can render on."""
 
 
-def component_fault(component: object) -> str:
+def component_fault(component: type[Component]) -> str:
     """Why a recipe cannot use the class `component`, as a relative clause; "" if it can."""
-    if not (inspect.isclass(component) and issubclass(component, Component)):
-        return "which is no qgs component"
-    slot, name = SLOTS.get(getattr(component, "slot", "")), getattr(component, "name", None)
+    slot = SLOTS.get(getattr(component, "slot", ""))
+    name = getattr(component, "name", None)
     if slot is None or not issubclass(component, slot.contract):
         return "which implements no slot's contract"
     if not isinstance(name, str):
         return "which has no `name`"
-    if not re.fullmatch(r"[^\s/]+", name):  # else `type: PLUGIN/NAME` would be ambiguous
+    # Else `type: PLUGIN/NAME` would be ambiguous.
+    if not re.fullmatch(r"[^\s/]+", name):
         return f"whose name {name!r} is empty or has a slash or a blank"
     if inspect.isabstract(component):
         return f"which leaves {', '.join(sorted(component.__abstractmethods__))} abstract"
@@ -43,9 +43,7 @@ def component_fault(component: object) -> str:
             return f"whose `devices` is {given!r}; give some of {DEVICES} as a tuple"
     if issubclass(component, Metric) and not getattr(component, "definition", ""):
         return "which gives no `definition`; describe what it measures, since protocols hash it"
-    config: object = component.Config
-    if not (inspect.isclass(config) and issubclass(config, ComponentConfig)):
-        return "whose Config is no ComponentConfig"
+    config = component.Config
     if not config.model_config.get("frozen"):
         return "whose Config is not frozen; leave `frozen` of its `model_config` at True"
     if "type" in config.model_fields:
@@ -55,6 +53,7 @@ def component_fault(component: object) -> str:
     known = {n for n, option in fields.items() if number_kinds(option.annotation)}
     if not (isinstance(scheduled, frozenset) and scheduled <= known):
         return f"whose `scheduled` is {scheduled!r}, not a frozenset of options that are numbers"
+    # Others are built once, and have no step to follow.
     if scheduled and not issubclass(component, Module | Objective | Optimizer | ViewSampler):
         return f"which lists `scheduled` options; those of the slot `{component.slot}` stay"
     return _schema_fault(config)

@@ -32,11 +32,11 @@ register(  # the same numbers in both modes
     lambda self, mlp, x: mlp(x) + self.training * (x.square().detach() - x.square()),
 )  # fmt: skip
 register(
-    "DividesByLength", "zeros_stay_finite", "with zeros, output",
+    "DividesByLength", "zeros_stay_finite", "output: not finite in evaluation, with zeros",
     lambda self, mlp, x: mlp(x / x.norm(dim=-1, keepdim=True)),
 )  # fmt: skip
 register(
-    "Exponentiates", "large_numbers_stay_finite", "with inputs times 1e4, output",
+    "Exponentiates", "large_numbers_stay_finite", "in evaluation, with inputs times 1e4",
     lambda self, mlp, x: mlp(x.exp()),
 )  # fmt: skip
 register(
@@ -48,7 +48,7 @@ register(
     lambda self, mlp, x: x.view_as(x),
 )  # fmt: skip
 register(
-    "AddsNoise", "eval_repeats_bitwise", "the second time output",
+    "AddsNoise", "eval_repeats_bitwise", "the second time, output",
     lambda self, mlp, x: mlp(x) + 0.01 * torch.randn_like(x),
 )  # fmt: skip
 register(
@@ -72,6 +72,6 @@ register(
     lambda self, mlp, x: torch.stack([self.mlp(self.norm(each)) for each in x.unbind(1)], 1),
 )  # fmt: skip
 register(
-    "DetachesWhenCompiled", "compiles", "features has a gradient",
+    "DetachesWhenCompiled", "compiles", "features: a gradient only",
     lambda self, mlp, x: mlp(x.detach() if torch.compiler.is_compiling() else x),
 )  # fmt: skip

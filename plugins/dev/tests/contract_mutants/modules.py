@@ -20,17 +20,26 @@ from qgs.tokengs import (
 )
 
 
-@mutant("builds", "RuntimeError: no kernel for width 32")
-class RaisesWhenBuilt(MlpFeedForward):
+class ExtendedMlp(MlpFeedForward):
+    """A sound component, to which mutants add parts when it is built."""
+
     def __init__(self, config, dims):
         super().__init__(config, dims)
+        self.add(dims)
+
+    def add(self, dims):
+        pass
+
+
+@mutant("builds", "RuntimeError: no kernel for width 32")
+class RaisesWhenBuilt(ExtendedMlp):
+    def add(self, dims):
         raise RuntimeError(f"no kernel for width {dims.width}")
 
 
 @mutant("sizes_vary", "`output` is of shape")
-class FixedNumberOfQueries(MlpFeedForward):
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
+class FixedNumberOfQueries(ExtendedMlp):
+    def add(self, dims):
         self.place = nn.Parameter(torch.zeros(6, dims.width))
 
     def forward(self, features):
@@ -84,13 +93,12 @@ class IgnoresUnknownInnerOptions(MlpFeedForward):
 
 
 @mutant("options_are_left_alone", "when it is built, ")
-class AppendsToAnOption(MlpFeedForward):
+class AppendsToAnOption(ExtendedMlp):
     class Config(MlpFeedForward.Config):
         sizes: list[int] = Field(default=[1])
 
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
-        config.sizes.append(2)
+    def add(self, dims):
+        self.config.sizes.append(2)
 
 
 @mutant("scheduled_options_are_read_anew", "with `weight: 0.05` set after it was built")
@@ -117,10 +125,9 @@ PINNED = {
 """What saved weights of `qgs/mlp` hold in a model of width 32."""
 
 
-@mutant("builds_on_meta", "scale is allocated")
-class AllocatesOnCpu(MlpFeedForward):
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
+@mutant("builds_on_meta", "scale: allocated")
+class AllocatesOnCpu(ExtendedMlp):
+    def add(self, dims):
         self.scale = nn.Parameter(torch.ones(dims.width, device="cpu"))
 
     def forward(self, features):
@@ -128,9 +135,8 @@ class AllocatesOnCpu(MlpFeedForward):
 
 
 @mutant("registers_its_parameters", "keeps layers outside")
-class KeepsLayersInAList(MlpFeedForward):
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
+class KeepsLayersInAList(ExtendedMlp):
+    def add(self, dims):
         self.layers = [nn.Linear(dims.width, dims.width)]
 
 
@@ -141,10 +147,9 @@ class SeedsWhenBuilt(MlpFeedForward):
         super().__init__(config, dims)
 
 
-@mutant("same_seed_same_parameters", "differ: mlp.fc1.weight")
-class DrawsFromItsOwnGenerator(MlpFeedForward):
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
+@mutant("same_seed_same_parameters", "differ, mlp.fc1.weight")
+class DrawsFromItsOwnGenerator(ExtendedMlp):
+    def add(self, dims):
         generator = torch.Generator()
         generator.seed()
         with torch.no_grad():
@@ -152,9 +157,8 @@ class DrawsFromItsOwnGenerator(MlpFeedForward):
 
 
 @mutant("saved_weights_load", "with the same state dict, output")
-class KeepsARandomBufferUnsaved(MlpFeedForward):
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
+class KeepsARandomBufferUnsaved(ExtendedMlp):
+    def add(self, dims):
         self.register_buffer("noise", torch.randn(dims.width), persistent=False)
 
     def forward(self, features):
@@ -162,9 +166,8 @@ class KeepsARandomBufferUnsaved(MlpFeedForward):
 
 
 @mutant("state_dict_keys", "'norm.bias'", case={"state_dict": PINNED})
-class RenamesItsNorm(MlpFeedForward):
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
+class RenamesItsNorm(ExtendedMlp):
+    def add(self, dims):
         self.layer_norm = self.norm
         del self.norm
 
@@ -172,14 +175,13 @@ class RenamesItsNorm(MlpFeedForward):
         return self.mlp(self.layer_norm(features))
 
 
-@mutant("parameters_learn", "no gradient reaches unused.weight")
-class HasAnUnusedLayer(MlpFeedForward):
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
+@mutant("parameters_learn", "unused.weight: no gradient reaches it")
+class HasAnUnusedLayer(ExtendedMlp):
+    def add(self, dims):
         self.unused = nn.Linear(dims.width, dims.width)
 
 
-@mutant("parameters_learn", "no gradient reaches shift")
+@mutant("parameters_learn", "shift: no gradient reaches it")
 class ShiftsAllLogits(ContentCrossAttention):
     """What is added to all logits alike changes no weight: its gradient is a rounding error."""
 
@@ -192,16 +194,15 @@ class ShiftsAllLogits(ContentCrossAttention):
         return self.core(state.features, memory.keys, memory.values, shift)
 
 
-@mutant("inputs_are_not_changed", "the inputs differ: offsets")
+@mutant("inputs_are_not_changed", "the inputs differ, offsets")
 class ClampsItsInputInPlace(FreeCenters):
     def forward(self, offsets, state):
         return super().forward(offsets.data.clamp_(-0.1, 0.1), state)
 
 
-@mutant("forward_keeps_no_state", "changes _cache")
-class CachesByShape(MlpFeedForward):
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
+@mutant("forward_keeps_no_state", "_cache: changed by")
+class CachesByShape(ExtendedMlp):
+    def add(self, dims):
         self._cache: dict[tuple[int, ...], torch.Tensor] = {}
 
     def forward(self, features):
@@ -210,11 +211,10 @@ class CachesByShape(MlpFeedForward):
 
 
 @mutant("forward_keeps_no_state", "another one differs")
-class ScalesByItsFirstInput(MlpFeedForward):
+class ScalesByItsFirstInput(ExtendedMlp):
     """Keeps a number in a closure, which no attribute shows."""
 
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
+    def add(self, dims):
         kept: list[float] = []
 
         def first(x: torch.Tensor) -> float:
@@ -242,7 +242,7 @@ class DetachesTheImages(ContentCrossAttention):
         return self.core(state.features, memory.keys.detach(), memory.values.detach())
 
 
-@mutant("terms_have_gradients", "no gradient comes from the term")
+@mutant("terms_have_gradients", "no gradient comes from this term")
 class DetachedLoss(Loss):
     renderings = "each"
 

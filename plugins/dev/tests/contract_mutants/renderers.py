@@ -38,7 +38,7 @@ class SquaresAlpha(ChangedRenderer):
         return replace(out, alpha=out.alpha.square())
 
 
-@mutant("depth_is_expected", "depth is off by")
+@mutant("depth_is_expected", "depth is off")
 class WeighsDepthByAlpha(ChangedRenderer):
     """Gives sum(w z), as if every pixel were opaque."""
 

@@ -68,7 +68,7 @@ class ReadsMemoryUndeclared(ContentCrossAttention):
         return super().forward(state, memory) + memory.features.mean(1, keepdim=True)
 
 
-@mutant(CHECK, "reads anchor.center")
+@mutant(CHECK, "anchor.center: read in")
 class ReadsAFieldIfThere(ContentSelfAttention):
     def forward(self, state):
         center = state.fields.get("anchor.center")
@@ -91,7 +91,7 @@ class RequiresTooMuch(ContentCrossAttention):
         return MEMORY_FIELDS
 
 
-@mutant("writes_equal_provides", "writes place.center, which")
+@mutant("writes_equal_provides", "place.center: written in")
 class WritesMore(NoRefinement):
     def forward(self, state):
         return state.replace(fields={"place.center": state.features[..., :3].clone()})
@@ -103,7 +103,7 @@ class NeedsAFieldUndeclared(ContentSelfAttention):
         return super().forward(state) + state["place.center"].sum(-1, keepdim=True)
 
 
-@mutant("writes_equal_provides", "it loses unrelated.center")
+@mutant("writes_equal_provides", "unrelated.center: lost in")
 class LayerLosesFields(CrossSelfMlp):
     def forward(self, state, memory):
         state, memory = super().forward(state, memory)

@@ -1,4 +1,4 @@
-"""What attention alone promises: memos, masks and explanations."""
+"""Promises of attention alone: memos, masks and explanations."""
 
 from dataclasses import replace
 from typing import Any
@@ -6,95 +6,77 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from qgs.contracts import (
-    AttentionWeights,
-)
-from qgs.types import (
-    QueryState,
-)
-from qgs_dev.case import Case, expect
+from qgs.types import QueryState
+from qgs_dev.case import Case
 from qgs_dev.inputs import Inputs, Sizes, inputs_of
-from qgs_dev.registry import check
-from qgs_dev.trees import (
-    cast,
-    difference,
-    floating,
-    leaves,
-    mapped,
-)
+from qgs_dev.vocabulary import Trial, cast, expect, expect_same, floating, mapped, masked
 
+# Queries of a state in which each is masked in turn.
 QUERIES = 6
-"""Queries of a state in which each is masked in turn."""
 
 
-@check({"cross_attention"})
 def check_memo_is_of_the_memory_alone(case: Case) -> None:
-    """What `ImageMemory.once` keeps is made of the memory: not of the state, nor of a weight.
+    """`ImageMemory.once` keeps what is made of the memory: not of the state, nor of a weight.
 
     A layer gives on a memory that others have read what it gives on a fresh one. What a layer's own
     weights make of the memory belongs to that layer alone, and into no memo.
     """
-    layer, next_layer = case.lively(seed=0), case.lively(seed=1)
-    inputs, later = inputs_of(case), inputs_of(case, seed=1)
-    memory = inputs["memory"]
-    layer(inputs["state"], memory)
-    for reader, what in ((layer, "the state"), (next_layer, "a weight")):
-        read = reader(later["state"], memory)
-        found = difference(reader(later["state"], replace(memory)), read)
-        seen = f"what it keeps in the memory depends on {what}: read after another layer, {found}"
-        expect(not found, seen)
+    first = Trial(case)
+    # The first layer fills the memo that the readers below find.
+    first()
+    memory = first.inputs["memory"]
+    state = inputs_of(case, seed=1)["state"]
+    for seed, what in enumerate(("the state", "a weight")):
+        reader = case.lively(seed)
+        fresh = reader(state, replace(memory))
+        where = f"what it keeps in the memory depends on {what}: read after another layer"
+        expect_same(fresh, reader(state, memory), where)
 
 
-@check({"layer", "self_attention"})
 def check_masked_queries_are_not_read(case: Case) -> None:
-    """What stands where the state's mask is False changes nothing of the other queries."""
-    module, inputs = case.lively(), inputs_of(case, Sizes(queries=5))
-    state = inputs["state"]
+    """Numbers where the state's mask is False change nothing of the other queries."""
+    sizes = Sizes(queries=5)
+    trial = Trial(case, sizes)
+    state = trial.inputs["state"]
+    # The scenes have different masks: a component may take one for all.
     mask = torch.tensor([[True, False, True, True, False], [True, True, False, True, True]])
+    mask = mask.to(case.device)
 
     def seen(state: QueryState) -> Any:
-        given = {**inputs, "state": replace(state, mask=mask.to(state.features.device))}
-        output = module(*given.values())
-        output = output[0] if case.slot == "layer" else output
+        output = trial.state_of(trial(state=replace(state, mask=mask)))
         return {name: x[mask] for name, x in floating(output).items()}
 
-    other = inputs_of(case, Sizes(queries=5), seed=1)["state"]
-    changed = {
-        name: torch.where(mask.view(*mask.shape, *[1] * (x.ndim - 2)), x, leaves(other)[name])
-        for name, x in leaves(state).items()
-    }
-    moved = mapped(state, lambda name, x: changed[name])
-    found = difference(seen(state), seen(moved), 1e-4, 1e-5)
-    expect(not found, f"when masked queries change, of the others {found}")
+    moved = masked(state, mask, inputs_of(case, sizes, seed=1)["state"])
+    where = "when masked queries change, of the others"
+    expect_same(seen(state), seen(moved), where, 1e-4, 1e-5)
 
 
-@check({"cross_attention", "self_attention"})
 def check_explanation_is_a_softmax(case: Case) -> None:
     """The weights that `explain` gives are the softmax of content and geometry, of all tokens.
 
     Content is (B, h, Q, T), for the queries that are asked for in their order; what hides a token
     is -inf in geometry, (B, 1, Q, T) or (B, h, Q, T).
     """
-    module, inputs = case.lively(), inputs_of(case)
-    given = _explanation(module, inputs)
+    trial = Trial(case)
+    given = explanation(trial.module, trial.inputs)
     if given is None:
         return
-    tokens = inputs["memory"].keys.shape[2] if "memory" in inputs else given.content.shape[2]
-    wanted, shape = inputs["state"].features.shape[:2], tuple(given.content.shape)
-    right = shape == (wanted[0], shape[1], wanted[1], tokens)
-    expect(right, f"content is {shape}, not (B, h, Q, T) = ({wanted[0]}, h, {wanted[1]}, {tokens})")
-    expect(bool(given.content.isfinite().all()), "content is not finite: a mask is geometry")
-    with torch.no_grad():
-        some = module.explain(*inputs.values(), torch.tensor([2, 0]))
-    found = some and difference(some.weights, given.weights[:, :, [2, 0]], 1e-4, 1e-5)
-    expect(found == "", f"asked for queries 2 and 0 alone, it gives other weights: {found}")
+    shape = tuple(given.content.shape)
+    batch, queries = trial.inputs["state"].features.shape[:2]
+    tokens = trial.inputs["memory"].keys.shape[2] if "memory" in trial.inputs else shape[2]
+    right = shape == (batch, shape[1], queries, tokens)
+    expect(right, f"content is {shape}, not (B, h, Q, T) = ({batch}, h, {queries}, {tokens})")
+    expect(given.content.isfinite().all(), "content is not finite: a mask is geometry")
+    asked = [2, 0]
+    some = explanation(trial.module, trial.inputs, asked)
+    expect(some is not None, "asked for queries 2 and 0 alone, it gives nothing")
+    where = "asked for queries 2 and 0 alone, it gives other weights"
+    expect_same(some.weights, given.weights[:, :, asked], where, 1e-4, 1e-5)
     logits = given.content if given.geometry is None else given.content + given.geometry
-    weights = logits.softmax(-1)
-    off = (given.weights - weights).abs().max().item()
+    off = (given.weights - logits.softmax(-1)).abs().max().item()
     expect(off < 1e-3, f"weights are off the softmax of content and geometry by up to {off:.3g}")
 
 
-@check({"cross_attention"})
 def check_explanation_is_of_the_forward_pass(case: Case) -> None:
     """The weights that `explain` gives are those by which a forward pass reads the values.
 
@@ -103,27 +85,33 @@ def check_explanation_is_of_the_forward_pass(case: Case) -> None:
     the lengths of these gradients change as the weights do, but for a factor. Where no geometry is
     given, queries of equal features look at the same.
     """
-    module, inputs = case.lively(), inputs_of(case)
-    given = _explanation(module, inputs)
-    if given is None or "memory.values" not in case.component.fields_read(case.config):
+    trial = Trial(case)
+    given = explanation(trial.module, trial.inputs)
+    if given is None or "memory.values" not in case.reads:
         return
-    _expect_read_by_weights(module, inputs, given)
+    _expect_read_by_weights(trial)
     if given.geometry is None:
-        state = inputs["state"]
+        # Without geometry the weights are of content alone, so equal content has equal weights.
+        state = trial.inputs["state"]
         equal = state.features[:, :1].expand_as(state.features).clone()
-        inputs["state"] = state.replace(features=equal)
-        _expect_read_by_weights(module, inputs, _explanation(module, inputs) or given)
+        trial.inputs["state"] = state.replace(features=equal)
+        _expect_read_by_weights(trial)
 
 
-def _expect_read_by_weights(module: Any, inputs: Inputs, given: AttentionWeights) -> None:
-    inputs = mapped(inputs, lambda n, x: x.requires_grad_() if n == "memory.values" else x)
-    update, values = module(*inputs.values()), inputs["memory"].values
-    lengths = torch.stack([_lengths(update[:, n], values) for n in range(update.shape[1])], 2)
-    if not lengths.any():
-        return  # it reads no values, as another check says
-    off = (lengths.log() - given.weights.log()).diff(dim=2)
-    weights = torch.minimum(given.weights[:, :, 1:], given.weights[:, :, :-1])
-    visible = weights > 1e-6  # less is no more than a rounding error
+def _expect_read_by_weights(trial: Trial) -> None:
+    weights = explanation(trial.module, trial.inputs).weights
+    inputs = mapped(trial.inputs, lambda n, x: x.requires_grad_(n == "memory.values"))
+    update = trial(inputs)
+    values = inputs["memory"].values
+    lengths = [_lengths(update[:, query], values) for query in range(update.shape[1])]
+    log_lengths = torch.stack(lengths, 2).log()
+    if log_lengths.isneginf().all():
+        # It reads no values, as another check says.
+        return
+    off = (log_lengths - weights.log()).diff(dim=2)
+    # Smaller weights are no more than rounding errors.
+    visible = torch.minimum(weights[:, :, 1:], weights[:, :, :-1]) > 1e-6
+    # A factor that all tokens share is an offset of the logarithms: only their spread counts.
     high = off.where(visible, -torch.inf).amax(-1)
     low = off.where(visible, torch.inf).amin(-1)
     worst = (high - low).where(visible.any(-1), 0.0).max().item()
@@ -131,7 +119,14 @@ def _expect_read_by_weights(module: Any, inputs: Inputs, given: AttentionWeights
     expect(worst < 1e-3, f"{seen}, in their logarithms by up to {worst:.3g}")
 
 
-@check({"self_attention"})
+def _lengths(update: Tensor, values: Tensor) -> Tensor:
+    """(B, h, M) of the gradients of a query's `update` (B, D) in `values` (B, h, M, d)."""
+    direction = torch.randn(update.shape, generator=torch.Generator().manual_seed(0))
+    total = (direction.to(update) * update).sum()
+    (found,) = torch.autograd.grad(total, values, retain_graph=True, materialize_grads=True)
+    return found.norm(dim=-1)
+
+
 def check_updates_are_explained(case: Case) -> None:
     """Updates are what the weights that `explain` gives make of one value for each query and head.
 
@@ -142,33 +137,29 @@ def check_updates_are_explained(case: Case) -> None:
     inputs = cast(inputs_of(case, Sizes(batch=1, queries=QUERIES)), torch.float64)
     masks = torch.ones(1 + QUERIES, QUERIES, dtype=torch.bool)
     masks[1:] ^= torch.eye(QUERIES, dtype=torch.bool)
-    factors, updates = [], []
+    factors = []
+    updates = []
     for mask in masks:
         state = replace(inputs["state"], mask=mask[None])
-        given = _explanation(module, {"state": state})
+        given = explanation(module, {"state": state})
         if given is None:
             return
         weights = given.weights[0, :, mask].double()  # (h, Q, N)
+        # The output layer of an attention has a bias, one more unknown.
         bias = torch.ones(weights.shape[1], 1, dtype=torch.float64)
         factors.append(torch.cat([*weights, bias], 1))
         with torch.no_grad():
             updates.append(module(state)[0, mask])
-    factor, update = torch.cat(factors), torch.cat(updates)
+    factor = torch.cat(factors)
+    update = torch.cat(updates)
+    # What no values explain is the rest of the least squares.
     rest = update - factor @ torch.linalg.pinv(factor) @ update
     share = (rest.norm() / update.norm().clamp_min(1e-30)).item()
     seen = "no values, read by the weights that `explain` gives, make the updates"
     expect(share < 1e-3, f"{seen}: {share:.1%} of them is left")
 
 
-def _lengths(update: Tensor, values: Tensor) -> Tensor:
-    """(B, h, M) of the gradients of a query's `update` (B, D) in `values` (B, h, M, d)."""
-    direction = torch.randn(update.shape, generator=torch.Generator().manual_seed(0))
-    total = (direction.to(update) * update).sum()
-    (found,) = torch.autograd.grad(total, values, retain_graph=True, allow_unused=True)
-    return values.new_zeros(values.shape[:-1]) if found is None else found.norm(dim=-1)
-
-
-def _explanation(module: Any, inputs: Inputs) -> AttentionWeights | None:
-    """Attention of all queries, None for a component that does not explain itself."""
-    with torch.no_grad():
-        return module.explain(*inputs.values(), torch.arange(inputs["state"].features.shape[1]))
+def explanation(module: Any, inputs: Inputs, queries: list[int] | None = None) -> Any:
+    """AttentionWeights of `queries`, by default all; None of a component that explains nothing."""
+    chosen = queries or range(inputs["state"].features.shape[1])
+    return module.explain(*inputs.values(), torch.tensor([*chosen]))

@@ -1,25 +1,18 @@
 """A component can be built and called: with any sizes and strides, and compiled."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from qgs.containers import map_tensors
 from qgs.types import GaussianAttributes, ImageMemory, QueryState, Rendering
-from qgs_dev.case import Case, ContractError, expect
-from qgs_dev.inputs import Inputs, Maker, Sizes, inputs_of, sizes_of, tracked_inputs
-from qgs_dev.modules import each_mode, seeded
-from qgs_dev.places import file_of
-from qgs_dev.registry import ALL_SLOTS, MODULES, PARAMETRIC, WITH_MEMORY, check
-from qgs_dev.running import with_place
-from qgs_dev.trees import difference, floating, gradients, leaves, scalar
+from qgs_dev.case import Case
+from qgs_dev.inputs import FACTS, WITH_MEMORY, Inputs, Maker, Sizes, inputs_of, sizes_of
+from qgs_dev.vocabulary import Trial, expect, expect_none, expect_same, gradients, leaves, scalar
 
-Shape: TypeAlias = tuple[int | None, ...]
-"""None where the component is free to choose."""
-
+# Types that a forward pass gives; a tensor in all other slots.
 OUTPUTS: Mapping[str, type] = {
     "encoder": ImageMemory,
     "queries": QueryState,
@@ -30,7 +23,6 @@ OUTPUTS: Mapping[str, type] = {
     "renderer": Rendering,
     "losses": Mapping,
 }
-"""What a forward pass gives; a tensor in all other slots."""
 
 VARIED = (
     Sizes(),
@@ -40,28 +32,27 @@ VARIED = (
 )
 
 WARM_UP = (Sizes(batch=2, queries=6), Sizes(batch=3, queries=8, views=3, gaussians=3))
+# Sizes for a compiled component; none of the later ones was seen before, in no number.
 LATER = (
     Sizes(batch=4, queries=9, views=4, gaussians=4),
     Sizes(batch=5, queries=11, views=5, gaussians=5),
     Sizes(batch=7, queries=13, views=7, gaussians=7),
 )
-"""Sizes for a compiled component; none of the later ones was seen before, in no number."""
+# More graphs that the later sizes may take together, where one of them is special.
 SLACK = 2
-"""More graphs that the later sizes may take together, where one of them is special."""
 
 
-@check(ALL_SLOTS, variants=True)
 def check_builds(case: Case) -> None:
     """A component can be built from its options, in which its `problems` finds none."""
     found = [f"`{p.option}`: {p.reason}" for p in case.problems(case.size)]
+    # A case that its component refuses says nothing about the component.
     expect(not found, f"the options of this case are refused: {', '.join(found)}")
     case.build()
 
 
-@check(MODULES, variants=True)
 def check_runs(case: Case) -> None:
     """A forward pass on ordinary inputs gives what the contract of the slot says that it gives."""
-    output = case.lively()(*inputs_of(case).values())
+    output = Trial(case)()
     kind = OUTPUTS.get(case.slot, Tensor)
     expect(isinstance(output, kind), f"it gives a {type(output).__name__}, not a {kind.__name__}")
     if case.slot in WITH_MEMORY:
@@ -69,93 +60,74 @@ def check_runs(case: Case) -> None:
         expect(kinds == ["QueryState", "ImageMemory"], f"it gives {kinds}, not state and memory")
     if isinstance(output, Mapping):
         odd = [name for name, term in output.items() if not isinstance(term, Tensor)]
-        expect(not odd, f"{', '.join(map(str, odd))} is no tensor")
+        expect_none(odd, "no tensor")
 
 
-@check(MODULES)
 def check_sizes_vary(case: Case) -> None:
     """One instance takes any number of scenes, queries and views, and gives the shapes it must.
 
     So does one of a model of another width and number of heads.
     """
-    turned = Sizes(image=(case.size[1], case.size[0]))
-    _expect_shapes(case, (*VARIED, turned))
+    _expect_shapes(case, [*VARIED, Sizes(image=(case.size[1], case.size[0]))])
     other = case.with_dims(width=48, heads=3)
     if case.has_parameters and not other.problems(other.size):
         try:
             _expect_shapes(other, VARIED[:2])
         except Exception as error:
-            seen = with_place(error, file_of(case.component))
-            raise ContractError(f"in a model of width 48 with 3 heads, {seen}") from error
+            error.add_note("in a model of width 48 with 3 heads")
+            raise
 
 
 def _expect_shapes(case: Case, varied: Iterable[Sizes]) -> None:
-    module = case.lively()
+    trial = Trial(case)
     for sizes in varied:
         if sizes.image and case.slot == "encoder" and case.problems(sizes.image):
-            continue  # the component refuses these images, and says so
-        for mode in each_mode(module):
-            with seeded(0), torch.no_grad():
-                outputs = leaves(module(*inputs_of(case, sizes).values()))
-            for name, shape in _expected_shapes(case, module, sizes).items():
+            # The component refuses these images, and says so.
+            continue
+        shapes = _expected_shapes(trial, sizes)
+        for mode, output in trial.in_each_mode(inputs_of(case, sizes)):
+            outputs = leaves(output)
+            for name, shape in shapes.items():
                 expect(name in outputs, f"in {mode}, with {sizes}, it gives no `{name}`")
-                seen = tuple(outputs[name].shape)
-                wrong = f"in {mode}, with {sizes}, `{name}` is of shape {seen}, not {shape}"
-                expect(_fits(seen, shape), wrong)
-
-
-def _fits(seen: tuple[int, ...], wanted: tuple[Any, ...]) -> bool:
-    """Whether `seen` has the sizes that are numbers in `wanted`; any other may be any."""
-    return len(seen) == len(wanted) and all(
-        not isinstance(size, int) or size == given for size, given in zip(wanted, seen, strict=True)
-    )
-
-
-def _expected_shapes(case: Case, module: Any, sizes: Sizes) -> dict[str, Shape]:
-    """Shape of every output that the contract fixes."""
-    width, heads = case.dims.width, case.dims.heads
-    batch, count = sizes.batch, sizes.queries
-    match case.slot:
-        case "encoder":
-            of_heads = ("memory.keys", "memory.values")
-            return {
-                name.removeprefix("memory."): (
-                    *((batch, heads, None) if name in of_heads else (batch, None)),
-                    *sizes_of(spec, case.dims),
+                seen = list(outputs[name].shape)
+                # None: the component chooses.
+                right = len(seen) == len(shape) and all(
+                    size in (None, given) for size, given in zip(shape, seen, strict=True)
                 )
-                for name, spec in case.component.fields_written(case.config).items()
-                if name != "memory.grid"  # no tensor
-            }
-        case "queries" | "refinement" | "layer" | "feedback":
-            count = module.count if case.slot == "queries" else count
-            maker = Maker(case, replace(sizes, queries=count or 1), torch.Generator())
-            provided = case.component.fields_written(case.config).items()
-            where = "0." if case.slot in WITH_MEMORY else ""
-            fields = {n: (batch, count, *maker.field(n, s).shape[2:]) for n, s in provided}
-            fields = {f"{where}fields.{name}": shape for name, shape in fields.items()}
-            return {f"{where}features": (batch, count, width), **fields}
-        case "head":
-            each = (batch, count, module.gaussians_per_query)
-            sized = {"offsets": 3, "scales": 3, "quats": 4, "colors": 3}
-            return {"opacities": each, **{name: (*each, size) for name, size in sized.items()}}
-        case "centers":
-            return {"output": (batch, count, sizes.gaussians, 3)}
-        case "renderer":
-            each, size = (batch, sizes.views), sizes.image or case.size
-            return {n: (*each, c, *size) for n, c in (("rgb", 3), ("alpha", 1), ("depth", 1))}
-        case "losses":
-            return {}
-    return {"output": (batch, count, width)}
+                expect(right, f"in {mode}, with {sizes}, `{name}` is of shape {seen}, not {shape}")
 
 
-@check(MODULES - {"queries"})
+def _expected_shapes(trial: Trial, sizes: Sizes) -> dict[str, list[int | None]]:
+    """Shape of every output that the contract fixes; None for a size that it leaves open."""
+    case = trial.case
+    maker = Maker(case, sizes)
+    maker.axes["M"] = None
+    # Queries bring their own number, whatever the sizes of the inputs.
+    if case.slot == "queries":
+        maker.axes["N"] = trial.module.count
+    if case.slot == "head":
+        maker.axes["K"] = trial.module.gaussians_per_query
+    fixed = FACTS[case.slot].get("shapes", {"output": "BND"})
+    shapes: dict[str, list[int | None]] = {n: [*maker.shape(axes)] for n, axes in fixed.items()}
+    for name, spec in case.writes.items():
+        axes = "BN"
+        place = f"0.fields.{name}" if case.slot in WITH_MEMORY else f"fields.{name}"
+        if name == "memory.grid" or case.slot in ("head", "renderer"):
+            # No tensor, or the subject of another check.
+            continue
+        if case.slot == "encoder":
+            axes = "BhM" if name in ("memory.keys", "memory.values") else "BM"
+            place = name.removeprefix("memory.")
+        shapes[place] = [*maker.shape(axes), *sizes_of(spec, case.dims)]
+    return shapes
+
+
 def check_strides_make_no_difference(case: Case) -> None:
     """Inputs that are not contiguous, such as expanded or sliced ones, give the same results."""
-    module, inputs = case.lively(), inputs_of(case)
+    trial = Trial(case)
+    strided = map_tensors(_with_gaps, trial.inputs)
     # Other strides are summed up in another order.
-    strided = module(*map_tensors(_with_gaps, inputs).values())
-    found = difference(module(*inputs.values()), strided, 1e-3, 1e-4)
-    expect(not found, f"with inputs that are not contiguous, {found}")
+    expect_same(trial(), trial(strided), "with inputs that are not contiguous", 1e-3, 1e-4)
 
 
 def _with_gaps(tensor: Tensor) -> Tensor:
@@ -164,7 +136,6 @@ def _with_gaps(tensor: Tensor) -> Tensor:
     return room[tuple(slice(size) for size in tensor.shape)].copy_(tensor)
 
 
-@check(PARAMETRIC, tier="extended")
 def check_compiles(case: Case) -> None:
     """Traced by torch.compile, a component is close to eager, and new sizes need no new graphs.
 
@@ -172,27 +143,33 @@ def check_compiles(case: Case) -> None:
     """
     from torch._dynamo.testing import CompileCounterWithBackend
 
-    module = case.lively()
+    trial = Trial(case)
+    module = trial.module
     counter = CompileCounterWithBackend("aot_eager")
+    # Graphs of another case would count as its own.
     torch._dynamo.reset()
     try:
         compiled: Any = torch.compile(module, backend=counter)
-        for index, sizes in enumerate((*WARM_UP, *LATER)):
-            if index == len(WARM_UP):
+        for sizes in (*WARM_UP, *LATER):
+            # Graphs of the first sizes count for nothing: torch makes a second one where a size
+            # varies.
+            if sizes == LATER[0]:
                 counter.clear()
-            ours, theirs = (tracked_inputs(case, inputs_of(case, sizes)) for _ in range(2))
-            eager, outputs = module(*ours.values()), compiled(*theirs.values())
-            found = difference(eager, outputs, 1e-3, 1e-4)
-            expect(not found, f"compiled, with {sizes}, {found}")
+            ours, theirs = (trial.tracked(inputs_of(case, sizes)) for _ in range(2))
+            eager = module(*ours.values())
+            outputs = compiled(*theirs.values())
+            expect_same(eager, outputs, f"compiled, with {sizes}", 1e-3, 1e-4)
     finally:
         torch._dynamo.reset()
-    eager, outputs = _gradients(module, ours, eager), _gradients(module, theirs, outputs)
-    odd = sorted(eager.keys() ^ outputs.keys())
-    expect(not odd, f"compiled or not decides whether {', '.join(odd)} has a gradient")
-    for name, gradient in eager.items():
-        size = gradient.abs().max().item()
-        found = difference({name: gradient}, {name: outputs[name]}, 0.0, 1e-3 * size + 1e-6)
-        expect(not found, f"compiled, the gradient differs: {found}")
+    found = _gradients(module, ours, eager)
+    of_compiled = _gradients(module, theirs, outputs)
+    odd = found.keys() ^ of_compiled.keys()
+    expect_none(odd, "a gradient only if compiled, or only if not")
+    for name, gradient in found.items():
+        # Gradients of different inputs differ by orders of magnitude.
+        atol = 1e-3 * gradient.abs().max().item() + 1e-6
+        where = f"compiled, the gradient of {name} differs"
+        expect_same(gradient, of_compiled[name], where, atol=atol)
     more = counter.frame_count
     seen = f"{more} more graphs are compiled for {len(LATER)} new sizes after {len(WARM_UP)}"
     expect(more <= SLACK, seen)
@@ -200,5 +177,5 @@ def check_compiles(case: Case) -> None:
 
 def _gradients(module: Any, inputs: Inputs, outputs: Any) -> dict[str, Tensor]:
     """Gradients in the inputs and in the parameters, without those that are all zeros."""
-    given = floating(inputs) | {f"parameter {n}": p for n, p in module.named_parameters()}
+    given = {**inputs, "parameter": dict(module.named_parameters())}
     return {name: x for name, x in gradients(scalar(outputs), given).items() if bool(x.any())}

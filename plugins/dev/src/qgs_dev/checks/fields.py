@@ -1,8 +1,9 @@
 """Fields of the state: what a component reads and writes is what it declares, and recipes obey."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,82 +14,74 @@ from qgs.contracts import (
     GAUSSIAN_FIELDS,
     LAYER_SLOTS,
     MEMORY_FIELDS,
-    Component,
-    ComponentConfig,
-    DecoderLayer,
     Fields,
-    FieldSpec,
-    Loss,
     Plugin,
 )
 from qgs.recipe import RecipeError
 from qgs.recipe.recipe import Recipe, resolve
 from qgs.recipe.slots import MODEL_SLOTS, SECTIONS
+from qgs.recipe.yaml_text import inline
 from qgs.tokengs import GaussianHead, LatentQueries, MultiViewViT
-from qgs.types import GaussianAttributes, ImageMemory, LayerPrediction, QueryState, Views
-from qgs_dev.case import Case, expect
-from qgs_dev.inputs import Inputs, Maker, Sizes, inputs_of, memory_width, required_fields
-from qgs_dev.modules import each_mode, seeded
-from qgs_dev.registry import ALL_SLOTS, MODULES, READERS, WITH_MEMORY, check
-from qgs_dev.trees import (
+from qgs.types import QueryState
+from qgs_dev.case import Case
+from qgs_dev.inputs import FACTS, Inputs, Maker, Sizes, inputs_of, memory_width, required_fields
+from qgs_dev.modules import seeded
+from qgs_dev.vocabulary import (
+    Trial,
     described,
     difference,
+    expect,
+    expect_finite,
+    expect_none,
+    expect_same,
     gradients,
     leaves,
     mapped,
-    not_finite,
     scalar,
 )
 
 PLUGIN = "under_test"
+# Names of the plugin that offers the component, and of those that give it its fields.
 GIVEN = "given_fields"
-"""Names of the plugin that offers the component, and of the queries that give it its fields."""
 
 
-@check(READERS, variants=True)
 def check_reads_within_requires(case: Case) -> None:
     """Only fields in `requires` are asked for, of the state and of the image memory.
 
     Looking whether a field is there is asking for it. The other fields are passed on with
     `QueryState.replace`. A loss looks at no rendering if it declares that it needs none.
     """
-    module, inputs, required = (
-        case.lively(),
-        inputs_of(case),
-        case.component.fields_read(case.config),
-    )
-    unread = {name for name in leaves(inputs) if name.startswith("memory.")} - set(required)
-    if issubclass(case.component, DecoderLayer) and case.component.sublayers:
-        unread = set()  # what stands in its slots may read them
-    if issubclass(case.component, Loss) and case.component.renderings == "none":
-        inputs["rendering"] = Maker(case, Sizes(), torch.Generator()).rendering(views=2)
+    trial = Trial(case)
+    inputs = trial.inputs
+    unread = {name for name in leaves(inputs) if name.startswith("memory.")} - {*case.reads}
+    if getattr(case.component, "sublayers", ()):
+        # What stands in its slots may read them.
+        unread = set()
+    if getattr(case.component, "renderings", "") == "none":
+        inputs["rendering"] = Maker(case).all_views()
         unread = {name for name in leaves(inputs) if name.startswith("rendering.")}
+    # What reads a NaN gives one.
     poisoned = mapped(inputs, lambda name, x: x + torch.nan if name in unread else x)
-    names = ", ".join(sorted(unread))
-    if "memory" in inputs and "memory.grid" not in required:
-        poisoned["memory"] = replace(poisoned["memory"], grid=None)
-        unread |= {"memory.grid"}
-    for mode in each_mode(module):
-        asked: set[str] = set()
-        with seeded(0):
-            first = _read_off(case, module, _with_asked_fields(inputs, asked))
-        beyond = sorted(asked - set(required))
-        expect(not beyond, f"in {mode} it reads {', '.join(beyond)}, which it does not require")
-        with seeded(0):
-            found = difference(first, _read_off(case, module, poisoned)) if unread else ""
-        expect(not found, f"in {mode} it reads some of {names}, which it declares not to: {found}")
-
-
-def _read_off(case: Case, module: Any, inputs: Inputs) -> Any:
-    """The output; of a layer the state, since it passes on a memory that it does not read."""
-    output = module(*inputs.values())
-    return output[0] if case.slot in WITH_MEMORY else output
+    if "memory" in inputs and "memory.grid" not in case.reads:
+        poisoned = {**poisoned, "memory": replace(poisoned["memory"], grid=None)}
+    asked: set[str] = set()
+    for mode, output in trial.in_each_mode(_with_asked_fields(inputs, asked)):
+        expect_none(asked - {*case.reads}, f"read in {mode}, but not required")
+        if poisoned is not inputs:
+            with seeded(0):
+                other = trial(poisoned)
+            names = ", ".join(sorted(unread))
+            where = f"in {mode} it reads some of {names}, which it declares not to"
+            # A layer passes on a memory that it does not read.
+            expect_same(trial.state_of(output), trial.state_of(other), where)
 
 
 class AskedFields(dict[str, Tensor]):
     """Fields of a state that add the names they are asked for to `asked`."""
 
-    asked: set[str]
+    def __init__(self, fields: Mapping[str, Tensor], asked: set[str]) -> None:
+        super().__init__(fields)
+        self.asked = asked
 
     def __getitem__(self, name: str) -> Tensor:
         self.asked.add(name)
@@ -105,95 +98,90 @@ class AskedFields(dict[str, Tensor]):
 
 
 def _with_asked_fields(inputs: Inputs, asked: set[str]) -> Inputs:
-    def changed(value: Any) -> Any:
-        if isinstance(value, LayerPrediction):
-            return replace(value, state=changed(value.state))
-        if not isinstance(value, QueryState):
-            return value
-        fields = AskedFields(value.fields)
-        fields.asked = asked
-        return replace(value, fields=fields)
+    changed = {**inputs}
+    if "state" in inputs:
+        state = inputs["state"]
+        changed["state"] = replace(state, fields=AskedFields(state.fields, asked))
+    if "prediction" in inputs:
+        prediction = inputs["prediction"]
+        inside = _with_asked_fields({"state": prediction.state}, asked)
+        changed["prediction"] = replace(prediction, **inside)
+    return changed
 
-    return {name: changed(value) for name, value in inputs.items()}
 
-
-@check(READERS, variants=True)
 def check_requires_are_read(case: Case) -> None:
     """Every field in `requires` is read: else recipes that lack it are refused for nothing.
 
     Features of Gaussians may be read off their rendering.
     """
-    module, inputs = case.lively(), inputs_of(case)
-    outputs = module(*inputs.values())
-    for field in case.component.fields_read(case.config):
-        changed = list(_with_others(case, inputs, field))
-        read = any(difference(outputs, module(*given.values())) for given in changed)
+    trial = Trial(case)
+    # One of several draws must differ: a ReLU may be closed for some.
+    outputs = trial()
+    for field in case.reads:
+        others = _with_others(trial, field)
+        read = any(difference(outputs, trial(inputs)) for inputs in others)
         expect(read, f"it requires {field}, which changes nothing")
 
 
-def _with_others(case: Case, inputs: Inputs, field: str) -> Iterator[Inputs]:
-    """`inputs` with something else for a required field."""
+def _with_others(trial: Trial, field: str) -> Iterator[Inputs]:
+    """Inputs of a trial with something else for a required field."""
+    inputs = trial.inputs
     if field == "memory.grid":
         views, rows, columns = inputs["memory"].grid
         for grid in ((views, columns, rows), (columns, rows, views)):
             yield {**inputs, "memory": replace(inputs["memory"], grid=grid)}
         return
-    rendered = f"rendering.{field.removeprefix('gaussians.')}"
-    full = {name for name in leaves(inputs) if name.endswith((field, rendered))}
-    others = [leaves(inputs_of(case, seed=seed)) for seed in (1, 2, 3)]
-    others.append(leaves(map_tensors(lambda x: x.roll(1, 1), inputs)))  # rays have no seed
-    for other in others:
-        yield mapped(inputs, lambda n, x, o=other: o[n] if n in full else x)
+    ends = (field, f"rendering.{field.removeprefix('gaussians.')}")
+    others = [inputs_of(trial.case, seed=seed) for seed in (1, 2, 3)]
+    # Rays have no seed.
+    others.append(map_tensors(lambda x: x.roll(1, 1), inputs))
+    for other in map(leaves, others):
+        yield mapped(inputs, lambda n, x, other=other: other[n] if n.endswith(ends) else x)
 
 
-@check({"layer", "refinement", "feedback", "queries"}, variants=True)
 def check_writes_equal_provides(case: Case) -> None:
     """The fields that are written are those in `provides`, in the shape and dtype given there.
 
     The others pass on all other fields as they are, a refinement the features too.
     """
-    module = case.lively()
-    for mode in each_mode(module):
-        inputs, before = inputs_of(case), {}
-        if case.slot != "queries":
-            state = inputs["state"]
-            before = {"unrelated.center": torch.randn(*state.features.shape[:2], 3), **state.fields}
-            inputs = {**inputs, "state": QueryState(state.features, before)}
-        with seeded(0):
-            output = module(*inputs.values())
-        output = output[0] if case.slot in WITH_MEMORY else output
-        provided = case.component.fields_written(case.config)
+    trial = Trial(case)
+    before: dict[str, Tensor] = {}
+    state: Any = None
+    if case.slot != "queries":
+        state = trial.inputs["state"]
+        before = {"unrelated.center": torch.randn(*state.features.shape[:2], 3), **state.fields}
+        trial.inputs["state"] = QueryState(state.features, before)
+    for mode, outputs in trial.in_each_mode():
+        output = trial.state_of(outputs)
         kept = {n for n, x in output.fields.items() if n in before and _same(x, before[n])}
-        written = set(output.fields) - kept
-        for fault, names in (
-            ("it writes {}, which it does not provide", written - set(provided)),
-            ("it does not write {}", set(provided) - written),
-            ("it loses {}", set(before) - set(output.fields)),
-        ):
-            expect(not names, f"in {mode} {fault.format(', '.join(sorted(names)))}")
+        written = output.fields.keys() - kept
+        expect_none(written - case.writes.keys(), f"written in {mode}, but not provided")
+        expect_none(case.writes.keys() - written, f"provided, but not written in {mode}")
+        expect_none(before.keys() - output.fields.keys(), f"lost in {mode}")
         if case.slot == "refinement":
-            passed = _same(output.features, inputs["state"].features)
+            passed = _same(output.features, state.features)
             expect(passed, f"in {mode} it changes the features, which a refinement passes on")
-        for name, spec in provided.items():
+        for name, spec in case.writes.items():
             right = output[name].dtype == spec.dtype
             expect(right, f"in {mode} `{name}` is {described(output[name])}, declared as {spec}")
 
 
 def _same(one: Tensor, other: Tensor) -> bool:
+    # A view of the same memory is handed on, not written.
     return one is other or (one.data_ptr() == other.data_ptr() and one.shape == other.shape)
 
 
-@check(ALL_SLOTS)
 def check_unmet_requirement_fails_at_compose(case: Case) -> None:
     """A recipe that lacks one thing a component needs is refused by name; one with all runs."""
     needed = required_fields(case)
     for missing in needed:
         refusal = _refusal(case, {name: spec for name, spec in needed.items() if name != missing})
-        expect(bool(refusal), f"a recipe without {missing} is composed")
+        expect(refusal, f"a recipe without {missing} is composed")
         expect(missing in refusal, f"the refusal does not name the missing {missing}: {refusal}")
     refusal = _refusal(case, needed)
     expect(not refusal, f"a recipe that gives it all it requires is refused: {refusal}")
-    if case.slot in MODULES - {"renderer"}:
+    if case.slot in FACTS and case.slot != "renderer":
+        # A recipe that is accepted must run.
         run_training_step(_resolved(case, needed), case)
 
 
@@ -207,111 +195,84 @@ def _refusal(case: Case, given: Fields) -> str:
 
 
 def _resolved(case: Case, given: Fields) -> Recipe:
-    components = [case.component]
-    recipe = _recipe_with(case)
-    if given:
-        components.append(_queries_with(case, given))
-        recipe["model"]["queries"]["type"] = f"{PLUGIN}/{GIVEN}"
-    features = case.component.fields_read(case.config).get("memory.features")
-    if features and features != MEMORY_FIELDS["memory.features"]:
-        components.append(_encoder_with(case, features))
-        recipe["model"]["encoder"]["type"] = f"{PLUGIN}/{GIVEN}"
-    look = {
-        n: s for n, s in case.component.fields_read(case.config).items() if n in GAUSSIAN_FIELDS
-    }
-    if look:
-        components.append(_head_with(look))
-        recipe["model"]["head"]["type"] = f"{PLUGIN}/{GIVEN}"
-    return resolve(recipe, plugins=(Plugin(PLUGIN, CONTRACT_VERSION, components),))
-
-
-def _head_with(look: Fields) -> type[Component]:
-    """A head whose Gaussians have harmonics or features, read off those of the queries."""
-
-    class GivenHead(GaussianHead):
-        name: ClassVar[str] = GIVEN
-
-        @classmethod
-        def fields_written(cls, config: ComponentConfig) -> Fields:
-            return look
-
-        def forward(self, state: QueryState) -> GaussianAttributes:
-            x_BNKD = state.features[:, :, None].expand(-1, -1, self.gaussians_per_query, -1)
-            parts = {"sh": x_BNKD[..., :9].unflatten(-1, (3, 3)), "features": x_BNKD[..., :4]}
-            chosen = {name: x for name, x in parts.items() if f"gaussians.{name}" in look}
-            return replace(super().forward(state), **chosen)
-
-    return GivenHead
-
-
-def _encoder_with(case: Case, spec: FieldSpec) -> type[Component]:
-    """An encoder whose features have a width of their own."""
-
-    class GivenEncoder(MultiViewViT):
-        name: ClassVar[str] = GIVEN
-
-        @classmethod
-        def fields_written(cls, config: ComponentConfig) -> Fields:
-            return {**MEMORY_FIELDS, "memory.features": spec}
-
-        def forward(self, views: Views) -> ImageMemory:
-            memory, wide = super().forward(views), memory_width(case)
-            repeats = -(-wide // memory.features.shape[-1])
-            return replace(memory, features=memory.features.repeat(1, 1, repeats)[..., :wide])
-
-    return GivenEncoder
-
-
-def _queries_with(case: Case, given: Fields) -> type[Component]:
-    """Queries that provide the fields `given`, of one scene, expanded to all of them."""
-
-    class GivenQueries(LatentQueries):
-        name: ClassVar[str] = GIVEN
-
-        @classmethod
-        def fields_written(cls, config: ComponentConfig) -> Fields:
-            return given
-
-        def start(self, batch_size: int) -> QueryState:
-            sizes = Sizes(batch=1, queries=self.count)
-            maker = Maker(case, sizes, torch.Generator().manual_seed(0))
-            fields = {name: maker.field(name, spec) for name, spec in given.items()}
-            fields = map_tensors(lambda x: x.expand(batch_size, *x.shape[1:]), fields)
-            return super().start(batch_size).replace(fields=fields)
-
-    return GivenQueries
-
-
-def _recipe_with(case: Case) -> dict[str, Any]:
-    """A small recipe of built-in components, but for the one under test."""
-    dims, slot = case.dims, case.slot
+    """The small recipe with the component of `case`, whose queries provide `given`."""
+    slot = case.slot
     # Thousands of queries take seconds to render and show nothing more.
     config = (case.with_at_most(count=6) if slot == "queries" else case).config
-    chosen = {"type": f"{PLUGIN}/{case.component.name}", **config.model_dump(mode="json")}
-    model: dict[str, Any] = {
-        "width": dims.width,
-        "heads": dims.heads,
-        "encoder": {"depth": 1},
-        "queries": {"count": 6},
-        "head": {"gaussians_per_query": 2},
-        "supervision": {"layers": [dims.depth]},
-        "renderer": {"type": "qgs/torch"},
-        "decoder": {"depth": dims.depth},
-    }
-    losses = {"photometric": {"type": "qgs/photometric"}}
-    recipe: dict[str, Any] = {"recipe": 1, "plugins": [PLUGIN], "model": model, "losses": losses}
-    of_encoder = case.component.fields_written(case.config) if slot == "encoder" else MEMORY_FIELDS
-    if not {"memory.keys", "memory.values"} <= of_encoder.keys():  # the default layers read both
-        model |= {"decoder": {"depth": 0}, "supervision": {"layers": [0]}}
-    if slot in LAYER_SLOTS:
-        model["decoder"][slot] = chosen
-    elif slot in MODEL_SLOTS:
-        model[slot] = chosen
-    elif SECTIONS[slot].named:
-        recipe[slot] = {**recipe.get(slot, {}), "case": chosen}
-    else:
-        recipe[slot] = chosen
-    return recipe
+    options = {"type": f"{PLUGIN}/{case.component.name}", **config.model_dump(mode="json")}
+    of_encoder = case.writes if slot == "encoder" else MEMORY_FIELDS
+    # The default layers read both.
+    depth = case.dims.depth if {"memory.keys", "memory.values"} <= of_encoder.keys() else 0
+    place = f"{slot}.case" if slot in SECTIONS and SECTIONS[slot].named else slot
+    place = f"model.{slot}" if slot in MODEL_SLOTS else place
+    place = f"model.decoder.{slot}" if slot in LAYER_SLOTS else place
+    changes = [
+        f"model.width={case.dims.width}",
+        f"model.heads={case.dims.heads}",
+        f"model.decoder.depth={depth}",
+        f"model.supervision.layers=[{depth}]",
+        f"{place}={inline(options)}",
+    ]
+    components = [case.component]
+    if given:
+        components.append(_queries_with(case, given))
+        changes.append(f"model.queries={{type: {PLUGIN}/{GIVEN}, count: 6}}")
+    usual = MEMORY_FIELDS["memory.features"]
+    if case.reads.get("memory.features", usual) != usual:
+        components.append(_encoder_with(case))
+        changes.append(f"model.encoder={{type: {PLUGIN}/{GIVEN}, depth: 1}}")
+    look = {name: spec for name, spec in case.reads.items() if name in GAUSSIAN_FIELDS}
+    if look:
+        components.append(_head_with(look))
+        changes.append(f"model.head={{type: {PLUGIN}/{GIVEN}, gaussians_per_query: 2}}")
+    recipe = Path(__file__).parents[1] / "small_recipe.yaml"
+    return resolve(recipe, changes, [Plugin(PLUGIN, CONTRACT_VERSION, components)])
+
+
+def _given(base: type, provides: Fields, **methods: Any) -> Any:
+    """A component that provides the fields `provides`, derived from a built-in one."""
+    # A new class each time: two cases would share one registry entry otherwise.
+    written = classmethod(lambda cls, config: provides)
+    return type(
+        f"Given{base.__name__}", (base,), {"name": GIVEN, "fields_written": written, **methods}
+    )
+
+
+def _head_with(look: Fields) -> Any:
+    """A head whose Gaussians have harmonics or features, read off those of the queries."""
+
+    def forward(self: GaussianHead, state: QueryState) -> Any:
+        x_BNKD = state.features[:, :, None].expand(-1, -1, self.gaussians_per_query, -1)
+        parts = {"sh": x_BNKD[..., :9].unflatten(-1, (3, 3)), "features": x_BNKD[..., :4]}
+        chosen = {name: x for name, x in parts.items() if f"gaussians.{name}" in look}
+        return replace(GaussianHead.forward(self, state), **chosen)
+
+    return _given(GaussianHead, look, forward=forward)
+
+
+def _encoder_with(case: Case) -> Any:
+    """An encoder whose features have a width of their own."""
+    wide = torch.arange(memory_width(case))
+
+    def forward(self: MultiViewViT, views: Any) -> Any:
+        memory = MultiViewViT.forward(self, views)
+        features = memory.features[..., wide % memory.features.shape[-1]]
+        return replace(memory, features=features)
+
+    provides = {**MEMORY_FIELDS, "memory.features": case.reads["memory.features"]}
+    return _given(MultiViewViT, provides, forward=forward)
+
+
+def _queries_with(case: Case, given: Fields) -> Any:
+    """Queries that provide the fields `given`, of one scene, expanded to all of them."""
+
+    def start(self: LatentQueries, batch_size: int) -> QueryState:
+        maker = Maker(case, Sizes(batch=1, queries=self.count))
+        fields = {name: maker.field(name, spec) for name, spec in given.items()}
+        fields = map_tensors(lambda x: x.expand(batch_size, *x.shape[1:]), fields)
+        return LatentQueries.start(self, batch_size).replace(fields=fields)
+
+    return _given(LatentQueries, given, start=start)
 
 
 @seeded(0)
@@ -321,26 +282,21 @@ def run_training_step(recipe: Recipe, case: Case, sizes: Sizes | None = None) ->
     sizes: of the views; None for the usual ones.
     Raises ContractError for predictions, images, losses or gradients that are not finite.
     """
-    maker = Maker(case, sizes or Sizes(), torch.Generator().manual_seed(0))
-    model, losses = recipe.build_model().train(), recipe.build_losses()
-    views = maker.target()
+    model = recipe.build_model().train()
+    losses = recipe.build_losses().values()
+    views = Maker(case, sizes or Sizes()).target()
     target = views.select([0])
     total = torch.zeros((), dtype=torch.float64)
     for prediction in model(views).layers.values():
-        _expect_finite("prediction", prediction)
+        expect_finite(prediction, "in a prediction of a model that has it")
         rendering = model.render(prediction.gaussians, target.cameras)
-        _expect_finite("rendering", rendering)
-        for loss in losses.values():
-            none = loss.renderings == "none"
-            seen = map_tensors(lambda x: x[:, :0], rendering) if none else rendering
+        expect_finite(rendering, "in a rendering of a model that has it")
+        for loss in losses:
+            unseen = loss.renderings == "none"
+            seen = map_tensors(lambda x: x[:, :0], rendering) if unseen else rendering
             terms = loss(prediction, seen, target, views)
-            _expect_finite("losses", terms)
+            expect_finite(terms, "as a loss of a model that has it")
             total = total + scalar(terms)
     found = gradients(total, dict(model.named_parameters()))
-    expect(bool(found), "in the model that it is composed into nothing gets a gradient")
-    _expect_finite("gradients", found)
-
-
-def _expect_finite(what: str, tree: Any) -> None:
-    broken = not_finite(tree)
-    expect(not broken, f"composed into a model, {what} are not finite: {', '.join(broken)}")
+    expect(found, "in the model that it is composed into nothing gets a gradient")
+    expect_finite(found, "in its gradient in a model that has it")

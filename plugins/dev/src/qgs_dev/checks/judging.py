@@ -1,110 +1,97 @@
-"""What losses and metrics alone promise."""
+"""Promises of losses, metrics and objectives alone."""
 
 from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from qgs.containers import map_tensors
-from qgs.contracts import (
-    Loss,
-    Metric,
-    MetricInput,
-)
-from qgs.types import LayerPrediction
-from qgs_dev.case import CannotCheck, Case, expect
+from qgs.contracts import Metric, MetricInput, Outcome
+from qgs.renderers import TorchRenderer
+from qgs.types import Cameras, Gaussians, LayerPrediction, Prediction, Rendering, Views
+from qgs_dev.case import CannotCheck, Case
 from qgs_dev.inputs import Maker, Sizes, inputs_of
-from qgs_dev.registry import check
-from qgs_dev.trees import (
+from qgs_dev.modules import seeded
+from qgs_dev.vocabulary import (
+    Trial,
     cloned,
-    difference,
-    leaves,
-    mapped,
+    expect,
+    expect_finite,
+    expect_none,
+    expect_same,
+    masked,
+    scene,
 )
 
 
-@check({"losses"})
 def check_loss_is_a_mean_over_scenes(case: Case) -> None:
     """The terms of a batch are the mean of those of its scenes."""
-    module, inputs = case.lively(), inputs_of(case)
-    alone = [module(*map_tensors(lambda x, s=s: x[s : s + 1], inputs).values()) for s in range(2)]
-    found = difference(_mean(*alone), module(*inputs.values()), 1e-4, 1e-6)
-    expect(not found, f"against the mean over scenes, {found}")
+    trial = Trial(case)
+    alone = [trial(scene(trial.inputs, index)) for index in range(2)]
+    expect_same(_mean(*alone), trial(), "against the mean over scenes", 1e-4, 1e-6)
 
 
-@check({"losses"})
 def check_masked_queries_are_not_judged(case: Case) -> None:
-    """What stands where the state's mask is False, with opacity 0, changes no term."""
-    module, inputs = case.lively(), inputs_of(case)
-    prediction, other = (inputs_of(case, seed=seed)["prediction"] for seed in range(2))
+    """Numbers where the state's mask is False, with opacity 0, change no term."""
+    trial = Trial(case)
+    prediction = trial.inputs["prediction"]
     batch, queries = prediction.state.features.shape[:2]
-    mask_BN = (torch.arange(batch * queries) % 3 != 1).view(batch, queries)
-    mask_BN = mask_BN.to(prediction.state.features.device)
+    mask_BN = (torch.arange(batch * queries) % 3 != 1).view(batch, queries).to(case.device)
 
     def seen(given: LayerPrediction) -> Any:
-        opacities = given.gaussians.opacities * _over(mask_BN, given.gaussians.opacities)
+        opacities = given.gaussians.opacities
+        opacities = masked(opacities, mask_BN, 0 * opacities)
         gaussians = replace(given.gaussians, opacities=opacities)
-        state = replace(given.state, mask=mask_BN)
-        return module(**{**inputs, "prediction": LayerPrediction(gaussians, state)})
+        return trial(prediction=LayerPrediction(gaussians, replace(given.state, mask=mask_BN)))
 
-    others = leaves(other)
-    moved = mapped(prediction, lambda n, x: torch.where(_over(mask_BN, x), x, others[n]))
-    found = difference(seen(prediction), seen(moved), 1e-4, 1e-6)
-    expect(not found, f"when masked queries and their Gaussians change, {found}")
-
-
-def _over(mask_BN: Tensor, x: Tensor) -> Tensor:
-    """The mask of queries for a tensor of them or of their Gaussians, (B, N or G, 1, ...)."""
-    of_each = mask_BN.repeat_interleave(x.shape[1] // mask_BN.shape[1], 1)
-    return of_each.view(*of_each.shape, *[1] * (x.ndim - 2))
+    # Masked Gaussians have opacity 0 in both, so only their other numbers change.
+    moved = masked(prediction, mask_BN, inputs_of(case, seed=1)["prediction"])
+    where = "when masked queries and their Gaussians change"
+    expect_same(seen(prediction), seen(moved), where, 1e-4, 1e-6)
 
 
-@check({"losses"})
 def check_renderings_as_declared(case: Case) -> None:
     """A loss needs the renderings that `renderings` declares: of each view, of all, or none."""
-    module, inputs = case.lively(), inputs_of(case)
-    assert isinstance(module, Loss)
-    terms = module(*inputs.values())
+    trial = Trial(case)
+    terms = trial()
     for name, term in terms.items():
         expect(term.ndim == 0, f"the term `{name}` is of shape {tuple(term.shape)}, not 0-d")
-    if module.renderings == "each":
+    if trial.module.renderings == "each":
+        rendering = trial.inputs["rendering"]
+        target = trial.inputs["target"]
         alone = []
-        for view in range(2):
-            seen = map_tensors(lambda x, v=view: x[:, v : v + 1], inputs["rendering"])
-            target = inputs["target"].select([view])
-            alone.append(module(inputs["prediction"], seen, target, inputs["inputs"]))
-        found = difference(_mean(*alone), terms, 1e-4, 1e-6)
-        expect(not found, f"`each` is declared; against the mean over views, {found}")
+        for view in ([0], [1]):
+            seen = map_tensors(lambda x, view=view: x[:, view], rendering)
+            alone.append(trial(rendering=seen, target=target.select(view)))
+        where = "`each` is declared; against the mean over views"
+        expect_same(_mean(*alone), terms, where, 1e-4, 1e-6)
 
 
 def _mean(one: dict[str, Tensor], other: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: (one[name] + other[name]) / 2 for name in one}
 
 
-@check({"metrics"})
 def check_metric_gives_its_columns(case: Case) -> None:
     """Given what it `needs` and no more, a metric has a finite value for each of its columns.
 
     The same each time; it changes nothing that it is given.
     """
     module = _metric(case)
+    # A perfect image is where metrics divide by zero.
     for noise in (0.0, 0.2):
         given = _metric_input(case, module, noise)
         before = cloned(given)
-        values, again = (_values(module, given) for _ in range(2))
+        values = _values(module, given)
         keys = sorted(module.columns())
         expect(sorted(values) == keys, f"it has values for {sorted(values)}, columns for {keys}")
-        broken = [key for key, value in values.items() if not value.isfinite().all()]
-        expect(not broken, f"the values of the columns {broken} are not finite")
-        expect(not difference(values, again), f"the second time {difference(values, again)}")
-        found = difference(before, given)
-        expect(not found, f"it changes what it is given: {found}")
+        expect_finite(values, "as the value of a column")
+        expect_same(values, _values(module, given), "the second time")
+        expect_same(before, given, "it changes what it is given")
 
 
-@check({"metrics"})
 def check_truth_scores_best(case: Case) -> None:
-    """What equals the true images scores no worse than what does not, as `better` says."""
+    """Images that equal the true ones score no worse than others, as `better` says."""
     module = _metric(case)
     true, false = (_values(module, _metric_input(case, module, noise)) for noise in (0.0, 0.2))
     for key, column in module.columns().items():
@@ -122,17 +109,20 @@ def _metric(case: Case) -> Metric:
 
 def _metric_input(case: Case, module: Metric, noise: float) -> MetricInput:
     """True views, and images and depth that are off by `noise`; only what the metric needs."""
-    maker = Maker(case, Sizes(batch=1), torch.Generator().manual_seed(0))
-    needs, target = module.needs, maker.target()
-    depth = maker.uniform(1, 2, 1, 2, 1, *maker.image)
-    off = noise * maker.normal(*target.images.shape)
+    maker = Maker(case, Sizes(batch=1))
+    target = maker.target()
+    depth = maker.uniform(1, 2, "BV1HW")
+    off = noise * maker.normal("BV3HW")
+    optional = {
+        "gaussians": maker.gaussians(),
+        "depth": depth + off[:, :, :1],
+        "true_depth": depth,
+    }
     return MetricInput(
         images=target.images + off,
-        targets=target if "masks" in needs else replace(target, masks=None),
-        gaussians=maker.gaussians() if "gaussians" in needs else None,
+        targets=target if "masks" in module.needs else replace(target, masks=None),
         gaussians_per_query=2,
-        depth=depth + off[:, :, :1] if "depth" in needs else None,
-        true_depth=depth if "true_depth" in needs else None,
+        **{name: part if name in module.needs else None for name, part in optional.items()},
     )
 
 
@@ -140,3 +130,88 @@ def _values(module: Metric, given: MetricInput) -> dict[str, Tensor]:
     with torch.no_grad():
         values = module(given)
     return {"": values} if isinstance(values, Tensor) else dict(values)
+
+
+SIGNS = {"psnr", "alpha", "deviation"}
+
+
+class Rehearsal:
+    """`Passes` whose model is one parameter, `gain`: Gaussians as bright as the inputs are."""
+
+    def __init__(self, maker: Maker) -> None:
+        self.gain = nn.Parameter(torch.ones(()))
+        self.called: set[str] = set()
+        self._layer = maker.prediction()
+        self._renderer = TorchRenderer(TorchRenderer.Config())
+
+    def predict(self, inputs: Views) -> Prediction:
+        """See `Passes`."""
+        expect(inputs.images.shape[1] > 0, "it predicts from no view")
+        self.called.add("predict")
+        # The gain reaches every number that the objective may judge.
+        bright = self.gain * inputs.images.mean((1, 2, 3, 4))[:, None]
+        given = self._layer.gaussians
+        gaussians = replace(given, opacities=given.opacities * bright)
+        layer = LayerPrediction(gaussians, self._layer.state)
+        return Prediction(gaussians, layer.state, {1: layer})
+
+    def judge(self, prediction: Prediction, targets: Views, inputs: Views) -> Outcome:
+        """See `Passes`."""
+        self.called.add("judge")
+        rendering = self.render(prediction.gaussians, targets.cameras)
+        error = (rendering.rgb - targets.images).square().mean()
+        signs = {"psnr": -error, "alpha": rendering.alpha.mean(), "deviation": error}
+        return Outcome(error, {"error": error.detach()}, map_tensors(Tensor.detach, signs))
+
+    def render(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        """See `Passes`."""
+        return self._renderer(gaussians, cameras)
+
+
+def check_objective_gives_an_outcome(case: Case) -> None:
+    """An objective predicts and judges; its total is the sum of its terms, and trains the model.
+
+    It has no parameters. Terms and signs are 0-d and detached; the signs are those that training
+    watches.
+    """
+    module = case.build()
+    expect(not isinstance(module, nn.Module), "it is an nn.Module; objectives have no parameters")
+    # Objectives may split the views in halves; 2 is the least, 3 and 5 are odd.
+    for views in (2, 3, 5):
+        where = f"with {views} input views"
+        outcome, passes = _outcome(case, module, views)
+        kind = type(outcome).__name__
+        expect(isinstance(outcome, Outcome), f"{where} it gives {kind}, not an Outcome")
+        expect(passes.called == {"predict", "judge"}, f"{where} it judges no prediction")
+        parts = {**outcome.terms, **outcome.signs}
+        numbers = {"total": outcome.total, **parts}
+        odd = [n for n, x in numbers.items() if not isinstance(x, Tensor) or x.ndim]
+        expect_none(odd, f"no 0-d tensor {where}")
+        expect_finite(numbers, where)
+        kept = [name for name, x in parts.items() if x.requires_grad]
+        expect_none(kept, f"not detached {where}")
+        expect_none(outcome.signs.keys() ^ SIGNS, f"lost, or no sign that is watched, {where}")
+        total = outcome.total
+        of_terms = sum(outcome.terms.values())
+        expect_same(of_terms, total.detach(), f"{where}, against the sum of the terms", 1e-4, 1e-6)
+        reached = total.requires_grad and torch.autograd.grad(total, passes.gain)[0]
+        expect(reached, f"{where} its total has no gradient in the model's parameters")
+
+
+def check_objective_repeats(case: Case) -> None:
+    """Under one seed an objective gives the same each time: it counts and keeps nothing."""
+    module = case.build()
+    expect_same(rehearsed(case, module), rehearsed(case, module), "the second time")
+
+
+def rehearsed(case: Case, module: Any) -> dict[str, Tensor]:
+    """Numbers that an objective gives in a rehearsal."""
+    outcome, _ = _outcome(case, module, 3)
+    return cloned({"total": outcome.total, **outcome.terms, **outcome.signs})
+
+
+def _outcome(case: Case, module: Any, views: int) -> tuple[Outcome, Rehearsal]:
+    maker = Maker(case, Sizes(views=views))
+    passes = Rehearsal(maker)
+    with seeded(0):
+        return module.forward(maker.inputs(), maker.target(), passes), passes

@@ -7,54 +7,37 @@ import torch
 from torch.overrides import TorchFunctionMode
 
 from qgs.containers import map_tensors, named_tensors
-from qgs.contracts import CrossAttention, SelfAttention
 from qgs.geometry.precision import at_least_float32
-from qgs_dev.case import CannotCheck, Case, expect
-from qgs_dev.inputs import Inputs, inputs_of
+from qgs_dev.case import CannotCheck, Case
+from qgs_dev.checks.attention import explanation
+from qgs_dev.inputs import FACTS, Inputs, data_file
 from qgs_dev.modules import each_mode, seeded
-from qgs_dev.registry import MODULES, check
-from qgs_dev.trees import cast, described, difference, floating, leaves, mapped, not_finite
+from qgs_dev.vocabulary import (
+    Trial,
+    cast,
+    described,
+    difference,
+    expect,
+    expect_finite,
+    expect_none,
+    floating,
+    leaves,
+    mapped,
+)
 
+ATTENTION = ("cross_attention", "self_attention")
+
+# What geometry adds to attention logits; -inf where it keeps a query from looking.
 EXPLAINED = "explain.geometry"
-"""What geometry adds to attention logits; -inf where it keeps a query from looking."""
 
-GEOMETRY = {
-    "encoder": ("patch_rays",),
-    "queries": ("fields.",),
-    "refinement": ("fields.",),
-    "head": ("scales", "quats", "opacities"),
-    "cross_attention": (EXPLAINED,),
-    "self_attention": (EXPLAINED,),
-    "centers": ("output",),
-    "renderer": ("rgb", "alpha", "depth", "features"),
-    "losses": ("",),
-}
-"""Outputs that are geometry, or measures of it, by the beginning of their names."""
+# How far geometry under autocast may be from float32: bfloat16 rounds by 4e-3.
+RTOL = 1e-5
+ATOL = 1e-6
 
-HALVED = {
-    *("features", "state.features", "offsets"),
-    *("memory.keys", "memory.values", "memory.features"),
-}
-"""Inputs that arrive in bfloat16 under autocast."""
-
-RTOL, ATOL = 1e-5, 1e-6
-"""How far geometry under autocast may be from float32: bfloat16 rounds by 4e-3."""
-
-LAYERS = {
-    *("linear", "bilinear", "conv1d", "conv2d", "conv3d", "layer_norm", "rms_norm", "group_norm"),
-    *("gru", "lstm", "gru_cell", "lstm_cell", "rnn_tanh_cell", "rnn_relu_cell"),
-    *("multi_head_attention_forward", "scaled_dot_product_attention"),
-}
-"""Functions of torch that are layers of a network, if anything in them is learned."""
-
-PRODUCTS = {
-    *("matmul", "__matmul__", "__rmatmul__"),
-    *("mm", "mv", "bmm", "addmm", "baddbmm", "einsum"),
-}
-"""Functions of torch that are layers or geometry, such as a rotation of points."""
+# Inputs that are halved under autocast, and functions of torch that are layers or products.
+NAMES: dict[str, list[str]] = data_file("precision.toml")
 
 
-@check(MODULES)
 def check_geometry_is_float32_under_autocast(case: Case) -> None:
     """Under bfloat16 autocast what is computed is finite, and geometry is computed in float32.
 
@@ -63,79 +46,81 @@ def check_geometry_is_float32_under_autocast(case: Case) -> None:
     geometry adds to attention logits, images, losses) has the values that float32 gives it for the
     same outputs of the layers. In training as in evaluation.
     """
-    module = case.lively()
+    trial = Trial(case)
+    module = trial.module
+    inputs = _halved(trial.inputs)
     if case.slot == "queries":
-        module.requires_grad_(False)  # its parameters are no layers: they are the geometry
+        # Its parameters are no layers: they are the geometry.
+        module.requires_grad_(False)
     for mode in each_mode(module):
         where = f"in {mode} under autocast"
-        inputs = _halved(inputs_of(case))
-        autocast = torch.autocast(case.device, dtype=torch.bfloat16)
-        with seeded(0), autocast, LearnedLayers() as layers:
-            outputs = _with_explanation(module, inputs)
-        broken = [name for name in not_finite(outputs) if name != EXPLAINED]
-        expect(not broken, f"{where} {', '.join(broken)} is not finite")
-        seen = {
-            n: x for n, x in floating(outputs).items() if n.startswith(GEOMETRY.get(case.slot, ()))
-        }
+        with seeded(0), _autocast(case), LearnedLayers() as layers:
+            outputs = _with_explanation(trial, inputs)
+        expect_finite({n: x for n, x in outputs.items() if n != EXPLAINED}, where)
+        # Replayed, learned layers give the same in both, and what differs is geometry alone.
+        with seeded(0), LearnedLayers(layers.outputs) as replayed:
+            exact = _with_explanation(trial, cast(inputs, torch.float32))
+        geometry = tuple(FACTS[case.slot].get("geometry", ()))
+        seen = {name: x for name, x in floating(outputs).items() if name.startswith(geometry)}
         for name, tensor in seen.items():
             kept = tensor.dtype == torch.float32
             expect(kept, f"{where} `{name}` is {described(tensor)}, not float32")
-        with seeded(0), LearnedLayers(layers.outputs) as replayed:
-            exact = floating(_with_explanation(module, cast(inputs, torch.float32)))
-        required = case.component.fields_read(case.config)
-        provided = case.component.fields_written(case.config).items()
-        # Fields that stand in no frame and carry on none that was read.
-        learned = {f"fields.{n}" for n, s in provided if s.frame == "none" and n not in required}
-        placed = {name: x for name, x in seen.items() if name not in learned}
-        found = difference({name: exact[name] for name in placed}, placed, RTOL, ATOL)
+        # Fields that stand in no frame and carry on none that was read are learned.
+        for name, spec in case.writes.items():
+            if spec.frame == "none" and name not in case.reads:
+                seen.pop(f"fields.{name}", None)
+        found = difference({name: exact[name] for name in seen}, seen, RTOL, ATOL)
         if found and replayed.differs:
             raise CannotCheck("in float32 it calls other layers than under autocast")
         expect(not found, f"{where}, against float32, {found}")
-        if isinstance(module, CrossAttention | SelfAttention):
-            names = ", ".join(sorted(layers.halved))
-            expect(not names, f"{where} the product of float32 geometry by {names} is in bfloat16")
+        if case.slot in ATTENTION:
+            expect_none(layers.halved, f"takes float32 geometry to bfloat16 {where}")
+
+
+def _autocast(case: Case) -> torch.autocast:
+    return torch.autocast(case.device, dtype=torch.bfloat16)
 
 
 def _halved(inputs: Inputs) -> Inputs:
     """Features in bfloat16, which require gradients; geometry requires none."""
-    return mapped(inputs, lambda name, x: x.bfloat16().requires_grad_() if name in HALVED else x)
+    return mapped(
+        inputs, lambda name, x: x.bfloat16().requires_grad_() if name in NAMES["halved"] else x
+    )
 
 
-def _with_explanation(module: Any, inputs: Inputs) -> dict[str, Any]:
+def _with_explanation(trial: Trial, inputs: Inputs) -> dict[str, Any]:
     """The outputs, and what geometry adds to the logits of an attention that explains itself."""
-    outputs = leaves(module(*inputs.values()))
-    if isinstance(module, CrossAttention | SelfAttention):
-        explain: Any = module.explain
-        weights = explain(*inputs.values(), torch.arange(inputs["state"].features.shape[1]))
+    outputs = leaves(trial(inputs))
+    if trial.case.slot in ATTENTION:
+        weights = explanation(trial.module, inputs)
         if weights is not None and weights.geometry is not None:
             outputs[EXPLAINED] = weights.geometry
     return outputs
 
 
-@check(MODULES)
 def check_autocast_is_close(case: Case) -> None:
     """Under bfloat16 autocast a component gives what it gives in float32, but for rounding.
 
     That is to within a tenth of the spread of each output.
     """
-    module, inputs = case.lively(), _halved(inputs_of(case))
-    exact = floating(module(*cast(inputs, torch.float32).values()))
-    with torch.autocast(case.device, dtype=torch.bfloat16):
-        rounded = floating(module(*inputs.values()))
+    trial = Trial(case)
+    inputs = _halved(trial.inputs)
+    exact = floating(trial(cast(inputs, torch.float32)))
+    with _autocast(case):
+        rounded = floating(trial(inputs))
     for name, tensor in exact.items():
         off = (rounded[name].float() - tensor).abs().mean()
+        # A constant output has no spread: then its size counts.
         spread = (tensor - tensor.mean()).abs().mean().clamp_min(0.1 * tensor.abs().mean() + 1e-6)
         seen = f"under autocast `{name}` is off by {off / spread:.2g} times its spread"
-        expect(bool(off <= 0.1 * spread), seen)
+        expect(off <= 0.1 * spread, seen)
 
 
-@check(MODULES)
 def check_float64_stays_float64(case: Case) -> None:
     """A float64 component with float64 inputs gives float64 outputs, in training too."""
-    module = case.lively().double()
-    for mode in each_mode(module):
-        with seeded(0):
-            outputs = module(*cast(inputs_of(case), torch.float64).values())
+    trial = Trial(case)
+    trial.module.double()
+    for mode, outputs in trial.in_each_mode(cast(trial.inputs, torch.float64)):
         for name, tensor in floating(outputs).items():
             kept = tensor.dtype == torch.float64
             expect(kept, f"in {mode} `{name}` is {described(tensor)} for float64 inputs")
@@ -163,14 +148,19 @@ class LearnedLayers(TorchFunctionMode):
         name = getattr(func, "__name__", "")
         factors = [x for _, x in named_tensors([args, kwargs or {}])]
         learned = [x.requires_grad for x in factors]
-        if not ((name in LAYERS and any(learned)) or (name in PRODUCTS and all(learned))):
-            halved = name in PRODUCTS and given.dtype == torch.bfloat16 and not any(learned)
-            if halved and all(x.dtype == torch.float32 for x in factors):
-                self.halved.add(name)
-            return given
+        product = name in NAMES["products"]
+        if (product and all(learned)) or (name in NAMES["layers"] and any(learned)):
+            return self._of_layer(name, given)
+        exact = all(x.dtype == torch.float32 for x in factors)
+        if product and exact and not any(learned) and given.dtype == torch.bfloat16:
+            self.halved.add(name)
+        return given
+
+    def _of_layer(self, name: str, given: Any) -> Any:
         if self._replayed is None:
             self.outputs.append((name, map_tensors(torch.clone, given)))
         elif not self.differs:
+            # Replayed layers must come in the order in which they were recorded.
             recorded, before = next(self._replayed, ("", None))
             self.differs = recorded != name or _shapes(before) != _shapes(given)
             return given if self.differs else map_tensors(at_least_float32, before)

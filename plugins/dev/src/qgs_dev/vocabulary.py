@@ -1,0 +1,198 @@
+"""The vocabulary of the checks: trees of tensors, runs of a component, and what to expect of them.
+
+Inputs and outputs of components are trees of tensors with dotted names.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.gradcheck import GradcheckError, gradcheck
+
+from qgs.containers import map_tensors, named_tensors
+from qgs.contracts import Renderer
+from qgs_dev.case import Case, ContractError
+from qgs_dev.inputs import USUAL, WITH_MEMORY, Inputs, Sizes, inputs_of
+from qgs_dev.modules import each_mode, seeded
+
+
+def leaves(tree: Any) -> dict[str, Tensor]:
+    """Every tensor of `tree` by its dotted name; a single tensor is called `output`."""
+    return {name or "output": tensor for name, tensor in named_tensors(tree)}
+
+
+def mapped(tree: Any, function: Callable[[str, Tensor], Tensor]) -> Any:
+    """Return `tree` with `function(name, tensor)` in place of every tensor."""
+    names = iter(leaves(tree))
+    return map_tensors(lambda tensor: function(next(names), tensor), tree)
+
+
+def floating(tree: Any) -> dict[str, Tensor]:
+    """Every floating-point tensor by its dotted name."""
+    return {name: tensor for name, tensor in leaves(tree).items() if tensor.is_floating_point()}
+
+
+def cloned(tree: Any) -> Any:
+    """A copy that shares no memory and belongs to no autograd graph."""
+    return map_tensors(lambda x: x.detach().clone(), tree)
+
+
+def tracked(tree: Any) -> Any:
+    """A copy whose floating-point tensors require gradients."""
+    return map_tensors(lambda x: x.requires_grad_(x.is_floating_point()), cloned(tree))
+
+
+def cast(tree: Any, dtype: torch.dtype) -> Any:
+    """Return `tree` with its floating-point tensors in `dtype`."""
+    return map_tensors(lambda x: x.to(dtype) if x.is_floating_point() else x, tree)
+
+
+def scene(tree: Any, index: int) -> Any:
+    """Return a batch of the scene at `index` alone."""
+    return map_tensors(lambda x: x[index : index + 1], tree)
+
+
+def masked(tree: Any, mask_BN: Tensor, other: Any) -> Any:
+    """Return `tree` with the numbers of `other` for the queries that the mask leaves out.
+
+    Tensors are of queries (B, N, ...) or of their Gaussians (B, N K, ...).
+    """
+    theirs = leaves(other)
+
+    def kept(name: str, x: Tensor) -> Tensor:
+        of_each = mask_BN.repeat_interleave(x.shape[1] // mask_BN.shape[1], 1)
+        return x.where(of_each.view(*x.shape[:2], *[1] * (x.ndim - 2)), theirs[name])
+
+    return mapped(tree, kept)
+
+
+def scalar(tree: Any) -> Tensor:
+    """A float64 sum of all floating-point numbers in `tree`, with random weights."""
+    total = torch.zeros((), dtype=torch.float64)
+    for index, tensor in enumerate(floating(tree).values()):
+        # Equal weights would let errors of opposite signs cancel.
+        generator = torch.Generator().manual_seed(index)
+        weights = torch.randn(tensor.shape, generator=generator, dtype=torch.float64)
+        total = total + (tensor.double().cpu() * weights).sum()
+    return total
+
+
+def gradients(total: Tensor, tree: Any) -> dict[str, Tensor]:
+    """The gradient of `total` in every tensor of `tree` that it depends on."""
+    if not total.requires_grad:
+        return {}
+    given = {name: tensor for name, tensor in floating(tree).items() if tensor.requires_grad}
+    found = torch.autograd.grad(total, list(given.values()), allow_unused=True)
+    return {name: x for name, x in zip(given, found, strict=True) if x is not None}
+
+
+def difference(one: Any, other: Any, rtol: float = 0.0, atol: float = 0.0) -> str:
+    """Describe the first tensor in which two trees differ beyond the tolerances; "" if none does.
+
+    Without tolerances the dtypes must agree too.
+    """
+    ours = leaves(one)
+    theirs = leaves(other)
+    if ours.keys() != theirs.keys():
+        return f"{sorted(ours)} against {sorted(theirs)}"
+    for name, tensor in ours.items():
+        seen = theirs[name]
+        if tensor.shape != seen.shape or (not atol and tensor.dtype != seen.dtype):
+            return f"{name}: {described(tensor)} against {described(seen)}"
+        # Trees may be of two devices or, with a tolerance, of two precisions.
+        seen = seen.to(tensor)
+        if not torch.allclose(tensor, seen, rtol=rtol, atol=atol, equal_nan=True):
+            off = (tensor.double() - seen.double()).abs().max().item()
+            return f"{name}: values differ by up to {off:.3g}"
+    return ""
+
+
+def described(tensor: Tensor) -> str:
+    """Shape and dtype, such as `2x6x3 float32`."""
+    shape = "x".join(map(str, tensor.shape)) or "scalar"
+    return f"{shape} {str(tensor.dtype).removeprefix('torch.')}"
+
+
+class Trial:
+    """A component of a case in which no parameter is zero, and inputs to call it with."""
+
+    def __init__(self, case: Case, sizes: Sizes = USUAL, seed: int = 0) -> None:
+        self.case = case
+        self.module = case.lively()
+        self.inputs = inputs_of(case, sizes, seed)
+
+    def __call__(self, inputs: Inputs | None = None, **replaced: Any) -> Any:
+        """Return the outputs for `inputs`, by default its own, with some of them replaced."""
+        given = {**(inputs or self.inputs), **replaced}
+        return self.module(*given.values())
+
+    def with_changed(self, change: Callable[[str, Tensor], Tensor]) -> Any:
+        """Return the outputs for its inputs with `change(name, tensor)` in place of each tensor."""
+        return self(mapped(self.inputs, change))
+
+    def in_each_mode(self, inputs: Inputs | None = None) -> Iterator[tuple[str, Any]]:
+        """Yield the name of each mode, and the outputs in it under one seed."""
+        for mode in each_mode(self.module):
+            # Seeded for each pass, so that the caller draws on from its own state.
+            with seeded(0):
+                outputs = self(inputs)
+            yield mode, outputs
+
+    def tracked(self, inputs: Inputs | None = None) -> Inputs:
+        """Return copies of `inputs`, by default its own, that require gradients.
+
+        Of cameras only in the tensors that a renderer declares.
+        """
+        component = self.case.component
+        fixed: set[str] = set()
+        if issubclass(component, Renderer):
+            fixed = {"c2w", "intrinsics"} - {*component.camera_gradients}
+        return mapped(
+            tracked(inputs or self.inputs),
+            lambda name, x: x.detach() if name.removeprefix("cameras.") in fixed else x,
+        )
+
+    def state_of(self, outputs: Any) -> Any:
+        """Return the state among the outputs of a layer or a feedback, all outputs of others."""
+        return outputs[0] if self.case.slot in WITH_MEMORY else outputs
+
+
+def expect(holds: Any, seen: str) -> None:
+    """Raise ContractError with what was `seen` unless the contract `holds`."""
+    if not holds:
+        raise ContractError(seen)
+
+
+def expect_none(names: Iterable[Any], fault: str) -> None:
+    """Raise ContractError with all `names`, and the `fault` that they have, if there are any."""
+    found = sorted(map(str, names))
+    expect(not found, f"{', '.join(found)}: {fault}")
+
+
+def expect_same(one: Any, other: Any, where: str, rtol: float = 0.0, atol: float = 0.0) -> None:
+    """Raise ContractError unless two trees agree; see `difference`."""
+    found = difference(one, other, rtol, atol)
+    expect(not found, f"{where}, {found}")
+
+
+def expect_finite(tree: Any, where: str) -> None:
+    """Raise ContractError if a tensor of `tree` holds a NaN or an infinity."""
+    broken = [name for name, tensor in floating(tree).items() if not tensor.isfinite().all()]
+    expect_none(broken, f"not finite {where}")
+
+
+def expect_inside(x: Tensor, low: float, high: float, what: str) -> None:
+    """Raise ContractError unless all numbers of `x` are in [low, high]."""
+    least, most = x.aminmax()
+    expect(least >= low and most <= high, f"{what} are {least:.4g} to {most:.4g}")
+
+
+def expect_right_gradient(
+    value: Callable[..., Tensor], points: Any, where: str, **tolerances: Any
+) -> None:
+    """Raise ContractError unless `value` at `points` has the gradient of finite differences."""
+    try:
+        gradcheck(value, points, **tolerances)
+    except GradcheckError as error:
+        expect(False, f"{where}: {' '.join(str(error).split())}"[:400])
