@@ -58,7 +58,6 @@ def run_calling(after_step, recipe, folder, resume=False):
     class Calling(TrainingProgress):
         def update(self, *_):
             after_step(trainer, stop)
-            return False
 
     with closing(Trainer(recipe, folder, resume=resume)) as trainer:
         return trainer.run(Calling(QUIET), stop)

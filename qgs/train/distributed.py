@@ -35,15 +35,16 @@ _PARALLEL = (DistributedType.NO, DistributedType.MULTI_CPU, DistributedType.MULT
 
 
 def make_accelerator(device: str, unread: bool = False) -> Accelerator:
-    """The processes that a launcher started (DDP), or this one alone.
+    """Return the processes that a launcher started (DDP), or this one alone.
 
-    unread: whether some parameters never get a gradient, which DDP must then search for.
+    unread: some parameters never get a gradient, which DDP must then search for.
     Raises ValueError for a launcher's request of anything but DDP.
     """
     group = InitProcessGroupKwargs(timeout=TIMEOUT)
     parallel = DistributedDataParallelKwargs(find_unused_parameters=unread)
-    options = {"cpu": device == "cpu", "mixed_precision": ACCELERATE}
-    accelerator = Accelerator(**options, kwargs_handlers=[group, parallel])
+    accelerator = Accelerator(
+        cpu=device == "cpu", mixed_precision=ACCELERATE, kwargs_handlers=[group, parallel]
+    )
     if accelerator.distributed_type not in _PARALLEL:
         kind = accelerator.distributed_type.value
         raise ValueError(f"training runs in one process or under DDP: launch it without {kind}")
@@ -51,14 +52,19 @@ def make_accelerator(device: str, unread: bool = False) -> Accelerator:
 
 
 def mean(accelerator: Accelerator, value: Tensor) -> Tensor:
-    """Mean of `value` over processes."""
-    reduced = accelerator.reduce(value, "mean")
-    assert isinstance(reduced, Tensor)
+    """Return the mean of `value` over processes, which must all call this."""
+    reduced: Any = accelerator.reduce(value, "mean")
     return reduced
 
 
+def true_anywhere(accelerator: Accelerator, flag: object) -> bool:
+    """Return whether `flag` is true in any process; all must call this, and all get one answer."""
+    own = torch.tensor(float(bool(flag)), device=accelerator.device)
+    return bool(mean(accelerator, own))
+
+
 def gathered(accelerator: Accelerator, own: Any) -> list[Any]:
-    """The `own` of every process, by rank."""
+    """Return the `own` of every process, by rank."""
     return gather_object([own]) if accelerator.num_processes > 1 else [own]
 
 
@@ -69,11 +75,12 @@ class RandomStates:
         self._accelerator = accelerator
 
     def state(self) -> dict[str, Any]:
-        """Tensors and JSON values; all processes must call it."""
+        """Return tensors and JSON values; all processes must call this."""
         version, words, gauss = random.getstate()
+        kind, twister, *rest = np.random.get_state()
         own: dict[str, Any] = {
             "python": [version, list(words), gauss],
-            "numpy": _with_key(np.random.get_state(legacy=False), np.ndarray.tolist),
+            "numpy": [kind, np.asarray(twister).tolist(), *rest],
             "torch": torch.get_rng_state(),
         }
         if self._accelerator.device.type == "cuda":
@@ -83,30 +90,27 @@ class RandomStates:
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore this process's generators; a rank that `state` lacks keeps its own."""
-        prefix, device = f"{self._accelerator.process_index}/", self._accelerator.device
+        prefix = f"{self._accelerator.process_index}/"
         own = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
         if not own:
             return
         version, words, gauss = own["python"]
         random.setstate((version, tuple(words), gauss))
-        np.random.set_state(_with_key(own["numpy"], lambda key: np.array(key, np.uint32)))
+        np.random.set_state(own["numpy"])
         torch.set_rng_state(own["torch"])
+        device = self._accelerator.device
         if device.type == "cuda" and "cuda" in own:
             torch.cuda.set_rng_state(own["cuda"], device)
-
-
-def _with_key(state: Any, function: Callable[[Any], Any]) -> dict[str, Any]:
-    """NumPy's state with `function` of the 624 words of its Mersenne Twister."""
-    return {**state, "state": {**state["state"], "key": function(state["state"]["key"])}}
 
 
 DEVICES = ("auto", "cpu", "cuda")
 
 
 def choose_device(wanted: str = "auto", say: Callable[[str], None] = print) -> str:
-    """ "cpu" or "cuda" for one of DEVICES; raises ValueError for others, and "cuda" without one.
+    """Return "cpu" or "cuda" for one of DEVICES.
 
     "auto" takes CUDA if there is one and gsplat is installed; `say` gets a note if it is missing.
+    Raises ValueError for another name, and for "cuda" where there is none.
     """
     if wanted not in DEVICES:
         raise ValueError(f"the device must be one of {', '.join(DEVICES)}, got {wanted!r}")
@@ -131,7 +135,7 @@ def choose_device(wanted: str = "auto", say: Callable[[str], None] = print) -> s
 
 @dataclass
 class StopRequest:
-    """Whether training was asked to stop, and by which signal."""
+    """A request to stop training, true once there is one. signal: the first that asked."""
 
     signal: signal.Signals | None = None
 
@@ -151,11 +155,13 @@ def stop_requests(quiet: bool = False) -> Iterator[StopRequest]:
         return
 
     def ask(number: int, frame: FrameType | None) -> None:
-        if request:  # launchers and terminals each send the signal: repeats mean nothing new
+        # Launchers and terminals each send the signal: repeats mean nothing new.
+        if request:
             return
         request.signal = signal.Signals(number)
         message = f"{request.signal.name}: finishing the step, then saving (Ctrl-\\ ends at once)"
-        if not quiet:  # print is not reentrant, and a handler may interrupt it
+        # Not print, which is not reentrant: a handler may interrupt it.
+        if not quiet:
             os.write(2, f"\n{message}\n".encode())
 
     # Restored afterwards: a notebook goes on with handlers of its own.

@@ -2,7 +2,9 @@
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
 from typing import Any, NoReturn
 
 from accelerate import Accelerator
@@ -12,9 +14,17 @@ from qgs.checkpoint.model_file import unique_tensors
 from qgs.checkpoint.tensors import nonfinite
 from qgs.contracts import TrainingConfig
 from qgs.data.samples import Batch
+from qgs.machine import is_out_of_memory
 from qgs.train.distributed import gathered
 from qgs.train.folder import Saver
-from qgs.train.incidents import Report, first_bad_tensor, save_batches, save_incident
+from qgs.train.incidents import (
+    blames_data,
+    described,
+    first_bad_tensor,
+    report_of,
+    save_batches,
+    save_incident,
+)
 from qgs.train.training_pass import TrainingPass
 from qgs.wording import listed
 
@@ -41,6 +51,11 @@ MAX_SAVED = 20
 _TOO_FAST = (
     "a learning rate too high for this model (lower optimizer.learning_rate, lengthen "
     "optimizer.warmup)"
+)
+
+LESS_MEMORY = (
+    "lower views.inputs, views.targets, training.batch_size, "
+    "data.image_size, model.queries.count or model.head.gaussians_per_query"
 )
 
 COLLAPSE_CAUSES = (
@@ -87,30 +102,38 @@ class Guard:
     def __init__(
         self,
         accelerator: Accelerator,
-        objective: TrainingPass,
+        training_pass: TrainingPass,
         saver: Saver,
         config: TrainingConfig,
         repeat: Callable[[Sequence[Batch]], Any],
     ) -> None:
-        """objective: not wrapped by accelerate. repeat: computes the gradients of batches again."""
-        self.detector = CollapseDetector(config.collapse_window)
-        self.good = GoodWeights(objective.model, keep=accelerator.is_main_process)
-        self.incidents = self.skipped = 0
-        self._accelerator, self._objective, self._repeat = accelerator, objective, repeat
-        self._saver, self._skips = saver, config.on_nonfinite == "skip"
+        """training_pass: not wrapped by accelerate. repeat: computes the gradients again."""
+        self.signs = SignsOfLife()
+        self.good = GoodWeights(training_pass.model, keep=accelerator.is_main_process)
+        self.incidents = 0
+        self.skipped = 0
+        self._accelerator = accelerator
+        self._training_pass = training_pass
+        self._saver = saver
+        self._config = config
+        self._repeat = repeat
 
     def state(self) -> dict[str, Any]:
-        counts = {"incidents": self.incidents, "skipped": self.skipped}
-        return {**counts, "detector": self.detector.state()}
+        return {
+            "incidents": self.incidents,
+            "skipped": self.skipped,
+            "detector": asdict(self.signs),
+        }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        self.incidents, self.skipped = state["incidents"], state["skipped"]
-        self.detector.load_state(state["detector"])
+        self.incidents = state["incidents"]
+        self.skipped = state["skipped"]
+        self.signs = SignsOfLife(**state["detector"])
 
     def passed(self, numbers: Mapping[str, float]) -> None:
         """Take note of a finite step."""
         self.skipped = 0
-        self.detector.observe(numbers)
+        self.signs.observe(numbers)
         self.good.observe(numbers)
 
     def leave_out(self, step: int, batches: Sequence[Batch], symptom: str) -> None:
@@ -119,17 +142,17 @@ class Guard:
         Raises NonFiniteError, the run saved as before that step, or CollapseError.
         """
         found, from_data = self.look_into(step + 1, batches, symptom)
-        if self._skips and self.skipped <= MAX_SKIPPED:
+        skips = self._config.on_nonfinite == "skip"
+        if skips and self.skipped <= MAX_SKIPPED:
             _log.warning("step %d is skipped: %s", step + 1, found)
             return
         # A model that was dying gave this NaN: going on from here would not help.
-        if self.detector.dead_steps or broken_tensors(self._saver.model):
+        if self.signs.dead or self._broken_weights():
             self._collapse(step + 1, found, NONFINITE_CAUSES)
         self._saver.save(step)
-        if self.skipped > MAX_SKIPPED:
+        remedy = "; continue without it by `--resume --set training.on_nonfinite=skip`"
+        if skips:
             remedy = f", after {MAX_SKIPPED} steps in a row were skipped; continue with --resume"
-        else:
-            remedy = "; continue without it by `--resume --set training.on_nonfinite=skip`"
         causes = f"Likely causes:{_as_list(NONFINITE_CAUSES)}"
         if from_data:
             causes = "The data is to blame: look at it with `qgs data check`"
@@ -145,37 +168,35 @@ class Guard:
         """
         self.incidents += 1
         self.skipped += 1
-        accelerator, place = self._accelerator, self._saver.folder.path / "incidents"
         # All processes repeat the step: its collective operations need everyone.
-        first = first_bad_tensor(self._objective, lambda: self._repeat(batches))
-        reports = gathered(accelerator, Report.of(accelerator.process_index, first, batches))
-        found = [report for report in reports if report.first] or reports[:1]
-        words = f"{symptom}; {'; '.join(map(str, found))}; "
+        first = first_bad_tensor(self._training_pass, lambda: self._repeat(batches))
+        process = self._accelerator.process_index
+        reports = gathered(self._accelerator, report_of(process, first, batches))
+        found = [report for report in reports if report["first"]] or reports[:1]
+        words = f"{symptom}; {'; '.join(map(described, found))}"
+        from_data = all(map(blames_data, found))
         if self.incidents > MAX_SAVED:
-            words += f"not saved, as {MAX_SAVED} incidents of this run are"
-        else:
-            place = place / f"step-{step}"
-            words += f"batch and weights are in {place}"
-            if accelerator.is_main_process:
-                save_incident(place, self._saver.model, step, symptom, reports)
-                save_batches(place / "batch.safetensors", batches)
-            elif first:
-                save_batches(place / f"batch-{accelerator.process_index}.safetensors", batches)
-            accelerator.wait_for_everyone()
-        return words, all(report.blames_data for report in found)
+            return f"{words}; not saved, as {MAX_SAVED} incidents of this run are", from_data
+        place = self._saver.folder.path / "incidents" / f"step-{step}"
+        if self._accelerator.is_main_process:
+            save_incident(place, self._saver.model, step, symptom, reports)
+            save_batches(place / "batch.safetensors", batches)
+        elif first:
+            save_batches(place / f"batch-{process}.safetensors", batches)
+        self._accelerator.wait_for_everyone()
+        return f"{words}; batch and weights are in {place}", from_data
 
     def refuse_collapse(self, step: int) -> None:
         """Raise CollapseError when the last steps, a whole window of them, were dead."""
-        if self.detector.dead_steps >= self.detector.window:
-            symptom = f"for {self.detector.dead_steps} steps {self.detector.symptom}"
-            self._collapse(step, symptom, COLLAPSE_CAUSES)
+        if self.signs.dead >= self._config.collapse_window:
+            self._collapse(step, f"for {self._dead_steps}", COLLAPSE_CAUSES)
 
     def keep_good(self, step: int) -> None:
         """Copy the weights if a copy is due and PSNR has not dropped.
 
         Raises CollapseError for weights that are not finite.
         """
-        if not self.detector.dead_steps and self.good.due(step, self.detector.window):
+        if not self.signs.dead and self.good.due(step, self._config.collapse_window):
             self._refuse_broken_weights(step)
             self.good.refresh(step)
 
@@ -186,51 +207,83 @@ class Guard:
 
     def save_to_go_on(self, step: int) -> None:
         """Save the run as one that may go on; a dead model's checkpoint is the last good one."""
-        if self.detector.dead_after(step):
-            self._saver.save_checkpoint(self.good.step, self.good.tensors)
-            # The state keeps the dead weights: a resumed run must equal an uninterrupted one.
-            self._saver.save(step, state_only=True)
-        else:
+        if not self._is_dead(step):
             self.save(step)
+            return
+        self._saver.save_checkpoint(*self.good.last)
+        # The state keeps the dead weights: a resumed run must equal an uninterrupted one.
+        self._saver.save(step, state_only=True)
 
     def finish(self, step: int, stopped: bool) -> None:
         """Save a run whose budget is used or that was stopped. Raises CollapseError."""
-        symptom = f"for the last {self.detector.dead_steps} steps {self.detector.symptom}"
-        if self.detector.dead_after(step):
+        symptom = f"for the last {self._dead_steps}"
+        if self._is_dead(step):
             if not stopped:
                 self._collapse(step, symptom, COLLAPSE_CAUSES)
-        elif self.detector.dead_steps:
+        elif self.signs.dead:
             _log.warning("training ended in doubt: %s; the weights are saved as they are", symptom)
         self.save_to_go_on(step)
 
+    @contextmanager
+    def memory_explained(self, step: int, saves: bool = False) -> Iterator[None]:
+        """Raise OutOfMemoryError where the block finds no memory; saves: weights are untouched."""
+        try:
+            yield
+        except Exception as error:
+            if not is_out_of_memory(error):
+                raise
+            # Saving takes memory too; the files of the last save are whole in any case. With
+            # several processes the others would wait for this one in vain.
+            if saves and step and self._accelerator.num_processes == 1:
+                with suppress(Exception):
+                    self.save_to_go_on(step)
+            raise OutOfMemoryError(
+                f"out of memory in step {step + 1}: {str(error).splitlines()[0][:300]}. "
+                "What was saved continues with --resume and a higher training.accumulate, more "
+                "processes, or fewer training.render_views. A new run also takes less when you "
+                f"{LESS_MEMORY}."
+            ) from error
+
+    @property
+    def _dead_steps(self) -> str:
+        return f"{self.signs.dead} steps {self.signs.symptom}"
+
+    def _is_dead(self, steps: int) -> bool:
+        # A run shorter than a window is dead when all of its steps were.
+        return self.signs.dead >= min(self._config.collapse_window, steps)
+
+    def _broken_weights(self) -> str:
+        names = nonfinite(unique_tensors(self._saver.model).items())
+        return f"weights are not finite: {listed(names)}" if names else ""
+
     def _refuse_broken_weights(self, step: int) -> None:
-        if problem := broken_tensors(self._saver.model):
+        if problem := self._broken_weights():
             self._collapse(step, problem, NONFINITE_CAUSES)
 
     def _collapse(self, step: int, problem: str, causes: Sequence[str]) -> NoReturn:
-        self._saver.save_checkpoint(self.good.step, self.good.tensors)
+        good, weights = self.good.last
+        self._saver.save_checkpoint(good, weights)
         raise CollapseError(
-            f"training collapsed at step {step}: {problem}. The weights of step {self.good.step} "
+            f"training collapsed at step {step}: {problem}. The weights of step {good} "
             f"are kept in {self._saver.folder.checkpoint}. Likely causes:{_as_list(causes)}"
         )
 
 
-def _as_list(causes: Iterable[str]) -> str:
+def _as_list(causes: Sequence[str]) -> str:
     return "".join(f"\n  - {cause}" for cause in causes)
 
 
-class CollapseDetector:
-    """Counts consecutive steps without signs of life.
+@dataclass
+class SignsOfLife:
+    """The signs of life of the latest steps. dead: steps in a row without any, for `symptom`.
 
     A step is dead when nothing is drawn (mean alpha under EMPTY_ALPHA), when no gradient is left,
     or when the images have gone back to the plain background after showing more.
     """
 
-    def __init__(self, window: int) -> None:
-        self.window = window
-        self.dead_steps = 0
-        self.symptom = ""
-        self._has_drawn = False
+    dead: int = 0
+    symptom: str = ""
+    has_drawn: bool = False
 
     def observe(self, numbers: Mapping[str, float]) -> None:
         """Take note of a step: "alpha" and "deviation" of its renderings, "gradient" (norm)."""
@@ -240,92 +293,82 @@ class CollapseDetector:
         elif numbers["gradient"] < NO_GRADIENT:
             self.symptom = f"the gradient has vanished (norm {numbers['gradient']:.1e})"
         # At the start plain images are normal: queries have not found the scene yet.
-        elif self._has_drawn and numbers["deviation"] < FLAT:
+        elif self.has_drawn and numbers["deviation"] < FLAT:
             self.symptom = "the renderings equal the background"
-        self.dead_steps = self.dead_steps + 1 if self.symptom else 0
+        self.dead = self.dead + 1 if self.symptom else 0
         # Well above FLAT, so that noise around the threshold is no image.
-        self._has_drawn |= numbers["deviation"] > 8 * FLAT
-
-    def dead_after(self, steps: int) -> bool:
-        """Whether all of a run's `steps` so far, or the whole window, were dead."""
-        return self.dead_steps >= min(self.window, steps)
-
-    def state(self) -> dict[str, Any]:
-        return {"dead": self.dead_steps, "symptom": self.symptom, "has_drawn": self._has_drawn}
-
-    def load_state(self, state: Mapping[str, Any]) -> None:
-        self.dead_steps, self.symptom = state["dead"], state["symptom"]
-        self._has_drawn = state["has_drawn"]
+        self.has_drawn |= numbers["deviation"] > 8 * FLAT
 
 
 class GoodWeights:
     """Copies in host memory of the weights at the last two times that the model was healthy.
 
-    A collapse is noticed late, and the newer copy may already be on its way down; `tensors` after
-    `step` optimiser steps are the older one. Copies are made every fifth of a window at first and a
-    window in long runs, and none is made while the images are worse than they were.
+    A collapse is noticed late, and the newer copy may already be on its way down, so the older one
+    is the last that is surely good. Copies are made every fifth of a window at first and a window
+    in long runs, and none is made while the images are worse than they were.
 
-    keep: whether this process holds the copies; one of several suffices.
+    keep: this process holds the copies; one of several suffices.
     """
 
     def __init__(self, model: nn.Module, keep: bool = True) -> None:
-        self._model, self._keep = model, keep
-        self._copies: list[tuple[int, dict[str, Tensor]]] = []
+        self._model = model
+        self._keep = keep
+        self._copies: list[tuple[int, Mapping[str, Tensor]]] = []
         self._psnr: float | None = None
         self._best: float | None = None
         self.refresh(0)
 
+    @property
+    def last(self) -> tuple[int, Mapping[str, Tensor]]:
+        """Optimiser steps, and the weights that they made."""
+        return self._copies[0]
+
     def observe(self, numbers: Mapping[str, float]) -> None:
         """Take note of a step's "psnr", in dB."""
-        now = numbers["psnr"]
         # PSNR of one batch depends on its scenes: compare running means.
-        self._psnr = now if self._psnr is None else self._psnr + (now - self._psnr) / 10
+        psnr = numbers["psnr"]
+        self._psnr = psnr if self._psnr is None else self._psnr + (psnr - self._psnr) / 10
 
     def due(self, step: int, window: int) -> bool:
         """Whether to copy the weights after `step` steps; the same in all processes."""
         # Rarer in long runs: each copy moves the whole model to the host.
         interval = max(window // 5, min(window, step // 10))
-        if step - self._copies[-1][0] < interval or self._psnr is None:
+        newest, _ = self._copies[-1]
+        if step - newest < interval or self._psnr is None:
             return False
-        self._best = max(self._psnr, self._psnr if self._best is None else self._best)
+        self._best = self._psnr if self._best is None else max(self._psnr, self._best)
         return self._psnr >= self._best - LOSS_OF_QUALITY
 
     def refresh(self, step: int) -> None:
         """Copy the present weights, which `step` optimiser steps made."""
-        # Host memory: the device's is needed for the training.
         present = unique_tensors(self._model) if self._keep else {}
+        # Host memory: the device's is needed for the training.
         copy = {name: tensor.detach().to("cpu", copy=True) for name, tensor in present.items()}
         self._copies = [*self._copies, (step, copy)][-2:]
-        self.step, self.tensors = self._copies[0]
 
     def state(self) -> dict[str, Any]:
-        copies = enumerate(tensors for _, tensors in self._copies)
-        tensors = {f"{i}/{name}": t for i, copy in copies for name, t in copy.items()}
-        quality = {"psnr": self._psnr, "best": self._best}
-        return {"steps": [step for step, _ in self._copies], **quality, **tensors}
+        found: dict[str, Any] = {"psnr": self._psnr, "best": self._best}
+        found["steps"] = [step for step, _ in self._copies]
+        for number, (_, copy) in enumerate(self._copies):
+            found |= {f"{number}/{name}": tensor for name, tensor in copy.items()}
+        return found
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        self._psnr, self._best, self._copies = state["psnr"], state["best"], []
-        for i, step in enumerate(state["steps"]):
-            copy = {n.removeprefix(f"{i}/"): t for n, t in state.items() if n.startswith(f"{i}/")}
-            self._copies.append((step, copy if self._keep else {}))
-        self.step, self.tensors = self._copies[0]
+        self._psnr = state["psnr"]
+        self._best = state["best"]
+        copies: list[dict[str, Tensor]] = [{} for _ in state["steps"]]
+        for key, value in state.items():
+            number, _, name = key.partition("/")
+            if name and self._keep:
+                copies[int(number)][name] = value
+        self._copies = list(zip(state["steps"], copies, strict=True))
 
 
-def broken_tensors(model: nn.Module) -> str:
-    """Which tensors of `model` hold NaN or infinity; "" if none does."""
-    names = nonfinite(unique_tensors(model).items())
-    return f"weights are not finite: {listed(names)}" if names else ""
-
-
-def not_finite(numbers: Mapping[str, float], module: nn.Module) -> str:
-    """What is NaN or infinite of a step: loss terms, else the gradient; "" if nothing is."""
-    # PSNR is infinite for a perfect image, the gradient is looked at by itself.
+def not_finite(numbers: Mapping[str, float]) -> str:
+    """Name what is NaN or infinite of a step: loss terms, else the gradient; "" if nothing is."""
+    # PSNR is infinite for a perfect image; the gradient follows the terms.
     terms = {name: n for name, n in numbers.items() if name not in ("gradient", "psnr")}
     bad = [f"loss term {name} is {n}" for name, n in terms.items() if not math.isfinite(n)]
-    if bad or math.isfinite(numbers["gradient"]):
-        return ", ".join(bad)
-    parameters = module.named_parameters()
-    names = nonfinite((name, p.grad) for name, p in parameters if p.grad is not None)
-    origin = f", from {listed(names)}" if names else ""
-    return f"the gradient norm is {numbers['gradient']}{origin}"
+    if not bad and not math.isfinite(numbers["gradient"]):
+        bad = [f"the gradient norm is {numbers['gradient']}"]
+    return ", ".join(bad)

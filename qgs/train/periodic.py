@@ -43,10 +43,10 @@ class _StoppedError(Exception):
 
 
 class PeriodicEvaluation:
-    """Judges the model on the recipe's test views, beside its moving average where there is one.
+    """Scores of the model on the recipe's test views, and of its moving average where it has one.
 
     Appends to RUN/evaluations.jsonl and writes RUN/pictures/step-N.png; restores random states and
-    the model's mode. One process judges and the others wait.
+    the model's mode. One process evaluates and the others wait.
 
     latest: the step of the latest evaluation of this session.
     """
@@ -61,22 +61,27 @@ class PeriodicEvaluation:
         trackers: Trackers,
     ) -> None:
         self.latest: int | None = None
-        self._accelerator, self._recipe, self._model = accelerator, recipe, model
-        self._average, self._folder, self._trackers = average, folder, trackers
-        self._random = RandomStates(accelerator)
+        self._accelerator = accelerator
+        self._recipe = recipe
+        self._model = model
+        self._average = average
+        self._folder = folder
+        self._trackers = trackers
         self._stop = StopRequest()
-        Measures(recipe)  # a metric that is wrong must fail now, not after the training
+        # A metric that is wrong must fail now, not after the training.
+        Measures(recipe)
 
-    def run(self, step: int, stop: StopRequest | None = None) -> None:
+    def run(self, step: int, stop: StopRequest) -> None:
         """Evaluate after `step` optimiser steps. All processes must call this.
 
         stop: where it is requested, the evaluation ends between two scenes. A failing evaluation is
         logged as a warning and does not end the training.
         """
         self.latest = step
-        self._stop = StopRequest() if stop is None else stop
+        self._stop = stop
         # An evaluation must not change what the training draws afterwards.
-        states = self._random.state()
+        random = RandomStates(self._accelerator)
+        states = random.state()
         try:
             if self._accelerator.is_main_process:
                 self._evaluate(step)
@@ -88,12 +93,12 @@ class PeriodicEvaluation:
             _log.debug("where it failed", exc_info=True)
         # The others wait here, see TIMEOUT in `distributed`.
         self._accelerator.wait_for_everyone()
-        self._random.load_state(states)
+        random.load_state(states)
 
     def _evaluate(self, step: int) -> None:
         records = [self._record("raw", step)]
         if self._average:
-            # The average is judged second: it is applied to the weights for as long as that takes.
+            # The average comes second: it is applied to the weights for as long as that takes.
             with self._average.applied():
                 records.append(self._record("ema", step))
         place = self._folder / "evaluations.jsonl"
@@ -101,8 +106,9 @@ class PeriodicEvaluation:
         kept = [record for record in read_records(place) if record["step"] < step]
         write_text(place, "".join(json.dumps(record) + "\n" for record in (*kept, *records)))
         for record in records:
-            group, scores = f"evaluation/{record['weights']}", record["scores"]
-            self._trackers.log({f"{group}/{name}": score for name, score in scores.items()}, step)
+            group = f"evaluation/{record['weights']}"
+            scores = {f"{group}/{name}": score for name, score in record["scores"].items()}
+            self._trackers.log(scores, step)
         picture = self._picture()
         write_png(picture, self._folder / "pictures" / f"step-{step}.png")
         self._trackers.picture("evaluation", picture, step)
@@ -124,20 +130,28 @@ class PeriodicEvaluation:
 
     @torch.no_grad()
     def _picture(self) -> Picture:
-        """A row per sample: input views, the first target view, its rendering and its depth."""
-        recipe, model, training = self._recipe, self._model, self._model.training
-        data = recipe.build_data(), recipe.views, recipe.evaluation
-        plan = EvaluationPlan(*data, index_of(recipe), recipe.build_view_sampler())
+        """Draw a row per sample: input views, first target view, its rendering and its depth."""
+        recipe = self._recipe
+        plan = EvaluationPlan(
+            recipe.build_data(),
+            recipe.views,
+            recipe.evaluation,
+            index_of(recipe),
+            recipe.build_view_sampler(),
+        )
         # A broken test scene has been reported by the scores; pictures take the next one.
         usable = (sample for sample in plan.samples() if isinstance(sample, Sample))
-        model.eval()
+        self._model.eval()
         try:
-            rows = [_row(model, sample) for sample in islice(usable, SAMPLES)]
+            rows = [_row(self._model, sample) for sample in islice(usable, SAMPLES)]
         finally:
-            model.train(training)
+            self._model.train()
+        # Scenes of an index may have different numbers of input views.
         width = max(row.shape[1] for row in rows)
-        wider = [((0, _GAP), (0, width - row.shape[1]), (0, 0)) for row in rows]
-        padded = [np.pad(r, w, constant_values=255) for r, w in zip(rows, wider, strict=True)]
+        padded = [
+            np.pad(row, ((0, _GAP), (0, width - row.shape[1]), (0, 0)), constant_values=255)
+            for row in rows
+        ]
         return np.concatenate(padded)[:-_GAP]
 
 

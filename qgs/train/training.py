@@ -1,11 +1,8 @@
 """The training loop."""
 
-import logging
 import math
-import time
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -17,7 +14,7 @@ from accelerate.utils import set_seed
 from rich.console import Console
 from torch import Tensor, nn
 
-from qgs.contracts import Outcome, SceneSource, TrainingConfig, ViewSampler
+from qgs.contracts import Outcome, SceneSource, TrainingConfig
 from qgs.contracts.schedule import follow
 from qgs.data.samples import Batch
 from qgs.data.stream import (
@@ -28,24 +25,22 @@ from qgs.data.stream import (
     trained_domain,
     training_batches,
 )
-from qgs.domain import Domain
 from qgs.files import write_text
-from qgs.machine import is_out_of_memory
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
 from qgs.recipe.flow import keys_are_read
-from qgs.recipe.recipe import annotated
+from qgs.recipe.recipe import annotated, flat
+from qgs.train.counters import Counters
 from qgs.train.distributed import (
     RandomStates,
     StopRequest,
     choose_device,
-    gathered,
     make_accelerator,
-    mean,
     stop_requests,
+    true_anywhere,
 )
-from qgs.train.folder import RunFolder, Saver, State, refuse_other_data, saved_state
-from qgs.train.guard import Guard, OutOfMemoryError, not_finite
+from qgs.train.folder import RunFolder, SavedState, Saver, saved_state
+from qgs.train.guard import Guard, not_finite
 from qgs.train.initial import initialise
 from qgs.train.parameters import MovingAverage, OptimizerState, make_optimizer
 from qgs.train.periodic import PeriodicEvaluation
@@ -54,13 +49,6 @@ from qgs.train.tracking import Trackers, TrainingProgress
 from qgs.train.training_pass import TrainingPass
 
 ELSEWHERE = "another process of this training has no next batch; see its own message"
-
-LESS_MEMORY = (
-    "lower views.inputs, views.targets, training.batch_size, "
-    "data.image_size, model.queries.count or model.head.gaussians_per_query"
-)
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -123,272 +111,196 @@ def train(
 
 
 class Trainer:
-    """One run: its state, and the loop.
+    """One run: its parts, and the loop.
 
     Making one opens the data and draws the first batch, but touches no file of a new run; its
     folder is made after the first step, when nothing is missing any more.
-
-    step, samples, seconds: optimiser steps, samples over all processes, and time spent so far, in
-        all sessions. A session's clock starts after its first step, in which kernels compile.
     """
 
     def __init__(
         self, recipe: Recipe, run: str | Path, device: str = "cpu", resume: bool = False
     ) -> None:
-        self.recipe, self.config = recipe, recipe.training
-        self.folder, self.trackers = RunFolder(run), Trackers(recipe.training.trackers)
-        self.step, self.samples, self.seconds = 0, 0, 0.0
-        self.left_out = Counter[str]()
-        self._last_tick: float | None = None
-        self._resumes, self._folder_is_open = resume, False
+        self.recipe = recipe
+        self.config = recipe.training
+        self.folder = RunFolder(run)
+        self.trackers = Trackers(recipe.training.trackers)
+        self._resumes = resume
+        self._folder_is_open = False
         with ExitStack() as resources:
             resources.callback(self.folder.close)
             resources.callback(self.trackers.close)
+            self.optimizer = recipe.build_optimizer()
+            self.accelerator = make_accelerator(device, unread=not keys_are_read(recipe.parts))
             # The order matters: the state is read before memory is taken for the model, the model
             # draws its random numbers before anything else does, and the data comes last, since
             # its first batch depends on how many samples the restored run has seen.
-            self.optimizer = recipe.build_optimizer()
-            self.accelerator = make_accelerator(device, unread=not keys_are_read(recipe.parts))
-            processes = self.accelerator.num_processes
-            scenes = self.config.scenes_per_batch(processes)
-            self._batch_samples = scenes * processes
-            saved = self._claim_folder()
+            saved = self._saved()
             self._build_model(initial=saved is None)
             source = recipe.build_data()
-            self._conditions = {
-                "step_size": self.config.batch_size,
-                "scenes": scenes_fingerprint(source),
-            }
-            sampler = recipe.build_view_sampler()
-            self._build_parts(self._domain(source, sampler))
-            if saved is not None:
-                self.saver.restore(saved)
-            self.resumed_at = self.step if saved is not None else None
+            self._build_parts(source)
+            if saved:
+                self.saver.restore(saved.parts)
+            self.resumed_at = self.counters.step if saved else None
             self._follow_schedules()
-            batches = training_batches(
-                source,
-                recipe.views,
-                scenes,
-                recipe.seed,
-                start=self.samples // self._batch_samples,
-                share=Share(self.accelerator.process_index, processes),
-                workers=self.config.workers,
-                skips=self.config.on_bad_sample == "skip",
-                sampler=sampler,
-                accumulate=self.config.accumulate,
-                depths=self.training_pass.reads_depths,
-            )
+            batches = self._open_data(source)
             resources.callback(batches.close)
             self.feed = Feed(batches, self.config.accumulate)
-            self._fetch_first()
+            self.feed.fetch()
+            # Where one process fails, all raise, and none waits for it.
+            if true_anywhere(self.accelerator, self.feed.error):
+                raise self.feed.error or SampleError(ELSEWHERE)
             self._resources = resources.pop_all()
 
-    def _claim_folder(self) -> Mapping[str, State] | None:
-        """Lock the folder of a run that is continued; its saved parts, None to start at step 0."""
+    def close(self) -> None:
+        """Stop reading ahead, end tracking and leave the folder to others."""
+        self._resources.close()
+
+    def _saved(self) -> SavedState | None:
+        """Lock the folder of a run that is continued; its saved state, None to start at step 0."""
         if not self._resumes:
             return None
         self.folder.refuse_other(resume=True)
         if self.accelerator.is_main_process and not self.folder.is_new:
             self.folder.take()
         self.accelerator.wait_for_everyone()
-        saved = saved_state(self.folder, self.recipe)
-        return saved.parts if saved else None
+        return saved_state(self.folder, self.recipe)
 
     def _build_model(self, initial: bool) -> None:
-        """The model, what trains it, and torch's optimiser; initial: load `init_from`."""
-        recipe, accelerator = self.recipe, self.accelerator
-        self.model = recipe.build_model(accelerator.device, pretrained=initial).train()
+        """Build the model, what trains it, and torch's optimiser; initial: load `init_from`."""
+        recipe = self.recipe
+        device = self.accelerator.device
+        self.model = recipe.build_model(device, pretrained=initial).train()
         self.notes = [f"warning: {text}" for text in recipe.warnings]
-        self.notes += initialise(self.model, recipe) if initial else []
-        if self.config.seconds:  # often inherited by recipes and options that set only the steps
+        if initial:
+            self.notes += initialise(self.model, recipe)
+        # A budget of time is often inherited by recipes and options that set only the steps.
+        if self.config.seconds:
             self.notes.append(
                 f"stops after {self.config.seconds:g} s (training.seconds) or "
                 f"{self.config.steps:,} steps (training.steps), whichever comes first"
             )
-        self.training_pass = TrainingPass.of(recipe, self.model).to(accelerator.device)
+        self.training_pass = TrainingPass(recipe, self.model).to(device)
         factors = recipe.rate_factors(self.training_pass)
         optimizer = make_optimizer(self.training_pass, self.optimizer, factors)
-        prepared: Any = accelerator.prepare(self.training_pass, optimizer)
+        prepared: Any = self.accelerator.prepare(self.training_pass, optimizer)
         wrapped, self.torch_optimizer = prepared
-        self._gradients = partial(compute_gradients, accelerator, wrapped, self.config)
+        self._gradients = partial(compute_gradients, self.accelerator, wrapped, self.config)
         self.average = MovingAverage(self.model, self.config.ema) if self.config.ema else None
 
-    def _domain(self, source: SceneSource, sampler: ViewSampler) -> Domain:
-        """What checkpoints carry; only the main process writes them."""
-        if not self.accelerator.is_main_process:
-            return Domain()
-        recipe, steps = self.recipe, self.config.steps
-        return trained_domain(source, recipe.views, recipe.seed, sampler, steps)
-
-    def _build_parts(self, domain: Domain) -> None:
-        """What watches, saves and judges; `saver.parts` is everything that continues the run."""
-        accelerator, training_pass = self.accelerator, self.training_pass
-        self.saver = Saver(accelerator, self.folder, self.model, domain)
-        self.guard = Guard(accelerator, training_pass, self.saver, self.config, self._gradients)
-        self.evaluations = PeriodicEvaluation(
-            accelerator, self.recipe, self.model, self.average, self.folder.path, self.trackers
+    def _build_parts(self, source: SceneSource) -> None:
+        """Make what counts, watches, saves and judges."""
+        recipe = self.recipe
+        # Only the main process writes checkpoints, which carry the range of the training views.
+        if self.accelerator.is_main_process:
+            sampler = recipe.build_view_sampler()
+            self.model.trained_on = trained_domain(
+                source, recipe.views, recipe.seed, sampler, self.config.steps
+            )
+        self.counters = Counters(self.accelerator, self.config, scenes_fingerprint(source))
+        self.saver = Saver(self.accelerator, self.folder, self.model)
+        self.guard = Guard(
+            self.accelerator, self.training_pass, self.saver, self.config, self._gradients
         )
-        self.saver.parts |= {
+        self.evaluations = PeriodicEvaluation(
+            self.accelerator, recipe, self.model, self.average, self.folder.path, self.trackers
+        )
+        # Beside the weights, all that continues the run.
+        parts = {
             "guard": self.guard,
             "good": self.guard.good,
-            "counters": self,
-            "moments": OptimizerState(training_pass, self.torch_optimizer),
+            "counters": self.counters,
+            "moments": OptimizerState(self.training_pass, self.torch_optimizer),
             "schedule": self.optimizer,
-            **({"ema": self.average} if self.average else {}),
-            # Last: restoring a part may draw random numbers.
-            "random": RandomStates(accelerator),
         }
+        if self.average:
+            parts["ema"] = self.average
+        # Last: restoring a part may draw random numbers.
+        parts["random"] = RandomStates(self.accelerator)
+        self.saver.parts = parts
+
+    def _open_data(self, source: SceneSource) -> Generator[Batch, None, None]:
+        """Return the batches from the first that the run has not seen yet."""
+        processes = self.accelerator.num_processes
+        return training_batches(
+            source,
+            self.recipe.views,
+            self.config.scenes_per_batch(processes),
+            self.recipe.seed,
+            # A step that accumulates takes several batches.
+            start=self.counters.samples * self.config.accumulate // self.config.batch_size,
+            share=Share(self.accelerator.process_index, processes),
+            workers=self.config.workers,
+            skips=self.config.on_bad_sample == "skip",
+            sampler=self.recipe.build_view_sampler(),
+            accumulate=self.config.accumulate,
+            depths=self.training_pass.reads_depths,
+        )
 
     def _follow_schedules(self) -> None:
-        self.training_pass.follow(self.step)
-        follow([self.optimizer], self.step)
-
-    def _fetch_first(self) -> None:
-        """Fetch the first batch; where one process fails, all raise, and none waits for it."""
-        self.feed.fetch()
-        flag = torch.tensor(float(bool(self.feed.error)), device=self.accelerator.device)
-        if float(mean(self.accelerator, flag)):
-            raise self.feed.error or SampleError(ELSEWHERE)
+        self.training_pass.follow(self.counters.step)
+        follow([self.optimizer], self.counters.step)
 
     def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
         """Train until the budget is used, a stop is asked for, or the model dies."""
-        if self.used >= 1:
-            if not self.folder.checkpoint.exists():
-                self.guard.save(self.step)
-            return self._result(None)
+        counters = self.counters
         stopped_by = None
-        while self.used < 1 and not stopped_by:
-            stopped_by = self._one_step(progress, stop)
-        stopped_by = stopped_by or self._stopped_by(stop)
+        if counters.used >= 1:
+            # A kill may have come between the state and the checkpoint of the last step.
+            if not self.folder.checkpoint.exists():
+                self.guard.save(counters.step)
+            return self._result(stopped_by)
+        while counters.used < 1 and not stopped_by:
+            self._one_step(progress, stop)
+            stopped_by = self._stopped_by(stop)
+            if not stopped_by:
+                self._refuse_missing_batches()
         # Saved before the last evaluation, which may take long or fail.
-        self.guard.finish(self.step, stopped=stopped_by is not None)
-        if self.average and not stopped_by and self.evaluations.latest != self.step:
+        self.guard.finish(counters.step, stopped=bool(stopped_by))
+        if self.average and not stopped_by and self.evaluations.latest != counters.step:
             self._evaluate(stop)
             stopped_by = self._stopped_by(stop)
         return self._result(stopped_by)
 
-    def _one_step(self, progress: TrainingProgress, stop: StopRequest) -> str | None:
-        """One optimiser step, and what is due after it; the signal that asked to stop, or None."""
-        rate = self._set_learning_rate()
-        batches = self.feed.batches
-        with self._memory_explained(saves=True):
-            measured = self._gradients(batches)
-        # The next batches are fetched before the step's numbers are read, so that a GPU computes
-        # gradients meanwhile, and processes learn of a failure together with the numbers.
-        if not stop and self.step + 1 < self.config.steps:
-            self.feed.fetch()
-        numbers, asked_to_stop, no_data = self._read(measured, stop)
-        symptom = not_finite(numbers, self.model)
-        if symptom:
-            self._open_folder()  # an incident is saved in it
-            self.guard.leave_out(self.step, batches, symptom)
-        else:
-            self._update(numbers)
-        self.step += 1
-        self.samples += self._batch_samples * len(batches)
-        self._follow_schedules()
-        # Only now, so that a start that fails in its first step leaves no folder.
-        self._open_folder()
-        record = {"step": self.step, "seconds": self.seconds, "lr": rate, **numbers}
-        self._report(record | ({"skipped": True} if symptom else {}), batches, progress)
-        # A dead model must not be saved as a good one, so this comes before saving.
-        self.guard.refuse_collapse(self.step)
-        self.guard.keep_good(self.step)
-        return self._save_and_evaluate(stop, asked_to_stop, no_data)
-
-    def _set_learning_rate(self) -> float:
-        rate = self.optimizer.learning_rate(self.step, self.seconds)
+    def _one_step(self, progress: TrainingProgress, stop: StopRequest) -> None:
+        """Make one optimiser step, and what is due after it."""
+        counters = self.counters
+        rate = self.optimizer.learning_rate(counters.step, counters.seconds)
         for group in self.torch_optimizer.param_groups:
             # Torch's own schedulers know no time budget and no factors of parts.
             group["lr"] = rate * group["factor"]
         self.torch_optimizer.zero_grad(set_to_none=True)
-        return rate
-
-    def _update(self, numbers: Mapping[str, float]) -> None:
-        with self._memory_explained():
-            self.torch_optimizer.step()
-        if self.average:
-            self.average.update()
-        self.guard.passed(numbers)
-
-    def _save_and_evaluate(
-        self, stop: StopRequest, asked_to_stop: bool, no_data: bool
-    ) -> str | None:
-        evaluates = self._every(self.config.evaluate_every)
-        saves = evaluates or self._every(self.config.save_every)
-        if saves and not self.guard.detector.dead_steps:
-            self.guard.save(self.step)
+        batches = self.feed.batches
+        with self.guard.memory_explained(counters.step, saves=True):
+            measured = self._gradients(batches)
+        # The next batches are fetched before the step's numbers are read, so that a GPU computes
+        # gradients meanwhile.
+        if not stop and counters.step + 1 < self.config.steps:
+            self.feed.fetch()
+        numbers = counters.read(measured)
+        if symptom := not_finite(numbers):
+            self._open_folder()  # an incident is saved in it
+            self.guard.leave_out(counters.step, batches, symptom)
+            numbers["skipped"] = True
+        else:
+            with self.guard.memory_explained(counters.step):
+                self.torch_optimizer.step()
+            if self.average:
+                self.average.update()
+            self.guard.passed(numbers)
+        counters.finish_step(batches)
+        self._follow_schedules()
+        # Only now, so that a start that fails in its first step leaves no folder.
+        self._open_folder()
+        self._report({"lr": rate, **numbers}, progress)
+        # A dead model must not be saved as a good one, so this comes before saving.
+        self.guard.refuse_collapse(counters.step)
+        self.guard.keep_good(counters.step)
+        evaluates = counters.every(self.config.evaluate_every)
+        saves = evaluates or counters.every(self.config.save_every)
+        if saves and not self.guard.signs.dead:
+            self.guard.save(counters.step)
         if evaluates:
             self._evaluate(stop)
-        stopped_by = self._stopped_by(stop) if asked_to_stop or evaluates else None
-        if no_data and self.used < 1 and not stopped_by:
-            self.guard.save_to_go_on(self.step)
-            error = self.feed.error or SampleError(ELSEWHERE)
-            error.add_note(f"The run is saved at step {self.step}; continue with --resume")
-            raise error
-        return stopped_by
-
-    @contextmanager
-    def _memory_explained(self, saves: bool = False) -> Iterator[None]:
-        """Raise OutOfMemoryError where the block finds no memory; saves: weights are untouched."""
-        try:
-            yield
-        except Exception as error:
-            if not is_out_of_memory(error):
-                raise
-            # Saving takes memory too; the files of the last save are whole in any case. With
-            # several processes the others would wait for this one in vain.
-            if saves and self.step and self.accelerator.num_processes == 1:
-                with suppress(Exception):
-                    self.guard.save_to_go_on(self.step)
-            raise OutOfMemoryError(
-                f"out of memory in step {self.step + 1}: {str(error).splitlines()[0][:300]}. "
-                "What was saved continues with --resume and a higher training.accumulate, more "
-                "processes, or fewer training.render_views. A new run also takes less when you "
-                f"{LESS_MEMORY}."
-            ) from error
-
-    @property
-    def used(self) -> float:
-        """Fraction of the budget that is used, the larger of steps and seconds."""
-        of_seconds = self.seconds / self.config.seconds if self.config.seconds else 0.0
-        return max(self.step / self.config.steps, of_seconds)
-
-    def state(self) -> dict[str, Any]:
-        """Counters, and what must not change for them to mean the same."""
-        counted = {"step": self.step, "samples": self.samples, "seconds": self.seconds}
-        return counted | self._conditions | {"left_out": self._all_left_out()}
-
-    def load_state(self, state: Mapping[str, Any]) -> None:
-        """Count on from `state`. Raises OtherRunError, see `refuse_other_data`."""
-        refuse_other_data(state, self._conditions, self.folder)
-        self.step, self.samples, self.seconds = (state[n] for n in ("step", "samples", "seconds"))
-        if self.accelerator.is_main_process:  # of all processes: one counts on
-            self.left_out = Counter(state["left_out"])
-
-    def _all_left_out(self) -> dict[str, int]:
-        """Samples left out by all processes, which must all call this."""
-        return dict(sum(gathered(self.accelerator, self.left_out), Counter[str]()))
-
-    def close(self) -> None:
-        """Stop reading ahead, close the history and leave the folder to others."""
-        self._resources.close()
-
-    def _read(
-        self, measured: Mapping[str, Tensor], stop: StopRequest
-    ) -> tuple[dict[str, float], bool, bool]:
-        """Means of a step's numbers over processes; whether any must stop, or has no next batch.
-
-        The one time in a step that the host waits for the device, so the clock is read here too:
-        its mean over processes, so that all use up a budget of time together.
-        """
-        now = time.perf_counter()
-        spent, self._last_tick = now - (self._last_tick or now), now
-        own = torch.tensor([spent, bool(stop), bool(self.feed.error)]).to(self.accelerator.device)
-        values = torch.stack([value.float() for value in (*measured.values(), *own)])
-        *numbers, spent, asked_to_stop, no_data = mean(self.accelerator, values).tolist()
-        self.seconds += spent
-        return dict(zip(measured, numbers, strict=True)), asked_to_stop > 0, no_data > 0
 
     def _open_folder(self) -> None:
         """Make the folder, once, write the recipe, and drop records of steps that were lost."""
@@ -400,79 +312,86 @@ class Trainer:
                 self.folder.refuse_other(resume=False)
             self.folder.take()
             write_text(self.folder.recipe, annotated(self.recipe) + "\n")
-            self.folder.cut_history(self.resumed_at or 0)
-            self.trackers.open(self.folder.path, self.recipe, self.resumed_at or 0)
+            begun = self.resumed_at or 0
+            self.folder.cut_history(begun)
+            self.trackers.open(self.folder.path, flat(self.recipe.tree), begun)
         self.accelerator.wait_for_everyone()
 
-    def _report(
-        self, record: Mapping[str, float], batches: Sequence[Batch], progress: TrainingProgress
-    ) -> None:
-        for bad in (bad for batch in batches for bad in batch.left_out):
-            if bad not in self.left_out:
-                _log.warning("a sample is left out: %s", bad)
-            self.left_out[bad] += 1
+    def _report(self, numbers: Mapping[str, float], progress: TrainingProgress) -> None:
+        counters = self.counters
+        record = {"step": counters.step, "seconds": counters.seconds, **numbers}
         if self.accelerator.is_main_process:
             # JSON has no NaN: a skipped step leaves only its finite numbers.
             finite = {name: value for name, value in record.items() if math.isfinite(value)}
             self.folder.append(finite)
-            self.trackers.log(finite, self.step)
-        judged = self.config.judge_inputs * self.recipe.views.inputs
-        images = self.samples * (self.recipe.views.targets + judged)
-        shown = record["loss"], record["psnr"], images, self.seconds, self.used
-        if progress.update(self.step, *shown):
-            self.folder.flush()
-
-    def _every(self, steps: int) -> bool:
-        """Whether this step is one of every `steps`; none is where that is 0."""
-        return bool(steps) and self.step % steps == 0
+            self.trackers.log(finite, counters.step)
+        views = self.recipe.views
+        judged = views.targets + self.config.judge_inputs * views.inputs
+        progress.update(
+            counters.step,
+            record["loss"],
+            record["psnr"],
+            counters.samples * judged,
+            counters.seconds,
+            counters.used,
+        )
 
     def _evaluate(self, stop: StopRequest) -> None:
-        """Evaluate, with the clock stopped."""
-        started = time.perf_counter()
-        self.evaluations.run(self.step, stop)
-        # Shifted, not reset: the time since the last step still counts.
-        if self._last_tick is not None:
-            self._last_tick += time.perf_counter() - started
+        with self.counters.clock_stopped():
+            self.evaluations.run(self.counters.step, stop)
 
     def _stopped_by(self, stop: StopRequest) -> str | None:
-        """The signal's name when any process was asked to stop."""
-        asked = mean(self.accelerator, torch.tensor(float(bool(stop))).to(self.accelerator.device))
-        name = stop.signal.name if stop.signal else "SIGTERM"
-        return name if float(asked) else None
+        """Return the signal's name when any process was asked to stop."""
+        if not true_anywhere(self.accelerator, stop):
+            return None
+        return stop.signal.name if stop.signal else "SIGTERM"
+
+    def _refuse_missing_batches(self) -> None:
+        """Save the run and raise where a process has no next batches, in all of them together."""
+        step = self.counters.step
+        if true_anywhere(self.accelerator, self.feed.error) and self.counters.used < 1:
+            self.guard.save_to_go_on(step)
+            error = self.feed.error or SampleError(ELSEWHERE)
+            error.add_note(f"The run is saved at step {step}; continue with --resume")
+            raise error
 
     def _result(self, stopped_by: str | None) -> TrainingResult:
         return TrainingResult(
-            self.model.eval(),
-            self.folder,
-            self.step,
-            self.seconds,
-            stopped_by,
-            self.accelerator.is_main_process,
-            self.resumed_at,
-            self._all_left_out(),
+            model=self.model.eval(),
+            folder=self.folder,
+            steps=self.counters.step,
+            seconds=self.counters.seconds,
+            stopped_by=stopped_by,
+            main=self.accelerator.is_main_process,
+            resumed_at=self.resumed_at,
+            left_out=self.counters.all_left_out(),
         )
 
 
 def compute_gradients(
-    accelerator: Accelerator, objective: nn.Module, config: TrainingConfig, batches: Sequence[Batch]
+    accelerator: Accelerator,
+    training_pass: nn.Module,
+    config: TrainingConfig,
+    batches: Sequence[Batch],
 ) -> dict[str, Tensor]:
-    """Leave the gradients of the mean loss of `batches`, clipped; what was measured, 0-d.
+    """Leave the gradients of the mean loss of `batches`, clipped; return what was measured, 0-d.
 
-    objective: a `TrainingPass` as accelerate wraps it. "gradient" is the norm before clipping, over
-    all processes; the rest is of this one. Nothing waits for the device.
+    training_pass: as accelerate wraps it. "gradient" is the norm before clipping, over all
+    processes; the rest is of this one. Nothing waits for the device.
     """
-    device, sums = accelerator.device, dict[str, Tensor]()
+    device = accelerator.device
+    sums: dict[str, Tensor] = {}
     for number, batch in enumerate(batches, start=1):
         # Only the last batch exchanges gradients between processes.
-        with nullcontext() if number == len(batches) else accelerator.no_sync(objective):
-            inputs, targets = batch.inputs.to(device), batch.targets.to(device)
+        last = number == len(batches)
+        with nullcontext() if last else accelerator.no_sync(training_pass):
             with autocast(config.precision, device.type):
-                outcome: Outcome = objective(inputs, targets)
+                outcome: Outcome = training_pass(batch.inputs.to(device), batch.targets.to(device))
             accelerator.backward(outcome.total / len(batches))
         found = {"loss": outcome.total.detach(), **outcome.terms, **outcome.signs}
         for name, value in found.items():
             sums[name] = sums.get(name, 0) + value / len(batches)
     # After the exchange, so that all processes clip by the same norm.
-    norm = accelerator.clip_grad_norm_(objective.parameters(), config.clip)
+    norm = accelerator.clip_grad_norm_(training_pass.parameters(), config.clip)
     sums["gradient"] = torch.as_tensor(norm, device=device)
     return sums

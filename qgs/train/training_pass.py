@@ -8,13 +8,12 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from qgs.containers import concatenated, map_tensors, named_tensors
-from qgs.contracts import Loss, Objective, Outcome
+from qgs.contracts import Loss, Outcome
 from qgs.contracts.schedule import follow
 from qgs.geometry.constants import constant
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
-from qgs.tokengs import OnePass
 from qgs.train.precision import no_autocast
 from qgs.types import Cameras, Gaussians, LayerPrediction, Prediction, Rendering, Views
 
@@ -33,45 +32,36 @@ class TrainingPass(nn.Module):
     next; the backward pass starts from their sums. Memory thus grows neither with layers nor with
     views. Where a loss needs all renderings at once, only the renderer's graphs are in parts.
 
-    objective: None for `qgs/one_pass`. judge_inputs: the input views become targets too, the last.
     hook: called with the name and value (tensors, or a nest of them) of each intermediate result.
     """
 
     def __init__(
         self,
+        recipe: Recipe,
         model: QueryGaussianModel,
-        losses: Mapping[str, Loss],
-        render_views: int = 0,
-        objective: Objective | None = None,
-        judge_inputs: bool = False,
+        losses: Mapping[str, Loss] | None = None,
     ) -> None:
+        """recipe: the one that `model` was built from. losses: None for those of the recipe."""
         super().__init__()
+        self.model = model
+        self.objective = recipe.build_objective()
+        losses = recipe.build_losses() if losses is None else losses
         if not losses:
             raise ValueError("a recipe needs at least one loss to train; add one under `losses`")
-        self.model = model
         self.losses = nn.ModuleDict(losses)
         self._of_gaussians = [n for n, loss in losses.items() if loss.renderings == "none"]
         self._of_images = [name for name in losses if name not in self._of_gaussians]
-        self.render_views, self.judge_inputs = render_views, judge_inputs
-        self.objective = objective or OnePass(OnePass.Config())
-        self._judged = 0
-        self.hook: Callable[[str, Any], None] = lambda name, value: None
         self._owners: dict[str, str] = {}  # names of terms to those of their losses
-
-    @classmethod
-    def of(cls, recipe: Recipe, model: QueryGaussianModel) -> "TrainingPass":
-        """The losses and objective of `recipe`, for a `model` that was built from it."""
-        config, objective = recipe.training, recipe.build_objective()
-        return cls(
-            model, recipe.build_losses(), config.render_views, objective, config.judge_inputs
-        )
+        self.render_views = recipe.training.render_views
+        self.judge_inputs = recipe.training.judge_inputs
+        self.hook: Callable[[str, Any], None] = lambda name, value: None
 
     def forward(self, inputs: Views, targets: Views) -> Outcome:
-        """What the objective makes of a batch.
+        """Return what the objective makes of a batch.
 
         Raises ValueError when two terms have one name, or one that a step's record has already.
         """
-        self._judged = 0
+        # Input views become targets too, the last ones.
         targets = targets.joined(inputs) if self.judge_inputs else targets
         outcome = self.objective.forward(inputs, targets, self)
         if taken := sorted(outcome.terms.keys() & RECORDED):
@@ -97,40 +87,40 @@ class TrainingPass(nn.Module):
 
         Raises ValueError when two losses have a term of one name.
         """
-        self._judged += 1
-        judgement = f" in judgement {self._judged}" if self._judged > 1 else ""
         parameters = dict(self.losses.named_parameters(prefix="losses"))
-        total, count = targets.images.new_zeros(()), targets.images.shape[1]
+        total = targets.images.new_zeros(())
+        count = targets.images.shape[1]
         terms: dict[str, Tensor] = {}
-        signs: list[tuple[float, dict[str, Tensor]]] = []
+        signs: list[tuple[float, Mapping[str, Tensor]]] = []
         rounds = [number for number in prediction.layers if number > len(self.model.decoder)]
         for number, weight in self.model.supervision.weights(rounds).items():
-            self.hook(f"prediction of layer {number}{judgement}", prediction.layers[number])
+            self.hook(f"prediction of layer {number}", prediction.layers[number])
             layer = DetachedLayer(prediction.layers[number], parameters)
-            signs = []  # of this layer: those of the last one remain
+            # Of this layer: those of the last one remain.
+            signs = []
             for part in self._parts(targets):
                 views = part.images.shape[1]
                 rendering = self.render(layer.prediction.gaussians, part.cameras)
-                self.hook(f"rendering of layer {number}{judgement}", rendering)
+                self.hook(f"rendering of layer {number}", rendering)
                 signs.append((views / count, self._signs(rendering, part)))
-                seen = rendering, part, inputs
-                found = self._terms(self._of_images, layer.prediction, *seen, number)
+                found = self._terms(self._of_images, layer.prediction, rendering, part, inputs)
+                self.hook(f"loss of layer {number}", found)
                 layer.add(found, weight * views / count)
-            if self._of_gaussians:  # once for all parts, with a rendering of no view
-                no_views = map_tensors(lambda x: x[:, :0].detach(), rendering)
-                seen = no_views, targets, inputs
-                found = self._terms(self._of_gaussians, layer.prediction, *seen, number)
-                layer.add(found, weight)
-            self.hook(f"gradient of layer {number}{judgement}", layer.gradients)
+            # Losses of the Gaussians run once for all parts, with a rendering of no view.
+            no_views = map_tensors(lambda x: x[:, :0].detach(), rendering)
+            found = self._terms(self._of_gaussians, layer.prediction, no_views, targets, inputs)
+            self.hook(f"loss of layer {number}", found)
+            layer.add(found, weight)
+            self.hook(f"gradient of layer {number}", layer.gradients)
             # Layers meet here: one backward pass through the network serves them all.
             total = total + layer.total()
             _add(layer.terms, terms)
-        mean = {
+        means = {
             name: torch.stack([share * found[name] for share, found in signs]).sum()
             for name in ("psnr", "alpha")
         }
         deviation = torch.stack([found["deviation"] for _, found in signs]).amax()
-        return Outcome(total, terms, {**mean, "deviation": deviation})
+        return Outcome(total, terms, {**means, "deviation": deviation})
 
     def _parts(self, targets: Views) -> list[Views]:
         """The target views in slices of `render_views`, or whole where a loss compares views."""
@@ -142,38 +132,29 @@ class TrainingPass(nn.Module):
         """See `Passes`: the graphs of at most `render_views` views exist at a time."""
         if cameras.shape[1] <= (self.render_views or cameras.shape[1]):
             return self.model.render(gaussians, cameras)
+        # Rendered again in the backward pass: memory for one part instead of all.
         parts = [
-            # Rendered again in the backward pass: memory for one part instead of all.
             checkpoint(self.model.render, gaussians, cameras[:, views], use_reentrant=False)
             for views in _slices(cameras, self.render_views)
         ]
         return concatenated(parts, 1)
 
-    def _terms(
-        self,
-        names: Sequence[str],
-        layer: LayerPrediction,
-        rendering: Rendering,
-        target: Views,
-        inputs: Views,
-        number: int,
-    ) -> dict[str, Tensor]:
-        """The terms of the losses `names`."""
+    def _terms(self, names: Sequence[str], *shown: Any) -> dict[str, Tensor]:
+        """Return the terms of the losses `names`. shown: what a `Loss` is called with."""
         terms: dict[str, Tensor] = {}
         for name in names:
-            new = self.losses[name](layer, rendering, target, inputs)
-            repeated = sorted(term for term in new if self._owners.setdefault(term, name) != name)
-            if repeated:
-                raise ValueError(
-                    f"losses.{name} and losses.{self._owners[repeated[0]]} both have terms "
-                    f"{repeated}; a recipe can use each such loss once"
-                )
-            terms |= new
-        self.hook(f"loss of layer {number}", terms)
+            for term, value in self.losses[name](*shown).items():
+                owner = self._owners.setdefault(term, name)
+                if owner != name:
+                    raise ValueError(
+                        f"losses.{name} and losses.{owner} both have a term {term}; a recipe can "
+                        "use each such loss once"
+                    )
+                terms[term] = value
         return terms
 
     @torch.no_grad()
-    def _signs(self, rendering: Rendering, target: Views) -> dict[str, Tensor]:
+    def _signs(self, rendering: Rendering, target: Views) -> Mapping[str, Tensor]:
         background = constant(self.model.renderer.config.background, rendering.rgb)
         alpha, deviation = measure(rendering.rgb, rendering.alpha, background)
         likeness = psnr(rendering.rgb, target.images).mean()
@@ -194,8 +175,8 @@ class DetachedLayer:
         )
         self.gradients: dict[str, Tensor] = {}
         self.terms: dict[str, Tensor] = {}
-        self._sources = _trained({**parameters, **dict(named_tensors(layer))})
-        self._copies = _trained({**parameters, **dict(named_tensors(self.prediction))})
+        self._sources = _trained(parameters, layer)
+        self._copies = _trained(parameters, self.prediction)
 
     def add(self, terms: Mapping[str, Tensor], share: float) -> None:
         """Add `share` times the 0-d `terms` and their gradients, and free their graph."""
@@ -206,13 +187,13 @@ class DetachedLayer:
             return
         with no_autocast(loss.device.type):
             found = torch.autograd.grad(loss, list(self._copies.values()), allow_unused=True)
-        for name, gradient in zip(self._copies, found, strict=True):
-            if gradient is not None:
-                before = self.gradients.get(name)
-                self.gradients[name] = gradient if before is None else before + gradient
+        gradients = zip(self._copies, found, strict=True)
+        _add(
+            {name: gradient for name, gradient in gradients if gradient is not None}, self.gradients
+        )
 
     def total(self) -> Tensor:
-        """The sum of the terms, 0-d, with `gradients` with respect to what was cut off."""
+        """Return the sum of the terms, 0-d, with `gradients` with respect to what was cut off."""
         # The graph of the losses is gone by now; only its gradients remain.
         sources = [self._sources[name] for name in self.gradients]
         return _KnownGradients.apply(_sum(self.terms), tuple(self.gradients.values()), *sources)
@@ -222,17 +203,17 @@ class _KnownGradients(torch.autograd.Function):
     """(value, gradients, *sources) -> value; backward returns `gradients` for the sources."""
 
     @staticmethod
-    def forward(ctx: Any, value: Tensor, gradients: tuple[Tensor, ...], *sources: Tensor) -> Tensor:
+    def forward(ctx: Any, value: Tensor, gradients: Sequence[Tensor], *sources: Tensor) -> Tensor:
         ctx.save_for_backward(*gradients)
         return value.clone()
 
     @staticmethod
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *slopes: Tensor) -> Any:
         return None, None, *(slopes[0] * gradient for gradient in ctx.saved_tensors)
 
 
 def measure(rgb: Tensor, alpha: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean alpha, and the largest of the views' mean |rgb - background|; both 0-d.
+    """Return mean alpha, and the largest of the views' mean |rgb - background|; both 0-d.
 
     rgb: (B, V, 3, H, W). Means over a view's pixels: a stray splat must not count as life.
     """
@@ -244,7 +225,8 @@ def _slices(cameras: Cameras, step: int) -> list[slice]:
     return [slice(first, first + step) for first in range(0, cameras.shape[1], step)]
 
 
-def _trained(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def _trained(parameters: Mapping[str, Tensor], layer: LayerPrediction) -> dict[str, Tensor]:
+    tensors = {**parameters, **dict(named_tensors(layer))}
     return {name: tensor for name, tensor in tensors.items() if tensor.requires_grad}
 
 
@@ -254,4 +236,5 @@ def _sum(terms: Mapping[str, Tensor]) -> Tensor:
 
 def _add(terms: Mapping[str, Tensor], sums: dict[str, Tensor]) -> None:
     for name, term in terms.items():
-        sums[name] = sums.get(name, 0) + term.detach()
+        term = term.detach()
+        sums[name] = sums[name] + term if name in sums else term

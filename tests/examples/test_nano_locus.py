@@ -22,7 +22,7 @@ def nano(monkeypatch):
 def test_loss_and_gradients_are_the_frameworks(nano):
     """With weights that differ everywhere from where they start."""
     recipe = resolve("tiny/locus.yaml", ["model.renderer.type=qgs/torch"])
-    passes = TrainingPass.of(recipe, recipe.build_model()).train()
+    passes = TrainingPass(recipe, recipe.build_model()).train()
     model = passes.model
     with torch.no_grad():
         for parameter in passes.parameters():

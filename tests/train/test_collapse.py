@@ -7,7 +7,7 @@ from training_runs import run, run_calling, tiny
 import qgs
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.train.folder import RunFolder
-from qgs.train.guard import EMPTY_ALPHA, CollapseDetector, CollapseError, GoodWeights, not_finite
+from qgs.train.guard import EMPTY_ALPHA, CollapseError, GoodWeights, SignsOfLife, not_finite
 from qgs.train.training_pass import measure
 
 ALIVE = {"alpha": 0.5, "deviation": 0.3, "gradient": 0.1}
@@ -17,26 +17,25 @@ INVISIBLE = "model.head.opacity_bias=-20.0"
 
 
 def observed(*signs):
-    """A detector with a window of 10 steps, after steps with these signs of life."""
-    detector = CollapseDetector(10)
+    """The signs of life after steps with these numbers."""
+    found = SignsOfLife()
     for step in signs:
-        detector.observe(step)
-    return detector
+        found.observe(step)
+    return found
 
 
-def test_a_window_of_dead_steps_and_no_less_is_a_collapse():
+def test_steps_without_signs_of_life_are_counted():
     for dead, words in (
         (ALIVE | {"alpha": 1e-4}, "empty"),
         (ALIVE | {"gradient": 0.0}, "vanished"),
         (PLAIN, "equal the background"),
     ):
-        assert not observed(ALIVE, *[dead] * 9).dead_after(10)
-        detector = observed(ALIVE, *[dead] * 10)
-        assert detector.dead_after(11)
-        assert words in detector.symptom
+        found = observed(ALIVE, *[dead] * 10)
+        assert found.dead == 10
+        assert words in found.symptom
     # one living step, and plain images at the start
-    assert not observed(*[*[DEAD] * 9, ALIVE] * 5).dead_after(50)
-    assert not observed(*[PLAIN] * 50).dead_after(50)
+    assert observed(*[DEAD] * 9, ALIVE, DEAD).dead == 1
+    assert observed(*[PLAIN] * 50).dead == 0
 
 
 def test_a_stray_splat_is_no_sign_of_life():
@@ -59,17 +58,16 @@ def test_good_weights_are_the_older_of_two_copies_made_before_the_images_got_wor
             good.refresh(step)
     assert good.state()["steps"] == [50, 60]
     assert not good.due(61, 50)
-    assert good.step == 50
-    assert (good.tensors["weight"] == 50).all()
+    step, weights = good.last
+    assert step == 50
+    assert (weights["weight"] == 50).all()
 
 
 def test_what_is_not_finite_is_named():
-    module = torch.nn.Linear(2, 2)
-    assert not not_finite({"mse": 1.0, "gradient": 0.5}, module)
-    assert "mse is nan" in not_finite({"mse": float("nan"), "gradient": 0.5}, module)
-    module.weight.grad = torch.full((2, 2), torch.inf)
-    module.bias.grad = torch.zeros(2)
-    assert not_finite({"mse": 1.0, "gradient": float("inf")}, module).endswith("from weight")
+    perfect = float("inf")
+    assert not not_finite({"mse": 1.0, "gradient": 0.5, "psnr": perfect})
+    assert not_finite({"mse": float("nan"), "gradient": 0.5}) == "loss term mse is nan"
+    assert not_finite({"mse": 1.0, "gradient": float("inf")}) == "the gradient norm is inf"
 
 
 def test_gaussians_invisible_from_the_start_end_a_run_at_the_window_or_its_end(tmp_path):
@@ -101,8 +99,8 @@ def test_weights_that_are_not_finite_end_a_run_and_are_never_saved(tmp_path):
 
 def test_one_dead_step_at_the_end_fails_no_run(tmp_path, caplog):
     def die_at_the_end(trainer, stop):
-        if trainer.step == 3:
-            trainer.guard.detector.observe(DEAD)
+        if trainer.counters.step == 3:
+            trainer.guard.signs.observe(DEAD)
 
     result = run_calling(die_at_the_end, tiny("tokengs"), tmp_path)
     assert CheckpointFile(result.folder.checkpoint).step == 3

@@ -15,7 +15,6 @@ from training_runs import same, tiny
 import qgs
 from qgs.containers import named_tensors
 from qgs.data.stream import training_batches
-from qgs.domain import Domain
 from qgs.train.distributed import make_accelerator
 from qgs.train.folder import RunFolder, Saver
 from qgs.train.guard import Guard
@@ -34,7 +33,7 @@ class Step:
         recipe = tiny("tokengs", "training.render_views=1")
         self.config, self.accelerator = recipe.training, make_accelerator("cpu")
         self.model = recipe.build_model().train()
-        self.objective = TrainingPass.of(recipe, self.model)
+        self.objective = TrainingPass(recipe, self.model)
         self.gradients = partial(
             compute_gradients, self.accelerator, self.objective, recipe.training
         )
@@ -46,7 +45,7 @@ class Step:
         return first_bad_tensor(self.objective, lambda: self.gradients(self.batches))
 
     def guard(self, folder):
-        saver = Saver(self.accelerator, RunFolder(folder), self.model, Domain())
+        saver = Saver(self.accelerator, RunFolder(folder), self.model)
         return Guard(self.accelerator, self.objective, saver, self.config, self.gradients)
 
 

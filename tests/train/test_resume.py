@@ -67,8 +67,8 @@ def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
     def note(trainer, stop):
         loss = trainer.training_pass.losses["photometric"]
         seen.append((trainer.model.renderer.config.dilation, loss.config.ssim_weight))
-        if trainer.step == 1:
-            stop.signal = signal.SIGTERM  # the next step is the last
+        if trainer.counters.step == 2:
+            stop.signal = signal.SIGTERM
 
     stopped = run_calling(note, recipe, parts)
     assert (stopped.steps, stopped.stopped_by) == (2, "SIGTERM")

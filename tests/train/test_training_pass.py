@@ -67,7 +67,7 @@ def setting(renderer, *kinds, dtype=torch.float32):
     masks = (batch.targets.images.mean(2, keepdim=True) > 0.4).float()
     targets = replace(batch.targets, masks=masks)
     model = recipe.build_model().train().to(dtype)
-    return TrainingPass(model, losses), batch.inputs.to(dtype), targets.to(dtype)
+    return TrainingPass(recipe, model, losses), batch.inputs.to(dtype), targets.to(dtype)
 
 
 def written_out(objective, inputs, targets):
@@ -137,7 +137,7 @@ def test_gradients_of_two_passes_are_those_of_the_definition():
     """As one graph, in which the two passes and both comparisons stand written out."""
     recipe = tiny("locus", *TWO, "objective.alpha_weight=0.1", "objective.depth_weight=0.2")
     model, batch = recipe.build_model().train(), first_batch(recipe)
-    step = TrainingPass.of(recipe, model)
+    step = TrainingPass(recipe, model)
     total, seen = torch.zeros(()), []
     for views in ([0, 1, 3, 4], [0, 2, 4]):
         some = batch.inputs.select(views)
@@ -216,7 +216,7 @@ def test_input_views_are_judged_too():
     recipe = tiny("tokengs", "training.judge_inputs=true", "losses.visibility=null")
     model, batch = recipe.build_model().train(), first_batch(recipe)
     inputs, targets = batch.inputs, batch.targets.select([0])
-    step = TrainingPass.of(recipe, model)
+    step = TrainingPass(recipe, model)
     of_inputs, of_targets = (written_out(step, inputs, views) for views in (inputs, targets))
     wanted = {name: (2 * of_inputs[name] + term) / 3 for name, term in of_targets.items()}
     torch.testing.assert_close(step(inputs, targets).terms, wanted)

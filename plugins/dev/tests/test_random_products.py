@@ -122,7 +122,7 @@ def _train(recipe: Recipe) -> None:
     views = replace(views, depths=torch.ones_like(views.images[:, :, :1]))
     inputs = replace(views, times=times, target_time=times[:, :1])
     model = recipe.build_model()
-    outcome = TrainingPass.of(recipe, model.train())(inputs, views.select([1, 2]))
+    outcome = TrainingPass(recipe, model.train())(inputs, views.select([1, 2]))
     outcome.total.backward()
     assert outcome.total.isfinite()
     found = [x.grad for x in model.parameters() if x.grad is not None]

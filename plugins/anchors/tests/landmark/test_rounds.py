@@ -112,7 +112,7 @@ def test_training_supervises_every_round_it_draws_and_learns():
     """The total is that of the layers and of the ends of rounds, later ones weighing more."""
     recipe = resolve(RECIPE)
     model, given, ends = recipe.build_model().train(), views(side=16), set()
-    passes = TrainingPass.of(recipe, model)
+    passes = TrainingPass(recipe, model)
     for seed in range(3):
         torch.manual_seed(seed)
         outcome = passes(given, given)

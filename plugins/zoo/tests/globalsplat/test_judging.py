@@ -82,9 +82,9 @@ def test_both_are_judged_and_compared():
     recipe = resolve(TINY, [*small, "views.inputs=5", two])
     model = recipe.build_model()
     inputs = odd_views(5, 16, 24)
-    outcome = TrainingPass.of(recipe, model)(inputs, VIEWS)
+    outcome = TrainingPass(recipe, model)(inputs, VIEWS)
     parts = [inputs.select(part) for part in ([0, 1, 3, 4], [0, 2, 4])]
-    alone = TrainingPass.of(resolve(TINY, small), model)
+    alone = TrainingPass(resolve(TINY, small), model)
     one, other = (alone(part, VIEWS).terms for part in parts)
     wanted = {name: (one[name] + other[name]) / 2 for name in one}
     one, other = (model.render(model(part).gaussians, VIEWS.cameras) for part in parts)

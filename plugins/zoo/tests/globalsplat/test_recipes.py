@@ -80,7 +80,7 @@ def test_parts_of_other_models_stand_beside_it():
 def test_it_learns():
     """One batch by heart, with every loss."""
     recipe = resolve(TINY, [*SMALL, "losses.regularisers={type: globalsplat/regularisers}"])
-    judged = TrainingPass.of(recipe, recipe.build_model().train())
+    judged = TrainingPass(recipe, recipe.build_model().train())
     batch = first_batch(recipe)
     optimizer = torch.optim.AdamW(judged.parameters(), 3e-3)
     errors = []

@@ -122,7 +122,7 @@ def test_the_objective_judges_dynamic_gaussians_again(model):
     rendering = model.render(gaussians, TARGETS.cameras)
     layer = LayerPrediction(gaussians, model.queries(MEMORY, INPUTS))
     for weight in (0.5, 0.0):
-        objective = TrainingPass.of(small(f"objective.weight={weight}"), model)
+        objective = TrainingPass(small(f"objective.weight={weight}"), model)
         outcome = objective(INPUTS, TARGETS)
         losses = [loss(layer, rendering, TARGETS, INPUTS) for loss in objective.losses.values()]
         expected = weight * sum(value for terms in losses for value in terms.values())
@@ -131,7 +131,7 @@ def test_the_objective_judges_dynamic_gaussians_again(model):
 
 
 def test_no_loss_may_have_the_term_of_the_objective(model):
-    objective = TrainingPass.of(small(), model)
+    objective = TrainingPass(small(), model)
     loss = next(iter(objective.losses.values()))
     loss.forward = lambda *given: {"dynamic": given[0].gaussians.means.sum()}
     with pytest.raises(ValueError, match=r"losses have terms \['dynamic'\] already"):

@@ -92,7 +92,7 @@ def make_task(
     )
     if operation == "step":
         # A whole step as `qgs train` makes it, so that losses and renderer are in its time.
-        objective = TrainingPass.of(recipe, model.train()).to(workload.device)
+        objective = TrainingPass(recipe, model.train()).to(workload.device)
         factors = recipe.rate_factors(objective)
         optimizer = make_optimizer(objective, recipe.build_optimizer(), factors)
 

@@ -1,0 +1,120 @@
+"""How far a run is: steps, samples, time, and the samples that it left out."""
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from accelerate import Accelerator
+from torch import Tensor
+
+from qgs.contracts import TrainingConfig
+from qgs.data.samples import Batch
+from qgs.train.distributed import gathered, mean
+from qgs.train.folder import OtherRunError
+
+_log = logging.getLogger(__name__)
+
+
+class Counters:
+    """What a run has made so far, in all sessions.
+
+    step, samples, seconds: optimiser steps, samples over all processes, and time spent; a session's
+    clock starts after its first step, in which kernels compile. left_out: of this process, how
+    often a sample could not be made, by reason.
+    """
+
+    def __init__(self, accelerator: Accelerator, config: TrainingConfig, scenes: str) -> None:
+        """scenes: the `scenes_fingerprint` of the data."""
+        self.step = 0
+        self.samples = 0
+        self.seconds = 0.0
+        self.left_out = Counter[str]()
+        self._accelerator = accelerator
+        self._config = config
+        self._scenes = scenes
+        self._last_tick = 0.0
+
+    @property
+    def used(self) -> float:
+        """Fraction of the budget that is used, the larger of steps and seconds."""
+        of_seconds = self.seconds / self._config.seconds if self._config.seconds else 0.0
+        return max(self.step / self._config.steps, of_seconds)
+
+    def every(self, steps: int) -> bool:
+        """Whether this step is one of every `steps`; none is where that is 0."""
+        return bool(steps) and self.step % steps == 0
+
+    def read(self, measured: Mapping[str, Tensor]) -> dict[str, float]:
+        """Return the means of a step's numbers over processes, and read the clock.
+
+        The host waits for the device here, so the clock shows what the step took; its mean over
+        processes, so that all use up a budget of time together.
+        """
+        now = time.perf_counter()
+        spent = torch.tensor(now - (self._last_tick or now), device=self._accelerator.device)
+        self._last_tick = now
+        values = torch.stack([value.float() for value in (*measured.values(), spent)])
+        *numbers, seconds = mean(self._accelerator, values).tolist()
+        self.seconds += seconds
+        return dict(zip(measured, numbers, strict=True))
+
+    @contextmanager
+    def clock_stopped(self) -> Iterator[None]:
+        """Count no time in the block."""
+        started = time.perf_counter()
+        yield
+        # Shifted, not reset: the time since the last step still counts.
+        self._last_tick += time.perf_counter() - started
+
+    def finish_step(self, batches: Iterable[Batch]) -> None:
+        """Count a step with `batches`, and log each new reason why a sample is left out."""
+        self.step += 1
+        self.samples += self._config.batch_size
+        for batch in batches:
+            for reason in batch.left_out:
+                if reason not in self.left_out:
+                    _log.warning("a sample is left out: %s", reason)
+                self.left_out[reason] += 1
+
+    def all_left_out(self) -> dict[str, int]:
+        """Return the samples left out by all processes, which must all call this."""
+        return dict(sum(gathered(self._accelerator, self.left_out), Counter[str]()))
+
+    def state(self) -> dict[str, Any]:
+        """Return the counts, and what must not change for them to mean the same."""
+        return {
+            "step": self.step,
+            "samples": self.samples,
+            "seconds": self.seconds,
+            "left_out": self.all_left_out(),
+            "step_size": self._config.batch_size,
+            "scenes": self._scenes,
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Count on from `state`.
+
+        Raises OtherRunError unless steps see the same data in number and order as before.
+        """
+        # Sample k depends on its number alone, so equal step sizes give the same batches.
+        size = state["step_size"]
+        if size != self._config.batch_size:
+            raise OtherRunError(
+                f"the optimiser steps of this run see {size} samples, here they would see "
+                f"{self._config.batch_size}: add --set training.batch_size={size}"
+            )
+        if state["scenes"] != self._scenes:
+            raise OtherRunError(
+                "the data lists other training scenes than when this run was saved: bring back "
+                "what was added or removed, or start a new run"
+            )
+        self.step = state["step"]
+        self.samples = state["samples"]
+        self.seconds = state["seconds"]
+        # These are of all processes: one counts on.
+        if self._accelerator.is_main_process:
+            self.left_out = Counter(state["left_out"])
