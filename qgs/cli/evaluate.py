@@ -15,7 +15,6 @@ from qgs.cli import options
 from qgs.cli.options import Checkpoint, Device, Overrides, Threads, Tune
 
 if TYPE_CHECKING:
-    from qgs.domain import Domain
     from qgs.evaluate.results import Evaluation
     from qgs.model import QueryGaussianModel
     from qgs.recipe import Recipe
@@ -68,7 +67,7 @@ def evaluate(
         model.feedback.rounds = recipe.build_model("meta", pretrained=False).feedback.rounds
     own = Path(run).expanduser().exists()  # so that results may be written beside it
     folder = out or evaluation_folder(checkpoint, bool(settings), own)
-    evaluation = evaluate_into(model, recipe, step, folder, console, batch, model.trained_on)
+    evaluation = evaluate_into(model, recipe, step, folder, console, batch)
     averaged = RunFolder(checkpoint.parent).checkpoint_ema
     if checkpoint.name == "checkpoint.safetensors" and averaged.is_file():
         console.print(f"averaged weights: qgs eval {averaged}", soft_wrap=True, markup=False)
@@ -98,7 +97,6 @@ def evaluate_into(
     folder: Path,
     console: Console,
     batch: int = 1,
-    trained_on: Domain | None = None,
 ) -> Evaluation:
     """Evaluate `model` as `recipe` says, write the results into `folder` and show them."""
     from qgs.evaluate.evaluation import evaluate as judge
@@ -109,7 +107,7 @@ def evaluate_into(
         def observe(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        evaluation = judge(model, recipe, step, batch, observe, trained_on)
+        evaluation = judge(model, recipe, step, batch, observe)
     evaluation.write(folder)
     evaluation.show(console)
     console.print(f"written to {folder}", soft_wrap=True)

@@ -37,7 +37,6 @@ def train(
     \b
         torchrun --standalone --nproc-per-node=8 -m qgs train RECIPE --out RUN
     """
-    from qgs.checkpoint.model_file import CheckpointFile
     from qgs.evaluate.protocol import index_of
     from qgs.recipe import resolve
     from qgs.train.guard import TrainingError
@@ -67,11 +66,7 @@ def train(
         elif finished and (run.evaluation / "protocol.json").exists():  # the last file of one
             console.print(f"evaluated before, see {run.evaluation}")
         else:
-            with CheckpointFile(run.checkpoint) as file:
-                trained_on = file.domain
-            evaluate_into(
-                result.model, resolved, result.steps, run.evaluation, console, trained_on=trained_on
-            )
+            evaluate_into(result.model, resolved, result.steps, run.evaluation, console)
     if result.stopped_by:
         raise typer.Exit(128 + signal.Signals[result.stopped_by])
 

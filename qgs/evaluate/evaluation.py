@@ -1,14 +1,16 @@
 """Scores of a model on the test views of a recipe, and of two baselines without a model."""
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from itertools import groupby, islice
 from pathlib import Path
 
 import torch
 
-from qgs.contracts import Column, Metric, MetricInput, SceneSource, ViewSampler
+from qgs.contracts import Column, Metric, MetricInput, ViewSampler
 from qgs.data.samples import Sample, stack_views
 from qgs.domain import Domain, remedies, verdict
 from qgs.evaluate.plan import EvaluationPlan, SceneFailure, ViewsOf
@@ -33,7 +35,6 @@ def evaluate(
     step: int | None = None,
     batch: int = 1,
     observe: Callable[[int, int], None] | None = None,
-    trained_on: Domain | None = None,
     views_of: ViewsOf | None = None,
     sampler: ViewSampler | None = None,
 ) -> Evaluation:
@@ -41,30 +42,33 @@ def evaluate(
 
     A scene that fails is named in the result with the reason, and the others go on. Restores the
     model's mode. step: optimiser steps behind the weights. batch: scenes in one forward pass; with
-    tuning each passes alone. observe: called with (scenes done, all scenes). trained_on: the domain
-    of the model, empty where it is unknown; None leaves out the remark on it. views_of: see
+    tuning each passes alone. observe: called with (scenes done, all scenes). views_of: see
     `EvaluationPlan`. sampler: of views, by default the recipe's.
 
     Raises what opening the data source or the index and `Measures` raise, and ValueError when no
-    scene could be scored or `batch` is less than 1.
+    scene could be scored.
     """
-    if batch < 1:
-        raise ValueError(f"batch is how many scenes pass together, at least 1, got {batch}")
-    source, index = recipe.build_data(), index_of(recipe)
-    sampler = sampler or recipe.build_view_sampler()
+    index = index_of(recipe)
     measures = Measures(recipe)
-    # Depth maps cost as much as photos to decode.
-    choices = index, sampler, views_of, "true_depth" in measures.needed
-    plan = EvaluationPlan(source, recipe.views, recipe.evaluation, *choices)
+    plan = EvaluationPlan(
+        recipe.build_data(),
+        recipe.views,
+        recipe.evaluation,
+        index,
+        sampler or recipe.build_view_sampler(),
+        views_of,
+        # Depth maps cost as much as photos to decode.
+        depths="true_depth" in measures.needed,
+    )
     scorer = _Scorer(model, recipe, measures)
     training = model.training
     # Components draw random numbers in training mode only.
     model.eval()
     try:
-        scores, missing = _by_scene(plan.wanted, scorer.scores(plan.samples(), batch), observe)
+        scores, failures = _by_scene(scorer.scores(plan.samples(), batch), len(plan.wanted), observe)
     finally:
         model.train(training)
-    missing = [SceneFailure(f.scene, _without_folder(f.reason, recipe)) for f in missing]
+    missing = [SceneFailure(f.scene, _without_folder(f.reason, recipe)) for f in failures]
     if not scores:
         first = f"{missing[0].scene}: {missing[0].reason}"
         raise ValueError(f"none of {len(missing)} scenes could be judged; the first, {first}")
@@ -78,14 +82,14 @@ def evaluate(
         null=plan.null,
         unlisted=plan.unlisted,
         incomplete=measures.incomplete(scores),
-        held_out=None if index else _held_out(source, scores),
+        held_out=None if index else _held_out(plan, scores),
         step=step,
     )
     fixed = ["scale"] if recipe.views.scale == "search" else []
-    likeness = "" if trained_on is None else verdict(trained_on, scorer.seen, fixed)
+    likeness = verdict(model.trained_on, scorer.seen, fixed) if model.trained_on else ""
     own = recipe.tree["data"] == (model.recipe or {}).get("data")
     remedy = "train for longer" if own else remedies(("baseline", "depth"), fixed)
-    remarks = likeness, plan.framing, _worse(evaluation, remedy)
+    remarks = (likeness, plan.framing, _worse(evaluation, remedy))
     return replace(evaluation, remarks=[*filter(None, remarks)])
 
 
@@ -94,14 +98,14 @@ def _worse(evaluation: Evaluation, remedy: str) -> str:
     if not evaluation.columns or any(score.given for score in evaluation.scores):
         return ""
     name, column = next(iter(evaluation.columns.items()))
-    means = evaluation.mean(name), evaluation.mean(name, "nearest_input")
-    return worse_than_nearest(column, *means, remedy)
+    nearest = evaluation.mean(name, "nearest_input")
+    return worse_than_nearest(column, evaluation.mean(name), nearest, remedy)
 
 
 class Measures:
     """The metrics of a recipe. columns: name of every value to how it is shown.
 
-    Making one finds what is wrong with the metrics before anything is judged: raises ValueError
+    Making one finds what is wrong with the metrics before any scene is scored: raises ValueError
     when two values have one name, PluginError for the code of a plugin that fails.
     """
 
@@ -110,8 +114,8 @@ class Measures:
         # eval(): layers of a learned metric may differ in training.
         self.metrics = {name: metric.eval() for name, metric in recipe.build_metrics().items()}
         self.needed = {need for metric in self.metrics.values() for need in metric.needs}
-        self._owners: dict[str, Metric] = {}
         self.columns: dict[str, Column] = {}
+        self._owners: dict[str, Metric] = {}
         for label, metric in self.metrics.items():
             with self._named(label, "columns"):
                 columns = metric.columns()
@@ -119,10 +123,11 @@ class Measures:
                 name = _name(label, key)
                 if name in self.columns:
                     raise ValueError(f"two values of the metrics are called {name}; rename one")
-                self.columns[name], self._owners[name] = column, metric
+                self.columns[name] = column
+                self._owners[name] = metric
 
     def __call__(self, method: str, given: MetricInput) -> dict[str, float]:
-        """A sample's values by METHOD_NAME, without those that lack what they need."""
+        """Return a sample's values by METHOD_NAME, without those that lack what they need."""
         values: dict[str, float] = {}
         for label, metric in self.metrics.items():
             # A baseline has no Gaussians and no depth: it has a dash in that column.
@@ -131,13 +136,9 @@ class Measures:
             with self._named(label, "forward"):
                 found = metric(given)
                 found = found if isinstance(found, Mapping) else {"": found}
-                if found.keys() != metric.columns().keys():
-                    raise ValueError(
-                        f"gives values for {[*found]}, but has columns for {[*metric.columns()]}"
-                    )
-                # float64, so that the mean adds no rounding of its own.
-                means = {key: float(value.double().mean()) for key, value in found.items()}
-            values |= {f"{method}_{_name(label, key)}": mean for key, mean in means.items()}
+                for key in metric.columns():
+                    # float64, so that the mean adds no rounding of its own.
+                    values[f"{method}_{_name(label, key)}"] = float(found[key].double().mean())
         return values
 
     @contextmanager
@@ -152,7 +153,7 @@ class Measures:
             raise component_failure(chosen.type, function, error, chosen.installed) from error
 
     def incomplete(self, scores: Sequence[SceneScore]) -> dict[str, str]:
-        """Why values are missing from `scores`, by name."""
+        """Return why values are missing from `scores`, by name."""
         found: dict[str, str] = {}
         for name, metric in self._owners.items():
             if metric.unavailable:
@@ -163,44 +164,45 @@ class Measures:
         return found
 
 
+def _name(metric: str, key: str) -> str:
+    return f"{metric}_{key}" if key else metric
+
+
 class _Scorer:
     """Scores samples; `seen` are their cameras, `gaussians` the most Gaussians of a scene."""
 
     def __init__(self, model: QueryGaussianModel, recipe: Recipe, measures: Measures) -> None:
+        self.seen = Domain()
+        self.gaussians = 0
         self._model = model
         self._device = next(model.parameters()).device
         self._measures = measures
-        self.seen = Domain()
-        self.gaussians = 0
+        self._tune = tuner(model, recipe) if recipe.evaluation.tuning_steps else None
         for metric in measures.metrics.values():
             metric.to(self._device)
-        self._tune = None
-        if recipe.evaluation.tuning_steps:
-            self._tune = tuner(model, recipe)
 
     def scores(
         self, samples: Iterable[Sample | SceneFailure], batch: int
     ) -> Iterator[SceneScore | SceneFailure]:
-        """The score of every sample, up to `batch` with inputs of one shape at a time."""
-        waiting: list[Sample] = []
-        for sample in samples:
-            # In their order: a failed scene is reported where it would have been judged.
-            if isinstance(sample, SceneFailure):
-                yield sample
-                continue
-            shapes = {s.inputs.images.shape for s in (*waiting, sample)}
-            # Scenes with other numbers of views cannot be stacked.
-            if len(waiting) == batch or len(shapes) > 1:
-                yield from self._together(waiting)
-                waiting = []
-            waiting.append(sample)
-        yield from self._together(waiting)
+        """Score every sample, up to `batch` with inputs of one shape at a time."""
+
+        # Scenes with other numbers of views cannot be stacked. Failures keep their place: a failed
+        # scene is reported where it would have been scored.
+        def shape(sample: Sample | SceneFailure) -> torch.Size | None:
+            return sample.inputs.images.shape if isinstance(sample, Sample) else None
+
+        for _, alike in groupby(samples, shape):
+            while some := list(islice(alike, batch)):
+                ready = [sample for sample in some if isinstance(sample, Sample)]
+                yield from self._together(ready)
+                yield from (failure for failure in some if isinstance(failure, SceneFailure))
 
     @torch.no_grad()
-    def _together(self, samples: Sequence[Sample]) -> list[SceneScore | SceneFailure]:
+    def _together(self, samples: Sequence[Sample]) -> Iterable[SceneScore | SceneFailure]:
         # Tuning changes the state of one scene, so tuned scenes run one by one.
         if len(samples) > 1 and not self._tune:
-            with suppress(Exception):  # then each runs by itself, to find the one that fails
+            # If it fails, each runs by itself, to find the one that fails.
+            with suppress(Exception):
                 inputs = stack_views([sample.inputs for sample in samples]).to(self._device)
                 gaussians = self._model(inputs).gaussians
                 return [self._score(s, gaussians[i : i + 1]) for i, s in enumerate(samples)]
@@ -209,7 +211,7 @@ class _Scorer:
     def _score(
         self, sample: Sample, gaussians: Gaussians | None = None
     ) -> SceneScore | SceneFailure:
-        values: dict[str, float] = {}
+        tuned: dict[str, float] = {}
         try:
             # Seen before the model runs: a failing scene counts among the cameras too.
             self.seen.see(sample.inputs.cameras, sample.targets.cameras)
@@ -217,9 +219,10 @@ class _Scorer:
             if self._tune:
                 tuning = self._tune(inputs)
                 gaussians = tuning.prediction.gaussians
-                values = dict(zip(TUNING, (tuning.losses[0], tuning.losses[-1]), strict=True))
-            found: Gaussians = gaussians or self._model(inputs).gaussians
-            values = {**self._values(sample, inputs, found), **values}
+                tuned = dict(zip(TUNING, (tuning.losses[0], tuning.losses[-1]), strict=True))
+            if gaussians is None:
+                gaussians = self._model(inputs).gaussians
+            values = self._values(sample, inputs, gaussians) | tuned
         except Exception as error:  # reported in the result; the other scenes go on
             return SceneFailure(sample.scene, one_line(error))
         # One NaN would spoil every mean over scenes.
@@ -233,65 +236,67 @@ class _Scorer:
         targets = sample.targets.to(self._device)
         self.gaussians = max(self.gaussians, gaussians.count)
         rendering = self._model.render(gaussians, targets.cameras)
-        count = self._model.head.gaussians_per_query
-        given = {
-            "model": MetricInput(
-                rendering.rgb, targets, gaussians, count, rendering.depth, true_depth=targets.depths
-            ),
-            **{n: MetricInput(f(inputs, targets.cameras), targets) for n, f in BASELINES.items()},
-        }
-        values: dict[str, float] = {}
-        for method, shown in given.items():
-            values |= self._measures(method, shown)
+        shown = MetricInput(
+            rendering.rgb,
+            targets,
+            gaussians=gaussians,
+            gaussians_per_query=self._model.head.gaussians_per_query,
+            depth=rendering.depth,
+            true_depth=targets.depths,
+        )
+        values = self._measures("model", shown)
+        for name, baseline in BASELINES.items():
+            values |= self._measures(name, MetricInput(baseline(inputs, targets.cameras), targets))
         values["gaussians_used"] = float((gaussians.opacities > OPACITY_USED).sum())
         return values
 
 
-def _name(metric: str, key: str) -> str:
-    return f"{metric}_{key}" if key else metric
-
-
 def _by_scene(
-    wanted: Sequence[str],
     results: Iterable[SceneScore | SceneFailure],
+    count: int,
     observe: Callable[[int, int], None] | None,
 ) -> tuple[list[SceneScore], list[SceneFailure]]:
-    """Scores and failures in the order of `wanted`; one failed sample fails its scene."""
-    samples: dict[str, list[SceneScore]] = {}
+    """Gather the results of samples by scene, of `count`; one failed sample fails its scene."""
+    samples = defaultdict[str, list[SceneScore]](list)
     failures: dict[str, SceneFailure] = {}
     for result in results:
         if isinstance(result, SceneFailure):
             failures.setdefault(result.scene, result)
         else:
-            samples.setdefault(result.scene, []).append(result)
+            samples[result.scene].append(result)
         if observe:
-            observe(len(samples.keys() | failures.keys()), len(wanted))
-    scores = []
-    for name in (name for name in wanted if name in samples and name not in failures):
-        found = [sample.values for sample in samples[name]]
-        # A value that one sample lacks would be a mean over other samples.
-        common = [key for key in found[0] if all(key in values for values in found)]
-        means = {key: sum(values[key] for values in found) / len(found) for key in common}
-        views = [frames for sample in samples[name] for frames in sample.views]
-        names = {frame: n for sample in samples[name] for frame, n in sample.names.items()}
-        scores.append(SceneScore(name, views, means, names))
-    return scores, [failures[name] for name in wanted if name in failures]
+            observe(len(samples.keys() | failures.keys()), count)
+    scores = [_mean(found) for scene, found in samples.items() if scene not in failures]
+    return scores, list(failures.values())
 
 
-def _held_out(source: SceneSource, scores: Sequence[SceneScore]) -> tuple[int, int] | None:
-    """Held-out frames that were targets, and all of them, over the scenes that were judged."""
-    judged = {score.scene: {f for _, targets in score.views for f in targets} for score in scores}
-    scenes, names = source.scenes("test"), enumerate(source.names("test"))
-    held_out = {name: set(scenes[place].held_out) for place, name in names if name in judged}
-    count = sum(len(judged[name] & frames) for name, frames in held_out.items())
-    total = sum(map(len, held_out.values()))
+def _mean(samples: Sequence[SceneScore]) -> SceneScore:
+    """Return the score of a scene from those of its samples."""
+    found = [sample.values for sample in samples]
+    # A value that one sample lacks would be a mean over other samples.
+    common = [key for key in found[0] if all(key in values for values in found)]
+    means = {key: sum(values[key] for values in found) / len(found) for key in common}
+    views = [frames for sample in samples for frames in sample.views]
+    names = {frame: name for sample in samples for frame, name in sample.names.items()}
+    return SceneScore(samples[0].scene, views, means, names)
+
+
+def _held_out(plan: EvaluationPlan, scores: Sequence[SceneScore]) -> tuple[int, int] | None:
+    """Held-out frames that were targets, and all of them, over the scenes with a score."""
+    count = 0
+    total = 0
+    for score in scores:
+        held_out = plan.held_out[score.scene]
+        total += len(held_out)
+        targets = {frame for _, frames in score.views for frame in frames}
+        count += len(held_out & targets)
     return (count, total) if total else None
 
 
 def _without_folder(reason: str, recipe: Recipe) -> str:
     """`reason` with paths relative to the data's folder, so that results do not depend on it."""
     path = recipe.tree["data"].get("path")
-    folders = [path, str(Path(path).expanduser().resolve())] if isinstance(path, str) else []
-    for folder in folders:
-        reason = reason.replace(folder.rstrip("/") + "/", "")
+    if isinstance(path, str):
+        for folder in (path, str(Path(path).expanduser().resolve())):
+            reason = reason.replace(folder.rstrip("/") + "/", "")
     return reason

@@ -88,8 +88,9 @@ class EvaluationPlan:
     frames of the span, or of one time. Targets of T times are T samples. views_of: makes the
     settings of a sample, such as its scale. depths: targets have true depth where scenes do.
 
-    wanted, null, unlisted: see `qgs.evaluate.results.Evaluation`. framing: of the first photo,
-    once `samples` has run. Raises ValueError without scenes.
+    wanted, null, unlisted: see `qgs.evaluate.results.Evaluation`. framing: of the first photo;
+    held_out: held-out frames by scene; both once `samples` has run. Raises ValueError without
+    scenes.
     """
 
     def __init__(
@@ -103,10 +104,13 @@ class EvaluationPlan:
         depths: bool = False,
     ) -> None:
         self.framing: str | None = None
+        self.held_out: dict[str, set[int]] = {}
         self._scenes = source.scenes("test")
         if not len(self._scenes):
             raise ValueError(f"the data source {type(source).name!r} has no test scenes")
-        self._views, self._evaluation, self._index = views, evaluation, index
+        self._views = views
+        self._evaluation = evaluation
+        self._index = index
         self._views_of = views_of or (lambda *window: views)
         self._depths = depths
         self._sampler = sampler or Span(Span.Config())
@@ -125,6 +129,7 @@ class EvaluationPlan:
                     raise ValueError("not among the test scenes of the data")
                 place = self._places[name]
                 scene = self._scenes[place]
+                self.held_out[name] = set(scene.held_out)
                 # a generator for each scene: a failing one changes no noise of the others
                 noise = np.random.default_rng([self._evaluation.seed, place])
                 for inputs, targets in self._choices(scene, place):

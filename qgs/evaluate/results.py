@@ -4,7 +4,7 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from qgs.evaluate.protocol import Protocol
 from qgs.files import write_text
 from qgs.metrics.baselines import BASELINES
 from qgs.metrics.dispersion import OPACITY_USED
-from qgs.wording import listed, numbered
+from qgs.wording import counted, listed, numbered
 
 METHODS = ("model", *BASELINES)
 TUNING = ("tuning_loss_before", "tuning_loss_after")
@@ -49,10 +49,21 @@ class SceneScore:
     names: Mapping[int, str] = field(default_factory=dict)
 
     @property
-    def given(self) -> tuple[int, ...]:
+    def given(self) -> list[int]:
         """Frames that one of the samples has as input and as target."""
         both = [given_targets(*frames) for frames in self.views]
-        return tuple(sorted({frame for frames in both for frame in frames}))
+        return sorted(set().union(*both))
+
+    def cells(self, named: bool) -> dict[str, str | float]:
+        """Return what scenes.csv says of it, by column; named: with the names of its frames."""
+        cells: dict[str, str | float] = {}
+        for place, column in enumerate(FRAME_COLUMNS[1:]):
+            sides = [[str(frame) for frame in frames[place]] for frames in self.views]
+            cells[column] = "; ".join(map(" ".join, sides))
+        for place, column in enumerate(NAME_COLUMNS if named else ()):
+            sides = [[self.names.get(f, str(f)) for f in frames[place]] for frames in self.views]
+            cells[column] = "; ".join(map(", ".join, sides))
+        return {**cells, **self.values}
 
 
 @dataclass(frozen=True)
@@ -82,33 +93,40 @@ class Evaluation:
     remarks: Sequence[str] = ()
 
     def mean(self, metric: str, method: str = "model") -> float | None:
-        """Mean over scenes of one of `columns`, each scene once; None if none has this value."""
+        """Return the mean over scenes of one of `columns`; None if none has this value."""
         values = self._values(f"{method}_{metric}")
         return sum(values) / len(values) if values else None
 
     def means(self, method: str = "model") -> dict[str, float | None]:
-        """`mean` of all `columns`."""
+        """Return the `mean` of all `columns`."""
         return {name: self.mean(name, method) for name in self.columns}
 
     @property
     def statement(self) -> str:
         """The model's first value, usually PSNR, and over how many scenes, in one line."""
         line = f"over {self._of_wanted(len(self.scores))} scene{'s' * (len(self.wanted) != 1)}"
-        if known := [name for name, value in self.means().items() if value is not None]:
-            column = self.columns[known[0]]
-            line = f"{column.heading} {column.shown(self.mean(known[0]))} {line}"
+        for name, value in self.means().items():
+            if value is not None:
+                column = self.columns[name]
+                line = f"{column.heading} {column.shown(value)} {line}"
+                break
         missing = listed([failure.scene for failure in self.missing])
         return f"{line}; missing: {missing}" if missing else line
 
     def summary(self) -> dict[str, Any]:
-        """Everything but the scores of single scenes, as plain values for JSON.
+        """Return everything but the scores of single scenes, as plain values for JSON.
 
         over_scenes: of each value of the model the mean, variance and median over scenes.
         """
+        protocol = self.protocol
         values = {name: self._values(f"model_{name}") for name in self.columns}
-        used, p = spread(self._values("gaussians_used")), self.protocol
+        used = spread(self._values("gaussians_used"))
         return {
-            "protocol": {"name": p.name, "sha256": p.sha256, "settings": p.settings()},
+            "protocol": {
+                "name": protocol.name,
+                "sha256": protocol.sha256,
+                "settings": protocol.settings(),
+            },
             "step": self.step,
             "statement": self.statement,
             "scenes": len(self.scores),
@@ -117,7 +135,7 @@ class Evaluation:
             "missing": {failure.scene: failure.reason for failure in self.missing},
             "null_entries": list(self.null),
             "not_in_index": list(self.unlisted),
-            "context_and_target": {s.scene: list(s.given) for s in self.scores if s.given},
+            "context_and_target": {s.scene: s.given for s in self.scores if s.given},
             "columns": {name: asdict(column) for name, column in self.columns.items()},
             **{method: self.means(method) for method in METHODS},
             "incomplete": dict(self.incomplete),
@@ -134,12 +152,16 @@ class Evaluation:
 
         protocol.json is `Protocol.canonical`: its SHA-256 is the protocol's hash.
         """
-        folder = Path(folder)
-        write_text(folder / "scenes.csv", self._csv())
-        write_text(folder / "summary.json", as_json(self.summary()))
         table = f"{markdown_table(self._rows())}\n\n{bullets(self._notes())}\n"
-        write_text(folder / "table.md", table)
-        write_text(folder / "protocol.json", self.protocol.canonical)
+        files = {
+            "scenes.csv": self._csv(),
+            "summary.json": as_json(self.summary()),
+            "table.md": table,
+            # Last: `qgs train --resume` takes it as the sign of a whole evaluation.
+            "protocol.json": self.protocol.canonical,
+        }
+        for name, text in files.items():
+            write_text(Path(folder, name), text)
 
     def show(self, console: Console) -> None:
         """Print the table and the notes of table.md."""
@@ -157,58 +179,51 @@ class Evaluation:
         settings = self.protocol.content["tuning"]
         if settings is None:
             return None
-        before, after = (sum(self._values(name)) / len(self.scores) for name in TUNING)
-        return {**settings, "loss_before": before, "loss_after": after}
+        losses = (spread(self._values(name))["mean"] for name in TUNING)
+        return {**settings, **dict(zip(("loss_before", "loss_after"), losses, strict=True))}
 
     def _rows(self) -> list[list[str]]:
-        """Means of all methods, then the model's variance and median over scenes."""
+        """Return the means of all methods, then the model's variance and median over scenes."""
         judged = self._of_wanted(len(self.scores))
         rows = [["method", *(column.title for column in self.columns.values()), "scenes"]]
         for method in METHODS:
             cells = [self.columns[name].shown(v) for name, v in self.means(method).items()]
             rows.append([method.replace("_", " "), *cells, judged])
-        found = {name: self._values(f"model_{name}") for name in self.columns}
         for kind in ("variance", "median"):
-            cells = [column.shown(None) for column in self.columns.values()]
-            for place, (name, values) in enumerate(found.items()):
-                if values:
-                    digits = self.columns[name].digits + (kind == "variance")
-                    cells[place] = f"{spread(values)[kind]:.{digits}f}"
+            cells = []
+            for name, column in self.columns.items():
+                values = self._values(f"model_{name}")
+                # A variance is small beside the values: one digit more.
+                finer = replace(column, digits=column.digits + (kind == "variance"))
+                cells.append(finer.shown(spread(values)[kind] if values else None))
             rows.append([f"model, {kind}", *cells, judged])
         return rows
 
     def _csv(self) -> str:
-        judged = {score.scene: score for score in self.scores}
         reasons = {failure.scene: failure.reason for failure in self.missing}
-        columns = list(dict.fromkeys(name for score in self.scores for name in score.values))
+        named = any(score.names for score in self.scores)
+        judged = {score.scene: score.cells(named) for score in self.scores}
+        columns = dict.fromkeys(column for cells in judged.values() for column in cells)
         text = io.StringIO()
-        named = NAME_COLUMNS if any(score.names for score in self.scores) else ()
-        fields = [*FRAME_COLUMNS, *named, *columns, "problem"]
-        writer = csv.DictWriter(text, fields, lineterminator="\n")
+        writer = csv.DictWriter(text, ["scene", *columns, "problem"], lineterminator="\n")
         writer.writeheader()
         # Every wanted scene has a row, so that a missing one shows in the file.
         for name in self.wanted:
-            row: dict[str, Any] = {"scene": name, "problem": reasons.get(name, "")}
-            if score := judged.get(name):
-                sides = [*zip(*score.views, strict=True)]
-                for key, side in zip(FRAME_COLUMNS[1:], sides, strict=True):
-                    row[key] = "; ".join(" ".join(map(str, frames)) for frames in side)
-                for key, side in zip(named, sides, strict=bool(named)):
-                    names = ([score.names.get(f, str(f)) for f in frames] for frames in side)
-                    row[key] = "; ".join(", ".join(frames) for frames in names)
-                row |= score.values
-            writer.writerow(row)
+            row = {"scene": name, "problem": reasons.get(name, "")}
+            writer.writerow(row | judged.get(name, {}))
         return text.getvalue()
 
     def _notes(self) -> Iterator[str]:
+        """Yield what table.md says below the table, a line each."""
         yield self.statement
-        protocol, poses = self.protocol, self.protocol.content["poses"]
-        height, width = protocol.content["image_size"]
+        content = self.protocol.content
+        height, width = content["image_size"]
         counts = sorted({len(inputs) for score in self.scores for inputs, _ in score.views})
+        poses = content["poses"]
         yield (
-            f"protocol {protocol.name}, sha256 {protocol.sha256}: {' or '.join(map(str, counts))} "
-            f"input views of {width} x {height} pixels, poses {poses['frame']}, scale "
-            f"{poses['scale']} {poses.get('scale_factor', '')}".rstrip()
+            f"protocol {self.protocol.name}, sha256 {self.protocol.sha256}: "
+            f"{' or '.join(map(str, counts))} input views of {width} x {height} pixels, poses "
+            f"{poses['frame']}, scale {poses['scale']} {poses.get('scale_factor', '')}".rstrip()
         )
         yield from (f"missing {f.scene}: {f.reason}" for f in self.missing[:10])
         if more := self.missing[10:]:
@@ -223,7 +238,7 @@ class Evaluation:
                 for s in given
             ]
             yield (
-                f"{len(given)} scene{'s' if len(given) > 1 else ''} with {GIVEN}, on which the "
+                f"{counted(len(given), 'scene')} with {GIVEN}, on which the "
                 f"nearest input view is perfect: {listed(named)}"
             )
         for name, why in self.incomplete.items():

@@ -104,7 +104,6 @@ def _train_and_evaluate(folder: Path, run: "Run", evaluations: list[str], device
     """Do what `run` lacks. Raises whatever training and evaluating raise."""
     from rich.console import Console
 
-    from qgs.checkpoint.model_file import CheckpointFile
     from qgs.evaluate.evaluation import evaluate
     from qgs.recipe import Recipe, resolve
     from qgs.train.training import train
@@ -120,13 +119,9 @@ def _train_and_evaluate(folder: Path, run: "Run", evaluations: list[str], device
     # It has saved, and the next call goes on from there.
     if result.stopped_by:
         return Outcome.STOPPED
-    with CheckpointFile(result.folder.checkpoint) as file:
-        trained_on = file.domain
     for name in evaluations:
         if not run.evaluated(name):
-            evaluation = evaluate(
-                result.model, recipe_of(name), result.steps, trained_on=trained_on
-            )
+            evaluation = evaluate(result.model, recipe_of(name), result.steps)
             evaluation.write(run.evaluation(name))
             console.print(f"{name or 'evaluation'}: {evaluation.statement}", highlight=False)
     return Outcome.DONE
