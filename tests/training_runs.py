@@ -56,7 +56,7 @@ def run_calling(after_step, recipe, folder, resume=False):
     stop = StopRequest()
 
     class Calling(TrainingProgress):
-        def update(self, *_):
+        def show(self, *_):
             after_step(trainer, stop)
 
     with closing(Trainer(recipe, folder, resume=resume)) as trainer:

@@ -5,6 +5,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -19,6 +20,7 @@ from qgs.train.folder import OtherRunError
 _log = logging.getLogger(__name__)
 
 
+@dataclass
 class Counters:
     """What a run has made so far, in all sessions.
 
@@ -27,22 +29,21 @@ class Counters:
     often a sample could not be made, by reason.
     """
 
-    def __init__(self, accelerator: Accelerator, config: TrainingConfig, scenes: str) -> None:
-        """scenes: the `scenes_fingerprint` of the data."""
-        self.step = 0
-        self.samples = 0
-        self.seconds = 0.0
-        self.left_out = Counter[str]()
-        self._accelerator = accelerator
-        self._config = config
-        self._scenes = scenes
-        self._last_tick = 0.0
+    accelerator: Accelerator
+    config: TrainingConfig
+    scenes: str
+    """The `scenes_fingerprint` of the data."""
+    step: int = 0
+    samples: int = 0
+    seconds: float = 0.0
+    left_out: Counter[str] = field(default_factory=Counter)
+    last_tick: float = 0.0
 
     @property
     def used(self) -> float:
         """Fraction of the budget that is used, the larger of steps and seconds."""
-        of_seconds = self.seconds / self._config.seconds if self._config.seconds else 0.0
-        return max(self.step / self._config.steps, of_seconds)
+        of_seconds = self.seconds / self.config.seconds if self.config.seconds else 0.0
+        return max(self.step / self.config.steps, of_seconds)
 
     def every(self, steps: int) -> bool:
         """Whether this step is one of every `steps`; none is where that is 0."""
@@ -55,10 +56,10 @@ class Counters:
         processes, so that all use up a budget of time together.
         """
         now = time.perf_counter()
-        spent = torch.tensor(now - (self._last_tick or now), device=self._accelerator.device)
-        self._last_tick = now
+        spent = torch.tensor(now - (self.last_tick or now), device=self.accelerator.device)
+        self.last_tick = now
         values = torch.stack([value.float() for value in (*measured.values(), spent)])
-        *numbers, seconds = mean(self._accelerator, values).tolist()
+        *numbers, seconds = mean(self.accelerator, values).tolist()
         self.seconds += seconds
         return dict(zip(measured, numbers, strict=True))
 
@@ -68,12 +69,12 @@ class Counters:
         started = time.perf_counter()
         yield
         # Shifted, not reset: the time since the last step still counts.
-        self._last_tick += time.perf_counter() - started
+        self.last_tick += time.perf_counter() - started
 
     def finish_step(self, batches: Iterable[Batch]) -> None:
         """Count a step with `batches`, and log each new reason why a sample is left out."""
         self.step += 1
-        self.samples += self._config.batch_size
+        self.samples += self.config.batch_size
         for batch in batches:
             for reason in batch.left_out:
                 if reason not in self.left_out:
@@ -82,7 +83,7 @@ class Counters:
 
     def all_left_out(self) -> dict[str, int]:
         """Return the samples left out by all processes, which must all call this."""
-        return dict(sum(gathered(self._accelerator, self.left_out), Counter[str]()))
+        return dict(sum(gathered(self.accelerator, self.left_out), Counter[str]()))
 
     def state(self) -> dict[str, Any]:
         """Return the counts, and what must not change for them to mean the same."""
@@ -91,8 +92,8 @@ class Counters:
             "samples": self.samples,
             "seconds": self.seconds,
             "left_out": self.all_left_out(),
-            "step_size": self._config.batch_size,
-            "scenes": self._scenes,
+            "step_size": self.config.batch_size,
+            "scenes": self.scenes,
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
@@ -102,12 +103,12 @@ class Counters:
         """
         # Sample k depends on its number alone, so equal step sizes give the same batches.
         size = state["step_size"]
-        if size != self._config.batch_size:
+        if size != self.config.batch_size:
             raise OtherRunError(
                 f"the optimiser steps of this run see {size} samples, here they would see "
-                f"{self._config.batch_size}: add --set training.batch_size={size}"
+                f"{self.config.batch_size}: add --set training.batch_size={size}"
             )
-        if state["scenes"] != self._scenes:
+        if state["scenes"] != self.scenes:
             raise OtherRunError(
                 "the data lists other training scenes than when this run was saved: bring back "
                 "what was added or removed, or start a new run"
@@ -116,5 +117,5 @@ class Counters:
         self.samples = state["samples"]
         self.seconds = state["seconds"]
         # These are of all processes: one counts on.
-        if self._accelerator.is_main_process:
+        if self.accelerator.is_main_process:
             self.left_out = Counter(state["left_out"])

@@ -68,11 +68,11 @@ def gathered(accelerator: Accelerator, own: Any) -> list[Any]:
     return gather_object([own]) if accelerator.num_processes > 1 else [own]
 
 
+@dataclass
 class RandomStates:
     """The generators of Python, NumPy and torch, of every process by its rank."""
 
-    def __init__(self, accelerator: Accelerator) -> None:
-        self._accelerator = accelerator
+    accelerator: Accelerator
 
     def state(self) -> dict[str, Any]:
         """Return tensors and JSON values; all processes must call this."""
@@ -83,14 +83,14 @@ class RandomStates:
             "numpy": [kind, np.asarray(twister).tolist(), *rest],
             "torch": torch.get_rng_state(),
         }
-        if self._accelerator.device.type == "cuda":
-            own["cuda"] = torch.cuda.get_rng_state(self._accelerator.device)
-        ranks = enumerate(gathered(self._accelerator, own))
+        if self.accelerator.device.type == "cuda":
+            own["cuda"] = torch.cuda.get_rng_state(self.accelerator.device)
+        ranks = enumerate(gathered(self.accelerator, own))
         return {f"{rank}/{key}": value for rank, found in ranks for key, value in found.items()}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore this process's generators; a rank that `state` lacks keeps its own."""
-        prefix = f"{self._accelerator.process_index}/"
+        prefix = f"{self.accelerator.process_index}/"
         own = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
         if not own:
             return
@@ -98,7 +98,7 @@ class RandomStates:
         random.setstate((version, tuple(words), gauss))
         np.random.set_state(own["numpy"])
         torch.set_rng_state(own["torch"])
-        device = self._accelerator.device
+        device = self.accelerator.device
         if device.type == "cuda" and "cuda" in own:
             torch.cuda.set_rng_state(own["cuda"], device)
 

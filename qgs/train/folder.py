@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
@@ -156,6 +157,7 @@ class Stateful(Protocol):
         ...
 
 
+@dataclass
 class Saver:
     """Writes the checkpoint and the state of a run; of several processes, the main one writes.
 
@@ -163,19 +165,16 @@ class Saver:
     Each file appears whole or not at all. All processes must call each method together.
     """
 
-    def __init__(
-        self, accelerator: Accelerator, folder: RunFolder, model: QueryGaussianModel
-    ) -> None:
-        self._accelerator = accelerator
-        self.folder = folder
-        self.model = model
-        self.parts: dict[str, Stateful] = {}
+    accelerator: Accelerator
+    folder: RunFolder
+    model: QueryGaussianModel
+    parts: dict[str, Stateful] = field(default_factory=dict)
 
     def save(self, step: int, state_only: bool = False) -> None:
         """Save the run after `step` optimiser steps; `state_only` leaves the checkpoints."""
         parts: dict[str, State] = {"weights": unique_tensors(self.model)}
         parts |= {name: part.state() for name, part in self.parts.items()}
-        if self._accelerator.is_main_process:
+        if self.accelerator.is_main_process:
             if not state_only:
                 # A kill between the files must not leave a checkpoint that cannot go on.
                 if not self.folder.state.exists():
@@ -185,13 +184,13 @@ class Saver:
                     self._write_checkpoint(self.folder.checkpoint_ema, step, parts["ema"])
             # Last: complete by itself, and never ahead of the weights.
             self._write_state(parts)
-        self._accelerator.wait_for_everyone()
+        self.accelerator.wait_for_everyone()
 
     def save_checkpoint(self, step: int, weights: Mapping[str, Tensor]) -> None:
         """Save a checkpoint of other weights than the present ones."""
-        if self._accelerator.is_main_process:
+        if self.accelerator.is_main_process:
             self._write_checkpoint(self.folder.checkpoint, step, weights)
-        self._accelerator.wait_for_everyone()
+        self.accelerator.wait_for_everyone()
 
     def restore(self, parts: Mapping[str, State]) -> None:
         """Bring every part back to its state in `parts`; raises CheckpointError."""

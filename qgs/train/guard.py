@@ -91,32 +91,28 @@ class OutOfMemoryError(TrainingError):
     """A step found no memory; the message says what is kept and what takes less."""
 
 
+@dataclass
 class Guard:
     """Stops a run that is dead or not finite, and sees that good weights are kept.
 
     All processes must call each of its methods together; `step` counts finished optimiser steps.
 
+    training_pass: not wrapped by accelerate. repeat: computes the gradients of a step again.
     incidents: steps that were not finite. skipped: how many of them came last, without a good one.
     """
 
-    def __init__(
-        self,
-        accelerator: Accelerator,
-        training_pass: TrainingPass,
-        saver: Saver,
-        config: TrainingConfig,
-        repeat: Callable[[Sequence[Batch]], Any],
-    ) -> None:
-        """training_pass: not wrapped by accelerate. repeat: computes the gradients again."""
+    accelerator: Accelerator
+    training_pass: TrainingPass
+    saver: Saver
+    config: TrainingConfig
+    repeat: Callable[[Sequence[Batch]], Any]
+    incidents: int = 0
+    skipped: int = 0
+
+    def __post_init__(self) -> None:
         self.signs = SignsOfLife()
-        self.good = GoodWeights(training_pass.model, keep=accelerator.is_main_process)
-        self.incidents = 0
-        self.skipped = 0
-        self._accelerator = accelerator
-        self._training_pass = training_pass
-        self._saver = saver
-        self._config = config
-        self._repeat = repeat
+        keep = self.accelerator.is_main_process
+        self.good = GoodWeights(self.training_pass.model, keep)
 
     def state(self) -> dict[str, Any]:
         return {
@@ -142,14 +138,14 @@ class Guard:
         Raises NonFiniteError, the run saved as before that step, or CollapseError.
         """
         found, from_data = self.look_into(step + 1, batches, symptom)
-        skips = self._config.on_nonfinite == "skip"
+        skips = self.config.on_nonfinite == "skip"
         if skips and self.skipped <= MAX_SKIPPED:
             _log.warning("step %d is skipped: %s", step + 1, found)
             return
         # A model that was dying gave this NaN: going on from here would not help.
         if self.signs.dead or self._broken_weights():
             self._collapse(step + 1, found, NONFINITE_CAUSES)
-        self._saver.save(step)
+        self.saver.save(step)
         remedy = "; continue without it by `--resume --set training.on_nonfinite=skip`"
         if skips:
             remedy = f", after {MAX_SKIPPED} steps in a row were skipped; continue with --resume"
@@ -169,26 +165,26 @@ class Guard:
         self.incidents += 1
         self.skipped += 1
         # All processes repeat the step: its collective operations need everyone.
-        first = first_bad_tensor(self._training_pass, lambda: self._repeat(batches))
-        process = self._accelerator.process_index
-        reports = gathered(self._accelerator, report_of(process, first, batches))
+        first = first_bad_tensor(self.training_pass, lambda: self.repeat(batches))
+        process = self.accelerator.process_index
+        reports = gathered(self.accelerator, report_of(process, first, batches))
         found = [report for report in reports if report["first"]] or reports[:1]
         words = f"{symptom}; {'; '.join(map(described, found))}"
         from_data = all(map(blames_data, found))
         if self.incidents > MAX_SAVED:
             return f"{words}; not saved, as {MAX_SAVED} incidents of this run are", from_data
-        place = self._saver.folder.path / "incidents" / f"step-{step}"
-        if self._accelerator.is_main_process:
-            save_incident(place, self._saver.model, step, symptom, reports)
+        place = self.saver.folder.path / "incidents" / f"step-{step}"
+        if self.accelerator.is_main_process:
+            save_incident(place, self.saver.model, step, symptom, reports)
             save_batches(place / "batch.safetensors", batches)
         elif first:
             save_batches(place / f"batch-{process}.safetensors", batches)
-        self._accelerator.wait_for_everyone()
+        self.accelerator.wait_for_everyone()
         return f"{words}; batch and weights are in {place}", from_data
 
     def refuse_collapse(self, step: int) -> None:
         """Raise CollapseError when the last steps, a whole window of them, were dead."""
-        if self.signs.dead >= self._config.collapse_window:
+        if self.signs.dead >= self.config.collapse_window:
             self._collapse(step, f"for {self._dead_steps}", COLLAPSE_CAUSES)
 
     def keep_good(self, step: int) -> None:
@@ -196,23 +192,23 @@ class Guard:
 
         Raises CollapseError for weights that are not finite.
         """
-        if not self.signs.dead and self.good.due(step, self._config.collapse_window):
+        if not self.signs.dead and self.good.due(step, self.config.collapse_window):
             self._refuse_broken_weights(step)
             self.good.refresh(step)
 
     def save(self, step: int) -> None:
         """Save the run. Raises CollapseError for weights that are not finite."""
         self._refuse_broken_weights(step)
-        self._saver.save(step)
+        self.saver.save(step)
 
     def save_to_go_on(self, step: int) -> None:
         """Save the run as one that may go on; a dead model's checkpoint is the last good one."""
         if not self._is_dead(step):
             self.save(step)
             return
-        self._saver.save_checkpoint(*self.good.last)
+        self.saver.save_checkpoint(*self.good.last)
         # The state keeps the dead weights: a resumed run must equal an uninterrupted one.
-        self._saver.save(step, state_only=True)
+        self.saver.save(step, state_only=True)
 
     def finish(self, step: int, stopped: bool) -> None:
         """Save a run whose budget is used or that was stopped. Raises CollapseError."""
@@ -234,7 +230,7 @@ class Guard:
                 raise
             # Saving takes memory too; the files of the last save are whole in any case. With
             # several processes the others would wait for this one in vain.
-            if saves and step and self._accelerator.num_processes == 1:
+            if saves and step and self.accelerator.num_processes == 1:
                 with suppress(Exception):
                     self.save_to_go_on(step)
             raise OutOfMemoryError(
@@ -250,10 +246,10 @@ class Guard:
 
     def _is_dead(self, steps: int) -> bool:
         # A run shorter than a window is dead when all of its steps were.
-        return self.signs.dead >= min(self._config.collapse_window, steps)
+        return self.signs.dead >= min(self.config.collapse_window, steps)
 
     def _broken_weights(self) -> str:
-        names = nonfinite(unique_tensors(self._saver.model).items())
+        names = nonfinite(unique_tensors(self.saver.model).items())
         return f"weights are not finite: {listed(names)}" if names else ""
 
     def _refuse_broken_weights(self, step: int) -> None:
@@ -262,10 +258,10 @@ class Guard:
 
     def _collapse(self, step: int, problem: str, causes: Sequence[str]) -> NoReturn:
         good, weights = self.good.last
-        self._saver.save_checkpoint(good, weights)
+        self.saver.save_checkpoint(good, weights)
         raise CollapseError(
             f"training collapsed at step {step}: {problem}. The weights of step {good} "
-            f"are kept in {self._saver.folder.checkpoint}. Likely causes:{_as_list(causes)}"
+            f"are kept in {self.saver.folder.checkpoint}. Likely causes:{_as_list(causes)}"
         )
 
 

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from qgs.checkpoint.model_file import CheckpointFile, load_weights, unique_tensors
 from qgs.checkpoint.tensors import CheckpointError, differing_tensors, shapes_of
+from qgs.contracts.weights import Shapes
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
 from qgs.recipe.recipe import differing_predictions
@@ -27,20 +28,23 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     if recipe.init_from is None:
         return []
     with CheckpointFile(recipe.init_from) as file:
-        path, theirs, stored = file.path, file.recipe, file.tensors
+        path = file.path
+        stored = file.tensors
+        differing = differing_predictions(file.recipe.tree, recipe.tree)
         count = file.untrained("meta").queries.count
+    # Checkpoints may hold half precision; training takes float32.
     learned = {n: t.float() if t.is_floating_point() else t for n, t in stored.items()}
     options = [
-        f"{option}: {their} (here {ours})"
-        for option, (their, ours) in differing_predictions(theirs.tree, recipe.tree).items()
+        f"{option}: {theirs} (here {ours})"
+        for option, (theirs, ours) in differing.items()
         if option != "model.queries.count"
     ]
     weights = dict(learned)
     for part in ("encoder", "feedback", "head"):
         adapted = getattr(model, part).adapted(_part(f"{part}.", learned))
         weights |= {f"{part}.{name}": values.cpu() for name, values in adapted.items()}
-    found = _differences(weights, model, count)
-    if found:
+    own = _comparable(unique_tensors(model), model.queries.count)
+    if found := differing_tensors(_comparable(weights, count), own):
         first = (
             f"init_from: {path} does not fit this recipe; only the number of queries, sizes that "
             "encoder and head adapt (of patches, to a multiple) and new feedback may differ:"
@@ -65,21 +69,16 @@ def _part(prefix: str, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _change(name: str, old: Tensor | None, new: Tensor) -> str:
-    if old is None or not name.startswith(_QUERIES):
-        return f"{name}: {'none' if old is None else tuple(old.shape)} -> {tuple(new.shape)}"
-    before, after = len(old), len(new)
-    kept = f"{before} kept, {after - before} noisy copies of them"
-    return f"{name}: {before} -> {after}, {'the first are kept' if after < before else kept}"
+    if old is None:
+        return f"{name}: none -> {tuple(new.shape)}"
+    if name.startswith(_QUERIES):
+        return f"{name}: {len(old)} -> {len(new)}, the first are kept, any more are noisy copies"
+    return f"{name}: {tuple(old.shape)} -> {tuple(new.shape)}"
 
 
-def _differences(
-    learned: Mapping[str, Tensor], model: QueryGaussianModel, count: int | None
-) -> list[str]:
-    """Differences from the weights of a model of `count` queries, except in that number."""
-    own, theirs = shapes_of(unique_tensors(model)), shapes_of(learned)
-    for name in own.keys() & theirs.keys():
-        ours, shape = own[name], theirs[name]
-        per_query = ours[:1] == (model.queries.count,) and shape[:1] == (count,)
-        if name.startswith(_QUERIES) and per_query and ours[1:] == shape[1:]:
-            del own[name], theirs[name]
-    return differing_tensors(theirs, own)
+def _comparable(tensors: Mapping[str, Tensor], count: int | None) -> Shapes:
+    """Return shapes by name with -1 for `count`, the number of queries, which may differ."""
+    return {
+        name: (-1, *shape[1:]) if name.startswith(_QUERIES) and shape[:1] == (count,) else shape
+        for name, shape in shapes_of(tensors).items()
+    }

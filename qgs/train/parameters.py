@@ -36,16 +36,16 @@ def parameter_groups(module: nn.Module, factors: Mapping[str, float]) -> list[Pa
     for name, parameter in module.named_parameters():
         if not parameter.requires_grad:
             continue
-        owners = [prefix for prefix in components if name.startswith(f"{prefix}.") or not prefix]
         # Biases and gains of norms are 1-d; decay would pull them from where they work.
-        factor, decays = factors[name], parameter.ndim != 1
-        if owners:
-            innermost = max(owners, key=len)
-            inner_name = name.removeprefix(innermost).removeprefix(".")
-            decays = components[innermost].decays(inner_name, parameter)
-        key = (not decays, factor)
+        decays = parameter.ndim != 1
+        # Modules come before those inside them, so the innermost component has the last word.
+        for outer, component in components.items():
+            if not outer or name.startswith(f"{outer}."):
+                inner = name.removeprefix(outer).removeprefix(".")
+                decays = component.decays(inner, parameter)
+        factor = factors[name]
         empty = ParameterGroup(params=[], decays=decays, factor=factor)
-        groups.setdefault(key, empty)["params"].append(parameter)
+        groups.setdefault((not decays, factor), empty)["params"].append(parameter)
     # Sorted: the same groups in every process and after a resume.
     return [groups[key] for key in sorted(groups)]
 
@@ -65,25 +65,28 @@ class OptimizerState:
     def state(self) -> dict[str, Any]:
         """Tensors and JSON values, PARAMETER/KEY; under "keys" the keys of every parameter."""
         kept = self._optimizer.state_dict()["state"]
-        keys = {name: [*kept.get(place, ())] for place, name in enumerate(self._names)}
-        return {"keys": keys} | {
-            f"{self._names[place]}/{key}": value
-            for place, values in kept.items()
-            for key, value in values.items()
-        }
+        keys: dict[str, list[str]] = {}
+        found: dict[str, Any] = {"keys": keys}
+        for place, name in enumerate(self._names):
+            values = kept.get(place, {})
+            # A parameter without a gradient has no moments: only its lack of keys shows that.
+            keys[name] = list(values)
+            found |= {f"{name}/{key}": value for key, value in values.items()}
+        return found
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore what `state()` gave; options of the groups stay.
 
         Raises KeyError with what is missing, ValueError for what is not of these parameters.
         """
-        # A parameter without a gradient has no moments, so that only "keys" shows what is missing.
-        keys = [(place, name, state["keys"][name]) for place, name in enumerate(self._names)]
-        kept = {p: {key: state[f"{name}/{key}"] for key in own} for p, name, own in keys if own}
+        kept: dict[int, dict[str, Any]] = {}
+        for place, name in enumerate(self._names):
+            if keys := state["keys"][name]:
+                kept[place] = {key: state[f"{name}/{key}"] for key in keys}
         if len(state) > 1 + sum(map(len, kept.values())):
             raise ValueError("it has values of unknown parameters")
-        groups = self._optimizer.state_dict()["param_groups"]
-        self._optimizer.load_state_dict({"state": kept, "param_groups": groups})
+        present = self._optimizer.state_dict()
+        self._optimizer.load_state_dict({**present, "state": kept})
 
 
 class MovingAverage:
@@ -93,10 +96,12 @@ class MovingAverage:
     """
 
     def __init__(self, model: nn.Module, decay: float) -> None:
-        self._model, self._decay = model, decay
+        self._model = model
+        self._decay = decay
         self._averages: dict[str, Tensor] = {}
         for name, tensor in unique_tensors(model).items():
             copy = tensor.detach().clone()
+            # float32, since a decay near 1 moves the average by less than bf16 resolves.
             self._averages[name] = copy.float() if isinstance(tensor, nn.Parameter) else copy
 
     @torch.no_grad()
@@ -104,7 +109,6 @@ class MovingAverage:
         """Take the present weights into the average."""
         for name, tensor in unique_tensors(self._model).items():
             if isinstance(tensor, nn.Parameter):
-                # float32, since a decay near 1 moves the average by less than bf16 resolves
                 self._averages[name].lerp_(tensor.detach().float(), 1 - self._decay)
             else:
                 self._averages[name].copy_(tensor)

@@ -2,6 +2,7 @@
 
 import json
 import logging
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,7 @@ class _StoppedError(Exception):
     """Training was asked to stop in the middle of an evaluation."""
 
 
+@dataclass
 class PeriodicEvaluation:
     """Scores of the model on the recipe's test views, and of its moving average where it has one.
 
@@ -51,25 +53,18 @@ class PeriodicEvaluation:
     latest: the step of the latest evaluation of this session.
     """
 
-    def __init__(
-        self,
-        accelerator: Accelerator,
-        recipe: Recipe,
-        model: QueryGaussianModel,
-        average: MovingAverage | None,
-        folder: Path,
-        trackers: Trackers,
-    ) -> None:
-        self.latest: int | None = None
-        self._accelerator = accelerator
-        self._recipe = recipe
-        self._model = model
-        self._average = average
-        self._folder = folder
-        self._trackers = trackers
-        self._stop = StopRequest()
+    accelerator: Accelerator
+    recipe: Recipe
+    model: QueryGaussianModel
+    average: MovingAverage | None
+    folder: Path
+    trackers: Trackers
+    latest: int | None = None
+
+    def __post_init__(self) -> None:
+        self.stop = StopRequest()
         # A metric that is wrong must fail now, not after the training.
-        Measures(recipe)
+        Measures(self.recipe)
 
     def run(self, step: int, stop: StopRequest) -> None:
         """Evaluate after `step` optimiser steps. All processes must call this.
@@ -78,12 +73,12 @@ class PeriodicEvaluation:
         logged as a warning and does not end the training.
         """
         self.latest = step
-        self._stop = stop
+        self.stop = stop
         # An evaluation must not change what the training draws afterwards.
-        random = RandomStates(self._accelerator)
+        random = RandomStates(self.accelerator)
         states = random.state()
         try:
-            if self._accelerator.is_main_process:
+            if self.accelerator.is_main_process:
                 self._evaluate(step)
         except _StoppedError:
             _log.warning("the evaluation at step %d is given up: training was asked to stop", step)
@@ -92,33 +87,33 @@ class PeriodicEvaluation:
             _log.warning("the evaluation at step %d failed: %s: %s", step, kind, error)
             _log.debug("where it failed", exc_info=True)
         # The others wait here, see TIMEOUT in `distributed`.
-        self._accelerator.wait_for_everyone()
+        self.accelerator.wait_for_everyone()
         random.load_state(states)
 
     def _evaluate(self, step: int) -> None:
         records = [self._record("raw", step)]
-        if self._average:
+        if self.average:
             # The average comes second: it is applied to the weights for as long as that takes.
-            with self._average.applied():
+            with self.average.applied():
                 records.append(self._record("ema", step))
-        place = self._folder / "evaluations.jsonl"
+        place = self.folder / "evaluations.jsonl"
         # A resumed run evaluates again what lies after its last save.
         kept = [record for record in read_records(place) if record["step"] < step]
         write_text(place, "".join(json.dumps(record) + "\n" for record in (*kept, *records)))
         for record in records:
             group = f"evaluation/{record['weights']}"
             scores = {f"{group}/{name}": score for name, score in record["scores"].items()}
-            self._trackers.log(scores, step)
+            self.trackers.log(scores, step)
         picture = self._picture()
-        write_png(picture, self._folder / "pictures" / f"step-{step}.png")
-        self._trackers.picture("evaluation", picture, step)
+        write_png(picture, self.folder / "pictures" / f"step-{step}.png")
+        self.trackers.picture("evaluation", picture, step)
 
     def _between_scenes(self, done: int, wanted: int) -> None:
-        if self._stop:
+        if self.stop:
             raise _StoppedError
 
     def _record(self, weights: str, step: int) -> dict[str, Any]:
-        evaluation = evaluate(self._model, self._recipe, step, observe=self._between_scenes)
+        evaluation = evaluate(self.model, self.recipe, step, observe=self._between_scenes)
         summary = evaluation.summary()
         return {
             "step": step,
@@ -131,7 +126,7 @@ class PeriodicEvaluation:
     @torch.no_grad()
     def _picture(self) -> Picture:
         """Draw a row per sample: input views, first target view, its rendering and its depth."""
-        recipe = self._recipe
+        recipe = self.recipe
         plan = EvaluationPlan(
             recipe.build_data(),
             recipe.views,
@@ -141,11 +136,11 @@ class PeriodicEvaluation:
         )
         # A broken test scene has been reported by the scores; pictures take the next one.
         usable = (sample for sample in plan.samples() if isinstance(sample, Sample))
-        self._model.eval()
+        self.model.eval()
         try:
-            rows = [_row(self._model, sample) for sample in islice(usable, SAMPLES)]
+            rows = [_row(self.model, sample) for sample in islice(usable, SAMPLES)]
         finally:
-            self._model.train()
+            self.model.train()
         # Scenes of an index may have different numbers of input views.
         width = max(row.shape[1] for row in rows)
         padded = [

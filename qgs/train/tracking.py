@@ -179,32 +179,24 @@ def _warn(name: str, error: Exception) -> None:
     _log.warning("the tracker %s fails and is left out from now on: %s", name, reason)
 
 
-class TrainingProgress:
+class TrainingProgress(Progress):
     """A bar with loss, PSNR, images/s and time left; a line now and then where no terminal is."""
 
     def __init__(self, console: Console) -> None:
-        self._console = console
-        self._bar = Progress(
+        super().__init__(
             TextColumn("step {task.fields[step]}"),
             BarColumn(),
             TextColumn("{task.fields[line]}"),
             console=console,
             auto_refresh=False,
             transient=True,
+            disable=not console.is_terminal,
         )
-        self._task = self._bar.add_task("training", total=1.0, step=0, line="")
+        self._task = self.add_task("training", total=1.0, step=0, line="")
         self._next = 0.0
-        self._start: tuple[int, float, float] | None = None
+        self._begun: tuple[int, float, float] | None = None
 
-    def __enter__(self) -> "TrainingProgress":
-        if self._console.is_terminal:
-            self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def update(
+    def show(
         self, step: int, loss: float, psnr: float, images: int, seconds: float, used: float
     ) -> None:
         """Show a step, unless the last one was shown a moment ago.
@@ -213,14 +205,13 @@ class TrainingProgress:
         fraction of the budget.
         """
         # Speed is of this session: a resumed run may be on another machine.
-        if self._start is None:
-            self._start = (images, seconds, used)
+        if self._begun is None:
+            self._begun = (images, seconds, used)
         now = time.monotonic()
         if now < self._next:
             return
-        on_terminal = self._console.is_terminal
-        self._next = now + (_REFRESH_SECONDS if on_terminal else _LOG_SECONDS)
-        first_images, first_seconds, first_used = self._start
+        self._next = now + (_LOG_SECONDS if self.disable else _REFRESH_SECONDS)
+        first_images, first_seconds, first_used = self._begun
         shown = images - first_images
         spent = seconds - first_seconds
         line = f"loss {loss:.4f}  {Psnr.column.heading} {Psnr.column.shown(psnr):>5}"
@@ -229,7 +220,7 @@ class TrainingProgress:
         if gained := used - first_used:
             left = max(spent * (1 - used) / gained, 0)
             line += f"  {timedelta(seconds=round(left))} left"
-        if on_terminal:
-            self._bar.update(self._task, completed=used, step=step, line=line, refresh=True)
+        if self.disable:
+            self.console.print(f"step {step}  {line}", highlight=False)
         else:
-            self._console.print(f"step {step}  {line}", highlight=False)
+            self.update(self._task, completed=used, step=step, line=line, refresh=True)

@@ -327,7 +327,7 @@ class Trainer:
             self.trackers.log(finite, counters.step)
         views = self.recipe.views
         judged = views.targets + self.config.judge_inputs * views.inputs
-        progress.update(
+        progress.show(
             counters.step,
             record["loss"],
             record["psnr"],

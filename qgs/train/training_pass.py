@@ -194,22 +194,13 @@ class DetachedLayer:
 
     def total(self) -> Tensor:
         """Return the sum of the terms, 0-d, with `gradients` with respect to what was cut off."""
-        # The graph of the losses is gone by now; only its gradients remain.
-        sources = [self._sources[name] for name in self.gradients]
-        return _KnownGradients.apply(_sum(self.terms), tuple(self.gradients.values()), *sources)
-
-
-class _KnownGradients(torch.autograd.Function):
-    """(value, gradients, *sources) -> value; backward returns `gradients` for the sources."""
-
-    @staticmethod
-    def forward(ctx: Any, value: Tensor, gradients: Sequence[Tensor], *sources: Tensor) -> Tensor:
-        ctx.save_for_backward(*gradients)
-        return value.clone()
-
-    @staticmethod
-    def backward(ctx: Any, *slopes: Tensor) -> Any:
-        return None, None, *(slopes[0] * gradient for gradient in ctx.saved_tensors)
+        total = _sum(self.terms)
+        for name, gradient in self.gradients.items():
+            # A linear function with this gradient, less its own value: the sum stays as it is. The
+            # graph of the losses is gone by now.
+            linear = (self._sources[name] * gradient).sum()
+            total = total + (linear - linear.detach())
+        return total
 
 
 def measure(rgb: Tensor, alpha: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:

@@ -38,7 +38,7 @@ def test_a_signal_saves_and_ends(tmp_path, monkeypatch, number):
         signal.raise_signal(number)
         signal.raise_signal(number)  # the second one changes nothing
 
-    monkeypatch.setattr(TrainingProgress, "update", ask_twice)
+    monkeypatch.setattr(TrainingProgress, "show", ask_twice)
     result = run(tiny("tokengs", "training.steps=200"), tmp_path)
     assert result.stopped_by == number.name
     assert result.steps == len(result.folder.history()) == 1

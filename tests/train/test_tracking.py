@@ -117,5 +117,5 @@ def test_speed_and_time_left_are_those_since_the_run_began_or_resumed(monkeypatc
         console = Console(width=200, file=io.StringIO())
         with TrainingProgress(console) as bar:
             for numbers in steps:
-                bar.update(*numbers)
+                bar.show(*numbers)
         assert re.search(rf" {told} left", console.file.getvalue())

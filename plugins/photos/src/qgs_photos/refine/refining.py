@@ -192,7 +192,7 @@ class _Run:
             if self.step > 1:  # the first one compiles
                 self.spent += perf_counter() - began
             used = self.spent / self.seconds
-            progress.update(self.step, loss, quality, self.step, self.spent, used)
+            progress.show(self.step, loss, quality, self.step, self.spent, used)
         if not stop and self.free.count < self.wanted:  # the budget was a few steps
             self.free.grow(self.wanted, self.generator)
         if compared is not None:
