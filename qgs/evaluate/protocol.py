@@ -39,7 +39,7 @@ class Protocol:
         return f"{self.name} ({self.sha256[:12]})"
 
     def settings(self) -> dict[str, Any]:
-        """`content` with size and hash in place of the index, which may be long."""
+        """Return `content` with size and hash in place of the index, which may be long."""
         views = self.content["views"]
         if index := views.get("index"):
             views = {"index": {"scenes": len(index), "sha256": _sha256(index)}}
@@ -47,7 +47,7 @@ class Protocol:
 
 
 def index_of(recipe: Recipe) -> EvaluationIndex | None:
-    """The index that `recipe` names, None where views are drawn. Raises as `read_index`."""
+    """Read the index that `recipe` names; None where views are drawn. Raises as `read_index`."""
     return read_index(recipe.evaluation.index) if recipe.evaluation.index else None
 
 
@@ -57,35 +57,15 @@ def protocol_of(
     scenes: Sequence[str] = (),
     step: int = END,
 ) -> Protocol:
-    """The protocol of `recipe` on the views of `index`, or on views drawn from `scenes`.
+    """Return the protocol of `recipe` on the views of `index`, or on views drawn from `scenes`.
 
-    With an index the kind of data, its split, and options at their defaults are left out, so that
-    one data set in two formats has one protocol. Scheduled options of the renderer are those after
-    `step` steps.
+    Scheduled options of the renderer are those after `step` steps.
     """
-    evaluation, part = recipe.evaluation, recipe.parts["data",]
-    renderer = recipe.parts["model", "renderer"]
-    config, source = part.config, part.component
-    assert isinstance(config, SceneSourceConfig)
-    assert issubclass(source, SceneSource)
-    # The size is there at the top level, for all kinds of data.
-    left_out = {"image_size", *source.not_in_protocol}
-    if index is None:
-        data = {"type": recipe.tree["data"]["type"]}
-        data |= config.model_dump(mode="json", exclude=left_out)
-        views = recipe.views.model_dump(mode="json", include={"inputs", "targets", "gap"})
-        rule = evaluation.model_dump(include={"scenes", "samples", "seed"})
-        judged: dict[str, Any] = {"drawn": {**views, **rule, "names": list(scenes)}}
-        # The default sampler is what `gap` says; any other one draws other views.
-        sampler = recipe.parts["view_sampler",]
-        if sampler.options != Span.Config().model_dump() or sampler.type != "qgs/span":
-            judged["drawn"]["sampler"] = {"type": sampler.type, **sampler.options}
-    else:
-        # An index names scenes and frames itself, whatever the split.
-        left_out |= source.split_options
-        data = config.model_dump(mode="json", exclude=left_out, exclude_defaults=True)
-        judged = {"index": {n: entry.model_dump() if entry else None for n, entry in index.items()}}
-    tuning, metrics = None, {}
+    evaluation = recipe.evaluation
+    source = recipe.parts["data",].config
+    assert isinstance(source, SceneSourceConfig)
+    data, views = _data_and_views(recipe, source, index, scenes)
+    tuning = None
     if evaluation.tuning_steps:
         tuning = {
             "what": evaluation.tuning,
@@ -94,21 +74,27 @@ def protocol_of(
             "optimizer": "Adam",
             "loss": tuning_loss(recipe).config.model_dump(mode="json"),
         }
+    metrics: dict[str, Any] = {}
     for path, chosen in recipe.parts.items():
         metric = chosen.component
         if issubclass(metric, Metric):
             options = chosen.config.model_dump(mode="json", exclude=set(metric.not_in_protocol))
             metrics[path[-1]] = {"type": chosen.type, "definition": metric.definition, **options}
     # Options without effect are left out: they must not part equal protocols.
-    factor = () if recipe.views.scale in ("auto", "search") else ("scale_factor",)
-    noise = {"noise": [recipe.views.pose_noise, evaluation.seed]} if recipe.views.pose_noise else {}
+    shown = {"frame", "scale"}
+    if recipe.views.scale not in ("auto", "search"):
+        shown.add("scale_factor")
+    poses = recipe.views.model_dump(include=shown)
+    if recipe.views.pose_noise:
+        poses["noise"] = [recipe.views.pose_noise, evaluation.seed]
+    renderer = recipe.parts["model", "renderer"]
     content = {
         "format": 1,
-        "image_size": list(config.image_size),
+        "image_size": list(source.image_size),
         "crop": "centre crop to the aspect ratio of image_size, then Lanczos resize",
         "data": data,
-        "poses": recipe.views.model_dump(include={"frame", "scale", *factor}) | noise,
-        "views": judged,
+        "poses": poses,
+        "views": views,
         "renderer": at_step(renderer.config, renderer.schedules, step).model_dump(mode="json"),
         "metrics": metrics,
         "tuning": tuning,
@@ -116,6 +102,39 @@ def protocol_of(
     # The name is for people: it is not part of the hash.
     file = (evaluation.index or "drawn").replace("\\", "/").rsplit("/", 1)[-1]
     return Protocol(evaluation.protocol or file.removesuffix(".json"), content)
+
+
+def _data_and_views(
+    recipe: Recipe,
+    config: SceneSourceConfig,
+    index: EvaluationIndex | None,
+    scenes: Sequence[str],
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what decides the photos, and which of them are compared.
+
+    With an index the kind of data, its split, and options at their defaults are left out, so that
+    one data set in two formats has one protocol.
+    """
+    part = recipe.parts["data",]
+    source = part.component
+    assert issubclass(source, SceneSource)
+    # The size is there at the top level, for all kinds of data.
+    left_out = {"image_size", *source.not_in_protocol}
+    if index is not None:
+        # An index names scenes and frames itself, whatever the split.
+        left_out |= source.split_options
+        data = config.model_dump(mode="json", exclude=left_out, exclude_defaults=True)
+        entries = {name: entry.model_dump() if entry else None for name, entry in index.items()}
+        return data, {"index": entries}
+    data = {"type": part.type, **config.model_dump(mode="json", exclude=left_out)}
+    drawn = recipe.views.model_dump(mode="json", include={"inputs", "targets", "gap"})
+    drawn |= recipe.evaluation.model_dump(include={"scenes", "samples", "seed"})
+    drawn["names"] = list(scenes)
+    # The default sampler is what `gap` says; any other one draws other views.
+    sampler = recipe.parts["view_sampler",]
+    if sampler.options != Span.Config().model_dump() or sampler.type != "qgs/span":
+        drawn["sampler"] = {"type": sampler.type, **sampler.options}
+    return data, {"drawn": drawn}
 
 
 def _canonical(value: Any) -> str:

@@ -36,28 +36,35 @@ def tuning_settings(tune: str | None) -> list[str]:
     match = re.fullmatch(r"(?:(queries|latents):)?(\d+)|(queries|latents)", tune)
     if match is None:
         raise ValueError(f"tuning is STEPS, queries[:STEPS] or latents[:STEPS], got {tune!r}")
-    what, steps = match[1] or match[3], match[2]
-    settings = [f"evaluation.tuning_steps={steps or 50}"]
-    return [*settings, *([f"evaluation.tuning={what}"] if what else [])]
+    what = match[1] or match[3]
+    steps = f"evaluation.tuning_steps={match[2] or 50}"
+    return [steps, f"evaluation.tuning={what}"] if what else [steps]
 
 
 def tuning_loss(recipe: Recipe) -> Photometric:
-    """What tuning minimises: the first `qgs/photometric` of `recipe`, else one with defaults.
+    """Return the first `qgs/photometric` loss of `recipe`, which tuning minimises, else a default.
 
     Weights that follow the training are those of its end, so that a protocol means one thing.
     """
-    follow((losses := recipe.build_losses(pretrained=False)).values(), END)
-    for loss in losses.values():
+    losses = recipe.build_losses(pretrained=False).values()
+    follow(losses, END)
+    for loss in losses:
         if isinstance(loss, Photometric) and any(loss.weights()):
             return loss
     return Photometric(Photometric.Config())
 
 
 def tuner(model: QueryGaussianModel, recipe: Recipe) -> Callable[[Views], Tuning]:
-    """`tune` with the options of `recipe`'s `evaluation`."""
+    """Return `tune` with the options of `recipe`'s `evaluation`."""
     settings = recipe.evaluation
-    what, steps, rate = settings.tuning, settings.tuning_steps, settings.rate
-    return partial(tune, model, loss=tuning_loss(recipe), steps=steps, rate=rate, what=what)
+    return partial(
+        tune,
+        model,
+        loss=tuning_loss(recipe),
+        steps=settings.tuning_steps,
+        rate=settings.rate,
+        what=settings.tuning,
+    )
 
 
 def tuned_gaussians(
@@ -110,6 +117,7 @@ def tune(
     )
     leaves = [tensor for _, tensor in named_tensors(tuned) if tensor.requires_grad]
     optimizer = torch.optim.Adam(leaves, lr=rate)
+    losses: list[float] = []
 
     def predicted() -> tuple[Prediction, Tensor]:
         # The part that is fixed was computed once, outside.
@@ -119,9 +127,10 @@ def tune(
             prediction = model.predict(views, model.encoder.project(tuned, memory), start, ())
         rendering = model.render(prediction.gaussians, views.cameras)
         terms = loss(prediction.layers[model.depth], rendering, views, views)
-        return prediction, torch.stack(list(terms.values())).sum()
+        value = torch.stack(list(terms.values())).sum()
+        losses.append(float(value.detach()))
+        return prediction, value
 
-    losses = []
     with torch.enable_grad():
         for _ in range(steps):
             _, value = predicted()
@@ -130,7 +139,6 @@ def tune(
             for leaf, gradient in zip(leaves, gradients, strict=True):
                 leaf.grad = gradient
             optimizer.step()
-            losses.append(float(value.detach()))
     with torch.no_grad():
-        prediction, value = predicted()
-    return Tuning(prediction, [*losses, float(value)])
+        prediction, _ = predicted()
+    return Tuning(prediction, losses)

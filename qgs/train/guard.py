@@ -182,17 +182,16 @@ class Guard:
         self.accelerator.wait_for_everyone()
         return f"{words}; batch and weights are in {place}", from_data
 
-    def refuse_collapse(self, step: int) -> None:
-        """Raise CollapseError when the last steps, a whole window of them, were dead."""
-        if self.signs.dead >= self.config.collapse_window:
-            self._collapse(step, f"for {self._dead_steps}", COLLAPSE_CAUSES)
+    def check(self, step: int) -> None:
+        """Copy the weights if they are good and a copy is due.
 
-    def keep_good(self, step: int) -> None:
-        """Copy the weights if a copy is due and PSNR has not dropped.
-
-        Raises CollapseError for weights that are not finite.
+        Raises CollapseError when the last steps, a whole window of them, were dead, and for weights
+        that are not finite.
         """
-        if not self.signs.dead and self.good.due(step, self.config.collapse_window):
+        window = self.config.collapse_window
+        if self.signs.dead >= window:
+            self._collapse(step, f"for {self._dead_steps}", COLLAPSE_CAUSES)
+        if not self.signs.dead and self.good.due(step, window):
             self._refuse_broken_weights(step)
             self.good.refresh(step)
 

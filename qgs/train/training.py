@@ -293,8 +293,7 @@ class Trainer:
         self._open_folder()
         self._report({"lr": rate, **numbers}, progress)
         # A dead model must not be saved as a good one, so this comes before saving.
-        self.guard.refuse_collapse(counters.step)
-        self.guard.keep_good(counters.step)
+        self.guard.check(counters.step)
         evaluates = counters.every(self.config.evaluate_every)
         saves = evaluates or counters.every(self.config.save_every)
         if saves and not self.guard.signs.dead:
