@@ -65,7 +65,9 @@ def evaluate(
     # Components draw random numbers in training mode only.
     model.eval()
     try:
-        scores, failures = _by_scene(scorer.scores(plan.samples(), batch), len(plan.wanted), observe)
+        scores, failures = _by_scene(
+            scorer.scores(plan.samples(), batch), len(plan.wanted), observe
+        )
     finally:
         model.train(training)
     missing = [SceneFailure(f.scene, _without_folder(f.reason, recipe)) for f in failures]
@@ -85,21 +87,32 @@ def evaluate(
         held_out=None if index else _held_out(plan, scores),
         step=step,
     )
+    return replace(evaluation, remarks=_remarks(evaluation, model, recipe, plan, scorer.seen))
+
+
+def _remarks(
+    evaluation: Evaluation,
+    model: QueryGaussianModel,
+    recipe: Recipe,
+    plan: EvaluationPlan,
+    seen: Domain,
+) -> list[str]:
+    """Return sentences on how far the model can be expected to do well, and on how it did."""
+    remarks: list[str] = []
     fixed = ["scale"] if recipe.views.scale == "search" else []
-    likeness = verdict(model.trained_on, scorer.seen, fixed) if model.trained_on else ""
-    own = recipe.tree["data"] == (model.recipe or {}).get("data")
-    remedy = "train for longer" if own else remedies(("baseline", "depth"), fixed)
-    remarks = (likeness, plan.framing, _worse(evaluation, remedy))
-    return replace(evaluation, remarks=[*filter(None, remarks)])
-
-
-def _worse(evaluation: Evaluation, remedy: str) -> str:
-    """See `worse_than_nearest`; on the first value, where no inputs were judged."""
-    if not evaluation.columns or any(score.given for score in evaluation.scores):
-        return ""
-    name, column = next(iter(evaluation.columns.items()))
-    nearest = evaluation.mean(name, "nearest_input")
-    return worse_than_nearest(column, evaluation.mean(name), nearest, remedy)
+    if model.trained_on is not None:
+        remarks.append(verdict(model.trained_on, seen, fixed))
+    if plan.framing:
+        remarks.append(plan.framing)
+    # Where a model sees what it is judged on, a copy of it is perfect.
+    if evaluation.columns and not any(score.given for score in evaluation.scores):
+        own = recipe.tree["data"] == (model.recipe or {}).get("data")
+        remedy = "train for longer" if own else remedies(("baseline", "depth"), fixed)
+        name, column = next(iter(evaluation.columns.items()))
+        nearest = evaluation.mean(name, "nearest_input")
+        if worse := worse_than_nearest(column, evaluation.mean(name), nearest, remedy):
+            remarks.append(worse)
+    return remarks
 
 
 class Measures:
@@ -220,9 +233,8 @@ class _Scorer:
                 tuning = self._tune(inputs)
                 gaussians = tuning.prediction.gaussians
                 tuned = dict(zip(TUNING, (tuning.losses[0], tuning.losses[-1]), strict=True))
-            if gaussians is None:
-                gaussians = self._model(inputs).gaussians
-            values = self._values(sample, inputs, gaussians) | tuned
+            found: Gaussians = gaussians or self._model(inputs).gaussians
+            values = self._values(sample, inputs, found) | tuned
         except Exception as error:  # reported in the result; the other scenes go on
             return SceneFailure(sample.scene, one_line(error))
         # One NaN would spoil every mean over scenes.

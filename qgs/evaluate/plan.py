@@ -40,7 +40,7 @@ GIVEN = "frames as context and as target"
 
 
 def given_targets(inputs: Iterable[int], targets: Iterable[int]) -> tuple[int, ...]:
-    """Frames, in order, that a model is given and judged on."""
+    """Return the frames, in order, that are input and target."""
     return tuple(sorted(set(inputs) & set(targets)))
 
 
@@ -48,7 +48,7 @@ _FORM = '{"scene": null or {"context": [frames], "target": [frames]}}'
 
 
 def read_index(path: str) -> EvaluationIndex:
-    """The index in the JSON file `path`, which may be an fsspec URL.
+    """Read the index in the JSON file `path`, which may be an fsspec URL.
 
     Raises FileNotFoundError, and ValueError for another form and for no scene to judge.
     """
@@ -122,7 +122,7 @@ class EvaluationPlan:
         self.unlisted = tuple(name for name in self._places if index and name not in index)
 
     def samples(self) -> Iterator[Sample | SceneFailure]:
-        """The samples, one decoded at a time; a scene that fails ends with its failure."""
+        """Yield the samples, one decoded at a time; a scene that fails ends with its failure."""
         for name in self.wanted:
             try:
                 if name not in self._places:
@@ -142,7 +142,7 @@ class EvaluationPlan:
                 yield SceneFailure(name, one_line(error))
 
     def _choices(self, scene: Scene, place: int) -> Iterator[tuple[Frames, Frames]]:
-        """Input and target frames of each sample."""
+        """Yield input and target frames of each sample."""
         if self._index is not None:
             yield _named(scene, self._index)
         elif windows := self._sampler.windows(scene, self._views):
@@ -164,7 +164,7 @@ def evaluation_samples(
     sampler: ViewSampler | None = None,
     **options: Any,
 ) -> Sequence[Sample]:
-    """Samples of a plan without an index; raises ValueError for the first scene that fails."""
+    """Return samples of a plan without an index; ValueError for the first scene that fails."""
     samples: list[Sample] = []
     for sample in EvaluationPlan(source, views, evaluation, None, sampler, **options).samples():
         if isinstance(sample, SceneFailure):
@@ -174,7 +174,7 @@ def evaluation_samples(
 
 
 def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
-    """Input and target frames such that every held-out frame is a target once.
+    """Return input and target frames such that every held-out frame is a target once.
 
     A window of the largest gap (in training frames, or times) is centred on the first such frame
     not yet covered and shifted into the scene, inputs evenly spaced; all within are targets.
@@ -192,7 +192,8 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Fra
         # centred, and at the ends of the scene shifted into it
         first = min(max(centre - (gap + 1) // 2, 0), len(usable) - 1 - gap)
         span = usable[first : first + gap + 1]
-        start, end = when[span[0][0]], when[span[-1][0]]
+        start = when[span[0][0]]
+        end = when[span[-1][0]]
         inside = {f for f in scene.held_out if start < when[f] < end or when[f] == when[frame]}
         targets = sorted(inside - covered)
         covered.update(targets)
@@ -201,7 +202,7 @@ def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Fra
 
 
 def _named(scene: Scene, index: EvaluationIndex) -> tuple[Frames, Frames]:
-    """The frames of `scene` that `index` names; raises ValueError where it lacks one."""
+    """Return the frames of `scene` that `index` names; raises ValueError where it lacks one."""
     entry = index[scene.name]
     assert entry is not None
     # frames are positions, which a missing image moves

@@ -30,7 +30,7 @@ NAME_COLUMNS = ("input_names", "target_names")
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
-    """Mean, variance (over the population) and median of a value over scenes."""
+    """Return mean, variance (over the population) and median of a value over scenes."""
     found = {"mean": np.mean(values), "variance": np.var(values), "median": np.median(values)}
     return {name: float(value) for name, value in found.items()}
 
@@ -262,24 +262,26 @@ class Evaluation:
 
 
 def as_json(value: Mapping[str, Any]) -> str:
-    """A file's text; raises ValueError for NaN and infinities."""
+    """Return a file's text; raises ValueError for NaN and infinities."""
     return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def markdown_table(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of equal length, headers first, as a Markdown table; numbers to the right."""
-    cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
-    first, *rest = (max(map(len, column)) for column in zip(*cells, strict=True))
-    rule = "|".join(["", ":" + "-" * (first + 1), *("-" * (width + 1) + ":" for width in rest), ""])
-    lines = []
-    for name, *values in cells:
-        right = [value.rjust(width) for value, width in zip(values, rest, strict=True)]
-        lines.append(f"| {' | '.join([name.ljust(first), *right])} |")
-    return "\n".join([lines[0], rule, *lines[1:]])
+    """Return rows of equal length, headers first, as a Markdown table; numbers to the right."""
+    columns: list[list[str]] = []
+    for place, column in enumerate(zip(*rows, strict=True)):
+        cells = [cell.replace("|", "\\|") for cell in column]
+        # Padded: the file is read in a terminal too.
+        width = max(map(len, cells))
+        padded = [cell.rjust(width) if place else cell.ljust(width) for cell in cells]
+        header, *values = (f" {cell} " for cell in padded)
+        rule = "-" * (width + 1)
+        columns.append([header, f"{rule}:" if place else f":{rule}", *values])
+    return "\n".join(f"|{'|'.join(line)}|" for line in zip(*columns, strict=True))
 
 
 def bullets(lines: Iterable[str]) -> str:
-    """Lines as a Markdown list."""
+    """Return lines as a Markdown list."""
     return "\n".join(f"- {line}" for line in lines)
 
 
