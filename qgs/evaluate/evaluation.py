@@ -4,7 +4,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby, islice
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from qgs.domain import Domain, remedies, verdict
 from qgs.evaluate.plan import EvaluationPlan, SceneFailure, ViewsOf
 from qgs.evaluate.protocol import index_of, protocol_of
 from qgs.evaluate.results import TUNING, Evaluation, SceneScore
-from qgs.evaluate.tuning import tuner
+from qgs.evaluate.tuning import Tuning, tuner
 from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.dispersion import OPACITY_USED
 from qgs.model import QueryGaussianModel
@@ -60,7 +60,8 @@ def evaluate(
         # Depth maps cost as much as photos to decode.
         depths="true_depth" in measures.needed,
     )
-    scorer = _Scorer(model, recipe, measures)
+    tune = tuner(model, recipe) if recipe.evaluation.tuning_steps else None
+    scorer = _Scorer(model, measures, tune)
     training = model.training
     # Components draw random numbers in training mode only.
     model.eval()
@@ -181,18 +182,20 @@ def _name(metric: str, key: str) -> str:
     return f"{metric}_{key}" if key else metric
 
 
+@dataclass
 class _Scorer:
     """Scores samples; `seen` are their cameras, `gaussians` the most Gaussians of a scene."""
 
-    def __init__(self, model: QueryGaussianModel, recipe: Recipe, measures: Measures) -> None:
-        self.seen = Domain()
-        self.gaussians = 0
-        self._model = model
-        self._device = next(model.parameters()).device
-        self._measures = measures
-        self._tune = tuner(model, recipe) if recipe.evaluation.tuning_steps else None
-        for metric in measures.metrics.values():
-            metric.to(self._device)
+    model: QueryGaussianModel
+    measures: Measures
+    tune: Callable[[Views], Tuning] | None
+    seen: Domain = field(default_factory=Domain)
+    gaussians: int = 0
+
+    def __post_init__(self) -> None:
+        self.device = next(self.model.parameters()).device
+        for metric in self.measures.metrics.values():
+            metric.to(self.device)
 
     def scores(
         self, samples: Iterable[Sample | SceneFailure], batch: int
@@ -213,11 +216,11 @@ class _Scorer:
     @torch.no_grad()
     def _together(self, samples: Sequence[Sample]) -> Iterable[SceneScore | SceneFailure]:
         # Tuning changes the state of one scene, so tuned scenes run one by one.
-        if len(samples) > 1 and not self._tune:
+        if len(samples) > 1 and not self.tune:
             # If it fails, each runs by itself, to find the one that fails.
             with suppress(Exception):
-                inputs = stack_views([sample.inputs for sample in samples]).to(self._device)
-                gaussians = self._model(inputs).gaussians
+                inputs = stack_views([sample.inputs for sample in samples]).to(self.device)
+                gaussians = self.model(inputs).gaussians
                 return [self._score(s, gaussians[i : i + 1]) for i, s in enumerate(samples)]
         return [self._score(sample) for sample in samples]
 
@@ -228,12 +231,12 @@ class _Scorer:
         try:
             # Seen before the model runs: a failing scene counts among the cameras too.
             self.seen.see(sample.inputs.cameras, sample.targets.cameras)
-            inputs = sample.inputs.to(self._device)
-            if self._tune:
-                tuning = self._tune(inputs)
+            inputs = sample.inputs.to(self.device)
+            if self.tune:
+                tuning = self.tune(inputs)
                 gaussians = tuning.prediction.gaussians
                 tuned = dict(zip(TUNING, (tuning.losses[0], tuning.losses[-1]), strict=True))
-            found: Gaussians = gaussians or self._model(inputs).gaussians
+            found: Gaussians = gaussians or self.model(inputs).gaussians
             values = self._values(sample, inputs, found) | tuned
         except Exception as error:  # reported in the result; the other scenes go on
             return SceneFailure(sample.scene, one_line(error))
@@ -245,20 +248,20 @@ class _Scorer:
         return SceneScore(sample.scene, [frames], values, sample.names)
 
     def _values(self, sample: Sample, inputs: Views, gaussians: Gaussians) -> dict[str, float]:
-        targets = sample.targets.to(self._device)
+        targets = sample.targets.to(self.device)
         self.gaussians = max(self.gaussians, gaussians.count)
-        rendering = self._model.render(gaussians, targets.cameras)
+        rendering = self.model.render(gaussians, targets.cameras)
         shown = MetricInput(
             rendering.rgb,
             targets,
             gaussians=gaussians,
-            gaussians_per_query=self._model.head.gaussians_per_query,
+            gaussians_per_query=self.model.head.gaussians_per_query,
             depth=rendering.depth,
             true_depth=targets.depths,
         )
-        values = self._measures("model", shown)
+        values = self.measures("model", shown)
         for name, baseline in BASELINES.items():
-            values |= self._measures(name, MetricInput(baseline(inputs, targets.cameras), targets))
+            values |= self.measures(name, MetricInput(baseline(inputs, targets.cameras), targets))
         values["gaussians_used"] = float((gaussians.opacities > OPACITY_USED).sum())
         return values
 

@@ -78,6 +78,7 @@ class SceneFailure:
     reason: str
 
 
+@dataclass
 class EvaluationPlan:
     """The scenes of a test split that are judged, and on which views; never mirrored.
 
@@ -93,33 +94,27 @@ class EvaluationPlan:
     scenes.
     """
 
-    def __init__(
-        self,
-        source: SceneSource,
-        views: ViewsConfig,
-        evaluation: EvaluationConfig,
-        index: EvaluationIndex | None = None,
-        sampler: ViewSampler | None = None,
-        views_of: ViewsOf | None = None,
-        depths: bool = False,
-    ) -> None:
+    source: SceneSource
+    views: ViewsConfig
+    evaluation: EvaluationConfig
+    index: EvaluationIndex | None = None
+    sampler: ViewSampler | None = None
+    views_of: ViewsOf | None = None
+    depths: bool = False
+
+    def __post_init__(self) -> None:
         self.framing: str | None = None
         self.held_out: dict[str, set[int]] = {}
-        self._scenes = source.scenes("test")
+        self._scenes = self.source.scenes("test")
         if not len(self._scenes):
-            raise ValueError(f"the data source {type(source).name!r} has no test scenes")
-        self._views = views
-        self._evaluation = evaluation
-        self._index = index
-        self._views_of = views_of or (lambda *window: views)
-        self._depths = depths
-        self._sampler = sampler or Span(Span.Config())
-        names = source.names("test")
+            raise ValueError(f"the data source {type(self.source).name!r} has no test scenes")
+        names = self.source.names("test")
         self._places = {name: place for place, name in enumerate(names)}
-        entries = dict.fromkeys(names[: evaluation.scenes], True) if index is None else index
+        first = dict.fromkeys(names[: self.evaluation.scenes], True)
+        entries = first if self.index is None else self.index
+        self.unlisted = tuple(n for n in names if self.index and n not in self.index)
         self.wanted = tuple(name for name, entry in entries.items() if entry)
         self.null = tuple(name for name, entry in entries.items() if not entry)
-        self.unlisted = tuple(name for name in self._places if index and name not in index)
 
     def samples(self) -> Iterator[Sample | SceneFailure]:
         """Yield the samples, one decoded at a time; a scene that fails ends with its failure."""
@@ -131,28 +126,31 @@ class EvaluationPlan:
                 scene = self._scenes[place]
                 self.held_out[name] = set(scene.held_out)
                 # a generator for each scene: a failing one changes no noise of the others
-                noise = np.random.default_rng([self._evaluation.seed, place])
+                noise = np.random.default_rng([self.evaluation.seed, place])
                 for inputs, targets in self._choices(scene, place):
                     if self.framing is None:
                         self.framing = framing(scene, inputs[0])
-                    views = self._views_of(scene, inputs, targets)
+                    views = self.views
+                    if self.views_of:
+                        views = self.views_of(scene, inputs, targets)
                     for part in [targets] if scene.times is None else moments(scene, targets):
-                        yield make_sample(scene, inputs, part, views, False, noise, self._depths)
+                        yield make_sample(scene, inputs, part, views, False, noise, self.depths)
             except Exception as error:  # whatever a reader raises; the other scenes go on
                 yield SceneFailure(name, one_line(error))
 
     def _choices(self, scene: Scene, place: int) -> Iterator[tuple[Frames, Frames]]:
         """Yield input and target frames of each sample."""
-        if self._index is not None:
-            yield _named(scene, self._index)
-        elif windows := self._sampler.windows(scene, self._views):
-            yield from evenly(windows, self._evaluation.scenes)
+        sampler = self.sampler or Span(Span.Config())
+        if self.index is not None:
+            yield _named(scene, self.index)
+        elif windows := sampler.windows(scene, self.views):
+            yield from evenly(windows, self.evaluation.scenes)
         elif scene.held_out:
-            yield from evenly(held_out_windows(scene, self._views), self._evaluation.scenes)
+            yield from evenly(held_out_windows(scene, self.views), self.evaluation.scenes)
         else:
-            for k in range(self._evaluation.samples):
-                rng = np.random.default_rng([self._evaluation.seed, place, k])
-                inputs, drawn = self._sampler.draw(scene, self._views, rng, END)
+            for k in range(self.evaluation.samples):
+                rng = np.random.default_rng([self.evaluation.seed, place, k])
+                inputs, drawn = sampler.draw(scene, self.views, rng, END)
                 every = range(inputs[0], inputs[-1] + 1) if scene.times is None else drawn
                 yield inputs, tuple(sorted({*every} - {*inputs} or {*drawn}))
 

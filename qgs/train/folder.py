@@ -5,7 +5,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from accelerate import Accelerator
@@ -145,30 +145,19 @@ class RunFolder:
             self._lock.release(force=True)
 
 
-class Stateful(Protocol):
-    """A part of a run that must be continued where it stopped."""
-
-    def state(self) -> State:
-        """Return what continues this object; all processes must call it."""
-        ...
-
-    def load_state(self, state: State) -> None:
-        """Restore from `state`."""
-        ...
-
-
 @dataclass
 class Saver:
     """Writes the checkpoint and the state of a run; of several processes, the main one writes.
 
-    parts: everything that continues the run, beside the weights, by name; "ema" has a checkpoint.
+    parts: everything that continues the run, beside the weights, by name. Each has `state()`, which
+    returns a State, and `load_state(state)`, which restores it. "ema" has a checkpoint too.
     Each file appears whole or not at all. All processes must call each method together.
     """
 
     accelerator: Accelerator
     folder: RunFolder
     model: QueryGaussianModel
-    parts: dict[str, Stateful] = field(default_factory=dict)
+    parts: dict[str, Any] = field(default_factory=dict)
 
     def save(self, step: int, state_only: bool = False) -> None:
         """Save the run after `step` optimiser steps; `state_only` leaves the checkpoints."""

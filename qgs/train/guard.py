@@ -295,6 +295,7 @@ class SignsOfLife:
         self.has_drawn |= numbers["deviation"] > 8 * FLAT
 
 
+@dataclass
 class GoodWeights:
     """Copies in host memory of the weights at the last two times that the model was healthy.
 
@@ -302,61 +303,63 @@ class GoodWeights:
     is the last that is surely good. Copies are made every fifth of a window at first and a window
     in long runs, and none is made while the images are worse than they were.
 
-    keep: this process holds the copies; one of several suffices.
+    keep: this process holds the copies; one of several suffices. psnr, best: its running mean, in
+    dB, and the largest one at a copy.
     """
 
-    def __init__(self, model: nn.Module, keep: bool = True) -> None:
-        self._model = model
-        self._keep = keep
-        self._copies: list[tuple[int, Mapping[str, Tensor]]] = []
-        self._psnr: float | None = None
-        self._best: float | None = None
+    model: nn.Module
+    keep: bool = True
+    psnr: float | None = None
+    best: float | None = None
+
+    def __post_init__(self) -> None:
+        self.copies: list[tuple[int, Mapping[str, Tensor]]] = []
         self.refresh(0)
 
     @property
     def last(self) -> tuple[int, Mapping[str, Tensor]]:
         """Optimiser steps, and the weights that they made."""
-        return self._copies[0]
+        return self.copies[0]
 
     def observe(self, numbers: Mapping[str, float]) -> None:
         """Take note of a step's "psnr", in dB."""
         # PSNR of one batch depends on its scenes: compare running means.
         psnr = numbers["psnr"]
-        self._psnr = psnr if self._psnr is None else self._psnr + (psnr - self._psnr) / 10
+        self.psnr = psnr if self.psnr is None else self.psnr + (psnr - self.psnr) / 10
 
     def due(self, step: int, window: int) -> bool:
         """Whether to copy the weights after `step` steps; the same in all processes."""
         # Rarer in long runs: each copy moves the whole model to the host.
         interval = max(window // 5, min(window, step // 10))
-        newest, _ = self._copies[-1]
-        if step - newest < interval or self._psnr is None:
+        newest, _ = self.copies[-1]
+        if step - newest < interval or self.psnr is None:
             return False
-        self._best = self._psnr if self._best is None else max(self._psnr, self._best)
-        return self._psnr >= self._best - LOSS_OF_QUALITY
+        self.best = self.psnr if self.best is None else max(self.psnr, self.best)
+        return self.psnr >= self.best - LOSS_OF_QUALITY
 
     def refresh(self, step: int) -> None:
         """Copy the present weights, which `step` optimiser steps made."""
-        present = unique_tensors(self._model) if self._keep else {}
+        present = unique_tensors(self.model) if self.keep else {}
         # Host memory: the device's is needed for the training.
         copy = {name: tensor.detach().to("cpu", copy=True) for name, tensor in present.items()}
-        self._copies = [*self._copies, (step, copy)][-2:]
+        self.copies = [*self.copies, (step, copy)][-2:]
 
     def state(self) -> dict[str, Any]:
-        found: dict[str, Any] = {"psnr": self._psnr, "best": self._best}
-        found["steps"] = [step for step, _ in self._copies]
-        for number, (_, copy) in enumerate(self._copies):
+        found: dict[str, Any] = {"psnr": self.psnr, "best": self.best}
+        found["steps"] = [step for step, _ in self.copies]
+        for number, (_, copy) in enumerate(self.copies):
             found |= {f"{number}/{name}": tensor for name, tensor in copy.items()}
         return found
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        self._psnr = state["psnr"]
-        self._best = state["best"]
+        self.psnr = state["psnr"]
+        self.best = state["best"]
         copies: list[dict[str, Tensor]] = [{} for _ in state["steps"]]
         for key, value in state.items():
             number, _, name = key.partition("/")
-            if name and self._keep:
+            if name and self.keep:
                 copies[int(number)][name] = value
-        self._copies = list(zip(state["steps"], copies, strict=True))
+        self.copies = list(zip(state["steps"], copies, strict=True))
 
 
 def not_finite(numbers: Mapping[str, float]) -> str:

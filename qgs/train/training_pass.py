@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from qgs.containers import concatenated, map_tensors, named_tensors
-from qgs.contracts import Loss, Outcome
+from qgs.contracts import Outcome
 from qgs.contracts.schedule import follow
 from qgs.geometry.constants import constant
 from qgs.metrics.images import psnr
@@ -35,17 +35,12 @@ class TrainingPass(nn.Module):
     hook: called with the name and value (tensors, or a nest of them) of each intermediate result.
     """
 
-    def __init__(
-        self,
-        recipe: Recipe,
-        model: QueryGaussianModel,
-        losses: Mapping[str, Loss] | None = None,
-    ) -> None:
-        """recipe: the one that `model` was built from. losses: None for those of the recipe."""
+    def __init__(self, recipe: Recipe, model: QueryGaussianModel) -> None:
+        """recipe: the one that `model` was built from."""
         super().__init__()
         self.model = model
         self.objective = recipe.build_objective()
-        losses = recipe.build_losses() if losses is None else losses
+        losses = recipe.build_losses()
         if not losses:
             raise ValueError("a recipe needs at least one loss to train; add one under `losses`")
         self.losses = nn.ModuleDict(losses)

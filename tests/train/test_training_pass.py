@@ -15,6 +15,7 @@ from qgs.containers import map_tensors
 from qgs.contracts import Loss
 from qgs.losses import Photometric
 from qgs.metrics.images import psnr
+from qgs.recipe import Recipe
 from qgs.train.training_pass import TrainingPass, measure
 
 TARGETS = 3
@@ -67,7 +68,10 @@ def setting(renderer, *kinds, dtype=torch.float32):
     masks = (batch.targets.images.mean(2, keepdim=True) > 0.4).float()
     targets = replace(batch.targets, masks=masks)
     model = recipe.build_model().train().to(dtype)
-    return TrainingPass(recipe, model, losses), batch.inputs.to(dtype), targets.to(dtype)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Recipe, "build_losses", lambda recipe: losses)
+        training_pass = TrainingPass(recipe, model)
+    return training_pass, batch.inputs.to(dtype), targets.to(dtype)
 
 
 def written_out(objective, inputs, targets):
