@@ -57,15 +57,22 @@ def evaluate(
     options.use_threads(threads)
     settings += tuning_settings(tune)
     free = (*SECTIONS, "model.feedback.rounds")
-    if foreign := [s for s in settings if not {k := s.split("=")[0], k.split(".")[0]} & {*free}]:
-        raise ValueError(f"{foreign[0]} would change the trained model; set only {', '.join(free)}")
+    for setting in settings:
+        option = setting.split("=")[0]
+        if option not in free and option.split(".")[0] not in free:
+            allowed = ", ".join(free)
+            raise ValueError(f"{setting} would change the trained model; set only {allowed}")
     with CheckpointFile(run) as file:
-        checkpoint, recipe, step = file.path, file.recipe, file.step
+        checkpoint = file.path
+        recipe = file.recipe
+        step = file.step
         model = file.model(choose_device(device))
     if settings:
         recipe = resolve(recipe.tree, settings)
+        # More rounds need no other weights, so a trained model may make more than in training.
         model.feedback.rounds = recipe.build_model("meta", pretrained=False).feedback.rounds
-    own = Path(run).expanduser().exists()  # so that results may be written beside it
+    # Results are written beside a checkpoint of the user's own, not into a cache.
+    own = Path(run).expanduser().exists()
     folder = out or evaluation_folder(checkpoint, bool(settings), own)
     evaluation = evaluate_into(model, recipe, step, folder, console, batch)
     averaged = RunFolder(checkpoint.parent).checkpoint_ema
@@ -76,7 +83,7 @@ def evaluate(
 
 
 def evaluation_folder(checkpoint: Path, other: bool, own: bool = True) -> Path:
-    """RUN/evaluation for RUN/checkpoint.safetensors, RUN/evaluation_ema for checkpoint_ema, ...
+    """Return RUN/evaluation for RUN/checkpoint.safetensors, RUN/evaluation_ema for checkpoint_ema.
 
     For `other` settings than the recipe's the first unused of RUN/evaluation-2, -3, ... Of a
     checkpoint that is not the user's `own`, a new folder in the working directory.

@@ -16,6 +16,7 @@ from qgs.wording import listed
 
 if TYPE_CHECKING:
     from qgs.recipe import Recipe
+    from qgs.train.training import TrainingResult
 
 
 def train(
@@ -51,28 +52,37 @@ def train(
     except TrainingError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(1) from None
-    run, finished = result.folder, result.resumed_at == result.steps
+    # Of several processes one speaks and evaluates.
     if result.main:
-        before = "was already finished: " if finished and not result.stopped_by else ""
-        console.print(f"{before}{result.steps} steps in {result.seconds:.0f} s, {run.checkpoint}")
-        if bad := result.left_out:
-            lines = [f"{count} x {reason}" for reason, count in bad.items()]
-            first = f"{sum(bad.values())} samples were left out (training.on_bad_sample: skip):"
-            text = "\n  ".join([first, listed(lines, 20, "\n  ")])
-            console.print(text, highlight=False, markup=False, soft_wrap=True)
-        if result.stopped_by:
-            console.print(f"stopped early by {result.stopped_by}; not evaluated")
-            console.print("continue with the same command and --resume", highlight=False)
-        elif finished and (run.evaluation / "protocol.json").exists():  # the last file of one
-            console.print(f"evaluated before, see {run.evaluation}")
-        else:
-            evaluate_into(result.model, resolved, result.steps, run.evaluation, console)
+        _report(result, console)
+        finished = result.resumed_at == result.steps
+        folder = result.folder.evaluation
+        # The protocol is the last file of a whole evaluation.
+        if finished and (folder / "protocol.json").exists():
+            console.print(f"evaluated before, see {folder}")
+        elif not result.stopped_by:
+            evaluate_into(result.model, resolved, result.steps, folder, console)
     if result.stopped_by:
         raise typer.Exit(128 + signal.Signals[result.stopped_by])
 
 
+def _report(result: TrainingResult, console: Console) -> None:
+    """Say what training made, what it left out, and how to go on."""
+    before = "was already finished: " if result.resumed_at == result.steps else ""
+    made = f"{result.steps} steps in {result.seconds:.0f} s, {result.folder.checkpoint}"
+    console.print(f"{before}{made}")
+    if bad := result.left_out:
+        lines = [f"{count} x {reason}" for reason, count in bad.items()]
+        first = f"{sum(bad.values())} samples were left out (training.on_bad_sample: skip):"
+        text = "\n  ".join([first, listed(lines, 20, "\n  ")])
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
+    if result.stopped_by:
+        console.print(f"stopped early by {result.stopped_by}; not evaluated")
+        console.print("continue with the same command and --resume", highlight=False)
+
+
 def with_absolute_path(recipe: Recipe) -> Recipe:
-    """`recipe` with absolute paths of data and index, so that its run can be judged anywhere."""
+    """Make paths of data and index absolute, so that the run can be evaluated from anywhere."""
     from qgs.paths import is_local, opened_path
 
     def absolute(section: dict[str, Any], *keys: str) -> dict[str, Any]:

@@ -141,6 +141,8 @@ class EvaluationPlan:
     def _choices(self, scene: Scene, place: int) -> Iterator[tuple[Frames, Frames]]:
         """Yield input and target frames of each sample."""
         sampler = self.sampler or Span(Span.Config())
+        # What somebody chose comes first: an index, then windows of the sampler's own. Held-out
+        # photos are scarce, so all of them are compared before any frame is drawn by chance.
         if self.index is not None:
             yield _named(scene, self.index)
         elif windows := sampler.windows(scene, self.views):
@@ -150,6 +152,7 @@ class EvaluationPlan:
         else:
             for k in range(self.evaluation.samples):
                 rng = np.random.default_rng([self.evaluation.seed, place, k])
+                # At the end of training: a sampler may widen its gap with the steps.
                 inputs, drawn = sampler.draw(scene, self.views, rng, END)
                 every = range(inputs[0], inputs[-1] + 1) if scene.times is None else drawn
                 yield inputs, tuple(sorted({*every} - {*inputs} or {*drawn}))

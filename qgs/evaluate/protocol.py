@@ -87,6 +87,7 @@ def protocol_of(
     poses = recipe.views.model_dump(include=shown)
     if recipe.views.pose_noise:
         poses["noise"] = [recipe.views.pose_noise, evaluation.seed]
+    # All renderers give the same image, so its type is left out and its options count.
     renderer = recipe.parts["model", "renderer"]
     content = {
         "format": 1,
@@ -138,6 +139,7 @@ def _data_and_views(
 
 
 def _canonical(value: Any) -> str:
+    # Sorted and without spaces: the hash must not depend on who wrote the mapping.
     return json.dumps(
         value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
     )

@@ -225,9 +225,11 @@ class Evaluation:
             f"{' or '.join(map(str, counts))} input views of {width} x {height} pixels, poses "
             f"{poses['frame']}, scale {poses['scale']} {poses.get('scale_factor', '')}".rstrip()
         )
+        # A broken data set would bury the table.
         yield from (f"missing {f.scene}: {f.reason}" for f in self.missing[:10])
         if more := self.missing[10:]:
             yield f"{len(more)} more missing scenes are in scenes.csv"
+        # Whatever an index leaves out is named: scores over other scenes are no comparison.
         if null := self.null:
             yield f"null entries of the index, not judged ({len(null)}): {listed(null)}"
         if names := self.unlisted:

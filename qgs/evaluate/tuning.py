@@ -46,6 +46,7 @@ def tuning_loss(recipe: Recipe) -> Photometric:
 
     Weights that follow the training are those of its end, so that a protocol means one thing.
     """
+    # The photometric loss reads no weights of others, which may be large.
     losses = recipe.build_losses(pretrained=False).values()
     follow(losses, END)
     for loss in losses:
@@ -116,6 +117,7 @@ def tune(
         start if what == "queries" else memory.features,
     )
     leaves = [tensor for _, tensor in named_tensors(tuned) if tensor.requires_grad]
+    # As published: no schedule, no weight decay.
     optimizer = torch.optim.Adam(leaves, lr=rate)
     losses: list[float] = []
 
