@@ -354,12 +354,11 @@ class GoodWeights:
     def load_state(self, state: Mapping[str, Any]) -> None:
         self.psnr = state["psnr"]
         self.best = state["best"]
-        copies: list[dict[str, Tensor]] = [{} for _ in state["steps"]]
-        for key, value in state.items():
-            number, _, name = key.partition("/")
-            if name and self.keep:
-                copies[int(number)][name] = value
-        self.copies = list(zip(state["steps"], copies, strict=True))
+        self.copies = []
+        for number, step in enumerate(state["steps"]):
+            prefix = f"{number}/"
+            copy = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
+            self.copies.append((step, copy))
 
 
 def not_finite(numbers: Mapping[str, float]) -> str:

@@ -60,6 +60,7 @@ class _OfAccelerate(Tracker):
     """A tracker that accelerate has; subclasses make it in `_tracker`."""
 
     _tracker: Any
+    _of_pictures: ClassVar[Mapping[str, str]] = {}
 
     def _start(self, options: Options) -> None:
         self._tracker.start()
@@ -67,6 +68,9 @@ class _OfAccelerate(Tracker):
 
     def log(self, values: Mapping[str, float], step: int) -> None:
         self._tracker.log(dict(values), step=step)
+
+    def picture(self, name: str, picture: np.ndarray, step: int) -> None:
+        self._tracker.log_images({name: picture[None]}, step=step, **self._of_pictures)
 
     def close(self) -> None:
         self._tracker.finish()
@@ -76,14 +80,12 @@ class TensorBoard(_OfAccelerate):
     """Writes into RUN/tensorboard."""
 
     package = "tensorboard"
+    _of_pictures: ClassVar = {"dataformats": "NHWC"}
 
     def __init__(self, run: Path, options: Options, step: int):
         # A resumed run repeats steps after its last save: TensorBoard drops those it has.
         self._tracker = TensorBoardTracker(self.package, run, purge_step=step + 1)
         self._start(options)
-
-    def picture(self, name: str, picture: np.ndarray, step: int) -> None:
-        self._tracker.log_images({name: picture[None]}, step=step, dataformats="NHWC")
 
 
 class WeightsAndBiases(_OfAccelerate):
@@ -99,9 +101,6 @@ class WeightsAndBiases(_OfAccelerate):
         known = place.read_text()
         self._tracker = WandBTracker("qgs", name=name, dir=str(run), id=known, resume="allow")
         self._start(options)
-
-    def picture(self, name: str, picture: np.ndarray, step: int) -> None:
-        self._tracker.log_images({name: [picture]}, step=step)
 
 
 def tracker_kind(name: str) -> type[Tracker]:

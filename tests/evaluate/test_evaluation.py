@@ -123,7 +123,8 @@ def test_scores_are_the_metrics_of_model_and_baselines(judged):
     model = recipe.build_model().eval()
     data = recipe.build_data()
     sample = evaluation_samples(data, recipe.views, recipe.evaluation, depths=True)[0]
-    inputs, targets = sample.inputs, sample.targets
+    inputs = sample.inputs
+    targets = sample.targets
     with torch.no_grad():
         gaussians = model(inputs).gaussians
         rendering = model.render(gaussians, targets.cameras)
@@ -199,7 +200,8 @@ def test_what_is_missing_is_told_in_the_same_line_as_the_score(tmp_path):
     assert summary["null_entries"] == ["nil"]
     assert len(summary["not_in_index"]) == 30
     evaluation.write(tmp_path)
-    text, table = shown(evaluation), (tmp_path / "table.md").read_text()
+    text = shown(evaluation)
+    table = (tmp_path / "table.md").read_text()
     line = f"PSNR {summary['model']['psnr']:.2f} over 1 of 3 scenes; missing: test/000001, gone"
     assert summary["statement"] == line
     for place in (text, table):
@@ -215,9 +217,12 @@ def test_what_is_missing_is_told_in_the_same_line_as_the_score(tmp_path):
 def test_a_failure_anywhere_ends_neither_evaluation_nor_in_silence(monkeypatch):
     """One failed sample fails its scene."""
     recipe = tiny("tokengs", "evaluation.scenes=4", "evaluation.samples=2")
-    model, source = recipe.build_model(), recipe.build_data()
-    rooms, encoder = type(source.scenes("test")[0]), type(model.encoder)
-    images, forward = rooms.images, encoder.forward
+    model = recipe.build_model()
+    source = recipe.build_data()
+    rooms = type(source.scenes("test")[0])
+    encoder = type(model.encoder)
+    images = rooms.images
+    forward = encoder.forward
     decoded = Counter()
 
     def images_of(scene, frames):
@@ -258,9 +263,11 @@ def test_photo_folders_are_judged_on_held_out_frames_beside_a_broken_one(tmp_pat
 
 
 def test_tuned_evaluations_say_so_and_score_the_tuned_tokens():
-    plain, tuned = tiny("locus"), tiny("locus", "evaluation.tuning_steps=2")
+    plain = tiny("locus")
+    tuned = tiny("locus", "evaluation.tuning_steps=2")
     model = plain.build_model()
-    first, second = evaluate(model, plain), evaluate(model, tuned, batch=2)
+    first = evaluate(model, plain)
+    second = evaluate(model, tuned, batch=2)
     assert same(model.state_dict(), plain.build_model().state_dict())
     assert first.summary()["tuning"] is None
     told = second.summary()["tuning"]
@@ -273,7 +280,9 @@ def test_a_protocol_has_a_metrics_definition_and_options():
     def protocol(options):
         return protocol_of(mine(f"metrics.error={{type: mine/mae{options}}}"), None, ["x"])
 
-    plain, same, other = protocol(""), protocol(", log: there"), protocol(", power: 2.0")
+    plain = protocol("")
+    same = protocol(", log: there")
+    other = protocol(", power: 2.0")
     told = {"type": "mine/mae", "definition": "mean absolute error", "power": 1.0}
     assert plain.content["metrics"]["error"] == told
     assert plain.sha256 == same.sha256 != other.sha256

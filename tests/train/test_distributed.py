@@ -34,12 +34,14 @@ def test_two_processes_continue_what_one_began(tmp_path):
         stop.signal = signal.SIGINT
 
     recipe = tiny("locus", "training.ema=0.9", PARTS)
-    two, alone = tmp_path / "two", tmp_path / "alone"
+    two = tmp_path / "two"
+    alone = tmp_path / "alone"
     run(recipe, alone)
     assert run_calling(ask, recipe, two).steps == 1
     train_in_two_processes(recipe, two)
     assert losses(two) == pytest.approx(losses(alone), abs=1e-5)
-    ours, theirs = parts_of(two), parts_of(alone)
+    ours = parts_of(two)
+    theirs = parts_of(alone)
     assert ours["moments"].pop("keys") == theirs["moments"].pop("keys")
     for name in ("weights", "moments", "ema", "good"):
         torch.testing.assert_close(ours[name], theirs[name], rtol=1e-3, atol=1e-4)

@@ -149,12 +149,14 @@ def test_a_full_disk_is_told_with_what_to_do(copied, monkeypatch):
 
 
 def test_a_damaged_state_is_refused_and_nothing_is_replaced(copied):
-    recipe, state = tiny("locus", *TRAINED, "training.steps=4"), RunFolder(copied).state
+    recipe = tiny("locus", *TRAINED, "training.steps=4")
+    state = RunFolder(copied).state
     with safe_open(state, "pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         metadata = file.metadata()
     contents = [state.read_bytes()[:-100], RunFolder(copied).checkpoint.read_bytes()]
-    weight, one = "queries.features", torch.ones(1)
+    weight = "queries.features"
+    one = torch.ones(1)
     for name, changed in (
         (f"weights/{weight}", one),
         (f"ema/{weight}", None),

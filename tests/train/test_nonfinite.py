@@ -23,7 +23,8 @@ from qgs.train.training import compute_gradients
 from qgs.train.training_pass import TrainingPass
 
 GUIDE = Path(__file__).parents[2] / "docs/training.md"
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
+INF = float("inf")
 
 
 class Step:
@@ -31,7 +32,8 @@ class Step:
 
     def __init__(self):
         recipe = tiny("tokengs", "training.render_views=1")
-        self.config, self.accelerator = recipe.training, make_accelerator("cpu")
+        self.config = recipe.training
+        self.accelerator = make_accelerator("cpu")
         self.model = recipe.build_model().train()
         self.objective = TrainingPass(recipe, self.model)
         self.gradients = partial(
@@ -111,7 +113,8 @@ def test_a_module_is_named_by_its_output_and_the_gradient_of_it(step, monkeypatc
 
 
 def test_gaussians_renderings_and_their_gradients_are_named(step, monkeypatch):
-    decode, render = step.model.decode, step.model.render
+    decode = step.model.decode
+    render = step.model.render
     scaled = spoiled(decode, 2, lambda g: replace(g, scales=g.scales * INF))
     blank = spoiled(render, 1, lambda r: replace(r, depth=torch.full_like(r.depth, NAN)))
     bent = lambda g, cameras: render(replace(g, quats=poisoned(1 * g.quats)), cameras)  # noqa: E731

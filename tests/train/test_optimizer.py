@@ -21,7 +21,8 @@ def adamw(steps, warmup, seconds=None, **options):
 
 def test_the_rates_of_steps_alone_and_with_plenty_of_time_follow_torch():
     for steps, warmup in ((40, 10), (100, 2), (7, 3), (50, 40)):
-        schedule, timed = adamw(steps, warmup), adamw(steps, warmup, seconds=1e6)
+        schedule = adamw(steps, warmup)
+        timed = adamw(steps, warmup, seconds=1e6)
         optimizer = torch.optim.SGD([nn.Parameter(torch.zeros(1))])
         reference = torch.optim.lr_scheduler.OneCycleLR(
             optimizer,
@@ -171,7 +172,8 @@ def test_a_plugin_adds_an_optimiser_by_one_class(tmp_path, install):
         "plugins=[rooms, locus, plain]",
         "optimizer={type: plain/plain, learning_rate: 0.02, parts: {encoder: 0, head: 0.5}}",
     )
-    through, halves = tmp_path / "through", tmp_path / "halves"
+    through = tmp_path / "through"
+    halves = tmp_path / "halves"
     history = run(recipe, through).folder.history()
     assert [record["lr"] for record in history] == [0.02] * 3
     run(resolve(recipe.tree, ["training.steps=2"]), halves)

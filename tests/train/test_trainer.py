@@ -53,8 +53,10 @@ def test_a_run_leaves_recipe_history_and_checkpoint(trained_run):
 
 
 def test_averages_and_evaluations_leave_the_training_alone(trained_run, tmp_path):
-    plain, folder = run(tiny("locus"), tmp_path), trained_run.folder
-    parts, watched = parts_of(tmp_path), parts_of(folder.path)
+    plain = run(tiny("locus"), tmp_path)
+    folder = trained_run.folder
+    parts = parts_of(tmp_path)
+    watched = parts_of(folder.path)
     for name in ("weights", "moments", "random"):
         assert same(parts[name], watched[name])
     assert losses(tmp_path) == losses(folder.path)
@@ -68,7 +70,8 @@ def test_averages_and_evaluations_leave_the_training_alone(trained_run, tmp_path
 
 
 def test_weights_and_their_average_are_judged_and_shown_side_by_side(trained_run):
-    folder, recipe = trained_run.folder, tiny("locus", *TRAINED)
+    folder = trained_run.folder
+    recipe = tiny("locus", *TRAINED)
     records = read_jsonl(folder.path / "evaluations.jsonl")
     told = [(r["step"], r["weights"], r["scenes"]) for r in records]
     assert told == [(step, weights, 2) for step in (2, 3) for weights in ("raw", "ema")]
@@ -129,7 +132,8 @@ def test_bad_steps_are_skipped_on_demand(tmp_path, monkeypatch, caplog):
     spoil(monkeypatch, 2, 6)
     options = ("training.steps=4", "training.ema=0.9")
     skipping = tiny("locus", *options, "training.on_nonfinite=skip")
-    through, stopped = tmp_path / "through", tmp_path / "stopped"
+    through = tmp_path / "through"
+    stopped = tmp_path / "stopped"
     run(skipping, through)
     told = [r.message.split(" is ")[0] for r in caplog.records if "is skipped" in r.message]
     assert told == ["step 2", "step 4"]
@@ -147,7 +151,8 @@ def test_bad_steps_are_skipped_on_demand(tmp_path, monkeypatch, caplog):
         assert part in str(error.value)
     assert len(losses(stopped)) == 1
     assert run(skipping, stopped, resume=True).resumed_at == 1
-    ours, theirs = parts_of(stopped), parts_of(through)
+    ours = parts_of(stopped)
+    theirs = parts_of(through)
     for name in ("weights", "ema"):
         assert same(ours[name], theirs[name])
         assert all(tensor.isfinite().all() for tensor in ours[name].values())

@@ -140,9 +140,11 @@ def test_terms_and_gradients_do_not_depend_on_how_many_views_are_rendered_at_onc
 def test_gradients_of_two_passes_are_those_of_the_definition():
     """As one graph, in which the two passes and both comparisons stand written out."""
     recipe = tiny("locus", *TWO, "objective.alpha_weight=0.1", "objective.depth_weight=0.2")
-    model, batch = recipe.build_model().train(), first_batch(recipe)
+    model = recipe.build_model().train()
+    batch = first_batch(recipe)
     step = TrainingPass(recipe, model)
-    total, seen = torch.zeros(()), []
+    total = torch.zeros(())
+    seen = []
     for views in ([0, 1, 3, 4], [0, 2, 4]):
         some = batch.inputs.select(views)
         total = total + sum(written_out(step, some, batch.targets).values()) / 2
@@ -218,8 +220,10 @@ def test_signs_are_those_of_all_views_of_the_last_layer():
 
 def test_input_views_are_judged_too():
     recipe = tiny("tokengs", "training.judge_inputs=true", "losses.visibility=null")
-    model, batch = recipe.build_model().train(), first_batch(recipe)
-    inputs, targets = batch.inputs, batch.targets.select([0])
+    model = recipe.build_model().train()
+    batch = first_batch(recipe)
+    inputs = batch.inputs
+    targets = batch.targets.select([0])
     step = TrainingPass(recipe, model)
     of_inputs, of_targets = (written_out(step, inputs, views) for views in (inputs, targets))
     wanted = {name: (2 * of_inputs[name] + term) / 3 for name, term in of_targets.items()}
@@ -242,7 +246,8 @@ def test_views_are_joined_in_order_and_only_with_their_like():
 
 def test_renderers_and_compiled_losses_follow_their_options():
     recipe = tiny("tokengs", "model.renderer.type=qgs/auto")
-    model, batch = recipe.build_model().eval(), first_batch(recipe)
+    model = recipe.build_model().eval()
+    batch = first_batch(recipe)
     loss = Photometric(Photometric.Config(ssim_weight=0.0))
     compiled = torch.compile(loss, backend="eager")
     layer = model(batch.inputs)
