@@ -178,7 +178,6 @@ def judge(models: Sequence[Model]) -> list[Result]:
             model.network,
             model.recipe,
             model.step,
-            trained_on=model.network.trained_on,
             views_of=model.search,
             sampler=model.windows,
         )
