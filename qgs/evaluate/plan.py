@@ -36,7 +36,7 @@ ViewsOf: TypeAlias = Callable[[Scene, Frames, Frames], ViewsConfig]
 """From a scene, input and target frames to the settings with which their sample is made."""
 
 GIVEN = "frames as context and as target"
-"""What `given_targets` are; a score on them means nothing, the nearest input view is perfect."""
+"""Words for `given_targets`: a score on them means nothing, the nearest input view is perfect."""
 
 
 def given_targets(inputs: Iterable[int], targets: Iterable[int]) -> tuple[int, ...]:

@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class Counters:
-    """What a run has made so far, in all sessions.
+    """Steps, samples and time of a run so far, in all sessions.
 
     step, samples, seconds: optimiser steps, samples over all processes, and time spent; a session's
     clock starts after its first step, in which kernels compile. left_out: of this process, how
@@ -46,7 +46,7 @@ class Counters:
         return max(self.step / self.config.steps, of_seconds)
 
     def every(self, steps: int) -> bool:
-        """Whether this step is one of every `steps`; none is where that is 0."""
+        """Return whether this step is one of every `steps`; none is where that is 0."""
         return bool(steps) and self.step % steps == 0
 
     def read(self, measured: Mapping[str, Tensor]) -> dict[str, float]:

@@ -76,7 +76,7 @@ class RunFolder:
 
     @property
     def is_new(self) -> bool:
-        """Whether the folder does not exist or holds nothing but what killed processes left."""
+        """True where the folder does not exist or holds only what killed processes left."""
         if not self.path.is_dir():
             return True
         return all(is_leftover(file) or file.name == _LOCK for file in self.path.iterdir())

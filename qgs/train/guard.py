@@ -1,4 +1,4 @@
-"""What ends a run by itself: a model that died, and steps that are not finite."""
+"""Ends of a run by itself: a model that died, and steps that are not finite."""
 
 import logging
 import math
@@ -328,7 +328,7 @@ class GoodWeights:
         self.psnr = psnr if self.psnr is None else self.psnr + (psnr - self.psnr) / 10
 
     def due(self, step: int, window: int) -> bool:
-        """Whether to copy the weights after `step` steps; the same in all processes."""
+        """Return whether to copy the weights after `step` steps; the same in all processes."""
         # Rarer in long runs: each copy moves the whole model to the host.
         interval = max(window // 5, min(window, step // 10))
         newest, _ = self.copies[-1]

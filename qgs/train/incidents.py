@@ -20,7 +20,7 @@ from qgs.train.training_pass import TrainingPass
 FRAMES = ("scenes", "input_frames", "target_frames")
 
 Report: TypeAlias = Mapping[str, Any]
-"""What a process found when it repeated a step, as JSON values: `process`, its number; `first`, the
+"""Findings of a process that repeated a step, as JSON values: `process`, its number; `first`, the
 fields of its first `BadTensor` or None; `batches`, FRAMES of each."""
 
 

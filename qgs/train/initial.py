@@ -64,7 +64,7 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
 
 
 def _part(prefix: str, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The weights of one part of the model, by their names in it."""
+    """Return the weights of one part of the model, by their names in it."""
     return {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
 
 

@@ -14,7 +14,7 @@ from qgs.contracts import ModelComponent, Optimizer, ParameterGroup
 def make_optimizer(
     module: nn.Module, optimizer: Optimizer, factors: Mapping[str, float]
 ) -> torch.optim.Optimizer:
-    """Torch's optimiser; a `Recipe.rate_factors` of 0 freezes, ValueError if all are 0."""
+    """Build torch's optimiser; a `Recipe.rate_factors` of 0 freezes, ValueError if all are 0."""
     for name, parameter in module.named_parameters():
         # Frozen, not only a rate of 0: no gradient, no moments, no weight decay.
         if factors[name] == 0:
@@ -26,7 +26,7 @@ def make_optimizer(
 
 
 def parameter_groups(module: nn.Module, factors: Mapping[str, float]) -> list[ParameterGroup]:
-    """The parameters of `module` that train, grouped by decay and factor of the learning rate.
+    """Group the parameters of `module` that train by decay and factor of the learning rate.
 
     The innermost component around a parameter decides whether it decays (`ModelComponent.decays`);
     outside of components all but 1-d parameters do. A shared parameter goes by its first name.
@@ -51,7 +51,7 @@ def parameter_groups(module: nn.Module, factors: Mapping[str, float]) -> list[Pa
 
 
 class OptimizerState:
-    """What torch's optimiser keeps for each parameter (moments, steps), by the parameter's name.
+    """Values that torch's optimiser keeps (moments, steps), by the names of parameters.
 
     Torch's own `state_dict` numbers parameters by their place in the groups. `torch.distributed`'s
     helpers name them too, but give parameters without a gradient moments that they do not have.
@@ -63,7 +63,7 @@ class OptimizerState:
         self._optimizer = optimizer
 
     def state(self) -> dict[str, Any]:
-        """Tensors and JSON values, PARAMETER/KEY; under "keys" the keys of every parameter."""
+        """Return values by PARAMETER/KEY; under "keys" the keys of every parameter."""
         kept = self._optimizer.state_dict()["state"]
         keys: dict[str, list[str]] = {}
         found: dict[str, Any] = {"keys": keys}
@@ -115,7 +115,7 @@ class MovingAverage:
 
     @contextmanager
     def applied(self) -> Iterator[None]:
-        """The model with the averaged weights, for the `with` block only."""
+        """Give the model the averaged weights, for the `with` block only."""
         tensors = unique_tensors(self._model)
         present = {name: tensor.detach().clone() for name, tensor in tensors.items()}
         try:
@@ -125,7 +125,7 @@ class MovingAverage:
             _copy(present, tensors)
 
     def state(self) -> dict[str, Tensor]:
-        """The averages, named as `qgs.checkpoint.model_file.save` takes weights."""
+        """Return the averages, named as `qgs.checkpoint.model_file.save` takes weights."""
         return dict(self._averages)
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:

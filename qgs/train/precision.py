@@ -15,7 +15,7 @@ ACCELERATE = "no"
 
 
 def autocast(precision: str, device: str) -> torch.autocast:
-    """The autocast of a forward pass; precision: one of DTYPES; device: a type such as "cuda"."""
+    """Return the autocast of a forward pass. precision: of DTYPES; device: such as "cuda"."""
     dtype = DTYPES[precision]
     return torch.autocast(device, dtype, enabled=dtype is not None)
 

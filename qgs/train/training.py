@@ -53,7 +53,7 @@ ELSEWHERE = "another process of this training has no next batch; see its own mes
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """What a run left: the trained model, its folder, optimiser steps, seconds on the clock.
+    """The trained model of a run, its folder, optimiser steps, seconds on the clock.
 
     stopped_by: name of the signal that ended it early, else None. main: whether this process writes
     the files. resumed_at: the step from which a run was continued, None for one that began here.

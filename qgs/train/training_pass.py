@@ -1,4 +1,4 @@
-"""What a training step runs: the objective with the model and the losses that it calls."""
+"""The forward pass of a training step: the objective with the model and the losses it calls."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -66,7 +66,7 @@ class TrainingPass(nn.Module):
 
     @property
     def reads_depths(self) -> bool:
-        """Whether a loss reads depth maps."""
+        """True where a loss reads depth maps."""
         return any(getattr(loss, "reads_depths", False) for loss in self.losses.values())
 
     def follow(self, step: int) -> None:
@@ -118,7 +118,7 @@ class TrainingPass(nn.Module):
         return Outcome(total, terms, {**means, "deviation": deviation})
 
     def _parts(self, targets: Views) -> list[Views]:
-        """The target views in slices of `render_views`, or whole where a loss compares views."""
+        """Slice the target views by `render_views`; whole where a loss compares views."""
         if not self.render_views or any(loss.renderings == "all" for loss in self.losses.values()):
             return [targets]
         return [targets.select(views) for views in _slices(targets.cameras, self.render_views)]
