@@ -38,6 +38,7 @@ def train(
     \b
         torchrun --standalone --nproc-per-node=8 -m qgs train RECIPE --out RUN
     """
+    # Here, so that the help of all commands needs no torch.
     from qgs.evaluate.protocol import index_of
     from qgs.recipe import resolve
     from qgs.train.guard import TrainingError
@@ -46,9 +47,11 @@ def train(
     use_threads(threads)
     console = Console()
     resolved = with_absolute_path(resolve(recipe, overrides or ()))
-    index_of(resolved)  # a missing index raises now, not after the training
+    # A missing index raises now, not after the training.
+    index_of(resolved)
     try:
         result = train_model(resolved, out, console=console, device=device, resume=resume)
+    # It names causes and remedies itself; a traceback would hide them.
     except TrainingError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(1) from None
