@@ -150,6 +150,8 @@ class Measures:
             with self._named(label, "forward"):
                 found = metric(given)
                 found = found if isinstance(found, Mapping) else {"": found}
+                if found.keys() != metric.columns().keys():
+                    raise ValueError(f"gives {[*found]}, its columns are {[*metric.columns()]}")
                 for key in metric.columns():
                     # float64, so that the mean adds no rounding of its own.
                     values[f"{method}_{_name(label, key)}"] = float(found[key].double().mean())
