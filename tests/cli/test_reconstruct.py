@@ -90,9 +90,7 @@ def test_everything_is_written_and_what_a_user_made_is_kept(
     assert Image.open(tmp_path / "orbit.gif").n_frames == len(record["orbit"])
 
 
-def test_photos_held_out_are_compared_with_and_not_refined_on(
-    checkpoint, photos, tmp_path, small_pictures
-):
+def test_photos_held_out_are_compared_with(checkpoint, photos, tmp_path, small_pictures):
     cases = {
         "": {3},
         "--holdout none": set(),
@@ -101,11 +99,7 @@ def test_photos_held_out_are_compared_with_and_not_refined_on(
         "--frames 2,3": set(),  # 3 is the held-out one
     }
     for options, compared in cases.items():
-        words = (*options.split(), "--refine", 0.01, "--overwrite")
-        record = written(checkpoint, photos, *words, out=tmp_path)
-        refined = record_of(tmp_path / "refined")
-        assert refined["refinement"]["frames"] == [*{*range(7)} - compared], options
-        assert kinds(refined) == kinds(record)
+        record = written(checkpoint, photos, *options.split(), "--overwrite", out=tmp_path)
         assert {f for f, kind in kinds(record).items() if kind == "novel"} == compared, options
 
 
@@ -122,29 +116,14 @@ def test_a_call_gives_what_the_command_gives(checkpoint, photos, tmp_path, small
     torch.testing.assert_close(own.means, result.gaussians.means)  # in the model's world
 
 
-def test_photos_of_the_training_are_not_called_novel_and_those_held_out_never_refined_on(
-    photos, tmp_path, small_pictures
-):
+def test_photos_of_the_training_are_not_called_novel(photos, tmp_path, small_pictures):
     """Of which 1 and 4 were held out."""
     file = saved(tmp_path / "own.safetensors", "qgs/photos", path=str(photos), holdout=3)
     record = written(file, photos, "--set", "views.scale_factor=0.5", out=tmp_path / "default")
     assert kinds(record) == {0: "input", 2: "input", 1: "novel"}
     assert record["to_photos"]["scale"] == 0.5
-    chosen = (file, photos, "--frames", "0,6", "--holdout", "1,3", "--refine", 0.05)
-    larger = ("--gaussians", 50, "--refine-size", "20x24")
-    for name, words, frames, size, count in (
-        ("inputs", ["--refine-inputs"], [0, 6], [16, 16], 32),
-        ("all", larger, [0, 2, 5, 6], [20, 24], 50),
-    ):
-        out = tmp_path / name
-        record = written(*chosen, *words, out=out)
-        assert kinds(record) == {0: "input", 6: "input", 1: "novel", 3: "seen in training"}
-        refined = record_of(out / "refined")
-        assert kinds(refined) == kinds(record)
-        assert refined["refinement"]["frames"] == frames
-        assert refined["views"][0]["size"] == size
-        assert PlyData.read(out / "gaussians.ply")["vertex"].count == 32
-        assert PlyData.read(out / "refined/gaussians.ply")["vertex"].count == count
+    record = written(file, photos, "--frames", "0,6", "--holdout", "1,3", out=tmp_path / "named")
+    assert kinds(record) == {0: "input", 6: "input", 1: "novel", 3: "seen in training"}
 
 
 @pytest.mark.parametrize("own", [False, True])
@@ -185,11 +164,7 @@ def test_photos_that_are_not_there_are_refused(photos):
 
 
 SENSELESS = """
---gaussians 50 | --gaussians
---refine-inputs | --refine-inputs
---refine-size 8x8 | --refine-size
---refine 0 | --refine
---refine 1 --refine-size 64 | --refine-size
+--size 64 | --size
 --set views.scale=big | views.scale
 --set data.path=x | data.path
 """

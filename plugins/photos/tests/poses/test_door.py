@@ -1,4 +1,4 @@
-"""Photos without cameras and videos, wherever qgs takes photos."""
+"""Photos without cameras and videos, wherever a command takes photos."""
 
 import re
 import shutil
@@ -7,12 +7,13 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from commands import run_qgs
 from photo_formats import opened
 from qgs_photos.poses import door, making
 from qgs_photos.poses.making import locked
 from qgs_photos.poses.photos import PosesError
 from walked import PHOTOS
+
+import qgs
 
 
 @pytest.fixture
@@ -25,7 +26,7 @@ def calls(made, monkeypatch):
         shutil.copytree(made.folder, out, dirs_exist_ok=True)
         return made
 
-    monkeypatch.setattr(door, "make_locked", found)
+    monkeypatch.setattr(making, "_made", found)
     return calls
 
 
@@ -35,25 +36,26 @@ def folder(walk, calls, tmp_path):
     return shutil.copytree(walk, tmp_path / "holiday")
 
 
+def photos_of(folder):
+    """Photos as a command opens them."""
+    return qgs.read_photos(folder, size=(8, 12)).images
+
+
 def test_poses_are_made_once_and_kept_beside_the_photos(folder, calls):
     for _ in range(2):
-        source = opened(folder)
-        assert source.names("train") == ["holiday"]
-        assert len(source.scenes("train")[0]) == PHOTOS
+        assert photos_of(folder).shape[1] == PHOTOS
     assert len(calls) == 1
-    assert (folder.parent / "holiday_poses/sparse/0").is_dir()
+    beside = folder.parent / "holiday_poses"
+    assert (beside / "sparse/0").is_dir()
+    assert {*folder.parent.iterdir()} == {folder, beside}
     (folder / "1.jpg").unlink()  # other photos are not mixed up
     with pytest.raises(PosesError, match="holiday_poses"):
-        opened(folder)
+        photos_of(folder)
 
 
-def test_no_poses_refuses(folder, calls, monkeypatch, tmp_path):
-    monkeypatch.setenv("QGS_NO_POSES", "1")
-    with pytest.raises(ValueError, match="--no-poses"):
-        opened(folder)
-    monkeypatch.setenv("QGS_NO_POSES", "")  # and what the command sets ends with the test
-    result = run_qgs("scene", folder, "--out", tmp_path / "out", "--no-poses")
-    assert "--no-poses" in str(result.exception)
+def test_a_training_makes_none(folder, calls):
+    with pytest.raises(FileNotFoundError, match="Make some by `qgs poses`"):
+        opened(folder).scenes("train")
     assert not calls
 
 
@@ -62,14 +64,14 @@ def test_a_folder_of_something_else_is_not_written_into(folder):
     notes.parent.mkdir()
     notes.touch()
     with pytest.raises(FileExistsError):
-        opened(folder)
+        photos_of(folder)
     assert [*notes.parent.iterdir()] == [notes]
 
 
 def test_a_folder_whose_photos_are_elsewhere_is_none(tmp_path):
     (tmp_path / "a/b").mkdir(parents=True)
     with pytest.raises(FileNotFoundError, match="lists no cameras"):
-        opened(tmp_path / "a")
+        photos_of(tmp_path / "a")
 
 
 def waiting(folder, monkeypatch):
@@ -90,24 +92,23 @@ def test_one_that_waits_takes_what_the_other_made(folder, calls, made, monkeypat
     out = door.beside(folder)
     with locked(folder, out, wait=False):
         call = waiting(folder, monkeypatch)
-        shutil.copytree(made.folder, out, dirs_exist_ok=True)
+        shutil.copytree(made.folder, out)
     assert call.result(20) == out
     assert not calls
 
 
-def test_one_that_waits_for_photos_without_poses_locks_a_new_folder(folder, made, monkeypatch):
+def test_one_that_waits_for_a_failed_call_makes_them_alone(folder, made, monkeypatch):
     out = door.beside(folder)
 
     def checked(*rest):
-        with pytest.raises(FileExistsError), locked(folder, out, wait=False):
+        with pytest.raises(FileExistsError, match="another process"), locked(folder, out, False):
             pass
         return made
 
-    monkeypatch.setattr(door, "make_locked", checked)
+    monkeypatch.setattr(making, "_made", checked)
     with locked(folder, out, wait=False):
         call = waiting(folder, monkeypatch)
-        time.sleep(0.2)  # it waits for the lock of the folder that now is deleted
-        out.rmdir()
+        time.sleep(0.2)  # it waits for the file that is deleted now
     assert call.result(20) == out
 
 

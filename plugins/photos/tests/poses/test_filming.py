@@ -1,10 +1,10 @@
-"""A reconstruction filmed by --video, and again from its folder by `qgs video`."""
+"""A reconstruction filmed from its folder by `qgs video`."""
 
 import json
 
 import numpy as np
 import torch
-from commands import run_qgs
+from commands import done, run_qgs
 from photo_formats import noisy_photos, row_of_frames
 from qgs_photos.poses.paths import read_path
 from training_runs import tiny
@@ -17,22 +17,17 @@ from qgs.types import Cameras
 
 
 def test_a_film_that_cannot_be_written_is_refused_at_once(tmp_path):
-    """The checkpoint does not exist, which is found out later."""
+    """The reconstruction does not exist, which is found out later."""
     phone = tmp_path / "phone.mp4"
     phone.write_bytes(b"mine")
-    words = f"reconstruct {tmp_path}/none.safetensors {phone} --out {tmp_path}/made --overwrite"
-    for film, error in (
-        ("phone.mp4 --path orbit", FileExistsError),
-        ("a.gif --path orbit", ValueError),
-        ("a.mp4 --path orbits", ValueError),
-    ):
-        result = run_qgs(*f"{words} --video {tmp_path}/{film}".split())
+    for film, error in (("phone.mp4", FileExistsError), ("a.gif", ValueError)):
+        result = run_qgs("video", tmp_path / "none", "--out", tmp_path / film)
         assert type(result.exception) is error, film
     assert [*tmp_path.iterdir()] == [phone]
     assert phone.read_bytes() == b"mine"
 
 
-def test_both_films_show_what_the_reconstruction_renders_of_the_photos_world(tmp_path):
+def test_a_film_shows_what_the_reconstruction_renders_of_the_photos_world(tmp_path):
     model = tiny("tokengs", "model.renderer.background=[0, 0, 0]").build_model()
     for weights in model.parameters():  # a fresh one draws all Gaussians alike
         weights.data += 0.02 * torch.randn_like(weights)
@@ -44,17 +39,15 @@ def test_both_films_show_what_the_reconstruction_renders_of_the_photos_world(tmp
     for frame in listed["frames"]:
         frame["transform_matrix"][2][3] = -0.38
     path.write_text(json.dumps(listed))
-    one, two, made = (tmp_path / name for name in ("one.mp4", "two.mp4", "made"))
-    reconstructing = f"reconstruct {checkpoint} {photos} --out {made} --inputs 2 --scale 2"
-    for command in (f"{reconstructing} --video {one}", f"video {made} --out {two}"):
-        result = run_qgs(*f"{command} --path {path}".split())
-        assert result.exit_code == 0, (result.output, result.exception)
+    film = tmp_path / "film.mp4"
+    made = tmp_path / "made"
+    done("reconstruct", checkpoint, photos, "--out", made, "--inputs", 2, "--scale", 2)
+    done("video", made, "--out", film, "--path", path)
 
     scene = reconstruct(qgs.load(checkpoint), photos, inputs=2, overrides=scale_settings(2.0))
     c2w, lens = read_path(path, (480, 480), None)
     rendered = scene.render(Cameras(c2w[None], lens[None], (480, 480))).rgb[0]
     expected = 255 * rendered.clamp(0, 1).permute(0, 2, 3, 1).numpy()
     assert np.abs(expected[0] - expected[1]).mean() > 0.05 * 255
-    for film in (frames(one), frames(two)):
-        assert np.shape(film) == expected.shape
-        assert np.abs(film - expected).mean((1, 2, 3)).max() < 0.01 * 255
+    assert np.shape(frames(film)) == expected.shape
+    assert np.abs(frames(film) - expected).mean((1, 2, 3)).max() < 0.01 * 255

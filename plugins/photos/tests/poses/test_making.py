@@ -82,8 +82,8 @@ def test_other_folders_are_left_alone(walk, made, tmp_path):
 
 
 def test_a_photo_of_several_models_is_in_the_largest_alone():
-    models = map(list, ["abcd", "bc", "def", "eg"])
-    assert making.apart([*models]) == [["a", "b", "c", "d"], ["e", "f"]]
+    models = ["abcd", "bc", "def", "eg"]
+    assert making.apart(models) == [["a", "b", "c", "d"], ["e", "f"]]
 
 
 def test_the_summary_says_what_to_do_where_some_have_none_and_what_differs(made):

@@ -9,7 +9,13 @@ import torch
 from commands import run_qgs
 from PIL import Image, ImageSequence
 from qgs_photos.poses.film import write_film
-from qgs_photos.poses.filming import Shot, Stage, cameras_of, open_stage, seen_depth
+from qgs_photos.poses.filming import (
+    FilmOptions,
+    FilmScene,
+    cameras_of,
+    open_film_scene,
+    seen_depth,
+)
 from qgs_photos.poses.paths import path_of, read_path, walk
 from tables import must_refuse
 from walked import frames
@@ -92,12 +98,12 @@ def test_a_file_that_is_no_path_is_refused(tmp_path):
 
 def test_size_length_and_angle_of_view():
     world = torch.eye(4).double(), 1.0
-    stage = Stage(wall(3.0), cameras(), AutoRenderer(AutoRenderer.Config()), world)
-    assert seen_depth(stage) == pytest.approx(3.0, rel=0.02)
-    path = cameras_of(stage, Shot("orbit", seconds=0.5, rate=10))
+    scene = FilmScene(wall(3.0), cameras(), AutoRenderer(AutoRenderer.Config()), world)
+    assert seen_depth(scene) == pytest.approx(3.0, rel=0.02)
+    path = cameras_of(scene, FilmOptions("orbit", seconds=0.5, rate=10))
     assert path.shape == (1, 5)
     assert path.size == (480, 720)
-    path = cameras_of(stage, Shot("spiral", (100, 200), 0.5, 10, fov=60))
+    path = cameras_of(scene, FilmOptions("spiral", size=(100, 200), seconds=0.5, rate=10, fov=60))
     focal = 50 / math.tan(math.radians(30))
     assert path.intrinsics[0, 0].tolist() == pytest.approx([focal, focal, 100, 50])
 
@@ -117,11 +123,11 @@ def test_a_film_shows_the_pictures(tmp_path):
 
 
 def test_a_scene_of_photos_is_filmed_from_their_cameras(made, tmp_path):
-    """What is rendered in the stage's world is what the photos' world shows."""
+    """What is rendered in the film's world is what the photos' world shows."""
     views = qgs.read_photos(made.folder, size=SIZE)
     gaussians = moved(wall(1.5), views.cameras.c2w[0, 0], 1.0)
     save_ply(gaussians, tmp_path / "scene.ply")
-    opened = open_stage(tmp_path / "scene.ply", str(made.folder), None)
+    opened = open_film_scene(tmp_path / "scene.ply", str(made.folder), None)
     third = opened.cameras[:, 2:3]
     lens = third.intrinsics * SIZE[0] / third.size[0]
     renderer = TorchRenderer(TorchRenderer.Config())
@@ -142,5 +148,6 @@ def test_the_command_films_and_overwrites_nothing(made, tmp_path):
         (f"{tmp_path}", ValueError),
         (f"{tmp_path} --out {tmp_path}/a.gif", ValueError),
         ("nothing", FileNotFoundError),
+        (film.replace("a.mp4", "b.mp4").replace("walk", "walks"), ValueError),
     ):
         assert isinstance(run_qgs("video", *refused.split()).exception, error)

@@ -10,15 +10,14 @@ from itertools import count
 import pytest
 import torch
 from line_scenes import circle
+from qgs_photos.refine import refine
 from qgs_photos.refine.growth import DEAD, FreeGaussians
 from qgs_photos.refine.refining import Extras, mean_psnr, resized
 from qgs_photos.refine.scene import masked
 from tables import must_refuse
 
-import qgs
-from qgs.containers import map_tensors
 from qgs.renderers import AutoRenderer
-from qgs.types import Cameras, Gaussians, Views
+from qgs.types import Cameras, Gaussians, Views, map_tensors
 
 RENDERER = AutoRenderer(AutoRenderer.Config())
 
@@ -89,7 +88,7 @@ def test_photos_that_are_not_optimised_on_are_met_better(scene):
     views, compared = scene
     start = cloud(40, seed=1)
     before = start.means.clone()
-    result, again = (qgs.refine(start, views, 100, compared=compared) for _ in range(2))
+    result, again = (refine(start, views, 100, compared=compared) for _ in range(2))
     refined = result.gaussians
     assert torch.equal(refined.means, again.gaussians.means)
     assert torch.equal(start.means, before)
@@ -108,8 +107,8 @@ def test_photos_that_are_not_optimised_on_are_met_better(scene):
 def test_there_are_as_many_as_wanted(scene):
     start = cloud(30)
     for wanted in (90, 12, 30):
-        assert qgs.refine(start, scene[0], 30, count=wanted).gaussians.count == wanted
-    two_steps = qgs.refine(start, scene[0], 1.5, count=12).gaussians.opacities[:, :6]
+        assert refine(start, scene[0], 30, count=wanted).gaussians.count == wanted
+    two_steps = refine(start, scene[0], 1.5, count=12).gaussians.opacities[:, :6]
     most_opaque = start.opacities.topk(6).values
     assert torch.allclose(two_steps.sort(descending=True).values, most_opaque, 0, 0.06)
 
@@ -119,7 +118,7 @@ def test_harmonics_are_refined_and_features_kept(scene):
     views, compared = scene
     marks = torch.arange(1.0, 31)[None, :, None]
     start = replace(cloud(30), sh=torch.zeros(1, 30, 8, 3), features=marks)
-    result = qgs.refine(start, views, 60, count=50, compared=compared).gaussians
+    result = refine(start, views, 60, count=50, compared=compared).gaussians
     assert result.sh.shape == (1, 50, 8, 3)
     assert result.sh.abs().max() > 1e-3
     assert {*result.features.flatten().tolist()} <= {*range(31)}
@@ -128,7 +127,7 @@ def test_harmonics_are_refined_and_features_kept(scene):
 
 def test_an_interrupt_keeps_what_there_is(scene, clock):
     clock(lambda now: os.kill(os.getpid(), signal.SIGINT) if now == 11 else None)
-    result = qgs.refine(cloud(30), scene[0], 1000)
+    result = refine(cloud(30), scene[0], 1000)
     assert result.stopped_by == "SIGINT"
     assert result.steps == 6  # that of the twelfth reading is finished
     assert result.gaussians.count == 30
@@ -150,7 +149,7 @@ def test_unusable_input_is_refused():
     views, four = photos(2), cloud(4)
 
     def refined(gaussians=four, given=views, seconds=1, wanted=4):
-        qgs.refine(gaussians, given, seconds, count=wanted)
+        refine(gaussians, given, seconds, count=wanted)
 
     for word, wrong in (
         ("2 scenes", {"gaussians": map_tensors(lambda x: x.expand(2, *x.shape[1:]), four)}),
@@ -212,7 +211,7 @@ def test_growth_leaves_the_rendering_as_it_is():
 
 def refined(views, seconds, **extras):
     """The true cloud, refined on views that are not quite true."""
-    return qgs.refine(cloud(60), views, seconds, swept=0.0, extras=Extras(**extras))
+    return refine(cloud(60), views, seconds, swept=0.0, extras=Extras(**extras))
 
 
 def test_a_photo_with_a_wrong_pose_is_met_and_the_others_stay():
@@ -258,7 +257,7 @@ def test_harmonics_grow_with_time():
 
     def watched(start, seconds):
         options = {"renderer": Watching(), "extras": Extras(degree=2)}
-        return qgs.refine(start, photos(2), seconds, **options).gaussians.sh.shape
+        return refine(start, photos(2), seconds, **options).gaussians.sh.shape
 
     assert watched(cloud(30), 40) == (1, 30, 8, 3)
     assert seen == sorted(seen)

@@ -16,7 +16,7 @@ def result(novel, side=8):
 
 
 def test_a_refinement_that_ended_too_early_is_remarked():
-    assert "--refine" in _worse_than_before(result(20.1), result(18.0))
+    assert "--seconds" in _worse_than_before(result(20.1), result(18.0))
     for before, after in (
         (result(18.0), result(20.1)),
         (result(20.104), result(20.101)),

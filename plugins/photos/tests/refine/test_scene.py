@@ -4,6 +4,7 @@ import io
 import json
 import re
 import shutil
+import sys
 from dataclasses import replace
 from unittest.mock import MagicMock
 
@@ -14,18 +15,18 @@ from commands import run_qgs
 from photo_formats import PhotoSet, write_colmap, write_nerfstudio
 from PIL import Image
 from plyfile import PlyData
-from qgs_photos.refine import scene as making
-from qgs_photos.refine.planning import (
+from qgs_photos.refine.initial import TIMED, photos_start, photos_world
+from qgs_photos.refine.options import NONE, Options
+from qgs_photos.refine.refining import Extras
+from qgs_photos.refine.result import page_writer
+from qgs_photos.refine.scene_photos import (
     LEAST_STEPS,
-    NONE,
-    Plan,
-    Scenes,
+    ScenePhotos,
+    StepTime,
     affordable,
     judged_frames,
     sized,
 )
-from qgs_photos.refine.refining import Extras
-from qgs_photos.refine.scene import photos_start, photos_world
 from rich.console import Console
 from test_refining import RENDERER
 from textured_room import INTRINSICS, walk
@@ -55,8 +56,8 @@ def photos(taken, tmp_path_factory):
 
 
 @pytest.fixture
-def scenes(photos):
-    return Scenes(str(photos), None, "8", None, None)
+def photos_of_scene(photos):
+    return ScenePhotos(str(photos), Options())
 
 
 def made(command, out):
@@ -101,10 +102,10 @@ def test_a_model_makes_the_start(photos, tmp_path):
 
 
 def test_without_the_viewer_there_is_no_page(monkeypatch):
-    monkeypatch.setattr("qgs.extensions.installed", lambda group: ())
+    monkeypatch.setitem(sys.modules, "qgs_viewer.page", None)
     console = Console(file=io.StringIO(), width=200)
-    assert making._page_writer(console) is None
-    assert "pip install query-gaussians-viewer" in console.file.getvalue()
+    assert page_writer(console) is None
+    assert "pip install" in console.file.getvalue()
 
 
 def test_options_that_cannot_be_used_are_refused(photos, tmp_path):
@@ -138,44 +139,52 @@ def test_judged_frames():
     assert (judged_frames(own, "8"), judged_frames(own, NONE)) == ((0, 5), ())
 
 
-def test_more_time_buys_larger_photos_and_more_gaussians(scenes):
-    assert sized(scenes.probe, 128) == (32, 48)  # photos are never enlarged
-    scenes.probe.stored_size = lambda frame: (720, 1280)
-    step, size = 0.01, (128, 128)
-    rows = [affordable(step, size, 2048, scenes, t, (None, None)) for t in (1, 120, 1200, 1e9)]
-    assert rows == sorted(rows)
-    sizes = [size for size, _ in rows]
+def test_more_time_buys_larger_photos_and_more_gaussians(photos_of_scene):
+    assert sized(photos_of_scene.small, 128) == (32, 48)  # photos are never enlarged
+    photos_of_scene.small.stored_size = lambda frame: (720, 1280)
+    time = StepTime(seconds=0.01, size=(128, 128), gaussians=2048)
+    given = [affordable(time, photos_of_scene, t, Options()) for t in (1, 120, 1200, 1e9)]
+    assert given == sorted(given)
+    sizes = [size for size, _ in given]
     assert sizes[::3] == [(96, 171), (720, 1280)]
     assert len({*sizes}) == 4
-    wanted = (90, 160), 77
-    assert affordable(step, size, 2048, scenes, 1, wanted) == wanted
-    assert step * LEAST_STEPS < 120
+    wanted = Options(size=(90, 160), gaussians=77)
+    assert affordable(time, photos_of_scene, 1, wanted) == ((90, 160), 77)
+    assert time.seconds * LEAST_STEPS < 120
 
 
-def test_a_plan_is_a_command_line():
-    plan = Plan("rooms/locus-64", ("a b.jpg", "c.jpg"), 0.381966, (64, 112), 900, 30.4, "8")
+def test_chosen_options_are_a_command_line():
+    options = Options(
+        model="rooms/locus-64",
+        frames="a b.jpg,c.jpg",
+        scale=0.381966,
+        size=(64, 112),
+        gaussians=900,
+        seconds=30.4,
+        scene="walk",
+    )
     words = "--scene walk --model rooms/locus-64 --frames 'a b.jpg,c.jpg' --scale 0.38197 "
     words += "--size 64x112 --gaussians 900 --seconds 30 --holdout 8 --degree "
     start = "qgs scene 'my photos' --out out "
-    assert plan.command("my photos", "out", "walk") == f"{start}{words}0"
-    plan = replace(plan, extras=Extras(degree=2, exposure=True, poses=True), masks=True)
-    command = plan.command("my photos", "out", "walk")
-    assert command == f"{start}{words}2 --exposure --refine-poses --masks"
+    assert options.command("my photos", "out") == f"{start}{words}0"
+    extras = Extras(degree=2, exposure=True, poses=True)
+    command = replace(options, extras=extras, masks=True).command("my photos", "out")
+    assert command == f"{start}{words}2 --adjust poses --adjust exposure --masks"
 
 
-def test_points_of_colmap_are_part_of_the_start(taken, photos, scenes, tmp_path):
+def test_points_of_colmap_are_part_of_the_start(taken, photos_of_scene, photos, tmp_path):
     """Of a folder of scenes, one of which is a COLMAP model with a point at (0, 0, 5)."""
     shutil.copytree(photos, tmp_path / "other")
     write_colmap(tmp_path / "mine", taken, "text")
-    of_colmap = Scenes(str(tmp_path), "mine", "8", None, None)
+    of_colmap = ScenePhotos(str(tmp_path), Options(scene="mine"))
     world = photos_world(of_colmap)
-    views = views_in(world, of_colmap.probe, of_colmap.frames)
-    found = photos_start(of_colmap.probe, world, views, 100, 40)
+    views = views_in(world, of_colmap.small, of_colmap.frames)
+    found = photos_start(of_colmap.small, world, views, 100, 40)
     assert found.count == 41
     point = moved(found, world[0], 1 / float(world[1])).means[0, 0]
     assert torch.allclose(point, torch.tensor([0.0, 0, 5]), 0, 1e-4)
-    found = photos_start(scenes.probe, photos_world(scenes), views, 100, 40)
-    assert found.count == making.TIMED
+    found = photos_start(photos_of_scene.small, photos_world(photos_of_scene), views, 100, 40)
+    assert found.count == TIMED
 
 
 def test_a_start_is_judged_on_photos_taken_nearby_whatever_their_order():

@@ -8,15 +8,9 @@ from rich.console import Console
 from upath import UPath
 
 from qgs.data.photos.reader import Listing, PhotoReader, image_files
-from qgs_photos.poses.making import (
-    Options,
-    fingerprint,
-    locked,
-    make_locked,
-    read_record,
-    refuse_foreign,
-)
+from qgs_photos.poses.making import Options, fingerprint, locked, make_locked, read_record
 from qgs_photos.poses.photos import PosesError
+from qgs_photos.printing import say
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
@@ -48,22 +42,30 @@ class Unposed(PhotoReader):
 
 
 def posed_folder(source: Path) -> Path:
-    """The poses of the photos or the video `source`, beside it in NAME_poses; made if need be.
+    """Return the poses of the photos or the video `source`, beside it in NAME_poses.
 
-    Raises PosesError where they belong to other photos than are there now, and as `make_poses`.
+    Makes them if need be. Raises PosesError where they belong to other photos than are there now,
+    and as `make_poses`.
     """
-    held, out = fingerprint(source), beside(source)
+    held = fingerprint(source)
+    out = beside(source)
     if is_made(source, held, out):
         return out
-    with locked(source, out, wait=True):  # of several processes of a training one makes them
+    console = Console(stderr=True)
+    with locked(source, out, wait=True):
+        # of several processes that open the same photos the first makes poses, the others wait
         if not is_made(source, held, out):
-            refuse_foreign(out)
-            _make(source, held, out)
+            say(
+                console,
+                f"{source} has no camera poses: they are made first, once, and kept in {out}",
+            )
+            for line in make_locked(source, held, out, Options(), console).summary:
+                say(console, line)
     return out
 
 
 def is_made(source: Path, held: Mapping[str, Any], out: Path) -> bool:
-    """Whether `out` has the poses of `source`. Raises PosesError where they are of other photos.
+    """Return whether `out` has the poses of `source`. Raises PosesError for those of others.
 
     held: fingerprint of `source`.
     """
@@ -76,18 +78,7 @@ def is_made(source: Path, held: Mapping[str, Any], out: Path) -> bool:
     return record is not None
 
 
-def _make(source: Path, held: Mapping[str, Any], out: Path) -> None:
-    console = Console(stderr=True)
-
-    def say(text: str) -> None:
-        console.print(text, soft_wrap=True, highlight=False, markup=False)
-
-    say(f"{source} has no camera poses: they are made first, once, and kept in {out}")
-    for line in make_locked(source, held, out, Options(), console).summary:
-        say(line)
-
-
 def beside(source: Path) -> Path:
-    """Where the poses of `source` are kept."""
+    """Return where the poses of `source` are kept."""
     whole = source.resolve()
     return whole.with_name(f"{whole.stem if source.is_file() else whole.name}_poses")

@@ -1,35 +1,33 @@
-"""`qgs video` and --video: what is filmed, from where, how large and how long."""
+"""What is filmed, from where, how large and how long."""
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from rich.console import Console
 from rich.progress import Progress
+from torch import Tensor
 
 from qgs.checkpoint.gaussians import load_ply
 from qgs.contracts import Renderer
 from qgs.data.recognition import open_for
-from qgs.files import refuse_existing
 from qgs.geometry.poses import relative_to, scaled
 from qgs.geometry.transforms import moved
-from qgs.reconstruction.result import Reconstruction
 from qgs.reconstruction.scenes import installed_sources, named_scene
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians
-from qgs_photos.poses.film import pictures, refuse_suffix, write_film
+from qgs_photos.poses.film import pictures, write_film
 from qgs_photos.poses.paths import KINDS, path_of, read_path
+from qgs_photos.record import GAUSSIANS, has_record, read_record
 
 _HEIGHT = 480  # pixels of the shorter side by default
 
 
 @dataclass(frozen=True)
-class Shot:
-    """How a scene is filmed. path: of KINDS, or a file. size: (H, W). fov: vertical, in degrees."""
+class FilmOptions:
+    """Options of a film. path: of KINDS, or a file. size: (H, W). fov: vertical, in degrees."""
 
     path: str = "orbit"
     size: tuple[int, int] | None = None
@@ -39,118 +37,114 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Stage:
+class FilmScene:
     """Gaussians (1, G) and the cameras (1, V) of photos of them, in one world.
 
-    photos: from the photos' world to that one, the pose (4, 4) of its reference camera and scale.
+    world: from the photos' world to that one, the pose (4, 4) of its reference camera and scale.
     """
 
     gaussians: Gaussians
     cameras: Cameras
     renderer: Renderer
-    photos: tuple[torch.Tensor, float]
+    world: tuple[Tensor, Tensor]
 
 
-def film_reconstruction(file: Path, path: str) -> Callable[[Reconstruction, Console], Path]:
-    """What films the result of `qgs reconstruct`, as --video and --path ask; see `film`.
-
-    Raises FileExistsError and ValueError at once, before anything is reconstructed.
-    """
-    refuse_existing(file)
-    refuse_suffix(file)
-    if path not in KINDS:
-        read_path(Path(path), (_HEIGHT, _HEIGHT), None)
-
-    def filmed(result: Reconstruction, console: Console) -> Path:
-        (reference, scale), renderer = result.world, result.model.renderer
-        cameras, world = result.sample.inputs.cameras, (reference.double(), float(scale))
-        film(Stage(result.gaussians, cameras, renderer, world), Shot(path), file, console)
-        return file
-
-    return filmed
-
-
-def film(stage: Stage, shot: Shot, file: Path, console: Console) -> None:
+def film(scene: FilmScene, options: FilmOptions, file: Path, console: Console) -> None:
     """Render the path and write `file`. Raises ValueError for a path that is none."""
-    path = cameras_of(stage, shot).to(stage.gaussians.means.device)
-    count = path.shape[1]
+    path = cameras_of(scene, options).to(scene.gaussians.means.device)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("rendering", total=count)
+        task = bar.add_task("rendering", total=path.shape[1])
 
         def progress(done: int) -> None:
             bar.update(task, completed=done)
 
-        frames = pictures(stage.gaussians, path, stage.renderer, progress)
-        write_film(frames, file, shot.rate)
+        frames = pictures(scene.gaussians, path, scene.renderer, progress)
+        write_film(frames, file, options.rate)
 
 
-def cameras_of(stage: Stage, shot: Shot) -> Cameras:
-    """The cameras (1, T) of the path, of the wanted size and angle of view."""
-    own = stage.cameras.size
-    factor = max(_HEIGHT / min(own), 1) if min(own) < _HEIGHT else 1.0
-    size = shot.size or (round(own[0] * factor / 2) * 2, round(own[1] * factor / 2) * 2)
-    count = max(round(shot.seconds * shot.rate), 2)
-    if shot.path not in KINDS:
-        c2w, lens = read_path(Path(shot.path), size, shot.fov)
-        reference, scale = stage.photos
-        c2w = scaled(relative_to(reference, c2w), scale)
-        return Cameras(c2w.float()[None], lens.float()[None], size)
-    path = path_of(shot.path, stage.cameras, seen_depth(stage), count)
-    return Cameras(path.c2w, lenses(path, size, shot.fov), size)
+def cameras_of(scene: FilmScene, options: FilmOptions) -> Cameras:
+    """Return the cameras (1, T) of the path, of the wanted size and angle of view."""
+    size = options.size or _film_size(scene.cameras.size)
+    if options.path in KINDS:
+        count = max(round(options.seconds * options.rate), 2)
+        path = path_of(options.path, scene.cameras, seen_depth(scene), count)
+        return Cameras(path.c2w, lenses(path, size, options.fov), size)
+    c2w, intrinsics = read_path(Path(options.path), size, options.fov)
+    reference, scale = scene.world
+    inside = scaled(relative_to(reference, c2w), scale)
+    return Cameras(inside.float()[None], intrinsics.float()[None], size)
 
 
-def lenses(path: Cameras, size: tuple[int, int], fov: float | None) -> torch.Tensor:
-    """Intrinsics (1, T, 4) at another size and angle of view, centred."""
+def _film_size(photos: tuple[int, int]) -> tuple[int, int]:
+    """Return even sides of the photos' aspect, the shorter one at least _HEIGHT: H.264 has them."""
+    factor = max(_HEIGHT / min(photos), 1.0)
+    height, width = (round(side * factor / 2) * 2 for side in photos)
+    return height, width
+
+
+def lenses(path: Cameras, size: tuple[int, int], fov: float | None) -> Tensor:
+    """Return intrinsics (1, T, 4) at another size and angle of view, centred."""
     height, width = size
     fx, fy, _, _ = path.intrinsics.unbind(-1)
-    if fov is not None:
-        focal = torch.full_like(fy, height / 2 / math.tan(math.radians(fov) / 2))
-        fx = fy = focal
-    else:  # all of the shorter side is seen
+    if fov is None:
+        # all of the shorter side is seen
         factor = max(height / path.size[0], width / path.size[1])
-        fx, fy = fx * factor, fy * factor
-    middle = torch.full_like(fx, width / 2), torch.full_like(fx, height / 2)
-    return torch.stack([fx, fy, *middle], -1)
+        fx = fx * factor
+        fy = fy * factor
+    else:
+        fy = torch.full_like(fy, height / 2 / math.tan(math.radians(fov) / 2))
+        fx = fy
+    cx = torch.full_like(fx, width / 2)
+    cy = torch.full_like(fx, height / 2)
+    return torch.stack([fx, fy, cx, cy], -1)
 
 
 @torch.no_grad()
-def seen_depth(stage: Stage) -> float:
-    """The median depth of what the first, the middle and the last camera see."""
-    count = stage.cameras.shape[1]
-    rendered = stage.renderer(stage.gaussians, stage.cameras[:, [0, count // 2, count - 1]])
-    seen = rendered.depth[rendered.alpha > 0.5]
-    return float(seen.median()) if seen.numel() else 1.0
+def seen_depth(scene: FilmScene) -> float:
+    """Return the median depth of what the first, the middle and the last camera see."""
+    count = scene.cameras.shape[1]
+    rendered = scene.renderer(scene.gaussians, scene.cameras[:, [0, count // 2, count - 1]])
+    depths = rendered.depth[rendered.alpha > 0.5]
+    return float(depths.median()) if depths.numel() else 1.0
 
 
-def open_stage(source: Path, photos: str | None, scene: str | None) -> Stage:
-    """The scene in a folder of `qgs reconstruct` or `qgs scene`, or in a PLY file, with its photos.
+def open_film_scene(source: Path, photos: str | None, name: str | None) -> FilmScene:
+    """Open a folder of `qgs reconstruct` or `qgs scene`, or a PLY file with its photos.
 
     photos: of the scene, where `source` does not hold their cameras. Raises ValueError without.
     """
-    record = source / "cameras.json"
-    if record.is_file() and (source / "gaussians.ply").is_file():
-        return _of_reconstruction(load_ply(source / "gaussians.ply"), record)
+    if has_record(source):
+        record = read_record(source)
+        cameras = record.cameras[:, : len(record.inputs)]
+        return FilmScene(record.gaussians, cameras, AutoRenderer(record.renderer), record.world)
     file = source / "scene.ply" if source.is_dir() else source
     if not file.is_file():
         raise FileNotFoundError(
-            f"{source} is no PLY file and has neither gaussians.ply with cameras.json nor "
+            f"{source} is no PLY file and has neither {GAUSSIANS} with cameras.json nor "
             "scene.ply: give what `qgs reconstruct` or `qgs scene` wrote"
         )
     if photos is None:
         raise ValueError(f"{file} holds no cameras: add the photos, as `qgs video {source} PHOTOS`")
-    gaussians = load_ply(file)
-    cameras = _cameras(photos, scene)
+    renderer = AutoRenderer(_scene_options(file.parent))
+    return _in_own_world(load_ply(file), _photo_cameras(photos, name), renderer)
+
+
+def _in_own_world(gaussians: Gaussians, cameras: Cameras, renderer: Renderer) -> FilmScene:
+    """Move Gaussians (1, G) and cameras (V,) of the photos' world to the first camera's."""
     # near and far of renderers are made for worlds in which what is seen is about 1 away
-    reference, scale = cameras.c2w[0].double(), 1 / _median_depth(gaussians, cameras)
+    reference = cameras.c2w[0].double()
+    scale = 1 / _median_depth(gaussians, reference)
     inside = scaled(relative_to(reference, cameras.c2w.double()), scale)
-    there = Cameras(inside.float()[None], cameras.intrinsics.float()[None], cameras.size)
-    gaussians = moved(gaussians, scaled(torch.linalg.inv(reference), scale), scale)
-    background = _background(source.parent if source.is_file() else source)
-    return Stage(gaussians, there, AutoRenderer(background), (reference, scale))
+    return FilmScene(
+        gaussians=moved(gaussians, scaled(torch.linalg.inv(reference), scale), float(scale)),
+        cameras=Cameras(inside.float()[None], cameras.intrinsics.float()[None], cameras.size),
+        renderer=renderer,
+        world=(reference, scale),
+    )
 
 
-def _cameras(photos: str, name: str | None) -> Cameras:
-    """Those of all photos, at their stored size."""
+def _photo_cameras(photos: str, name: str | None) -> Cameras:
+    """Return the cameras (V,) of all photos, at their stored size."""
     sources = installed_sources()
     scene = named_scene(open_for(photos, None, None, sources)[0], photos, name)
     if stored := scene.stored_size(0):
@@ -158,38 +152,18 @@ def _cameras(photos: str, name: str | None) -> Cameras:
     return scene.cameras
 
 
-def _median_depth(gaussians: Gaussians, cameras: Cameras) -> float:
-    """Of Gaussians before the first camera."""
-    w2c = torch.linalg.inv(cameras.c2w[0].double())
+def _median_depth(gaussians: Gaussians, c2w: Tensor) -> Tensor:
+    """Return the median depth of Gaussians before the camera at `c2w` (4, 4), 1 for none."""
+    w2c = torch.linalg.inv(c2w)
     depths = gaussians.means[0].double() @ w2c[2, :3] + w2c[2, 3]
     ahead = depths[depths > 0]
-    return float(ahead.median()) if ahead.numel() else 1.0
+    return ahead.median() if ahead.numel() else torch.ones((), dtype=torch.float64)
 
 
-def _background(folder: Path) -> AutoRenderer.Config:
-    """The renderer's options of what `qgs scene` wrote, else the default ones."""
+def _scene_options(folder: Path) -> AutoRenderer.Config:
+    """Return the renderer's options of what `qgs scene` wrote, else the default ones."""
     try:
         given = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))["background"]
         return AutoRenderer.Config.model_validate({"background": tuple(given)})
     except (OSError, ValueError, KeyError, TypeError):
         return AutoRenderer.Config()
-
-
-def _of_reconstruction(gaussians: Gaussians, record: Path) -> Stage:
-    try:
-        data: dict[str, Any] = json.loads(record.read_text(encoding="utf-8"))
-        views = [view for view in data["views"] if view["kind"] == "input"]
-        c2w = torch.tensor([view["c2w"] for view in views])
-        lens = torch.tensor([view["intrinsics"] for view in views])
-        height, width = views[0]["size"]
-        cameras = Cameras(c2w[None], lens[None], (height, width))
-        world = data["to_photos"]
-        reference = torch.tensor(world["reference_c2w"], dtype=torch.float64)
-        given = {"background": tuple(data["background"])} if data.get("background") else {}
-        renderer = AutoRenderer(AutoRenderer.Config.model_validate(given))
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        raise ValueError(
-            f"{record} is no record of a reconstruction ({type(error).__name__}: {error}): make it "
-            "again with `qgs reconstruct`"
-        ) from error
-    return Stage(gaussians, cameras, renderer, (reference, float(world["scale"])))

@@ -1,16 +1,109 @@
-"""A reconstruction refined on the photos of its scene."""
+"""A reconstruction in a folder, refined on the photos of its scene."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
+import torch
 from rich.console import Console
 
-from qgs.contracts import Scene
-from qgs.data.samples import Sample, training_frames, views_in
+from qgs.checkpoint.model_file import load
+from qgs.contracts import Frames, Scene
+from qgs.data.samples import Sample, cameras_in, training_frames, views_in
 from qgs.metrics.images import Psnr
+from qgs.recipe import resolve
 from qgs.reconstruction.result import Reconstruction, reconstruct_sample
+from qgs.reconstruction.scenes import Size, chosen_scene
 from qgs.types import Views
-from qgs_photos.refine.refining import refine
+from qgs.wording import listed
+from qgs_photos.record import Record, has_record, read_record
+from qgs_photos.refine.refining import RefinedScene, refine
+
+# JSON keeps float32 poses whole; photos whose poses were made again differ by far more.
+_SAME_POSE = 1e-3
+
+
+@dataclass(frozen=True)
+class OpenedReconstruction:
+    """A reconstruction and its photos. scene: at the size to refine at.
+
+    seen: frames that the model was trained on.
+    """
+
+    start: Reconstruction
+    scene: Scene
+    seen: Sequence[int]
+
+
+def opened_reconstruction(
+    folder: Path, photos: str, size: Size | None, name: str | None, device: str
+) -> OpenedReconstruction:
+    """Open what `qgs reconstruct` wrote into `folder`, with its photos.
+
+    size: (H, W) of the photos to refine on, by default the recorded one. name: of the scene, by
+    default the recorded one. Raises FileNotFoundError for another folder, ValueError for a
+    reconstruction without a model and for other photos, and as the model and the data do.
+    """
+    if not has_record(folder):
+        raise FileNotFoundError(
+            f"{folder} has no gaussians.ply with cameras.json: give a folder that "
+            "`qgs reconstruct` wrote"
+        )
+    record = read_record(folder)
+    if not record.model:
+        raise ValueError(
+            f"{folder} was made by a model that is in no file: save it and reconstruct again, or "
+            "call qgs_photos.refine.refine in Python"
+        )
+    model = load(record.model, device)
+    recipe = resolve(model.recipe or {})
+    wanted = name or record.scene
+    scene, seen = chosen_scene(recipe, photos, record.cameras.size, wanted)
+    # Photos that were named to be compared with are the only ones that stay aside, and with none
+    # compared all are refined on; the record does not say so, its frames do.
+    default = bool(record.compared) and {*record.compared} <= {*scene.held_out}
+    if not default:
+        scene, seen = chosen_scene(recipe, photos, record.cameras.size, wanted, holdout=False)
+    refuse_other_photos(record, scene, photos)
+    start = reconstruct_sample(
+        model,
+        _sample(record, scene),
+        record.world,
+        seen,
+        record.gaussians.to(device),
+        record.tuning,
+    )
+    if size is not None:
+        scene, seen = chosen_scene(recipe, photos, size, wanted, holdout=default)
+    return OpenedReconstruction(start=start, scene=scene, seen=seen)
+
+
+def refuse_other_photos(record: Record, scene: Scene, photos: str) -> None:
+    """Raise ValueError unless `scene` has the recorded frames: their files and their poses."""
+    frames = (*record.inputs, *record.compared)
+    expected = [record.photos.get(frame, str(frame)) for frame in frames]
+    found = [scene.frame_name(frame) for frame in frames if frame < len(scene)]
+    if found == expected:
+        poses = cameras_in(record.world, scene, frames).c2w
+        if torch.allclose(poses, record.cameras.c2w, _SAME_POSE, _SAME_POSE):
+            return
+    raise ValueError(
+        f"{photos} are not the photos that {record.folder} was made of, or have other poses now; "
+        f"it has {listed(expected, 3)}: give those, or reconstruct again"
+    )
+
+
+def _sample(record: Record, scene: Scene) -> Sample:
+    count = len(record.inputs)
+    views = views_in(record.world, scene, (*record.inputs, *record.compared))
+    return Sample(
+        scene=scene.name,
+        inputs=views.select(slice(count)),
+        targets=views.select(slice(count, None)),
+        input_frames=record.inputs,
+        target_frames=record.compared,
+        names=record.photos,
+    )
 
 
 def refine_reconstruction(
@@ -25,74 +118,89 @@ def refine_reconstruction(
 ) -> Reconstruction:
     """Refine the Gaussians of `start` on photos of `scene`, at the size of these photos.
 
-    seconds, count: as in `refine`. inputs_only: optimise on the input photos alone; otherwise on
-    all photos that are neither compared with nor held out of training. seen: frames that the model
-    was trained on.
+    seconds, count: see `refine`. inputs_only: optimise on the input photos alone; otherwise on all
+    photos that are neither compared with nor held out of training. seen: frames that the model was
+    trained on.
     """
-    sample, photos, frames = _photos(scene, start, inputs_only)
-    compared = sample.targets if sample.target_frames else None
-    result = refine(
-        start.gaussians, photos, seconds, count=count, compared=compared,
-        renderer=start.model.renderer, console=console,
-    )  # fmt: skip
-    ended = f", ended by {result.stopped_by}" if result.stopped_by else ""
+    frames, targets = _chosen_frames(scene, start, inputs_only)
+    every = views_in(start.world, scene, (*frames, *targets)).to(start.gaussians.means.device)
+    photos = every.select(slice(len(frames)))
+    compared = every.select(slice(len(frames), None))
+    refined = refine(
+        start.gaussians,
+        photos,
+        seconds,
+        count=count,
+        compared=compared if targets else None,
+        renderer=start.model.renderer,
+        console=console,
+    )
+    _tell(start, refined, photos, console)
+    inputs = start.sample.input_frames
+    sample = replace(
+        start.sample,
+        inputs=photos.select([frames.index(frame) for frame in inputs]),
+        targets=compared,
+        target_frames=targets,
+        names={frame: scene.frame_name(frame) for frame in (*inputs, *targets)},
+    )
+    record = {
+        "seconds": refined.seconds,
+        "steps": refined.steps,
+        "frames": frames,
+        "photos": [scene.frame_name(frame) for frame in frames],
+        "stopped_by": refined.stopped_by,
+        "curve": [asdict(point) for point in refined.curve],
+    }
+    found = reconstruct_sample(
+        start.model, sample, start.world, seen, refined.gaussians, start.tuning, record
+    )
+    remarks = [found.worse_than_nearest, _worse_than_before(start, found)]
+    return replace(found, remarks=[remark for remark in remarks if remark])
+
+
+def _chosen_frames(
+    scene: Scene, start: Reconstruction, inputs_only: bool
+) -> tuple[list[int], Frames]:
+    """Return the frames to optimise on, and those to compare with."""
+    inputs = start.sample.input_frames
+    targets = start.sample.target_frames
+    # A reconstruction is compared near its inputs; its refinement covers the whole scene, and is
+    # compared with all held-out photos, unless the user named some.
+    if targets and {*targets} < {*scene.held_out}:
+        targets = tuple(sorted({*scene.held_out} - {*inputs}))
+    usable = {*inputs} if inputs_only else {*training_frames(scene), *inputs}
+    return sorted(usable - {*targets}), targets
+
+
+def _tell(start: Reconstruction, refined: RefinedScene, photos: Views, console: Console) -> None:
     height, width = photos.cameras.size
+    ended = f", ended by {refined.stopped_by}" if refined.stopped_by else ""
     console.print(
-        f"refined for {result.seconds:.1f} s{ended}: {result.steps} steps on {len(frames)} photos "
-        f"of {width} x {height} pixels, {start.gaussians.count:,} -> {result.gaussians.count:,} "
-        "Gaussians",
+        f"refined for {refined.seconds:.1f} s{ended}: {refined.steps} steps on "
+        f"{photos.images.shape[1]} photos of {width} x {height} pixels, "
+        f"{start.gaussians.count:,} -> {refined.gaussians.count:,} Gaussians",
         highlight=False,
         soft_wrap=True,
     )
-    record = {
-        "seconds": result.seconds,
-        "steps": result.steps,
-        "frames": frames,
-        "photos": [scene.frame_name(frame) for frame in frames],
-        "stopped_by": result.stopped_by,
-        "curve": [asdict(point) for point in result.curve],
-    }
-    found = reconstruct_sample(
-        start.model, sample, start.world, seen, result.gaussians, start.tuning, record
-    )
-    remarks = found.worse_than_nearest, _worse_than_before(start, found)
-    return replace(found, remarks=[*filter(None, remarks)])
 
 
 def _worse_than_before(start: Reconstruction, found: Reconstruction) -> str:
-    """A remark where the compared photos are nearer to the prediction than to its refinement."""
-    # PSNR falls with resolution: other sizes (--refine-size) are not compared
+    """Return a remark where the prediction is nearer to the compared photos than its refinement."""
+    # PSNR falls with resolution, so photos of another --size are not compared.
     if start.rendering.rgb.shape != found.rendering.rgb.shape:
         return ""
-    means = [
-        sum(novel) / len(novel)
-        for result in (start, found)
-        if (novel := [score.psnr for score in result.scores if score.kind != "input"])
-    ]
-    shown = Psnr.column.shown
-    if not means or not Psnr.column.beats(*means):
+    before = _novel_psnr(start)
+    after = _novel_psnr(found)
+    if before is None or after is None or not Psnr.column.beats(before, after):
         return ""
+    shown = Psnr.column.shown
     return (
-        f"the prediction is better on the compared photos, {shown(means[0])} against "
-        f"{shown(means[1])} dB: refine for longer (--refine SECONDS), or keep the prediction"
+        f"the prediction is better on the compared photos, {shown(before)} against "
+        f"{shown(after)} dB: refine for longer (--seconds), or keep the prediction"
     )
 
 
-def _photos(
-    scene: Scene, start: Reconstruction, inputs_only: bool
-) -> tuple[Sample, Views, list[int]]:
-    """The sample of `start` at the size of `scene`, the photos to optimise on, and their frames.
-
-    Held-out photos are compared with all together, unless others were named; but for inputs.
-    """
-    inputs, targets = start.sample.input_frames, start.sample.target_frames
-    if targets and {*targets} < {*scene.held_out}:  # of the whole scene, not of a window
-        targets = tuple(sorted({*scene.held_out} - {*inputs}))
-    usable = {*inputs} if inputs_only else {*training_frames(scene), *inputs} - {*targets}
-    frames = sorted(usable)
-    every = views_in(start.world, scene, (*frames, *targets)).to(start.gaussians.means.device)
-    photos, compared = every.select(slice(len(frames))), every.select(slice(len(frames), None))
-    own = photos.select([frames.index(frame) for frame in inputs])
-    names = {frame: scene.frame_name(frame) for frame in (*inputs, *targets)}
-    parts = {"inputs": own, "targets": compared, "target_frames": targets, "names": names}
-    return replace(start.sample, **parts), photos, frames
+def _novel_psnr(result: Reconstruction) -> float | None:
+    novel = [score.psnr for score in result.scores if score.kind != "input"]
+    return sum(novel) / len(novel) if novel else None

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from qgs.cli.options import SceneName, Threads, parse_size, use_threads
+from qgs.cli.options import Threads
+from qgs_photos.printing import say
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 app = typer.Typer(help="Camera poses of photos or a video.")
-video_app = typer.Typer(help="A camera path through Gaussians, as a video.")
 
 
 @app.command()
@@ -50,7 +50,7 @@ def poses(
     ] = 0,
     threads: Threads = None,
 ) -> None:
-    """Camera poses of photos or a video, by COLMAP: sparse/0 and images, checked at once.
+    """Find camera poses of photos or a video, by COLMAP: sparse/0 and images, checked at once.
 
     The photos stay where they are. An interrupted call goes on where it was when it is repeated.
     """
@@ -66,18 +66,18 @@ def poses(
     if frames is not None and not source.is_file():
         raise ValueError("--frames is for a video: leave it out")
     console = Console()
-    options = Options(frames, side, matching, features, seed=seed)
+    options = Options(frames=frames, side=side, matching=matching, features=features, seed=seed)
     if threads:
         options = replace(options, threads=threads)
     made = make_poses(source, out or beside(source), options, console)
     for line in made.summary:
-        _line(console, line)
+        say(console, line)
     show_verdict(made.folder, console)
-    _line(console, f"wrote {made.folder}; next: qgs demo {made.folder}")
+    say(console, f"wrote {made.folder}; next: qgs demo {made.folder}")
 
 
 def show_verdict(folder: Path, console: Console) -> None:
-    """What `qgs data check` finds in `folder`."""
+    """Print what `qgs data check` finds in `folder`."""
     from qgs.paths import opened_path
     from qgs.wording import counted
     from qgs_photos.datatools.check import Options, check
@@ -85,61 +85,11 @@ def show_verdict(folder: Path, console: Console) -> None:
     with console.status("checking"):
         report = check(opened_path(folder), Options())
     for finding in report.findings:
-        _line(console, str(finding))
+        say(console, str(finding))
     (scene,) = report.scenes
     warnings = len(report.findings) - report.errors
-    _line(
+    say(
         console,
         f"checked: {counted(report.errors, 'error')}, {counted(warnings, 'warning')}; matched "
         f"points lie {scene.epipolar} pixels from their epipolar lines",
     )
-
-
-def _line(console: Console, text: str) -> None:
-    console.print(text, soft_wrap=True, highlight=False, markup=False)
-
-
-@video_app.command()
-def video(
-    source: Annotated[
-        Path, typer.Argument(help="What qgs reconstruct or qgs scene wrote, or a PLY file.")
-    ],
-    photos: Annotated[
-        str | None,
-        typer.Argument(help="Photos of the scene, for qgs scene and PLY: the path follows them."),
-    ] = None,
-    out: Annotated[Path, typer.Option(help="New .mp4 (H.264) or .webp file.")] = Path("video.mp4"),
-    path: Annotated[
-        str,
-        typer.Option(
-            help="orbit, spiral, walk, or a file: a camera path of nerfstudio's viewer or a "
-            "transforms file, in the world of the photos."
-        ),
-    ] = "orbit",
-    size: Annotated[
-        str | None,
-        typer.Option(metavar="HxW", help="Of the video; default: the photos', from 480 pixels on."),
-    ] = None,
-    seconds: Annotated[float, typer.Option(min=0.1, help="Of orbit, spiral and walk.")] = 8.0,
-    rate: Annotated[int, typer.Option(min=1, max=120, help="Frames a second.")] = 24,
-    fov: Annotated[
-        float | None,
-        typer.Option(min=1, max=170, help="Vertical angle of view, degrees; default: the photos'."),
-    ] = None,
-    scene: SceneName = None,
-    threads: Threads = None,
-) -> None:
-    """A camera path through Gaussians, as mp4 or webp."""
-    from rich.console import Console
-
-    from qgs.files import refuse_existing
-    from qgs_photos.poses.film import refuse_suffix
-    from qgs_photos.poses.filming import Shot, film, open_stage
-
-    refuse_existing(out)
-    refuse_suffix(out)
-    use_threads(threads)
-    console = Console()
-    shot = Shot(path, parse_size(size), seconds, rate, fov)
-    film(open_stage(source, photos, scene), shot, out, console)
-    _line(console, f"wrote {out}")

@@ -1,7 +1,6 @@
 """`qgs scene`."""
 
-from __future__ import annotations
-
+from enum import StrEnum
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Annotated
@@ -9,8 +8,16 @@ from typing import Annotated
 import typer
 
 from qgs.cli.options import Device, Frames, Scale, SceneName, parse_size
+from qgs_photos.commands import refuse_filled, refuse_no_time
 
 app = typer.Typer(help="The best scene of photos in a given time.")
+
+
+class Adjustment(StrEnum):
+    """Properties of a photo that can be optimised beside the Gaussians."""
+
+    POSES = "poses"
+    EXPOSURE = "exposure"
 
 
 @app.command()
@@ -46,40 +53,55 @@ def scene(
     degree: Annotated[
         int, typer.Option(min=0, max=3, help="Harmonics of the colours, which grow with time.")
     ] = 1,
-    exposure: Annotated[
-        bool, typer.Option("--exposure", help="Optimise an affine map of each photo's colours.")
-    ] = False,
-    refine_poses: Annotated[
-        bool, typer.Option("--refine-poses", help="Optimise the cameras of the photos too.")
-    ] = False,
+    adjust: Annotated[
+        list[Adjustment] | None,
+        typer.Option(
+            help="Optimise the camera of each photo too, or an affine map of its colours; "
+            "repeatable."
+        ),
+    ] = None,
     masks: Annotated[
         bool, typer.Option("--masks", help="What the photos' masks leave out is background.")
     ] = False,
     scene_name: SceneName = None,
     device: Device = "auto",
 ) -> None:
-    """The best scene of photos in a given time: scene.ply, scene.splat, a page, held-out scores.
+    """Make the best scene of photos in a given time: PLY, .splat, a page, held-out scores.
 
     The start is made of the photos, or of a model, and then optimised on the photos. What was
     chosen is printed as a command that makes the scene again. Ctrl-C ends the optimisation and
     writes what there is.
     """
     began = perf_counter() - process_time()  # imports took time already
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FileExistsError(f"{out} is not empty: choose another --out, or delete it yourself")
-    for option, value in (("--minutes", minutes), ("--seconds", seconds)):
-        if value is not None and not 0 < value < float("inf"):
-            raise ValueError(f"{option} must be a time above 0, got {value:g}")
+    refuse_filled(out)
+    refuse_no_time("--minutes", minutes)
+    refuse_no_time("--seconds", seconds)
     pixels = parse_size(size)
 
     from rich.console import Console
 
     from qgs.train.distributed import choose_device
+    from qgs_photos.refine.options import Options
     from qgs_photos.refine.refining import Extras
-    from qgs_photos.refine.scene import Wanted, make_scene
+    from qgs_photos.refine.scene import make_scene
 
-    wanted = Wanted(
-        model, frames, scale, pixels, gaussians, seconds, holdout, scene_name,
-        choose_device(device), Extras(degree, exposure, refine_poses), masks,
-    )  # fmt: skip
-    make_scene(photos, out, wanted, began, 60 * minutes, Console())
+    adjusted = adjust or []
+    extras = Extras(
+        degree=degree,
+        exposure=Adjustment.EXPOSURE in adjusted,
+        poses=Adjustment.POSES in adjusted,
+    )
+    options = Options(
+        model=model,
+        frames=frames,
+        scale=scale,
+        size=pixels,
+        gaussians=gaussians,
+        seconds=seconds,
+        holdout=holdout,
+        scene=scene_name,
+        device=choose_device(device),
+        extras=extras,
+        masks=masks,
+    )
+    make_scene(photos, out, options, began, 60 * minutes, Console())

@@ -1,0 +1,63 @@
+"""`qgs video`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from qgs.cli.options import SceneName, Threads, parse_size, use_threads
+from qgs_photos.printing import say
+
+app = typer.Typer(help="A camera path through Gaussians, as a video.")
+
+
+@app.command()
+def video(
+    source: Annotated[
+        Path, typer.Argument(help="What qgs reconstruct or qgs scene wrote, or a PLY file.")
+    ],
+    photos: Annotated[
+        str | None,
+        typer.Argument(help="Photos of the scene, for qgs scene and PLY: the path follows them."),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="New .mp4 (H.264) or .webp file.")] = Path("video.mp4"),
+    path: Annotated[
+        str,
+        typer.Option(
+            help="orbit, spiral, walk, or a file: a camera path of nerfstudio's viewer or a "
+            "transforms file, in the world of the photos."
+        ),
+    ] = "orbit",
+    size: Annotated[
+        str | None,
+        typer.Option(metavar="HxW", help="Of the video; default: the photos', from 480 pixels on."),
+    ] = None,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Of orbit, spiral and walk.")] = 8.0,
+    rate: Annotated[int, typer.Option(min=1, max=120, help="Frames a second.")] = 24,
+    fov: Annotated[
+        float | None,
+        typer.Option(min=1, max=170, help="Vertical angle of view, degrees; default: the photos'."),
+    ] = None,
+    scene: SceneName = None,
+    threads: Threads = None,
+) -> None:
+    """Film a camera path through Gaussians, as mp4 or webp."""
+    from rich.console import Console
+
+    from qgs.files import refuse_existing
+    from qgs_photos.poses.film import refuse_suffix
+    from qgs_photos.poses.filming import FilmOptions, film, open_film_scene
+
+    refuse_existing(out)
+    refuse_suffix(out)
+    use_threads(threads)
+    console = Console()
+    options = FilmOptions(
+        path=path,
+        size=parse_size(size),
+        seconds=seconds,
+        rate=rate,
+        fov=fov,
+    )
+    film(open_film_scene(source, photos, scene), options, out, console)
+    say(console, f"wrote {out}")

@@ -1,0 +1,87 @@
+"""A folder that `qgs reconstruct` wrote: Gaussians, cameras, and the world that they are in."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from qgs.checkpoint.gaussians import load_ply
+from qgs.renderers import AutoRenderer
+from qgs.types import Cameras, Gaussians
+
+GAUSSIANS = "gaussians.ply"
+CAMERAS = "cameras.json"
+
+
+@dataclass(frozen=True)
+class Record:
+    """A reconstruction as its folder holds it, in its own world.
+
+    model: its checkpoint, "" if it was not loaded from a file. world: reference pose (4, 4) and
+    scale, see `own_world`. inputs, compared: frames, in this order in `cameras` (1, V). photos:
+    files of the frames that have some. renderer: options, with the background of the model.
+    """
+
+    folder: Path
+    scene: str
+    model: str
+    tuning: Mapping[str, Any] | None
+    world: tuple[Tensor, Tensor]
+    inputs: tuple[int, ...]
+    compared: tuple[int, ...]
+    photos: Mapping[int, str]
+    cameras: Cameras
+    renderer: AutoRenderer.Config
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """Gaussians (1, G)."""
+        return load_ply(self.folder / GAUSSIANS)
+
+
+def has_record(folder: Path) -> bool:
+    """Return whether `folder` has the files of a reconstruction."""
+    return (folder / CAMERAS).is_file() and (folder / GAUSSIANS).is_file()
+
+
+def read_record(folder: Path) -> Record:
+    """Read the record in `folder`. Raises ValueError where it is damaged."""
+    file = folder / CAMERAS
+    try:
+        return _parsed(folder, json.loads(file.read_text(encoding="utf-8")))
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise ValueError(
+            f"{file} is no record of a reconstruction ({type(error).__name__}: {error}): make it "
+            "again with `qgs reconstruct`"
+        ) from error
+
+
+def _parsed(folder: Path, data: dict[str, Any]) -> Record:
+    inputs = [view for view in data["views"] if view["kind"] == "input"]
+    compared = [view for view in data["views"] if view["kind"] != "input"]
+    views = [*inputs, *compared]
+    height, width = inputs[0]["size"]
+    reference = torch.tensor(data["to_photos"]["reference_c2w"], dtype=torch.float64)
+    scale = torch.tensor(data["to_photos"]["scale"], dtype=torch.float64)
+    background = data.get("background")
+    options = {"background": tuple(background)} if background else {}
+    return Record(
+        folder=folder,
+        scene=data["scene"],
+        model=data.get("model") or "",
+        tuning=data.get("tuning"),
+        world=(reference, scale),
+        inputs=tuple(view["frame"] for view in inputs),
+        compared=tuple(view["frame"] for view in compared),
+        photos={view["frame"]: view["photo"] for view in views if view.get("photo")},
+        cameras=Cameras(
+            torch.tensor([view["c2w"] for view in views])[None],
+            torch.tensor([view["intrinsics"] for view in views])[None],
+            (height, width),
+        ),
+        renderer=AutoRenderer.Config.model_validate(options),
+    )

@@ -1,0 +1,56 @@
+"""Options of `qgs scene`, as a user gives them and as they are once all are chosen."""
+
+import shlex
+from dataclasses import dataclass
+
+from qgs.reconstruction.scenes import Size
+from qgs_photos.refine.refining import NO_EXTRAS, Extras
+
+NONE = "none"
+"""As a model: the start is made of the photos alone; as a holdout: all are optimised on."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of `qgs scene`; None where it chooses. seconds: of the optimisation alone.
+
+    frames: inputs of the model, as text. size: (H, W) of the photos.
+    """
+
+    model: str | None = None
+    frames: str | None = None
+    scale: float | None = None
+    size: Size | None = None
+    gaussians: int | None = None
+    seconds: float | None = None
+    holdout: str = "8"
+    scene: str | None = None
+    device: str = "cpu"
+    extras: Extras = NO_EXTRAS
+    masks: bool = False
+
+    def command(self, photos: str, out: str) -> str:
+        """Return a command line that makes the scene again; all must be chosen."""
+        assert self.size is not None
+        assert self.seconds is not None
+        height, width = self.size
+        values = {
+            "--out": out,
+            "--scene": self.scene,
+            "--model": self.model,
+            "--frames": self.frames,
+            "--scale": None if self.scale is None else f"{self.scale:.5g}",
+            "--size": f"{height}x{width}",
+            "--gaussians": self.gaussians,
+            "--seconds": f"{self.seconds:.0f}" if self.seconds >= 10 else f"{self.seconds:.2g}",
+            "--holdout": self.holdout,
+            "--degree": self.extras.degree,
+        }
+        adjusted = {"poses": self.extras.poses, "exposure": self.extras.exposure}
+        words = ["qgs", "scene", photos]
+        for name, value in values.items():
+            words += [] if value is None else [name, str(value)]
+        for what, wanted in adjusted.items():
+            words += ["--adjust", what] if wanted else []
+        words += ["--masks"] if self.masks else []
+        return shlex.join(words)

@@ -1,0 +1,161 @@
+"""The files and scores of an optimised scene."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from qgs.checkpoint.gaussians import save_ply, save_splat
+from qgs.drawing import images
+from qgs.drawing.figures import figure_picture, grid_figure
+from qgs.drawing.images import rgb_picture
+from qgs.extensions import INSTALL_ALL
+from qgs.files import replacing_entries, write_text
+from qgs.geometry.transforms import moved
+from qgs.metrics.baselines import nearest_input
+from qgs.metrics.images import psnr, ssim
+from qgs.renderers import AutoRenderer
+from qgs.types import Gaussians, Views
+from qgs_photos.printing import say
+from qgs_photos.refine.plain import plain
+from qgs_photos.refine.refining import RefinedScene
+from qgs_photos.refine.scene_photos import ScenePhotos
+
+_SHOWN = 6  # held-out photos in the picture
+_ON_PAGE = 12  # photos on the page
+_SCORES = ("psnr", "ssim", "nearest_input")
+
+PageWriter = Callable[[Gaussians, Views, tuple[float, float, float]], str]
+
+
+@dataclass(frozen=True)
+class Result:
+    """An optimised scene, photos `views` (1, V) optimised on, and `judged` (1, H) held-out ones.
+
+    world: of the Gaussians, reference pose (4, 4) and scale, as of `own_world`.
+    """
+
+    command: str
+    world: tuple[Tensor, Tensor]
+    refined: RefinedScene
+    renderer: AutoRenderer
+    photos: ScenePhotos
+    views: Views
+    judged: Views
+
+    def in_photos_world(self, gaussians: Gaussians) -> Gaussians:
+        """Return Gaussians (1, G) in the frame and unit of the photos' cameras."""
+        reference, scale = self.world
+        return moved(gaussians, reference, 1 / float(scale))
+
+    def photo(self, frame: int) -> str:
+        """Return the file of a photo."""
+        return self.photos.small.frame_name(frame)
+
+    def render(self, views: Views) -> Tensor:
+        """Return the scene as from the cameras of `views` (1, V): (1, V, 3, H, W)."""
+        gaussians = replace(self.refined.gaussians, features=None)
+        return self.renderer(gaussians, views.cameras).rgb
+
+
+@torch.no_grad()
+def write_scene(
+    result: Result, out: Path, page: PageWriter | None, began: float, console: Console
+) -> None:
+    """Write scene.ply, scene.splat, metrics.json, held_out.png and the page into `out`.
+
+    began: start of the command, for the total time in metrics.json.
+    """
+    refined = result.refined
+    shown = plain(refined.gaussians, refined.cameras)
+    record = scores(result)
+    with replacing_entries(out, "scene.ply") as fresh:
+        save_ply(result.in_photos_world(refined.gaussians), fresh / "scene.ply")
+        save_splat(result.in_photos_world(shown), fresh / "scene.splat")
+        if result.photos.held_out:
+            picture = held_out_picture(result, record["held_out"])
+            images.write_png(picture, fresh / "held_out.png")
+        if page:
+            views = replace(result.views, cameras=refined.cameras)
+            every = max(len(result.photos.frames) // _ON_PAGE, 1)
+            few = views.select(slice(None, None, every))
+            write_text(fresh / "index.html", page(shown, few, result.renderer.config.background))
+        record["total_seconds"] = round(perf_counter() - began, 1)
+        write_text(fresh / "metrics.json", json.dumps(record, indent=1))
+        names = sorted(entry.name for entry in fresh.iterdir())
+    ended = f", ended by {refined.stopped_by}" if refined.stopped_by else ""
+    say(
+        console,
+        f"{refined.gaussians.count:,} Gaussians after {refined.steps:,} steps in "
+        f"{refined.seconds:.0f} s on {len(result.photos.frames)} photos{ended}",
+    )
+    if mean := record["mean"]:
+        say(
+            console,
+            f"{len(record['held_out'])} held-out photos: PSNR {mean['psnr']:.2f} dB, SSIM "
+            f"{mean['ssim']:.3f}; the nearest photo {mean['nearest_input']:.2f} dB",
+        )
+    for name in names:
+        say(console, f"wrote {out / name}")
+
+
+def scores(result: Result) -> dict[str, Any]:
+    """Return metrics.json: the command, the optimisation, scores of held-out photos."""
+    refined = result.refined
+    rows = list[dict[str, Any]]()
+    for place, frame in enumerate(result.photos.held_out):
+        photo = result.judged.select([place])
+        rgb = result.render(photo)
+        nearest = nearest_input(result.views, photo.cameras)
+        rows.append(
+            {
+                "frame": frame,
+                "photo": result.photo(frame),
+                "psnr": float(psnr(rgb, photo.images).mean()),
+                "ssim": float(ssim(rgb, photo.images).mean()),
+                "nearest_input": float(psnr(nearest, photo.images).mean()),
+            }
+        )
+    mean = {name: sum(row[name] for row in rows) / len(rows) for name in _SCORES} if rows else {}
+    return {
+        "command": result.command,
+        "gaussians": refined.gaussians.count,
+        "background": list(result.renderer.config.background),
+        "steps": refined.steps,
+        "seconds": round(refined.seconds, 1),
+        "stopped_by": refined.stopped_by,
+        "refined_on": [result.photo(frame) for frame in result.photos.frames],
+        "mean": mean,
+        "held_out": rows,
+    }
+
+
+def held_out_picture(result: Result, rows: Sequence[Mapping[str, Any]]) -> images.Picture:
+    """Draw some held-out photos over what was rendered of them."""
+    every = -(-len(rows) // _SHOWN)
+    views = result.judged.select(slice(None, None, every))
+    pictures = {
+        "photo": [rgb_picture(image) for image in views.images[0]],
+        "render": [rgb_picture(image) for image in result.render(views)[0]],
+    }
+    titles = [f"{Path(row['photo']).name}\n{row['psnr']:.2f} dB" for row in rows[::every]]
+    return figure_picture(grid_figure(pictures, titles), 120)
+
+
+def page_writer(console: Console) -> PageWriter | None:
+    """Return the viewer's function that makes a page; None, with a remark, without the viewer."""
+    try:
+        from qgs_viewer.page import gaussians_html
+    except ImportError:
+        say(
+            console,
+            f"no page to turn the scene on, it needs query-gaussians-viewer: {INSTALL_ALL}",
+        )
+        return None
+    return gaussians_html

@@ -1,0 +1,142 @@
+"""`qgs refine` on what `qgs reconstruct` wrote: photos that are used, files, what is refused."""
+
+import json
+import shutil
+from functools import partial
+
+import numpy as np
+import pytest
+from commands import MODEL, done, run_qgs
+from photo_formats import noisy_photos
+from plyfile import PlyData
+
+import qgs
+from qgs.reconstruction import saving
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    """A row of 7, 0.1 apart."""
+    return noisy_photos(tmp_path_factory.mktemp("photos") / "row")
+
+
+def saved(file, kind, **data):
+    """A model of such data."""
+    overrides = [
+        "plugins=[rooms]",
+        "views={inputs: 2, targets: 2, gap: [2, 4], scale: constant}",
+        f"data={{type: {kind}, image_size: [16, 16]}}",
+        *(f"data.{name}={value}" for name, value in data.items()),
+    ]
+    qgs.save(qgs.compose({"recipe": 1, "model": MODEL}, overrides), file)
+    return file
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    return saved(tmp_path_factory.mktemp("rooms") / "rooms.safetensors", "rooms/procedural")
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch):
+    """Pictures take most of the time, and are tested with `qgs reconstruct`."""
+    monkeypatch.setattr(saving, "orbit_path", partial(saving.orbit_path, frames=2, side=16))
+    monkeypatch.setattr(saving, "overview", lambda result: np.zeros((4, 4, 3), np.uint8))
+
+
+@pytest.fixture
+def reconstruction(checkpoint, photos, tmp_path):
+    done("reconstruct", checkpoint, photos, "--scale", 0.5, "--out", tmp_path / "made")
+    return tmp_path / "made"
+
+
+def record_of(folder):
+    return json.loads((folder / "cameras.json").read_text())
+
+
+def kinds(folder):
+    """Of the frames of views: inputs, then those that are compared with."""
+    return {view["frame"]: view["kind"] for view in record_of(folder)["views"]}
+
+
+def gaussians_in(folder):
+    return PlyData.read(folder / "gaussians.ply")["vertex"].count
+
+
+def test_photos_held_out_are_compared_with_and_not_refined_on(checkpoint, photos, tmp_path):
+    cases = {
+        "": {3},
+        "--holdout none": set(),
+        "--holdout 1.png,3": {1, 3},
+        "--frames 2,4": {3},
+        "--frames 2,3": set(),  # 3 is the held-out one
+    }
+    for options, compared in cases.items():
+        out = tmp_path / f"out{options}"
+        words = (*options.split(), "--scale", 0.5, "--out", out)
+        done("reconstruct", checkpoint, photos, *words)
+        done("refine", out, photos, "--seconds", 0.01)
+        refined = out / "refined"
+        assert record_of(refined)["refinement"]["frames"] == [*{*range(7)} - compared], options
+        assert kinds(refined) == kinds(out)
+        assert {f for f, kind in kinds(out).items() if kind == "novel"} == compared, options
+
+
+def test_photos_of_the_training_are_not_called_novel_and_those_held_out_never_refined_on(
+    photos, tmp_path
+):
+    """Of which 1 and 4 were held out."""
+    file = saved(tmp_path / "own.safetensors", "qgs/photos", path=str(photos), holdout=3)
+    made = tmp_path / "made"
+    done("reconstruct", file, photos, "--frames", "0,6", "--holdout", "1,3", "--out", made)
+    larger = ("--gaussians", 50, "--size", "20x24")
+    for name, words, frames, size, count in (
+        ("inputs", ["--inputs-only"], [0, 6], [16, 16], 32),
+        ("all", larger, [0, 2, 5, 6], [20, 24], 50),
+    ):
+        out = tmp_path / name
+        done("refine", made, photos, "--seconds", 0.05, *words, "--out", out)
+        assert kinds(out) == {0: "input", 6: "input", 1: "novel", 3: "seen in training"}
+        assert record_of(out)["refinement"]["frames"] == frames
+        assert record_of(out)["views"][0]["size"] == size
+        assert gaussians_in(out) == count
+    assert gaussians_in(made) == 32
+
+
+def test_an_earlier_result_stays_and_a_single_file_is_written(reconstruction, photos, tmp_path):
+    file = tmp_path / "refined.ply"
+    done("refine", reconstruction, photos, "--seconds", 0.01, "--out", file)
+    assert PlyData.read(file)["vertex"].count == 32
+    again = run_qgs("refine", reconstruction, photos, "--seconds", 0.01, "--out", file)
+    assert isinstance(again.exception, FileExistsError)
+
+
+def test_what_makes_no_sense_is_refused_in_a_sentence(reconstruction, photos, tmp_path):
+    moved = shutil.copytree(photos, tmp_path / "moved")
+    listing = json.loads((moved / "transforms.json").read_text())
+    listing["frames"][2]["transform_matrix"][0][3] += 0.05
+    (moved / "transforms.json").write_text(json.dumps(listing))
+    few = shutil.copytree(photos, tmp_path / "few")
+    listing["frames"] = listing["frames"][:2]
+    (few / "transforms.json").write_text(json.dumps(listing))
+    by_hand = shutil.copytree(reconstruction, tmp_path / "by hand")
+    damaged = shutil.copytree(reconstruction, tmp_path / "damaged")
+    (by_hand / "cameras.json").write_text(json.dumps({**record_of(by_hand), "model": ""}))
+    (damaged / "cameras.json").write_text("{}")
+    out = tmp_path / "out"
+    for source, given, options, message in (
+        (tmp_path / "none", photos, (), "give a folder that `qgs reconstruct` wrote"),
+        (photos, photos, (), "give a folder that `qgs reconstruct` wrote"),
+        (by_hand, photos, (), "a model that is in no file"),
+        (damaged, photos, (), "is no record of a reconstruction"),
+        (reconstruction, tmp_path / "nowhere", (), "does not exist"),
+        (reconstruction, photos, ("--scene", "other"), "no scene 'other'"),
+        (reconstruction, moved, ("--scene", "moved"), "or have other poses now"),
+        (reconstruction, few, ("--scene", "few"), "are not the photos that"),
+        (reconstruction, photos, ("--seconds", 0), "--seconds must be a time above 0"),
+        (reconstruction, photos, ("--size", "64"), "--size must be HxW"),
+    ):
+        result = run_qgs("refine", source, given, *options, "--out", out)
+        assert isinstance(result.exception, ValueError | OSError), (options, result.output)
+        assert message in str(result.exception)
+        assert not out.exists()
