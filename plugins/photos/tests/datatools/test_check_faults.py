@@ -53,7 +53,7 @@ def test_faults_of_files(planted, shots):
 
 
 def test_faults_of_cameras(planted):
-    opencv = planted(f"error: {ALL}*OpenCV poses read as OpenGL*negate columns 1 and 2*")
+    opencv = planted(f"error: {ALL}the poses do not fit the photos: *check the convention*")
     opencv.poses @= FLIP
     planted("error: frame 1 (images/1.jpg): the pose mirrors*").poses[1, :, 0] *= -1
     planted("error: frame 4 (images/4.jpg): the pose has NaN*").poses[4] = np.nan
@@ -83,14 +83,16 @@ def test_faults_of_cameras(planted):
 
 def test_faults_that_several_frames_show_together(planted, shots):
     two = "frames 1, 4 (images/1.jpg to images/4.jpg): "
-    both = planted(f"error: {two}their poses look exchanged*")
+    fit = "the pose or the intrinsics do not fit *"
+    both = planted(f"error: {two}{fit}")
     both.poses[[1, 4]] = both.poses[[4, 1]]
-    off = planted("warning: frame 3 (images/3.jpg): the pose or the intrinsics do not fit *")
+    off = planted(f"error: frame 3 (images/3.jpg): {fit}")
     off.poses[3, 1, 3] += 0.3
-    focal = planted(f"error: {ALL}the focal lengths do not fit*")
+    misfit = f"*: {ALL}the poses do not fit the photos: matches lie *pixels from where they may *"
+    focal = planted(misfit)
     focal.camera.update(fl_x=1.3 * FX, fl_y=1.3 * FY)
-    planted(f"error: {ALL}cx and cy look exchanged*").camera.update(cx=CY, cy=CX)
-    cut = planted(f"error: {ALL}the intrinsics do not fit*")
+    planted(misfit).camera.update(cx=CY, cy=CX)
+    cut = planted(misfit)
     cut.camera["w"] -= 45
     bgr = planted(f"warning: {two}red and blue look exchanged: *")
     black = planted("error: frame 2 (images/2.jpg): the image is black*")
@@ -186,7 +188,7 @@ def test_faults_of_a_scene_in_a_chunk(shots, tmp_path):
         "error: a, frame 2 (2): the pose has NaN*",
         "error: b, frames 0-5 (0 to 5): *on one point*",
         "error: c, frame 4 (4): the image cannot be decoded*",
-        "error: d, frames 0-5 (0 to 5): *OpenGL poses read as OpenCV*negate rows 1 and 2*",
+        "error: d, frames 0-5 (0 to 5): the poses do not fit the photos: *",
         "error: e, frames 0-5 (0 to 5): *width and height are swapped*",
         "error: f, frames 0-5 (0 to 5): *look like pixels*",
     )

@@ -11,10 +11,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from qgs_photos.printing import say
+
 if TYPE_CHECKING:
     from qgs.contracts import SceneSource
-    from qgs_photos.datatools.check import CheckReport, SceneReport
     from qgs_photos.datatools.packing import Packed, Splits
+    from qgs_photos.datatools.report import CheckReport, SceneReport
 
 app = typer.Typer(no_args_is_help=True, help="Check and pack data sets.")
 
@@ -55,43 +57,47 @@ def check(
     from qgs_photos.datatools.check import Options, check
 
     console = Console()
-    options = Options(geometry, quick, threads, format, images)
+    options = Options(
+        geometry=geometry,
+        headers_only=quick,
+        threads=threads,
+        format=format,
+        images=images,
+    )
     indices = [opened_path(name) for name in index or []]
     with console.status("listing scenes") as status:
-        result = check(
-            opened_path(path), options, indices,
-            lambda done, total, name: status.update(f"{done} of {total} scenes, now {name}"),
-        )  # fmt: skip
+
+        def progress(done: int, total: int, name: str) -> None:
+            status.update(f"{done} of {total} scenes, now {name}")
+
+        result = check(opened_path(path), options, indices, progress)
     _print(console, result)
     if report is not None:
         from qgs.files import write_text
         from qgs_photos.datatools.page import check_html
 
         write_text(report, check_html(result))
-        _line(console, f"report: {report}")
+        say(console, f"report: {report}")
     if result.errors:
         raise typer.Exit(1)
 
 
 def _print(console: Console, result: CheckReport) -> None:
+    from qgs.wording import counted
+
     if result.scenes:
         console.print(_table(result.scenes))
     if (hidden := len(result.scenes) - _ROWS) > 0:
-        _line(console, f"and {hidden} more scenes, none of them with more findings than these")
+        say(console, f"and {hidden} more scenes, none of them with more findings than these")
     for finding in result.findings:
-        _line(console, str(finding))
+        say(console, str(finding))
     for summary in result.indices:
-        _line(console, f"index {summary}")
-    for note in [*result.notes, *filter(None, [result.auto_scale])]:
-        _line(console, f"note: {note}")
-    warnings = len(result.findings) - result.errors
-    counts = {"scene": len(result.scenes), "error": result.errors, "warning": warnings}
-    parts = (f"{count} {what}{'' if count == 1 else 's'}" for what, count in counts.items())
-    _line(console, f"{result.path}: {', '.join(parts)}")
-
-
-def _line(console: Console, text: str) -> None:
-    console.print(text, highlight=False, markup=False, soft_wrap=True)
+        say(console, f"index {summary}")
+    for note in (*result.notes, result.auto_scale):
+        if note:
+            say(console, f"note: {note}")
+    counts = ", ".join([counted(len(result.scenes), "scene"), *result.counts])
+    say(console, f"{result.path}: {counts}")
 
 
 def _table(scenes: Sequence[SceneReport]) -> Table:
@@ -151,17 +157,22 @@ def pack(
     source, settings = _opened(path, options or [], image_size)
     splits = _splits(source, test_scenes, test_every)
     settings |= {"test_scenes": test_scenes, "test_every": test_every}
-    name = TextColumn("{task.description}")
-    columns = (MofNCompleteColumn(), BarColumn(), TimeRemainingColumn(), name)
-    quiet = not console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=quiet) as bar:
+    with Progress(
+        MofNCompleteColumn(),
+        BarColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    ) as bar:
         task = bar.add_task("", total=sum(map(len, splits.values())))
         packed = packing.pack(
             source,
             splits,
             opened_path(out),
             settings,
-            Encoding(image_size is not None, jpeg),
+            Encoding(resized=image_size is not None, jpeg=jpeg),
             chunk_bytes=chunk_mb * 2**20,
             leave_out_broken=leave_out_broken,
             progress=lambda name: bar.update(task, advance=1, description=name),
@@ -172,7 +183,7 @@ def pack(
 def _opened(
     path: str, options: list[str], image_size: tuple[int, int] | None
 ) -> tuple[SceneSource, dict[str, Any]]:
-    """The source of scenes at `path`, and what it was asked for."""
+    """Return the source of scenes at `path`, and what it was asked for."""
     from qgs.data.recognition import recognised
     from qgs.paths import opened_path
     from qgs.recipe import resolve
@@ -181,7 +192,7 @@ def _opened(
     recipe: Any = path
     if Path(path).suffix not in {".yaml", ".yml"}:
         for note in left_out():
-            _line(Console(), note)
+            say(Console(), note)
         kind = recognised(opened_path(path), sources())
         plugin = kind.partition("/")[0]
         recipe = {"recipe": 1, "data": {"type": kind, "path": path}}
@@ -207,14 +218,14 @@ def _splits(source: SceneSource, test_scenes: str | None, test_every: int | None
 def _print_packed(console: Console, packed: Packed, out: str) -> None:
     scenes = ", ".join(f"{count} {split}" for split, count in packed.scenes.items())
     again = f", {packed.resumed} of them packed before" if packed.resumed else ""
-    _line(
+    say(
         console,
         f"{out}: scenes {scenes}{again}; {packed.frames} images now, {packed.kept} kept as they "
         f"were, {packed.frames - packed.kept} written anew",
     )
     if not packed.scenes["test"]:
-        _line(console, "there are no test scenes: held-out frames are what is evaluated")
+        say(console, "there are no test scenes: held-out frames are what is evaluated")
     if packed.left_out:
-        _line(console, f"{len(packed.left_out)} scenes could not be read and are left out:")
+        say(console, f"{len(packed.left_out)} scenes could not be read and are left out:")
         for name, reason in packed.left_out.items():
-            _line(console, f"  {name}: {reason}")
+            say(console, f"  {name}: {reason}")

@@ -79,7 +79,6 @@ def poses(
 def show_verdict(folder: Path, console: Console) -> None:
     """Print what `qgs data check` finds in `folder`."""
     from qgs.paths import opened_path
-    from qgs.wording import counted
     from qgs_photos.datatools.check import Options, check
 
     with console.status("checking"):
@@ -87,9 +86,8 @@ def show_verdict(folder: Path, console: Console) -> None:
     for finding in report.findings:
         say(console, str(finding))
     (scene,) = report.scenes
-    warnings = len(report.findings) - report.errors
     say(
         console,
-        f"checked: {counted(report.errors, 'error')}, {counted(warnings, 'warning')}; matched "
-        f"points lie {scene.epipolar} pixels from their epipolar lines",
+        f"checked: {', '.join(report.counts)}; matched points lie {scene.epipolar} pixels from "
+        "their epipolar lines",
     )

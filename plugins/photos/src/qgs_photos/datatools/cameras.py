@@ -17,22 +17,22 @@ _FAR_OFF_CENTRE = 0.25  # of a side, from the middle
 
 
 def camera_findings(scene: DecodedScene, sized: set[int]) -> tuple[list[Finding], list[Finding]]:
-    """What is wrong with poses, and with the rest. sized: frames whose listed size is wrong."""
+    """Return faults of poses, and of the rest. sized: frames whose listed size is wrong."""
     poses: list[Finding] = []
     others: list[Finding] = []
     for frame, (photo, result) in enumerate(zip(scene.photos, scene.decoded, strict=True)):
         listed = photo.listed
-        unread = bool(listed.problems) and not np.isfinite(listed.c2w).all()
-        of_pose = [] if unread else list(pose_problems(listed.c2w))
+        if not listed.problems or np.isfinite(listed.c2w).all():
+            for problem in pose_problems(listed.c2w):
+                poses.append(scene.finding([frame], problem.reason, problem.fix))
         rest = list(listed.problems)
-        if not listed.problems and frame not in sized:
-            rest += _of_intrinsics(listed.intrinsics, listed.size or result.size)
-        for problems, found in ((of_pose, poses), (rest, others)):
-            found += [scene.finding([frame], p.reason, p.fix) for p in problems]
+        if not rest and frame not in sized:
+            rest = _intrinsics_problems(listed.intrinsics, listed.size or result.size)
+        others += [scene.finding([frame], problem.reason, problem.fix) for problem in rest]
     return poses, others
 
 
-def _of_intrinsics(intrinsics: Intrinsics, size: Size | None) -> list[FrameProblem]:
+def _intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> list[FrameProblem]:
     problems = list(intrinsics_problems(intrinsics, size))
     if size is None or problems:
         return problems
@@ -51,7 +51,7 @@ def _of_intrinsics(intrinsics: Intrinsics, size: Size | None) -> list[FrameProbl
 def sharing_findings(
     scene: DecodedScene, usable: Sequence[int], *, float32: bool
 ) -> Iterator[Finding]:
-    """Frames of `usable` that share a pose or a place. float32: the precision of the format."""
+    """Yield frames of `usable` that share a pose or a place. float32: precision of the format."""
     if len(usable) < 2:
         return
     poses = np.stack([scene.photos[frame].listed.c2w for frame in usable])
@@ -62,13 +62,11 @@ def sharing_findings(
         return
     for place in _groups(poses[:, :3, 3], near):
         groups = _groups(poses[place, :3, :3].reshape(len(place), 9), _SAME)
-        firsts = [usable[place[same[0]]] for same in groups]
-        for first, same in zip(firsts, groups, strict=True):
-            for other in (usable[place[index]] for index in same[1:]):
-                if scene.photos[first].listed.time == scene.photos[other].listed.time:
-                    yield _duplicate(scene, first, other)
-        if len(groups) > 1:
-            first, *rest = firsts
+        alike = [[usable[place[index]] for index in group] for group in groups]
+        for first, *others in alike:
+            yield from _duplicates(scene, first, others)
+        first, *rest = (group[0] for group in alike)
+        if rest:
             yield scene.finding(
                 rest,
                 f"the camera stands on the same point as that of {scene.label(first)}, a zero "
@@ -78,19 +76,22 @@ def sharing_findings(
 
 
 def _tolerances(poses: np.ndarray, float32: bool) -> tuple[float, float]:
-    """Distances up to which two cameras, and all, share a point, by the poses' precision."""
-    rotations, centres = poses[:, :3, :3], poses[:, :3, 3]
+    """Return distances up to which two cameras, and all, share a point, by the poses' precision."""
+    rotations = poses[:, :3, :3]
+    centres = poses[:, :3, 3]
     off_rigid = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
-    distance, extent = np.abs(centres).max(), np.ptp(centres, axis=0).max()
+    distance = np.abs(centres).max()
+    extent = np.ptp(centres, axis=0).max()
     precision = max(_SAME if float32 else _DOUBLE, float(np.median(off_rigid)))
     together = _SAME if float32 else min(precision, _FLOAT32)
     return min(distance * precision, extent * _OF_EXTENT), distance * together
 
 
 def _groups(rows: np.ndarray, tolerance: float) -> list[list[int]]:
-    """Groups of indices of rows (F, D) that differ from the group's first by no more."""
+    """Return groups of indices of rows (F, D) that differ from the group's first by no more."""
+    # sorted by one coordinate, a row is compared with few: thousands of frames take no second
     order = np.argsort(rows[:, 0], kind="stable")
-    sorted_ = rows[order, 0]
+    column = rows[order, 0]
     groups: dict[int, list[int]] = {}
     leader = np.full(len(rows), -1)
     for index in range(len(rows)):
@@ -98,17 +99,23 @@ def _groups(rows: np.ndarray, tolerance: float) -> list[list[int]]:
             groups[leader[index]].append(index)
             continue
         groups[index] = [index]
-        low, high = np.searchsorted(sorted_, rows[index, 0] + np.array([-1.0, 1.0]) * tolerance)
+        low, high = np.searchsorted(column, rows[index, 0] + np.array([-1.0, 1.0]) * tolerance)
         near = order[low : high + 1]
         same = near[np.abs(rows[near] - rows[index]).max(1) <= tolerance]
         leader[same[leader[same] < 0]] = index
     return list(groups.values())
 
 
-def _duplicate(scene: DecodedScene, first: int, second: int) -> Finding:
-    which = scene.label(first)
-    if scene.decoded[first].digest and scene.decoded[first].digest == scene.decoded[second].digest:
-        reason, fix = f"the photo and its pose repeat {which}", "remove one of the two"
-        return scene.finding([second], reason, fix, "warning")
-    reason = f"the pose repeats that of {which}, whose photo is another one"
-    return scene.finding([second], reason, "correct the pose, or remove one of the frames")
+def _duplicates(scene: DecodedScene, first: int, others: Sequence[int]) -> Iterator[Finding]:
+    label = scene.label(first)
+    digest = scene.decoded[first].digest
+    for frame in others:
+        # a camera that stands still may film what moves
+        if scene.photos[first].listed.time != scene.photos[frame].listed.time:
+            continue
+        if digest and digest == scene.decoded[frame].digest:
+            reason = f"the photo and its pose repeat {label}"
+            yield scene.finding([frame], reason, "remove one of the two", "warning")
+        else:
+            reason = f"the pose repeats that of {label}, whose photo is another one"
+            yield scene.finding([frame], reason, "correct the pose, or remove one of the frames")

@@ -11,30 +11,38 @@ from qgs.data.images import decode_rgb
 from qgs.data.lenses import Size, undistorted
 from qgs.data.photos.reader import PhotoFrame
 from qgs.data.photos.turning import turned
-from qgs_photos.datatools.conventions import Convention
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A listed photo, what reads its bytes, and whether it and its mask exist."""
+    """A listed photo, what reads its bytes, and whether it and its mask exist.
+
+    read_mask: reads a mask that is in no file, (H, W).
+    """
 
     listed: PhotoFrame
     read: Callable[[], bytes]
     exists: bool = True
     mask_exists: bool = True
-    read_mask: Callable[[], np.ndarray | None] | None = None  # a mask that is in no file, (H, W)
+    read_mask: Callable[[], np.ndarray | None] | None = None
 
     def picture(self, size: Size | None, side: int) -> tuple[np.ndarray, np.ndarray]:
-        """Pinhole RGB, `side` pixels long at most, and its intrinsics (4,). Raises OSError."""
+        """Return pinhole RGB, at most `side` pixels long, and intrinsics (4,). Raises OSError."""
         frame = self.listed if self.listed.size else replace(self.listed, size=size)
         image = turned(decode_rgb(io.BytesIO(self.read()), (1.0, 1.0, 1.0)), frame)
-        scale = min(1.0, side / max(image.size))
-        width, height = (max(1, round(extent * scale)) for extent in image.size)
-        pixels = np.array(image.resize((width, height), Image.Resampling.LANCZOS))
+        pixels = np.array(shrunk(image, side, Image.Resampling.LANCZOS))
+        height, width, _ = pixels.shape
         intrinsics = frame.at_size((height, width))
         if frame.lens is not None:
             pixels = undistorted(pixels, intrinsics, frame.lens)
         return pixels, np.array(intrinsics)
+
+
+def shrunk(image: Image.Image, side: int, filter: Image.Resampling) -> Image.Image:
+    """Return the image with `side` pixels on its longer side, or as it is if that is shorter."""
+    scale = min(1.0, side / max(image.size))
+    width, height = (max(1, round(extent * scale)) for extent in image.size)
+    return image.resize((width, height), filter)
 
 
 @dataclass(frozen=True)
@@ -47,7 +55,6 @@ class Candidate:
     name: str
     scene: str
     kind: str
-    convention: Convention
     photos: Callable[[], Sequence[Photo]]
     split: str = ""
     missing: Callable[[], Sequence[str]] = tuple

@@ -3,32 +3,25 @@
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
-import torch
 from upath import UPath
 
 from qgs.data.photos import read_listing, readers
-from qgs.geometry.poses import look_at_depth
 from qgs.wording import counted, listed
 from qgs_photos.datatools.cameras import camera_findings, sharing_findings
-from qgs_photos.datatools.candidates import Candidate
+from qgs_photos.datatools.candidates import Candidate, Photo
 from qgs_photos.datatools.chunks import chunk_folders
-from qgs_photos.datatools.decoding import (
-    DecodedScene,
-    decode,
-    error_text,
-    file_findings,
-    size_findings,
-)
+from qgs_photos.datatools.decoding import DecodedScene, decode, error_text
+from qgs_photos.datatools.files import file_findings, size_findings
 from qgs_photos.datatools.findings import Finding, errors_of, merged
 from qgs_photos.datatools.folders import dl3dv_scenes, photo_folders
-from qgs_photos.datatools.geometry import TOO_FEW, Geometry, geometry_findings, judge_scene
+from qgs_photos.datatools.geometry import TOO_FEW, geometry_findings, judge_scene
 from qgs_photos.datatools.indices import Held, found_indices, index_findings
 from qgs_photos.datatools.masks import matched_findings, picture_findings
+from qgs_photos.datatools.report import CheckReport, SceneReport
 from qgs_photos.datatools.sources import OF_FILES, kind_of, left_out, source_scenes, sources
 
 PHOTOS, FEWEST = 400, 20
@@ -46,93 +39,6 @@ class Options:
     images: str | None = None
 
 
-@dataclass(frozen=True)
-class SceneReport:
-    """What was found in a scene.
-
-    split: empty where the format has none. numbered: photos that a reader has as frames.
-    pose_problems: frames whose pose is wrong. c2w: (F, 3, 4) float32 OpenCV poses of `frames`, the
-    numbers of those that can be drawn; fov: (F, 2) tangents of half the angles of view, x and y.
-    geometry: None where it was not asked for.
-    """
-
-    name: str
-    scene: str
-    kind: str
-    split: str = ""
-    listed: int = 0
-    decodable: int = 0
-    missing: int = 0
-    numbered: int = 0
-    pose_problems: int = 0
-    frames: tuple[int, ...] = ()
-    c2w: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 4), np.float32))
-    fov: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.float32))
-    geometry: Geometry | None = None
-    findings: Sequence[Finding] = ()
-
-    @property
-    def errors(self) -> int:
-        """Number of findings that are errors."""
-        return len(errors_of(self.findings))
-
-    @property
-    def partly_judged(self) -> bool:
-        """Whether photos were left out when the cameras were judged."""
-        return self.geometry is not None and self.geometry.left_out > 0
-
-    @property
-    def look_at_depth(self) -> float:
-        """Depth of what the cameras look at, scene units; 0 where that is no common point."""
-        return float(look_at_depth(torch.from_numpy(self.c2w))) if len(self.c2w) > 1 else 0.0
-
-    @property
-    def epipolar(self) -> str:
-        """Median distance of matches to epipolar lines in pixels, or why there is none."""
-        if self.geometry is None:
-            return "-"
-        return f"{self.geometry.pixels:.2f}" if self.geometry.distances else "not judged"
-
-
-@dataclass(frozen=True)
-class CheckReport:
-    """The result of `check`. general: findings about files of the data set. judged: how many scenes
-    had their poses matched with photos. indices: a line for each. notes: omitted checks, and why.
-    """
-
-    path: str
-    scenes: Sequence[SceneReport]
-    general: Sequence[Finding]
-    indices: Sequence[str]
-    judged: int
-    notes: Sequence[str]
-
-    @property
-    def auto_scale(self) -> str:
-        """The factors of `views.scale: auto` as text; empty without scenes."""
-        depths = [scene.look_at_depth for scene in self.scenes]
-        factors = sorted(1 / depth for depth in depths if depth)
-        none = [scene.name for scene in self.scenes if not scene.look_at_depth]
-        parts = []
-        if factors:
-            middle, ends = np.median(factors), f", from {factors[0]:.4g} to {factors[-1]:.4g}"
-            parts += [f"is a factor of {middle:.4g}{ends if len(factors) > 1 else ''}"]
-        if none:
-            parts += [f"finds no common point that the cameras look at in {listed(none)}"]
-        return f"views.scale: auto {' and '.join(parts)}" if parts else ""
-
-    @property
-    def findings(self) -> list[Finding]:
-        """All findings, those of files first, then scene by scene; errors before warnings."""
-        found = [*self.general, *(f for scene in self.scenes for f in scene.findings)]
-        return sorted(found, key=lambda finding: finding.severity != "error")
-
-    @property
-    def errors(self) -> int:
-        """Number of findings that are errors."""
-        return len(errors_of(self.findings))
-
-
 def check(
     path: UPath,
     options: Options,
@@ -144,16 +50,7 @@ def check(
     progress: called with scenes done, scenes in all and a name. Raises FileNotFoundError without a
     data set or an index, MissingExtraError for the format, ValueError for an unknown one.
     """
-    formats = (
-        "auto",
-        *readers(),
-        "dl3dv",
-        "chunks",
-        *(kind for kind in sources(options.format) if kind.partition("/")[0] not in OF_FILES),
-    )
-    if options.format not in formats:
-        usable = f"{', '.join(formats)}, or PLUGIN/NAME of a source that reads a path"
-        raise ValueError(f"there is no format {options.format!r}: use one of {usable}")
+    _refuse_unknown(options.format)
     if path.is_file() and path.suffix in (".json", ".npy"):
         path = path.parent
     candidates, general, reported = _candidates(path, options)
@@ -174,17 +71,31 @@ def check(
         findings, summary = index_findings(file, held, reported)
         general += findings
         summaries += [summary] if summary else []
-    if partly := sum(scene.partly_judged for scene in scenes):
+    if partly := sum(bool(scene.geometry and scene.geometry.left_out) for scene in scenes):
         notes.append(
             f"in {counted(partly, 'scene')} only some of the photos were matched "
             "with others; a lower --geometry judges fewer scenes by more of theirs"
         )
-    notes = [*left_out(options.format), *notes]
-    return CheckReport(str(path), scenes, general, summaries, len(judged), notes)
+    return CheckReport(
+        path=str(path),
+        scenes=scenes,
+        general=general,
+        indices=summaries,
+        judged=len(judged),
+        notes=[*left_out(options.format), *notes],
+    )
+
+
+def _refuse_unknown(format: str) -> None:
+    of_plugins = [kind for kind in sources(format) if kind.partition("/")[0] not in OF_FILES]
+    known = ["auto", *readers(), "dl3dv", "chunks", *of_plugins]
+    if format not in known:
+        usable = f"{', '.join(known)}, or PLUGIN/NAME of a source that reads a path"
+        raise ValueError(f"there is no format {format!r}: use one of {usable}")
 
 
 def _candidates(path: UPath, options: Options) -> tuple[list[Candidate], list[Finding], set[str]]:
-    """Scenes, findings about files, and names of scenes that such findings may be about."""
+    """Return scenes, findings about files, and scenes that such findings may be about."""
     kind = options.format
     if kind == "auto":
         is_chunk = path.is_file() and path.suffix == ".torch"
@@ -193,21 +104,17 @@ def _candidates(path: UPath, options: Options) -> tuple[list[Candidate], list[Fi
         if options.images is not None:
             raise ValueError("chunks hold their images: leave --images out")
         folders = chunk_folders(path)
-        return (
-            [candidate for folder in folders for candidate in folder.candidates],
-            [finding for folder in folders for finding in folder.findings],
-            {key for folder in folders for key in folder.index},
-        )
+        candidates = [candidate for folder in folders for candidate in folder.candidates]
+        findings = [finding for folder in folders for finding in folder.findings]
+        return candidates, findings, {key for folder in folders for key in folder.index}
     if kind == "dl3dv":
-        return dl3dv_scenes(path, options.images), [], set()
-    if "/" in kind:
-        return list(source_scenes(kind, path, options.images)), [], set()
-    items = list(photo_folders(path, _photo_format(options), options.images))
-    return (
-        [item for item in items if isinstance(item, Candidate)],
-        [item for item in items if isinstance(item, Finding)],
-        set(),
-    )
+        items = list[Candidate | Finding](dl3dv_scenes(path, options.images))
+    elif "/" in kind:
+        items = list[Candidate | Finding](source_scenes(kind, path, options.images))
+    else:
+        items = list(photo_folders(path, _photo_format(options), options.images))
+    candidates = [item for item in items if isinstance(item, Candidate)]
+    return candidates, [item for item in items if isinstance(item, Finding)], set()
 
 
 def _photo_format(options: Options) -> str:
@@ -215,14 +122,15 @@ def _photo_format(options: Options) -> str:
 
 
 def _scenes_to_judge(count: int, options: Options) -> tuple[set[int], list[str]]:
-    """Numbers of the scenes whose poses are matched with photos, and a note on the others."""
+    """Return the scenes whose poses are matched with photos, and a note on the others."""
     if options.headers_only:
         return set(), ["quick: only headers of images were read, and no pose was judged by photos"]
     if not options.geometry:
         return set(), ["no pose was judged by photos (--geometry 0)"]
-    places = np.linspace(0, max(count - 1, 0), min(options.geometry, count)).round().astype(int)
-    left = f"poses were judged by photos in {len({*places})} of {count} scenes; --geometry {count}"
-    return set(places.tolist()), [f"{left} judges all"] if len({*places}) < count else []
+    spread = np.linspace(0, max(count - 1, 0), min(options.geometry, count)).round()
+    places = {int(place) for place in spread}
+    left = f"poses were judged by photos in {len(places)} of {count} scenes; --geometry {count}"
+    return places, [f"{left} judges all"] if len(places) < count else []
 
 
 def check_scene(candidate: Candidate, options: Options, most_photos: int) -> SceneReport:
@@ -233,74 +141,84 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
     name = candidate.name
     report = SceneReport(name, candidate.scene, candidate.kind, candidate.split)
     try:
-        photos, missing = candidate.photos(), candidate.missing()
+        photos = candidate.photos()
+        missing = candidate.missing()
     except Exception as error:  # whatever a reader raises; the other scenes go on
-        reason, colon, fix = str(error).rpartition(": ")  # messages end with a remedy
-        if not colon or not isinstance(error, OSError | ValueError):
-            reason, fix = error_text(error), "get the files again, or mend what reads them"
-        return replace(report, findings=[Finding(name, reason, fix)])
-    reason = f"listed images that do not exist: {listed(missing, 3)}; later frames move up"
-    fix = "add the files, or take them out of what lists them"
-    absent = [Finding(name, f"{reason} in an index", fix)] if missing else []
+        return replace(report, findings=[_unreadable(name, error)])
+    absent = list[Finding]()
+    if missing:
+        reason = f"listed images that do not exist: {listed(missing, 3)}; later frames move up in"
+        fix = "add the files, or take them out of what lists them"
+        absent.append(Finding(name, f"{reason} an index", fix))
     if not photos:
         nothing = Finding(name, "no photos are listed", "export the scene again")
         return replace(report, findings=absent or [nothing])
     with ThreadPoolExecutor(options.threads) as pool:
-        decoded = pool.map(partial(decode, headers_only=options.headers_only), photos)
-    scene = DecodedScene(name, photos, list(decoded))
+        decoded = list(pool.map(partial(decode, headers_only=options.headers_only), photos))
+    scene = DecodedScene(name, photos, decoded)
     if (there := sum(photo.exists for photo in photos)) < 2:
         fix = "add photos, or take the scene out"
         absent.append(Finding(name, f"{there} photos are there, and a scene needs 2", fix))
-    listings = {name: reader.listing for name, reader in readers().items()}
-    listings |= {"dl3dv": "transforms.json", "chunks": "the chunk"}
-    files = list(file_findings(scene, listings.get(candidate.kind, "the data set")))
     sizes = list(size_findings(scene))
     poses, others = camera_findings(scene, _frames(sizes))
+    faulty_poses = _frames(poses)
     placed = [
         frame
         for frame, photo in enumerate(photos)
-        if frame not in _frames(poses) and np.isfinite(photo.listed.c2w).all()
+        if frame not in faulty_poses and np.isfinite(photo.listed.c2w).all()
     ]
     sharing = list(sharing_findings(scene, placed, float32=candidate.kind == "chunks"))
-    pictures = list(picture_findings(scene))
+    files = file_findings(scene, _listing(candidate.kind))
+    pictures = picture_findings(scene)
     findings = merged([*absent, *files, *sizes, *poses, *others, *sharing, *pictures])
     geometry = None
     if most_photos:
         faulty = _frames([*sizes, *others, *sharing])
-        usable = [f for f in placed if f not in faulty and scene.decoded[f].size is not None]
-        geometry = judge_scene(scene, usable, candidate.convention, most_photos)
-        explained = errors_of(findings) and geometry.unjudged != TOO_FEW
-        if geometry.distances or not explained:
-            findings += geometry_findings(scene, geometry, candidate.convention)
+        usable = [f for f in placed if f not in faulty and decoded[f].size is not None]
+        geometry = judge_scene(scene, usable, most_photos)
+        # what else is wrong says already why nothing could be judged
+        explained = errors_of(findings) and geometry.unjudged not in ("", TOO_FEW)
+        if not explained:
+            findings += geometry_findings(scene, geometry)
         findings += matched_findings(scene, geometry.pairs)
+    drawn = [frame for frame in placed if scene.numbers[frame] is not None]
+    c2w = [photos[frame].listed.c2w[:3] for frame in drawn]
+    fov = [_angles_of_view(photos[frame], decoded[frame].size or (1, 1)) for frame in drawn]
     return replace(
         report,
         listed=len(photos) + len(missing),
-        decodable=sum(result.size is not None for result in scene.decoded),
-        missing=len(missing) + sum(not photo.exists for photo in photos),
+        decodable=sum(result.size is not None for result in decoded),
+        missing=len(missing) + len(photos) - there,
         numbered=sum(number is not None for number in scene.numbers),
         pose_problems=len(_frames([*poses, *sharing])),
+        frames=tuple(scene.numbers[frame] for frame in drawn),
+        c2w=np.array(c2w, np.float32).reshape(-1, 3, 4),
+        fov=np.array(fov, np.float32).reshape(-1, 2),
         geometry=geometry,
         findings=findings,
-        **_drawn(scene, placed),
     )
+
+
+def _unreadable(name: str, error: Exception) -> Finding:
+    reason, colon, fix = str(error).rpartition(": ")  # messages end with a remedy
+    if colon and isinstance(error, OSError | ValueError):
+        return Finding(name, reason, fix)
+    return Finding(name, error_text(error), "get the files again, or mend what reads them")
+
+
+def _listing(kind: str) -> str:
+    """Return what messages call the file that lists the photos of a format."""
+    known = {"dl3dv": "transforms.json", "chunks": "the chunk"}
+    known |= {name: reader.listing for name, reader in readers().items()}
+    return known.get(kind, "the data set")
 
 
 def _frames(findings: Sequence[Finding]) -> set[int]:
     return {frame for finding in errors_of(findings) for frame in finding.frames}
 
 
-def _drawn(scene: DecodedScene, frames: Sequence[int]) -> dict[str, Any]:
-    """What a picture of the cameras needs."""
-    frames = [frame for frame in frames if scene.numbers[frame] is not None]
-    if not frames:
-        return {}
-    fov, c2w = [], []
-    for frame in frames:
-        photo = scene.photos[frame].listed
-        height, width = photo.size or scene.decoded[frame].size or (1, 1)
-        sides = zip((width, height), photo.intrinsics, strict=False)
-        fov.append([side / 2 / focal if focal > 0 else 0.0 for side, focal in sides])
-        c2w.append(photo.c2w[:3])
-    drawn = {"c2w": np.array(c2w, np.float32), "fov": np.array(fov, np.float32)}
-    return {"frames": tuple(scene.numbers[frame] for frame in frames), **drawn}
+def _angles_of_view(photo: Photo, size: tuple[int, int]) -> tuple[float, float]:
+    """Return tangents of half the angles of view, x and y; 0 for an unusable focal length."""
+    height, width = photo.listed.size or size
+    fx, fy, _, _ = photo.listed.intrinsics
+    return (width / 2 / fx if fx > 0 else 0.0), (height / 2 / fy if fy > 0 else 0.0)

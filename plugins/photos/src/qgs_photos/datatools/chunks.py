@@ -14,7 +14,7 @@ from upath import UPath
 
 from qgs.data.lenses import Size
 from qgs.data.photos.reader import PhotoFrame
-from qgs.wording import listed
+from qgs.wording import counted, listed
 from qgs_photos.datasets.chunk_files import (
     INDEX,
     SUFFIX,
@@ -28,14 +28,13 @@ from qgs_photos.datasets.chunk_files import (
     unit_problems,
 )
 from qgs_photos.datatools.candidates import Candidate, Photo
-from qgs_photos.datatools.conventions import OPENCV
-from qgs_photos.datatools.findings import Finding
+from qgs_photos.datatools.findings import Finding, Severity
 
 _REPACK = "pack the data set again with `qgs data pack`, or copy the file again"
 
 
 def chunk_folders(path: UPath) -> list[ChunkFolder]:
-    """The folders of chunks of a data set: train and test, or `path`; or a single chunk file."""
+    """Read the folders of chunks of a data set: train and test, or `path`; or a single file."""
     if path.is_file():
         single = ChunkFolder("")
         single.add_chunk(path)
@@ -51,14 +50,12 @@ def chunk_folders(path: UPath) -> list[ChunkFolder]:
             folder.compare_index({item.name for item in part.iterdir()})
         folders.append(folder)
     if len(folders) == 2:
+        reason = (
+            "the scene is in train and in test, so that models are evaluated on scenes of their "
+            "training"
+        )
         for key in sorted(folders[0].found & folders[1].found):
-            folders[0].report(
-                key,
-                "the scene is in train and in test, so that models are evaluated on scenes "
-                "of their training",
-                "remove it from one of the two",
-                warning=True,
-            )
+            folders[0].report(key, reason, "remove it from one of the two", "warning")
     return folders
 
 
@@ -75,13 +72,12 @@ class ChunkFolder:
         self._keys: dict[str, set[str]] = {}  # scenes by file, of files that could be read
         self._broken: set[str] = set()  # files with entries that are no scenes
 
-    def report(self, scene: str, reason: str, fix: str, *, warning: bool = False) -> None:
+    def report(self, scene: str, reason: str, fix: str, severity: Severity = "error") -> None:
         """Add a finding."""
-        severity = "warning" if warning else "error"
         self.findings.append(Finding(scene, reason, fix, severity=severity))
 
     def read_index(self, file: UPath) -> bool:
-        """Read index.json; whether there is a readable one."""
+        """Read index.json; return whether there is a readable one."""
         if not file.is_file():
             return False
         try:
@@ -112,16 +108,15 @@ class ChunkFolder:
             if not isinstance(key, str):
                 strange.append(entry)
             elif key in self.found:
-                self.report(
-                    key,
-                    f"the scene is in {label}, and was in this split before",
-                    "remove one of the two, or pack the data set again with `qgs data pack`",
-                )
+                reason = f"the scene is in {label}, and was in this split before"
+                self.report(key, reason, f"remove one of the two, or {_REPACK}")
             else:
                 keys.add(key)
                 self.found.add(key)
                 photos = partial(_photos, file, place)
-                self.candidates.append(Candidate(key, key, "chunks", OPENCV, photos, self.split))
+                self.candidates.append(
+                    Candidate(name=key, scene=key, kind="chunks", photos=photos, split=self.split)
+                )
         if strange:
             self._broken.add(file.name)
             self.report(
@@ -133,43 +128,38 @@ class ChunkFolder:
 
     def compare_index(self, files: set[str]) -> None:
         """Report where the index and the folder's `files` differ."""
+        index = self._label(INDEX)
         if not self.index:
-            self.report(self._label(INDEX), "it names no scene", "remove it, or write it anew")
+            self.report(index, "it names no scene", "remove it, or write it anew")
         for name, keys in self._placed.items():
             if name not in files:
-                self.report(
-                    self._label(name),
-                    f"the chunk does not exist; {INDEX} places there {_counted(keys)}",
-                    f"download the chunk, or take its scenes out of {INDEX}",
-                )
+                reason = f"the chunk does not exist; {INDEX} places there {_scenes(keys)}"
+                fix = f"download the chunk, or take its scenes out of {INDEX}"
+                self.report(self._label(name), reason, fix)
         for key, name in self.index.items():
             if name in self._keys and key not in self._keys[name] and name not in self._broken:
-                self.report(
-                    key,
-                    f"{self._label(INDEX)} places the scene in {name}, which does not hold it",
-                    f"take the scene out of {INDEX}, or get the chunk that holds it",
-                )
+                reason = f"{index} places the scene in {name}, which does not hold it"
+                fix = f"take the scene out of {INDEX}, or get the chunk that holds it"
+                self.report(key, reason, fix)
         for name, keys in self._keys.items():
+            reason = (
+                f"{self._label(name)} holds the scene, but {index} does not name it, so that it is "
+                "never read"
+            )
             for key in sorted(keys - self.index.keys()):
-                self.report(
-                    key,
-                    f"{self._label(name)} holds the scene, but {self._label(INDEX)} does not name "
-                    "it, so that it is never read",
-                    f"add it to {INDEX}",
-                    warning=True,
-                )
+                self.report(key, reason, f"add it to {INDEX}", "warning")
 
     def _label(self, name: str) -> str:
         return f"{self.split}/{name}" if self.split else name
 
     def _lost(self, name: str) -> str:
-        """Text on the scenes that the index places in a broken file."""
+        """Return text on the scenes that the index places in a broken file."""
         keys = [k for k in self._placed.get(name, ()) if k not in self._keys.get(name, ())]
-        return f"; {INDEX} places there {_counted(keys)}" if keys else ""
+        return f"; {INDEX} places there {_scenes(keys)}" if keys else ""
 
 
-def _counted(keys: Sequence[str]) -> str:
-    return f"{len(keys)} scene{'s' if len(keys) > 1 else ''}: {listed(keys)}"
+def _scenes(keys: Sequence[str]) -> str:
+    return f"{counted(len(keys), 'scene')}: {listed(keys)}"
 
 
 @lru_cache(maxsize=1)
@@ -206,7 +196,7 @@ def _photo(file: UPath, record: Record, frame: int, size: Size | None) -> Photo:
 
 
 def _listed_sizes(record: Record) -> list[Size] | None:
-    """(H, W) of every image: as the chunk says, else what most of the scene's headers say."""
+    """Return (H, W) of every image: as the chunk says, else what most of the headers say."""
     if record.sizes is not None:
         return record.image_sizes
     stored: Counter[Size] = Counter()

@@ -28,21 +28,28 @@ class Encoding:
     jpeg: int | None = None
 
     def image(self, pixels: np.ndarray) -> bytes:
-        """(H, W, 3) uint8 as the bytes of a file."""
-        return _file(pixels, self.jpeg)
+        """Return (H, W, 3) uint8 as the bytes of a file."""
+        if self.jpeg is None:
+            return png(pixels)
+        file = io.BytesIO()
+        Image.fromarray(pixels).save(file, format="JPEG", quality=self.jpeg, subsampling=0)
+        return file.getvalue()
 
 
-def _file(pixels: np.ndarray, jpeg: int | None = None) -> bytes:
-    file, image = io.BytesIO(), Image.fromarray(pixels)
-    if jpeg is None:
-        image.save(file, format="PNG")
-    else:
-        image.save(file, format="JPEG", quality=jpeg, subsampling=0)
+def png(pixels: np.ndarray) -> bytes:
+    """Return pixels (H, W, 3) or (H, W), uint8, as the bytes of a PNG file."""
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, format="PNG")
     return file.getvalue()
 
 
+def bytes_of(image: Tensor) -> np.ndarray:
+    """Return an image (C, H, W) in [0, 1] as (H, W, C) uint8."""
+    return np.ascontiguousarray(image.movedim(0, -1).mul(255).round().byte().numpy())
+
+
 def encoded_frames(scene: Scene, encoding: Encoding) -> Iterator[tuple[EncodedFrame, bool]]:
-    """The decodable frames in order, and whether each keeps its bytes. Raises as the scene."""
+    """Yield the decodable frames, and whether each keeps its bytes. Raises as the scene."""
     for index in range(len(scene)):
         if isinstance(scene, EncodedScene) and not encoding.resized:
             yield _stored(scene, index, encoding)
@@ -60,44 +67,59 @@ def _stored(scene: EncodedScene, index: int, encoding: Encoding) -> tuple[Encode
             f"scene {scene.name!r}, frame {index} ({frame.name}) cannot be read as an image "
             f"({error}): replace the file, or leave the scene out"
         ) from error
-    with Image.open(io.BytesIO(frame.data)) as image:  # every reader gets three channels out of it
+    with Image.open(io.BytesIO(frame.data)) as image:
+        # every reader gets three channels out of it
         plain = image.mode == "RGB" and not image.has_transparency_data
-        stays = frame.lens is None and plain and image.format in _KEPT_FORMATS
-    if stays:
-        return frame, True
+        if frame.lens is None and plain and image.format in _KEPT_FORMATS:
+            return frame, True
     if frame.lens is not None:
-        pixels = undistorted(pixels, frame.intrinsics, frame.lens)
-        mask = None if mask is None else undistorted(mask, frame.intrinsics, frame.lens)
-        zoom = whole_zoom(frame.intrinsics, frame.lens, frame.size, frame.size)
-        if zoom > 1:
-            crop = CropResize(frame.size, frame.size, zoom)
-            own = crop.intrinsics(torch.tensor(frame.intrinsics, dtype=torch.float64)).tolist()
-            frame = replace(frame, intrinsics=tuple(own))
-            pixels = crop.image(Image.fromarray(pixels))
-            mask = None if mask is None else crop.image(Image.fromarray(mask))
-    mask_file = None if mask is None else _file(mask)
-    return replace(frame, data=encoding.image(pixels), lens=None, mask=mask_file), False
+        return _straightened(frame, pixels, mask, encoding), False
+    mask_file = None if mask is None else png(mask)
+    return replace(frame, data=encoding.image(pixels), mask=mask_file), False
+
+
+def _straightened(
+    frame: EncodedFrame, pixels: np.ndarray, mask: np.ndarray | None, encoding: Encoding
+) -> EncodedFrame:
+    """Return the frame as a pinhole's, without edges that straightening leaves black."""
+    assert frame.lens is not None
+    zoom = whole_zoom(frame.intrinsics, frame.lens, frame.size, frame.size)
+    crop = CropResize(frame.size, frame.size, zoom)
+    lens = frame.lens
+
+    def straight(image: np.ndarray) -> np.ndarray:
+        whole = undistorted(image, frame.intrinsics, lens)
+        return crop.image(Image.fromarray(whole)) if zoom > 1 else whole
+
+    own = torch.tensor(frame.intrinsics, dtype=torch.float64)
+    fx, fy, cx, cy = (crop.intrinsics(own) if zoom > 1 else own).tolist()
+    return replace(
+        frame,
+        data=encoding.image(straight(pixels)),
+        intrinsics=(fx, fy, cx, cy),
+        lens=None,
+        mask=None if mask is None else png(straight(mask)),
+    )
 
 
 def _delivered(scene: Scene, index: int, encoding: Encoding) -> EncodedFrame:
-    cameras, masks = scene.cameras[index], scene.masks([index])
+    cameras = scene.cameras[index]
+    masks = scene.masks([index])
     fx, fy, cx, cy = cameras.intrinsics.double().tolist()
-    pixels = scene.images([index])[0].permute(1, 2, 0).mul(255).round().byte().numpy()
-    mask = None if masks is None else masks[0, 0].mul(255).round().byte().numpy()
     return EncodedFrame(
         name=scene.frame_name(index),
-        data=encoding.image(np.ascontiguousarray(pixels)),
+        data=encoding.image(bytes_of(scene.images([index])[0])),
         c2w=cameras.c2w.double().numpy(),
         intrinsics=(fx, fy, cx, cy),
         size=cameras.size,
-        mask=None if mask is None else _file(mask),
+        mask=None if masks is None else png(bytes_of(masks[0])[..., 0]),
     )
 
 
 def chunk_entry(
     key: str, frames: Sequence[EncodedFrame], held_out: Sequence[int], times: Tensor | None = None
 ) -> ChunkEntry:
-    """The entry of a scene; see `qgs_photos.datasets.chunk_files` for its keys."""
+    """Return the entry of a scene; see `qgs_photos.datasets.chunk_files` for its keys."""
     names = [frame.name for frame in frames]
     entry = {
         "key": key,
@@ -118,11 +140,12 @@ def chunk_entry(
 
 
 def _bytes(data: bytes) -> Tensor:
+    # a copy: torch wants memory that may be written to
     return torch.from_numpy(np.frombuffer(data, np.uint8).copy())
 
 
 def _camera(frame: EncodedFrame) -> np.ndarray:
-    """(18,) float32: normalised intrinsics, two zeros, rows of the world-to-camera matrix."""
+    """Return (18,) float32: normalised intrinsics, two zeros, rows of world-to-camera."""
     height, width = frame.size
     fx, fy, cx, cy = frame.intrinsics
     w2c = np.linalg.inv(frame.c2w)[:3].flatten()
@@ -131,6 +154,7 @@ def _camera(frame: EncodedFrame) -> np.ndarray:
 
 
 def _timestamps(names: Sequence[str]) -> Tensor:
-    """The frames' names where all are whole numbers, as time stamps are; else their order."""
+    """Return the names where all are whole numbers, as time stamps are; else their order."""
+    # 19 digits may be more than an int64 holds
     stamps = all(name.isascii() and name.isdigit() and len(name) < 19 for name in names)
-    return torch.tensor([int(n) for n in (names if stamps else range(len(names)))]).long()
+    return torch.tensor([int(name) for name in (names if stamps else range(len(names)))]).long()

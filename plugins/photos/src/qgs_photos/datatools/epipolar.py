@@ -1,21 +1,20 @@
-"""Points that two photos share, and how far they are from the epipolar lines of two poses."""
+"""Points that two photos share, and how far they are from where two poses want them."""
 
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from functools import cached_property
+from typing import Any
 
 import numpy as np
-from skimage.feature import SIFT, match_descriptors
-from skimage.measure import ransac
-from skimage.transform import FundamentalMatrixTransform
-
-Reading: TypeAlias = Callable[[np.ndarray], np.ndarray]
-"""What a pose (4, 4) that was read may have been meant as."""
+import torch
+from kornia.feature import match_smnn
+from kornia.geometry.ransac import RANSAC
+from skimage.feature import SIFT
 
 MIN_MATCHES = 24  # fewer say nothing about a pair of photos
 _RATIO = 0.8  # of descriptor distances (Lowe 2004)
 _INLIER_PIXELS = 1.5
-_TRIALS = 400
 _RGB_TO_GREY = np.array([0.299, 0.587, 0.114]) / 255
 
 
@@ -32,45 +31,59 @@ class Features:
 
 
 def detect(picture: np.ndarray) -> Features:
-    """Features of a photo (H, W, 3) uint8."""
+    """Find features of a photo (H, W, 3) uint8."""
+    # kornia's SIFT finds as much, and takes one and a half times as long or more
     sift: Any = SIFT()
     try:
         sift.detect_and_extract((picture @ _RGB_TO_GREY).astype(np.float32))
     except RuntimeError:  # an image without any feature, such as a plain wall
         return Features(np.zeros((0, 2)), np.zeros((0, 128)), np.zeros((0, 3)))
     rows, columns = sift.keypoints.astype(int).T
-    colors = picture[rows, columns] / 255
-    return Features(sift.keypoints[:, ::-1] + 0.5, sift.descriptors, colors)
+    return Features(
+        points=sift.keypoints[:, ::-1] + 0.5,
+        descriptors=sift.descriptors,
+        colors=picture[rows, columns] / 255,
+    )
 
 
-def match(first: Features, second: Features, seed: int = 0) -> tuple[np.ndarray, np.ndarray] | None:
-    """Points (2, P, 2) of one epipolar geometry, found without any pose, and colours (2, P, 3).
+def match(first: Features, second: Features) -> np.ndarray | None:
+    """Return pairs (P, 2) of features of one epipolar geometry, found without any pose.
 
     None for too few.
     """
-    if min(len(first.points), len(second.points)) < MIN_MATCHES:
-        return None
-    pairs = match_descriptors(
-        first.descriptors, second.descriptors, max_ratio=_RATIO, cross_check=True
-    )
+    one, two = (torch.from_numpy(each.descriptors).float() for each in (first, second))
+    _, pairs = match_smnn(one, two, _RATIO)
     if len(pairs) < MIN_MATCHES:
         return None
-    a, b = first.points[pairs[:, 0]], second.points[pairs[:, 1]]
-    found: Any = ransac(
-        (a, b),
-        FundamentalMatrixTransform,
-        min_samples=8,
-        residual_threshold=_INLIER_PIXELS,
-        max_trials=_TRIALS,
-        rng=seed,
-    )
-    inliers = found[1]
-    if inliers is None or inliers.sum() < MIN_MATCHES:
-        return None
-    kept = pairs[inliers].T
-    return np.stack([a[inliers], b[inliers]]), np.stack(
-        [features.colors[rows] for features, rows in zip((first, second), kept, strict=True)]
-    )
+    points = [
+        torch.from_numpy(f.points[rows]) for f, rows in zip((first, second), pairs.T, strict=True)
+    ]
+    _, inliers = RANSAC("fundamental", inl_th=_INLIER_PIXELS, seed=0)(points[0], points[1])
+    return pairs[inliers].numpy() if inliers.sum() >= MIN_MATCHES else None
+
+
+@dataclass(frozen=True)
+class HalfLines:
+    """Where P points of one photo may be seen in another: the parts of epipolar lines before both.
+
+    ends: (P, 2), where points infinitely far away are seen, pixels. directions: (P, 2), unit, in
+    which nearer ones lie; 0 without a baseline. ahead: (P,), False where all of the line counts.
+    """
+
+    ends: np.ndarray
+    directions: np.ndarray
+    ahead: np.ndarray
+
+    def along(self, points: np.ndarray) -> np.ndarray:
+        """Return how far `points` (P, 2) are along their lines, from the end on."""
+        return ((points - self.ends) * self.directions).sum(1)
+
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """Return the distances (P,) of `points` (P, 2), each from its half-line, in pixels."""
+        off = points - self.ends
+        across = off[:, 0] * self.directions[:, 1] - off[:, 1] * self.directions[:, 0]
+        before = np.where(self.ahead, np.minimum(self.along(points), 0), 0)
+        return np.hypot(across, before)
 
 
 @dataclass(frozen=True)
@@ -88,57 +101,57 @@ class Pair:
     intrinsics: np.ndarray
     size: tuple[int, int]
 
-    @property
-    def baseline(self) -> float:
-        """Distance of the two cameras, scene units."""
-        return float(np.linalg.norm(self.poses[1, :3, 3] - self.poses[0, :3, 3]))
-
-    def lines(self, reading: Reading = np.asarray) -> np.ndarray:
-        """Epipolar lines (2, P, 3), a x + b y + c = 0 (Hartley and Zisserman, section 9.2)."""
-        first, second = (reading(pose) for pose in self.poses)
-        relative = np.linalg.inv(second) @ first
-        x, y, z = relative[:3, 3]
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        one, two = (
-            np.linalg.inv([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-            for fx, fy, cx, cy in self.intrinsics
+    def half_lines(self, photo: int) -> HalfLines:
+        """Return where the other photo's points may be seen in `photo`, 0 or 1."""
+        # kornia has whole lines; two poses that are exchanged, or inverted ones, leave those as
+        # they are where no camera turns
+        points = self.matches[1 - photo]
+        lens = self.intrinsics[1 - photo]
+        own = self.intrinsics[photo]
+        relative = np.linalg.inv(self.poses[photo]) @ self.poses[1 - photo]
+        rays = np.concatenate([(points - lens[2:]) / lens[:2], np.ones((len(points), 1))], 1)
+        far = rays @ relative[:3, :3].T
+        near = relative[:3, 3]
+        infinity = far[:, :2] / far[:, 2:]
+        toward = (near[:2] - near[2] * infinity) / far[:, 2:] * own[:2]
+        length = np.linalg.norm(toward, axis=1, keepdims=True)
+        return HalfLines(
+            ends=infinity * own[:2] + own[2:],
+            directions=toward / np.where(length > 0, length, 1),
+            ahead=far[:, 2] > 0,
         )
-        fundamental = two.T @ cross @ relative[:3, :3] @ one
-        a, b = _homogeneous(self.matches)
-        return np.stack([b @ fundamental, a @ fundamental.T])
 
-    def distance(self, reading: Reading = np.asarray) -> float:
-        """Median distance of matches to where the other photo's may be seen, of the diagonal.
+    @cached_property
+    def distance(self) -> float:
+        """Median distance of matches to where the other photo's may be seen, of the diagonal."""
+        both = [self.half_lines(photo).distances(self.matches[photo]) for photo in (0, 1)]
+        return float(np.median(sum(both)) / 2 / np.hypot(*self.size))
 
-        That is the part of the epipolar line on which points are before both cameras: two poses
-        that are exchanged leave the line as it is where neither turns. 0 without a baseline.
-        """
-        first, second = (reading(pose) for pose in self.poses)
-        relative = np.linalg.inv(second) @ first
-        one, two = self.matches
-        there = _distances(one, two, relative, *self.intrinsics)
-        back = _distances(two, one, np.linalg.inv(relative), *self.intrinsics[::-1])
-        return float(np.median(there + back) / 2 / np.hypot(*self.size))
+    @property
+    def channels_differ(self) -> bool:
+        """Whether red and blue of one photo are exchanged against the other's."""
+        # exposure moves all channels together, so their difference is compared
+        one, two = self.colors[..., 0] - self.colors[..., 2]
+        same = np.median(np.abs(one - two))
+        exchanged = np.median(np.abs(one + two))
+        # grey points differ by noise alone
+        return bool(same > max(1.5 * exchanged, 0.02))
 
 
-def _distances(
-    from_: np.ndarray, to: np.ndarray, relative: np.ndarray, one: np.ndarray, two: np.ndarray
-) -> np.ndarray:
-    """Of points `to` (P, 2) from the half-lines on which those of the other photo may be seen.
+def frames_above(values: Sequence[tuple[tuple[int, int], float]], limit: float) -> dict[int, float]:
+    """Return frames of two pairs or more whose values are all above `limit`, and the least of each.
 
-    relative: (4, 4), first camera to second. one, two: (4,) intrinsics.
+    The worst goes first with its pairs, so that its partners are not blamed.
     """
-    rays = np.concatenate([(from_ - one[2:]) / one[:2], np.ones((len(from_), 1))], 1)
-    far, near = rays @ relative[:3, :3].T, relative[:3, 3]  # directions, and what is added nearby
-    infinity = far[:, :2] / far[:, 2:]
-    toward = (near[:2] - near[2] * infinity) / far[:, 2:] * two[:2]
-    length = np.linalg.norm(toward, axis=1, keepdims=True)
-    x, y = (toward / np.where(length > 0, length, 1)).T
-    off = to - (infinity * two[:2] + two[2:])
-    across = off[:, 0] * y - off[:, 1] * x
-    along = np.where(far[:, 2] > 0, off[:, 0] * x + off[:, 1] * y, 0)
-    return np.hypot(across, np.minimum(along, 0))
-
-
-def _homogeneous(points: np.ndarray) -> np.ndarray:
-    return np.concatenate([points, np.ones((*points.shape[:-1], 1))], -1)
+    found = dict[int, float]()
+    while True:
+        of_frame = defaultdict[int, list[float]](list)
+        for frames, value in values:
+            for frame in frames:
+                of_frame[frame].append(value)
+        above = {f: v for f, v in of_frame.items() if len(v) > 1 and min(v) > limit}
+        if not above:
+            return found
+        worst = max(above, key=lambda frame: (len(above[frame]), sum(above[frame])))
+        found[worst] = min(above[worst])
+        values = [item for item in values if worst not in item[0]]

@@ -38,8 +38,11 @@ class Finding:
         numbers = [number for number in self.numbers or self.frames if number is not None]
         if not numbers:
             return listed(names, 3)
-        named = f" ({names[0]}{f' to {names[-1]}' if len(names) > 1 else ''})" if names else ""
-        return f"frame{'s' if len(numbers) > 1 else ''} {spans(numbers)}{named}"
+        text = f"frame{'s' if len(numbers) > 1 else ''} {spans(numbers)}"
+        if not names:
+            return text
+        last = f" to {names[-1]}" if len(names) > 1 else ""
+        return f"{text} ({names[0]}{last})"
 
     def __str__(self) -> str:
         where = f"{self.scene}, {self.place}" if self.frames else self.scene
@@ -47,12 +50,12 @@ class Finding:
 
 
 def errors_of(findings: Iterable[Finding]) -> list[Finding]:
-    """Those of `findings` that are errors."""
+    """Return the errors among `findings`."""
     return [finding for finding in findings if finding.severity == "error"]
 
 
 def spans(numbers: Iterable[int]) -> str:
-    """Numbers as text, such as 0-3, 7; after eight runs the rest is counted."""
+    """Return numbers as text, such as 0-3, 7; after eight runs the rest is counted."""
     # numbers of one run are all equally far ahead of their places
     grouped = groupby(enumerate(sorted(set(numbers))), lambda item: item[1] - item[0])
     runs = [[number for _, number in run] for _, run in grouped]
@@ -62,21 +65,23 @@ def spans(numbers: Iterable[int]) -> str:
 
 
 def merged(findings: Sequence[Finding]) -> list[Finding]:
-    """One finding for all frames with the same fault; for more than three, the same remedy."""
-    equal = _together(findings, attrgetter("reason", "fix", "severity"))
+    """Join findings of frames with the same fault; where more than three, with the same remedy."""
+    equal = _joined(findings, attrgetter("reason", "fix", "severity"))
     kinds = Counter(finding.fix for finding in equal)
     few = [finding for finding in equal if kinds[finding.fix] <= _FEW]
     many = [finding for finding in equal if kinds[finding.fix] > _FEW]
-    return [*few, *_together(many, attrgetter("fix", "severity"))]
+    return [*few, *_joined(many, attrgetter("fix", "severity"))]
 
 
-def _together(findings: Sequence[Finding], key: Callable[[Finding], Any]) -> list[Finding]:
-    together: dict[Any, Finding] = {}
+def _joined(findings: Sequence[Finding], key: Callable[[Finding], Any]) -> list[Finding]:
+    joined: dict[Any, Finding] = {}
     for finding in findings:
-        if known := together.get(key(finding)):
-            both = {
-                k: getattr(known, k) + getattr(finding, k) for k in ("frames", "names", "numbers")
-            }
-            finding = replace(known, **both)
-        together[key(finding)] = finding
-    return list(together.values())
+        known = joined.setdefault(key(finding), finding)
+        if known is not finding:
+            joined[key(finding)] = replace(
+                known,
+                frames=known.frames + finding.frames,
+                names=known.names + finding.names,
+                numbers=known.numbers + finding.numbers,
+            )
+    return list(joined.values())

@@ -5,7 +5,7 @@ from functools import partial
 
 from upath import UPath
 
-from qgs.data.photos import formats_of, read_listing, readers
+from qgs.data.photos import formats_of, read_listing
 from qgs.data.photos.checks import refuse_outside
 from qgs.data.photos.reader import existing
 from qgs.data.photos.source import folder_name
@@ -13,15 +13,12 @@ from qgs.data.photos.turning import upright
 from qgs.paths import read_file
 from qgs_photos.datasets.dl3dv import find_scenes, scene_folder
 from qgs_photos.datatools.candidates import Candidate, Photo
-from qgs_photos.datatools.conventions import LLFF, OPENCV, OPENCV_C2W, OPENGL
 from qgs_photos.datatools.findings import Finding
 from qgs_photos.datatools.sources import kind_of
 
-_POSES = {"opengl": OPENGL, "opencv": OPENCV, "opencv c2w": OPENCV_C2W, "llff": LLFF}
-
 
 def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Candidate | Finding]:
-    """The scenes of format `wanted` in `root`: itself, its folders, or those in train and test."""
+    """Yield scenes of a format in `root`: itself, its folders, or those in train and test."""
     if formats_of(root):
         yield from _listings(root, folder_name(root), wanted, images)
         return
@@ -39,12 +36,12 @@ def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Cand
 
 
 def _listings(folder: UPath, name: str, wanted: str, images: str | None) -> Iterator[Candidate]:
-    """A candidate for each of the listings that a folder holds, or for the wanted one."""
+    """Yield a candidate for each of the listings that a folder holds, or for the wanted one."""
     held = [kind for kind in formats_of(folder) if wanted in ("auto", kind)]
     for kind in held:
         label = f"{name} ({kind})" if len(held) > 1 else name
         photos = partial(_photos, folder, kind, images)
-        yield Candidate(label, name, kind, _POSES[readers()[kind].poses], photos)
+        yield Candidate(name=label, scene=name, kind=kind, photos=photos)
 
 
 def _no_scene(folder: UPath, wanted: str) -> Finding:
@@ -52,20 +49,23 @@ def _no_scene(folder: UPath, wanted: str) -> Finding:
     reason = "the folder lists no cameras and is no scene"
     fix = "make poses for it, or move it away"
     if kind != "photos":
-        reason = f"the folder is another data set ({kind}) and is not checked with the photos"
-        reason, fix = f"{reason} beside it", f"run `qgs data check {folder}`"
+        reason = (
+            f"the folder is another data set ({kind}) and is not checked with the photos beside it"
+        )
+        fix = f"run `qgs data check {folder}`"
     return Finding(folder.name, reason, fix, severity="warning")
 
 
-def dl3dv_scenes(path: UPath, images: str | None) -> list[Candidate]:
-    """The scenes below `path`. Raises FileNotFoundError when there is none."""
-    return [
-        Candidate(
-            name, name, "dl3dv", OPENGL,
-            lambda place=place: _photos(scene_folder(place), "nerfstudio", images),
-        )
-        for name, place in find_scenes(path).items()
-    ]  # fmt: skip
+def dl3dv_scenes(path: UPath, images: str | None) -> Iterator[Candidate]:
+    """Yield the scenes below `path`. Raises FileNotFoundError when there is none."""
+    for name, place in find_scenes(path).items():
+        # an archive is opened when its scene's turn comes
+        photos = partial(_archived_photos, place, images)
+        yield Candidate(name=name, scene=name, kind="dl3dv", photos=photos)
+
+
+def _archived_photos(place: UPath, images: str | None) -> list[Photo]:
+    return _photos(scene_folder(place), "nerfstudio", images)
 
 
 def _photos(folder: UPath, kind: str, images: str | None) -> list[Photo]:
@@ -76,8 +76,11 @@ def _photos(folder: UPath, kind: str, images: str | None) -> list[Photo]:
     masks = existing(frame.mask for frame in frames if frame.mask is not None)
     return [
         Photo(
-            frame, partial(read_file, frame.path), frame.path in there,
-            frame.mask is None or frame.mask == frame.path or frame.mask in masks,
+            listed=frame,
+            read=partial(read_file, frame.path),
+            exists=frame.path in there,
+            # a photo's own alpha channel, or none, is never missing
+            mask_exists=frame.mask in {None, frame.path, *masks},
         )
         for frame in frames
-    ]  # fmt: skip
+    ]

@@ -1,44 +1,38 @@
 """Whether a scene's cameras agree with its photos, judged on pairs of neighbours."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from qgs_photos.datatools.conventions import Convention
+from qgs.wording import counted
 from qgs_photos.datatools.decoding import DecodedScene
-from qgs_photos.datatools.epipolar import MIN_MATCHES, Features, Pair, detect, match
-from qgs_photos.datatools.findings import Finding
-from qgs_photos.datatools.suspects import (
-    OtherLens,
-    exchanged_poses,
-    frames_of_other_channels,
-    frames_off,
-    other_lens,
-)
+from qgs_photos.datatools.epipolar import MIN_MATCHES, Features, Pair, detect, frames_above, match
+from qgs_photos.datatools.findings import Finding, Severity
 
-AS_READ = "as read"  # the reading of poses that changes nothing
 SIDE = 400  # pixels on the longer side of the photos that are matched
 TOLERANCE = 0.005  # largest median distance that good poses leave, of the image's diagonal
-CLEARLY_BETTER = 3.0  # a reading whose distance is this many times smaller replaces the present one
 TOO_FEW = f"too few matches, below {MIN_MATCHES} in every pair that was tried"
 _RUNS = 5  # of consecutive frames, where not all are matched
 _GAPS = (8, 4, 2, 1)
 _NO_BASELINE = 1e-4  # of the cameras' extent: poses so close say nothing about their lines
 _NONSENSE = 0.02  # of the diagonal: no lens or rounding explains more
+_FAR = 4.0  # times the better pairs: a frame is off that is so far from all its partners
+_ADVICE = (
+    "check the convention of the poses, that they are in the order of the photos, and the "
+    "intrinsics; docs/photos.md says how each looks"
+)
 
 
 @dataclass(frozen=True)
 class Geometry:
     """How well the poses of a scene explain its photos.
 
-    distances: median over pairs of the distance of matches to epipolar lines by reading of the
-    poses, fractions of the diagonal; empty where `unjudged` says why. pairs: the worst first;
-    photos: both of the worst one, (H, W, 3) uint8. diagonal: of the files, in pixels. labels: what
-    messages call the photos. left_out: frames that were not matched.
+    unjudged: why there are no `pairs`. pairs: the worst first; photos: both of that one, (H, W, 3)
+    uint8. diagonal: of the files, in pixels. labels: what messages call the photos. left_out:
+    frames that were not matched.
     """
 
-    distances: Mapping[str, float] = field(default_factory=dict)
     unjudged: str = ""
     pairs: Sequence[Pair] = ()
     photos: tuple[np.ndarray, ...] = ()
@@ -48,8 +42,8 @@ class Geometry:
 
     @property
     def fraction(self) -> float:
-        """Median distance to the epipolar line as read, as a fraction of the diagonal."""
-        return self.distances[AS_READ]
+        """Median over pairs of their distance, of the diagonal; 0 for none."""
+        return float(np.median([pair.distance for pair in self.pairs])) if self.pairs else 0.0
 
     @property
     def pixels(self) -> float:
@@ -57,46 +51,35 @@ class Geometry:
         return self.fraction * self.diagonal
 
     @property
-    def better(self) -> str | None:
-        """The reading that explains the photos where the present one does not."""
-        best = min(self.distances, key=lambda reading: self.distances[reading])
-        clear = self.fraction > CLEARLY_BETTER * self.distances[best]
-        return best if clear and self.distances[best] <= TOLERANCE else None
-
-    @property
     def agrees(self) -> bool:
-        """Whether the poses, as read, explain the photos."""
-        return self.fraction <= TOLERANCE and self.better is None
+        """Whether the poses explain the photos."""
+        return self.fraction <= TOLERANCE
 
 
-def judge_scene(
-    scene: DecodedScene, usable: Sequence[int], convention: Convention, most: int
-) -> Geometry:
+def judge_scene(scene: DecodedScene, usable: Sequence[int], most: int) -> Geometry:
     """Match each frame that is `usable`, of runs of at most `most`, with the next and another."""
     if len(usable) < 2:
-        return Geometry(unjudged="fewer than 2 usable frames")
+        return Geometry("fewer than 2 usable frames")
     matcher = _Matcher(scene, [frame for run in _runs(usable, most) for frame in run])
     if not np.ptp(matcher.centres, axis=0).any():
-        return Geometry(unjudged="all cameras on one point")
-    pairs = matcher.pairs()
+        return Geometry("all cameras on one point")
+    pairs = sorted(matcher.pairs(), key=lambda pair: -pair.distance)
     if not pairs:
-        return Geometry(unjudged=TOO_FEW)
-    pairs.sort(key=lambda pair: -pair.distance())
-    readings = {AS_READ: np.asarray, **{name: m.meant for name, m in convention.items()}}
-    distances = {
-        name: float(np.median([pair.distance(reading) for pair in pairs]))
-        for name, reading in readings.items()
-    }
-    photos = tuple(matcher.picture(frame)[0] for frame in pairs[0].frames)
-    size = scene.decoded[pairs[0].frames[0]].size
+        return Geometry(TOO_FEW)
+    frames = pairs[0].frames
+    size = scene.decoded[frames[0]].size
     assert size is not None
-    labels = tuple(map(scene.label, pairs[0].frames))
-    left_out = len(usable) - len(matcher.frames)
-    return Geometry(distances, "", pairs, photos, float(np.hypot(*size)), labels, left_out)
+    return Geometry(
+        pairs=pairs,
+        photos=tuple(matcher.picture(frame)[0] for frame in frames),
+        diagonal=float(np.hypot(*size)),
+        labels=tuple(map(scene.label, frames)),
+        left_out=len(usable) - len(matcher.frames),
+    )
 
 
 def _runs(frames: Sequence[int], most: int) -> list[Sequence[int]]:
-    """All frames, or runs of neighbours, spread over them, that together have `most`."""
+    """Return all frames, or runs of neighbours, spread over them, that together have `most`."""
     if len(frames) <= most:
         return [frames]
     length = max(most // _RUNS, 2)
@@ -108,17 +91,18 @@ class _Matcher:
     """Pairs of a scene's frames, by their places in `frames`; features are detected once."""
 
     def __init__(self, scene: DecodedScene, frames: Sequence[int]) -> None:
-        self.scene, self.frames = scene, frames
+        self.scene = scene
+        self.frames = frames
         self.poses = np.stack([scene.photos[frame].listed.c2w for frame in frames])
         self.centres = self.poses[:, :3, 3]
-        self._features: dict[int, tuple[Features, np.ndarray, tuple[int, int]]] = {}
+        self._known: dict[int, tuple[Features, np.ndarray, tuple[int, int]]] = {}
 
     def picture(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """The photo as it is matched, and its intrinsics; by its number in the scene."""
+        """Return the photo as it is matched, and its intrinsics; by its number in the scene."""
         return self.scene.photos[frame].picture(self.scene.decoded[frame].size, SIDE)
 
     def pairs(self) -> list[Pair]:
-        """Each frame with the next one, and with the first of its partners that shares enough."""
+        """Pair each frame with the next, and with the first of its partners that shares enough."""
         found: dict[frozenset[int], Pair | None] = {}
         for start in range(len(self.frames)):
             partners = list(self.partners(start))
@@ -129,99 +113,77 @@ class _Matcher:
                         found[both] = self.pair(min(both), max(both))
                     if found[both]:
                         break
-        return [*filter(None, found.values())]
+        return [pair for pair in found.values() if pair]
 
     def pair(self, first: int, second: int) -> Pair | None:
-        """None where too little is shared."""
-        for place in {first, second} - self._features.keys():
+        """Match two photos; None where too little is shared."""
+        one, lens_of_one, size = self._features(first)
+        two, lens_of_two, _ = self._features(second)
+        found = match(one, two)
+        if found is None:
+            return None
+        rows = found.T
+        return Pair(
+            frames=(self.frames[first], self.frames[second]),
+            matches=np.stack([one.points[rows[0]], two.points[rows[1]]]),
+            colors=np.stack([one.colors[rows[0]], two.colors[rows[1]]]),
+            poses=self.poses[[first, second]],
+            intrinsics=np.stack([lens_of_one, lens_of_two]),
+            size=size,
+        )
+
+    def _features(self, place: int) -> tuple[Features, np.ndarray, tuple[int, int]]:
+        if place not in self._known:
             picture, intrinsics = self.picture(self.frames[place])
             height, width, _ = picture.shape
-            self._features[place] = detect(picture), intrinsics, (height, width)
-        (one, k1, size), (two, k2, _) = self._features[first], self._features[second]
-        matches = match(one, two)
-        if matches is None:
-            return None
-        frames, poses = (self.frames[first], self.frames[second]), self.poses[[first, second]]
-        return Pair(frames, *matches, poses, np.stack([k1, k2]), size)
+            self._known[place] = detect(picture), intrinsics, (height, width)
+        return self._known[place]
 
     def partners(self, start: int) -> Iterator[int]:
         """Places of frames that may see the same: along the listing, then near in space."""
         along = [place for gap in _GAPS for place in (start + gap, start - gap)]
         along = [place for place in along if 0 <= place < len(self.frames)]
         forward = [place for place in along if place > start] or along
-        near = np.argsort(np.linalg.norm(self.centres - self.centres[start], axis=1))
-        extent = np.ptp(self.centres, axis=0).max()
-        for place in dict.fromkeys([*forward, *near[1:4].tolist()]):
-            distance = np.linalg.norm(self.centres[place] - self.centres[start])
-            if place != start and distance > _NO_BASELINE * extent:
+        distances = np.linalg.norm(self.centres - self.centres[start], axis=1)
+        near = np.argsort(distances)[1:4].tolist()
+        least = _NO_BASELINE * np.ptp(self.centres, axis=0).max()
+        for place in dict.fromkeys([*forward, *near]):
+            if place != start and distances[place] > least:
                 yield place
 
 
-def geometry_findings(
-    scene: DecodedScene, geometry: Geometry, convention: Convention
-) -> Iterator[Finding]:
-    """What the distances mean for the scene; a warning where there are none."""
-    if not geometry.distances:
+def geometry_findings(scene: DecodedScene, geometry: Geometry) -> Iterator[Finding]:
+    """Yield what the distances mean for the scene; a warning where there are none."""
+    if geometry.unjudged:
         reason = f"the poses are not judged against the photos: {geometry.unjudged}"
         fix = "look at the cameras yourself, in the picture that --report draws"
         yield Finding(scene.name, reason, fix, severity="warning")
         return
-    frames = range(len(scene.photos))
-    off = (
-        f"matches lie {geometry.pixels:.1f} pixels from their epipolar lines, "
-        f"median of {len(geometry.pairs)} pairs"
-    )
-    if geometry.better is not None:
-        misreading = convention[geometry.better]
-        after = geometry.distances[geometry.better] * geometry.diagonal
-        reason = f"{misreading.reason} ({off}; {after:.1f} when read so)"
-        yield scene.finding(frames, reason, misreading.fix)
-    elif both := exchanged_poses(geometry.pairs, TOLERANCE):
-        reason = "their poses look exchanged: with each other's they fit those of the other frames"
-        yield scene.finding(both, reason, "exchange the two poses, or the two photos")
-    elif lens := other_lens(geometry.pairs, TOLERANCE):
-        yield _of_lens(scene, geometry, lens)
-    elif not geometry.agrees:
-        reason = f"the poses do not explain the photos ({off}), nor in another convention"
-        fix = "check that poses and photos are in the same order, and the intrinsics"
-        moves = len({photo.listed.time for photo in scene.photos}) > 1  # and what moves lies off
-        severity = "error" if geometry.fraction > _NONSENSE and not moves else "warning"
-        yield scene.finding(frames, reason, fix, severity)
-    elif off_frames := frames_off(geometry.pairs, TOLERANCE):
+    # what moves lies off its lines, however good the poses are
+    moves = len({photo.listed.time for photo in scene.photos}) > 1
+    distances = [(pair.frames, pair.distance) for pair in geometry.pairs]
+
+    def severity(fraction: float) -> Severity:
+        return "error" if fraction > _NONSENSE and not moves else "warning"
+
+    better = float(np.quantile([distance for _, distance in distances], 0.25))
+    off = frames_above(distances, max(min(_FAR * better, _NONSENSE), TOLERANCE))
+    rest = [distance for frames, distance in distances if off.keys().isdisjoint(frames)]
+    # a few wrong frames are in most of the pairs of a short scene: without them it must agree
+    if off and rest and np.median(rest) <= TOLERANCE:
         reason = "the pose or the intrinsics do not fit those of the other frames"
-        fix = "check that it belongs to the photo, correct it, or remove the frame"
-        yield scene.finding(off_frames, reason, fix, "warning")
-    if channels := frames_of_other_channels(geometry.pairs):
-        every = {frame for pair in geometry.pairs for frame in pair.frames}
-        which = ", or in all others" if 2 * len(channels) == len(every) else ""
+        fix = "check that they belong to the photo, correct them, or remove the frame"
+        yield scene.finding(sorted(off), reason, fix, severity(min(off.values())))
+    elif not geometry.agrees:
         reason = (
-            f"red and blue look exchanged{which}: what other photos show too has their colours so"
+            f"the poses do not fit the photos: matches lie {geometry.pixels:.1f} pixels from where "
+            f"they may be seen, median of {counted(len(geometry.pairs), 'pair')}; good poses leave "
+            f"up to {TOLERANCE * geometry.diagonal:.1f}"
         )
-        yield scene.finding(channels, reason, "write the photo as RGB, not as BGR", "warning")
-
-
-def _of_lens(scene: DecodedScene, geometry: Geometry, lens: OtherLens) -> Finding:
-    """A finding on intrinsics that do not fit the photos, and on those that do."""
-    pair, scale = geometry.pairs[0], geometry.diagonal / np.hypot(*geometry.pairs[0].size)
-    fx, _, cx, cy = scale * pair.intrinsics[0]
-    change = scale * max(pair.size) * np.array(lens.shift)
-    off = (
-        f"matches lie {lens.before * geometry.diagonal:.1f} pixels from their epipolar lines, "
-        f"and {lens.after * geometry.diagonal:.1f}"
-    )
-    if lens.exchanged:
-        reason = f"cx and cy look exchanged ({off} with cx {cy:.0f}, cy {cx:.0f})"
-        fix = "exchange them"
-    elif not change.any():
-        reason = f"the focal lengths do not fit the photos ({off} with {lens.zoom:.2f} times them)"
-        fix = "correct them, or the size that goes with them; photos that were cut have other ones"
-    else:
-        x, y = np.array([cx, cy]) + change
-        reason = (
-            f"the intrinsics do not fit the photos ({off} with a focal length of "
-            f"{fx * lens.zoom:.0f} instead of {fx:.0f} and a principal point ({x:.0f}, {y:.0f}) "
-            f"instead of ({cx:.0f}, {cy:.0f}))"
-        )
-        fix = "give those of the photos as they are; cutting moves cx and cy, scaling changes all"
-    severity = "error" if geometry.fraction > TOLERANCE else "warning"
-    return scene.finding(range(len(scene.photos)), reason, fix, severity)
+        every = range(len(scene.photos))
+        yield scene.finding(every, reason, _ADVICE, severity(geometry.fraction))
+    differ = [(pair.frames, float(pair.channels_differ)) for pair in geometry.pairs]
+    if exchanged := frames_above(differ, 0.5):
+        reason = "red and blue look exchanged: what other photos show too has their colours so"
+        fix = "write the photo as RGB, not as BGR"
+        yield scene.finding(sorted(exchanged), reason, fix, "warning")

@@ -19,7 +19,7 @@ class Held:
 
 
 def found_indices(path: UPath) -> list[UPath]:
-    """The JSON files in the folder `path` that have the form of an evaluation index."""
+    """Return the JSON files in the folder `path` that have the form of an evaluation index."""
     files = path.iterdir() if path.is_dir() else ()
     return sorted((file for file in files if file.suffix == ".json" and _is_index(file)), key=str)
 
@@ -29,15 +29,14 @@ def _is_index(file: UPath) -> bool:
         data = read_json(file, "")
     except (OSError, ValueError):
         return False
-    return isinstance(data, dict) and any(
-        isinstance(entry, dict) and {"context", "target"} <= entry.keys() for entry in data.values()
-    )
+    entries = data.values() if isinstance(data, dict) else ()
+    return any(isinstance(e, dict) and {"context", "target"} <= e.keys() for e in entries)
 
 
 def index_findings(
     file: UPath, scenes: Mapping[str, Sequence[Held]], reported: Container[str] = ()
 ) -> tuple[list[Finding], str | None]:
-    """Findings on entries of the index that neither exist nor are `reported`; a line on the index.
+    """Return findings on entries that neither exist nor are `reported`, and a line on the index.
 
     The line is None where the file is no index.
     """

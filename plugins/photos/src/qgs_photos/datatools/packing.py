@@ -29,35 +29,40 @@ Splits: TypeAlias = Mapping[Split, Places]  # what is packed into which split
 
 
 def own_splits(source: SceneSource) -> Splits:
-    """The source's own splits; scenes that are in both are packed once, for training."""
-    train, test = _places(source, "train"), _places(source, "test")
+    """Return the source's own splits; scenes in both are packed once, for training."""
+    train = _places(source, "train")
+    test = _places(source, "test")
     return {"train": train, "test": {name: test[name] for name in test if name not in train}}
 
 
 def splits_by_list(source: SceneSource, test_scenes: Collection[str]) -> Splits:
-    """All scenes, those named for testing. Raises ValueError for names that no scene has."""
-    splits = own_splits(source)
-    places = [*splits["train"], *splits["test"]]
-    if absent := [name for name in test_scenes if name not in set(places)]:
+    """Split all scenes, those named for testing. Raises ValueError for names of no scene."""
+    places = _every_place(source)
+    if absent := [name for name in test_scenes if name not in places]:
         raise ValueError(
             f"{len(absent)} of {len(test_scenes)} test scenes are not there: {listed(absent)}; the "
             f"{len(places)} scenes are called {listed(places)}. Correct the list, or take them out "
             "of it"
         )
-    return _split_again(splits, set(test_scenes))
+    return _split(places, {*test_scenes})
 
 
 def splits_by_number(source: SceneSource, every: int) -> Splits:
-    """All scenes, every n-th of them for testing, beginning with scene n - 1."""
+    """Split all scenes, every n-th of them for testing, beginning with scene n - 1."""
+    places = _every_place(source)
+    return _split(places, {*[*places][every - 1 :: every]})
+
+
+def _every_place(source: SceneSource) -> Places:
     splits = own_splits(source)
-    return _split_again(splits, {*[*splits["train"], *splits["test"]][every - 1 :: every]})
+    return {**splits["train"], **splits["test"]}
 
 
-def _split_again(splits: Splits, test: Collection[str]) -> Splits:
-    again: dict[Split, dict[str, tuple[Split, int]]] = {"train": {}, "test": {}}
-    for name, place in {**splits["train"], **splits["test"]}.items():
-        again["test" if name in test else "train"][name] = place
-    return again
+def _split(places: Places, test: Collection[str]) -> Splits:
+    return {
+        "train": {name: place for name, place in places.items() if name not in test},
+        "test": {name: place for name, place in places.items() if name in test},
+    }
 
 
 def _places(source: SceneSource, split: Split) -> dict[str, tuple[Split, int]]:
@@ -86,7 +91,7 @@ class Journal:
 
 
 def open_journal(folder: UPath, settings: Mapping[str, Any]) -> Journal:
-    """The journal in `folder`, a new one where nothing is there yet.
+    """Open the journal in `folder`, a new one where nothing is there yet.
 
     Raises FileExistsError for other content, ValueError for other settings or a strange journal.
     """
@@ -115,19 +120,20 @@ def open_journal(folder: UPath, settings: Mapping[str, Any]) -> Journal:
 def _read(file: UPath) -> Mapping[str, Any]:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
+        files = content["files"]
+        parts = [content["settings"], *(files[split] for split in get_args(Split))]
+        if all(isinstance(part, dict) for part in parts):
+            return content
+        reason = "was not written by a packing"
     except ValueError as error:
         reason = f"is not valid JSON ({error})"
-    else:
-        of_ours = isinstance(content, dict) and isinstance(content.get("settings"), dict)
-        files = content.get("files") if of_ours else None
-        if isinstance(files, dict) and all(isinstance(files.get(s), dict) for s in get_args(Split)):
-            return content
+    except (KeyError, TypeError):
         reason = "was not written by a packing"
     raise ValueError(f"{file} {reason}: move it away if you know it, or give a new folder")
 
 
 def _is_unfinished(path: UPath) -> bool:
-    """Whether `path` is a file that `opened_replacing` was writing when its process was killed."""
+    """Return whether a process was writing `path` by `opened_replacing` when it was killed."""
     return path.name.startswith(".") and path.suffix == ".tmp"
 
 
@@ -172,26 +178,20 @@ def pack(
 
     def entries(places: Places, done: Collection[str]) -> Iterator[ChunkEntry]:
         for name, (split, index) in places.items():
-            if name in done:
-                packed.resumed += 1
-            else:
-                try:
-                    scene = source.scenes(split)[index]
-                    frames = list(encoded_frames(scene, encoding))
-                    packed.frames += len(frames)
-                    packed.kept += sum(kept for _, kept in frames)
-                    of_frames = [frame for frame, _ in frames]
-                    entry = chunk_entry(name, of_frames, scene.held_out, scene.times)
-                except (ValueError, OSError) as error:
-                    if not leave_out_broken:
-                        raise
-                    packed.left_out[name] = str(error)
+            try:
+                if name in done:
+                    packed.resumed += 1
                 else:
-                    yield entry
+                    yield _entry(name, source.scenes(split)[index], encoding, packed)
+            except (ValueError, OSError) as error:
+                if not leave_out_broken:
+                    raise
+                packed.left_out[name] = str(error)
             progress(name)
 
     for split, places in splits.items():
-        done, inside = journal.files[split], folder / split
+        done = journal.files[split]
+        inside = folder / split
         for item in inside.iterdir() if inside.is_dir() else ():
             if _is_unfinished(item):
                 item.unlink()
@@ -212,6 +212,13 @@ def pack(
     return packed
 
 
+def _entry(name: str, scene: Any, encoding: Encoding, packed: Packed) -> ChunkEntry:
+    frames, kept = zip(*encoded_frames(scene, encoding), strict=True)
+    packed.frames += len(frames)
+    packed.kept += sum(kept)
+    return chunk_entry(name, frames, scene.held_out, scene.times)
+
+
 def _chunks(entries: Iterable[ChunkEntry], limit: int) -> Iterator[list[ChunkEntry]]:
     chunk: list[ChunkEntry] = []
     total = 0
@@ -219,7 +226,8 @@ def _chunks(entries: Iterable[ChunkEntry], limit: int) -> Iterator[list[ChunkEnt
         size = sum(data.nbytes for key in ("images", "masks") for data in entry.get(key, ()))
         if chunk and total + size > limit:
             yield chunk
-            chunk, total = [], 0
+            chunk = []
+            total = 0
         chunk.append(entry)
         total += size
     if chunk:
@@ -228,7 +236,7 @@ def _chunks(entries: Iterable[ChunkEntry], limit: int) -> Iterator[list[ChunkEnt
 
 @contextmanager
 def opened_replacing(path: UPath) -> Iterator[IO[bytes]]:
-    """A file that replaces `path` when the block ends well; missing parent folders are made.
+    """Open a file that replaces `path` when the block ends well; makes missing parent folders.
 
     Moving is as atomic as the file system's: object stores show an object when it is complete.
     """

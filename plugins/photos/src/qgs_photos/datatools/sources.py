@@ -12,8 +12,7 @@ from qgs.data.photos.reader import PhotoFrame
 from qgs.data.recognition import recognised
 from qgs.recipe.registry import Registry, load_registry, load_usable_plugins
 from qgs_photos.datatools.candidates import Candidate, Photo
-from qgs_photos.datatools.conventions import OPENCV
-from qgs_photos.datatools.entries import Encoding
+from qgs_photos.datatools.entries import bytes_of, png
 
 OF_FILES = ("qgs", "datasets")
 """Plugins whose sources are checked by their files, not by what they deliver."""
@@ -23,7 +22,7 @@ _SIZE = (256, 256)  # of the images that a source is asked for
 
 @cache
 def _imported(format: str) -> tuple[Registry, list[str]]:
-    """All plugins for "auto"; else OF_FILES, and that of a `format` PLUGIN/NAME."""
+    """Import all plugins for "auto"; else OF_FILES, and that of a `format` PLUGIN/NAME."""
     if format == "auto":
         return load_usable_plugins()
     plugin, slash, _ = format.partition("/")
@@ -31,7 +30,7 @@ def _imported(format: str) -> tuple[Registry, list[str]]:
 
 
 def sources(format: str = "auto") -> dict[str, type[Component]]:
-    """The sources that read a path, by PLUGIN/NAME: of OF_FILES, and of the plugins for `format`.
+    """Return the sources that read a path, by PLUGIN/NAME: of OF_FILES and those for `format`.
 
     Raises PluginError where the one that `format` names cannot be used.
     """
@@ -40,19 +39,19 @@ def sources(format: str = "auto") -> dict[str, type[Component]]:
 
 
 def left_out(format: str = "auto") -> list[str]:
-    """A note on each plugin that cannot be used."""
+    """Return a note on each plugin that cannot be used."""
     return [f"left out: {problem}" for problem in _imported(format)[1]]
 
 
 def kind_of(path: UPath, format: str = "auto") -> str:
-    """PLUGIN/NAME of the source that reads `path`, or NAME for those whose files are checked."""
+    """Return PLUGIN/NAME of the source that reads `path`, or NAME for one of OF_FILES."""
     kind = recognised(path, sources(format))
     plugin, _, name = kind.partition("/")
     return name if plugin in OF_FILES else kind
 
 
 def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candidate]:
-    """The scenes of a plugin's source, as it delivers them. Raises as the source does.
+    """Yield the scenes of a plugin's source, as it delivers them. Raises as the source does.
 
     images: for its option of that name. Raises ValueError where it has none.
     """
@@ -66,9 +65,14 @@ def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candid
     for split in get_args(Split):
         for place, name in enumerate(opened.names(split)):
             if name not in known:
-                photos = partial(_photos, opened, split, place)
-                missing = partial(_missing, opened, split, place)
-                yield Candidate(name, name, kind, OPENCV, photos, split, missing)
+                yield Candidate(
+                    name=name,
+                    scene=name,
+                    kind=kind,
+                    photos=partial(_photos, opened, split, place),
+                    split=split,
+                    missing=partial(_missing, opened, split, place),
+                )
             known.add(name)
 
 
@@ -78,28 +82,39 @@ def _missing(source: SceneSource, split: Split, place: int) -> Sequence[str]:
 
 def _photos(source: SceneSource, split: Split, place: int) -> list[Photo]:
     scene = source.scenes(split)[place]
-    image, mask = partial(_image_file, scene), partial(_read_mask, scene)
     return [
-        Photo(_frame(scene, i), partial(image, i), read_mask=partial(mask, i))
-        for i in range(len(scene))
+        Photo(
+            listed=_frame(scene, frame),
+            read=partial(_image_file, scene, frame),
+            read_mask=partial(_read_mask, scene, frame),
+        )
+        for frame in range(len(scene))
     ]
 
 
 def _frame(scene: Scene, frame: int) -> PhotoFrame:
-    camera, name = scene.cameras[frame], scene.frame_name(frame)
+    camera = scene.cameras[frame]
+    name = scene.frame_name(frame)
     fx, fy, cx, cy = camera.intrinsics.tolist()
-    c2w = camera.c2w.double().numpy()
-    time = None if scene.times is None else float(scene.times[frame])
-    return PhotoFrame(name, UPath(name), c2w, (fx, fy, cx, cy), camera.size, time=time)
+    return PhotoFrame(
+        name=name,
+        path=UPath(name),
+        c2w=camera.c2w.double().numpy(),
+        intrinsics=(fx, fy, cx, cy),
+        size=camera.size,
+        time=None if scene.times is None else float(scene.times[frame]),
+    )
 
 
 def _image_file(scene: Scene, frame: int) -> bytes:
-    pixels = scene.images([frame])[0].permute(1, 2, 0).mul(255).round().byte().numpy()
-    return Encoding().image(np.ascontiguousarray(pixels))
+    return png(bytes_of(scene.images([frame])[0]))
 
 
 def _read_mask(scene: Scene, frame: int) -> np.ndarray | None:
-    mask, wanted = scene.masks([frame]), (1, 1, *scene.cameras.size)
-    if mask is not None and (mask.shape != wanted or not bool(((mask >= 0) & (mask <= 1)).all())):
+    mask = scene.masks([frame])
+    if mask is None:
+        return None
+    wanted = (1, 1, *scene.cameras.size)
+    if mask.shape != wanted or not bool(((mask >= 0) & (mask <= 1)).all()):
         raise ValueError(f"its mask {tuple(mask.shape)} is not of shape {wanted} and in [0, 1]")
-    return None if mask is None else mask[0, 0].numpy()
+    return mask[0, 0].numpy()
