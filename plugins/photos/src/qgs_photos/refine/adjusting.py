@@ -7,62 +7,61 @@ from torch import Tensor
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import Cameras
 
-_RATES = {"poses": 3e-4, "colours": 5e-3}
-_LAST = 0.1  # final learning rates over the first
+_RATES = {"poses": 3e-4, "colors": 5e-3}
+# Final learning rates over the first.
+_LAST = 0.1
 # Weights of squares, so that the world and its colours stay where they are in the mean.
-_HELD = {"poses": 10.0, "colours": 0.1}
+_HELD = {"poses": 10.0, "colors": 0.1}
 
 
 class Adjustments:
     """Corrections of V photos, each optimised in the steps of its own photo.
 
     poses: (6,) of each photo, half the axis of a turn and a shift over `size`, both in the
-    camera's frame. colours: (3, 4), what is added to an affine map of rendered RGB. Empty for
+    camera's frame. colors: (3, 4), what is added to an affine map of rendered RGB. Empty for
     neither.
     """
 
     def __init__(self, photos: int, poses: bool, exposure: bool, size: float, like: Tensor) -> None:
         self.size = size
-        shapes = ({"poses": (6,)} if poses else {}) | ({"colours": (3, 4)} if exposure else {})
+        shapes: dict[str, tuple[int, ...]] = {"poses": (6,)} if poses else {}
+        if exposure:
+            shapes["colors"] = (3, 4)
+        # One tensor a photo: Adam leaves those without a gradient where they are.
         self._parts = {
             name: [like.new_zeros(shape).requires_grad_() for _ in range(photos)]
             for name, shape in shapes.items()
         }
-        groups = [{"params": p, "lr": _RATES[k], "name": k} for k, p in self._parts.items()]
-        # one tensor a photo: Adam leaves those without a gradient where they are
+        groups = [{"params": part, "name": name} for name, part in self._parts.items()]
         self._optimizer = torch.optim.Adam(groups, eps=1e-15) if groups else None
 
     def cameras(self, photo: int, cameras: Cameras) -> Cameras:
-        """Cameras (1, 1) of a photo, as corrected."""
+        """Return the cameras (1, 1) of a photo, as corrected."""
         if "poses" not in self._parts:
             return cameras
         turn, shift = self._parts["poses"][photo].split(3)
         quat = F.normalize(torch.cat([turn.new_ones(1), turn]), dim=0)
-        move = torch.eye(4).to(turn)
-        move = torch.cat(
-            [torch.cat([quat_to_matrix(quat), self.size * shift[:, None]], 1), move[3:]]
-        )
+        rows = torch.cat([quat_to_matrix(quat), self.size * shift[:, None]], 1)
+        move = torch.cat([rows, rows.new_tensor([[0.0, 0, 0, 1]])])
         return Cameras(cameras.c2w @ move, cameras.intrinsics, cameras.size)
 
     def every_camera(self, cameras: Cameras) -> Cameras:
-        """Cameras (1, V) of all photos, as corrected, without gradients."""
-        if "poses" not in self._parts:
-            return cameras
+        """Return the cameras (1, V) of all photos, as corrected, without gradients."""
         with torch.no_grad():
             each = [self.cameras(v, cameras[:, v : v + 1]).c2w for v in range(cameras.shape[1])]
         return Cameras(torch.cat(each, 1), cameras.intrinsics, cameras.size)
 
     def seen(self, photo: int, rgb: Tensor) -> Tensor:
-        """Rendered rgb (1, 1, 3, H, W) in the exposure of a photo."""
-        if "colours" not in self._parts:
+        """Return rendered rgb (1, 1, 3, H, W) in the exposure of a photo."""
+        if "colors" not in self._parts:
             return rgb
-        change = self._parts["colours"][photo]
+        change = self._parts["colors"][photo]
         turned = torch.einsum("ij,bvjhw->bvihw", change[:, :3], rgb)
         return rgb + turned + change[:, 3, None, None]
 
     def cost(self, photo: int) -> Tensor | float:
-        """What the corrections of a photo add to the loss."""
-        return sum(_HELD[k] * p[photo].square().sum() for k, p in self._parts.items())
+        """Return what the corrections of a photo add to the loss."""
+        return sum(_HELD[k] * part[photo].square().sum() for k, part in self._parts.items())
 
     def step(self, used: float) -> None:
         """Follow the gradients of a step. used: part of the budget spent so far."""

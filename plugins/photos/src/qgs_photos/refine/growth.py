@@ -16,8 +16,10 @@ from qgs.types import Gaussians
 DEAD = 0.005
 """Opacity below which a Gaussian is relocated, as in the paper. A higher threshold deletes
 semi-transparent fog, whose single Gaussians are all faint."""
-_BESIDE = 0.2  # displacement of a copy over its parent's scales
-_MOST_COPIES = 51  # of one Gaussian at a time, as in the paper's code
+# Displacement of a copy over its parent's scales.
+_BESIDE = 0.2
+# Copies of one Gaussian at a time, as in the paper's code.
+_MOST_COPIES = 51
 _COLOR_MARGIN, _OPACITY_MARGIN = 0.02, 1e-4
 
 
@@ -31,7 +33,7 @@ class FreeGaussians:
 
     def __init__(self, gaussians: Gaussians, rates: Mapping[str, float]) -> None:
         free = gaussians.sh is not None
-        values = {
+        given = {
             "means": gaussians.means,
             "log_scales": gaussians.scales.clamp_min(1e-7).log(),
             "quats": gaussians.quats,
@@ -41,12 +43,18 @@ class FreeGaussians:
             "sh": gaussians.sh,
             "features": gaussians.features,
         }
-        given = {name: value for name, value in values.items() if value is not None}
-        self.values = {k: v[0].detach().float().clone().requires_grad_() for k, v in given.items()}
-        groups = [
-            {"params": [self.values[name]], "name": name, "lr": rates[name]} for name in given
-        ]
-        self.optimizer = torch.optim.Adam(groups, eps=1e-15)
+        self.values = {
+            name: value[0].detach().float().clone().requires_grad_()
+            for name, value in given.items()
+            if value is not None
+        }
+        self.optimizer = torch.optim.Adam(
+            [
+                {"params": [value], "name": name, "lr": rates[name]}
+                for name, value in self.values.items()
+            ],
+            eps=1e-15,
+        )
         self.active = None if gaussians.sh is None else gaussians.sh.shape[-2]
 
     @property
@@ -55,13 +63,17 @@ class FreeGaussians:
         return len(self.values["means"])
 
     def gaussians(self) -> Gaussians:
-        """Gaussians (1, G) with gradients to `values`."""
-        v = {name: value[None] for name, value in self.values.items()}
-        shape = v["log_scales"].exp(), F.normalize(v["quats"], dim=-1)
-        colors = v["colors"] if "colors" in v else v["color_logits"].sigmoid()
-        look = v["opacity_logits"].sigmoid(), colors
-        sh = v["sh"][:, :, : self.active] if self.active else None
-        return Gaussians(v["means"], *shape, *look, sh, v.get("features"))
+        """Return Gaussians (1, G) with gradients to `values`."""
+        values = {name: value[None] for name, value in self.values.items()}
+        return Gaussians(
+            means=values["means"],
+            scales=values["log_scales"].exp(),
+            quats=F.normalize(values["quats"], dim=-1),
+            opacities=values["opacity_logits"].sigmoid(),
+            colors=values["colors"] if "colors" in values else values["color_logits"].sigmoid(),
+            sh=values["sh"][:, :, : self.active] if self.active else None,
+            features=values.get("features"),
+        )
 
     @torch.no_grad()
     def grow(self, count: int, generator: torch.Generator) -> None:
@@ -74,24 +86,27 @@ class FreeGaussians:
         faint = (opacities < DEAD) & (opacities >= DEAD).any()
         dead = faint.nonzero()[:, 0]
         needed = len(dead) + max(count - self.count, 0)
-        weights = torch.where(faint, 0, opacities).cpu()
         if not needed:
             return
+        weights = torch.where(faint, 0, opacities).cpu()
         parents = torch.multinomial(weights, needed, replacement=True, generator=generator)
         parents = parents.to(opacities.device)
         self._split(parents)
         places = self._places_in(parents, generator)
+        restarted = torch.cat([dead, parents])
         for group in self.optimizer.param_groups:
-            (old,), name = group["params"], group["name"]
+            name = group["name"]
+            old = self.values[name]
             copies = places if name == "means" else old[parents]
-            new = torch.cat([old.index_copy(0, dead, copies[: len(dead)]), copies[len(dead) :]])
+            moved, added = copies.tensor_split([len(dead)])
+            new = torch.cat([old.index_copy(0, dead, moved), added]).requires_grad_()
             state = self.optimizer.state.pop(old, {})
             for moment in state.keys() & {"exp_avg", "exp_avg_sq"}:
-                kept = state[moment].index_fill(0, torch.cat([dead, parents]), 0)
-                state[moment] = torch.cat([kept, torch.zeros_like(copies[len(dead) :])])
-            leaf = new.requires_grad_()
-            group["params"], self.values[name] = [leaf], leaf
-            self.optimizer.state[leaf] = state
+                kept = state[moment].index_fill(0, restarted, 0)
+                state[moment] = torch.cat([kept, torch.zeros_like(added)])
+            group["params"] = [new]
+            self.values[name] = new
+            self.optimizer.state[new] = state
 
     def _split(self, parents: Tensor) -> None:
         """Set opacity and scale of every parent to the values that its copies get too."""
@@ -103,7 +118,7 @@ class FreeGaussians:
         self.values["log_scales"][chosen] += shrink.log()[:, None]
 
     def _places_in(self, parents: Tensor, generator: torch.Generator) -> Tensor:
-        """Points (n, 3), each drawn around the centre of one of `parents` (n,)."""
+        """Return points (n, 3), each drawn around the centre of one of `parents` (n,)."""
         values = self.values
         turns = quat_to_matrix(F.normalize(values["quats"][parents], dim=-1))
         drawn = torch.randn(len(parents), 3, 1, generator=generator).to(turns)
@@ -112,7 +127,7 @@ class FreeGaussians:
 
 
 def shared(opacities: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity and scale factor of N equal Gaussians that together look like one.
+    """Return opacity and scale factor of N equal Gaussians that together look like one.
 
     opacities: (n,), of the one. shares: (n,) integers N, clamped to _MOST_COPIES.
     Equation 9 of the paper: the sum over k of C(N, k+1) (-1)^k / sqrt(k+1) a^(k+1). In float64,

@@ -27,21 +27,38 @@ from qgs_photos.refine.adjusting import Adjustments
 from qgs_photos.refine.growth import FreeGaussians
 from qgs_photos.refine.sweeping import swept
 
-_RATES = {"means": 3.5e-3, "log_scales": 2e-2, "quats": 5e-3}  # of means: of the scene's size
-_RATES |= {"opacity_logits": 0.05, "color_logits": 2.5e-2}
-_RATES |= {"colors": 6e-3}  # beside `sh`: as the logits move a colour of one half
-_RATES |= {"sh": 1.25e-3, "features": 0.0}  # a twentieth of the logits', as 3DGS; kept as they are
-_LAST, _LAST_OF_MEANS = 0.1, 0.01  # final learning rates over the first
-_SSIM = 0.25  # weight beside the mean squared error
+_RATES = {
+    # Of the scene's size.
+    "means": 3.5e-3,
+    "log_scales": 2e-2,
+    "quats": 5e-3,
+    "opacity_logits": 0.05,
+    "color_logits": 2.5e-2,
+    # Beside `sh`: as the logits move a colour of one half.
+    "colors": 6e-3,
+    # A twentieth of the logits', as 3DGS has it.
+    "sh": 1.25e-3,
+    # Features are kept as they are.
+    "features": 0.0,
+}
+# Final learning rates over the first.
+_LAST, _LAST_OF_MEANS = 0.1, 0.01
+# Weight of SSIM beside the mean squared error.
+_SSIM = 0.25
 # Weight of mean opacity and mean scale: at least the first, else the second over the number of
 # photos, because few photos leave more freedom to fill space with fog.
 _SMALL, _SMALL_OF_FEW = 0.06, 0.4
-_GROWN, _SETTLED = 0.6, 0.8  # parts of the budget: growth is complete; relocation ends
+# Parts of the budget at which growth is complete, and at which relocation ends.
+_GROWN, _SETTLED = 0.6, 0.8
 _STEPS_BETWEEN_GROWTHS = 40
-_LEVELS = ((4, 0.2), (2, 0.5), (1, 1.0))  # part of the resolution, up to this part of the budget
-_LEAST_SIDE = 64  # pixels: no level is smaller
-_POINTS = 12  # of the curve
-_DEGREES_FROM = (0.1, 0.35, 0.6)  # part of the budget from which on a degree of harmonics is used
+# Part of the resolution, up to this part of the budget: coarse levels move Gaussians farther.
+_LEVELS = ((4, 0.2), (2, 0.5), (1, 1.0))
+# No level is smaller, in pixels: SSIM and the sweep need some.
+_LEAST_SIDE = 64
+# Points of the curve.
+_POINTS = 12
+# Part of the budget from which on a degree of harmonics is used.
+_DEGREES_FROM = (0.1, 0.35, 0.6)
 
 
 @dataclass(frozen=True)
@@ -113,26 +130,33 @@ def refine(
     """
     wanted = gaussians.count if count is None else count
     _refuse_unusable(gaussians, views, seconds, wanted)
-    quiet, stopping = console or Console(quiet=True), stop_requests(console is None)
-    with TrainingProgress(quiet) as progress, stopping as stop, torch.enable_grad():
-        renderer = renderer or AutoRenderer(AutoRenderer.Config())
+    renderer = renderer or AutoRenderer(AutoRenderer.Config())
+    stopping = stop_requests(console is None)
+    progress = TrainingProgress(console or Console(quiet=True))
+    with progress, stopping as stop, torch.enable_grad():
         run = _Run(gaussians, views, seconds, wanted, renderer, swept, extras)
         curve = list(run.curve(compared, progress, stop))
-        name = stop.signal.name if stop.signal else None
-        refined = map_tensors(Tensor.detach, run.free.gaussians())
-        cameras = run.adjustments.every_camera(views.cameras)
-        return RefinedScene(refined, curve, run.step, run.spent, cameras, name)
+        return RefinedScene(
+            gaussians=map_tensors(Tensor.detach, run.free.gaussians()),
+            curve=curve,
+            steps=run.step,
+            seconds=run.spent,
+            cameras=run.adjustments.every_camera(views.cameras),
+            stopped_by=stop.signal.name if stop.signal else None,
+        )
 
 
 def seconds_of_step(
     gaussians: Gaussians, views: Views, renderer: nn.Module, extras: Extras = NO_EXTRAS
 ) -> float:
-    """Time of a step of `refine` with these Gaussians at the size of the photos `views` (1, V).
+    """Return the time of a step of `refine` with these Gaussians and photos (1, V) of this size.
 
     The least of three, after one in which kernels compile, with all harmonics in use.
     """
     run = _Run(gaussians, views, math.inf, gaussians.count, renderer, 0.0, extras)
-    run.levels, run.grows, times = run.levels[-1:], False, list[float]()
+    run.levels = run.levels[-1:]
+    run.grows = False
+    times = list[float]()
     with torch.enable_grad():
         for _ in range(4):
             began = perf_counter()
@@ -152,25 +176,36 @@ class _Run:
         wanted: int,
         renderer: nn.Module,
         swept: float,
-        extras: Extras = NO_EXTRAS,
+        extras: Extras,
     ) -> None:
-        self.renderer, self.wanted, self.given, self.grows = renderer, wanted, gaussians, False
-        self.generator, began = torch.Generator().manual_seed(0), perf_counter()
+        began = perf_counter()
+        self.renderer = renderer
+        self.wanted = wanted
+        self.given = gaussians
+        self.seconds = seconds
+        self.generator = torch.Generator().manual_seed(0)
         side = min(views.cameras.size)
-        levels = [level for level in _LEVELS if level[0] == 1 or side // level[0] >= _LEAST_SIDE]
-        self.levels = [(resized(views, part), end) for part, end in levels]
+        self.levels = [
+            (resized(views, part), end)
+            for part, end in _LEVELS
+            if part == 1 or side // part >= _LEAST_SIDE
+        ]
         self.start = min(wanted, gaussians.count)
-        gaussians = partly_swept(gaussians, self.levels[0][0], self.start, swept, self.generator)
-        self.size, photos = distance(gaussians, views), views.images.shape[1]
-        if extras.degree and gaussians.sh is None:
-            zeros = gaussians.means.new_zeros(1, gaussians.count, SH_COUNTS[extras.degree - 1], 3)
-            gaussians, self.grows = replace(gaussians, sh=zeros), True
+        coarsest, _ = self.levels[0]
+        gaussians = partly_swept(gaussians, coarsest, self.start, swept, self.generator)
+        self.size = distance(gaussians, views)
+        self.grows = bool(extras.degree) and gaussians.sh is None
+        if self.grows:
+            shape = (1, gaussians.count, SH_COUNTS[extras.degree - 1], 3)
+            gaussians = replace(gaussians, sh=gaussians.means.new_zeros(shape))
         self.rates = {**_RATES, "means": _RATES["means"] * self.size}
         self.free = FreeGaussians(gaussians, self.rates)
+        self.photos = views.images.shape[1]
         self.adjustments = Adjustments(
-            photos, extras.poses, extras.exposure, self.size, gaussians.means
+            self.photos, extras.poses, extras.exposure, self.size, gaussians.means
         )
-        self.seconds, self.step, self.grown = seconds, 0, 0
+        self.step = 0
+        self.grown = 0
         # half of the time is for steps, however long a slow machine matches photos
         self.spent = min(perf_counter() - began, seconds / 2)
         self.order: list[int] = []
@@ -182,18 +217,21 @@ class _Run:
         if compared is not None:
             quality = mean_psnr(self.given, compared, self.renderer)
             yield CurvePoint(0.0, 0, self.given.count, quality)
-        due = self.seconds / _POINTS
+        between = self.seconds / _POINTS
+        due = between
         while self.spent < self.seconds and not stop:
             if compared is not None and self.spent >= due:
-                due = (self.spent // (self.seconds / _POINTS) + 1) * self.seconds / _POINTS
+                due = (self.spent // between + 1) * between
                 yield self._point(compared)
             began = perf_counter()
             loss, quality = self.optimise()
-            if self.step > 1:  # the first one compiles
+            # the first step compiles kernels
+            if self.step > 1:
                 self.spent += perf_counter() - began
             used = self.spent / self.seconds
             progress.show(self.step, loss, quality, self.step, self.spent, used)
-        if not stop and self.free.count < self.wanted:  # the budget was a few steps
+        # a budget of a few steps ends before growth is due
+        if not stop and self.free.count < self.wanted:
             self.free.grow(self.wanted, self.generator)
         if compared is not None:
             yield self._point(compared)
@@ -203,14 +241,14 @@ class _Run:
         return CurvePoint(self.spent, self.step, self.free.count, quality)
 
     def optimise(self) -> tuple[float, float]:
-        """One step on one photo, then growth if it is due; the loss and PSNR before the step."""
+        """Take one step on one photo, then grow if due; return the loss and PSNR before it."""
         used = min(self.spent / self.seconds, 1.0)
         for group in self.free.optimizer.param_groups:
-            name = group["name"]
-            group["lr"] = self.rates[name] * (_LAST_OF_MEANS if name == "means" else _LAST) ** used
+            last = _LAST_OF_MEANS if group["name"] == "means" else _LAST
+            group["lr"] = self.rates[group["name"]] * last**used
         views = next(views for views, end in self.levels if used < end or end == 1)
         if not self.order:
-            self.order = torch.randperm(views.images.shape[1], generator=self.generator).tolist()
+            self.order = torch.randperm(self.photos, generator=self.generator).tolist()
         place = self.order.pop()
         photo = views.select([place])
         if self.grows:
@@ -221,9 +259,9 @@ class _Run:
         rgb = self.renderer(replace(gaussians, features=None), cameras).rgb
         rgb = self.adjustments.seen(place, rgb)
         error = mean_squared_error(rgb, photo.images)
-        loss = error + _SSIM * (1 - mean_ssim(rgb, photo.images, "same"))
         spread = gaussians.opacities.mean() + gaussians.scales.mean() / self.size
-        loss = loss + max(_SMALL, _SMALL_OF_FEW / views.images.shape[1]) * spread
+        loss = error + _SSIM * (1 - mean_ssim(rgb, photo.images, "same"))
+        loss = loss + max(_SMALL, _SMALL_OF_FEW / self.photos) * spread
         loss = loss + self.adjustments.cost(place)
         self.free.optimizer.zero_grad()
         loss.backward()
@@ -246,7 +284,7 @@ class _Run:
 def partly_swept(
     gaussians: Gaussians, views: Views, count: int, part: float, generator: torch.Generator
 ) -> Gaussians:
-    """`count` Gaussians (1, count): the most opaque given ones, and a `part` swept from the photos.
+    """Return `count` Gaussians (1, count): the most opaque given ones, and a `part` swept.
 
     A single photo has no depth, so that all are given ones. Spherical harmonics and features of
     the swept ones are 0.
@@ -256,26 +294,30 @@ def partly_swept(
     if not new:
         return kept
     others = swept(views, new, distance(gaussians, views), generator)
-    added = (("sh", kept.sh), ("features", kept.features))
-    zeros = {k: x.new_zeros(1, new, *x.shape[2:]) for k, x in added if x is not None}
-    return concatenated([kept, replace(others, **zeros)], 1)
+    for name in ("sh", "features"):
+        given = getattr(kept, name)
+        if given is not None:
+            others = replace(others, **{name: given.new_zeros(1, new, *given.shape[2:])})
+    return concatenated([kept, others], 1)
 
 
 def distance(gaussians: Gaussians, views: Views) -> float:
-    """Median distance of Gaussians (1, G) from the nearest camera of `views` (1, V), above 0."""
+    """Return the median distance of Gaussians (1, G) from the nearest camera, above 0."""
     distances = torch.cdist(gaussians.means[0], views.cameras.c2w[0, :, :3, 3])
     return float(distances.amin(1).median().clamp_min(1e-6))
 
 
 def resized(views: Views, part: int) -> Views:
-    """The views at 1/part of their resolution, by means over areas."""
+    """Return the views at 1/part of their resolution, by means over areas."""
     if part == 1:
         return views
     height, width = views.cameras.size
-    size = height // part, width // part
-    images, masks = map_tensors(
-        lambda x: F.interpolate(x[0], size=size, mode="area")[None], (views.images, views.masks)
-    )
+    size = (height // part, width // part)
+
+    def smaller(images: Tensor) -> Tensor:
+        return F.interpolate(images[0], size=size, mode="area")[None]
+
+    images, masks = map_tensors(smaller, (views.images, views.masks))
     factors = [size[1] / width, size[0] / height]
     intrinsics = views.cameras.intrinsics * views.cameras.intrinsics.new_tensor(factors * 2)
     cameras = Cameras(views.cameras.c2w, intrinsics, size)
@@ -284,18 +326,19 @@ def resized(views: Views, part: int) -> Views:
 
 @torch.no_grad()
 def mean_psnr(gaussians: Gaussians, views: Views, renderer: nn.Module) -> float:
-    """Mean PSNR in dB of renderings against `views` (1, V)."""
+    """Return the mean PSNR in dB of renderings against `views` (1, V)."""
     rgb: Tensor = renderer(replace(gaussians, features=None), views.cameras).rgb
     return float(psnr(rgb[0], views.images[0]).mean())
 
 
 def _refuse_unusable(gaussians: Gaussians, views: Views, seconds: float, count: int) -> None:
-    given = (*gaussians.means.shape[:2], *views.images.shape[:2])
-    if given[0] != 1 or given[2] != 1 or 0 in given or not seconds > 0 or count < 1:
+    scenes, given = gaussians.means.shape[:2]
+    photographed, photos = views.images.shape[:2]
+    if scenes != 1 or photographed != 1 or not (given and photos and seconds > 0 and count > 0):
         raise ValueError(
-            "refinement takes Gaussians (1, G) and photos (1, V) of one scene; got {} scenes of "
-            "{} Gaussians, {} scenes of {} photos".format(*given)
-            + f", {seconds:g} seconds, count={count}: give at least one of each"
+            "refinement takes Gaussians (1, G) and photos (1, V) of one scene; got "
+            f"{scenes} scenes of {given} Gaussians, {photographed} scenes of {photos} photos, "
+            f"{seconds:g} seconds, count={count}: give at least one of each"
         )
     if not all(bool(tensor.isfinite().all()) for _, tensor in named_tensors(gaussians)):
         raise ValueError(

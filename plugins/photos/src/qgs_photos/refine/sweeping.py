@@ -11,89 +11,106 @@ from torch import Tensor
 
 from qgs.types import Cameras, Gaussians, Views
 
-_DEPTHS, _NEAREST, _FARTHEST = 56, 0.1, 4.0  # number of hypotheses; their range over the size
-_OTHERS = 6  # photos that a pixel is compared with; the better half counts, for occlusions
-_BASELINE, _TURNED = 0.06, 10.0  # best baseline over the size; weight of 1 - cosine of the axes
-_PATCH = 1  # radius in pixels of the compared patch
-_MAX_COST = 0.3  # truncation of a difference of colours; half of it outside a photo
-_NO_EVIDENCE = 1e-4  # cost per e-fold of depth away from the size: breaks ties only
-_AT_ONCE = 1024  # pixels, so that memory stays within 0.3 GB
-_OPACITY, _PIXELS = 0.1, 2.0  # opacity of the Gaussians; standard deviation in pixels
+# Number of hypotheses for a depth, and their range over the size of the scene.
+_DEPTHS, _NEAREST, _FARTHEST = 56, 0.1, 4.0
+# Photos that a pixel is compared with; the better half counts, because others may see it hidden.
+_OTHERS = 6
+# Best baseline over the size of the scene; weight of 1 - cosine of the axes.
+_BASELINE, _TURNED = 0.06, 10.0
+# Radius of the compared patch, in pixels.
+_PATCH = 1
+# Truncation of a difference of colours; half of it outside a photo.
+_MAX_COST = 0.3
+# Cost per e-fold of depth away from the size: breaks ties only.
+_NO_EVIDENCE = 1e-4
+# Pixels at once, so that memory stays within 0.3 GB.
+_AT_ONCE = 1024
+# Opacity of the Gaussians, and their standard deviation in pixels.
+_OPACITY, _PIXELS = 0.1, 2.0
 
 
 @torch.no_grad()
 def swept(views: Views, count: int, size: float, generator: torch.Generator) -> Gaussians:
-    """Gaussians (1, count) at random pixels of the photos `views` (1, V), with their colours.
+    """Return Gaussians (1, count) at random pixels of photos (1, V), with their colours.
 
     size: approximate distance of the scene from the cameras; also the depth of pixels that no
     other photo shows.
     """
-    (height, width), device = views.cameras.size, views.images.device
-    of_photo = height * width
-    drawn = torch.randint(views.images.shape[1] * of_photo, (count,), generator=generator)
+    height, width = views.cameras.size
+    pixels = height * width
+    drawn = torch.randint(views.images.shape[1] * pixels, (count,), generator=generator)
     drawn = drawn.sort().values
-    parts = [
-        _on_photo(views, photo, pixels.to(device), size)
-        for photo, start in enumerate(range(0, views.images.shape[1] * of_photo, of_photo))
-        for pixels in (drawn[(drawn >= start) & (drawn < start + of_photo)] - start).split(_AT_ONCE)
-    ]
+    parts = list[tuple[Tensor, Tensor, Tensor]]()
+    for photo in range(views.images.shape[1]):
+        own = drawn[drawn // pixels == photo] % pixels
+        parts += [_on_photo(views, photo, few, size) for few in own.split(_AT_ONCE)]
     means, scales, colors = (torch.cat(part)[None] for part in zip(*parts, strict=True))
-    quats = torch.tensor([1.0, 0, 0, 0], device=device).expand(1, count, 4)
+    quats = means.new_tensor([1.0, 0, 0, 0]).expand(1, count, 4)
     return Gaussians(means, scales, quats, torch.full_like(means[..., 0], _OPACITY), colors)
 
 
 def _on_photo(
     views: Views, photo: int, pixels: Tensor, size: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Means, scales and colors (n, 3) at `pixels` (n,) of one photo, in row-major order."""
-    cameras, width = views.cameras, views.cameras.size[1]
-    rows, columns = pixels // width, pixels % width
-    pose = cameras.c2w[0, photo]
+    """Return means, scales and colours (n, 3) at `pixels` (n,) of a photo, in row-major order."""
+    cameras = views.cameras
+    pixels = pixels.to(views.images.device)
+    rows = pixels // cameras.size[1]
+    columns = pixels % cameras.size[1]
     depths = _depths(views, photo, rows, columns, size)
     rays = _rays(cameras, photo, rows, columns)
-    means = pose[:3, 3] + rays * depths[:, None]
+    means = cameras.c2w[0, photo, :3, 3] + rays * depths[:, None]
     scales = (_PIXELS * depths / cameras.intrinsics[0, photo, 0])[:, None].expand(-1, 3)
     return means, scales, views.images[0, photo][:, rows, columns].T
 
 
 def _rays(cameras: Cameras, photo: int, rows: Tensor, columns: Tensor) -> Tensor:
-    """World directions (..., 3) of pixels (...), scaled to depth 1 in the camera."""
+    """Return world directions (..., 3) of pixels (...), scaled to depth 1 in the camera."""
     fx, fy, cx, cy = cameras.intrinsics[0, photo]
-    x, y = (columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy
+    x = (columns + 0.5 - cx) / fx
+    y = (rows + 0.5 - cy) / fy
     return torch.stack([x, y, torch.ones_like(x)], -1) @ cameras.c2w[0, photo, :3, :3].T
 
 
 def _depths(views: Views, photo: int, rows: Tensor, columns: Tensor, size: float) -> Tensor:
-    """Depth (n,) of pixels (n,) of one photo, of least cost against the other photos."""
-    cameras, (height, width) = views.cameras, views.cameras.size
+    """Return the depth (n,) of pixels (n,) of one photo, of least cost against the others."""
+    cameras = views.cameras
+    height, width = cameras.size
     logs = torch.linspace(math.log(_NEAREST), math.log(_FARTHEST), _DEPTHS, device=rows.device)
-    tried, others = size * logs.exp(), _others(cameras, photo, size)
+    tried = size * logs.exp()
     steps = torch.arange(-_PATCH, _PATCH + 1, device=rows.device)
-    down, right = (x.reshape(-1) for x in torch.meshgrid(steps, steps, indexing="ij"))
+    down, right = torch.cartesian_prod(steps, steps).T
     rows = (rows[:, None] + down).clamp(0, height - 1)
     columns = (columns[:, None] + right).clamp(0, width - 1)
-    pose, own = cameras.c2w[0, photo], views.images[0, photo][:, rows, columns]
-    points = pose[:3, 3] + _rays(cameras, photo, rows, columns)[:, :, None] * tried[:, None]
-    costs = []  # (n, depths) of every other photo
-    for other in others:
-        w2c, (fx, fy, cx, cy) = cameras.w2c[0, other], cameras.intrinsics[0, other]
-        x, y, z = (points @ w2c[:3, :3].T + w2c[:3, 3]).unbind(-1)
-        ahead = z.clamp_min(1e-3 * size)
-        at = torch.stack([fx * x / ahead + cx, fy * y / ahead + cy], -1)
-        at = 2 * at / at.new_tensor([width, height]) - 1
-        seen = (z >= ahead) & (at.abs() < 1).all(-1)
-        flat = at.flatten(0, 1)[None]
+    colors = views.images[0, photo][:, rows, columns]
+    rays = _rays(cameras, photo, rows, columns)
+    points = cameras.c2w[0, photo, :3, 3] + rays[:, :, None] * tried[:, None]
+    costs = list[Tensor]()
+    for other in _others(cameras, photo, size):
+        w2c = cameras.w2c[0, other]
+        focal, centre = cameras.intrinsics[0, other].split(2)
+        seen_from = points @ w2c[:3, :3].T + w2c[:3, 3]
+        depth = seen_from[..., 2:]
+        ahead = depth.clamp_min(1e-3 * size)
+        places = (focal * seen_from[..., :2] / ahead + centre) / ahead.new_tensor([width, height])
+        places = 2 * places - 1
+        visible = (depth >= ahead)[..., 0] & (places.abs() < 1).all(-1)
+        flat = places.flatten(0, 1)[None]
         found = F.grid_sample(views.images[:, other], flat, "bilinear", "border", False)
-        cost = (found.view(*own.shape, _DEPTHS) - own[..., None]).abs().mean(0)
-        costs.append(torch.where(seen, cost.clamp_max(_MAX_COST), _MAX_COST / 2).mean(1))
-    best = torch.stack(costs).topk((len(costs) + 1) // 2, 0, largest=False).values.mean(0)
+        cost = (found.view(*colors.shape, _DEPTHS) - colors[..., None]).abs().mean(0)
+        costs.append(torch.where(visible, cost.clamp_max(_MAX_COST), _MAX_COST / 2).mean(1))
+    half = (len(costs) + 1) // 2
+    best = torch.stack(costs).topk(half, 0, largest=False).values.mean(0)
     return tried[(best + _NO_EVIDENCE * logs.abs()).argmin(-1)]
 
 
 def _others(cameras: Cameras, photo: int, size: float) -> list[int]:
-    """Photos with the best baseline and direction for matching `photo`; itself if alone."""
-    eyes, axes = cameras.c2w[0, :, :3, 3], cameras.c2w[0, :, :3, 2]
-    baseline = (eyes - eyes[photo]).norm(dim=-1) / size
-    unlike = (baseline.clamp_min(1e-6) / _BASELINE).log().abs() + _TURNED * (1 - axes @ axes[photo])
+    """Return photos with the best baseline and direction for matching `photo`; itself if alone."""
+    centres = cameras.c2w[0, :, :3, 3]
+    axes = cameras.c2w[0, :, :3, 2]
+    baseline = (centres - centres[photo]).norm(dim=-1) / size
+    turned = 1 - axes @ axes[photo]
+    unlike = (baseline.clamp_min(1e-6) / _BASELINE).log().abs() + _TURNED * turned
     unlike[photo] = math.inf
-    return unlike.topk(min(_OTHERS, max(len(eyes) - 1, 1)), largest=False).indices.tolist()
+    count = min(_OTHERS, max(len(centres) - 1, 1))
+    return unlike.topk(count, largest=False).indices.tolist()
