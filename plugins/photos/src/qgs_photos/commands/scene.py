@@ -72,7 +72,8 @@ def scene(
     chosen is printed as a command that makes the scene again. Ctrl-C ends the optimisation and
     writes what there is.
     """
-    began = perf_counter() - process_time()  # imports took time already
+    # imports took time already
+    began = perf_counter() - process_time()
     refuse_filled(out)
     refuse_no_time("--minutes", minutes)
     refuse_no_time("--seconds", seconds)

@@ -61,9 +61,10 @@ class Bounded(ViewSampler):
     def span(
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int, parts: int = 1
     ) -> list[Frames]:
-        """Moments from the first to the last that is drawn from; gaps are divided by `parts`."""
+        """Return the moments that are drawn from, first to last; gaps are divided by `parts`."""
         refuse_too_many(views.inputs + views.targets, scene)
-        options, usable = self.options(step), moments(scene)
+        options = self.options(step)
+        usable = moments(scene)
         low, high = (gap // parts for gap in self.gaps(step))
         high = min(high, len(usable) - 1)
         # a target needs a place at the margin from both ends, and each input one of its own
@@ -80,15 +81,16 @@ class Bounded(ViewSampler):
     def seen(
         self, scene: Scene, span: Sequence[Frames], rng: np.random.Generator, step: int
     ) -> list[int]:
-        """The frames of a span that targets are drawn from."""
+        """Return the frames of a span that targets are drawn from."""
         margin = self.options(step).margin
         inside = span[margin : len(span) - margin]
-        if scene.times is not None:  # all targets of a sample are of one moment
+        # all targets of a sample are of one moment
+        if scene.times is not None:
             inside = [inside[int(rng.integers(len(inside)))]]
         return [frame for moment in inside for frame in moment]
 
     def gaps(self, step: int) -> tuple[int, int]:
-        """Least and largest gap after `step` steps: linear from the initial to the final bounds."""
+        """Return the least and largest gap after `step` steps: linear between the bounds."""
         options = self.options(step)
         share = min(step / options.warm_up_steps, 1.0) if options.warm_up_steps else 1.0
         bounds = (

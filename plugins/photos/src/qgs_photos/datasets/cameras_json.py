@@ -30,11 +30,14 @@ _NAMES = ("image", "image_path", "file_path", "filename", "file_name", "file", "
 _C2W = ("c2w", "cam2world", "cam_to_world", "camera_to_world", "camtoworld")
 _W2C = ("w2c", "world2cam", "world_to_cam", "world_to_camera", "worldtocam")
 _OPENGL = ("transform_matrix",)
-_OPEN = ("extrinsics", "extrinsic", "pose")  # used for both directions
+# Used for both directions.
+_OPEN = ("extrinsics", "extrinsic", "pose")
 _K = ("K", "intrinsics", "intrinsic", "camera_matrix")
 _FOCAL = (("fx", "fl_x"), ("fy", "fl_y"), ("cx",), ("cy",))
-_NORMALISED = 3.0  # intrinsics up to here are in parts of the width and height
-_START = 4_000_000  # bytes of a file that are looked at; a thousand cameras have a tenth of that
+# Intrinsics up to here are in parts of the width and height.
+_NORMALISED = 3.0
+# Bytes of a file that are looked at; a thousand cameras have a tenth of that.
+_START = 4_000_000
 _FORM = '{"frames": [{"image": "0.png", "c2w": 4 x 4, "K": 3 x 3}, ...]}'
 
 
@@ -62,7 +65,8 @@ class CamerasJson(PhotoReader):
             return False
         with open_file(file) as opened:
             start = opened.read(_START)
-        if b'"to_photos"' in start:  # what `qgs reconstruct` writes beside its pictures
+        # what `qgs reconstruct` writes beside its pictures
+        if b'"to_photos"' in start:
             return False
         known = all(key in start for key in (b'"c2w"', b'"K"'))
         return known or any(map(image_files, (folder, folder / "images")))
@@ -76,7 +80,8 @@ class CamerasJson(PhotoReader):
         if not cameras:
             raise ValueError(f"{file} lists no cameras: expected {_FORM}")
         folders = [folder / images] if images else [folder, folder / "images"]
-        if any(names):  # relative to the first of the folders that holds some of them
+        # relative to the first of the folders that holds some of them
+        if any(names):
             names = _with_suffixes(names, folders)
             held = (place for place in folders if existing(place / name for name in names if name))
             place = next(held, folders[0])
@@ -97,22 +102,25 @@ class CamerasJson(PhotoReader):
 
 
 def _with_suffixes(names: list[str], folders: list[UPath]) -> list[str]:
-    """`names`, of which those without a suffix get that of the photo of the name."""
+    """Return `names`, of which those without a suffix get that of the photo of the name."""
     known = {photo.stem: photo.name for folder in folders for photo in image_files(folder)}
     return [name if "." in name else known.get(name, name) for name in names]
 
 
 def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
-    """The entry of each camera, with defaults from the top level. Raises ValueError."""
+    """Return the entry of each camera, with defaults from the top level. Raises ValueError."""
     top = data if isinstance(data, Mapping) else {}
     given = next((top[key] for key in _LISTS if isinstance(top.get(key), list)), data)
     if not isinstance(given, list):
-        pose, matrix = _first(top, (*_C2W, *_W2C, *_OPENGL, *_OPEN)), _first(top, _K)
-        columns: Any = [top.get(key) for key in (pose, matrix, "images")]
-        poses, matrices, names = columns
+        pose = _first(top, (*_C2W, *_W2C, *_OPENGL, *_OPEN))
+        matrix = _first(top, _K)
+        poses: Any = top.get(pose)
+        matrices: Any = top.get(matrix)
+        names: Any = top.get("images")
         if not isinstance(poses, list):
             return []
-        one = numbers(matrices)  # (4, 4) may be fx, fy, cx, cy of four cameras
+        # (4, 4) may be fx, fy, cx, cy of four cameras
+        one = numbers(matrices)
         shared = one.shape in ((3, 3), (4,)) or (one.shape == (4, 4) and not one[3, :3].any())
         matrices = [matrices] * len(poses) if shared else matrices
         names = names if isinstance(names, list) and len(names) == len(poses) else [""] * len(poses)
@@ -128,15 +136,17 @@ def _cameras(file: UPath, data: Any) -> list[Mapping[str, Any]]:
 
 
 def _first(values: Mapping[str, Any], keys: tuple[str, ...]) -> str:
-    """The first of `keys` that is given; "" for none."""
+    """Return the first of `keys` that is given; "" for none."""
     return next((key for key in keys if values.get(key) is not None), "")
 
 
 class _Camera:
-    """What an entry of the file says. name: of its photo, below `place`; "" for none."""
+    """An entry of the file. name: of its photo, below `place`; "" for none."""
 
     def __init__(self, values: Mapping[str, Any], place: UPath, name: str) -> None:
-        self.values, self.place, self.name = values, place, name
+        self.values = values
+        self.place = place
+        self.name = name
         self.problems = list[FrameProblem]()
         sides = [values.get(s, values.get(long)) for s, long in (("h", "height"), ("w", "width"))]
         self.size: Size | None = None
@@ -154,9 +164,11 @@ class _Camera:
         self.problems.append(FrameProblem(field, reason, f"write {_FORM}"))
 
     def _pose(self) -> tuple[np.ndarray, str]:
-        """OpenCV camera-to-world (4, 4), and what was read as that."""
-        values, key = self.values, _first(self.values, (*_C2W, *_W2C, *_OPENGL))
-        pose, meaning = numbers(values.get(key)), key
+        """Return OpenCV camera-to-world (4, 4), and what was read as that."""
+        values = self.values
+        key = _first(values, (*_C2W, *_W2C, *_OPENGL))
+        pose = numbers(values.get(key))
+        meaning = key
         if not key and {"position", "rotation"} <= values.keys():
             rotation, position = (numbers(values[k]) for k in ("rotation", "position"))
             meaning = "position and rotation (camera-to-world, as 3DGS writes them)"
@@ -177,11 +189,12 @@ class _Camera:
             singular = not np.isfinite(pose).all() or abs(np.linalg.det(pose)) < 1e-9
             pose = np.full((4, 4), np.nan) if singular else np.linalg.inv(pose)
         if key in _OPENGL:
-            meaning, pose = f"{key} (OpenGL camera-to-world)", pose * [1, -1, -1, 1]
+            meaning = f"{key} (OpenGL camera-to-world)"
+            pose = pose * [1, -1, -1, 1]
         return pose, f"{key} (camera-to-world)" if key in _C2W[1:] else meaning
 
     def _intrinsics(self) -> tuple[np.ndarray, str]:
-        """fx, fy, cx, cy in pixels, and what was read as that."""
+        """Return fx, fy, cx, cy in pixels, and what was read as that."""
         key = _first(self.values, _K)
         matrix = numbers(self.values.get(key))
         names = [_first(self.values, names) for names in _FOCAL]
@@ -205,17 +218,23 @@ class _Camera:
         return matrix, f"{key or names[0]} in pixels"
 
     def _photo_size(self) -> Size | None:
-        """As listed, else that of the file; None of one that cannot be read."""
+        """Return (H, W) as listed, else that of the file; None of one that cannot be read."""
         if self.size is None and self.name:
             with suppress(ValueError):
                 self.size = image_size(self.place / self.name)
         return self.size
 
     def frame(self, folder: UPath) -> PhotoFrame:
-        """The photo, with its name below `folder`."""
-        name, place = self.name, self.place
+        """Return the photo, with its name below `folder`."""
+        inside = self.name
+        if self.place != folder and inside:
+            inside = f"{self.place.name}/{inside}"
         fx, fy, cx, cy = self.intrinsics.tolist()
-        inside = name if place == folder or not name else f"{place.name}/{name}"
         return PhotoFrame(
-            inside, place / name, self.pose, (fx, fy, cx, cy), self.size, problems=(*self.problems,)
+            name=inside,
+            path=self.place / self.name,
+            c2w=self.pose,
+            intrinsics=(fx, fy, cx, cy),
+            size=self.size,
+            problems=(*self.problems,),
         )

@@ -39,9 +39,12 @@ from qgs.wording import listed, name_shown, warn_once
 
 INDEX = "index.json"
 SUFFIX = ".torch"
-_RIGID = 0.9e-3  # of rotations against orthonormality, below what `pose_problems` refuses
-_IN_PIXELS = 50.0  # a focal length above is no multiple of the image's width or height
-_DIVIDED_TWICE = 0.02  # a focal length below is an angle of view of more than 175 degrees
+# Of rotations against orthonormality, below what `pose_problems` refuses.
+_RIGID = 0.9e-3
+# A focal length above is no multiple of the image's width or height.
+_IN_PIXELS = 50.0
+# A focal length below is an angle of view of more than 175 degrees.
+_DIVIDED_TWICE = 0.02
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ class Record:
         return len(self.images)
 
     def place(self, frame: int) -> str:
-        """File, key, frame number and name, for messages."""
+        """Return file, key, frame number and name, for messages."""
         return f"{self.where}, frame {frame} ({self.names[frame]})"
 
     @cached_property
@@ -80,7 +83,7 @@ class Record:
         return [self.stored_size(0)] * len(self)
 
     def stored_size(self, frame: int) -> Size:
-        """(H, W) in the header of an image. Raises ValueError for no readable image."""
+        """Return (H, W) in the header of an image. Raises ValueError for no readable image."""
         try:
             return encoded_size(io.BytesIO(self.images[frame].numpy().tobytes()))
         except OSError as error:
@@ -90,13 +93,13 @@ class Record:
             ) from error
 
     def intrinsics(self, frame: int, size: Size) -> Intrinsics:
-        """fx, fy, cx, cy in pixels of an image of `size` (H, W)."""
+        """Return fx, fy, cx, cy in pixels of an image of `size` (H, W)."""
         fx, fy, cx, cy = self.cameras[frame, :4].double().tolist()
         return fx * size[1], fy * size[0], cx * size[1], cy * size[0]
 
 
 def parse_record(file: str, data: Any) -> Record:
-    """The scene in an entry of the chunk `file`. Raises ValueError for another structure."""
+    """Return the scene in an entry of the chunk `file`. Raises ValueError for another structure."""
     if not isinstance(data, Mapping) or not isinstance(data.get("key"), str):
         raise ValueError(
             f"{file} holds {a_type(data)}, expected a mapping with 'key', 'cameras' and 'images': "
@@ -121,7 +124,8 @@ def parse_record(file: str, data: Any) -> Record:
     if masks is not None:
         masks = _files(where, "masks", masks)
         _expect(len(masks) == count, where, f"{len(masks)} masks for {count} images")
-    if names is None:  # RealEstate10K's: the time of a frame in its video
+    # RealEstate10K's: the time of a frame in its video
+    if names is None:
         stamps = data.get("timestamps")
         names = stamps.flatten().tolist() if isinstance(stamps, Tensor) else range(count)
     fits = isinstance(names, list | range) and len(names) == count
@@ -144,13 +148,13 @@ def _expect(valid: bool, where: str, reason: str) -> None:
 
 
 def a_type(value: object) -> str:
-    """The type of `value` with its article, such as "an int"."""
+    """Return the type of `value` with its article, such as "an int"."""
     name = type(value).__name__
     return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
 
 
 def _is_plain(data: Tensor) -> bool:
-    """Whether its numbers are all stored: an expanded tensor of a small file can fill the memory.
+    """Return whether all numbers are stored: an expanded tensor can fill the memory.
 
     Sparse, quantised and nested tensors and those of other devices are refused too.
     """
@@ -180,7 +184,7 @@ def _files(where: str, name: str, data: Any) -> Sequence[Tensor]:
 
 
 def read_mask(record: Record, frame: int) -> np.ndarray | None:
-    """The mask of a frame, (H, W) uint8 of its image's shape; None without. Raises ValueError."""
+    """Read the mask of a frame, (H, W) uint8 as its image; None without. Raises ValueError."""
     data = None if record.masks is None else record.masks[frame].numpy().tobytes()
     if not data:
         return None
@@ -216,7 +220,7 @@ def require_usable(record: Record) -> None:
 
 
 def camera_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
-    """What is wrong with the camera of a frame."""
+    """Yield what is wrong with the camera of a frame."""
     yield from pose_problems(record.w2c[frame].numpy())
     of_unit = list(unit_problems(record, frame))
     yield from of_unit
@@ -226,7 +230,7 @@ def camera_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
 
 
 def unit_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
-    """Problems of the unit of a frame's intrinsics, fractions of the image's sides."""
+    """Yield problems of the unit of a frame's intrinsics, fractions of the image's sides."""
     values = record.cameras[frame, :4].tolist()
     focal = max(values[:2])
     divided_twice = 0 < focal < _DIVIDED_TWICE
@@ -241,7 +245,7 @@ def unit_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
 
 
 def load_chunk(path: UPath) -> list[Any]:
-    """The entries of a chunk, tensors and plain containers; a local zip file is memory-mapped.
+    """Load the entries of a chunk, tensors and plain containers; a local zip file is memory-mapped.
 
     Raises FileNotFoundError, and ValueError for a file that is no list.
     """
@@ -254,9 +258,11 @@ def load_chunk(path: UPath) -> list[Any]:
         mapped = is_local(path) and zipfile.is_zipfile(file)
         # weights_only refuses Python objects, whose loading could run code
         data = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
-    except Exception as error:  # damaged files raise anything
+    except Exception as error:
+        # damaged files raise anything
         reason = "damaged, or with Python objects, whose loading could run code"
-        if type(error).__name__ != "UnpicklingError":  # whose text advises to trust the file
+        # whose text advises to trust the file
+        if type(error).__name__ != "UnpicklingError":
             reason = (str(error) or type(error).__name__).splitlines()[0]
         raise ValueError(
             f"{path} cannot be read as a torch file of tensors and lists ({reason}): copy or "
@@ -280,14 +286,15 @@ class Chunk:
         for place, entry in enumerate(load_chunk(path)):
             key = entry.get("key") if isinstance(entry, dict) else None
             if not isinstance(key, str):
-                parse_record(f"{path}: entry {place}", entry)  # raises
+                # raises
+                parse_record(f"{path}: entry {place}", entry)
             elif key in self.entries:
                 raise ValueError(f"{path} holds the scene {key!r} twice: pack the data set again")
             else:
                 self.entries[key] = entry
 
     def record(self, key: str) -> Record:
-        """A scene. Raises ValueError when it is not in this chunk or is malformed."""
+        """Return a scene. Raises ValueError when it is not in this chunk or is malformed."""
         if key not in self.entries:
             raise ValueError(
                 f"{self.path} does not hold the scene {key!r}, which index.json places there: "
@@ -299,20 +306,20 @@ class Chunk:
 
 
 def has_chunks(folder: UPath) -> bool:
-    """Whether a folder looks like one of chunks: it holds an index.json or .torch files."""
+    """Return whether a folder looks like one of chunks: it holds an index.json or .torch files."""
     return folder.is_dir() and (
         (folder / INDEX).is_file() or any(item.suffix == SUFFIX for item in folder.iterdir())
     )
 
 
 def stays_inside(name: str) -> bool:
-    """Whether a relative name, with either kind of slash, stays inside the folder it starts in."""
+    """Return whether a relative name, with either kind of slash, stays in the folder."""
     parts = PurePosixPath(name.replace("\\", "/")).parts
     return bool(parts) and parts[0] != "/" and ".." not in parts and ":" not in parts[0]
 
 
 def read_chunk_index(path: UPath) -> dict[str, str]:
-    """An index.json: key to file name. Raises ValueError for a file outside the folder."""
+    """Read an index.json: key to file name. Raises ValueError for a file outside the folder."""
     index = read_json(path, "copy it again, or remove it to have the chunks read instead")
     if not isinstance(index, dict) or not all(isinstance(name, str) for name in index.values()):
         raise ValueError(f"{path} must map each scene's key to the name of its chunk file")
@@ -327,7 +334,7 @@ def read_chunk_index(path: UPath) -> dict[str, str]:
 
 
 def list_scenes(folder: UPath) -> dict[str, UPath]:
-    """The scenes of a folder by key, in the order of its index, or else of its chunks.
+    """List the scenes of a folder by key, in the order of its index, or else of its chunks.
 
     Scenes whose chunk is missing are left out and logged. Raises FileNotFoundError when none is
     left, ValueError for an index or a chunk that cannot be read.

@@ -30,8 +30,10 @@ from qgs_photos.datasets.chunk_files import (
     require_usable,
 )
 
-_OPEN = 4  # chunks kept open
-_SAME_ASPECT = 0.01  # relative difference between an image's aspect ratio and the scene's
+# Chunks kept open.
+_OPEN = 4
+# Relative difference between an image's aspect ratio and the scene's.
+_SAME_ASPECT = 0.01
 
 
 class ChunksConfig(SceneSource.Config):
@@ -57,7 +59,10 @@ class ChunkScene(EncodedScene):
     def __init__(
         self, name: str, file: UPath, config: ChunksConfig, chunks: BoundedCache[Chunk]
     ) -> None:
-        self.name, self._file, self._config, self._chunks = name, file, config, chunks
+        self.name = name
+        self._file = file
+        self._config = config
+        self._chunks = chunks
 
     @property
     def _record(self) -> Record:
@@ -84,7 +89,8 @@ class ChunkScene(EncodedScene):
     @cached_property
     def cameras(self) -> Cameras:
         """See `Scene`; float64. Raises ValueError for cameras that cannot be used."""
-        record, target = self._record, self._config.image_size
+        record = self._record
+        target = self._config.image_size
         require_usable(record)
         intrinsics = record.cameras[:, :4].double()
         sizes = torch.tensor(record.image_sizes)
@@ -183,7 +189,7 @@ class ChunksSource(LazySource):
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
-        """Chunk files or an index.json in train or test, or chunk files in the folder itself."""
+        """Return whether train or test hold chunks or an index.json, or the folder chunks."""
         inside = [path, *path.iterdir()] if path.is_dir() else []
         splits = [item for item in inside if item.name in ("train", "test")]
         return any(map(has_chunks, splits)) or any(item.suffix == SUFFIX for item in inside)
@@ -192,8 +198,10 @@ class ChunksSource(LazySource):
         """See `SceneSource`. Without test chunks, a training scene says if frames are held out."""
         if split in self.splits:
             return self.splits[split]
-        train, first = self.splits["train"], self.groups("train")[:1]
-        return train if any(train[i].held_out for group in first for i in group) else self._nothing
+        train = self.splits["train"]
+        # one chunk tells: `qgs data pack` holds frames out in all scenes or in none
+        first = next(iter(self.groups("train")), ())
+        return train if any(train[i].held_out for i in first) else self._nothing
 
     def groups(self, split: Split) -> Sequence[Sequence[int]]:
         """See `SceneSource`: one group for each chunk file."""
@@ -224,7 +232,7 @@ def _folders(path: UPath) -> dict[Split, UPath]:
 def _long_enough(
     folder: UPath, config: ChunksConfig, opener: Callable[[str, UPath], ChunkScene]
 ) -> dict[str, UPath]:
-    """The scenes with `min_frames` frames; the others are counted and named."""
+    """Return the scenes with `min_frames` frames; the others are counted and named."""
     files = list_scenes(folder)
     if not config.min_frames:
         return files

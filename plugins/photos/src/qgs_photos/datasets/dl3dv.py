@@ -17,8 +17,10 @@ from qgs.paths import opened_path, read_file, read_json
 from qgs.wording import listed, warn_once
 
 LISTING = "transforms.json"
-_INSIDE = ("", "gaussian_splat", "nerfstudio")  # folders of a scene that may hold the listing
-_DEPTH = 2  # folders between the data set's and a scene
+# Folders of a scene that may hold the listing.
+_INSIDE = ("", "gaussian_splat", "nerfstudio")
+# Folders between the data set's and a scene.
+_DEPTH = 2
 _HASH = re.compile(r"[0-9a-f]{64}")
 
 
@@ -57,7 +59,8 @@ class Dl3dvSource(LazySource):
     def __init__(self, config: Dl3dvConfig) -> None:
         super().__init__(config)
         places = find_scenes(opened_path(config.path))
-        train, test = places, places if config.holdout else {}
+        train = places
+        test = places if config.holdout else {}
         if config.test_scenes is not None:
             named = read_scene_list(opened_path(config.test_scenes))
             absent = [name for name in named if name not in places]
@@ -76,8 +79,10 @@ class Dl3dvSource(LazySource):
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
-        """Archives, and folders named by a hash or laid out as DL3DV's benchmark, also in folders
-        such as 1K. A folder of photos that lists them itself is left to `qgs/photos`.
+        """Return whether there are archives, or folders named by a hash or laid out as DL3DV's
+        benchmark, also in folders such as 1K.
+
+        A folder of photos that lists them itself is left to `qgs/photos`.
         """
         if path.is_file():
             return path.suffix == ".zip"
@@ -92,7 +97,7 @@ def _opened(name: str, place: UPath, **options: Any) -> PhotoScene:
 
 
 def find_scenes(path: UPath) -> dict[str, UPath]:
-    """Folders and archives of scenes at or below `path` by name, folders before archives.
+    """Find folders and archives of scenes at or below `path` by name, folders before archives.
 
     Raises FileNotFoundError for none.
     """
@@ -133,14 +138,15 @@ def _places(path: UPath, depth: int) -> Iterator[tuple[str, UPath]]:
 
 
 def scene_folder(place: UPath) -> UPath:
-    """The folder with transforms.json of a folder or an archive.
+    """Return the folder with transforms.json of a folder or an archive.
 
     Raises FileNotFoundError without it, ValueError for an archive that cannot be read.
     """
     tops = [place]
     if place.suffix == ".zip":
         try:
-            top = UPath(f"zip:///::{place}")  # open as long as paths below it live
+            # open as long as paths below it live
+            top = UPath(f"zip:///::{place}")
             folders = (item for item in top.iterdir() if item.is_dir())
             tops = [top, *(item for item in folders if item.name not in _INSIDE)]
         except (zipfile.BadZipFile, OSError) as error:
@@ -158,7 +164,10 @@ def scene_folder(place: UPath) -> UPath:
 
 
 def read_scene_list(file: UPath) -> list[str]:
-    """Scenes: keys of a JSON mapping, a list, or lines. Raises FileNotFoundError, ValueError."""
+    """Read names of scenes: keys of a JSON mapping, a list, or lines.
+
+    Raises FileNotFoundError, and ValueError for none.
+    """
     if not file.is_file():
         raise FileNotFoundError(f"the list of scenes {file} does not exist")
     if file.suffix == ".json":

@@ -46,7 +46,8 @@ class Farthest(Bounded):
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
     ) -> tuple[Frames, Frames]:
         """See `ViewSampler`."""
-        most, fewest = views.inputs, self.config.fewest
+        most = views.inputs
+        fewest = self.config.fewest
         count = most if step == END else fewest + step % (most - fewest + 1)
         views = views.model_copy(update={"inputs": count})
         span = self.span(scene, views, rng, step, parts=most // count)
@@ -61,11 +62,14 @@ class Farthest(Bounded):
 
 
 def farthest_points(points: Tensor, count: int) -> list[int]:
-    """`count` of `points` (N, 3): that farthest from their mean, then always that farthest from all
-    chosen ones. Points that coincide with a chosen one come last, each once."""
+    """Choose `count` of `points` (N, 3): the one farthest from their mean, then from all chosen.
+
+    Points that coincide with a chosen one come last, each once.
+    """
     chosen = [int((points - points.mean(0)).norm(dim=-1).argmax())]
     while len(chosen) < count:
         distance = torch.cdist(points, points[chosen]).amin(-1)
-        distance[chosen] = -1  # the release can choose a point twice where all coincide
+        # the release can choose a point twice where all coincide
+        distance[chosen] = -1
         chosen.append(int(distance.argmax()))
     return chosen

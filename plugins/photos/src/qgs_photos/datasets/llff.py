@@ -23,7 +23,8 @@ class Llff(PhotoReader):
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
         """See `PhotoReader`. Raises ValueError unless there are as many photos as rows."""
-        file, photos = folder / cls.listing, image_folder(folder, images)
+        file = folder / cls.listing
+        photos = image_folder(folder, images)
         rows = _rows(file)
         files = image_files(photos)
         if len(files) != len(rows):
@@ -35,11 +36,12 @@ class Llff(PhotoReader):
 
 
 def _rows(file: UPath) -> np.ndarray:
-    """(N, 17) float64. Raises ValueError for a file of something else, and for near > far."""
+    """Read (N, 17) float64. Raises ValueError for a file of something else, and for near > far."""
     try:
         with open_file(file) as opened:
             rows = load_array(opened)
-    except Exception as error:  # NumPy raises anything on damaged headers
+    except Exception as error:
+        # NumPy raises anything on damaged headers
         raise ValueError(
             f"{file} is no NumPy file of numbers ({error}): export it again"
         ) from error
@@ -57,7 +59,8 @@ def _rows(file: UPath) -> np.ndarray:
 def _frame(path: UPath, row: np.ndarray) -> PhotoFrame:
     down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
     c2w = np.eye(4)
-    c2w[:3] = np.stack([right, down, -back, centre], 1)  # OpenCV's axes
+    # OpenCV's axes
+    c2w[:3] = np.stack([right, down, -back, centre], 1)
     size, problems = listed_size(float(height), float(width))
     return PhotoFrame(
         name=f"{path.parent.name}/{path.name}",

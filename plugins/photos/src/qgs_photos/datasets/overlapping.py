@@ -48,7 +48,8 @@ class Overlapping(ViewSampler):
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)
-        self._depths: dict[str, float] = {}  # by the names of scenes; a sweep takes a third second
+        # by the names of scenes; a sweep takes a third second
+        self._depths: dict[str, float] = {}
 
     def draw(
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
@@ -59,7 +60,8 @@ class Overlapping(ViewSampler):
         refuse_too_many(views.inputs + views.targets, scene)
         usable = _enough(scene, views.inputs + 1)
         factor = float(np.exp(rng.uniform(*np.log(self.config.apart))))
-        frusta, target = self._frusta(scene, factor), int(rng.choice(usable))
+        frusta = self._frusta(scene, factor)
+        target = int(rng.choice(usable))
         others = [frame for frame in usable if frame != target]
         count = max(views.inputs, round(_SHARE * len(others)))
         some = sorted(map(int, rng.choice(others, count, replace=False)))
@@ -73,28 +75,29 @@ class Overlapping(ViewSampler):
             return []
         # without held-out photos the target is one of those that inputs are chosen from
         usable = _enough(scene, views.inputs if scene.held_out else views.inputs + 1)
-        frusta, found = self._frusta(scene), []
+        frusta = self._frusta(scene)
+        found = list[tuple[Frames, Frames]]()
         for target in sorted(scene.held_out) or evenly(usable, _JUDGED):
             _, inputs = frusta.window(target, usable, views.inputs)
             found.append((_ascending(inputs), (target,)))
         return found
 
     def _frusta(self, scene: Scene, factor: float = 1.0) -> Frusta:
-        """Of cameras that may stand, and turn, `factor` times as far apart as usual."""
+        """Return frusta of cameras that may stand and turn `factor` times as far apart."""
         if scene.name not in self._depths:
             self._depths[scene.name] = scene_depth(scene)
         return Frusta(scene, apart(Domain(), factor), self._depths[scene.name])
 
 
 def apart(domain: Domain, factor: float) -> Domain:
-    """As `domain`, with inputs `factor` times as far apart and turned as it has the best ones."""
+    """Return `domain` with the best inputs `factor` times as far apart and turned."""
     (low, high), turn = trained_ratios(domain)
     ends = {"baseline": [factor * low, factor * high], "turn": [0.0, factor * turn]}
     return Domain({**ends, "depth": [1.0, 1.0]}, domain.samples)
 
 
 def _enough(scene: Scene, least: int) -> list[int]:
-    """The frames of training; raises ValueError for fewer than `least`."""
+    """Return the frames of training; raises ValueError for fewer than `least`."""
     usable = training_frames(scene)
     if len(usable) < least:
         besides = f" beside {len(scene.held_out)} held-out ones" if scene.held_out else ""

@@ -9,11 +9,16 @@ from qgs.data.photos.checks import FrameProblem, intrinsics_problems, pose_probl
 from qgs_photos.datatools.decoding import DecodedScene
 from qgs_photos.datatools.findings import Finding
 
-_SAME = 2e-6  # of a rotation's entries, and of coordinates that float32 holds
-_DOUBLE = 1e-9  # of coordinates that float64 holds, after they were computed
-_FLOAT32 = 2e-7  # of coordinates that were float32 before they were written
-_OF_EXTENT = 1e-4  # of the cameras' extent: the largest distance that counts as none
-_FAR_OFF_CENTRE = 0.25  # of a side, from the middle
+# Of a rotation's entries, and of coordinates that float32 holds.
+_SAME = 2e-6
+# Of coordinates that float64 holds, after they were computed.
+_DOUBLE = 1e-9
+# Of coordinates that were float32 before they were written.
+_FLOAT32 = 2e-7
+# Of the cameras' extent: the largest distance that counts as none.
+_OF_EXTENT = 1e-4
+# Of a side, from the middle.
+_FAR_OFF_CENTRE = 0.25
 
 
 def camera_findings(scene: DecodedScene, sized: set[int]) -> tuple[list[Finding], list[Finding]]:

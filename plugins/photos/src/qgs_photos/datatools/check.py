@@ -12,7 +12,7 @@ from upath import UPath
 from qgs.data.photos import read_listing, readers
 from qgs.wording import counted, listed
 from qgs_photos.datatools.cameras import camera_findings, sharing_findings
-from qgs_photos.datatools.candidates import Candidate, Photo
+from qgs_photos.datatools.candidates import Candidate
 from qgs_photos.datatools.chunks import chunk_folders
 from qgs_photos.datatools.decoding import DecodedScene, decode, error_text
 from qgs_photos.datatools.files import file_findings, size_findings
@@ -55,7 +55,8 @@ def check(
         path = path.parent
     candidates, general, reported = _candidates(path, options)
     if not candidates and not general:
-        read_listing(path, _photo_format(options))  # raises: what is missing for a photo folder
+        # raises: what is missing for a photo folder
+        read_listing(path, _photo_format(options))
         raise FileNotFoundError(f"{path} holds no {options.format}: leave --format out")
     judged, notes = _scenes_to_judge(len(candidates), options)
     scenes: list[SceneReport] = []
@@ -143,7 +144,8 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
     try:
         photos = candidate.photos()
         missing = candidate.missing()
-    except Exception as error:  # whatever a reader raises; the other scenes go on
+    except Exception as error:
+        # whatever a reader raises; the other scenes go on
         return replace(report, findings=[_unreadable(name, error)])
     absent = list[Finding]()
     if missing:
@@ -183,7 +185,6 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
         findings += matched_findings(scene, geometry.pairs)
     drawn = [frame for frame in placed if scene.numbers[frame] is not None]
     c2w = [photos[frame].listed.c2w[:3] for frame in drawn]
-    fov = [_angles_of_view(photos[frame], decoded[frame].size or (1, 1)) for frame in drawn]
     return replace(
         report,
         listed=len(photos) + len(missing),
@@ -193,14 +194,14 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
         pose_problems=len(_frames([*poses, *sharing])),
         frames=tuple(scene.numbers[frame] for frame in drawn),
         c2w=np.array(c2w, np.float32).reshape(-1, 3, 4),
-        fov=np.array(fov, np.float32).reshape(-1, 2),
         geometry=geometry,
         findings=findings,
     )
 
 
 def _unreadable(name: str, error: Exception) -> Finding:
-    reason, colon, fix = str(error).rpartition(": ")  # messages end with a remedy
+    # messages end with a remedy
+    reason, colon, fix = str(error).rpartition(": ")
     if colon and isinstance(error, OSError | ValueError):
         return Finding(name, reason, fix)
     return Finding(name, error_text(error), "get the files again, or mend what reads them")
@@ -215,10 +216,3 @@ def _listing(kind: str) -> str:
 
 def _frames(findings: Sequence[Finding]) -> set[int]:
     return {frame for finding in errors_of(findings) for frame in finding.frames}
-
-
-def _angles_of_view(photo: Photo, size: tuple[int, int]) -> tuple[float, float]:
-    """Return tangents of half the angles of view, x and y; 0 for an unusable focal length."""
-    height, width = photo.listed.size or size
-    fx, fy, _, _ = photo.listed.intrinsics
-    return (width / 2 / fx if fx > 0 else 0.0), (height / 2 / fy if fy > 0 else 0.0)

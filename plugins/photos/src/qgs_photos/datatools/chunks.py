@@ -68,9 +68,12 @@ class ChunkFolder:
         self.found: set[str] = set()
         self.candidates: list[Candidate] = []
         self.findings: list[Finding] = []
-        self._placed: dict[str, list[str]] = defaultdict(list)  # scenes by file, as in the index
-        self._keys: dict[str, set[str]] = {}  # scenes by file, of files that could be read
-        self._broken: set[str] = set()  # files with entries that are no scenes
+        # scenes by file, as in the index
+        self._placed: dict[str, list[str]] = defaultdict(list)
+        # scenes by file, of files that could be read
+        self._keys: dict[str, set[str]] = {}
+        # files with entries that are no scenes
+        self._broken: set[str] = set()
 
     def report(self, scene: str, reason: str, fix: str, severity: Severity = "error") -> None:
         """Add a finding."""
@@ -96,7 +99,8 @@ class ChunkFolder:
             entries = load_chunk(file)
         except (OSError, ValueError) as error:
             text = " ".join(str(error).replace(f"{file} ", "the file ").split())
-            reason = text.rpartition(": ")[0] or text  # without the remedy behind the last colon
+            # without the remedy behind the last colon
+            reason = text.rpartition(": ")[0] or text
             self.report(label, reason + self._lost(file.name), _REPACK)
             return
         keys = self._keys[file.name] = set()

@@ -27,9 +27,12 @@ from qgs_photos.datatools.candidates import Photo, shrunk
 from qgs_photos.datatools.findings import Finding, Severity
 
 _ERRORS = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
-_SMALLEST = (8, 8)  # asks JPEG for its coarsest picture: all bytes are read, few pixels are made
-_SMALL = 96  # pixels of the longer side: shows the outline of a mask
-_BLACK = 4  # of 255: a covered lens has noise
+# Asks JPEG for its coarsest picture: all bytes are read, few pixels are made.
+_SMALLEST = (8, 8)
+# Pixels of the longer side: shows the outline of a mask.
+_SMALL = 96
+# Of 255: a covered lens has noise.
+_BLACK = 4
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,8 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
             black = _is_black(eight_bits(image))
             # EXIF may stand behind the pixels
             by_exif = orientation(image) != 1 and not photo.listed.turns
-    except Exception as error:  # whatever a reader raises; the other photos go on
+    except Exception as error:
+        # whatever a reader raises; the other photos go on
         return Decoded(error=error_text(error))
     errors = list[tuple[str, str]]()
     mask = _sound("mask", photo.listed.mask, _mask_reader(photo), size, errors)
@@ -142,7 +146,8 @@ def _mask_reader(photo: Photo) -> Callable[[], np.ndarray | None] | None:
 
     def alpha() -> np.ndarray | None:
         channel = alpha_mask(mask)
-        return None if channel.min() == 255 else channel  # an opaque photo has no mask
+        # an opaque photo has no mask
+        return None if channel.min() == 255 else channel
 
     return alpha
 

@@ -17,7 +17,8 @@ from qgs.data.scenes import EncodedFrame, EncodedScene
 
 ChunkEntry: TypeAlias = dict[str, Any]
 
-_KEPT_FORMATS = {"JPEG", "MPO", "PNG"}  # MPO: a JPEG with further pictures behind it
+# MPO: a JPEG with further pictures behind it.
+_KEPT_FORMATS = {"JPEG", "MPO", "PNG"}
 
 
 @dataclass(frozen=True)

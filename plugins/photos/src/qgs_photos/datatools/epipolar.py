@@ -12,8 +12,10 @@ from kornia.feature import match_smnn
 from kornia.geometry.ransac import RANSAC
 from skimage.feature import SIFT
 
-MIN_MATCHES = 24  # fewer say nothing about a pair of photos
-_RATIO = 0.8  # of descriptor distances (Lowe 2004)
+# Fewer say nothing about a pair of photos.
+MIN_MATCHES = 24
+# Of descriptor distances (Lowe 2004).
+_RATIO = 0.8
 _INLIER_PIXELS = 1.5
 _RGB_TO_GREY = np.array([0.299, 0.587, 0.114]) / 255
 
@@ -36,7 +38,8 @@ def detect(picture: np.ndarray) -> Features:
     sift: Any = SIFT()
     try:
         sift.detect_and_extract((picture @ _RGB_TO_GREY).astype(np.float32))
-    except RuntimeError:  # an image without any feature, such as a plain wall
+    except RuntimeError:
+        # an image without any feature, such as a plain wall
         return Features(np.zeros((0, 2)), np.zeros((0, 128)), np.zeros((0, 3)))
     rows, columns = sift.keypoints.astype(int).T
     return Features(

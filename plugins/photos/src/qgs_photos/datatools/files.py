@@ -12,8 +12,10 @@ from qgs.data.photos.reader import PhotoFrame
 from qgs_photos.datatools.decoding import DecodedScene
 from qgs_photos.datatools.findings import Finding, Severity
 
-_ROUNDING = 1.5  # pixels by which a scaled copy's sides may be off
-_CENTRED = 0.1  # of a side: how far from the middle a principal point usually lies at most
+# Pixels by which a scaled copy's sides may be off.
+_ROUNDING = 1.5
+# Of a side: how far from the middle a principal point usually lies at most.
+_CENTRED = 0.1
 _COPY = re.compile(r"images_\d+")
 
 

@@ -10,14 +10,20 @@ from qgs_photos.datatools.decoding import DecodedScene
 from qgs_photos.datatools.epipolar import MIN_MATCHES, Features, Pair, detect, frames_above, match
 from qgs_photos.datatools.findings import Finding, Severity
 
-SIDE = 400  # pixels on the longer side of the photos that are matched
-TOLERANCE = 0.005  # largest median distance that good poses leave, of the image's diagonal
+# Pixels on the longer side of the photos that are matched.
+SIDE = 400
+# Largest median distance that good poses leave, of the image's diagonal.
+TOLERANCE = 0.005
 TOO_FEW = f"too few matches, below {MIN_MATCHES} in every pair that was tried"
-_RUNS = 5  # of consecutive frames, where not all are matched
+# Of consecutive frames, where not all are matched.
+_RUNS = 5
 _GAPS = (8, 4, 2, 1)
-_NO_BASELINE = 1e-4  # of the cameras' extent: poses so close say nothing about their lines
-_NONSENSE = 0.02  # of the diagonal: no lens or rounding explains more
-_FAR = 4.0  # times the better pairs: a frame is off that is so far from all its partners
+# Of the cameras' extent: poses so close say nothing about their lines.
+_NO_BASELINE = 1e-4
+# Of the diagonal: no lens or rounding explains more.
+_NONSENSE = 0.02
+# Times the better pairs: a frame is off that is so far from all its partners.
+_FAR = 4.0
 _ADVICE = (
     "check the convention of the poses, that they are in the order of the photos, and the "
     "intrinsics; docs/photos.md says how each looks"

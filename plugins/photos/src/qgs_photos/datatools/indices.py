@@ -48,7 +48,8 @@ def index_findings(
     for name, entry in index.items():
         if entry is not None and (name in scenes or name not in reported):
             findings += _entry_findings(file.name, name, entry, scenes.get(name, ()))
-    null = sum(entry is None for entry in index.values())  # scenes that are never judged
+    # scenes that are never judged
+    null = sum(entry is None for entry in index.values())
     return findings, f"{file}: {len(index)} scenes, {null} of them without frames (null)"
 
 

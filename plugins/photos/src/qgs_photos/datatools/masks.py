@@ -8,11 +8,16 @@ from qgs_photos.datatools.decoding import DecodedScene
 from qgs_photos.datatools.epipolar import Pair, frames_above
 from qgs_photos.datatools.findings import Finding, Severity
 
-_OBJECTS = 0.5  # masks that are whiter, as those of what moves, may be all white in some frames
-_OPPOSITE = 0.5  # of matches with another frame contradict an inverted mask; of a sound one 0.1
-_BORDER = 0.9  # white share of the border of masks that are white outside of an object
-_STATIC = 0.5  # matches on black per area, by those on white: what moves matches less
-_SURE = 3.2  # standard deviations between two counts of contradictions; sound masks have up to 3
+# Masks that are whiter, as those of what moves, may be all white in some frames.
+_OBJECTS = 0.5
+# Of matches with another frame contradict an inverted mask; of a sound one 0.1.
+_OPPOSITE = 0.5
+# White share of the border of masks that are white outside of an object.
+_BORDER = 0.9
+# Matches on black per area, by those on white: what moves matches less.
+_STATIC = 0.5
+# Standard deviations between two counts of contradictions; sound masks have up to 3.
+_SURE = 3.2
 _FIX = "invert the mask: white marks what is modelled"
 
 

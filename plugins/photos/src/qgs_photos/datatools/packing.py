@@ -25,7 +25,8 @@ _VERSION = 1
 Places: TypeAlias = Mapping[str, tuple[Split, int]]
 """Scenes by name: the split of the source that has each, and its index there."""
 
-Splits: TypeAlias = Mapping[Split, Places]  # what is packed into which split
+# What is packed into which split.
+Splits: TypeAlias = Mapping[Split, Places]
 
 
 def own_splits(source: SceneSource) -> Splits:

@@ -18,8 +18,7 @@ class SceneReport:
 
     split: empty where the format has none. numbered: photos that a reader has as frames.
     pose_problems: frames whose pose is wrong. c2w: (F, 3, 4) float32 OpenCV poses of `frames`, the
-    numbers of those that can be drawn; fov: (F, 2) tangents of half the angles of view, x and y.
-    geometry: None where it was not asked for.
+    numbers of those that can be drawn. geometry: None where it was not asked for.
     """
 
     name: str
@@ -33,7 +32,6 @@ class SceneReport:
     pose_problems: int = 0
     frames: tuple[int, ...] = ()
     c2w: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 4), np.float32))
-    fov: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.float32))
     geometry: Geometry | None = None
     findings: Sequence[Finding] = ()
 

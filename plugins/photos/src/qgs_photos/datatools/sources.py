@@ -17,7 +17,8 @@ from qgs_photos.datatools.entries import bytes_of, png
 OF_FILES = ("qgs", "datasets")
 """Plugins whose sources are checked by their files, not by what they deliver."""
 
-_SIZE = (256, 256)  # of the images that a source is asked for
+# Of the images that a source is asked for.
+_SIZE = (256, 256)
 
 
 @cache

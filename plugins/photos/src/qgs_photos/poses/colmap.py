@@ -27,38 +27,41 @@ REFUSALS = {
 }
 """Why the process went no further, by the word of its result."""
 
-_LINES = 30  # of COLMAP's log that are kept for a crash
+# Of COLMAP's log, kept for a crash.
+_LINES = 30
+# Lines of its log by which progress is told: features, neighbours, blocks of pairs.
 _FILE = re.compile(r"Processed file \[\d+/\d+\]")
-_IMAGE, _BLOCK = (
-    re.compile(r"Processing image \[(\d+)/(\d+)\]"),
-    re.compile(r"Processing block \[(\d+)/(\d+), (\d+)/(\d+)\]"),
-)
+_IMAGE = re.compile(r"Processing image \[(\d+)/(\d+)\]")
+_BLOCK = re.compile(r"Processing block \[(\d+)/(\d+), (\d+)/(\d+)\]")
 
 
 class Log:
-    """What the process prints: how far it is. stage, done, total: of the last line."""
+    """The log of the process: how far it is. stage, done, total: of the last line."""
 
     def __init__(self, total: int) -> None:
-        self.stage, self.done, self.total = FEATURES, 0, total
+        self.stage = FEATURES
+        self.done = 0
+        self.total = total
         self.last = deque[str](maxlen=_LINES)
 
     def read(self, line: str) -> None:
         """Take a line in."""
         if line.startswith("{"):
-            told = json.loads(line)
-            self.stage, self.done, self.total = told["stage"], told["done"], told["total"]
+            self.stage, self.done, self.total = json.loads(line).values()
             return
         self.last.append(line.rstrip())
         if _FILE.search(line):
             self.done = min(self.done + 1, self.total)
         elif self.stage == MATCHING and (found := _IMAGE.search(line)):
-            self.done, self.total = int(found[1]) - 1, int(found[2])
+            done, self.total = map(int, found.groups())
+            self.done = done - 1
         elif self.stage == MATCHING and (found := _BLOCK.search(line)):
             row, rows, column, columns = map(int, found.groups())
-            self.done, self.total = (row - 1) * columns + column - 1, rows * columns
+            self.done = (row - 1) * columns + column - 1
+            self.total = rows * columns
 
     def crash(self, code: int) -> str:
-        """A sentence on a process that ended with `code`."""
+        """Return a sentence on a process that ended with `code`."""
         errors = [line for line in self.last if re.match("[EF]\\d{8}|.*Error", line)]
         reason = (errors or [*self.last] or ["it logged nothing"])[-1]
         how = f"signal {-code}" if code < 0 else f"exit code {code}"
@@ -80,7 +83,8 @@ def run(job: Job, photos: int, show: Callable[[str, int, int], None]) -> None:
         stderr=subprocess.STDOUT,
         encoding="utf-8",
         errors="replace",
-        start_new_session=True,  # Ctrl-C reaches this process alone, which ends the other
+        # Ctrl-C reaches this process alone, which ends the other
+        start_new_session=True,
     )
     assert process.stdin is not None
     assert process.stdout is not None

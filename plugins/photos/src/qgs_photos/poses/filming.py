@@ -22,7 +22,8 @@ from qgs_photos.poses.film import pictures, write_film
 from qgs_photos.poses.paths import KINDS, path_of, read_path
 from qgs_photos.record import GAUSSIANS, has_record, read_record
 
-_HEIGHT = 480  # pixels of the shorter side by default
+# Pixels of the shorter side, where the photos have fewer.
+_HEIGHT = 480
 
 
 @dataclass(frozen=True)

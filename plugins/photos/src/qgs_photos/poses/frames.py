@@ -14,14 +14,18 @@ from PIL import Image
 from qgs.wording import counted
 from qgs_photos.poses.photos import LEAST, PosesError, laplacian_variance
 
-FEWEST, MOST, PER_SECOND = 40, 240, 2.0
-"""How many frames are taken of a video, and the least rate of them."""
 # 120 at even steps of time are too few where the camera turns fast: of a walk through an office as
 # a video, 42 of 120 frames got poses, and 143 of the 143 that follow the motion.
+FEWEST, MOST, PER_SECOND = 40, 240, 2.0
+"""How many frames are taken of a video, and the least rate of them."""
 STEP = 0.06
 """Shift of the picture, in parts of its width, after which another frame is taken."""
-_JUDGED = 8  # frames of an interval that are compared
-_SIDE, _THUMB = 640, (48, 64)
+# Frames of an interval that are compared.
+_JUDGED = 8
+# Longer side in pixels at which sharpness is measured.
+_SIDE = 640
+# Height and width of the pictures that motion is measured by.
+_THUMB = (48, 64)
 _WINDOW = np.outer(np.hanning(_THUMB[0]), np.hanning(_THUMB[1]))
 
 
@@ -38,7 +42,7 @@ def extract(
     remarks. What cannot be decoded is left out. Raises PosesError for no video, and for fewer than
     LEAST frames.
     """
-    times, broken = _times(video)
+    times, damaged = _times(video)
     if len(times) < LEAST:
         raise PosesError(
             f"{video} has {counted(len(times), 'frame')} that can be read, and poses need {LEAST} "
@@ -49,45 +53,44 @@ def extract(
     length = float(times[-1] - start) * len(times) / (len(times) - 1) or 1.0
     intervals = Intervals(float(start), length, count)
     every = max(int(len(times) / (length * intervals.rate) / _JUDGED), 1)
-    place, best, sharpest, faults, last = 0, None, -1.0, 0, start
     scores = dict[Path, float]()
-
-    def keep() -> None:
-        if best is not None:
-            scores[_write(best, folder / f"{place:05d}.jpg")] = sharpest
-
+    best: tuple[Any, Path] | None = None
+    last = start
     for number, (time, frame) in enumerate(_decoded(video)):
         if frame is None:
-            faults += 1
+            damaged = True
             continue
-        here, last = intervals.place(float(time), frame), max(last, time)
-        if here != place:
-            keep()
-            best, sharpest = None, -1.0
-        place = here
+        last = max(last, time)
+        place = intervals.place(float(time), frame)
         progress(int(time - start), int(length))
-        if best is not None and number % every:
+        path = folder / f"{place:05d}.jpg"
+        if path in scores and number % every:
             continue
+        # a frame is written once its interval is over: large ones take long
+        if best and path not in scores:
+            _write(*best)
         score = _sharpness(frame)
-        if score > sharpest:
-            best, sharpest = frame, score
-    keep()
+        if score > scores.get(path, -1.0):
+            scores[path] = score
+            best = (frame, path)
+    if best:
+        _write(*best)
     if len(scores) < LEAST:
         raise PosesError(
             f"{video} has {counted(len(scores), 'frame')} that can be decoded, and poses need "
             f"{LEAST} at least: convert it to H.264, or copy it again"
         )
     if count is None:
-        for path in {*scores} - {*thinned(scores, MOST)}:
+        for path in scores.keys() - {*thinned(scores, MOST)}:
             path.unlink()
-    if not (broken or faults):
+    if not damaged:
         return []
-    at = f"{float(last - start):.1f} s"
-    return [f"{video} is damaged: frames are taken up to {at}, where they could be decoded"]
+    seconds = f"{float(last - start):.1f} s"
+    return [f"{video} is damaged: frames are taken up to {seconds}, where they could be decoded"]
 
 
 def thinned(scores: Mapping[Path, float], most: int) -> list[Path]:
-    """At most `most` of the frames: of each even number of neighbours the one of highest score."""
+    """Return at most `most` frames: of each even number of neighbours the one of highest score."""
     best = dict[int, Path]()
     for number, path in enumerate(sorted(scores)):
         part = number * most // len(scores)
@@ -102,26 +105,36 @@ class Intervals:
     """
 
     def __init__(self, start: float, length: float, count: int | None) -> None:
-        self.start, self.count = start, count
+        self.start = start
+        self.count = count
         self.rate = count / length if count else max(PER_SECOND, FEWEST / length)
-        self._place, self._opened, self._moved = 0, start, 0.0
+        self._place = 0
+        self._opened = start
+        self._moved = 0.0
         self._thumb: np.ndarray | None = None
 
     def place(self, time: float, frame: Any) -> int:
-        """The number of the interval of the next frame."""
+        """Return the number of the interval of the next frame."""
+        # times are fractions: an interval ends with the frame that is due, in spite of rounding
         if self.count:
-            return min(max(int((time - self.start) * self.rate + 1e-6), 0), self.count - 1)
+            place = int((time - self.start) * self.rate + 1e-6)
+            return min(max(place, 0), self.count - 1)
         thumb = _grey(frame, _THUMB)
         if self._thumb is not None:
             self._moved += shift(self._thumb, thumb)
         self._thumb = thumb
         if max((time - self._opened) * self.rate + 1e-6, self._moved / STEP) >= 1:
-            self._place, self._opened, self._moved = self._place + 1, time, 0.0
+            self._place += 1
+            self._opened = time
+            self._moved = 0.0
         return self._place
 
 
 def shift(before: np.ndarray, after: np.ndarray) -> float:
-    """How far a small picture moved, in parts of its sides: the peak of the phase correlation."""
+    """Return how far a small picture moved, in parts of its sides.
+
+    By the peak of the phase correlation.
+    """
     one, other = (np.fft.rfft2((x - x.mean()) * _WINDOW) for x in (before, after))
     product = one * other.conj()
     found = np.fft.irfft2(product / (np.abs(product) + 1e-9), s=_THUMB)
@@ -131,7 +144,7 @@ def shift(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def _opened(video: Path) -> Any:
-    """The container and its first video stream. Raises PosesError where there is none."""
+    """Open the container. Raises PosesError where it has no video stream."""
     try:
         container = av.open(str(video))
     except (FFmpegError, ValueError) as error:
@@ -139,7 +152,6 @@ def _opened(video: Path) -> Any:
             f"{video} cannot be read as a video ({error}): convert it to H.264 in mp4, or copy it "
             "again"
         ) from error
-    # a cover picture of a song is a video of one frame
     if not container.streams.video:
         container.close()
         raise PosesError(f"{video} has no pictures: give a video")
@@ -147,8 +159,9 @@ def _opened(video: Path) -> Any:
 
 
 def _times(video: Path) -> tuple[list[Fraction], bool]:
-    """When each frame is shown, ascending, from the packets alone; whether the file is cut off."""
-    times, broken = list[Fraction](), False
+    """Return when each frame is shown, ascending, by the packets; whether the file is cut off."""
+    times = list[Fraction]()
+    broken = False
     with _opened(video) as container:
         stream = container.streams.video[0]
         try:
@@ -162,11 +175,12 @@ def _times(video: Path) -> tuple[list[Fraction], bool]:
 
 
 def _decoded(video: Path) -> Iterator[tuple[Fraction, Any]]:
-    """Time and frame; (0, None) for a packet that cannot be decoded."""
+    """Yield time and frame; (0, None) for a packet that cannot be decoded."""
     with _opened(video) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
-        with suppress(FFmpegError):  # what follows a hole in the file is lost
+        # what follows a hole in the file is lost
+        with suppress(FFmpegError):
             for packet in container.demux(stream):
                 try:
                     frames = packet.decode()
@@ -180,6 +194,7 @@ def _decoded(video: Path) -> Iterator[tuple[Fraction, Any]]:
 
 def _sharpness(frame: Any) -> float:
     scale = _SIDE / max(frame.width, frame.height)
+    # FFmpeg wants even sides
     height, width = (max(round(side * scale) // 2 * 2, 4) for side in (frame.height, frame.width))
     return laplacian_variance(_grey(frame, (height, width)))
 
@@ -189,12 +204,10 @@ def _grey(frame: Any, size: tuple[int, int]) -> np.ndarray:
     return grey.astype(np.float32)
 
 
-def _write(frame: Any, path: Path) -> Path:
-    """As JPEG, turned as the video says."""
+def _write(frame: Any, path: Path) -> None:
+    """Write a frame as JPEG, turned as the video says."""
     image = Image.fromarray(frame.to_ndarray(format="rgb24"))
-    turns = round(frame.rotation / 90) % 4  # counterclockwise, in degrees
-    if turns:
-        kinds = (Image.Transpose.ROTATE_90, Image.Transpose.ROTATE_180, Image.Transpose.ROTATE_270)
-        image = image.transpose(kinds[turns - 1])
+    # both count counterclockwise, in degrees
+    if turn := round(frame.rotation / 90) % 4 * 90:
+        image = image.rotate(turn, expand=True)
     image.save(path, quality=95, subsampling=0)
-    return path

@@ -1,14 +1,15 @@
-"""What the process of COLMAP is asked to do; no torch is imported here."""
+"""The job of the process that runs COLMAP; no torch is imported here."""
 
 from dataclasses import dataclass
 
-FEATURES, MATCHING, MAPPING = "features", "matching", "mapping"
-"""Its stages."""
+FEATURES = "features"
+MATCHING = "matching"
+MAPPING = "mapping"
 
 
 @dataclass(frozen=True)
 class Job:
-    """What the process is to do.
+    """What the process does.
 
     images: folder of photos, upright RGB. database, models: of COLMAP. groups: names of photos that
     share a camera. sizes: (H, W) of each photo for which the result is. sequential: match

@@ -29,7 +29,10 @@ from qgs_photos.poses.photos import (
 )
 from qgs_photos.poses.stages import Stages
 
-RECORD, WORKING, IMAGES, SPARSE = "poses.json", "working", "images", "sparse"
+RECORD = "poses.json"
+WORKING = "working"
+IMAGES = "images"
+SPARSE = "sparse"
 EXHAUSTIVE = 80
 """Photos up to which every pair is matched; of more, and of videos, neighbours in time."""
 
@@ -118,7 +121,8 @@ def make_poses(source: Path, out: Path, options: Options, console: Console) -> P
     that an interrupted call with the same options left is finished. Raises PosesError for photos
     without poses, FileExistsError for a folder of something else, and OSError.
     """
-    held = fingerprint(source)  # too few photos raise before anything is written
+    # too few photos raise before anything is written
+    held = fingerprint(source)
     with locked(source, out, wait=False):
         return make_locked(source, held, out, options, console)
 
@@ -163,7 +167,8 @@ def make_locked(
             return _made(source, held, out, options, stages)
     except ColmapError:
         raise
-    except PosesError:  # the same call would end there again
+    except PosesError:
+        # the same call would end there again
         for part in (WORKING, IMAGES, SPARSE):
             shutil.rmtree(out / part, ignore_errors=True)
         if not any(out.iterdir()):
@@ -184,7 +189,8 @@ def _made(
     source: Path, held: Mapping[str, Any], out: Path, options: Options, stages: Stages
 ) -> Poses:
     asked = asdict(options)
-    del asked["threads"]  # another number may go on with what is there
+    # another number may go on with what is there
+    del asked["threads"]
     begun = {"source": held, "options": asked}
     working = out / WORKING
     if _read(working / "begun.json") != begun:

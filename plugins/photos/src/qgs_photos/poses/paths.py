@@ -20,13 +20,16 @@ from qgs.reconstruction.saving import SWAY, orbit
 from qgs.types import Cameras
 
 KINDS = ("orbit", "spiral", "walk")
-_OPENGL = np.array([1.0, -1.0, -1.0, 1.0])  # of a pose's columns
-_SMOOTH = 1.5  # photos over which a walk is smoothed
-_TURNS = 2.0  # of a spiral
+# Signs of a pose's columns.
+_OPENGL = np.array([1.0, -1.0, -1.0, 1.0])
+# Photos over which a walk is smoothed.
+_SMOOTH = 1.5
+# Of a spiral.
+_TURNS = 2.0
 
 
 def path_of(kind: str, cameras: Cameras, depth: float, frames: int) -> Cameras:
-    """A path (1, frames) of a kind of KINDS past `cameras` (1, V).
+    """Return a path (1, frames) of a kind of KINDS past `cameras` (1, V).
 
     depth: of what they show. The intrinsics are those of the first camera.
     """
@@ -39,7 +42,7 @@ def path_of(kind: str, cameras: Cameras, depth: float, frames: int) -> Cameras:
 
 
 def spiral(c2w: Tensor, depth: float, frames: int) -> Tensor:
-    """Poses (frames, 4, 4) that circle the mean of `c2w` (V, 4, 4) and look at one point.
+    """Return poses (frames, 4, 4) that circle the mean of `c2w` (V, 4, 4) and look at one point.
 
     They move to and fro meanwhile, as the spirals of LLFF (Mildenhall et al., 2019) do.
     """
@@ -52,7 +55,7 @@ def spiral(c2w: Tensor, depth: float, frames: int) -> Tensor:
 
 
 def walk(c2w: Tensor, frames: int) -> Tensor:
-    """Poses (frames, 4, 4) along those of photos (V, 4, 4) in their order, smoothed."""
+    """Return poses (frames, 4, 4) along those of photos (V, 4, 4) in their order, smoothed."""
     count = len(c2w)
     times = torch.linspace(0, count - 1, frames).to(c2w)
     gaps = times[:, None] - torch.arange(count).to(c2w)
@@ -62,7 +65,7 @@ def walk(c2w: Tensor, frames: int) -> Tensor:
 
 
 def read_path(file: Path, size: tuple[int, int], fov: float | None) -> tuple[Tensor, Tensor]:
-    """Poses (T, 4, 4) in OpenCV axes and intrinsics (T, 4) in pixels of `size` (H, W), float64.
+    """Read OpenCV poses (T, 4, 4) and intrinsics (T, 4) in pixels of `size` (H, W), float64.
 
     file: a camera path of nerfstudio's viewer, or a transforms file. fov: vertical angle of view in
     degrees instead of the file's. Raises ValueError where it is neither.
@@ -88,18 +91,18 @@ def read_path(file: Path, size: tuple[int, int], fov: float | None) -> tuple[Ten
 
 
 def _keyframe(entry: Mapping[str, Any], size: tuple[int, int]) -> tuple[np.ndarray, float]:
-    """The pose of an entry of a path of nerfstudio's viewer, in OpenCV axes, and fy."""
+    """Return the pose of an entry of a path of nerfstudio's viewer, in OpenCV axes, and fy."""
     pose = np.array(entry["camera_to_world"], np.float64).reshape(4, 4)
     return pose * _OPENGL, _focal(float(entry.get("fov") or 50.0), size[0])
 
 
 def _photo(frame: PhotoFrame, size: tuple[int, int]) -> tuple[np.ndarray, float]:
-    """The pose of a photo of a transforms file and fy at another size."""
+    """Return the pose of a photo of a transforms file and fy at another size."""
     if frame.problems or frame.size is None:
         raise ValueError(f"{frame.name}: {next(iter(frame.problems), 'add its h and w')}")
     return frame.c2w, frame.intrinsics[1] * size[0] / frame.size[0]
 
 
 def _focal(angle: float, height: int) -> float:
-    """In pixels, of a vertical angle of view in degrees."""
+    """Return the focal length in pixels of a vertical angle of view in degrees."""
     return height / 2 / math.tan(math.radians(angle) / 2)

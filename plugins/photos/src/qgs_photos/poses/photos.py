@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +21,16 @@ from qgs.data.photos.reader import image_files
 from qgs.wording import counted, listed
 
 LEAST = 3
-SMALLEST = 64  # pixels of a side
+# Pixels of a side.
+SMALLEST = 64
 _FOREIGN = (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".avif", ".jxl")
+# Kinds that browsers, viewers and COLMAP read; others are written as PNG.
+_PLAIN = ("JPEG", "MPO", "PNG")
 _ORIENTATION, _SUB, _MAKE, _MODEL = 0x0112, 0x8769, 0x010F, 0x0110
-_LENS = (0x920A, 0xA405, 0xA434)  # focal length, its equivalent of 35 mm film, lens
-_JUDGED = 640  # pixels of the longer side at which sharpness is measured
+# Focal length, its equivalent of 35 mm film, lens.
+_LENS = (0x920A, 0xA405, 0xA434)
+# Pixels of the longer side at which sharpness is measured.
+_JUDGED = 640
 _THUMB = (48, 48)
 ALIKE = 1.2
 """Mean difference of thumbnails in 1/255 up to which two photos show the same; noise gives .5."""
@@ -55,27 +61,33 @@ class Photo:
 
 
 def photo_files(folder: Path) -> list[Path]:
-    """The photos in `folder`, or in its `images`, 2 before 10. Raises PosesError below LEAST."""
+    """Return the photos in `folder`, or in its `images`, 2 before 10.
+
+    Raises PosesError below LEAST.
+    """
     found = next((f for f in (folder, folder / "images") if image_files(UPath(f))), folder)
-    files = [file for file in map(Path, map(str, image_files(UPath(found)))) if file.is_file()]
-    foreign = sorted(f.name for f in found.iterdir() if f.suffix.lower() in _FOREIGN)
-    if len(files) < LEAST:
-        text = f"{found} holds {counted(len(files), 'photo')}, and poses need {LEAST} at least"
-        if foreign:
-            text += f"; {listed(foreign, 3)} cannot be read: convert them to JPEG"
-        raise PosesError(text if foreign else f"{text}: take more, from places of your own choice")
-    return sorted(files, key=lambda file: _by_number(file.name))
+    files = [Path(str(file)) for file in image_files(UPath(found)) if file.is_file()]
+    if len(files) >= LEAST:
+        return sorted(files, key=lambda file: _by_number(file.name))
+    text = f"{found} holds {counted(len(files), 'photo')}, and poses need {LEAST} at least"
+    if foreign := _foreign(found):
+        raise PosesError(f"{text}; {listed(foreign, 3)} cannot be read: convert them to JPEG")
+    raise PosesError(f"{text}: take more, from places of your own choice")
 
 
 def _by_number(name: str) -> tuple[str, str]:
-    """Sorts 2 before 10."""
+    """Return a key that sorts 2 before 10."""
     return re.sub(r"\d+", lambda found: found[0].zfill(20), name), name
 
 
-def left_out_formats(files: Sequence[Path]) -> list[str]:
-    """Names of photos beside `files` in formats that are not read."""
-    names = (file.name for file in files[0].parent.iterdir())
+def _foreign(folder: Path) -> list[str]:
+    names = (file.name for file in folder.iterdir())
     return sorted(name for name in names if name.lower().endswith(_FOREIGN))
+
+
+def left_out_formats(files: Sequence[Path]) -> list[str]:
+    """Return names of photos beside `files` in formats that are not read."""
+    return _foreign(files[0].parent)
 
 
 def prepare(
@@ -91,7 +103,8 @@ def prepare(
     ready, in the order of `files`, and of the others name and reason. Names get a number before
     them where they sort differently as text, which COLMAP and readers of its models go by.
     """
-    ready, faulty = list[Photo](), dict[str, str]()
+    ready = list[Photo]()
+    faulty = dict[str, str]()
     names = [file.name for file in files]
     if names != sorted(names):
         digits = len(str(len(names)))
@@ -100,7 +113,8 @@ def prepare(
         try:
             ready.append(_prepared(file, name, kept, working, side))
         except (OSError, ValueError) as error:
-            if isinstance(error, OSError) and error.errno is not None:  # the disk, not the photo
+            # a number of the system's: it is the disk that is at fault, not the photo
+            if isinstance(error, OSError) and error.errno is not None:
                 raise
             faulty[file.name] = str(error)
         progress(number + 1)
@@ -112,68 +126,75 @@ def _prepared(file: Path, name: str, kept: Path, working: Path, side: int) -> Ph
         if min(image.size) < SMALLEST:
             raise ValueError(f"it has {image.width} x {image.height} pixels")
         image.load()
-        turned, kind = orientation(image) != 1, image.format
-        plain = image.mode in ("RGB", "L") and kind in ("JPEG", "MPO", "PNG")
+        turned = orientation(image) != 1
+        stays = image.format in _PLAIN
+        plain = stays and image.mode in ("RGB", "L")
         upright = ImageOps.exif_transpose(image) if turned else image
-        exif, camera = _exif(image)  # last, because it takes the orientation out
+        # last, because it takes the orientation out
+        exif, camera = _exif(image)
     rgb = eight_bits(upright).convert("RGB")
-    name = name if kind in ("JPEG", "MPO", "PNG") else f"{name}.png"
+    name = name if stays else f"{name}.png"
     if plain and not turned:
         _link(file, kept / name)
     else:
         _save(rgb, kept / name, exif)
-    scale = side / max(rgb.size)
+    scale = min(side / max(rgb.size), 1.0)
     if scale < 1 or not plain:
-        width, height = (max(round(extent * min(scale, 1)), 1) for extent in rgb.size)
-        _save(rgb.resize((width, height), Image.Resampling.LANCZOS), working / name, exif)
+        _save(_scaled(rgb, scale, Image.Resampling.LANCZOS), working / name, exif)
     else:
         _link(kept / name, working / name)
     grey = rgb.convert("L")
-    thumb = np.array(grey.resize(_THUMB, Image.Resampling.BOX), np.float32)
-    return Photo(name, (rgb.height, rgb.width), camera, sharpness(grey), thumb)
+    judged = _scaled(grey, _JUDGED / max(grey.size), Image.Resampling.BOX)
+    return Photo(
+        name=name,
+        size=(rgb.height, rgb.width),
+        camera=camera,
+        sharpness=laplacian_variance(np.asarray(judged, np.float32)),
+        thumb=np.array(grey.resize(_THUMB, Image.Resampling.BOX), np.float32),
+    )
+
+
+def _scaled(image: Image.Image, scale: float, filter: Image.Resampling) -> Image.Image:
+    width, height = (max(round(extent * scale), 3) for extent in image.size)
+    return image.resize((width, height), filter)
 
 
 def _exif(image: Image.Image) -> tuple[bytes, str]:
-    """EXIF without the orientation, and what tells one camera, or focal length of it, from another.
+    """Return EXIF without the orientation, and what tells cameras and focal lengths apart.
 
     Both are empty where EXIF is damaged.
     """
     try:
         exif = image.getexif()
-        sub = exif.get_ifd(_SUB)
-        values = [exif.get(tag) for tag in (_MAKE, _MODEL)] + [sub.get(tag) for tag in _LENS]
+        lens = exif.get_ifd(_SUB)
+        values = [exif.get(_MAKE), exif.get(_MODEL), *(lens.get(tag) for tag in _LENS)]
         exif.pop(_ORIENTATION, None)
         return exif.tobytes(), json.dumps([str(value).strip("\0 ") for value in values if value])
-    except Exception:  # Pillow raises anything of it
+    except Exception:
+        # Pillow raises anything of it
         return b"", ""
 
 
 def _save(image: Image.Image, path: Path, exif: bytes) -> None:
-    options = {"quality": 95, "subsampling": 0} if path.suffix.lower() != ".png" else {}
-    kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
-    path.unlink(missing_ok=True)  # an earlier call may have linked the user's own file there
-    image.save(path, kind, exif=exif, **options)
+    # an earlier call may have linked the user's own file there
+    path.unlink(missing_ok=True)
+    if path.suffix.lower() == ".png":
+        image.save(path, "PNG", exif=exif)
+    else:
+        image.save(path, "JPEG", exif=exif, quality=95, subsampling=0)
 
 
 def _link(file: Path, path: Path) -> None:
-    if path.exists():
-        path.unlink()
+    path.unlink(missing_ok=True)
     try:
         os.link(file.resolve(), path)
-    except OSError:  # another file system, or one without links
+    except OSError:
+        # another file system, or one without links
         shutil.copyfile(file, path)
 
 
-def sharpness(grey: Image.Image) -> float:
-    """Variance of the Laplacian of a grey image, at _JUDGED pixels of its longer side."""
-    scale = _JUDGED / max(grey.size)
-    small = (max(round(grey.width * scale), 3), max(round(grey.height * scale), 3))
-    pixels = np.asarray(grey.resize(small, Image.Resampling.BOX), np.float32)
-    return laplacian_variance(pixels)
-
-
 def laplacian_variance(pixels: np.ndarray) -> float:
-    """Of grey pixels (H, W) float32, without the border."""
+    """Return the sharpness of grey pixels (H, W) float32, without the border."""
     inner = pixels[1:-1, 1:-1]
     around = pixels[:-2, 1:-1] + pixels[2:, 1:-1] + pixels[1:-1, :-2] + pixels[1:-1, 2:]
     return float((around - 4 * inner).var())
@@ -193,7 +214,7 @@ def refuse_hopeless(photos: Sequence[Photo], faulty: dict[str, str], what: str) 
             "them. Take sharp ones, in more light, of something with texture"
         )
     first = photos[0].thumb
-    if all(float(np.abs(photo.thumb - first).mean()) < ALIKE for photo in photos[1:]):
+    if all(np.abs(photo.thumb - first).mean() < ALIKE for photo in photos):
         raise PosesError(
             f"all photos of {what} show the same view: walk while you take them, a step between "
             "two photos; turning on the spot gives no depth either"
@@ -201,8 +222,8 @@ def refuse_hopeless(photos: Sequence[Photo], faulty: dict[str, str], what: str) 
 
 
 def camera_groups(photos: Sequence[Photo]) -> list[list[str]]:
-    """Names of the photos that share a camera: of one size, one lens, one focal length."""
-    groups: dict[object, list[str]] = {}
+    """Return names of the photos that share a camera: of one size, one lens, one focal length."""
+    groups = defaultdict[object, list[str]](list)
     for photo in photos:
-        groups.setdefault((photo.size, photo.camera), []).append(photo.name)
+        groups[photo.size, photo.camera].append(photo.name)
     return list(groups.values())

@@ -17,17 +17,23 @@ import pycolmap
 
 from qgs_photos.poses.job import FEATURES, MAPPING, MATCHING, Job
 
-COLMAP: Any = pycolmap  # takes dictionaries for options, which its types do not say
+# Takes dictionaries for options, which its types do not say.
+COLMAP: Any = pycolmap
 
-FEW_FEATURES = 40  # of a photo; fewer give no poses
-FEW_MATCHES = 15  # of two photos, COLMAP's own least number for a pair
-FEW_POINTS = 30  # of a model
+# Of a photo; fewer give no poses.
+FEW_FEATURES = 40
+# Of two photos, COLMAP's own least number for a pair.
+FEW_MATCHES = 15
+# Of a model; photos from one place give models of next to no points.
+FEW_POINTS = 30
 SMALL = {"init_min_tri_angle": 4.0, "init_min_num_inliers": 50}
 """Of the first two photos where COLMAP finds none by its own limits, 16 degrees and 100 points."""
 SMALL_SIDE = 1000
 """Longer side in pixels up to which photos are doubled first, which finds more and takes longer."""
-BETTER = 0.99  # of the error in pixels: what a refined principal point must reach
-FREE_CENTRE = 20  # photos of a camera from which on its principal point is refined
+# Of the error in pixels: what a refined principal point must reach.
+BETTER = 0.99
+# Photos of a camera from which on its principal point is refined.
+FREE_CENTRE = 20
 
 
 def main() -> None:
@@ -44,12 +50,12 @@ def _end_with_parent() -> None:
 
 
 def tell(stage: str, done: int, total: int) -> None:
-    """A line for the process that reads this one's output."""
+    """Print a line for the process that reads this one's output."""
     print(json.dumps({"stage": stage, "done": done, "total": total}), flush=True)
 
 
 def mapped(job: Job) -> Mapping[str, Any]:
-    """Features, matches, poses; the models are in `job.models`/0, 1, ..., the largest in `best`.
+    """Find features, matches, poses; models go to `job.models`/0, 1, ..., the largest to `best`.
 
     Returns "refused" with a word and numbers where there is nothing to go on with, else the names
     of the photos of each model, largest first.
@@ -95,14 +101,14 @@ def mapped(job: Job) -> Mapping[str, Any]:
 
 
 def _camera(database: str, group: Sequence[str]) -> int:
-    """The camera of those of `group` that an interrupted process left; -1 for a new one."""
+    """Return the camera that an interrupted process gave to `group`; -1 for a new one."""
     with COLMAP.Database.open(database) as opened:
         images = opened.read_all_images()
     return next((image.camera_id for image in images if image.name in group), -1)
 
 
 def _features(database: str) -> dict[str, int]:
-    """Photo to number of features."""
+    """Return the number of features by photo."""
     with COLMAP.Database.open(database) as opened:
         return {
             image.name: opened.num_keypoints_for_image(image.image_id)
@@ -111,17 +117,18 @@ def _features(database: str) -> dict[str, int]:
 
 
 def _pairs(database: str) -> int:
-    """How many pairs of photos share FEW_MATCHES features that one motion explains."""
+    """Return how many pairs of photos share FEW_MATCHES features that one motion explains."""
     with COLMAP.Database.open(database) as opened:
         _, counts = opened.read_two_view_geometry_num_inliers()
     return sum(count >= FEW_MATCHES for count in counts)
 
 
 def _models(job: Job, total: int) -> Mapping[str, Any]:
-    done = 2  # the first two come together
+    done = 0
 
     def began() -> None:
         nonlocal done
+        # the first two come together
         done = 2
         tell(MAPPING, done, total)
 
@@ -141,7 +148,6 @@ def _models(job: Job, total: int) -> Mapping[str, Any]:
             initial_image_pair_callback=began,
             next_image_callback=further,
         )
-        # photos from one place give models of next to no points
         solid = [model for model in models.values() if model.num_points3D() >= FEW_POINTS]
         if solid:
             break
@@ -157,7 +163,7 @@ def _models(job: Job, total: int) -> Mapping[str, Any]:
 
 
 def _centred(model: Any, threads: int) -> Any:
-    """`model` with principal points refined, where enough photos share a camera and it fits better.
+    """Refine principal points, where many photos share a camera and it fits better.
 
     COLMAP keeps them in the middle of the image; photos that are cut out of larger ones then turn.
     Long lenses do not show where it is: the error of `mary_rose` (19 degrees) stays the same, and
@@ -174,15 +180,16 @@ def _centred(model: Any, threads: int) -> Any:
     options.ceres.solver_options.num_threads = threads
     moved = COLMAP.Reconstruction(model)
     COLMAP.bundle_adjustment(moved, options)
-    errors = [each.compute_mean_reprojection_error() for each in (model, moved)]
-    return moved if errors[1] < BETTER * errors[0] else model
+    before = model.compute_mean_reprojection_error()
+    return moved if moved.compute_mean_reprojection_error() < BETTER * before else model
 
 
 def _scaled(model: Any, sizes: Mapping[str, tuple[int, int]]) -> Any:
-    """`model` in pixels of the photos of `sizes`, of which COLMAP saw smaller copies."""
+    """Return `model` in pixels of the photos of `sizes`, of which COLMAP saw smaller copies."""
     scales = dict[int, Any]()
     for image in model.images.values():
-        camera, (height, width) = model.cameras[image.camera_id], sizes[image.name]
+        camera = model.cameras[image.camera_id]
+        height, width = sizes[image.name]
         if image.camera_id not in scales:
             scales[image.camera_id] = (width / camera.width, height / camera.height)
             camera.rescale(width, height)

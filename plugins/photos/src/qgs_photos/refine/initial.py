@@ -33,8 +33,10 @@ ENOUGH = 4
 """Photos from which on a start at their pixels is as good as a model's, see docs/refine.md."""
 TIMED = 2048
 """Pixels whose depth is found at least."""
-_SEARCH = 0.15  # part of the time in which models are compared
-_JUDGED = 4  # photos on which they are
+# Part of the time in which models are compared.
+_SEARCH = 0.15
+# Photos on which they are.
+_JUDGED = 4
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,10 @@ from qgs_photos.refine.plain import plain
 from qgs_photos.refine.refining import RefinedScene
 from qgs_photos.refine.scene_photos import ScenePhotos
 
-_SHOWN = 6  # held-out photos in the picture
-_ON_PAGE = 12  # photos on the page
+# Held-out photos in the picture.
+_SHOWN = 6
+# Photos on the page.
+_ON_PAGE = 12
 _SCORES = ("psnr", "ssim", "nearest_input")
 
 PageWriter = Callable[[Gaussians, Views, tuple[float, float, float]], str]

@@ -22,7 +22,8 @@ from qgs_photos.refine.sweeping import swept
 
 END, PART_OF_END = 4.0, 0.03
 """Seconds, and part of the time, kept for scores and files."""
-_LEAST_PART = 0.1  # of the time for the optimisation, however long all else took
+# Of the time for the optimisation, however long all else took.
+_LEAST_PART = 0.1
 SWEEP = 0.12
 """Part of the time in which pixels get a depth."""
 

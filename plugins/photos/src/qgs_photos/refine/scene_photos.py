@@ -23,10 +23,14 @@ STEPS_OF_PHOTO = 25
 DENSITY = 0.6
 """Gaussians over pixels of a photo."""
 MOST_GAUSSIANS = 262_144
-_BYTES = 16  # of memory for each value of a photo, at all its sizes: half of it is kept free
-_OF_PIXELS, _OF_GAUSSIANS = 0.77, 0.3  # exponents of the time of a step, measured on CPUs
-_COARSE = 0.9  # time of a step in the mean over coarse levels, over that of a start at full size
-_SMALL = 128  # shorter side with which a step is timed
+# Of memory for each value of a photo, at all its sizes: half of it is kept free.
+_BYTES = 16
+# Exponents of the time of a step, measured on CPUs.
+_OF_PIXELS, _OF_GAUSSIANS = 0.77, 0.3
+# Time of a step in the mean over coarse levels, over that of a start at full size.
+_COARSE = 0.9
+# Shorter side with which a step is timed.
+_SMALL = 128
 
 
 class ScenePhotos:
