@@ -63,10 +63,12 @@ def read_record(folder: Path) -> Record:
 def _parsed(folder: Path, data: dict[str, Any]) -> Record:
     inputs = [view for view in data["views"] if view["kind"] == "input"]
     compared = [view for view in data["views"] if view["kind"] != "input"]
+    # inputs first, whatever the order in the file: `Record.cameras` promises it
     views = [*inputs, *compared]
     height, width = inputs[0]["size"]
     reference = torch.tensor(data["to_photos"]["reference_c2w"], dtype=torch.float64)
     scale = torch.tensor(data["to_photos"]["scale"], dtype=torch.float64)
+    # of models whose background is their default nothing is recorded
     background = data.get("background")
     options = {"background": tuple(background)} if background else {}
     return Record(

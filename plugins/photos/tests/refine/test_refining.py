@@ -16,8 +16,9 @@ from qgs_photos.refine.refining import Extras, mean_psnr, resized
 from qgs_photos.refine.scene import masked
 from tables import must_refuse
 
+from qgs.containers import map_tensors
 from qgs.renderers import AutoRenderer
-from qgs.types import Cameras, Gaussians, Views, map_tensors
+from qgs.types import Cameras, Gaussians, Views
 
 RENDERER = AutoRenderer(AutoRenderer.Config())
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 from rich.console import Console
@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 app = typer.Typer(no_args_is_help=True, help="Check and pack data sets.")
 
 _ROWS = 40
+
+Quality: TypeAlias = Annotated[
+    int | None,
+    typer.Option(help="Quality of images written anew, as JPEG instead of PNG.", min=1, max=100),
+]
 
 
 @app.command("check")
@@ -93,6 +98,7 @@ def _print(console: Console, result: CheckReport) -> None:
         say(console, str(finding))
     for summary in result.indices:
         say(console, f"index {summary}")
+    # the note on scale is last: it is advice, the others say what was not checked
     for note in (*result.notes, result.auto_scale):
         if note:
             say(console, f"note: {note}")
@@ -126,12 +132,7 @@ def pack(
         tuple[int, int] | None,
         typer.Option(help="Height and width of all images; their own by default.", min=1),
     ] = None,
-    jpeg: Annotated[
-        int | None,
-        typer.Option(
-            help="Quality of images written anew, as JPEG instead of PNG.", min=1, max=100
-        ),
-    ] = None,
+    jpeg: Quality = None,
     chunk_mb: Annotated[int, typer.Option(help="Size of a chunk, in megabytes.", min=1)] = 100,
     test_scenes: Annotated[
         str | None, typer.Option(help="File that names the test scenes: an index, a list.")

@@ -67,6 +67,7 @@ def poses(
         raise ValueError("--frames is for a video: leave it out")
     console = Console()
     options = Options(frames=frames, side=side, matching=matching, features=features, seed=seed)
+    # none given: all cores, as `Options` has them
     if threads:
         options = replace(options, threads=threads)
     made = make_poses(source, out or beside(source), options, console)

@@ -1,7 +1,7 @@
 """`qgs refine`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import typer
 
@@ -10,6 +10,10 @@ from qgs_photos.commands import refuse_filled, refuse_no_time
 from qgs_photos.printing import say
 
 app = typer.Typer(help="Fit a reconstruction to the photos of its scene.")
+
+Count: TypeAlias = Annotated[
+    int | None, typer.Option(min=1, help="Number at the end; default: as many as there are.")
+]
 
 
 @app.command()
@@ -25,9 +29,7 @@ def refine(
         ),
     ] = None,
     seconds: Annotated[float, typer.Option(help="Time of the optimisation.")] = 30.0,
-    gaussians: Annotated[
-        int | None, typer.Option(min=1, help="Number at the end; default: as many as there are.")
-    ] = None,
+    gaussians: Count = None,
     size: Annotated[
         str | None,
         typer.Option(
@@ -46,6 +48,7 @@ def refine(
     result has the same files; both tables show scores before and after. Ctrl-C ends the
     optimisation and writes what there is.
     """
+    # a result is never overwritten: minutes of work are in it
     target = out or reconstruction / "refined"
     refuse_filled(target)
     refuse_no_time("--seconds", seconds)
@@ -53,6 +56,7 @@ def refine(
 
     from rich.console import Console
 
+    # heavy imports wait until the options are known to be right
     from qgs.cli.reconstruct import show
     from qgs.train.distributed import choose_device
     from qgs_photos.refine.reconstruction import opened_reconstruction, refine_reconstruction

@@ -3,7 +3,7 @@
 from enum import StrEnum
 from pathlib import Path
 from time import perf_counter, process_time
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import typer
 
@@ -20,49 +20,58 @@ class Adjustment(StrEnum):
     EXPOSURE = "exposure"
 
 
+Minutes: TypeAlias = Annotated[
+    float, typer.Option(help="Time for everything, from the start to the last file.")
+]
+Model: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        help="Trained model of the start, or none; default: of fewer than four photos the best one "
+        "that is installed, else none."
+    ),
+]
+PhotoSize: TypeAlias = Annotated[
+    str | None,
+    typer.Option(metavar="HxW", help="Size of the photos; default: what the time allows."),
+]
+Count: TypeAlias = Annotated[
+    int | None, typer.Option(min=1, help="How many; default: what the time allows.")
+]
+Seconds: TypeAlias = Annotated[
+    float | None, typer.Option(help="Time of the optimisation alone, in place of --minutes.")
+]
+Holdout: TypeAlias = Annotated[
+    str, typer.Option(help="Judge every n-th photo and optimise on the others, or none.")
+]
+Degree: TypeAlias = Annotated[
+    int, typer.Option(min=0, max=3, help="Harmonics of the colours, which grow with time.")
+]
+Adjust: TypeAlias = Annotated[
+    list[Adjustment] | None,
+    typer.Option(
+        help="Optimise the camera of each photo too, or an affine map of its colours; repeatable."
+    ),
+]
+Masks: TypeAlias = Annotated[
+    bool, typer.Option("--masks", help="What the photos' masks leave out is background.")
+]
+
+
 @app.command()
 def scene(
     photos: Annotated[str, typer.Argument(help="Folder of photos, its URL, or a video.")],
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("scene"),
-    minutes: Annotated[
-        float, typer.Option(help="Time for everything, from the start to the last file.")
-    ] = 5.0,
-    model: Annotated[
-        str | None,
-        typer.Option(
-            help="Trained model of the start, or none; default: of fewer than four photos the best "
-            "one that is installed, else none."
-        ),
-    ] = None,
+    minutes: Minutes = 5.0,
+    model: Model = None,
     frames: Frames = None,
     scale: Scale = None,
-    size: Annotated[
-        str | None,
-        typer.Option(metavar="HxW", help="Size of the photos; default: what the time allows."),
-    ] = None,
-    gaussians: Annotated[
-        int | None, typer.Option(min=1, help="How many; default: what the time allows.")
-    ] = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option(help="Time of the optimisation alone, in place of --minutes."),
-    ] = None,
-    holdout: Annotated[
-        str, typer.Option(help="Judge every n-th photo and optimise on the others, or none.")
-    ] = "8",
-    degree: Annotated[
-        int, typer.Option(min=0, max=3, help="Harmonics of the colours, which grow with time.")
-    ] = 1,
-    adjust: Annotated[
-        list[Adjustment] | None,
-        typer.Option(
-            help="Optimise the camera of each photo too, or an affine map of its colours; "
-            "repeatable."
-        ),
-    ] = None,
-    masks: Annotated[
-        bool, typer.Option("--masks", help="What the photos' masks leave out is background.")
-    ] = False,
+    size: PhotoSize = None,
+    gaussians: Count = None,
+    seconds: Seconds = None,
+    holdout: Holdout = "8",
+    degree: Degree = 1,
+    adjust: Adjust = None,
+    masks: Masks = False,
     scene_name: SceneName = None,
     device: Device = "auto",
 ) -> None:
@@ -74,6 +83,7 @@ def scene(
     """
     # imports took time already
     began = perf_counter() - process_time()
+    # what can be refused is refused before anything heavy is imported
     refuse_filled(out)
     refuse_no_time("--minutes", minutes)
     refuse_no_time("--seconds", seconds)

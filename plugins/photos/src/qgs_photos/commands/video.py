@@ -48,6 +48,7 @@ def video(
     from qgs_photos.poses.film import refuse_suffix
     from qgs_photos.poses.filming import FilmOptions, film, open_film_scene
 
+    # before the scene is opened, which takes seconds
     refuse_existing(out)
     refuse_suffix(out)
     use_threads(threads)

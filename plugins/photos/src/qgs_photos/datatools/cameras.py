@@ -60,6 +60,7 @@ def sharing_findings(
     if len(usable) < 2:
         return
     poses = np.stack([scene.photos[frame].listed.c2w for frame in usable])
+    # exact poses may be close, rounded ones are equal by chance
     near, one_point = _tolerances(poses, float32)
     if np.ptp(poses[:, :3, 3], axis=0).max() <= one_point:
         reason = f"all {len(usable)} cameras stand on one point, so that depth is undetermined"
@@ -88,6 +89,7 @@ def _tolerances(poses: np.ndarray, float32: bool) -> tuple[float, float]:
     distance = np.abs(centres).max()
     extent = np.ptp(centres, axis=0).max()
     precision = max(_SAME if float32 else _DOUBLE, float(np.median(off_rigid)))
+    # far from the origin, as on maps, float32 cannot tell centres apart
     together = _SAME if float32 else min(precision, _FLOAT32)
     return min(distance * precision, extent * _OF_EXTENT), distance * together
 

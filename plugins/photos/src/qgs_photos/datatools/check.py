@@ -1,7 +1,7 @@
 """All scenes of a data set, whatever its format, and its evaluation indices."""
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,7 +12,7 @@ from upath import UPath
 from qgs.data.photos import read_listing, readers
 from qgs.wording import counted, listed
 from qgs_photos.datatools.cameras import camera_findings, sharing_findings
-from qgs_photos.datatools.candidates import Candidate
+from qgs_photos.datatools.candidates import Candidate, Photo
 from qgs_photos.datatools.chunks import chunk_folders
 from qgs_photos.datatools.decoding import DecodedScene, decode, error_text
 from qgs_photos.datatools.files import file_findings, size_findings
@@ -51,6 +51,7 @@ def check(
     data set or an index, MissingExtraError for the format, ValueError for an unknown one.
     """
     _refuse_unknown(options.format)
+    # a listing stands for its folder
     if path.is_file() and path.suffix in (".json", ".npy"):
         path = path.parent
     candidates, general, reported = _candidates(path, options)
@@ -128,6 +129,7 @@ def _scenes_to_judge(count: int, options: Options) -> tuple[set[int], list[str]]
         return set(), ["quick: only headers of images were read, and no pose was judged by photos"]
     if not options.geometry:
         return set(), ["no pose was judged by photos (--geometry 0)"]
+    # over the whole data set: faults come in batches of scenes
     spread = np.linspace(0, max(count - 1, 0), min(options.geometry, count)).round()
     places = {int(place) for place in spread}
     left = f"poses were judged by photos in {len(places)} of {count} scenes; --geometry {count}"
@@ -139,29 +141,21 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
 
     most_photos: that are matched with each other, to judge its cameras.
     """
-    name = candidate.name
-    report = SceneReport(name, candidate.scene, candidate.kind, candidate.split)
+    report = SceneReport(candidate.name, candidate.scene, candidate.kind, candidate.split)
     try:
         photos = candidate.photos()
         missing = candidate.missing()
     except Exception as error:
         # whatever a reader raises; the other scenes go on
-        return replace(report, findings=[_unreadable(name, error)])
-    absent = list[Finding]()
-    if missing:
-        reason = f"listed images that do not exist: {listed(missing, 3)}; later frames move up in"
-        fix = "add the files, or take them out of what lists them"
-        absent.append(Finding(name, f"{reason} an index", fix))
+        return replace(report, findings=[_unreadable(candidate.name, error)])
+    absent = list(_absent(candidate.name, photos, missing))
     if not photos:
-        nothing = Finding(name, "no photos are listed", "export the scene again")
-        return replace(report, findings=absent or [nothing])
+        return replace(report, findings=absent)
     with ThreadPoolExecutor(options.threads) as pool:
         decoded = list(pool.map(partial(decode, headers_only=options.headers_only), photos))
-    scene = DecodedScene(name, photos, decoded)
-    if (there := sum(photo.exists for photo in photos)) < 2:
-        fix = "add photos, or take the scene out"
-        absent.append(Finding(name, f"{there} photos are there, and a scene needs 2", fix))
+    scene = DecodedScene(candidate.name, photos, decoded)
     sizes = list(size_findings(scene))
+    # a wrong size makes intrinsics look wrong, a wrong pose says nothing about shared ones
     poses, others = camera_findings(scene, _frames(sizes))
     faulty_poses = _frames(poses)
     placed = [
@@ -189,7 +183,7 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
         report,
         listed=len(photos) + len(missing),
         decodable=sum(result.size is not None for result in decoded),
-        missing=len(missing) + len(photos) - there,
+        missing=len(missing) + sum(not photo.exists for photo in photos),
         numbered=sum(number is not None for number in scene.numbers),
         pose_problems=len(_frames([*poses, *sharing])),
         frames=tuple(scene.numbers[frame] for frame in drawn),
@@ -197,6 +191,19 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
         geometry=geometry,
         findings=findings,
     )
+
+
+def _absent(name: str, photos: Sequence[Photo], missing: Sequence[str]) -> Iterator[Finding]:
+    """Yield what is wrong with the number of photos."""
+    if missing:
+        names = listed(missing, 3)
+        reason = f"listed images that do not exist: {names}; later frames move up in an index"
+        yield Finding(name, reason, "add the files, or take them out of what lists them")
+    elif not photos:
+        yield Finding(name, "no photos are listed", "export the scene again")
+    if photos and (there := sum(photo.exists for photo in photos)) < 2:
+        reason = f"{there} photos are there, and a scene needs 2"
+        yield Finding(name, reason, "add photos, or take the scene out")
 
 
 def _unreadable(name: str, error: Exception) -> Finding:

@@ -174,6 +174,7 @@ def _entries(file: UPath) -> list[Any]:
 def _photos(file: UPath, place: int) -> list[Photo]:
     record = parse_record(str(file), _entries(file)[place])
     sizes = _listed_sizes(record)
+    # without sizes each image would be opened again to know its own
     judged = record if sizes is None else replace(record, sizes=torch.tensor(sizes))
     return [_photo(file, judged, i, sizes[i] if sizes else None) for i in range(len(record))]
 
@@ -181,6 +182,7 @@ def _photos(file: UPath, place: int) -> list[Photo]:
 def _photo(file: UPath, record: Record, frame: int, size: Size | None) -> Photo:
     try:
         c2w = np.linalg.inv(record.w2c[frame].numpy())
+    # a singular matrix is told as a pose with NaN
     except np.linalg.LinAlgError:
         c2w = np.full((4, 4), np.nan)
     photo = PhotoFrame(

@@ -37,6 +37,7 @@ def detect(picture: np.ndarray) -> Features:
     # kornia's SIFT finds as much, and takes one and a half times as long or more
     sift: Any = SIFT()
     try:
+        # on grey, as SIFT is defined
         sift.detect_and_extract((picture @ _RGB_TO_GREY).astype(np.float32))
     except RuntimeError:
         # an image without any feature, such as a plain wall

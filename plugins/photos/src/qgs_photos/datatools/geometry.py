@@ -67,6 +67,7 @@ def judge_scene(scene: DecodedScene, usable: Sequence[int], most: int) -> Geomet
     if len(usable) < 2:
         return Geometry("fewer than 2 usable frames")
     matcher = _Matcher(scene, [frame for run in _runs(usable, most) for frame in run])
+    # no baseline, no epipolar lines
     if not np.ptp(matcher.centres, axis=0).any():
         return Geometry("all cameras on one point")
     pairs = sorted(matcher.pairs(), key=lambda pair: -pair.distance)
@@ -111,6 +112,7 @@ class _Matcher:
         """Pair each frame with the next, and with the first of its partners that shares enough."""
         found: dict[frozenset[int], Pair | None] = {}
         for start in range(len(self.frames)):
+            # the next shares most and says least; a farther one has a baseline
             partners = list(self.partners(start))
             for group in ([p for p in partners if p == start + 1], partners):
                 for place in group:

@@ -26,6 +26,7 @@ def picture_findings(scene: DecodedScene) -> Iterator[Finding]:
     if black := [frame for frame, result in enumerate(scene.decoded) if result.black]:
         yield scene.finding(black, "the image is black", "replace it, or remove the frame")
     shares = {frame: float(mask.mean()) for frame, mask in _masks(scene).items()}
+    # masks of objects leave most out, those of what moves little
     usual = np.median([share for share in shares.values() if 0 < share < 1] or [1.0])
     for value, color in ((0, "black"), (1, "white")):
         frames = [frame for frame, share in shares.items() if share == value]
@@ -118,6 +119,7 @@ def _leave_out_what_stands(
     ratios = list[float]()
     for pair, values in own:
         share = float(masks[pair.frames[0]].mean())
+        # matches per area: what stands still matches wherever it is
         on_white = values.mean() / share
         on_black = (~values).mean() / (1 - share)
         ratios.append(on_black / max(on_white, 1e-6))

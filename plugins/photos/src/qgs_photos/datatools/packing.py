@@ -172,6 +172,7 @@ def pack(
     Raises FileExistsError for a folder with other content, ValueError and OSError as the scenes do.
     """
     encoding = encoding or Encoding()
+    # chunks of two settings in one folder would be a data set that nobody asked for
     decides = {**settings, **asdict(encoding), "chunk_bytes": chunk_bytes}
     journal = open_journal(folder, decides)
     journal.save()
@@ -198,6 +199,7 @@ def pack(
                 item.unlink()
         for chunk in _chunks(entries(places, frozenset(done)), chunk_bytes):
             file = f"{len(set(done.values())):06d}{SUFFIX}"
+            # first the chunk, then the journal: what it names is whole
             with opened_replacing(inside / file) as opened:
                 torch.save(chunk, opened)
             done.update({entry["key"]: file for entry in chunk})

@@ -96,6 +96,7 @@ def _draw_photo(
     axis: Axes, photo: Picture, points: np.ndarray, lines: HalfLines, chosen: np.ndarray
 ) -> None:
     height, width = photo.shape[:2]
+    # pale, so that dots and lines stand out
     light = (255 - (255 - photo.astype(float)) * 0.6).astype(np.uint8)
     axis.imshow(light, extent=(0, width, height, 0))
     colors = colormaps["turbo"](np.linspace(0.05, 0.95, len(chosen)))

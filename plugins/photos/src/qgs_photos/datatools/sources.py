@@ -62,6 +62,7 @@ def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candid
         raise ValueError(f"{kind} has no option `images`: leave --images out")
     config = source.config_for(str(path), _SIZE, None)
     opened = source(config if images is None else config.model_copy(update={"images": images}))
+    # a scene in both splits is checked once
     known: set[str] = set()
     for split in get_args(Split):
         for place, name in enumerate(opened.names(split)):

@@ -62,6 +62,7 @@ class Log:
 
     def crash(self, code: int) -> str:
         """Return a sentence on a process that ended with `code`."""
+        # glog begins errors by E or F and the date
         errors = [line for line in self.last if re.match("[EF]\\d{8}|.*Error", line)]
         reason = (errors or [*self.last] or ["it logged nothing"])[-1]
         how = f"signal {-code}" if code < 0 else f"exit code {code}"
@@ -76,6 +77,7 @@ def run(job: Job, photos: int, show: Callable[[str, int, int], None]) -> None:
 
     show: called with stage, what is done and what there is.
     """
+    # a failed check of COLMAP ends its process: it must not be that of the command
     process = subprocess.Popen(
         [sys.executable, "-m", "qgs_photos.poses.worker"],
         stdin=subprocess.PIPE,
@@ -96,6 +98,7 @@ def run(job: Job, photos: int, show: Callable[[str, int, int], None]) -> None:
             log.read(line)
             show(log.stage, log.done, log.total)
         process.wait()
+    # whatever ends the loop, Ctrl-C too, must not leave a process behind
     finally:
         process.kill()
         process.wait()

@@ -35,6 +35,7 @@ class Unposed(PhotoReader):
     @classmethod
     def posed(cls, path: UPath) -> UPath | None:
         """Return the folder with the poses of `path`, made if need be, beside it in NAME_poses."""
+        # anything else is left to the readers of listings, whose errors say what it lacks
         is_video = path.suffix.lower() in VIDEOS and path.is_file()
         if is_video or any(map(image_files, (path, path / "images"))):
             return UPath(posed_folder(Path(str(path))))

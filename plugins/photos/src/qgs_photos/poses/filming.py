@@ -103,6 +103,7 @@ def lenses(path: Cameras, size: tuple[int, int], fov: float | None) -> Tensor:
 @torch.no_grad()
 def seen_depth(scene: FilmScene) -> float:
     """Return the median depth of what the first, the middle and the last camera see."""
+    # three views say enough, and each is rendered whole
     count = scene.cameras.shape[1]
     rendered = scene.renderer(scene.gaussians, scene.cameras[:, [0, count // 2, count - 1]])
     depths = rendered.depth[rendered.alpha > 0.5]
@@ -147,6 +148,7 @@ def _in_own_world(gaussians: Gaussians, cameras: Cameras, renderer: Renderer) ->
 def _photo_cameras(photos: str, name: str | None) -> Cameras:
     """Return the cameras (V,) of all photos, at their stored size."""
     sources = installed_sources()
+    # the stored size is known once the scene is open
     scene = named_scene(open_for(photos, None, None, sources)[0], photos, name)
     if stored := scene.stored_size(0):
         scene = named_scene(open_for(photos, stored, None, sources)[0], photos, name)

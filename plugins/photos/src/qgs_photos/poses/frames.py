@@ -94,6 +94,7 @@ def thinned(scores: Mapping[Path, float], most: int) -> list[Path]:
     best = dict[int, Path]()
     for number, path in enumerate(sorted(scores)):
         part = number * most // len(scores)
+        # of equal ones the first
         best[part] = max(best.get(part, path), path, key=scores.__getitem__)
     return list(best.values())
 

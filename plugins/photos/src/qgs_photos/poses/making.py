@@ -198,6 +198,7 @@ def _made(
         shutil.rmtree(out / IMAGES, ignore_errors=True)
         working.mkdir(parents=True)
         write_text(working / "begun.json", json.dumps(begun))
+    # each stage leaves files that the next call of an interrupted one finds
     files, remarks = _files(source, working / "frames", options, stages)
     photos, faulty = _prepared(files, out, options, stages)
     refuse_hopeless(photos, faulty, str(source))
@@ -257,8 +258,10 @@ def _mapped(
     Raises PosesError where it refuses or ends.
     """
     models = out / WORKING / "models"
+    # models are cheap beside features and matches, which are in the database
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir()
+    # neighbours in a video share most; all pairs of 80 photos take a minute
     ordered = video or len(photos) > EXHAUSTIVE
     job = Job(
         images=str(out / WORKING / "small"),
@@ -291,6 +294,7 @@ def apart(models: Sequence[Sequence[str]]) -> list[list[str]]:
     kept = list[list[str]]()
     for names in models:
         left = [name for name in names if name not in taken]
+        # one photo alone is no group that fits each other
         if len(left) > 1:
             kept.append(left)
         taken.update(names)

@@ -57,6 +57,7 @@ def spiral(c2w: Tensor, depth: float, frames: int) -> Tensor:
 def walk(c2w: Tensor, frames: int) -> Tensor:
     """Return poses (frames, 4, 4) along those of photos (V, 4, 4) in their order, smoothed."""
     count = len(c2w)
+    # a mean of poses is none: `look_at` makes one of its axes
     times = torch.linspace(0, count - 1, frames).to(c2w)
     gaps = times[:, None] - torch.arange(count).to(c2w)
     weights = torch.softmax(-0.5 * (gaps / min(_SMOOTH, count / 4)) ** 2, -1)
@@ -85,6 +86,7 @@ def read_path(file: Path, size: tuple[int, int], fov: float | None) -> tuple[Ten
             "nerfstudio's viewer saved, a transforms.json, or one of " + ", ".join(KINDS)
         ) from error
     height, width = size
+    # focal lengths of both axes are the same: paths list one angle
     given = fov and _focal(fov, height)
     lenses = [(given or focal,) * 2 + (width / 2, height / 2) for _, focal in read]
     return torch.from_numpy(poses), torch.tensor(lenses, dtype=torch.float64)

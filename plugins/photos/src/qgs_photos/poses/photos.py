@@ -106,6 +106,7 @@ def prepare(
     ready = list[Photo]()
     faulty = dict[str, str]()
     names = [file.name for file in files]
+    # IMG 10 comes before IMG 2 as text
     if names != sorted(names):
         digits = len(str(len(names)))
         names = [f"{number:0{digits}}_{name}" for number, name in enumerate(names)]
@@ -167,6 +168,7 @@ def _exif(image: Image.Image) -> tuple[bytes, str]:
     try:
         exif = image.getexif()
         lens = exif.get_ifd(_SUB)
+        # another focal length of one phone is another camera
         values = [exif.get(_MAKE), exif.get(_MODEL), *(lens.get(tag) for tag in _LENS)]
         exif.pop(_ORIENTATION, None)
         return exif.tobytes(), json.dumps([str(value).strip("\0 ") for value in values if value])

@@ -55,6 +55,7 @@ class Stages:
             self._stage = stage
             self._began = perf_counter()
             self._task = self._bar.add_task(stage, total=total)
+            # a log has no bars
             if self._bar.disable:
                 self._console.print(f"{stage} ...", highlight=False, markup=False)
         self._bar.update(self._task, completed=done, total=total)

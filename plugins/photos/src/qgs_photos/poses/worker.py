@@ -64,6 +64,7 @@ def mapped(job: Job) -> Mapping[str, Any]:
     names = [name for group in job.groups for name in group]
     tell(FEATURES, 0, len(names))
     for group in job.groups:
+        # octave -1 is twice the size of the photo
         small = max(job.sizes[group[0]]) <= SMALL_SIDE
         sift = {"max_num_features": job.features, "first_octave": -1 if small else 0}
         extraction = {"num_threads": job.threads, "sift": sift}
@@ -90,10 +91,12 @@ def mapped(job: Job) -> Mapping[str, Any]:
     }
     if job.sequential:
         pairing = {"overlap": 10, "quadratic_overlap": True, "loop_detection": False}
+        # loops need a vocabulary file, which would be downloaded
         COLMAP.match_sequential(job.database, pairing_options=pairing, **settings)
     else:
         # blocks of 5 for steps of progress
         COLMAP.match_exhaustive(job.database, pairing_options={"block_size": 5}, **settings)
+    # a model needs three photos, so two pairs
     pairs = _pairs(job.database)
     if pairs < 2:
         return {"refused": "overlap", "pairs": pairs}
@@ -139,6 +142,7 @@ def _models(job: Job, total: int) -> Mapping[str, Any]:
 
     tell(MAPPING, 0, total)
     options = {"num_threads": job.threads, "random_seed": job.seed, "min_model_size": 3}
+    # COLMAP's own limits first: easier ones accept first pairs with little parallax
     for mapper in ({}, SMALL):
         models = COLMAP.incremental_mapping(
             job.database,
@@ -190,6 +194,7 @@ def _scaled(model: Any, sizes: Mapping[str, tuple[int, int]]) -> Any:
     for image in model.images.values():
         camera = model.cameras[image.camera_id]
         height, width = sizes[image.name]
+        # photos share cameras: each is scaled once
         if image.camera_id not in scales:
             scales[image.camera_id] = (width / camera.width, height / camera.height)
             camera.rescale(width, height)

@@ -40,6 +40,7 @@ class Adjustments:
         if "poses" not in self._parts:
             return cameras
         turn, shift = self._parts["poses"][photo].split(3)
+        # small turns: half the axis is the quaternion's vector
         quat = F.normalize(torch.cat([turn.new_ones(1), turn]), dim=0)
         rows = torch.cat([quat_to_matrix(quat), self.size * shift[:, None]], 1)
         move = torch.cat([rows, rows.new_tensor([[0.0, 0, 0, 1]])])

@@ -88,6 +88,7 @@ class FreeGaussians:
         needed = len(dead) + max(count - self.count, 0)
         if not needed:
             return
+        # on the CPU, as the generator is
         weights = torch.where(faint, 0, opacities).cpu()
         parents = torch.multinomial(weights, needed, replacement=True, generator=generator)
         parents = parents.to(opacities.device)
@@ -100,6 +101,7 @@ class FreeGaussians:
             copies = places if name == "means" else old[parents]
             moved, added = copies.tensor_split([len(dead)])
             new = torch.cat([old.index_copy(0, dead, moved), added]).requires_grad_()
+            # Adam knows tensors by identity: moments follow to the new one
             state = self.optimizer.state.pop(old, {})
             for moment in state.keys() & {"exp_avg", "exp_avg_sq"}:
                 kept = state[moment].index_fill(0, restarted, 0)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from qgs.checkpoint.model_file import load
 from qgs.cli.options import scale_settings
+from qgs.containers import concatenated
 from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.data.depth import scene_depth
 from qgs.data.inputs import choose_windows
@@ -22,7 +23,7 @@ from qgs.recipe import resolve
 from qgs.recipe.registry import load_usable_plugins
 from qgs.reconstruction.scale import further_photos
 from qgs.reconstruction.scenes import reconstruct
-from qgs.types import Gaussians, Views, concatenated
+from qgs.types import Gaussians, Views
 from qgs.wording import listed
 from qgs_photos.refine.options import NONE, Options
 from qgs_photos.refine.points import from_points, sparse_points
@@ -104,6 +105,7 @@ def best_model(
         if inputs is None:
             views = resolve(model.recipe or {}).views
             windows = choose_windows(photos.small, views, model.trained_on or Domain())
+            # all models get the same inputs, or scores would compare photos
             inputs, _ = windows[0]
         found.append(_predicted(photos, name, model, inputs, options.scale))
     if len(found) > 1:
@@ -159,6 +161,7 @@ def photos_start(
     """
     parts = list[Gaussians]()
     if isinstance(scene, PhotoScene) and (points := sparse_points(scene.folder)):
+        # COLMAP's points are exact and few; pixels fill what they leave
         parts.append(from_points(points, world, count).to(views.images.device))
     left = min(count - sum(part.count for part in parts), most)
     pixels = max(left, 0 if parts else TIMED)

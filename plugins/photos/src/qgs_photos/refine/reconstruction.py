@@ -58,6 +58,7 @@ def opened_reconstruction(
     model = load(record.model, device)
     recipe = resolve(model.recipe or {})
     wanted = name or record.scene
+    # at the recorded size, so that the scores before are those of the reconstruction
     scene, seen = chosen_scene(recipe, photos, record.cameras.size, wanted)
     # Photos that were named to be compared with are the only ones that stay aside, and with none
     # compared all are refined on; the record does not say so, its frames do.
@@ -169,6 +170,7 @@ def _chosen_frames(
     # compared with all held-out photos, unless the user named some.
     if targets and {*targets} < {*scene.held_out}:
         targets = tuple(sorted({*scene.held_out} - {*inputs}))
+    # inputs are optimised on even where they are held out: the model saw them
     usable = {*inputs} if inputs_only else {*training_frames(scene), *inputs}
     return sorted(usable - {*targets}), targets
 

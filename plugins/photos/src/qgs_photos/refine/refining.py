@@ -181,6 +181,7 @@ class _Run:
         began = perf_counter()
         self.renderer = renderer
         self.wanted = wanted
+        # the curve begins with what was given, before pixels replaced half of it
         self.given = gaussians
         self.seconds = seconds
         self.generator = torch.Generator().manual_seed(0)
@@ -248,6 +249,7 @@ class _Run:
             group["lr"] = self.rates[group["name"]] * last**used
         views = next(views for views, end in self.levels if used < end or end == 1)
         if not self.order:
+            # each photo once before any comes again
             self.order = torch.randperm(self.photos, generator=self.generator).tolist()
         place = self.order.pop()
         photo = views.select([place])
@@ -290,6 +292,7 @@ def partly_swept(
     the swept ones are 0.
     """
     new = int(part * count) if views.images.shape[1] > 1 else 0
+    # faint Gaussians of a model are fog, which hides more than it shows
     kept = gaussians.most_opaque(count - new)
     if not new:
         return kept

@@ -75,8 +75,10 @@ def write_scene(
     began: start of the command, for the total time in metrics.json.
     """
     refined = result.refined
+    # neither .splat files nor the page show harmonics
     shown = plain(refined.gaussians, refined.cameras)
     record = scores(result)
+    # all files or none: a scene without its scores is none
     with replacing_entries(out, "scene.ply") as fresh:
         save_ply(result.in_photos_world(refined.gaussians), fresh / "scene.ply")
         save_splat(result.in_photos_world(shown), fresh / "scene.splat")
@@ -114,6 +116,7 @@ def scores(result: Result) -> dict[str, Any]:
     for place, frame in enumerate(result.photos.held_out):
         photo = result.judged.select([place])
         rgb = result.render(photo)
+        # what no optimisation is needed for
         nearest = nearest_input(result.views, photo.cameras)
         rows.append(
             {

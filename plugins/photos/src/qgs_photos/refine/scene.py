@@ -52,6 +52,7 @@ def make_scene(
     path: str, out: Path, options: Options, began: float, seconds: float, console: Console
 ) -> None:
     """Choose, optimise, judge and write. began, seconds: see `Deadline`."""
+    # its remark comes first, before minutes of bars
     page = page_writer(console)
     deadline = Deadline(began=began, seconds=seconds, optimising=options.seconds)
     photos = ScenePhotos(path, options)
@@ -60,6 +61,7 @@ def make_scene(
     renderer = AutoRenderer(AutoRenderer.Config(background=background))
     small = views_in(start.world, photos.small, photos.frames).to(options.device)
     few, seconds_of_pixel = timed_sweep(small)
+    # on this machine, with these options: exposure and harmonics cost time too
     time = StepTime(
         seconds=seconds_of_step(few, small, renderer, options.extras),
         size=small.cameras.size,
@@ -71,6 +73,7 @@ def make_scene(
     if options.masks:
         every = masked(every, background)
     budget = deadline.left()
+    # what was chosen is printed before the optimisation: an interrupted one can be repeated
     chosen = replace(options, model=start.model, size=size, gaussians=count, seconds=budget)
     if start.model != NONE:
         inputs = ",".join(start.frames)
@@ -127,6 +130,7 @@ def timed_sweep(views: Views) -> tuple[Gaussians, float]:
 
 def backdrop(scene: Scene, frames: Sequence[int]) -> tuple[float, float, float]:
     """Return the median colour at photos' edges: what is there need not be made of Gaussians."""
+    # 16 photos show the background as well as all
     few = frames[:: max(len(frames) // 16, 1)]
     pixels = scene.images(few)
     edges = [pixels[..., 0, :], pixels[..., -1, :], pixels[..., 0], pixels[..., -1]]

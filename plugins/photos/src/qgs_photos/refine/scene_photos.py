@@ -48,6 +48,7 @@ class ScenePhotos:
         self.small = self.at(sized(found, _SMALL))
         self.held_out = judged_frames(found, options.holdout)
         self.frames = tuple(frame for frame in range(len(found)) if frame not in self.held_out)
+        # a model's inputs are chosen among the others
         self.small.held_out = self.held_out
 
     def at(self, size: Size | None) -> Scene:
@@ -72,6 +73,7 @@ def judged_frames(scene: Scene, holdout: str) -> Frames:
 def sized(scene: Scene, side: int) -> Size:
     """Return (H, W) of whole photos with this shorter side, never larger than stored."""
     stored = scene.stored_size(0) or scene.cameras.size
+    # enlarged photos show nothing more and take longer
     factor = min(side / min(stored), 1.0)
     height, width = (max(round(factor * length), 1) for length in stored)
     return height, width
@@ -104,6 +106,7 @@ def affordable(
     for size in _sizes(photos.small, options.size):
         count = options.gaussians or min(round(DENSITY * math.prod(size)), MOST_GAUSSIANS)
         memory = 3 * math.prod(size) * len(photos.frames) * _BYTES
+        # sizes ascend: the first that takes too long ends the search
         if best is not None and (steps * time.at(size, count) > seconds or memory > available):
             break
         best = size, count
