@@ -58,7 +58,8 @@ def forms(names, poses):
 
 def dialects(names, poses):
     """What is read as something that is told."""
-    c2w, w2c = poses.tolist(), np.linalg.inv(poses)
+    c2w = poses.tolist()
+    w2c = np.linalg.inv(poses)
     plain = {"image": names, "c2w": c2w}
     opengl = (poses * [1, -1, -1, 1]).tolist()
     parts = (np.array(K) / [[40], [30], [1]]).tolist()
@@ -96,7 +97,8 @@ def test_what_is_read_and_whether_its_meaning_is_logged(tmp_path, photos, caplog
 
 
 def test_what_is_refused_names_the_file(photos, file):
-    names, c2w = [f.name for f in photos.files], photos.c2w.tolist()
+    names = [f.name for f in photos.files]
+    c2w = photos.c2w.tolist()
     plain = {"image": names, "c2w": c2w}
     for content in (
         rows({"c2w": c2w[:4]}, K=K),

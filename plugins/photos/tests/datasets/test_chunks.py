@@ -141,7 +141,8 @@ def test_legacy_files_are_read_whole(tmp_path):
 
 def test_scenes_travel_to_other_processes_without_open_files(tmp_path):
     data_set(tmp_path)
-    source, scene = opened(tmp_path), first(tmp_path)
+    source = opened(tmp_path)
+    scene = first(tmp_path)
     before = scene.images([1])
     data = pickle.dumps((source, scene))
     assert len(data) < 3000
@@ -257,7 +258,8 @@ def test_names_that_stay_inside():
 
 
 def test_folders_that_are_not_there(tmp_path):
-    absent, empty = tmp_path / "nothing", "holds no chunks.*qgs data pack"
+    absent = tmp_path / "nothing"
+    empty = "holds no chunks.*qgs data pack"
     must_refuse("does not exist", opened, absent, kind=FileNotFoundError)
     must_refuse(empty, opened, tmp_path, kind=FileNotFoundError)
     must_refuse("cannot be opened as a path or URL", opened, "nosuch://bucket")

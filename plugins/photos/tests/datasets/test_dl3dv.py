@@ -163,7 +163,8 @@ def test_test_scenes(tmp_path, caplog):
 
 
 def test_lists_of_scenes(tmp_path):
-    text, listed = UPath(tmp_path / "list.txt"), UPath(tmp_path / "list.json")
+    text = UPath(tmp_path / "list.txt")
+    listed = UPath(tmp_path / "list.json")
     text.write_text("# benchmark\ns1\n\ns2  # hard\ns1\n")
     listed.write_text('["s3"]')
     assert read_scene_list(text) == ["s1", "s2"]
@@ -191,7 +192,8 @@ def test_folders_that_are_not_there(tmp_path):
 
 def test_scenes_travel_to_other_processes_without_open_archives(tmp_path):
     several(tmp_path)
-    source, before = opened(tmp_path), scene(tmp_path)
+    source = opened(tmp_path)
+    before = scene(tmp_path)
     before.images([1])
     source, copy = pickle.loads(pickle.dumps((source, before)))  # noqa: S301
     for again in (copy, source.scenes("train")[0]):

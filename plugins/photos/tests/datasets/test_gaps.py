@@ -37,7 +37,8 @@ def test_the_gap_widens_as_in_pixelsplat():
     """initial + int((final - initial) * step / warm_up_steps), at most the final number."""
     steps = {0: (4, 6), 50: (5, 9), 99: (5, 11), 100: (6, 12), 500: (6, 12), END: (6, 12)}
     for step, bounds in steps.items():
-        gaps, places = set(), set()
+        gaps = set()
+        places = set()
         for seed in range(120):
             (left, right), targets = bounded().draw(Line(30), TWO, seeded(seed), step)
             gaps.add(right - left)
@@ -123,7 +124,8 @@ class Bend(Line):
 
 
 def test_inputs_stand_where_cameras_move():
-    sampler, four = farthest(max_gap=20), ViewsConfig(inputs=4, targets=8)
+    sampler = farthest(max_gap=20)
+    four = ViewsConfig(inputs=4, targets=8)
     assert sampler.draw(Bend(21), four, seeded(), END)[0][1:] == (18, 19, 20)
 
 

@@ -73,7 +73,9 @@ def test_faults_of_cameras(planted):
         "error: frame 3 (images/3.jpg): the camera stands on the same point as that of frame 2 "
         "(images/2.jpg), a zero baseline*"
     )
-    far, far_too, here = planted(), planted(same_point), planted(same_point)
+    far = planted()
+    far_too = planted(same_point)
+    here = planted(same_point)
     for room in (here, far_too):
         room.poses[3, :3, 3] = room.poses[2, :3, 3]
     for room in (far, far_too):

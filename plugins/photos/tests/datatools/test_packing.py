@@ -245,7 +245,8 @@ def command(words):
 
 
 def test_the_command(six, tmp_path):
-    out, small = tmp_path / "out", tmp_path / "small"
+    out = tmp_path / "out"
+    small = tmp_path / "small"
     told = command(f"{tmp_path}/scenes --out {out} --test-every 3 --set holdout=0")
     assert "scenes 4 train, 2 test; 12 images now, 12 kept" in told
     assert packed(out).scenes("train")[0].held_out == ()

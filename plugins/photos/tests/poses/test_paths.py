@@ -110,7 +110,8 @@ def test_size_length_and_angle_of_view():
 
 def test_a_film_shows_the_pictures(tmp_path):
     levels = [20, 60, 100, 140, 180]
-    mp4, webp = tmp_path / "film.mp4", tmp_path / "film.webp"
+    mp4 = tmp_path / "film.mp4"
+    webp = tmp_path / "film.webp"
     for file in (mp4, webp):
         write_film((np.full((31, 48, 3), level, np.uint8) for level in levels), file, 12)
     with av.open(str(mp4)) as container:

@@ -7,7 +7,8 @@ import numpy as np
 from PIL import Image
 from rich.console import Console
 
-SCALE, PHOTOS = 2, 6
+SCALE = 2
+PHOTOS = 6
 """Size of the photos over that of `textured_room`, and how many there are."""
 
 
@@ -31,7 +32,8 @@ def write_video(path, images, rate=10, codec="libx264", times=None, **options):
         for number, image in enumerate(images):
             frame = av.VideoFrame.from_ndarray(image)
             if times:
-                frame.pts, frame.time_base = times[number], Fraction(1, rate)
+                frame.pts = times[number]
+                frame.time_base = Fraction(1, rate)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
     return path

@@ -12,7 +12,8 @@ def coloured():
 
 
 def test_one_photo_is_rendered_as_with_harmonics():
-    gaussians, cameras = coloured(), ring(1, 48)
+    gaussians = coloured()
+    cameras = ring(1, 48)
     found = plain(gaussians, cameras)
     assert found.sh is None
     full, same, flat = (
@@ -23,7 +24,8 @@ def test_one_photo_is_rendered_as_with_harmonics():
 
 
 def test_photos_that_do_not_show_a_gaussian_do_not_count():
-    gaussians, cameras = coloured(), ring(2, 48)
+    gaussians = coloured()
+    cameras = ring(2, 48)
     away = cameras.c2w.clone()
     away[:, 1, :3, [0, 2]] *= -1
     one = plain(gaussians, cameras[:, :1]).colors

@@ -44,7 +44,8 @@ def cloud(number, seed=0):
     normal = torch.randn(1, number, 7, generator=generator)
     even = torch.rand(1, number, 7, generator=generator)
     quats = torch.nn.functional.normalize(normal[..., 3:], dim=-1)
-    scales, opacities = 0.05 + 0.1 * even[..., :3], 0.3 + 0.6 * even[..., 3]
+    scales = 0.05 + 0.1 * even[..., :3]
+    opacities = 0.3 + 0.6 * even[..., 3]
     return Gaussians(0.3 * normal[..., :3], scales, quats, opacities, even[..., 4:])
 
 
@@ -94,7 +95,8 @@ def test_photos_that_are_not_optimised_on_are_met_better(scene):
     assert torch.equal(refined.means, again.gaussians.means)
     assert torch.equal(start.means, before)
     assert result.steps == 100  # the first, in which kernels compile, is not counted; the sweep is
-    first, last = result.curve[0].psnr, result.curve[-1].psnr
+    first = result.curve[0].psnr
+    last = result.curve[-1].psnr
     assert first == pytest.approx(mean_psnr(start, compared, RENDERER), abs=0.3)
     assert last > first + 6
     assert last == pytest.approx(mean_psnr(refined, compared, RENDERER))
@@ -147,7 +149,8 @@ def test_a_coarser_level_shows_the_same_scene():
 
 
 def test_unusable_input_is_refused():
-    views, four = photos(2), cloud(4)
+    views = photos(2)
+    four = cloud(4)
 
     def refined(gaussians=four, given=views, seconds=1, wanted=4):
         refine(gaussians, given, seconds, count=wanted)

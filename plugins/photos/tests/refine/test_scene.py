@@ -68,7 +68,8 @@ def made(command, out):
 
 
 def test_a_scene_is_made_in_seconds_and_can_be_made_again_in_the_photos_world(photos, tmp_path):
-    out, again = tmp_path / "scene", tmp_path / "again"
+    out = tmp_path / "scene"
+    again = tmp_path / "again"
     few = "--minutes 0.003 --size 32x48 --gaussians 300"
     output, record = made(f"scene {photos} {few}", out)
     names = {"scene.ply", "scene.splat", "index.html", "metrics.json", "held_out.png"}
