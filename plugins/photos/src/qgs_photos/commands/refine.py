@@ -56,7 +56,6 @@ def refine(
 
     from rich.console import Console
 
-    # heavy imports wait until the options are known to be right
     from qgs.cli.reconstruct import show
     from qgs.train.distributed import choose_device
     from qgs_photos.refine.reconstruction import opened_reconstruction, refine_reconstruction

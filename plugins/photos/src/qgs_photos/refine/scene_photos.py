@@ -116,7 +116,5 @@ def affordable(
 
 def _sizes(scene: Scene, wanted: Size | None) -> Iterator[Size]:
     """Yield the wanted size, else those of SIZES up to the stored one, ascending."""
-    if wanted is not None:
-        yield wanted
-        return
-    yield from dict.fromkeys(sized(scene, side) for side in SIZES)
+    own = dict.fromkeys(sized(scene, side) for side in SIZES)
+    yield from own if wanted is None else (wanted,)
