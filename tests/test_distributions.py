@@ -11,12 +11,10 @@ def project(folder):
 
 
 def test_all_distributions_are_named_where_everything_is_installed():
-    folders = sorted(path.parent.name for path in ROOT.glob("plugins/*/pyproject.toml"))
-    lines = (ROOT / "plugins/all.txt").read_text().split("\n")
-    assert (
-        sorted(line.removeprefix("-e plugins/") for line in lines if "plugins/" in line) == folders
-    )
-    names = {project(f"plugins/{folder}")["name"] for folder in folders}
+    folders = {path.parent.name for path in ROOT.glob("plugins/*/pyproject.toml")}
+    lines = (ROOT / "plugins/all.txt").read_text().splitlines()
+    assert {f"-e plugins/{folder}" for folder in folders} <= {*lines}
     everything = project(".")["optional-dependencies"]["all"]
-    assert names == {name.split(">")[0] for name in everything if name.startswith("query-")}
-    assert names == {f"query-gaussians-{folder}" for folder in folders}
+    released = {name.split(">")[0] for name in everything if name.startswith("query-")}
+    assert released == {project(f"plugins/{folder}")["name"] for folder in folders}
+    assert released == {f"query-gaussians-{folder}" for folder in folders}
