@@ -31,8 +31,12 @@ class RecipeProblem(Problem):
     cause: Exception | None = field(default=None, compare=False, repr=False)
 
     def __str__(self) -> str:
-        place = f"{Origin(self.file, self.line)}: {self.option or 'recipe'}"
-        return f"{place}\n  why: {self.reason}\n  fix: {self.fix}"
+        return f"{self.place}\n  why: {self.reason}\n  fix: {self.fix}"
+
+    @property
+    def place(self) -> str:
+        """File, line and option."""
+        return f"{Origin(self.file, self.line)}: {self.option or 'recipe'}"
 
 
 class RecipeError(ValueError):
@@ -51,24 +55,30 @@ class RecipeError(ValueError):
 class Problems:
     """Collects problems while a recipe is read, so that all are reported at once.
 
-    what: the kind of file that is read.
+    what: the kind of file that is read. found: the problems, in the order in which they were met.
     """
 
     def __init__(self, what: str = "recipe") -> None:
-        self._what = what
-        self._found: list[RecipeProblem] = []
+        self.what = what
+        self.found: list[RecipeProblem] = []
         self._stopped = False
 
-    def stop(self, origin: Origin, path: str, reason: str, fix: str) -> None:
+    def stop(self, origin: Origin, path: str | Iterable[str], reason: str, fix: str) -> None:
         """Note a mistake that hides part of the recipe: checks of the rest would mislead."""
         self.add(origin, path, reason, fix)
         self._stopped = True
 
     def add(
-        self, origin: Origin, path: str, reason: str, fix: str, cause: Exception | None = None
+        self,
+        origin: Origin,
+        path: str | Iterable[str],
+        reason: str,
+        fix: str,
+        cause: Exception | None = None,
     ) -> None:
-        """Note a mistake and go on."""
-        self._found.append(RecipeProblem(path, reason, fix, origin.file, origin.line, cause))
+        """Note a mistake and go on. path: of the option, with dots or in parts."""
+        option = path if isinstance(path, str) else ".".join(path)
+        self.found.append(RecipeProblem(option, reason, fix, origin.file, origin.line, cause))
 
     def raise_if_stopped(self) -> None:
         """Raise RecipeError if part of the recipe could not be read."""
@@ -77,8 +87,8 @@ class Problems:
 
     def raise_any(self) -> None:
         """Raise RecipeError if anything was found, chained to what plugins raised."""
-        if self._found:
-            error = RecipeError(self._found, self._what)
+        if self.found:
+            error = RecipeError(self.found, self.what)
             causes = [problem.cause for problem in error.problems if problem.cause]
             raise error from (ExceptionGroup("of plugins", causes) if causes else None)
 

@@ -29,24 +29,33 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
     place of an option it is a value, in place of a component or a section it leaves the default, in
     place of a swap it drops the swap.
     """
-    other_type = "type" in over and type_at(base, path) not in (None, type_at(over, path))
-    kinds = [key for key in ("kind", "schedule") if key in over]
-    other_kind = any(base.get(key) not in (None, over[key]) for key in kinds)
-    if other_type or other_kind or (path[:1] == ("swap",) and len(path) == 2):
+    if _replaces(base, over, path):
         return over
     merged = MapNode(over.origin, base.entries())
+    merged.under = base
     for key, value, origin in over.entries():
-        below, old = (*path, key), base.get(key)
+        below = (*path, key)
+        old = base.get(key)
         if path == ("swap",) and value is None and old is not None:
             del merged[key]
             continue
         if below == ("plugins",) and isinstance(old, ListNode) and isinstance(value, ListNode):
-            added = [item for item in zip(value, value.origins, strict=True) if item[0] not in old]
-            value = ListNode(value.origin, [*zip(old, old.origins, strict=True), *added])
+            added = [entry for entry in value.entries() if entry[0] not in old]
+            value = ListNode(value.origin, [*old.entries(), *added])
         elif isinstance(old, MapNode) and isinstance(value, MapNode):
             value = merge(old, value, below)
-        merged[key], merged.origins[key] = value, origin
+        merged.put(key, value, origin)
     return merged
+
+
+def _replaces(base: MapNode, over: MapNode, path: KeyPath) -> bool:
+    """Whether nothing of `base` stays under `over`."""
+    if path[:1] == ("swap",) and len(path) == 2:
+        return True
+    if "type" in over and type_at(base, path) not in (None, type_at(over, path)):
+        return True
+    kinds = [key for key in ("kind", "schedule") if key in over]
+    return any(base.get(key) not in (None, over[key]) for key in kinds)
 
 
 def recipe_folder() -> Path:
@@ -74,11 +83,10 @@ def read_recipe(recipe: str | Path | Mapping[str, Any], problems: Problems) -> M
     files = _Files(problems)
     if not isinstance(recipe, Mapping):
         return files.read(found_recipe(Path(recipe), recipe), (), None)
-    if isinstance(recipe, MapNode):  # which knows where it was written
-        return files.with_bases(recipe, Path(), ())
     origin = Origin("<mapping>")
     try:
-        node = from_plain(recipe, origin)
+        # A study's variant is a mapping that knows where it was written.
+        node = recipe if isinstance(recipe, MapNode) else from_plain(recipe, origin)
     except ValueError as error:
         problems.stop(origin, "", str(error), "give mappings, lists, strings, numbers, bools, None")
         return MapNode(origin)
@@ -88,7 +96,8 @@ def read_recipe(recipe: str | Path | Mapping[str, Any], problems: Problems) -> M
 
 def files_of(recipe: Path) -> list[Path]:
     """A recipe file and all that it extends, each once, links resolved; raises RecipeError."""
-    files = _Files(problems := Problems())
+    problems = Problems()
+    files = _Files(problems)
     files.read(recipe, (), None)
     problems.raise_any()
     return [*files.trees]
@@ -98,7 +107,7 @@ class _Files:
     """Reads the files of one recipe, each once. trees: by resolved path."""
 
     def __init__(self, problems: Problems) -> None:
-        self._problems = problems
+        self.problems = problems
         self.trees: dict[Path, MapNode] = {}
 
     def read(self, file: Path, chain: tuple[Path, ...], extended_at: Origin | None) -> MapNode:
@@ -109,51 +118,60 @@ class _Files:
         place = Path(os.path.realpath(file))
         if place in self.trees:
             return self.trees[place]
+        origin = Origin(str(file))
         try:
             with open_file(file) as opened:
                 text = opened.read().decode("utf-8")
         except UnicodeDecodeError:
-            self._problems.stop(Origin(str(file)), "", "this is no UTF-8 text", "save it as UTF-8")
-            return MapNode(Origin(str(file)))
-        except (OSError, ValueError) as error:  # ValueError: no name that a file can have
-            reason = f"{file} cannot be read: {getattr(error, 'strerror', None) or error}"
-            fix = "check the path, or take one of `qgs recipes`"
-            if isinstance(error, FileNotFoundError):
-                reason = f"{file} does not exist"
-                stems = [path.stem for path in file.parent.glob("*.yaml") if path not in chain]
-                if near := nearest(file.stem, stems):
-                    fix = f"did you mean `{file.parent / near}.yaml`?"
+            self.problems.stop(origin, "", "this is no UTF-8 text", "save it as UTF-8")
+            return MapNode(origin)
+        # ValueError: no name that a file can have.
+        except (OSError, ValueError) as error:
+            reason, fix = _why_unreadable(file, error, chain)
             if extended_at:
                 home = "the file it stands in" if chain else "the working directory"
                 fix += f" (`extends` is relative to {home})"
-            origin, option = extended_at or Origin(str(file)), "extends" if extended_at else ""
-            self._problems.stop(origin, option, reason, fix)
+            option = "extends" if extended_at else ""
+            self.problems.stop(extended_at or origin, option, reason, fix)
             return MapNode(origin)
-        node = load_mapping(text, str(file), self._problems)
+        node = load_mapping(text, str(file), self.problems)
         self.trees[place] = self.with_bases(node, file.parent, (*chain, file))
         return self.trees[place]
 
     def with_bases(self, node: MapNode, folder: Path, chain: tuple[Path, ...]) -> MapNode:
         """`node` laid over the files that it extends, the later ones over the earlier ones."""
-        written, at = node.get("extends"), node.origins.get("extends", node.origin)
+        written = node.get("extends")
+        at = node.origin_of("extends")
         if not isinstance(written, ListNode):
             written = ListNode(at, [] if written is None else [(written, at)])
         layers: list[MapNode] = []
-        for name, origin in zip(written, written.origins, strict=True):
+        for name, origin in written.entries():
             if not isinstance(name, str):
                 reason = "`extends` names one recipe file or a list of them"
                 fix = "write `extends: base.yaml`, relative to this file"
-                self._problems.stop(at, "extends", reason, fix)
+                self.problems.stop(at, "extends", reason, fix)
                 continue
             file = found_recipe(Path(os.path.normpath(folder / name)), name)
-            places = [os.path.realpath(above) for above in chain]
-            if (place := os.path.realpath(file)) in places:
-                circle = " -> ".join(map(str, [*chain[places.index(place) :], file]))
+            above = [os.path.realpath(link) for link in chain]
+            place = os.path.realpath(file)
+            if place in above:
+                circle = " -> ".join(map(str, [*chain[above.index(place) :], file]))
                 reason = f"recipes extend each other in a circle: {circle}"
-                self._problems.stop(origin, "extends", reason, "remove one `extends` of the circle")
+                self.problems.stop(origin, "extends", reason, "remove one `extends` of the circle")
             else:
                 layers.append(self.read(file, chain, origin))
         return reduce(merge, [*layers, node.without("extends")])
+
+
+def _why_unreadable(file: Path, error: Exception, chain: Sequence[Path]) -> tuple[str, str]:
+    """Reason and fix."""
+    if not isinstance(error, FileNotFoundError):
+        why = getattr(error, "strerror", None) or error
+        return f"{file} cannot be read: {why}", "check the path, or take one of `qgs recipes`"
+    neighbours = [path.stem for path in file.parent.glob("*.yaml") if path not in chain]
+    near = nearest(file.stem, neighbours)
+    fix = "check the path, or take one of `qgs recipes`"
+    return f"{file} does not exist", f"did you mean `{file.parent / near}.yaml`?" if near else fix
 
 
 def apply_overrides(tree: MapNode, overrides: Sequence[str], problems: Problems) -> MapNode:
@@ -167,7 +185,7 @@ def apply_overrides(tree: MapNode, overrides: Sequence[str], problems: Problems)
 def _read_override(text: str, origin: Origin, problems: Problems) -> MapNode:
     name, equals, value = text.partition("=")
     name = name.strip()
-    path = name.split(".")
+    path = tuple(name.split("."))
     reason = f"an override cannot set `{name}`"
     if not equals or not all(path) or len(path) > MAX_DEPTH:
         reason = f"{text!r:.100} is no override"
@@ -177,7 +195,7 @@ def _read_override(text: str, origin: Origin, problems: Problems) -> MapNode:
     elif path[0] == "swap" and len(path) > 1:
         fix = "set the option itself, or give all swaps as `swap={PATTERN: {type: NAME}}`"
     else:
-        node: Node = load_text(value, origin.file, problems, 0, tuple(path))
+        node: Node = load_text(value, origin.file, problems, 0, path)
         for key in reversed(path):
             node = MapNode(origin, [(key, node, origin)])
         assert isinstance(node, MapNode)

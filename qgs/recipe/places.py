@@ -28,15 +28,15 @@ class Place:
 
 def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place]:
     """All places of `tree`; a layer's overrides are laid over the decoder's template."""
-    places = [_place(tree, ("model", name)) for name in MODEL_SLOTS]
-    template = [_place(tree, ("model", "decoder", name)) for name in LAYER_SLOTS]
-    places += template
-    layers = tree.child("model", "decoder", "layers")
+    decoder = ("model", "decoder")
+    template = [_place(tree, (*decoder, name)) for name in LAYER_SLOTS]
+    places = [_place(tree, ("model", name)) for name in MODEL_SLOTS] + template
+    layers = tree.child(*decoder, "layers")
     indices = [str(index) for index in range(depth)]
     for key, _, origin in layers.without(*indices).entries():
         reason = f"there is no layer `{key}` in a decoder of depth {depth}"
         fix = f"name layers by their index, 0 to {depth - 1}"
-        problems.add(origin, f"model.decoder.layers.{key}", reason, fix)
+        problems.add(origin, (*decoder, "layers", key), reason, fix)
     for index in indices:
         places += [_layer_place(place, index, layers.child(index)) for place in template]
     for name, section in SECTIONS.items():
@@ -49,21 +49,23 @@ def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place
 
 
 def _place(tree: MapNode, path: KeyPath) -> Place:
-    parent, slot = tree.child(*path[:-1]), slot_at(path)
+    slot = slot_at(path)
     assert slot is not None
-    origin = parent.origins.get(path[-1], parent.origin)
-    return Place(path, path, slot, parent.get(path[-1]), origin)
+    *above, name = path
+    parent = tree.child(*above)
+    return Place(path, path, slot, parent.get(name), parent.origin_of(name))
 
 
 def _layer_place(template: Place, index: str, layer: MapNode) -> Place:
     """The place of one slot in layer `index`. layer: what is written for this layer alone."""
-    name, base = template.path[-1], template.node
+    name = template.path[-1]
     path = ("model", "decoder", "layers", index, name)
     node = layer.get(name)
     if node is None:
         return replace(template, path=path)
-    if isinstance(node, MapNode) and (base is None or isinstance(base, MapNode)):
-        node = merge(MapNode(template.origin) if base is None else base, node, path)
+    base = MapNode(template.origin) if template.node is None else template.node
+    if isinstance(node, MapNode) and isinstance(base, MapNode):
+        node = merge(base, node, path)
     return Place(path, path, template.slot, node, layer.origins[name])
 
 
@@ -80,40 +82,43 @@ def apply_swaps(
     # Swaps of the decoder's template would be lost under the layers made from it.
     swappable = [path for path in places if path[:2] != ("model", "decoder") or len(path) == 5]
     for pattern, node, origin in swaps.entries():
-        name = f"swap.{pattern}"
+        source = ("swap", pattern)
+        hits = [path for path in swappable if _matches(pattern, path)]
         if node is None:
             reason = f"there is no inherited swap `{pattern}` that null could drop"
             fix = "remove this line, or name the pattern as inherited"
-            problems.add(origin, name, reason, fix)
-            continue
-        if not isinstance(node, MapNode) or node.get("type") is None:
+            problems.add(origin, source, reason, fix)
+        elif not isinstance(node, MapNode) or node.get("type") is None:
             reason = f"a swap puts a component, this is {kind_of(node)} without a `type`"
-            problems.add(origin, name, reason, "write `PATTERN: {type: PLUGIN/NAME, ...}`")
-            continue
-        hits = [path for path in swappable if _matches(pattern, path)]
-        if not hits:
+            problems.add(origin, source, reason, "write `PATTERN: {type: PLUGIN/NAME, ...}`")
+        elif not hits:
             reason = f"the pattern `{pattern}` matches no place"
             known = dict.fromkeys(_starred(path).removeprefix("model.") for path in swappable)
             fix = near_pattern(pattern, swappable) or f"places: {', '.join(known)}"
-            problems.add(origin, name, reason, fix)
-        for path in hits:
-            place, shown = result[path], ".".join(path)
-            if place.source[0] == "swap":
-                reason = f"`{shown}` is already swapped by `{place.source[1]}` ({place.origin})"
-                fix = "narrow one of the two patterns, or remove one"
-            elif "layers" in place.source:
-                reason = f"`{shown}` is already set for this layer at {place.origin}"
-                fix = f"narrow the pattern, or remove `{shown}` (null removes an inherited one)"
-            else:
-                result[path] = replace(place, source=("swap", pattern), node=node, origin=origin)
-                continue
-            problems.add(origin, name, reason, fix)
-            break
+            problems.add(origin, source, reason, fix)
+        elif conflict := next(filter(None, (_conflict(result[path]) for path in hits)), None):
+            problems.add(origin, source, *conflict)
+        else:
+            swapped = {"source": source, "node": node, "origin": origin}
+            result |= {path: replace(result[path], **swapped) for path in hits}
     return result
 
 
+def _conflict(place: Place) -> tuple[str, str] | None:
+    """Reason and fix where `place` cannot be swapped (again)."""
+    shown = ".".join(place.path)
+    if place.source[0] == "swap":
+        reason = f"`{shown}` is already swapped by `{place.source[1]}` ({place.origin})"
+        return reason, "narrow one of the two patterns, or remove one"
+    if "layers" in place.source:
+        reason = f"`{shown}` is already set for this layer at {place.origin}"
+        return reason, f"narrow the pattern, or remove `{shown}` (null removes an inherited one)"
+    return None
+
+
 def _matches(pattern: str, path: KeyPath) -> bool:
-    parts = tuple(pattern.split("."))
+    parts = pattern.split(".")
+    # `model.` may be left out, so `*.renderer` is no place of the model.
     shown = path[1:] if path[0] == "model" and parts[0] != "model" else path
     return len(parts) == len(shown) and all(map(fnmatchcase, shown, parts))
 
@@ -124,8 +129,8 @@ def near_pattern(pattern: str, paths: Iterable[KeyPath]) -> str:
     Layers are compared as one: of hundreds, each has the same names.
     """
     names = {".".join(path).removeprefix("model.") for path in paths}
-    given = tuple(pattern.removeprefix("model.").split("."))
-    near = nearest(_starred(given), {_starred(tuple(name.split("."))) for name in names})
+    given = pattern.removeprefix("model.").split(".")
+    near = nearest(_starred(given), {_starred(name.split(".")) for name in names})
     if not near:
         return ""
     pairs = zip(near.split("."), given, strict=False)
@@ -133,5 +138,5 @@ def near_pattern(pattern: str, paths: Iterable[KeyPath]) -> str:
     return f"did you mean `{at_layers if at_layers in names else near}`?"
 
 
-def _starred(path: KeyPath) -> str:
+def _starred(path: Iterable[str]) -> str:
     return ".".join("*" if x.isdigit() else x for x in path)

@@ -12,29 +12,44 @@ from qgs.recipe.errors import Origin, Problems
 
 KeyPath: TypeAlias = tuple[str, ...]
 
-MAX_DEPTH, MAX_NODES = 64, 20_000
-"""Limits of a tree, aliases written out: a few lines of aliases can stand for billions of nodes."""
+# A few lines of aliases can stand for billions of nodes: limits hold for the tree written out.
+MAX_DEPTH = 64
+MAX_NODES = 20_000
 
 _STANDARD = "tag:yaml.org,2002:"
-_TAGS = {_STANDARD + name for name in ("null", "bool", "int", "float", "str", "map", "seq")}
-_RESOLVERS = (
-    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
-    ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
-    ("int", r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+", "-+0123456789"),
-    ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", "-+.0123456789"),
-    ("float", r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", "-+."),
-)
+# YAML 1.1, which PyYAML reads, takes `off` for false, 1_000 and 1:30 for numbers, 017 for 15.
+_SCALARS = {
+    "null": r"~|null|Null|NULL|",
+    "bool": r"true|True|TRUE|false|False|FALSE",
+    "int": r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+",
+    "float": r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+}
+"""How YAML 1.2 writes scalars without quotes that are no strings."""
+_RESOLVERS: dict[str | None, list[tuple[str, re.Pattern[str]]]] = {
+    None: [(_STANDARD + kind, re.compile(rf"({text})\Z")) for kind, text in _SCALARS.items()]
+}
+_TAGS = {_STANDARD + kind for kind in (*_SCALARS, "str", "map", "seq")}
 
 
 class MapNode(dict[str, Any]):
-    """A mapping. origin: where it begins. origins: where each key was written."""
+    """A mapping. origin: where it begins. origins: where each key was written.
+
+    under: of what `qgs.recipe.files.merge` made, the mapping that it was laid over.
+    """
 
     def __init__(self, origin: Origin, items: Iterable[tuple[str, Any, Origin]] = ()) -> None:
         super().__init__()
         self.origin = origin
         self.origins: dict[str, Origin] = {}
-        for key, value, place in items:
-            self[key], self.origins[key] = value, place
+        self.under: MapNode | None = None
+        for key, value, written in items:
+            self.put(key, value, written)
+
+    def put(self, key: str, value: Any, origin: Origin) -> None:
+        """Set `key`, which is written at `origin`."""
+        self[key] = value
+        self.origins[key] = origin
 
     def entries(self) -> list[tuple[str, Any, Origin]]:
         """Keys and values, and where each key was written."""
@@ -48,19 +63,30 @@ class MapNode(dict[str, Any]):
         """The mapping at `path`, an empty one where there is none."""
         found = self
         for key in path:
+            empty = MapNode(found.origin_of(key))
             value = found.get(key)
-            empty = MapNode(found.origins.get(key, found.origin))
             found = value if isinstance(value, MapNode) else empty
         return found
+
+    def origin_of(self, *keys: str) -> Origin:
+        """Where the first of `keys` that is there was written, else where the mapping begins."""
+        return next((self.origins[key] for key in keys if key in self.origins), self.origin)
 
 
 class ListNode(list[Any]):
     """A list. origin: where it begins. origins: where each item was written."""
 
     def __init__(self, origin: Origin, items: Iterable[tuple[Any, Origin]] = ()) -> None:
-        items = list(items)
-        super().__init__(value for value, _ in items)
-        self.origin, self.origins = origin, [place for _, place in items]
+        super().__init__()
+        self.origin = origin
+        self.origins: list[Origin] = []
+        for value, written in items:
+            self.append(value)
+            self.origins.append(written)
+
+    def entries(self) -> list[tuple[Any, Origin]]:
+        """Items, and where each was written."""
+        return [*zip(self, self.origins, strict=True)]
 
 
 Node: TypeAlias = MapNode | ListNode | str | int | float | None
@@ -74,12 +100,15 @@ def from_plain(value: Any, origin: Origin, path: KeyPath = ()) -> Node:
     if len(path) > MAX_DEPTH:
         raise ValueError(f"more than {MAX_DEPTH} levels, or a value that contains itself")
     if isinstance(value, Mapping):
-        entries = ((str(k), from_plain(x, origin, (*path, str(k)))) for k, x in value.items())
-        return MapNode(origin, ((key, item, origin) for key, item in entries))
-    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        items = (from_plain(x, origin, (*path, str(i))) for i, x in enumerate(value))
-        return ListNode(origin, ((item, origin) for item in items))
-    value = os.fspath(value) if isinstance(value, os.PathLike) else value
+        named = [(str(key), item) for key, item in value.items()]
+        entries = [(key, from_plain(item, origin, (*path, key)), origin) for key, item in named]
+        return MapNode(origin, entries)
+    if isinstance(value, list | tuple):
+        numbered = enumerate(value)
+        items = [(from_plain(item, origin, (*path, str(n))), origin) for n, item in numbered]
+        return ListNode(origin, items)
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
     if value is None or isinstance(value, str | bool | int | float):
         return value
     raise ValueError(f"`{'.'.join(path)}` is a {type(value).__name__}, which no recipe holds")
@@ -90,22 +119,26 @@ def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Ori
 
     Returns the steps taken, where the last one was written, and the value found.
     """
-    taken, origin, node = list[str | int](), tree.origin, cast("Any", tree)
+    taken = list[str | int]()
+    origin = tree.origin
+    node = cast("Any", tree)
     for step in path:
-        if isinstance(node, MapNode) and str(step) in node:
-            origin, node = node.origins[str(step)], node[str(step)]
-        elif isinstance(node, ListNode) and isinstance(step, int) and step < len(node):
-            origin, node = node.origins[step], node[step]
-        else:
-            continue
-        taken.append(step)
+        key: Any = str(step) if isinstance(node, MapNode) else step
+        inside = isinstance(node, MapNode) and key in node
+        inside |= isinstance(node, ListNode) and isinstance(step, int) and step < len(node)
+        if inside:
+            origin = node.origins[key]
+            node = node[key]
+            taken.append(step)
     return taken, origin, node
 
 
 def kind_of(value: Any) -> str:
     """The kind of a node's value, for messages."""
-    if isinstance(value, dict | list):
-        return "a mapping" if isinstance(value, dict) else "a list"
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, list):
+        return "a list"
     if value is None:
         return "nothing (null)"
     if isinstance(value, bool):
@@ -114,25 +147,19 @@ def kind_of(value: Any) -> str:
 
 
 class Yaml12Loader(yaml.SafeLoader):
-    """Composes nodes with YAML 1.2 tags; `_scalar_value` reads their values."""
+    """Composes nodes with YAML 1.2 tags; `_scalar` reads their values."""
 
-    yaml_implicit_resolvers: dict = {}  # noqa: RUF012
+    yaml_implicit_resolvers = _RESOLVERS
 
 
 class Yaml12Dumper(yaml.SafeDumper):
     """Quotes exactly the strings that Yaml12Loader would not read as strings."""
 
-    yaml_implicit_resolvers: dict = {}  # noqa: RUF012
+    yaml_implicit_resolvers = _RESOLVERS
 
     def ignore_aliases(self, data: Any) -> bool:
         """Write repeated values out."""
         return True
-
-
-for _kind, _pattern, _first in _RESOLVERS:
-    for _class in (Yaml12Loader, Yaml12Dumper):
-        _full = re.compile(f"^(?:{_pattern})$")
-        _class.add_implicit_resolver(_STANDARD + _kind, _full, list(_first))
 
 
 def dump(value: Any, *, flow: bool | None = False) -> str:
@@ -167,36 +194,45 @@ def load_text(
 
     line: given to every node in place of its own line. path: where the text belongs.
     """
-    number = 1
     try:
         root = _composed(text)
         return None if root is None else _Reader(file, problems, line).read(root, path)
-    except yaml.reader.ReaderError as error:
-        number += text.count("\n", 0, error.position)
-        reason, fix = f"the character {chr(error.character)!r} is not allowed in YAML", "remove it"
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        number += mark.line if mark else 0
-        written = "".join(text.splitlines()[number - 1 : number])
-        if "\t" in written[: len(written) - len(written.lstrip())] or "'\\t'" in str(error):
-            reason, fix = "a tab stands where YAML wants spaces", "indent with spaces"
-        else:
-            reason = f"this is no valid YAML: {error.problem}"
-            fix = "correct the line; check indentation, brackets, quotes and `: ` before it"
-    except RecursionError:  # raised while PyYAML composes, before the reader counts levels
-        reason, fix = "mappings or lists are nested too deep", "write the recipe flatter"
-    problems.stop(Origin(file, number if line is None else line), ".".join(path), reason, fix)
+    except (yaml.YAMLError, RecursionError) as error:
+        number, reason, fix = _syntax_fault(text, error)
+    problems.stop(Origin(file, number if line is None else line), path, reason, fix)
     return MapNode(Origin(file, number))
 
 
-_composed = lru_cache(maxsize=128)(partial(yaml.compose, Loader=Yaml12Loader))  # parses bases once
+# The variants of a study extend the same files over and over.
+_composed = lru_cache(maxsize=128)(partial(yaml.compose, Loader=Yaml12Loader))
+
+
+def _syntax_fault(text: str, error: yaml.YAMLError | RecursionError) -> tuple[int, str, str]:
+    """The line at which `text` is no YAML, the reason and a fix."""
+    if isinstance(error, yaml.reader.ReaderError):
+        line = 1 + text.count("\n", 0, error.position)
+        return line, f"the character {chr(error.character)!r} is not allowed in YAML", "remove it"
+    if not isinstance(error, yaml.MarkedYAMLError):
+        # Python's stack ends while PyYAML composes, before `_Reader` counts levels.
+        return 1, "mappings or lists are nested too deep", "write the recipe flatter"
+    mark = error.problem_mark or error.context_mark
+    line = 1 + (mark.line if mark else 0)
+    written = "".join(text.splitlines()[line - 1 : line])
+    indentation = written[: len(written) - len(written.lstrip())]
+    if "\t" in indentation or "'\\t'" in str(error):
+        return line, "a tab stands where YAML wants spaces", "indent with spaces"
+    fix = "correct the line; check indentation, brackets, quotes and `: ` before it"
+    return line, f"this is no valid YAML: {error.problem}", fix
 
 
 class _Reader:
     """Turns PyYAML's nodes into ours. line: see `load_text`."""
 
     def __init__(self, file: str, problems: Problems, line: int | None) -> None:
-        self.file, self.problems, self.line, self.count = file, problems, line, 0
+        self.file = file
+        self.problems = problems
+        self.line = line
+        self.count = 0
 
     def origin(self, node: yaml.Node) -> Origin:
         return Origin(self.file, node.start_mark.line + 1 if self.line is None else self.line)
@@ -206,54 +242,59 @@ class _Reader:
         if len(path) > MAX_DEPTH or self.count > MAX_NODES:
             what = f"more than {MAX_DEPTH} levels or {MAX_NODES:,} values, aliases written out"
             raise yaml.MarkedYAMLError(problem=what, problem_mark=node.start_mark)
+        origin = self.origin(node)
         if node.tag not in _TAGS:
             reason = f"the tag {node.tag!r} is not allowed in a recipe"
             fix = "remove the tag; components are named with `type`"
-            return self.problems.stop(self.origin(node), ".".join(path), reason, fix)
+            return self.problems.stop(origin, path, reason, fix)
         if isinstance(node, yaml.MappingNode):
             return self.read_mapping(node, path)
         if isinstance(node, yaml.SequenceNode):
-            items = enumerate(node.value)
-            read = ((self.read(x, (*path, str(i))), self.origin(x)) for i, x in items)
-            return ListNode(self.origin(node), read)
+            numbered = enumerate(node.value)
+            items = ((self.read(x, (*path, str(n))), self.origin(x)) for n, x in numbered)
+            return ListNode(origin, items)
+        kind = node.tag.removeprefix(_STANDARD)
         try:
-            return _scalar_value(node.tag, node.value)
+            return _scalar(kind, node.value)
         except ValueError:
-            reason = f"{node.value!r:.100} is no {node.tag.removeprefix(_STANDARD)} of 64 bits"
-            return self.problems.stop(self.origin(node), ".".join(path), reason, "correct it")
+            reason = f"{node.value!r:.100} is no {kind} of 64 bits"
+            return self.problems.stop(origin, path, reason, "correct it")
 
     def read_mapping(self, node: yaml.MappingNode, path: KeyPath) -> MapNode:
-        read: dict[str, tuple[str, Node, Origin]] = {}
+        read = MapNode(self.origin(node))
         for key_node, value_node in node.value:
-            key, origin, reason = key_node.value, self.origin(key_node), ""
+            key = key_node.value
+            origin = self.origin(key_node)
+            below = (*path, key)
             if not isinstance(key_node, yaml.ScalarNode):
-                key, reason, fix = "", "a key is a mapping or a list", "use a plain word as the key"
+                below = path
+                reason = "a key is a mapping or a list"
+                fix = "use a plain word as the key"
             elif key == "<<" and key_node.style is None:
                 reason = "merge keys (`<<`) are not part of YAML 1.2"
                 fix = "write the keys out, or share them between files with `extends`"
             elif key in read:
-                reason = f"the key `{key}` is already given at {read[key][2]}"
+                reason = f"the key `{key}` is already given at {read.origins[key]}"
                 fix = "keep one of the two"
-            if reason:
-                place = ".".join((*path, key)).removesuffix(".")
-                self.problems.add(origin, place, reason, fix)
             else:
-                read[key] = (key, self.read(value_node, (*path, key)), origin)
-        return MapNode(self.origin(node), read.values())
+                read.put(key, self.read(value_node, below), origin)
+                continue
+            self.problems.add(origin, below, reason, fix)
+        return read
 
 
-def _scalar_value(tag: str, text: str) -> Any:
-    """The value of a scalar of a resolved `tag`; raises ValueError for a text that has none."""
-    kind = tag.removeprefix(_STANDARD)
+def _scalar(kind: str, text: str) -> Any:
+    """The value of a scalar; raises ValueError for a text that is none of this kind."""
     if kind == "null":
         return None
     if kind == "bool":
         return text.lower() == "true"
     if kind == "int":
         value = int(text, {"0o": 8, "0x": 16}.get(text[:2], 10))
-        if abs(value) >= 2**63:  # torch could not hold it
+        # Seeds and sizes go to torch, which holds 64 bits.
+        if abs(value) >= 2**63:
             raise ValueError
         return value
     if kind == "float":
-        return float(re.sub(r"\.(inf|nan)$", r"\1", text, flags=re.IGNORECASE))
+        return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
     return text
