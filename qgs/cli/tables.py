@@ -13,7 +13,7 @@ from qgs.contracts import LAYER_SLOTS
 from qgs.model import QueryGaussianModel
 from qgs.model_text import parameter_counts
 from qgs.recipe import Recipe
-from qgs.recipe.decode import SETTINGS
+from qgs.recipe.sections import SETTINGS
 from qgs.recipe.errors import did_you_mean
 from qgs.recipe.registry import Registry, default_config
 from qgs.recipe.schema import recipe_schema

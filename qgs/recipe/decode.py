@@ -1,4 +1,4 @@
-"""From what is written to settings of sections, and to component classes and their Configs."""
+"""From what is written at a place to a component class and its Config."""
 
 from __future__ import annotations
 
@@ -6,82 +6,22 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar, get_args, get_origin
+from typing import Any, TypeAlias, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails, PydanticUndefinedType, to_jsonable_python
 
-from qgs.contracts import (
-    LAYER_SLOTS,
-    Component,
-    ComponentConfig,
-    EvaluationConfig,
-    OptionError,
-    TrainingConfig,
-    ViewsConfig,
-)
+from qgs.contracts import Component, ComponentConfig, OptionError
 from qgs.contracts.schedule import Schedule, at_step, number_kinds
-from qgs.recipe.errors import Problems, did_you_mean, nearest
+from qgs.recipe.errors import Origin, Problems, did_you_mean, nearest
 from qgs.recipe.places import Place
 from qgs.recipe.registry import InstalledPlugin, Registry, available_plugins, component_failure
-from qgs.recipe.slots import MODEL_SLOTS, SECTIONS, SLOTS, type_at
+from qgs.recipe.slots import SLOTS, type_at
 from qgs.recipe.yaml_text import KeyPath, ListNode, MapNode, find, inline, kind_of
 from qgs.tokengs.schedules import SCHEDULES
 
 ConfigT = TypeVar("ConfigT", bound=ComponentConfig)
 _BOOLS = {"on": "true", "yes": "true", "y": "true", "off": "false", "no": "false", "n": "false"}
-
-
-class ModelSettings(ComponentConfig):
-    """The model: sizes that all of its components share."""
-
-    width: int = Field(default=1024, ge=1, le=65_536)
-    """Features of a token and of a query (D in the papers)."""
-    heads: int = Field(default=16, ge=1)
-    """Attention heads (h in the papers), a divisor of the width."""
-
-
-class DecoderSettings(ComponentConfig):
-    """The decoder, but for the components of its layers."""
-
-    depth: int = Field(default=12, ge=0, le=256)
-    """Number of layers (L in the papers); 0 decodes the queries as they start."""
-    layer_scale: float = Field(default=5e-5, gt=0)
-    """Initial LayerScale of every sublayer (TokenGS release)."""
-
-
-class RecipeSettings(ComponentConfig):
-    """Settings at the top of a recipe."""
-
-    recipe: int = Field(ge=1, le=1)
-    """Version of the recipe format."""
-    seed: int = Field(default=0, ge=0, lt=2**63)
-    """Of the model's initial parameters and of training."""
-    init_from: str | None = None
-    """Checkpoint whose weights training starts from, its queries made as many as this recipe has
-    (LocusGS release: finetuning); null to start from the initial parameters."""
-
-
-SETTINGS: dict[KeyPath, type[ComponentConfig]] = {
-    (): RecipeSettings,
-    ("model",): ModelSettings,
-    ("model", "decoder"): DecoderSettings,
-    ("views",): ViewsConfig,
-    ("training",): TrainingConfig,
-    ("evaluation",): EvaluationConfig,
-}
-_BESIDE: dict[KeyPath, tuple[str, ...]] = {
-    (): ("plugins", "swap", "model", *SECTIONS, "views", "training", "evaluation"),
-    ("model",): (*MODEL_SLOTS, "decoder"),
-    ("model", "decoder"): (*LAYER_SLOTS, "layers"),
-}
-"""Keys that stand beside the settings of a section."""
-_KEYS = {path: {*SETTINGS[path].model_fields, *keys} for path, keys in _BESIDE.items()}
-_LAYERS: KeyPath = ("model", "decoder", "layers")
-_MAPPINGS: set[KeyPath] = {
-    *(("swap",), _LAYERS, *SETTINGS),
-    *((name,) for name, section in SECTIONS.items() if section.named),
-}
 
 
 @dataclass(frozen=True)
@@ -104,6 +44,10 @@ class Chosen:
         written = {name: s.model_dump(mode="json") for name, s in self.schedules.items()}
         return self.config.model_dump(mode="json") | written
 
+    def equals(self, other: Chosen | None) -> bool:
+        """Whether `other` is the same component with the same options."""
+        return other is not None and self.type == other.type and self.options == other.options
+
     @property
     def later(self) -> list[ComponentConfig]:
         """The options at the extremes of the schedules, but for the first."""
@@ -115,35 +59,45 @@ class Chosen:
         return ".".join(self.place.source)
 
     @property
+    def node(self) -> MapNode:
+        """What is written at its place; empty where that is nothing."""
+        node = self.place.node
+        return node if isinstance(node, MapNode) else MapNode(self.place.origin)
+
+    @property
     def chosen_at(self) -> str:
         """Where its `type` is written."""
-        node = self.place.node
-        origin = node.origins.get("type") if isinstance(node, MapNode) else None
-        return str(origin) if origin else "default of the slot"
+        return str(self.node.origins.get("type", "default of the slot"))
+
+
+Parts: TypeAlias = Mapping[KeyPath, Chosen | None]
+"""What stands at each place; None for a component that could not be decoded."""
 
 
 def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen | None:
     """The component of a place; None, with a problem, where there is none to be had."""
-    path = ".".join(place.source)
     node = MapNode(place.origin) if place.node is None else place.node
     if not isinstance(node, MapNode):
         reason = f"a component is a mapping, this is {kind_of(node)}"
-        problems.add(place.origin, path, reason, "write `{type: PLUGIN/NAME, option: value}`")
+        fix = "write `{type: PLUGIN/NAME, option: value}`"
+        problems.add(place.origin, place.source, reason, fix)
         return None
     name = type_at(node, place.path)
     origin = node.origins.get("type", place.origin)
-    component = registry.components(place.slot.name).get(name) if isinstance(name, str) else None
+    plugin = name.partition("/")[0] if isinstance(name, str) else ""
+    component = registry.components(place.slot.name).get(name) if plugin else None
     if component is None:
-        plugin = name.partition("/")[0] if isinstance(name, str) else ""
-        if plugin not in registry.unusable:  # else the plugin has been reported already
-            problems.add(origin, f"{path}.type", *_why_no_component(name, place, registry))
+        # What comes from a plugin that cannot be used has been reported with the plugin.
+        if plugin not in registry.unusable:
+            reason, fix = _why_no_component(name, place, registry)
+            problems.add(origin, (*place.source, "type"), reason, fix)
         return None
-    installed = registry.plugins[name.partition("/")[0]]
+    installed = registry.plugins[plugin]
     try:
         found = _decode_options(component, name, node.without("type"), place.source, problems)
     except Exception as error:
         failure = component_failure(name, "Config", error, installed)
-        problems.add(origin, path, failure.reason, failure.fix, error)
+        problems.add(origin, place.source, failure.reason, failure.fix, error)
         return None
     if found is None:
         return None
@@ -155,37 +109,46 @@ def _decode_options(
     component: type[Component], name: str, node: MapNode, path: KeyPath, problems: Problems
 ) -> tuple[ComponentConfig, dict[str, Schedule]] | None:
     """The first options and the schedules of the rest, all of whose extremes are within limits."""
-    schedules, fields, valid = dict[str, Schedule](), component.Config.model_fields, True
+    fields = component.Config.model_fields
+    schedules = dict[str, Schedule | None]()
     for option, value, origin in node.entries():
         number = option in fields and number_kinds(fields[option].annotation)
-        if not number or not isinstance(value, MapNode):
-            continue
-        below, schedule = (*path, option), None
-        kind = str(value.get("schedule", ""))
-        if option not in component.scheduled:
+        if number and isinstance(value, MapNode) and option in component.scheduled:
+            schedules[option] = _decode_schedule(value, origin, (*path, option), problems)
+        elif number and isinstance(value, MapNode):
             reason = f"`{option}` of `{name}` takes no schedule: it is fixed in training"
-            can = f"options that can: {', '.join(sorted(component.scheduled)) or 'none'}"
-            problems.add(origin, ".".join(below), reason, f"give one number ({can})")
-        elif kind in SCHEDULES:
-            schedule = decode_config(SCHEDULES[kind], value, below, problems)
-        else:
-            reason = "a mapping in place of a number is a schedule, and names its kind"
-            fix = did_you_mean(kind, SCHEDULES, "schedules")
-            where = value.origins.get("schedule", origin)
-            problems.add(where, ".".join((*below, "schedule")), reason, fix)
-        valid &= schedule is not None
-        schedules |= {option: schedule} if schedule else {}
+            can = ", ".join(sorted(component.scheduled)) or "none"
+            fix = f"give one number (options that can: {can})"
+            problems.add(origin, (*path, option), reason, fix)
+            schedules[option] = None
+    valid = {option: schedule for option, schedule in schedules.items() if schedule}
+    if len(valid) < len(schedules):
+        return None
     configs = list[ComponentConfig]()
-    for step in corners(schedules) if valid else ():
-        numbers = {n: s.number(step) for n, s in schedules.items()}
-        # Options that are integers refuse 2.0, so that integral numbers are written as 2.
-        written = {n: int(x) if x.is_integer() else x for n, x in numbers.items()}
-        entries = ((n, written.get(n, value), at) for n, value, at in node.entries())
-        config = decode_config(component.Config, MapNode(node.origin, entries), path, problems)
+    for step in corners(valid):
+        options = MapNode(node.origin, node.entries())
+        for option, schedule in valid.items():
+            number = schedule.number(step)
+            # Options that are integers refuse 2.0, so that integral numbers are written as 2.
+            written = int(number) if number.is_integer() else number
+            options.put(option, written, node.origins[option])
+        config = decode_config(component.Config, options, path, problems)
         if config is None:
             return None
         configs.append(config)
-    return (configs[0], schedules) if configs else None
+    return configs[0], valid
+
+
+def _decode_schedule(
+    node: MapNode, origin: Origin, path: KeyPath, problems: Problems
+) -> Schedule | None:
+    kind = str(node.get("schedule", ""))
+    if kind in SCHEDULES:
+        return decode_config(SCHEDULES[kind], node, path, problems)
+    reason = "a mapping in place of a number is a schedule, and names its kind"
+    fix = did_you_mean(kind, SCHEDULES, "schedules")
+    problems.add(node.origins.get("schedule", origin), (*path, "schedule"), reason, fix)
+    return None
 
 
 def corners(schedules: Mapping[str, Schedule]) -> list[int]:
@@ -213,16 +176,25 @@ def _why_no_component(name: object, place: Place, registry: Registry) -> tuple[s
         return reason, f"did you mean `{same[0]}`?" if same else choice
     if plugin not in registry.plugins:
         reason = f"`{name}` is of the plugin `{plugin}`, which this recipe does not use"
-        available = available_plugins()
-        if plugin not in available and (near := nearest(plugin, [*registry.plugins, *available])):
-            return reason, f"did you mean the plugin `{near}`?"
-        listed = ", ".join([used for used in registry.plugins if used != "qgs"] + [plugin])
-        install = "" if plugin in available else f"install the distribution of `{plugin}` and "
-        return reason, f"{install}add `plugins: [{listed}]`"
-    if elsewhere := [other for other in SLOTS if name in registry.components(other)]:
-        return f"`{name}` belongs in the slot `{elsewhere[0]}`, not in `{slot}`", choice
+        return reason, _how_to_use(plugin, registry)
+    for other in SLOTS:
+        if name in registry.components(other):
+            return f"`{name}` belongs in the slot `{other}`, not in `{slot}`", choice
     reason = f"there is no component `{name}` for the slot `{slot}`"
     return reason, did_you_mean(name, known, "components")
+
+
+def _how_to_use(plugin: str, registry: Registry) -> str:
+    """A fix for a recipe that does not list `plugin`."""
+    available = available_plugins()
+    if plugin in available:
+        install = ""
+    elif near := nearest(plugin, [*registry.plugins, *available]):
+        return f"did you mean the plugin `{near}`?"
+    else:
+        install = f"install the distribution of `{plugin}` and "
+    listed = [used for used in registry.plugins if used != "qgs"]
+    return f"{install}add `plugins: [{', '.join([*listed, plugin])}]`"
 
 
 def decode_config(
@@ -236,40 +208,45 @@ def decode_config(
     except ValidationError as error:
         details = error.errors()
     for detail in details:
-        loc, kind = detail["loc"], detail["type"]
+        loc = detail["loc"]
         steps, origin, given = find(node, loc)
-        if kind == "missing" and isinstance(given, ListNode):
-            same = [d["loc"][-1] for d in details if d["loc"][:-1] == loc[:-1]]
-            count = 1 + max(index for index in same if isinstance(index, int))
-            reason, fix = f"needs {count} items, got {len(given)}", f"give {count} items"
-        else:
-            steps += [loc[-1]] if kind == "missing" else []
+        if detail["type"] != "missing":
             reason, fix = _explain(detail, given, config)
-        name = ".".join([*path, *map(str, steps)])
+        elif isinstance(given, ListNode):
+            # pydantic reports each item that a tuple lacks
+            same = [other["loc"][-1] for other in details if other["loc"][:-1] == loc[:-1]]
+            count = 1 + max(index for index in same if isinstance(index, int))
+            reason = f"needs {count} items, got {len(given)}"
+            fix = f"give {count} items"
+        else:
+            steps.append(loc[-1])
+            reason = f"the option `{loc[-1]}` is missing and has no default"
+            fix = f"add `{loc[-1]}: ...`"
         field = config.model_fields.get(str(loc[0])) if loc else None
         if field and not isinstance(field.default, BaseModel | PydanticUndefinedType):
             fix += f" (default: {inline(to_jsonable_python(field.get_default()))})"
-        problems.add(origin, name, reason, fix)
+        problems.add(origin, [*path, *map(str, steps)], reason, fix)
     return None
 
 
 def _explain(error: ErrorDetails, given: Any, config: type[BaseModel]) -> tuple[str, str]:
     """Reason and fix: pydantic's message, or a better one where we know more than pydantic."""
-    kind, context = error["type"], error.get("ctx", {})
+    kind = error["type"]
+    context = error.get("ctx", {})
     cause = context.get("error")
-    option = str(error["loc"][-1]) if error["loc"] else ""
     if kind == "extra_forbidden":
+        option = str(error["loc"][-1])
         siblings = _options_beside(config, error["loc"])
         return f"there is no option `{option}`", did_you_mean(option, siblings, "options")
-    if kind == "missing":
-        return f"the option `{option}` is missing and has no default", f"add `{option}: ...`"
     if isinstance(cause, OptionError):
         return cause.reason, cause.fix
     if kind == "value_error":
         return str(cause), "change the value so that this holds"
-    message = re.sub(r"^\w+ should ", "must ", error["msg"].split(", got")[0])
-    got = "" if kind in ("too_long", "too_short") else f", got {kind_of(given)}"
-    reason, written = message.replace(" after validation", "") + got, str(given)
+    written = str(given)
+    reason = re.sub(r"^\w+ should ", "must ", error["msg"].split(", got")[0])
+    reason = reason.replace(" after validation", "")
+    if kind not in ("too_long", "too_short"):
+        reason += f", got {kind_of(given)}"
     if kind == "bool_type" and written.lower() in _BOOLS:
         word = _BOOLS[written.lower()]
         return reason, f"write `{word}`: in YAML 1.2 `{written}` is a string"
@@ -298,42 +275,3 @@ def models_in(annotation: Any) -> set[type[BaseModel]]:
         is_model = isinstance(annotation, type) and issubclass(annotation, BaseModel)
         return {annotation} if is_model else set()
     return {model for part in get_args(annotation) for model in models_in(part)}
-
-
-def check_tree(tree: MapNode, problems: Problems, path: KeyPath = ()) -> MapNode:
-    """Report unknown keys and sections that are no mappings; the tree without them."""
-    known = {*LAYER_SLOTS} if path[:-1] == _LAYERS else _KEYS.get(path)
-    checked = []
-    for key, node, origin in tree.entries():
-        below = (*path, key)
-        if known is not None and key not in known:
-            homes = [".".join((*home, key)) for home, keys in _KEYS.items() if key in keys]
-            fix = f"did you mean `{homes[0]}`?" if homes else did_you_mean(key, known, "keys")
-            problems.add(origin, ".".join(below), f"there is no key `{key}` here", fix)
-        elif below not in _MAPPINGS and path != _LAYERS:
-            checked.append((key, node, origin))
-        elif isinstance(node, MapNode):
-            checked.append((key, check_tree(node, problems, below), origin))
-        elif node is not None:
-            reason = f"`{key}` is a mapping, this is {kind_of(node)}"
-            fix = f"write `key: value` lines below `{key}:`"
-            problems.add(origin, ".".join(below), reason, fix)
-    return MapNode(tree.origin, checked)
-
-
-def decode_settings(tree: MapNode, problems: Problems) -> tuple[dict[KeyPath, Any], bool]:
-    """Settings by section, defaults for one with problems; whether the model's sizes are valid."""
-    settings: dict[KeyPath, Any] = {}
-    sizes_known = True
-    for path, config in SETTINGS.items():
-        node = tree.child(*path).without(*_BESIDE.get(path, ()))
-        found = decode_config(config, node, path, problems)
-        settings[path] = found or config.model_construct()
-        sizes_known &= bool(found) or path[:1] != ("model",)
-    model, node = settings["model",], tree.child("model")
-    if model.width % model.heads:
-        reason = f"{model.heads} heads do not divide the width {model.width}"
-        fix = f"set model.heads to a divisor of {model.width}"
-        origin = node.origins.get("heads", node.origins.get("width", node.origin))
-        problems.add(origin, "model.heads", reason, fix)
-    return settings, sizes_known

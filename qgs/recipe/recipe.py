@@ -1,5 +1,6 @@
 """Resolving a recipe: read, merge, check, and write out every default; no tensor is allocated."""
 
+import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,26 +11,18 @@ import torch
 from torch import nn
 
 from qgs import contracts
-from qgs.contracts import LAYER_SLOTS
 from qgs.contracts.schedule import Schedule
 from qgs.machine import refuse_more_than_memory
 from qgs.model import QueryGaussianModel
 from qgs.recipe.build import build, build_model, load_pretrained, rate_factors
-from qgs.recipe.decode import Chosen, DecoderSettings, check_tree, decode_place, decode_settings
-from qgs.recipe.errors import Origin, Problems
-from qgs.recipe.files import apply_overrides, merge, read_recipe
-from qgs.recipe.flow import (
-    Parts,
-    check_flow,
-    check_options,
-    idle_fields,
-    unfinished,
-    without_idle_sublayers,
-)
-from qgs.recipe.places import apply_swaps, expand
-from qgs.recipe.registry import Registry, load_plugins
-from qgs.recipe.slots import MODEL_SLOTS, SECTIONS
-from qgs.recipe.yaml_text import KeyPath, ListNode, MapNode, from_plain, inline
+from qgs.recipe.checks import check
+from qgs.recipe.decode import Chosen
+from qgs.recipe.draft import draft_of
+from qgs.recipe.errors import Problems
+from qgs.recipe.files import apply_overrides, read_recipe
+from qgs.recipe.flow import idle_fields, unfinished
+from qgs.recipe.spell_out import flat, provenance, spell_out
+from qgs.recipe.yaml_text import KeyPath, inline
 
 
 @dataclass(frozen=True)
@@ -148,207 +141,27 @@ def resolve(
     Raises RecipeError with every problem that was found.
     """
     problems = Problems()
-    tree = apply_overrides(read_recipe(recipe, problems), overrides, problems)
-    tree = check_tree(tree, problems)
-    problems.raise_if_stopped()
-    tree = _with_defaults(tree)
-    settings, sizes_known = decode_settings(tree, problems)
-    model, decoder = settings["model",], settings["model", "decoder"]
-    dims = contracts.ModelDims(model.width, model.heads, decoder.depth)
-    registry = load_plugins(tree, problems, plugins)
-    places = apply_swaps(tree.child("swap"), expand(tree, dims.depth, problems), problems)
-    decoded = {path: decode_place(place, registry, problems) for path, place in places.items()}
-    parts = without_idle_sublayers(decoded, dims.depth, problems)
-    if sizes_known:
-        data = parts.get(("data",))
-        source = data.config if data else None
-        size = source.image_size if isinstance(source, contracts.SceneSourceConfig) else None
-        inputs = settings["views",].inputs if data else None
-        timed = bool(data and getattr(data.component, "tells_times", False))
-        context = contracts.RecipeContext(dims, size, inputs, timed)
-        checked = {
-            p: c if c and check_options(c, context, problems) else None for p, c in parts.items()
-        }
-        check_flow(checked, dims.depth, registry, problems)
-    _check_settings(tree, settings, parts, registry, problems)
+    written = apply_overrides(read_recipe(recipe, problems), overrides, problems)
+    draft = draft_of(written, problems, plugins)
+    parts = check(draft, problems)
     problems.raise_any()
+    settings = draft.settings
     chosen = {path: part for path, part in parts.items() if part is not None}
-    out = _spell_out(tree, settings, registry, chosen)
+    spelled = spell_out(draft, chosen)
+    used = [draft.registry.plugins[name] for name in ("qgs", *spelled["plugins"])]
     return Recipe(
-        tree=out.values,
-        provenance=out.provenance,
+        tree=json.loads(json.dumps(spelled)),
+        provenance=provenance(spelled),
         parts=chosen,
-        dims=dims,
-        layer_scale=decoder.layer_scale,
+        dims=draft.dims,
+        layer_scale=settings["model", "decoder"].layer_scale,
         seed=settings[()].seed,
         init_from=settings[()].init_from,
         views=settings["views",],
         training=settings["training",],
         evaluation=settings["evaluation",],
-        releases={
-            name: (registry.plugins[name].distribution, registry.plugins[name].version)
-            for name in ("qgs", *out.values["plugins"])
-        },
+        releases={one.plugin.name: (one.distribution, one.version) for one in used},
     )
-
-
-def _check_settings(
-    tree: MapNode,
-    settings: Mapping[KeyPath, Any],
-    parts: Parts,
-    registry: Registry,
-    problems: Problems,
-) -> None:
-    """Report settings that contradict the components, or have no effect with them."""
-
-    def report(path: KeyPath, reason: str, fix: str) -> None:
-        node = tree.child(*path[:-1])
-        problems.add(node.origins.get(path[-1], node.origin), ".".join(path), reason, fix)
-
-    encoder, objective = parts["model", "encoder"], parts["objective",]
-    if encoder and settings["evaluation",].tuning == "latents":
-        known: dict[str, Any] = dict(registry.components("encoder"))
-        if not known[encoder.type].tunable:
-            others = " or ".join(f"`{name}`" for name in sorted(known) if known[name].tunable)
-            reason = f"`{encoder.type}` at model.encoder has no latents to tune"
-            fix = f"write `queries`, or use {others} in the slot `encoder`"
-            report(("evaluation", "tuning"), reason, fix)
-
-    decoder, default = settings["model", "decoder"], DecoderSettings().layer_scale
-    layers = [parts["model", "decoder", "layers", str(i), "layer"] for i in range(decoder.depth)]
-    kinds: list[Any] = [layer.component if layer else contracts.DecoderLayer for layer in layers]
-    if decoder.layer_scale != default and not any(kind.reads_layer_scale for kind in kinds):
-        names = " and ".join(sorted({f"`{layer.type}`" for layer in layers if layer}))
-        reason = f"it has no effect: {names or 'a decoder of depth 0'} does not read it"
-        fix = f"remove it; the default, `layer_scale: {inline(default)}`, drops an inherited one"
-        report(("model", "decoder", "layer_scale"), reason, fix)
-
-    if settings["training",].judge_inputs:
-        path, fix = ("training", "judge_inputs"), "set it to false; evaluations do not read it"
-        if settings["views",].pose_noise:
-            reason = "views.pose_noise moves the cameras of input views, which must be exact"
-            report(path, reason, fix)
-        kind: Any = objective.component if objective else contracts.Objective
-        if objective and not kind.judges_inputs:
-            reason = f"`{objective.type}` reconstructs one moment, input views show others"
-            report(path, reason, fix)
-
-    if ("data",) in parts and not any(path[0] == "losses" for path in parts):
-        reason = "a recipe with data needs at least one loss to train"
-        report(("losses",), reason, "add one under `losses`, or drop the data with `data: null`")
-
-
-def _with_defaults(tree: MapNode) -> MapNode:
-    """`tree` with the default components of sections such as `losses` under what is written."""
-    missing = {
-        name: {key: {"type": kind} for key, kind in section.defaults.items()}
-        for name, section in SECTIONS.items()
-        if section.named and (section.defaults_stay or name not in tree)
-    }
-    defaults = from_plain(missing, Origin("default"))
-    assert isinstance(defaults, MapNode)
-    return merge(defaults, tree)
-
-
-def _spell_out(
-    source: MapNode,
-    settings: Mapping[KeyPath, contracts.ComponentConfig],
-    registry: Registry,
-    parts: Mapping[KeyPath, Chosen],
-) -> "_Tree":
-    """What `source` describes, with every default; only plugins that are used."""
-    tree = _Tree(source)
-    tree.put_settings((), settings[()])
-    tree.values["plugins"] = []  # known at the end
-    tree.put_settings(("model",), settings["model",])
-    for name in MODEL_SLOTS:
-        tree.put_component(("model", name), parts["model", name])
-        if name == "queries":
-            tree.put_settings(("model", "decoder"), settings["model", "decoder"])
-            _put_decoder(tree, parts)
-    for name, section in SECTIONS.items():
-        for path, part in parts.items():
-            if path[0] == name:
-                tree.put_component(path, part)
-        dropped = [key for key in section.defaults if (name, key) not in parts]
-        if section.defaults_stay:
-            tree.put((name,), dict.fromkeys(dropped), source.child(name), "default")
-        if section.named and not tree.values.get(name):
-            tree.put((), {name: {}}, source, "default")
-    for name in ("views", "training", "evaluation"):
-        tree.put_settings((name,), settings[name,])
-    # A plugin with weight layouts alone has no component to use: `qgs import` reads it.
-    found = registry.plugins.items()
-    kept = [n for n, p in found if n in tree.used - {"qgs"} or not p.plugin.components]
-    tree.put((), {"plugins": kept}, source, "default")
-    written = source.get("plugins")
-    if isinstance(written, ListNode) and kept:
-        origins = [o for n, o in zip(written, written.origins, strict=True) if n in kept]
-        tree.provenance["plugins"] = ", ".join(dict.fromkeys(map(str, origins)))
-    return tree
-
-
-def _put_decoder(tree: "_Tree", parts: Mapping[KeyPath, Chosen]) -> None:
-    """The template, then every layer that differs; a template that no layer uses gives way."""
-    decoder = ("model", "decoder")
-    layers = {path: part for path, part in parts.items() if path[:-2] == (*decoder, "layers")}
-    templates = {}
-    for name in LAYER_SLOTS:
-        if (*decoder, name) not in parts:
-            continue
-        standing = [part for path, part in layers.items() if path[-1] == name]
-        chosen = [(part.type, part.options) for part in standing]
-        same = chosen.count(chosen[0]) == len(chosen)
-        template = standing[0] if same else parts[(*decoder, name)]
-        tree.put_component((*decoder, name), template)
-        templates[name] = (template.type, template.options)
-    for path, part in layers.items():
-        if (part.type, part.options) != templates[path[-1]]:
-            tree.put_component(path, part)
-
-
-class _Tree:
-    """The plain mapping of a resolved recipe, its provenance, and the plugins that it uses."""
-
-    def __init__(self, source: MapNode) -> None:
-        self.source, self.used = source, set[str]()
-        self.values: dict[str, Any] = {}
-        self.provenance: dict[str, str] = {}
-
-    def put(self, path: KeyPath, values: Mapping[str, Any], written: Any, default: str) -> None:
-        """written: what the recipe has at `path`; the rest is set by `default`."""
-        origins = written.origins if isinstance(written, MapNode) else {}
-        below = self.values
-        for key in path:
-            below = below.setdefault(key, {})
-        for name, value in values.items():
-            inner = written.get(name) if origins else None
-            if isinstance(value, dict) and value and isinstance(inner, MapNode):
-                self.put((*path, name), value, inner, default)
-            else:
-                below[name] = value
-                origin = str(origins.get(name, default))
-                self.provenance.update(dict.fromkeys(flat({name: value}, path), origin))
-
-    def put_settings(self, path: KeyPath, config: contracts.ComponentConfig) -> None:
-        self.put(path, config.model_dump(mode="json"), self.source.child(*path), "default")
-
-    def put_component(self, path: KeyPath, chosen: Chosen) -> None:
-        self.used.add(chosen.installed.plugin.name)
-        self.put(path, {"type": chosen.type}, chosen.place.node, "default of the slot")
-        self.put(path, chosen.options, chosen.place.node, f"default of {chosen.type}")
-
-
-def flat(tree: Mapping[str, Any], path: KeyPath = ()) -> dict[str, Any]:
-    """Dotted path to value, mappings opened."""
-    values: dict[str, Any] = {}
-    for key, value in tree.items():
-        below = (*path, key)
-        if isinstance(value, Mapping) and value:
-            values |= flat(value, below)
-        else:
-            values[".".join(below)] = value
-    return values
 
 
 def differing_options(

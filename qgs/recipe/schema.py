@@ -5,8 +5,8 @@ from typing import Any
 
 from qgs.contracts import LAYER_SLOTS, Component, ComponentConfig
 from qgs.contracts.schedule import Schedule
-from qgs.recipe.decode import SETTINGS
 from qgs.recipe.registry import Registry
+from qgs.recipe.sections import SETTINGS
 from qgs.recipe.slots import MODEL_SLOTS, SECTIONS, SLOTS
 from qgs.recipe.yaml_text import KeyPath
 from qgs.tokengs.schedules import SCHEDULES

@@ -9,7 +9,7 @@ import yaml
 from guide_pages import DOCS, all_pages
 
 from qgs.contracts import Component
-from qgs.recipe.decode import RecipeSettings
+from qgs.recipe.sections import RecipeSettings
 from qgs.recipe.errors import Problems
 from qgs.recipe.registry import load_registry
 from qgs.recipe.slots import SLOTS
