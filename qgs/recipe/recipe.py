@@ -15,6 +15,7 @@ from qgs.contracts.schedule import Schedule
 from qgs.machine import refuse_more_than_memory
 from qgs.model import QueryGaussianModel
 from qgs.recipe.build import build, build_model, load_pretrained, rate_factors
+from qgs.recipe.causes import at_their_causes
 from qgs.recipe.checks import check
 from qgs.recipe.decode import Chosen
 from qgs.recipe.draft import draft_of
@@ -143,7 +144,9 @@ def resolve(
     problems = Problems()
     written = apply_overrides(read_recipe(recipe, problems), overrides, problems)
     draft = draft_of(written, problems, plugins)
-    parts = check(draft, problems)
+    together = Problems()
+    parts = check(draft, together)
+    problems.found += at_their_causes(draft, together.found, plugins)
     problems.raise_any()
     settings = draft.settings
     chosen = {path: part for path, part in parts.items() if part is not None}

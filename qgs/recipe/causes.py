@@ -1,0 +1,80 @@
+"""Problems of a recipe at the line that caused them.
+
+A file or an override laid over others may replace a component that theirs rely on. Then its line is
+to blame, and not those that were right before.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+from qgs.contracts import Plugin
+from qgs.recipe.checks import check
+from qgs.recipe.decode import Chosen
+from qgs.recipe.draft import Draft, draft_of
+from qgs.recipe.errors import Problems, RecipeProblem
+
+
+def at_their_causes(
+    draft: Draft, found: Sequence[RecipeProblem], plugins: Sequence[Plugin]
+) -> Iterator[RecipeProblem]:
+    """`found`, what is wrong with `draft` as a whole; those of one cause become one problem."""
+    drafts = [draft]
+    while found and (under := drafts[-1].written.under) is not None:
+        drafts.append(draft_of(under, Problems(), plugins))
+    caused: dict[RecipeProblem, list[RecipeProblem]] = {}
+    for problem in found:
+        blame = _blamed(problem, drafts)
+        # Whoever wrote both sees the contradiction where it is.
+        if blame is None or blame.file == problem.file:
+            yield problem
+        else:
+            caused.setdefault(blame, []).append(problem)
+    for blame, broken in caused.items():
+        told = dict.fromkeys(f"{problem.place}: {problem.reason}" for problem in broken)
+        fixes = dict.fromkeys(problem.fix for problem in broken)
+        reason = "\n    ".join([f"{blame.reason} breaks:", *told])
+        yield replace(blame, reason=reason, fix=f"{blame.fix}, or: {'; '.join(fixes)}")
+
+
+def _blamed(problem: RecipeProblem, drafts: Sequence[Draft]) -> RecipeProblem | None:
+    """The problem of the line with which `problem` came.
+
+    drafts: the whole recipe, and before each file or override that was laid over it, newest first.
+    """
+    for newer, older in pairwise(drafts):
+        if _has(older, problem):
+            continue
+        parts = dict(older.parts)
+        for source in {part.place.source: None for part in newer.parts.values() if part}:
+            changed = {
+                path: part
+                for path, part in newer.parts.items()
+                if part and part.place.source == source and not part.equals(parts.get(path))
+            }
+            before = [parts.get(path) for path in changed]
+            parts |= changed
+            if changed and _has(replace(older, parts=parts), problem):
+                return _replacing([*changed.values()][0], before[0])
+        return None
+    return None
+
+
+def _has(draft: Draft, problem: RecipeProblem) -> bool:
+    problems = Problems()
+    check(draft, problems)
+    return (problem.place, problem.reason) in [(x.place, x.reason) for x in problems.found]
+
+
+def _replacing(new: Chosen, old: Chosen | None) -> RecipeProblem | None:
+    """The problem of the line that put `new`, or options of it, in place of `old`."""
+    if old is None:
+        return None
+    lines = new.node.origins
+    origin = lines.get("type", new.place.origin)
+    reason = f"`{new.type}` in place of `{old.type}` ({old.chosen_at})"
+    if new.type == old.type:
+        differing = [key for key in lines if new.options.get(key) != old.options.get(key)]
+        origin = new.node.origin_of(*differing)
+        reason = f"`{new.type}` with other options than at {old.place.origin}"
+    return RecipeProblem(new.path, reason, f"keep `{old.type}` as it was", origin.file, origin.line)
