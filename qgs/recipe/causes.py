@@ -52,10 +52,13 @@ def _blamed(problem: RecipeProblem, drafts: Sequence[Draft]) -> RecipeProblem | 
                 for path, part in newer.parts.items()
                 if part and part.place.source == source and not part.equals(parts.get(path))
             }
-            before = [parts.get(path) for path in changed]
+            if not changed:
+                continue
+            path, new = next(iter(changed.items()))
+            old = parts.get(path)
             parts |= changed
-            if changed and _has(replace(older, parts=parts), problem):
-                return _replacing([*changed.values()][0], before[0])
+            if _has(replace(older, parts=parts), problem):
+                return _replacing(new, old) if old else None
         return None
     return None
 
@@ -66,10 +69,8 @@ def _has(draft: Draft, problem: RecipeProblem) -> bool:
     return (problem.place, problem.reason) in [(x.place, x.reason) for x in problems.found]
 
 
-def _replacing(new: Chosen, old: Chosen | None) -> RecipeProblem | None:
+def _replacing(new: Chosen, old: Chosen) -> RecipeProblem:
     """The problem of the line that put `new`, or options of it, in place of `old`."""
-    if old is None:
-        return None
     lines = new.node.origins
     origin = lines.get("type", new.place.origin)
     reason = f"`{new.type}` in place of `{old.type}` ({old.chosen_at})"

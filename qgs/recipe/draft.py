@@ -60,6 +60,4 @@ def _with_defaults(tree: MapNode) -> MapNode:
         for name, section in SECTIONS.items()
         if section.named and (section.defaults_stay or name not in tree)
     }
-    defaults = from_plain(missing, Origin("default"))
-    assert isinstance(defaults, MapNode)
-    return merge(defaults, tree)
+    return merge(from_plain(missing, Origin("default")), tree)

@@ -16,6 +16,7 @@ from qgs.recipe.yaml_text import (
     MapNode,
     Node,
     from_plain,
+    items_of,
     load_mapping,
     load_text,
 )
@@ -39,9 +40,9 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
         if path == ("swap",) and value is None and old is not None:
             del merged[key]
             continue
-        if below == ("plugins",) and isinstance(old, ListNode) and isinstance(value, ListNode):
-            added = [entry for entry in value.entries() if entry[0] not in old]
-            value = ListNode(value.origin, [*old.entries(), *added])
+        if below == ("plugins",) and isinstance(old, list) and isinstance(value, list):
+            added = [item for item in items_of(value, origin) if item[0] not in old]
+            value = ListNode(origin, [*items_of(old, base.origins[key]), *added])
         elif isinstance(old, MapNode) and isinstance(value, MapNode):
             value = merge(old, value, below)
         merged.put(key, value, origin)
@@ -87,10 +88,9 @@ def read_recipe(recipe: str | Path | Mapping[str, Any], problems: Problems) -> M
     try:
         # A study's variant is a mapping that knows where it was written.
         node = recipe if isinstance(recipe, MapNode) else from_plain(recipe, origin)
-    except ValueError as error:
+    except (ValueError, TypeError, RecursionError) as error:
         problems.stop(origin, "", str(error), "give mappings, lists, strings, numbers, bools, None")
         return MapNode(origin)
-    assert isinstance(node, MapNode)
     return files.with_bases(node, Path(), ())
 
 
@@ -140,12 +140,9 @@ class _Files:
 
     def with_bases(self, node: MapNode, folder: Path, chain: tuple[Path, ...]) -> MapNode:
         """`node` laid over the files that it extends, the later ones over the earlier ones."""
-        written = node.get("extends")
         at = node.origin_of("extends")
-        if not isinstance(written, ListNode):
-            written = ListNode(at, [] if written is None else [(written, at)])
         layers: list[MapNode] = []
-        for name, origin in written.entries():
+        for name, origin in items_of(node.get("extends"), at):
             if not isinstance(name, str):
                 reason = "`extends` names one recipe file or a list of them"
                 fix = "write `extends: base.yaml`, relative to this file"

@@ -7,7 +7,7 @@ from fnmatch import fnmatchcase
 from qgs.contracts import LAYER_SLOTS
 from qgs.recipe.errors import Origin, Problems, nearest
 from qgs.recipe.files import merge
-from qgs.recipe.slots import MODEL_SLOTS, SECTIONS, Slot, slot_at
+from qgs.recipe.slots import AFTER_LAYERS, SECTIONS, Slot, slot_at
 from qgs.recipe.yaml_text import KeyPath, MapNode, Node, kind_of
 
 
@@ -27,10 +27,13 @@ class Place:
 
 
 def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place]:
-    """All places of `tree`; a layer's overrides are laid over the decoder's template."""
+    """All places of `tree`, in the order in which a recipe is read.
+
+    A layer's overrides are laid over the decoder's template.
+    """
     decoder = ("model", "decoder")
     template = [_place(tree, (*decoder, name)) for name in LAYER_SLOTS]
-    places = [_place(tree, ("model", name)) for name in MODEL_SLOTS] + template
+    places = [_place(tree, ("model", name)) for name in ("encoder", "queries")] + template
     layers = tree.child(*decoder, "layers")
     indices = [str(index) for index in range(depth)]
     for key, _, origin in layers.without(*indices).entries():
@@ -39,6 +42,7 @@ def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place
         problems.add(origin, (*decoder, "layers", key), reason, fix)
     for index in indices:
         places += [_layer_place(place, index, layers.child(index)) for place in template]
+    places += [_place(tree, ("model", name)) for name in AFTER_LAYERS]
     for name, section in SECTIONS.items():
         if section.named:
             written = tree.child(name).items()

@@ -16,7 +16,7 @@ from qgs.contracts import Component, ComponentConfig, OptionError
 from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
 from qgs.recipe.errors import Origin, Problems
 from qgs.recipe.slots import SLOTS
-from qgs.recipe.yaml_text import ListNode, MapNode, kind_of
+from qgs.recipe.yaml_text import MapNode, items_of, kind_of
 from qgs.version import __version__
 
 BUILTIN = Plugin(
@@ -99,13 +99,15 @@ def load_registry(names: Iterable[str]) -> Registry:
 def load_plugins(tree: MapNode, problems: Problems, given: Sequence[Plugin] = ()) -> Registry:
     """The components of the recipe's `plugins`; a problem for each that cannot be used."""
     at_hand = {plugin.name: InstalledPlugin(plugin) for plugin in given}
-    plugins, seen = {"qgs": builtin()}, dict[str, Origin]()
+    plugins = {"qgs": builtin()}
+    seen = dict[str, Origin]()
     written = tree.get("plugins")
-    if written is not None and not isinstance(written, ListNode):
+    at = tree.origin_of("plugins")
+    if not isinstance(written, list | None):
         reason = f"`plugins` is a list, this is {kind_of(written)}"
-        problems.add(tree.origins["plugins"], "plugins", reason, "write `plugins: [NAME]`")
-    written = written if isinstance(written, ListNode) else ListNode(tree.origin)
-    for index, (name, origin) in enumerate(zip(written, written.origins, strict=True)):
+        problems.add(at, "plugins", reason, "write `plugins: [NAME]`")
+        written = None
+    for index, (name, origin) in enumerate(items_of(written, at)):
         path = f"plugins.{index}"
         if not isinstance(name, str):
             reason = f"a plugin is a name, this is {kind_of(name)}"

@@ -3,41 +3,66 @@
 from collections.abc import Mapping
 from typing import Any
 
-from qgs.contracts import LAYER_SLOTS
 from qgs.recipe.decode import Chosen
 from qgs.recipe.draft import Draft
 from qgs.recipe.errors import Origin
-from qgs.recipe.slots import AFTER_LAYERS, SECTIONS
-from qgs.recipe.yaml_text import KeyPath, ListNode, MapNode
+from qgs.recipe.sections import SETTINGS
+from qgs.recipe.slots import SECTIONS
+from qgs.recipe.yaml_text import KeyPath, MapNode, items_of
 
 _DEFAULT = Origin("default")
 
 
 def spell_out(draft: Draft, parts: Mapping[KeyPath, Chosen]) -> MapNode:
     """What a draft describes, in the order in which a recipe is read; only plugins in use."""
-    whole = _section(draft)
-    whole["plugins"] = None  # known at the end
-    model = _section(draft, "model")
-    for name in ("encoder", "queries"):
-        model[name] = _component(parts["model", name])
-    model["decoder"] = _decoder(draft, parts)
-    for name in AFTER_LAYERS:
-        model[name] = _component(parts["model", name])
-    whole["model"] = model
+    shown = _shown(parts)
+    whole = _section(draft, ())
+    _put_plugins(whole, draft, {part.installed.plugin.name for part in shown.values()})
+    for path, part in shown.items():
+        if path == ("model", "feedback"):
+            # The decoder stands before it, also one of depth 0, which has no component.
+            _holder(whole, ("model", "decoder", ""), draft)
+        _holder(whole, path, draft)[path[-1]] = _component(part)
     for name, section in SECTIONS.items():
-        if section.named:
-            _put_named(whole, name, draft, parts)
-        elif (name,) in parts:
-            whole[name] = _component(parts[name,])
+        written = draft.tree.child(name)
+        dropped = [key for key in section.defaults if (name, key) not in parts]
+        for key in dropped if section.defaults_stay else ():
+            _holder(whole, (name, key), draft).put(key, None, written.origin_of(key))
+        if section.named and name not in whole:
+            whole.put(name, {}, draft.tree.origins.get(name, _DEFAULT))
     for name in ("views", "training", "evaluation"):
-        whole[name] = _section(draft, name)
-    _put_plugins(whole, draft)
+        whole[name] = _section(draft, (name,))
     return whole
 
 
-def _section(draft: Draft, *path: str) -> MapNode:
-    """The settings of a section."""
-    values = draft.settings[path].model_dump(mode="json")
+def _shown(parts: Mapping[KeyPath, Chosen]) -> dict[KeyPath, Chosen]:
+    """Parts as a recipe writes them: the decoder's template, and what differs from it in layers.
+
+    A template that no layer uses gives way to what all layers have.
+    """
+    shown = {path: part for path, part in parts.items() if "layers" not in path}
+    layers = {path: part for path, part in parts.items() if "layers" in path}
+    for path in [*shown]:
+        standing = [part for at, part in layers.items() if (*at[:2], at[-1]) == path]
+        if standing and all(part.equals(standing[0]) for part in standing):
+            shown[path] = standing[0]
+    own = {p: part for p, part in layers.items() if not part.equals(shown[*p[:2], p[-1]])}
+    return shown | own
+
+
+def _holder(whole: MapNode, path: KeyPath, draft: Draft) -> MapNode:
+    """The mapping that holds `path`; one that is new begins with the settings of its section."""
+    holder = whole
+    for end, key in enumerate(path[:-1], start=1):
+        if key not in holder:
+            holder[key] = _section(draft, path[:end])
+        holder = holder[key]
+    return holder
+
+
+def _section(draft: Draft, path: KeyPath) -> MapNode:
+    """The settings of a section, if it has any."""
+    values = draft.settings[path].model_dump(mode="json") if path in SETTINGS else {}
     return _spelled(values, draft.tree.child(*path), _DEFAULT)
 
 
@@ -60,51 +85,16 @@ def _spelled(values: Mapping[str, Any], written: MapNode, default: Origin) -> Ma
     return spelled
 
 
-def _decoder(draft: Draft, parts: Mapping[KeyPath, Chosen]) -> MapNode:
-    """The template, then every layer that differs; a template that no layer uses gives way."""
-    path = ("model", "decoder")
-    decoder = _section(draft, *path)
-    templates = {}
-    for name in LAYER_SLOTS:
-        if (*path, name) not in parts:
-            continue
-        standing = [part for at, part in parts.items() if at[2:3] == ("layers",) and at[-1] == name]
-        same = all(part.equals(standing[0]) for part in standing)
-        templates[name] = standing[0] if same else parts[*path, name]
-        decoder[name] = _component(templates[name])
-    for at, part in parts.items():
-        if at[2:3] == ("layers",) and not part.equals(templates[at[-1]]):
-            layers = decoder.setdefault("layers", MapNode(part.place.origin))
-            layers.setdefault(at[3], MapNode(part.place.origin))[at[-1]] = _component(part)
-    return decoder
-
-
-def _put_named(whole: MapNode, name: str, draft: Draft, parts: Mapping[KeyPath, Chosen]) -> None:
-    """The components of a section such as `losses`, and defaults of it that `null` drops."""
-    written = draft.tree.child(name)
-    section = MapNode(written.origin)
-    for path, part in parts.items():
-        if path[0] == name:
-            section[path[1]] = _component(part)
-    for key in SECTIONS[name].defaults if SECTIONS[name].defaults_stay else ():
-        if key not in section:
-            section.put(key, None, written.origin_of(key))
-    whole.put(name, section, draft.tree.origins.get(name, _DEFAULT))
-
-
-def _put_plugins(whole: MapNode, draft: Draft) -> None:
-    kinds = [str(value) for path, value in flat(whole).items() if path.endswith(".type")]
+def _put_plugins(whole: MapNode, draft: Draft, used: set[str]) -> None:
     kept = [
         name
         for name, installed in draft.registry.plugins.items()
         # One with weight layouts alone has no component to use: `qgs import` reads it.
-        if not installed.plugin.components or any(kind.startswith(f"{name}/") for kind in kinds)
+        if name != "qgs" and (name in used or not installed.plugin.components)
     ]
-    kept = [name for name in kept if name != "qgs"]
     origin = draft.tree.origins.get("plugins", _DEFAULT)
-    written = draft.tree.get("plugins")
-    if isinstance(written, ListNode) and kept:
-        lines = [str(line) for name, line in written.entries() if name in kept]
+    lines = [str(at) for name, at in items_of(draft.tree.get("plugins"), origin) if name in kept]
+    if lines:
         origin = Origin(", ".join(dict.fromkeys(lines)))
     whole.put("plugins", kept, origin)
 

@@ -1,5 +1,6 @@
 """Recipes as YAML 1.2 text, and as nodes that know the line where each key was written."""
 
+import json
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -84,34 +85,31 @@ class ListNode(list[Any]):
             self.append(value)
             self.origins.append(written)
 
-    def entries(self) -> list[tuple[Any, Origin]]:
-        """Items, and where each was written."""
-        return [*zip(self, self.origins, strict=True)]
+
+Node: TypeAlias = MapNode | list[Any] | str | int | float | None
 
 
-Node: TypeAlias = MapNode | ListNode | str | int | float | None
+def items_of(value: Any, origin: Origin) -> list[tuple[Any, Origin]]:
+    """Items of a list, and where each was written: at `origin` for one that does not know.
 
-
-def from_plain(value: Any, origin: Origin, path: KeyPath = ()) -> Node:
-    """A tree of a plain Python value, which stands at `path`.
-
-    Raises ValueError for a value that YAML could not hold, and for one that contains itself.
+    One value stands for a list of it, null for none.
     """
-    if len(path) > MAX_DEPTH:
-        raise ValueError(f"more than {MAX_DEPTH} levels, or a value that contains itself")
-    if isinstance(value, Mapping):
-        named = [(str(key), item) for key, item in value.items()]
-        entries = [(key, from_plain(item, origin, (*path, key)), origin) for key, item in named]
-        return MapNode(origin, entries)
-    if isinstance(value, list | tuple):
-        numbered = enumerate(value)
-        items = [(from_plain(item, origin, (*path, str(n))), origin) for n, item in numbered]
-        return ListNode(origin, items)
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    if value is None or isinstance(value, str | bool | int | float):
-        return value
-    raise ValueError(f"`{'.'.join(path)}` is a {type(value).__name__}, which no recipe holds")
+    if isinstance(value, ListNode):
+        return [*zip(value, value.origins, strict=True)]
+    items = value if isinstance(value, list) else [] if value is None else [value]
+    return [(item, origin) for item in items]
+
+
+def from_plain(value: Mapping[str, Any], origin: Origin) -> MapNode:
+    """A tree of plain Python values.
+
+    Raises ValueError or TypeError for what YAML could not hold.
+    """
+
+    def mapping(pairs: list[tuple[str, Any]]) -> MapNode:
+        return MapNode(origin, ((key, item, origin) for key, item in pairs))
+
+    return json.loads(json.dumps(value, default=os.fspath), object_pairs_hook=mapping)
 
 
 def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Origin, Node]:
@@ -125,9 +123,10 @@ def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Ori
     for step in path:
         key: Any = str(step) if isinstance(node, MapNode) else step
         inside = isinstance(node, MapNode) and key in node
-        inside |= isinstance(node, ListNode) and isinstance(step, int) and step < len(node)
+        inside |= isinstance(node, list) and isinstance(step, int) and step < len(node)
         if inside:
-            origin = node.origins[key]
+            # Lists of Python mappings know no lines.
+            origin = node.origins[key] if isinstance(node, MapNode | ListNode) else origin
             node = node[key]
             taken.append(step)
     return taken, origin, node

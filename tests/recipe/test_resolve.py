@@ -102,7 +102,7 @@ def test_mappings_and_files_that_hold_no_recipe(tmp_path):
     knot["model"] = knot
     for recipe in (knot, SMALL | {"seed": b"1"}):
         assert refused(recipe).file == "<mapping>"
-    assert "`seed` is a Tensor" in refused(SMALL | {"seed": torch.zeros(1)}).reason
+    assert "Tensor" in refused(SMALL | {"seed": torch.zeros(1)}).reason
     assert resolve(SMALL | {"init_from": Path("a")}).init_from == "a"
     binary = tmp_path / "binary.yaml"
     binary.write_bytes(b"recipe: \xff\n")
