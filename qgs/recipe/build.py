@@ -1,9 +1,11 @@
 """From chosen components to a model, and the learning-rate factors of its parameters."""
 
-from collections.abc import Mapping, Sequence
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -15,7 +17,6 @@ from qgs.contracts import (
     Component,
     LayerParts,
     ModelComponent,
-    ModelDims,
     Optimizer,
     OptimizerConfig,
     Refinement,
@@ -25,62 +26,70 @@ from qgs.contracts.component import MissingExtraError
 from qgs.machine import is_out_of_memory
 from qgs.model import QueryGaussianModel
 from qgs.recipe.decode import Chosen
-from qgs.recipe.errors import Problems, RecipeError, RecipeProblem
+from qgs.recipe.errors import Problems, RecipeError
 from qgs.recipe.places import near_pattern
 from qgs.recipe.registry import BUILTIN, component_failure
 from qgs.recipe.slots import AFTER_LAYERS
-from qgs.recipe.yaml_text import KeyPath, MapNode, find
+from qgs.recipe.yaml_text import KeyPath
+
+if TYPE_CHECKING:
+    from qgs.recipe.recipe import Recipe
 
 
-def build_model(
-    parts: Mapping[KeyPath, Chosen],
-    dims: ModelDims,
-    layer_scale: float,
-    seed: int,
-    tree: Mapping[str, Any],
-    device: torch.device | str | None,
-) -> QueryGaussianModel:
+def build_model(recipe: Recipe, device: torch.device | str | None) -> QueryGaussianModel:
     """The model of a checked recipe; on "meta" nothing is allocated.
 
-    Parameters are drawn on the CPU from `seed`, whatever the device; the global random state stays.
+    Parameters are drawn on the CPU from the recipe's seed, whatever the device; the global random
+    state stays.
     """
     on_meta = device is not None and torch.device(device).type == "meta"
-    shared: list[tuple[Chosen, nn.Module]] = []
-
-    def at(*path: str) -> Any:
-        chosen = parts["model", *path]
-        for known, built in shared:
-            if known.component is chosen.component and known.options == chosen.options:
-                return built
-        built = build(chosen, *(dims,) if issubclass(chosen.component, ModelComponent) else ())
-        if issubclass(chosen.component, Refinement) and chosen.component.shared_by_layers:
-            shared.append((chosen, built))
-        return built
-
     with (
         torch.random.fork_rng(devices=()),
         torch.device("meta" if on_meta else "cpu"),
         OnMeta() if on_meta else nullcontext(),
     ):
-        torch.default_generator.manual_seed(seed)
-        # The order is fixed: each component draws its parameters after the one before it.
-        encoder, queries = at("encoder"), at("queries")
-        decoder, refinements = [], []
-        for index in map(str, range(dims.depth)):
-            path = ("decoder", "layers", index)
-            sublayers = {s: at(*path, s) for s in SUBLAYER_SLOTS if ("model", *path, s) in parts}
-            layer = parts["model", *path, "layer"]
-            decoder.append(build(layer, LayerParts(dims, sublayers, layer_scale)))
-            refinements.append(at(*path, "refinement"))
-        model = QueryGaussianModel(
-            encoder=encoder,
-            queries=queries,
-            decoder=decoder,
-            refinements=refinements,
-            recipe=tree,
-            **{name: at(name) for name in AFTER_LAYERS},
-        )
+        torch.default_generator.manual_seed(recipe.seed)
+        model = _assemble(recipe)
     return model if on_meta or device is None else model.to(device)
+
+
+def _assemble(recipe: Recipe) -> QueryGaussianModel:
+    shared: list[tuple[Chosen, nn.Module]] = []
+
+    def at(*path: str) -> Any:
+        chosen = recipe.parts["model", *path]
+        for known, built in shared:
+            if known.equals(chosen):
+                return built
+        sized = issubclass(chosen.component, ModelComponent)
+        built = build(chosen, recipe.dims) if sized else build(chosen)
+        if issubclass(chosen.component, Refinement) and chosen.component.shared_by_layers:
+            shared.append((chosen, built))
+        return built
+
+    # The order is fixed: each component draws its parameters after the one before it.
+    encoder = at("encoder")
+    queries = at("queries")
+    decoder = []
+    refinements = []
+    for index in range(recipe.dims.depth):
+        path = ("decoder", "layers", str(index))
+        slots = [slot for slot in SUBLAYER_SLOTS if ("model", *path, slot) in recipe.parts]
+        sublayers = {slot: at(*path, slot) for slot in slots}
+        layer_parts = LayerParts(recipe.dims, sublayers, recipe.layer_scale)
+        decoder.append(build(recipe.parts["model", *path, "layer"], layer_parts))
+        refinements.append(at(*path, "refinement"))
+    return QueryGaussianModel(
+        encoder=encoder,
+        queries=queries,
+        decoder=decoder,
+        refinements=refinements,
+        recipe=recipe.tree,
+        **{name: at(name) for name in AFTER_LAYERS},
+    )
+
+
+_ARITHMETIC = ("add", "sub", "mul", "div", "pow", "__pow__", "__rsub__", "__rdiv__", "__rpow__")
 
 
 class OnMeta(TorchFunctionMode):
@@ -90,30 +99,32 @@ class OnMeta(TorchFunctionMode):
     arithmetic give float32 tensors by shape alone: for these torch imports its compiler, 1 to 3 s.
     """
 
-    names = ("add", "sub", "mul", "div", "pow", "__pow__", "__rsub__", "__rdiv__", "__rpow__")
-    arithmetic = frozenset(getattr(Tensor, name) for name in names)
-    hooked = (nn.init.kaiming_uniform_, nn.init.uniform_, nn.init.normal_)  # mode off inside
-    draws = frozenset({*hooked, Tensor.uniform_, Tensor.normal_})
+    arithmetic = frozenset(getattr(Tensor, name) for name in _ARITHMETIC)
+    # torch turns the mode off inside of its initialisers, so that they are caught as well.
+    draws = frozenset({nn.init.normal_, Tensor.normal_})
 
     def __torch_function__(
         self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None
     ) -> Any:
-        if func in self.draws and (tensor := args[0] if args else kwargs["tensor"]).is_meta:
-            return tensor
+        kwargs = kwargs or {}
         if func is torch.linspace:
-            kwargs = {"device": "cpu", **(kwargs or {})}
-        elif func is torch.randn and not kwargs:
-            func = torch.empty
-        elif (func is torch.cat or func in self.arithmetic) and not kwargs:
-            tensors = [x for x in (args[0] if func is torch.cat else args) if isinstance(x, Tensor)]
-            shapes = [x.shape for x in tensors]
-            if all(x.is_meta and x.dtype is torch.float32 for x in tensors):
-                if func is not torch.cat:
-                    return torch.empty(np.broadcast_shapes(*shapes))
-                dim = args[1] % len(shapes[0]) if len(args) > 1 else 0
-                length = sum(shape[dim] for shape in shapes)
-                return torch.empty(*shapes[0][:dim], length, *shapes[0][dim + 1 :])
-        return func(*args, **(kwargs or {}))
+            return func(*args, **{"device": "cpu", **kwargs})
+        if func is torch.randn and not kwargs:
+            return torch.empty(*args)
+        given = kwargs.values() if func in self.draws and not args else args
+        tensors = [x for x in (args[0] if func is torch.cat else given) if isinstance(x, Tensor)]
+        if not all(x.is_meta and x.dtype is torch.float32 for x in tensors):
+            return func(*args, **kwargs)
+        if func in self.draws:
+            return tensors[0]
+        if func in self.arithmetic:
+            return torch.empty(np.broadcast_shapes(*(x.shape for x in tensors)))
+        if func is torch.cat:
+            dim = args[1] if len(args) > 1 else 0
+            shape = list(tensors[0].shape)
+            shape[dim] = sum(x.shape[dim] for x in tensors)
+            return torch.empty(shape)
+        return func(*args, **kwargs)
 
 
 def build(chosen: Chosen, *arguments: Any) -> Any:
@@ -133,9 +144,9 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
         if users_mistake or is_out_of_memory(error) or chosen.installed.plugin is BUILTIN:
             raise
         failure = component_failure(chosen.type, "__init__", error, chosen.installed)
-        where = chosen.place.origin.file, chosen.place.origin.line
-        problem = RecipeProblem(chosen.path, failure.reason, failure.fix, *where)
-        raise RecipeError([problem]) from error
+        problems = Problems()
+        problems.add(chosen.place.origin, chosen.path, failure.reason, failure.fix)
+        raise RecipeError(problems.found) from error
     if chosen.schedules:
         built.schedules = chosen.schedules
     return built
@@ -158,29 +169,33 @@ def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
     module: a model, which leaves patterns of `losses` unchecked, or what holds both. A shared
     parameter goes by its first name. Raises RecipeError.
     """
-    config, node, problems = optimizer.config, optimizer.place.node, Problems()
-    written = node if isinstance(node, MapNode) else MapNode(optimizer.place.origin)
+    config = optimizer.config
     model = next(m for m in module.modules() if isinstance(m, QueryGaussianModel))
     factors = {name: 1.0 for name, _ in module.named_parameters()}
-    known: dict[int, dict[KeyPath, list[str]]] = {}  # names below a path, by its length
-    for name in factors:
-        for path in _paths(name.removeprefix("model."), model):
-            for end in range(1, len(path) + 1):
-                known.setdefault(end, {}).setdefault(path[:end], []).append(name)
+    paths = {name: _paths(name.removeprefix("model."), model) for name in factors}
+    problems = Problems()
     for pattern, factor in config.parts.items() if isinstance(config, OptimizerConfig) else ():
         wanted = pattern.removeprefix("model.").split(".")
-        below = known.get(len(wanted), {}).items()
-        named = [n for p, names in below if all(map(fnmatchcase, p, wanted)) for n in names]
+        named = [name for name in factors if any(_is_below(path, wanted) for path in paths[name])]
         factors |= dict.fromkeys(named, factor)
         if not named and (module is not model or wanted[0] != "losses"):
-            parts = [path for paths in known.values() for path in paths]
+            known = {part for below in paths.values() for path in below for part in _heads(path)}
             reason = f"the pattern `{pattern}` matches no parameter of the model"
-            outermost = ", ".join(dict.fromkeys(path[0] for path in parts))
-            fix = near_pattern(pattern, parts) or f"its parts: {outermost}"
-            _, origin, _ = find(written, ("parts", pattern))
+            outermost = ", ".join(dict.fromkeys(below[0][0] for below in paths.values()))
+            fix = near_pattern(pattern, known) or f"its parts: {outermost}"
+            origin = optimizer.node.child("parts").origin_of(pattern)
             problems.add(origin, f"optimizer.parts.{pattern}", reason, fix)
     problems.raise_any()
     return factors
+
+
+def _is_below(path: KeyPath, wanted: Sequence[str]) -> bool:
+    return len(path) >= len(wanted) and all(map(fnmatchcase, path, wanted))
+
+
+def _heads(path: KeyPath) -> Iterator[KeyPath]:
+    """A path and all that it lies below."""
+    return (path[:end] for end in range(1, len(path) + 1))
 
 
 def _paths(name: str, model: QueryGaussianModel) -> list[KeyPath]:

@@ -46,7 +46,9 @@ class Chosen:
 
     def equals(self, other: Chosen | None) -> bool:
         """Whether `other` is the same component with the same options."""
-        return other is not None and self.type == other.type and self.options == other.options
+        if other is None or self.component is not other.component:
+            return False
+        return self.options == other.options
 
     @property
     def later(self) -> list[ComponentConfig]:

@@ -74,13 +74,12 @@ class Recipe:
         pretrained: components read the weights that options name; False where a checkpoint follows.
         Raises TooLargeError for weights that do not fit into memory, before any is made.
         """
-        arguments = self.parts, self.dims, self.layer_scale, self.seed, self.tree
         if device is None or torch.device(device).type != "meta":
-            state = build_model(*arguments, "meta").state_dict()
+            state = build_model(self, "meta").state_dict()
             sizes = {name: x.numel() * x.element_size() for name, x in state.items()}
             fix = "Lower the option of the model that makes the largest of them."
             refuse_more_than_memory("the model with its weights", sizes, fix)
-        model = build_model(*arguments, device)
+        model = build_model(self, device)
         model.releases = self.releases
         if pretrained:
             load_pretrained(model)
