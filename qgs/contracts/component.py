@@ -188,10 +188,7 @@ def component_of(config: ComponentConfig) -> type[Component]:
     """The component that has the options `config`; raises TypeError where there is none."""
     component = type(config).__component__ if isinstance(config, ComponentConfig) else None
     if component is None:
-        raise TypeError(
-            f"{type(config).__name__} holds options of no component; "
-            "give the Config of a component class, such as MyAttention.Config()"
-        )
+        raise TypeError(f"{type(config).__name__} is not the Config of a component class")
     return component
 
 

@@ -25,7 +25,7 @@ class AttentionWeights:
 
     content: (B, h, Q, T) logits of content alone, finite. geometry: what is added to them, (B, 1,
     Q, T) or one for each head (B, h, Q, T), -inf for tokens that a mask hides; None where nothing
-    is. weights: (B, h, Q, T) softmax of the sum. Raises ValueError for other shapes.
+    is. weights: (B, h, Q, T) softmax of the sum.
     """
 
     content: Tensor
@@ -34,14 +34,12 @@ class AttentionWeights:
 
     def __post_init__(self) -> None:
         shape = tuple(self.content.shape)
-        if len(shape) != 4:
-            raise ValueError(f"content must have shape (B, h, Q, T), got {shape}")
-        shared = (shape[0], 1, *shape[2:])
-        if self.geometry is not None and self.geometry.shape not in (shared, shape):
-            given = f"got {tuple(self.geometry.shape)}"
-            raise ValueError(f"geometry must have shape {shared} or {shape}, {given}")
-        if self.weights.shape != shape:
-            raise ValueError(f"weights must have shape {shape}, got {tuple(self.weights.shape)}")
+        assert len(shape) == 4, f"content has the shape {shape}, not (B, h, Q, T)"
+        assert self.weights.shape == shape, f"weights {tuple(self.weights.shape)}, content {shape}"
+        if self.geometry is not None:
+            found = tuple(self.geometry.shape)
+            shared = (shape[0], 1, *shape[2:])
+            assert found in (shared, shape), f"geometry {found}, content {shape}"
 
 
 @dataclass(frozen=True)

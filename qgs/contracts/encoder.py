@@ -103,7 +103,8 @@ class PatchEncoder(Encoder):
 
     def grid(self, views: Views) -> tuple[int, int, int]:
         """(V, H/P, W/P); raises ValueError where patches do not divide the images."""
-        patch, (count, _, height, width) = self.config.patch_size, views.images.shape[1:]
+        patch = self.config.patch_size
+        count, _, height, width = views.images.shape[1:]
         if height % patch or width % patch:
             raise ValueError(
                 f"images of {height} x {width} cannot be cut into patches of {patch}; "

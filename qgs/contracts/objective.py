@@ -31,14 +31,17 @@ class Outcome:
 
         Raises ValueError for a term that is named as one of the outcomes'.
         """
-        first, share = outcomes[0], 1 / len(outcomes)
+        first = outcomes[0]
+        share = 1 / len(outcomes)
         if taken := sorted(first.terms.keys() & terms.keys()):
             raise ValueError(f"the recipe's losses have terms {taken} already; rename the others")
         judged = {n: share * _sum(o.terms[n] for o in outcomes) for n in first.terms}
         signs = {n: share * _sum(o.signs[n] for o in outcomes) for n in first.signs}
+        # One collapsed pass is a sign that a mean would hide.
         signs["deviation"] = torch.stack([o.signs["deviation"] for o in outcomes]).amax()
         total = share * _sum(o.total for o in outcomes) + _sum(terms.values())
-        return cls(total, {**judged, **{n: x.detach() for n, x in terms.items()}}, signs)
+        detached = {n: term.detach() for n, term in terms.items()}
+        return cls(total, judged | detached, signs)
 
 
 def _sum(terms: Iterable[Tensor]) -> Tensor:

@@ -90,24 +90,16 @@ class Renderer(Component, torch.nn.Module):
 
 def check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
     """Raise ValueError unless Gaussians (B, G) and cameras (B, V) belong together."""
-    if gaussians.means.ndim != 3:
+    means = gaussians.means
+    if means.ndim != 3 or len(cameras.shape) != 2 or len(means) != cameras.shape[0]:
         raise ValueError(
-            f"a renderer takes Gaussians of B scenes, means (B, G, 3), got "
-            f"{tuple(gaussians.means.shape)}; add a leading dimension for a single scene"
+            f"a renderer takes means (B, G, 3) and cameras (B, V) of the same scenes, got "
+            f"{tuple(means.shape)} and {tuple(cameras.shape)}; add leading dimensions for a single "
+            "scene or view"
         )
-    if len(cameras.shape) != 2:
+    if means.device != cameras.c2w.device:
         raise ValueError(
-            f"a renderer takes cameras of shape (B, V), got {tuple(cameras.shape)}; "
-            "add leading dimensions for a single scene or view"
-        )
-    if gaussians.means.shape[0] != cameras.shape[0]:
-        raise ValueError(
-            f"Gaussians of {gaussians.means.shape[0]} scenes cannot be rendered from cameras of "
-            f"{cameras.shape[0]} scenes; both need the same batch size"
-        )
-    if gaussians.means.device != cameras.c2w.device:
-        raise ValueError(
-            f"Gaussians are on {gaussians.means.device}, cameras on {cameras.c2w.device}; "
+            f"Gaussians are on {means.device}, cameras on {cameras.c2w.device}; "
             "move one with .to(device)"
         )
 

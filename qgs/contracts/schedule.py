@@ -38,16 +38,19 @@ def number_kinds(annotation: Any) -> set[type]:
 
 def at_step(config: ConfigT, schedules: Mapping[str, Schedule], step: int) -> ConfigT:
     """`config` with the numbers after `step` steps, rounded for options that are whole numbers."""
-    fields, numbers = type(config).model_fields, {n: s.number(step) for n, s in schedules.items()}
-    whole = [name for name in numbers if float not in number_kinds(fields[name].annotation)]
-    return config.model_copy(update=numbers | {name: round(numbers[name]) for name in whole})
+    numbers = {name: schedule.number(step) for name, schedule in schedules.items()}
+    for name in numbers:
+        if float not in number_kinds(type(config).model_fields[name].annotation):
+            numbers[name] = round(numbers[name])
+    return config.model_copy(update=numbers)
 
 
 def follow(parts: Iterable[object], step: int) -> None:
     """Give those of `parts` that are components the options that they have after `step` steps."""
     for part in parts:
         if isinstance(part, Component) and part.schedules:
-            part.config, part.followed = at_step(part.config, part.schedules, step), step
+            part.config = at_step(part.config, part.schedules, step)
+            part.followed = step
 
 
 def steps_followed(parts: Iterable[object]) -> int | None:
