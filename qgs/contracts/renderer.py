@@ -91,11 +91,16 @@ class Renderer(Component, torch.nn.Module):
 def check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
     """Raise ValueError unless Gaussians (B, G) and cameras (B, V) belong together."""
     means = gaussians.means
-    if means.ndim != 3 or len(cameras.shape) != 2 or len(means) != cameras.shape[0]:
+    if means.ndim != 3 or len(cameras.shape) != 2:
         raise ValueError(
-            f"a renderer takes means (B, G, 3) and cameras (B, V) of the same scenes, got "
-            f"{tuple(means.shape)} and {tuple(cameras.shape)}; add leading dimensions for a single "
-            "scene or view"
+            f"a renderer takes Gaussians of B scenes, means (B, G, 3), and cameras of shape "
+            f"(B, V), got {tuple(means.shape)} and {tuple(cameras.shape)}; add leading dimensions "
+            "for a single scene or view"
+        )
+    if len(means) != cameras.shape[0]:
+        raise ValueError(
+            f"Gaussians of {len(means)} scenes cannot be rendered from cameras of "
+            f"{cameras.shape[0]} scenes; both need the same batch size"
         )
     if means.device != cameras.c2w.device:
         raise ValueError(

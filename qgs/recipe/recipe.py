@@ -58,8 +58,9 @@ class Recipe:
     @property
     def warnings(self) -> list[str]:
         """What works and is probably not what was meant, a sentence each."""
-        length = self.training.steps, self.training.seconds
-        return [*idle_fields(self.parts), *unfinished(self.parts, *length)]
+        training = self.training
+        late = unfinished(self.parts, training.steps, training.seconds)
+        return [*idle_fields(self.parts), *late]
 
     @property
     def schedules(self) -> dict[KeyPath, Mapping[str, Schedule]]:
@@ -87,24 +88,28 @@ class Recipe:
 
     def build_losses(self, pretrained: bool = True) -> dict[str, contracts.Loss]:
         """Losses by the names that the recipe gives; only one without data may have none."""
-        losses = {path[1]: build(part) for path, part in self.parts.items() if path[0] == "losses"}
+        losses = self._named("losses")
         if pretrained:
             load_pretrained(*losses.values())
         return losses
 
-    def build_objective(self) -> contracts.Objective:
-        """What a training step computes."""
-        return build(self.parts["objective",])
-
     def build_metrics(self) -> dict[str, contracts.Metric]:
         """What evaluations measure, by the names that the recipe gives."""
-        found = {path[1]: build(part) for path, part in self.parts.items() if path[0] == "metrics"}
-        for metric in found.values():
+        metrics = self._named("metrics")
+        for metric in metrics.values():
             try:
                 load_pretrained(metric)
             except contracts.MissingExtraError as error:
-                metric.unavailable = str(error)  # evaluations go on with the other metrics
-        return found
+                # Evaluations go on with the other metrics.
+                metric.unavailable = str(error)
+        return metrics
+
+    def _named(self, section: str) -> dict[str, Any]:
+        return {at[1]: build(part) for at, part in self.parts.items() if at[0] == section}
+
+    def build_objective(self) -> contracts.Objective:
+        """What a training step computes."""
+        return build(self.parts["objective",])
 
     def build_optimizer(self) -> contracts.Optimizer:
         """The optimiser; raises ValueError where `training` is too short for it."""
@@ -173,15 +178,14 @@ def differing_options(
 
     None stands for an option that a recipe does not have.
     """
-    of_a, of_b, absent = flat(a), flat(b), object()
-    return {
-        path: (
-            inline(of_a[path]) if path in of_a else None,
-            inline(of_b[path]) if path in of_b else None,
-        )
-        for path in of_a | of_b
-        if of_a.get(path, absent) != of_b.get(path, absent)
-    }
+    ours = flat(a)
+    theirs = flat(b)
+    differing = [key for key in ours | theirs if ours.get(key, ...) != theirs.get(key, ...)]
+    return {key: (_shown(ours, key), _shown(theirs, key)) for key in differing}
+
+
+def _shown(options: Mapping[str, Any], key: str) -> str | None:
+    return inline(options[key]) if key in options else None
 
 
 _NO_EFFECT_ONCE_TRAINED = re.compile(
@@ -206,7 +210,8 @@ def annotated(recipe: Recipe) -> str:
 
     def lines_of(tree: Mapping[str, Any], path: KeyPath) -> Iterator[tuple[str, str]]:
         for key, value in tree.items():
-            below, name = (*path, key), "  " * len(path) + inline(key)
+            below = (*path, key)
+            name = "  " * len(path) + inline(key)
             if isinstance(value, Mapping) and value:
                 yield f"{name}:", ""
                 yield from lines_of(value, below)
@@ -214,5 +219,6 @@ def annotated(recipe: Recipe) -> str:
                 yield f"{name}: {inline(value)}", recipe.provenance[".".join(below)]
 
     lines = list(lines_of(recipe.tree, ()))
-    width = min(max(len(text) for text, _ in lines), 100)  # one long list must not move them all
+    # One long list must not move the comments of all lines.
+    width = min(max(len(text) for text, _ in lines), 100)
     return "\n".join(f"{text:<{width}}  # {origin}" if origin else text for text, origin in lines)

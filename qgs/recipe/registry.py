@@ -126,7 +126,8 @@ def load_plugins(tree: MapNode, problems: Problems, given: Sequence[Plugin] = ()
 
 def load_usable_plugins() -> tuple[Registry, list[str]]:
     """The components of every installed plugin that can be used, and why the others cannot."""
-    plugins, broken = {"qgs": builtin()}, []
+    plugins = {"qgs": builtin()}
+    broken = []
     available = available_plugins()
     for release in map(_release, available.pop("qgs", [])):
         broken.append(f"{release} offers a plugin `qgs`, the framework's name; uninstall {release}")
@@ -151,7 +152,8 @@ def load_plugin(name: str) -> InstalledPlugin:
         releases = ", ".join(sorted(map(_release, entries)))
         reason = f"several distributions offer a plugin `{name}`: {releases}"
         raise PluginError(reason, "uninstall all of them but one")
-    entry, release = entries[0], _release(entries[0])
+    entry = entries[0]
+    release = _release(entry)
     assert entry.dist is not None
     named = f"the plugin `{name}` of {release}"
     try:

@@ -3,6 +3,8 @@
 import inspect
 from typing import Any
 
+import yaml
+
 from qgs.contracts import LAYER_SLOTS, Component, ComponentConfig
 from qgs.contracts.schedule import Schedule
 from qgs.recipe.registry import Registry
@@ -11,8 +13,26 @@ from qgs.recipe.slots import MODEL_SLOTS, SECTIONS, SLOTS
 from qgs.recipe.yaml_text import KeyPath
 from qgs.tokengs.schedules import SCHEDULES
 
-_NAMES = {"type": "array", "items": {"type": "string"}}
 _NULL = {"type": "null"}
+_WRITTEN = """
+extends:
+  description: Recipe file or files that this one is laid over, relative to it.
+  anyOf: [{type: string}, {type: array, items: {type: string}}]
+plugins:
+  description: Plugins whose components the recipe may name.
+  type: array
+  items: {type: string}
+swap:
+  description: Components by pattern of the places that they take, such as
+    `decoder.layers.*.feed_forward`; null drops an inherited swap.
+  type: object
+layers:
+  description: Overrides of single layers, by their index from 0.
+  type: object
+  patternProperties: {"^[0-9]+$": {type: object}}
+  additionalProperties: false
+"""
+"""What stands beside settings and components."""
 
 
 def recipe_schema(registry: Registry) -> dict[str, Any]:
@@ -20,37 +40,22 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
 
     Nothing is required, as in overlays; without a `type` the options of all its slot may stand.
     """
+    beside: dict[str, Any] = yaml.safe_load(_WRITTEN)
     layer = {name: _component(name) for name in LAYER_SLOTS}
-    layers = {
-        "description": "Overrides of single layers, by their index from 0.",
-        "type": "object",
-        "patternProperties": {
-            "^[0-9]+$": {"type": "object", "properties": layer, "additionalProperties": False}
-        },
-        "additionalProperties": False,
-    }
+    layers = beside.pop("layers")
+    for overrides in layers["patternProperties"].values():
+        overrides |= {"properties": layer, "additionalProperties": False}
     decoder = _section(("model", "decoder"), layer | {"layers": layers})
     parts = {name: _component(name) for name in MODEL_SLOTS}
-    beside: dict[str, Any] = {
-        "extends": {
-            "description": "Recipe file or files that this one is laid over, relative to it.",
-            "anyOf": [{"type": "string"}, _NAMES],
-        },
-        "plugins": {"description": "Plugins whose components the recipe may name.", **_NAMES},
-        "swap": {
-            "description": "Components by pattern of the places that they take, such as "
-            "`decoder.layers.*.feed_forward`; null drops an inherited swap.",
-            "type": "object",
-            "additionalProperties": {"anyOf": [*map(_ref, SLOTS), _NULL]},
-        },
-        "model": _section(("model",), parts | {"decoder": decoder}),
-    }
+    beside["swap"]["additionalProperties"] = {"anyOf": [*map(_ref, SLOTS), _NULL]}
+    beside["model"] = _section(("model",), parts | {"decoder": decoder})
     for name, section in SECTIONS.items():
-        description, component = summary_of(SLOTS[name].contract), {"anyOf": [_ref(name), _NULL]}
+        described = _component(name)
+        component = {"anyOf": described["anyOf"]}
         if section.named:
-            description = f"By name: {description}"
             component = {"type": "object", "additionalProperties": component}
-        beside[name] = {"description": description, **component}
+        by_name = "By name: " if section.named else ""
+        beside[name] = {"description": by_name + described["description"], **component}
     beside |= {path[0]: _section(path) for path in SETTINGS if path and path[0] not in beside}
     definitions: dict[str, dict[str, Any]] = {
         slot: {"anyOf": [_type(name, c) for name, c in registry.components(slot).items()]}
@@ -64,13 +69,14 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
 
 def _type(name: str, component: type[Component]) -> dict[str, Any]:
     """The options of `component`, and the `type` that chooses it."""
-    description, schema = summary_of(component), _settings(component.Config)
+    description = summary_of(component)
+    schema = _settings(component.Config)
     properties = {"type": {"const": name, "description": description}, **schema["properties"]}
     for option in component.scheduled:
         number = dict(properties[option])
-        shown = {
-            key: number.pop(key) for key in ("description", "title", "default") if key in number
-        }
+        # What editors show of an option stands beside its alternatives, not inside of one.
+        apart = [key for key in ("description", "title", "default") if key in number]
+        shown = {key: number.pop(key) for key in apart}
         properties[option] = {**shown, "anyOf": [number, {"$ref": "#/$defs/schedule"}]}
     return schema | {"description": description, "properties": properties}
 

@@ -82,9 +82,30 @@ def test_attention_of_other_shapes_is_refused():
 
     whole, flat, long = (2, 4, 3, 5), (2, 3, 5), (2, 4, 3, 6)
     faults = (
-        fault(r"content .* \(2, 3, 5\), not \(B, h, Q, T\)", weights, flat, None, flat),
-        fault(r"geometry \(2, 3, 5\), content \(2, 4, 3, 5\)", weights, whole, flat, whole),
-        fault(r"geometry \(1, 1, 3, 5\)", weights, whole, (1, 1, 3, 5), whole),
-        fault(r"weights \(2, 4, 3, 6\), content \(2, 4, 3, 5\)", weights, whole, None, long),
+        fault(
+            r"content .* \(2, 3, 5\), not \(B, h, Q, T\)",
+            weights,
+            flat,
+            None,
+            flat,
+            kind=AssertionError,
+        ),
+        fault(
+            r"geometry \(2, 3, 5\), content \(2, 4, 3, 5\)",
+            weights,
+            whole,
+            flat,
+            whole,
+            kind=AssertionError,
+        ),
+        fault(r"geometry \(1, 1, 3, 5\)", weights, whole, (1, 1, 3, 5), whole, kind=AssertionError),
+        fault(
+            r"weights \(2, 4, 3, 6\), content \(2, 4, 3, 5\)",
+            weights,
+            whole,
+            None,
+            long,
+            kind=AssertionError,
+        ),
     )
     assert not any(faults), faults
