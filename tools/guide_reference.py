@@ -10,8 +10,8 @@ from typing import Any
 
 from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
 from qgs.recipe import slots
-from qgs.recipe.sections import DecoderSettings, ModelSettings, RecipeSettings
 from qgs.recipe.registry import Registry, load_registry
+from qgs.recipe.sections import DecoderSettings, ModelSettings, RecipeSettings
 from qgs.recipe.slots import SLOTS
 from qgs.recipe.yaml_text import dump
 

@@ -13,10 +13,10 @@ from qgs.contracts import LAYER_SLOTS
 from qgs.model import QueryGaussianModel
 from qgs.model_text import parameter_counts
 from qgs.recipe import Recipe
-from qgs.recipe.sections import SETTINGS
 from qgs.recipe.errors import did_you_mean
 from qgs.recipe.registry import Registry, default_config
 from qgs.recipe.schema import recipe_schema
+from qgs.recipe.sections import SETTINGS
 from qgs.recipe.slots import MODEL_SLOTS, SLOTS
 from qgs.recipe.yaml_text import inline
 

@@ -1,6 +1,18 @@
 """The composer: from a recipe to a checked, reproducible model.
 
-`compose` makes the model; `resolve` merges and checks a recipe without allocating a tensor.
+`compose` makes the model; `resolve` merges and checks a recipe without allocating a tensor. The way
+of a recipe, each step in a file of its own:
+
+| step | file |
+|---|---|
+| read it with what it extends, lay overrides over it | `files.py`, `yaml_text.py` |
+| decode its sections and settings | `sections.py` |
+| find what stands at each place: defaults, layers, swaps | `places.py`, `slots.py` |
+| choose components and decode their options | `registry.py`, `decode.py`, together `draft.py` |
+| check them beside each other, follow fields from writer to reader | `checks.py`, `flow.py` |
+| find the line that caused a problem | `causes.py` |
+| write out every default | `spell_out.py`, `recipe.py` |
+| build the model | `build.py` |
 """
 
 from collections.abc import Mapping, Sequence

@@ -44,12 +44,14 @@ def build_model(recipe: Recipe, device: torch.device | str | None) -> QueryGauss
     """
     on_meta = device is not None and torch.device(device).type == "meta"
     with (
+        # Composing a model must not change what a script draws after it.
         torch.random.fork_rng(devices=()),
         torch.device("meta" if on_meta else "cpu"),
         OnMeta() if on_meta else nullcontext(),
     ):
         torch.default_generator.manual_seed(recipe.seed)
         model = _assemble(recipe)
+    # Drawn on the CPU first: every device begins with the same numbers.
     return model if on_meta or device is None else model.to(device)
 
 
@@ -59,6 +61,7 @@ def _assemble(recipe: Recipe) -> QueryGaussianModel:
     def at(*path: str) -> Any:
         chosen = recipe.parts["model", *path]
         for known, built in shared:
+            # LocusGS refines after all layers with the same weights.
             if known.equals(chosen):
                 return built
         sized = issubclass(chosen.component, ModelComponent)
@@ -175,10 +178,12 @@ def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
     paths = {name: _paths(name.removeprefix("model."), model) for name in factors}
     problems = Problems()
     for pattern, factor in config.parts.items() if isinstance(config, OptimizerConfig) else ():
+        # What is trained holds the model as `model`, a recipe its parts in the section `model`.
         wanted = pattern.removeprefix("model.").split(".")
         named = [name for name in factors if any(_is_below(path, wanted) for path in paths[name])]
         factors |= dict.fromkeys(named, factor)
         if not named and (module is not model or wanted[0] != "losses"):
+            # Only for the fix of a pattern that matches nothing.
             known = {part for below in paths.values() for path in below for part in _heads(path)}
             reason = f"the pattern `{pattern}` matches no parameter of the model"
             outermost = ", ".join(dict.fromkeys(below[0][0] for below in paths.values()))

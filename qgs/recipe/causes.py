@@ -20,6 +20,7 @@ def at_their_causes(
 ) -> Iterator[RecipeProblem]:
     """`found`, what is wrong with `draft` as a whole; those of one cause become one problem."""
     drafts = [draft]
+    # Only a recipe that is refused is read once more for each layer.
     while found and (under := drafts[-1].written.under) is not None:
         drafts.append(draft_of(under, Problems(), plugins))
     caused: dict[RecipeProblem, list[RecipeProblem]] = {}
@@ -31,6 +32,7 @@ def at_their_causes(
         else:
             caused.setdefault(blame, []).append(problem)
     for blame, broken in caused.items():
+        # The layers of a decoder may have the same problem.
         told = dict.fromkeys(f"{problem.place}: {problem.reason}" for problem in broken)
         fixes = dict.fromkeys(problem.fix for problem in broken)
         reason = "\n    ".join([f"{blame.reason} breaks:", *told])
@@ -45,6 +47,7 @@ def _blamed(problem: RecipeProblem, drafts: Sequence[Draft]) -> RecipeProblem | 
     for newer, older in pairwise(drafts):
         if _has(older, problem):
             continue
+        # Changes are made one after the other until the problem is there: the last one brought it.
         parts = dict(older.parts)
         for source in {part.place.source: None for part in newer.parts.values() if part}:
             changed = {

@@ -54,6 +54,7 @@ def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -
         component.fields_written(config)
         if issubclass(component, Supervision):
             called = "weights"
+            # `check_flow` asks for them, outside of this guard.
             component(config).weights()
         called = "problems"
         # A scheduled option must be valid at every extreme of its schedule.
@@ -118,6 +119,7 @@ def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, 
     """Path, reason and fix."""
     settings = draft.settings
     encoder: Any = parts["model", "encoder"]
+    # Tuning fits what an encoder can make keys and values of anew.
     if encoder and settings["evaluation",].tuning == "latents" and not encoder.component.tunable:
         known: dict[str, Any] = draft.registry.components("encoder")
         others = " or ".join(f"`{name}`" for name in sorted(known) if known[name].tunable)
@@ -127,6 +129,7 @@ def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, 
     if settings["training",].judge_inputs:
         path = ("training", "judge_inputs")
         fix = "set it to false; evaluations do not read it"
+        # A loss would compare renderings from moved cameras with photos from true ones.
         if settings["views",].pose_noise:
             reason = "views.pose_noise moves the cameras of input views, which must be exact"
             yield path, reason, fix
@@ -141,6 +144,7 @@ def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, 
 
 def _idle_layer_scale(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, str]]:
     """Path, reason and fix where `layer_scale` was changed and no layer reads it."""
+    # A resolved recipe writes the default out, which must stay valid.
     default = DecoderSettings().layer_scale
     places = [("model", "decoder", "layers", str(index)) for index in range(draft.dims.depth)]
     layers: list[Any] = [parts[*place, "layer"] for place in places]

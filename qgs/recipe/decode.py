@@ -21,6 +21,7 @@ from qgs.recipe.yaml_text import KeyPath, ListNode, MapNode, find, inline, kind_
 from qgs.tokengs.schedules import SCHEDULES
 
 ConfigT = TypeVar("ConfigT", bound=ComponentConfig)
+# YAML 1.1, which most tools read, takes these words for truth values.
 _BOOLS = {"on": "true", "yes": "true", "y": "true", "off": "false", "no": "false", "n": "false"}
 
 
@@ -127,6 +128,7 @@ def _decode_options(
     if len(valid) < len(schedules):
         return None
     configs = list[ComponentConfig]()
+    # Between two corners a schedule is monotonic, so that no other step is beyond its limits.
     for step in corners(valid):
         options = MapNode(node.origin, node.entries())
         for option, schedule in valid.items():
@@ -179,6 +181,7 @@ def _why_no_component(name: object, place: Place, registry: Registry) -> tuple[s
     if plugin not in registry.plugins:
         reason = f"`{name}` is of the plugin `{plugin}`, which this recipe does not use"
         return reason, _how_to_use(plugin, registry)
+    # The same name may stand in several slots, such as `qgs/none`.
     for other in SLOTS:
         if name in registry.components(other):
             return f"`{name}` belongs in the slot `{other}`, not in `{slot}`", choice
@@ -267,6 +270,7 @@ def _options_beside(config: type[BaseModel], loc: tuple[str | int, ...]) -> set[
         fields = [(name, field, m) for m in models for name, field in m.model_fields.items()]
         inner = [models_in(field.annotation) for name, field, _ in fields if name == step]
         tagged = {m for _, field, m in fields if step in get_args(field.annotation)}
+        # A step that is no field is an index of a list or a key of a mapping.
         models = set().union(*inner) or tagged or models
     return {name for model in models for name in model.model_fields}
 

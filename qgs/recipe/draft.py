@@ -43,7 +43,9 @@ def draft_of(written: MapNode, problems: Problems, plugins: Sequence[Plugin]) ->
     plugins: those that it may name although they are not installed.
     """
     tree = check_keys(written, problems)
+    # What a file that cannot be read would have set is not missing from the recipe.
     problems.raise_if_stopped()
+    # Under what is written: `losses: {}` has none, a recipe without `losses` the default ones.
     tree = _with_defaults(tree)
     settings, sizes_known = decode_settings(tree, problems)
     registry = load_plugins(tree, problems, plugins)

@@ -46,6 +46,7 @@ class RecipeError(ValueError):
     """
 
     def __init__(self, problems: Iterable[RecipeProblem], what: str = "recipe") -> None:
+        # A template of the decoder may be refused once for each of its layers.
         ordered = sorted(set(problems), key=lambda p: (p.file, p.line, p.option, p.reason, p.fix))
         self.problems = tuple(ordered)
         title = "1 problem" if len(ordered) == 1 else f"{len(ordered)} problems"
@@ -66,6 +67,7 @@ class Problems:
     def stop(self, origin: Origin, path: str | Iterable[str], reason: str, fix: str) -> None:
         """Note a mistake that hides part of the recipe: checks of the rest would mislead."""
         self.add(origin, path, reason, fix)
+        # The caller goes on until all files are read, so that all of them are reported.
         self._stopped = True
 
     def add(
@@ -95,6 +97,7 @@ class Problems:
 
 def nearest(word: str, choices: Iterable[str]) -> str | None:
     """The choice that `word` is probably a misspelling of."""
+    # Below .6 difflib takes words for similar that share a few letters.
     found = get_close_matches(word, sorted(choices), n=1, cutoff=0.6)
     return found[0] if found else None
 

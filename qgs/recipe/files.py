@@ -30,6 +30,7 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
     place of an option it is a value, in place of a component or a section it leaves the default, in
     place of a swap it drops the swap.
     """
+    # Options of another component would be refused, or worse, mean something else.
     if _replaces(base, over, path):
         return over
     merged = MapNode(over.origin, base.entries())
@@ -41,6 +42,7 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
             del merged[key]
             continue
         if below == ("plugins",) and isinstance(old, list) and isinstance(value, list):
+            # A file names the plug-ins that it needs and leaves those of its base.
             added = [item for item in items_of(value, origin) if item[0] not in old]
             value = ListNode(origin, [*items_of(old, base.origins[key]), *added])
         elif isinstance(old, MapNode) and isinstance(value, MapNode):
@@ -71,6 +73,7 @@ def found_recipe(file: Path, name: str | Path) -> Path:
 
     name: such as tiny/locus.yaml, or recipes/tiny/locus.yaml.
     """
+    # A wheel has no repository around it.
     home = recipe_folder()
     for folder in (home, home.parent):
         shipped = Path(os.path.normpath(folder / name))
@@ -115,6 +118,7 @@ class _Files:
 
         chain: the files that extend each other down to `file`. extended_at: the last `extends`.
         """
+        # Two files may extend the same third one, by links as well.
         place = Path(os.path.realpath(file))
         if place in self.trees:
             return self.trees[place]
@@ -148,6 +152,7 @@ class _Files:
                 fix = "write `extends: base.yaml`, relative to this file"
                 self.problems.stop(at, "extends", reason, fix)
                 continue
+            # `..` must not follow links: a recipe names its base as it is written.
             file = found_recipe(Path(os.path.normpath(folder / name)), name)
             above = [os.path.realpath(link) for link in chain]
             place = os.path.realpath(file)
@@ -165,6 +170,7 @@ def _why_unreadable(file: Path, error: Exception, chain: Sequence[Path]) -> tupl
     if not isinstance(error, FileNotFoundError):
         why = getattr(error, "strerror", None) or error
         return f"{file} cannot be read: {why}", "check the path, or take one of `qgs recipes`"
+    # A file that extends itself would be a poor advice.
     neighbours = [path.stem for path in file.parent.glob("*.yaml") if path not in chain]
     near = nearest(file.stem, neighbours)
     fix = "check the path, or take one of `qgs recipes`"
@@ -175,6 +181,7 @@ def apply_overrides(tree: MapNode, overrides: Sequence[str], problems: Problems)
     """`tree` with every override laid over it in order; the n-th has the origin `--set #n`."""
     assert not isinstance(overrides, str), f"overrides are a list of strings: [{overrides!r}]"
     for number, text in enumerate(overrides, start=1):
+        # One by one: an override may set an option of a component that the one before chose.
         tree = merge(tree, _read_override(text, Origin(f"--set #{number}"), problems))
     return tree
 
@@ -189,6 +196,7 @@ def _read_override(text: str, origin: Origin, problems: Problems) -> MapNode:
         fix = "write `path.to.option=value`, such as `model.queries.count=128`"
     elif path[0] == "extends":
         fix = "write a recipe that extends both, or set single options"
+    # Patterns have dots as well, so that the path would end nobody knows where.
     elif path[0] == "swap" and len(path) > 1:
         fix = "set the option itself, or give all swaps as `swap={PATTERN: {type: NAME}}`"
     else:

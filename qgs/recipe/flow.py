@@ -34,6 +34,7 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
                 continue
             needed = chosen.component.fields_read(chosen.config)
             missing = {name: spec for name, spec in needed.items() if name not in fields}
+            # All layers made of a template have its path.
             key = (chosen.path, *missing)
             if missing and complete and key not in reported:
                 reported.add(key)
@@ -59,6 +60,7 @@ def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[list[Chosen | N
     decoded = {depth}
     supervision: Any = parts["model", "supervision"]
     if supervision is not None:
+        # A supervised layer is decoded and judged right after it.
         decoded |= supervision.component(supervision.config).weights().keys()
     decode = [parts["model", name] for name in ("head", "centers", "renderer")]
     decode += [part for path, part in parts.items() if path[0] in ("losses", "objective")]
@@ -112,6 +114,7 @@ def keys_are_read(parts: Mapping[KeyPath, Chosen]) -> bool:
 def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
     """A sentence for each learnable field of the queries that only refinements read."""
     used = [part for path, part in parts.items() if path[:-1] != ("model", "decoder")]
+    # A refinement reads what it updates, which alone makes no use of it.
     readers = [part for part in used if not issubclass(part.component, Refinement)]
     read = {name for part in readers for name in part.component.fields_read(part.config)}
     queries = parts["model", "queries"]
@@ -125,12 +128,14 @@ def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
 
 def unfinished(parts: Mapping[KeyPath, Chosen], steps: int, seconds: float | None) -> Iterator[str]:
     """A sentence for each schedule that goes on after `steps` steps, or may after `seconds`."""
+    # Once for the template of a decoder, not for each layer.
     for part in {part.path: part for part in parts.values()}.values():
         for option, schedule in part.schedules.items():
             last = max(schedule.corners, default=0)
             told = f"{part.path}.{option} changes until step {last}"
             if last > steps:
                 yield f"{told}, training ends at {steps}"
+            # How many steps fit into a time budget depends on the machine.
             elif last and seconds is not None:
                 yield (
                     f"{told}, and training.seconds may end training before, after {seconds:g} s: "

@@ -34,6 +34,7 @@ def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place
     decoder = ("model", "decoder")
     template = [_place(tree, (*decoder, name)) for name in LAYER_SLOTS]
     places = [_place(tree, ("model", name)) for name in ("encoder", "queries")] + template
+    # A layer with an index beyond the depth is often one of a base that was deeper.
     layers = tree.child(*decoder, "layers")
     indices = [str(index) for index in range(depth)]
     for key, _, origin in layers.without(*indices).entries():
@@ -67,6 +68,7 @@ def _layer_place(template: Place, index: str, layer: MapNode) -> Place:
     node = layer.get(name)
     if node is None:
         return replace(template, path=path)
+    # Only what is written for this layer changes; the rest is the template's.
     base = MapNode(template.origin) if template.node is None else template.node
     if isinstance(node, MapNode) and isinstance(base, MapNode):
         node = merge(base, node, path)

@@ -76,6 +76,7 @@ class Recipe:
         Raises TooLargeError for weights that do not fit into memory, before any is made.
         """
         if device is None or torch.device(device).type != "meta":
+            # A width of 65,536 is valid, and would end in the kernel's out-of-memory killer.
             state = build_model(self, "meta").state_dict()
             sizes = {name: x.numel() * x.element_size() for name, x in state.items()}
             fix = "Lower the option of the model that makes the largest of them."
@@ -148,6 +149,7 @@ def resolve(
     problems = Problems()
     written = apply_overrides(read_recipe(recipe, problems), overrides, problems)
     draft = draft_of(written, problems, plugins)
+    # A component that could not be decoded is reported at its own line.
     together = Problems()
     parts = check(draft, together)
     problems.found += at_their_causes(draft, together.found, plugins)
@@ -157,6 +159,7 @@ def resolve(
     spelled = spell_out(draft, chosen)
     used = [draft.registry.plugins[name] for name in ("qgs", *spelled["plugins"])]
     return Recipe(
+        # A plain mapping: a checkpoint stores it, and nobody changes the draft through it.
         tree=json.loads(json.dumps(spelled)),
         provenance=provenance(spelled),
         parts=chosen,

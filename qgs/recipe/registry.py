@@ -158,10 +158,12 @@ def load_plugin(name: str) -> InstalledPlugin:
     named = f"the plugin `{name}` of {release}"
     try:
         plugin = entry.load()
+    # A plug-in's module may do anything, `sys.exit` included.
     except (Exception, SystemExit) as error:
         message = f"cannot be imported from `{entry.value}`: {type(error).__name__}: {error}"
         missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
         fix = f"update or correct {release}"
+        # Metadata without modules is what an interrupted uninstall leaves.
         if missing == entry.module:
             fix = f"install {release} again, its files are gone"
         elif missing.partition(".")[0] not in ("", "qgs", entry.module.partition(".")[0]):
@@ -185,6 +187,7 @@ def _plugin_fault(plugin: object, name: str) -> str:
     if plugin.contract_version != CONTRACT_VERSION:
         versions = f"version {plugin.contract_version}; this qgs has version {CONTRACT_VERSION}"
         return f"was written for contract {versions}"
+    # Recipes name the entry point, messages the plug-in.
     if plugin.name != name:
         return f"calls itself `{plugin.name}`; the two names must be one"
     for component in plugin.components:

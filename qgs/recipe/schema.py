@@ -90,6 +90,7 @@ def _section(path: KeyPath, beside: dict[str, Any] | None = None) -> dict[str, A
 def _settings(config: type[ComponentConfig]) -> dict[str, Any]:
     schema = {"properties": {}} | config.model_json_schema()
     definitions = schema.pop("$defs", {})
+    # An overlay sets an option and leaves the rest to its base.
     for key in ("required", "title"):
         schema.pop(key, None)
     return _inlined(schema, definitions)
@@ -102,6 +103,7 @@ def _inlined(schema: Any, definitions: dict[str, Any]) -> Any:
     if not isinstance(schema, dict):
         return schema
     if "$ref" in schema:
+        # Editors show the description at the reference, if there is one.
         schema = definitions[schema["$ref"].rsplit("/", 1)[1]] | schema
     left_out = ("$ref", "discriminator")
     return {k: _inlined(item, definitions) for k, item in schema.items() if k not in left_out}

@@ -77,11 +77,13 @@ def dims_of(settings: Mapping[KeyPath, Any]) -> ModelDims:
 
 def check_keys(tree: MapNode, problems: Problems, path: KeyPath = ()) -> MapNode:
     """Report unknown keys and sections that are no mappings; the tree without them."""
+    # Options of components are checked where their Config is known.
     known = {*LAYER_SLOTS} if path[:-1] == _LAYERS else _KEYS.get(path)
     checked = MapNode(tree.origin)
     for key, node, origin in tree.entries():
         below = (*path, key)
         if known is not None and key not in known:
+            # A key that stands somewhere else is no typing error: name its section.
             homes = [".".join((*home, key)) for home, keys in _KEYS.items() if key in keys]
             fix = f"did you mean `{homes[0]}`?" if homes else did_you_mean(key, known, "keys")
             problems.add(origin, below, f"there is no key `{key}` here", fix)
@@ -103,6 +105,7 @@ def decode_settings(tree: MapNode, problems: Problems) -> tuple[dict[KeyPath, An
     for path, config in SETTINGS.items():
         written = tree.child(*path).without(*_BESIDE.get(path, ()))
         found = decode_config(config, written, path, problems)
+        # Go on with defaults, so that problems of other sections are reported as well.
         settings[path] = found or config.model_construct()
         sizes_known &= bool(found) or path[:1] != ("model",)
     dims = dims_of(settings)

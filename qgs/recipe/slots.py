@@ -56,6 +56,7 @@ SLOTS = {
         Slot(contracts.ViewSampler, "qgs/span"),
     )
 }
+# In the order in which their parameters are drawn: another one makes other models of a seed.
 AFTER_LAYERS = ("feedback", "head", "centers", "supervision", "renderer")
 MODEL_SLOTS = ("encoder", "queries", *AFTER_LAYERS)
 _SECTIONS = ("losses", "objective", "data", "view_sampler", "metrics", "optimizer")

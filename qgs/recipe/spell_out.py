@@ -25,9 +25,11 @@ def spell_out(draft: Draft, parts: Mapping[KeyPath, Chosen]) -> MapNode:
         _holder(whole, path, draft)[path[-1]] = _component(part)
     for name, section in SECTIONS.items():
         written = draft.tree.child(name)
+        # Without a `null` the default metric would come back when the recipe is read again.
         dropped = [key for key in section.defaults if (name, key) not in parts]
         for key in dropped if section.defaults_stay else ():
             _holder(whole, (name, key), draft).put(key, None, written.origin_of(key))
+        # An empty section is not a missing one, which stands for the defaults.
         if section.named and name not in whole:
             whole.put(name, {}, draft.tree.origins.get(name, _DEFAULT))
     for name in ("views", "training", "evaluation"):
@@ -43,6 +45,7 @@ def _shown(parts: Mapping[KeyPath, Chosen]) -> dict[KeyPath, Chosen]:
     shown = {path: part for path, part in parts.items() if "layers" not in path}
     layers = {path: part for path, part in parts.items() if "layers" in path}
     for path in [*shown]:
+        # A swap of all layers reads better as the template.
         standing = [part for at, part in layers.items() if (*at[:2], at[-1]) == path]
         if standing and all(part.equals(standing[0]) for part in standing):
             shown[path] = standing[0]

@@ -43,6 +43,7 @@ class MapNode(dict[str, Any]):
         super().__init__()
         self.origin = origin
         self.origins: dict[str, Origin] = {}
+        # Causes of problems are found in what a recipe was before its last layer.
         self.under: MapNode | None = None
         for key, value, written in items:
             self.put(key, value, written)
@@ -109,6 +110,7 @@ def from_plain(value: Mapping[str, Any], origin: Origin) -> MapNode:
     def mapping(pairs: list[tuple[str, Any]]) -> MapNode:
         return MapNode(origin, ((key, item, origin) for key, item in pairs))
 
+    # JSON refuses what contains itself, and what is no plain value.
     return json.loads(json.dumps(value, default=os.fspath), object_pairs_hook=mapping)
 
 
@@ -121,6 +123,7 @@ def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Ori
     origin = tree.origin
     node = cast("Any", tree)
     for step in path:
+        # Pydantic names the tag of a union as a step, which nobody writes.
         key: Any = str(step) if isinstance(node, MapNode) else step
         inside = isinstance(node, MapNode) and key in node
         inside |= isinstance(node, list) and isinstance(step, int) and step < len(node)
@@ -156,6 +159,7 @@ class Yaml12Dumper(yaml.SafeDumper):
 
     yaml_implicit_resolvers = _RESOLVERS
 
+    # Anchors would be hard to read in a resolved recipe.
     def ignore_aliases(self, data: Any) -> bool:
         """Write repeated values out."""
         return True
@@ -163,6 +167,7 @@ class Yaml12Dumper(yaml.SafeDumper):
 
 def dump(value: Any, *, flow: bool | None = False) -> str:
     """`value` as YAML 1.2, keys in their order."""
+    # A width that long breaks no line: each option of a recipe stays on its own.
     style: Any = {"default_flow_style": flow, "sort_keys": False, "width": 10_000}
     return yaml.dump(value, Dumper=Yaml12Dumper, **style)
 
@@ -265,6 +270,7 @@ class _Reader:
             key = key_node.value
             origin = self.origin(key_node)
             below = (*path, key)
+            # The last of two equal keys would win in silence.
             if not isinstance(key_node, yaml.ScalarNode):
                 below = path
                 reason = "a key is a mapping or a list"

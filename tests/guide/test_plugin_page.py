@@ -100,6 +100,6 @@ def test_the_recipes_work_and_what_the_page_says_is_refused(package):
     assert {*resolve("nearby.yaml", plugins=plugins).tree["plugins"]} >= {"locus", "sightline"}
     with pytest.raises(RecipeError, match="far must be more than near, 9\n  fix: set it farther"):
         resolve("frustum.yaml", ["model.centers.near=9"], plugins=plugins)
-    needed = r"`sightline/deepen` needs sightline\.log_depth .*\n  fix: use `sightline/deep`"
+    needed = r"`sightline/deepen` needs sightline\.log_depth [\s\S]*use `sightline/deep`"
     with pytest.raises(RecipeError, match=needed):
         resolve("depth.yaml", ["model.queries.type=qgs/latent"], plugins=plugins)
