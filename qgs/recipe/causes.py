@@ -74,11 +74,12 @@ def _has(draft: Draft, problem: RecipeProblem) -> bool:
 
 def _replacing(new: Chosen, old: Chosen) -> RecipeProblem:
     """The problem of the line that put `new`, or options of it, in place of `old`."""
-    lines = new.node.origins
-    origin = lines.get("type", new.place.origin)
+    changed = [key for key in new.node if new.options.get(key) != old.options.get(key)]
+    option = new.path
+    origin = new.node.origins.get("type", new.place.origin)
     reason = f"`{new.type}` in place of `{old.type}` ({old.chosen_at})"
-    if new.type == old.type:
-        differing = [key for key in lines if new.options.get(key) != old.options.get(key)]
-        origin = new.node.origin_of(*differing)
-        reason = f"`{new.type}` with other options than at {old.place.origin}"
-    return RecipeProblem(new.path, reason, f"keep `{old.type}` as it was", origin.file, origin.line)
+    if new.type == old.type and changed:
+        option = f"{new.path}.{changed[0]}"
+        origin = new.node.origins[changed[0]]
+        reason = f"another {' and '.join(changed)} of `{new.type}` than at {old.place.origin}"
+    return RecipeProblem(option, reason, f"keep `{old.type}` as it was", origin.file, origin.line)

@@ -157,7 +157,7 @@ model.head.gaussians_per_query=2
 model.centers.radius_min=0.1
     model.centers:
 model.queries.cells=null
-    model.head:
+    model.queries.cells: model.head:
 model.queries.far=0.1
     model.queries.far:
 """

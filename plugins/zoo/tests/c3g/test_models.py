@@ -80,7 +80,8 @@ def test_what_stands_in_another_layer_is_refused():
 def test_tokens_of_another_width_are_refused_and_of_the_models_run():
     wide = "model.encoder={type: tokengs2026/multiscale_vit, depth: 2, blocks: [1, 2]}"
     problem = refused(TINY, [*SMALL, wide])
-    assert problem.reason.startswith("`c3g/joint` reads memory.features as D float32")
+    assert problem.option == "model.encoder"
+    assert "`c3g/joint` reads memory.features as D float32" in problem.reason
     assert "writes it as 2*D float32" in problem.reason
     ran(wide.replace("[1, 2]", "[2]"))
     latents = "depth: 1, blocks: [1], latents: 5, latent_depth: 1"

@@ -46,9 +46,9 @@ def model(*overrides):
 def test_what_cannot_work_is_refused():
     for overrides, option in (
         ((*LAYERS, CONTENT), "model.decoder.cross_attention"),  # no keys
-        ((ANCHORS,), "model.centers"),  # no patches
-        (("model.centers.near=4",), "model.centers.far"),
-        (("data.image_size=[60, 64]",), "model.encoder.patch_size"),
+        ((ANCHORS,), "model.queries"),  # no patches
+        (("model.centers.near=4",), "model.centers.near"),
+        (("data.image_size=[60, 64]",), "data.image_size"),
     ):
         assert refused(TINY, [*SMALL, *overrides]).option == option
     with pytest.raises(ValueError, match="images of 60 x 64 cannot be cut into patches of 8"):
