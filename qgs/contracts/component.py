@@ -10,6 +10,7 @@ import torch
 from pydantic import BaseModel, ConfigDict
 
 
+# A ValueError, since pydantic turns these into problems of the option.
 class OptionError(ValueError):
     """For validators of a Config: `reason` says what is wrong, `fix` what to write instead."""
 
@@ -29,10 +30,14 @@ class ComponentConfig(BaseModel):
     """The component that has these options; None for settings of a section of a recipe."""
 
     model_config = ConfigDict(
+        # Checkpoints and hashes hold the options: nothing may change them behind their back.
         frozen=True,
+        # `count: "8"` is a mistake of whoever wrote it, not an 8.
         strict=True,
         extra="forbid",
+        # NaN would pass every limit, and end in a loss that is NaN.
         allow_inf_nan=False,
+        # The JSON Schema shows them in editors, `qgs list` in the terminal.
         use_attribute_docstrings=True,
     )
 
@@ -106,6 +111,7 @@ def without_effect(
     for option in options:
         default = type(config).model_fields[option].get_default()
         if getattr(config, option) != default:
+            # As a recipe writes it.
             word = "null" if default is None else default
             fix = f"leave it at its default, {word}, or change what makes it idle"
             yield Problem(option, f"`{option}` has no effect: {because}", fix)
@@ -148,6 +154,7 @@ class Component(metaclass=ABCMeta):
     def __init_subclass__(cls, **options: Any) -> None:
         """Give every class a Config of its own, for `component_of`."""
         super().__init_subclass__(**options)
+        # `component_of` finds a component by its Config, so that no two may share one.
         inherited = cls.Config
         if not (isinstance(inherited, type) and issubclass(inherited, ComponentConfig)):
             return  # reported when the plugin is loaded
@@ -186,6 +193,7 @@ class Component(metaclass=ABCMeta):
 
 def component_of(config: ComponentConfig) -> type[Component]:
     """The component that has the options `config`; raises TypeError where there is none."""
+    # Options tell their component, so that a call needs no registry.
     component = type(config).__component__ if isinstance(config, ComponentConfig) else None
     if component is None:
         raise TypeError(f"{type(config).__name__} is not the Config of a component class")
@@ -204,6 +212,7 @@ class ModelComponent(Component, torch.nn.Module):
 
         By default, to all but 1-d parameters: biases, norms, LayerScale (LocusGS release).
         """
+        # Pulled towards 0, a norm or a LayerScale would silence its layer.
         return parameter.ndim != 1
 
     def adapted(self, learned: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

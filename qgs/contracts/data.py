@@ -116,6 +116,7 @@ class SceneSource(Component):
     @classmethod
     def trains_on(cls, root: UPath, path: UPath) -> bool:
         """Whether the training data at `root` is `path` or has it as a scene, both absolute."""
+        # Sources whose scenes are files below the root say more.
         return path == root
 
     @classmethod
@@ -126,6 +127,7 @@ class SceneSource(Component):
 
         trained: options of that data, of any source; what goes for `path` too is taken over.
         """
+        # Of the trained data, only how photos look goes for others as well.
         options: dict[str, object] = {"path": path, "image_size": image_size}
         background = getattr(trained, "background", None)
         if background is not None and "background" in cls.Config.model_fields:
@@ -138,6 +140,7 @@ class SceneSource(Component):
 
     def names(self, split: Split) -> Sequence[str]:
         """The name of every scene of `scenes(split)`; sources that know them open no scene."""
+        # Correct for any source, and slow where opening a scene reads files.
         return [scene.name for scene in self.scenes(split)]
 
     def groups(self, split: Split) -> Sequence[Sequence[int]]:

@@ -38,6 +38,7 @@ class AttentionWeights:
         assert self.weights.shape == shape, f"weights {tuple(self.weights.shape)}, content {shape}"
         if self.geometry is not None:
             found = tuple(self.geometry.shape)
+            # Geometry is most often the same for all heads, and large.
             shared = (shape[0], 1, *shape[2:])
             assert found in (shared, shape), f"geometry {found}, content {shape}"
 

@@ -71,6 +71,7 @@ class Encoder(ModelComponent):
         `project(memory.features, memory)` is that memory again. Raises NotImplementedError unless
         the encoder is `tunable`.
         """
+        # Recipes that would come here are refused: see `tunable`.
         raise NotImplementedError(f"{type(self).__name__} makes no memory of other features")
 
 
@@ -88,6 +89,7 @@ class PatchEncoder(Encoder):
         """A patch that does not divide the data's images."""
         size, patch = context.image_size, config.patch_size
         if size and any(side % patch for side in size):
+            # The multiple that crops or enlarges least.
             nearest = [max(round(side / patch), 1) * patch for side in size]
             yield Problem(
                 "patch_size",

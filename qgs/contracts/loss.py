@@ -54,8 +54,10 @@ class Loss(Component, torch.nn.Module):
     ) -> dict[str, Tensor]:
         """The terms, weighted, by name: that of the component where there is one; none for 0."""
         weight = self.config.weight
+        # A weight of 0 takes no time: the term is not even computed.
         if not weight:
             return {}
+        # One term is called as its component, several have names of their own.
         found = self.term(prediction, rendering, target, inputs)
         terms = found if isinstance(found, Mapping) else {self.name: found}
         return {name: weight * term for name, term in terms.items()}

@@ -33,6 +33,7 @@ class Column:
 
     def best(self, values: Iterable[float | None]) -> float | None:
         """The best of `values`, None if there is none."""
+        # A method without Gaussians has no value of metrics that need them.
         known = [value for value in values if value is not None]
         return (max if self.better == "higher" else min)(known, default=None)
 

@@ -33,6 +33,7 @@ class Outcome:
         """
         first = outcomes[0]
         share = 1 / len(outcomes)
+        # One of two equal names would be lost from the log.
         if taken := sorted(first.terms.keys() & terms.keys()):
             raise ValueError(f"the recipe's losses have terms {taken} already; rename the others")
         judged = {n: share * _sum(o.terms[n] for o in outcomes) for n in first.terms}
@@ -40,6 +41,7 @@ class Outcome:
         # One collapsed pass is a sign that a mean would hide.
         signs["deviation"] = torch.stack([o.signs["deviation"] for o in outcomes]).amax()
         total = share * _sum(o.total for o in outcomes) + _sum(terms.values())
+        # Numbers for the log; their graph would hold the memory of the step.
         detached = {n: term.detach() for n, term in terms.items()}
         return cls(total, judged | detached, signs)
 

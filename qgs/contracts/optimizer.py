@@ -56,6 +56,7 @@ class Optimizer(Component):
     def __init__(self, config: OptimizerConfig, training: TrainingConfig | None = None) -> None:
         """training: its budget of steps and seconds."""
         self.config = config
+        # Without a recipe, such as in a test of a component.
         self.training = training or TrainingConfig()
 
     def check(self) -> None:

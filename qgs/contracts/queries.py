@@ -79,6 +79,8 @@ def _resized(values: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """The first `count` items of `values`, or all of them and then noisy copies in turn."""
     if count <= len(values):
         return values[:count]
+    # In turn, so that every learned query has as many descendants as the others.
     copied = values[torch.arange(len(values), count) % len(values)]
+    # Exact copies would have equal gradients, and stay copies.
     noise = torch.randn(copied.shape, generator=generator, dtype=copied.dtype)
     return torch.cat([values, copied + GROWTH_NOISE * noise])

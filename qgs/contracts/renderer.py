@@ -37,6 +37,7 @@ class RendererConfig(ComponentConfig):
     @classmethod
     def _far_is_behind_near(cls, far: float, info: ValidationInfo) -> float:
         near = info.data.get("near")
+        # A `near` that is refused itself is not among the data.
         if near is not None and far <= near:
             raise OptionError(
                 f"far must be more than near, got near {near:g} and far {far:g}",
@@ -102,6 +103,7 @@ def check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
             f"Gaussians of {len(means)} scenes cannot be rendered from cameras of "
             f"{cameras.shape[0]} scenes; both need the same batch size"
         )
+    # Torch would say so somewhere inside of a kernel.
     if means.device != cameras.c2w.device:
         raise ValueError(
             f"Gaussians are on {means.device}, cameras on {cameras.c2w.device}; "
@@ -111,6 +113,7 @@ def check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
 
 def raise_precision(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
     """Both as float64 if the means are, as float32 otherwise."""
+    # Half precision would move the projection of a Gaussian by pixels.
     dtype = torch.promote_types(gaussians.means.dtype, torch.float32)
     return gaussians.to(dtype), cameras.to(dtype)
 
@@ -125,6 +128,7 @@ def background_of(
 ) -> Tensor:
     """The background RGB (3,) in the dtype and on the device of `like`."""
     if background is None:
+        # Made once for a device, since a copy to a GPU waits for it.
         return constant(configured, like)
     if background.shape != (3,):
         raise ValueError(f"background must be one RGB of shape (3,), got {tuple(background.shape)}")

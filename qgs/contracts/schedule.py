@@ -8,6 +8,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 from qgs.contracts.component import Component, ComponentConfig
 
 ConfigT = TypeVar("ConfigT", bound=ComponentConfig)
+# A float counts every step up to here.
 END = 2**53
 """A step after the end of every schedule."""
 
@@ -32,6 +33,7 @@ def number_kinds(annotation: Any) -> set[type]:
     """Which of int and float an option of this type can hold; none where it is no number."""
     if annotation in (int, float):
         return {annotation}
+    # `float | None`, and numbers with limits; a list of numbers is no number.
     parts = get_args(annotation) if get_origin(annotation) in (Union, UnionType, Annotated) else ()
     return {kind for part in parts for kind in number_kinds(part)}
 
@@ -42,12 +44,14 @@ def at_step(config: ConfigT, schedules: Mapping[str, Schedule], step: int) -> Co
     for name in numbers:
         if float not in number_kinds(type(config).model_fields[name].annotation):
             numbers[name] = round(numbers[name])
+    # Every value was within its limits at the corners, so that it is not checked again.
     return config.model_copy(update=numbers)
 
 
 def follow(parts: Iterable[object], step: int) -> None:
     """Give those of `parts` that are components the options that they have after `step` steps."""
     for part in parts:
+        # Modules of torch are among the parts as well.
         if isinstance(part, Component) and part.schedules:
             part.config = at_step(part.config, part.schedules, step)
             part.followed = step

@@ -39,6 +39,7 @@ class ViewsConfig(ComponentConfig):
     @field_validator("gap")
     @classmethod
     def _gap_is_ordered(cls, gap: tuple[int, int]) -> tuple[int, int]:
+        # Here and not by limits, so that the fix can name the numbers in order.
         low, high = gap
         if not 1 <= low <= high:
             raise OptionError(
@@ -93,6 +94,7 @@ class TrainingConfig(ComponentConfig):
         parts = processes * self.accumulate
         scenes, left = divmod(self.batch_size, parts)
         if left:
+            # The multiples below and above; 0 scenes are no batch.
             near = f"{scenes * parts or parts} or {(scenes or 1) * parts + parts}"
             raise ValueError(
                 f"training.batch_size: {self.batch_size} scenes do not split evenly over "
@@ -128,4 +130,5 @@ class EvaluationConfig(ComponentConfig):
     @property
     def rate(self) -> float:
         """`tuning_rate`, or the default of what is tuned."""
+        # TokenGS tunes features with a hundred times the rate of queries.
         return self.tuning_rate or {"queries": 1e-4, "latents": 1e-2}[self.tuning]

@@ -26,6 +26,7 @@ class Rename:
 
     def renamed(self, ours: str) -> str | None:
         """The published name of `ours`; None if this rename does not apply."""
+        # Only `{}` stands for something: the dots of a name are dots.
         pattern = re.escape(self.ours).replace(r"\{\}", r"(\d+)")
         match = re.match(pattern if self.ours.endswith(".") else pattern + "$", ours)
         if match is None:
@@ -64,6 +65,7 @@ class WeightLayout:
 def layer_count(shapes: Shapes, prefix: str) -> int:
     """Number of layers stored as `prefix`N.: the largest N plus one."""
     pattern = re.compile(re.escape(prefix) + r"(\d+)\.")
+    # Layers may be missing from a file: it is then refused for what is missing.
     return max((int(match[1]) + 1 for name in shapes if (match := pattern.match(name))), default=0)
 
 
@@ -87,5 +89,6 @@ def real_ratio(size: int, unit: int, what: str) -> float:
     """A ratio such that int(ratio * unit) is `size`; raises LayoutError if there is none."""
     if unit < 1 or not size:
         raise LayoutError(f"{what}: {size} is no multiple of {unit}")
+    # A published width need not be a multiple; rounding down must give it back.
     ratio = size / unit
     return ratio if int(ratio * unit) == size else math.nextafter(ratio, math.inf)
