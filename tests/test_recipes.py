@@ -1,4 +1,4 @@
-"""What shipped recipes promise: alone, beside the papers' models, each other and the pages.
+"""Promises of shipped recipes: alone, beside the papers' models, each other and the pages.
 
 And the studies: each composes, at both sizes, from the same changes.
 """
@@ -64,7 +64,7 @@ PARAMETERS = {
     "gslrm/(re10k|dl3dv)": GSLRM,
     "locus/(re10k|dl3dv)|ablations/": LOCUSGS,
 }
-"""Of recipes whose names begin so, with N queries in place of 1024."""
+"""Parameters of recipes whose names begin so, with N queries in place of 1024."""
 EQUALS = {
     "tiny/c3g.yaml": "tiny/tokengs.yaml",
     "tiny/gslrm.yaml": "tiny/locus.yaml",

@@ -1,4 +1,4 @@
-"""What all components share: a name, a Config, the fields they read and write, problems."""
+"""The base of all components: a name, a Config, the fields they read and write, problems."""
 
 from abc import ABCMeta
 from collections.abc import Iterable, Iterator, Mapping
@@ -91,7 +91,7 @@ class RecipeContext:
 
 @dataclass(frozen=True)
 class Problem:
-    """What is wrong with an option, and what to do about it.
+    """A fault of an option, and what to do about it.
 
     option: dotted path below the component, "" for the component itself.
     """
@@ -208,7 +208,7 @@ class ModelComponent(Component, torch.nn.Module):
         self.dims = dims
 
     def decays(self, name: str, parameter: torch.nn.Parameter) -> bool:
-        """Whether weight decay applies to `parameter`, called `name` inside this component.
+        """Return whether weight decay applies to `parameter`, called `name` inside this component.
 
         By default, to all but 1-d parameters: biases, norms, LayerScale (LocusGS release).
         """

@@ -33,7 +33,7 @@ class Scene(ABC):
     missing: Sequence[str] = ()
     """Images that are listed and do not exist; they are no frames, so later ones move up."""
     times: Tensor | None = None
-    """When each frame (F,) was taken, float64, in any unit; None where nothing moves."""
+    """Times (F,) at which frames were taken, float64, in any unit; None where nothing moves."""
 
     @property
     @abstractmethod
@@ -52,7 +52,7 @@ class Scene(ABC):
         return None
 
     def frame_name(self, frame: int) -> str:
-        """What a person knows a frame by: a file name or a time stamp."""
+        """The name by which a person knows a frame: a file name or a time stamp."""
         return str(frame)
 
     def label(self, frame: int) -> str:
@@ -64,7 +64,7 @@ class Scene(ABC):
         return None
 
     def zoom(self, frame: int) -> float:
-        """By how much a photo is enlarged past its crop, to hide what its lens did not see."""
+        """Factor by which a photo is enlarged past its crop, to hide what its lens did not see."""
         return 1.0
 
     def depths(self, frames: Sequence[int]) -> Tensor | None:
@@ -77,7 +77,7 @@ class Scene(ABC):
 
 
 class SceneSourceConfig(ComponentConfig):
-    """What all sources have in common. Where a source's data lies is its option `path`."""
+    """Options of all sources. Where a source's data lies is its option `path`."""
 
     image_size: tuple[Side, Side] = (64, 64)
     """(H, W) of every delivered image, in pixels."""
@@ -107,7 +107,7 @@ class SceneSource(Component):
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
-        """Whether the existing `path` looks like data of this source, by its names of files.
+        """Return whether the existing `path` looks like data of this source, by its names of files.
 
         So that `qgs reconstruct` and `qgs data` open it without a recipe. By default no path does.
         """
@@ -115,7 +115,7 @@ class SceneSource(Component):
 
     @classmethod
     def trains_on(cls, root: UPath, path: UPath) -> bool:
-        """Whether the training data at `root` is `path` or has it as a scene, both absolute."""
+        """Return whether training data at `root` is `path` or has it as a scene, both absolute."""
         # Sources whose scenes are files below the root say more.
         return path == root
 

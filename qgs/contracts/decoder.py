@@ -45,7 +45,7 @@ class AttentionWeights:
 
 @dataclass(frozen=True)
 class LayerParts:
-    """What a decoder layer is built of.
+    """Parts of which a decoder layer is built.
 
     sublayers: components by slot, those that the class names. layer_scale: `decoder.layer_scale`.
     """
@@ -164,7 +164,7 @@ class Feedback(ModelComponent):
     rounds: int = 0
 
     def drawn(self) -> int:
-        """How many rounds a forward pass in training makes; they may be random."""
+        """Number of rounds that a forward pass in training makes; it may be random."""
         return self.rounds
 
     def compared(self, views: Views) -> Views:
@@ -175,4 +175,4 @@ class Feedback(ModelComponent):
     def forward(
         self, state: QueryState, memory: ImageMemory, rendering: Rendering, photos: Views
     ) -> tuple[QueryState, ImageMemory]:
-        """What the first repeated layer reads. photos: `compared` views, (B, V) as `rendering`."""
+        """Input of the first repeated layer. photos: `compared` views, (B, V) as `rendering`."""

@@ -28,7 +28,7 @@ MEMORY_FIELDS: Fields = {
 
 
 def memory_fields(*names: str) -> Fields:
-    """Those of MEMORY_FIELDS: `memory_fields("keys", "values")`."""
+    """Some of MEMORY_FIELDS: `memory_fields("keys", "values")`."""
     return {f"memory.{name}": MEMORY_FIELDS[f"memory.{name}"] for name in names}
 
 
@@ -55,7 +55,7 @@ class Encoder(ModelComponent):
 
     @classmethod
     def size_multiple(cls, config: ComponentConfig) -> int | None:
-        """Of which both sides of an image must be multiples; None: it takes the trained size alone.
+        """Divisor of both sides of an image; None where it takes the trained size alone.
 
         Photos of a user are then seen whole, in their own aspect, and are not cropped.
         """

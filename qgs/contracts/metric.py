@@ -15,7 +15,7 @@ from qgs.types import Gaussians, Views
 
 @dataclass(frozen=True)
 class Column:
-    """How a value is shown. digits: after the point; comparisons show one more."""
+    """Display of a value in tables. digits: after the point; comparisons show one more."""
 
     heading: str
     better: Literal["higher", "lower"]
@@ -38,7 +38,7 @@ class Column:
         return (max if self.better == "higher" else min)(known, default=None)
 
     def beats(self, value: float | None, other: float | None) -> bool:
-        """Whether `value` is better than `other` in the digits that tables show."""
+        """Return whether `value` is better than `other` in the digits that tables show."""
         # 14.463 and 14.457 both read 14.46: a sentence that ranks them would puzzle its reader
         if value is None or other is None or self.shown(value) == self.shown(other):
             return False
@@ -85,7 +85,7 @@ class Metric(Component, torch.nn.Module):
     unavailable: str = ""
 
     def columns(self) -> Mapping[str, Column]:
-        """How values are shown, by key; override it for several values or headings by option.
+        """Columns of values by key; override it for several values or headings by option.
 
         A value is called as the recipe calls the metric, with `_KEY` behind unless the key is "".
         """

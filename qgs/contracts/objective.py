@@ -14,7 +14,7 @@ from qgs.types import Cameras, Gaussians, Prediction, Rendering, Views
 
 @dataclass(frozen=True)
 class Outcome:
-    """What is minimised, and numbers about it; all 0-d.
+    """The loss that is minimised, and numbers about it; all 0-d.
 
     total: the sum of the terms, with gradients. terms: by name, weighted, detached.
     signs: of life, as training watches them: means "psnr" and "alpha", and "deviation", the largest
@@ -52,7 +52,7 @@ def _sum(terms: Iterable[Tensor]) -> Tensor:
 
 
 class Passes(Protocol):
-    """What training lends to an objective for one step."""
+    """Functions that training lends to an objective for one step."""
 
     def predict(self, inputs: Views) -> Prediction:
         """A forward pass of the model."""

@@ -77,7 +77,7 @@ class Optimizer(Component):
 
     @property
     def follows_schedule(self) -> bool:
-        """Whether the recipe writes a schedule for `learning_rate`."""
+        """Return whether the recipe writes a schedule for `learning_rate`."""
         return "learning_rate" in self.schedules
 
     def state(self) -> Mapping[str, Any]:

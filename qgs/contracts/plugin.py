@@ -1,4 +1,4 @@
-"""What a distribution offers to recipes."""
+"""The plugin, which a distribution offers to recipes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ CONTRACT_VERSION = 1
 """Goes up when components written for the old contracts no longer fit."""
 
 ENTRY_POINT_GROUP = "qgs.plugins"
-"""Where a distribution lists its `Plugin` object, under the plugin's name."""
+"""Entry points at which a distribution lists its `Plugin` object, under the plugin's name."""
 
 
 @dataclass(frozen=True)

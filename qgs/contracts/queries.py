@@ -52,7 +52,7 @@ class Queries(ModelComponent):
         }
 
     def support(self, state: QueryState) -> SpatialSupport | None:
-        """Where each query of `state` looks; None for queries without a position."""
+        """Space in which each query of `state` looks; None for queries without a position."""
         return None
 
 

@@ -128,7 +128,7 @@ def background_of(
 ) -> Tensor:
     """The background RGB (3,) in the dtype and on the device of `like`."""
     if background is None:
-        # Made once for a device, since a copy to a GPU waits for it.
+        # A tensor of Python numbers would make the GPU wait for a copy.
         return constant(configured, like)
     if background.shape != (3,):
         raise ValueError(f"background must be one RGB of shape (3,), got {tuple(background.shape)}")

@@ -30,7 +30,7 @@ class Schedule(ComponentConfig):
 
 
 def number_kinds(annotation: Any) -> set[type]:
-    """Which of int and float an option of this type can hold; none where it is no number."""
+    """Kinds of int and float that an option of this type can hold; none where it is no number."""
     if annotation in (int, float):
         return {annotation}
     # `float | None`, and numbers with limits; a list of numbers is no number.

@@ -7,7 +7,7 @@ from pydantic import Field, field_validator
 from qgs.contracts.component import ComponentConfig, OptionError
 
 Tuned: TypeAlias = Literal["queries", "latents"]
-"""What is tuned at test time."""
+"""Parts that can be tuned at test time."""
 
 
 class ViewsConfig(ComponentConfig):

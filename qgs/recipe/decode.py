@@ -46,7 +46,7 @@ class Chosen:
         return self.config.model_dump(mode="json") | written
 
     def equals(self, other: Chosen | None) -> bool:
-        """Whether `other` is the same component with the same options."""
+        """Return whether `other` is the same component with the same options."""
         if other is None or self.component is not other.component:
             return False
         return self.options == other.options
@@ -63,18 +63,18 @@ class Chosen:
 
     @property
     def node(self) -> MapNode:
-        """What is written at its place; empty where that is nothing."""
+        """The mapping written at its place; an empty one where there is none."""
         node = self.place.node
         return node if isinstance(node, MapNode) else MapNode(self.place.origin)
 
     @property
     def chosen_at(self) -> str:
-        """Where its `type` is written."""
+        """File and line of its `type`."""
         return str(self.node.origins.get("type", "default of the slot"))
 
 
 Parts: TypeAlias = Mapping[KeyPath, Chosen | None]
-"""What stands at each place; None for a component that could not be decoded."""
+"""Components by place; None for one that could not be decoded."""
 
 
 def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen | None:

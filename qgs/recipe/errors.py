@@ -1,4 +1,4 @@
-"""What is wrong with a recipe: every problem with its place, its reason and a fix."""
+"""Problems of a recipe, each with its place, its reason and a fix."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from qgs.contracts import Problem
 
 @dataclass(frozen=True)
 class Origin:
-    """Where something was written; line 0 where lines mean nothing."""
+    """File and line where something was written; line 0 where lines mean nothing."""
 
     file: str
     line: int = 0

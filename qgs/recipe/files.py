@@ -52,7 +52,7 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
 
 
 def _replaces(base: MapNode, over: MapNode, path: KeyPath) -> bool:
-    """Whether nothing of `base` stays under `over`."""
+    """Return whether nothing of `base` stays under `over`."""
     if path[:1] == ("swap",) and len(path) == 2:
         return True
     if "type" in over and type_at(base, path) not in (None, type_at(over, path)):

@@ -97,7 +97,7 @@ def _offers(part: Chosen) -> Fields:
 
 
 def _offered(component: type[Component], config: ComponentConfig | None) -> Fields:
-    """What `component` provides without requiring it; nothing where a plugin's code fails."""
+    """Fields that `component` provides without requiring them; none where a plugin's code fails."""
     with suppress(Exception):
         assert config is not None
         given = component.fields_read(config)
@@ -106,7 +106,7 @@ def _offered(component: type[Component], config: ComponentConfig | None) -> Fiel
 
 
 def keys_are_read(parts: Mapping[KeyPath, Chosen]) -> bool:
-    """Whether a component requires keys or values of the image memory."""
+    """Return whether a component requires keys or values of the image memory."""
     read = {name for part in parts.values() for name in part.component.fields_read(part.config)}
     return not read.isdisjoint({"memory.keys", "memory.values"})
 

@@ -57,14 +57,14 @@ class Recipe:
 
     @property
     def warnings(self) -> list[str]:
-        """What works and is probably not what was meant, a sentence each."""
+        """A sentence for each thing that works and is probably not what was meant."""
         training = self.training
         late = unfinished(self.parts, training.steps, training.seconds)
         return [*idle_fields(self.parts), *late]
 
     @property
     def schedules(self) -> dict[KeyPath, Mapping[str, Schedule]]:
-        """Of each place with options that follow the progress of training, these options."""
+        """Scheduled options by place."""
         return {path: part.schedules for path, part in self.parts.items() if part.schedules}
 
     def build_model(
@@ -95,7 +95,7 @@ class Recipe:
         return losses
 
     def build_metrics(self) -> dict[str, contracts.Metric]:
-        """What evaluations measure, by the names that the recipe gives."""
+        """Metrics by the names that the recipe gives."""
         metrics = self._named("metrics")
         for metric in metrics.values():
             try:
@@ -109,7 +109,7 @@ class Recipe:
         return {at[1]: build(part) for at, part in self.parts.items() if at[0] == section}
 
     def build_objective(self) -> contracts.Objective:
-        """What a training step computes."""
+        """The objective, which a training step computes."""
         return build(self.parts["objective",])
 
     def build_optimizer(self) -> contracts.Optimizer:
@@ -123,7 +123,7 @@ class Recipe:
         return rate_factors(module, self.parts["optimizer",])
 
     def build_view_sampler(self) -> contracts.ViewSampler:
-        """What draws the frames of samples."""
+        """The sampler that draws the frames of samples."""
         return build(self.parts["view_sampler",])
 
     def build_data(self) -> contracts.SceneSource:

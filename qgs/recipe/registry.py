@@ -181,7 +181,7 @@ def _release(entry: EntryPoint) -> str:
 
 
 def _plugin_fault(plugin: object, name: str) -> str:
-    """Why the plugin at the entry point `name` cannot be used, as the end of a sentence; or ""."""
+    """The end of a sentence on why the plugin at the entry point `name` cannot be used; or ""."""
     if not isinstance(plugin, Plugin):
         return f"is no qgs.Plugin: its entry point leads to an object of type {type(plugin)}"
     if plugin.contract_version != CONTRACT_VERSION:

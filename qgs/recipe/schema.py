@@ -32,7 +32,7 @@ layers:
   patternProperties: {"^[0-9]+$": {type: object}}
   additionalProperties: false
 """
-"""What stands beside settings and components."""
+"""Schemas of keys that are neither settings nor components."""
 
 
 def recipe_schema(registry: Registry) -> dict[str, Any]:

@@ -14,7 +14,7 @@ _DEFAULT = Origin("default")
 
 
 def spell_out(draft: Draft, parts: Mapping[KeyPath, Chosen]) -> MapNode:
-    """What a draft describes, in the order in which a recipe is read; only plugins in use."""
+    """Return all that a draft describes, in the order of a recipe; only plugins in use."""
     shown = _shown(parts)
     whole = _section(draft, ())
     _put_plugins(whole, draft, {part.installed.plugin.name for part in shown.values()})

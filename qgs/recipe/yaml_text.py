@@ -26,7 +26,7 @@ _SCALARS = {
     "float": r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"
     r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
 }
-"""How YAML 1.2 writes scalars without quotes that are no strings."""
+"""Scalars of YAML 1.2 that are no strings when they stand without quotes, by kind."""
 _RESOLVERS: dict[str | None, list[tuple[str, re.Pattern[str]]]] = {
     None: [(_STANDARD + kind, re.compile(rf"({text})\Z")) for kind, text in _SCALARS.items()]
 }
@@ -71,7 +71,7 @@ class MapNode(dict[str, Any]):
         return found
 
     def origin_of(self, *keys: str) -> Origin:
-        """Where the first of `keys` that is there was written, else where the mapping begins."""
+        """The origin of the first of `keys` that is there, else of the mapping."""
         return next((self.origins[key] for key in keys if key in self.origins), self.origin)
 
 

@@ -36,7 +36,7 @@ def has_all(text, words):
 
 
 def faults(files):
-    """What is not as the case says."""
+    """Return all that is not as the case says."""
     overrides = [REFUSED.sub("", line) for line in files.get("--set", "").splitlines() if line]
     expected = [
         (f"{name} #{number}" if name == "--set" else f"{name}:{number}", *found.groups())
