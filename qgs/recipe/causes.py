@@ -13,6 +13,7 @@ from qgs.recipe.checks import check
 from qgs.recipe.decode import Chosen
 from qgs.recipe.draft import Draft, draft_of
 from qgs.recipe.errors import Problems, RecipeProblem
+from qgs.recipe.yaml_text import KeyPath
 
 
 def at_their_causes(
@@ -23,11 +24,12 @@ def at_their_causes(
     # Only a recipe that is refused is read once more for each layer.
     while found and (under := drafts[-1].written.under) is not None:
         drafts.append(draft_of(under, Problems(), plugins))
+    blames = _blames(found, drafts)
     caused: dict[RecipeProblem, list[RecipeProblem]] = {}
     for problem in found:
-        blame = _blamed(problem, drafts)
-        # Whoever wrote both sees the contradiction where it is.
-        if blame is None or blame.file == problem.file:
+        blame = blames.get(problem, problem)
+        # Whoever wrote both sees the contradiction where it is; a plug-in's failure is its own.
+        if blame.file == problem.file or problem.cause:
             yield problem
         else:
             caused.setdefault(blame, []).append(problem)
@@ -39,37 +41,51 @@ def at_their_causes(
         yield replace(blame, reason=reason, fix=f"{blame.fix}, or: {'; '.join(fixes)}")
 
 
-def _blamed(problem: RecipeProblem, drafts: Sequence[Draft]) -> RecipeProblem | None:
-    """The problem of the line with which `problem` came.
+def _blames(
+    found: Sequence[RecipeProblem], drafts: Sequence[Draft]
+) -> dict[RecipeProblem, RecipeProblem]:
+    """The problem of the line with which each of `found` came, where a component was replaced.
 
     drafts: the whole recipe, and before each file or override that was laid over it, newest first.
     """
+    blames: dict[RecipeProblem, RecipeProblem] = {}
+    left = list(found)
     for newer, older in pairwise(drafts):
-        if _has(older, problem):
-            continue
+        known = _told(older)
+        fresh = [problem for problem in left if _key(problem) not in known]
+        left = [problem for problem in left if _key(problem) in known]
         # Changes are made one after the other until the problem is there: the last one brought it.
         parts = dict(older.parts)
-        for source in {part.place.source: None for part in newer.parts.values() if part}:
-            changed = {
-                path: part
-                for path, part in newer.parts.items()
-                if part and part.place.source == source and not part.equals(parts.get(path))
-            }
-            if not changed:
-                continue
+        for changed in _changes(newer, older) if fresh else ():
             path, new = next(iter(changed.items()))
             old = parts.get(path)
             parts |= changed
-            if _has(replace(older, parts=parts), problem):
-                return _replacing(new, old) if old else None
-        return None
-    return None
+            now = _told(replace(older, parts=parts))
+            for problem in [problem for problem in fresh if _key(problem) in now]:
+                fresh.remove(problem)
+                if old:
+                    blames[problem] = _replacing(new, old)
+    return blames
 
 
-def _has(draft: Draft, problem: RecipeProblem) -> bool:
+def _changes(newer: Draft, older: Draft) -> list[dict[KeyPath, Chosen]]:
+    """Components that a layer changed, those of one line together, in the order of a recipe."""
+    changed: dict[KeyPath, dict[KeyPath, Chosen]] = {}
+    for path, part in newer.parts.items():
+        if part and not part.equals(older.parts.get(path)):
+            changed.setdefault(part.place.source, {})[path] = part
+    return [*changed.values()]
+
+
+def _told(draft: Draft) -> set[tuple[str, str]]:
     problems = Problems()
     check(draft, problems)
-    return (problem.place, problem.reason) in [(x.place, x.reason) for x in problems.found]
+    return {_key(problem) for problem in problems.found}
+
+
+def _key(problem: RecipeProblem) -> tuple[str, str]:
+    # A fix may name more components than another layer's plug-ins offer.
+    return problem.place, problem.reason
 
 
 def _replacing(new: Chosen, old: Chosen) -> RecipeProblem:
