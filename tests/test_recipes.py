@@ -35,12 +35,16 @@ OVERLAYS = (
 )
 """Laid over recipes with data; they say nothing of its type."""
 
-D, N, LAYERS = 1024, 4096, 12
+D = 1024
+N = 4096
+LAYERS = 12
 """Width, queries and decoder layers of the published models."""
 HEAD_OF_RADII = (D * D + D) + (D + 1)
 POSITION_MLPS = LAYERS * ((3 * 128 * D + D) + (D * D + D))
 GAMMAS = LAYERS
-TOKENGS, TOKENGS_2026_6, DYNAMIC = 222_016_768, 362_695_680, 360_076_288
+TOKENGS = 222_016_768
+TOKENGS_2026_6 = 362_695_680
+DYNAMIC = 360_076_288
 LOCUSGS = 241_514_780 - 52_236
 """Without parameters that the published LocusGS carries and never uses."""
 GSLRM = 303_548_416
@@ -149,10 +153,12 @@ def alone(file: str) -> dict[str, bool]:
 
 def as_published(file: str, wanted: int) -> dict[str, bool]:
     """The number of parameters, and the structure of ablations without sizes and initial values."""
-    golden, without = "", 0
+    golden = ""
+    without = 0
     if file.startswith("ablations/"):
         golden, without = ABLATIONS.get(Path(file).stem, ("", 0))
-    count, queries = without + parameters(file), model(file).queries
+    count = without + parameters(file)
+    queries = model(file).queries
     if queries.count == 1024:
         count += (N - 1024) * sum(x[0].numel() for x in queries.parameters())
     shown = SHOWN.get(file, f"{wanted - without:,}")
@@ -179,7 +185,8 @@ def beside_its_twin(file: str, twin: str) -> dict[str, bool]:
     """LocusGS is compared with TokenGS at one budget."""
     sections = ("data", "views", "optimizer", "training", "evaluation", "metrics")
     parts = ("model.width", "model.heads", "model.encoder", "model.renderer")
-    first, second = model(file), model(twin)
+    first = model(file)
+    second = model(twin)
     return {
         **keeps(file, twin, *sections, *parts),
         "has as many queries": first.queries.count == second.queries.count,

@@ -84,7 +84,8 @@ def test_a_layers_override_lies_over_the_template():
 
 def test_same_recipe_same_parameters_and_the_global_random_state_stays():
     before = torch.get_rng_state()
-    first, second = compose(SMALL).state_dict(), compose(SMALL).state_dict()
+    first = compose(SMALL).state_dict()
+    second = compose(SMALL).state_dict()
     other = compose(SMALL, ["seed=1"]).queries.features
     assert torch.equal(torch.get_rng_state(), before)
     torch.testing.assert_close(first, second, rtol=0, atol=0)
