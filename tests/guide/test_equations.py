@@ -9,9 +9,9 @@ import yaml
 from guide_pages import DOCS, all_pages
 
 from qgs.contracts import Component
-from qgs.recipe.sections import RecipeSettings
 from qgs.recipe.errors import Problems
 from qgs.recipe.registry import load_registry
+from qgs.recipe.sections import RecipeSettings
 from qgs.recipe.slots import SLOTS
 from qgs.recipe.yaml_text import load_text
 
