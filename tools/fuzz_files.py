@@ -4,9 +4,10 @@
 
     python tools/fuzz_files.py --seed 0 --only 17
 
-A checkpoint is loaded and made into Gaussians, or starts a training; what is made of a damaged one
-that is not refused must be what the whole one gives. Half of them are sealed anew, as by somebody
-who means harm: these may give other numbers. PLY files are shown. See fuzzing.py.
+A checkpoint is loaded and made into Gaussians, or starts a training; what is made of one with
+damaged metadata that is not refused must be what the whole one gives. Other tensors, and metadata
+that are sealed anew, as by somebody who means harm, may give other numbers. PLY files are shown.
+See fuzzing.py.
 """
 
 import json
@@ -34,7 +35,7 @@ from qgs.contracts import LearnedQueries
 from qgs.recipe import resolve
 from qgs.train.initial import initialise
 
-SEALED = "forged"
+FORGED = "forged"
 RECIPE = Path(__file__).parents[1] / "recipes" / "tiny" / "locus.yaml"
 SMALL = ("model.width=16", "model.heads=2", "model.queries.count=8", "data.image_size=[16, 16]",
          "model.decoder.depth=2", "model.supervision.layers=[2]")  # fmt: skip
@@ -108,17 +109,18 @@ def damage_checkpoint(file: Path, dice: random.Random) -> str:
     whole = file.read_bytes()
     end = 8 + int.from_bytes(whole[:8], "little")
     header, data = json.loads(whole[8:end]), bytearray(whole[end:])
-    if dice.random() < 0.7:  # else hardly anything but the digest would be tried
-        del header["__metadata__"]["qgs.digest"]
     change = dice.choice((other_tensor, other_tensor, other_metadata, other_metadata, other_recipe))
     change(header, data, dice)
     metadata = header["__metadata__"]
     is_whole = isinstance(metadata, dict) and all(isinstance(x, str) for x in metadata.values())
     if sealed := is_whole and dice.random() < 0.5:
-        metadata[SEAL] = seal(metadata)  # else hardly anything behind it would be tried
+        # Else hardly anything behind the seal would be tried.
+        metadata[SEAL] = seal(metadata)
     text = json.dumps(header).encode()
     file.write_bytes(len(text).to_bytes(8, "little") + text + data)
-    return f"{SEALED} {change.__name__}" if sealed else change.__name__
+    # Nothing seals the tensors, and whoever writes a seal may write other metadata.
+    forged = sealed or change is not other_metadata
+    return f"{FORGED} {change.__name__}" if forged else change.__name__
 
 
 def damage_ply(file: Path, dice: random.Random) -> str:
@@ -188,8 +190,9 @@ def prepared(scratch: Path) -> Callable[[random.Random, Path], tuple[str, Use]]:
         use, damage, whole = dice.choice(kinds)
         path = folder / ("a.ply" if damage is damage_ply else "a.safetensors")
         path.write_bytes((scratch / path.name).read_bytes())
-        what = (other_bytes if dice.random() < 0.15 else damage)(path, dice)
-        forged = what.startswith(SEALED)  # whoever writes a seal may write other weights
+        any_bytes = dice.random() < 0.15
+        what = (other_bytes if any_bytes else damage)(path, dice)
+        forged = any_bytes or what.startswith(FORGED)
         return f"{use.__name__}, {what}", partial(judged, use, path, None if forged else whole)
 
     return case_in

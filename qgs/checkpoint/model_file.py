@@ -41,7 +41,8 @@ class CheckpointFile(TensorFile):
     """A checkpoint, opened once for all that it holds.
 
         with CheckpointFile("rooms/locus-64") as file:
-            model, recipe, step = file.model(), file.recipe, file.step
+            model = file.model()
+            recipe = file.recipe
 
     name: a path, of a run folder too, PLUGIN/NAME of a shipped model, or a URL; see
     `checkpoint_path`. Parts are read when they are used.
@@ -68,7 +69,7 @@ class CheckpointFile(TensorFile):
 
     @cached_property
     def recipe(self) -> Recipe:
-        """The recipe of the model.
+        """Recipe of the model.
 
         Raises CheckpointError that names the releases which wrote the file, where components are
         missing here or differ.
@@ -77,10 +78,12 @@ class CheckpointFile(TensorFile):
             return self.stored_recipe(_RECIPE)
         except RecipeError as error:
             names = {**self.mapping(_DISTRIBUTIONS), "qgs": "query-gaussians"}
-            versions = self.mapping(_PLUGINS).items()
-            releases = {plugin: f"{names.get(plugin, plugin)} {v}" for plugin, v in versions}
+            releases = {
+                plugin: f"{names.get(plugin, plugin)} {version}"
+                for plugin, version in self.mapping(_PLUGINS).items()
+            }
             available = {"qgs", *available_plugins()}
-            absent = [release for plugin, release in releases.items() if plugin not in available]
+            absent = [releases[plugin] for plugin in releases if plugin not in available]
             raise CheckpointError(
                 f"{self.path} was made with {listed(releases.values())}, and its recipe fails "
                 f"here; install {listed(absent) or 'those releases'}:\n{error}"
@@ -88,12 +91,12 @@ class CheckpointFile(TensorFile):
 
     @cached_property
     def tensors(self) -> dict[str, Tensor]:
-        """The weights, memory-mapped; raises CheckpointError where they are not those saved."""
+        """Weights by name, memory-mapped."""
         return self.read()
 
     @cached_property
     def step(self) -> int | None:
-        """The training step; None where the file has none, as for imported weights."""
+        """Training step; None where the file has none, as for imported weights."""
         if "step" not in self.extra:
             return None
         with self.entry(_EXTRA + "step") as text:
@@ -101,7 +104,7 @@ class CheckpointFile(TensorFile):
 
     @cached_property
     def domain(self) -> Domain:
-        """The ranges of the views that the model was trained on; empty where unknown."""
+        """Ranges of the views that the model was trained on; empty where unknown."""
         key = _EXTRA + KEY
         if key not in self.metadata:
             return Domain()
@@ -109,7 +112,7 @@ class CheckpointFile(TensorFile):
             return Domain.read(self.mapping(key))
 
     def untrained(self, device: str | torch.device | None = None) -> QueryGaussianModel:
-        """The model with initial parameters; "meta" takes no memory. Raises CheckpointError."""
+        """Build the model with initial parameters; "meta" takes no memory. Raises CheckpointError."""
         try:
             return self.recipe.build_model(device, pretrained=False)
         except (RecipeError, TooLargeError) as error:
@@ -118,11 +121,11 @@ class CheckpointFile(TensorFile):
             ) from error
 
     def model(self, device: str | torch.device | None = None) -> QueryGaussianModel:
-        """The model on `device` (default: CPU), in evaluation mode, half precision as float32.
+        """Return the model on `device` (default: CPU), in evaluation mode, half precision as float32.
 
         Raises CheckpointError, and ValueError for weights that are NaN or infinite.
         """
-        # Sizes are compared on the meta device, before the recipe's model takes memory.
+        # On the meta device first: sizes are compared before the recipe's model takes memory.
         refuse_misfit(self.untrained("meta"), self.tensors, str(self.path))
         model = self.untrained()
         load_weights(model, self.tensors, str(self.path))
@@ -130,15 +133,15 @@ class CheckpointFile(TensorFile):
         model.trained_on = self.domain
         local = Path(self.name).expanduser().exists()
         model.loaded_from = str(self.path.resolve()) if local else self.name
-        settings = self.recipe.tree.get("views")
-        model.register_forward_pre_hook(FirstViews(settings, self.domain))
+        first_views = FirstViews(self.recipe.tree.get("views"), self.domain)
+        model.register_forward_pre_hook(first_views)
         return (model if device is None else model.to(device)).eval()
 
 
 def load(
     name: str | os.PathLike[str], device: str | torch.device | None = None
 ) -> QueryGaussianModel:
-    """The model of a checkpoint, in evaluation mode; name, device and errors: `CheckpointFile`."""
+    """Load a checkpoint's model in evaluation mode; name, device and errors: `CheckpointFile`."""
     with CheckpointFile(name) as file:
         return file.model(device)
 
@@ -193,12 +196,11 @@ def write_checkpoint(
 
 
 def unique_tensors(model: nn.Module) -> dict[str, Tensor]:
-    """Parameters and persistent buffers, a shared one only under its first name."""
-    first_names: dict[int, str] = {}
-    state = model.state_dict(keep_vars=True)
-    for name, tensor in state.items():
-        first_names.setdefault(id(tensor), name)
-    return {name: state[name] for name in first_names.values()}
+    """Return parameters and persistent buffers, a shared one only under its first name."""
+    first: dict[int, tuple[str, Tensor]] = {}
+    for name, tensor in model.state_dict(keep_vars=True).items():
+        first.setdefault(id(tensor), (name, tensor))
+    return dict(first.values())
 
 
 def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -> None:
@@ -225,7 +227,8 @@ def refuse_misfit(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) 
     """Raise CheckpointError that lists in what `tensors` differ from those of `model`."""
     own = unique_tensors(model)
     differences = differing_tensors(shapes_of(tensors), shapes_of(own))
-    if differences := differences + differing_types(tensors, own, widened=True):
+    differences += differing_types(tensors, own)
+    if differences:
         raise CheckpointError(
             f"{origin} does not fit the model of its recipe, {len(differences)} differences:\n  "
             + listed(differences, 20, "\n  ")

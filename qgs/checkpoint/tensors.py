@@ -20,8 +20,8 @@ from qgs.recipe import Recipe, RecipeError, resolve
 from qgs.version import __version__
 from qgs.wording import name_shown
 
-SEAL, _DIGEST = "qgs.seal", "qgs.digest"
-"""Metadata entries with the checksums of all others, and of the tensors."""
+SEAL = "qgs.seal"
+"""Metadata entry with the checksum of all others."""
 _PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}
 
 
@@ -54,12 +54,9 @@ class TensorFile:
         self._file.__exit__(*exception)
 
     def read(self) -> dict[str, Tensor]:
-        """All tensors, memory-mapped; they outlive the open file."""
+        """Return all tensors, memory-mapped; they outlive the open file."""
         with self._whole():
-            tensors = {name: self._file.get_tensor(name) for name in self._file.keys()}  # noqa: SIM118
-        if (written := self.metadata.get(_DIGEST)) and written != digest(tensors):
-            raise self.damaged("its tensors are not those that were written")
-        return tensors
+            return {name: self._file.get_tensor(name) for name in self._file.keys()}  # noqa: SIM118
 
     @contextmanager
     def _whole(self) -> Iterator[None]:
@@ -67,9 +64,10 @@ class TensorFile:
             yield
         # A wrong header makes safetensors and torch raise anything.
         except Exception as error:
+            # An error of the system, such as a failing disk, is no fault of the file.
             if isinstance(error, MemoryError) or getattr(error, "errno", None) is not None:
-                raise  # the system's, such as a failing disk
-            if kind := pickle_kind(self.path):  # opens it: PermissionError is of here
+                raise
+            if kind := pickle_kind(self.path):
                 raise CheckpointError(
                     f"{self.path} is {kind}, which can run code when it is read; use the "
                     "safetensors file of the run, or name published weights .pt"
@@ -80,7 +78,7 @@ class TensorFile:
             ) from error
 
     def damaged(self, what: str) -> CheckpointError:
-        """The error for a file that is not as it was written. what: part and reason."""
+        """Return the error for a file that is not as it was written. what: part and reason."""
         return CheckpointError(
             f"{self.path} is damaged: {name_shown(what, 5000)}. Copy the file again from where it "
             "came, or take another checkpoint of the run"
@@ -88,18 +86,19 @@ class TensorFile:
 
     @contextmanager
     def entry(self, key: str) -> Iterator[str]:
-        """The text of the metadata entry `key`; errors in the block become CheckpointErrors."""
+        """Yield the text of the metadata entry `key`; errors inside become CheckpointErrors."""
         try:
             yield self.metadata[key]
         except (RecipeError, CheckpointError):
             raise
-        except Exception as error:  # forged JSON makes later code raise anything
+        # Forged JSON makes later code raise anything.
+        except Exception as error:
             kind = "nested too deep" if isinstance(error, RecursionError) else str(error)[:200]
             what = f"`{key}` in its metadata cannot be read ({type(error).__name__}: {kind})"
             raise self.damaged(what) from error
 
     def mapping(self, key: str) -> dict[str, Any]:
-        """The JSON mapping in the entry `key`. Raises CheckpointError."""
+        """Return the JSON mapping in the entry `key`. Raises CheckpointError."""
         with self.entry(key) as text:
             found = json.loads(text)
             if not isinstance(found, dict):
@@ -107,7 +106,7 @@ class TensorFile:
             return found
 
     def stored_recipe(self, key: str) -> Recipe:
-        """The resolved recipe in the entry `key`; no file that it names is followed.
+        """Return the resolved recipe in the entry `key`; no file that it names is followed.
 
         Raises CheckpointError, and RecipeError where components here do not fit the recipe.
         """
@@ -118,7 +117,7 @@ class TensorFile:
             return resolve(tree)
 
     def refuse_newer(self, key: str, ours: int) -> int:
-        """The format version in the entry `key`; CheckpointError where it is above `ours`."""
+        """Return the format version in the entry `key`; CheckpointError where it is above `ours`."""
         with self.entry(key) as text:
             written = int(text[:20])
         if written > ours:
@@ -135,56 +134,45 @@ def write_tensors(
     """Write `tensors`, contiguous and on the CPU, to `path`; see `replacing`. Raises OSError."""
     with replacing(path) as temporary:
         try:
-            metadata = {**metadata, _DIGEST: digest(tensors)}
             save_file(dict(tensors), temporary, {**metadata, SEAL: seal(metadata)})
-        except SafetensorError as error:  # it gives the number of an OSError as text only
+        except SafetensorError as error:
+            # It gives the number of an OSError as text only.
             if number := re.search(r"os error (\d+)", str(error)):
                 raise OSError(int(number[1]), str(error), os.fspath(path)) from error
             raise
 
 
-def digest(tensors: Mapping[str, Tensor]) -> str:
-    """A checksum of the names, dtypes, shapes and bytes of contiguous tensors on the CPU."""
-    total = blake2b(digest_size=16)
-    for name, tensor in sorted(tensors.items()):
-        total.update(f"{name} {tensor.dtype} {list(tensor.shape)}\n".encode())
-        total.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
-    return total.hexdigest()
-
-
 def seal(metadata: Mapping[str, str]) -> str:
-    """A checksum of all metadata entries but SEAL."""
+    """Return a checksum of all metadata entries but SEAL."""
     entries = sorted((key, text) for key, text in metadata.items() if key != SEAL)
     return blake2b(json.dumps(entries).encode(), digest_size=16).hexdigest()
 
 
 def pickle_kind(path: str | os.PathLike[str]) -> str:
-    """The kind of a file that can run code when it is read; "" for any other file."""
+    """Return the kind of a file that can run code when it is read; "" for any other file."""
     with open(path, "rb") as file:
         start = file.read(9)
-    if start[8:] == b"{":  # safetensors: a length whose bytes may look like a pickle, then JSON
+    # safetensors begins with a length, whose bytes may look like a pickle, then JSON.
+    if start[8:] == b"{":
         return ""
     return next((kind for magic, kind in _PICKLES.items() if start.startswith(magic)), "")
 
 
 def shapes_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
-    """Names to shapes."""
+    """Map names to shapes."""
     return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
 
 
 def nonfinite(tensors: Iterable[tuple[str, Tensor]]) -> list[str]:
-    """Names of the tensors, all on one device, that hold NaN or infinity."""
-    names, finite = [], []
-    for name, tensor in tensors:
-        names.append(name)
-        finite.append(tensor.isfinite().all())
+    """Return the names of the tensors, all on one device, that hold NaN or infinity."""
+    finite = {name: tensor.isfinite().all() for name, tensor in tensors}
     # One read for all: each read would make the host wait for the device.
-    flags = torch.stack(finite).tolist() if finite else []
-    return [name for name, is_finite in zip(names, flags, strict=True) if not is_finite]
+    flags = torch.stack([*finite.values()]).tolist() if finite else []
+    return [name for name, is_finite in zip(finite, flags, strict=True) if not is_finite]
 
 
 def differing_tensors(file: Shapes, recipe: Shapes) -> list[str]:
-    """Differences in names and shapes between a file and the model of a recipe, one line each."""
+    """List differences in names and shapes between a file and a recipe's model, one line each."""
     found = [f"missing: {name}" for name in recipe if name not in file]
     found += [f"unexpected: {name}" for name in file if name not in recipe]
     return found + [
@@ -194,17 +182,14 @@ def differing_tensors(file: Shapes, recipe: Shapes) -> list[str]:
     ]
 
 
-def differing_types(
-    file: Mapping[str, Tensor], recipe: Mapping[str, Tensor], widened: bool = False
-) -> list[str]:
-    """Differences in dtypes, one line each, of the tensors that both have.
+def differing_types(file: Mapping[str, Tensor], recipe: Mapping[str, Tensor]) -> list[str]:
+    """List differences in dtypes, one line each, of the tensors that both have.
 
-    widened: accept half precision in the file where the recipe has float32.
+    Half precision in the file fits float32 in the recipe.
     """
-    halves = (torch.float16, torch.bfloat16) if widened else ()
+    allowed = {torch.float32: (torch.float32, torch.float16, torch.bfloat16)}
     return [
         f"type of {name}: {file[name].dtype} in the file, {tensor.dtype} in the recipe"
         for name, tensor in recipe.items()
-        if name in file and file[name].dtype != tensor.dtype
-        if tensor.dtype != torch.float32 or file[name].dtype not in halves
+        if name in file and file[name].dtype not in allowed.get(tensor.dtype, (tensor.dtype,))
     ]

@@ -152,11 +152,6 @@ def test_every_difference_is_listed_at_once(saved):
 
 
 def test_damaged_files_are_refused_by_name(saved, written):
-    for position in (-100, -5):
-        content = bytearray(written)
-        content[position] ^= 1
-        saved.write_bytes(content)
-        must_not_load(f"^{saved} is damaged", saved)
     cut = [written[:kept] for kept in (0, 4, 100, -10)]
     for content in (*cut, b"recipe: 1\nmodel:\n"):
         saved.write_bytes(content)
@@ -195,7 +190,7 @@ def test_sizes_are_compared_before_anything_is_allocated(saved, monkeypatch):
 def test_a_changed_letter_in_any_metadata_is_refused(saved):
     """Of the recipe, the step, the ranges, the seal itself, and their names."""
     own, metadata = tensors_of(saved), metadata_of(saved)
-    assert len(metadata) == 9
+    assert len(metadata) == 8
     for name, text in metadata.items():
         for changed in ({name: text[:-1] + "x"}, {name[:-1] + "x": text}):
             rest = dict(metadata)
