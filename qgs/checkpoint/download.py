@@ -20,7 +20,7 @@ from qgs.paths import opened_path
 from qgs.terminal import without_secrets
 
 LARGEST = 20 * 10**9
-"""Bytes of a download, at most."""
+"""Most bytes of a download."""
 PATIENCE = 60.0
 """Seconds that a server may stay silent."""
 
@@ -71,7 +71,8 @@ def _download(url: str, file: Path) -> None:
                 _copy(stream, local, file.parent)
             with safe_open(temporary, "pt"):
                 pass
-    except Exception as error:  # whatever the file system of the URL raises
+    # The file system of the URL may raise anything.
+    except Exception as error:
         cause = str(getattr(error, "reason", error)) or type(error).__name__
         if isinstance(error, HTTPError):
             fix = _FIXES.get(error.code, "try again later")

@@ -26,12 +26,10 @@ OPACITY_EPS = 1e-6
 SCALE_MIN = 1e-12
 """Smallest scale stored, world units: the logarithm of 0 is infinite."""
 
-_MEANS, _COLORS, _SCALES, _QUATS = (
-    ("x", "y", "z"),
-    ("f_dc_0", "f_dc_1", "f_dc_2"),
-    ("scale_0", "scale_1", "scale_2"),
-    ("rot_0", "rot_1", "rot_2", "rot_3"),
-)
+_MEANS = ("x", "y", "z")
+_COLORS = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 NEEDED = (*_MEANS, *_COLORS, "opacity", *_SCALES, *_QUATS)
 REST = tuple(f"f_rest_{index}" for index in range(3 * SH_COUNTS[-1]))
 """Spherical harmonics of degrees 1 to 3, all of red first, then green, then blue; always written,
@@ -41,7 +39,8 @@ PROPERTIES = (*_MEANS, "nx", "ny", "nz", *_COLORS, *REST, "opacity", *_SCALES, *
 SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 """A Gaussian of a .splat file, 32 bytes. Source: github.com/antimatter15/splat, convert.py."""
 
-_HEADER = 2**16  # bytes of a header, at most: that of the 3DGS release has 1,500
+# Bytes of a header, at most: that of the 3DGS release has 1,500.
+_HEADER = 2**16
 
 
 def save_gaussians(gaussians: Gaussians, path: str | Path) -> None:
@@ -50,7 +49,8 @@ def save_gaussians(gaussians: Gaussians, path: str | Path) -> None:
     Raises ValueError for a suffix without a writer (see `scene_writers`), for several scenes, and
     for numbers that are not finite.
     """
-    suffix, writers = Path(path).suffix.lower(), scene_writers()
+    writers = scene_writers()
+    suffix = Path(path).suffix.lower()
     if suffix not in writers:
         raise ValueError(
             f"{path} must end in {listed(writers, between=' or ')}; for .spz, .sog and others give "
@@ -60,9 +60,9 @@ def save_gaussians(gaussians: Gaussians, path: str | Path) -> None:
 
 
 def scene_writers() -> Mapping[str, Callable[[], Callable[[Gaussians, str | Path], None]]]:
-    """Suffix to what finds the function that writes such files, of WRITER_GROUP and `save_ply`.
+    """Return by suffix a function that finds the writer of such files.
 
-    Finding one raises ExtensionError where its distribution cannot be imported.
+    Finding one of WRITER_GROUP raises ExtensionError where its distribution cannot be imported.
     """
     added = {
         f".{entry.name.lower()}": partial(imported, entry) for entry in installed(WRITER_GROUP)
@@ -104,14 +104,15 @@ def save_splat(gaussians: Gaussians, path: str | Path) -> None:
     """
     scene = one_scene(gaussians, ".splat", "sh", "features")
     # Viewers draw a file while it loads, so what covers most comes first.
-    first = (scene.scales.prod(-1) * scene.opacities).argsort(descending=True, stable=True)
-    scene = scene[first]
+    covering = scene.scales.prod(-1) * scene.opacities
+    scene = scene[covering.argsort(descending=True, stable=True)]
 
     def as_bytes(values: Tensor) -> Tensor:
         return values.round().clamp(0, 255).byte()
 
     records = np.empty(scene.count, SPLAT)
-    records["mean"], records["scale"] = scene.means, scene.scales
+    records["mean"] = scene.means
+    records["scale"] = scene.scales
     records["rgba"] = as_bytes(torch.cat([scene.colors, scene.opacities[:, None]], -1) * 255)
     records["quat"] = as_bytes(F.normalize(scene.quats, dim=-1) * 128 + 128)
     with replacing(path) as temporary:
@@ -119,38 +120,16 @@ def save_splat(gaussians: Gaussians, path: str | Path) -> None:
 
 
 def load_ply(path: str | Path) -> Gaussians:
-    """The Gaussians (1, G) of a PLY file in the layout of the 3DGS release, whatever wrote it.
+    """Return the Gaussians (1, G) of a PLY file in the layout of the 3DGS release, whatever wrote it.
 
     `sh` ends with the last degree of f_rest that is not all zeros, None without one. Raises
     FileNotFoundError, and ValueError for another kind of file or of PLY, such as a compressed one,
     and for numbers that are not finite.
     """
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"no file at {path}")
-    try:
-        with open(path, "rb") as start:
-            header, end, _ = start.read(_HEADER).partition(b"end_header")
-        counts = map(int, re.findall(rb"element\s+\S+\s+(\d{1,99})", header))
-        if not end or max(counts, default=0) > Path(path).stat().st_size:  # else memory goes first
-            raise ValueError(f"its header is not whole in {_HEADER:,} bytes, or promises too much")
-        file = PlyData.read(str(path))
-    except (PlyHeaderParseError, PlyElementParseError, ValueError, MemoryError) as error:
-        raise ValueError(f"{path} is no whole PLY file ({error}): copy it again") from error
-    found = {element.name: element for element in file.elements}
-    kinds = (found["vertex"].data.dtype.fields if "vertex" in found else None) or {}
-    names = [name for name, kind in kinds.items() if not kind[0].hasobject]  # no lists
-    if missing := [name for name in NEEDED if name not in names]:
-        kind = "a compressed PLY" if "chunk" in found else "no PLY of Gaussians"
-        raise ValueError(
-            f"{path} is {kind}: it lacks {listed(missing)}; give one with the properties of the "
-            "3DGS release, as SuperSplat's uncompressed export writes it"
-        )
-    vertices = found["vertex"].data
-    if not len(vertices):
-        raise ValueError(f"{path} holds no Gaussians")
-    rest = [name for name in REST if name in names]
+    vertices, names = _vertices(Path(path))
     count = sum(name.startswith("f_rest_") for name in names)
-    if count not in (0, *(3 * n for n in SH_COUNTS)) or rest != list(REST[:count]):
+    rest = REST[:count]
+    if count not in (0, *(3 * n for n in SH_COUNTS)) or not names.issuperset(rest):
         raise ValueError(
             f"{path} has {count} properties f_rest_*; spherical harmonics of degrees 1, 2 or 3 "
             "are f_rest_0 to f_rest_8, f_rest_23 or f_rest_44: write the file anew, or without them"
@@ -159,11 +138,12 @@ def load_ply(path: str | Path) -> Gaussians:
     def columns(*names: str) -> Tensor:
         return torch.from_numpy(np.stack([vertices[name] for name in names], -1, dtype=np.float32))
 
-    quats = columns(*_QUATS).double()  # in which norms are finite
+    # In float64 norms are finite; a quaternion of 0 becomes NaN, which is refused below.
+    quats = columns(*_QUATS).double()
     scene = Gaussians(
         means=columns(*_MEANS),
         scales=columns(*_SCALES).exp(),
-        quats=(quats / quats.norm(dim=-1, keepdim=True)).float(),  # NaN for 0
+        quats=(quats / quats.norm(dim=-1, keepdim=True)).float(),
         opacities=columns("opacity")[:, 0].sigmoid(),
         colors=columns(*_COLORS) * SH_C0 + 0.5,
         sh=_used_degrees(columns(*rest).unflatten(-1, (3, -1)).mT) if rest else None,
@@ -174,8 +154,37 @@ def load_ply(path: str | Path) -> Gaussians:
         raise ValueError(f"{path}: {error}") from None
 
 
+def _vertices(path: Path) -> tuple[np.ndarray, set[str]]:
+    """Return the vertices of a PLY file of Gaussians, and the names of their numbers."""
+    if not path.is_file():
+        raise FileNotFoundError(f"no file at {path}")
+    try:
+        with path.open("rb") as start:
+            header, end, _ = start.read(_HEADER).partition(b"end_header")
+        counts = map(int, re.findall(rb"element\s+\S+\s+(\d{1,99})", header))
+        # plyfile takes the memory that a header promises.
+        if not end or max(counts, default=0) > path.stat().st_size:
+            raise ValueError(f"its header is not whole in {_HEADER:,} bytes, or promises too much")
+        elements = {element.name: element.data for element in PlyData.read(str(path)).elements}
+    except (PlyHeaderParseError, PlyElementParseError, ValueError, MemoryError) as error:
+        raise ValueError(f"{path} is no whole PLY file ({error}): copy it again") from error
+    vertices = elements.get("vertex", np.empty(0))
+    kinds = vertices.dtype.fields or {}
+    # Lists are objects to NumPy.
+    names = {name for name, kind in kinds.items() if not kind[0].hasobject}
+    if missing := [name for name in NEEDED if name not in names]:
+        kind = "a compressed PLY" if "chunk" in elements else "no PLY of Gaussians"
+        raise ValueError(
+            f"{path} is {kind}: it lacks {listed(missing)}; give one with the properties of the "
+            "3DGS release, as SuperSplat's uncompressed export writes it"
+        )
+    if not len(vertices):
+        raise ValueError(f"{path} holds no Gaussians")
+    return vertices, names
+
+
 def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> Gaussians:
-    """The Gaussians (G, ...) of (G, ...) or (1, G, ...), float32 on the CPU, for a file.
+    """Return the Gaussians (G, ...) of (G, ...) or (1, G, ...), float32 on the CPU, for a file.
 
     Warns about the parts in `lost`. Raises ValueError for several scenes or for numbers whose
     squares are not finite. kind: of the file.
@@ -197,6 +206,10 @@ def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> Gaussians:
 
 
 def _used_degrees(sh: Tensor) -> Tensor | None:
-    """The coefficients (G, C, 3) up to the last degree that is not all zeros; None if all are."""
-    used = int(sh.any(0).any(-1).nonzero().max()) + 1 if sh.any() else 0
-    return sh[:, : next(count for count in SH_COUNTS if count >= used)] if used else None
+    """Return the coefficients (G, C, 3) up to the last degree that is not all zeros; None if all are."""
+    for count in reversed(SH_COUNTS):
+        # The degree below ends where this one's last coefficients begin.
+        below = max((fewer for fewer in SH_COUNTS if fewer < count), default=0)
+        if sh[:, below:count].any():
+            return sh[:, :count]
+    return None

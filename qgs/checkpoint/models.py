@@ -12,7 +12,7 @@ CHECKPOINT = "checkpoint.safetensors"
 
 
 def checkpoint_path(name: str | os.PathLike[str]) -> Path:
-    """The local file that `name` stands for; anything that exists under that name comes first.
+    """Return the local file that `name` stands for; anything that exists under that name comes first.
 
     name: a path, of a run folder for the checkpoint in it, PLUGIN/NAME of a model that an installed
     plugin ships (`qgs list`), or a URL that fsspec opens, see `qgs.checkpoint.download`.
@@ -21,18 +21,15 @@ def checkpoint_path(name: str | os.PathLike[str]) -> Path:
     """
     text = os.fspath(name)
     path = Path(text).expanduser()
-    plugin, slash, model = text.partition("/")
-    if path.exists():
-        path = path / CHECKPOINT if path.is_dir() else path
-    elif "://" in text:
-        return downloaded(text)
-    elif (
-        slash
-        and "/" not in model
-        and path.suffix != ".safetensors"
-        and plugin in available_plugins()
-    ):
-        return _shipped(plugin, text)
+    plugin, _, model = text.partition("/")
+    if path.is_dir():
+        path = path / CHECKPOINT
+    elif not path.exists():
+        if "://" in text:
+            return downloaded(text)
+        is_name = bool(model) and "/" not in model and path.suffix != ".safetensors"
+        if is_name and plugin in available_plugins():
+            return _shipped(plugin, text)
     if not path.is_file():
         raise FileNotFoundError(
             f"no checkpoint at {path}; give a run folder of `qgs train`, a .safetensors file, its "
@@ -59,12 +56,12 @@ def _shipped(plugin: str, name: str) -> Path:
 
 
 def card_of(file: Path) -> str:
-    """The card of a model, NAME.md beside the checkpoint NAME.safetensors; "" without one."""
+    """Return the card of a model, NAME.md beside the checkpoint NAME.safetensors; "" without one."""
     card = file.with_suffix(".md")
     return card.read_text(encoding="utf-8") if card.is_file() else ""
 
 
 def about(file: Path) -> str:
-    """What the model in `file` is: the first paragraph of its card; "" without one."""
-    paragraphs = [part for part in card_of(file).split("\n\n") if not part.startswith("#")]
-    return " ".join(paragraphs[0].split()) if paragraphs else ""
+    """Return the first paragraph of the card of the model in `file`; "" without one."""
+    paragraphs = (part for part in card_of(file).split("\n\n") if not part.startswith("#"))
+    return " ".join(next(paragraphs, "").split())
