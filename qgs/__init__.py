@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
     from qgs.model import QueryGaussianModel
     from qgs.recipe import compose
+    from qgs.reconstruction.reconstruct import reconstruct
     from qgs.reconstruction.result import Reconstruction
-    from qgs.reconstruction.scenes import read_photos, reconstruct
+    from qgs.reconstruction.scenes import read_photos
     from qgs.reconstruction.trace import trace
     from qgs.types import Cameras, Gaussians, Prediction, QueryState, Rendering, Views
 
@@ -48,7 +49,7 @@ _ELSEWHERE = {
     "load": "qgs.checkpoint.model_file",
     "load_ply": "qgs.checkpoint.gaussians",
     "read_photos": "qgs.reconstruction.scenes",
-    "reconstruct": "qgs.reconstruction.scenes",
+    "reconstruct": "qgs.reconstruction.reconstruct",
     "save": "qgs.checkpoint.model_file",
     "save_ply": "qgs.checkpoint.gaussians",
     "trace": "qgs.reconstruction.trace",

@@ -120,7 +120,7 @@ def save_splat(gaussians: Gaussians, path: str | Path) -> None:
 
 
 def load_ply(path: str | Path) -> Gaussians:
-    """Return the Gaussians (1, G) of a PLY file in the layout of the 3DGS release, whatever wrote it.
+    """Return the Gaussians (1, G) of a PLY file in the layout of the 3DGS release.
 
     `sh` ends with the last degree of f_rest that is not all zeros, None without one. Raises
     FileNotFoundError, and ValueError for another kind of file or of PLY, such as a compressed one,
@@ -206,7 +206,7 @@ def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> Gaussians:
 
 
 def _used_degrees(sh: Tensor) -> Tensor | None:
-    """Return the coefficients (G, C, 3) up to the last degree that is not all zeros; None if all are."""
+    """Return the coefficients (G, C, 3) without degrees that are zeros; None without any."""
     for count in reversed(SH_COUNTS):
         # The degree below ends where this one's last coefficients begin.
         below = max((fewer for fewer in SH_COUNTS if fewer < count), default=0)

@@ -112,7 +112,7 @@ class CheckpointFile(TensorFile):
             return Domain.read(self.mapping(key))
 
     def untrained(self, device: str | torch.device | None = None) -> QueryGaussianModel:
-        """Build the model with initial parameters; "meta" takes no memory. Raises CheckpointError."""
+        """Build the model with initial weights; "meta" takes no memory. Raises CheckpointError."""
         try:
             return self.recipe.build_model(device, pretrained=False)
         except (RecipeError, TooLargeError) as error:
@@ -121,7 +121,7 @@ class CheckpointFile(TensorFile):
             ) from error
 
     def model(self, device: str | torch.device | None = None) -> QueryGaussianModel:
-        """Return the model on `device` (default: CPU), in evaluation mode, half precision as float32.
+        """Return the model on `device` (default: CPU), in evaluation mode, in float32.
 
         Raises CheckpointError, and ValueError for weights that are NaN or infinite.
         """

@@ -12,7 +12,7 @@ CHECKPOINT = "checkpoint.safetensors"
 
 
 def checkpoint_path(name: str | os.PathLike[str]) -> Path:
-    """Return the local file that `name` stands for; anything that exists under that name comes first.
+    """Return the local file of `name`; what exists under that name comes first.
 
     name: a path, of a run folder for the checkpoint in it, PLUGIN/NAME of a model that an installed
     plugin ships (`qgs list`), or a URL that fsspec opens, see `qgs.checkpoint.download`.
@@ -56,7 +56,7 @@ def _shipped(plugin: str, name: str) -> Path:
 
 
 def card_of(file: Path) -> str:
-    """Return the card of a model, NAME.md beside the checkpoint NAME.safetensors; "" without one."""
+    """Return the card of a model, NAME.md beside NAME.safetensors; "" without one."""
     card = file.with_suffix(".md")
     return card.read_text(encoding="utf-8") if card.is_file() else ""
 

@@ -117,7 +117,7 @@ class TensorFile:
             return resolve(tree)
 
     def refuse_newer(self, key: str, ours: int) -> int:
-        """Return the format version in the entry `key`; CheckpointError where it is above `ours`."""
+        """Return the format version in the entry `key`; CheckpointError if it is above `ours`."""
         with self.entry(key) as text:
             written = int(text[:20])
         if written > ours:

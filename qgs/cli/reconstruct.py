@@ -67,7 +67,7 @@ def reconstruct(
 
     from qgs.checkpoint.gaussians import scene_writers
     from qgs.checkpoint.model_file import load
-    from qgs.reconstruction.scenes import reconstruct as run
+    from qgs.reconstruction.reconstruct import reconstruct as run
     from qgs.train.distributed import choose_device
 
     if find := scene_writers().get(out.suffix.lower()):

@@ -13,27 +13,30 @@ from torch import Tensor
 from qgs.files import replacing
 from qgs.types import Cameras
 
-Picture = np.ndarray  # uint8 (H, W, 3)
-NOTHING = (232, 233, 235)  # where there is nothing to show: no depth, no attention
+# uint8 (H, W, 3)
+Picture = np.ndarray
+# Where there is nothing to show: no depth, no attention.
+NOTHING = (232, 233, 235)
 DEPTH_MAP = "viridis_r"
-EXACT = 128  # pixels on the longer side up to which photos in pages are not compressed with loss
+# Pixels on the longer side up to which photos in pages are not compressed with loss.
+EXACT = 128
 
 
 def rgb_picture(image: Tensor) -> Picture:
-    """RGB (3, H, W), clipped to [0, 1]."""
+    """Return RGB (3, H, W), clipped to [0, 1], as a picture."""
     pixels = image.detach().float().clamp(0, 1).mul(255).round().byte()
     return pixels.permute(1, 2, 0).cpu().numpy()
 
 
 def depth_picture(depth: Tensor, near: float, far: float) -> Picture:
-    """Depth (1, H, W) from near (light) to far (dark); pixels without depth (0) are grey."""
+    """Draw depth (1, H, W) from near (light) to far (dark); pixels without depth (0) are grey."""
     picture = shaded(depth, near, far, DEPTH_MAP)
     picture[depth.detach()[0].cpu().numpy() <= 0] = NOTHING
     return picture
 
 
 def shaded(values: Tensor, low: float, high: float, colors: str) -> Picture:
-    """Values (1, H, W) from `low` to `high` in the colours of a Matplotlib map."""
+    """Draw values (1, H, W) from `low` to `high` in the colours of a Matplotlib map."""
     from matplotlib import colormaps
 
     shade = (values.detach().float().cpu().numpy()[0] - low) / max(high - low, 1e-12)
@@ -41,7 +44,7 @@ def shaded(values: Tensor, low: float, high: float, colors: str) -> Picture:
 
 
 def depth_range(depths: Tensor) -> tuple[float, float]:
-    """The 2nd and 98th percentile of all values that are not 0, for a scale that pictures share."""
+    """Return the 2nd and 98th percentile of values above 0, for a scale that pictures share."""
     seen = depths.detach()[depths.detach() > 0].float()
     if seen.numel() == 0:
         return 0.0, 1.0
@@ -50,62 +53,66 @@ def depth_range(depths: Tensor) -> tuple[float, float]:
 
 
 def side_by_side(pictures: list[Picture], gap: int = 4) -> Picture:
-    """Pictures of one height in a row, white between them."""
-    height = pictures[0].shape[0]
-    spacer = np.full((height, gap, 3), 255, np.uint8)
-    parts = [part for picture in pictures for part in (picture, spacer)]
-    return np.concatenate(parts[:-1], 1)
+    """Join pictures of one height in a row, white between them."""
+    first, *others = pictures
+    spacer = np.full((len(first), gap, 3), 255, np.uint8)
+    parts = [first]
+    for picture in others:
+        parts += [spacer, picture]
+    return np.concatenate(parts, 1)
 
 
 def png_bytes(picture: Picture) -> bytes:
-    """A uint8 (H, W, 3) picture as the bytes of a PNG file."""
+    """Return a picture as the bytes of a PNG file."""
     buffer = BytesIO()
     checked(picture).save(buffer, format="PNG", optimize=True)
     return buffer.getvalue()
 
 
 def write_png(picture: Picture, path: str | Path) -> None:
-    """Write a uint8 (H, W, 3) picture."""
+    """Write a picture as PNG."""
     with replacing(path) as temporary:
         temporary.write_bytes(png_bytes(picture))
 
 
 def write_gif(frames: Sequence[Picture], path: str | Path, frames_per_second: float) -> None:
-    """Write frames of one size as an endless GIF with one palette. Raises ValueError."""
-    sizes = {frame.shape for frame in frames}
-    if len(sizes) != 1:
-        raise ValueError(f"a GIF needs frames of one size, got {sorted(sizes) or 'none'}")
+    """Write frames of one size as an endless GIF with one palette."""
+    # One palette for all: others would make still pixels flicker.
     sample = checked(np.concatenate(frames[:: max(1, len(frames) // 8)]))
     palette = sample.quantize(256, method=Image.Quantize.MEDIANCUT)
     images = [checked(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
-    options = {"duration": round(1000 / frames_per_second), "loop": 0}
+    milliseconds = round(1000 / frames_per_second)
+    first, *rest = images
     with replacing(path) as temporary:
-        images[0].save(temporary, "GIF", save_all=True, append_images=images[1:], **options)
+        first.save(
+            temporary, "GIF", save_all=True, append_images=rest, duration=milliseconds, loop=0
+        )
 
 
 def data_uri(image: Picture | list[Picture], photo: bool = False) -> str:
-    """A picture as PNG, a large `photo` as WebP, frames as an endless WebP animation."""
+    """Encode a picture as PNG, a large `photo` as WebP, frames as an endless WebP animation."""
     frames = image if isinstance(image, list) else [image]
     if len(frames) == 1 and not (photo and max(frames[0].shape) > EXACT):
         return "data:image/png;base64," + base64.b64encode(png_bytes(frames[0])).decode()
     buffer = BytesIO()
     first, *rest = map(checked, frames)
-    options = {"duration": 90, "loop": 0, "quality": 90 if photo else 80, "method": 2}  # ms
-    first.save(buffer, format="WEBP", save_all=True, append_images=rest, **options)
+    quality = 90 if photo else 80
+    first.save(
+        buffer, "WEBP", save_all=True, append_images=rest,
+        duration=90, loop=0, quality=quality, method=2,
+    )  # fmt: skip
     return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def checked(picture: Picture) -> Image.Image:
-    """The picture for Pillow. Raises ValueError for what is none."""
-    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
-        raise ValueError(
-            f"a picture must be uint8 (H, W, 3), got {picture.dtype} {tuple(picture.shape)}"
-        )
+    """Return the picture for Pillow."""
+    assert picture.dtype == np.uint8, picture.dtype
+    assert picture.shape[2:] == (3,), picture.shape
     return Image.fromarray(picture)
 
 
 def enlarged(picture: Picture, side: int) -> Picture:
-    """The picture with its longer side at `side` pixels, smooth."""
+    """Return the picture with its longer side at `side` pixels, smooth."""
     height, width = picture.shape[:2]
     factor = side / max(height, width)
     size = (round(width * factor), round(height * factor))
@@ -113,7 +120,7 @@ def enlarged(picture: Picture, side: int) -> Picture:
 
 
 def finer(cameras: Cameras, side: int) -> Cameras:
-    """The same cameras with at least `side` pixels on the longer side, a whole multiple."""
+    """Return the same cameras with at least `side` pixels on the longer side, a whole multiple."""
     height, width = cameras.size
     factor = max(1, round(side / max(height, width)))
     return Cameras(cameras.c2w, cameras.intrinsics * factor, (height * factor, width * factor))

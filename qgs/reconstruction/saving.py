@@ -19,22 +19,24 @@ from qgs.reconstruction.result import Reconstruction, sample_cameras
 from qgs.types import Cameras
 from qgs.wording import numbered
 
-ORBIT_FRAMES, ORBIT_SIDE, FRAMES_PER_SECOND = 48, 320, 16
+ORBIT_FRAMES = 48
+ORBIT_SIDE = 320
+FRAMES_PER_SECOND = 16
 SWAY = 0.12
-"""Of an orbit, per distance to what is seen."""
+"""Motion to the side of an orbit, per distance to what is seen."""
 OVERVIEW_COLUMNS = 8
 
 
 def orbit_path(
     inputs: Cameras, depths: Tensor, frames: int = ORBIT_FRAMES, side: int = ORBIT_SIDE
 ) -> Cameras:
-    """`orbit` about the middle of the rendered `depths`, at least `side` pixels large."""
+    """Return an `orbit` about the middle of the rendered `depths`, at least `side` pixels large."""
     near, far = depth_range(depths)
     return images.finer(orbit(inputs, (near + far) / 2, frames), side)
 
 
 def orbit(inputs: Cameras, depth: float, frames: int) -> Cameras:
-    """A loop (1, frames) past the input cameras (1, V), swaying by SWAY times `depth`."""
+    """Return a loop (1, frames) past the input cameras (1, V), swaying by SWAY times `depth`."""
     angles = torch.arange(frames, device=inputs.c2w.device) * (2 * math.pi / frames)
     count = inputs.shape[1]
     # From 0, the first input, to count - 1, the last, and back.
@@ -81,33 +83,40 @@ def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
 
 
 def _pictures(result: Reconstruction) -> dict[str, list[Picture]]:
-    """Photo, render and depth of every view."""
-    sample, rendering = result.sample, result.rendering
+    """Return photo, render and depth of every view."""
+    sample = result.sample
+    rendering = result.rendering
     near, far = depth_range(rendering.depth)
+    photos = (*sample.inputs.images[0], *sample.targets.images[0])
     return {
-        "photo": [rgb_picture(i) for i in (*sample.inputs.images[0], *sample.targets.images[0])],
+        "photo": [rgb_picture(image) for image in photos],
         "render": [rgb_picture(image) for image in rendering.rgb[0]],
         "depth": [depth_picture(depth, near, far) for depth in rendering.depth[0]],
     }
 
 
 def overview(result: Reconstruction, dpi: int = 120) -> Picture:
-    """Photos over renders and depth, of at most OVERVIEW_COLUMNS views: inputs stay longest."""
+    """Draw photos over renders and depth, of at most OVERVIEW_COLUMNS views, inputs first."""
     scores = result.scores
     shown = sorted(range(min(len(scores), OVERVIEW_COLUMNS)), key=lambda i: scores[i].frame)
     titles = []
-    for score in (scores[i] for i in shown):
+    for index in shown:
+        score = scores[index]
         file = Path(result.sample.names.get(score.frame, "")).name
         quality = f"{Psnr.column.shown(score.psnr)} {Psnr.column.unit}"
         titles.append(f"frame {numbered(score.frame, file)}\n{score.kind.split()[0]}, {quality}")
     rows = {kind: [pictures[i] for i in shown] for kind, pictures in _pictures(result).items()}
-    scale = depth_range(result.rendering.depth)
-    return figure_picture(grid_figure(rows, titles, depth_row=("depth", *scale)), dpi)
+    figure = grid_figure(rows, titles, depth_range(result.rendering.depth))
+    return figure_picture(figure, dpi)
 
 
 def _camera_record(result: Reconstruction, path: Cameras) -> dict[str, Any]:
     reference, scale = result.world
-    names, cameras = result.sample.names, _plain(sample_cameras(result.sample))
+    views = []
+    for score, camera in zip(result.scores, _plain(sample_cameras(result.sample)), strict=True):
+        photo = result.sample.names.get(score.frame)
+        view = {"frame": score.frame, "photo": photo, "kind": score.kind}
+        views.append({**view, "psnr": round(score.psnr, 3), **camera})
     return {
         "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
         "scene": result.sample.scene,
@@ -122,18 +131,12 @@ def _camera_record(result: Reconstruction, path: Cameras) -> dict[str, Any]:
             "scale": float(scale),
             "search": result.scale.record if result.scale else None,
         },
-        "views": [
-            {"frame": s.frame, "photo": names.get(s.frame), "kind": s.kind}
-            | {"psnr": round(s.psnr, 3), **camera}
-            for s, camera in zip(result.scores, cameras, strict=True)
-        ],
+        "views": views,
         "orbit": _plain(path),
     }
 
 
 def _plain(cameras: Cameras) -> list[dict[str, Any]]:
-    c2w, intrinsics = cameras.c2w[0].tolist(), cameras.intrinsics[0].tolist()
-    return [
-        {"c2w": pose, "intrinsics": lens, "size": list(cameras.size)}
-        for pose, lens in zip(c2w, intrinsics, strict=True)
-    ]
+    pairs = zip(cameras.c2w[0].tolist(), cameras.intrinsics[0].tolist(), strict=True)
+    size = list(cameras.size)
+    return [{"c2w": c2w, "intrinsics": intrinsics, "size": size} for c2w, intrinsics in pairs]

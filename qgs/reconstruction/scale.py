@@ -26,12 +26,20 @@ from qgs.wording import listed
 
 FURTHER = 2
 """Photos that are judged with the inputs, at most."""
-STEP, MOST = 1.6, 16
-"""Ratio of neighbouring factors at first, and how many there are before the search goes finer."""
-BASELINES, BELOW, ABOVE = (0.06, 0.25), 2.0, 4.0
-"""Baselines where those of the training are unknown; how far the search goes past both ends."""
-NEAREST, REACH = 0.8, 6.0
-"""Least depth that cameras look at where that of the training is unknown; up to REACH times it."""
+STEP = 1.6
+"""Ratio of neighbouring factors at first."""
+MOST = 16
+"""Factors that are tried before the search goes finer."""
+BASELINES = (0.06, 0.25)
+"""Baselines where those of the training are unknown."""
+BELOW = 2.0
+"""How far the search goes below the least baseline of the training."""
+ABOVE = 4.0
+"""How far the search goes above the largest baseline of the training."""
+NEAREST = 0.8
+"""Least depth that cameras look at where that of the training is unknown."""
+REACH = 6.0
+"""The search brings what cameras look at to REACH times the least depth."""
 PENALTY = 5.0
 """dB for each e-fold by which depths are below those of the training, for inputs alone."""
 POOR = 14.0
@@ -58,13 +66,15 @@ class FoundScale:
     @property
     def poor(self) -> str:
         """A remark where no factor gave a good result or the inputs alone decide, else ""."""
-        if not self.psnr >= POOR:  # NaN is poor too
+        # NaN is poor too.
+        if not self.psnr >= POOR:
             return (
-                f"no scale fits, at the best the photos are rendered at {self.psnr:.1f} dB: choose "
-                "inputs that overlap more (frames), or give the scale"
+                f"no scale fits: the best gives only {self.psnr:.1f} dB; choose inputs that "
+                "overlap more (frames), or give the scale"
             )
-        alone = "inputs alone can mislead the search: add photos between them, or give the scale"
-        return "" if self.further else alone
+        if self.further:
+            return ""
+        return "inputs alone can mislead the search: add photos between them, or give the scale"
 
     @property
     def text(self) -> str:
@@ -93,14 +103,14 @@ class ScaleSearch:
         """See `find_scale`."""
         if self.views.scale != "search":
             return self.views
-        key = scene.name, tuple(inputs), tuple(compared)
+        key = (scene.name, tuple(inputs), tuple(compared))
         if key not in self.found:
-            self.found[key] = find_scale(self.model, scene, *key[1:], self.views)
+            self.found[key] = find_scale(self.model, scene, inputs, compared, self.views)
         return constant_scale(self.views, self.found[key].factor)
 
 
 def photo_settings(views: ViewsConfig, own: bool, overrides: Sequence[str] = ()) -> ViewsConfig:
-    """`views` for photos of a user: `search` in place of a constant scale not set for them.
+    """Return `views` for photos of a user: `search` for a constant scale not set for them.
 
     own: whether the model was trained on these photos. overrides: settings of `views`.
     """
@@ -110,7 +120,7 @@ def photo_settings(views: ViewsConfig, own: bool, overrides: Sequence[str] = ())
 
 
 def constant_scale(views: ViewsConfig, factor: float) -> ViewsConfig:
-    """`views` with this factor of all translations."""
+    """Return `views` with this factor of all translations."""
     return views.model_copy(update={"scale": "constant", "scale_factor": factor})
 
 
@@ -126,11 +136,13 @@ def find_scale(
     factors that bring what the cameras look at nearer than in training lose PENALTY. Where the
     model is; restores its mode.
     """
-    began, training = time.perf_counter(), model.training
-    further, given = further_photos(scene, inputs, compared), tuple(inputs)
-    if not further and len(inputs) > 2:
-        middle = len(inputs) // 2
-        further, given = given[middle : middle + 1], given[:middle] + given[middle + 1 :]
+    began = time.perf_counter()
+    training = model.training
+    given = tuple(inputs)
+    further = further_photos(scene, inputs, compared)
+    if not further and len(given) > 2:
+        further = (given[len(given) // 2],)
+        given = tuple(frame for frame in given if frame not in further)
     sample = make_sample(scene, given, further, constant_scale(views, 1.0), mirror=False)
     frames = given if len(given) > 1 else given + further
     low, high, nearest = search_range(model.trained_on or Domain(), scene, frames)
@@ -157,7 +169,7 @@ def find_scale(
 
 
 def further_photos(scene: Scene, inputs: Frames, compared: Frames, most: int = FURTHER) -> Frames:
-    """At most `most` photos in the middle of the inputs, none held out or compared with.
+    """Return at most `most` photos in the middle of the inputs, none held out or compared with.
 
     The middle has the smallest largest distance from inputs: of centres, over that between inputs,
     plus the angle between axes. None of scenes that move.
@@ -166,7 +178,8 @@ def further_photos(scene: Scene, inputs: Frames, compared: Frames, most: int = F
     if scene.times is not None or not left:
         return ()
     c2w = scene.cameras.c2w.double()
-    own, other = c2w[list(inputs)], c2w[left]
+    own = c2w[list(inputs)]
+    other = c2w[left]
     apart = torch.cdist(other[:, :3, 3], own[:, :3, 3])
     extent = float(torch.cdist(own[:, :3, 3], own[:, :3, 3]).max() or apart.max()) or 1.0
     turn = (other[:, :3, 2] @ own[:, :3, 2].T).clamp(-1, 1).acos()
@@ -175,13 +188,14 @@ def further_photos(scene: Scene, inputs: Frames, compared: Frames, most: int = F
 
 
 def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, float, float]:
-    """The smallest and largest factor of a search, and from where on depths are as in training.
+    """Return the ends of a search, and the factor from which on depths are as in training.
 
     The last is 0 where the depth that the cameras look at is unknown.
     """
     depth = float(look_at_depth(scene.cameras.c2w))
     centres = scene.cameras.c2w[list(frames), :3, 3].double()
-    baseline, found = float(torch.cdist(centres, centres).max()), list[float]()
+    baseline = float(torch.cdist(centres, centres).max())
+    found: list[float] = []
     low, high = trained.ranges.get("baseline", BASELINES)
     if baseline > 0 and high > 0:
         found += [max(low, high / 10) / baseline / BELOW, high / baseline * ABOVE]
@@ -190,7 +204,7 @@ def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, 
     if depth > 0:
         found += [near / TOLERANCE / depth, near * REACH / depth]
     nearest = near * TOLERANCE / depth if depth > 0 else 0.0
-    # cameras on one point: no factor changes what they see
+    # Cameras on one point leave nothing to search: no factor changes what they see.
     return min(found, default=1.0), max(found, default=1.0), nearest
 
 
@@ -204,9 +218,13 @@ class _Trial:
     def __init__(
         self, model: QueryGaussianModel, sample: Sample, low: float, step: float, nearest: float
     ) -> None:
-        self._model, self._low, self._step, self._nearest = model, low, step, nearest
+        self._model = model
+        self._low = low
+        self._step = step
+        self._nearest = nearest
         device = next(model.parameters()).device
-        self._inputs, self._further = sample.inputs.to(device), sample.targets.to(device)
+        self._inputs = sample.inputs.to(device)
+        self._further = sample.targets.to(device)
         self.tried: dict[float, tuple[float, float]] = {}
 
     def factor(self, place: float) -> float:
@@ -222,13 +240,13 @@ class _Trial:
         return -math.inf if math.isnan(found) else found
 
     def best(self, places: Sequence[float]) -> float:
-        """Try those places; the best of all so far."""
+        """Try these places; return the best of all so far."""
         new = [place for place in places if place not in self.tried]
         each = max(PIXELS // self._inputs.images[:, :, 0].numel(), 1)
         for start in range(0, len(new), each):
             part = new[start : start + each]
             factors = self._inputs.images.new_tensor([self.factor(place) for place in part])
-            # not through its hooks: one warns of views unlike the training's, which are tried here
+            # Not through its hooks: one warns of views unlike the training's, as are tried here.
             gaussians = self._model.forward(at_factors(self._inputs, factors)).gaussians
             columns = []
             for views in (self._inputs, self._further):
@@ -240,12 +258,13 @@ class _Trial:
         return max(self.tried, key=self.score)
 
     def past(self, place: float) -> Sequence[float]:
-        """Places past the ends of those that were tried, where `place` is such an end."""
-        low, high = min(self.tried), max(self.tried)
-        return [low - 6, low - 3] if place == low else [high + 3, high + 6] * (place == high)
+        """Return places past the ends of those tried where `place` is such an end, else none."""
+        if place == min(self.tried):
+            return [place - 6, place - 3]
+        return [place + 3, place + 6] if place == max(self.tried) else []
 
     def vertex(self, place: float) -> float:
-        """Of the parabola through the scores at `place`, the best, and beside it, from `place`."""
+        """Return the offset from `place` to the vertex of the parabola through three scores."""
         if not {place - 1, place + 1} <= self.tried.keys():
             return 0.0
         left, middle, right = (self.score(place + side) for side in (-1, 0, 1))
@@ -254,7 +273,7 @@ class _Trial:
 
 
 def at_factors(views: Views, factors: Tensor) -> Views:
-    """Views (1, V) as (F, V), with translations multiplied by each of `factors` (F,)."""
+    """Return views (1, V) as (F, V), with translations multiplied by each of `factors` (F,)."""
     many = map_tensors(lambda tensor: tensor.expand(len(factors), *tensor.shape[1:]), views)
     c2w = scaled(many.cameras.c2w, factors[:, None])
     return replace(many, cameras=replace(many.cameras, c2w=c2w))

@@ -165,6 +165,7 @@ def test_photos_that_are_not_there_are_refused(photos):
 
 SENSELESS = """
 --size 64 | --size
+--scale 0 | --scale
 --set views.scale=big | views.scale
 --set data.path=x | data.path
 """

@@ -13,7 +13,8 @@ from walk import Walk
 
 import qgs
 from qgs.checkpoint.gaussians import load_ply
-from qgs.reconstruction.result import choose_sample, reconstruct_sample
+from qgs.reconstruction.reconstruct import choose_sample
+from qgs.reconstruction.result import reconstruct_sample
 
 
 def finish(folder, views, *settings):

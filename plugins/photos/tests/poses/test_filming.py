@@ -12,7 +12,7 @@ from walked import frames
 
 import qgs
 from qgs.cli.options import scale_settings
-from qgs.reconstruction.scenes import reconstruct
+from qgs.reconstruction.reconstruct import reconstruct
 from qgs.types import Cameras
 
 

@@ -7,7 +7,7 @@ from qgs.contracts import Scene, ViewsConfig
 from qgs.data.samples import make_sample, own_world
 from qgs.geometry.poses import relative_to, scaled
 from qgs.model import QueryGaussianModel
-from qgs.reconstruction.result import checked_window
+from qgs.reconstruction.reconstruct import checked_window
 from qgs.types import Cameras
 from qgs_viewer.placement import Placement
 from qgs_viewer.query_scene import QueryScene, explained

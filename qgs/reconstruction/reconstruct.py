@@ -1,0 +1,192 @@
+"""From photos and a model to a reconstruction in one call: inputs, scale, forward pass, remarks."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from os import PathLike, fspath
+
+from torch import Tensor
+
+from qgs.contracts import Scene, ViewsConfig
+from qgs.data.images import framing
+from qgs.data.inputs import NOVEL, Frusta, Window, choose_windows
+from qgs.data.samples import Sample, evenly, make_sample, moments, own_world, spread
+from qgs.domain import Domain, verdict
+from qgs.evaluate.plan import ViewsOf
+from qgs.evaluate.tuning import tuned_gaussians, tuning_settings
+from qgs.model import QueryGaussianModel
+from qgs.recipe import Recipe, resolve
+from qgs.reconstruction.result import Reconstruction, reconstruct_sample
+from qgs.reconstruction.scale import ScaleSearch, photo_settings
+from qgs.reconstruction.scenes import (
+    ChosenScene,
+    Frames,
+    GivenScene,
+    Size,
+    chosen_scene,
+    frame_list,
+)
+from qgs.types import Views
+from qgs.wording import counted, listed
+
+
+def reconstruct(
+    model: QueryGaussianModel,
+    photos: str | PathLike[str] | Views,
+    *,
+    inputs: int | None = None,
+    frames: Frames | None = None,
+    compare: Frames | None = None,
+    size: Size | None = None,
+    scene: str | None = None,
+    overrides: Sequence[str] = (),
+    tune: str | None = None,
+) -> Reconstruction:
+    """Reconstruct one scene as `qgs reconstruct` does, in the frame of the recipe.
+
+    The scale is the recipe's; where that is a constant and the model was not trained on these
+    photos, it is searched, see `qgs.reconstruction.scale`.
+
+    photos: a folder of photos and cameras, or its URL; or Views (1, V) in any world, which all
+        become inputs unless `frames` names some. OpenCV cameras, images in [0, 1].
+    inputs: how many; the recipe's number by default.
+    frames: which photos, by number or file name; by default see `qgs.data.inputs`.
+    compare: photos to compare with, "none" or no frames for none; of a folder, by default those
+        near the inputs of every eighth photo, which is held out.
+    size: (H, W) of the photos of a folder; by default see `chosen_scene`.
+    scene: name, where a folder holds several.
+    overrides: of the recipe's `views`, such as "views.scale=auto".
+    tune: fit queries or latents to the inputs first, see `qgs.evaluate.tuning.tuning_settings`.
+
+    Raises ValueError for a model without a recipe, several scenes, and images out of range, and as
+    the data do.
+    """
+    recipe = _recipe(model, overrides, tune)
+    if isinstance(photos, Views):
+        if size is not None or scene is not None:
+            raise ValueError("`size` and `scene` are for folders: Views have one scene and size")
+        chosen = ChosenScene(GivenScene(photos))
+        if frames is None and inputs is None:
+            frames = range(len(chosen.scene))
+    else:
+        chosen = chosen_scene(recipe, fspath(photos), size, scene, compare is None)
+    found = chosen.scene
+    wanted = None if frames is None else frame_list(frames, "frames", found)
+    against = [] if compare == "none" else compare
+    against = None if against is None else frame_list(against, "compare", found)
+    views = photo_settings(recipe.views, chosen.is_training_data, overrides)
+    search = ScaleSearch(model, views)
+    domain = model.trained_on
+    sample, world = choose_sample(found, recipe.views, inputs, wanted, against, domain, search)
+    training = model.training
+    try:
+        model.eval()
+        steps = recipe.evaluation.tuning_steps if tune else 0
+        tuned, record = tuned_gaussians(model, recipe, sample.inputs) if steps else (None, None)
+        result = reconstruct_sample(model, sample, world, chosen.seen, tuned, record)
+    finally:
+        model.train(training)
+    result = replace(result, scale=next(iter(search.found.values()), None))
+    return replace(result, remarks=_remarks(result, found))
+
+
+def _recipe(model: QueryGaussianModel, overrides: Sequence[str], tune: str | None) -> Recipe:
+    """Return the model's recipe with other `views` and tuning. Raises ValueError without one."""
+    if model.recipe is None:
+        raise ValueError(
+            "this model was built by hand and has no recipe, so the frame and scale of its world "
+            "are not known; build it with qgs.compose, or bring cameras into its world yourself"
+        )
+    if foreign := [text for text in overrides if not text.startswith("views.")]:
+        raise ValueError(f"only options of `views` can be set here, got {listed(foreign)}")
+    return resolve(model.recipe, [*overrides, *tuning_settings(tune)])
+
+
+def choose_sample(
+    scene: Scene,
+    views: ViewsConfig,
+    inputs: int | None,
+    frames: Sequence[int] | None,
+    compare: Sequence[int] | None,
+    trained_on: Domain | None = None,
+    views_of: ViewsOf | None = None,
+) -> tuple[Sample, tuple[Tensor, Tensor]]:
+    """Return inputs and compared views of `scene`, and their world as of `own_world`.
+
+    frames, compare: by default the best of `choose_windows`; where times are known, inputs spread
+    over them, and views of one time between. trained_on: of the model. views_of: makes the settings
+    of the chosen views, such as their scale; None takes `views`. Raises ValueError for frames that
+    do not exist or come twice, and for too few.
+    """
+    views = views.model_copy(update={"inputs": inputs or views.inputs})
+    domain = trained_on or Domain()
+    novel = tuple(compare or ())
+    if frames is not None:
+        checked_window(len(scene), frames)
+    if scene.times is not None:
+        frames, novel = _over_time(scene, scene.times, views, frames)
+    elif frames is None:
+        frames, novel = choose_windows(scene, views, domain, held_out=compare)[0]
+    elif compare is None:
+        novel = Frusta(scene, domain).compared(tuple(frames))
+    picked = checked_window(len(scene), frames, novel if compare is None else compare)
+    # Only now: the scale is searched on the chosen views.
+    views = views_of(scene, *picked) if views_of else views
+    sample = make_sample(scene, *picked, views, mirror=False)
+    return sample, own_world(scene, sample.input_frames, views)
+
+
+def checked_window(total: int, frames: Sequence[int], compare: Sequence[int] = ()) -> Window:
+    """Return input and compared frames; ValueError for one twice or not of 0 to total - 1."""
+    every = [*frames, *compare]
+    if missing := [frame for frame in every if not 0 <= frame < total]:
+        raise ValueError(f"frames {listed(missing)} do not exist; the photos are 0..{total - 1}")
+    if twice := sorted({frame for frame in every if every.count(frame) > 1}):
+        raise ValueError(
+            f"frames named twice: {listed(twice)}; inputs and compared frames must differ"
+        )
+    return tuple(frames), tuple(compare)
+
+
+def _over_time(
+    scene: Scene, times: Tensor, views: ViewsConfig, frames: Sequence[int] | None
+) -> Window:
+    """Return inputs, and at most NOVEL frames of one time between them, held-out ones first."""
+    if frames is None:
+        usable = moments(scene)
+        if views.inputs > len(usable):
+            raise ValueError(f"there are {len(usable)} times, too few for {views.inputs} inputs")
+        first = max(len(usable) - max(views.gap[1] + 1, views.inputs), 0) // 2
+        frames = spread(usable[first : len(usable) - first], views.inputs)
+    between = [f for f in range(min(frames), max(frames) + 1) if f not in frames]
+    held_out = [frame for frame in between if frame in scene.held_out]
+    novel = evenly(held_out or between, NOVEL)
+    # A model renders one time in one pass.
+    moment = times[novel[len(novel) // 2]] if novel else None
+    return tuple(frames), tuple(frame for frame in novel if times[frame] == moment)
+
+
+def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
+    """Return what a user must know of photos and result."""
+    sample = result.sample
+    found = Domain()
+    found.see(sample.inputs.cameras, sample.targets.cameras)
+    remarks = (
+        choice(sample, scene),
+        verdict(result.model.trained_on or Domain(), found, ["scale"] if result.scale else []),
+        result.scale.poor if result.scale else "",
+        framing(scene, sample.input_frames[0]),
+        result.worse_than_nearest,
+    )
+    return [*filter(None, remarks)]
+
+
+def choice(sample: Sample, scene: Scene, compares: bool = True) -> str:
+    """Return a sentence on the photos of `sample` and, if it compares, on held-out ones."""
+    text = f"inputs {listed(map(scene.frame_name, sample.input_frames))}"
+    if not compares:
+        return text
+    if sample.target_frames:
+        text += f", compared with {listed(map(scene.frame_name, sample.target_frames))}"
+    if scene.held_out:
+        text += f"; {len(scene.held_out)} of {counted(len(scene), 'photo')} held out"
+    return text
