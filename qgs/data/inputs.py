@@ -9,7 +9,7 @@ import torch
 
 from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.data.depth import scene_depth
-from qgs.data.samples import evenly
+from qgs.data.frames import evenly
 from qgs.domain import Domain
 from qgs.geometry.rays import pixel_directions
 

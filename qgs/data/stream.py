@@ -2,7 +2,6 @@
 
 import atexit
 import hashlib
-import logging
 import os
 import signal
 import threading
@@ -75,9 +74,17 @@ def training_batches(
     them. skips, sampler, depths: see `SampleStream`. accumulate: batches of an optimiser step.
     Raises ValueError without training scenes or with too few frames, SampleError and WorkerError.
     """
-    per_step = batch_size * share.processes * accumulate
-    options = (views, seed, skips, sampler, per_step, depths)
-    batches = _Batches(source, options, batch_size, share)
+    batches = _Batches(
+        source,
+        batch_size,
+        share,
+        views=views,
+        seed=seed,
+        skips=skips,
+        sampler=sampler,
+        per_step=batch_size * share.processes * accumulate,
+        depths=depths,
+    )
     return _from_workers(batches, start, workers) if workers else _from_thread(batches, start)
 
 
@@ -88,59 +95,38 @@ def trained_domain(
     sampler: ViewSampler | None = None,
     steps: int = 0,
 ) -> Domain:
-    """The ranges of the cameras of MEASURED training samples; no image is decoded.
+    """Measure the cameras of MEASURED training samples; no image is decoded.
 
     The scenes are the first ones of the training, and the samples those of steps spread evenly
     from 0 to `steps`, since the options of `sampler` may follow them. A scene that fails is left
     out: training itself reports it.
     """
-    stream, domain = SampleStream(source, views, seed, sampler=sampler), Domain()
+    stream = SampleStream(source, views, seed, sampler=sampler)
     drawn = defaultdict[int, list[tuple[Cameras, Cameras]]](list)
     for number in range(MEASURED):
-        with suppress(Exception):  # whatever a reader raises
+        # A reader may raise anything.
+        with suppress(Exception):
             inputs, targets = stream.cameras(number, round(number / (MEASURED - 1) * steps))
             drawn[inputs.shape[1]].append((inputs, targets))
+    domain = Domain()
     for alike in drawn.values():
         domain.see(*concatenated(alike, 0))
     return domain
 
 
 def scenes_fingerprint(source: SceneSource) -> str:
-    """Hash of the number of training scenes and of their groups."""
+    """Return a hash of the number of training scenes and of their groups."""
     digest = hashlib.sha256()
     for group in filter(len, source.groups("train")):
         digest.update(len(group).to_bytes(8, "little") + np.asarray(group, "<i8").tobytes())
     return digest.hexdigest()[:16]
 
 
-class SceneOrder:
-    """The scenes of an endless sequence of samples: a function of (groups, seed) alone.
-
-    Each epoch visits the `groups` (see `SceneSource.groups`) in a random order, and the scenes of
-    each at random.
-    """
-
-    def __init__(self, groups: Sequence[Sequence[int]], count: int, seed: int) -> None:
-        self._groups = [np.asarray(group, np.int64) for group in groups if len(group)]
-        listed = np.concatenate([np.empty(0, np.int64), *self._groups])
-        assert np.array_equal(np.sort(listed), np.arange(count)), "groups hold every scene once"
-        self._count, self._seed = count, seed
-        self._epoch = lru_cache(maxsize=2)(self._draw_epoch)
-
-    def scene(self, sample: int) -> int:
-        """The scene of a sample, counted from 0 over all epochs."""
-        epoch, position = divmod(sample, self._count)
-        return int(self._epoch(epoch)[position])
-
-    def _draw_epoch(self, epoch: int) -> np.ndarray:
-        rng = np.random.default_rng([self._seed, 0, epoch])
-        # groups in turn, such as files of scenes: each is opened once an epoch
-        shuffled = rng.permutation(len(self._groups))
-        return np.concatenate([rng.permutation(self._groups[index]) for index in shuffled])
-
-
 class SampleStream:
     """Samples by number, each a function of (seed, number) alone. Raises ValueError without scenes.
+
+    Each epoch visits the groups (see `SceneSource.groups`) in a random order, and the scenes of
+    each at random.
 
     skips: replace a failing sample by one of the next scene, at most MAX_REPLACED times. sampler:
     `Span` by default. per_step: samples of an optimiser step, by which the sampler knows the step
@@ -157,16 +143,34 @@ class SampleStream:
         per_step: int = 1,
         depths: bool = False,
     ) -> None:
-        self._views, self._seed, self._skips = views, seed, skips
+        self._views = views
+        self._seed = seed
+        self._skips = skips
         self._sampler = sampler or Span(Span.Config())
-        self._per_step, self._depths = per_step, depths
+        self._per_step = per_step
+        self._depths = depths
         self._scenes = source.scenes("train")
         if not len(self._scenes):
             raise ValueError(f"the data source {type(source).name!r} has no training scenes")
-        self.order = SceneOrder(source.groups("train"), len(self._scenes), seed)
+        self._groups = [np.asarray(group, np.int64) for group in source.groups("train")]
+        every = np.sort(np.concatenate([np.empty(0, np.int64), *self._groups]))
+        whole = np.arange(len(self._scenes))
+        assert np.array_equal(every, whole), "groups hold every scene once"
+        self._epoch = lru_cache(maxsize=2)(self._draw_epoch)
+
+    def _scene(self, number: int) -> Scene:
+        epoch, place = divmod(number, len(self._scenes))
+        return self._scenes[int(self._epoch(epoch)[place])]
+
+    def _draw_epoch(self, epoch: int) -> np.ndarray:
+        rng = np.random.default_rng([self._seed, 0, epoch])
+        groups = [group for group in self._groups if len(group)]
+        # Groups in turn, such as files of scenes: each is opened once an epoch.
+        shuffled = rng.permutation(len(groups))
+        return np.concatenate([rng.permutation(groups[index]) for index in shuffled])
 
     def batch(self, numbers: Sequence[int]) -> Batch:
-        """Samples by number. Raises ValueError for too few frames in a scene, else SampleError."""
+        """Make samples by number. Raises ValueError for too few frames, else SampleError."""
         left_out: list[str] = []
         batch = collate([self._sample(number, left_out) for number in numbers])
         return replace(batch, left_out=tuple(left_out))
@@ -174,7 +178,7 @@ class SampleStream:
     def _sample(self, number: int, left_out: list[str]) -> Sample:
         for attempt in range(MAX_REPLACED + 1):
             try:
-                return self._made(number, attempt)
+                return self._sample_after(number, attempt)
             except Exception as error:
                 if not self._skips or is_out_of_memory(error):
                     raise
@@ -184,27 +188,28 @@ class SampleStream:
         )
 
     def cameras(self, number: int, step: int) -> tuple[Cameras, Cameras]:
-        """Of the inputs and targets (1, V) of a sample as drawn after `step` optimiser steps."""
+        """Draw the cameras (1, V) of inputs and targets as after `step` optimiser steps."""
         rng = np.random.default_rng([self._seed, 1, number])
-        scene = self._scenes[self.order.scene(number)]
+        scene = self._scene(number)
         _, inputs, targets = self._drawn(scene, rng, step)
-        world, count = own_world(scene, inputs, self._views), len(inputs)
-        both = cameras_in(world, scene, (*inputs, *targets))
+        count = len(inputs)
+        both = cameras_in(own_world(scene, inputs, self._views), scene, (*inputs, *targets))
         both = with_noise(both, count, self._views, rng) if self._views.pose_noise else both
         return both[:, :count], both[:, count:]
 
     def _drawn(
         self, scene: Scene, rng: np.random.Generator, step: int
     ) -> tuple[bool, Frames, Frames]:
-        """Whether a sample is mirrored, and its input and target frames."""
+        """Draw whether a sample is mirrored, and its input and target frames."""
         mirror = bool(rng.random() < self._views.mirror)
         return mirror, *self._sampler.draw(scene, self._views, rng, step)
 
-    def _made(self, number: int, attempt: int) -> Sample:
-        """Sample `number`, or its replacement after `attempt` failures."""
-        # the first attempt draws from (seed, 1, number), whether others were replaced or not
-        rng = np.random.default_rng([self._seed, 1, number, *[attempt] * bool(attempt)])
-        scene = self._scenes[self.order.scene(number + attempt)]
+    def _sample_after(self, number: int, attempt: int) -> Sample:
+        """Make sample `number`, or its replacement after `attempt` failures."""
+        # The first attempt draws from (seed, 1, number), whether others were replaced or not.
+        key = [self._seed, 1, number]
+        rng = np.random.default_rng([*key, attempt] if attempt else key)
+        scene = self._scene(number + attempt)
         mirror, inputs, targets = self._drawn(scene, rng, number // self._per_step)
         try:
             return make_sample(scene, inputs, targets, self._views, mirror, rng, self._depths)
@@ -214,48 +219,42 @@ class SampleStream:
             raise SampleError(f"scene {scene.name!r}: {one_line(error)}") from error
 
 
-@dataclass(frozen=True)
-class _Failure:
-    """An error of a worker as text; exceptions with arguments of their own cannot be pickled."""
-
-    message: str
-    trace: str
-    no_memory: bool
-
-
-class _Batches(Dataset[Batch | _Failure]):
+class _Batches(Dataset[Batch | Exception]):
     """The batches of one process; a copy in a worker opens the data itself on first use."""
 
-    def __init__(
-        self, source: SceneSource, options: tuple[Any, ...], batch_size: int, share: Share
-    ) -> None:
-        self._source, self._options = (type(source), source.config), options
-        self._stream: SampleStream | None = SampleStream(source, *options)
-        self._size, self._share = batch_size, share
+    def __init__(self, source: SceneSource, batch_size: int, share: Share, **options: Any) -> None:
+        self._kind = type(source)
+        self._config = source.config
+        self._options = options
+        self._stream: SampleStream | None = SampleStream(source, **options)
+        self._size = batch_size
+        self._share = share
 
-    # open scenes hold files and caches, which cannot be sent to a worker
+    # Open scenes hold files and caches, which cannot be sent to a worker.
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_stream": None}
 
     def batch(self, number: int) -> Batch:
-        """This process's slice of global batch `number`."""
+        """Make this process's slice of global batch `number`."""
         if self._stream is None:
-            kind, config = self._source
-            self._stream = SampleStream(kind(config), *self._options)
+            self._stream = SampleStream(self._kind(self._config), **self._options)
         first = (number * self._share.processes + self._share.rank) * self._size
         return self._stream.batch(range(first, first + self._size))
 
-    def __getitem__(self, number: int) -> Batch | _Failure:
-        """As `batch`, for a worker, whose failures are returned."""
+    def __getitem__(self, number: int) -> Batch | Exception:
+        """As `batch`, for a worker, which returns failures."""
         try:
             return self.batch(number)
         except Exception as error:
-            no_memory = is_out_of_memory(error)
-            return _Failure(str(error) or one_line(error), traceback.format_exc(), no_memory)
+            # Exceptions with arguments of their own cannot be pickled.
+            kind = MemoryError if is_out_of_memory(error) else SampleError
+            failure = kind(str(error) or one_line(error))
+            failure.add_note(f"In a process that decodes data:\n{traceback.format_exc()}")
+            return failure
 
 
 def _from_thread(batches: _Batches, start: int) -> Generator[Batch, None, None]:
-    """Batches start, start + 1, ..., each made while the one before is in use."""
+    """Yield batches start, start + 1, ..., each made while the one before is in use."""
     with ThreadPoolExecutor(1, thread_name_prefix="qgs-loader") as pool:
         pending = pool.submit(batches.batch, start)
         for number in count(start + 1):
@@ -265,7 +264,7 @@ def _from_thread(batches: _Batches, start: int) -> Generator[Batch, None, None]:
 
 
 def _from_workers(batches: _Batches, start: int, workers: int) -> Generator[Batch, None, None]:
-    """Batches from `start` on by spawned processes: numba and torch do not survive a fork."""
+    """Yield batches from `start` on, of spawned processes: numba and torch survive no fork."""
     loader = DataLoader(
         batches,
         batch_size=None,
@@ -273,7 +272,8 @@ def _from_workers(batches: _Batches, start: int, workers: int) -> Generator[Batc
         num_workers=workers,
         multiprocessing_context="spawn",
         worker_init_fn=_prepare_worker,
-        generator=torch.Generator(),  # so that no random number of the training is used up
+        # Its own, so that no random number of the training is used up.
+        generator=torch.Generator(),
     )
     handler = signal.getsignal(signal.SIGCHLD)
     made = iter(loader)
@@ -285,16 +285,14 @@ def _from_workers(batches: _Batches, start: int, workers: int) -> Generator[Batc
         while True:
             try:
                 batch = next(made)
-            # What torch raises for a worker's sudden end, and a connection to it when it breaks.
+            # Torch raises the first for a worker's sudden end, a broken connection the others.
             except (RuntimeError, OSError, EOFError) as error:
                 raise WorkerError(
                     f"a process that decodes data ended suddenly ({error}): often the system was "
                     "out of memory; lower training.workers, or views and image sizes"
                 ) from error
-            if isinstance(batch, _Failure):
-                error = (MemoryError if batch.no_memory else SampleError)(batch.message)
-                error.add_note(f"In a process that decodes data:\n{batch.trace}")
-                raise error
+            if isinstance(batch, Exception):
+                raise batch
             yield batch
     finally:
         del made
@@ -305,7 +303,6 @@ def _prepare_worker(number: int) -> None:
     show_safely()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    logging.getLogger("qgs.data.scenes").setLevel(logging.ERROR)  # reported when data was opened
     # Python's own end aborts where the thread that sends batches is inside torch at that moment.
     atexit.register(os._exit, 0)
 
@@ -319,11 +316,14 @@ class Feed:
     def __init__(self, stream: Iterator[Batch], count: int) -> None:
         self.batches: Sequence[Batch] = ()
         self.error: Exception | None = None
-        self._stream, self._count = stream, count
+        self._stream = stream
+        self._count = count
 
     def fetch(self) -> None:
         """Get the `count` batches of the next step; none, and `error`, when that fails."""
         try:
             self.batches = list(islice(self._stream, self._count))
-        except Exception as error:  # raised by whoever reads `error`
-            self.batches, self.error = (), error
+        # Whoever reads `error` raises it, once all processes know.
+        except Exception as error:
+            self.batches = ()
+            self.error = error

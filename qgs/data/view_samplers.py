@@ -7,7 +7,7 @@ from pydantic import Field
 
 from qgs.contracts import Frames, Problem, RecipeContext, Scene, ViewSampler, ViewsConfig
 from qgs.contracts.component import ComponentConfig
-from qgs.data.samples import draw_frames
+from qgs.data.frames import draw_frames
 
 
 class Span(ViewSampler):

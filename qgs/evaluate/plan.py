@@ -9,8 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewSampler, ViewsConfig
 from qgs.contracts.schedule import END
+from qgs.data.frames import evenly, gap_range, moments, spread
 from qgs.data.images import framing
-from qgs.data.samples import Frames, Sample, evenly, gap_range, make_sample, moments, spread
+from qgs.data.samples import Frames, Sample, make_sample
 from qgs.data.view_samplers import Span
 from qgs.paths import opened_path, read_json
 from qgs.wording import listed, one_line

@@ -7,9 +7,10 @@ from os import PathLike, fspath
 from torch import Tensor
 
 from qgs.contracts import Scene, ViewsConfig
+from qgs.data.frames import evenly, moments, spread
 from qgs.data.images import framing
 from qgs.data.inputs import NOVEL, Frusta, Window, choose_windows
-from qgs.data.samples import Sample, evenly, make_sample, moments, own_world, spread
+from qgs.data.samples import Sample, make_sample, own_world
 from qgs.domain import Domain, verdict
 from qgs.evaluate.plan import ViewsOf
 from qgs.evaluate.tuning import tuned_gaussians, tuning_settings

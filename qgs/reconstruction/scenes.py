@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import Component, Encoder, Scene, SceneSource, SceneSourceConfig, Split
+from qgs.data.frames import training_frames
 from qgs.data.recognition import open_for
-from qgs.data.samples import training_frames, views_in
+from qgs.data.samples import views_in
 from qgs.domain import value_range_problem
 from qgs.recipe import Recipe
 from qgs.recipe.registry import load_usable_plugins

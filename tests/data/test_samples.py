@@ -9,7 +9,8 @@ from tables import must_refuse
 from torch.testing import assert_close
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
-from qgs.data.samples import collate, draw_frames, make_sample, mirrored_views, stack_views
+from qgs.data.frames import draw_frames
+from qgs.data.samples import collate, make_sample, mirrored_views, stack_views
 from qgs.evaluate.plan import evaluation_samples, held_out_windows
 from qgs.evaluate.protocol import protocol_of
 from qgs.geometry.poses import look_at, look_at_depth

@@ -9,7 +9,8 @@ from torch.testing import assert_close
 from training_runs import run
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
-from qgs.data.samples import collate, draw_frames, make_sample
+from qgs.data.frames import draw_frames
+from qgs.data.samples import collate, make_sample
 from qgs.evaluate.plan import evaluation_samples, held_out_windows
 from qgs.recipe import RecipeError, resolve
 

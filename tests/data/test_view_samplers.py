@@ -7,7 +7,7 @@ from training_runs import tiny
 
 from qgs.contracts import ViewsConfig
 from qgs.contracts.schedule import END
-from qgs.data.samples import draw_frames
+from qgs.data.frames import draw_frames
 from qgs.data.view_samplers import Span
 from qgs.recipe import RecipeError
 from qgs.tokengs.schedules import Linear

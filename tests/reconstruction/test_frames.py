@@ -7,7 +7,7 @@ import torch
 from photo_formats import noisy_photos
 
 from qgs.contracts import ViewsConfig
-from qgs.data.samples import held_out_frames
+from qgs.data.frames import held_out_frames
 from qgs.reconstruction.reconstruct import checked_window, choose_sample
 from qgs.reconstruction.scenes import GivenScene, read_photos
 

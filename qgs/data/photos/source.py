@@ -16,6 +16,7 @@ from torch import Tensor
 from upath import UPath
 
 from qgs.contracts import OptionError, SceneSource, SceneSourceConfig
+from qgs.data.frames import held_out_frames
 from qgs.data.images import (
     TURN,
     TURNED,
@@ -33,7 +34,6 @@ from qgs.data.photos import formats_of, read_listing, readers
 from qgs.data.photos.checks import refuse_fatal_problems, refuse_outside, size_problems
 from qgs.data.photos.reader import PhotoFrame, existing
 from qgs.data.photos.turning import turned, turned_size, upright
-from qgs.data.samples import held_out_frames
 from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, LazySource
 from qgs.paths import is_local, opened_path, read_file
 from qgs.types import Cameras

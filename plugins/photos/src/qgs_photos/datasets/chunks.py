@@ -13,9 +13,9 @@ from torch import Tensor
 from upath import UPath
 
 from qgs.contracts import SceneSource, Split
+from qgs.data.frames import held_out_frames
 from qgs.data.images import CropResize, decode_rgb, to_tensor
 from qgs.data.lenses import Size
-from qgs.data.samples import held_out_frames
 from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, LazySource
 from qgs.paths import opened_path
 from qgs.types import Cameras

@@ -6,8 +6,8 @@ from pydantic import field_validator
 from qgs.contracts import Frames, OptionError, Scene, ViewSampler, ViewsConfig
 from qgs.contracts.component import ComponentConfig
 from qgs.data.depth import scene_depth
+from qgs.data.frames import evenly, refuse_too_many, training_frames
 from qgs.data.inputs import Frusta, trained_ratios
-from qgs.data.samples import evenly, refuse_too_many, training_frames
 from qgs.domain import Domain
 
 _SHARE = 0.5

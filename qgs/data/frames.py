@@ -1,0 +1,130 @@
+"""Which frames of a scene are held out, and which a training sample shows.
+
+Source: TokenGS release (gap, targets from the span of the inputs).
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from itertools import cycle
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from qgs.contracts import Frames, Scene, ViewsConfig
+from qgs.machine import refuse_more_than_memory
+from qgs.wording import warn_once
+
+_T = TypeVar("_T")
+
+
+def held_out_frames(total: int, every: int) -> Frames:
+    """Return every n-th of `total` frames, from n // 2 on, or the middle one; none of 2, by 0."""
+    every = min(every, total)
+    return tuple(range(every // 2, total, every)) if every and total > 2 else ()
+
+
+def training_frames(scene: Scene) -> list[int]:
+    """Return the frames that training may see: all but the held-out ones."""
+    return sorted({*range(len(scene))} - {*scene.held_out})
+
+
+def moments(scene: Scene, frames: Iterable[int] | None = None) -> list[Frames]:
+    """Group frames, by default those of training, by time; a static scene gives groups of one."""
+    frames = training_frames(scene) if frames is None else frames
+    if scene.times is None:
+        return [(frame,) for frame in frames]
+    together = defaultdict[float, list[int]](list)
+    for frame in frames:
+        together[scene.times[frame].item()].append(frame)
+    return [tuple(together[time]) for time in sorted(together)]
+
+
+def gap_range(count: int, views: ViewsConfig, scene: Scene) -> tuple[int, int]:
+    """Return the least and largest gap that `count` `moments` allow. ValueError for too few."""
+    low, high = views.gap
+    what = "frames" if scene.times is None else "times"
+    if views.inputs - 1 > high:
+        raise ValueError(
+            f"views.inputs is {views.inputs}, but views.gap [{low}, {high}] spans only {high + 1} "
+            f"{what}: raise the upper gap to {views.inputs - 1} or more, or ask for fewer inputs"
+        )
+    needed = max(views.inputs, 2)
+    if count < needed:
+        raise ValueError(
+            f"scene {scene.name!r} has {count} {what} for inputs, but views.inputs is "
+            f"{views.inputs} and at least {needed} are needed: use fewer inputs, hold out fewer "
+            "frames, or drop the scene"
+        )
+    if count - 1 < low:
+        warn_once(
+            f"scene {scene.name!r} has {count} {what} for inputs, fewer than views.gap "
+            f"[{low}, {high}] asks for: its gap is {count - 1}"
+        )
+    high = min(high, count - 1)
+    # Each input takes a frame of its own.
+    return max(min(low, high), views.inputs - 1), high
+
+
+def refuse_too_many(frames: int, scene: Scene) -> None:
+    """Raise TooLargeError when that many images of `scene` do not fit into memory."""
+    height, width = scene.cameras.size
+    refuse_more_than_memory(
+        f"a sample of {frames} images of {height} x {width}",
+        {"images": frames * 3 * height * width * torch.float32.itemsize},
+        "Ask for fewer views (views.inputs, views.targets) or smaller images (data.image_size).",
+    )
+
+
+def draw_frames(
+    scene: Scene, views: ViewsConfig, rng: np.random.Generator
+) -> tuple[Frames, Frames]:
+    """Draw input frames, ascending, and target frames of a training sample from a span.
+
+    Targets are no inputs, where there are enough frames; then inputs join, then frames repeat.
+    Where times are known, the span is of times, each input is of another one and of another camera,
+    as far as there are, and all targets are of one (TokenGS 2026.6).
+    """
+    refuse_too_many(views.inputs + views.targets, scene)
+    usable = moments(scene)
+    low, high = gap_range(len(usable), views, scene)
+    gap = int(rng.integers(low, high + 1))
+    first = int(rng.integers(0, len(usable) - gap))
+    span = usable[first : first + gap + 1]
+    if views.inputs == 1:
+        places = [int(rng.choice(gap + 1))]
+    else:
+        more = views.inputs - 2
+        between = rng.choice(range(1, gap), more, replace=False) if more else ()
+        places = [0, *sorted(map(int, between)), gap]
+    # Permuting one camera draws nothing: static scenes have the same numbers after it.
+    cameras = rng.permutation(max(map(len, span))).tolist()
+    inputs = one_of_each([span[place] for place in places], cameras)
+    pool = [frame for moment in span for frame in moment]
+    if scene.times is not None:
+        novel = [moment for moment in span if {*moment} - {*inputs}] or span
+        pool = novel[rng.integers(len(novel))]
+    # New views first, then inputs, then repetitions, so that short scenes can be used too.
+    targets = [*rng.permutation([frame for frame in pool if frame not in inputs])]
+    targets += [*rng.permutation([frame for frame in inputs if frame in pool])]
+    targets += list(rng.choice(pool, max(views.targets - len(targets), 0)))
+    return inputs, tuple(map(int, targets[: views.targets]))
+
+
+def one_of_each(chosen: Sequence[Frames], cameras: Sequence[int]) -> Frames:
+    """Return one frame per moment, cycling through the cameras."""
+    turns = zip(chosen, cycle(cameras), strict=False)
+    return tuple(moment[camera % len(moment)] for moment, camera in turns)
+
+
+def evenly(items: Sequence[_T], count: int) -> list[_T]:
+    """Return at most `count` of `items`, evenly spaced from first to last; one: the middle."""
+    last = len(items) - 1
+    count = min(count, len(items))
+    places = np.linspace(0, last, count) if count > 1 else np.full(count, last // 2)
+    return [items[place] for place in places.round().astype(int)]
+
+
+def spread(span: Sequence[Frames], count: int) -> Frames:
+    """Return frames of `count` moments, spaced by `evenly`."""
+    return one_of_each(evenly(span, count), range(count))
