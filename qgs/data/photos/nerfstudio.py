@@ -1,10 +1,10 @@
 """nerfstudio's `transforms.json`, and files of the same schema: Blender's, DL3DV's."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import PurePosixPath
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -23,15 +23,16 @@ from qgs.data.photos.reader import (
 )
 from qgs.paths import read_json
 
-Value = TypeVar("Value")
-
+# DL3DV ships reduced copies alone, under the listing of the full size.
 _REDUCED = ("images_2", "images_4", "images_8")
 _PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 _FISHEYE = "OPENCV_FISHEYE"
+# Coefficients of camera models that are not known here.
 _OTHER = ("k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "sx1", "sy1", "b1", "b2")
 _NO_POSE = np.full((4, 4), np.nan)
 _NO_INTRINSICS: Intrinsics = (math.nan, math.nan, math.nan, math.nan)
-_OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0, 1.0])  # of a pose's columns
+# Of a pose's columns: the camera's y and z axes change sign.
+_OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0, 1.0])
 
 
 class Nerfstudio(PhotoReader):
@@ -50,7 +51,6 @@ class Nerfstudio(PhotoReader):
             return Listing(file, with_images(frames, folder, images))
         top = {PurePosixPath(frame.name).parts[:1] for frame in frames}
         if top == {("images",)} and not (folder / "images").is_dir():
-            # DL3DV ships reduced copies alone, under the listing of the full size
             for copy in _REDUCED:
                 if (folder / copy).is_dir():
                     moved = with_images(frames, folder, copy)
@@ -60,7 +60,7 @@ class Nerfstudio(PhotoReader):
 
 
 def read_transforms(file: UPath) -> list[PhotoFrame]:
-    """The frames of a transforms file in order, with their faults in them. Raises ValueError."""
+    """Read the frames of a transforms file in order, with their faults. Raises ValueError."""
     data = read_json(file, "export it again")
     entries = data.get("frames") if isinstance(data, Mapping) else None
     if not isinstance(entries, list) or not entries:
@@ -68,141 +68,151 @@ def read_transforms(file: UPath) -> list[PhotoFrame]:
     folder = file.parent
     frames = [_frame(folder, data, entry, None) for entry in entries]
     try:
-        # an angle of view needs the image's size; a header is read only where nothing lists one
+        # An angle of view needs the image's size; a header is read only where nothing lists one.
         if any(frame.problems and not frame.size for frame in frames):
             present = existing(frame.path for frame in frames)
-            first = next((frame.path for frame in frames if frame.path in present), None)
-            size = image_size(first) if first else None
+            first = [frame.path for frame in frames if frame.path in present][:1]
+            size = image_size(first[0]) if first else None
             frames = [_frame(folder, data, entry, size) for entry in entries]
         return _with_splits(frames, data)
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from error
 
 
-class _UnreadableError(Exception):
-    """A value of a frame that cannot be read. Arguments: field of `PhotoFrame`, reason, fix."""
-
-
 def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None) -> PhotoFrame:
-    """size: (H, W) of the image where neither the frame nor the top of `data` gives 'h' and 'w'."""
+    """Read an entry of 'frames'; what cannot be read becomes a problem of the frame.
+
+    size: (H, W) of the image where neither the entry nor the top of `data` gives 'h' and 'w'.
+    """
     path = entry.get("file_path") if isinstance(entry, Mapping) else None
     if not isinstance(path, str) or not PurePosixPath(path).name or "://" in path:
         problem = FrameProblem("path", "its 'file_path' names no file", "correct or remove it")
         return PhotoFrame("", folder, _NO_POSE, _NO_INTRINSICS, problems=(problem,))
-    values = {**data, **entry}
+    values = _Values({**data, **entry})
+    height = values.number("h")
+    width = values.number("w")
+    if height is not None and width is not None:
+        listed, problems = listed_size(height, width)
+        size = listed or size
+        values.problems += problems
     name = image_name(path)
-    height, width = (_number(values, key) for key in ("h", "w"))
-    given, wrong = (
-        listed_size(height, width) if height is not None and width is not None else (None, ())
-    )
-    size, problems = given or size, [*wrong]
-
-    def read(value: Callable[[], Value], otherwise: Value) -> Value:
-        try:
-            return value()
-        except _UnreadableError as error:
-            problems.append(FrameProblem(*error.args))
-            return otherwise
-
-    mask, depth = (entry.get(key) for key in ("mask_path", "depth_file_path"))
+    mask = entry.get("mask_path")
+    depth = entry.get("depth_file_path")
     return PhotoFrame(
         name=name,
         path=folder / name,
-        c2w=read(lambda: _pose(entry), _NO_POSE),
-        intrinsics=read(lambda: _intrinsics(values, size), _NO_INTRINSICS),
+        c2w=_pose(entry.get("transform_matrix"), values),
+        intrinsics=_intrinsics(values, size),
         size=size,
-        lens=read(lambda: _lens(values), None),
+        lens=_lens(values),
         mask=folder / mask if isinstance(mask, str) and mask else None,
         depth=folder / depth if isinstance(depth, str) and depth else None,
-        time=read(lambda: _finite(entry, "time", "time"), None),
-        problems=tuple(problems),
+        # A time at the top of the file would be that of no photo.
+        time=values.finite("time", "time") if "time" in entry else None,
+        problems=tuple(values.problems),
     )
 
 
+class _Values(dict[str, Any]):
+    """Values of a frame, or of all frames, and the problems of those that cannot be read."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        super().__init__(values)
+        self.problems: list[FrameProblem] = []
+
+    def problem(self, field: str, reason: str, fix: str) -> None:
+        """Note that a `field` of `PhotoFrame` cannot be read."""
+        self.problems.append(FrameProblem(field, reason, fix))
+
+    def number(self, key: str) -> float | None:
+        """Return a number, NaN included; None where it is absent, null or something else."""
+        value = self.get(key)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return None
+        return float(value)
+
+    def finite(self, key: str, field: str) -> float | None:
+        """Return a finite number for `field`; None where it is absent or null, or a problem."""
+        number = self.number(key)
+        if number is not None and math.isfinite(number):
+            return number
+        if self.get(key) is not None:
+            self.problem(field, f"{key!r} must be a finite number, got {self[key]!r}", "correct it")
+        return None
+
+
 def image_name(file_path: str) -> str:
-    """`file_path` in one spelling; one without an image's suffix, as in Blender's sets, is PNG."""
+    """Return `file_path` in one spelling; one without an image's suffix, as of Blender, is PNG."""
     name = PurePosixPath(file_path.replace("\\", "/"))
     suffix = name.suffix.lower()
     known = suffix[1:].isalpha() or suffix in Image.registered_extensions()
     return str(name if known else name.with_name(f"{name.name}.png"))
 
 
-def _pose(entry: Mapping[str, Any]) -> np.ndarray:
-    """OpenGL to OpenCV: the camera's y and z axes change sign."""
-    c2w = numbers(entry.get("transform_matrix"))
+def _pose(matrix: object, values: _Values) -> np.ndarray:
+    c2w = numbers(matrix)
     if c2w.shape == (3, 4):
         c2w = np.vstack([c2w, [0, 0, 0, 1]])
     if c2w.shape != (4, 4):
-        reason = "'transform_matrix' must be 4 x 4 numbers"
-        raise _UnreadableError("c2w", reason, "export the pose again")
+        values.problem("c2w", "'transform_matrix' must be 4 x 4 numbers", "export the pose again")
+        return _NO_POSE
     return c2w * _OPENGL_TO_OPENCV
 
 
-def _number(values: Mapping[str, Any], key: str) -> float | None:
-    """A number, NaN included; None where it is absent, null or something else."""
-    value = values.get(key)
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
-
-
-def _intrinsics(values: Mapping[str, Any], size: Size | None) -> Intrinsics:
-    def focal(key: str, angle_key: str, axis: int) -> float | None:
-        """In pixels, as given or from the angle of view."""
-        angle = _number(values, angle_key)
-        if angle is None or size is None or not 0 < angle < math.pi:
-            return _number(values, key) or None
-        return _number(values, key) or size[axis] / 2 / math.tan(angle / 2)
-
-    fx = focal("fl_x", "camera_angle_x", 1)
-    fy = focal("fl_y", "camera_angle_y", 0) or fx  # pixels are square unless listed
+def _intrinsics(values: _Values, size: Size | None) -> Intrinsics:
+    fx = _focal(values, "fl_x", "camera_angle_x", size and size[1])
+    # Pixels are square unless listed.
+    fy = _focal(values, "fl_y", "camera_angle_y", size and size[0]) or fx
     if fx is None or fy is None:
-        raise _UnreadableError(
+        values.problem(
             "intrinsics",
             "there is no focal length",
             "expected 'fl_x' (pixels), or 'camera_angle_x' (radians) with 'w' and 'h', in the "
             "frame or at the top of the file",
         )
-    cx, cy = _number(values, "cx"), _number(values, "cy")
+        return _NO_INTRINSICS
+    cx = values.number("cx")
+    cy = values.number("cy")
     if size is None and (cx is None or cy is None):
         reason = "neither 'cx' and 'cy' nor 'w' and 'h' are given"
-        raise _UnreadableError("intrinsics", reason, "add either pair")
+        values.problem("intrinsics", reason, "add either pair")
+        return _NO_INTRINSICS
     height, width = size or (0, 0)
     return fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy
 
 
-def _lens(values: Mapping[str, Any]) -> Lens | None:
+def _focal(values: _Values, key: str, angle_key: str, side: int | None) -> float | None:
+    """Return a focal length in pixels, as given or from the angle of view of a `side`."""
+    angle = values.number(angle_key)
+    given = values.number(key)
+    if given or angle is None or side is None or not 0 < angle < math.pi:
+        return given or None
+    return side / 2 / math.tan(angle / 2)
+
+
+def _lens(values: _Values) -> Lens | None:
     model = values.get("camera_model", "PINHOLE")
     fisheye = model == _FISHEYE or bool(values.get("is_fisheye"))
     if model not in _PINHOLE and not fisheye:
         known = ", ".join(sorted((*_PINHOLE, _FISHEYE)))
         fix = f"undistort the photos first, or export one of {known}"
-        raise _UnreadableError("lens", f"the camera model {model!r} is not known", fix)
-    # an ignored coefficient would shift pixels against the poses without an error
+        values.problem("lens", f"the camera model {model!r} is not known", fix)
+        return None
+    # An ignored coefficient would shift pixels against the poses without an error.
     for key in _OTHER if fisheye else (*_OTHER, "k4"):
-        if _finite(values, key, "lens"):
+        if values.finite(key, "lens"):
             reason = f"{key!r} is set, which belongs to another camera model"
-            fix = "undistort the photos first, or export without it"
-            raise _UnreadableError("lens", reason, fix)
+            values.problem("lens", reason, "undistort the photos first, or export without it")
     kind = Fisheye if fisheye else RadialTangential
     names = (field.name for field in fields(kind))
-    return bending(kind(**{name: _finite(values, name, "lens") or 0.0 for name in names}))
-
-
-def _finite(values: Mapping[str, Any], key: str, field: str) -> float | None:
-    """A number for a `field` of `PhotoFrame`; None where it is absent or null."""
-    if values.get(key) is None:
-        return None
-    number = _number(values, key)
-    if number is None or not math.isfinite(number):
-        reason = f"{key!r} must be a finite number, got {values[key]!r}"
-        raise _UnreadableError(field, reason, "correct it")
-    return number
+    return bending(kind(**{name: values.finite(name, "lens") or 0.0 for name in names}))
 
 
 def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[PhotoFrame]:
-    """`frames` with nerfstudio's splits: val is test; unnamed ones are the other, or unused."""
+    """Return `frames` with nerfstudio's splits; unnamed frames are of the other one, or unused."""
     known = {frame.name for frame in frames}
-    splits: dict[str, set[str]] = {"train": set(), "test": set()}
-    for part, split in (("train", "train"), ("test", "test"), ("val", "test")):
+
+    def named(part: str) -> set[str]:
         key = f"{part}_filenames"
         given = data.get(key) or []
         if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
@@ -210,10 +220,14 @@ def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[
         names = set(map(image_name, given))
         if unknown := sorted(names - known):
             raise ValueError(f"{key!r} names {unknown[0]}, which no frame has: remove the name")
-        splits[split] |= names
-    train, test = splits["train"], splits["test"]
-    rest = ("unused" if test else "test") if train else ("train" if test else None)
-    return [
-        replace(f, split="train" if f.name in train else "test" if f.name in test else rest)
-        for f in frames
-    ]
+        return names
+
+    train = named("train")
+    test = named("test") | named("val")
+    splits = {**dict.fromkeys(test, "test"), **dict.fromkeys(train, "train")}
+    rest = None
+    if train:
+        rest = "unused" if test else "test"
+    elif test:
+        rest = "train"
+    return [replace(frame, split=splits.get(frame.name, rest)) for frame in frames]

@@ -1,4 +1,4 @@
-"""What a reader of photos is and gives: frames with poses, intrinsics, lenses and files."""
+"""Base of readers of photos, and the frames that they give: poses, intrinsics, lenses, files."""
 
 import re
 from abc import ABC, abstractmethod
@@ -55,9 +55,10 @@ class PhotoFrame:
     problems: tuple[FrameProblem, ...] = ()
 
     def at_size(self, size: Size) -> Intrinsics:
-        """Intrinsics in pixels of an image file of `size`, a scaled copy of what is listed."""
+        """Return intrinsics in pixels of an image of `size`, a scaled copy of what is listed."""
         height, width = self.size or size
-        x, y = size[1] / width, size[0] / height
+        x = size[1] / width
+        y = size[0] / height
         fx, fy, cx, cy = self.intrinsics
         return fx * x, fy * y, cx * x, cy * y
 
@@ -85,7 +86,7 @@ class PhotoReader(ABC):
 
     @classmethod
     def recognises(cls, folder: UPath) -> bool:
-        """Whether `folder` holds photos in this format."""
+        """Return whether `folder` holds photos in this format."""
         return (folder / cls.listing).is_file()
 
     @classmethod
@@ -100,7 +101,7 @@ class PhotoReader(ABC):
     @classmethod
     @abstractmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
-        """The photos that `folder` lists; neighbours in the list should be neighbours in space.
+        """Read the photos that `folder` lists; neighbours in the list should be so in space.
 
         images: folder of photos to read instead of the listed one, such as images_4. Raises
         FileNotFoundError where it does not exist, ValueError for a listing that cannot be read.
@@ -108,7 +109,7 @@ class PhotoReader(ABC):
 
 
 def numbers(value: object) -> np.ndarray:
-    """Nested lists as float64; an empty array for what is no array of numbers."""
+    """Return nested lists as float64; an empty array for what is no array of numbers."""
     try:
         return np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -116,42 +117,44 @@ def numbers(value: object) -> np.ndarray:
 
 
 def existing(paths: Iterable[UPath]) -> set[UPath]:
-    """Those of `paths` that exist; each folder is listed once, which object stores need."""
-    by_folder: dict[str, list[UPath]] = {}
-    for path in paths:
-        by_folder.setdefault(str(path.parent), []).append(path)
+    """Return those of `paths` that exist; each folder is listed once, which object stores need."""
+    names: dict[str, set[str]] = {}
     held: set[UPath] = set()
-    for inside in by_folder.values():
-        names = {item.name for item in listing(inside[0].parent)}
-        held.update(path for path in inside if path.name in names)
+    for path in paths:
+        folder = str(path.parent)
+        if folder not in names:
+            names[folder] = {item.name for item in listing(path.parent)}
+        if path.name in names[folder]:
+            held.add(path)
     return held
 
 
 def image_files(folder: UPath) -> list[UPath]:
-    """The photos in a folder, by name."""
+    """Return the photos in a folder, by name."""
     files = [item for item in listing(folder) if not item.name.startswith(".")]
     photos = [item for item in files if item.name.lower().endswith(IMAGE_SUFFIXES)]
     return sorted(photos, key=lambda item: item.name)
 
 
 def image_folder(folder: UPath, wanted: str | None) -> UPath:
-    """`wanted`, else images, else its least reduced copy. Raises FileNotFoundError."""
+    """Return `wanted`, else images, else its least reduced copy. Raises FileNotFoundError."""
     if wanted is not None:
-        if not (folder / wanted).is_dir():
-            raise FileNotFoundError(f"{folder / wanted} does not exist: correct `images`")
-        return folder / wanted
+        chosen = folder / wanted
+        if not chosen.is_dir():
+            raise FileNotFoundError(f"{chosen} does not exist: correct `images`")
+        return chosen
     copies = [item for item in folder.iterdir() if _COPY.fullmatch(item.name) and item.is_dir()]
     if not copies:
         raise FileNotFoundError(
             f"{folder} has neither a folder `images` nor a scaled copy such as images_4: name the "
             "folder of photos as `images`"
         )
-    # `images` counts as reduced by 1
+    # `images` counts as reduced by 1.
     return min(copies, key=lambda item: int(item.name.partition("_")[2] or 1))
 
 
 def with_images(frames: Sequence[PhotoFrame], folder: UPath, wanted: str) -> list[PhotoFrame]:
-    """`frames` with photos from `folder`/`wanted`. Raises FileNotFoundError without it."""
+    """Return `frames` with photos from `folder`/`wanted`. Raises FileNotFoundError without it."""
     image_folder(folder, wanted)
 
     def moved(frame: PhotoFrame) -> PhotoFrame:
