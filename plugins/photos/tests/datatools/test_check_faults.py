@@ -11,7 +11,7 @@ from planted import ALL, FLIP, HASH, INTRINSICS, SIZE, alike, record, save, told
 from qgs_photos.datatools.check import Options, check
 from upath import UPath
 
-from qgs.data.photos.source import present_frames
+from qgs.data.photos.present import present_frames
 
 FX, FY, CX, CY = INTRINSICS
 
