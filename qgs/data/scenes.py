@@ -39,33 +39,36 @@ class EncodedScene(Scene):
 
     @abstractmethod
     def encoded(self, frame: int) -> EncodedFrame:
-        """A frame as it is stored. Raises ValueError for a file that cannot be read."""
+        """Return a frame as it is stored. Raises ValueError for a file that cannot be read."""
 
 
 class BoundedCache(Generic[Value]):
     """LRU cache, safe for threads, empty after pickling. limit: of the values' summed `cost`."""
 
     def __init__(self, limit: int, cost: Callable[[Value], int] | None = None) -> None:
-        self._limit, self._cost = limit, cost
+        self._limit = limit
+        self._cost = cost
         self._kept: OrderedDict[Hashable, tuple[Value, int]] = OrderedDict()
-        self._total, self._lock = 0, Lock()
+        self._total = 0
+        self._lock = Lock()
 
-    # copies in workers start empty: locks cannot be pickled, and images would be sent for nothing
+    # Copies in workers start empty: locks cannot be pickled, and images would be sent for nothing.
     def __reduce__(self) -> tuple[object, ...]:
         return type(self), (self._limit, self._cost)
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
-        """The value kept for `key`, or what `make` returns, which is kept if it fits."""
+        """Return the value kept for `key`, or what `make` returns, which is kept if it fits."""
         with self._lock:
             if key in self._kept:
-                self._kept.move_to_end(key)  # the front is the least recently used
+                # The front is the least recently used.
+                self._kept.move_to_end(key)
                 return self._kept[key][0]
-        # made outside of the lock, so that threads decode side by side; two may make the same
+        # Made outside of the lock, so that threads decode side by side; two may make the same.
         value = make()
         cost = self._cost(value) if self._cost else 1
         with self._lock:
             if key not in self._kept:
-                self._kept[key] = value, cost
+                self._kept[key] = (value, cost)
                 self._total += cost
             while self._total > self._limit:
                 self._total -= self._kept.popitem(last=False)[1][1]
@@ -78,7 +81,8 @@ class LazyScenes(Sequence[Scene]):
     def __init__(
         self, places: Mapping[str, Any], open: Callable[[str, Any], Scene], limit: int = 0
     ) -> None:
-        self.names, self._open = list(places)[: limit or None], open
+        self.names = list(places)[: limit or None]
+        self._open = open
         self.places = {name: places[name] for name in self.names}
         self._opened: BoundedCache[Scene] = BoundedCache(64)
 
@@ -86,7 +90,7 @@ class LazyScenes(Sequence[Scene]):
         return len(self.names)
 
     def __getitem__(self, index: Any) -> Any:
-        """The scene at an index, or the scenes at a slice."""
+        """Return the scene at an index, or the scenes at a slice."""
         name = self.names[index]
         if isinstance(name, list):
             return [self[place] for place in range(len(self))[index]]

@@ -24,14 +24,14 @@ _SMALLEST = (
 
 
 def readers() -> dict[str, type[PhotoReader]]:
-    """Format name to reader: READERS, then those of installed distributions.
+    """Return readers by format name: READERS, then those of installed distributions.
 
     The latter come last, so that installing one changes no folder that could be read before. One
     that cannot be loaded is left out and logged.
     """
     found = {reader.name: reader for reader in READERS}
     for entry in installed(GROUP):
-        # a broken distribution must not hinder folders of other formats
+        # A broken distribution must not hinder folders of other formats.
         try:
             found.setdefault(entry.name, load(entry, PhotoReader))
         except ExtensionError as error:
@@ -40,7 +40,7 @@ def readers() -> dict[str, type[PhotoReader]]:
 
 
 def formats_of(folder: UPath) -> list[str]:
-    """The formats whose listings `folder` holds, in the order of `readers`."""
+    """Return the formats whose listings `folder` holds, in the order of `readers`."""
     return [name for name, reader in readers().items() if reader.recognises(folder)]
 
 
@@ -55,7 +55,7 @@ def with_cameras(path: UPath) -> UPath:
 
 
 def read_listing(folder: UPath, format: str = "auto", images: str | None = None) -> Listing:
-    """The photos that `folder` lists in `format`, or in the first of `readers` that it holds.
+    """Read the photos that `folder` lists in `format`, or in the first of `readers` that it holds.
 
     images: another folder of photos, such as images_4. Raises FileNotFoundError for no folder or no
     listing, ValueError for an unknown format and for a listing that cannot be read.

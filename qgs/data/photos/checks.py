@@ -12,13 +12,20 @@ from qgs.data.lenses import Intrinsics, Size
 from qgs.data.photos.reader import FrameProblem, Listing, PhotoFrame
 from qgs.wording import listed, name_shown, numbered, warn_once
 
-LARGEST_SIDE = 10**6  # pixels of a listed photo
-_FARTHEST = 1e12  # largest coordinate of a camera; the square of larger ones overflows float32
-_RIGID = 1e-3  # of rotations against orthonormality
-_SAME_ASPECT = 0.01  # relative difference between the file's and the listing's aspect ratio
-_SQUARE = 0.1  # relative difference of sides, or of fx and fy, that counts as equal
-_NORMALISED = 5.0  # a focal length below is in units of the image, not of its pixels
-_FOCAL = (0.1, 30.0)  # of the longer side: angles of view of 157 and 2 degrees
+# Pixels of a listed photo.
+LARGEST_SIDE = 10**6
+# Largest coordinate of a camera: the square of larger ones overflows float32.
+_FARTHEST = 1e12
+# Tolerance of rotations against orthonormality.
+_RIGID = 1e-3
+# Relative difference between the file's and the listing's aspect ratio.
+_SAME_ASPECT = 0.01
+# Relative difference of sides, or of fx and fy, that counts as equal.
+_SQUARE = 0.1
+# A focal length below is in units of the image, not of its pixels.
+_NORMALISED = 5.0
+# Focal lengths per longer side: angles of view of 157 and 2 degrees.
+_FOCAL = (0.1, 30.0)
 
 
 def refuse_outside(folder: UPath, found: Listing) -> None:
@@ -33,7 +40,7 @@ def refuse_outside(folder: UPath, found: Listing) -> None:
 
 
 def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
-    """Problems of a pose (4, 4): NaN, mirrored, sheared or scaled."""
+    """Yield problems of a pose (4, 4): NaN, mirrored, sheared or scaled."""
     if not np.isfinite(c2w).all():
         yield FrameProblem("c2w", "the pose has NaN or infinite numbers", "remove the frame")
         return
@@ -60,7 +67,7 @@ def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
 
 
 def intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> Iterator[FrameProblem]:
-    """Problems of fx, fy, cx, cy in pixels of `size` (H, W); not all are fatal."""
+    """Yield problems of fx, fy, cx, cy in pixels of `size` (H, W); not all are fatal."""
 
     def problem(reason: str, fix: str, *, fatal: bool = True) -> FrameProblem:
         values = f"fx {fx:.6g}, fy {fy:.6g}, cx {cx:.6g}, cy {cy:.6g}"
@@ -83,39 +90,47 @@ def intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> Iterator[F
     if not (0 < cx < width and 0 < cy < height):
         fix = "correct cx and cy, unless the photo is cut from a larger one"
         yield problem("the principal point lies off the image", fix, fatal=False)
-    aspect, focal = width / height, [f / max(size) for f in (fx, fy)]
-    # fx / fy is the square of the aspect ratio where width and height of square pixels were swapped
+    aspect = width / height
+    # fx / fy is the square of the aspect ratio where the sides of square pixels were swapped.
     if abs(aspect - 1) > _SQUARE and abs(fx / fy / aspect**2 - 1) < _SQUARE:
         yield problem(
             "fx and fy differ as if divided by the wrong side of the image",
             "width and height are swapped; divide fx and cx by the width, fy and cy by the height",
             fatal=False,
         )
-    elif min(focal) < _FOCAL[0] or max(focal) > _FOCAL[1] or not 0.5 < fx / fy < 2:
+        return
+    nearest, farthest = (limit * max(size) for limit in _FOCAL)
+    if min(fx, fy) < nearest or max(fx, fy) > farthest or not 0.5 < fx / fy < 2:
         fix = "correct them, or the size that goes with them"
         yield problem("the focal lengths are implausible", fix, fatal=False)
 
 
 def size_problems(size: Size, listed: Size | None) -> Iterator[FrameProblem]:
-    """Problems of an image file of `size` (H, W); a scaled copy of `listed` has none."""
-    if listed is None:
+    """Yield problems of an image file of `size` (H, W); a scaled copy of `listed` has none."""
+    if listed is None or _alike(size, listed):
         return
-    ratio = size[1] * listed[0] / (size[0] * listed[1])
-    if abs(ratio - 1) <= _SAME_ASPECT:
-        return
-    swapped = abs(size[1] * listed[1] / (size[0] * listed[0]) - 1) <= _SAME_ASPECT
+    if _alike(size, (listed[1], listed[0])):
+        fix = (
+            "width and height are swapped; swap them back, or turn the photos' pixels where EXIF "
+            "does (`mogrify -auto-orient`)"
+        )
+    else:
+        fix = "give the original image, or correct the listed size"
     yield FrameProblem(
         "size",
         f"the image is {size[1]} x {size[0]} pixels, but listed as {listed[1]} x {listed[0]}, "
         "another aspect ratio, so that the intrinsics cannot be scaled",
-        "width and height are swapped; swap them back, or turn the photos' pixels where EXIF does "
-        "(`mogrify -auto-orient`)" if swapped
-        else "give the original image, or correct the listed size",
-    )  # fmt: skip
+        fix,
+    )
+
+
+def _alike(size: Size, other: Size) -> bool:
+    """Return whether two sizes have about the same aspect ratio."""
+    return abs(size[1] * other[0] / (size[0] * other[1]) - 1) <= _SAME_ASPECT
 
 
 def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FrameProblem, ...]]:
-    """The listed size (H, W); None, and the problem, where no photo can have it."""
+    """Return the listed size (H, W); None, and the problem, where no photo can have it."""
     if all(1 <= side <= LARGEST_SIDE for side in (height, width)):
         return (round(height), round(width)), ()
     size = f"{str(width)[:12]} x {str(height)[:12]}"
@@ -124,19 +139,22 @@ def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FramePr
 
 
 def with_equal_times(listing: Listing) -> Listing:
-    """`listing`, with a problem for each frame that lacks the time that others have."""
-    count, without = len(listing.frames), sum(frame.time is None for frame in listing.frames)
+    """Return `listing`, with a problem for each frame that lacks the time that others have."""
+    count = len(listing.frames)
+    without = sum(frame.time is None for frame in listing.frames)
+    if without in (0, count):
+        return listing
     reason = f"it has no 'time', like {without} of {count} frames, and the others have"
     problem = FrameProblem("time", reason, "write it for each, or for none where nothing moves")
     frames = [
         replace(frame, problems=frame.problems or (problem,)) if frame.time is None else frame
         for frame in listing.frames
     ]
-    return replace(listing, frames=frames) if 0 < without < count else listing
+    return replace(listing, frames=frames)
 
 
 def frame_problems(frame: PhotoFrame) -> Iterator[FrameProblem]:
-    """All problems of `frame` as listed; its image is not opened."""
+    """Yield all problems of `frame` as listed; its image is not opened."""
     yield from frame.problems
     if not frame.problems:
         yield from pose_problems(frame.c2w)
@@ -152,9 +170,8 @@ def refuse_fatal_problems(listing: object, frames: Sequence[PhotoFrame]) -> None
         for problem in problems:
             if problem.fatal:
                 raise ValueError(f"{listing}: {where}: {problem}")
-        doubtful += [f"{where}: {problems[0]}"] if problems else []
+        if problems:
+            doubtful.append(f"{where}: {problems[0]}")
     if doubtful:
-        warn_once(
-            f"{listing}: {len(doubtful)} of {len(frames)} frames are doubtful: "
-            + listed(doubtful, 3, "; ")
-        )
+        shown = listed(doubtful, 3, "; ")
+        warn_once(f"{listing}: {len(doubtful)} of {len(frames)} frames are doubtful: {shown}")

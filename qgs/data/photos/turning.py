@@ -20,12 +20,13 @@ _QUARTER = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 
 
 def upright(frame: PhotoFrame) -> PhotoFrame:
-    """`frame` as EXIF turns its photo, camera and lens included; of a store as it is.
+    """Return `frame` as EXIF turns its photo, camera and lens included; of a store as it is.
 
     Where the listed size is the upright one, so are the listed cameras; where size does not tell,
     as of squares and half turns, they are those of the stored pixels.
     """
-    if not is_local(frame.path) or not frame.path.is_file():  # each header would be a request
+    # Of a store each header would be a request.
+    if not is_local(frame.path) or not frame.path.is_file():
         return frame
     size, turns = _header(str(frame.path), frame.path.stat().st_mtime_ns)
     if not turns:
@@ -39,21 +40,23 @@ def upright(frame: PhotoFrame) -> PhotoFrame:
 
 
 def turned_size(size: Size, frame: PhotoFrame) -> Size:
-    """(H, W) of a stored photo of `frame`, or of its mask or depth map, when it is upright."""
+    """Return (H, W) of a stored photo of `frame`, its mask or depth map, when it is upright."""
     already = frame.turns % 2 and _fits(size, frame.size) and not _fits(_swapped(size), frame.size)
     return size if already or frame.turns % 2 == 0 else _swapped(size)
 
 
 def turned(image: Image.Image, frame: PhotoFrame) -> Image.Image:
-    """The stored photo, mask or depth map, upright; one that was drawn upright stays."""
-    size = image.height, image.width
+    """Return the stored photo, mask or depth map, upright; one that was drawn upright stays."""
+    if not frame.turns:
+        return image
+    size = (image.height, image.width)
     stays = frame.turns % 2 and turned_size(size, frame) == size and size[0] != size[1]
-    return image.transpose(_TRANSPOSED[frame.turns - 1]) if frame.turns and not stays else image
+    return image if stays else image.transpose(_TRANSPOSED[frame.turns - 1])
 
 
 @lru_cache(maxsize=2**16)
 def _header(path: str, changed: int) -> tuple[Size, int]:
-    """(H, W) as stored and quarter turns; none of a file that is no image."""
+    """Return (H, W) as stored and quarter turns; none of a file that is no image."""
     try:
         with open(path, "rb") as file, opened_image(file) as image:
             return (image.height, image.width), _TURNS.get(orientation(image), 0)
@@ -70,12 +73,18 @@ def _fits(size: Size, listed: Size | None) -> bool:
 
 
 def _quarter(frame: PhotoFrame) -> PhotoFrame:
-    """Camera, size and lens of `frame`, a quarter turn clockwise."""
+    """Turn camera, size and lens of `frame` by a quarter, clockwise."""
     assert frame.size is not None
-    (height, width), (fx, fy, cx, cy), lens = frame.size, frame.intrinsics, frame.lens
-    if isinstance(lens, RadialTangential):  # (p2, p1) is a vector in the image
+    height, width = frame.size
+    fx, fy, cx, cy = frame.intrinsics
+    lens = frame.lens
+    if isinstance(lens, RadialTangential):
+        # (p2, p1) is a vector in the image.
         lens = replace(lens, p1=lens.p2, p2=-lens.p1)
     return replace(
-        frame, size=(width, height), c2w=frame.c2w @ _QUARTER,
-        intrinsics=(fy, fx, height - cy, cx), lens=lens,
-    )  # fmt: skip
+        frame,
+        size=(width, height),
+        c2w=frame.c2w @ _QUARTER,
+        intrinsics=(fy, fx, height - cy, cx),
+        lens=lens,
+    )
