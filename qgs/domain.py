@@ -1,4 +1,4 @@
-"""The range of views that a model was trained on, and whether other views lie inside it.
+"""The range of views that a model was trained on, and how other views leave it.
 
 Only cameras in the model's frame are compared, so it works for any data.
 """
@@ -47,7 +47,7 @@ The scale comes first: it costs nothing and moves baseline and depth together.""
 
 @dataclass
 class Domain:
-    """Values of each of WORDS over `samples` samples, in four digits; of a file, their ends."""
+    """Measurements by name of WORDS, over `samples` samples; after loading only the two ends."""
 
     values: dict[str, list[float]] = field(default_factory=dict)
     samples: int = 0
@@ -56,46 +56,50 @@ class Domain:
         """Add samples: cameras (B, V_in) and (B, V_out) in the model's frame."""
         for name, values in _measured(inputs, targets):
             known = values[~values.isnan()].tolist()
-            # four digits are what `text` needs: the comparison allows 25 %
+            # Four digits are enough for a comparison that allows 25 %.
             self.values.setdefault(name, []).extend(float(f"{value:.4g}") for value in known)
         self.samples += len(inputs.c2w)
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
         """(least, largest) of each name, without OUTLIERS of its values at either end."""
-        ordered = {name: sorted(values) for name, values in self.values.items() if values}
-        places = {name: int(OUTLIERS * len(values)) for name, values in ordered.items()}
-        return {name: (v[places[name]], v[-1 - places[name]]) for name, v in ordered.items()}
+        found = {}
+        for name, values in self.values.items():
+            left_out = int(OUTLIERS * len(values))
+            if kept := sorted(values)[left_out : len(values) - left_out]:
+                found[name] = (kept[0], kept[-1])
+        return found
 
     @property
     def text(self) -> str:
         """Its ranges as JSON; null stands for infinity."""
-        # JSON has no infinity, which is the depth of parallel axes
-        plain = {k: [v if math.isfinite(v) else None for v in r] for k, r in self.ranges.items()}
-        return json.dumps({"samples": self.samples, "ranges": plain})
+        # JSON has no infinity, which is the depth of parallel axes.
+        ranges = {
+            name: [end if math.isfinite(end) else None for end in ends]
+            for name, ends in self.ranges.items()
+        }
+        return json.dumps({"samples": self.samples, "ranges": ranges})
 
     @classmethod
     def read(cls, plain: Mapping[str, Any]) -> Domain:
-        """The domain of a parsed `text`. Raises ValueError, TypeError or KeyError."""
-        ends = {
-            name: [math.inf if end is None else float(end) for end in (low, high)]
-            for name, (low, high) in plain["ranges"].items()
-        }
-        domain = cls(ends, int(plain["samples"]))
-        numbers = [domain.samples, *(end for both in ends.values() for end in both)]
-        if not (ends.keys() <= WORDS.keys() and all(n >= 0 for n in numbers)):
-            raise ValueError(f"these are no ranges of views: {str(plain)[:100]}")
+        """Return the domain of a parsed `text`. Raises ValueError, TypeError or KeyError."""
+        domain = cls(samples=int(plain["samples"]))
+        for name, (low, high) in plain["ranges"].items():
+            ends = [math.inf if end is None else float(end) for end in (low, high)]
+            # NaN is not above 0 either.
+            if name not in WORDS or not all(end >= 0 for end in (domain.samples, *ends)):
+                raise ValueError(f"these are no ranges of views: {str(plain)[:100]}")
+            domain.values[name] = ends
         return domain
 
     def differences(self, found: Domain) -> dict[str, str]:
-        """By name a phrase for each range of the training that the range of `found` exceeds."""
-        phrases, seen = dict[str, str](), found.ranges
+        """Describe by name each range of the training that the range of `found` exceeds."""
+        phrases: dict[str, str] = {}
+        seen = found.ranges
         for name, trained in self.ranges.items():
-            if name not in seen:
-                continue
-            low, high = seen[name]
+            low, high = seen.get(name, trained)
             if low * TOLERANCE < trained[0] or high > trained[1] * TOLERANCE:
-                words = WORDS[name].format(_shown(seen[name]))
+                words = WORDS[name].format(_shown((low, high)))
                 if low == math.inf:
                     words = "their axes meet at no point before them"
                 phrases[name] = f"{words} (trained: {_shown(trained)})"
@@ -135,8 +139,8 @@ def remedies(outside: Collection[str], fixed: Collection[str] = ()) -> str:
 
 
 def value_range_problem(images: Tensor) -> str:
-    """An error where values of `images` (..., H, W) leave [0, 1], else ""; reads each 8th pixel."""
-    # resampling overshoots [0, 1] a little at edges
+    """Return an error where `images` (..., H, W) leave [0, 1], else ""; reads each 8th pixel."""
+    # Resampling overshoots [0, 1] a little at edges.
     low, high = map(float, images[..., ::8, ::8].aminmax())
     if low >= -0.5 and high <= 1.5:
         return ""
@@ -154,18 +158,20 @@ class FirstViews:
     """
 
     def __init__(self, settings: Mapping[str, Any] | None, trained: Domain | None) -> None:
-        self.settings, self.trained, self.pending = settings, trained, True
+        self.settings = settings
+        self.trained = trained
+        self.pending = True
 
     def __call__(self, model: nn.Module, args: tuple[Any, ...]) -> None:
         """Check the first argument if it is Views, but not while a CUDA graph is captured."""
         if model.training or not self.pending or torch.compiler.is_compiling():
             return
-        # before anything can raise: a check that fails once would fail in every pass
+        # Before anything can raise: a check that fails once would fail in every pass.
         self.pending = False
         views = args[0] if args else None
         if not isinstance(views, Views) or views.cameras.c2w.is_meta or not views.images.numel():
             return
-        # a graph cannot wait for the device, which a look at values does
+        # A graph cannot wait for the device, which a look at values does.
         if views.cameras.c2w.is_cuda and torch.cuda.is_current_stream_capturing():
             return
         if faults := [*filter(None, self._faults(views))]:
@@ -180,7 +186,7 @@ class FirstViews:
         if self.settings is not None:
             frame = self.settings["frame"]
             place = reference_pose(frame, c2w)
-            # exact up to the rounding of poses; worlds of other conventions differ by far more
+            # Exact up to the rounding of poses; worlds of other conventions differ by far more.
             if float((place - torch.eye(4).to(place)).abs().max()) > 0.05:
                 distance = float(place[..., :3, 3].norm(dim=-1).max())
                 yield (
@@ -189,30 +195,32 @@ class FirstViews:
                     "are OpenCV camera-to-world (x right, y down, z forward; of OpenGL axes negate "
                     "columns 1, 2)"
                 )
-        reach = (self.trained.ranges if self.trained else {}).get("baseline", (0.0, math.inf))[1]
-        if (baseline := float(largest_distance(c2w).max())) > GROSS * reach:
+        trained = self.trained or Domain()
+        _, reach = trained.ranges.get("baseline", (0.0, math.inf))
+        baseline = float(largest_distance(c2w).max())
+        if baseline > GROSS * reach:
             yield f"the baseline of the inputs is {baseline:.3g}, in training at most {reach:.3g}"
 
 
 def _measured(inputs: Cameras, targets: Cameras) -> Iterator[tuple[str, Tensor]]:
-    """Name and values of WORDS; distances and axes only for several inputs."""
+    """Yield names of WORDS and their values; distances and axes only for several inputs."""
     count = inputs.c2w.shape[1]
     yield "views", torch.tensor([float(count)])
     if count > 1:
-        # float64: in float32 a cosine near 1 is off by angles of 0.02 degrees
+        # In float32 a cosine near 1 is off by angles of 0.02 degrees.
         c2w = inputs.c2w.double()
         yield "baseline", torch.cdist(c2w[..., :3, 3], c2w[..., :3, 3]).amax((-2, -1))
         axes = c2w[..., :3, 2]
         cosines = (axes @ axes.transpose(-2, -1)).amin((-2, -1)).clamp(-1, 1)
         yield "turn", cosines.arccos().rad2deg()
     depths = torch.stack([look_at_depth(c2w) for c2w in torch.cat([inputs.c2w, targets.c2w], 1)])
-    # axes that meet behind the cameras diverge in front of them: no depth, as of parallel ones
+    # Axes that meet behind the cameras diverge in front of them: no depth, as of parallel ones.
     yield "depth", torch.where(depths > 0, depths, math.inf)
     halves = inputs.size[1] / 2 / inputs.intrinsics[..., 0].double()
     yield "fov", 2 * halves.arctan().rad2deg()
 
 
 def _shown(values: tuple[float, float]) -> str:
-    """A range as text, three digits."""
+    """Return a range as text, three digits."""
     low, high = (f"{value:.3g}" if math.isfinite(value) else "infinitely far" for value in values)
     return low if low == high else f"{low} to {high}"
