@@ -26,7 +26,7 @@ class DiskFullError(OSError):
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends without an error.
+    """Yield a temporary path beside `path`, which it replaces when the block ends well.
 
     Makes missing parent folders; the file gets the usual permissions whatever wrote it. The new
     file is on the disk before it replaces the old one, which stays where the block raises.
@@ -65,7 +65,7 @@ def naming_full_disk(path: Path) -> Iterator[None]:
 
 
 def is_leftover(path: Path) -> bool:
-    """Whether `path` is the temporary file of `replacing` or of safetensors (.tmpXXXXXX)."""
+    """Return whether `path` is the temporary file of `replacing` or of safetensors (.tmpXXXXXX)."""
     name = r"\..+\.\d+\.tmp|\.tmp[A-Za-z0-9]{6}"
     return bool(re.fullmatch(name, path.name)) and path.is_file()
 
@@ -81,7 +81,7 @@ def _synchronise(path: Path) -> None:
 
 @contextmanager
 def replacing_entries(folder: str | os.PathLike[str], mark: str) -> Iterator[Path]:
-    """A temporary folder whose entries move into `folder` when the block ends well.
+    """Yield a temporary folder whose entries move into `folder` when the block ends well.
 
     An entry takes the place of all that was under its name, folders included; what else `folder`
     holds stays. When the block raises, `folder` stays as it was. mark: the entry of earlier
@@ -90,7 +90,8 @@ def replacing_entries(folder: str | os.PathLike[str], mark: str) -> Iterator[Pat
     target = Path(folder)
     target.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as temporary:
-        fresh, old = Path(temporary, "fresh"), Path(temporary, "old")
+        fresh = Path(temporary, "fresh")
+        old = Path(temporary, "old")
         fresh.mkdir()
         old.mkdir()
         yield fresh
@@ -105,6 +106,7 @@ def replacing_entries(folder: str | os.PathLike[str], mark: str) -> Iterator[Pat
                 if name in there:
                     (target / name).rename(old / name)
                 (fresh / name).rename(target / name)
+        # Ctrl-C too must leave an earlier result as it was.
         except BaseException:
             # What was moved aside comes back, so that a failure changes nothing.
             for entry in old.iterdir():
@@ -127,7 +129,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def read_records(path: Path) -> list[dict[str, Any]]:
-    """The records of `path` with a "step"; none when the file does not exist.
+    """Return the records of `path` with a "step"; none when the file does not exist.
 
     Damaged lines are skipped with a warning, an unfinished last line silently: a killed process
     leaves one.

@@ -17,16 +17,18 @@ from qgs.terminal import without_secrets
 LARGEST = 500_000_000
 """Bytes of a file that is read as a whole, such as an uncompressed photo of 120 million pixels."""
 
-_LARGEST_JSON = 50_000_000  # which may take forty times as much once parsed
+# It may take forty times as much once parsed.
+_LARGEST_JSON = 50_000_000
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError)
 
 
 def opened_path(path: str | Path | UPath) -> UPath:
-    """`path`, a URL or local, as a UPath. Raises ValueError for an unusable file system."""
+    """Return `path`, a URL or local, as a UPath. Raises ValueError for an unusable file system."""
     try:
         url = UPath(path)
-        url.fs  # noqa: B018  asks for the file system, whose package may be missing
-    except Exception as error:  # whatever a file system's constructor raises
+        # The package of a file system may be missing, and its constructor may raise anything.
+        url.fs  # noqa: B018
+    except Exception as error:
         what = without_secrets(f"{path} cannot be opened as a path or URL: {error}")
         raise ValueError(what) from error
     if url.protocol in {"file", "local"}:
@@ -35,12 +37,12 @@ def opened_path(path: str | Path | UPath) -> UPath:
 
 
 def is_local(path: Path | UPath) -> bool:
-    """Whether the system can open `path` by its name, as torch and zipfile do."""
+    """Return whether the system can open `path` by its name, as torch and zipfile do."""
     return isinstance(path, Path)
 
 
 def listing(folder: UPath) -> list[UPath]:
-    """The content of `folder`; nothing where it is no folder."""
+    """List the content of `folder`; nothing where it is no folder."""
     try:
         return list(folder.iterdir())
     except (FileNotFoundError, NotADirectoryError):
@@ -48,19 +50,22 @@ def listing(folder: UPath) -> list[UPath]:
 
 
 def open_file(path: Path | UPath) -> IO[bytes]:
-    """`path`, open for reading bytes. Raises OSError, and as `read_file` what is not local."""
-    if is_local(path) and (path.is_fifo() or path.is_char_device()):  # which may never end
+    """Open `path` for reading bytes. Raises OSError, and as `read_file` what is not local."""
+    if not is_local(path):
+        # Decoders seek to and fro, and each seek would be a request to a store.
+        return io.BytesIO(read_file(path))
+    # Reading them may never end.
+    if path.is_fifo() or path.is_char_device():
         raise OSError(f"{path} is a pipe or a device")
-    # decoders seek to and fro, and each seek would be a request to a store
-    return path.open("rb") if is_local(path) else io.BytesIO(read_file(path))
+    return path.open("rb")
 
 
 def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
-    """The bytes of `path`. Raises OSError for more than `most`, and for a damaged archive."""
+    """Return the bytes of `path`. Raises OSError for more than `most` and damaged archives."""
     try:
         with open_file(path) if is_local(path) else path.open("rb") as file:
-            # One more than allowed tells whether there is more.
-            content: bytes = file.read(most + 1)  # of an archive, whose header may promise less
+            # The header of an archive may promise less than it holds.
+            content: bytes = file.read(most + 1)
     except _DAMAGED as error:
         raise OSError(f"{path} is damaged: {error}") from error
     if len(content) > most:
@@ -69,7 +74,7 @@ def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
 
 
 def read_json(path: UPath, fix: str) -> Any:
-    """The content of a JSON file.
+    """Return the content of a JSON file.
 
     fix: the remedy, for messages. Raises ValueError for a file that is no JSON, FileNotFoundError.
     """

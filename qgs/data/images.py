@@ -22,10 +22,12 @@ TURNED = "have an EXIF orientation, which is not followed: they are read as they
 TURN = "poses must be of the stored pixels; `mogrify -auto-orient` turns pixels for good"
 
 _EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "HSV")
-# of photos; others, such as EPS, would start programs
+# Of photos; others, such as EPS, would start programs.
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "DIB", "GIF", "PPM", "JPEG2000", "TGA")
-_MOST_PIXELS = 120_000_000  # which take 2 GB with transparency; the largest phones make 108
-_ORIENTATION = 0x0112  # tag of EXIF
+# They take 2 GB with transparency; the largest phones make 108 million.
+_MOST_PIXELS = 120_000_000
+# A tag of EXIF.
+_ORIENTATION = 0x0112
 
 
 @dataclass(frozen=True)
@@ -47,45 +49,53 @@ class CropResize:
     @property
     def box(self) -> tuple[float, float, float, float]:
         """Left, top, right and bottom edge of the crop, in source pixels."""
-        height, width = (extent / self.scale for extent in self.target)
-        top, left = (self.source[0] - height) / 2, (self.source[1] - width) / 2
-        right, bottom = min(left + width, self.source[1]), min(top + height, self.source[0])
-        return max(left, 0.0), max(top, 0.0), right, bottom
+        height, width = self.source
+        down = self.target[0] / self.scale
+        across = self.target[1] / self.scale
+        left = (width - across) / 2
+        top = (height - down) / 2
+        # Rounding must not leave the image.
+        return max(left, 0.0), max(top, 0.0), min(left + across, width), min(top + down, height)
 
     def intrinsics(self, source: Tensor) -> Tensor:
-        """fx, fy, cx, cy (..., 4) after the crop (shift), then the resize (scale)."""
+        """Return fx, fy, cx, cy (..., 4) after the crop (shift), then the resize (scale)."""
         left, top, _, _ = self.box
         return (source - source.new_tensor([0.0, 0.0, left, top])) * self.scale
 
     def image(
         self, image: Image.Image, kernel: Image.Resampling = Image.Resampling.LANCZOS
     ) -> np.ndarray:
-        """`image`, of the source's size, as (H, W, 3) uint8, or (H, W) where it has one channel."""
+        """Return `image`, of the source's size, as (H, W, 3) uint8; (H, W) for one channel."""
         return np.array(image.resize((self.target[1], self.target[0]), kernel, box=self.box))
 
 
 def framing(scene: Scene, frame: int) -> str:
-    """A sentence on crop and scale of a photo; "" for one that is delivered as stored."""
-    stored, size, zoom = scene.stored_size(frame), scene.cameras.size, scene.zoom(frame)
+    """Return a sentence on crop and scale of a photo; "" for one that is delivered as stored."""
+    stored = scene.stored_size(frame)
+    size = scene.cameras.size
+    zoom = scene.zoom(frame)
     if stored is None or (stored == size and zoom == 1):
         return ""
     left, top, right, bottom = CropResize(stored, size, zoom).box
     cut = 1 - (right - left) * (bottom - top) / (stored[0] * stored[1])
-    part = f"the middle {right - left:.0f} x {bottom - top:.0f} ({cut:.0%} is cut off)"
+    part = "all"
+    if cut >= 0.01:
+        part = f"the middle {right - left:.0f} x {bottom - top:.0f} ({cut:.0%} is cut off)"
     return (
-        f"the model sees {part if cut >= 0.01 else 'all'} of photos such as frame "
-        f"{scene.label(frame)}, {stored[1]} x {stored[0]} pixels, at {size[1]} x {size[0]}"
+        f"the model sees {part} of photos such as frame {scene.label(frame)}, "
+        f"{stored[1]} x {stored[0]} pixels, at {size[1]} x {size[0]}"
     )
 
 
 @contextmanager
 def _readable(path: Path | UPath, kind: str) -> Iterator[IO[bytes]]:
-    """`path`, open. Raises ValueError for whatever a decoder raises inside."""
+    """Open `path`. Raises ValueError for whatever a decoder raises inside."""
     try:
         with open_file(path) as file:
             yield file
     except Exception as error:
-        if is_out_of_memory(error):  # no fault of the file
+        # No fault of the file.
+        if is_out_of_memory(error):
             raise
         reason = str(error) or type(error).__name__
         raise ValueError(
@@ -95,19 +105,19 @@ def _readable(path: Path | UPath, kind: str) -> Iterator[IO[bytes]]:
 
 
 def image_size(path: UPath) -> tuple[int, int]:
-    """(H, W) in the header of an image file. Raises ValueError for a file that is no image."""
+    """Return (H, W) in the header of an image file. Raises ValueError for no image."""
     with _readable(path, "an image") as file:
         return encoded_size(file)
 
 
 def encoded_size(file: IO[bytes]) -> tuple[int, int]:
-    """(H, W) in the header of an open file. Raises OSError for no image."""
+    """Return (H, W) in the header of an open file. Raises OSError for no image."""
     with opened_image(file) as image:
         return image.height, image.width
 
 
 def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Image.Image:
-    """The file as RGB, over `background` in [0, 1]. Raises ValueError where it is unreadable.
+    """Read the file as RGB, over `background` in [0, 1]. Raises ValueError where it is unreadable.
 
     Pixels stay where they are stored; `qgs.data.photos.turning` follows EXIF.
     """
@@ -116,21 +126,22 @@ def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Imag
 
 
 def orientation(image: Image.Image) -> int:
-    """How EXIF would turn a decoded image; 1 for not at all."""
+    """Return how EXIF would turn a decoded image; 1 for not at all."""
     try:
         return image.getexif().get(_ORIENTATION, 1)
-    except Exception:  # Pillow raises anything for damaged EXIF, which does not matter
+    # Pillow raises anything for damaged EXIF, which does not matter.
+    except Exception:
         return 1
 
 
 def open_mask(path: UPath) -> np.ndarray:
-    """A mask as (H, W) uint8, 255 for what is modelled; 0/1 files too. Raises ValueError."""
+    """Read a mask as (H, W) uint8, 255 for what is modelled; 0/1 files too. Raises ValueError."""
     with _readable(path, "the mask of a photo") as file:
         return decode_mask(file)
 
 
 def alpha_mask(path: UPath) -> np.ndarray:
-    """The alpha channel of a photo as (H, W) uint8; 255 for one without. Raises as `open_mask`."""
+    """Read the alpha channel of a photo as (H, W) uint8; 255 for none. Raises as `open_mask`."""
     with _readable(path, "an image") as file:
         image = eight_bits(_decoded(file))
     if not image.has_transparency_data:
@@ -139,7 +150,10 @@ def alpha_mask(path: UPath) -> np.ndarray:
 
 
 def open_depth(path: UPath, unit: float) -> np.ndarray:
-    """A depth map as (H, W) float32; unit: world units per number; 0: unknown. ValueError."""
+    """Read a depth map as (H, W) float32, 0 where unknown. Raises ValueError.
+
+    unit: world units per number of the file.
+    """
     with _readable(path, "a depth map") as file:
         if path.suffix.lower() == ".npy":
             depth = load_array(file).squeeze()
@@ -154,19 +168,21 @@ def open_depth(path: UPath, unit: float) -> np.ndarray:
 
 
 def load_array(file: IO[bytes]) -> np.ndarray:
-    """The array of a .npy file. Raises ValueError for objects and for one that is too large."""
-    # NumPy allocates what the header promises, so that a few bytes could ask for all memory
-    version = np.lib.format.read_magic(file)
-    of_version = {(1, 0): np.lib.format.read_array_header_1_0}
-    shape, _, dtype = of_version.get(version, np.lib.format.read_array_header_2_0)(file)
-    if (size := math.prod(shape) * dtype.itemsize) > LARGEST:
+    """Read the array of a .npy file. Raises ValueError for objects and what is too large."""
+    # NumPy allocates what the header promises, so that a few bytes could ask for all memory.
+    if np.lib.format.read_magic(file) == (1, 0):
+        shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+    else:
+        shape, _, dtype = np.lib.format.read_array_header_2_0(file)
+    size = math.prod(shape) * dtype.itemsize
+    if size > LARGEST:
         raise ValueError(f"it has {with_unit(size)}: scale it down")
     file.seek(0)
     return np.load(file, allow_pickle=False)
 
 
 def decode_rgb(file: IO[bytes], background: tuple[float, float, float]) -> Image.Image:
-    """As `open_rgb`, for an open file. Raises OSError for bytes that are no readable image."""
+    """Decode as `open_rgb`, of an open file. Raises OSError for no readable image."""
     image = eight_bits(_decoded(file))
     if image.has_transparency_data:
         color = tuple(round(255 * channel) for channel in background)
@@ -176,20 +192,21 @@ def decode_rgb(file: IO[bytes], background: tuple[float, float, float]) -> Image
 
 
 def eight_bits(image: Image.Image) -> Image.Image:
-    """`image` with 8 bits a channel.
+    """Return `image` with 8 bits a channel.
 
     Raises OSError where no number is known to be white: float, 32-bit and LAB files.
     """
     if image.mode.startswith("I;16"):
         numbers = np.array(image).astype(np.uint32)
-        return Image.fromarray(((numbers + 128) // 257).astype(np.uint8))  # rounded, 65535 is 255
+        # Rounded: 65535 is 255.
+        return Image.fromarray(((numbers + 128) // 257).astype(np.uint8))
     if image.mode not in _EIGHT_BITS:
         raise OSError(f"its pixels are of the kind {image.mode!r}: give 8 or 16 bits a channel")
     return image
 
 
 def decode_mask(file: IO[bytes]) -> np.ndarray:
-    """As `open_mask`, for an open file. Raises OSError for no image, and for one with colours."""
+    """Decode as `open_mask`, of an open file. Raises OSError for no image, or one with colours."""
     image = eight_bits(_decoded(file))
     if image.mode in ("1", "L") and not image.has_transparency_data:
         grey = np.array(image.convert("L"))
@@ -198,7 +215,8 @@ def decode_mask(file: IO[bytes]) -> np.ndarray:
         grey = rgba[..., 0]
         if (rgba[..., 1:3] != rgba[..., :1]).any() or (rgba[..., 3] != 255).any():
             raise OSError("it has colours or transparency: give a grey image, white on the object")
-    return grey * np.uint8(255) if grey.max() == 1 else grey  # some tools write 0 and 1
+    # Some tools write 0 and 1.
+    return grey * np.uint8(255) if grey.max() == 1 else grey
 
 
 def _decoded(file: IO[bytes]) -> Image.Image:
@@ -209,7 +227,7 @@ def _decoded(file: IO[bytes]) -> Image.Image:
 
 @contextmanager
 def opened_image(file: IO[bytes]) -> Iterator[Image.Image]:
-    """An image of a format of photos, not yet decoded. Raises OSError, inside of the block too."""
+    """Open an image of a format of photos, not yet decoded. Raises OSError, in the block too."""
     try:
         with Image.open(file, formats=_FORMATS) as image:
             if image.width * image.height > _MOST_PIXELS:
@@ -219,10 +237,11 @@ def opened_image(file: IO[bytes]) -> Iterator[Image.Image]:
         raise OSError("its header is none of a known image format") from error
     except (OSError, MemoryError):
         raise
-    except Exception as error:  # decoders raise anything on damaged files
+    # Decoders raise anything on damaged files.
+    except Exception as error:
         raise OSError(str(error) or type(error).__name__) from error
 
 
 def to_tensor(images: np.ndarray) -> Tensor:
-    """(F, H, W, 3) uint8 -> (F, 3, H, W) float32 in [0, 1]."""
+    """Convert (F, H, W, 3) uint8 to (F, 3, H, W) float32 in [0, 1]."""
     return torch.from_numpy(images).permute(0, 3, 1, 2).float().div_(255).contiguous()

@@ -11,7 +11,7 @@ from qgs.wording import one_line, warn_once
 
 
 def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
-    """PLUGIN/NAME of the first of `sources` that recognises `path`, else qgs/photos.
+    """Return PLUGIN/NAME of the first of `sources` that recognises `path`, else qgs/photos.
 
     A warning names all if several do. Raises FileNotFoundError when `path` does not exist.
     """
@@ -19,7 +19,7 @@ def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
         raise FileNotFoundError(
             f"{path} (from {UPath.cwd()}) does not exist: give the folder of a data set"
         )
-    # plugins first: photos lie in many a layout that only a plugin reads in full
+    # Plugins first: photos lie in many a layout that only a plugin reads in full.
     asked = sorted(sources, key=lambda kind: kind.startswith("qgs/"))
     found = [kind for kind in asked if _recognises(kind, sources[kind], path)]
     if len(found) > 1:
@@ -27,14 +27,16 @@ def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
             f"{path} looks like data of {' and of '.join(found)}, and is read as {found[0]}; to "
             "choose another, name it as `data.type` of a recipe"
         )
-    return found[0] if found else "qgs/photos"  # whose errors say best what a folder lacks
+    # The errors of photos say best what a folder lacks.
+    return found[0] if found else "qgs/photos"
 
 
 def _recognises(kind: str, source: type[Component], path: UPath) -> bool:
     assert issubclass(source, SceneSource)
     try:
         return source.recognises(path)
-    except Exception as error:  # of a plugin, which must not hinder the others
+    # One of a plugin must not hinder the others.
+    except Exception as error:
         if kind.startswith("qgs/"):
             raise
         warn_once(f"{kind} is not asked whether it reads {path}: it raises {one_line(error)}")
@@ -42,7 +44,7 @@ def _recognises(kind: str, source: type[Component], path: UPath) -> bool:
 
 
 def is_training_data(path: str, trained: SceneSourceConfig | None) -> bool:
-    """Whether a model with the data `trained` was trained on the data at `path`."""
+    """Return whether a model with the data `trained` was trained on the data at `path`."""
     root = getattr(trained, "path", None)
     if trained is None or not isinstance(root, str):
         return False
@@ -57,7 +59,7 @@ def open_for(
     trained: SceneSourceConfig | None,
     sources: Mapping[str, type[Component]],
 ) -> tuple[SceneSource, bool]:
-    """The data at `path`, and whether a model with the data `trained` was trained on it.
+    """Open the data at `path`; return too whether a model with data `trained` was trained on it.
 
     Then it has the same options, held-out frames included; else it is opened as `recognised`, and
     photos without cameras get some (`with_cameras`).

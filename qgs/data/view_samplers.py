@@ -38,6 +38,7 @@ class Span(ViewSampler):
     ) -> tuple[Frames, Frames]:
         """See `ViewSampler`."""
         options = self.options(step)
-        # a schedule may bring the largest gap below the least one of the recipe
-        low, high = options.min_gap or views.gap[0], options.max_gap or views.gap[1]
-        return draw_frames(scene, views.model_copy(update={"gap": (min(low, high), high)}), rng)
+        high = options.max_gap or views.gap[1]
+        # A schedule may bring the largest gap below the least one of the recipe.
+        low = min(options.min_gap or views.gap[0], high)
+        return draw_frames(scene, views.model_copy(update={"gap": (low, high)}), rng)
