@@ -26,7 +26,7 @@ class CommandGroup(TyperGroup):
         return [*own, *sorted({entry.name for entry in installed(GROUP)} - {*own})]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Our command of that name, or the imported one of a distribution; else ValueError."""
+        """Return our command of that name, or that of a distribution; else ValueError."""
         own = super().get_command(ctx, cmd_name)
         if own is not None:
             return own
@@ -39,36 +39,36 @@ class CommandGroup(TyperGroup):
 
 
 def offered_command(name: str, offers: list[EntryPoint]) -> Any:
-    """The command `name` of a distribution, or one that says why it cannot be used."""
+    """Import the command `name` of a distribution; one that cannot be used says why."""
     releases = listed(
         sorted({f"{entry.dist.name} {entry.dist.version}" for entry in offers if entry.dist})
     )
     named = f"the command `qgs {name}` of {releases}"
     if len(offers) > 1:
-        return UnusableCommand(name, f"{named} is offered several times; uninstall all but one")
+        return _unusable(name, f"{named} is offered several times; uninstall all but one")
     entry = offers[0]
     try:
         app = entry.load()
         assert isinstance(app, typer.Typer), f"it is a {type(app)}, not a typer.Typer"
-    except (Exception, SystemExit) as error:  # importing runs the distribution's code
+    # Importing runs the distribution's code.
+    except (Exception, SystemExit) as error:
         reason = f"cannot be used: `{entry.value}`: {type(error).__name__}: {error}"
-        return UnusableCommand(name, f"{named} {reason}; update {releases}")
-    app._add_completion = False  # what it would install completes no command of qgs
+        return _unusable(name, f"{named} {reason}; update {releases}")
+    # What it would install completes no command of qgs.
+    app._add_completion = False
     command = typer.main.get_command(app)
     command.name = name
     return command
 
 
-class UnusableCommand(TyperCommand):
-    """A distribution's command that cannot run; its help is the reason."""
+def _unusable(name: str, reason: str) -> TyperCommand:
+    """Return a command that raises ValueError; its help is the reason."""
 
-    def __init__(self, name: str, reason: str) -> None:
-        self.reason = reason
-        super().__init__(name, help=reason)
+    def refuse() -> None:
+        raise ValueError(reason)
 
-    def make_context(self, *given: Any, **extra: Any) -> Any:
-        """Raise ValueError with the reason."""
-        raise ValueError(self.reason)
+    anything = {"ignore_unknown_options": True, "allow_extra_args": True}
+    return TyperCommand(name, help=reason, callback=refuse, context_settings=anything)
 
 
 app = typer.Typer(

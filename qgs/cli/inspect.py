@@ -47,7 +47,8 @@ def compose(recipe: RecipeFile, overrides: Overrides = None) -> None:
 
     resolved = resolve(recipe, overrides or ())
     model = resolved.build_model("meta")
-    resolved.rate_factors(model)  # patterns that name no parameter are refused
+    # Patterns that name no parameter are refused.
+    resolved.rate_factors(model)
     typer.echo(annotated(resolved))
     Console(stderr=True).print(parameter_table(resolved, model))
     for warning in resolved.warnings:
@@ -102,7 +103,8 @@ def recipes(
         typer.echo(known[name].read_text(encoding="utf-8"), nl=False)
     else:
         copies = {out / path.relative_to(home): path for path in files_of(known[name])}
-        for target in copies:  # all of them or, where one lies in the way, none
+        # All of them or, where one lies in the way, none.
+        for target in copies:
             refuse_existing(target)
         for target, path in copies.items():
             write_text(target, path.read_text(encoding="utf-8"))

@@ -43,19 +43,22 @@ ViewsSettings: TypeAlias = Annotated[
 Scale: TypeAlias = Annotated[
     float | None,
     typer.Option(
-        help="Factor of the cameras' translations; default: the one of several at which the model "
-        "renders the inputs and photos between them best."
+        help="Scale of the cameras' positions; default: the one at which the model renders the "
+        "inputs and photos between them best."
     ),
 ]
-TUNE_HELP = (
-    "Fit the queries to the input photos first, for STEPS steps, or with latents:STEPS the "
-    "features of the photos; 0 for none."
-)
-Tune: TypeAlias = Annotated[str | None, typer.Option(metavar="[WHAT:]STEPS", help=TUNE_HELP)]
+Tune: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        metavar="[WHAT:]STEPS",
+        help="Fit the queries to the input photos first, for STEPS steps, or with latents:STEPS "
+        "the features of the photos; 0 for none.",
+    ),
+]
 
 
 def scale_settings(scale: float | None) -> list[str]:
-    """The settings that --scale stands for. Raises ValueError for a factor that is not above 0."""
+    """Return the settings of --scale. Raises ValueError for a factor that is not above 0."""
     if scale is None:
         return []
     if not 0 < scale < float("inf"):
@@ -72,7 +75,7 @@ def use_threads(threads: int | None) -> None:
 
 
 def parse_size(text: str | None, option: str = "--size") -> tuple[int, int] | None:
-    """(H, W) of "HxW"; raises ValueError for anything else."""
+    """Return (H, W) of "HxW"; raises ValueError for anything else."""
     if text is None:
         return None
     match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)

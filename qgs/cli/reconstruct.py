@@ -38,8 +38,8 @@ def reconstruct(
     holdout: Annotated[
         str | None,
         typer.Option(
-            help="Photos to compare with, or none; default: those near the inputs of every eighth "
-            "photo, which is held out."
+            help="Photos to compare with, or none; default: held-out ones (every eighth) near the "
+            "inputs."
         ),
     ] = None,
     tune: Tune = None,
@@ -71,7 +71,8 @@ def reconstruct(
     from qgs.train.distributed import choose_device
 
     if find := scene_writers().get(out.suffix.lower()):
-        find()  # one that cannot be imported is an error now, not after the work
+        # One that cannot be imported is an error now, not after the work.
+        find()
     options.use_threads(threads)
     console = Console()
     result = run(

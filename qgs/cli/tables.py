@@ -27,7 +27,7 @@ _BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusive
 
 
 def folded_table(title: str, *columns: str, right: int = 0) -> Table:
-    """A table with folded cells; its last `right` columns are aligned to the right."""
+    """Return a table with folded cells; its last `right` columns are aligned to the right."""
     table = Table(title=title or None, title_justify="left")
     for index, column in enumerate(columns):
         justify = "right" if index >= len(columns) - right else "left"
@@ -36,7 +36,7 @@ def folded_table(title: str, *columns: str, right: int = 0) -> Table:
 
 
 def overview(registry: Registry) -> Iterator[Table]:
-    """One table per slot: installed components, what they are, where they come from."""
+    """Yield a table per slot: installed components, what they are, where they come from."""
     definitions = recipe_schema(registry)["$defs"]
     for name, slot in SLOTS.items():
         default = f" (default {slot.default})" if slot.default else ""
@@ -52,49 +52,65 @@ def overview(registry: Registry) -> Iterator[Table]:
 
 
 def details(name: str, registry: Registry) -> Iterator[Group]:
-    """Options of a component, a slot's components or a section; file and card of a trained model.
+    """Explain a section of settings, a trained model, a component or the components of a slot.
 
     name: such as qgs/latent, queries, training, or rooms/locus_64; `recipe` stands for the
     settings at the top of a recipe. Raises ValueError for other names.
     """
-    schema = recipe_schema(registry)
     settings = {".".join(path) or "recipe": path for path in SETTINGS}
-    models, slot = _models(registry), name.removeprefix("model.").removeprefix("decoder.")
-    components = [(s, kind, c) for s in SLOTS for kind, c in registry.components(s).items()]
-    shown = [found for found in components if name == found[1] or slot == found[0]]
+    models = _models(registry)
+    slot = name.removeprefix("model.").removeprefix("decoder.")
+    components = [(s, kind) for s in SLOTS for kind in registry.components(s)]
+    shown = [(s, kind) for s, kind in components if name == kind or slot == s]
     if name in settings:
-        for key in settings[name]:
-            schema = schema["properties"][key]
-        options = {key: schema["properties"][key] for key in SETTINGS[settings[name]].model_fields}
-        described = schema.get("description", "")
-        yield Group(f"[bold]{name}[/bold]", escape(described), _options(options))
+        yield _section(name, settings[name], recipe_schema(registry))
     elif name in models:
         file = checkpoint_path(name)
-        size = f"{file}: {file.stat().st_size / 1e6:.1f} MB"
         heading = f"[bold]{escape(name)}[/bold], {escape(_release(name, registry))}"
+        size = f"{file}: {file.stat().st_size / 1e6:.1f} MB"
         yield Group(heading, escape(size), "", escape(card_of(file)))
     elif not shown:
-        known = [*SLOTS, *settings, *models, *(kind for _, kind, _ in components)]
+        known = [*SLOTS, *settings, *models, *(kind for _, kind in components)]
         hint = did_you_mean(name, known, "names")
         raise ValueError(f"there is no slot, component or section `{name}`; {hint}")
-    for place, kind, component in shown:
-        written = _by_type(schema["$defs"][place])[kind]
-        options = {key: option for key, option in written["properties"].items() if key != "type"}
-        heading = f"{recipe_path(place)}: {kind}, {_release(kind, registry)}"
-        lines = [f"[bold]{escape(heading)}[/bold]", escape(written["description"])]
-        config = default_config(component)
-        declared = {"requires": component.fields_read, "provides": component.fields_written}
-        fields = []
-        for word, declare in declared.items():
-            found = declare(config).items() if config else ()
-            if text := "; ".join(f"{name} ({spec})" for name, spec in found):
+    for place, kind in shown:
+        yield _component(place, kind, registry)
+
+
+def _section(name: str, path: tuple[str, ...], schema: Schema) -> Group:
+    for key in path:
+        schema = schema["properties"][key]
+    options = {key: schema["properties"][key] for key in SETTINGS[path].model_fields}
+    return Group(f"[bold]{name}[/bold]", escape(schema.get("description", "")), _options(options))
+
+
+def _component(slot: str, kind: str, registry: Registry) -> Group:
+    """Explain the options of a component, and the fields that it needs and makes by default."""
+    component = registry.components(slot)[kind]
+    schema = _by_type(recipe_schema(registry)["$defs"][slot])[kind]
+    options = {key: option for key, option in schema["properties"].items() if key != "type"}
+    heading = f"{recipe_path(slot)}: {kind}, {_release(kind, registry)}"
+    config = default_config(component)
+    fields = []
+    if config is not None:
+        declared = {
+            "requires": component.fields_read(config),
+            "provides": component.fields_written(config),
+        }
+        for word, specs in declared.items():
+            if specs:
+                text = "; ".join(f"{name} ({spec})" for name, spec in specs.items())
                 fields.append(escape(f"  {word}: {text}"))
-        yield Group(*lines, _options(options), *fields, "")
+    described = escape(schema["description"])
+    return Group(f"[bold]{escape(heading)}[/bold]", described, _options(options), *fields, "")
 
 
 def _models(registry: Registry) -> dict[str, Path]:
-    """The file of every shipped model by PLUGIN/NAME."""
-    return {k: file for known in registry.plugins.values() for k, file in known.models.items()}
+    """Return the file of every shipped model by PLUGIN/NAME."""
+    found: dict[str, Path] = {}
+    for plugin in registry.plugins.values():
+        found |= plugin.models
+    return found
 
 
 def _by_type(definition: Schema) -> dict[str, Schema]:
@@ -106,22 +122,24 @@ def _release(kind: str, registry: Registry) -> str:
 
 
 def recipe_path(slot: str) -> str:
-    """Where in a recipe the components of `slot` are written."""
+    """Return where in a recipe the components of `slot` are written."""
     if slot in MODEL_SLOTS:
         return f"model.{slot}"
     return f"model.decoder.{slot}" if slot in LAYER_SLOTS else slot
 
 
 def _options(properties: Mapping[str, Schema]) -> Table | str:
-    """A table of options, given as properties of a JSON Schema."""
+    """Return a table of options, given as properties of a JSON Schema."""
+    if not properties:
+        return "  no options"
     table = folded_table("", "option", "type", "default", "meaning")
     for cells in _rows(properties):
         table.add_row(*map(escape, cells))
-    return table if properties else "  no options"
+    return table
 
 
 def _rows(properties: Mapping[str, Schema], above: str = "") -> Iterator[tuple[str, ...]]:
-    """An option a row; those inside a mapping follow it, `option.inner`."""
+    """Yield an option a row; those inside a mapping follow it, `option.inner`."""
     for name, option in properties.items():
         default = inline(option["default"]) if "default" in option else "required"
         meaning = " ".join(option.get("description", "").split())
@@ -131,7 +149,7 @@ def _rows(properties: Mapping[str, Schema], above: str = "") -> Iterator[tuple[s
 
 
 def _type(option: Schema) -> str:
-    """Which values a JSON Schema allows."""
+    """Return which values a JSON Schema allows."""
     match option:
         case {"$ref": name}:
             return name.rpartition("/")[2]
@@ -155,14 +173,18 @@ def _type(option: Schema) -> str:
 
 
 def parameter_table(recipe: Recipe, model: QueryGaussianModel) -> Table:
-    """Parameters of each component of `model`, built from `recipe`."""
+    """Return the parameters of each component of `model`, built from `recipe`."""
     table = folded_table("parameters", "component", "type", "parameters", right=1)
     counts = parameter_counts(model)
     for name, count in counts.items():
-        slot = name.removeprefix("decoder.")  # of the decoder, the types in all layers
+        slot = name.removeprefix("decoder.")
+        # Of the decoder, the types in all layers.
         path = ("model", slot) if slot == name else ("model", "decoder", "layers")
-        places = ((p, c) for p, c in recipe.parts.items() if p[: len(path)] == path)
-        kinds = dict.fromkeys(c.type for p, c in places if p[-1] == slot)
+        kinds = dict.fromkeys(
+            part.type
+            for place, part in recipe.parts.items()
+            if place[: len(path)] == path and place[-1] == slot
+        )
         table.add_row(name, ", ".join(kinds), f"{count:,}")
     table.add_section()
     table.add_row("total", "", f"{sum(counts.values()):,}")

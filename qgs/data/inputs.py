@@ -11,7 +11,6 @@ from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.data.depth import scene_depth
 from qgs.data.frames import evenly
 from qgs.domain import Domain
-from qgs.geometry.poses import scaled
 from qgs.geometry.rays import pixel_directions
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.types import Cameras
@@ -95,7 +94,8 @@ class Frusta:
     def __init__(self, scene: Scene, trained_on: Domain, depth: float | None = None) -> None:
         self.scene = scene
         given = scene.cameras
-        c2w = scaled(given.c2w.double(), 1 / (depth or scene_depth(scene)))
+        c2w = given.c2w.double().clone()
+        c2w[:, :3, 3] /= depth or scene_depth(scene)
         self.cameras = Cameras(c2w, given.intrinsics.double(), given.size)
         self.centres = c2w[:, :3, 3].numpy()
         axes = c2w[:, :3, 2].numpy()
