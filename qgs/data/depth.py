@@ -10,11 +10,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from qgs.containers import map_tensors
 from qgs.contracts import Scene
 from qgs.geometry.poses import largest_distance, look_at_depth
 from qgs.geometry.rays import pixel_directions
 from qgs.geometry.transforms import to_camera, to_pixels
-from qgs.types import map_tensors
 
 # Photos that are swept, and the ranks by distance of those that each is matched with.
 _PHOTOS = 4

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from qgs.containers import concatenated
 from qgs.data.samples import Sample
 from qgs.domain import remedies
 from qgs.geometry.poses import relative_to, scaled
@@ -17,7 +18,7 @@ from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
 from qgs.reconstruction.scale import FoundScale
-from qgs.types import Cameras, Gaussians, Prediction, Rendering, concatenated
+from qgs.types import Cameras, Gaussians, Prediction, Rendering
 
 KINDS = ("input", "novel", "seen in training")
 """A compared view of a folder that the model was trained on is novel if it was held out."""

@@ -11,9 +11,9 @@ from qgs.data.images import framing
 from qgs.data.recognition import is_training_data
 from qgs.domain import Domain, verdict
 from qgs.recipe import Recipe, resolve
-from qgs.reconstruction.result import choose_sample
+from qgs.reconstruction.reconstruct import choice, choose_sample
 from qgs.reconstruction.scale import ScaleSearch, photo_settings
-from qgs.reconstruction.scenes import choice, chosen_scene, frame_list, named_scene
+from qgs.reconstruction.scenes import chosen_scene, frame_list, named_scene
 from qgs.wording import listed
 from qgs_viewer.finished import is_finished, open_finished
 from qgs_viewer.query_scene import QueryScene
@@ -88,7 +88,7 @@ def open_model(name: str, options: ViewOptions) -> Source:
 def _scene(recipe: Recipe, options: ViewOptions) -> Scene:
     """Return the scene of the photos, or the named or first test scene of the recipe's data."""
     if options.photos is not None:
-        return chosen_scene(recipe, options.photos, options.size, options.scene)[0]
+        return chosen_scene(recipe, options.photos, options.size, options.scene).scene
     if recipe.data_config is None:
         raise ValueError("the checkpoint's recipe has no data: name a folder of photos after it")
     data = recipe.build_data()

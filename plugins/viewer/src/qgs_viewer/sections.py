@@ -13,7 +13,7 @@ from torch import Tensor
 
 from qgs.containers import map_tensors
 from qgs.contracts import LearnedQueries
-from qgs.data.samples import evenly
+from qgs.data.frames import evenly
 from qgs.drawing import images
 from qgs.drawing.figures import figure_picture
 from qgs.drawing.images import Picture, depth_picture, depth_range, rgb_picture, side_by_side
