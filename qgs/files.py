@@ -37,6 +37,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     with naming_full_disk(target):
         try:
+            # A library may write with other permissions, so those of a plain file are kept.
             temporary.touch()
             mode = temporary.stat().st_mode
             yield temporary
@@ -44,6 +45,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
             # Otherwise a crash could leave the new name with old or no content.
             _synchronise(temporary)
             os.replace(temporary, target)
+            # The name too must be on the disk.
             _synchronise(target.parent)
         finally:
             temporary.unlink(missing_ok=True)

@@ -39,6 +39,7 @@ def downloaded(url: str) -> Path:
     except ValueError as error:
         raise OSError(f"{name} is no URL: {error}") from None
     cache = Path(os.environ.get("QGS_CACHE") or "~/.cache/qgs").expanduser()
+    # By the whole URL: two servers may have files of one name.
     key = hashlib.sha256(url.encode()).hexdigest()[:16]
     # A file name may have 255 bytes.
     file = cache / key / (last.strip(".")[-50:] or "checkpoint")
@@ -89,6 +90,7 @@ def _download(url: str, file: Path) -> None:
 def _copy(stream: Any, local: IO[bytes], folder: Path) -> None:
     """Copy `stream` to `local`. Raises OSError for more than LARGEST, or than fits."""
     announced = getattr(stream, "length", None) or getattr(stream, "size", None) or 0
+    # A server may announce less than it sends, or nothing.
     limit = min(LARGEST, shutil.disk_usage(folder).free)
     left = limit
     while announced <= limit and left > 0 and (part := stream.read(2**20)):

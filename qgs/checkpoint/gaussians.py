@@ -86,7 +86,8 @@ def save_ply(gaussians: Gaussians, path: str | Path) -> None:
         ("opacity",): scene.opacities.clamp(OPACITY_EPS, 1 - OPACITY_EPS).logit()[:, None],
         _SCALES: scene.scales.clamp_min(SCALE_MIN).log(),
         _QUATS: scene.quats,
-        REST: rest.mT.flatten(1),  # channel by channel
+        # Channel by channel.
+        REST: rest.mT.flatten(1),
     }
     vertices = np.zeros(scene.count, dtype=[(name, "<f4") for name in PROPERTIES])
     for names, values in columns.items():

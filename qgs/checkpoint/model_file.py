@@ -163,6 +163,7 @@ def save(
         raise ValueError(
             "this model was built by hand and has no recipe to save; build it with qgs.compose"
         )
+    # Copied, since safetensors refuses tensors that share memory or are strided.
     tensors = {
         name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
         for name, tensor in (weights or unique_tensors(model)).items()
@@ -209,6 +210,7 @@ def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -
     Raises CheckpointError that lists differences in names, shapes and types, and ValueError for NaN
     and infinity.
     """
+    # Everything is compared before anything is copied.
     refuse_misfit(model, tensors, origin)
     refuse_nonfinite(tensors, origin)
     with torch.no_grad():

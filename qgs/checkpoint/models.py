@@ -27,6 +27,7 @@ def checkpoint_path(name: str | os.PathLike[str]) -> Path:
     elif not path.exists():
         if "://" in text:
             return downloaded(text)
+        # Only a plug-in that is installed makes a name of what may be a path.
         is_name = bool(model) and "/" not in model and path.suffix != ".safetensors"
         if is_name and plugin in available_plugins():
             return _shipped(plugin, text)

@@ -29,6 +29,7 @@ def list_components(
     from qgs.recipe.registry import load_registry, load_usable_plugins
 
     plugin, slash, _ = (name or "").partition("/")
+    # One plug-in is enough for a name that begins with it: all would take seconds.
     registry, broken = (load_registry([plugin]), []) if slash else load_usable_plugins()
     for part in details(name, registry) if name else overview(registry):
         Console().print(part, highlight=False)

@@ -60,19 +60,14 @@ def reconstruct(
     For other photos the scale of the world is the one at which the model renders them best.
     `qgs refine OUT PHOTOS` then fits the Gaussians to all photos, `qgs video OUT` films them.
     """
-    if not overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
-        raise FileExistsError(f"{out} is not empty: choose another --out, or add --overwrite")
+    _refuse_unusable(out, overwrite)
 
     from rich.console import Console
 
-    from qgs.checkpoint.gaussians import scene_writers
     from qgs.checkpoint.model_file import load
     from qgs.reconstruction.reconstruct import reconstruct as run
     from qgs.train.distributed import choose_device
 
-    if find := scene_writers().get(out.suffix.lower()):
-        # One that cannot be imported is an error now, not after the work.
-        find()
     options.use_threads(threads)
     console = Console()
     result = run(
@@ -89,6 +84,18 @@ def reconstruct(
     show(result, console)
     for file in result.save(out):
         console.print(f"wrote {file}", soft_wrap=True)
+
+
+def _refuse_unusable(out: Path, overwrite: bool) -> None:
+    """Raise an error now, not after the work, where `out` cannot be written."""
+    if not overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
+        raise FileExistsError(f"{out} is not empty: choose another --out, or add --overwrite")
+
+    from qgs.checkpoint.gaussians import scene_writers
+
+    # A writer of another distribution may fail to import.
+    if find := scene_writers().get(out.suffix.lower()):
+        find()
 
 
 def show(result: Reconstruction, console: Console) -> None:

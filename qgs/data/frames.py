@@ -89,6 +89,7 @@ def draw_frames(
     usable = moments(scene)
     low, high = gap_range(len(usable), views, scene)
     gap = int(rng.integers(low, high + 1))
+    # The order of draws is that of the release: another one would change all trainings.
     first = int(rng.integers(0, len(usable) - gap))
     span = usable[first : first + gap + 1]
     if views.inputs == 1:

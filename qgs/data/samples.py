@@ -118,6 +118,7 @@ def shaken(c2w: Tensor, angle: float, rng: np.random.Generator) -> Tensor:
     # The matrix of the cross product with a turn; its exponential is the rotation.
     cross = torch.linalg.cross(turns[:, None], torch.eye(3).to(c2w)[None]).mT
     distances = (c2w[:, :3, 3] - c2w[0, :3, 3]).norm(dim=-1, keepdim=True)
+    # The first pose sets the world and stays exact; farther cameras are off by more.
     off = c2w.clone()
     off[1:, :3, :3] = (c2w[:, :3, :3] @ torch.linalg.matrix_exp(cross))[1:]
     off[1:, :3, 3] += (moves * distances)[1:]
@@ -249,6 +250,7 @@ def _flipped(images: Tensor) -> Tensor:
 
 def collate(samples: Sequence[Sample]) -> Batch:
     """Stack samples of equal view counts and image size. ValueError where only some have times."""
+    # Models that read times need them in every sample of a batch.
     still = [sample.scene for sample in samples if sample.inputs.times is None]
     if 0 < len(still) < len(samples):
         raise ValueError(

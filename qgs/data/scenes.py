@@ -67,6 +67,7 @@ class BoundedCache(Generic[Value]):
         value = make()
         cost = self._cost(value) if self._cost else 1
         with self._lock:
+            # Another thread may have kept its own meanwhile.
             if key not in self._kept:
                 self._kept[key] = (value, cost)
                 self._total += cost
@@ -92,6 +93,7 @@ class LazyScenes(Sequence[Scene]):
     def __getitem__(self, index: Any) -> Any:
         """Return the scene at an index, or the scenes at a slice."""
         name = self.names[index]
+        # Of a slice.
         if isinstance(name, list):
             return [self[place] for place in range(len(self))[index]]
         return self._opened.get(name, lambda: self._open(name, self.places[name]))

@@ -180,6 +180,7 @@ class SampleStream:
             try:
                 return self._sample_after(number, attempt)
             except Exception as error:
+                # Another scene would need the same memory.
                 if not self._skips or is_out_of_memory(error):
                     raise
                 left_out.append(one_line(error))
@@ -258,6 +259,7 @@ def _from_thread(batches: _Batches, start: int) -> Generator[Batch, None, None]:
     with ThreadPoolExecutor(1, thread_name_prefix="qgs-loader") as pool:
         pending = pool.submit(batches.batch, start)
         for number in count(start + 1):
+            # Taken before the next is begun: one thread reads, as files and caches expect.
             ready = pending.result()
             pending = pool.submit(batches.batch, number)
             yield ready
@@ -295,6 +297,7 @@ def _from_workers(batches: _Batches, start: int, workers: int) -> Generator[Batc
                 raise batch
             yield batch
     finally:
+        # The iterator of torch ends its workers when it goes.
         del made
 
 

@@ -48,6 +48,7 @@ def depth_range(depths: Tensor) -> tuple[float, float]:
     seen = depths.detach()[depths.detach() > 0].float()
     if seen.numel() == 0:
         return 0.0, 1.0
+    # A few far pixels would make everything else one colour.
     near, far = torch.quantile(seen.cpu(), torch.tensor([0.02, 0.98])).tolist()
     return near, far
 

@@ -79,6 +79,7 @@ class Reconstruction:
     def render(self, cameras: Cameras) -> Rendering:
         """Render from cameras (1, V) in the photos' world; depth is in its unit."""
         reference, scale = (part.to(cameras.c2w.device) for part in self.world)
+        # In float64: coordinates of maps have seven digits before the point.
         c2w = scaled(relative_to(reference, cameras.c2w.double()), scale).float()
         own = Cameras(c2w, cameras.intrinsics.float(), cameras.size).to(self.gaussians.means.device)
         with torch.no_grad():

@@ -42,9 +42,11 @@ def orbit(inputs: Cameras, depth: float, frames: int) -> Cameras:
     # From 0, the first input, to count - 1, the last, and back.
     times_T = (1 - angles.cos()) / 2 * (count - 1)
     distances_TV = times_T[:, None] - torch.arange(count, device=times_T.device)
+    # A smooth mean of neighbouring inputs, so that the path has no corner at any of them.
     weights_TV = torch.softmax(-0.5 * (distances_TV / 0.6) ** 2, -1)
     mean = torch.einsum("tv,vij->tij", weights_TV, inputs.c2w[0])
     _, down, forward, centre = mean[:, :3].unbind(-1)
+    # A mean of rotations is no rotation: its axes are made orthonormal again.
     right, down, forward, centre = look_at(centre, forward, down)[:, :3].unbind(-1)
     reach = SWAY * depth
     eye = centre + reach * angles.sin()[:, None] * right
@@ -65,6 +67,7 @@ def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
         save_gaussians(result.in_photos_world, out)
         return [out]
     path = orbit_path(result.sample.inputs.cameras, result.rendering.depth)
+    # Rendered before the folder is touched: an earlier result stays where this fails.
     with torch.no_grad():
         frames = result.model.render(result.gaussians, path).rgb[0]
     rows = _pictures(result)

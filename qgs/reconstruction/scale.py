@@ -146,8 +146,10 @@ def find_scale(
     sample = make_sample(scene, given, further, constant_scale(views, 1.0), mirror=False)
     frames = given if len(given) > 1 else given + further
     low, high, nearest = search_range(model.trained_on or Domain(), scene, frames)
+    # Even steps in log scale: what counts is the ratio to the right factor.
     count = min(math.ceil(math.log(high / low) / math.log(STEP)) + 1, MOST)
     ratio = (high / low) ** (1 / max(count - 1, 1))
+    # Places are thirds of a step, so that the finer search lies between those of the first.
     trial = _Trial(model.eval(), sample, low, ratio ** (1 / 3), 0.0 if further else nearest)
     try:
         best = trial.best(range(0, 3 * count, 3))
@@ -198,6 +200,7 @@ def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, 
     found: list[float] = []
     low, high = trained.ranges.get("baseline", BASELINES)
     if baseline > 0 and high > 0:
+        # A training may have seen baselines near 0, which no search needs to reach.
         found += [max(low, high / 10) / baseline / BELOW, high / baseline * ABOVE]
     near = trained.ranges.get("depth", (NEAREST, math.inf))[0]
     near = near if 0 < near < math.inf else NEAREST
@@ -231,6 +234,7 @@ class _Trial:
         return self._low * self._step**place
 
     def psnr(self, place: float) -> float:
+        # Photos that are not given count twice: inputs alone mislead.
         own, further = self.tried[place]
         return own if math.isnan(further) else (own + 2 * further) / 3
 

@@ -116,6 +116,7 @@ def size_multiple(recipes: Iterable[Recipe]) -> int | None:
     """Return the least common multiple of all models' size multiples; None if one size is fixed."""
     known = list[int]()
     for recipe in recipes:
+        # The parts are known without building a model.
         part = recipe.parts["model", "encoder"]
         assert issubclass(part.component, Encoder)
         multiple = part.component.size_multiple(part.config)
@@ -163,6 +164,7 @@ def frame_list(frames: Frames, option: str, scene: Scene) -> list[int]:
         if part.removeprefix("-").isdecimal():
             numbers.append(int(part))
             continue
+        # From a folder's start on: "1.png" is not "11.png".
         found = [frame for frame, name in enumerate(names) if f"/{name}".endswith(f"/{part}")]
         if len(found) != 1:
             fits = f"fits {listed(map(scene.label, found))}" if found else "is no photo"

@@ -58,56 +58,73 @@ def trace(
     numbers = _checked(layers, range(1, model.depth + 1), "layers")
     if model.queries.count is not None:
         _checked(queries, range(model.queries.count), "queries")
-    record, current = Trace(torch.tensor([], dtype=torch.long)), 0
-
-    def chosen(state: QueryState) -> QueryState:
-        index = record.queries.to(state.features.device)
-        return map_tensors(lambda tensor: tensor.detach()[:, index], state)
-
-    def start(module: nn.Module, args: Any) -> None:
-        nonlocal current
-        record.layers.clear()
-        record.grid, current = None, 0
-
-    def enter(module: nn.Module, args: tuple[QueryState, ImageMemory]) -> None:
-        nonlocal current  # layers run in order, though rounds and refinements share modules
-        state, memory = args
-        number = current = current + 1
-        record.grid = memory.grid
-        if number == 1:
-            found = _checked(queries, range(state.features.shape[1]), "queries")
-            record.queries = torch.tensor(found, dtype=torch.long)
-        if number in numbers:
-            lacking = [part for part in ATTENTIONS if not hasattr(module, part)]
-            absent = {part: f"{type(module).__name__} has no slot `{part}`" for part in lacking}
-            record.layers[number] = LayerTrace(chosen(state), absent=absent)
-
-    @torch.no_grad()
-    def explain(part: str, module: Any, args: tuple[Any, ...]) -> None:
-        if current not in numbers:
-            return
-        weights = module.explain(*args, record.queries.to(args[0].features.device))
-        setattr(record.layers[current], part, weights)
-        if weights is None:
-            record.layers[current].absent[part] = f"{type(module).__name__}.explain returned None"
-
-    def leave(module: nn.Module, args: Any, state: QueryState) -> None:
-        if current in numbers:
-            record.layers[current].after = chosen(state)
-
-    handles = [model.register_forward_pre_hook(start)]
+    recorder = _Recorder(numbers, queries)
+    handles = [model.register_forward_pre_hook(recorder.start)]
     for layer in model.decoder:
-        handles.append(layer.register_forward_pre_hook(enter))
+        handles.append(layer.register_forward_pre_hook(recorder.enter))
         for part in ATTENTIONS:
             if hasattr(layer, part):
-                hook = partial(explain, part)
+                hook = partial(recorder.explain, part)
                 handles.append(getattr(layer, part).register_forward_pre_hook(hook))
-    handles += [part.register_forward_hook(leave) for part in model.refinements]
+    handles += [part.register_forward_hook(recorder.leave) for part in model.refinements]
     try:
-        yield record
+        yield recorder.trace
     finally:
         for handle in handles:
             handle.remove()
+
+
+class _Recorder:
+    """Hooks that fill a `Trace`; layers run in order, though rounds and refinements share modules.
+
+    current: number of the layer that runs.
+    """
+
+    def __init__(self, layers: Sequence[int], queries: Sequence[int] | None) -> None:
+        self.trace = Trace(torch.tensor([], dtype=torch.long))
+        self.current = 0
+        self._layers = layers
+        self._queries = queries
+
+    def start(self, module: nn.Module, args: Any) -> None:
+        """Forget the pass before, when the model begins."""
+        self.trace.layers.clear()
+        self.trace.grid = None
+        self.current = 0
+
+    def enter(self, module: nn.Module, args: tuple[QueryState, ImageMemory]) -> None:
+        """Note a layer that begins, and the queries that it gets."""
+        state, memory = args
+        self.current += 1
+        self.trace.grid = memory.grid
+        # Some queries are known only now, such as those that a model makes of the photos.
+        if self.current == 1:
+            found = _checked(self._queries, range(state.features.shape[1]), "queries")
+            self.trace.queries = torch.tensor(found, dtype=torch.long)
+        if self.current in self._layers:
+            lacking = [part for part in ATTENTIONS if not hasattr(module, part)]
+            absent = {part: f"{type(module).__name__} has no slot `{part}`" for part in lacking}
+            self.trace.layers[self.current] = LayerTrace(self._chosen(state), absent=absent)
+
+    @torch.no_grad()
+    def explain(self, part: str, module: Any, args: tuple[Any, ...]) -> None:
+        """Keep the weights of an attention that begins."""
+        if self.current not in self._layers:
+            return
+        layer = self.trace.layers[self.current]
+        weights = module.explain(*args, self.trace.queries.to(args[0].features.device))
+        setattr(layer, part, weights)
+        if weights is None:
+            layer.absent[part] = f"{type(module).__name__}.explain returned None"
+
+    def leave(self, module: nn.Module, args: Any, state: QueryState) -> None:
+        """Keep the queries of a layer, which ends with its refinement."""
+        if self.current in self._layers:
+            self.trace.layers[self.current].after = self._chosen(state)
+
+    def _chosen(self, state: QueryState) -> QueryState:
+        index = self.trace.queries.to(state.features.device)
+        return map_tensors(lambda tensor: tensor.detach()[:, index], state)
 
 
 def _checked(wanted: Collection[int] | None, existing: range, what: str) -> list[int]:

@@ -48,6 +48,7 @@ def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
         reason = f"the pose has a number larger than {_FARTHEST:.0e}"
         yield FrameProblem("c2w", reason, "correct it, or remove the frame")
         return
+    # Mirrored is told from sheared: the remedies differ.
     rotation = c2w[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     determinant = float(np.linalg.det(rotation))

@@ -17,6 +17,7 @@ def present_frames(
     exist, ValueError for poses and intrinsics that cannot be right.
     """
     listing = read_listing(folder, format, images)
+    # A listing of a stranger must not name other files of this machine.
     if not outside:
         refuse_outside(folder, listing)
     frames = [frame for frame in listing.frames if frame.split != "unused"]

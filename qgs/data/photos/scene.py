@@ -92,6 +92,7 @@ class PhotoScene(EncodedScene):
         self._frames = frames = [*map(upright, frames[: config.max_frames or None])]
         times = [frame.time for frame in frames if frame.time is not None]
         self.times = torch.tensor(times, dtype=torch.float64) if len({*times}) > 1 else None
+        # What a listing says of its splits goes before the option.
         if any(frame.split for frame in frames):
             self.held_out = tuple(i for i, frame in enumerate(frames) if frame.split == "test")
         else:
@@ -151,6 +152,7 @@ class PhotoScene(EncodedScene):
         photo = self._frames[frame]
         size = self.stored_size(frame)
         background = self._config.background
+        # Pixels are stored again only where EXIF turns them.
         if photo.turns:
             data = _upright_png(open_rgb(photo.path, background), photo)
         else:
@@ -212,6 +214,7 @@ class PhotoScene(EncodedScene):
         if frame.lens is not None:
             pixels = undistorted(np.array(image), frame.at_size(size), frame.lens, mode)
             image = Image.fromarray(pixels)
+        # A mean of depths at an edge would be a surface that is not there.
         kernel = Image.Resampling.NEAREST if mode == "nearest" else Image.Resampling.LANCZOS
         return self._crop(frame, size).image(image, kernel)
 
