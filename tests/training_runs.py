@@ -112,11 +112,11 @@ def read_jsonl(path):
 
 def change_samples(monkeypatch, change):
     """`change(sample, number, attempt)` alters each training sample in place, or raises."""
-    made = SampleStream._made
+    made = SampleStream._sample_after
 
     def changed(stream, number, attempt):
         sample = made(stream, number, attempt)
         change(sample, number, attempt)
         return sample
 
-    monkeypatch.setattr(SampleStream, "_made", changed)
+    monkeypatch.setattr(SampleStream, "_sample_after", changed)

@@ -43,8 +43,9 @@ def is_docstring(node: ast.AST) -> bool:
 
 def is_parallel(node: ast.AST) -> bool:
     """Tell whether a statement assigns several values at once."""
-    is_tuple = isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple)
-    return is_tuple and isinstance(node.value, ast.Tuple)
+    if not isinstance(node, ast.Assign):
+        return False
+    return isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple)
 
 
 def measure(text: str) -> Counter[str]:

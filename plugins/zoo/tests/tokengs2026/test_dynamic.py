@@ -78,9 +78,9 @@ def test_that_nothing_reads_which_queries_move_is_no_warning():
 
 
 def test_what_reads_dynamic_queries_is_refused_without_them():
-    attention, objective = problems_of(PUBLISHED, ["model.queries.dynamic=0"])
-    assert MOVES in attention.reason
-    assert f"`tokengs2026/dynamic` needs {MOVES}" in objective.reason
+    (problem,) = problems_of(PUBLISHED, ["model.queries.dynamic=0"])
+    for reader in ("block_causal", "dynamic"):
+        assert f"`tokengs2026/{reader}` needs {MOVES}" in problem.reason
 
 
 @pytest.fixture

@@ -59,25 +59,25 @@ def opened_reconstruction(
     model = load(record.model, device)
     recipe = resolve(model.recipe or {})
     wanted = name or record.scene
-    # at the recorded size, so that the scores before are those of the reconstruction
-    scene, seen = chosen_scene(recipe, photos, record.cameras.size, wanted)
+    # At the recorded size, so that the scores before are those of the reconstruction
+    chosen = chosen_scene(recipe, photos, record.cameras.size, wanted)
     # Photos that were named to be compared with are the only ones that stay aside, and with none
     # compared all are refined on; the record does not say so, its frames do.
-    default = bool(record.compared) and {*record.compared} <= {*scene.held_out}
+    default = bool(record.compared) and {*record.compared} <= {*chosen.scene.held_out}
     if not default:
-        scene, seen = chosen_scene(recipe, photos, record.cameras.size, wanted, holdout=False)
-    refuse_other_photos(record, scene, photos)
+        chosen = chosen_scene(recipe, photos, record.cameras.size, wanted, holdout=False)
+    refuse_other_photos(record, chosen.scene, photos)
     start = reconstruct_sample(
         model,
-        _sample(record, scene),
+        _sample(record, chosen.scene),
         record.world,
-        seen,
+        chosen.seen,
         record.gaussians.to(device),
         record.tuning,
     )
     if size is not None:
-        scene, seen = chosen_scene(recipe, photos, size, wanted, holdout=default)
-    return OpenedReconstruction(start=start, scene=scene, seen=seen)
+        chosen = chosen_scene(recipe, photos, size, wanted, holdout=default)
+    return OpenedReconstruction(start=start, scene=chosen.scene, seen=chosen.seen)
 
 
 def refuse_other_photos(record: Record, scene: Scene, photos: str) -> None:
