@@ -43,5 +43,6 @@ def gaussians():
     z = z + 1
     quats = torch.tensor([1.0, 0, 0, 0]).expand(1, 48, 4)
     means = torch.cat([(xy - 0.5) * z, z], -1)
-    scales, opacities = torch.full((1, 48, 3), 0.05), torch.full((1, 48), 0.8)
+    scales = torch.full((1, 48, 3), 0.05)
+    opacities = torch.full((1, 48), 0.8)
     return Gaussians(means, scales, quats, opacities, colours)

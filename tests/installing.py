@@ -15,7 +15,8 @@ def install(tmp_path_factory, monkeypatch):
     """
 
     def install(distribution, plugin, source, version="1.2", editable=False, group="qgs.plugins"):
-        folder, safe = tmp_path_factory.mktemp("site"), distribution.replace("-", "_")
+        folder = tmp_path_factory.mktemp("site")
+        safe = distribution.replace("-", "_")
         (folder / f"_test_{safe}.py").write_text(dedent(source))
         info = folder / f"{safe}-{version}.dist-info"
         info.mkdir()

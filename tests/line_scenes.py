@@ -18,7 +18,9 @@ class Line(Scene):
 
     def __init__(self, count, held_out=(), step=0.5, name=""):
         self.name = name or f"line{count}"
-        self.held_out, self.count, self.step = held_out, count, step
+        self.held_out = held_out
+        self.count = count
+        self.step = step
 
     @property
     def cameras(self):

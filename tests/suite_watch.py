@@ -90,7 +90,8 @@ class SuiteWatch:
         """What the whole fast suite does not keep; a run of some tests may cost what it will."""
         if not is_whole(self.config):
             return []
-        limit, count = MAX_SHARE * self.whole(), len(self.seconds)
+        limit = MAX_SHARE * self.whole()
+        count = len(self.seconds)
         found = [
             f"{name} takes {seconds:.1f} CPU seconds, more than a twentieth of all: "
             "make it smaller, share what it makes, or mark it slow"

@@ -14,7 +14,8 @@ class Tape(Scene):
 
     def __init__(self, file):
         with np.load(file) as arrays:
-            self._images, self._c2w = arrays["images"], arrays["c2w"]
+            self._images = arrays["images"]
+            self._c2w = arrays["c2w"]
         self.name = file.stem
         self.held_out = tuple(range(1, len(self._images), 3))
 

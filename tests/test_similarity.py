@@ -19,14 +19,17 @@ def slow(x, y, padding):
     offset = torch.arange(-5.0, 6.0, dtype=torch.float64)
     weights = torch.exp(-(offset[:, None] ** 2 + offset**2) / (2 * 1.5**2)).flatten()
     border = 5 if padding == "same" else 0
-    x, y = x.double(), y.double()
+    x = x.double()
+    y = y.double()
 
     def mean(image):
         windows = F.unfold(image.reshape(-1, 1, *image.shape[-2:]), 11, padding=border)
         return (weights / weights.sum() * windows.mT).sum(-1)
 
-    a, b = mean(x), mean(y)
-    variances, covariance = mean(x * x) - a * a + mean(y * y) - b * b, mean(x * y) - a * b
+    a = mean(x)
+    b = mean(y)
+    variances = mean(x * x) - a * a + mean(y * y) - b * b
+    covariance = mean(x * y) - a * b
     first = (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
     return (first * (2 * covariance + 9e-4) / (variances + 9e-4)).mean()
 

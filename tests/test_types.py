@@ -25,8 +25,10 @@ def zeros(*shape):
     return torch.zeros(shape)
 
 
-THREE, ONE = zeros(1, 2, 5, 3), zeros(1, 2, 5)
-RGB, ALPHA = zeros(1, 2, 3, 4, 5), zeros(1, 2, 1, 4, 5)
+THREE = zeros(1, 2, 5, 3)
+ONE = zeros(1, 2, 5)
+RGB = zeros(1, 2, 3, 4, 5)
+ALPHA = zeros(1, 2, 1, 4, 5)
 BALLS = [x[:, 0] for x in (THREE, THREE, zeros(1, 2, 5, 4), ONE, THREE)]
 
 
@@ -45,7 +47,8 @@ def test_what_does_not_fit_together_is_refused():
 
 
 def test_memo_does_not_leak_between_gradient_modes():
-    keys, rays = zeros(2, 4, 6, 8), torch.ones(2, 6, 6, requires_grad=True)
+    keys = zeros(2, 4, 6, 8)
+    rays = torch.ones(2, 6, 6, requires_grad=True)
     memory = ImageMemory(
         keys=keys, values=keys, features=zeros(2, 6, 32), patch_rays=rays, grid=(1, 2, 3)
     )
@@ -99,7 +102,8 @@ def test_the_most_opaque_keep_all_that_they_have():
 
 
 def test_containers_are_put_together_tensor_by_tensor():
-    one, other = rich_gaussians(3), rich_gaussians(4, seed=1)
+    one = rich_gaussians(3)
+    other = rich_gaussians(4, seed=1)
     both = concatenated([one, other], 1)
     assert both.count == 7
     assert torch.equal(both.sh[:, 3:], other.sh)

@@ -86,7 +86,8 @@ def saved_step(folder):
 
 def assert_equal_runs(first, second):
     """Same weights, optimiser state and random states to the bit, same history but for time."""
-    ours, theirs = parts_of(first), parts_of(second)
+    ours = parts_of(first)
+    theirs = parts_of(second)
     for parts in (ours, theirs):
         del parts["counters"]["seconds"]
     assert ours.keys() == theirs.keys()

@@ -6,7 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-HARMONICS, FEATURES = 8, 4
+HARMONICS = 8
+FEATURES = 4
 
 
 class VaryingHead(nn.Module):
@@ -14,7 +15,8 @@ class VaryingHead(nn.Module):
 
     def __init__(self, head):
         super().__init__()
-        self.head, self.config = head, head.config
+        self.head = head
+        self.config = head.config
         channels = head.gaussians_per_query * (3 * HARMONICS + FEATURES)
         generator = torch.Generator().manual_seed(4)
         self.linear = nn.Linear(head.linear.in_features, channels, bias=False)

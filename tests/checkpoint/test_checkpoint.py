@@ -76,7 +76,8 @@ def test_a_loaded_model_is_the_saved_one(model, saved):
     assert not loaded.training
     own, found = (dict(m.named_parameters()) for m in (model, loaded))
     torch.testing.assert_close(found, own, rtol=0, atol=0)
-    recipe, metadata = CheckpointFile(saved).recipe, metadata_of(saved)
+    recipe = CheckpointFile(saved).recipe
+    metadata = metadata_of(saved)
     assert recipe.tree == loaded.recipe == model.recipe
     assert metadata["qgs.version"] == qgs.__version__
     assert json.loads(metadata["qgs.plugins"]) == {n: v for n, (_, v) in recipe.releases.items()}
@@ -102,7 +103,8 @@ def test_a_model_without_a_step_is_saved_without_one(tmp_path):
     """As an imported one: what follows the training is at its end, in every copy."""
     ramp = "model.renderer.dilation={schedule: linear, values: [10, 0.5], at: [1, 9]}"
     recipe = resolve(RECIPES / "tokengs.yaml", [*SMALL, ramp])
-    first, second = tmp_path / "first.safetensors", tmp_path / "second.safetensors"
+    first = tmp_path / "first.safetensors"
+    second = tmp_path / "second.safetensors"
     tensors = {k: x.detach() for k, x in unique_tensors(recipe.build_model()).items()}
     write_checkpoint(first, tensors, recipe.tree, recipe.releases, {})
     save(qgs.load(first), second)
@@ -189,7 +191,8 @@ def test_sizes_are_compared_before_anything_is_allocated(saved, monkeypatch):
 
 def test_a_changed_letter_in_any_metadata_is_refused(saved):
     """Of the recipe, the step, the ranges, the seal itself, and their names."""
-    own, metadata = tensors_of(saved), metadata_of(saved)
+    own = tensors_of(saved)
+    metadata = metadata_of(saved)
     assert len(metadata) == 8
     for name, text in metadata.items():
         for changed in ({name: text[:-1] + "x"}, {name[:-1] + "x": text}):
@@ -200,7 +203,8 @@ def test_a_changed_letter_in_any_metadata_is_refused(saved):
 
 
 def test_files_of_the_format_without_a_seal_are_read(saved):
-    own, metadata = tensors_of(saved), metadata_of(saved)
+    own = tensors_of(saved)
+    metadata = metadata_of(saved)
     del metadata[SEAL]
     save_file(own, saved, metadata)
     must_refuse("lack", CheckpointFile, saved, kind=CheckpointError)

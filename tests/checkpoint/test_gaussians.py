@@ -84,7 +84,8 @@ def test_the_round_trip(tmp_path):
 
 
 def test_several_scenes_and_numbers_that_are_not_finite_leave_no_file(tmp_path):
-    broken, harmonic = random_gaussians(4), random_gaussians(4, harmonics=3)
+    broken = random_gaussians(4)
+    harmonic = random_gaussians(4, harmonics=3)
     broken.means[2, 0] = torch.nan
     harmonic.sh[1:3, 2, 0] = torch.inf
     for gaussians, words in (
@@ -121,7 +122,8 @@ def test_files_of_fewer_degrees_are_read(tmp_path):
         return path
 
     rest = [f"f_rest_{index}" for index in range(45)]
-    first, zeros = rest[0:3] + rest[15:18] + rest[30:33], rest[3:15] + rest[18:30]
+    first = rest[0:3] + rest[15:18] + rest[30:33]
+    zeros = rest[3:15] + rest[18:30]
     assert torch.equal(load_ply(written(first)).sh, given.sh)
     assert load_ply(written(zeros)).sh is None
     must_refuse("10 properties", load_ply, written(zeros[:10]))

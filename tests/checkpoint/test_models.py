@@ -72,7 +72,8 @@ def test_models_are_listed_and_checked(shipped):
 def test_half_precision_is_stored_and_loads_as_float32(shipped):
     result = run_qgs("export", "box/small", "--half", "--out", "half.safetensors")
     assert result.exit_code == 0, result.output
-    half, whole = load_file("half.safetensors"), load_file(shipped)
+    half = load_file("half.safetensors")
+    whole = load_file(shipped)
     for name, tensor in half.items():
         assert (tensor.dtype == torch.float16) == whole[name].is_floating_point()
     for name, tensor in qgs.load("half.safetensors").named_parameters():

@@ -56,7 +56,8 @@ def kinds(record):
 def test_everything_is_written_and_what_a_user_made_is_kept(
     checkpoint, photos, tmp_path, short_orbit
 ):
-    notes, old = tmp_path / "notes.ply", tmp_path / "views/00099_novel.png"
+    notes = tmp_path / "notes.ply"
+    old = tmp_path / "views/00099_novel.png"
     notes.write_text("mine")
     old.parent.mkdir()
     old.touch()

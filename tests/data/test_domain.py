@@ -103,7 +103,8 @@ def test_the_sentence():
 def test_what_helps_is_named_and_the_scale_comes_first():
     """A baseline that is too wide, and a field of view that is."""
     for half, focal, options in ((0.9, 8.0, ["scale", "frames"]), (0.1, 4.0, ["scale"])):
-        trained, found = domain(around(1, (-0.1, 0.1))), domain(around(1, (-half, half), focal))
+        trained = domain(around(1, (-0.1, 0.1)))
+        found = domain(around(1, (-half, half), focal))
         assert re.findall(r"\((scale|frames|inputs)\)", verdict(trained, found)) == options
         left = re.findall(r"\((scale|frames|inputs)\)", verdict(trained, found, ["scale"]))
         assert left == options[1:]
@@ -118,7 +119,8 @@ GROWING = "view_sampler.max_gap={schedule: linear, values: [4, 20], at: [0, 10]}
 def test_the_own_test_data_of_a_recipe_lie_inside(name, options, monkeypatch):
     monkeypatch.setattr(stream, "MEASURED", 128)
     recipe = resolve(f"recipes/tiny/{name}.yaml", options)
-    source, sampler = recipe.build_data(), recipe.build_view_sampler()
+    source = recipe.build_data()
+    sampler = recipe.build_view_sampler()
     trained = trained_domain(source, recipe.views, recipe.seed, sampler, recipe.training.steps)
     test = Domain()
     for sample in evaluation_samples(source, recipe.views, recipe.evaluation, sampler):

@@ -19,7 +19,8 @@ VIEWS = ViewsConfig(inputs=2, gap=(2, 5))
 class Strip(Line):
     """A line that counts what it decodes, or cannot be decoded."""
 
-    broken, decoded = None, 0
+    broken = None
+    decoded = 0
 
     def __init__(self, name, frames=8):
         super().__init__(frames, name=name)
@@ -111,7 +112,8 @@ def test_scenes_that_do_not_decode_are_told_and_the_rest_goes_on():
 
 
 def test_damaged_photo_folders_are_named_and_positions_never_move_in_silence(tmp_path):
-    photos, sets = synthetic(tmp_path / "photos", 5), tmp_path / "sets"
+    photos = synthetic(tmp_path / "photos", 5)
+    sets = tmp_path / "sets"
     index = {name: entry([0, 3], [2]) for name in ("broken", "cut", "gap", "good")}
     for name in index:
         write_nerfstudio(sets / name, photos)

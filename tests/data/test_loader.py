@@ -80,7 +80,8 @@ def test_worker_processes_change_nothing_and_end_with_an_error_that_names_the_fi
 
 def test_reading_ahead_leaves_the_autocast_of_training_alone():
     """Threads share the cache of cast weights; a thread that empties it changes gradients."""
-    weight, x = torch.eye(4, requires_grad=True), torch.ones(1, 4)
+    weight = torch.eye(4, requires_grad=True)
+    x = torch.ones(1, 4)
     with torch.autocast("cpu", torch.bfloat16):
         first = torch.nn.functional.linear(x, weight).grad_fn
         batches(ROOMS, 2, 1)

@@ -57,7 +57,8 @@ def test_depth_maps(folder):
 
 def test_depth_that_is_not_finite_is_unknown(folder):
     depth = np.full((30, 40, 1), 2000.0)
-    depth[3, 4], depth[5, 6] = np.nan, np.inf
+    depth[3, 4] = np.nan
+    depth[5, 6] = np.inf
     np.save(folder / "depth.npy", depth)
     change(folder, 0, depth_file_path="depth.npy")
     assert read(folder).depths([0])[0, 0, [3, 5, 7], [4, 6, 8]].tolist() == [0, 0, 2]

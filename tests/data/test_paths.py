@@ -23,13 +23,17 @@ def test_local_paths_are_told_from_urls(tmp_path, monkeypatch):
 
 
 def test_photos_of_a_store_are_read_several_at_a_time(tmp_path, monkeypatch):
-    folder, url = tmp_path / "scene", f"memory://{tmp_path.name}"
+    folder = tmp_path / "scene"
+    url = f"memory://{tmp_path.name}"
     write_nerfstudio(folder, synthetic(tmp_path / "photos"))
     uploaded(folder, UPath(url))
-    expected, photos = scene(folder).images([0, 2, 1]), scene(url)
-    source, views = opened(url, holdout=0), ViewsConfig(inputs=2, targets=1, gap=(1, 3))
+    expected = scene(folder).images([0, 2, 1])
+    photos = scene(url)
+    source = opened(url, holdout=0)
+    views = ViewsConfig(inputs=2, targets=1, gap=(1, 3))
     assert SampleStream(source, views, 0).batch([0]).scenes
-    store, together = type(UPath(url).fs), threading.Barrier(3)
+    store = type(UPath(url).fs)
+    together = threading.Barrier(3)
     whole = store._open
 
     def waiting(self, path, *given, **options):

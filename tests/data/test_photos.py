@@ -108,7 +108,8 @@ def test_files_outside_of_the_folder_are_read_only_if_allowed(tmp_path):
 
 def test_where_the_lens_would_fold_the_photo_it_sees_nothing(tmp_path):
     """x (1 - 0.6 x^2) is largest at 0.745, and x of its angle's polynomial at an angle of it."""
-    largest, wide = math.sqrt(1 / 1.8), {"fl_x": 30.0, "fl_y": 30.0, "cx": 32.0, "cy": 24.0}
+    largest = math.sqrt(1 / 1.8)
+    wide = {"fl_x": 30.0, "fl_y": 30.0, "cx": 32.0, "cy": 24.0}
     for model, lens, turn in (
         ("OPENCV", RadialTangential, largest),
         ("OPENCV_FISHEYE", Fisheye, math.tan(largest)),
@@ -130,9 +131,12 @@ def test_black_edges_of_undistorted_photos_are_cut_off(tmp_path):
         scene = read(distorted, size=size)
         image = scene.images([0])[0] * 255
         assert (image[1] > 240).all()  # resampling overshoots a little
-        row, column = size[0] // 2, size[1] - 4  # a pixel still shows what its camera says
+        # a pixel still shows what its camera says
+        row = size[0] // 2
+        column = size[1] - 4
         fx, fy, cx, cy = scene.cameras.intrinsics[0].tolist()
-        x, y = (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy
+        x = (column + 0.5 - cx) / fx
+        y = (row + 0.5 - cy) / fy
         expected = 36 + 100 * x * (1 + 0.9 * (x * x + y * y)) - 0.5
         assert image[0, row, column].item() == pytest.approx(3 * expected + 9, abs=3)
 

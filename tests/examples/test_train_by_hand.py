@@ -13,7 +13,8 @@ EXAMPLE = Path(__file__).parents[2] / "docs/examples/train_by_hand.py"
 
 def test_it_is_short_trains_and_saves_a_scene(tmp_path, monkeypatch, capsys):
     assert len(EXAMPLE.read_text().splitlines()) <= 120
-    recipe, out = tmp_path / "recipe.yaml", tmp_path / "scene.ply"
+    recipe = tmp_path / "recipe.yaml"
+    out = tmp_path / "scene.ply"
     smaller = ["model.queries.count=64", "data.image_size=[32, 32]"]
     recipe.write_text(annotated(resolve("tiny/locus.yaml", smaller)))
     command = [EXAMPLE, recipe, "--steps", "11", "--out", out]

@@ -40,7 +40,8 @@ def test_they_are_the_real_harmonics_by_degree_and_order():
 
 
 def test_turned_coefficients_give_the_values_of_before_degree_by_degree():
-    d, mixed = directions(), torch.randn(4, 15, 3).double()
+    d = directions()
+    mixed = torch.randn(4, 15, 3).double()
     mixed[0, 3:8] = 0
     for count in SH_COUNTS:
         sh = mixed[:, :count]

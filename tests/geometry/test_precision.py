@@ -67,7 +67,8 @@ class Layer(nn.Module):
 
 
 def test_a_method_leaves_autocast_for_a_state_and_compiles_without_a_break():
-    layer, given = Layer(), state(torch.bfloat16)
+    layer = Layer()
+    given = state(torch.bfloat16)
     expected = layer(given)
     compiled = torch.compile(layer, backend="eager", fullgraph=True)
     with torch.autocast("cpu", torch.bfloat16):
@@ -81,7 +82,8 @@ def test_autocast_is_left_for_the_device_of_the_tensors(monkeypatch):
     autocast = Mock(return_value=nullcontext())
     monkeypatch.setattr(torch, "is_autocast_enabled", lambda device: True)
     monkeypatch.setattr(torch, "autocast", autocast)
-    elsewhere, here = QueryState(torch.ones(1, 2, 3, device="meta")), torch.ones(1)
+    elsewhere = QueryState(torch.ones(1, 2, 3, device="meta"))
+    here = torch.ones(1)
     for args, left in (
         ((elsewhere,), []),
         (({"a": [here]},), ["cpu"]),

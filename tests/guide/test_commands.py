@@ -34,7 +34,8 @@ def commands():
 
 def parse(group, words):
     """Let the command line read `words`, without running anything; raises its UsageError."""
-    command, context = group, group.make_context("qgs", list(words))
+    command = group
+    context = group.make_context("qgs", list(words))
     while isinstance(command, TyperGroup):
         rest = [*context._protected_args, *context.args]
         name, command, rest = command.resolve_command(context, rest)

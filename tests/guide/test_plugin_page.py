@@ -64,7 +64,8 @@ def test_the_second_component_computes_its_formula(package):
 
 
 def test_the_field_starts_changes_and_places(package):
-    depth, dims = package.depth, ModelDims(16, 2, 1)
+    depth = package.depth
+    dims = ModelDims(16, 2, 1)
     queries = depth.DepthQueries(depth.DepthQueries.Config(count=4), dims)
     refinement = depth.DepthRefinement(depth.DepthRefinement.Config(), dims)
     centers = depth.DepthCenters(depth.DepthCenters.Config(), dims)
@@ -78,7 +79,8 @@ def test_the_field_starts_changes_and_places(package):
 @torch.no_grad()
 def test_every_second_head_reads_close_rays_alone_and_says_so(package):
     case = Case(package.NearbyAttention.Config(reach=0.5))
-    inputs, attention = inputs_of(case), case.build()
+    inputs = inputs_of(case)
+    attention = case.build()
     explained = attention.explain(*inputs.values(), torch.arange(6))
     shared = RayBiasedCrossAttention.bias(attention, *inputs.values()).dense()
     assert torch.equal(explained.geometry[:, 0], shared)

@@ -10,7 +10,8 @@ from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering
 GOLDEN = load_file(Path(__file__).parents[1] / "golden" / "loss_a.safetensors")
 """Inputs and results of the released losses."""
 CAMERAS = Cameras(GOLDEN["c2w"], GOLDEN["intrinsics"], (16, 24))
-PREDICTED, TRUTH = GOLDEN["images_pred"], GOLDEN["images_gt"]
+PREDICTED = GOLDEN["images_pred"]
+TRUTH = GOLDEN["images_gt"]
 
 
 NO_POINTS = torch.zeros(2, 0, 3)

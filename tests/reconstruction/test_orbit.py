@@ -5,7 +5,8 @@ from qgs.reconstruction.saving import orbit
 
 def test_the_loop_is_smooth_closed_and_rigid_and_passes_between_the_inputs(cameras):
     c2w = orbit(cameras, depth=1.0, frames=60).c2w[0]
-    rotation, eyes = c2w[:, :3, :3], c2w[:, :3, 3]
+    rotation = c2w[:, :3, :3]
+    eyes = c2w[:, :3, 3]
     torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(60, 3, 3))
     assert (torch.linalg.det(rotation) > 0).all()
     steps = (eyes.roll(-1, 0) - eyes).norm(dim=-1)

@@ -32,10 +32,8 @@ def test_further_photos_lie_between_and_are_not_compared_with():
 
 
 def test_without_further_photos_an_input_is_judged_or_inputs_alone():
-    views, model = (
-        ViewsConfig(inputs=2, scale="search"),
-        qgs.compose("tiny/tokengs.yaml", ["model.queries.count=12"]),
-    )
+    views = ViewsConfig(inputs=2, scale="search")
+    model = qgs.compose("tiny/tokengs.yaml", ["model.queries.count=12"])
     search = scale.ScaleSearch(model, views)
     chosen = search(Walk(), (0, 2, 4), (1, 3, 5))
     (three,) = search.found.values()

@@ -102,7 +102,8 @@ FIXED_BY_GSPLAT = {"alpha_min": 0.2, "alpha_cap": 0.5, "transmittance_min": 0.3}
 
 
 def test_every_option_has_its_effect(build):
-    scene, plain = make_scene(scale=0.2), build()
+    scene = make_scene(scale=0.2)
+    plain = build()
     fixed = {} if plain.name == "gsplat" else FIXED_BY_GSPLAT
     for option, value in (OPTIONS | fixed).items():
         rendering, _ = compared(build(**{option: value}), scene, **{option: value})

@@ -14,7 +14,8 @@ from qgs.renderers import TorchRenderer
 
 def splat(scene, g, w2c, lens, size):
     """Pixel, inverse of J W S W^T J^T + 0.3, depth; J by autograd, held 15 % past the border."""
-    focal, centre = lens[:2], lens[2:]
+    focal = lens[:2]
+    centre = lens[2:]
 
     def pixel(point):
         return focal * point[:2] / point[2] + centre
@@ -41,11 +42,13 @@ def test_images_follow_the_formulas():
     colors = seen_colors(gaussians, cameras)
     background = torch.tensor(config.background, dtype=torch.float64)
     for b, v in product(range(2), range(2)):
-        scene, lens = gaussians[b], cameras.intrinsics[b, v]
+        scene = gaussians[b]
+        lens = cameras.intrinsics[b, v]
         splats = [splat(scene, g, cameras.w2c[b, v], lens, torch.tensor([5, 4])) for g in range(15)]
         order = sorted(range(15), key=lambda g: splats[g][2])
         for row, column in product(range(4), range(5)):
-            transmittance, sums = 1.0, torch.zeros(6, dtype=torch.float64)
+            transmittance = 1.0
+            sums = torch.zeros(6, dtype=torch.float64)
             for g in order:
                 place, conic, depth = splats[g]
                 off = torch.tensor([column + 0.5, row + 0.5]) - place
@@ -68,7 +71,8 @@ def test_images_follow_the_formulas():
 
 def test_a_moved_and_enlarged_world_looks_the_same():
     gaussians, cameras = make_scene(views=2, harmonics=15)
-    pose, c2w = torch.matrix_power(cameras.c2w[0, 1], 30), cameras.c2w.clone()
+    pose = torch.matrix_power(cameras.c2w[0, 1], 30)
+    c2w = cameras.c2w.clone()
     c2w[..., :3, 3] *= 2
     render = TorchRenderer(RendererConfig())
     before = render(gaussians, cameras)

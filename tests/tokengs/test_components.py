@@ -63,7 +63,8 @@ def test_supervision_weights():
 
 def test_a_bias_is_for_all_heads_or_for_each():
     core = CrossAttentionCore(16, 2)
-    features, bias = torch.randn(2, 3, 16), torch.randn(2, 2, 3, 5)
+    features = torch.randn(2, 3, 16)
+    bias = torch.randn(2, 2, 3, 5)
     keys, values = torch.randn(2, 2, 2, 5, 8).unbind()
     logits = core.project(features) @ keys.mT / 8**0.5
     for given, by_head in (
@@ -80,7 +81,9 @@ def test_attention_of_other_shapes_is_refused():
     def weights(*shapes):
         return AttentionWeights(*(shape and torch.zeros(shape) for shape in shapes))
 
-    whole, flat, long = (2, 4, 3, 5), (2, 3, 5), (2, 4, 3, 6)
+    whole = (2, 4, 3, 5)
+    flat = (2, 3, 5)
+    long = (2, 4, 3, 6)
     faults = (
         fault(
             r"content .* \(2, 3, 5\), not \(B, h, Q, T\)",

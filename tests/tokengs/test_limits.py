@@ -49,12 +49,14 @@ def test_limits_of_losses_are_published_by_default_and_matter():
     first = slice(1)
     depths = torch.full_like(TRUTH[:, first, :1], 1.5)
     views = Views(TRUTH[:, first], CAMERAS[:, first], depths=depths)
-    means, opacities = GOLDEN["points"], GOLDEN["opacity"][..., 0]
+    means = GOLDEN["points"]
+    opacities = GOLDEN["opacity"][..., 0]
     losses = {loss.name: loss for loss in (*LOSSES, *plugin.components)}
     wrong = []
     for row in TABLE["losses"]:
         options = dict(row)
-        loss, beside = losses[options.pop("loss")], options.pop("beside", {})
+        loss = losses[options.pop("loss")]
+        beside = options.pop("beside", {})
         for option, (published, other) in options.items():
             configs = [loss.Config(**beside), loss.Config(**{**beside, option: other})]
             terms = [judged(loss(config), views, means, opacities)[loss.name] for config in configs]
@@ -87,7 +89,8 @@ def test_the_recipes_have_the_limits_of_their_releases():
         ("locus/dl3dv.yaml", 10.0, 1e-4, 100.0, 1000.0),
     ):
         model = resolve(recipe).tree["model"]
-        head, centers = model["head"], model["centers"]
+        head = model["head"]
+        centers = model["centers"]
         found = [head["scale_input_limit"], head["quat_eps"]]
         found += [centers["input_limit"], centers["output_limit"]]
         assert found == published, recipe

@@ -17,7 +17,8 @@ from qgs.tokengs import (
 
 UNBOUNDED = FreeCenters.Config(output_limit=None)
 LARGE = "large_numbers_stay_finite"
-GRADIENTS, INPUTS = "gradients_match_differences", "gradients_reach_inputs"
+GRADIENTS = "gradients_match_differences"
+INPUTS = "gradients_reach_inputs"
 
 
 class CannotDefault(MlpFeedForward):

@@ -24,7 +24,8 @@ def test_every_check_has_a_mutant() -> None:
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=str)
 def test_the_mutant_is_caught_by_the_check_that_is_meant(mutant: Mutant) -> None:
-    case, meant = mutant.to_case(), CHECKS[mutant.check]
+    case = mutant.to_case()
+    meant = CHECKS[mutant.check]
     result = run_check(meant, case)
     assert result.verdict == "failed", result
     assert mutant.seen in result.message

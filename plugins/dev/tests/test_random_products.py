@@ -23,11 +23,13 @@ KNOWN = tomllib.loads(Path(__file__).with_name("random_products.toml").read_text
 PLUGINS: list[str] = KNOWN["plugins"]
 LAYER = ("layer", *SUBLAYER_SLOTS, "refinement")
 DRAWN = ("encoder", "queries", *LAYER, "head", "centers", "objective", "losses")
-DRAWS, LEAST = 300, 60
+DRAWS = 300
+LEAST = 60
 """Recipes that are drawn; how many of them must train, and how many must be refused."""
 
 SIZES = Sizes(batch=1, views=4, image=(16, 24))
-WIDTH, HEADS = 16, 2
+WIDTH = 16
+HEADS = 2
 Choices = dict[str, list[tuple[type[Component], dict[str, Any]]]]
 
 
@@ -134,7 +136,9 @@ def _train(recipe: Recipe) -> None:
 
 @pytest.mark.slow
 def test_each_product_trains_or_is_refused() -> None:
-    trained, refused, faults = list[Recipe](), 0, list[str]()
+    trained = list[Recipe]()
+    refused = 0
+    faults = list[str]()
     for seed in range(DRAWS):
         tree = _drawn(random.Random(seed))
         try:

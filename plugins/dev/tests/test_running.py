@@ -23,7 +23,8 @@ from qgs.tokengs import MlpFeedForward
 
 CASE = Case(MlpFeedForward.Config())
 CACHES = Case(CachesByShape.Config())
-STATE, FROZEN = "forward_keeps_no_state", "config_round_trip"
+STATE = "forward_keeps_no_state"
+FROZEN = "config_round_trip"
 
 
 def test_an_error_is_reported_with_its_place_in_the_component() -> None:

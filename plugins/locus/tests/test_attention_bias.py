@@ -79,7 +79,8 @@ def test_a_pass_without_gradients_comes_before_one_with_them(monkeypatch):
 def test_what_is_frozen_gets_no_gradient_and_the_others_get_the_same(monkeypatch):
     given = case(SIZES)
     best = exact(RayBias, given, LEARNT)
-    made, of_bias = [], AttentionBias.gradients
+    made = []
+    of_bias = AttentionBias.gradients
 
     def kept(*read):
         made.append(of_bias(*read))

@@ -45,7 +45,8 @@ def test_frustum_centers_lie_in_the_frustum():
 
 
 def test_linear_offsets_count_in_radii():
-    state, offsets = _state(), torch.randn(2, 5, 3, 3)
+    state = _state()
+    offsets = torch.randn(2, 5, 3, 3)
     means = made(RadiusScaledCenters, offset="linear")(offsets, state)
     radius = F.softplus(state[RAW_RADIUS])[:, :, None]
     assert_close(means, state[CENTER][:, :, None] + radius * offsets)

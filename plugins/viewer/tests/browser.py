@@ -28,8 +28,11 @@ class Page:
     """
 
     def __init__(self, socket):
-        self._socket, self._number = socket, 0
-        self.requests, self.errors, self.targets = [], [], []
+        self._socket = socket
+        self._number = 0
+        self.requests = []
+        self.errors = []
+        self.targets = []
         self._listen()
 
     def _listen(self, **to):
@@ -73,7 +76,9 @@ class Page:
         self.call("Page.navigate", url="about:blank")
         time.sleep(1)
         self.evaluate("0")  # collects events
-        self.requests, self.errors, self.targets = [], [], []
+        self.requests = []
+        self.errors = []
+        self.targets = []
         self.call("Page.navigate", url=url)
 
     def evaluate(self, code):

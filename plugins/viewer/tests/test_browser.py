@@ -167,7 +167,8 @@ def _slide(page):
         page.key("PageUp", 33)
     share = page.evaluate(value)
     assert 20 < share < 60
-    mixed, cut = shown(), int(truth.shape[1] * share / 100)
+    mixed = shown()
+    cut = int(truth.shape[1] * share / 100)
     assert abs(truth - render).mean() > 10
     np.testing.assert_allclose(mixed[:, : cut - 8], truth[:, : cut - 8], atol=3)
     np.testing.assert_allclose(mixed[:, cut + 8 :], render[:, cut + 8 :], atol=3)

@@ -28,7 +28,8 @@ def test_supports_and_attention_are_those_of_a_traced_pass(kind):
     states = [layers[1].before, *(layer.after for layer in layers.values())]
     assert scene.attention(5, 0) is None
     for layer, state in enumerate(states):
-        found, expected = scene.support(layer), model.queries.support(state)
+        found = scene.support(layer)
+        expected = model.queries.support(state)
         assert (found is None) == (expected is None) == (kind == "tokengs")
         if found:
             assert_close(vars(found), vars(expected.to(torch.float64)))
@@ -64,7 +65,8 @@ def test_other_inputs_leave_the_scene_where_it_is():
         scene = source.scene_of(frames)
         c2w = scene.views.cameras.c2w[0].double()
         shown = source.cameras().c2w[list(frames)]
-        turned, places = scene.placement.rotation @ c2w[:, :3, :3], c2w[:, :3, 3]
+        turned = scene.placement.rotation @ c2w[:, :3, :3]
+        places = c2w[:, :3, 3]
         assert_close(turned, shown[:, :3, :3], rtol=0, atol=1e-5)
         assert_close(scene.placement.points(places), shown[:, :3, 3], rtol=0, atol=1e-5)
 

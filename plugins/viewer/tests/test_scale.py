@@ -15,7 +15,8 @@ from qgs.drawing.images import rgb_picture, write_png
 from qgs.recipe import resolve
 from qgs.reconstruction import scale
 
-MODEL, UNIT = "rooms/tokengs-64", 7.0
+MODEL = "rooms/tokengs-64"
+UNIT = 7.0
 
 
 @pytest.fixture(scope="module")

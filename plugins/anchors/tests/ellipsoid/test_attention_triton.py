@@ -127,7 +127,8 @@ def test_kernels_compile_for_gpus_that_are_not_here(
     driver = import_module("triton.runtime.driver").driver
     target = import_module("triton.backends.compiler").GPUTarget("cuda", arch, 32)
     attention = import_module("qgs_locus.kernels.attention_triton").TritonAttention
-    compiled, run = [], jit.run
+    compiled = []
+    run = jit.run
 
     def compile_alone(self, *args, warmup, **kwargs):
         compiled.append(run(self, *args, warmup=True, **kwargs))

@@ -42,7 +42,8 @@ def test_a_turn_is_about_an_axis_of_the_world_and_never_half_a_turn():
         angle = 2 * math.atan(length / 2)
         quat = turned(about_z, torch.tensor([length, 0.0, 0.0]).double())
         assert_close(quat.norm().item(), 1.0)
-        c, s = math.cos(angle), math.sin(angle)
+        c = math.cos(angle)
+        s = math.sin(angle)
         about_x = torch.tensor([[1.0, 0, 0], [0, c, -s], [0, s, c]]).double()
         assert_close(quat_to_matrix(quat), about_x @ quat_to_matrix(about_z))
 
@@ -65,7 +66,8 @@ def test_queries_give_what_they_learned_in_the_form_that_they_promise():
 
 
 def test_attention_and_pictures_speak_of_one_ellipsoid():
-    state, rays = _state(), torch.cat([0.5 * torch.randn(2, 24, 3), torch.randn(2, 24, 3)], -1)
+    state = _state()
+    rays = torch.cat([0.5 * torch.randn(2, 24, 3), torch.randn(2, 24, 3)], -1)
     memory = ImageMemory(torch.randn(2, 24, 16), patch_rays=rays)
     chosen = {"sigma0": 0.3, "sigma_sq_min": 0.05, "bias_min": -7.0, "gamma_init": 0.4}
     bias = made(EllipsoidCrossAttention, **chosen, **OFFSET).bias(state, memory).dense()
@@ -80,13 +82,15 @@ def test_attention_and_pictures_speak_of_one_ellipsoid():
 
 
 def test_the_step_of_a_centre_is_linear_on_demand():
-    refinement, state = made(EllipsoidRefinement, center_step="linear"), _state()
+    refinement = made(EllipsoidRefinement, center_step="linear")
+    state = _state()
     expected = state[CENTER] + refinement.center_mlp(state.features)
     assert_close(refinement(state)[CENTER], expected)
 
 
 def test_a_refinement_that_starts_at_zero_can_learn():
-    refinement, state = made(EllipsoidRefinement, zero_init=True), _state()
+    refinement = made(EllipsoidRefinement, zero_init=True)
+    state = _state()
     refined = refinement(state)
     assert_close(refined.fields, state.fields)
     sum((field * torch.randn_like(field)).sum() for field in refined.fields.values()).backward()
@@ -95,7 +99,8 @@ def test_a_refinement_that_starts_at_zero_can_learn():
 
 
 def test_centers_follow_their_formula():
-    state, offsets = _state(), torch.randn(2, 6, 3, 3)
+    state = _state()
+    offsets = torch.randn(2, 6, 3, 3)
     local = F.softplus(state[RAW_RADII])[:, :, None] * posact(offsets)
     steps = torch.einsum("bnij,bnkj->bnki", quat_to_matrix(state[ROTATION]), local)
     means = made(AxisScaledCenters)(offsets, state)
@@ -103,7 +108,8 @@ def test_centers_follow_their_formula():
 
 
 def test_a_radius_along_a_direction_reaches_the_surface():
-    radii, quats = 0.1 + torch.rand(2, 5, 3), F.normalize(torch.randn(2, 5, 4, 4), dim=-1)
+    radii = 0.1 + torch.rand(2, 5, 3)
+    quats = F.normalize(torch.randn(2, 5, 4, 4), dim=-1)
     surface = quat_to_matrix(quats) * radii_along(radii, quats)[..., None, :]
     in_ball = surface / radii[:, :, None, :, None]
     assert_close(in_ball.norm(dim=-2), torch.ones(2, 5, 4, 3))
@@ -114,7 +120,8 @@ def test_gaussians_turn_and_grow_with_their_anchor():
     plain = made(GaussianHead, gaussians_per_query=3)
     plain.load_state_dict(head.state_dict())
     state = _state()
-    local, placed = plain(state), head(state)
+    local = plain(state)
+    placed = head(state)
     expected = anchor_rotation(state[ROTATION])[:, :, None] @ quat_to_matrix(local.quats)
     assert_close(quat_to_matrix(placed.quats), expected, atol=1e-5, rtol=0)
     radii = F.softplus(state[RAW_RADII])
@@ -124,7 +131,8 @@ def test_gaussians_turn_and_grow_with_their_anchor():
 
 
 def test_quaternions_of_no_use_become_the_identity():
-    head, state = made(EllipsoidHead, gaussians_per_query=2), _state()
+    head = made(EllipsoidHead, gaussians_per_query=2)
+    state = _state()
     with torch.no_grad():
         head.linear.weight.zero_()
         head.linear.bias.view(2, 14)[1, 9:13] = 1e-6

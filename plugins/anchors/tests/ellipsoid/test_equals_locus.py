@@ -61,7 +61,8 @@ def _shared(layer):
 
 @pytest.mark.parametrize(("radius_refined", "bound"), [(False, "floor"), (True, "offset")])
 def test_every_tensor_of_every_layer_is_that_of_locusgs(radius_refined, bound):
-    models, photos = _pair(radius_refined, bound), odd_views(2, 32, 40)
+    models = _pair(radius_refined, bound)
+    photos = odd_views(2, 32, 40)
     theirs, ours = (model(photos, layers=(1, 2, 3)) for model in models)
     for number, expected in theirs.layers.items():
         seen = ours.layers[number]

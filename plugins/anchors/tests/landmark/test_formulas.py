@@ -21,7 +21,9 @@ from qgs.tokengs.blocks import split_heads
 from qgs.train.initial import initialise
 from qgs.types import Cameras, ImageMemory, QueryState, Rendering, Views
 
-GRID, SIZE, PATCH = (2, 4, 6), (16, 24), 4
+GRID = (2, 4, 6)
+SIZE = (16, 24)
+PATCH = 4
 TOKENS = math.prod(GRID)
 BY_PHOTO = torch.arange(TOKENS) // (TOKENS // 2)
 """Photos of the tokens; queries of a number take photos in turn."""
@@ -207,7 +209,8 @@ def test_what_an_anchor_reads_is_written_out():
 
 
 def test_nobody_reads_what_is_no_query():
-    module, mask = attention(6), drawn(0, 2, 40) < 0.2
+    module = attention(6)
+    mask = drawn(0, 2, 40) < 0.2
     read = module(CLOUD.replace(mask=mask))
     for scene, held in enumerate(mask):
         features, center = (x[scene, held][None] for x in (CLOUD.features, CLOUD[CENTER]))

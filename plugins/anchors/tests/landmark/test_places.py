@@ -30,7 +30,8 @@ CPU = torch.device("cpu")
 
 
 def test_bilinear_features_are_those_of_torch():
-    maps, place = torch.randn(2, 72, 5).double(), torch.rand(2, 50, 2).double()
+    maps = torch.randn(2, 72, 5).double()
+    place = torch.rand(2, 50, 2).double()
     view = torch.randint(3, (50,))
     images = maps.unflatten(1, GRID)[:, view].movedim(-1, 2).flatten(0, 1)
     at = 2 * place.view(100, 1, 1, 2) - 1

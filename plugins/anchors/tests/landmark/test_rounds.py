@@ -58,7 +58,8 @@ def run(model, layers, state, memory):
 
 @torch.no_grad()
 def test_rounds_run_the_last_layers_on_the_first_memory():
-    model, given = built(), views()
+    model = built()
+    given = views()
     found = model(given, layers=[1])
     memory = after = model.encoder(given)
     state = model.queries(memory, given)
@@ -77,7 +78,8 @@ def test_rounds_run_the_last_layers_on_the_first_memory():
 
 @torch.no_grad()
 def test_a_built_model_makes_other_numbers_of_rounds():
-    model, given = built(), views()
+    model = built()
+    given = views()
     for rounds in (0, 1, 4):
         model.feedback.rounds = rounds
         assert list(model(given).layers) == [3 + 2 * n for n in range(rounds + 1)]
@@ -96,7 +98,8 @@ def test_an_evaluation_sets_the_number_of_rounds(tmp_path):
 
     def scores(made, asked):
         torch.manual_seed(0)
-        file, out = tmp_path / f"{made}.safetensors", tmp_path / f"{made}{asked}"
+        file = tmp_path / f"{made}.safetensors"
+        out = tmp_path / f"{made}{asked}"
         qgs.save(built(*rooms, f"model.feedback.rounds={made}"), file)
         result = run_qgs("eval", file, "--set", f"model.feedback.rounds={asked}", "--out", out)
         assert result.exit_code == 0, result.output
@@ -111,7 +114,9 @@ def test_an_evaluation_sets_the_number_of_rounds(tmp_path):
 def test_training_supervises_every_round_it_draws_and_learns():
     """The total is that of the layers and of the ends of rounds, later ones weighing more."""
     recipe = resolve(RECIPE)
-    model, given, ends = recipe.build_model().train(), views(side=16), set()
+    model = recipe.build_model().train()
+    given = views(side=16)
+    ends = set()
     passes = TrainingPass(recipe, model)
     for seed in range(3):
         torch.manual_seed(seed)
@@ -134,7 +139,8 @@ def test_training_supervises_every_round_it_draws_and_learns():
 
 @torch.no_grad()
 def test_rounds_are_traced_as_layers_are():
-    model, given = built(), views()
+    model = built()
+    given = views()
     with qgs.trace(model, queries=[1, 3]) as trace:
         found = model(given, layers=range(1, 8))
     after = {number: layer.after.features for number, layer in trace.layers.items()}
@@ -179,7 +185,8 @@ def test_a_model_without_rounds_starts_one_with_rounds(tmp_path):
     plain = built(NO_ROUNDS)
     save(plain, tmp_path / "plain.safetensors")
     grown = resolve(RECIPE, (f"init_from={tmp_path}/plain.safetensors",))
-    model, given = grown.build_model().eval(), views()
+    model = grown.build_model().eval()
+    given = views()
     said = initialise(model, grown)
     assert "feedback.marker: none -> (32,)" in said
     assert "learned with model.feedback.type: qgs/none (here landmark/rendered)" in said

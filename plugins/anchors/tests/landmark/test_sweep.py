@@ -11,7 +11,8 @@ from torch.testing import assert_close
 from qgs.geometry.rays import camera_rays
 from qgs.types import Cameras, ImageMemory, Views
 
-SIZE, WALL = (24, 32), 1.5
+SIZE = (24, 32)
+WALL = 1.5
 """H x W; depth of the wall z = WALL, that the first camera looks at."""
 DEPTHS = torch.tensor([0.8, 1.1, WALL, 2.0, 3.0]).double()
 FIRST = torch.zeros(1, dtype=torch.long)

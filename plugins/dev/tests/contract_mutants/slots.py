@@ -175,7 +175,8 @@ class OrdersTokensByColumn(ChangedEncoder):
             x = x.unflatten(tokens, memory.grid).transpose(tokens + 1, tokens + 2)
             return x.flatten(tokens, tokens + 2)
 
-        keys, values = turned(memory.keys, 2), turned(memory.values, 2)
+        keys = turned(memory.keys, 2)
+        values = turned(memory.values, 2)
         return replace(memory, keys=keys, values=values, features=turned(memory.features, 1))
 
 

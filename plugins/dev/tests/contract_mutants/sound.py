@@ -65,7 +65,8 @@ class FusesInHalf(ContentCrossAttention):
     """Attention by one kernel in half precision, spelled out in any other."""
 
     def forward(self, state, memory):
-        keys, values = memory.keys, memory.values
+        keys = memory.keys
+        values = memory.values
         query = self.core.project(state.features).to(values.dtype)
         if values.dtype == torch.bfloat16:
             read = F.scaled_dot_product_attention(query, keys, values)

@@ -165,7 +165,8 @@ class BiasesInHalf(ContentCrossAttention):
         return {**PLACE, **{name: MEMORY_FIELDS[name] for name in memory}}
 
     def bias(self, state, memory):
-        center, directions = state["place.center"], memory.patch_rays[..., 3:]
+        center = state["place.center"]
+        directions = memory.patch_rays[..., 3:]
         return (center @ directions.transpose(-1, -2)).to(center)
 
     def forward(self, state, memory):

@@ -40,7 +40,8 @@ def test_the_head_follows_its_formula():
     assert colors.min() < 0 < 1 < colors.max()
     out = head(state)
     found = (out.offsets, out.scales, out.quats, out.opacities, out.colors)
-    scale, quats = 0.02 * F.softplus(scale), F.normalize(quats, dim=-1)
+    scale = 0.02 * F.softplus(scale)
+    quats = F.normalize(quats, dim=-1)
     assert_close(found, (offsets, scale, quats, opacity[..., 0].sigmoid(), colors.clamp(0, 1)))
 
 

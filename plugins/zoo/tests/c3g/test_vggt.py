@@ -121,7 +121,8 @@ def test_a_checkpoint_needs_no_file_of_weights(weights, tmp_path):
     model = recipe.build_model().eval()
     qgs.save(model, tmp_path / "checkpoint.safetensors")
     weights.unlink()
-    loaded, given = qgs.load(tmp_path / "checkpoint.safetensors"), odd_views(3, 28, 42)
+    loaded = qgs.load(tmp_path / "checkpoint.safetensors")
+    given = odd_views(3, 28, 42)
     assert torch.equal(loaded(given).gaussians.means, model(given).gaussians.means)
     with pytest.raises(MissingExtraError, match="there are no weights"):
         recipe.build_model()

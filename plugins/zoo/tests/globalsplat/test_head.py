@@ -13,7 +13,8 @@ from torch.testing import assert_close
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.types import QueryState
 
-LOW, HIGH = math.log(1e-4) - 1, math.log(0.05) + 2
+LOW = math.log(1e-4) - 1
+HIGH = math.log(0.05) + 2
 DRAW = torch.Generator().manual_seed(0)
 GEOMETRY = 2 * torch.randn(1, 3, 16, 14, generator=DRAW).double()
 GEOMETRY[..., 0, 3:5] = torch.tensor([-9, 9])  # scales beyond both bounds
@@ -83,7 +84,8 @@ def test_quaternions_of_all_rotations():
 
 
 def test_what_tells_no_rotation_still_gives_a_unit_quaternion():
-    same, second = [1.0, 2, 3] * 2, [0.0, 0, 0, 1, 0, 0]
+    same = [1.0, 2, 3] * 2
+    second = [0.0, 0, 0, 1, 0, 0]
     vectors = torch.tensor([[0.0] * 6, same, second, [1e-9] * 6], requires_grad=True)
     quats = rotation_6d(vectors)
     assert_close(quats.norm(dim=-1), torch.ones(4))
@@ -95,7 +97,8 @@ def test_the_head_reads_both_streams_after_their_norms():
     head = made(MergingHead, candidates=4, level=2)
     geometry = head.geometry(layer_norm(STATE.features, (16,))).unflatten(-1, (4, 14))
     texture = head.texture(layer_norm(STATE[TEXTURE], (16,))).unflatten(-1, (4, 48))
-    out, wanted = head(STATE), head.activate(geometry, texture)
+    out = head(STATE)
+    wanted = head.activate(geometry, texture)
     assert_close((out.sh, out.scales), (wanted.sh, wanted.scales), rtol=0, atol=0)
 
 

@@ -16,7 +16,8 @@ from torch.testing import assert_close
 from qgs.recipe import resolve
 from qgs.train.training_pass import TrainingPass
 
-SOFT, NEAR = 0.1, 0.2
+SOFT = 0.1
+NEAR = 0.2
 VIEWS = odd_views(2, 16, 24)
 
 
@@ -69,7 +70,8 @@ def test_losses_are_means_over_gaussians_of_tokens_that_decode_some():
 
 def test_passes_share_the_ends_and_part_the_rest():
     for count in range(3, 13):
-        one, other = subset(count, 0), subset(count, 1)
+        one = subset(count, 0)
+        other = subset(count, 1)
         assert {*one} & {*other} == {0, count - 1}
         assert {*one} | {*other} == {*range(count)}
         assert [sorted(one), sorted(other)] == [[*one], [*other]]

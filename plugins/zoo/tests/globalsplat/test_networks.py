@@ -20,12 +20,16 @@ SMALL = {"rgb_width": 6, "ray_width": 5, "lens_width": 3, "bands": 2}
 
 
 def test_a_token_is_its_colours_beside_its_rays_and_its_camera():
-    encoder, given = made(PosedPatches, patch_size=4, **SMALL), odd_views(2, 16, 24)
+    encoder = made(PosedPatches, patch_size=4, **SMALL)
+    given = odd_views(2, 16, 24)
     memory = encoder(given)
     assert memory.features.shape == (2, 2 * 4 * 6 + 4, 11)
     assert memory.grid is memory.keys is memory.patch_rays is None
     assert torch.equal(memory.features[0, -4:], encoder.registers)
-    scene, view, row, column = 1, 1, 2, 3
+    scene = 1
+    view = 1
+    row = 2
+    column = 3
     token = memory.features[scene, view * 24 + row * 6 + column]
     patch = (scene, view, slice(None), slice(8, 12), slice(12, 16))
     assert_close(token[:6], encoder.rgb_embedding(2 * given.images[patch] - 1).flatten())

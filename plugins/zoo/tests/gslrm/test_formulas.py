@@ -40,8 +40,10 @@ def test_rays_of_a_patch_are_spread_evenly():
 
 def test_means_lie_on_the_rays_of_their_pixels():
     """And gradients of what queries know of rays reach the cameras."""
-    given, memory = odd_views(3, 8, 12), ImageMemory(torch.randn(2, 18, 16), grid=GRID)
-    queries, c2w = made(PixelQueries), given.cameras.c2w.requires_grad_()
+    given = odd_views(3, 8, 12)
+    memory = ImageMemory(torch.randn(2, 18, 16), grid=GRID)
+    queries = made(PixelQueries)
+    c2w = given.cameras.c2w.requires_grad_()
     state = queries(memory, given)
     assert state.features is memory.features
     assert queries.count is None
@@ -108,5 +110,6 @@ def test_the_head_follows_its_formulas():
         out = head(QueryState(features))
         found = (out.offsets, out.colors, out.scales, out.quats, out.opacities)
         colors = (0.5 + rgb / math.sqrt(4 * math.pi)).clip(0, 1)
-        scale, opacity = (scale + bias).clip(max=limit).exp(), (opacity[..., 0] + logit).sigmoid()
+        scale = (scale + bias).clip(max=limit).exp()
+        opacity = (opacity[..., 0] + logit).sigmoid()
         assert_close(found, (position.expand(2, 7, 5, 3), colors, scale, quats, opacity))

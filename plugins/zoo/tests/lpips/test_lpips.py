@@ -125,7 +125,8 @@ def test_the_loss_is_the_mean_of_the_metric_and_pulls_towards_the_truth(vgg):
     rgb, truth = torch.rand(2, 2, 2, 3, 24, 32)
 
     def value(rgb):
-        rendering, target = SimpleNamespace(rgb=rgb), SimpleNamespace(images=truth)
+        rendering = SimpleNamespace(rgb=rgb)
+        target = SimpleNamespace(images=truth)
         return loss(None, rendering, target, None)["vgg16"]
 
     found = value(rgb.requires_grad_())

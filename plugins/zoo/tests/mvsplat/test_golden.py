@@ -62,15 +62,19 @@ def test_a_published_file_gives_the_released_gaussians(name, monkeypatch):
     model = qgs.compose(tree).eval()
     model.load_state_dict(names_of(resolve(tree)).from_published(weights))
     # near and far of the files differ from view to view
-    near, far, own = golden.input("near"), golden.input("far"), model.encoder.predict
+    near = golden.input("near")
+    far = golden.input("far")
+    own = model.encoder.predict
     monkeypatch.setattr(model.encoder, "predict", lambda given, *_: own(given, near, far))
     done = qgs.reconstruct(model, views, overrides=["views.scale=constant"])
     assert torch.equal(done.sample.inputs.cameras.c2w, views.cameras.c2w)
-    ours, theirs = done.gaussians, golden.tensors
+    ours = done.gaussians
+    theirs = golden.tensors
     factors = quat_to_matrix(ours.quats) * ours.scales[..., None, :]
     # Colours in 50 directions in place of harmonics: the family's rasteriser reads directions as
     # z, x, y, and never degree 4.
-    seen, sh = directions(50).float(), theirs["harmonics"][..., :16]
+    seen = directions(50).float()
+    sh = theirs["harmonics"][..., :16]
     turned = harmonics(seen[:, [2, 0, 1]], sh.shape[-1] - 1) @ sh[..., 1:].mT
     colours = ours.colors[..., None, :] + harmonics(seen, ours.sh.shape[-2]) @ ours.sh
     found = (ours.means, factors @ factors.mT, ours.opacities, colours)
@@ -82,7 +86,8 @@ def test_a_published_file_gives_the_released_gaussians(name, monkeypatch):
 def test_both_ways_to_correlate_agree(monkeypatch):
     """Few pixels for each candidate: all pairs at once; many: warped features, in chunks."""
     golden = read("depthsplat_a")
-    cameras, features = views_of(golden).cameras, golden.tensors["features_mv.0"]
+    cameras = views_of(golden).cameras
+    features = golden.tensors["features_mv.0"]
     neighbours = nearest_neighbours(cameras.c2w, 2)
     inverse = golden.tensors["inverse_depth_candidates.0"][..., None, None]
     lens = feature_lenses(cameras, features.shape[-2:])
