@@ -61,7 +61,7 @@ install() {
     "$environment/bin/python" -m pip --version >/dev/null 2>&1 ||
         die "the virtual environment $environment has no pip." \
             "Add it with: $environment/bin/python -m ensurepip"
-    local plugin packages=(--editable "$root[$extras]")
+    local plugin packages=(--editable "$root${extras:+[$extras]}")
     if ! is_installed "$environment" "$wanted" plugins; then
         for plugin in "$root"/plugins/[a-z]*/; do
             packages+=(--editable "$plugin")
@@ -89,7 +89,7 @@ is_installed() {
 }
 
 use_environment() {
-    local extras=$1 environment=${VIRTUAL_ENV:-$root/.venv} wanted
+    local extras=${1:-} environment=${VIRTUAL_ENV:-$root/.venv} wanted
     if [[ -n ${VIRTUAL_ENV:-} ]]; then
         is_new_enough "$environment/bin/python" ||
             die "the active virtual environment $environment has no Python 3.11 or newer." \
@@ -98,7 +98,7 @@ use_environment() {
         make_environment "$environment"
     fi
     wanted=$(fingerprint "$environment")
-    if ! is_installed "$environment" "$wanted" "$extras"; then
+    if ! is_installed "$environment" "$wanted" "$extras,plugins"; then
         install "$environment" "$extras" "$wanted"
     fi
     export VIRTUAL_ENV=$environment PATH="$environment/bin:$PATH"
