@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 from rich.console import Console
@@ -19,6 +19,14 @@ if TYPE_CHECKING:
     from qgs.model import QueryGaussianModel
     from qgs.recipe import Recipe
 
+Out: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(
+        help="Folder; default: RUN/evaluation; RUN/evaluation-N for other settings; "
+        "evaluation_NAME here for a shipped model or a URL."
+    ),
+]
+
 
 def evaluate(
     run: Checkpoint,
@@ -28,13 +36,7 @@ def evaluate(
     ] = None,
     tune: Tune = None,
     batch: Annotated[int, typer.Option(min=1, help="Scenes passed through the model at once.")] = 1,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder; default: RUN/evaluation; RUN/evaluation-N for other settings; "
-            "evaluation_NAME here for a shipped model or a URL."
-        ),
-    ] = None,
+    out: Out = None,
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit with 1 when a scene has no score.")
     ] = False,
@@ -42,10 +44,10 @@ def evaluate(
     device: Device = "auto",
 ) -> None:
     """Evaluate a checkpoint on unseen views, beside the nearest input view and the mean colour."""
+    console = Console()
     settings = list(overrides or ())
     if index is not None:
         settings.append(f"evaluation.index={json.dumps(index, ensure_ascii=False)}")
-    console = Console()
 
     from qgs.checkpoint.model_file import CheckpointFile
     from qgs.evaluate.evaluation import SECTIONS

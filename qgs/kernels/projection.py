@@ -97,6 +97,19 @@ def _scaled_columns(rows, scale):
 
 
 @kernel
+def _seen(c2w, mean):
+    """Rows of a camera's rotation, a mean from its centre, and the mean in its frame."""
+    pose = (_vector(c2w[0]), _vector(c2w[1]), _vector(c2w[2]))
+    offset = _plus(_vector(mean), -_ONE, (c2w[0, 3], c2w[1, 3], c2w[2, 3]))
+    return pose, offset, _combine(offset, pose)
+
+
+@kernel
+def _four(row):
+    return row[0], row[1], row[2], row[3]
+
+
+@kernel
 def _clamp(slope, focal, principal, size, margin):
     """`slope` held within `margin` of the image, and whether it was held."""
     low = (-margin * size - principal) / focal
@@ -141,13 +154,8 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, size, lim
         reach = np.sqrt(_TWO * fall)
         lowest = -_LOG2_E * fall - _SLACK
         for v in range(c2w.shape[0]):
-            pose = (_vector(c2w[v, 0]), _vector(c2w[v, 1]), _vector(c2w[v, 2]))
-            position = (c2w[v, 0, 3], c2w[v, 1, 3], c2w[v, 2, 3])
-            fx = lenses[v, 0]
-            fy = lenses[v, 1]
-            cx = lenses[v, 2]
-            cy = lenses[v, 3]
-            seen = _combine(_plus(_vector(means[g]), -_ONE, position), pose)
+            pose, _, seen = _seen(c2w[v], means[g])
+            fx, fy, cx, cy = _four(lenses[v])
             z = seen[2]
             out = splats[v, g]
             out[6] = _ZERO
@@ -257,6 +265,25 @@ def _add_camera(out, offset, factor_rows, of_seen, of_turned, of_mean, of_lens):
 
 
 @kernel
+def _added(of_factor, pose, of_turned):
+    """Slopes of the rows of R S with those of one view added."""
+    return (
+        _plus(of_factor[0], _ONE, _combine(pose[0], of_turned)),
+        _plus(of_factor[1], _ONE, _combine(pose[1], of_turned)),
+        _plus(of_factor[2], _ONE, _combine(pose[2], of_turned)),
+    )
+
+
+@kernel
+def _sum_parts(given, g, slopes):
+    """Write the sum over parts of a splat's slopes, given as (P, G, 10)."""
+    slopes[:] = given[0, g]
+    for part in range(1, given.shape[0]):
+        for i in range(slopes.shape[0]):
+            slopes[i] += given[part, g, i]
+
+
+@kernel
 def project_backward_unit(
     means, scales, quats, c2w, lenses, bounds, size, limits, splats, given, wants_cameras,
     of_means, of_scales, of_quats, of_opacities, of_colors, of_cameras,
@@ -274,31 +301,20 @@ def project_backward_unit(
         rows, quat, norm = _rotation(quats[g])
         scale = _vector(scales[g])
         factor = _scaled_columns(rows, scale)
-        of_mean = zeros
-        of_color = zeros
+        of_mean = of_color = zeros
         of_opacity = _ZERO
         of_factor = (zeros, zeros, zeros)
         for v in range(c2w.shape[0]):
             splat = splats[v, g]
             if not splat[6] > _ZERO:
                 continue
-            slopes[:] = given[v, 0, g]
-            for part in range(1, given.shape[1]):
-                for i in range(slopes.shape[0]):
-                    slopes[i] += given[v, part, g, i]
+            _sum_parts(given[v], g, slopes)
             of_opacity += slopes[6]
             of_color = _plus(of_color, _ONE, _vector(slopes[7:]))
-            pose = (_vector(c2w[v, 0]), _vector(c2w[v, 1]), _vector(c2w[v, 2]))
-            position = (c2w[v, 0, 3], c2w[v, 1, 3], c2w[v, 2, 3])
-            fx = lenses[v, 0]
-            fy = lenses[v, 1]
-            cx = lenses[v, 2]
-            cy = lenses[v, 3]
-            offset = _plus(_vector(means[g]), -_ONE, position)
-            seen = _combine(offset, pose)
+            pose, offset, seen = _seen(c2w[v], means[g])
+            fx, fy, cx, cy = _four(lenses[v])
             z = seen[2]
-            x = seen[0] / z
-            y = seen[1] / z
+            x, y = seen[0] / z, seen[1] / z
             turned = _turn(pose, factor)
             held_x, is_held_x = _clamp(x, fx, cx, size[1], margin)
             held_y, is_held_y = _clamp(y, fy, cy, size[0], margin)
@@ -315,19 +331,14 @@ def project_backward_unit(
             of_turned = (of_turned_x, of_turned_y, _plus(turned_z_x, _ONE, turned_z_y))
             of_offset = (_dot(pose[0], of_seen), _dot(pose[1], of_seen), _dot(pose[2], of_seen))
             of_mean = _plus(of_mean, _ONE, of_offset)
-            of_factor = (
-                _plus(of_factor[0], _ONE, _combine(pose[0], of_turned)),
-                _plus(of_factor[1], _ONE, _combine(pose[1], of_turned)),
-                _plus(of_factor[2], _ONE, _combine(pose[2], of_turned)),
-            )
+            of_factor = _added(of_factor, pose, of_turned)
             if wants_cameras:
                 _add_camera(
                     of_cameras[v], offset, _columns(factor), of_seen, of_turned, of_offset,
                     (of_fx, of_fy, of_cx, of_cy),
                 )  # fmt: skip
         of_opacities[g] = of_opacity
-        of_columns = _columns(of_factor)
-        axes = _columns(rows)
+        of_columns, axes = _columns(of_factor), _columns(rows)
         for i in range(3):
             of_means[g, i] = of_mean[i]
             of_colors[g, i] = of_color[i]

@@ -249,11 +249,27 @@ def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
 
 
 @kernel
+def _rows_within(above, reach):
+    """First and last row of a tile whose pixel centres lie within `reach` of a splat's centre."""
+    first = max(0, int(np.ceil(above - reach)))
+    last = min(TILE - 1, int(np.floor(above + reach)))
+    return first, last
+
+
+@kernel
+def _store_sums(state, sums, y0, x0, rows, columns):
+    for row in range(rows):
+        for lane in range(columns):
+            base = row * _ROW + lane
+            for channel in range(SUMS):
+                sums[channel, y0 + row, x0 + lane] = state[base + (2 + channel) * TILE]
+
+
+@kernel
 def _unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, backward):
     """Walk the tile rows [first, last) of one image; `backward` is a constant of either caller."""
     height, width = sums.shape[1:]
-    top = tile_rows[0] * TILE
-    bottom = min(tile_rows[1] * TILE, height)
+    top, bottom = tile_rows[0] * TILE, min(tile_rows[1] * TILE, height)
     order = _by_depth(splats, top, bottom, width)
     row_order = np.empty(order.shape[0] + 1, np.int32)
     state = np.empty(TILE * _ROW, np.float32)
@@ -270,19 +286,12 @@ def _unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, back
             since_check = 0
             for i in range(n):
                 g = row_order[i]
-                u = splats[g, 0]
-                v = splats[g, 1]
-                ex = splats[g, 6]
+                u, v, ex, ey = splats[g, 0], splats[g, 1], splats[g, 6], splats[g, 7]
                 if u + ex <= x0 or u - ex >= x0 + columns:
                     continue
-                xx = splats[g, 2]
-                xy = splats[g, 3]
-                yy = splats[g, 4]
+                xx, xy, yy = splats[g, 2], splats[g, 3], splats[g, 4]
                 look = opacities[g], colors[g, 0], colors[g, 1], colors[g, 2], splats[g, 5]
-                # Rows whose pixel centres lie within ey of v.
-                above = v - np.float32(y0) - _HALF
-                first = max(0, int(np.ceil(above - splats[g, 7])))
-                last = min(TILE - 1, int(np.floor(above + splats[g, 7])))
+                first, last = _rows_within(v - np.float32(y0) - _HALF, ey)
                 dx0 = np.float32(x0) + _HALF - u
                 quadratic = -_HALF * _LOG2_E * xx
                 # the peak of a row moves by lean dy
@@ -315,13 +324,8 @@ def _unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, back
                     since_check = 0
                     if not _close_rows(state, live):
                         break
-            if backward:
-                continue
-            for row in range(rows):
-                for lane in range(columns):
-                    base = row * _ROW + lane
-                    for channel in range(SUMS):
-                        sums[channel, y0 + row, x0 + lane] = state[base + (2 + channel) * TILE]
+            if not backward:
+                _store_sums(state, sums, y0, x0, rows, columns)
 
 
 @kernel

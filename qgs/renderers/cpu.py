@@ -37,7 +37,7 @@ class CpuRenderer(Renderer):
         if not can_compile():
             raise MissingExtraError(
                 "the renderer qgs/cpu needs numba, which is not installed: run "
-                '`pip install numba`, or choose `renderer: {type: qgs/torch}` '
+                "`pip install numba`, or choose `renderer: {type: qgs/torch}` "
                 "(much slower)"
             )
 

@@ -63,6 +63,12 @@ def write(queries, tokens, out):
 
 
 @kernel
+def _store(out, values):
+    for i in range(len(values)):
+        out[i] = values[i]
+
+
+@kernel
 def gradients(queries, tokens, gradient, out):
     """Gradients of the queries. A gradient g of e = m - mu x d is g x d of mu."""
     for n in range(queries.shape[0]):
@@ -72,17 +78,14 @@ def gradients(queries, tokens, gradient, out):
         mu = (q[0], q[1], q[2])
         c = _nine(q, 3)
         w = _nine(q, 12)
-        factor = q[21]
-        lower = q[22]
+        factor, lower = q[21], q[22]
         of_x = of_y = of_z = of_factor = of_lower = _ZERO
         # Eighteen sums as scalars, which the compiler keeps in registers; an array it would not.
         c0 = c1 = c2 = c3 = c4 = c5 = c6 = c7 = c8 = _ZERO
         w0 = w1 = w2 = w3 = w4 = w5 = w6 = w7 = w8 = _ZERO
         for j in range(row.shape[0]):
             e = _moment(mu, tokens, j)
-            u = tokens[6, j]
-            v = tokens[7, j]
-            t = tokens[8, j]
+            u, v, t = tokens[6, j], tokens[7, j], tokens[8, j]
             a = _times(c, e[0], e[1], e[2])
             b = _times(w, u, v, t)
             above = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
@@ -93,9 +96,7 @@ def gradients(queries, tokens, gradient, out):
             of_lower += row[j] - inside
             of_factor -= inside * ratio
             up = -_TWO * factor * inside / below
-            a0 = up * a[0]
-            a1 = up * a[1]
-            a2 = up * a[2]
+            a0, a1, a2 = up * a[0], up * a[1], up * a[2]
             c0 += a0 * e[0]
             c1 += a0 * e[1]
             c2 += a0 * e[2]
@@ -114,9 +115,7 @@ def gradients(queries, tokens, gradient, out):
             of_z += e0 * tokens[4, j] - e1 * tokens[3, j]
             # d ratio = d above / below - ratio d below / below.
             down = -up * ratio
-            b0 = down * b[0]
-            b1 = down * b[1]
-            b2 = down * b[2]
+            b0, b1, b2 = down * b[0], down * b[1], down * b[2]
             w0 += b0 * u
             w1 += b0 * v
             w2 += b0 * t
@@ -126,26 +125,7 @@ def gradients(queries, tokens, gradient, out):
             w6 += b2 * u
             w7 += b2 * v
             w8 += b2 * t
-        of[0] = of_x
-        of[1] = of_y
-        of[2] = of_z
-        of[3] = c0
-        of[4] = c1
-        of[5] = c2
-        of[6] = c3
-        of[7] = c4
-        of[8] = c5
-        of[9] = c6
-        of[10] = c7
-        of[11] = c8
-        of[12] = w0
-        of[13] = w1
-        of[14] = w2
-        of[15] = w3
-        of[16] = w4
-        of[17] = w5
-        of[18] = w6
-        of[19] = w7
-        of[20] = w8
+        _store(of, (of_x, of_y, of_z, c0, c1, c2, c3, c4, c5, c6, c7, c8))
+        _store(of[12:], (w0, w1, w2, w3, w4, w5, w6, w7, w8))
         of[21] = of_factor
         of[22] = of_lower
