@@ -22,6 +22,7 @@ class CommandGroup(TyperGroup):
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Names, our own first."""
+        # In our order, not by the alphabet: what a newcomer needs first stands first.
         own = super().list_commands(ctx)
         return [*own, *sorted({entry.name for entry in installed(GROUP)} - {*own})]
 
@@ -99,6 +100,7 @@ def main() -> None:
 
     The environment variable QGS_DEBUG=1 shows the traceback.
     """
+    # Names of files and messages of servers may hold anything.
     show_safely()
     try:
         app()

@@ -27,6 +27,7 @@ def convert(
     from qgs.checkpoint.gaussians import load_ply, save_gaussians
     from qgs.files import refuse_existing
 
+    # Before the file is read, which may take a while.
     refuse_existing(out)
     gaussians = load_ply(source)
     kept = gaussians if count is None else gaussians.most_opaque(count)

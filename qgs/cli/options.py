@@ -78,6 +78,7 @@ def parse_size(text: str | None, option: str = "--size") -> tuple[int, int] | No
     """Return (H, W) of "HxW"; raises ValueError for anything else."""
     if text is None:
         return None
+    # Height first, as in recipes and tensors.
     match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
     if match is None:
         raise ValueError(f"{option} must be HxW in pixels, such as 256x448, got {text!r}")

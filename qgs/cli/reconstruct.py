@@ -88,6 +88,7 @@ def reconstruct(
 
 def _refuse_unusable(out: Path, overwrite: bool) -> None:
     """Raise an error now, not after the work, where `out` cannot be written."""
+    # Before anything heavy is imported: the answer is known already.
     if not overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
         raise FileExistsError(f"{out} is not empty: choose another --out, or add --overwrite")
 

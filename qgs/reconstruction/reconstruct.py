@@ -65,6 +65,7 @@ def reconstruct(
     if isinstance(photos, Views):
         if size is not None or scene is not None:
             raise ValueError("`size` and `scene` are for folders: Views have one scene and size")
+        # Nobody names photos among Views that were put together by hand: all are inputs.
         chosen = ChosenScene(GivenScene(photos))
         if frames is None and inputs is None:
             frames = range(len(chosen.scene))
@@ -74,6 +75,7 @@ def reconstruct(
     wanted = None if frames is None else frame_list(frames, "frames", found)
     against = [] if compare == "none" else compare
     against = None if against is None else frame_list(against, "compare", found)
+    # A model's own data keep its scale; photos of a user have any unit.
     views = photo_settings(recipe.views, chosen.is_training_data, overrides)
     search = ScaleSearch(model, views)
     domain = model.trained_on
@@ -86,6 +88,7 @@ def reconstruct(
         result = reconstruct_sample(model, sample, world, chosen.seen, tuned, record)
     finally:
         model.train(training)
+    # There was one window, so one scale.
     result = replace(result, scale=next(iter(search.found.values()), None))
     return replace(result, remarks=_remarks(result, found))
 
@@ -97,6 +100,7 @@ def _recipe(model: QueryGaussianModel, overrides: Sequence[str], tune: str | Non
             "this model was built by hand and has no recipe, so the frame and scale of its world "
             "are not known; build it with qgs.compose, or bring cameras into its world yourself"
         )
+    # Weights fit the recipe: another model option would be another model.
     if foreign := [text for text in overrides if not text.startswith("views.")]:
         raise ValueError(f"only options of `views` can be set here, got {listed(foreign)}")
     return resolve(model.recipe, [*overrides, *tuning_settings(tune)])
@@ -129,6 +133,7 @@ def choose_sample(
         frames, novel = choose_windows(scene, views, domain, held_out=compare)[0]
     elif compare is None:
         novel = Frusta(scene, domain).compared(tuple(frames))
+    # Named photos win over those that were chosen beside the inputs.
     picked = checked_window(len(scene), frames, novel if compare is None else compare)
     # Only now: the scale is searched on the chosen views.
     views = views_of(scene, *picked) if views_of else views

@@ -125,6 +125,7 @@ def reconstruct_sample(
     pass; `tuning` or `refinement` is the record of how they were made.
     """
     device = next(model.parameters()).device
+    # Views come from the data on the CPU.
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
     prediction: Prediction | None = model(sample.inputs) if tuned is None else None
     gaussians = prediction.gaussians if prediction else tuned
@@ -149,6 +150,7 @@ def _scores(sample: Sample, rendering: Rendering, seen: Collection[int]) -> list
     targets = sample.targets
     photos = torch.cat([inputs.images, targets.images], 1)
     quality = psnr(rendering.rgb, photos)[0].tolist()
+    # What needs no model, on the same views.
     baselines = {
         name: psnr(baseline(inputs, targets.cameras), targets.images)[0].tolist()
         for name, baseline in BASELINES.items()

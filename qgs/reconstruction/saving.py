@@ -43,6 +43,7 @@ def orbit(inputs: Cameras, depth: float, frames: int) -> Cameras:
     times_T = (1 - angles.cos()) / 2 * (count - 1)
     distances_TV = times_T[:, None] - torch.arange(count, device=times_T.device)
     # A smooth mean of neighbouring inputs, so that the path has no corner at any of them.
+    # Between inputs the camera moves on a smooth mean of their poses.
     weights_TV = torch.softmax(-0.5 * (distances_TV / 0.6) ** 2, -1)
     mean = torch.einsum("tv,vij->tij", weights_TV, inputs.c2w[0])
     _, down, forward, centre = mean[:, :3].unbind(-1)
@@ -63,6 +64,7 @@ def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
     With the suffix of a scene writer (.ply, .splat, ...) `out` is one file of the Gaussians, in the
     world of the photos.
     """
+    # A file holds Gaussians alone, so they are in the world of the photos.
     if out.suffix.lower() in scene_writers():
         save_gaussians(result.in_photos_world, out)
         return [out]
@@ -101,6 +103,7 @@ def _pictures(result: Reconstruction) -> dict[str, list[Picture]]:
 def overview(result: Reconstruction, dpi: int = 120) -> Picture:
     """Draw photos over renders and depth, of at most OVERVIEW_COLUMNS views, inputs first."""
     scores = result.scores
+    # Inputs come first in `scores`, so they stay where the row is too long.
     shown = sorted(range(min(len(scores), OVERVIEW_COLUMNS)), key=lambda i: scores[i].frame)
     titles = []
     for index in shown:

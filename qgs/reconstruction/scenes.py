@@ -75,6 +75,7 @@ def chosen_scene(
     source, is_training_data = open_for(path, size, recipe.data_config, installed_sources())
     scene = named_scene(source, path, name)
     if is_training_data:
+        # Scenes of the test split were never seen, though their folder was trained on.
         seen = training_frames(scene) if scene.name in source.names("train") else ()
         return ChosenScene(scene, is_training_data, seen)
     # Size and split depend on the photos, so the scene is opened once more where they differ.
@@ -92,6 +93,7 @@ def _resized(source: SceneSource, config: SceneSourceConfig, size: Size) -> Scen
 
 def holding_out(config: SceneSourceConfig, scene: Scene) -> SceneSourceConfig:
     """Return options with every HOLDOUT-th photo held out, unless `scene` or they have a split."""
+    # A listing's own split, or one in the options, is somebody's decision.
     split = scene.held_out or getattr(config, "holdout", None) != 0
     return config if split else config.model_copy(update={"holdout": HOLDOUT})
 
