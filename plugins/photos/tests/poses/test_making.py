@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import textured_room
-from bench_poses import aligned
 from PIL import Image
 from qgs_photos.poses import making
 from qgs_photos.poses.making import Options, make_poses, read_record
 from qgs_photos.poses.photos import PosesError
+from scipy.spatial.transform import Rotation
 from upath import UPath
 from walked import PHOTOS, SCALE, quiet, write_photos, write_video
 
@@ -18,13 +18,21 @@ from qgs.data.photos import formats_of, read_listing
 
 
 def assert_close(folder, shots):
+    """After a similarity: positions in parts of the largest distance of two cameras."""
     frames = read_listing(UPath(folder)).frames
     assert len(frames) == PHOTOS
-    turn, distance = aligned(
-        np.stack([frame.c2w for frame in frames]), np.stack([shot.c2w for shot in shots])
-    )
-    assert np.median(turn) < 1
-    assert np.median(distance) < 0.02
+    found = np.stack([frame.c2w for frame in frames])
+    true = np.stack([shot.c2w for shot in shots])
+    axes = [poses[:, :3, :3].swapaxes(1, 2).reshape(-1, 3) for poses in (true, found)]
+    turn = Rotation.align_vectors(*axes)[0]
+    off = Rotation.from_matrix(true[:, :3, :3]).inv() * turn * Rotation.from_matrix(found[:, :3, :3])
+    assert np.median(np.degrees(off.magnitude())) < 1
+    centers = true[:, :3, 3] - true[:, :3, 3].mean(0)
+    turned = turn.apply(found[:, :3, 3] - found[:, :3, 3].mean(0))
+    scale = (turned * centers).sum() / (turned**2).sum()
+    distances = np.linalg.norm(scale * turned - centers, axis=-1)
+    extent = np.linalg.norm(centers[:, None] - centers[None], axis=-1).max()
+    assert np.median(distances) / extent < 0.02
 
 
 def test_photos_get_the_poses_they_were_taken_with(made, shots, walk):

@@ -5,7 +5,6 @@ import re
 import shutil
 from types import SimpleNamespace
 
-import fill_evidence
 import numpy as np
 import pytest
 import yaml
@@ -139,7 +138,6 @@ def test_one_seed_leaves_it_open_however_sure_the_scenes_are(tmp_path):
     assert answer(found).endswith("one training a side. Missing: 6 of 9 runs.")
     assert "missing runs: full seed 1" in "\n".join(notes(found))
     write_files(found)
-    assert "| noisy | 23.01 (–) |" in fill_evidence.page_of(tmp_path)
 
 
 def test_files_hold_the_same_numbers(plain, tmp_path):
