@@ -196,8 +196,8 @@ def test_random_states_come_back():
 @pytest.mark.slow
 def test_killed_runs_go_on_from_whole_files(monkeypatch):
     """Some kills must come inside a save, for this to prove anything."""
-    tool = Path(__file__).parents[2] / "tools/kill.py"
+    tool = Path(__file__).parents[2] / "tools/fuzz.py"
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    command = [sys.executable, tool, "training", "--kills=12", "--width=192", "--steps=150"]
+    command = [sys.executable, tool, "kill-training", "--count=12"]
     told = subprocess.check_output(command, text=True)
     assert re.match(r"12 kills, [1-9]\d* inside a save", told), told

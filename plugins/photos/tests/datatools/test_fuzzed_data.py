@@ -1,12 +1,10 @@
-"""A run of tools/fuzz_data.py; see there."""
+"""A run of `tools/fuzz.py data`; see there."""
 
 import pytest
-from fuzz_data import prepared
-from fuzzing import fuzz
+from fuzzing import cases, data
 
 
 @pytest.mark.slow
 def test_damaged_data_sets_are_read_or_refused(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sys.argv", ["fuzz_data", "--count", "200"])
-    assert fuzz("", prepared) == 0, capsys.readouterr().out
+    assert cases.fuzz(data, tmp_path, seed=0, count=200) == 0, capsys.readouterr().out

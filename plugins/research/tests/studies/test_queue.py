@@ -10,9 +10,9 @@ import time
 from concurrent.futures import Future
 from pathlib import Path
 
-import kill
 import pytest
 from commands import done
+from fuzzing import kill
 from qgs_research.studies import queue as queue_module
 from qgs_research.studies.plan import planned
 from qgs_research.studies.queue import Queue, last_record
@@ -49,8 +49,8 @@ def begun(out):
 @pytest.mark.slow
 def test_two_queues_share_a_folder_and_additions_run_alone(study):
     out = study.parent / "out"
-    command = ["study", str(study), "--out", str(out), "--threads", "1", "--device", "cpu"]
-    queues = [kill.started([*command, "--workers", "1"], study.parent / "log") for _ in range(2)]
+    command = f"study {study} --out {out} --threads 1 --device cpu --workers 1"
+    queues = [kill.started(command, study.parent / "log") for _ in range(2)]
     assert [queue.wait(600) for queue in queues] == [0, 0]
     runs = {f"{v}/seed-{s}": 1 for v in ("locus", "flat") for s in (0, 1)}
     assert begun(out) == runs
@@ -131,9 +131,8 @@ def test_a_process_has_its_threads_and_prints_into_the_log(plan, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_killed_study_has_the_table_of_a_quiet_one(monkeypatch):
-    monkeypatch.setattr("sys.argv", ["kill.py", "study", "--kills", "3", "--steps", "20"])
-    assert kill.main() == 0
+def test_a_killed_study_has_the_table_of_a_quiet_one(tmp_path):
+    assert kill.study(tmp_path, 3, steps=20) == 0
 
 
 def hold(run, pipe):

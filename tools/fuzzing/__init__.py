@@ -1,0 +1,1 @@
+"""Random cases of what users and strangers give, each used in a process of its own."""

@@ -1,0 +1,153 @@
+"""Checkpoints and PLY files, damaged in many ways: each is used, or refused by its name.
+
+Half of the checkpoints are sealed anew, as by somebody who means harm.
+"""
+
+import json
+import random
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from random import choice, randrange
+from typing import Any
+
+import numpy as np
+import torch
+
+import qgs
+from fuzzing.cases import JUNK, TABLES, Use, other_bytes, other_leaf, refused
+from qgs.checkpoint.model_file import CheckpointFile
+from qgs.checkpoint.tensors import SEAL, seal
+from qgs.contracts import LearnedQueries
+from qgs.recipe import resolve
+from qgs.train.initial import initialise
+
+RECIPE = Path(__file__).parents[2] / "recipes" / "tiny" / "locus.yaml"
+SMALL = TABLES["small"].split()
+
+
+def other_tensor(header: Any, data: bytearray) -> None:
+    """Give a tensor another type, shape, place, name or value."""
+    name = choice([key for key in header if key != "__metadata__"])
+    entry = header[name]
+    shape = entry["shape"]
+    first, last = entry["data_offsets"]
+    shapes = (shape[::-1], [*shape, 1], [0, *shape], [n * 2**40 for n in shape], [2**62])
+    places = ([last, first], [first, 2**63], [-1, last], [0, last], [first + 4, last])
+    entry |= choice(
+        (
+            {},
+            {"dtype": choice(TABLES["dtype"])},
+            {"shape": choice((*shapes, [-n for n in shape], choice(JUNK)))},
+            {"data_offsets": choice((*places, choice(JUNK)))},
+        )
+    )
+    if random.random() < 0.2:
+        header[choice((*TABLES["name"], f"{name}x"))] = header.pop(name)
+    # NaN, infinity, or anything.
+    data[first : first + 4] = choice((b"\xff" * 4, b"\x00\x00\x80\x7f", random.randbytes(4)))
+
+
+def other_metadata(header: Any, _: bytearray) -> None:
+    """Put another text, or a leaf or branch of the JSON, into an entry of the metadata."""
+    metadata = header["__metadata__"]
+    key = choice(list(metadata))
+    text = metadata.pop(key)
+    tree = json.loads(text) if text[:1] in "{[" else [text]
+    other_leaf(tree)
+    changed = json.dumps(tree)
+    cut = text[: randrange(len(text) + 1)]
+    texts = [changed, changed, changed, cut, '{"a":' * 5000, json.dumps(choice(JUNK)), "", text * 2]
+    if random.random() < 0.9:
+        metadata[key] = choice(texts)
+
+
+def other_recipe(header: Any, _: bytearray) -> None:
+    """Name files in the recipe, and sizes that no tensor has or no machine holds."""
+    tree = json.loads(header["__metadata__"]["qgs.recipe"])
+    new = choice(TABLES["recipes"])
+    texts = [new, tree | new]
+    tree["model"] |= choice(TABLES["sizes"])
+    header["__metadata__"]["qgs.recipe"] = json.dumps(choice([*texts, tree, tree]))
+
+
+def damage_checkpoint(file: Path) -> str:
+    """Change the header or the tensors of a checkpoint; return what was done."""
+    whole = file.read_bytes()
+    end = 8 + int.from_bytes(whole[:8], "little")
+    header = json.loads(whole[8:end])
+    data = bytearray(whole[end:])
+    change = choice((other_tensor, other_tensor, other_metadata, other_metadata, other_recipe))
+    change(header, data)
+    if random.random() < 0.5:
+        # Else hardly anything behind the seal would be tried.
+        header["__metadata__"][SEAL] = seal(header["__metadata__"])
+    if random.random() < 0.05:
+        header["__metadata__"] = choice(TABLES["metadata"])
+    text = json.dumps(header).encode()
+    file.write_bytes(len(text).to_bytes(8, "little") + text + data)
+    return change.__name__
+
+
+def damage_ply(file: Path) -> str:
+    """Write another word into the header, and perhaps a value that is no number or extreme."""
+    head, end, data = file.read_bytes().partition(b"end_header\n")
+    values = np.frombuffer(data, "<f4").copy()
+    if random.random() < 0.5:
+        values[randrange(len(values))] = choice(TABLES["numbers"])
+    words = head.split(b" ")
+    words[randrange(len(words))] = choice([*TABLES["words"], "float"]).encode("latin-1")
+    file.write_bytes(b" ".join(words) + end + values.tobytes())
+    return "other words and numbers"
+
+
+def decode(file: Path) -> None:
+    """Load a checkpoint and make Gaussians of its queries."""
+    with CheckpointFile(file) as checkpoint:
+        model = checkpoint.model()
+        _ = checkpoint.extra
+    assert isinstance(model.queries, LearnedQueries)
+    with torch.no_grad():
+        gaussians = model.decode(model.queries.start(1))
+    # Weights may be any numbers; Gaussians that are none must not be written.
+    qgs.save_ply(gaussians, file.with_suffix(".ply"))
+
+
+def start_from(file: Path) -> None:
+    """Start a training from a checkpoint."""
+    recipe = resolve(RECIPE, [*SMALL, "model.queries.count=9", f"init_from={file}"])
+    initialise(recipe.build_model(), recipe)
+
+
+def convert(file: Path) -> None:
+    """Read a PLY and write it again."""
+    qgs.save_ply(qgs.load_ply(file), file.with_name("again.ply"))
+
+
+def judged(use: Callable[[Path], None], path: Path) -> str:
+    """Return how `use` ended."""
+    end = "success"
+    try:
+        use(path)
+    except (ValueError, OSError) as error:
+        # Numbers that are not finite are found when Gaussians are written, under another name.
+        end = refused(error, "" if "not finite" in str(error) else str(path))
+    return f"{use.__name__} {end}"
+
+
+def prepare(scratch: Path) -> None:
+    """Write a checkpoint and a PLY file."""
+    model = qgs.compose(RECIPE, SMALL)
+    qgs.save(model, scratch / "a.safetensors", extra={"step": "3"})
+    decode(scratch / "a.safetensors")
+
+
+def case_in(scratch: Path, folder: Path) -> tuple[str, Use]:
+    """Damage a copy of one of the files."""
+    use = choice((decode, start_from, convert))
+    path = folder / ("a.ply" if use is convert else "a.safetensors")
+    path.write_bytes((scratch / path.name).read_bytes())
+    damage = damage_ply if use is convert else damage_checkpoint
+    if random.random() < 0.15:
+        damage = other_bytes
+    return f"{use.__name__}, {damage(path)}", partial(judged, use, path)

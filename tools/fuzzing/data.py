@@ -1,0 +1,169 @@
+"""Small data sets of every format with one damaged file: each is read, or refused by its name.
+
+Each is checked as `qgs data check` does and read as training does. What cannot be read, the check
+must call an error.
+"""
+
+import json
+import logging
+import random
+import shutil
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from random import choice, randrange
+from typing import Any
+
+import numpy as np
+import torch
+from qgs_photos.datatools.check import Options, check
+from qgs_photos.datatools.packing import own_splits, pack
+from qgs_photos.datatools.sources import sources
+from upath import UPath
+
+from fuzzing.cases import JUNK, FaultError, Use, other_bytes, other_leaf, refused
+from qgs.contracts import SceneSource, ViewsConfig
+from qgs.data.recognition import open_for
+from qgs.data.stream import SampleStream
+from qgs.paths import opened_path
+
+formats: Any = import_module("photo_formats")
+SIZE = (30, 40)
+RAN = Path("qgs-fuzz-ran")
+
+
+def opened(folder: Path) -> SceneSource:
+    """Open a data set as training does."""
+    return open_for(str(folder), (16, 16), None, sources())[0]
+
+
+def write_nerfstudio(folder: Path, photos: Any) -> None:
+    """With masks and depth maps."""
+    formats.write_nerfstudio(folder, photos)
+    (folder / "mask.png").write_bytes(formats.encoded(np.full(SIZE, 255, np.uint8)))
+    np.save(folder / "depth.npy", np.ones(SIZE, np.float32))
+    listing = folder / "transforms.json"
+    more = '"mask_path": "mask.png", "depth_file_path": "depth.npy", "file_path"'
+    listing.write_text(listing.read_text().replace('"file_path"', more))
+
+
+def write_cameras(folder: Path, photos: Any) -> None:
+    """As a project's own listing: poses and lenses have other names there."""
+    formats.write_nerfstudio(folder, photos, K=photos.intrinsics)
+    listing = folder / "transforms.json"
+    text = listing.read_text().replace("transform_matrix", "c2w")
+    listing.rename(folder / "cameras.json").write_text(text)
+
+
+def write_dl3dv(folder: Path, photos: Any) -> None:
+    inner = folder.with_name("inner")
+    write_nerfstudio(inner, photos)
+    shutil.make_archive(str(folder / ("0123456789abcdef" * 4)), "zip", inner)
+
+
+def write_chunks(folder: Path, photos: Any) -> None:
+    inner = folder.with_name("inner")
+    write_nerfstudio(inner, photos)
+    source = opened(inner)
+    pack(source, own_splits(source), UPath(folder), {})
+
+
+WRITERS: dict[str, Callable[[Path, Any], object]] = {
+    "nerfstudio": write_nerfstudio,
+    "blender": partial(formats.write_blender, train=3),
+    "cameras": write_cameras,
+    "llff": formats.write_llff,
+    "colmap text": partial(formats.write_colmap, kind="text"),
+    "colmap binary": partial(formats.write_colmap, kind="binary"),
+    "dl3dv": write_dl3dv,
+    "chunks": write_chunks,
+}
+
+
+class Payload:
+    """Code that a pickle would run."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (RAN,)
+
+
+def damaged(file: Path) -> str:
+    """Change what a file says, or its bytes if its format is unknown; return what was done."""
+    match file.suffix:
+        case ".json":
+            tree = json.loads(file.read_text())
+            what = other_leaf(tree)
+            file.write_text(json.dumps(tree))
+        case ".txt":
+            words = file.read_text().split(" ")
+            what = other_leaf(words)
+            file.write_text(" ".join(map(str, words)))
+        case ".npy":
+            values = np.load(file).astype(np.float64)
+            values.flat[randrange(values.size)] = choice((np.nan, np.inf, 1e308, -1.0))
+            np.save(file, values[: choice((None, -1))])
+            what = "values or their number"
+        case ".torch":
+            records = torch.load(file)
+            what = other_leaf(records, [*JUNK, Payload(), torch.tensor([2**62])])
+            torch.save(records, file)
+        case _:
+            what = other_bytes(file)
+    return what
+
+
+def case_in(_: Path, folder: Path) -> tuple[str, Use]:
+    """Write a data set and damage one of its files."""
+    data = folder / "data"
+    data.mkdir()
+    kind = choice([*WRITERS])
+    suffix = choice(["png", "jpg"])
+    photos = formats.synthetic(folder / "photos", 5, SIZE, suffix, randrange(1000))
+    WRITERS[kind](data, formats.centred(photos))
+    found = [file for file in sorted(data.rglob("*")) if file.is_file()]
+    listings = [file for file in found if file.suffix not in (".png", ".jpg")]
+    file = choice(listings if random.random() < 0.7 else found)
+    damage = damaged if random.random() < 0.6 else other_bytes
+    return f"{kind}: {file.name}: {damage(file)}", partial(judged, data)
+
+
+def read(folder: Path) -> None:
+    """Read all frames of all scenes, and draw a sample. Raises what reading raises."""
+    source = opened(folder)
+    for split in ("train", "test"):
+        for scene in source.scenes(split):
+            cameras = scene.cameras
+            frames = range(len(scene))
+            every = [scene.images(frames), scene.masks(frames), scene.depths(frames)]
+            for tensor in (cameras.c2w, cameras.intrinsics, *every):
+                if tensor is not None and not torch.isfinite(tensor).all():
+                    raise FaultError(f"{scene.name} is delivered with NaN or infinite numbers")
+    scenes = source.scenes("train")
+    if scenes and all(len(scene) - len(scene.held_out) > 1 for scene in scenes):
+        SampleStream(source, ViewsConfig(inputs=2, targets=1, gap=(1, 3)), 0).batch([0])
+
+
+def judged(folder: Path) -> str:
+    """Return how checking and reading end. Raises what a user must not see."""
+    try:
+        report = check(opened_path(folder), Options(geometry=1, threads=1))
+        errors = [str(finding) for finding in report.findings if finding.severity == "error"]
+    except (ValueError, OSError) as error:
+        refused(error, str(folder))
+        errors = [str(error)]
+    try:
+        read(folder)
+    except (ValueError, OSError) as error:
+        if not errors:
+            raise FaultError(f"the check finds nothing, reading raises: {error}") from error
+        return f"{refused(error, str(folder))}: {error}"
+    if RAN.exists():
+        raise FaultError("code of a pickle ran")
+    return "success" if not errors else f"success, with errors of the check: {errors}"
+
+
+def prepare(_: Path) -> None:
+    """Be quiet about what damaged files cause."""
+    np.seterr(all="ignore")
+    logging.disable(logging.CRITICAL)

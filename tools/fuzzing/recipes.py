@@ -1,0 +1,124 @@
+"""Shipped recipes in which values, types, structure or text were changed.
+
+A case passes when it resolves, builds on "meta" and resolves to itself again, or when it is refused
+by one RecipeError of which no problem comes from a component that fails inside.
+"""
+
+import json
+import random
+import shutil
+from functools import partial
+from pathlib import Path
+from random import choice, randrange
+from typing import Any
+
+from fuzzing.cases import TABLES, FaultError, Use, refused
+from qgs.contracts import MissingExtraError
+from qgs.recipe import PluginError, RecipeError, resolve
+from qgs.recipe.recipe import annotated, flat
+from qgs.recipe.registry import load_usable_plugins
+from qgs.recipe.slots import SLOTS
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+PARTS = ("finetune/dl3dv", "rooms/budget", "studies/")
+"""Beginnings of names of files that are no whole recipes."""
+FOUND = sorted(path.relative_to(RECIPES).as_posix() for path in RECIPES.rglob("*.yaml"))
+OPTIONS = {name: flat(resolve(RECIPES / name).tree) for name in FOUND if not name.startswith(PARTS)}
+REGISTRY = load_usable_plugins()[0]
+TYPES = sorted(kind for slot in SLOTS for kind in REGISTRY.components(slot))
+YAML = TABLES["yaml"].splitlines()
+YAML += ["9" * 30, "9" * 5000, "x" * 1000, "[" * 80 + "]" * 80, "[" * 3000 + "]" * 3000]
+
+
+Options = dict[str, Any]
+"""Values by path of a resolved recipe."""
+Change = tuple[list[str], str]
+"""A path, and the YAML that is written there."""
+
+
+def any_value(options: Options) -> Change:
+    """Write any text in place of an option or a section."""
+    path = choice([*options]).split(".")
+    return path[: choice([None, None, None, None, -1, 1])] or path, choice(YAML)
+
+
+def scaled(options: Options) -> Change:
+    """Make a number larger, smaller, negative or a fraction."""
+    path = choice([path for path, value in options.items() if type(value) in (int, float)])
+    number = options[path] * choice(TABLES["factors"])
+    whole = isinstance(options[path], int) and random.random() < 0.9
+    return path.split("."), str(int(number) if whole else number)
+
+
+def other_component(options: Options) -> Change:
+    """Put any component in place of another, of layers and by swaps too."""
+    path = choice([path for path in options if path.endswith(".type")]).split(".")[:-1]
+    layer = ["model", "decoder", "layers", choice(TABLES["layers"]), path[-1]]
+    swap = ["swap", choice([".".join(path), f"decoder.layers.*.{path[-1]}", "*", "*.x"])]
+    component = f"{{type: {choice(TYPES)}}}"
+    return choice((path, layer, swap)), choice((component, component, "null", "{}"))
+
+
+def elsewhere(options: Options) -> Change:
+    """Misspell an option, move it elsewhere, or name another base."""
+    path = choice([*options])
+    *section, name = path.split(".")
+    others = choice([*options]).split(".")
+    value = json.dumps(options[path])
+    base = choice([*OPTIONS, *TABLES["bases"]])
+    moved = ([*others[:-1], name], value)
+    return choice((([*section, name[::-1]], value), moved, (["extends"], base)))
+
+
+def broken(text: str) -> str:
+    """Return the text cut, with a piece left out or repeated, or with characters put into it."""
+    lines = text.splitlines(keepends=True)
+    pieces = choice((lines, list(text)))
+    first, last = sorted(randrange(len(pieces) + 1) for _ in range(2))
+    head = pieces[:first]
+    rest = pieces[first:]
+    odd = [*head, choice(TABLES["odd"]), *rest]
+    return "".join(choice((head, head + pieces[last:], pieces[:last] + rest, odd)))
+
+
+def judged(text: str, overrides: list[str], file: Path) -> str:
+    """Return how a case ends. Raises what nobody should see."""
+    file.write_text(text, encoding="utf-8")
+    try:
+        recipe = resolve(file, overrides)
+        recipe.rate_factors(recipe.build_model("meta"))
+    except (RecipeError, MissingExtraError) as error:
+        for problem in getattr(error, "problems", ()):
+            if problem.cause and not isinstance(problem.cause, PluginError):
+                raise FaultError(f"{problem} {problem.cause!r}") from error
+        return refused(error)
+    file.write_text(annotated(recipe), encoding="utf-8")
+    for again in (file, json.loads(json.dumps(recipe.tree))):
+        if resolve(again).tree != recipe.tree:
+            raise FaultError(f"resolves to another recipe when it is written as {type(again)}")
+    return "success"
+
+
+def case_in(scratch: Path, _: Path) -> tuple[str, Use]:
+    """Write a recipe with one change beside the shipped one; others are overrides."""
+    name = choice([*OPTIONS])
+    shipped = scratch / "recipes" / name
+    changes: list[Change] = []
+    for _change in range(choice([1, 1, 1, 2, 2, 3, 5])):
+        change = choice((any_value, any_value, scaled, other_component, elsewhere))
+        changes.append(change(OPTIONS[name]))
+    path, value = changes.pop()
+    keys = [f"{'  ' * depth}{json.dumps(key)}:" for depth, key in enumerate(path)]
+    text = "\n".join(keys) + f" {value}\n"
+    if path != ["extends"]:
+        text = f"extends: {shipped.name}\n{text}"
+    if random.random() < 0.3:
+        text = broken(choice((text, shipped.read_text(encoding="utf-8"))))
+    overrides = [f"{'.'.join(path)}={value}" for path, value in changes]
+    shown = f"{name}, {overrides}\n{text[:3000]}"
+    return shown, partial(judged, text, overrides, shipped.with_name("case.yaml"))
+
+
+def prepare(scratch: Path) -> None:
+    """Copy the shipped recipes."""
+    shutil.copytree(RECIPES, scratch / "recipes")
