@@ -18,12 +18,13 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import torch
 import torch.nn.functional as F
+import yaml
 from qgs_anchors.ellipsoid.fields import anchor_rotation
 from qgs_anchors.ellipsoid.ray_bias import EllipsoidBias
 from qgs_anchors.ellipsoid.ray_bias import ray_tokens as ellipsoid_tokens
@@ -34,127 +35,78 @@ from qgs_research.bench.run import in_turn, quartiles
 from torch import Tensor
 
 ROOT = Path(__file__).parents[1]
-TINY = ("tokengs", "locus", "landmark", "ellipsoid", "c3g", "gslrm", "mvsplat", "globalsplat")
-PAIR = ("tokengs/dl3dv_4096_4views.yaml", "locus/dl3dv_4096_4views.yaml")
-SMALLER = ("locus/dl3dv.yaml", "landmark/dl3dv.yaml")
+PHASES = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text("utf-8"))
 BUILD = "gsplat compiles"
 KERNELS: Any = ("plain", "blocks", "triton")
 TOLERANCES = {torch.float32: 1e-5, torch.bfloat16: 4 * 2**-7, torch.float16: 4 * 2**-10}
 """Half precision rounds the output once, and the kernels the weights and their derivative; the
 plain path rounds the bias, which is -5 at least here: less than 8 halves of a unit."""
 
-
-@dataclass(frozen=True)
-class Step:
-    """One check. limit: seconds."""
-
-    name: str
-    command: Sequence[str]
-    limit: float = 900
+Step = dict[str, Any]
+"""name, command, limit: as in gpu_check.yaml, for one combination of its words."""
 
 
-def checks(out: Path) -> Iterator[list[Step]]:
-    """Lists of steps that may run side by side; those that others depend on come first."""
-    python = sys.executable
-    tests = (python, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-rs", "-m", "")
-    compiled = "import gsplat.cuda._backend as b; assert b._C"
-    yield [
-        Step(BUILD, [python, "-c", compiled], 1800),
-        # Triton compiles each case of these tests for some 15 s, on one core.
-        Step(
-            "Triton kernels",
-            [*tests, "-n", "8", "plugins/anchors/tests/ellipsoid/test_attention_triton.py"],
-        ),
-    ]
-    contract = ("tests/renderers", "tests/train/test_training_pass.py", "-k", "gsplat")
-    yield [
-        Step("renderer contract on gsplat", [*tests, *contract], 1800),
-        *(
-            training(out, name, precision)
-            for name in TINY
-            for precision in ("float32", "bf16")
-        ),
-        two_processes(out),
-    ]  # fmt: skip
-    yield [Step("attention against float64, timed", [python, __file__, "--attention"])]
-    narrow = ("--set", "model.width=384", "--set", "model.heads=6")
-    for name, pair, changes in (
-        ("at 1024 anchors", SMALLER, (*narrow, "--views", "4", "--size", "256x256")),
-        ("at published size", PAIR, ("--memory", "--step")),
-    ):
-        for precision in ("float32", "bf16"):
-            options = ("--precision", precision, "--device", "cuda", "--rounds", "30")
-            file = ("--warmup", "5", "--json", f"{name.replace(' ', '-')}-{precision}.json")
-            command = ["qgs", "bench", *pair, *changes, *options, *file]
-            yield [Step(f"latency {name}, {precision}", command)]
-    options = ("--device", "cuda", "--rounds", "5", "--memory")
-    views = [("--views", str(count)) for count in (2, 8, 32)]
-    queries = [("--set", f"model.queries.count={count}") for count in (256, 2048, 16384)]
-    yield [
-        Step(f"latency, {' '.join(point)}", ["qgs", "bench", *PAIR, *point, *options], 900)
-        for point in (*views, *queries)
-    ]
-
-
-def training(out: Path, name: str, precision: str) -> Step:
-    """A short training of a tiny recipe on the GPU."""
-    run = ("--out", str(out / "runs" / f"{name}-{precision}"), "--device", "cuda", "--threads", "1")
-    changes = ("--set", "training.steps=200", "--set", f"training.precision={precision}")
-    command = ["qgs", "train", f"tiny/{name}.yaml", *run, *changes]
-    return Step(f"training of {name}, {precision}", command, 600)
-
-
-def two_processes(out: Path) -> Step:
-    """DDP. NCCL refuses two processes on one GPU; gloo is for CPUs."""
-    device = "cuda" if torch.cuda.device_count() > 1 else "cpu"
-    launch = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
-    run = ("--out", str(out / "runs/two"), "--set", "training.steps=50", "--device", device)
-    program = str(Path(sys.executable).with_name("qgs"))
-    command = [*launch, program, "train", "tiny/locus.yaml", *run]
-    return Step(f"DDP of two processes, {device}", command, 600)
+def steps_of(phase: dict[str, Any], out: Path, words: Sequence[str]) -> Iterator[Step]:
+    """Yield the steps of a phase, or those that have one of `words` in their name."""
+    places = {
+        "out": shlex.quote(str(out)),
+        "root": ROOT,
+        "qgs": Path(sys.executable).with_name("qgs"),
+        "device": "cuda" if torch.cuda.device_count() > 1 else "cpu",
+    }
+    for step in phase["steps"]:
+        each = step.get("each", {})
+        for chosen in product(*each.values()):
+            values = places | dict(zip(each, chosen, strict=True))
+            name = step["name"].format(**values)
+            if not words or any(word in name for word in (BUILD, *words)):
+                yield {**step, "name": name, "command": step["command"].format(**values)}
 
 
 def run_step(step: Step, out: Path) -> tuple[bool, str, str]:
-    """Run it in OUT; whether it passed, its row of the table, and the end of its output."""
-    log = out / "logs" / f"{step.name.replace(' ', '-').replace(',', '')}.txt"
+    """Run a step in OUT; return whether it passed, its row of the table, its output's end."""
+    log = out / "logs" / f"{step['name'].replace(' ', '-').replace(',', '')}.txt"
     log.parent.mkdir(parents=True, exist_ok=True)
-    paths = os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
-    where, started = ROOT if "pytest" in step.command else out, time.perf_counter()
+    env = {**os.environ, "PYTHONPATH": str(ROOT / "tests")}
+    env["PATH"] = f"{Path(sys.executable).parent}:{env['PATH']}"
+    started = time.perf_counter()
     with log.open("w") as file:
         process = subprocess.Popen(
-            step.command, cwd=where, env={**os.environ, "PYTHONPATH": paths}, stdout=file,
-            stderr=subprocess.STDOUT, start_new_session=True,
-        )  # fmt: skip
+            shlex.split(step["command"]),
+            cwd=ROOT if "pytest" in step["command"] else out,
+            env=env,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
         try:
-            code = process.wait(step.limit)
+            code = process.wait(step["limit"])
         except subprocess.TimeoutExpired as error:
-            os.killpg(process.pid, signal.SIGKILL)  # its own processes too
+            # Its own processes too.
+            os.killpg(process.pid, signal.SIGKILL)
             code = str(error)
             file.write(f"\n{error}\n")
     verdict = "passed" if code == 0 else "FAILED"
-    row = f"| {step.name} | {verdict} | {time.perf_counter() - started:.0f} |"
+    row = f"| {step['name']} | {verdict} | {time.perf_counter() - started:.0f} |"
     print(row, flush=True)
     end = "\n".join(log.read_text(errors="replace").splitlines()[-40:])
-    command = f"## {step.name}\n\n`{shlex.join(step.command)}`"
-    return code == 0, row, f"{command}\n\n```\n{end}\n```"
+    return code == 0, row, f"## {step['name']}\n\n`{step['command']}`\n\n```\n{end}\n```"
 
 
 def report(out: Path, words: Sequence[str]) -> bool:
-    """Run the steps, and write OUT/report.md anew after each; whether all passed."""
-    names = ", ".join(
-        torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())
-    )
-    head = f"# Checks on {names}, torch {torch.__version__}, CUDA {torch.version.cuda}"
+    """Run the steps, and write OUT/report.md anew after each; return whether all passed."""
+    names = [torch.cuda.get_device_name(n) for n in range(torch.cuda.device_count())]
+    head = f"# Checks on {', '.join(names)}, torch {torch.__version__}, CUDA {torch.version.cuda}"
     results: list[tuple[bool, str, str]] = []
-    for steps in checks(out):
-        named = (BUILD, *words)
-        wanted = [s for s in steps if not words or any(name in s.name for name in named)]
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            for done in as_completed([pool.submit(run_step, step, out) for step in wanted]):
-                results.append(done.result())
-                rows = ["| step | | seconds |", "|---|---|--:|", *(row for _, row, _ in results)]
-                parts = [head, "\n".join(rows), *(end for _, _, end in results)]
-                (out / "report.md").write_text("\n\n".join(parts) + "\n")
+    for phase in PHASES:
+        with ThreadPoolExecutor(os.cpu_count() if phase["together"] else 1) as pool:
+            runs = [pool.submit(run_step, step, out) for step in steps_of(phase, out, words)]
+            for run in as_completed(runs):
+                results.append(run.result())
+                rows = "\n".join(row for _, row, _ in results)
+                ends = "\n\n".join(end for _, _, end in results)
+                text = f"{head}\n\n| step | | seconds |\n|---|---|--:|\n{rows}\n\n{ends}\n"
+                (out / "report.md").write_text(text)
     return all(passed for passed, _, _ in results)
 
 

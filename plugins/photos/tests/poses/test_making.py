@@ -25,12 +25,13 @@ def assert_close(folder, shots):
     true = np.stack([shot.c2w for shot in shots])
     axes = [poses[:, :3, :3].swapaxes(1, 2).reshape(-1, 3) for poses in (true, found)]
     turn = Rotation.align_vectors(*axes)[0]
-    off = Rotation.from_matrix(true[:, :3, :3]).inv() * turn * Rotation.from_matrix(found[:, :3, :3])
+    turned = turn * Rotation.from_matrix(found[:, :3, :3])
+    off = Rotation.from_matrix(true[:, :3, :3]).inv() * turned
     assert np.median(np.degrees(off.magnitude())) < 1
     centers = true[:, :3, 3] - true[:, :3, 3].mean(0)
-    turned = turn.apply(found[:, :3, 3] - found[:, :3, 3].mean(0))
-    scale = (turned * centers).sum() / (turned**2).sum()
-    distances = np.linalg.norm(scale * turned - centers, axis=-1)
+    placed = turn.apply(found[:, :3, 3] - found[:, :3, 3].mean(0))
+    scale = (placed * centers).sum() / (placed**2).sum()
+    distances = np.linalg.norm(scale * placed - centers, axis=-1)
     extent = np.linalg.norm(centers[:, None] - centers[None], axis=-1).max()
     assert np.median(distances) / extent < 0.02
 
