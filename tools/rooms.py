@@ -7,13 +7,18 @@ they import. An arrow leads to a room that is imported and that no other arrow l
 """
 
 import ast
-from collections import defaultdict
-from html import escape
 from pathlib import Path
+
+import networkx as nx
+from jinja2 import Template
 
 ROOT = Path(__file__).parents[1]
 PICTURE = ROOT / "docs/images/rooms.svg"
-WIDTH, HEIGHT, GAP, ROW = 168, 50, 14, 104
+TEMPLATE = Path(__file__).with_name("rooms.svg.jinja")
+GAP = 14
+ROW = 104
+ACROSS = 182
+"""From the left of a room to that of the next."""
 COLUMNS = 7
 
 
@@ -44,44 +49,14 @@ def imports(files: list[Path]) -> set[str]:
     return own | {part[0] for part in parts if part[0].startswith("qgs_")}
 
 
-def graph() -> dict[str, set[str]]:
-    """Return every room and the others that it imports."""
+def graph() -> nx.DiGraph:
+    """Return every room, with an edge to each other room that it imports."""
     found = rooms()
-    return {name: (imports(files) & found.keys()) - {name} for name, files in found.items()}
-
-
-def reach(arrows: dict[str, set[str]], start: str) -> set[str]:
-    """Return all rooms that `start` leads to."""
-    seen = set[str]()
-    waiting = [start]
-    while waiting:
-        for name in arrows[waiting.pop()] - seen:
-            seen.add(name)
-            waiting.append(name)
-    return seen
-
-
-def reduced(arrows: dict[str, set[str]]) -> dict[str, set[str]]:
-    """Return `arrows` without those that a longer way makes needless."""
-    far = {name: reach(arrows, name) for name in arrows}
-    return {
-        name: {to for to in others if not any(to in far[way] for way in others - {to})}
-        for name, others in arrows.items()
-    }
-
-
-def heights(arrows: dict[str, set[str]]) -> dict[str, int]:
-    """Return the row of every room, 0 at the bottom: one above the highest that it imports."""
-    found: dict[str, int] = {}
-
-    def height(name: str) -> int:
-        if name not in found:
-            found[name] = 1 + max((height(other) for other in arrows[name]), default=-1)
-        return found[name]
-
-    for name in arrows:
-        height(name)
-    return found
+    arrows = nx.DiGraph()
+    for name, files in found.items():
+        arrows.add_node(name)
+        arrows.add_edges_from((name, to) for to in imports(files) & found.keys() - {name})
+    return arrows
 
 
 def title(files: list[Path]) -> str:
@@ -95,48 +70,25 @@ def drawn() -> str:
     """Return the picture as SVG."""
     arrows = graph()
     files = rooms()
-    rows: dict[int, list[str]] = defaultdict(list)
-    for name, row in heights(arrows).items():
-        rows[row].append(name)
     lines: list[list[str]] = []
-    for row in sorted(rows, reverse=True):
-        names = sorted(rows[row], key=lambda name: (name.startswith("qgs_"), name))
+    # The first generation is imported by no other; reversed, it imports none.
+    ground, *upper = nx.topological_generations(arrows.reverse())
+    for row in (*reversed(upper), ground):
+        names = sorted(row, key=lambda name: (name.startswith("qgs_"), name))
         lines += [names[start : start + COLUMNS] for start in range(0, len(names), COLUMNS)]
-    across = WIDTH + GAP
-    places: dict[str, tuple[float, float]] = {}
+    places: dict[str, tuple[float, int]] = {}
     for number, names in enumerate(lines):
-        left = (COLUMNS - len(names)) * across / 2 + GAP
+        left = (COLUMNS - len(names)) * ACROSS / 2 + GAP
         for column, name in enumerate(names):
-            places[name] = (left + column * across, GAP + number * ROW)
-    size = (COLUMNS * across + GAP, len(lines) * ROW)
-    parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {size[0]} {size[1]}" '
-        'font-family="sans-serif" font-size="11">',
-        f'<rect width="{size[0]}" height="{size[1]}" fill="white"/>',
-    ]
-    ground = {name for name, row in heights(arrows).items() if row == 0}
-    for name, others in reduced(arrows).items():
-        x, y = places[name]
-        for other in sorted(others - ground):
-            to_x, to_y = places[other]
-            start = (x + WIDTH / 2, y + HEIGHT)
-            end = (to_x + WIDTH / 2, to_y)
-            bend = (start[1] + end[1]) / 2
-            parts.append(
-                f'<path d="M{start[0]} {start[1]} C{start[0]} {bend} {end[0]} {bend} '
-                f'{end[0]} {end[1]}" fill="none" stroke="#9aa7b2"/>'
-            )
-    for name, (x, y) in places.items():
-        color = "#e6f0e4" if name.startswith("qgs_") else "#e7eef6"
-        parts.append(
-            f'<rect x="{x}" y="{y}" width="{WIDTH}" height="{HEIGHT}" rx="6" fill="{color}" '
-            'stroke="#5b6b79"/>'
-            f'<text x="{x + WIDTH / 2}" y="{y + 21}" text-anchor="middle" font-weight="bold" '
-            f'font-size="13">{name}</text>'
-            f'<text x="{x + WIDTH / 2}" y="{y + 38}" text-anchor="middle" fill="#44525e">'
-            f"{escape(title(files[name]))}</text>"
-        )
-    return "\n".join([*parts, "</svg>\n"])
+            places[name] = (left + column * ACROSS, GAP + number * ROW)
+    reduced = nx.transitive_reduction(arrows)
+    edges = sorted(edge for edge in reduced.edges if edge[1] not in ground)
+    return Template(TEMPLATE.read_text("utf-8"), autoescape=True, trim_blocks=True).render(
+        width=COLUMNS * ACROSS + GAP,
+        height=len(lines) * ROW,
+        arrows=[(*places[name], *places[other]) for name, other in edges],
+        rooms=[(name, *place, title(files[name])) for name, place in places.items()],
+    )
 
 
 if __name__ == "__main__":
