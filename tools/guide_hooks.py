@@ -21,7 +21,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from guide_reference import reference
+from guide_reference import filled_template, reference
 from qgs_dev import CHECKS
 
 from qgs.recipe.slots import SLOTS
@@ -80,9 +80,12 @@ def _file(found: Any) -> str:
 def _entry(name: str, options: str | None) -> str:
     """A link from docs/api/ to the file of `name`, with the first paragraph of its docstring."""
     found = resolve_name(name)
-    summary = " ".join((inspect.getdoc(found) or "").split("\n\n")[0].split())
-    line = f"[`{name}`](../../{_file(found)}): {summary}"
+    line = f"[`{name}`](../../{_file(found)}): {_summary(found)}"
     return line + (f"\n<!-- {options} -->" if options else "")
+
+
+def _summary(documented: Any) -> str:
+    return " ".join((inspect.getdoc(documented) or "").split("\n\n")[0].split())
 
 
 def _part(name: str, text: str) -> str:
@@ -97,17 +100,14 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def check_list() -> str:
-    """Tables of all checks by subject, Markdown."""
-    parts: list[str] = []
-    for module, checks in groupby(CHECKS.values(), key=lambda check: check.function.__module__):
-        summary = (sys.modules[module].__doc__ or "").strip().split("\n\n")[0]
-        parts += [f"### {module.rpartition('.')[2].capitalize()}", "", summary, ""]
-        parts += ["| check | tier | slots | contract |", "|---|---|---|---|"]
-        for check in checks:
-            slots = _slots_in_words(check.slots)
-            parts.append(f"| `{check.name}` | {check.tier} | {slots} | {check.contract} |")
-        parts.append("")
-    return "\n".join(parts)
+    """Return tables of all checks by subject, Markdown."""
+    return filled_template(
+        "guide_checks.md.jinja",
+        modules=groupby(CHECKS.values(), key=lambda check: check.function.__module__),
+        title=lambda module: module.rpartition(".")[2].capitalize(),
+        summary=lambda module: _summary(sys.modules[module]),
+        in_words=_slots_in_words,
+    )
 
 
 def _slots_in_words(slots: Collection[str]) -> str:

@@ -10,7 +10,6 @@ from guide_pages import DOCS, all_pages
 
 from qgs.contracts import Component
 from qgs.recipe.errors import Problems
-from qgs.recipe.registry import load_registry
 from qgs.recipe.sections import RecipeSettings
 from qgs.recipe.slots import SLOTS
 from qgs.recipe.yaml_text import load_text
@@ -67,7 +66,7 @@ ROWS = rows_of(EQUATIONS)
 
 @cache
 def configs(slot):
-    components = load_registry(guide_reference.PLUGINS).components(slot)
+    components = guide_reference.REGISTRY.components(slot)
     return {name: component.Config for name, component in components.items()}
 
 

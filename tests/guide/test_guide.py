@@ -13,7 +13,6 @@ from qgs_dev import Case
 
 from qgs.contracts import ModelDims
 from qgs.recipe import RecipeError, resolve
-from qgs.recipe.registry import load_registry
 from qgs.recipe.slots import SLOTS
 from qgs.types import QueryState
 
@@ -66,7 +65,7 @@ def test_recipes_of_the_five_ideas():
 
 
 def test_the_reference_explains_every_option():
-    registry = load_registry(guide_reference.PLUGINS)
+    registry = guide_reference.REGISTRY
     configs = [*guide_reference.SECTIONS.values()]
     configs += [c.Config for slot in SLOTS for c in registry.components(slot).values()]
     for config in configs:
