@@ -4,12 +4,11 @@ from typing import Any
 
 import torch
 from qgs_zoo.dinov2.vit import PATCH, VitConfig
-from qgs_zoo.mvsplat.adapter import band_mask, camera_quaternions, turn_of_harmonics
 from qgs_zoo.mvsplat.depthsplat import DepthPredictor, finer_candidates, nearest_neighbours
 from qgs_zoo.mvsplat.depthsplat_encoder import DepthSplatEncoder
 from qgs_zoo.mvsplat.depthsplat_head import WorldHead
 from qgs_zoo.mvsplat.mvsplat import Sweep, expected_disparity
-from qgs_zoo.mvsplat.pixels import OnRays, PixelQueries
+from qgs_zoo.mvsplat.pixels import OnRays
 from qgs_zoo.mvsplat.sweep import (
     feature_lenses,
     inverse_depth_candidates,
@@ -21,15 +20,39 @@ from qgs_zoo.mvsplat.windows import shift_mask
 from torch import Tensor
 
 from published.files import GoldenFile
-from published.splats import Recorder, views_of, weights_of
+from published.splats import Recorder, gaussians, pixel_state, views_of, weights_of
 from qgs.contracts import LayerParts, ModelDims
-from qgs.geometry.transforms import quat_to_matrix
-from qgs.types import GaussianAttributes, ImageMemory, QueryState, Views
+from qgs.types import ImageMemory, Views
 
 DIMS = {1: ModelDims(38, 1, 0), 2: ModelDims(39, 1, 2)}
 """Of models of one scale, and of two with both depths."""
-DEGREE = 2
 VITS = {"vits": VitConfig(), "vitb": VitConfig(width=768, depth=12, heads=12)}
+
+OUTPUTS = """
+features_cnn.0                        depth_predictor.backbone.conv2
+dino_block.0                          depth_predictor.pretrained.blocks.0
+delta_inverse_depth                   depth_predictor.upsampler
+upsampler.concat_projects.0           depth_predictor.upsampler.concat_projects.0
+upsampler.concat_projects.1           depth_predictor.upsampler.concat_projects.1
+upsampler.concat_projects.2           depth_predictor.upsampler.concat_projects.2
+upsampler.refinenet1                  depth_predictor.upsampler.scratch.refinenet1
+upsampler.refinenet2                  depth_predictor.upsampler.scratch.refinenet2
+upsampler.refinenet3                  depth_predictor.upsampler.scratch.refinenet3
+upsampler.refinenet4                  depth_predictor.upsampler.scratch.refinenet4
+upsampled_features                    feature_upsampler
+feature_upsampler.concat_projects.0   feature_upsampler.concat_projects.0
+feature_upsampler.concat_projects.1   feature_upsampler.concat_projects.1
+feature_upsampler.concat_projects.2   feature_upsampler.concat_projects.2
+feature_upsampler.refinenet1          feature_upsampler.scratch.refinenet1
+feature_upsampler.refinenet2          feature_upsampler.scratch.refinenet2
+feature_upsampler.refinenet3          feature_upsampler.scratch.refinenet3
+feature_upsampler.refinenet4          feature_upsampler.scratch.refinenet4
+"""
+"""Names in the file, and modules of the network."""
+FINER_OUTPUTS = """
+features_mv.1     mv_pyramid.stages.1
+features_mono.1   mono_pyramid.stages.1
+"""
 
 
 def encoder_of(golden: GoldenFile) -> DepthSplatEncoder:
@@ -69,21 +92,26 @@ def depthsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
         *(side // encoder.config.stride for side in size), device=near.device
     )
     swept(found, predictor, sweep)
-    return found | gaussians(views, numbers, encoder.dims)
+    numbers = numbers.movedim(2, -1)
+    # Behind the harmonics stands the coarse depth, of models that have one.
+    found |= gaussians(views, numbers[..., :38], *outputs_of(DIMS[1]))
+    found["depth"] = numbers[..., 0].exp()
+    found["scales"] = found["scales"][..., 0, :]
+    if encoder.dims.depth:
+        found |= training_gaussians(views, numbers, encoder.dims)
+    return found
 
 
 def watch(kept: Recorder, encoder: DepthSplatEncoder, size: tuple[int, int]) -> None:
     """Hooks on all modules whose output a file has."""
     network, predictor = encoder.network, encoder.network.depth_predictor
     low = (size[0] // encoder.config.stride, size[1] // encoder.config.stride)
-    kept.output("features_cnn.0", predictor.backbone.conv2)
+    kept.table(network, OUTPUTS)
     kept.transformer(predictor.transformer, low, "features_mv.0")
     vit = predictor.pretrained
     if encoder.config.scales > 1:
-        kept.output("features_mv.1", predictor.mv_pyramid.stages[1])
-        kept.output("features_mono.1", predictor.mono_pyramid.stages[1])
+        kept.table(predictor, FINER_OUTPUTS)
     kept.input("dino_input", vit)
-    kept.output("dino_block.0", vit.blocks[0])
 
     def keep_all(_: Any, __: Any, out: list[Tensor]) -> None:
         for index, x in enumerate(out):
@@ -102,17 +130,6 @@ def watch(kept: Recorder, encoder: DepthSplatEncoder, size: tuple[int, int]) -> 
         kept.output(f"cost_unet_out.{scale}", regressor)
         kept.input(f"cost_volume_refined.{scale}", head)
         kept.output(f"match_logits.{scale}", head)
-    for name, head in (
-        ("upsampler", predictor.upsampler),
-        ("feature_upsampler", network.feature_upsampler),
-    ):
-        for index in range(3):
-            kept.output(f"{name}.concat_projects.{index}", head.concat_projects[index])
-        for index in range(1, 5):
-            fusion = head.scratch.get_submodule(f"refinenet{index}")
-            kept.output(f"{name}.refinenet{index}", fusion)
-    kept.output("delta_inverse_depth", predictor.upsampler)
-    kept.output("upsampled_features", network.feature_upsampler)
     network.gaussian_head.register_forward_hook(
         lambda _, __, out: kept.keep("raw_gaussians", out.movedim(1, -1))
     )
@@ -143,41 +160,20 @@ def swept(found: dict[str, Tensor], predictor: DepthPredictor, sweep: Sweep) -> 
         found[f"coarse_inverse_depth.{scale}"] = inverse.unflatten(0, shape)
 
 
-def gaussians(views: Views, numbers_BVCHW: Tensor, dims: ModelDims) -> dict[str, Tensor]:
-    """Outputs behind the networks, by queries, layers, head and centres."""
-    cameras = views.cameras
-    count, size = cameras.shape[1], cameras.size
-    numbers = numbers_BVCHW.movedim(2, -1)
-    memory = ImageMemory(numbers.flatten(1, 3), grid=(count, *size))
-    state = PixelQueries(PixelQueries.Config(), dims)(memory, views)
-    out, means = decoded(state, dims)
-    factors = quat_to_matrix(out.quats) * out.scales[..., None, :]
-    turn = turn_of_harmonics(cameras.c2w[..., :3, :3], DEGREE) * band_mask(DEGREE, cameras.c2w)
-    sh = numbers[..., 11:38].unflatten(-1, (3, -1))
-    row, column = torch.meshgrid(*(torch.arange(n) for n in size), indexing="ij")
-    place = torch.stack([column, row], -1) + numbers[..., 2:4].sigmoid()
-    found = {
-        "depth": numbers[..., 0].exp(),
-        "ray_xy": place / torch.tensor([size[1], size[0]]),
-        "means": means,
-        "covariances": (factors @ factors.mT)[:, :, 0],
-        "opacities": out.opacities[..., 0],
-        "scales": out.scales.unflatten(1, (count, *size))[..., 0, :],
-        "rotations": camera_quaternions(numbers[..., 7:11]),
-        "harmonics": torch.einsum("bvkl,bvhwxl->bvhwxk", turn, sh).flatten(1, 3),
-    }
-    if dims.depth:
-        layer = Exchange(Exchange.Config(), LayerParts(dims, {}, 1.0))
-        states = [layer(state, memory)[0]]
-        states.append(layer(states[0], memory)[0])
-        depths = torch.cat([numbers[..., -1], numbers[..., 0]])
-        means = torch.cat([decoded(each, dims)[1] for each in states])
-        found |= {"training.depths": depths.exp(), "training.means": means}
-    return found
+def training_gaussians(views: Views, numbers: Tensor, dims: ModelDims) -> dict[str, Tensor]:
+    """Return depths and means of both scales, one behind the other, as training decodes them."""
+    memory = ImageMemory(numbers.flatten(1, 3), grid=(views.cameras.shape[1], *views.cameras.size))
+    layer = Exchange(Exchange.Config(), LayerParts(dims, {}, 1.0))
+    head, centers = outputs_of(dims)
+    state = pixel_state(views, numbers)
+    means: list[Tensor] = []
+    for _ in range(2):
+        state = layer(state, memory)[0]
+        means.append(centers(head(state).offsets, state)[:, :, 0])
+    depths = torch.cat([numbers[..., -1], numbers[..., 0]])
+    return {"training.depths": depths.exp(), "training.means": torch.cat(means)}
 
 
-def decoded(state: QueryState, dims: ModelDims) -> tuple[GaussianAttributes, Tensor]:
-    """Gaussians of a state and their means (B, N, 3)."""
-    out = WorldHead(WorldHead.Config(), dims)(state)
-    centers = OnRays(OnRays.Config(measure="depth"), dims)
-    return out, centers(out.offsets, state)[:, :, 0]
+def outputs_of(dims: ModelDims) -> tuple[WorldHead, OnRays]:
+    """Return the head and the centers that decode a pixel's numbers."""
+    return WorldHead(WorldHead.Config(), dims), OnRays(OnRays.Config(measure="depth"), dims)

@@ -1,15 +1,13 @@
 """A file of golden numbers: tensors, and in its metadata what they were computed with."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
-
-from published.idle_options import IDLE_OPTIONS
 
 WEIGHTS = "weights."
 EXPECTED = "expected."
@@ -23,15 +21,11 @@ class GoldenFileError(ValueError):
 
 @dataclass
 class GoldenFile:
-    """tensors: by name. config: the JSON in the metadata.
-
-    read: names given out as inputs. known: options that were asked for.
-    """
+    """tensors: by name. config: the JSON in the metadata. read: names given out as inputs."""
 
     tensors: dict[str, Tensor]
     config: dict[str, Any]
     read: set[str] = field(default_factory=set)
-    known: set[str] = field(default_factory=set)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -43,7 +37,7 @@ class GoldenFile:
         return size[0], size[1]
 
     def options(self, group: str, beside: Mapping[str, Any] | None = None) -> Mapping[str, Any]:
-        """The published options under `group` and `beside`; what is read from them is noted.
+        """Return the published options under `group`, and `beside`.
 
         Raises GoldenFileError if the metadata has no such group of options.
         """
@@ -52,13 +46,7 @@ class GoldenFile:
         options = self.config[group]
         if not isinstance(options, dict):
             raise GoldenFileError(f"`{group}` must be a mapping of options, got {options!r}")
-        return _Noting({**options, **(beside or {})}, self.known)
-
-    def unknown_options(self) -> list[str]:
-        """Options that nothing has read and that are not in IDLE_OPTIONS."""
-        groups = (value for name, value in self.config.items() if name.endswith("options"))
-        names = {name for group in groups for name in group}
-        return sorted(names - self.known - IDLE_OPTIONS)
+        return {**options, **(beside or {})}
 
     @property
     def is_of_losses(self) -> bool:
@@ -93,23 +81,6 @@ class GoldenFile:
         if not isinstance(outputs, list) or not all(isinstance(name, str) for name in outputs):
             raise GoldenFileError(f"`outputs` must be a list of names, got {outputs!r}")
         return [name for name in outputs if not name.startswith(LOADER)]
-
-
-class _Noting(Mapping[str, Any]):
-    """Options; the names that were asked for go into `asked`."""
-
-    def __init__(self, options: Mapping[str, Any], asked: set[str]) -> None:
-        self._options, self._asked = options, asked
-
-    def __getitem__(self, name: str) -> Any:
-        self._asked.add(name)
-        return self._options[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._options)
-
-    def __len__(self) -> int:
-        return len(self._options)
 
 
 def read_golden(path: Path) -> GoldenFile:

@@ -40,37 +40,37 @@ def locusgs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
         "refinement": _refinement(released),
     }
     model["centers"] = _centers(released)
-    model["supervision"] = {"layers": sorted(set(released.counts("anchor_supervision_layers")))}
+    model["supervision"] = {"layers": sorted(set(released["anchor_supervision_layers"]))}
     return {"recipe": 1, "plugins": ["locus"], "model": model}
 
 
 def _radius(options: ReleasedOptions, read: bool) -> dict[str, Any]:
-    return {"radius_min": options.number("anchor_radius_min")} if read else {}
+    return {"radius_min": options["anchor_radius_min"]} if read else {}
 
 
 def _queries(options: ReleasedOptions) -> dict[str, Any]:
     queries = {"type": "locus/anchored", **query_options(options)}
     queries["center_init"] = {
         "kind": "normal",
-        "mean": [0.0, 0.0, options.number("gaussian_z_offset")],
+        "mean": [0.0, 0.0, options["gaussian_z_offset"]],
     }
-    if not options.flag("use_anchor_radius"):
+    if not options["use_anchor_radius"]:
         return queries | {"radius": False}
-    return queries | _radius(options, True) | {"init_radius": options.number("anchor_radius_init")}
+    return queries | _radius(options, True) | {"init_radius": options["anchor_radius_init"]}
 
 
 def _cross_attention(options: ReleasedOptions) -> dict[str, Any]:
     chosen = options.meaning("cross_attn_variant", CROSS_ATTENTION)
     if chosen == "qgs/content":
         return {"type": chosen}
-    sigma = options.number("geo_sigma") if "geo_sigma" in options else 0.1
-    by_radius = options.flag("anchor_radius_affects_bias")
+    sigma = options.get("geo_sigma", 0.1)
+    by_radius = options["anchor_radius_affects_bias"]
     bandwidth = "radius" if by_radius else "fixed"
     return {"type": chosen, "bandwidth": bandwidth, "sigma0": sigma} | _radius(options, by_radius)
 
 
 def _refinement(options: ReleasedOptions) -> dict[str, Any]:
-    refined = options.flag("anchor_radius_refinement")
+    refined = options["anchor_radius_refinement"]
     return {"type": "locus/refine", "radius": refined} | _radius(options, refined)
 
 

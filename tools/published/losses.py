@@ -155,17 +155,17 @@ def _whole_loss(
     found |= {f"{name}_per_scene": values for name, values in per_scene.items()}
     if "lambda_opacity" in options:
         found["loss_opacity"] = inputs.value(Opacity(Opacity.Config(weight=1.0)))
-        found["loss"] = found["loss"] + options.number("lambda_opacity") * found["loss_opacity"]
+        found["loss"] = found["loss"] + options["lambda_opacity"] * found["loss_opacity"]
     return found
 
 
 def _terms(release: str, options: ReleasedOptions, ssim: str) -> Iterator[tuple[str, float, Loss]]:
     """Name, published weight and unweighted component of each term that is a sum over scenes."""
-    clamp = _clamp(options.number("visibility_distance_threshold"))
+    clamp = _clamp(options["visibility_distance_threshold"])
     yield RGB_TERM[release], 1.0, Photometric(Photometric.Config(ssim_weight=0.0))
-    yield "loss_mask", options.number("lambda_mask"), Mask(Mask.Config(weight=1.0))
+    yield "loss_mask", options["lambda_mask"], Mask(Mask.Config(weight=1.0))
     visibility = Visibility(Visibility.Config(weight=1.0, clamp=clamp))
-    yield "loss_visibility", options.number("lambda_visibility"), visibility
+    yield "loss_visibility", options["lambda_visibility"], visibility
     ssim_weight = _ssim_weight(options, ssim)
     if ssim_weight:
         ssim_loss = Photometric.Config(mse_weight=0.0, ssim_weight=1.0, padding="same")
@@ -176,7 +176,7 @@ def _ssim_weight(options: ReleasedOptions, ssim: str) -> float:
     """The option is a number (0 for `nossim`), or text such as "0 (nossim) / 0.2 (refssim)"."""
     text = options["lambda_ssim"]
     if not isinstance(text, str):
-        return 0.0 if ssim == "nossim" else float(options.number("lambda_ssim"))
+        return 0.0 if ssim == "nossim" else float(options["lambda_ssim"])
     match = re.search(rf"([\d.]+) \({ssim}\)", text)
     if not match:
         raise GoldenFileError(f"the option lambda_ssim is {text!r}; it tells no weight of {ssim}")

@@ -1,10 +1,9 @@
 """Every tensor of a golden file of MVSplat, computed by the components."""
 
 import torch
-from qgs_zoo.mvsplat.adapter import band_mask, camera_quaternions, turn_of_harmonics
 from qgs_zoo.mvsplat.head import RayHead
 from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder, Sweep
-from qgs_zoo.mvsplat.pixels import OnRays, PixelQueries
+from qgs_zoo.mvsplat.pixels import OnRays
 from qgs_zoo.mvsplat.sweep import (
     cyclic_neighbours,
     feature_lenses,
@@ -16,10 +15,20 @@ from qgs_zoo.mvsplat.windows import shift_mask
 from torch import Tensor
 
 from published.files import GoldenFile
-from published.splats import Recorder, views_of, weights_of
+from published.splats import Recorder, gaussians, views_of, weights_of
 from qgs.contracts import ModelDims
-from qgs.geometry.transforms import quat_to_matrix
-from qgs.types import ImageMemory, Views
+
+OUTPUTS = """
+cnn.layer2                          backbone.backbone.layer2
+features_cnn                        backbone.backbone.conv2
+cost_unet.stem                      depth_predictor.corr_refine_net.2
+cost_volume_unet                    depth_predictor.corr_refine_net
+match_logits                        depth_predictor.depth_head_lowres
+fullres_features                    depth_predictor.upsampler
+projected_features                  depth_predictor.proj_feature
+delta_disparity_and_density_logit   depth_predictor.to_disparity
+"""
+"""Names in the file, and modules of the encoder."""
 
 
 def encoder_of(golden: GoldenFile) -> MVSplatEncoder:
@@ -63,53 +72,26 @@ def mvsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     grid = warp_grid(*(x.flatten(0, 2) for x in (depth, lens, poses)))
     found["warp_grid"] = grid.unflatten(0, poses.shape[:3])
     found["shift_mask"] = shift_mask(*low, device=near.device)
-    return found | gaussians(views, raw, encoder.dims)
+    numbers = raw.movedim(2, -1)
+    head = RayHead(RayHead.Config(), encoder.dims)
+    found |= gaussians(views, numbers, head, OnRays(OnRays.Config(), encoder.dims))
+    # The release keeps an axis of Gaussians a pixel here.
+    found["rotations"] = found["rotations"][..., None, :]
+    found["depth"] = numbers[..., :1].exp()
+    found["density"] = numbers[..., 1:2].sigmoid()
+    found["raw_gaussians"] = numbers[..., 2:]
+    return found
 
 
 def watch(kept: Recorder, encoder: MVSplatEncoder, low: tuple[int, ...]) -> None:
     """Hooks on all modules whose output or input a file has."""
-    predictor, cnn = encoder.depth_predictor, encoder.backbone.backbone
-    kept.output("cnn.layer2", cnn.layer2)
-    kept.output("features_cnn", cnn.conv2)
-    kept.transformer(encoder.backbone.transformer, low, "features")
+    predictor = encoder.depth_predictor
     refined = predictor.corr_refine_net
+    kept.table(encoder, OUTPUTS)
+    kept.transformer(encoder.backbone.transformer, low, "features")
     kept.input("cost_volume", refined, slice(encoder.config.candidates))
-    kept.output("cost_unet.stem", refined[2])
     kept.unet("cost_unet", refined[3])
-    kept.output("cost_volume_unet", refined)
     kept.input("cost_volume_refined", predictor.depth_head_lowres)
-    kept.output("match_logits", predictor.depth_head_lowres)
-    kept.output("fullres_features", predictor.upsampler)
-    kept.output("projected_features", predictor.proj_feature)
     kept.input("fullres_disparity", predictor.refine_unet, slice(-2, -1))
     kept.input("pdf_max_fullres", predictor.refine_unet, slice(-1, None))
     kept.unet("depth_unet", predictor.refine_unet[3])
-    kept.output("delta_disparity_and_density_logit", predictor.to_disparity)
-
-
-def gaussians(views: Views, raw_BVCHW: Tensor, dims: ModelDims) -> dict[str, Tensor]:
-    """Outputs behind the networks, by queries, head and centres."""
-    raw, cameras = raw_BVCHW.movedim(2, -1), views.cameras
-    count, size = cameras.shape[1], cameras.size
-    memory = ImageMemory(raw.flatten(1, 3), grid=(count, *size))
-    state = PixelQueries(PixelQueries.Config(), dims)(memory, views)
-    out = RayHead(RayHead.Config(), dims)(state)
-    means = OnRays(OnRays.Config(), dims)(out.offsets, state)
-    factors = quat_to_matrix(out.quats) * out.scales[..., None, :]
-    sh = raw[..., 11:].unflatten(-1, (3, -1))
-    degree = round(sh.shape[-1] ** 0.5) - 1
-    turn = turn_of_harmonics(cameras.c2w[..., :3, :3], degree) * band_mask(degree, cameras.c2w)
-    row, column = torch.meshgrid(*(torch.arange(n) for n in size), indexing="ij")
-    place = torch.stack([column, row], -1) + raw[..., 2:4].sigmoid()
-    return {
-        "depth": raw[..., :1].exp(),
-        "density": raw[..., 1:2].sigmoid(),
-        "raw_gaussians": raw[..., 2:],
-        "ray_xy": place / torch.tensor([size[1], size[0]]),
-        "means": means[:, :, 0],
-        "covariances": (factors @ factors.mT)[:, :, 0],
-        "opacities": out.opacities[..., 0],
-        "scales": out.scales.unflatten(1, (count, *size)),
-        "rotations": camera_quaternions(raw[..., 7:11])[..., None, :],
-        "harmonics": torch.einsum("bvkl,bvhwxl->bvhwxk", turn, sh).flatten(1, 3),
-    }

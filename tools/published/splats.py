@@ -5,12 +5,16 @@ from typing import Any
 
 import numpy as np
 import torch
+from qgs_zoo.mvsplat.adapter import band_mask, camera_quaternions, turn_of_harmonics
+from qgs_zoo.mvsplat.pixels import PixelQueries
 from qgs_zoo.mvsplat.windows import out_of_windows
 from torch import Tensor, nn
 
 from published.files import GoldenFile, GoldenFileError
 from published.seeded_weights import seeded_state_dict, weights_check
-from qgs.types import Cameras, Views
+from qgs.contracts import ModelDims
+from qgs.geometry.transforms import quat_to_matrix
+from qgs.types import Cameras, ImageMemory, QueryState, Views
 
 
 def views_of(golden: GoldenFile) -> Views:
@@ -40,6 +44,39 @@ def weights_of(golden: GoldenFile) -> dict[str, Tensor]:
     return {name: torch.from_numpy(x) for name, x in arrays.items()}
 
 
+def gaussians(views: Views, numbers: Tensor, head: Any, centers: Any) -> dict[str, Tensor]:
+    """Return outputs behind the networks, by queries, head and centers.
+
+    numbers: (B, V, H, W, C), what the networks give for each pixel.
+    """
+    cameras = views.cameras
+    count = cameras.shape[1]
+    state = pixel_state(views, numbers)
+    out = head(state)
+    factors = quat_to_matrix(out.quats) * out.scales[..., None, :]
+    sh = numbers[..., 11:].unflatten(-1, (3, -1))
+    degree = round(sh.shape[-1] ** 0.5) - 1
+    turn = turn_of_harmonics(cameras.c2w[..., :3, :3], degree) * band_mask(degree, cameras.c2w)
+    row, column = torch.meshgrid(*(torch.arange(side) for side in cameras.size), indexing="ij")
+    place = torch.stack([column, row], -1) + numbers[..., 2:4].sigmoid()
+    return {
+        "ray_xy": place / torch.tensor([cameras.size[1], cameras.size[0]]),
+        "means": centers(out.offsets, state)[:, :, 0],
+        "covariances": (factors @ factors.mT)[:, :, 0],
+        "opacities": out.opacities[..., 0],
+        "scales": out.scales.unflatten(1, (count, *cameras.size)),
+        "rotations": camera_quaternions(numbers[..., 7:11]),
+        "harmonics": torch.einsum("bvkl,bvhwxl->bvhwxk", turn, sh).flatten(1, 3),
+    }
+
+
+def pixel_state(views: Views, numbers: Tensor) -> QueryState:
+    """Return a query for each pixel, with its numbers (B, V, H, W, C)."""
+    memory = ImageMemory(numbers.flatten(1, 3), grid=(views.cameras.shape[1], *views.cameras.size))
+    dims = ModelDims(numbers.shape[-1], 1, 0)
+    return PixelQueries(PixelQueries.Config(), dims)(memory, views)
+
+
 class Recorder:
     """Outputs of modules by name, (B, V, ...)."""
 
@@ -62,6 +99,12 @@ class Recorder:
     def input(self, name: str, module: nn.Module, channels: slice = slice(None)) -> None:
         """What a module is given."""
         module.register_forward_pre_hook(lambda _, given: self.keep(name, given[0][:, channels]))
+
+    def table(self, root: nn.Module, text: str) -> None:
+        """Keep outputs of modules: a name and the path of a module below `root` a line."""
+        for line in text.strip().splitlines():
+            name, path = line.split()
+            self.output(name, root.get_submodule(path))
 
     def transformer(self, transformer: Any, size: Sequence[int], last: str) -> None:
         """The stream before and behind each attention in windows; `last` names the result."""

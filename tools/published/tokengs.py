@@ -22,7 +22,7 @@ def tokengs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
     model["encoder"] |= encoder_options(released)
     model["head"] |= {
         "gaussians_per_query": released.count("dec_patch_size") ** 2,
-        "opacity_bias": -released.number("opacity_bias"),
+        "opacity_bias": -released["opacity_bias"],
         "scale_input_limit": None,
         "quat_eps": 1e-12,
     }
@@ -30,7 +30,7 @@ def tokengs_recipe(options: Mapping[str, Any]) -> dict[str, Any]:
     model |= motion_options(released, model)
     model["centers"] = {
         "type": "qgs/free",
-        "z_offset": released.number("gaussian_z_offset"),
+        "z_offset": released["gaussian_z_offset"],
         "input_limit": None,
         "output_limit": None,
     }
@@ -50,10 +50,10 @@ def backbone(options: ReleasedOptions) -> dict[str, Any]:
         "encoder": {
             "patch_size": options.count("patch_size"),
             "depth": options.count("enc_depth"),
-            "mlp_ratio": options.number("mlp_ratio"),
+            "mlp_ratio": options["mlp_ratio"],
         },
         "decoder": {"depth": options.count("dec_depth")},
-        "head": {"scale_cap": options.number("gaussian_scale_cap")},
+        "head": {"scale_cap": options["gaussian_scale_cap"]},
     }
 
 
@@ -63,7 +63,7 @@ def motion_options(options: ReleasedOptions, model: dict[str, Any]) -> dict[str,
     if not (dynamic or timed):
         return {}
     count = options.count("num_dynamic_gs_tokens")
-    channels = options.count("time_embedding_dim") if options.flag("time_embedding") else 0
+    channels = options.count("time_embedding_dim") if options["time_embedding"] else 0
     queries = {**model["queries"], "type": "tokengs2026/dynamic", "dynamic": count}
     queries |= {"count": queries["count"] + count, "time_channels": channels}
     queries |= {"patch_size": model["encoder"]["patch_size"]}
@@ -77,13 +77,13 @@ def motion_options(options: ReleasedOptions, model: dict[str, Any]) -> dict[str,
 
 def encoder_options(options: ReleasedOptions) -> dict[str, Any]:
     """Which encoder it is, and the options that only the encoders of TokenGS 2026.6 have."""
-    multiscale, latent = (name in options and options.flag(name) for name in OF_2026_6)
-    timed = "time_embedding" in options and options.flag("time_embedding")
+    multiscale, latent = (name in options and options[name] for name in OF_2026_6)
+    timed = "time_embedding" in options and options["time_embedding"]
     if not (multiscale or latent or timed):
         return {"type": "qgs/multiview_vit"}
     depth = options.count("enc_depth")
     # The release numbers blocks from 0; without the readout it reads the last one.
-    read = sorted(set(options.counts("multiscale_encoder_layers"))) if multiscale else [depth - 1]
+    read = sorted(set(options["multiscale_encoder_layers"])) if multiscale else [depth - 1]
     found: dict[str, Any] = {"type": "tokengs2026/multiscale_vit", "blocks": [n + 1 for n in read]}
     if latent:
         found |= {
@@ -96,4 +96,4 @@ def encoder_options(options: ReleasedOptions) -> dict[str, Any]:
 
 def query_options(options: ReleasedOptions) -> dict[str, Any]:
     """Number and initial spread of the queries."""
-    return {"count": options.count("num_gs_tokens"), "std": options.number("gs_token_std")}
+    return {"count": options.count("num_gs_tokens"), "std": options["gs_token_std"]}
