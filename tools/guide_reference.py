@@ -13,8 +13,8 @@ from jinja2 import Template
 
 from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
 from qgs.recipe import slots
-from qgs.recipe.sections import DecoderSettings, ModelSettings, RecipeSettings
 from qgs.recipe.registry import load_usable_plugins
+from qgs.recipe.sections import DecoderSettings, ModelSettings, RecipeSettings
 from qgs.recipe.yaml_text import dump
 
 REGISTRY = load_usable_plugins()[0]
