@@ -21,8 +21,8 @@ from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.recipe import resolve
 from qgs.recipe.registry import load_usable_plugins
-from qgs.reconstruction.scale import further_photos
 from qgs.reconstruction.reconstruct import reconstruct
+from qgs.reconstruction.scale import further_photos
 from qgs.types import Gaussians, Views
 from qgs.wording import listed
 from qgs_photos.refine.options import NONE, Options

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from qgs.contracts import Frames, Scene
-from qgs.data.recognition import open_for
 from qgs.data.frames import held_out_frames
+from qgs.data.recognition import open_for
 from qgs.machine import available_bytes
 from qgs.reconstruction.scenes import Size, installed_sources, named_scene
 from qgs_photos.refine.options import NONE, Options
