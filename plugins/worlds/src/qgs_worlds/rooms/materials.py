@@ -1,31 +1,33 @@
-"""Materials of a room: textures whose colours go together."""
+"""Materials of a room: textures whose colours go together, drawn from a table of kinds."""
 
 import colorsys
+import tomllib
 from collections.abc import Sequence
+from pathlib import Path
 from random import Random
+from typing import Any
 
 import numpy as np
 
-from qgs_worlds.caster import patterns as s
+from qgs_worlds.caster import patterns
 from qgs_worlds.caster.tables import TEXTURE
-from qgs_worlds.rooms.shapes import Color
 
-WHITE: Color = (0.95, 0.94, 0.91)
-DARK: Color = (0.10, 0.09, 0.09)
-WOODS: tuple[Color, ...] = (
-    (0.72, 0.52, 0.32),
-    (0.55, 0.35, 0.20),
-    (0.36, 0.22, 0.14),
-    (0.82, 0.68, 0.48),
-    (0.62, 0.58, 0.53),
-)
-_ACCENT = (s.PLAIN, s.STRIPES, s.CHECKER, s.DOTS, s.CLOUDS, s.GRADIENT)
+Color = Sequence[float]
+
+# The file says what its keys mean.
+_KINDS: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
+_FIXED: dict[str, Color] = {"white": (0.95, 0.94, 0.91), "dark": (0.10, 0.09, 0.09)}
+_WOODS: list[Color] = _KINDS["floor"]["kinds"][0]["paints"]["board"]["any"]
 
 
 def toned(color: Color, factor: float) -> Color:
-    """`color` made darker (factor < 1) or lighter, within [0, 1]."""
-    r, g, b = color
-    return min(r * factor, 1.0), min(g * factor, 1.0), min(b * factor, 1.0)
+    """Return `color` made darker (factor < 1) or lighter, within [0, 1]."""
+    return [min(part * factor, 1.0) for part in color]
+
+
+def between(rng: Random, value: float | Sequence[float]) -> float:
+    """Return a number as it is, or one drawn evenly from a range [low, high]."""
+    return value if isinstance(value, int | float) else rng.uniform(*value)
 
 
 class Materials:
@@ -33,122 +35,62 @@ class Materials:
 
     def __init__(self, rng: Random) -> None:
         self.rng = rng
-        self.rows: list[tuple[int, float, int, float, Sequence[Color]]] = []
+        self._rows: list[dict[str, Any]] = []
         # neighbours, an opposite and a third hue, which go together
         base = rng.random()
         self._hues = [(base + step + 0.04 * rng.gauss(0, 1)) % 1 for step in (0.0, 0.08, 0.5, 0.35)]
-        self.wood = rng.choice(WOODS)
+        self._wood = rng.choice(_WOODS)
 
-    def add(self, kind: int, period: float, colors: Sequence[Color], emission: float = 0.0) -> int:
-        """Register a texture of three colours and return its index."""
-        seed = int(self.rng.random() * 65536)
-        self.rows.append((kind, period, seed, emission, colors))
-        return len(self.rows) - 1
+    def __call__(self, name: str) -> int:
+        """Draw a material of a kind of `materials.toml` and return its index."""
+        rng = self.rng
+        paints = dict(_FIXED)
+        kind = _KINDS[name]
+        row = self._pattern(kind, paints)
+        if "kinds" in kind:
+            pick = rng.random()
+            one = next(one for one in kind["kinds"] if pick < one["below"])
+            row |= self._pattern(one, paints)
+            kind = kind | one
+        self._rows.append(
+            {
+                **row,
+                "period": between(rng, kind["period"]),
+                "seed": int(rng.random() * 65536),
+                "emission": kind.get("emission", 0.0),
+                "colors": [toned(paints[paint], factor) for paint, factor in kind["colors"]],
+            }
+        )
+        return len(self._rows) - 1
 
     def table(self, first: Sequence[int]) -> np.ndarray:
         """Return the table of TEXTURE of the ray caster: `first` of them, then all."""
-        rows = [self.rows[i] for i in first] + self.rows
+        rows = [self._rows[i] for i in first] + self._rows
         table = np.zeros(len(rows), TEXTURE)
-        kind, period, seed, emission, colors = zip(*rows, strict=True)
-        table["pattern"] = kind
-        table["period"] = period
-        table["seed"] = seed
-        table["emission"] = emission
-        table["colors"][:, :3] = colors
+        for field in rows[0].keys() - {"colors"}:
+            table[field] = [row[field] for row in rows]
+        table["colors"][:, :3] = [row["colors"] for row in rows]
         return table
 
-    def color(self, saturation: tuple[float, float], value: tuple[float, float]) -> Color:
-        """One of the room's hues at a random saturation and value."""
-        pick, s, v = (self.rng.random() for _ in range(3))
-        hue = self._hues[int(pick * len(self._hues))]
-        (low_s, high_s) = saturation
-        (low_v, high_v) = value
-        return colorsys.hsv_to_rgb(hue, low_s + s * (high_s - low_s), low_v + v * (high_v - low_v))
+    def _pattern(self, kind: dict[str, Any], paints: dict[str, Color]) -> dict[str, int]:
+        """Draw the pattern of a kind, and its paints into `paints`."""
+        names = kind.get("patterns", [])
+        # a choice among one would use a random number up
+        name = self.rng.choice(names) if len(names) > 1 else "".join(names)
+        for paint, how in kind.get("paints", {}).items():
+            paints[paint] = self._paint(how, paints)
+        return {"pattern": getattr(patterns, name)} if name else {}
 
-    def paint(self) -> int:
-        """A nearly even colour for lacquered things."""
-        color = self.color((0.3, 0.85), (0.35, 0.95))
-        return self.add(s.PLAIN, 1.0, (toned(color, 0.93), toned(color, 1.07), DARK))
-
-    def pale(self) -> int:
-        """A pale, even colour: ceilings, lamp shades, doors."""
-        color = self.color((0.0, 0.12), (0.85, 0.98))
-        return self.add(s.PLAIN, 1.0, (toned(color, 0.98), color, DARK))
-
-    def metal(self) -> int:
-        """Dark or light grey."""
-        grey = self.rng.choice([0.2, 0.45, 0.75])
-        return self.add(s.PLAIN, 1.0, ((grey, grey, grey), (grey, grey, grey), DARK))
-
-    def timber(self) -> int:
-        """Wood of the room's kind, with grain."""
-        wood = toned(self.wood, self.rng.uniform(0.8, 1.15))
-        period = self.rng.uniform(0.12, 0.3)
-        return self.add(s.PLANKS, period, (toned(wood, 0.75), toned(wood, 1.15), toned(wood, 0.5)))
-
-    def fabric(self) -> int:
-        """A patterned cloth or ornament."""
-        kind = self.rng.choice(_ACCENT)
-        a = self.color((0.25, 0.8), (0.3, 0.9))
-        b = self.color((0.1, 0.7), (0.5, 0.98))
-        return self.add(kind, self.rng.uniform(0.1, 0.3), (a, b, WHITE))
-
-    def books(self) -> int:
-        """A row of spines."""
-        a = self.color((0.4, 0.9), (0.2, 0.5))
-        b = self.color((0.2, 0.8), (0.6, 0.95))
-        return self.add(s.BOOKS, self.rng.uniform(0.03, 0.06), (a, b, WHITE))
-
-    def picture(self) -> int:
-        """A landscape for a frame."""
-        sky = self.color((0.2, 0.6), (0.7, 0.95))
-        land = self.color((0.4, 0.9), (0.2, 0.5))
-        return self.add(s.PICTURE, 1.0, (sky, (0.98, 0.92, 0.7), land), 0.1)
-
-    def rug(self) -> int:
-        """A woven rug with borders."""
-        a = self.color((0.4, 0.85), (0.3, 0.7))
-        b = self.color((0.1, 0.4), (0.75, 0.95))
-        return self.add(s.RUG, self.rng.uniform(0.15, 0.3), (a, b, toned(a, 0.5)))
-
-    def window(self) -> int:
-        """Sky and trees behind panes; it shines."""
-        green = (0.35, 0.5, 0.3) if self.rng.random() < 0.7 else (0.6, 0.55, 0.5)
-        return self.add(s.WINDOW, 1.0, ((0.72, 0.85, 0.98), green, WHITE), 0.9)
-
-    def glow(self) -> int:
-        """A lamp shade lit from inside."""
-        warm = (1.0, 0.93, 0.75)
-        return self.add(s.PLAIN, 1.0, (warm, WHITE, WHITE), 0.85)
-
-    def wall(self) -> int:
-        """Paint, wallpaper or brick."""
+    def _paint(self, how: dict[str, Any], paints: dict[str, Color]) -> Color:
         rng = self.rng
-        color = self.color((0.04, 0.5), (0.5, 1.0))
-        # bricks are rare, patterns less so
-        pick = rng.random()
-        if pick < 0.12:
-            brick = (rng.uniform(0.5, 0.7), 0.35, 0.27)
-            colors = (toned(brick, 0.8), toned(brick, 1.15), (0.75, 0.72, 0.68))
-            return self.add(s.BRICKS, 0.12, colors)
-        if pick < 0.38:
-            kind = rng.choice([s.STRIPES, s.DOTS, s.CHECKER])
-            other = toned(color, rng.choice([0.78, 0.85, 1.12]))
-            return self.add(kind, rng.uniform(0.2, 0.5), (color, other, WHITE))
-        return self.add(s.CLOUDS, 1.2, (toned(color, 0.92), toned(color, 1.05), color))
-
-    def floor(self) -> int:
-        """Boards, tiles or carpet."""
-        rng = self.rng
-        pick = rng.random()
-        if pick < 0.5:
-            wood = rng.choice(WOODS)
-            colors = (toned(wood, 0.75), toned(wood, 1.1), toned(wood, 0.45))
-            return self.add(s.PLANKS, rng.uniform(0.12, 0.3), colors)
-        if pick < 0.85:
-            kind = rng.choice([s.TILES, s.CHECKER])
-            color = self.color((0.05, 0.4), (0.5, 0.9))
-            colors = (toned(color, 0.7), toned(color, 1.1), toned(color, 0.5))
-            return self.add(kind, rng.uniform(0.3, 0.6), colors)
-        color = self.color((0.2, 0.6), (0.35, 0.7))
-        return self.add(s.CLOUDS, 0.25, (toned(color, 0.85), toned(color, 1.1), color))
+        if "hue" in how:
+            hue = self._hues[int(rng.random() * len(self._hues))]
+            saturation, value = (rng.uniform(*part) for part in how["hue"])
+            return colorsys.hsv_to_rgb(hue, saturation, value)
+        if "any" in how:
+            return rng.choice(how["any"])
+        if "wood" in how:
+            return toned(self._wood, rng.uniform(*how["wood"]))
+        if "of" in how:
+            return toned(paints[how["of"]], rng.choice(how["by"]))
+        return [between(rng, part) for part in how["rgb"]]

@@ -27,27 +27,27 @@ _SMALLEST: tuple[Point, Point] = ((-0.15, -0.15, 0.0), (0.15, 0.15, 0.3))
 
 def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
     """Return a room of `size` whose furniture leaves the camera centres `eyes` (F, 3) free."""
-    m = Materials(rng)
+    material = Materials(rng)
     # most rooms have four walls of one kind
-    wall = m.wall()
-    walls = [wall] + [m.wall() if rng.random() < 0.4 else wall for _ in range(3)]
-    surfaces = [*walls, m.floor(), m.pale()]
+    wall = material("wall")
+    walls = [wall] + [material("wall") if rng.random() < 0.4 else wall for _ in range(3)]
+    surfaces = [*walls, material("floor"), material("pale")]
     furnisher = Furnisher(size, eyes)
     # the table first, as it needs the most room
-    _centre(rng, m, furnisher)
+    _centre(rng, material, furnisher)
     for side in range(4):
-        _against_wall(rng, m, furnisher, side)
+        _against_wall(rng, material, furnisher, side)
     for _ in range(3):
         maker = rng.choice(LOOSE)
         x, y = (rng.uniform(-0.4, 0.4) * extent for extent in size[:2])
-        furnisher.place(maker(rng, m), x, y, rng.uniform(0, 2 * math.pi))
+        furnisher.place(maker(rng, material), x, y, rng.uniform(0, 2 * math.pi))
     window_side = rng.randrange(4)
-    furnisher.shapes += _on_walls(rng, m, size, window_side)
-    furnisher.shapes += _fixed(rng, m, size)
+    furnisher.shapes += _on_walls(rng, material, size, window_side)
+    furnisher.shapes += _fixed(rng, material, size)
     shapes = packed(size, furnisher.shapes)
     lights = _lights(rng, size, window_side)
     floor = floor_shadows(shapes, size, lights["place"][0])
-    return Room(shapes, NO_HEIGHTS, m.table(surfaces), size, lights, floor)
+    return Room(shapes, NO_HEIGHTS, material.table(surfaces), size, lights, floor)
 
 
 class Furnisher:
@@ -101,10 +101,10 @@ def turned(low: Point, high: Point, x: float, y: float, turn: float) -> tuple[Po
     return (min(xs), min(ys), low[2]), (max(xs), max(ys), high[2])
 
 
-def _centre(rng: Random, m: Materials, furnisher: Furnisher) -> None:
+def _centre(rng: Random, material: Materials, furnisher: Furnisher) -> None:
     maker = rng.choice(CENTRAL)
     turn = float(rng.randrange(4)) * math.pi / 2 + rng.gauss(0, 0.12)
-    piece = maker(rng, m)
+    piece = maker(rng, material)
     # a few tries, after which the room stays without
     for _ in range(4):
         x, y = (rng.uniform(-0.18, 0.18) * extent for extent in furnisher.size[:2])
@@ -112,7 +112,7 @@ def _centre(rng: Random, m: Materials, furnisher: Furnisher) -> None:
             return
 
 
-def _against_wall(rng: Random, m: Materials, furnisher: Furnisher, side: int) -> None:
+def _against_wall(rng: Random, material: Materials, furnisher: Furnisher, side: int) -> None:
     """Pieces in a row along one wall, backs to it. Side 0 is -x, 1 is -y, 2 is +x, 3 is +y."""
     across = furnisher.size[side % 2]
     along = furnisher.size[1 - side % 2]
@@ -122,7 +122,7 @@ def _against_wall(rng: Random, m: Materials, furnisher: Furnisher, side: int) ->
         # drawing a piece takes long: first see whether any would fit
         spot = turned(*_SMALLEST, *_from_wall(side, across / 2 - 0.2, position + 0.2), turn)
         if furnisher.free(*spot):
-            piece = rng.choice(AGAINST_WALLS)(rng, m)
+            piece = rng.choice(AGAINST_WALLS)(rng, material)
             low, high = bounds(piece)
             at = _from_wall(side, across / 2 - float(high[1]) - 0.02, position - float(low[0]))
             if furnisher.place(piece, *at, turn):
@@ -138,7 +138,7 @@ def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
     return cos * away + sin * along, sin * away - cos * along
 
 
-def _on_walls(rng: Random, m: Materials, size: Size, window_side: int) -> list[Shape]:
+def _on_walls(rng: Random, material: Materials, size: Size, window_side: int) -> list[Shape]:
     """A window on one wall, pictures on the others."""
     shapes: list[Shape] = []
     for side in range(4):
@@ -146,7 +146,7 @@ def _on_walls(rng: Random, m: Materials, size: Size, window_side: int) -> list[S
         along = size[1 - side % 2]
         turn = math.pi / 2 + side * math.pi / 2
         if side == window_side:
-            hung = _framed(m.pale(), m.window(), rng.uniform(1.2, 2.0), 1.25, 0.95, 0.07)
+            hung = _framed(material("pale"), material("window"), rng.uniform(1.2, 2.0), 1.25, 0.95, 0.07)
             # a window is not in a corner
             places = [rng.uniform(-0.15, 0.15) * along]
         else:
@@ -155,7 +155,7 @@ def _on_walls(rng: Random, m: Materials, size: Size, window_side: int) -> list[S
             hung = []
         for place in places:
             width, height = [rng.uniform(0.4, 0.75) for _ in range(2)]
-            item = hung or _framed(m.timber(), m.picture(), width, height, 1.45, 0.05)
+            item = hung or _framed(material("timber"), material("picture"), width, height, 1.45, 0.05)
             x, y = _from_wall(side, across / 2, place)
             shapes += [shape.moved(x, y, turn) for shape in item]
     return shapes
@@ -170,15 +170,15 @@ def _framed(
     ]
 
 
-def _fixed(rng: Random, m: Materials, size: Size) -> list[Shape]:
+def _fixed(rng: Random, material: Materials, size: Size) -> list[Shape]:
     """The rug, the skirting boards and the ceiling lamp."""
-    board = m.pale()
+    board = material("pale")
     w, d, h = size
     shapes = [box(0, side * d / 2, 0, (w, 0.04, 0.09), board) for side in (-1, 1)]
     shapes += [box(side * w / 2, 0, 0, (0.04, d, 0.09), board) for side in (-1, 1)]
-    shapes.append(cylinder(0, 0, h - 0.12, 0.25, 0.12, m.glow()))
+    shapes.append(cylinder(0, 0, h - 0.12, 0.25, 0.12, material("glow")))
     if rng.random() < 0.75:
-        rug = box(0, 0, 0, (rng.uniform(0.35, 0.6) * w, rng.uniform(0.35, 0.6) * d, 0.012), m.rug())
+        rug = box(0, 0, 0, (rng.uniform(0.35, 0.6) * w, rng.uniform(0.35, 0.6) * d, 0.012), material("rug"))
         x, y = [rng.uniform(-0.3, 0.3) for _ in range(2)]
         shapes.append(rug.moved(x, y, rng.gauss(0, 0.1)))
     return shapes
