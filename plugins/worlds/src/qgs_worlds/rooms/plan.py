@@ -7,7 +7,7 @@ import numpy as np
 
 from qgs_worlds.caster.interiors import floor_shadows
 from qgs_worlds.caster.tables import LIGHT, Room
-from qgs_worlds.rooms.furniture import AGAINST_WALLS, CENTRAL, LOOSE, Piece
+from qgs_worlds.rooms.furniture import AGAINST_WALLS, CENTRAL, LOOSE, Furniture, Piece
 from qgs_worlds.rooms.materials import Materials
 from qgs_worlds.rooms.shapes import Shape, box, cylinder, packed
 
@@ -32,18 +32,19 @@ def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
     wall = material("wall")
     walls = [wall] + [material("wall") if rng.random() < 0.4 else wall for _ in range(3)]
     surfaces = [*walls, material("floor"), material("pale")]
+    make = Furniture(rng, material)
     furnisher = Furnisher(size, eyes)
     # the table first, as it needs the most room
-    _centre(rng, material, furnisher)
+    _centre(make, furnisher)
     for side in range(4):
-        _against_wall(rng, material, furnisher, side)
+        _against_wall(make, furnisher, side)
     for _ in range(3):
-        maker = rng.choice(LOOSE)
+        name = rng.choice(LOOSE)
         x, y = (rng.uniform(-0.4, 0.4) * extent for extent in size[:2])
-        furnisher.place(maker(rng, material), x, y, rng.uniform(0, 2 * math.pi))
+        furnisher.place(make.piece(name), x, y, rng.uniform(0, 2 * math.pi))
     window_side = rng.randrange(4)
-    furnisher.shapes += _on_walls(rng, material, size, window_side)
-    furnisher.shapes += _fixed(rng, material, size)
+    furnisher.shapes += _on_walls(make, size, window_side)
+    furnisher.shapes += _fixed(make, size)
     shapes = packed(size, furnisher.shapes)
     lights = _lights(rng, size, window_side)
     floor = floor_shadows(shapes, size, lights["place"][0])
@@ -101,10 +102,11 @@ def turned(low: Point, high: Point, x: float, y: float, turn: float) -> tuple[Po
     return (min(xs), min(ys), low[2]), (max(xs), max(ys), high[2])
 
 
-def _centre(rng: Random, material: Materials, furnisher: Furnisher) -> None:
-    maker = rng.choice(CENTRAL)
+def _centre(make: Furniture, furnisher: Furnisher) -> None:
+    rng = make.rng
+    name = rng.choice(CENTRAL)
     turn = float(rng.randrange(4)) * math.pi / 2 + rng.gauss(0, 0.12)
-    piece = maker(rng, material)
+    piece = make.piece(name)
     # a few tries, after which the room stays without
     for _ in range(4):
         x, y = (rng.uniform(-0.18, 0.18) * extent for extent in furnisher.size[:2])
@@ -112,8 +114,9 @@ def _centre(rng: Random, material: Materials, furnisher: Furnisher) -> None:
             return
 
 
-def _against_wall(rng: Random, material: Materials, furnisher: Furnisher, side: int) -> None:
-    """Pieces in a row along one wall, backs to it. Side 0 is -x, 1 is -y, 2 is +x, 3 is +y."""
+def _against_wall(make: Furniture, furnisher: Furnisher, side: int) -> None:
+    """Place pieces in a row along a wall, backs to it. Sides are -x, -y, +x and +y."""
+    rng = make.rng
     across = furnisher.size[side % 2]
     along = furnisher.size[1 - side % 2]
     turn = math.pi / 2 + side * math.pi / 2
@@ -122,7 +125,7 @@ def _against_wall(rng: Random, material: Materials, furnisher: Furnisher, side: 
         # drawing a piece takes long: first see whether any would fit
         spot = turned(*_SMALLEST, *_from_wall(side, across / 2 - 0.2, position + 0.2), turn)
         if furnisher.free(*spot):
-            piece = rng.choice(AGAINST_WALLS)(rng, material)
+            piece = make.piece(rng.choice(AGAINST_WALLS))
             low, high = bounds(piece)
             at = _from_wall(side, across / 2 - float(high[1]) - 0.02, position - float(low[0]))
             if furnisher.place(piece, *at, turn):
@@ -138,47 +141,43 @@ def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
     return cos * away + sin * along, sin * away - cos * along
 
 
-def _on_walls(rng: Random, material: Materials, size: Size, window_side: int) -> list[Shape]:
-    """A window on one wall, pictures on the others."""
+def _on_walls(make: Furniture, size: Size, window_side: int) -> list[Shape]:
+    """Return a window on one wall, and pictures on the others."""
+    rng = make.rng
     shapes: list[Shape] = []
     for side in range(4):
         across = size[side % 2]
         along = size[1 - side % 2]
         turn = math.pi / 2 + side * math.pi / 2
         if side == window_side:
-            hung = _framed(material("pale"), material("window"), rng.uniform(1.2, 2.0), 1.25, 0.95, 0.07)
+            window = make.piece("window")
             # a window is not in a corner
-            places = [rng.uniform(-0.15, 0.15) * along]
+            hung = {rng.uniform(-0.15, 0.15) * along: window}
+            # a window once took the numbers of a picture's size: the room of a seed stays the same
+            rng.random()
+            rng.random()
         else:
             places = [along * (rng.uniform(-0.06, 0.06) + k) for k in (-0.27, 0.0, 0.27)]
             places = [place for place in places if rng.random() < 0.65]
-            hung = []
-        for place in places:
-            width, height = [rng.uniform(0.4, 0.75) for _ in range(2)]
-            item = hung or _framed(material("timber"), material("picture"), width, height, 1.45, 0.05)
+            hung = {place: make.piece("picture") for place in places}
+        for place, item in hung.items():
             x, y = _from_wall(side, across / 2, place)
             shapes += [shape.moved(x, y, turn) for shape in item]
     return shapes
 
 
-def _framed(
-    frame: int, inner: int, width: float, height: float, bottom: float, border: float
-) -> list[Shape]:
-    return [
-        box(0, 0, bottom, (width, 0.06, height), frame),
-        box(0, 0, bottom + border, (width - 2 * border, 0.08, height - 2 * border), inner),
-    ]
-
-
-def _fixed(rng: Random, material: Materials, size: Size) -> list[Shape]:
-    """The rug, the skirting boards and the ceiling lamp."""
-    board = material("pale")
+def _fixed(make: Furniture, size: Size) -> list[Shape]:
+    """Return the rug, the skirting boards and the ceiling lamp."""
+    rng = make.rng
+    board = make.material("pale")
     w, d, h = size
-    shapes = [box(0, side * d / 2, 0, (w, 0.04, 0.09), board) for side in (-1, 1)]
-    shapes += [box(side * w / 2, 0, 0, (0.04, d, 0.09), board) for side in (-1, 1)]
-    shapes.append(cylinder(0, 0, h - 0.12, 0.25, 0.12, material("glow")))
+    shapes = [box(0, side * d / 2, 0, w, 0.04, 0.09, board) for side in (-1, 1)]
+    shapes += [box(side * w / 2, 0, 0, 0.04, d, 0.09, board) for side in (-1, 1)]
+    shapes.append(cylinder(0, 0, h - 0.12, 0.25, 0.12, make.material("glow")))
     if rng.random() < 0.75:
-        rug = box(0, 0, 0, (rng.uniform(0.35, 0.6) * w, rng.uniform(0.35, 0.6) * d, 0.012), material("rug"))
+        wide = rng.uniform(0.35, 0.6) * w
+        deep = rng.uniform(0.35, 0.6) * d
+        rug = box(0, 0, 0, wide, deep, 0.012, make.material("rug"))
         x, y = [rng.uniform(-0.3, 0.3) for _ in range(2)]
         shapes.append(rug.moved(x, y, rng.gauss(0, 0.1)))
     return shapes

@@ -12,7 +12,6 @@ import numpy as np
 
 from qgs_worlds.caster import tables as s
 
-Color = tuple[float, float, float]
 Point = tuple[float, float, float]
 
 # Surfaces of a room: -x, +x, -y, +y, floor and ceiling.
@@ -48,9 +47,8 @@ class Shape(NamedTuple):
         return x - a, y - b, z - c, x + a, y + b, z + c
 
 
-def box(x: float, y: float, z: float, size: Point, texture: int) -> Shape:
-    """Return a box whose bottom centre is (x, y, z), of full `size`."""
-    w, d, h = size
+def box(x: float, y: float, z: float, w: float, d: float, h: float, texture: int) -> Shape:
+    """Return a box whose bottom centre is (x, y, z), w wide along x, d along y and h high."""
     return Shape(s.BLOCK, (x, y, z + h / 2), (w / 2, d / 2, h / 2), 0.0, texture)
 
 
