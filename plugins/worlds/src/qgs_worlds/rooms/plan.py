@@ -70,7 +70,7 @@ class Furnisher:
         return True
 
     def free(self, low: Point, high: Point) -> bool:
-        """Whether the box between two corners is in the room, off other pieces and the cameras."""
+        """Return whether the box between two corners is in the room and off pieces and cameras."""
         half_x = self.size[0] / 2
         half_y = self.size[1] / 2
         if low[0] < -half_x or high[0] > half_x or low[1] < -half_y or high[1] > half_y:
@@ -88,13 +88,13 @@ class Furnisher:
 
 
 def bounds(shapes: list[Shape]) -> tuple[Point, Point]:
-    """Lowest and highest corner of the box around `shapes`."""
+    """Return lowest and highest corner of the box around `shapes`."""
     x0, y0, z0, x1, y1, z1 = zip(*[shape.bounds() for shape in shapes], strict=True)
     return (min(x0), min(y0), min(z0)), (max(x1), max(y1), max(z1))
 
 
 def turned(low: Point, high: Point, x: float, y: float, turn: float) -> tuple[Point, Point]:
-    """Corners of a box that holds the given one after it was turned about z and moved."""
+    """Return corners of a box that holds the given one after it was turned about z and moved."""
     cos = math.cos(turn)
     sin = math.sin(turn)
     xs = [x + cos * a - sin * b for a in (low[0], high[0]) for b in (low[1], high[1])]
@@ -134,7 +134,7 @@ def _against_wall(make: Furniture, furnisher: Furnisher, side: int) -> None:
 
 
 def _from_wall(side: int, away: float, along: float) -> tuple[float, float]:
-    """The point `away` from the centre towards wall `side`, `along` it."""
+    """Return the point `away` from the centre towards wall `side`, `along` it."""
     angle = math.pi + side * math.pi / 2
     cos = math.cos(angle)
     sin = math.sin(angle)

@@ -37,12 +37,12 @@ class Rig:
     motion: str
 
     def lens(self, size: tuple[int, int]) -> np.ndarray:
-        """fx, fy, cx, cy in pixels of images (H, W)."""
+        """Return fx, fy, cx, cy in pixels of images (H, W)."""
         focal = lens(self.fov, (max(size), max(size)))[0]
         return np.array([focal, focal, size[1] / 2, size[0] / 2])
 
     def sight(self, place: Place) -> tuple[np.ndarray, float]:
-        """Middle and radius of a ball that holds most of what they see; indoors, the room."""
+        """Return centre and radius of a ball around most of what they see; indoors, the room."""
         if place.kind == "indoors":
             half = 0.5 * place.top
             return np.array([0.0, 0.0, half]), math.hypot(*place.high[:2], half) + 0.5
@@ -74,9 +74,9 @@ def draw_cameras(
     count: int,
     varied: bool,
 ) -> Rig:
-    """Cameras in `place` that see something; the best of a few draws. world: shapes and heights.
+    """Return cameras in `place` that see something. world: shapes and heights.
 
-    They keep `CLEARANCE` from fixed shapes; others that are nearer are to be taken out.
+    They are the best of a few draws. They keep `CLEARANCE` from fixed shapes; others that are nearer are to be taken out.
     """
     best = None
     least = math.inf
@@ -97,13 +97,13 @@ def draw_cameras(
 
 
 def _outside(eyes: np.ndarray, place: Place, shapes: np.ndarray) -> float:
-    """0 if all eyes are where they may be, 100 or more if not."""
+    """Return 0 if all eyes are where they may be, 100 if not."""
     inside = (eyes >= place.low).all() and (eyes <= place.high).all()
     return 0.0 if inside and clearances(shapes[: place.fixed], eyes).min() > CLEARANCE else 100.0
 
 
 def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
-    """The worst view's share of sky and of things right before the camera."""
+    """Return the worst view's share of sky and of things right before the camera."""
     intrinsics = rig.lens(_PROBE)
     near = clearances(world[0], rig.c2w[:, :3, 3]).min()
     views = [trace(*_PROBE, 0, 1, *world, c2w, intrinsics)[0].ravel() for c2w in rig.c2w]
@@ -114,7 +114,7 @@ def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
 
 
 def _still(rng: np.random.Generator, place: Place, shapes: np.ndarray, count: int, rig: Rig) -> Rig:
-    """Cameras a few millimetres apart at the freest of some points, if nothing else was found."""
+    """Return cameras a few millimetres apart at the freest of some points, if all else fails."""
     # any point is better than a camera inside of a wall
     points = rng.uniform(place.low, place.high, (64, 3))
     base = points[clearances(shapes[: place.fixed], points).min(1).argmax()]
@@ -126,7 +126,7 @@ def _still(rng: np.random.Generator, place: Place, shapes: np.ndarray, count: in
 
 
 def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shrink: float) -> Rig:
-    """Cameras anywhere in the place. shrink: factor of the path's length."""
+    """Draw cameras anywhere in the place. shrink: factor of the path's length."""
     target = np.array(place.targets[rng.integers(len(place.targets))])
     base, distance = _stand(rng, place, target, varied)
     s = np.linspace(-0.5, 0.5, count)
@@ -155,7 +155,7 @@ def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shri
 def _stand(
     rng: np.random.Generator, place: Place, target: np.ndarray, varied: bool
 ) -> tuple[np.ndarray, float]:
-    """A point to look at the target from, and its distance."""
+    """Draw a point to look at the target from; return it and its distance."""
     low, high = np.log(place.distance)
     for _ in range(20):
         distance = math.exp(rng.uniform(low, high))
@@ -177,61 +177,43 @@ def _stand(
 
 
 def _walk(rng: np.random.Generator, path: Path) -> Motion:
-    """Along a bent line; looking ahead or at what is passed, the longer the lens the more."""
-    base = path.base
-    target = path.target
-    length = path.length
-    s = path.s
+    """Move along a bent line; looking ahead or at what is passed, the longer the lens the more."""
+    base, target, length, s, fov = path
     # people walk more along than up
     way = rng.normal(size=3) * (1, 1, 0.3)
     way /= np.linalg.norm(way)
     bend = rng.normal(size=3) * (0.3, 0.3, 0.1)
     eyes = base + length * (s[:, None] * way + (s**2)[:, None] * bend)
-    ahead = rng.uniform(0, min(path.fov / AHEAD_FOV, 1))
+    ahead = rng.uniform(0, min(fov / AHEAD_FOV, 1))
     return eyes, target + ahead * (eyes - base)
 
 
 def _orbit(rng: np.random.Generator, path: Path) -> Motion:
-    """Around the target, rising and coming nearer a little."""
-    base = path.base
-    target = path.target
-    length = path.length
-    s = path.s
+    """Move around the target, rising and coming nearer a little."""
+    base, target, length, s, _ = path
     offset = base - target
     flat = max(math.hypot(offset[0], offset[1]), 0.2)
     # less than half of a circle, or views share too little
     angles = s * min(length / flat, 2.4)
-    cos = np.cos(angles)
-    sin = np.sin(angles)
     nearer = 1 + 0.2 * rng.normal() * s
     rise = 0.2 * length * rng.normal() * s
-    x = cos * offset[0] - sin * offset[1]
-    y = sin * offset[0] + cos * offset[1]
+    x, y = _turned(offset, angles)
     eyes = target + np.stack([nearer * x, nearer * y, offset[2] + rise], 1)
     return eyes, np.tile(target, (len(s), 1))
 
 
 def _round(rng: np.random.Generator, path: Path) -> Motion:
-    """From one place in directions that overlap."""
-    base = path.base
-    target = path.target
-    length = path.length
-    s = path.s
-    angles = s * math.radians(path.fov) * rng.uniform(0.3, 1.2)
-    cos = np.cos(angles)
-    sin = np.sin(angles)
-    x, y, z = target - base
-    way = np.stack([cos * x - sin * y, sin * x + cos * y, np.full(len(s), z)], 1)
+    """Look from one place in directions that overlap."""
+    base, target, length, s, fov = path
+    angles = s * math.radians(fov) * rng.uniform(0.3, 1.2)
+    way = np.stack([*_turned(target - base, angles), np.full(len(s), (target - base)[2])], 1)
     eyes = base + 0.3 * length * rng.normal(size=3) * s[:, None]
     return eyes, eyes + way
 
 
 def _gather(rng: np.random.Generator, path: Path) -> Motion:
-    """From places scattered around one point, all at the target."""
-    base = path.base
-    target = path.target
-    length = path.length
-    s = path.s
+    """Look from places scattered around one point, all at the target."""
+    base, target, length, s, _ = path
     offsets = rng.normal(size=(len(s), 3)) * (1, 1, 0.5)
     # the square root spreads them nearly evenly over the disc
     offsets *= rng.random((len(s), 1)) ** 0.5 / np.linalg.norm(offsets, axis=1, keepdims=True)
@@ -239,6 +221,13 @@ def _gather(rng: np.random.Generator, path: Path) -> Motion:
 
 
 _MOTIONS = {"walk": _walk, "orbit": _orbit, "round": _round, "gather": _gather}
+
+
+def _turned(way: np.ndarray, angles: np.ndarray) -> Motion:
+    """Return x and y (F,) of a vector turned about z by some angles."""
+    cos = np.cos(angles)
+    sin = np.sin(angles)
+    return cos * way[0] - sin * way[1], sin * way[0] + cos * way[1]
 
 
 def _look_at(eyes: np.ndarray, targets: np.ndarray, roll: np.ndarray) -> np.ndarray:

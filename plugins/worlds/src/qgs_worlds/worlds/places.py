@@ -46,7 +46,7 @@ class Place:
 
 
 def draw_place(kind: Kind, rng: Random, things: Things, count: int, maps: np.ndarray) -> Place:
-    """A scene of a kind with `count` things. maps: height maps, which terrains may take."""
+    """Draw a scene of a kind with `count` things. maps: height maps, which terrains may take."""
     if kind == "indoors":
         return _indoors(rng, things, count)
     return (
@@ -56,6 +56,11 @@ def draw_place(kind: Kind, rng: Random, things: Things, count: int, maps: np.nda
 
 def _level(x: float, y: float) -> float:
     return 0.0
+
+
+def _toward(angle: float, away: float) -> tuple[float, float]:
+    """Return x and y of the point at a distance from the middle in a direction."""
+    return away * math.cos(angle), away * math.sin(angle)
 
 
 def _box(center: Point, half: Point) -> Primitive:
@@ -103,7 +108,7 @@ def _indoors(rng: Random, things: Things, count: int) -> Place:
 
 
 def _put(rng: Random, things: Things, at: Point, size: float, ceiling: float) -> Thing:
-    """A thing on the floor, at some height, or under the ceiling."""
+    """Draw a thing on the floor, at some height, or under the ceiling."""
     thing = things.draw()
     pick = rng.random()
     lift = 0.0
@@ -113,7 +118,7 @@ def _put(rng: Random, things: Things, at: Point, size: float, ceiling: float) ->
 
 
 def _beam(rng: Random, things: Things, x: float, y: float, z: float) -> Shape:
-    """A thin bar, column or cable through the room."""
+    """Draw a thin bar, column or cable through the room."""
     a = (rng.uniform(-x, x), rng.uniform(-y, y))
     b = (rng.uniform(-x, x), rng.uniform(-y, y))
     ends = rng.choice((((*a, 0.0), (*a, z)), ((-x, a[1], z * 0.9), (x, b[1], z * 0.9))))
@@ -121,7 +126,7 @@ def _beam(rng: Random, things: Things, x: float, y: float, z: float) -> Shape:
 
 
 def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
-    """Four walls and a ceiling, and windows or doors in up to `most` of them."""
+    """Draw four walls and a ceiling, and windows or doors in up to `most` of them."""
     half_x = size[0] / 2
     half_y = size[1] / 2
     height = size[2]
@@ -152,7 +157,7 @@ def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
 
 
 def _panes(rng: Random, things: Things, hole: Primitive) -> list[Shape]:
-    """Bars in an opening."""
+    """Draw bars in an opening."""
     (x, y, z) = hole.center
     (_, wide, high) = hole.half
     radius = rng.uniform(0.015, 0.05)
@@ -187,9 +192,8 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
     for _ in range(count):
         # denser in the middle, where cameras look
         away = 9 * rng.random() ** 0.7
-        angle = rng.uniform(0, math.tau)
-        at = (away * math.cos(angle), away * math.sin(angle), 0.0)
-        at = at if rng.random() < 0.85 else (at[0], at[1], rng.uniform(0.3, 3))
+        x, y = _toward(rng.uniform(0, math.tau), away)
+        at = (x, y, 0.0 if rng.random() < 0.85 else rng.uniform(0.3, 3))
         near += placed(things.draw(), at, rng.uniform(0, math.tau), spread(rng, 0.25, 2), ground)
     shapes += near
     low = (-12.0, -12.0, level + 0.3)
@@ -199,41 +203,39 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
 
 
 def _on(field: np.ndarray, amplitude: float) -> Callable[[float, float], float]:
-    """Height of a terrain at x, y."""
+    """Return a function for the height of a terrain at x, y."""
     return lambda x, y: (
         amplitude * height_of(field, np.float32(x / _TERRAIN), np.float32(y / _TERRAIN))
     )
 
 
 def _far(rng: Random, things: Things, angle: float) -> Thing:
-    """A hill, a building or a tree in a direction; it begins below any ground."""
+    """Draw a hill, a building or a tree in a direction; it begins below any ground."""
     pick = rng.random()
     if pick < 0.3:
         away = rng.uniform(60, 220)
         size = rng.uniform(15, 60)
-        at = (away * math.cos(angle), away * math.sin(angle), 0.0)
+        x, y = _toward(angle, away)
         half = (size, size * rng.uniform(0.6, 1.8), size * rng.uniform(0.2, 0.6))
-        body = Primitive(s.ELLIPSOID, at, half, about_z(rng.uniform(0, math.tau)))
+        body = Primitive(s.ELLIPSOID, (x, y, 0.0), half, about_z(rng.uniform(0, math.tau)))
         return [things.skinned(body, size / 2)]
-    away = spread(rng, 11, 70)
-    at = (away * math.cos(angle), away * math.sin(angle), 0.0)
+    x, y = _toward(angle, spread(rng, 11, 70))
     if pick < 0.65:
         wide = rng.uniform(2, 7)
         deep = rng.uniform(2, 7)
         high = spread(rng, 2, 14)
-        body = Primitive(
-            s.BOX, (*at[:2], high - 1), (wide, deep, high + 1), about_z(rng.uniform(0, math.tau))
-        )
+        half = (wide, deep, high + 1)
+        body = Primitive(s.BOX, (x, y, high - 1), half, about_z(rng.uniform(0, math.tau)))
         return [things.skinned(body, spread(rng, 2, 9))]
     high = rng.uniform(1, 3)
     crown = things.texture()[0]
     half = (0.12 * high, 0.12 * high, high + 1)
-    trunk = Primitive(s.FRUSTUM, (*at[:2], high - 1), half, extra=0.6)
+    trunk = Primitive(s.FRUSTUM, (x, y, high - 1), half, extra=0.6)
     tree = [things.skinned(trunk)]
     for _ in range(rng.randint(1, 4)):
-        x, y = (rng.uniform(-0.5, 0.5) * high for _ in range(2))
+        aside, behind = (rng.uniform(-0.5, 0.5) * high for _ in range(2))
         half = tuple(rng.uniform(0.35, 0.9) * high for _ in range(3))
-        leaves = Primitive(s.ELLIPSOID, (at[0] + x, at[1] + y, rng.uniform(1.7, 2.6) * high), half)  # type: ignore[arg-type]
+        leaves = Primitive(s.ELLIPSOID, (x + aside, y + behind, rng.uniform(1.7, 2.6) * high), half)  # type: ignore[arg-type]
         tree.append(Shape(leaves, None, crown, 1, 0, rng.uniform(0.5, 2)))
     return tree
 
@@ -260,9 +262,9 @@ def _objects(rng: Random, things: Things, count: int) -> Place:
             y = rng.gauss(0, 0.7)
         else:
             away = 0.5 * math.sqrt(rng.random())
-            angle = rng.uniform(0, math.tau)
-            x = spot[0] + away * math.cos(angle)
-            y = spot[1] + away * math.sin(angle)
+            x, y = _toward(rng.uniform(0, math.tau), away)
+            x += spot[0]
+            y += spot[1]
         at = (x, y, level if math.hypot(x, y) < wide else 0.0)
         size = spread(rng, 0.1, 0.5)
         shapes += placed(things.draw(), at, rng.uniform(0, math.tau), size, _level)

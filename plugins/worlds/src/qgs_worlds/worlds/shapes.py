@@ -25,7 +25,7 @@ class Primitive(NamedTuple):
     extra: float = 0.0
 
     def moved(self, to: Point, turn: Turn, size: float) -> "Primitive":
-        """Scaled about the origin, turned, then moved."""
+        """Return it scaled about the origin, turned, then moved."""
         x, y, z = rotated(turn, self.center)
         center = (to[0] + size * x, to[1] + size * y, to[2] + size * z)
         a, b, c = self.half
@@ -33,7 +33,7 @@ class Primitive(NamedTuple):
         return Primitive(self.kind, center, half, product(turn, self.turn), self.extra)
 
     def reach(self) -> float:
-        """How far it extends up and down from its centre, metres, at most."""
+        """Return how far it extends up and down from its centre, metres, at most."""
         size = self.half[2]
         up = abs(self.turn[8])
         if self.kind == s.CAPSULE:
@@ -64,14 +64,14 @@ class Shape(NamedTuple):
 
 
 def rotated(turn: Turn, p: Point) -> Point:
-    """A rotation of a point."""
+    """Return a rotated point."""
     a, b, c, d, e, f, g, h, i = turn
     x, y, z = p
     return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
 
 def product(a: Turn, b: Turn) -> Turn:
-    """The rotation by b, then by a."""
+    """Return the rotation by b, then by a."""
     x = rotated(a, (b[0], b[3], b[6]))
     y = rotated(a, (b[1], b[4], b[7]))
     z = rotated(a, (b[2], b[5], b[8]))
@@ -79,14 +79,14 @@ def product(a: Turn, b: Turn) -> Turn:
 
 
 def about_z(angle: float) -> Turn:
-    """A rotation about the vertical."""
+    """Return a rotation about the vertical."""
     cos = math.cos(angle)
     sin = math.sin(angle)
     return cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0
 
 
 def any_turn(rng: Random) -> Turn:
-    """A rotation drawn evenly from all (a random unit quaternion)."""
+    """Draw a rotation evenly from all (a random unit quaternion)."""
     # Gaussians have no direction that they prefer
     w, x, y, z = (rng.gauss(0, 1) for _ in range(4))
     f = 2 / (w * w + x * x + y * y + z * z)
@@ -98,7 +98,7 @@ def any_turn(rng: Random) -> Turn:
 
 
 def rod(start: Point, end: Point, radius: float, square: bool = False) -> Primitive:
-    """A round or square bar between two points."""
+    """Return a round or square bar between two points."""
     x, y, z = (b - a for a, b in zip(start, end, strict=True))
     length = math.sqrt(x * x + y * y + z * z) + 1e-9
     x = x / length

@@ -22,7 +22,7 @@ Thing = list[Shape]
 
 
 def spread(rng: Random, low: float, high: float) -> float:
-    """A number drawn log-uniformly."""
+    """Draw a number log-uniformly."""
     return low * (high / low) ** rng.random()
 
 
@@ -66,17 +66,17 @@ class Things:
         self._textures = textures
 
     def texture(self) -> tuple[int, int]:
-        """First texture of a shape and the number of them."""
+        """Draw the first texture of a shape and the number of them."""
         faces = 6 if self.rng.random() < 0.3 else 1
         return self.rng.randrange(self._textures - 5), faces
 
     def skinned(self, body: Primitive, scale: float = 1.0, cut: Primitive | None = None) -> Shape:
-        """A shape with textures of its own."""
+        """Return a shape with textures of its own."""
         first, faces = self.texture()
         return Shape(body, cut, first, faces, self.rng.randrange(self._textures), scale)
 
     def draw(self) -> Thing:
-        """A thing."""
+        """Draw a thing."""
         # one number for both shares
         pick = self.rng.random() - self.style.wired
         if pick < 0:
@@ -110,7 +110,7 @@ class Things:
         return Primitive(kind, center, (a, b, c), self._turn(), extra)
 
     def _cut(self, body: Primitive) -> Primitive | None:
-        """What is taken away from a primitive, at its surface or through it."""
+        """Draw what is taken away from a primitive, at its surface or through it."""
         # their exits are not known, which cuts need
         if body.kind in (s.TORUS, s.HEIGHT):
             return None
@@ -130,12 +130,8 @@ class Things:
         skin = self.texture()
         for _ in range(count):
             reach = 0.6 if count > 1 else 0.0
-            center = (
-                rng.uniform(-reach, reach),
-                rng.uniform(-reach, reach),
-                rng.uniform(-reach, reach),
-            )
-            body = self._primitive(center, 1.0 if count == 1 else rng.uniform(0.4, 0.9))
+            x, y, z = (rng.uniform(-reach, reach) for _ in range(3))
+            body = self._primitive((x, y, z), 1.0 if count == 1 else rng.uniform(0.4, 0.9))
             # parts of a thing often share a texture
             skin = skin if rng.random() < 0.4 else self.texture()
             hole = self._cut(body) if cut else None
@@ -144,7 +140,7 @@ class Things:
         return thing
 
     def _row(self) -> Thing:
-        """One shape, repeated along a line, growing or turning from one to the next."""
+        """Repeat one shape along a line, growing or turning from one to the next."""
         rng = self.rng
         count = rng.randint(3, 7)
         first = self.skinned(self._primitive((0.0, 0.0, 0.0), 1.2 / count))
@@ -166,7 +162,7 @@ class Things:
         ]
 
     def _frame(self) -> Thing:
-        """The edges of a box."""
+        """Draw the edges of a box."""
         rng = self.rng
         a, b, c = (rng.uniform(0.4, 1) for _ in range(3))
         points = [(x, y, z) for x in (-a, a) for y in (-b, b) for z in (-c, c)]
@@ -174,7 +170,7 @@ class Things:
         return self._rods(points, pairs, spread(rng, 0.012, 0.08))
 
     def _wire(self) -> Thing:
-        """A line of rods through a few points, or an arc of them."""
+        """Draw a line of rods through a few points, or an arc of them."""
         rng = self.rng
         count = rng.randint(3, 8)
         if rng.random() < 0.5:
@@ -188,13 +184,11 @@ class Things:
         return self._rods(points, pairs, spread(rng, 0.008, 0.05))  # type: ignore[arg-type]
 
     def _bars(self) -> Thing:
-        """Parallel bars between two rails, like a fence or a ladder."""
+        """Draw parallel bars between two rails, like a fence or a ladder."""
         rng = self.rng
         count = rng.randint(3, 9)
         high = rng.uniform(0.4, 1)
-        ends = [(-1.0, 0.0, s * high) for s in (-0.8, 0.8)] + [
-            (1.0, 0.0, s * high) for s in (-0.8, 0.8)
-        ]
+        ends = [(x, 0.0, s * high) for x in (-1.0, 1.0) for s in (-0.8, 0.8)]
         places = [2 * (k + 0.5) / count - 1 for k in range(count)]
         points = ends + [(x, 0.0, s * high) for x in places for s in (-1, 1)]
         pairs = [(0, 2), (1, 3)] + [(4 + 2 * k, 5 + 2 * k) for k in range(count)]
@@ -202,14 +196,14 @@ class Things:
 
 
 def lowest(thing: Thing) -> float:
-    """The least height of a thing, or a little below."""
+    """Return the least height of a thing, or a little below."""
     return min(shape.body.center[2] - shape.body.reach() for shape in thing)
 
 
 def placed(
     thing: Thing, to: Point, turn: float, size: float, on: Callable[[float, float], float]
 ) -> Thing:
-    """The thing scaled and turned, to[2] metres above the ground `on` (x, y)."""
+    """Return the thing scaled and turned, to[2] metres above the ground `on` (x, y)."""
     low = lowest(thing) * size
     place = (to[0], to[1], to[2] + on(to[0], to[1]) - low)
     return [shape.moved(place, about_z(turn), size) for shape in thing]
