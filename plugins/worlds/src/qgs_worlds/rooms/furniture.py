@@ -89,7 +89,7 @@ class Furniture:
         pick = self.rng.random()
         return self.material(next(name for name, below in how.items() if pick < below))
 
-    def _spots(self, most: float) -> list[float]:
+    def spots(self, most: float) -> list[float]:
         """Draw one to three places, as shares of a width."""
         return [self.rng.uniform(-most, most) for _ in range(self.rng.randrange(1, 4))]
 
@@ -100,7 +100,7 @@ def _around_table(make: Furniture, sizes: Sizes) -> Piece:
     w = sizes["w"]
     d = sizes["d"]
     piece = []
-    for x in make._spots(0.38):
+    for x in make.spots(0.38):
         piece += make.ornament(x * w, rng.uniform(-0.3, 0.3) * d, sizes["h"])
     # chairs around one table are alike
     alike = {"seat": make.material("fabric"), "frame": make.material("timber")}
@@ -114,7 +114,7 @@ def _around_table(make: Furniture, sizes: Sizes) -> Piece:
 
 def _cushions(make: Furniture, sizes: Sizes) -> Piece:
     piece = []
-    for x in make._spots(0.32):
+    for x in make.spots(0.32):
         (cushion,) = make.piece("cushion", x=x * sizes["w"])
         piece.append(cushion._replace(turn=make.rng.gauss(0, 0.15)))
     return piece

@@ -17,7 +17,7 @@ TRAVEL = (0.65, 1.2)
 def camera_path(
     rng: np.random.Generator, size: tuple[float, float, float], count: int
 ) -> np.ndarray:
-    """Return OpenCV c2w (count, 4, 4) of cameras that look from one side of the room to the other."""
+    """Return OpenCV c2w (count, 4, 4) of cameras that look across the room."""
     # drawn along one wall, then turned, so that all four are alike
     side = int(rng.integers(4))
     across = size[0] if side % 2 == 0 else size[1]

@@ -153,7 +153,7 @@ def _on_walls(make: Furniture, size: Size, window_side: int) -> list[Shape]:
             window = make.piece("window")
             # a window is not in a corner
             hung = {rng.uniform(-0.15, 0.15) * along: window}
-            # a window once took the numbers of a picture's size: the room of a seed stays the same
+            # the size of a picture that is not there, or the rooms of all seeds would change
             rng.random()
             rng.random()
         else:

@@ -76,7 +76,8 @@ def draw_cameras(
 ) -> Rig:
     """Return cameras in `place` that see something. world: shapes and heights.
 
-    They are the best of a few draws. They keep `CLEARANCE` from fixed shapes; others that are nearer are to be taken out.
+    They are the best of a few draws, and keep `CLEARANCE` from fixed shapes; others that are nearer
+    are to be taken out.
     """
     best = None
     least = math.inf
