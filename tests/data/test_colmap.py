@@ -123,24 +123,32 @@ CUT = {"images.bin": (4, 60, 110, 200, -1), "cameras.bin": (40,)}
 """How much of a file is left: no count, a part of a pose, of points, of an image, of a camera."""
 COUNTS = {"images.bin": b"\1", "cameras.bin": b"\0"}
 """Fewer than there are."""
-BROKEN = (
-    ("cameras.bin", struct.pack("<QIiQQ3d", 1, 7, 99, 40, 30, 1, 1, 1)),  # an unknown camera
-    ("cameras.txt", b"7 PINHOLE 4_0 30 50 52 19 16\n"),  # digits of Python
-    ("cameras.txt", b"7 PINHOLE 40 30 50 52 19 16\n" * 2),  # a camera twice
-    ("images.txt", b"1 1 0 0 0 0 0 1 a.png\n\n"),  # a number too few
-    ("images.txt", b"1 1 0 0 0 0 0 1 7 a.png\n\n" * 2),  # an image twice
-    ("images.txt", b"1 1 0 0 0 0 0 1 7 a.png\n2 1 0 0 0 0 0 1 7 b.png\n"),  # no points
-    ("images.txt", b"1 1 0 0 0 zero 0 1 7 a.png\n\n"),
-    ("images.txt", b"1 3 0 0 0 0 0 1 7 a.png\n\n"),  # a quaternion of length 3
-    ("images.txt", b"1 0 0 0 0 0 0 1 7 a.png\n\n"),  # and of length 0
-    ("images.txt", b"1 1 0 0 0 1_000 0 1 7 a.png\n\n"),
-    ("images.txt", b"1 1 0 0 0 0 0 1 8 a.png\n\n"),  # no such camera
-)
+UNKNOWN_CAMERA = struct.pack("<QIiQQ3d", 1, 7, 99, 40, 30, 1, 1, 1)
+BROKEN = """
+cameras.txt: 7 PINHOLE 4_0 30 50 52 19 16/
+cameras.txt: 7 PINHOLE 40 30 50 52 19 16/7 PINHOLE 40 30 50 52 19 16/
+images.txt: 1 1 0 0 0 0 0 1 a.png//
+images.txt: 1 1 0 0 0 0 0 1 7 a.png//1 1 0 0 0 0 0 1 7 a.png//
+images.txt: 1 1 0 0 0 0 0 1 7 a.png/2 1 0 0 0 0 0 1 7 b.png/
+images.txt: 1 1 0 0 0 zero 0 1 7 a.png//
+images.txt: 1 3 0 0 0 0 0 1 7 a.png//
+images.txt: 1 0 0 0 0 0 0 1 7 a.png//
+images.txt: 1 1 0 0 0 1_000 0 1 7 a.png//
+images.txt: 1 1 0 0 0 0 0 1 8 a.png//
+"""
+"""Lines of a file, each ended by a slash.
+
+Digits of Python, a camera twice; a number too few, an image twice, no points, no number, a
+quaternion of length 3 and of length 0, digits of Python, no such camera.
+"""
 
 
 def test_broken_models_are_told(tmp_path, photos):
     whole = write_colmap(tmp_path / "whole", photos, "binary") / "sparse/0"
-    broken = [*BROKEN]
+    broken = [("cameras.bin", UNKNOWN_CAMERA)]
+    for line in BROKEN.strip().splitlines():
+        name, lines = line.split(": ")
+        broken.append((name, lines.replace("/", "\n").encode()))
     broken += [(n, (whole / n).read_bytes()[:kept]) for n, parts in CUT.items() for kept in parts]
     broken += [(n, count + (whole / n).read_bytes()[1:]) for n, count in COUNTS.items()]
     for name, content in broken:

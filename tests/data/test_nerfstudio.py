@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
+import yaml
 from photo_formats import scene as read
 from photo_formats import synthetic, write_nerfstudio
 from PIL import Image
@@ -101,15 +102,19 @@ def test_lenses(folder):
     assert lenses == [RadialTangential(0.1, p2=0.01, k3=0.002), Fisheye(0.1, k4=0.3), None]
 
 
+LISTED = r"""
+./train/r_0: train/r_0.png
+train/at_0.5: train/at_0.5.png
+images/a.JPG: images/a.JPG
+images\b.jp2: images/b.jp2
+images/c.exr: images/c.exr
+../d: ../d.png
+"""
+"""A name in transforms.json, and the file that it means."""
+
+
 def test_names_of_images():
-    names = {
-        "./train/r_0": "train/r_0.png",
-        "train/at_0.5": "train/at_0.5.png",
-        "images/a.JPG": "images/a.JPG",
-        "images\\b.jp2": "images/b.jp2",
-        "images/c.exr": "images/c.exr",
-        "../d": "../d.png",
-    }
+    names = yaml.safe_load(LISTED)
     assert {listed: image_name(listed) for listed in names} == names
 
 

@@ -1,6 +1,7 @@
 """Which source opens a path: those of qgs and of plugins alike."""
 
 import pytest
+import yaml
 from qgs_photos.datasets import plugin as datasets
 from tape_source import TapeSource, plugin, write_tape
 from upath import UPath
@@ -12,38 +13,40 @@ from qgs.recipe.registry import InstalledPlugin, Registry, builtin
 
 HASH = "0a" * 32
 BLACK = (0.0, 0.0, 0.0)
-HOLDINGS = {
-    "train/index.json": "datasets/chunks",
-    "test/000000.torch": "datasets/chunks",
-    "000000.torch": "datasets/chunks",
-    "transforms.json": "qgs/photos",
-    "transforms_train.json": "qgs/photos",
-    "poses_bounds.npy": "qgs/photos",
-    "scene/transforms.json": "qgs/photos",
-    "train/scene/transforms.json": "qgs/photos",
-    f"{HASH}.zip": "datasets/dl3dv",
-    f"1K/{HASH}.zip": "datasets/dl3dv",
-    f"{HASH}/transforms.json": "datasets/dl3dv",
-    f"{HASH}/gaussian_splat/transforms.json": "datasets/dl3dv",
-    "garden/nerfstudio/transforms.json": "datasets/dl3dv",
-    "2K/garden/gaussian_splat/transforms.json": "datasets/dl3dv",
-    "garden.tape": "tapes/tape",
-    "readme.txt": "qgs/photos",
-}
+HOLDINGS = """
+train/index.json: datasets/chunks
+test/000000.torch: datasets/chunks
+000000.torch: datasets/chunks
+transforms.json: qgs/photos
+transforms_train.json: qgs/photos
+poses_bounds.npy: qgs/photos
+scene/transforms.json: qgs/photos
+train/scene/transforms.json: qgs/photos
+HASH.zip: datasets/dl3dv
+1K/HASH.zip: datasets/dl3dv
+HASH/transforms.json: datasets/dl3dv
+HASH/gaussian_splat/transforms.json: datasets/dl3dv
+garden/nerfstudio/transforms.json: datasets/dl3dv
+2K/garden/gaussian_splat/transforms.json: datasets/dl3dv
+garden.tape: tapes/tape
+readme.txt: qgs/photos
+"""
+"""A file in a folder, and the source that opens the folder."""
 PLUGINS = {"datasets": InstalledPlugin(datasets), "tapes": InstalledPlugin(plugin)}
 SOURCES = Registry({"qgs": builtin(), **PLUGINS}).components("data")
 
 
 def test_by_content(tmp_path):
+    expected = yaml.safe_load(HOLDINGS.replace("HASH", HASH))
     for place in (str(tmp_path), f"memory://recognition{tmp_path}"):
         found = {}
-        for number, held in enumerate(HOLDINGS):
+        for number, held in enumerate(expected):
             root = UPath(place) / f"place{number}"
             file = root / held
             file.parent.mkdir(parents=True)
             file.write_bytes(b"")
             found[held] = recognised(root, SOURCES)
-        assert found == HOLDINGS
+        assert found == expected
 
 
 def test_files_and_nothing(tmp_path):

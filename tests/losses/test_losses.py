@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+import yaml
 from losses.judging import CAMERAS, GOLDEN, PREDICTED, TRUTH, judged
 from torch.testing import assert_close
 
@@ -60,13 +61,17 @@ def test_points_behind_a_camera_are_invisible_on_demand():
     assert_close(corrected[in_front], published[in_front])
 
 
+OPTIONS = """
+- [{near: 0.1}, [near]]
+- [{infinite_pixel: 10.0}, [infinite_pixel]]
+- [{behind_camera: invisible, clamp: null}, [clamp]]
+- [{behind_camera: invisible, near: 0.1}, []]
+"""
+"""Options of visibility, and those that are refused."""
+
+
 def test_options_of_visibility_that_cannot_work_are_refused():
     context = RecipeContext(ModelDims(width=8, heads=1, depth=1))
-    for options, expected in (
-        ({"near": 0.1}, ["near"]),
-        ({"infinite_pixel": 10.0}, ["infinite_pixel"]),
-        ({"behind_camera": "invisible", "clamp": None}, ["clamp"]),
-        ({"behind_camera": "invisible", "near": 0.1}, []),
-    ):
+    for options, expected in yaml.safe_load(OPTIONS):
         problems = Visibility.problems(Visibility.Config(**options), context)
         assert [problem.option for problem in problems] == expected

@@ -47,13 +47,19 @@ def test_frames_that_are_given_are_taken_as_they_are_or_refused(photos):
             checked_window(5, frames, [compared])
 
 
+HELD_OUT = """
+20 8: 4 12
+7 8: 3
+3 8: 1
+2 8:
+7 3: 1 4
+9 0:
+"""
+"""How many photos there are, every which is held out, and which these are."""
+
+
 def test_every_nth_photo_is_held_out_or_the_middle_one():
-    for count, every, *held_out in (
-        (20, 8, 4, 12),
-        (7, 8, 3),
-        (3, 8, 1),
-        (2, 8),
-        (7, 3, 1, 4),
-        (9, 0),
-    ):
-        assert [*held_out_frames(count, every)] == held_out
+    for line in HELD_OUT.strip().splitlines():
+        given, _, expected = line.partition(":")
+        held_out = held_out_frames(*map(int, given.split()))
+        assert [*held_out] == [*map(int, expected.split())], line

@@ -6,6 +6,7 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+import yaml
 from safetensors.torch import load_file
 from training_runs import TWO, losses, parts_of, read_jsonl, run, run_calling, tiny
 from two_processes import told_by_two
@@ -94,15 +95,19 @@ def test_two_processes_stop_together_at_a_sample_that_one_cannot_make_or_leave_i
     assert len(losses(folder)) == 3
 
 
+DEVICES = """
+- [auto, false, null, cpu, 0]
+- [auto, false, true, cpu, 0]
+- [auto, true, null, cpu, 1]
+- [auto, true, true, cuda, 0]
+- [cpu, true, true, cpu, 0]
+- [cuda, true, null, cuda, 0]
+"""
+"""The option, CUDA, gsplat, the device that is taken, how many lines are said."""
+
+
 def test_the_device_and_what_is_said(monkeypatch):
-    for wanted, cuda, gsplat, expected, told in (
-        ("auto", False, None, "cpu", 0),
-        ("auto", False, True, "cpu", 0),
-        ("auto", True, None, "cpu", 1),
-        ("auto", True, True, "cuda", 0),
-        ("cpu", True, True, "cpu", 0),
-        ("cuda", True, None, "cuda", 0),
-    ):
+    for wanted, cuda, gsplat, expected, told in yaml.safe_load(DEVICES):
         monkeypatch.setattr(torch.cuda, "is_available", Mock(return_value=cuda))
         monkeypatch.setattr(distributed, "find_spec", Mock(return_value=gsplat))
         said = []
