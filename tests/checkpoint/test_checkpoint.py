@@ -199,7 +199,7 @@ def test_a_changed_letter_in_any_metadata_is_refused(saved):
             rest = dict(metadata)
             del rest[name]
             save_file(own, saved, rest | changed)
-            must_refuse("", CheckpointFile, saved, kind=CheckpointError)
+            must_refuse(".", CheckpointFile, saved, kind=CheckpointError)
 
 
 def test_files_of_the_format_without_a_seal_are_read(saved):

@@ -1,6 +1,7 @@
 """Copying the nearest input view, and the mean colour."""
 
 import torch
+import yaml
 from torch.testing import assert_close
 
 from qgs.contracts import Column
@@ -47,13 +48,17 @@ def test_mean_colour_is_flat():
     assert_close(found, mean.expand(1, 2, 3, 8, 8))
 
 
+FIGURES = """
+- [higher, 14.457, 14.463, false]
+- [higher, 14.454, 14.463, true]
+- [lower, 0.31, 0.30, true]
+- [lower, 0.304, 0.301, false]
+- [higher, 15.0, null, false]
+"""
+"""Which is better, the model's figure, the nearest photo's, and whether it is remarked on."""
+
+
 def test_a_model_is_worse_only_where_the_shown_figures_differ():
-    for better, model, nearest, remarked in (
-        ("higher", 14.457, 14.463, False),
-        ("higher", 14.454, 14.463, True),
-        ("lower", 0.31, 0.30, True),
-        ("lower", 0.304, 0.301, False),
-        ("higher", 15.0, None, False),
-    ):
+    for better, model, nearest, remarked in yaml.safe_load(FIGURES):
         text = worse_than_nearest(Column("score", better, 2), model, nearest, "try this")
         assert ("try this" in text) == bool(text) == remarked, (model, nearest)

@@ -2,7 +2,7 @@
 
 import torch
 from renderers.scenes import differentiate, make_scene
-from tables import fault
+from tables import must_refuse
 from torch.testing import assert_close
 
 from qgs.containers import concatenated, named_tensors
@@ -131,10 +131,7 @@ def test_half_precision_is_rendered_in_float32(build):
 def test_mismatches_are_named(build):
     gaussians, cameras = make_scene(batch=2, views=2)
     render = build()
-    faults = [
-        fault("2 scenes cannot be rendered from cameras of 1", render, gaussians, cameras[:1]),
-        fault(r"means \(B, G, 3\)", render, gaussians[0], cameras),
-        fault(r"cameras of shape \(B, V\)", render, gaussians, cameras[0]),
-        fault(r"shape \(3,\)", render, gaussians, cameras, torch.zeros(1, 3)),
-    ]
-    assert not any(faults), faults
+    must_refuse("2 scenes cannot be rendered from cameras of 1", render, gaussians, cameras[:1])
+    must_refuse(r"means \(B, G, 3\)", render, gaussians[0], cameras)
+    must_refuse(r"cameras of shape \(B, V\)", render, gaussians, cameras[0])
+    must_refuse(r"shape \(3,\)", render, gaussians, cameras, torch.zeros(1, 3))

@@ -6,7 +6,7 @@ import pytest
 import torch
 from losses.judging import CAMERAS, TRUTH
 from small_parts import DIMS, made
-from tables import fault
+from tables import must_refuse
 from torch.testing import assert_close
 
 from qgs import QueryState, Views
@@ -84,31 +84,10 @@ def test_attention_of_other_shapes_is_refused():
     whole = (2, 4, 3, 5)
     flat = (2, 3, 5)
     long = (2, 4, 3, 6)
-    faults = (
-        fault(
-            r"content .* \(2, 3, 5\), not \(B, h, Q, T\)",
-            weights,
-            flat,
-            None,
-            flat,
-            kind=AssertionError,
-        ),
-        fault(
-            r"geometry \(2, 3, 5\), content \(2, 4, 3, 5\)",
-            weights,
-            whole,
-            flat,
-            whole,
-            kind=AssertionError,
-        ),
-        fault(r"geometry \(1, 1, 3, 5\)", weights, whole, (1, 1, 3, 5), whole, kind=AssertionError),
-        fault(
-            r"weights \(2, 4, 3, 6\), content \(2, 4, 3, 5\)",
-            weights,
-            whole,
-            None,
-            long,
-            kind=AssertionError,
-        ),
-    )
-    assert not any(faults), faults
+    for words, shapes in (
+        (r"content .* \(2, 3, 5\), not \(B, h, Q, T\)", (flat, None, flat)),
+        (r"geometry \(2, 3, 5\), content \(2, 4, 3, 5\)", (whole, flat, whole)),
+        (r"geometry \(1, 1, 3, 5\)", (whole, (1, 1, 3, 5), whole)),
+        (r"weights \(2, 4, 3, 6\), content \(2, 4, 3, 5\)", (whole, None, long)),
+    ):
+        must_refuse(words, weights, *shapes, kind=AssertionError)
