@@ -10,6 +10,7 @@ import pytest
 import torch
 import yaml
 from safetensors.torch import save
+from tables import must_refuse
 from upath import UPath
 
 from qgs.checkpoint import download
@@ -100,10 +101,13 @@ def test_failures(server, cache, capsys):
 
 
 def test_no_server_and_no_url():
-    with pytest.raises(OSError, match=r"nothing was kept: .*refused"):
-        checkpoint_path("http://127.0.0.1:9/a.safetensors")
-    with pytest.raises(OSError, match="no URL"):
-        checkpoint_path("https://[::1/a.safetensors")
+    must_refuse(
+        r"nothing was kept: .*refused",
+        checkpoint_path,
+        "http://127.0.0.1:9/a.safetensors",
+        kind=OSError,
+    )
+    must_refuse("no URL", checkpoint_path, "https://[::1/a.safetensors", kind=OSError)
 
 
 def test_any_name_is_kept_in_a_folder_of_the_cache(server, cache):

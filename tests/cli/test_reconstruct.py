@@ -10,6 +10,7 @@ from commands import MODEL, done
 from photo_formats import noisy_photos, scene
 from PIL import Image
 from plyfile import PlyData
+from tables import must_refuse
 
 import qgs
 from qgs.reconstruction.scenes import frame_list
@@ -156,12 +157,12 @@ def test_tuned_tokens_meet_the_inputs_better_and_are_told(
 def test_photos_that_are_not_there_are_refused(photos):
     found = scene(photos)
     assert frame_list("0,8", "--frames", found) == [0, 8]
-    with pytest.raises(ValueError, match=r"--frames: '0-8' is no photo"):
-        frame_list("0-8", "--frames", found)
+    must_refuse(r"--frames: '0-8' is no photo", frame_list, "0-8", "--frames", found)
     found.frame_name = ["a/1.png", "b/1.png", "11.png", *"defg"].__getitem__
     assert frame_list("b/1.png", "--frames", found) == [1]
-    with pytest.raises(ValueError, match=r"'1\.png' fits 0 \(a/1\.png\), 1 \(b/1\.png\)\."):
-        frame_list("1.png", "--frames", found)
+    must_refuse(
+        r"'1\.png' fits 0 \(a/1\.png\), 1 \(b/1\.png\)\.", frame_list, "1.png", "--frames", found
+    )
 
 
 SENSELESS = """

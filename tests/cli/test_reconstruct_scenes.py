@@ -9,6 +9,7 @@ from commands import MODEL
 from photo_formats import centred, opened, synthetic, write_llff, write_nerfstudio
 from PIL import Image
 from qgs_photos.datatools import packing
+from tables import must_refuse
 from upath import UPath
 
 from qgs.recipe import resolve
@@ -95,18 +96,15 @@ def test_one_scene_of_chunks(folders, tmp_path):
 
 
 def test_a_scene_that_is_not_named_or_not_there(folders, tmp_path):
-    with pytest.raises(ValueError, match=r"holds 2 scenes: a, b: name one of them \(scene\)"):
-        chosen(ROOMS, folders)
+    must_refuse(r"holds 2 scenes: a, b: name one of them \(scene\)", chosen, ROOMS, folders)
     with pytest.raises(ValueError, match="holds no scene 'c', but a, b: name one"):
         chosen(ROOMS, folders, name="c")
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty/transforms.txt").touch()
-    with pytest.raises(FileNotFoundError, match="lists no cameras"):
-        chosen(ROOMS, tmp_path / "empty")
+    must_refuse("lists no cameras", chosen, ROOMS, tmp_path / "empty", kind=FileNotFoundError)
 
 
 def test_a_recipe_without_data_takes_the_size_that_is_given(folders):
-    with pytest.raises(ValueError, match="give `size`, such as 256x256"):
-        chosen(NO_DATA, folders / "a")
+    must_refuse("give `size`, such as 256x256", chosen, NO_DATA, folders / "a")
     for trained in (NO_DATA, recipe("qgs/photos", path=str(folders / "a"))):
         assert chosen(trained, folders / "a", (8, 24))[2] == (8, 24)

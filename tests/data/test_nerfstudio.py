@@ -9,6 +9,7 @@ import yaml
 from photo_formats import scene as read
 from photo_formats import synthetic, write_nerfstudio
 from PIL import Image
+from tables import must_refuse
 
 from qgs.data.lenses import Fisheye, RadialTangential
 from qgs.data.photos.nerfstudio import image_name, read_transforms
@@ -29,8 +30,7 @@ def change(folder, frame=None, **values):
 
 def test_masks_are_read_at_the_delivered_size(folder):
     change(folder, 1, mask_path="left.png")
-    with pytest.raises(FileNotFoundError, match=r"left\.png"):
-        read(folder)
+    must_refuse(r"left\.png", read, folder, kind=FileNotFoundError)
     mask = np.zeros((30, 40), np.uint8)
     mask[:, :20] = 255
     Image.fromarray(mask).save(folder / "left.png")
@@ -89,8 +89,7 @@ def test_splits(folder, caplog):
 
 def test_a_split_that_names_no_frame_is_told(folder):
     change(folder, train_filenames=["images/other.png"])
-    with pytest.raises(ValueError, match=r"transforms\.json: 'train_filenames' names .*other\.png"):
-        read(folder)
+    must_refuse(r"transforms\.json: 'train_filenames' names .*other\.png", read, folder)
 
 
 def test_lenses(folder):
@@ -140,5 +139,4 @@ def test_the_world_is_that_of_the_poses(folder):
 def test_images_of_another_size_are_told_when_decoded(folder):
     Image.new("RGB", (40, 40)).save(folder / NAMES[3])
     scene = read(folder)
-    with pytest.raises(ValueError, match=r"view_003\.png"):
-        scene.images([3])
+    must_refuse(r"view_003\.png", scene.images, [3])

@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 from renderers.scenes import make_scene
+from tables import must_refuse
 
 import qgs.renderers as auto_module
 import qgs.renderers.gsplat as gsplat_module
@@ -79,8 +80,7 @@ def test_options_that_the_kernels_fix_are_refused():
             assert problem.option == option
             assert "qgs/cpu" in problem.fix
             assert [*cls.problems(RendererConfig(near=1.0, dilation=1.0), context)] == []
-        with pytest.raises(ValueError, match=option):
-            GsplatRenderer(config)
+        must_refuse(option, GsplatRenderer, config)
 
 
 ON_CUDA = SimpleNamespace(means=SimpleNamespace(is_cuda=True, dtype=torch.float32))
@@ -92,8 +92,7 @@ def test_tensors_elsewhere_and_intrinsics_that_want_a_gradient_are_refused():
     with pytest.raises(ValueError, match="CUDA tensors, got Gaussians on cpu"):
         GsplatRenderer(RendererConfig())(gaussians, cameras)
     cameras.intrinsics.requires_grad_()
-    with pytest.raises(ValueError, match="no gradient for intrinsics"):
-        gsplat_module._check_supported(ON_CUDA, cameras)
+    must_refuse("no gradient for intrinsics", gsplat_module._check_supported, ON_CUDA, cameras)
 
 
 def test_auto_goes_by_where_the_gaussians_are(monkeypatch):

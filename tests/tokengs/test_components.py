@@ -34,8 +34,7 @@ def test_posact_its_slope_at_zero_and_its_limits():
 
 def test_an_image_that_patches_do_not_divide():
     encoder = made(MultiViewViT, patch_size=5)
-    with pytest.raises(ValueError, match="16 x 24 cannot be cut into patches of 5"):
-        encoder(Views(TRUTH, CAMERAS))
+    must_refuse("16 x 24 cannot be cut into patches of 5", encoder, Views(TRUTH, CAMERAS))
     problems = encoder.problems(encoder.config, RecipeContext(DIMS, (16, 24)))
     assert [problem.option for problem in problems] == ["patch_size"]
 
