@@ -1,4 +1,4 @@
-"""A fresh virtual environment with qgs, LocusGS, rooms and tools for authors from their wheels.
+"""A fresh virtual environment with qgs, LocusGS, worlds and tools for authors from their wheels.
 
 Installing torch again for every test would take minutes. All packages of the present environment
 but qgs and its plugins are lent through a folder of links, so that qgs can only come from its
@@ -44,7 +44,7 @@ def make_fresh_environment(folder):
     """Build the wheels of qgs and three plugins and install them into a new environment."""
     wheels = folder / "wheels"
     build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--wheel-dir", str(wheels)]
-    plugins = (str(ROOT / "plugins" / name) for name in ("locus", "rooms", "plugintools"))
+    plugins = (str(ROOT / "plugins" / name) for name in ("locus", "worlds", "dev"))
     subprocess.run([*build, str(ROOT), *plugins], check=True)
     venv.create(folder / "venv", with_pip=True)
     environment = FreshEnvironment(folder / "venv")

@@ -62,7 +62,7 @@ def test_gaussians_have_the_same_gradients_without_those_of_the_cameras():
 
 def test_missing_numba_says_what_to_do(monkeypatch):
     monkeypatch.setattr(qgs.renderers.cpu, "can_compile", lambda: False)
-    with pytest.raises(RuntimeError, match=r'pip install numba.*qgs/torch'):
+    with pytest.raises(RuntimeError, match=r"pip install numba.*qgs/torch"):
         CpuRenderer(RendererConfig())
 
 
