@@ -61,7 +61,7 @@ GRADIENTS = ("render_gradients_match_differences", "camera_gradients_match_diffe
             for encoder in (sound.ConvolvesByThree, sound.ConvolvesByFour)
             for patch, size in [(4, None), (16, None), (8, (64, 64)), (8, (16, 24))]
         ],
-        (["saved_weights_load"], Case(ContentCrossAttention.Config(), ModelDims(48, 3, 1))),
+        (["construction"], Case(ContentCrossAttention.Config(), ModelDims(48, 3, 1))),
         (GRADIENTS, Case(TorchRenderer.Config(dilation=0.1))),
         (GRADIENTS, Case(TorchRenderer.Config(dilation=1.0))),
         (GRADIENTS, Case(TorchRenderer.Config(alpha_min=1 / 128))),

@@ -24,7 +24,7 @@ from qgs.tokengs import MlpFeedForward
 CASE = Case(MlpFeedForward.Config())
 CACHES = Case(CachesByShape.Config())
 STATE = "forward_keeps_no_state"
-FROZEN = "config_round_trip"
+FROZEN = "construction"
 
 
 def test_an_error_is_reported_with_its_place_in_the_component() -> None:

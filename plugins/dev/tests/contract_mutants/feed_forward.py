@@ -56,7 +56,7 @@ register(
     lambda self, mlp, x: mlp(x) * (random.random() if self.training else 1),
 )  # fmt: skip
 register(
-    "StaysOnCpu", "moves_to_a_device", "device",
+    "StaysOnCpu", "construction", "device",
     lambda self, mlp, x: mlp(x) * torch.ones(x.shape[-1]),
 )  # fmt: skip
 register(

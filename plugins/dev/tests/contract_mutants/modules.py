@@ -64,7 +64,7 @@ class ViewsAField(PlacesByALayer):
         return self.attention(self.norm(state.features + place), state.mask)
 
 
-@mutant("config_round_trip", "is read again as", options={"z_offset": 0.3})
+@mutant("construction", "is read again as", options={"z_offset": 0.3})
 class RoundsAnOption(FreeCenters):
     class Config(FreeCenters.Config):
         @field_serializer("z_offset")
@@ -72,7 +72,7 @@ class RoundsAnOption(FreeCenters):
             return float(round(z_offset))
 
 
-@mutant("misspelt_option_is_refused", "`z_offset_x` is accepted")
+@mutant("construction", "`z_offset_x` is accepted")
 class IgnoresUnknownOptions(FreeCenters):
     class Config(FreeCenters.Config):
         model_config = ConfigDict(extra="ignore")
@@ -86,13 +86,13 @@ class Outer(ComponentConfig):
     inners: tuple[Inner, ...] = ()
 
 
-@mutant("misspelt_option_is_refused", "Inner accepts any option")
+@mutant("construction", "Inner accepts any option")
 class IgnoresUnknownInnerOptions(MlpFeedForward):
     class Config(MlpFeedForward.Config):
         outer: Outer | None = None
 
 
-@mutant("options_are_left_alone", "when it is built, ")
+@mutant("construction", "when it is built, ")
 class AppendsToAnOption(ExtendedMlp):
     class Config(MlpFeedForward.Config):
         sizes: list[int] = Field(default=[1])
@@ -125,7 +125,7 @@ PINNED = {
 """What saved weights of `qgs/mlp` hold in a model of width 32."""
 
 
-@mutant("builds_on_meta", "scale: allocated")
+@mutant("construction", "scale: allocated")
 class AllocatesOnCpu(ExtendedMlp):
     def add(self, dims):
         self.scale = nn.Parameter(torch.ones(dims.width, device="cpu"))
@@ -134,20 +134,20 @@ class AllocatesOnCpu(ExtendedMlp):
         return self.scale * super().forward(features)
 
 
-@mutant("registers_its_parameters", "keeps layers outside")
+@mutant("construction", "keeps layers outside")
 class KeepsLayersInAList(ExtendedMlp):
     def add(self, dims):
         self.layers = [nn.Linear(dims.width, dims.width)]
 
 
-@mutant("same_seed_same_parameters", "torch is in one state")
+@mutant("construction", "torch is in one state")
 class SeedsWhenBuilt(MlpFeedForward):
     def __init__(self, config, dims):
         torch.manual_seed(0)
         super().__init__(config, dims)
 
 
-@mutant("same_seed_same_parameters", "differ, mlp.fc1.weight")
+@mutant("construction", "differ, mlp.fc1.weight")
 class DrawsFromItsOwnGenerator(ExtendedMlp):
     def add(self, dims):
         generator = torch.Generator()
@@ -156,7 +156,7 @@ class DrawsFromItsOwnGenerator(ExtendedMlp):
             self.mlp.fc1.weight.normal_(generator=generator)
 
 
-@mutant("saved_weights_load", "with the same state dict, output")
+@mutant("construction", "with the same state dict, output")
 class KeepsARandomBufferUnsaved(ExtendedMlp):
     def add(self, dims):
         self.register_buffer("noise", torch.randn(dims.width), persistent=False)

@@ -1,19 +1,14 @@
-"""Parameters and state: drawn, kept, saved, moved, learned; a forward pass changes none of it."""
+"""Parameters and state: parameters learn, and a forward pass changes nothing that is kept."""
 
-import random
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
-from unittest.mock import patch
 
-import numpy
 import torch
-from safetensors.torch import load, save
-from torch import Tensor, nn
+from pydantic import ValidationError
 
-from qgs.containers import map_tensors
-from qgs.recipe.build import OnMeta
+from qgs.contracts import ComponentConfig
 from qgs_dev.case import Case
+from qgs_dev.checks.construction import other_generators
+from qgs_dev.checks.judging import rehearsed
 from qgs_dev.inputs import Inputs, inputs_of
 from qgs_dev.modules import attributes, each_mode, seeded, tensors_of
 from qgs_dev.vocabulary import (
@@ -24,110 +19,12 @@ from qgs_dev.vocabulary import (
     expect_finite,
     expect_none,
     expect_same,
-    floating,
     leaves,
     scalar,
-    tracked,
 )
 
 # Share of the largest gradient that float32 inside of a float64 component leaves of none.
 ROUNDING = 1e-8
-
-
-def check_builds_on_meta(case: Case) -> None:
-    """Built under the meta device, a component allocates no parameter and no buffer."""
-    with torch.device("meta"), OnMeta():
-        module = case.construct()
-    real = [name for name, tensor in tensors_of(module).items() if not tensor.is_meta]
-    expect_none(real, "allocated; leave the device to the caller")
-
-
-def check_registers_its_parameters(case: Case) -> None:
-    """Every tensor that a component keeps is a parameter or a buffer, so that it moves along.
-
-    Torch's own layers may list their parameters a second time, as its recurrent ones do.
-    """
-    for name, part in case.build().named_modules():
-        of_torch = type(part).__module__.startswith("torch.")
-        for key, value in vars(part).items():
-            listed = value if isinstance(value, list | tuple) and not of_torch else ()
-            kept = [value] if isinstance(value, Tensor) else listed
-            outside = any(isinstance(x, Tensor | nn.Module) for x in kept)
-            where = f"{name or 'the component'} keeps {key}"
-            expect(not outside, f"{where} outside of its parameters, buffers and modules")
-
-
-def check_same_seed_same_parameters(case: Case) -> None:
-    """Initial parameters are drawn from torch's global generator alone, which is not seeded.
-
-    Two instances built from one seed have the same parameters, to the bit.
-    """
-    # Training resumes torch's generator alone.
-    others = other_generators()
-    after = []
-    for seed in (1, 2):
-        with seeded(seed):
-            case.construct()
-            after.append(torch.get_rng_state())
-    expect(not torch.equal(*after), "after being built from two seeds, torch is in one state")
-    expect(others == other_generators(), "building draws from numpy's or random's generator")
-    first, second = (dict(case.build(seed=3).state_dict()) for _ in range(2))
-    expect_same(first, second, "two instances built from one seed differ")
-
-
-def other_generators() -> tuple[Any, str]:
-    """The states of the random generators that components must not use."""
-    return random.getstate(), str(numpy.random.get_state())
-
-
-def check_saved_weights_load(case: Case) -> None:
-    """Weights saved as safetensors and loaded into a new instance give the same bits."""
-    module = case.lively(seed=1)
-    other = case.build(seed=2).eval()
-    weights = {name: x.contiguous() for name, x in module.state_dict().items()}
-    other.load_state_dict(load(save(weights)))
-    inputs = inputs_of(case).values()
-    expect_same(module(*inputs), other(*inputs), "with the same state dict")
-
-
-def check_state_dict_keys(case: Case) -> None:
-    """Names and shapes in the state dict are as pinned in the case; a forward pass keeps them."""
-    module = case.build()
-    shapes = {name: tuple(x.shape) for name, x in module.state_dict().items()}
-    module(*inputs_of(case).values())
-    expect(shapes.keys() == module.state_dict().keys(), "a forward pass changes the names")
-    if case.state_dict is not None:
-        pinned = {name: tuple(shape) for name, shape in case.state_dict.items()}
-        moved = pinned.items() ^ shapes.items()
-        expect_none(moved, "pinned or present, not both; saved weights would not load")
-
-
-def check_moves_to_a_device(case: Case) -> None:
-    """Moved to another device (CUDA, else meta), a component computes there, without the CPU."""
-    device = "cuda" if torch.cuda.is_available() else "meta"
-    module = case.lively().to(device)
-    inputs = tracked(map_tensors(lambda x: x.to(device), inputs_of(case)))
-    with _autocast_accepts_meta():
-        outputs = floating(module(*inputs.values()))
-    for name, tensor in outputs.items():
-        moved = tensor.device.type == device
-        expect(moved, f"`{name}` is on {tensor.device}, the component on {device}")
-    # The backward pass has devices of its own.
-    totals = [x.sum() for x in outputs.values() if x.requires_grad]
-    if totals:
-        torch.autograd.backward(totals)
-
-
-@contextmanager
-def _autocast_accepts_meta() -> Iterator[None]:
-    """`torch.autocast(x.device.type, enabled=False)` is valid code, which torch refuses on meta."""
-    start = torch.autocast.__init__
-
-    def begin(self: Any, device_type: str, *args: Any, **kwargs: Any) -> None:
-        start(self, "cpu" if device_type == "meta" else device_type, *args, **kwargs)
-
-    with patch.object(torch.autocast, "__init__", begin):
-        yield
 
 
 @seeded(0)
@@ -172,6 +69,16 @@ def check_parameters_learn(case: Case) -> None:
         if step and (draws_nothing or not idle):
             break
     expect_none(idle, "no gradient reaches it; use it or name it in `unlearned`")
+
+
+def check_state_dict_keys(case: Case) -> None:
+    """Names and shapes in the state dict are as pinned in the case, if it pins any."""
+    if case.state_dict is None:
+        return
+    shapes = {name: tuple(x.shape) for name, x in case.build().state_dict().items()}
+    pinned = {name: tuple(shape) for name, shape in case.state_dict.items()}
+    moved = pinned.items() ^ shapes.items()
+    expect_none(moved, "pinned or present, not both; saved weights would not load")
 
 
 def check_inputs_are_not_changed(case: Case) -> None:
@@ -262,3 +169,46 @@ def _outputs(module: Any, inputs: Inputs, seed: int) -> tuple[Any, torch.Tensor]
     with seeded(seed), torch.no_grad():
         outputs = cloned(module(*inputs.values()))
         return outputs, torch.get_rng_state()
+
+
+def check_scheduled_options_are_read_anew(case: Case) -> None:
+    """An option in `scheduled` counts in the next call once it is changed, as if built with it.
+
+    What a component requires and provides does not depend on it.
+    """
+    for option in sorted(case.component.scheduled):
+        other = case.with_config(_with_another(case.config, option))
+        if other.config == case.config or other.problems(case.size):
+            continue
+        what = f"`{option}: {getattr(other.config, option)}`"
+        same = dict(other.reads) == dict(case.reads) and dict(other.writes) == dict(case.writes)
+        expect(same, f"{what} changes what it requires or provides")
+        module = _ready(case)
+        # A first call may keep what the second must read anew.
+        _called(case, module)
+        module.config = other.config
+        where = f"with {what} set after it was built"
+        expect_same(_called(case, _ready(other)), _called(case, module), where)
+
+
+def _with_another(config: ComponentConfig, option: str) -> ComponentConfig:
+    """Return `config` with half or twice a number, or 0.5 for 0; itself if neither is allowed."""
+    value = getattr(config, option)
+    for other in (value / 2, 2 * value) if value else (0.5, 1):
+        try:
+            changed = {**dict(config), option: type(value)(other)}
+            return type(config).model_validate(changed)
+        except (ValidationError, TypeError):
+            continue
+    return config
+
+
+def _ready(case: Case) -> Any:
+    return case.build() if case.slot == "objective" else case.lively()
+
+
+def _called(case: Case, module: Any) -> Any:
+    if case.slot == "objective":
+        return rehearsed(case, module)
+    with seeded(0):
+        return module(*inputs_of(case).values())
