@@ -184,8 +184,8 @@ class Case:
 
     def with_config(self, config: ComponentConfig) -> "Case":
         """Return the same case with other options."""
-        return replace(self, config=config, state_dict=None)
+        return replace(self, config=config)
 
     def with_dims(self, **sizes: int) -> "Case":
         """Return the same component in a model of other sizes."""
-        return replace(self, dims=replace(self.dims, **sizes), state_dict=None)
+        return replace(self, dims=replace(self.dims, **sizes))

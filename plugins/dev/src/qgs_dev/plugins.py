@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from qgs.contracts import Component, ComponentConfig, ModelDims
 from qgs.recipe.registry import InstalledPlugin, PluginError, default_config, load_plugin
 from qgs_dev.case import SMALL, Case
-from qgs_dev.registry import TIERS, Tier, checked_tiers
+from qgs_dev.registry import TIERS, Tier
 from qgs_dev.running import CaseRun, CheckResult, refuse_unexpectable, with_place
 
 # Decoder depths that are tried in turn until the component's `problems` accepts one.
@@ -67,12 +67,10 @@ def runs_of(plugin: str | InstalledPlugin) -> list[CaseRun]:
 def check_plugin(name: str, tiers: Iterable[Tier] = TIERS) -> Iterator[CheckResult]:
     """Run every check on every case of the plugin `name`, case by case.
 
-    Raises PluginError for a plugin that is unusable or has invalid examples or exemptions, and
-    ValueError for no tiers and for unknown ones.
+    Raises PluginError for a plugin that is unusable or has invalid examples or exemptions.
     """
-    wanted = checked_tiers(tiers)
     runs = runs_of(name)
-    return (result for run in runs for result in run.results(wanted))
+    return (result for run in runs for result in run.results(tiers))
 
 
 def _case(config: ComponentConfig) -> Case:

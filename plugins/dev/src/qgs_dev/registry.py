@@ -68,9 +68,11 @@ def checks_for(case: Case, tiers: Iterable[Tier] = TIERS, variant: bool = False)
     """The checks that apply to the slot of `case`, causes before what they cause.
 
     variant: whether another case of its class comes before it; then only those of `variants`.
-    Raises ValueError for no tiers and for unknown ones.
     """
-    wanted = checked_tiers(tiers)
+    wanted = {*tiers}
+    # No check at all would pass.
+    assert wanted, "no tiers"
+    assert wanted <= {*TIERS}, f"tiers are {wanted}, not some of {TIERS}"
     found = [
         check
         for check in CHECKS.values()
@@ -78,11 +80,3 @@ def checks_for(case: Case, tiers: Iterable[Tier] = TIERS, variant: bool = False)
     ]
     # False sorts before True.
     return sorted(found, key=lambda check: [check.name != name for name in FIRST])
-
-
-def checked_tiers(given: Iterable[Tier]) -> tuple[Tier, ...]:
-    """Return `given` as a tuple; raises ValueError if it is empty, a text, or names no tiers."""
-    tiers = tuple(given)
-    if not tiers or not set(tiers) <= set(TIERS):
-        raise ValueError(f"tiers is {given!r}; give a list of some of {', '.join(TIERS)}")
-    return tiers

@@ -1,16 +1,13 @@
 """Faults of a class that recipes cannot use as a component."""
 
-import inspect
 import re
 from collections.abc import Mapping
-from functools import cache
 from typing import Any
 
 from torch.nn import Module
 
 from qgs.contracts import (
     Component,
-    ComponentConfig,
     Metric,
     Objective,
     Optimizer,
@@ -18,7 +15,6 @@ from qgs.contracts import (
     ViewSampler,
 )
 from qgs.contracts.schedule import number_kinds
-from qgs.recipe.slots import SLOTS
 
 # Types of the devices that a renderer can render on.
 DEVICES = ("cpu", "cuda", "mps")
@@ -26,17 +22,12 @@ DEVICES = ("cpu", "cuda", "mps")
 
 def component_fault(component: type[Component]) -> str:
     """Why a recipe cannot use the class `component`, as a relative clause; "" if it can."""
-    slot = SLOTS.get(getattr(component, "slot", ""))
     name = getattr(component, "name", None)
-    if slot is None or not issubclass(component, slot.contract):
-        return "which implements no slot's contract"
     if not isinstance(name, str):
         return "which has no `name`"
     # Else `type: PLUGIN/NAME` would be ambiguous.
     if not re.fullmatch(r"[^\s/]+", name):
         return f"whose name {name!r} is empty or has a slash or a blank"
-    if inspect.isabstract(component):
-        return f"which leaves {', '.join(sorted(component.__abstractmethods__))} abstract"
     if issubclass(component, Renderer):
         given: object = component.devices
         if not (isinstance(given, tuple) and given and set(given) <= set(DEVICES)):
@@ -56,13 +47,4 @@ def component_fault(component: type[Component]) -> str:
     # Others are built once, and have no step to follow.
     if scheduled and not issubclass(component, Module | Objective | Optimizer | ViewSampler):
         return f"which lists `scheduled` options; those of the slot `{component.slot}` stay"
-    return _schema_fault(config)
-
-
-@cache
-def _schema_fault(config: type[ComponentConfig]) -> str:
-    try:
-        config.model_json_schema()
-        return ""
-    except Exception as error:
-        return f"whose Config has options that YAML cannot express: {str(error).splitlines()[0]}"
+    return ""
