@@ -8,9 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from qgs_research.studies.figures import write_figures
 from qgs_research.studies.intervals import crossed_interval
-from qgs_research.studies.output import record, table_rows, write_files
+from qgs_research.studies.output import record, study_summary, write_figures, write_files
 from qgs_research.studies.results import Results
 from qgs_research.studies.runs import Plan, run_of
 from qgs_research.studies.statements import answer, notes
@@ -70,6 +69,11 @@ def results(folder, lead=(0, 0, 0), views=lambda variant, evaluation: evaluation
     return Results(plan)
 
 
+def table_of(found):
+    """The table of the recipes' own evaluation, behind that of the hypotheses."""
+    return study_summary(found).tables[1][1]
+
+
 @pytest.fixture
 def plain(tmp_path):
     return results(tmp_path)
@@ -80,7 +84,7 @@ def test_numbers_are_those_of_the_definition(plain):
         np.array([[score(variant, "", seed, n) for n in range(8)] for seed in range(3)])
         for variant in ("less", "full")
     )
-    assert plain.variants() == ["full", "less", "other"]
+    assert plain.models() == ["full", "less", "other"]
     mean = plain.score("less", "psnr")
     apart = plain.difference("less", "psnr")
     assert mean.mean == pytest.approx(less.mean())
@@ -161,7 +165,7 @@ def test_numbers_of_unlike_protocols_are_not_compared(tmp_path):
     views = {"full": "two", "less": "two", "other": "six"}
     found = results(tmp_path, views=lambda variant, evaluation: evaluation or views[variant])
     assert answer(found).startswith("Undecided (evaluation `noisy`): other, ")
-    cells = {row[0]: row[3:6] for row in table_rows(found)[1:]}
+    cells = {row[0]: row[3:6] for row in table_of(found)[1:]}
     assert cells["full"] == ["reference", "–", "–"]
     assert cells["other"] == ["–", "–", "–"]
     assert cells["less"][0].startswith("-0.9")
@@ -177,7 +181,7 @@ def test_a_variant_without_the_metric_is_a_row_of_dashes(plain, tmp_path):
         file = run_of(tmp_path, "less", seed).evaluation("") / "scenes.csv"
         file.write_text(re.sub(r"(,1 2),[^,]*", r"\1,", file.read_text()))
     found = Results(plain.plan)
-    row = next(row for row in table_rows(found) if row[0] == "less")
+    row = next(row for row in table_of(found) if row[0] == "less")
     assert row[1:6] == ["–"] * 5
     write_files(found)
     table = json.loads((tmp_path / "results.json").read_text())["table"]
@@ -189,6 +193,6 @@ def test_published_values_are_shown_and_ranked_from_five_variants_on(tmp_path):
     text = text.replace("other: 22.0", "other: 22.0, four: 21.5, five: 21.0")
     found = results(tmp_path, (-2, -2, -2), text=text)
     assert found.rank_correlation() == (pytest.approx(1.0), 5)
-    head, *rows = table_rows(found)
+    head, *rows = table_of(found)
     shown = {row[0]: row[head.index("published")] for row in rows}
     assert (shown["full"], shown["four"]) == ("24.000", "21.500")

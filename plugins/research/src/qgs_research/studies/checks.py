@@ -52,15 +52,15 @@ def check_equal(study: Study, recipes: Mapping[str, Recipe], problems: Problems)
             if path == "training.steps" and settings.budget.images is not None:
                 continue
             # Variants of several files may name one index by different paths.
-            if path == INDEX and ours and theirs and index_of(recipe) == index_of(first):
+            if path == INDEX and index_of(recipe) == index_of(first):
                 continue
             reported.add(option)
             reason = (
-                f"`{path}` is {ours!r} in `{name}` and {theirs!r} in the reference "
+                f"`{path}` is {ours} in `{name}` and {theirs} in the reference "
                 f"`{settings.reference}` ({recipe.provenance.get(path, 'absent')})"
             )
             fix = f"make them equal (`overlay` sets it for all), or add `differs: [{option}]`"
-            problems.add(study.origins[name], f"variants.{name}", reason, fix)
+            problems.add(study.variants[name].origin, f"variants.{name}", reason, fix)
     for path in settings.differs:
         if path not in used:
             at = Origin(str(study.file))
@@ -78,7 +78,7 @@ def check_distinct(study: Study, recipes: Mapping[str, Recipe], problems: Proble
         if other != name:
             reason = f"`{name}` is the same model as `{other}`"
             fix = "change an option of it, or leave one of them out"
-            problems.add(study.origins[name], f"variants.{name}", reason, fix)
+            problems.add(study.variants[name].origin, f"variants.{name}", reason, fix)
 
 
 def check_data(plan: Plan) -> None:
@@ -124,7 +124,7 @@ def refuse_changed(plan: Plan) -> None:
         # Where the index lies is no matter; which scenes and frames it names is, below.
         changed.pop(INDEX, None)
         if changed:
-            shown = [f"{path}: {old!r} then, {new!r} now" for path, (old, new) in changed.items()]
+            shown = [f"{path}: {old} then, {new} now" for path, (old, new) in changed.items()]
             raise ValueError(
                 f"{plan.study.file}: {what} is not what {len(made)} runs in {plan.folder} were "
                 f"made with ({listed(shown, between='; ')}); {remedy}"

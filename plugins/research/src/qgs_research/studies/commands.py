@@ -36,14 +36,18 @@ def compare(
 
     Nothing is evaluated. Runs of one recipe with several seeds count as one side.
     """
+    from qgs.evaluate.results import as_json
+    from qgs.files import write_text
     from qgs_research.studies.comparison import compare as compared
+    from qgs_research.studies.comparison import record, summary
     from qgs_research.studies.stored import read_results
 
     console = Console()
-    comparisons = compared([read_results(run) for run in runs], across_protocols)
-    comparisons.show(console)
+    scores = compared([read_results(run) for run in runs], across_protocols)
+    summary(scores).show(console)
     if out:
-        comparisons.write(out)
+        write_text(out / "comparison.json", as_json(record(scores)))
+        write_text(out / "comparison.md", summary(scores).markdown)
     end = f"written to {out}" if out else "add --out FOLDER to keep this as JSON and Markdown"
     console.print(end, soft_wrap=True)
 
@@ -118,8 +122,7 @@ def run_and_report(
 
     Raises Exit with 128 + the signal that stopped it, or with 1 where a run failed.
     """
-    from qgs_research.studies.output import show
-    from qgs_research.studies.page import write_all
+    from qgs_research.studies.output import study_summary, write_all
     from qgs_research.studies.queue import Queue
     from qgs_research.studies.results import Results
 
@@ -142,7 +145,7 @@ def run_and_report(
     results = Results(plan)
     if results.columns:
         page = write_all(results)
-        show(results, console)
+        study_summary(results).show(console)
         console.print(f"written to {page}", soft_wrap=True, highlight=False)
     else:
         console.print("no run is finished: there is nothing to report yet")

@@ -1,20 +1,20 @@
 """Confidence intervals of mean differences: over scenes, or over trainings and scenes."""
 
 import numpy as np
+from scipy.stats import bootstrap
 from scipy.stats import t as student
 
 RESAMPLES = 10_000
 CONFIDENCE = 0.95
 SEED = 0
-_AT_A_TIME = 1_000_000  # numbers that the bootstrap draws at once, which bounds its memory
-
-CROSSED = "two-way variance, t with Satterthwaite's degrees of freedom"
+_AT_A_TIME = 1_000_000
+"""Numbers that the bootstrap draws at once, which bounds its memory."""
 
 
 def crossed_interval(
     values: np.ndarray, confidence: float = CONFIDENCE
 ) -> tuple[float, float] | None:
-    """Interval of the mean of differences (S, C) of S >= 2 trainings, each on the same C scenes.
+    """Return the interval of the mean of differences (S, C) of S trainings on the same C scenes.
 
     Both are random: it holds for other trainings and for other scenes; see `crossed_error`. None
     for fewer than two of either.
@@ -29,7 +29,7 @@ def crossed_interval(
 def interval(
     values: np.ndarray, confidence: float = CONFIDENCE
 ) -> tuple[float, float] | tuple[None, None]:
-    """Interval of the mean of differences (S, C) of S trainings on C scenes.
+    """Return the interval of the mean of differences (S, C) of S trainings on C scenes.
 
     Of one training it covers scenes alone, at 95 %; without an interval (None, None), as of one
     scene.
@@ -38,9 +38,9 @@ def interval(
 
 
 def crossed_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard error of the means of `values` (..., S, C), and its degrees of freedom, both (...).
+    """Return the standard error of the means of `values` (..., S, C), and its degrees of freedom.
 
-    The variance is that of two-way analysis of variance, a sum of mean squares; its degrees of
+    Both have the shape (...). The variance is that of two-way analysis of variance, a sum of mean squares; its degrees of
     freedom are those of Satterthwaite 1946 (doi.org/10.2307/3002019), at least those of the smaller
     side. Without the scenes' own (Hillis 2007, doi.org/10.1002/sim.2532) it is too narrow for few.
     """
@@ -61,7 +61,7 @@ def crossed_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def paired_interval(differences: np.ndarray) -> tuple[float, float] | None:
-    """Percentile bootstrap interval of the mean of differences (S,), one per scene.
+    """Return the percentile bootstrap interval of the mean of differences (S,), one per scene.
 
     The resamples are seeded, so that equal numbers give equal intervals. None for fewer than two
     scenes.
@@ -69,14 +69,15 @@ def paired_interval(differences: np.ndarray) -> tuple[float, float] | None:
     count = len(differences)
     if count < 2:
         return None
-    # A generator of its own: what the caller draws stays as it was.
-    rng = np.random.default_rng(SEED)
-    step = max(_AT_A_TIME // count, 1)
-    means = []
-    # In parts, because 10,000 resamples of many scenes would fill memory.
-    for start in range(0, RESAMPLES, step):
-        drawn = rng.integers(0, count, (min(step, RESAMPLES - start), count))
-        means.append(differences[drawn].mean(1))
-    tail = (1 - CONFIDENCE) / 2
-    low, high = np.quantile(np.concatenate(means), [tail, 1 - tail])
+    found = bootstrap(
+        (differences,),
+        np.mean,
+        n_resamples=RESAMPLES,
+        # In parts, because 10,000 resamples of many scenes would fill memory.
+        batch=max(_AT_A_TIME // count, 1),
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        rng=SEED,
+    )
+    low, high = found.confidence_interval
     return float(low), float(high)

@@ -1,120 +1,119 @@
-"""The tables of a study, printed, and its files: results.json and table.md."""
+"""The files of a study: results.json, table.md, study.html and the figures."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
-from rich.console import Console
+from matplotlib.figure import Figure
 
-from qgs.evaluate.results import as_json, bullets, markdown_table, print_lines, print_table
-from qgs.files import write_text
-from qgs_research.studies.hypotheses import MAIN
+from qgs.drawing import page_environment
+from qgs.drawing.figures import figure_picture, figure_style
+from qgs.drawing.images import data_uri
+from qgs.evaluate.results import as_json
+from qgs.files import replacing, write_text
+from qgs.model_text import parameter_counts
+from qgs_research.studies.estimates import interval_shown, shown
+from qgs_research.studies.figures import curves_figure, values_figure
 from qgs_research.studies.queue import last_record
-from qgs_research.studies.results import Estimate, Results
+from qgs_research.studies.results import Judgement, Results
+from qgs_research.studies.runs import differences
 from qgs_research.studies.statements import answer, notes
-from qgs_research.studies.stored import COMPACT, StoredResults
+from qgs_research.studies.tables import Rows, Summary, table_records, table_rows
 
-Rows = list[list[str]]
+_DPI = 160
 
 
-def table_rows(results: Results, evaluation: str = MAIN) -> Rows:
-    """One table, headers first: the study's metric in full, means of the others."""
-    metric = results.metric
+def write_all(results: Results) -> Path:
+    """Write all files; return the page."""
+    write_files(results)
+    figures = write_figures(results)
+    page = results.plan.folder / "study.html"
+    write_text(page, study_html(results, figures))
+    return page
+
+
+def write_files(results: Results) -> None:
+    """Write results.json and table.md; equal runs give equal files but for `times`."""
+    write_text(results.plan.folder / "table.md", study_summary(results).markdown)
+    write_text(results.plan.folder / "results.json", as_json(record(results)))
+
+
+def write_figures(results: Results) -> dict[str, Figure]:
+    """Write figures/: values of every evaluation and learning curves; return them by name."""
+    figures = {"curves": curves_figure(results)}
+    for name in results.plan.evaluations:
+        figures[f"values-{name}" if name else "values"] = values_figure(results, name)
+    written: dict[str, Figure] = {}
+    for name, figure in figures.items():
+        if figure is None:
+            continue
+        written[name] = figure
+        for suffix in ("pdf", "png"):
+            # Equal results give equal files: a PDF would hold the time.
+            metadata = {"CreationDate": None} if suffix == "pdf" else None
+            file = results.plan.folder / "figures" / f"{name}.{suffix}"
+            with replacing(file) as path, figure_style():
+                figure.savefig(path, format=suffix, dpi=_DPI, metadata=metadata)
+    return written
+
+
+def study_html(results: Results, figures: dict[str, Figure]) -> str:
+    """Return the whole page; it needs no other file and no network."""
+    recipes = results.plan.recipes
+    # Without memory: a page needs the shapes alone.
+    models = {name: recipe.build_model("meta") for name, recipe in recipes.items()}
+    reference = recipes[results.reference]
+    template = page_environment("qgs_research.studies", uri=data_uri).get_template("study.html")
+    return template.render(
+        plan=results.plan,
+        settings=results.settings,
+        missing=len(results.missing),
+        summary=study_summary(results),
+        pictures={name: figure_picture(figure, _DPI) for name, figure in figures.items()},
+        changes={name: differences(recipe, reference) for name, recipe in recipes.items()},
+        parameters={name: sum(parameter_counts(model).values()) for name, model in models.items()},
+    )
+
+
+def study_summary(results: Results) -> Summary:
+    """Return the answer, the verdicts, the table of every evaluation that has results, notes."""
+    tables = [("", _hypothesis_rows(results))] if results.settings.hypotheses else []
+    others = [name for name in results.columns if name != results.metric]
     published = results.settings.published
-    # The study's metric has five columns, others one each.
-    others = [name for name in results.columns if name != metric]
-    head = ["variant", results.column.title, "sd", "difference", "95 % interval", "better in"]
-    if published:
-        head.append("published")
-    rows = [[*head, *(results.columns[name].title for name in others), "seeds", "steps"]]
-    for variant in results.variants(evaluation):
-        scores = {name: results.score(variant, name, evaluation) for name in results.columns}
-        means = {name: score.mean if score else None for name, score in scores.items()}
-        shown = {name: results.shown(mean, name, sign=False) for name, mean in means.items()}
-        score = scores[metric]
-        apart = results.difference(variant, metric, evaluation)
-        difference = results.shown(apart.mean if apart else None)
-        row = [
-            variant,
-            shown.pop(metric),
-            results.shown(score.deviation if score else None, sign=False),
-            "reference" if variant == results.settings.reference else difference,
-            results.interval(apart),
-            apart.ahead(results.sign) if apart else "–",
-        ]
-        if published:
-            row.append(results.shown(published.get(variant), sign=False))
-        runs = results.stored[variant, evaluation].values()
-        rows.append([*row, *shown.values(), str(len(runs)), steps_shown(runs)])
-    # Baselines stand below the variants: they were not trained.
-    for name, values in results.baselines(evaluation).items():
-        first, *rest = [results.shown(values.get(m), m, sign=False) for m in (metric, *others)]
-        dashes = ["–"] * (len(head) - 2)
-        rows.append([name.replace("_", " "), first, *dashes, *rest, "–", "–"])
-    return rows
+    for name in results.plan.evaluations:
+        if results.models(name):
+            rows = table_rows(results, name, results.metric, others, published)
+            tables.append((name, rows))
+    return Summary(answer=answer(results), tables=tables, notes=notes(results))
 
 
-def steps_shown(runs: Iterable[StoredResults]) -> str:
-    """Steps of runs: 2,100, or from the fewest to the most where they differ."""
-    # Budgets in seconds end at different steps.
-    steps = sorted({stored.step for stored in runs if stored.step is not None})
-    return " to ".join(f"{step:,}" for step in (*steps[:1], *steps[1:][-1:])) or "–"
-
-
-def hypothesis_rows(results: Results) -> Rows:
-    """The verdicts, headers first."""
+def _hypothesis_rows(results: Results) -> Rows:
     head = ["hypothesis", "metric", "left - right", "95 % interval", "verdict", "of", "note"]
-    rows = [head]
-    for judgement in results.judgements():
-        estimate = judgement.estimate
-        metric = judgement.metric
-        reason = f" ({judgement.reason})" if judgement.reason else ""
-        row = [
-            judgement.hypothesis.claim,
-            results.columns[metric].heading if metric in results.columns else metric,
-            results.shown(estimate.mean if estimate else None, metric),
-            results.interval(estimate, metric),
-            judgement.verdict + reason,
-            estimate.sample if estimate else "–",
-            judgement.hypothesis.note,
-        ]
-        rows.append(row)
+    rows = [head, *(_hypothesis_row(results, judgement) for judgement in results.judgements())]
     # An empty column would only widen the table.
     with_notes = any(row[-1] for row in rows[1:])
     return rows if with_notes else [row[:-1] for row in rows]
 
 
-def tables(results: Results) -> Iterator[tuple[str, Rows]]:
-    """Rows of the verdicts and of the table of every evaluation that has results, with its name."""
-    if results.settings.hypotheses:
-        yield "", hypothesis_rows(results)
-    for name in results.plan.evaluations:
-        if results.variants(name):
-            yield name, table_rows(results, name)
-
-
-def show(results: Results, console: Console) -> None:
-    """Print the answer, the tables, the notes."""
-    print_lines(console, [answer(results)])
-    for name, rows in tables(results):
-        print_table(console, name, rows, **COMPACT)
-    print_lines(console, notes(results))
-
-
-def write_files(results: Results) -> None:
-    """Write results.json and table.md; equal runs give equal files but for `times`."""
-    parts = [answer(results)]
-    for name, rows in tables(results):
-        parts += [f"**{name}**"] if name else []
-        parts.append(markdown_table(rows))
-    text = "\n\n".join([*parts, bullets(notes(results))]) + "\n"
-    write_text(results.plan.folder / "table.md", text)
-    write_text(results.plan.folder / "results.json", as_json(record(results)))
+def _hypothesis_row(results: Results, judgement: Judgement) -> list[str]:
+    column = results.columns.get(judgement.metric, results.column)
+    estimate = judgement.estimate
+    reason = f" ({judgement.reason})" if judgement.reason else ""
+    return [
+        judgement.hypothesis.claim,
+        column.heading,
+        shown(column, estimate.mean if estimate else None, "+"),
+        interval_shown(column, estimate),
+        judgement.verdict + reason,
+        estimate.sample if estimate else "–",
+        judgement.hypothesis.note,
+    ]
 
 
 def record(results: Results) -> dict[str, Any]:
-    """Everything that the tables say, as plain values, and the times of every run."""
+    """Return everything that the tables say, as plain values, and the times of every run."""
     settings = results.settings
+    table = [row for name in results.plan.evaluations for row in table_records(results, name)]
     return {
         "title": results.plan.study.title,
         "answer": answer(results),
@@ -123,49 +122,25 @@ def record(results: Results) -> dict[str, Any]:
         "seeds": list(settings.seeds),
         "budget": settings.budget.model_dump(exclude_none=True),
         "metric": results.metric,
-        "table": [*_table_records(results)],
+        "table": table,
         "hypotheses": [
             {
                 **judgement.hypothesis.model_dump(),
                 "metric": judgement.metric,
                 "verdict": judgement.verdict,
                 "reason": judgement.reason,
-                **_estimate_record(judgement.estimate),
+                **(judgement.estimate.record() if judgement.estimate else {}),
             }
             for judgement in results.judgements()
         ],
         "rank_correlation": results.rank_correlation()[0],
         "notes": notes(results),
-        "times": [*_time_records(results)],
+        "times": [*_times(results)],
     }
 
 
-def _estimate_record(estimate: Estimate | None) -> dict[str, Any]:
-    """Nothing where there is no estimate."""
-    if estimate is None:
-        return {}
-    return {"mean": estimate.mean, "sd": estimate.deviation, **asdict(estimate)}
-
-
-def _table_records(results: Results) -> Iterator[dict[str, Any]]:
-    """Mean and difference to the reference of every variant, by evaluation and metric."""
-    for evaluation in results.plan.evaluations:
-        for variant in results.variants(evaluation):
-            for metric in results.columns:
-                if score := results.score(variant, metric, evaluation):
-                    apart = results.difference(variant, metric, evaluation)
-                    yield {
-                        "evaluation": evaluation,
-                        "variant": variant,
-                        "metric": metric,
-                        **_estimate_record(score),
-                        "difference": _estimate_record(apart),
-                        "steps": steps_shown(results.stored[variant, evaluation].values()),
-                    }
-
-
-def _time_records(results: Results) -> Iterator[dict[str, Any]]:
-    """Measured times of every run, which no other machine or day repeats."""
+def _times(results: Results) -> Iterator[dict[str, Any]]:
+    """Yield measured times of every run, which no other machine or day repeats."""
     for run in results.plan.runs:
         # Of the clock of training, which pauses between sessions do not move.
         step, seconds = last_record(run.folder / "history.jsonl")

@@ -37,7 +37,7 @@ def composed(study: Study) -> dict[str, Recipe]:
     problems = Problems("study")
     recipes: dict[str, Recipe] = {}
     for name, node in study.variants.items():
-        with _collected(problems, f"variants.{name}", study.origins[name]):
+        with _collected(problems, f"variants.{name}", study.variants[name].origin):
             # A recipe has one seed; the runs set theirs over it.
             recipe = resolve(node, [f"seed={study.settings.seeds[0]}"])
             recipes[name] = _with_budget(study, with_absolute_path(recipe))
@@ -55,7 +55,7 @@ def composed(study: Study) -> dict[str, Recipe]:
             _build(recipe)
         except (ValueError, OSError) as error:
             # What a component raises does not know in which variant it stands.
-            error.add_note(f"in the variant `{name}`, {study.origins[name]}")
+            error.add_note(f"in the variant `{name}`, {study.variants[name].origin}")
             raise
     return recipes
 

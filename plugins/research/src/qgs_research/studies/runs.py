@@ -4,13 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 from qgs.files import write_text
 from qgs.recipe import Recipe, resolve
 from qgs.recipe.errors import Origin
 from qgs.recipe.files import merge
-from qgs.recipe.recipe import annotated, flat
+from qgs.recipe.recipe import annotated, differing_options
 from qgs.recipe.yaml_text import MapNode, from_plain
 from qgs.train.guard import CollapseError, NonFiniteError
 from qgs.wording import counted
@@ -139,10 +138,7 @@ def write_plan(plan: Plan) -> None:
         write_text(recipe_file(plan.folder, variant, evaluation), f"{text}\n")
 
 
-def differences(ours: Recipe, theirs: Recipe) -> dict[str, tuple[Any, Any]]:
+def differences(ours: Recipe, theirs: Recipe) -> dict[str, tuple[str | None, str | None]]:
     """Return options in which two recipes differ, seeds and names of plugins aside."""
-    a = flat(ours.tree)
-    b = flat(theirs.tree)
-    # In the order of the first, then what only the second has.
-    paths = [p for p in {**a, **b} if p not in BESIDE and a.get(p) != b.get(p)]
-    return {path: (a.get(path), b.get(path)) for path in paths}
+    found = differing_options(ours.tree, theirs.tree)
+    return {path: values for path, values in found.items() if path not in BESIDE}

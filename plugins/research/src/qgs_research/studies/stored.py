@@ -7,16 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich import box
-
 from qgs.contracts import Column
 from qgs.evaluate.protocol import Protocol
 from qgs.evaluate.results import FRAME_COLUMNS, NAME_COLUMNS
 from qgs.recipe.errors import Problems
 from qgs.recipe.yaml_text import load_mapping
-
-COMPACT: Mapping[str, Any] = {"box": box.SIMPLE_HEAD, "collapse_padding": True, "pad_edge": False}
-"""How tables are printed."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +21,7 @@ class StoredResults:
     scenes: `SceneScore.values` of the evaluated scenes. frames: their input and target frames, as
     scenes.csv writes them. wanted: number of scenes of the protocol. columns, missing, null and
     step as in `Evaluation`. recipe, seed, budget: of a run folder; its resolved recipe as JSON
-    without seed and evaluation. runs: the trainings whose mean this is; empty for a single one.
+    without seed and evaluation.
     """
 
     name: str
@@ -41,15 +36,9 @@ class StoredResults:
     recipe: str = ""
     seed: int | None = None
     budget: str = ""
-    runs: Sequence["StoredResults"] = ()
-
-    @property
-    def trainings(self) -> Sequence["StoredResults"]:
-        """`runs`, or the single one that this is."""
-        return self.runs or [self]
 
     def scores(self, metric: str, scenes: Iterable[str]) -> list[float]:
-        """Values of the model in these scenes; raises KeyError where one has none."""
+        """Return values of the model in these scenes; raises KeyError where one has none."""
         return [self.scenes[scene][f"model_{metric}"] for scene in scenes]
 
 
@@ -57,8 +46,21 @@ def scenes_with(metric: str, results: Sequence[StoredResults]) -> list[str]:
     """Return the scenes in which all of `results` have the metric, in the order of the first."""
     # scenes.csv has the baselines' values too.
     value = f"model_{metric}"
+    scenes = common_scenes(results)
+    return [scene for scene in scenes if all(value in one.scenes[scene] for one in results)]
+
+
+def common_scenes(results: Sequence[StoredResults]) -> list[str]:
+    """Return the scenes that all of `results` have, in the order of the first."""
     first = results[0].scenes if results else {}
-    return [scene for scene in first if all(value in one.scenes.get(scene, ()) for one in results)]
+    return [scene for scene in first if all(scene in one.scenes for one in results)]
+
+
+def moved_scenes(results: Sequence[StoredResults]) -> list[str]:
+    """Return scenes that all of `results` judged, but not on the same frames."""
+    # Protocols that draw views name no frames: the data decides.
+    scenes = common_scenes(results)
+    return [scene for scene in scenes if len({one.frames[scene] for one in results}) > 1]
 
 
 def read_results(path: str | Path) -> StoredResults:
@@ -112,7 +114,7 @@ def _read(folder: Path, name: str) -> StoredResults:
 
 
 def _training(recipe: Path) -> dict[str, Any]:
-    """Recipe, seed and budget of the run whose resolved recipe is in the file; {} without it."""
+    """Return recipe, seed and budget of the run of a resolved recipe; {} without the file."""
     if not recipe.is_file():
         return {}
     tree = load_mapping(recipe.read_text(encoding="utf-8"), str(recipe), Problems())

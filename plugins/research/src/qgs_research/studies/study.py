@@ -3,10 +3,11 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from qgs.contracts import ComponentConfig, OptionError
 from qgs.evaluate.evaluation import SECTIONS
@@ -14,8 +15,11 @@ from qgs.paths import open_file
 from qgs.recipe.decode import decode_config
 from qgs.recipe.errors import Origin, Problems, did_you_mean
 from qgs.recipe.files import found_recipe, merge
-from qgs.recipe.yaml_text import ListNode, MapNode, kind_of, load_mapping
+from qgs.recipe.yaml_text import ListNode, MapNode, load_mapping
 from qgs_research.studies.hypotheses import NAME, Contrast, parsed
+
+_BY_NAME = ("variants", "evaluations", "published")
+"""Keys whose entries a study that extends another replaces one by one."""
 
 
 def _folder_name(name: str) -> str:
@@ -25,7 +29,25 @@ def _folder_name(name: str) -> str:
     return name
 
 
+def _variant_name(name: str, info: ValidationInfo) -> str:
+    # Without variants, which were refused, no name is known.
+    variants = info.data.get("variants", {name: None})
+    if name not in variants:
+        fix = did_you_mean(name, variants, "variants")
+        raise OptionError(f"there is no variant `{name}`", fix)
+    return name
+
+
+def _evaluation_section(key: str) -> str:
+    if key not in SECTIONS:
+        fix = f"an evaluation can only set {', '.join(SECTIONS)}"
+        raise OptionError(f"`{key}` would change the trained model", fix)
+    return key
+
+
 Name: TypeAlias = Annotated[str, AfterValidator(_folder_name)]
+VariantName: TypeAlias = Annotated[str, AfterValidator(_variant_name)]
+Section: TypeAlias = Annotated[str, AfterValidator(_evaluation_section)]
 
 
 class Budget(ComponentConfig):
@@ -40,7 +62,7 @@ class Budget(ComponentConfig):
 
     @model_validator(mode="after")
     def _is_one(self) -> "Budget":
-        given = [n for n in type(self).model_fields if getattr(self, n) is not None]
+        given = self.model_dump(exclude_none=True)
         if len(given) != 1:
             raise OptionError(
                 f"a budget is one of steps, seconds and images, got {len(given)} of them",
@@ -66,8 +88,17 @@ class Hypothesis(ComponentConfig):
         return {"claim": written} if isinstance(written, str) else written
 
 
+def _known_terms(hypothesis: Hypothesis, info: ValidationInfo) -> Hypothesis:
+    if {"variants", "evaluations"} <= info.data.keys():
+        parsed(hypothesis.claim, info.data["variants"], info.data["evaluations"])
+    return hypothesis
+
+
 class StudySettings(ComponentConfig):
-    """A study as its file has it, with the files that it extends."""
+    """A study as its file has it, with the files that it extends.
+
+    A field is checked against those before it: variants and evaluations come first.
+    """
 
     study: int = Field(ge=1, le=1)
     """Version of the format."""
@@ -75,9 +106,17 @@ class StudySettings(ComponentConfig):
     """Heading of the page; empty takes the file's name."""
     question: str = ""
     """What the study is to answer, in a sentence or more."""
+    base: Any = None
+    """Recipe, or several laid over each other, that variants are laid over."""
+    overlay: dict[str, Any] = Field(default_factory=dict)
+    """Part of a recipe that is laid over every variant."""
+    variants: dict[Name, dict[str, Any] | None] = Field(min_length=1, max_length=200)
+    """A recipe file, or the part of a recipe, by name. Each takes a tenth of a second to check."""
+    evaluations: dict[Name, dict[Section, Any]] = Field(default_factory=dict)
+    """What is changed before every trained model is judged once more, by name."""
     seeds: tuple[int, ...] = Field(default=(0, 1, 2), min_length=1)
     """One run of each variant for each: the model's start, and which data it sees in what order."""
-    reference: str
+    reference: VariantName
     """The variant that the others are held against."""
     budget: Budget
     """The same for all variants."""
@@ -85,29 +124,20 @@ class StudySettings(ComponentConfig):
     """The value that decides, as evaluations call it."""
     differs: tuple[str, ...] = ()
     """Options of data, views, training, evaluation and metrics in which variants may differ."""
-    hypotheses: tuple[Hypothesis, ...] = ()
+    hypotheses: tuple[Annotated[Hypothesis, AfterValidator(_known_terms)], ...] = ()
     """What is expected; a text stands for its claim."""
-    base: Any = None
-    """Recipe, or several laid over each other, that variants are laid over."""
-    overlay: dict[str, Any] = Field(default_factory=dict)
-    """Part of a recipe that is laid over every variant."""
-    variants: dict[Name, Any] = Field(min_length=1, max_length=200)
-    """A recipe file, or the part of a recipe, by name. Each takes a tenth of a second to check."""
-    evaluations: dict[Name, dict[str, Any]] = Field(default_factory=dict)
-    """What is changed before every trained model is judged once more, by name."""
-    published: dict[str, float] = Field(default_factory=dict)
+    published: dict[VariantName, float] = Field(default_factory=dict)
     """The metric as published, by variant: shown beside ours, with the rank correlation."""
 
     @field_validator("variants", "evaluations")
     @classmethod
     def _folders_differ(cls, named: dict[str, Any]) -> dict[str, Any]:
         names = {name.lower(): name for name in named}
-        if same := [name for name in named if names[name.lower()] != name]:
-            raise OptionError(
-                f"`{same[0]}` and `{names[same[0].lower()]}` are one folder where file names have "
-                "no case",
-                "give them other names",
-            )
+        for name in named:
+            other = names[name.lower()]
+            if other != name:
+                reason = f"`{name}` and `{other}` are one folder where file names have no case"
+                raise OptionError(reason, "give them other names")
         return named
 
     @field_validator("seeds")
@@ -125,20 +155,24 @@ class Study:
     """A study that was read. file: where it is written.
 
     variants: by name what `qgs.recipe.resolve` takes. evaluations: by name what is laid over a
-    trained recipe before its model is judged once more. contrasts: of `settings.hypotheses`.
+    trained recipe before its model is judged once more. Both know where they are written.
     """
 
     file: Path
     settings: StudySettings
     variants: Mapping[str, MapNode]
     evaluations: Mapping[str, MapNode]
-    contrasts: Sequence[Contrast]
-    origins: Mapping[str, Origin]
 
     @property
     def title(self) -> str:
         """The heading."""
         return self.settings.title or self.file.stem.replace("_", " ")
+
+    @cached_property
+    def contrasts(self) -> Sequence[Contrast]:
+        """The hypotheses as sums of means."""
+        claims = [hypothesis.claim for hypothesis in self.settings.hypotheses]
+        return [parsed(claim, self.variants, self.evaluations) for claim in claims]
 
 
 def read_study(file: str | Path) -> Study:
@@ -151,146 +185,89 @@ def read_study(file: str | Path) -> Study:
     tree = _read(found, problems, ())
     # A file that cannot be read hides what else is wrong.
     problems.raise_if_stopped()
+    for name, written, origin in tree.child("variants").entries():
+        # A file name is a recipe that changes nothing of that file.
+        if isinstance(written, str):
+            tree["variants"][name] = MapNode(origin, [("extends", written, origin)])
     settings = decode_config(StudySettings, tree, (), problems)
-    variants = _variants(tree, problems)
     problems.raise_any()
     assert settings is not None
-    _check_names(settings, tree, problems)
-    contrasts = _contrasts(settings, tree, problems)
+    variants = {name: _variant(tree, name, problems) for name in settings.variants}
     problems.raise_any()
     evaluations: Any = dict(tree.child("evaluations"))
-    return Study(
-        file=found,
-        settings=settings,
-        variants=variants,
-        evaluations=evaluations,
-        contrasts=contrasts,
-        origins=tree.child("variants").origins,
-    )
+    for node in evaluations.values():
+        _locate_index(node)
+    return Study(file=found, settings=settings, variants=variants, evaluations=evaluations)
 
 
 def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
-    """The tree of `file` over that of the study that it extends, names of files made absolute."""
-    origin = Origin(str(file))
+    """Return the tree of `file` over that of the study that it extends."""
     try:
         with open_file(file) as opened:
             text = opened.read().decode("utf-8")
     except (OSError, ValueError) as error:
         fix = "check the path, or take one such as studies/tiny/structural.yaml"
-        problems.stop(origin, "study", f"{file} cannot be read: {error}", fix)
-        return MapNode(origin)
+        problems.stop(Origin(str(file)), "study", f"{file} cannot be read: {error}", fix)
+        return MapNode(Origin(str(file)))
     tree = load_mapping(text, str(file), problems)
-    # Before the files are merged: names are relative to the file that has them.
-    _locate_files(tree, file.parent, problems)
-    base = tree.get("extends")
-    if base is None:
+    extended = tree.get("extends")
+    if extended is None:
         return tree
-    if not isinstance(base, str) or file in chain:
+    if not isinstance(extended, str) or file in chain:
         reason = "`extends` names one other study, and no circle of them"
         fix = "write `extends: other.yaml`, relative to this file"
         problems.stop(tree.origins["extends"], "extends", reason, fix)
         return tree
-    under = _read(found_recipe(file.parent / base, base), problems, (*chain, file))
-    return _merged(under, tree.without("extends"))
-
-
-def _merged(base: MapNode, over: MapNode) -> MapNode:
-    """Keys of `over` replace those of `base`; of variants and evaluations each by its name.
-
-    A variant or evaluation that is null is left out.
-    """
-    entries = {key: (key, value, origin) for key, value, origin in base.entries()}
-    for key, value, origin in over.entries():
+    base = _read(found_recipe(file.parent / extended, extended), problems, (*chain, file))
+    for key, value, origin in tree.without("extends").entries():
         old = base.get(key)
         if isinstance(old, MapNode) and isinstance(value, MapNode):
             if key == "overlay":
                 value = merge(old, value)
-            elif key in ("variants", "evaluations", "published"):
+            elif key in _BY_NAME:
+                # Null drops an entry; a variant that is new and null is the base itself.
                 dropped = [name for name in value if value[name] is None and name in old]
-                kept = old.without(*value).entries()
-                value = MapNode(origin, [*kept, *value.without(*dropped).entries()])
-        entries[key] = (key, value, origin)
-    return MapNode(over.origin, entries.values())
+                both = MapNode(origin, [*old.entries(), *value.entries()])
+                value = both.without(*dropped)
+        base[key] = value
+        base.origins[key] = origin
+    return base
 
 
-def _locate_files(tree: MapNode, folder: Path, problems: Problems) -> None:
-    """Make names of recipes and indices in `tree`, relative to `folder`, hold anywhere."""
-
-    def located(written: Any, at: Origin, option: str) -> Any:
-        if isinstance(written, ListNode):
-            names = zip(written, written.origins, strict=True)
-            return ListNode(at, [(located(name, origin, option), origin) for name, origin in names])
-        # Other kinds are refused where the recipe is composed.
-        if not isinstance(written, str):
-            return written
-        file = found_recipe(folder / written, written).resolve()
-        if not file.exists():
-            fix = "check the path, or take one of `qgs recipes`"
-            problems.stop(at, option, f"there is no recipe {file}", fix)
-        return str(file)
-
-    if "base" in tree:
-        tree["base"] = located(tree["base"], tree.origins["base"], "base")
+def _variant(tree: MapNode, name: str, problems: Problems) -> MapNode:
+    """Return the recipe of a variant: the base or what it extends, the variant, the overlay."""
     variants = tree.child("variants")
-    for name, node, origin in variants.entries():
-        # A file name is a recipe that changes nothing of that file.
-        if isinstance(node, str):
-            node = MapNode(origin, [("extends", node, origin)])
-            variants[name] = node
-        if isinstance(node, MapNode) and "extends" in node:
-            at = node.origins["extends"]
-            node["extends"] = located(node["extends"], at, f"variants.{name}.extends")
-    for node in (tree.child("overlay"), *tree.child("evaluations").values()):
-        section = node.child("evaluation") if isinstance(node, MapNode) else MapNode(tree.origin)
-        index = section.get("index")
+    origin = variants.origins[name]
+    node = variants.child(name)
+    holder, key = (node, "extends") if "extends" in node else (tree, "base")
+    if holder.get(key) is None:
+        reason = f"`{name}` has neither a recipe of its own nor a `base` to be laid over"
+        fix = "add `base: RECIPE.yaml`, or `extends` here"
+        problems.add(origin, f"variants.{name}", reason, fix)
+        return node
+    at = holder.origins[key]
+    written = holder[key]
+    files = []
+    for recipe in written if isinstance(written, list) else [written]:
+        file = found_recipe(Path(at.file).parent / recipe, recipe).resolve()
+        if not file.exists():
+            option = "base" if holder is tree else f"variants.{name}.extends"
+            fix = "check the path, or take one of `qgs recipes`"
+            problems.add(at, option, f"there is no recipe {file}", fix)
+        files.append((str(file), at))
+    overlay = tree.child("overlay")
+    _locate_index(overlay)
+    whole = merge(node.without("extends"), overlay)
+    extends = ("extends", ListNode(at, files), at)
+    return MapNode(origin, [extends, ("recipe", 1, origin), *whole.entries()])
+
+
+def _locate_index(node: MapNode) -> None:
+    """Make the name of an index hold anywhere: it may be relative to the study that has it."""
+    section = node.child("evaluation")
+    index = section.get("index")
+    if isinstance(index, str):
+        file = Path(section.origins["index"].file).parent / index
         # Otherwise it is relative to the working directory, as in a recipe.
-        if isinstance(index, str) and (folder / index).is_file():
-            section["index"] = str((folder / index).resolve())
-
-
-def _variants(tree: MapNode, problems: Problems) -> dict[str, MapNode]:
-    """By name: the base or what a variant extends, the variant, the overlay."""
-    found: dict[str, MapNode] = {}
-    for name, written, origin in tree.child("variants").entries():
-        option = f"variants.{name}"
-        node = MapNode(origin) if written is None else written
-        if not isinstance(node, MapNode):
-            reason = f"a variant is a recipe or the part of one, this is {kind_of(node)}"
-            problems.add(origin, option, reason, "write a recipe's file name, or a mapping")
-            continue
-        holder, key = (node, "extends") if "extends" in node else (tree, "base")
-        if holder.get(key) is None:
-            reason = f"`{name}` has neither a recipe of its own nor a `base` to be laid over"
-            problems.add(origin, option, reason, "add `base: RECIPE.yaml`, or `extends` here")
-            continue
-        whole = merge(node.without("extends"), tree.child("overlay"))
-        first = [("extends", holder[key], holder.origins[key]), ("recipe", 1, origin)]
-        found[name] = MapNode(origin, [*first, *whole.entries()])
-    return found
-
-
-def _check_names(settings: StudySettings, tree: MapNode, problems: Problems) -> None:
-    """Report names of variants that there are not, and evaluations that change the model."""
-    named = [("reference", settings.reference, tree.origins["reference"])]
-    for name, _, origin in tree.child("published").entries():
-        named.append((f"published.{name}", name, origin))
-    for option, name, at in named:
-        if name not in settings.variants:
-            fix = did_you_mean(name, settings.variants, "variants")
-            problems.add(at, option, f"there is no variant `{name}`", fix)
-    for name, node in tree.child("evaluations").items():
-        for key in [key for key in node if key not in SECTIONS]:
-            reason = f"`{key}` would change the trained model"
-            fix = f"an evaluation can only set {', '.join(SECTIONS)}"
-            problems.add(node.origins[key], f"evaluations.{name}.{key}", reason, fix)
-
-
-def _contrasts(settings: StudySettings, tree: MapNode, problems: Problems) -> list[Contrast]:
-    found = []
-    for number, hypothesis in enumerate(settings.hypotheses):
-        try:
-            found.append(parsed(hypothesis.claim, settings.variants, settings.evaluations))
-        except OptionError as error:
-            at = tree["hypotheses"].origins[number]
-            problems.add(at, f"hypotheses.{number}", error.reason, error.fix)
-    return found
+        if file.is_file():
+            section["index"] = str(file.resolve())

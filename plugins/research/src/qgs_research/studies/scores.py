@@ -1,0 +1,128 @@
+"""Scores of models by evaluation and seed: means, differences to a reference, baselines."""
+
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import TypeAlias
+
+import numpy as np
+
+from qgs.contracts import Column
+from qgs.metrics.baselines import BASELINES
+from qgs_research.studies.estimates import Estimate, Runs, estimate
+from qgs_research.studies.hypotheses import MAIN
+from qgs_research.studies.intervals import CONFIDENCE
+from qgs_research.studies.stored import StoredResults
+
+Terms: TypeAlias = Mapping[tuple[str, str], int]
+"""Weights of means, by model and evaluation."""
+
+
+@dataclass
+class Scores:
+    """Results by model and evaluation, then by seed. reference: the model that others are held to.
+
+    metric: the one that decides. across_protocols: whether numbers of two protocols are compared.
+    """
+
+    stored: Mapping[tuple[str, str], Runs]
+    reference: str
+    metric: str
+    across_protocols: bool = False
+
+    @cached_property
+    def columns(self) -> dict[str, Column]:
+        """How values are shown, of all metrics: models may have some that others lack."""
+        columns: dict[str, Column] = {}
+        for runs in self.stored.values():
+            for result in runs.values():
+                columns = {**result.columns, **columns}
+        return columns
+
+    @property
+    def column(self) -> Column:
+        """How the metric that decides is shown; raises KeyError without results."""
+        return self.columns[self.metric]
+
+    def models(self, evaluation: str = MAIN) -> list[str]:
+        """Return models that have results by `evaluation`."""
+        return [name for (name, of), runs in self.stored.items() if of == evaluation and runs]
+
+    def score(self, model: str, metric: str, evaluation: str = MAIN) -> Estimate | None:
+        """Return the mean of a model; None where it has no values of the metric."""
+        return self.estimate({(model, evaluation): 1}, metric)
+
+    def difference(
+        self,
+        model: str,
+        metric: str,
+        evaluation: str = MAIN,
+        confidence: float = CONFIDENCE,
+    ) -> Estimate | None:
+        """Return a model minus the reference.
+
+        None of the reference itself, and where the two were not judged by one protocol.
+        """
+        terms = {(model, evaluation): 1, (self.reference, evaluation): -1}
+        # Numbers of two protocols do not measure the same.
+        if model == self.reference or (self.unlike(terms) and not self.across_protocols):
+            return None
+        return self.estimate(terms, metric, confidence)
+
+    def differences(
+        self, evaluation: str = MAIN, confidence: float = CONFIDENCE
+    ) -> dict[str, Estimate]:
+        """Return the differences in the metric that decides, by model, where there are any."""
+        found: dict[str, Estimate] = {}
+        for model in self.models(evaluation):
+            if apart := self.difference(model, self.metric, evaluation, confidence):
+                found[model] = apart
+        return found
+
+    def estimate(
+        self, terms: Terms, metric: str, confidence: float = CONFIDENCE
+    ) -> Estimate | None:
+        """Return the sum of means that `terms` weigh; None where they share no seed or scene."""
+        parts = [(self.stored.get(term, {}), weight) for term, weight in terms.items()]
+        return estimate(parts, metric, confidence)
+
+    def baselines(self, evaluation: str = MAIN) -> dict[str, dict[str, float]]:
+        """Return means over scenes of what needs no model, by name and metric.
+
+        None where an evaluation has several protocols, which have baselines each.
+        """
+        if len(self.protocols(evaluation)) != 1:
+            return {}
+        # Any run will do: baselines see the photos, not the model.
+        scenes = self.results_of(evaluation)[0].scenes.values()
+        found: dict[str, dict[str, float]] = defaultdict(dict)
+        for name, metric in product(BASELINES, self.columns):
+            value = f"{name}_{metric}"
+            if values := [scene[value] for scene in scenes if value in scene]:
+                found[name][metric] = float(np.mean(values))
+        return found
+
+    def protocols(self, evaluation: str) -> set[str]:
+        """Return hashes of all protocols by which `evaluation` judged."""
+        return {result.protocol.sha256 for result in self.results_of(evaluation)}
+
+    def results_of(self, evaluation: str) -> list[StoredResults]:
+        """Return the results of all runs by `evaluation`."""
+        parts = (runs for (_, of), runs in self.stored.items() if of == evaluation)
+        return [result for runs in parts for result in runs.values()]
+
+    def unlike(self, terms: Terms) -> bool:
+        """Return True if terms of one evaluation weigh numbers of unlike protocols."""
+        # Terms of one protocol may cancel: `A@two - B@two < C - D` compares like with like twice.
+        sums: dict[tuple[str, str], int] = defaultdict(int)
+        for (model, evaluation), weight in terms.items():
+            runs = self.stored.get((model, evaluation), {}).values()
+            hashes = {result.protocol.sha256 for result in runs}
+            if len(hashes) > 1:
+                return True
+            for sha256 in hashes:
+                sums[evaluation, sha256] += weight
+        weighed = [evaluation for (evaluation, _), weight in sums.items() if weight]
+        return len(set(weighed)) < len(weighed)

@@ -1,0 +1,121 @@
+"""Tables of scores with what is said above and below: on the terminal, as Markdown and JSON."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from rich import box
+from rich.console import Console
+
+from qgs.evaluate.results import bullets, markdown_table, print_lines, print_table
+from qgs_research.studies.estimates import (
+    Estimate,
+    count_better,
+    interval_shown,
+    shown,
+)
+from qgs_research.studies.hypotheses import MAIN
+from qgs_research.studies.scores import Scores
+from qgs_research.studies.stored import StoredResults
+
+Rows: TypeAlias = Sequence[Sequence[str]]
+"""Cells of a table, headers first."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Results in words and tables. answer: one line, or "". tables: titles and rows."""
+
+    answer: str
+    tables: Sequence[tuple[str, Rows]]
+    notes: Sequence[str]
+
+    def show(self, console: Console) -> None:
+        """Print everything."""
+        print_lines(console, filter(None, [self.answer]))
+        for title, rows in self.tables:
+            compact = {"collapse_padding": True, "pad_edge": False}
+            print_table(console, title, rows, box=box.SIMPLE_HEAD, **compact)
+        print_lines(console, self.notes)
+
+    @property
+    def markdown(self) -> str:
+        """Text of a Markdown file."""
+        parts = [self.answer]
+        for title, rows in self.tables:
+            parts += [f"**{title}**" if title else "", markdown_table(rows)]
+        return "\n\n".join(filter(None, [*parts, bullets(self.notes)])) + "\n"
+
+
+def table_rows(
+    scores: Scores,
+    evaluation: str,
+    metric: str,
+    others: Sequence[str] = (),
+    published: Mapping[str, float] | None = None,
+) -> Rows:
+    """Return a row for each model and baseline: a metric in full, means of `others`."""
+    column = scores.columns[metric]
+    head = [column.title, "sd", "difference", "95 % interval", "better in"]
+    head += ["published"] if published else []
+    head += [scores.columns[name].title for name in others]
+    rows = [["variant", *head, "seeds", "steps"]]
+    for model in scores.models(evaluation):
+        score = scores.score(model, metric, evaluation)
+        apart = scores.difference(model, metric, evaluation)
+        difference = shown(column, apart.mean if apart else None, "+")
+        row = [
+            model,
+            shown(column, score.mean if score else None),
+            shown(column, score.deviation if score else None),
+            "reference" if model == scores.reference else difference,
+            interval_shown(column, apart),
+            count_better(column, apart),
+        ]
+        if published:
+            row.append(shown(column, published.get(model)))
+        for name in others:
+            other = scores.score(model, name, evaluation)
+            row.append(shown(scores.columns[name], other.mean if other else None))
+        runs = scores.stored[model, evaluation].values()
+        rows.append([*row, str(len(runs)), steps_shown(runs)])
+    # Baselines stand below the models: they were not trained.
+    for name, values in scores.baselines(evaluation).items():
+        first, *rest = [shown(scores.columns[m], values.get(m)) for m in (metric, *others)]
+        dashes = ["–"] * (len(head) - 1 - len(rest))
+        rows.append([name.replace("_", " "), first, *dashes, *rest, "–", "–"])
+    return rows
+
+
+def steps_shown(runs: Iterable[StoredResults]) -> str:
+    """Return steps of runs: 2,100, or from the fewest to the most where they differ."""
+    # Budgets in seconds end at different steps.
+    steps = sorted({stored.step for stored in runs if stored.step is not None})
+    return " to ".join(f"{step:,}" for step in (*steps[:1], *steps[1:][-1:])) or "–"
+
+
+def table_records(scores: Scores, evaluation: str = MAIN) -> Iterator[dict[str, Any]]:
+    """Yield mean and difference to the reference, by model and metric, as plain values."""
+    for model in scores.models(evaluation):
+        for metric in scores.columns:
+            if score := scores.score(model, metric, evaluation):
+                apart = scores.difference(model, metric, evaluation)
+                yield {
+                    "evaluation": evaluation,
+                    "variant": model,
+                    "metric": metric,
+                    **score.record(),
+                    "difference": apart.record() if apart else {},
+                    "steps": steps_shown(scores.stored[model, evaluation].values()),
+                }
+
+
+def interval_notes(differences: Iterable[Estimate]) -> Iterator[str]:
+    """Yield what intervals cover."""
+    seeds = {len(estimate.seeds) for estimate in differences}
+    if max(seeds, default=0) > 1:
+        yield "intervals: 95 %, over trainings and scenes; sd: over seeds"
+    if 1 in seeds:
+        yield "one training a side: its interval covers scenes alone"
+    if any(estimate.scenes == 1 for estimate in differences):
+        yield "one scene is too few for an interval"
