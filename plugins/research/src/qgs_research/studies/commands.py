@@ -5,16 +5,13 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import Annotated, TypeAlias
 
 import typer
 from rich.console import Console
 
 from qgs.cli.options import Device
 from qgs.wording import counted
-
-if TYPE_CHECKING:
-    from qgs_research.studies.runs import Plan, Run
 
 app = typer.Typer(help="Train variants of a model by seeds, and compare them.")
 compare_app = typer.Typer(help="Compare results of evaluations.")
@@ -36,7 +33,7 @@ def compare(
 
     Nothing is evaluated. Runs of one recipe with several seeds count as one side.
     """
-    from qgs.evaluate.results import as_json
+    from qgs.evaluate.results import as_json, print_lines
     from qgs.files import write_text
     from qgs_research.studies.comparison import compare as compared
     from qgs_research.studies.comparison import record, summary
@@ -49,7 +46,7 @@ def compare(
         write_text(out / "comparison.json", as_json(record(scores)))
         write_text(out / "comparison.md", summary(scores).markdown)
     end = f"written to {out}" if out else "add --out FOLDER to keep this as JSON and Markdown"
-    console.print(end, soft_wrap=True)
+    print_lines(console, [end])
 
 
 Workers: TypeAlias = Annotated[
@@ -102,7 +99,11 @@ def study(
     docs/studies.md has all keys of a study (differs, evaluations, published
     ...). Studies that come with qgs: studies/tiny/structural.yaml and others.
     """
+    from qgs.evaluate.results import print_lines
+    from qgs_research.studies.output import study_summary, write_all
     from qgs_research.studies.plan import planned
+    from qgs_research.studies.queue import Queue
+    from qgs_research.studies.results import Results
     from qgs_research.studies.runs import write_plan
     from qgs_research.studies.study import read_study
 
@@ -110,47 +111,29 @@ def study(
     with console.status("composing and checking all variants"):
         plan = planned(read_study(file), out)
         write_plan(plan)
-    chosen = plan.runs if only is None else [plan.runs[only]]
-    threads = threads or max(_usable_cores() // max(workers, 1), 1)
-    run_and_report(plan, chosen, workers, threads, device, console)
-
-
-def run_and_report(
-    plan: Plan, runs: list[Run], workers: int, threads: int, device: str, console: Console
-) -> None:
-    """Train what is missing of `runs`, and write what all results of the plan say.
-
-    Raises Exit with 128 + the signal that stopped it, or with 1 where a run failed.
-    """
-    from qgs_research.studies.output import study_summary, write_all
-    from qgs_research.studies.queue import Queue
-    from qgs_research.studies.results import Results
-
     for name, recipe in plan.recipes.items():
-        for warning in recipe.warnings:
-            console.print(f"warning: {name}: {warning}", highlight=False, soft_wrap=True)
+        print_lines(console, [f"warning: {name}: {warning}" for warning in recipe.warnings])
     missing = [run for run in plan.runs if not plan.done(run)]
-    count = counted(len(plan.runs), "run")
-    console.print(f"{plan.size}: {count}, {len(missing)} of them missing", highlight=False)
+    runs = counted(len(plan.runs), "run")
+    print_lines(console, [f"{plan.size}: {runs}, {len(missing)} of them missing"])
     queue = Queue(
         plan=plan,
-        runs=runs,
+        runs=plan.runs if only is None else [plan.runs[only]],
         workers=workers,
-        threads=threads,
+        threads=threads or max(_usable_cores() // max(workers, 1), 1),
         device=device,
         console=console,
         gpus=_gpus(device),
     )
     stopped = queue.work() if workers and missing else None
     results = Results(plan)
+    end = "no run is finished: there is nothing to report yet"
     if results.columns:
-        page = write_all(results)
+        end = f"written to {write_all(results)}"
         study_summary(results).show(console)
-        console.print(f"written to {page}", soft_wrap=True, highlight=False)
-    else:
-        console.print("no run is finished: there is nothing to report yet")
+    print_lines(console, [end])
     if stopped:
-        console.print(f"stopped by {stopped}; the same command goes on", highlight=False)
+        print_lines(console, [f"stopped by {stopped}; the same command goes on"])
         raise typer.Exit(128 + signal.Signals[stopped])
     if queue.failures:
         raise typer.Exit(1)

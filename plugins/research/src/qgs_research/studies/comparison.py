@@ -4,7 +4,7 @@ Several trainings of one recipe count as one side, whose interval then covers tr
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 from qgs.wording import listed
@@ -14,12 +14,6 @@ from qgs_research.studies.intervals import CONFIDENCE, RESAMPLES, SEED
 from qgs_research.studies.scores import Scores
 from qgs_research.studies.stored import StoredResults, common_scenes, moved_scenes
 from qgs_research.studies.tables import Summary, interval_notes, table_records, table_rows
-
-_UNEQUAL = 1.02
-"""Ratio of steps from which trainings are called unequal.
-
-Two runs of one budget in seconds differ by a little.
-"""
 
 
 def compare(results: Sequence[StoredResults], across_protocols: bool = False) -> Scores:
@@ -127,28 +121,22 @@ def _notes(scores: Scores) -> Iterator[str]:
         yield f"{name}: {budget}protocol {first.protocol.name}, sha256 {first.protocol.sha256}"
         for words, names in _left_out(scores, name).items():
             if names:
-                yield f"{name}: {words} ({len(names)}): {listed(names)}"
-    steps = [result.step for result in scores.results_of(MAIN) if result.step]
-    if steps and max(steps) > _UNEQUAL * min(steps):
-        yield f"unequal training: up to {max(steps) / min(steps):.2f} times the steps of another"
+                yield f"{name}: {words} ({len(names)}): {listed(sorted(names))}"
     if len(scores.protocols(MAIN)) > 1:
         yield "the protocols differ: the scores do not measure the same"
 
 
-def _left_out(scores: Scores, name: str) -> dict[str, Sequence[str]]:
-    """Return what no number of a side, or no difference, is made of, by what it is."""
+def _left_out(scores: Scores, name: str) -> dict[str, Collection[str]]:
+    """Return what no difference of a side is made of, by what is wrong with it."""
     runs = scores.stored[name, MAIN]
     reference = scores.stored[scores.reference, MAIN]
     results = [*reference.values(), *runs.values()]
-    shared = common_scenes(results)
-    scenes = dict.fromkeys(scene for result in results for scene in result.scenes)
-    columns = [result.columns for result in results]
     unpaired = runs.keys() ^ reference.keys()
+    scenes = dict.fromkeys(scene for result in results for scene in result.scenes)
     return {
-        "no score of": sorted({s for result in runs.values() for s in result.missing}),
-        "null entries of the index, not judged": next(iter(runs.values())).null,
+        "no score of": results[-1].missing,
+        "null entries of the index, not judged": results[-1].null,
         "nothing to pair with": [{**reference, **runs}[key].name for key in unpaired],
-        "scenes not in both": [scene for scene in scenes if scene not in shared],
-        "metrics not in both": [m for m in scores.columns if any(m not in of for of in columns)],
+        "scenes not in both": scenes.keys() - common_scenes(results),
         "judged on other frames": moved_scenes(results),
     }

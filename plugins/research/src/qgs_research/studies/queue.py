@@ -22,11 +22,13 @@ from qgs_research.studies.runs import Plan, Run
 from qgs_research.studies.work import Outcome, begin, is_free, work
 
 _POLL_SECONDS = 0.3
-_TAIL = 4096  # bytes of a history that hold its last record
+_TAIL = 4096
+"""Bytes of a history that hold its last record."""
 DEATHS = 3
 """Killed processes of a run in a row, without a save between, after which the run has failed."""
 
-_PATIENCE = 120.0  # seconds that stopped runs have to save
+_PATIENCE = 120.0
+"""Seconds that stopped runs have to save."""
 
 
 @dataclass
@@ -62,10 +64,15 @@ class Queue:
                 why = f"{run} is not trained again, it would end so each time: {run.failed}"
                 self._say(f"{why}; to train it again, delete {run.failure}{and_folder}")
         before = {s: signal.signal(s, self._stop) for s in (signal.SIGINT, signal.SIGTERM)}
-        columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-        silent = not self.console.is_terminal
-        # Runs take minutes to days: the time that is left comes from the last ten minutes.
-        bar = Progress(*columns, console=self.console, disable=silent, speed_estimate_period=600)
+        bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TimeRemainingColumn(),
+            console=self.console,
+            disable=not self.console.is_terminal,
+            # Runs take minutes to days: the time that is left comes from the last ten minutes.
+            speed_estimate_period=600,
+        )
         task = bar.add_task("", total=len(self.runs))
         try:
             with bar:

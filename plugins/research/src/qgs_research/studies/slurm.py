@@ -15,6 +15,25 @@ app = typer.Typer(help="Write jobs for Slurm that save before their time ends, a
 COMMENT = "# Change time, memory, partition and GPUs to those of your cluster."
 
 
+# Slurm requeues preempted jobs by itself, those whose time is over only on request. The command runs
+# in the background: bash runs a trap only after a command in the foreground has ended.
+_JOB = """#!/bin/bash
+#SBATCH --job-name={name}
+#SBATCH --output={log}
+#SBATCH --ntasks=1
+{options}
+#SBATCH --time=24:00:00
+#SBATCH --signal=B:TERM@300
+#SBATCH --requeue
+#SBATCH --open-mode=append
+{note}
+cd {folder}
+trap '{stop}; wait "$job"; scontrol requeue "$SLURM_JOB_ID"' TERM
+{command} & job=$!
+wait "$job"
+"""
+
+
 # Options that this command does not have are those of `qgs train`.
 @app.command(context_settings={"ignore_unknown_options": True})
 def train(
@@ -39,10 +58,8 @@ def train(
     run = given["out"].absolute()
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
     train = ["-m", "qgs", "train", *words, "--resume"]
-    options = [
-        "nodes=1",
-        f"cpus-per-task={gpus * ((given['threads'] or 1) + recipe.training.workers)}",
-    ]
+    cores = gpus * ((given["threads"] or 1) + recipe.training.workers)
+    options = ["nodes=1", f"cpus-per-task={cores}"]
     if given["device"] != "cpu":
         options.append(f"gpus-per-node={gpus}")
     _write_job(
@@ -110,23 +127,14 @@ def _write_job(
     """
     from qgs.files import write_text
 
-    lines = [
-        "#!/bin/bash",
-        f"#SBATCH --job-name={shlex.quote(name)}",
-        f"#SBATCH --output={shlex.quote(str(log))}",
-        "#SBATCH --ntasks=1",
-        *(f"#SBATCH --{option}" for option in options),
-        "#SBATCH --time=24:00:00",
-        "#SBATCH --signal=B:TERM@300",
-        "#SBATCH --requeue",
-        "#SBATCH --open-mode=append",
-        note,
-        f"cd {shlex.quote(str(Path.cwd()))}",
-        # Slurm requeues preempted jobs by itself, those whose time is over only on request.
-        f'trap \'{stop}; wait "$job"; scontrol requeue "$SLURM_JOB_ID"\' TERM',
-        # In the background: bash runs a trap only after a command in the foreground has ended.
-        f"{command} & job=$!",
-        'wait "$job"',
-    ]
-    write_text(script, "\n".join(lines) + "\n")
+    text = _JOB.format(
+        name=shlex.quote(name),
+        log=shlex.quote(str(log)),
+        options="\n".join(f"#SBATCH --{option}" for option in options),
+        note=note,
+        folder=shlex.quote(str(Path.cwd())),
+        stop=stop,
+        command=command,
+    )
+    write_text(script, text)
     typer.echo(f"wrote {script}; submit it with: sbatch {script}")

@@ -19,7 +19,7 @@ class StoredResults:
     """Results of one evaluation. name: the folder, as it was given.
 
     scenes: `SceneScore.values` of the evaluated scenes. frames: their input and target frames, as
-    scenes.csv writes them. wanted: number of scenes of the protocol. columns, missing, null and
+    scenes.csv writes them. columns, missing, null and
     step as in `Evaluation`. recipe, seed, budget: of a run folder; its resolved recipe as JSON
     without seed and evaluation.
     """
@@ -29,7 +29,6 @@ class StoredResults:
     columns: Mapping[str, Column]
     scenes: Mapping[str, Mapping[str, float]]
     frames: Mapping[str, tuple[str, str]]
-    wanted: int
     missing: Sequence[str] = ()
     null: Sequence[str] = ()
     step: int | None = None
@@ -105,7 +104,6 @@ def _read(folder: Path, name: str) -> StoredResults:
         columns={column: Column(**facts) for column, facts in summary["columns"].items()},
         scenes=scenes,
         frames=frames,
-        wanted=summary["scenes_in_protocol"],
         missing=list(summary["missing"]),
         null=summary["null_entries"],
         step=summary["step"],

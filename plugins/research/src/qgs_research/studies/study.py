@@ -227,8 +227,8 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
             elif key in _BY_NAME:
                 # Null drops an entry; a variant that is new and null is the base itself.
                 dropped = [name for name in value if value[name] is None and name in old]
-                both = MapNode(origin, [*old.entries(), *value.entries()])
-                value = both.without(*dropped)
+                kept = old.without(*value).entries()
+                value = MapNode(origin, [*kept, *value.without(*dropped).entries()])
         base[key] = value
         base.origins[key] = origin
     return base
