@@ -1,25 +1,24 @@
 """Studies that run: queues on one folder, kills, what is added later. Trainings of seconds."""
 
 import io
-import json
 import multiprocessing
 import os
 import re
 import signal
 import time
-from concurrent.futures import Future
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from commands import done
 from fuzzing import kill
 from qgs_research.studies import queue as queue_module
 from qgs_research.studies.plan import planned
-from qgs_research.studies.queue import Queue, last_record
+from qgs_research.studies.queue import Queue
 from qgs_research.studies.results import Results
 from qgs_research.studies.runs import run_of
 from qgs_research.studies.study import read_study
-from qgs_research.studies.work import Outcome, is_free, lock_of, work
+from qgs_research.studies.work import is_free, lock_of, work
 from rich.console import Console
 
 RECIPES = Path(__file__).parents[4] / "recipes"
@@ -84,7 +83,7 @@ def test_what_failed_comes_last_and_a_collapse_is_final(study, plan, monkeypatch
         started.append(run)
         if len(started) == 3:
             queue._stop(signal.SIGTERM, None)
-        return Future()
+        return SimpleNamespace(exitcode=None, terminate=int, join=float, kill=int)
 
     monkeypatch.setattr(Queue, "_start", start)
     queue = queue_of(plan, workers=4)
@@ -111,19 +110,20 @@ def test_a_run_that_is_killed_again_and_again_says_so_in_the_results(plan, monke
     assert Results(plan).failed == [killed]
 
 
-def outcome_of(*given):
+def told(*given):
     """What a process of a run does, as far as it prepares for it."""
     print(f"threads {os.environ['OMP_NUM_THREADS']}, {given}", flush=True)
     os.write(1, b"and a library\n")
-    return Outcome.TAKEN
 
 
 def test_a_process_has_its_threads_and_prints_into_the_log(plan, monkeypatch):
-    monkeypatch.setattr(queue_module, "work", outcome_of)
+    monkeypatch.setattr(queue_module, "work", told)
     run = plan.runs[0]
     queue = queue_of(plan, runs=[run])
     queue._gpu_of[run] = ""
-    assert queue._start(run).result() is Outcome.TAKEN
+    process = queue._start(run)
+    process.join()
+    assert process.exitcode == 0
     text = run.log.read_text()
     assert "threads 1" in text
     assert str((plan.folder.absolute(), run.variant, run.seed, ["", "more"], "cpu", 1)) in text
@@ -149,16 +149,8 @@ def test_one_process_has_a_run_until_it_dies(tmp_path):
     holder.start()
     assert here.recv()
     assert not is_free(run)
-    assert work(tmp_path, run.variant, run.seed, [""], "cpu", 1) is Outcome.TAKEN
+    work(tmp_path, run.variant, run.seed, [""], "cpu", 1)
+    assert not run.failed
     holder.kill()
     holder.join()
     assert is_free(run)
-
-
-def test_the_last_whole_record_tells_how_far_a_run_is(tmp_path):
-    history = tmp_path / "history.jsonl"
-    assert last_record(history) == (0, 0.0)
-    lines = [json.dumps({"step": n, "seconds": n / 2, "loss": "x" * 100}) for n in range(1, 90)]
-    for damaged in ('{"step": 90, "sec', '{"step": 90, "sec\n'):
-        history.write_text("\n".join([*lines, damaged]))
-        assert last_record(history) == (89, 44.5)

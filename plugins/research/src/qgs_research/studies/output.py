@@ -10,11 +10,9 @@ from qgs.drawing import page_environment
 from qgs.drawing.figures import figure_picture, figure_style
 from qgs.drawing.images import data_uri
 from qgs.evaluate.results import as_json
-from qgs.files import replacing, write_text
-from qgs.model_text import parameter_counts
+from qgs.files import read_records, replacing, write_text
 from qgs_research.studies.estimates import interval_shown, shown
 from qgs_research.studies.figures import curves_figure, values_figure
-from qgs_research.studies.queue import last_record
 from qgs_research.studies.results import Judgement, Results
 from qgs_research.studies.runs import differences
 from qgs_research.studies.statements import answer, notes
@@ -60,8 +58,6 @@ def write_figures(results: Results) -> dict[str, Figure]:
 def study_html(results: Results, figures: dict[str, Figure]) -> str:
     """Return the whole page; it needs no other file and no network."""
     recipes = results.plan.recipes
-    # Without memory: a page needs the shapes alone.
-    models = {name: recipe.build_model("meta") for name, recipe in recipes.items()}
     reference = recipes[results.reference]
     template = page_environment("qgs_research.studies", uri=data_uri).get_template("study.html")
     return template.render(
@@ -71,7 +67,6 @@ def study_html(results: Results, figures: dict[str, Figure]) -> str:
         summary=study_summary(results),
         pictures={name: figure_picture(figure, _DPI) for name, figure in figures.items()},
         changes={name: differences(recipe, reference) for name, recipe in recipes.items()},
-        parameters={name: sum(parameter_counts(model).values()) for name, model in models.items()},
     )
 
 
@@ -142,8 +137,13 @@ def record(results: Results) -> dict[str, Any]:
 def _times(results: Results) -> Iterator[dict[str, Any]]:
     """Yield measured times of every run, which no other machine or day repeats."""
     for run in results.plan.runs:
+        records = read_records(run.folder / "history.jsonl")
         # Of the clock of training, which pauses between sessions do not move.
-        step, seconds = last_record(run.folder / "history.jsonl")
-        milliseconds = 1000 * seconds / step if step else None
-        known = {"variant": run.variant, "seed": run.seed, "step": step}
-        yield {**known, "seconds": round(seconds, 1), "ms_per_step": milliseconds}
+        last = records[-1] if records else {"step": 0, "seconds": 0.0}
+        yield {
+            "variant": run.variant,
+            "seed": run.seed,
+            "step": last["step"],
+            "seconds": round(last["seconds"], 1),
+            "ms_per_step": 1000 * last["seconds"] / last["step"] if records else None,
+        }

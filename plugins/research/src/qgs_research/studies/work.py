@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 import traceback
-from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,16 +20,6 @@ if TYPE_CHECKING:
     from qgs_research.studies.runs import Run
 
 _WATCH_SECONDS = 1.0
-_WORKING = threading.Lock()
-
-
-class Outcome(Enum):
-    """How the process of a run ended. taken: another process has the run."""
-
-    DONE = "done"
-    STOPPED = "stopped"
-    FAILED = "failed"
-    TAKEN = "taken"
 
 
 def begin(log: Path, threads: int, gpu: str, parent: int) -> None:
@@ -54,15 +43,15 @@ def _end_with(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(_WATCH_SECONDS)
     os.kill(os.getpid(), signal.SIGTERM)
-    # Nobody waits for the outcome, and a pool's process waits for orders for ever.
-    with _WORKING:
-        os._exit(1)
 
 
 def work(
     folder: Path, variant: str, seed: int, evaluations: list[str], device: str, threads: int
-) -> Outcome:
-    """Train a run of the study in `folder`, and evaluate it; what is there already is kept."""
+) -> None:
+    """Train a run of the study in `folder`, and evaluate it; what is there already is kept.
+
+    Does nothing where another process has the run. An error is written beside the run.
+    """
     import torch
 
     from qgs.files import write_text
@@ -71,18 +60,14 @@ def work(
     run = run_of(folder, variant, seed)
     try:
         # The kernel releases the lock of a process that dies, so a killed run is free at once.
-        with _WORKING, lock_of(run):
+        with lock_of(run):
             torch.set_num_threads(threads)
-            outcome = _train_and_evaluate(folder, run, evaluations, device)
-            # What an earlier call reported is over.
-            run.failure.unlink(missing_ok=True)
-            return outcome
+            _train_and_evaluate(folder, run, evaluations, device)
     except Timeout:
-        return Outcome.TAKEN
+        return
     except Exception as error:
         traceback.print_exc()
         write_text(run.failure, f"{type(error).__name__}: {error}\n")
-        return Outcome.FAILED
 
 
 def lock_of(run: "Run") -> FileLock:
@@ -92,7 +77,7 @@ def lock_of(run: "Run") -> FileLock:
 
 
 def is_free(run: "Run") -> bool:
-    """Return whether no process has `run`."""
+    """Return True if no process has `run`."""
     try:
         with lock_of(run):
             return True
@@ -100,7 +85,7 @@ def is_free(run: "Run") -> bool:
         return False
 
 
-def _train_and_evaluate(folder: Path, run: "Run", evaluations: list[str], device: str) -> Outcome:
+def _train_and_evaluate(folder: Path, run: "Run", evaluations: list[str], device: str) -> None:
     """Do what `run` lacks. Raises whatever training and evaluating raise."""
     from rich.console import Console
 
@@ -118,10 +103,9 @@ def _train_and_evaluate(folder: Path, run: "Run", evaluations: list[str], device
     result = train(recipe_of(MAIN), run.folder, console=console, device=device, resume=True)
     # It has saved, and the next call goes on from there.
     if result.stopped_by:
-        return Outcome.STOPPED
+        return
     for name in evaluations:
         if not run.evaluated(name):
             evaluation = evaluate(result.model, recipe_of(name), result.steps)
             evaluation.write(run.evaluation(name))
             console.print(f"{name or 'evaluation'}: {evaluation.statement}", highlight=False)
-    return Outcome.DONE
