@@ -7,7 +7,8 @@ from itertools import product
 import numpy as np
 import pytest
 from commands import done
-from qgs_research.studies.comparison import compare
+from qgs_research.studies.comparison import compare, summary
+from qgs_research.studies.estimates import count_better
 from qgs_research.studies.intervals import crossed_error, crossed_interval, paired_interval
 from qgs_research.studies.stored import StoredResults
 from scipy import stats
@@ -23,8 +24,8 @@ def results(name, recipe="", seed=None, step=None, **psnr):
     scenes = {scene: {"model_psnr": v, "model_lpips": v / 100} for scene, v in psnr.items()}
     protocol = Protocol("rooms", {"format": 1, "views": "rooms"})
     frames = dict.fromkeys(scenes, ("0 3", "1 2"))
-    stored = StoredResults(name, protocol, COLUMNS, scenes, frames, len(scenes))
-    return replace(stored, recipe=recipe, seed=seed, step=step, budget="60 s" * bool(recipe))
+    stored = StoredResults(name, protocol, COLUMNS, scenes, frames)
+    return replace(stored, recipe=recipe, seed=seed, step=step)
 
 
 def test_the_bootstrap_interval_is_that_of_scipy():
@@ -37,25 +38,24 @@ def test_the_bootstrap_interval_is_that_of_scipy():
 
 
 def test_scenes_pair_by_name_and_lower_is_better_for_lpips():
-    first = results("first", a=10.0, b=12.0, c=11.0, only=50.0)
-    second = results("second", c=11.0, b=10.0, a=9.0, other=1.0, another=2.0)
-    (pair,) = compare([first, second]).pairs
-    psnr, lpips = pair.differences
-    assert (psnr.first, psnr.second, psnr.scenes) == (11.0, 10.0, 3)
-    assert psnr.difference == pytest.approx(1.0)
-    assert (psnr.wins, psnr.losses, lpips.wins, lpips.losses) == (2, 0, 0, 2)
-    record = pair.record()
-    assert (record["only_first"], record["only_second"]) == (["only"], ["other", "another"])
+    first = results("first", c=11.0, b=10.0, a=9.0, other=1.0, another=2.0)
+    second = results("second", a=10.0, b=12.0, c=11.0, only=50.0)
+    scores = compare([first, second])
+    psnr, lpips = (scores.difference("second", metric) for metric in COLUMNS)
+    assert (psnr.mean, psnr.scenes) == (pytest.approx(1.0), 3)
+    assert count_better(COLUMNS["psnr"], psnr) == "2 of 3"
+    assert count_better(COLUMNS["lpips"], lpips) == "0 of 3"
+    assert "second: scenes not in both (3): another, only, other" in summary(scores).notes
 
 
 def test_the_first_is_compared_with_each_of_the_others():
     three = [results(name, a=value, b=value) for name, value in zip("xyz", (3, 2, 5), strict=True)]
     seeds = [results(name, "A", s, 100, a=1.0 + s, b=2.0) for s, name in enumerate("xy")]
-    cases = ((three, ["xy", "xz"], [1, -2]), (seeds, ["xy"], [-0.5]))  # or seeds of one recipe
-    for given, names, differences in cases:
-        pairs = compare(given).pairs
-        assert [pair.first.name + pair.second.name for pair in pairs] == names
-        assert [pair.differences[0].difference for pair in pairs] == differences
+    # Or seeds of one recipe, each of which is then a side.
+    for given, expected in ((three, {"y": -1, "z": 2}), (seeds, {"y": 0.5})):
+        scores = compare(given)
+        assert scores.reference == "x"
+        assert {name: apart.mean for name, apart in scores.differences().items()} == expected
 
 
 def test_what_cannot_be_compared_is_refused():
@@ -66,22 +66,25 @@ def test_what_cannot_be_compared_is_refused():
             compare(pair)
     halls = replace(second, protocol=Protocol("halls", {"format": 1, "views": "halls"}))
     moved = replace(second, frames={**second.frames, "b": ("0 4", "1 2")})
-    for other, key, told in ((halls, "same_protocol", False), (moved, "other_frames", ["b"])):
+    notes = ("the protocols differ: the scores do not measure the same", "judged on other frames")
+    for other, note in zip((halls, moved), notes, strict=True):
         with pytest.raises(ValueError, match="across-protocols"):
             compare([first, other])
-        assert compare([first, other], across_protocols=True).pairs[0].record()[key] == told
+        scores = compare([first, other], across_protocols=True)
+        assert scores.difference("y", "psnr").mean == 0
+        assert note in "\n".join(summary(scores).notes)
 
 
 def test_trainings_of_one_recipe_are_one_side_paired_by_seed():
     ours = [results(f"r/a/{s}", "A", s, 100, a=10.0 + s, b=12.0) for s in range(3)]
     theirs = [results(f"r/b/{s}", "B", s, 190, a=9.0 + s, b=11.5) for s in (2, 0)]
-    found = compare([*ours, *theirs])
-    (pair,) = found.pairs
-    psnr = pair.differences[0]
-    assert (psnr.trainings, psnr.scenes, psnr.difference) == (2, 2, pytest.approx(0.75))
-    assert (pair.first.name, pair.second.name) == ("r/a", "r/b")
-    assert "r/a: seed 1 left out" in found.markdown()
-    assert "1.90 times" in found.markdown()
+    scores = compare([*ours, *theirs])
+    apart = scores.difference("r/b", "psnr")
+    assert (apart.sample, apart.mean) == ("2 seeds x 2 scenes", pytest.approx(-0.75))
+    assert scores.models() == ["r/a", "r/b"]
+    assert "r/b: nothing to pair with (1): r/a/1" in summary(scores).notes
+    alone = compare([*ours, results("r/c/7", "C", 7, a=9.0, b=11.0), results("d", a=1.0, b=1.0)])
+    assert [apart.mean for apart in alone.differences().values()] == [-1.0, -10.0]
 
 
 def test_two_runs_compare_scene_by_scene(tmp_path):
@@ -91,11 +94,14 @@ def test_two_runs_compare_scene_by_scene(tmp_path):
         folder = run / "evaluation"
         done("eval", f"rooms/{run.name}", "--set", "evaluation.scenes=2", "--out", folder)
         means.append(json.loads((folder / "summary.json").read_text())["model"]["psnr"])
-    done("compare", *runs, "--out", tmp_path)
-    psnr = json.loads((tmp_path / "comparison.json").read_text())["pairs"][0]["differences"][0]
-    assert psnr["difference"] == pytest.approx(means[0] - means[1])
-    assert psnr["low"] <= psnr["difference"] <= psnr["high"]
-    assert psnr["wins"] + psnr["losses"] == psnr["scenes"] == 2
+    shown = done("compare", *runs, "--out", tmp_path).output
+    assert "better in" in shown
+    table = json.loads((tmp_path / "comparison.json").read_text())["table"]
+    apart = next(row["difference"] for row in table if row["variant"] == str(runs[1]))
+    assert apart["mean"] == pytest.approx(means[1] - means[0])
+    assert apart["low"] <= apart["mean"] <= apart["high"]
+    assert apart["scenes"] == 2
+    assert "| PSNR ↑ |" in (tmp_path / "comparison.md").read_text()
 
 
 def test_the_interval_over_trainings_and_scenes_holds_the_truth():

@@ -112,34 +112,29 @@ def refuse_changed(plan: Plan) -> None:
     for variant, name in product(plan.recipes, plan.evaluations):
         recipe = plan.evaluation_recipe(variant, name)
         file = recipe_file(plan.folder, variant, name)
-        what = f"the evaluation `{name}`" if name else f"the variant `{variant}`"
-        remedy = f"give {what} another name, or another --out"
         # Runs of seeds that the study no longer names count too: it may name them again.
-        folders = (plan.folder / "runs" / variant).glob("seed-*")
-        runs = [Run(variant, 0, folder) for folder in folders if folder.is_dir()]
-        evaluated = [run.evaluation(name) for run in runs if run.evaluated(name)]
-        begun = [run.folder for run in runs if not RunFolder(run.folder).is_new]
-        made = evaluated if name else begun
+        folders = (plan.folder / "runs" / variant).glob("seed-*/")
+        runs = [Run(variant, 0, folder) for folder in folders]
+        evaluated = [run for run in runs if run.evaluated(name)]
+        made = evaluated if name else [run for run in runs if not RunFolder(run.folder).is_new]
         changed = differences(resolve(file), recipe) if made and file.is_file() else {}
-        # Where the index lies is no matter; which scenes and frames it names is, below.
+        # Where the index lies is no matter, but which scenes and frames it names.
         changed.pop(INDEX, None)
+        index = index_of(recipe)
+        if any(_stored_index(run.evaluation(name)) != index for run in evaluated):
+            changed[INDEX] = ("other scenes or frames", recipe.evaluation.index)
         if changed:
+            what = f"the evaluation `{name}`" if name else f"the variant `{variant}`"
             shown = [f"{path}: {old} then, {new} now" for path, (old, new) in changed.items()]
             raise ValueError(
                 f"{plan.study.file}: {what} is not what {len(made)} runs in {plan.folder} were "
-                f"made with ({listed(shown, between='; ')}); {remedy}"
+                f"made with ({listed(shown, between='; ')}); give {what} another name, or another "
+                "--out"
             )
-        index = index_of(recipe)
-        for folder in evaluated:
-            if _stored_index(folder) != index:
-                raise ValueError(
-                    f"{plan.study.file}: the results in {folder} were judged on other scenes or "
-                    f"frames than evaluation.index names now ({recipe.evaluation.index}); {remedy}"
-                )
 
 
 def _stored_index(results: Path) -> EvaluationIndex | None:
-    """The index by which results were made; raises ValueError for a file that is none."""
+    """Return the index by which results were made; raises ValueError for a file that is none."""
     content = json.loads((results / "protocol.json").read_text(encoding="utf-8"))
     index = content.get("views", {}).get("index")
     return index and TypeAdapter(dict[str, IndexEntry | None]).validate_python(index)

@@ -116,9 +116,8 @@ def _notes(scores: Scores) -> Iterator[str]:
     yield f"difference: minus {scores.reference}, over the scenes that both have"
     yield from interval_notes([*scores.differences().values()])
     for name in scores.models():
-        first = next(iter(scores.stored[name, MAIN].values()))
-        budget = f"budget {first.budget}, " if first.budget else ""
-        yield f"{name}: {budget}protocol {first.protocol.name}, sha256 {first.protocol.sha256}"
+        protocol = next(iter(scores.stored[name, MAIN].values())).protocol
+        yield f"{name}: protocol {protocol.name}, sha256 {protocol.sha256}"
         for words, names in _left_out(scores, name).items():
             if names:
                 yield f"{name}: {words} ({len(names)}): {listed(sorted(names))}"
@@ -135,7 +134,6 @@ def _left_out(scores: Scores, name: str) -> dict[str, Collection[str]]:
     scenes = dict.fromkeys(scene for result in results for scene in result.scenes)
     return {
         "no score of": results[-1].missing,
-        "null entries of the index, not judged": results[-1].null,
         "nothing to pair with": [{**reference, **runs}[key].name for key in unpaired],
         "scenes not in both": scenes.keys() - common_scenes(results),
         "judged on other frames": moved_scenes(results),

@@ -4,12 +4,7 @@ from matplotlib.figure import Figure
 
 from qgs.drawing.figures import INK, categorical, figure_style, hex_color, running_mean
 from qgs.files import read_records
-from qgs.metrics.images import Psnr
 from qgs_research.studies.results import Results
-
-_STYLES = ("-", "--", ":")
-_COLORS = 6
-"""Colours that are told apart: `categorical` repeats them."""
 
 
 def values_figure(results: Results, evaluation: str) -> Figure | None:
@@ -44,29 +39,21 @@ def values_figure(results: Results, evaluation: str) -> Figure | None:
 
 
 def curves_figure(results: Results) -> Figure | None:
-    """Return PSNR of the training views by step, a line for each run that has not failed."""
+    """Return PSNR of the training views by step, a line for each run."""
+    variants = [*results.plan.recipes]
     with figure_style():
         figure = Figure(figsize=(8.4, 3.6), layout="constrained")
         axes = figure.subplots()
-        variants = [*results.plan.recipes]
         for run in results.plan.runs:
             records = [r for r in read_records(run.folder / "history.jsonl") if "psnr" in r]
             # A running mean needs two values.
-            if len(records) > 1 and not run.failed:
-                number = variants.index(run.variant)
-                axes.plot(
-                    [record["step"] for record in records],
-                    running_mean([record["psnr"] for record in records]),
-                    _STYLES[number // _COLORS % len(_STYLES)],
-                    color=hex_color(categorical(number)),
-                    linewidth=0.9,
-                    label=run.variant,
-                )
-        without = "; without trainings that failed" if results.failed else ""
-        title = f"{Psnr.column.heading} of the training views, {Psnr.column.unit}{without}"
-        axes.set(title=title, xlabel="steps")
-        lines, names = axes.get_legend_handles_labels()
-        # One entry a variant, not one a seed.
-        entries = dict(zip(names, lines, strict=True))
-        figure.legend([*entries.values()], [*entries], loc="outside right center")
-    return figure if entries else None
+            if len(records) > 1:
+                steps = [record["step"] for record in records]
+                values = running_mean([record["psnr"] for record in records])
+                color = hex_color(categorical(variants.index(run.variant)))
+                axes.plot(steps, values, color=color, linewidth=0.9, label=run)
+        axes.set(title="PSNR of the training views, dB", xlabel="steps")
+        if not axes.lines:
+            return None
+        figure.legend(loc="outside right center")
+    return figure

@@ -15,8 +15,8 @@ app = typer.Typer(help="Write jobs for Slurm that save before their time ends, a
 COMMENT = "# Change time, memory, partition and GPUs to those of your cluster."
 
 
-# Slurm requeues preempted jobs by itself, those whose time is over only on request. The command runs
-# in the background: bash runs a trap only after a command in the foreground has ended.
+# Slurm requeues preempted jobs by itself, those whose time is over only on request. The command
+# runs in the background: bash runs a trap only after a command in the foreground has ended.
 _JOB = """#!/bin/bash
 #SBATCH --job-name={name}
 #SBATCH --output={log}
@@ -111,19 +111,13 @@ def study(
 
 
 def _write_job(
-    script: Path,
-    name: str,
-    *,
-    log: Path,
-    options: Sequence[str],
-    command: str,
-    stop: str,
-    note: str = COMMENT,
+    script: Path, name: str, *, log: Path, options: Sequence[str], note: str = COMMENT, **words: str
 ) -> None:
-    """Write a script for sbatch that runs `command` in this folder, and requeues itself.
+    """Write a script for sbatch that runs a command in this folder, and requeues itself.
 
-    options: of sbatch, such as "nodes=1". stop: shell command that makes the process $job save and
-    end; Slurm's signal, 5 minutes before the end of the job's time, runs it.
+    options: of sbatch, such as "nodes=1". words: of `_JOB`: command, and stop, a shell command that
+    makes the process $job save and end; Slurm's signal, 5 minutes before the end of the job's time,
+    runs it.
     """
     from qgs.files import write_text
 
@@ -133,8 +127,7 @@ def _write_job(
         options="\n".join(f"#SBATCH --{option}" for option in options),
         note=note,
         folder=shlex.quote(str(Path.cwd())),
-        stop=stop,
-        command=command,
+        **words,
     )
     write_text(script, text)
     typer.echo(f"wrote {script}; submit it with: sbatch {script}")

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping
 
-from qgs.evaluate.evaluation import SECTIONS
 from qgs.wording import listed
 from qgs_research.studies.estimates import Estimate, interval_shown, shown, sign_of
 from qgs_research.studies.intervals import CONFIDENCE
@@ -65,13 +64,9 @@ def _best_of(results: Results, found: Mapping[str, Estimate]) -> str:
 
 
 def _without_shared_protocol(results: Results) -> str:
-    # What the variants evaluate differently is what an evaluation must set for all.
-    differs = results.settings.differs
-    varied = listed(path for path in differs if path.split(".")[0] in SECTIONS)
-    that_sets = f" that sets {varied}" if varied else ""
     text = (
-        "Not known: no evaluation judges all variants by one protocol; add one"
-        f"{that_sets} to the study's `evaluations`."
+        "Not known: no evaluation judges all variants by one protocol; add one that sets what "
+        "differs to the study's `evaluations`."
     )
     verdicts = Counter(judgement.verdict for judgement in results.judgements())
     counts = ", ".join(f"{number} {verdict}" for verdict, number in verdicts.items())

@@ -19,9 +19,9 @@ class StoredResults:
     """Results of one evaluation. name: the folder, as it was given.
 
     scenes: `SceneScore.values` of the evaluated scenes. frames: their input and target frames, as
-    scenes.csv writes them. columns, missing, null and
-    step as in `Evaluation`. recipe, seed, budget: of a run folder; its resolved recipe as JSON
-    without seed and evaluation.
+    scenes.csv writes them. columns, missing and step as in
+    `Evaluation`. recipe, seed: of a run folder; its resolved recipe as JSON without seed and
+    evaluation.
     """
 
     name: str
@@ -30,11 +30,9 @@ class StoredResults:
     scenes: Mapping[str, Mapping[str, float]]
     frames: Mapping[str, tuple[str, str]]
     missing: Sequence[str] = ()
-    null: Sequence[str] = ()
     step: int | None = None
     recipe: str = ""
     seed: int | None = None
-    budget: str = ""
 
     def scores(self, metric: str, scenes: Iterable[str]) -> list[float]:
         """Return values of the model in these scenes; raises KeyError where one has none."""
@@ -105,21 +103,17 @@ def _read(folder: Path, name: str) -> StoredResults:
         scenes=scenes,
         frames=frames,
         missing=list(summary["missing"]),
-        null=summary["null_entries"],
         step=summary["step"],
         **_training(folder.parent / "recipe.yaml"),
     )
 
 
 def _training(recipe: Path) -> dict[str, Any]:
-    """Return recipe, seed and budget of the run of a resolved recipe; {} without the file."""
+    """Return recipe and seed of the run of a resolved recipe; {} without the file."""
     if not recipe.is_file():
         return {}
     tree = load_mapping(recipe.read_text(encoding="utf-8"), str(recipe), Problems())
     # Trainings that differ in nothing but these are one side of a comparison.
     seed = tree.pop("seed")
     del tree["evaluation"]
-    training = tree["training"]
-    seconds = training["seconds"]
-    budget = f"{seconds:g} s" if seconds else f"{training['steps']:,} steps"
-    return {"recipe": json.dumps(tree), "seed": seed, "budget": budget}
+    return {"recipe": json.dumps(tree), "seed": seed}
