@@ -120,7 +120,8 @@ def drawn(kind: str, queries: int, tokens: int, heads: int, lowest: float = -5.0
     q, k, v, out = (normal(heads, n, 64) for n in (queries, tokens, tokens, queries))
     directions = F.normalize(normal(tokens, 3), dim=-1)
     rays = torch.cat([torch.linalg.cross(normal(tokens, 3), directions), directions], -1)
-    center, variance = normal(queries, 3), (0.3 + normal(queries, 3).abs()).square()
+    center = normal(queries, 3)
+    variance = (0.3 + normal(queries, 3).abs()).square()
     last = lowest, torch.tensor(0.9, device="cuda")
     if kind == "locus":
         return q, k, v, out, RayBias.of(center, variance[..., :1], locus_tokens(rays), *last)

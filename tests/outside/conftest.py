@@ -6,5 +6,5 @@ from fresh_environment import make_fresh_environment
 
 @pytest.fixture(scope="session")
 def fresh(tmp_path_factory):
-    """qgs, LocusGS, worlds and tools for authors from their wheels, nothing from the source tree."""
+    """qgs, LocusGS, worlds and tools for authors from wheels, nothing from the source tree."""
     return make_fresh_environment(tmp_path_factory.mktemp("fresh"))

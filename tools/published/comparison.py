@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-RTOL, ATOL = 1e-4, 5e-5
+RTOL = 1e-4
+ATOL = 5e-5
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,8 @@ def _row(name: str, found: Tensor | None, expected: Tensor) -> Row:
         return Row(name, shape, problem="not compared: nothing here has this name")
     if found.shape != expected.shape:
         return Row(name, shape, problem=f"shape {tuple(found.shape)} here")
-    ours, theirs = found.detach().double(), expected.double()
+    ours = found.detach().double()
+    theirs = expected.double()
     # 0 where both are the same infinity or NaN, infinite where one alone is.
     same = (ours == theirs) | (ours.isnan() & theirs.isnan())
     error = (ours - theirs).abs().nan_to_num(torch.inf, torch.inf).masked_fill(same, 0.0)

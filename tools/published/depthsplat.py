@@ -75,12 +75,15 @@ def encoder_of(golden: GoldenFile) -> DepthSplatEncoder:
 @torch.no_grad()
 def depthsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     """Every output of a golden file."""
-    encoder, views = encoder_of(golden), views_of(golden)
-    near, far = golden.input("near"), golden.input("far")
+    encoder = encoder_of(golden)
+    views = views_of(golden)
+    near = golden.input("near")
+    far = golden.input("far")
     kept = Recorder(near.shape[1])
     watch(kept, encoder, views.cameras.size)
     numbers = encoder.predict(views, near, far)
-    found, predictor = kept.found, encoder.network.depth_predictor
+    found = kept.found
+    predictor = encoder.network.depth_predictor
     neighbours = nearest_neighbours(views.cameras.c2w, encoder.config.neighbours)
     sweep = Sweep(views.cameras, neighbours, near, far)
     size = views.cameras.size
@@ -104,7 +107,8 @@ def depthsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
 
 def watch(kept: Recorder, encoder: DepthSplatEncoder, size: tuple[int, int]) -> None:
     """Hooks on all modules whose output a file has."""
-    network, predictor = encoder.network, encoder.network.depth_predictor
+    network = encoder.network
+    predictor = encoder.network.depth_predictor
     low = (size[0] // encoder.config.stride, size[1] // encoder.config.stride)
     kept.table(network, OUTPUTS)
     kept.transformer(predictor.transformer, low, "features_mv.0")
@@ -138,7 +142,8 @@ def watch(kept: Recorder, encoder: DepthSplatEncoder, size: tuple[int, int]) -> 
 
 def swept(found: dict[str, Tensor], predictor: DepthPredictor, sweep: Sweep) -> None:
     """What the sweeps compute between modules."""
-    shape, poses = sweep.near.shape, relative_poses(sweep.cameras.c2w, sweep.neighbours)
+    shape = sweep.near.shape
+    poses = relative_poses(sweep.cameras.c2w, sweep.neighbours)
     counts = [predictor.candidates(scale) for scale in range(predictor.sizes.scales)]
     candidates = inverse_depth_candidates(sweep.near, sweep.far, counts[0])
     found["inverse_depth_candidates.0"] = candidates

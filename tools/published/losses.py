@@ -57,9 +57,11 @@ def read_inputs(golden: GoldenFile, images: bool) -> LossInputs:
         return golden.input(name) if images or name in golden.tensors else torch.ones(shape)
 
     views = cameras.c2w.shape[:2]
-    colours, pixels = (*views, 3, *golden.size), (*views, 1, *golden.size)
+    colours = (*views, 3, *golden.size)
+    pixels = (*views, 1, *golden.size)
     opacity = read("opacity", *points.shape[:2], 1)
-    rgb, alpha = read("images_pred", *colours), read("alphas_pred", *pixels)
+    rgb = read("images_pred", *colours)
+    alpha = read("alphas_pred", *pixels)
     masks = read("masks_gt", *pixels)
     truth = read("images_gt", *colours) * masks + (1 - masks)
     quats = torch.zeros(*points.shape[:2], 4)
@@ -97,7 +99,8 @@ def loss_tensors(golden: GoldenFile) -> dict[str, Tensor]:
 
 def _pixels(inputs: LossInputs, cam_view: Tensor | None) -> Tensor:
     """Pixels of the points; near z = 0 they depend on the last bit of the file's view matrix."""
-    cameras, points = inputs.target.cameras, inputs.prediction.gaussians.means
+    cameras = inputs.target.cameras
+    points = inputs.prediction.gaussians.means
     seen = cameras.w2c.transpose(-1, -2) if cam_view is None else cam_view.to(points)
     camera_points = points[:, None] @ seen[..., :3, :3] + seen[..., 3:, :3]
     return to_pixels(camera_points, cameras.intrinsics)
@@ -120,7 +123,8 @@ def _clamp(threshold: float | str) -> float | None:
 
 def _visibility(inputs: LossInputs, threshold: str) -> dict[str, Tensor]:
     """Per point, per scene and in all; in all views and in the first alone."""
-    clamp, points = _clamp(threshold), inputs.prediction.gaussians.means
+    clamp = _clamp(threshold)
+    points = inputs.prediction.gaussians.means
     guard = AnchorVisibility.Config().z_guard
     found = {}
     for suffix, views in (("", slice(None)), ("_view0", slice(1))):
@@ -144,7 +148,8 @@ def _whole_loss(
 ) -> dict[str, Tensor]:
     """Every term of a release's loss, unweighted, and their weighted sum; per scene and in all."""
     options.only({"rgb_loss_type": "l2", "lambda_rgb": 1.0, "lambda_lpips": 0.0})
-    per_scene, total_per_scene = {}, torch.zeros(len(inputs.has_mask))
+    per_scene = {}
+    total_per_scene = torch.zeros(len(inputs.has_mask))
     for name, weight, loss in _terms(release, options, ssim):
         values = torch.stack([scene.value(loss) for scene in inputs.scenes()])
         per_scene[name] = values * inputs.has_mask if name == "loss_mask" else values

@@ -32,7 +32,8 @@ COMPUTED: Mapping[str, Callable[[GoldenFile], dict[str, Tensor]]] = {
 
 TIMES = ("times", "target_time")
 TUNED = "tuned_latents"
-LAST_NORM, READ_NORM = "enc_dec_backbone.encoder_norm.", "enc_dec_backbone.multiscale_norms.0."
+LAST_NORM = "enc_dec_backbone.encoder_norm."
+READ_NORM = "enc_dec_backbone.multiscale_norms.0."
 DECODER_MLP = "enc_dec_backbone.decoder_blocks.0.mlp.mlp.fc1.weight"
 
 
@@ -47,7 +48,8 @@ def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     recipe = resolve(recipe_of(golden))
     model = recipe.build_model().eval()
     weights = golden.weights()
-    if hasattr(model.encoder, "norms"):  # runs that read one block name its norm as TokenGS does
+    # Runs that read one block name its norm as TokenGS does.
+    if hasattr(model.encoder, "norms"):
         weights = {name.replace(LAST_NORM, READ_NORM): x for name, x in weights.items()}
     model.load_state_dict(names_of(recipe).from_published(weights), strict=True)
     cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), golden.size)
@@ -69,7 +71,8 @@ def recipe_of(golden: GoldenFile) -> dict[str, Any]:
     _expect_agreement(golden, "gaussians_per_token", model["head"]["gaussians_per_query"])
     _expect_agreement(golden, "anchor_radius_min", model["queries"].get("radius_min"))
     weights = golden.weights()
-    if DECODER_MLP in weights:  # the releases have no option for it
+    # The releases have no option for it.
+    if DECODER_MLP in weights:
         hidden, width = weights[DECODER_MLP].shape
         model["decoder"]["feed_forward"] = {"ratio": real_ratio(hidden, width, DECODER_MLP)}
     return recipe

@@ -53,13 +53,16 @@ def encoder_of(golden: GoldenFile) -> MVSplatEncoder:
 @torch.no_grad()
 def mvsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     """Every output of a golden file."""
-    encoder, views = encoder_of(golden), views_of(golden)
-    near, far = golden.input("near"), golden.input("far")
+    encoder = encoder_of(golden)
+    views = views_of(golden)
+    near = golden.input("near")
+    far = golden.input("far")
     low = tuple(side // 4 for side in views.cameras.size)
     kept = Recorder(near.shape[1])
     watch(kept, encoder, low)
     raw = encoder.predict(views, near, far)
-    found, count = kept.found, encoder.config.candidates
+    found = kept.found
+    count = encoder.config.candidates
     found["disparity_candidates"] = disparity = inverse_depth_candidates(near, far, count)
     found["match_pdf"] = found["match_logits"].softmax(2)
     neighbours = cyclic_neighbours(*near.shape, device=near.device)

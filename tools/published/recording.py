@@ -103,8 +103,10 @@ class _Recorder:
         self.found["encoder_in"] = args[0]
 
     def _memory(self, module: nn.Module, args: Any, memory: ImageMemory) -> None:
-        self.found["keys"], self.found["values"] = memory["keys"], memory["values"]
-        if memory.patch_rays is not None:  # then its features are those of image tokens
+        self.found["keys"] = memory["keys"]
+        self.found["values"] = memory["values"]
+        # Then its features are those of image tokens.
+        if memory.patch_rays is not None:
             self.found["encoder_features"] = memory.features
             self.found["plucker_patch"] = memory.patch_rays
 

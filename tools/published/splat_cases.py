@@ -18,7 +18,8 @@ from qgs.types import Cameras, QueryState
 
 def cases_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     """Every output of a file of cases but those of the release's data loader."""
-    lens, pose = lens_of(golden.input("warp.intrinsics")), golden.input("warp.pose")
+    lens = lens_of(golden.input("warp.intrinsics"))
+    pose = golden.input("warp.pose")
     grid = warp_grid(golden.input("warp.depth"), lens, pose)
     found = {"warp.grid": grid, "warp.warped": warped(golden.input("warp.features"), grid)}
     if "opacity.pdf" in golden.tensors:
@@ -71,7 +72,8 @@ def rays(golden: GoldenFile) -> dict[str, Tensor]:
     height, width = golden.config["image_shape"]
     c2w = golden.input("adapter.extrinsics")[:, None]
     lens = lens_of(golden.input("adapter.intrinsics"), (height, width))[:, None]
-    fields = pixel_fields(Cameras(c2w, lens, (height, width)), 1, 1)  # of the image as one pixel
+    # Of the image as one pixel.
+    fields = pixel_fields(Cameras(c2w, lens, (height, width)), 1, 1)
     origin, corner, across, down = fields[PIXEL].unbind(2)
     x, y = golden.input("adapter.coordinates")[:, None, :, None].unbind(2)
     own = across / width, down / height

@@ -42,7 +42,8 @@ def crossed_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Both have the shape (...). The variance is that of two-way analysis of variance, a sum of mean
     squares; its degrees of freedom are those of Satterthwaite 1946 (doi.org/10.2307/3002019), at
-    least those of the smaller side. Without the scenes' own (Hillis 2007, doi.org/10.1002/sim.2532) it is too narrow for few.
+    least those of the smaller side. Without the scenes' own (Hillis 2007, doi.org/10.1002/sim.2532)
+    it is too narrow for few.
     """
     *_, trainings, scenes = values.shape
     of_training = values.mean(-1, keepdims=True)
