@@ -16,7 +16,7 @@ LIMITS = {
     "all": {"tokens": 553_800},
     "qgs": {"tokens": 120_600, "parallel": 1, "why": 3},
     "plugins": {"tokens": 217_900, "parallel": 1, "why": 3.5},
-    "tests": {"tokens": 187_000, "parallel": 1},
+    "tests": {"tokens": 187_100, "parallel": 1},
     "tools": {"tokens": 23_700, "parallel": 1},
 }
 """Limits of each group, as `python tools/size.py` counts: tokens and parallel assignments at most,

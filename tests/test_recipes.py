@@ -130,7 +130,8 @@ def broken(promises: dict[str, bool]) -> list[str]:
 
 def changed(file: str, other: str) -> dict[str, tuple[Any, Any]]:
     """Options of `other` that `file` changes: old value, new value."""
-    return differences(recipe(other), recipe(file))
+    found = differences(recipe(other), recipe(file))
+    return {p: tuple(x and yaml.safe_load(x) for x in both) for p, both in found.items()}
 
 
 def keeps(file: str, other: str, *parts: str) -> dict[str, bool]:

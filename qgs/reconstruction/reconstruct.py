@@ -65,7 +65,6 @@ def reconstruct(
     if isinstance(photos, Views):
         if size is not None or scene is not None:
             raise ValueError("`size` and `scene` are for folders: Views have one scene and size")
-        # Nobody names photos among Views that were put together by hand: all are inputs.
         chosen = ChosenScene(GivenScene(photos))
         if frames is None and inputs is None:
             frames = range(len(chosen.scene))
@@ -123,6 +122,7 @@ def choose_sample(
     do not exist or come twice, and for too few.
     """
     views = views.model_copy(update={"inputs": inputs or views.inputs})
+    # A model whose checkpoint records no range takes any views.
     domain = trained_on or Domain()
     novel = tuple(compare or ())
     if frames is not None:

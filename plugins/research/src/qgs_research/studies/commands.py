@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 from rich.console import Console
 
 from qgs.cli.options import Device
 from qgs.wording import counted
+
+if TYPE_CHECKING:
+    from qgs_research.studies.runs import Plan
 
 app = typer.Typer(help="Train variants of a model by seeds, and compare them.")
 compare_app = typer.Typer(help="Compare results of evaluations.")
@@ -59,15 +62,18 @@ Only: TypeAlias = Annotated[
     int | None, typer.Option(min=0, help="Train the run of this number, from 0, alone.")
 ]
 
+StudyFile: TypeAlias = Annotated[
+    str, typer.Argument(metavar="STUDY", help="Study file, or one that comes with qgs.")
+]
+StudyFolder: TypeAlias = Annotated[
+    Path, typer.Option("--out", help="Folder of the study; what is there already is not run again.")
+]
+
 
 @app.command()
 def study(
-    file: Annotated[
-        str, typer.Argument(metavar="STUDY", help="Study file, or one that comes with qgs.")
-    ],
-    out: Annotated[
-        Path, typer.Option(help="Folder of the study; what is there already is not run again.")
-    ],
+    file: StudyFile,
+    out: StudyFolder,
     workers: Workers = 1,
     threads: RunThreads = None,
     only: Only = None,
@@ -75,10 +81,8 @@ def study(
 ) -> None:
     """Train every variant with every seed, evaluate all by one protocol, and compare the scores.
 
-    It is checked as a whole before anything trains. Give the same command
-    again at any time: each run is trained once, a killed one continues,
-    and only missing ones run. OUT/study.html has the answer, and
-    OUT/results.json the numbers.
+    It is checked as a whole before anything trains. The same command goes on
+    at any time. OUT/study.html has the answer, OUT/results.json the numbers.
 
     \b
         study: 1
@@ -95,15 +99,11 @@ def study(
     \b
         qgs study mine_study.yaml --out studies/mine --workers 2
 
-    A variant is `base` with or without changes, or the name of a recipe file.
-    docs/studies.md has all keys of a study (differs, evaluations, published
-    ...). Studies that come with qgs: studies/tiny/structural.yaml and others.
+    A variant changes `base`, or names a recipe file; docs/studies.md has all keys.
     """
     from qgs.evaluate.results import print_lines
-    from qgs_research.studies.output import study_summary, write_all
     from qgs_research.studies.plan import planned
     from qgs_research.studies.queue import Queue
-    from qgs_research.studies.results import Results
     from qgs_research.studies.runs import write_plan
     from qgs_research.studies.study import read_study
 
@@ -113,9 +113,8 @@ def study(
         write_plan(plan)
     for name, recipe in plan.recipes.items():
         print_lines(console, [f"warning: {name}: {warning}" for warning in recipe.warnings])
-    missing = [run for run in plan.runs if not plan.done(run)]
-    runs = counted(len(plan.runs), "run")
-    print_lines(console, [f"{plan.size}: {runs}, {len(missing)} of them missing"])
+    missing = sum(not plan.done(run) for run in plan.runs)
+    print_lines(console, [f"{plan.size}: {counted(len(plan.runs), 'run')}, {missing} missing"])
     queue = Queue(
         plan=plan,
         runs=plan.runs if only is None else [plan.runs[only]],
@@ -126,17 +125,25 @@ def study(
         gpus=_gpus(device),
     )
     stopped = queue.work() if workers and missing else None
-    results = Results(plan)
-    end = "no run is finished: there is nothing to report yet"
-    if results.columns:
-        end = f"written to {write_all(results)}"
-        study_summary(results).show(console)
-    print_lines(console, [end])
+    print_lines(console, [_reported(plan, console)])
     if stopped:
         print_lines(console, [f"stopped by {stopped}; the same command goes on"])
         raise typer.Exit(128 + signal.Signals[stopped])
     if queue.failures:
         raise typer.Exit(1)
+
+
+def _reported(plan: Plan, console: Console) -> str:
+    """Write the results of what is finished and show them; return where they are."""
+    from qgs_research.studies.output import study_summary, write_all
+    from qgs_research.studies.results import Results
+
+    results = Results(plan)
+    if not results.columns:
+        return "no run is finished: there is nothing to report yet"
+    folder = write_all(results)
+    study_summary(results).show(console)
+    return f"written to {folder}"
 
 
 def _gpus(device: str) -> list[str]:
