@@ -211,7 +211,7 @@ def _measured(inputs: Cameras, targets: Cameras) -> Iterator[tuple[str, Tensor]]
         c2w = inputs.c2w.double()
         yield "baseline", torch.cdist(c2w[..., :3, 3], c2w[..., :3, 3]).amax((-2, -1))
         axes = c2w[..., :3, 2]
-        cosines = (axes @ axes.transpose(-2, -1)).amin((-2, -1)).clamp(-1, 1)
+        cosines = (axes @ axes.mT).amin((-2, -1)).clamp(-1, 1)
         yield "turn", cosines.arccos().rad2deg()
     depths = torch.stack([look_at_depth(c2w) for c2w in torch.cat([inputs.c2w, targets.c2w], 1)])
     # Axes that meet behind the cameras diverge in front of them: no depth, as of parallel ones.

@@ -56,7 +56,7 @@ class Cameras(TensorContainer):
     def w2c(self) -> Tensor:
         """(..., 4, 4) world-to-camera: the rigid inverse of `c2w`, differentiable."""
         # Rigid, so the inverse needs no solver, and its gradient stays exact.
-        rotation = self.c2w[..., :3, :3].transpose(-1, -2)
+        rotation = self.c2w[..., :3, :3].mT
         translation = -rotation @ self.c2w[..., :3, 3:]
         return torch.cat([torch.cat([rotation, translation], -1), self.c2w[..., 3:, :]], -2)
 

@@ -1,8 +1,11 @@
 """`qgs` as a user types it, a model of one layer, and overrides that make recipes small."""
 
+import json
+
 import yaml
 from typer.testing import CliRunner
 
+import qgs
 from qgs.cli import app
 
 MODEL = yaml.safe_load("""
@@ -26,6 +29,23 @@ def done(*words):
     result = CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result
+
+
+def saved(file, kind, **data):
+    """A model of data of such a kind, in `file`."""
+    overrides = [
+        "plugins=[rooms, tapes]" if "tapes" in kind else "plugins=[rooms]",
+        "views={inputs: 2, targets: 2, gap: [2, 4], scale: constant}",
+        f"data={{type: {kind}, image_size: [16, 16]}}",
+        *(f"data.{name}={value}" for name, value in data.items()),
+    ]
+    qgs.save(qgs.compose({"recipe": 1, "model": MODEL}, overrides), file)
+    return file
+
+
+def record_of(folder):
+    """What `qgs reconstruct` and `qgs refine` say of a result."""
+    return json.loads((folder / "cameras.json").read_text())
 
 
 def sets(*overrides):

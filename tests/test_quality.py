@@ -13,10 +13,10 @@ TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
 LIMITS = {
-    "all": {"tokens": 553_800},
+    "all": {"tokens": 553_300},
     "qgs": {"tokens": 120_600, "parallel": 1, "why": 3},
-    "plugins": {"tokens": 217_900, "parallel": 1, "why": 3.5},
-    "tests": {"tokens": 187_100, "parallel": 1},
+    "plugins": {"tokens": 217_400, "parallel": 1, "why": 3.5},
+    "tests": {"tokens": 187_000, "parallel": 1},
     "tools": {"tokens": 23_700, "parallel": 1},
 }
 """Limits of each group, as `python tools/size.py` counts: tokens and parallel assignments at most,

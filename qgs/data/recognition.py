@@ -70,9 +70,10 @@ def open_for(
         source = component_of(trained)
         assert issubclass(source, SceneSource)
         return source(trained.model_copy(update={"path": path, "image_size": size})), True
-    kind = recognised(opened_path(path), sources)
+    opened = opened_path(path)
+    kind = recognised(opened, sources)
     if kind == "qgs/photos":
-        path = str(with_cameras(opened_path(path)))
+        path = str(with_cameras(opened))
     source = sources[kind]
     assert issubclass(source, SceneSource)
     return source(source.config_for(path, size, trained)), False

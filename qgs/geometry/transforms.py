@@ -1,4 +1,4 @@
-"""Points into cameras and pixels, quaternions to rotation matrices, worlds to worlds."""
+"""Points into cameras and pixels, quaternions and their matrices, worlds to worlds."""
 
 from dataclasses import replace
 
@@ -24,10 +24,19 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 
 
 @full_precision
+def quat_product(left: Tensor, right: Tensor) -> Tensor:
+    """Hamilton products (..., 4), w x y z: the rotation `right`, then the rotation `left`."""
+    w, v = left.split((1, 3), -1)
+    w2, v2 = right.split((1, 3), -1)
+    real = w * w2 - (v * v2).sum(-1, keepdim=True)
+    return torch.cat([real, w * v2 + w2 * v + torch.linalg.cross(v, v2, dim=-1)], -1)
+
+
+@full_precision
 def to_camera(points: Tensor, cameras: Cameras) -> Tensor:
     """Camera-frame points (B, V, P, 3) of world points (B, P, 3) in cameras (B, V)."""
     w2c = cameras.w2c
-    return points[:, None] @ w2c[..., :3, :3].transpose(-1, -2) + w2c[..., None, :3, 3]
+    return points[:, None] @ w2c[..., :3, :3].mT + w2c[..., None, :3, 3]
 
 
 @full_precision
@@ -45,7 +54,6 @@ def to_pixels(camera_points: Tensor, intrinsics: Tensor) -> Tensor:
 def moved(gaussians: Gaussians, pose: Tensor, factor: float) -> Gaussians:
     """The Gaussians enlarged by `factor` about the origin, then placed by the rigid pose (4, 4)."""
     from kornia.geometry.conversions import rotation_matrix_to_quaternion
-    from kornia.geometry.quaternion import Quaternion
 
     pose = pose.to(gaussians.means)
     rotation = pose[:3, :3]
@@ -54,6 +62,6 @@ def moved(gaussians: Gaussians, pose: Tensor, factor: float) -> Gaussians:
         gaussians,
         means=gaussians.means * factor @ rotation.T + pose[:3, 3],
         scales=gaussians.scales * factor,
-        quats=(Quaternion(turn) * Quaternion(gaussians.quats)).data,
+        quats=quat_product(turn, gaussians.quats),
         sh=None if gaussians.sh is None else rotated(gaussians.sh, rotation),
     )

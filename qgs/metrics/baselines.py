@@ -49,6 +49,6 @@ def _distance(inputs: Tensor, targets: Tensor) -> Tensor:
     # In units of the inputs' spread, so that a distance counts in any world.
     extent = torch.cdist(centres, centres).amax((-1, -2), keepdim=True)
     distance = torch.cdist(seen_from, centres) / torch.where(extent > 0, extent, 1.0)
-    cosine = targets[..., :3, 2] @ inputs[..., :3, 2].transpose(-1, -2)
+    cosine = targets[..., :3, 2] @ inputs[..., :3, 2].mT
     # Metres and radians add up: both are about 1 for a view of another place.
     return distance + cosine.clamp(-1, 1).acos()

@@ -47,15 +47,24 @@ def read_photos(
     names; all by default. scene: name, where the folder holds several. Raises FileNotFoundError,
     ValueError, and TooLargeError for more photos than fit into memory.
     """
-    path = fspath(folder)
-    source, _ = open_for(path, size, None, installed_sources())
-    found = named_scene(source, path, scene)
-    if size is None and (stored := found.stored_size(0)):
-        found = named_scene(_resized(source, source.config, stored), path, scene)
+    found = photo_scene(fspath(folder), size, scene)
     wanted = range(len(found)) if frames is None else frame_list(frames, "frames", found)
     origin = torch.eye(4, dtype=torch.float64)
     unit = torch.ones((), dtype=torch.float64)
     return views_in((origin, unit), found, tuple(wanted))
+
+
+def photo_scene(path: str, size: Size | None, name: str | None) -> Scene:
+    """Return the scene called `name` at `path`, or the only one.
+
+    size: (H, W) of images; by default the stored size of the first photo.
+    """
+    source, _ = open_for(path, size, None, installed_sources())
+    scene = named_scene(source, path, name)
+    # The stored size is known once the scene is open.
+    if size is None and (stored := scene.stored_size(0)):
+        scene = named_scene(_resized(source, source.config, stored), path, name)
+    return scene
 
 
 def chosen_scene(

@@ -47,7 +47,7 @@ def project(
     w2c = cameras.w2c
     turns = quat_to_matrix(F.normalize(gaussians.quats, dim=-1))
     factors = turns * gaussians.scales[..., None, :]  # (B, G, 3, 3)
-    position = w2c[..., :3, :3] @ gaussians.means.transpose(-1, -2)[:, None] + w2c[..., :3, 3:]
+    position = w2c[..., :3, :3] @ gaussians.means.mT[:, None] + w2c[..., :3, 3:]
     x, y, z = position.unbind(-2)  # (B, V, G) each
     in_range = (z >= near) & (z <= far)
     # Placeholders where nothing is drawn: a NaN there would reach every gradient through 0 * NaN.

@@ -1,12 +1,10 @@
 """`qgs reconstruct` as a user types it: files, photos that are used, what is refused."""
 
-import json
-
 import numpy as np
 import pytest
 import tape_source
 import torch
-from commands import MODEL, done
+from commands import done, record_of, saved
 from photo_formats import noisy_photos, scene
 from PIL import Image
 from plyfile import PlyData
@@ -22,25 +20,9 @@ def photos(tmp_path_factory):
     return noisy_photos(tmp_path_factory.mktemp("photos") / "row")
 
 
-def saved(file, kind, **data):
-    """A model of such data."""
-    overrides = [
-        "plugins=[rooms, tapes]" if "tapes" in kind else "plugins=[rooms]",
-        "views={inputs: 2, targets: 2, gap: [2, 4], scale: constant}",
-        f"data={{type: {kind}, image_size: [16, 16]}}",
-        *(f"data.{name}={value}" for name, value in data.items()),
-    ]
-    qgs.save(qgs.compose({"recipe": 1, "model": MODEL}, overrides), file)
-    return file
-
-
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
     return saved(tmp_path_factory.mktemp("rooms") / "rooms.safetensors", "rooms/procedural")
-
-
-def record_of(folder):
-    return json.loads((folder / "cameras.json").read_text())
 
 
 def written(*words, out):

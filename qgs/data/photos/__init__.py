@@ -46,9 +46,10 @@ def formats_of(folder: UPath) -> list[str]:
 
 def with_cameras(path: UPath) -> UPath:
     """Return `path`, or the folder with cameras that a reader makes of photos without cameras."""
-    folders = [path, *(item for item in listing(path) if item.is_dir())]
+    if not is_local(path) or formats_of(path):
+        return path
     # A folder of scenes may hold other pictures too.
-    if not is_local(path) or any(map(formats_of, folders)):
+    if any(formats_of(item) for item in listing(path) if item.is_dir()):
         return path
     made = (reader.posed(path) for reader in readers().values())
     return next(filter(None, made), path)

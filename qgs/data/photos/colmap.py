@@ -44,7 +44,6 @@ class Colmap(PhotoReader):
 
     name = "colmap"
     listing = "sparse/0/{cameras,images}.{bin,txt}"
-    poses = "opencv"
 
     @classmethod
     def recognises(cls, folder: UPath) -> bool:

@@ -40,7 +40,6 @@ class Nerfstudio(PhotoReader):
 
     name = "nerfstudio"
     listing = "transforms.json"
-    poses = "opengl"
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:

@@ -80,10 +80,6 @@ class PhotoReader(ABC):
     listing: ClassVar[str]
     """The file that lists the photos, below the folder, for messages."""
 
-    poses: ClassVar[Literal["opengl", "opencv", "opencv c2w", "llff"]]
-    """How the files hold poses: camera-to-world, but for "opencv", which is world-to-camera.
-    `qgs data check` says by it what wrong poses may have been meant as."""
-
     @classmethod
     def recognises(cls, folder: UPath) -> bool:
         """Return whether `folder` holds photos in this format."""

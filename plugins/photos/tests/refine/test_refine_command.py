@@ -6,11 +6,10 @@ from functools import partial
 
 import numpy as np
 import pytest
-from commands import MODEL, done, run_qgs
+from commands import done, record_of, run_qgs, saved
 from photo_formats import noisy_photos
 from plyfile import PlyData
 
-import qgs
 from qgs.reconstruction import saving
 
 
@@ -18,18 +17,6 @@ from qgs.reconstruction import saving
 def photos(tmp_path_factory):
     """A row of 7, 0.1 apart."""
     return noisy_photos(tmp_path_factory.mktemp("photos") / "row")
-
-
-def saved(file, kind, **data):
-    """A model of such data."""
-    overrides = [
-        "plugins=[rooms]",
-        "views={inputs: 2, targets: 2, gap: [2, 4], scale: constant}",
-        f"data={{type: {kind}, image_size: [16, 16]}}",
-        *(f"data.{name}={value}" for name, value in data.items()),
-    ]
-    qgs.save(qgs.compose({"recipe": 1, "model": MODEL}, overrides), file)
-    return file
 
 
 @pytest.fixture(scope="module")
@@ -48,10 +35,6 @@ def small_pictures(monkeypatch):
 def reconstruction(checkpoint, photos, tmp_path):
     done("reconstruct", checkpoint, photos, "--scale", 0.5, "--out", tmp_path / "made")
     return tmp_path / "made"
-
-
-def record_of(folder):
-    return json.loads((folder / "cameras.json").read_text())
 
 
 def kinds(folder):

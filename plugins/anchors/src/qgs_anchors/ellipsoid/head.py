@@ -6,11 +6,11 @@ from torch import Tensor
 
 from qgs.contracts import Fields
 from qgs.geometry.precision import full_precision
-from qgs.geometry.transforms import quat_to_matrix
+from qgs.geometry.transforms import quat_product, quat_to_matrix
 from qgs.tokengs import GaussianHead
 from qgs.types import GaussianAttributes, QueryState
 from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_axes, shape_fields
-from qgs_anchors.ellipsoid.rotations import quat_product, unit_quats
+from qgs_anchors.ellipsoid.rotations import unit_quats
 
 
 class EllipsoidHead(GaussianHead):

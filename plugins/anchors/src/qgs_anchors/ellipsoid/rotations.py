@@ -6,6 +6,7 @@ from torch import Tensor
 
 from qgs.geometry.constants import constant
 from qgs.geometry.precision import full_precision
+from qgs.geometry.transforms import quat_product
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
@@ -20,17 +21,6 @@ def unit(v: Tensor, otherwise: tuple[float, ...]) -> Tensor:
 def unit_quats(quats: Tensor) -> Tensor:
     """Quaternions (..., 4) of length 1; the identity for those of length 0."""
     return unit(quats, IDENTITY)
-
-
-@full_precision
-def quat_product(left: Tensor, right: Tensor) -> Tensor:
-    """Hamilton product (..., 4): the rotation `right`, then the rotation `left`."""
-    w = left[..., :1]
-    v = left[..., 1:]
-    w2 = right[..., :1]
-    v2 = right[..., 1:]
-    real = w * w2 - (v * v2).sum(-1, keepdim=True)
-    return torch.cat([real, w * v2 + w2 * v + torch.linalg.cross(v, v2, dim=-1)], -1)
 
 
 @full_precision

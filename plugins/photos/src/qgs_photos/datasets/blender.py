@@ -15,7 +15,6 @@ class Blender(PhotoReader):
 
     name = "blender"
     listing = "transforms_train.json"
-    poses = "opengl"
 
     @classmethod
     def recognises(cls, folder: UPath) -> bool:

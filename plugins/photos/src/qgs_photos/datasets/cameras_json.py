@@ -55,7 +55,6 @@ class CamerasJson(PhotoReader):
 
     name = "cameras"
     listing = "cameras.json"
-    poses = "opencv c2w"
 
     @classmethod
     def recognises(cls, folder: UPath) -> bool:

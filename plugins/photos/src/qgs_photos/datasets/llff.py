@@ -18,7 +18,6 @@ class Llff(PhotoReader):
 
     name = "llff"
     listing = "poses_bounds.npy"
-    poses = "llff"
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:

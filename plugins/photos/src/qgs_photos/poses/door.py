@@ -20,7 +20,6 @@ class Unposed(PhotoReader):
 
     name = "unposed"
     listing = "photos or a video for `qgs poses`"
-    poses = "opencv"
 
     @classmethod
     def recognises(cls, folder: UPath) -> bool:

@@ -12,10 +12,9 @@ from torch import Tensor
 
 from qgs.checkpoint.gaussians import load_ply
 from qgs.contracts import Renderer
-from qgs.data.recognition import open_for
 from qgs.geometry.poses import relative_to, scaled
 from qgs.geometry.transforms import moved
-from qgs.reconstruction.scenes import installed_sources, named_scene
+from qgs.reconstruction.scenes import photo_scene
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians
 from qgs_photos.poses.film import pictures, write_film
@@ -128,7 +127,8 @@ def open_film_scene(source: Path, photos: str | None, name: str | None) -> FilmS
     if photos is None:
         raise ValueError(f"{file} holds no cameras: add the photos, as `qgs video {source} PHOTOS`")
     renderer = AutoRenderer(_scene_options(file.parent))
-    return _in_own_world(load_ply(file), _photo_cameras(photos, name), renderer)
+    cameras = photo_scene(photos, None, name).cameras
+    return _in_own_world(load_ply(file), cameras, renderer)
 
 
 def _in_own_world(gaussians: Gaussians, cameras: Cameras, renderer: Renderer) -> FilmScene:
@@ -143,16 +143,6 @@ def _in_own_world(gaussians: Gaussians, cameras: Cameras, renderer: Renderer) ->
         renderer=renderer,
         world=(reference, scale),
     )
-
-
-def _photo_cameras(photos: str, name: str | None) -> Cameras:
-    """Return the cameras (V,) of all photos, at their stored size."""
-    sources = installed_sources()
-    # the stored size is known once the scene is open
-    scene = named_scene(open_for(photos, None, None, sources)[0], photos, name)
-    if stored := scene.stored_size(0):
-        scene = named_scene(open_for(photos, stored, None, sources)[0], photos, name)
-    return scene.cameras
 
 
 def _median_depth(gaussians: Gaussians, c2w: Tensor) -> Tensor:

@@ -25,6 +25,7 @@ from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.precision import full_precision
 from qgs.types import GaussianAttributes, QueryState
 from qgs_zoo.globalsplat.streams import TEXTURE, TEXTURE_FIELD
+from qgs_zoo.rotations import quaternions
 
 CHANNELS = (3, 3, 6, 1)
 """Of geometry, per candidate: position, log scale, rotation, opacity; then the gate."""
@@ -203,23 +204,3 @@ def rotation_6d(vectors: Tensor) -> Tensor:
     second = F.normalize(second, dim=-1, eps=LEAST_LENGTH)
     third = torch.linalg.cross(first, second, dim=-1)
     return quaternions(torch.stack([first, second, third], -1))
-
-
-@full_precision
-def quaternions(matrices: Tensor) -> Tensor:
-    """Unit quaternions (..., 4), w x y z, of rotation matrices (..., 3, 3).
-
-    With q the quaternion, 4 q q' is linear in the matrix; its longest row is taken, so that none is
-    divided by a small number.
-    """
-    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrices.unbind(-2))
-    outer = [
-        1 + a + e + i, h - f, c - g, d - b,
-        h - f, 1 + a - e - i, d + b, c + g,
-        c - g, d + b, 1 - a + e - i, h + f,
-        d - b, c + g, h + f, 1 - a - e + i,
-    ]  # fmt: skip
-    rows = torch.stack(outer, -1).unflatten(-1, (4, 4))
-    longest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None]
-    row = rows.gather(-2, longest.expand(*longest.shape[:-1], 4)).squeeze(-2)
-    return F.normalize(row, dim=-1)

@@ -10,6 +10,7 @@ from torch import Tensor
 from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import rotated
 from qgs.geometry.precision import full_precision
+from qgs.geometry.transforms import quat_product
 
 SH_DEGREE = 3
 """Largest degree that the rasteriser of the released code and ours read."""
@@ -112,32 +113,6 @@ def world_harmonics(rotation: Tensor, degree: int) -> Tensor:
     """
     turn = turn_of_harmonics(rotation, degree) * band_mask(degree, rotation)
     return _fixed(degree, rotation.device)[2].to(rotation) @ turn
-
-
-def quaternions(rotation: Tensor) -> Tensor:
-    """Unit quaternions (..., 4), w x y z, of rotations (..., 3, 3), up to sign."""
-    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotation.unbind(-2))
-    # 4 q q^T: every row is the quaternion times four of its numbers; the largest loses no digits.
-    rows = [
-        [1 + a + e + i, h - f, c - g, d - b],
-        [h - f, 1 + a - e - i, b + d, c + g],
-        [c - g, b + d, 1 - a + e - i, f + h],
-        [d - b, c + g, f + h, 1 - a - e + i],
-    ]
-    outer = torch.stack([torch.stack(row, -1) for row in rows], -2)
-    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1, keepdim=True)[..., None]
-    row = outer.gather(-2, largest.expand(*largest.shape[:-1], 4))[..., 0, :]
-    return F.normalize(row, dim=-1)
-
-
-def quat_product(left: Tensor, right: Tensor) -> Tensor:
-    """Quaternion products (..., 4), w x y z."""
-    w = left[..., :1]
-    v = left[..., 1:]
-    w2 = right[..., :1]
-    v2 = right[..., 1:]
-    real = w * w2 - (v * v2).sum(-1, keepdim=True)
-    return torch.cat([real, w * v2 + w2 * v + torch.linalg.cross(v, v2, dim=-1)], -1)
 
 
 def camera_quaternions(raw_xyzw: Tensor) -> Tensor:

@@ -20,7 +20,8 @@ from qgs.contracts import (
 )
 from qgs.geometry.precision import full_precision
 from qgs.types import Cameras, ImageMemory, QueryState, Views
-from qgs_zoo.mvsplat.adapter import coefficients, quaternions, world_harmonics
+from qgs_zoo.mvsplat.adapter import coefficients, world_harmonics
+from qgs_zoo.rotations import quaternions
 
 PIXEL = "mvsplat.pixel"
 TURN = "mvsplat.turn"
