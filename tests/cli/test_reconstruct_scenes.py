@@ -88,7 +88,7 @@ def test_photos_of_another_kind_are_seen_whole():
 def test_one_scene_of_chunks(folders, tmp_path):
     chunks = tmp_path / "chunks"
     source = opened(folders, SIZE, holdout=4)
-    packing.pack(source, packing.own_splits(source), UPath(chunks), {})
+    packing.pack(source, packing.chosen_splits(source), UPath(chunks), {})
     trained = recipe("datasets/chunks", path=str(chunks))
     assert chosen(trained, chunks, (8, 12), "a") == ((2,), (0, 1, 3), (8, 12))
     elsewhere = recipe("datasets/chunks", path=str(tmp_path))

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from qgs_photos.datatools.check import Options, check
-from qgs_photos.datatools.packing import own_splits, pack
+from qgs_photos.datatools.packing import chosen_splits, pack
 from qgs_photos.datatools.sources import sources
 from upath import UPath
 
@@ -66,7 +66,7 @@ def write_chunks(folder: Path, photos: Any) -> None:
     inner = folder.with_name("inner")
     write_nerfstudio(inner, photos)
     source = opened(inner)
-    pack(source, own_splits(source), UPath(folder), {})
+    pack(source, chosen_splits(source), UPath(folder), {})
 
 
 WRITERS: dict[str, Callable[[Path, Any], object]] = {

@@ -52,7 +52,7 @@ def test_missing_images_are_told_and_counted(tapes, monkeypatch):
         "error: a: listed images that do not exist: 2.png, 4.png; later frames move up in an "
         "index: add the files, or take them out of what lists them" in output
     )
-    assert "context frame 6, but the scene's 6 frames are 0 to 5" in output
+    assert "has frames 6, but the scene's are 0 to 5" in output
 
 
 def test_a_source_that_fails_is_told_and_the_others_go_on(tapes, monkeypatch):

@@ -11,12 +11,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from qgs.wording import counted
 from qgs_photos.printing import say
 
 if TYPE_CHECKING:
     from qgs.contracts import SceneSource
-    from qgs_photos.datatools.packing import Packed, Splits
-    from qgs_photos.datatools.report import CheckReport, SceneReport
+    from qgs_photos.datatools.findings import SceneReport
+    from qgs_photos.datatools.packing import Packed
 
 app = typer.Typer(no_args_is_help=True, help="Check and pack data sets.")
 
@@ -41,9 +42,6 @@ def check(
     images: Annotated[
         str | None, typer.Option(help="Folder of photos to read, such as images_4.")
     ] = None,
-    report: Annotated[
-        Path | None, typer.Option(help="HTML page to write, with cameras and the worst pairs.")
-    ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Read only the headers of images, match none.")
     ] = False,
@@ -60,6 +58,7 @@ def check(
     """
     from qgs.paths import opened_path
     from qgs_photos.datatools.check import Options, check
+    from qgs_photos.datatools.findings import errors_of
 
     console = Console()
     options = Options(
@@ -76,34 +75,16 @@ def check(
             status.update(f"{done} of {total} scenes, now {name}")
 
         result = check(opened_path(path), options, indices, progress)
-    _print(console, result)
-    if report is not None:
-        from qgs.files import write_text
-        from qgs_photos.datatools.page import check_html
-
-        write_text(report, check_html(result))
-        say(console, f"report: {report}")
-    if result.errors:
-        raise typer.Exit(1)
-
-
-def _print(console: Console, result: CheckReport) -> None:
-    from qgs.wording import counted
-
     if result.scenes:
         console.print(_table(result.scenes))
-    if (hidden := len(result.scenes) - _ROWS) > 0:
-        say(console, f"and {hidden} more scenes, none of them with more findings than these")
-    for finding in result.findings:
-        say(console, str(finding))
-    for summary in result.indices:
-        say(console, f"index {summary}")
-    # the note on scale is last: it is advice, the others say what was not checked
-    for note in (*result.notes, result.auto_scale):
-        if note:
-            say(console, f"note: {note}")
-    counts = ", ".join([counted(len(result.scenes), "scene"), *result.counts])
-    say(console, f"{result.path}: {counts}")
+    for line in (*result.findings, *(f"note: {note}" for note in result.notes)):
+        say(console, str(line))
+    errors = len(errors_of(result.findings))
+    warnings = len(result.findings) - errors
+    counts = {"scene": len(result.scenes), "error": errors, "warning": warnings}
+    say(console, f"{path}: {', '.join(counted(count, what) for what, count in counts.items())}")
+    if errors:
+        raise typer.Exit(1)
 
 
 def _table(scenes: Sequence[SceneReport]) -> Table:
@@ -112,11 +93,12 @@ def _table(scenes: Sequence[SceneReport]) -> Table:
     table.add_column("format")
     for column in ("frames", "decodable", "missing", "bad poses", "epipolar px"):
         table.add_column(column, justify="right")
-    if len(scenes) > _ROWS:
-        scenes = sorted(scenes, key=lambda scene: -len(scene.findings))[:_ROWS]
-    for scene in scenes:
+    # of many scenes the worst
+    for scene in sorted(scenes, key=lambda scene: -len(scene.findings))[:_ROWS]:
         counts = (scene.listed, scene.decodable, scene.missing, scene.pose_problems)
         table.add_row(scene.name, scene.kind, *map(str, counts), scene.epipolar)
+    if len(scenes) > _ROWS:
+        table.add_row(f"and {len(scenes) - _ROWS} more")
     return table
 
 
@@ -151,12 +133,16 @@ def pack(
     installed plugin to ask which reads a data set; for a recipe only its own.
     """
     from qgs.paths import opened_path
+    from qgs_photos.datasets.dl3dv import read_scene_list
     from qgs_photos.datatools import packing
     from qgs_photos.datatools.entries import Encoding
 
     console = Console()
+    if test_scenes is not None and test_every is not None:
+        raise typer.BadParameter("give --test-scenes or --test-every, not both")
     source, settings = _opened(path, options or [], image_size)
-    splits = _splits(source, test_scenes, test_every)
+    test = None if test_scenes is None else read_scene_list(opened_path(test_scenes))
+    splits = packing.chosen_splits(source, test, test_every)
     settings |= {"test_scenes": test_scenes, "test_every": test_every}
     with Progress(
         MofNCompleteColumn(),
@@ -202,18 +188,6 @@ def _opened(
     if image_size is not None:
         source = type(source)(source.config.model_copy(update={"image_size": image_size}))
     return source, {"source": type(source).name, **source.config.model_dump(mode="json")}
-
-
-def _splits(source: SceneSource, test_scenes: str | None, test_every: int | None) -> Splits:
-    from qgs.paths import opened_path
-    from qgs_photos.datasets.dl3dv import read_scene_list
-    from qgs_photos.datatools.packing import own_splits, splits_by_list, splits_by_number
-
-    if test_scenes is not None and test_every is not None:
-        raise typer.BadParameter("give --test-scenes or --test-every, not both")
-    if test_scenes is not None:
-        return splits_by_list(source, read_scene_list(opened_path(test_scenes)))
-    return own_splits(source) if test_every is None else splits_by_number(source, test_every)
 
 
 def _print_packed(console: Console, packed: Packed, out: str) -> None:

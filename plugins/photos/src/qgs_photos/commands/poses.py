@@ -87,8 +87,4 @@ def show_verdict(folder: Path, console: Console) -> None:
     for finding in report.findings:
         say(console, str(finding))
     (scene,) = report.scenes
-    say(
-        console,
-        f"checked: {', '.join(report.counts)}; matched points lie {scene.epipolar} pixels from "
-        "their epipolar lines",
-    )
+    say(console, f"matched points lie {scene.epipolar} pixels from their epipolar lines")

@@ -7,21 +7,19 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+import torch
 from upath import UPath
 
 from qgs.data.photos import read_listing, readers
-from qgs.wording import counted, listed
-from qgs_photos.datatools.cameras import camera_findings, sharing_findings
-from qgs_photos.datatools.candidates import Candidate, Photo
-from qgs_photos.datatools.chunks import chunk_folders
-from qgs_photos.datatools.decoding import DecodedScene, decode, error_text
-from qgs_photos.datatools.files import file_findings, size_findings
-from qgs_photos.datatools.findings import Finding, errors_of, merged
+from qgs.geometry.poses import look_at_depth
+from qgs.wording import listed
+from qgs_photos.datatools.chunks import chunk_scenes
+from qgs_photos.datatools.faults import photo_findings, pose_findings, sharing_findings
+from qgs_photos.datatools.findings import CheckReport, Finding, SceneReport, errors_of, merged
 from qgs_photos.datatools.folders import dl3dv_scenes, photo_folders
 from qgs_photos.datatools.geometry import TOO_FEW, geometry_findings, judge_scene
-from qgs_photos.datatools.indices import Held, found_indices, index_findings
-from qgs_photos.datatools.masks import matched_findings, picture_findings
-from qgs_photos.datatools.report import CheckReport, SceneReport
+from qgs_photos.datatools.indices import found_indices, index_findings
+from qgs_photos.datatools.photos import Candidate, DecodedScene, Photo, decode, error_text
 from qgs_photos.datatools.sources import OF_FILES, kind_of, left_out, source_scenes, sources
 
 PHOTOS, FEWEST = 400, 20
@@ -54,38 +52,38 @@ def check(
     # a listing stands for its folder
     if path.is_file() and path.suffix in (".json", ".npy"):
         path = path.parent
-    candidates, general, reported = _candidates(path, options)
-    if not candidates and not general:
+    items = list(_items(path, options))
+    candidates = [item for item in items if isinstance(item, Candidate)]
+    general = [item for item in items if isinstance(item, Finding)]
+    if not items:
         # raises: what is missing for a photo folder
         read_listing(path, _photo_format(options))
         raise FileNotFoundError(f"{path} holds no {options.format}: leave --format out")
-    judged, notes = _scenes_to_judge(len(candidates), options)
+    count = len(candidates)
+    # over the whole data set: faults come in batches of scenes
+    wanted = 0 if options.headers_only else min(options.geometry, count)
+    judged = {*np.linspace(0, max(count - 1, 0), wanted).round().astype(int).tolist()}
+    notes = left_out(options.format)
+    if len(judged) < count:
+        some = f"poses were judged by photos in {len(judged)} of {count} scenes"
+        notes.append(f"{some}; --geometry {count} judges all")
+    held = defaultdict[str, list[SceneReport]](list)
     scenes: list[SceneReport] = []
-    held: dict[str, list[Held]] = defaultdict(list)
     for number, candidate in enumerate(candidates):
-        progress(number, len(candidates), candidate.name)
+        progress(number, count, candidate.name)
         most = max(PHOTOS // len(judged), FEWEST) if number in judged else 0
         report = check_scene(candidate, options, most)
         scenes.append(report)
-        held[report.scene].append(Held(report.split, report.numbered or None))
-    summaries: list[str] = []
+        held[report.scene].append(report)
     for file in dict.fromkeys(file.resolve() for file in (*indices, *found_indices(path))):
-        findings, summary = index_findings(file, held, reported)
-        general += findings
-        summaries += [summary] if summary else []
-    if partly := sum(bool(scene.geometry and scene.geometry.left_out) for scene in scenes):
-        notes.append(
-            f"in {counted(partly, 'scene')} only some of the photos were matched "
-            "with others; a lower --geometry judges fewer scenes by more of theirs"
-        )
-    return CheckReport(
-        path=str(path),
-        scenes=scenes,
-        general=general,
-        indices=summaries,
-        judged=len(judged),
-        notes=[*left_out(options.format), *notes],
-    )
+        general += index_findings(file, held)
+        notes.append(f"compared with the index {file}")
+    if factors := [1 / scene.depth for scene in scenes if scene.depth]:
+        ends = f"{min(factors):.4g} to {max(factors):.4g}"
+        notes.append(f"views.scale: auto is a factor of {np.median(factors):.4g} ({ends})")
+    else:
+        notes.append("views.scale: auto finds no common point that the cameras look at")
+    return CheckReport(scenes=scenes, general=general, notes=notes)
 
 
 def _refuse_unknown(format: str) -> None:
@@ -96,44 +94,25 @@ def _refuse_unknown(format: str) -> None:
         raise ValueError(f"there is no format {format!r}: use one of {usable}")
 
 
-def _candidates(path: UPath, options: Options) -> tuple[list[Candidate], list[Finding], set[str]]:
-    """Return scenes, findings about files, and scenes that such findings may be about."""
+def _items(path: UPath, options: Options) -> Iterator[Candidate | Finding]:
+    """Yield scenes, and findings about files."""
     kind = options.format
     if kind == "auto":
         is_chunk = path.is_file() and path.suffix == ".torch"
         kind = "chunks" if is_chunk else kind_of(path)
+    if kind == "chunks" and options.images is not None:
+        raise ValueError("chunks hold their images: leave --images out")
     if kind == "chunks":
-        if options.images is not None:
-            raise ValueError("chunks hold their images: leave --images out")
-        folders = chunk_folders(path)
-        candidates = [candidate for folder in folders for candidate in folder.candidates]
-        findings = [finding for folder in folders for finding in folder.findings]
-        return candidates, findings, {key for folder in folders for key in folder.index}
+        return chunk_scenes(path)
     if kind == "dl3dv":
-        items = list[Candidate | Finding](dl3dv_scenes(path, options.images))
-    elif "/" in kind:
-        items = list[Candidate | Finding](source_scenes(kind, path, options.images))
-    else:
-        items = list(photo_folders(path, _photo_format(options), options.images))
-    candidates = [item for item in items if isinstance(item, Candidate)]
-    return candidates, [item for item in items if isinstance(item, Finding)], set()
+        return dl3dv_scenes(path, options.images)
+    if "/" in kind:
+        return source_scenes(kind, path, options.images)
+    return photo_folders(path, _photo_format(options), options.images)
 
 
 def _photo_format(options: Options) -> str:
     return options.format if options.format in readers() else "auto"
-
-
-def _scenes_to_judge(count: int, options: Options) -> tuple[set[int], list[str]]:
-    """Return the scenes whose poses are matched with photos, and a note on the others."""
-    if options.headers_only:
-        return set(), ["quick: only headers of images were read, and no pose was judged by photos"]
-    if not options.geometry:
-        return set(), ["no pose was judged by photos (--geometry 0)"]
-    # over the whole data set: faults come in batches of scenes
-    spread = np.linspace(0, max(count - 1, 0), min(options.geometry, count)).round()
-    places = {int(place) for place in spread}
-    left = f"poses were judged by photos in {len(places)} of {count} scenes; --geometry {count}"
-    return places, [f"{left} judges all"] if len(places) < count else []
 
 
 def check_scene(candidate: Candidate, options: Options, most_photos: int) -> SceneReport:
@@ -154,31 +133,27 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
     with ThreadPoolExecutor(options.threads) as pool:
         decoded = list(pool.map(partial(decode, headers_only=options.headers_only), photos))
     scene = DecodedScene(candidate.name, photos, decoded)
-    sizes = list(size_findings(scene))
-    # a wrong size makes intrinsics look wrong, a wrong pose says nothing about shared ones
-    poses, others = camera_findings(scene, _frames(sizes))
+    of_photos = list(photo_findings(scene))
+    poses = list(pose_findings(scene))
     faulty_poses = _frames(poses)
     placed = [
         frame
         for frame, photo in enumerate(photos)
         if frame not in faulty_poses and np.isfinite(photo.listed.c2w).all()
     ]
-    sharing = list(sharing_findings(scene, placed, float32=candidate.kind == "chunks"))
-    files = file_findings(scene, _listing(candidate.kind))
-    pictures = picture_findings(scene)
-    findings = merged([*absent, *files, *sizes, *poses, *others, *sharing, *pictures])
-    geometry = None
+    sharing = list(sharing_findings(scene, placed))
+    findings = merged([*absent, *of_photos, *poses, *sharing])
+    epipolar = "-"
     if most_photos:
-        faulty = _frames([*sizes, *others, *sharing])
+        faulty = _frames([*of_photos, *sharing])
         usable = [f for f in placed if f not in faulty and decoded[f].size is not None]
         geometry = judge_scene(scene, usable, most_photos)
+        epipolar = "not judged" if geometry.unjudged else f"{geometry.pixels:.2f}"
         # what else is wrong says already why nothing could be judged
         explained = errors_of(findings) and geometry.unjudged not in ("", TOO_FEW)
         if not explained:
             findings += geometry_findings(scene, geometry)
-        findings += matched_findings(scene, geometry.pairs)
-    drawn = [frame for frame in placed if scene.numbers[frame] is not None]
-    c2w = [photos[frame].listed.c2w[:3] for frame in drawn]
+    c2w = np.array([photos[f].listed.c2w for f in placed if scene.numbers[f] is not None])
     return replace(
         report,
         listed=len(photos) + len(missing),
@@ -186,9 +161,8 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
         missing=len(missing) + sum(not photo.exists for photo in photos),
         numbered=sum(number is not None for number in scene.numbers),
         pose_problems=len(_frames([*poses, *sharing])),
-        frames=tuple(scene.numbers[frame] for frame in drawn),
-        c2w=np.array(c2w, np.float32).reshape(-1, 3, 4),
-        geometry=geometry,
+        epipolar=epipolar,
+        depth=float(look_at_depth(torch.from_numpy(c2w))) if len(c2w) > 1 else 0.0,
         findings=findings,
     )
 
@@ -199,9 +173,8 @@ def _absent(name: str, photos: Sequence[Photo], missing: Sequence[str]) -> Itera
         names = listed(missing, 3)
         reason = f"listed images that do not exist: {names}; later frames move up in an index"
         yield Finding(name, reason, "add the files, or take them out of what lists them")
-    elif not photos:
-        yield Finding(name, "no photos are listed", "export the scene again")
-    if photos and (there := sum(photo.exists for photo in photos)) < 2:
+    there = sum(photo.exists for photo in photos)
+    if there < 2:
         reason = f"{there} photos are there, and a scene needs 2"
         yield Finding(name, reason, "add photos, or take the scene out")
 
@@ -212,13 +185,6 @@ def _unreadable(name: str, error: Exception) -> Finding:
     if colon and isinstance(error, OSError | ValueError):
         return Finding(name, reason, fix)
     return Finding(name, error_text(error), "get the files again, or mend what reads them")
-
-
-def _listing(kind: str) -> str:
-    """Return what messages call the file that lists the photos of a format."""
-    known = {"dl3dv": "transforms.json", "chunks": "the chunk"}
-    known |= {name: reader.listing for name, reader in readers().items()}
-    return known.get(kind, "the data set")
 
 
 def _frames(findings: Sequence[Finding]) -> set[int]:

@@ -1,9 +1,7 @@
 """Chunks of a data set: their scenes, to be checked, and what is wrong with the files."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any
@@ -19,7 +17,6 @@ from qgs_photos.datasets.chunk_files import (
     INDEX,
     SUFFIX,
     Record,
-    a_type,
     has_chunks,
     load_chunk,
     parse_record,
@@ -27,143 +24,82 @@ from qgs_photos.datasets.chunk_files import (
     read_mask,
     unit_problems,
 )
-from qgs_photos.datatools.candidates import Candidate, Photo
 from qgs_photos.datatools.findings import Finding, Severity
+from qgs_photos.datatools.photos import Candidate, Photo
 
 _REPACK = "pack the data set again with `qgs data pack`, or copy the file again"
 
 
-def chunk_folders(path: UPath) -> list[ChunkFolder]:
-    """Read the folders of chunks of a data set: train and test, or `path`; or a single file."""
-    if path.is_file():
-        single = ChunkFolder("")
-        single.add_chunk(path)
-        return [single]
+def chunk_scenes(path: UPath) -> Iterator[Candidate | Finding]:
+    """Yield scenes and faults of a data set of chunks: train and test, or `path`; or one file."""
     parts = {split: path / split for split in ("train", "test") if has_chunks(path / split)}
-    folders: list[ChunkFolder] = []
+    found = {split: dict[str, str]() for split in ("train", "test", "")}
     for split, part in (parts or {"": path}).items():
-        folder = ChunkFolder(split)
-        indexed = folder.read_index(part / INDEX)
-        for file in sorted((item for item in part.iterdir() if item.suffix == SUFFIX), key=str):
-            folder.add_chunk(file)
-        if indexed:
-            folder.compare_index({item.name for item in part.iterdir()})
-        folders.append(folder)
-    if len(folders) == 2:
-        reason = (
-            "the scene is in train and in test, so that models are evaluated on scenes of their "
-            "training"
-        )
-        for key in sorted(folders[0].found & folders[1].found):
-            folders[0].report(key, reason, "remove it from one of the two", "warning")
-    return folders
+        yield from _folder_scenes(split, part, found[split])
+    for key in sorted(found["train"].keys() & found["test"].keys()):
+        reason = "the scene is in train and in test, so that models are judged on training data"
+        yield Finding(key, reason, "remove it from one of the two", severity="warning")
 
 
-class ChunkFolder:
-    """Content of a folder of chunks. split: train, test or empty. index, found: scenes."""
-
-    def __init__(self, split: str) -> None:
-        self.split = split
-        self.index: Mapping[str, str] = {}
-        self.found: set[str] = set()
-        self.candidates: list[Candidate] = []
-        self.findings: list[Finding] = []
-        # scenes by file, as in the index
-        self._placed: dict[str, list[str]] = defaultdict(list)
-        # scenes by file, of files that could be read
-        self._keys: dict[str, set[str]] = {}
-        # files with entries that are no scenes
-        self._broken: set[str] = set()
-
-    def report(self, scene: str, reason: str, fix: str, severity: Severity = "error") -> None:
-        """Add a finding."""
-        self.findings.append(Finding(scene, reason, fix, severity=severity))
-
-    def read_index(self, file: UPath) -> bool:
-        """Read index.json; return whether there is a readable one."""
-        if not file.is_file():
-            return False
-        try:
-            self.index = read_chunk_index(file)
-        except (OSError, ValueError) as error:
-            self.report(self._label(INDEX), str(error), "write it anew: scene to file, in JSON")
-            return False
-        for key, name in self.index.items():
-            self._placed[name].append(key)
-        return True
-
-    def add_chunk(self, file: UPath) -> None:
-        """Add the scenes of a file as candidates, and findings on entries that cannot be parsed."""
-        label = self._label(file.name)
-        try:
-            entries = load_chunk(file)
-        except (OSError, ValueError) as error:
-            text = " ".join(str(error).replace(f"{file} ", "the file ").split())
-            # without the remedy behind the last colon
-            reason = text.rpartition(": ")[0] or text
-            self.report(label, reason + self._lost(file.name), _REPACK)
-            return
-        keys = self._keys[file.name] = set()
-        if not entries:
-            self.report(label, "the chunk holds no scene", _REPACK)
-        strange: list[Any] = []
-        for place, entry in enumerate(entries):
-            key = entry.get("key") if isinstance(entry, Mapping) else None
-            if not isinstance(key, str):
-                strange.append(entry)
-            elif key in self.found:
-                reason = f"the scene is in {label}, and was in this split before"
-                self.report(key, reason, f"remove one of the two, or {_REPACK}")
-            else:
-                keys.add(key)
-                self.found.add(key)
-                photos = partial(_photos, file, place)
-                self.candidates.append(
-                    Candidate(name=key, scene=key, kind="chunks", photos=photos, split=self.split)
-                )
-        if strange:
-            self._broken.add(file.name)
-            self.report(
-                label,
-                f"{len(strange)} of its {len(entries)} entries are no mappings with a 'key' (the "
-                f"first is {a_type(strange[0])})" + self._lost(file.name),
-                _REPACK,
-            )
-
-    def compare_index(self, files: set[str]) -> None:
-        """Report where the index and the folder's `files` differ."""
-        index = self._label(INDEX)
-        if not self.index:
-            self.report(index, "it names no scene", "remove it, or write it anew")
-        for name, keys in self._placed.items():
-            if name not in files:
-                reason = f"the chunk does not exist; {INDEX} places there {_scenes(keys)}"
-                fix = f"download the chunk, or take its scenes out of {INDEX}"
-                self.report(self._label(name), reason, fix)
-        for key, name in self.index.items():
-            if name in self._keys and key not in self._keys[name] and name not in self._broken:
-                reason = f"{index} places the scene in {name}, which does not hold it"
-                fix = f"take the scene out of {INDEX}, or get the chunk that holds it"
-                self.report(key, reason, fix)
-        for name, keys in self._keys.items():
-            reason = (
-                f"{self._label(name)} holds the scene, but {index} does not name it, so that it is "
-                "never read"
-            )
-            for key in sorted(keys - self.index.keys()):
-                self.report(key, reason, f"add it to {INDEX}", "warning")
-
-    def _label(self, name: str) -> str:
-        return f"{self.split}/{name}" if self.split else name
-
-    def _lost(self, name: str) -> str:
-        """Return text on the scenes that the index places in a broken file."""
-        keys = [k for k in self._placed.get(name, ()) if k not in self._keys.get(name, ())]
-        return f"; {INDEX} places there {_scenes(keys)}" if keys else ""
+def _folder_scenes(
+    split: str, folder: UPath, found: dict[str, str]
+) -> Iterator[Candidate | Finding]:
+    """Yield what a folder of chunks, or one file, holds. found: gets file names by scene."""
+    if folder.is_file():
+        files = [folder]
+    else:
+        files = sorted((item for item in folder.iterdir() if item.suffix == SUFFIX), key=str)
+    for file in files:
+        yield from _file_scenes(split, file, found)
+    if not (folder / INDEX).is_file():
+        return
+    label = _label(split, INDEX)
+    try:
+        index = read_chunk_index(folder / INDEX)
+    except (OSError, ValueError) as error:
+        yield Finding(label, str(error), "write it anew: scene to file, in JSON")
+        return
+    lost = defaultdict[str, list[str]](list)
+    for key, name in index.items():
+        if found.get(key) != name:
+            lost[name].append(key)
+    for name, keys in lost.items():
+        reason = f"{INDEX} places there {counted(len(keys), 'scene')} not in it: {listed(keys)}"
+        fix = f"get the chunk again, or take its scenes out of {INDEX}"
+        yield Finding(_label(split, name), reason, fix)
+    if unnamed := sorted(found.keys() - index.keys()):
+        reason = f"it does not name {listed(unnamed)}, so that nothing reads what chunks hold"
+        severity: Severity = "warning" if index else "error"
+        yield Finding(label, reason, "add the scenes to it", severity=severity)
 
 
-def _scenes(keys: Sequence[str]) -> str:
-    return f"{counted(len(keys), 'scene')}: {listed(keys)}"
+def _file_scenes(split: str, file: UPath, found: dict[str, str]) -> Iterator[Candidate | Finding]:
+    label = _label(split, file.name)
+    try:
+        entries = load_chunk(file)
+    except (OSError, ValueError) as error:
+        text = " ".join(str(error).replace(f"{file} ", "the file ").split())
+        # without the remedy behind the last colon
+        yield Finding(label, text.rpartition(": ")[0] or text, _REPACK)
+        return
+    scenes = 0
+    for place, entry in enumerate(entries):
+        key = entry.get("key") if isinstance(entry, Mapping) else None
+        if isinstance(key, str) and key in found:
+            reason = f"the scene is in {label}, and was in this split before"
+            yield Finding(key, reason, f"remove one of the two, or {_REPACK}")
+        elif isinstance(key, str):
+            found[key] = file.name
+            scenes += 1
+            photos = partial(_photos, file, place)
+            yield Candidate(name=key, scene=key, kind="chunks", photos=photos, split=split)
+    if scenes < len(entries) or not entries:
+        reason = f"{scenes} of its {len(entries)} entries are mappings with a 'key' of their own"
+        yield Finding(label, reason, _REPACK)
+
+
+def _label(split: str, name: str) -> str:
+    return f"{split}/{name}" if split else name
 
 
 @lru_cache(maxsize=1)
@@ -197,7 +133,7 @@ def _photo(file: UPath, record: Record, frame: int, size: Size | None) -> Photo:
     return Photo(
         photo,
         lambda: record.images[frame].numpy().tobytes(),
-        read_mask=lambda: read_mask(record, frame),
+        {"mask": lambda: read_mask(record, frame)},
     )
 
 

@@ -1,4 +1,4 @@
-"""What a check finds: faults with scene, frames and remedy, one line each."""
+"""What a check finds: faults with scene, frames and remedy, one line each, and a row a scene."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -18,7 +18,7 @@ _FEW = 3
 class Finding:
     """A fault and its remedy. frames, names: as listed. An error makes results wrong.
 
-    numbers: of the frames, as `DecodedScene.numbers`; those of `frames` where none are given.
+    numbers: of the frames, as `DecodedScene.numbers`.
     """
 
     scene: str
@@ -32,10 +32,8 @@ class Finding:
     @property
     def place(self) -> str:
         """The frames as text; empty where the whole scene is meant."""
-        if not self.frames:
-            return ""
         names = [name for name in self.names if name]
-        numbers = [number for number in self.numbers or self.frames if number is not None]
+        numbers = [number for number in self.numbers if number is not None]
         if not numbers:
             return listed(names, 3)
         text = f"frame{'s' if len(numbers) > 1 else ''} {spans(numbers)}"
@@ -45,7 +43,7 @@ class Finding:
         return f"{text} ({names[0]}{last})"
 
     def __str__(self) -> str:
-        where = f"{self.scene}, {self.place}" if self.frames else self.scene
+        where = ", ".join(filter(None, [self.scene, self.place]))
         return " ".join(f"{self.severity}: {where}: {self.reason}: {self.fix}".split())
 
 
@@ -59,9 +57,7 @@ def spans(numbers: Iterable[int]) -> str:
     # numbers of one run are all equally far ahead of their places
     grouped = groupby(enumerate(sorted(set(numbers))), lambda item: item[1] - item[0])
     runs = [[number for _, number in run] for _, run in grouped]
-    shown = [f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs[:8]]
-    more = sum(map(len, runs[8:]))
-    return ", ".join(shown) + (f" and {more} more" if more else "")
+    return listed(f"{run[0]}-{run[-1]}" if len(run) > 1 else run[0] for run in runs)
 
 
 def merged(findings: Sequence[Finding]) -> list[Finding]:
@@ -85,3 +81,42 @@ def _joined(findings: Sequence[Finding], key: Callable[[Finding], Any]) -> list[
                 numbers=known.numbers + finding.numbers,
             )
     return list(joined.values())
+
+
+@dataclass(frozen=True)
+class SceneReport:
+    """What was found in a scene.
+
+    split: empty where the format has none. numbered: photos that a reader has as frames.
+    pose_problems: frames whose pose is wrong. epipolar: median distance of matches to epipolar
+    lines in pixels as text, or why there is none. depth: of what the cameras look at, scene units;
+    0 where that is no common point.
+    """
+
+    name: str
+    scene: str
+    kind: str
+    split: str = ""
+    listed: int = 0
+    decodable: int = 0
+    missing: int = 0
+    numbered: int = 0
+    pose_problems: int = 0
+    epipolar: str = "-"
+    depth: float = 0.0
+    findings: Sequence[Finding] = ()
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """The result of `check`. general: findings about files of the data set."""
+
+    scenes: Sequence[SceneReport]
+    general: Sequence[Finding]
+    notes: Sequence[str]
+
+    @property
+    def findings(self) -> list[Finding]:
+        """All findings, those of files first, then scene by scene; errors before warnings."""
+        found = [*self.general, *(f for scene in self.scenes for f in scene.findings)]
+        return sorted(found, key=lambda finding: finding.severity != "error")

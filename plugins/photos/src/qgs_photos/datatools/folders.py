@@ -3,18 +3,19 @@
 from collections.abc import Iterator
 from functools import partial
 
+import numpy as np
 from upath import UPath
 
+from qgs.data.images import alpha_mask, open_depth, open_mask
 from qgs.data.photos import formats_of, read_listing
 from qgs.data.photos.checks import refuse_outside
-from qgs.data.photos.reader import existing
+from qgs.data.photos.reader import PhotoFrame, existing
 from qgs.data.photos.source import folder_name
 from qgs.data.photos.turning import upright
 from qgs.paths import read_file
 from qgs_photos.datasets.dl3dv import find_scenes, scene_folder
-from qgs_photos.datatools.candidates import Candidate, Photo
 from qgs_photos.datatools.findings import Finding
-from qgs_photos.datatools.sources import kind_of
+from qgs_photos.datatools.photos import Candidate, Photo
 
 
 def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Candidate | Finding]:
@@ -30,7 +31,9 @@ def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Cand
         if folder in scenes or folder.name.startswith("."):
             continue
         if scenes:
-            yield _no_scene(folder, wanted)
+            reason = "the folder lists no cameras, and is not checked with the photos beside it"
+            fix = f"run `qgs data check {folder}` if it is another data set, else move it away"
+            yield Finding(folder.name, reason, fix, severity="warning")
         elif folder.name in ("train", "test"):
             yield from photo_folders(folder, wanted, images)
 
@@ -42,18 +45,6 @@ def _listings(folder: UPath, name: str, wanted: str, images: str | None) -> Iter
         label = f"{name} ({kind})" if len(held) > 1 else name
         photos = partial(_photos, folder, kind, images)
         yield Candidate(name=label, scene=name, kind=kind, photos=photos)
-
-
-def _no_scene(folder: UPath, wanted: str) -> Finding:
-    kind = kind_of(folder, wanted)
-    reason = "the folder lists no cameras and is no scene"
-    fix = "make poses for it, or move it away"
-    if kind != "photos":
-        reason = (
-            f"the folder is another data set ({kind}) and is not checked with the photos beside it"
-        )
-        fix = f"run `qgs data check {folder}`"
-    return Finding(folder.name, reason, fix, severity="warning")
 
 
 def dl3dv_scenes(path: UPath, images: str | None) -> Iterator[Candidate]:
@@ -73,14 +64,22 @@ def _photos(folder: UPath, kind: str, images: str | None) -> list[Photo]:
     refuse_outside(folder, listing)
     frames = [*map(upright, listing.frames)]
     there = existing(frame.path for frame in frames if frame.name)
-    masks = existing(frame.mask for frame in frames if frame.mask is not None)
     return [
         Photo(
             listed=frame,
             read=partial(read_file, frame.path),
+            maps={"mask": partial(_mask, frame), "depth map": partial(_depth, frame)},
             exists=frame.path in there,
-            # a photo's own alpha channel, or none, is never missing
-            mask_exists=frame.mask in {None, frame.path, *masks},
         )
         for frame in frames
     ]
+
+
+def _mask(frame: PhotoFrame) -> np.ndarray | None:
+    if frame.mask is None:
+        return None
+    return alpha_mask(frame.path) if frame.mask == frame.path else open_mask(frame.mask)
+
+
+def _depth(frame: PhotoFrame) -> np.ndarray | None:
+    return None if frame.depth is None else open_depth(frame.depth, 1.0)

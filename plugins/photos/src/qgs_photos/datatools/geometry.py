@@ -1,20 +1,31 @@
-"""Whether a scene's cameras agree with its photos, judged on pairs of neighbours."""
+"""Whether a scene's cameras agree with its photos: points that pairs of neighbours share."""
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
 
 import numpy as np
+import torch
+from kornia.feature import match_smnn
+from kornia.geometry.ransac import RANSAC
+from skimage.feature import SIFT
 
 from qgs.wording import counted
-from qgs_photos.datatools.decoding import DecodedScene
-from qgs_photos.datatools.epipolar import MIN_MATCHES, Features, Pair, detect, frames_above, match
 from qgs_photos.datatools.findings import Finding, Severity
+from qgs_photos.datatools.photos import DecodedScene
 
 # Pixels on the longer side of the photos that are matched.
 SIDE = 400
+# Fewer matches say nothing about a pair of photos.
+MIN_MATCHES = 24
 # Largest median distance that good poses leave, of the image's diagonal.
 TOLERANCE = 0.005
 TOO_FEW = f"too few matches, below {MIN_MATCHES} in every pair that was tried"
+# Of descriptor distances (Lowe 2004).
+_RATIO = 0.8
+_INLIER_PIXELS = 1.5
+_RGB_TO_GREY = np.array([0.299, 0.587, 0.114]) / 255
 # Of consecutive frames, where not all are matched.
 _RUNS = 5
 _GAPS = (8, 4, 2, 1)
@@ -26,40 +37,89 @@ _NONSENSE = 0.02
 _FAR = 4.0
 _ADVICE = (
     "check the convention of the poses, that they are in the order of the photos, and the "
-    "intrinsics; docs/photos.md says how each looks"
+    "intrinsics (docs/photos.md), or make poses by `qgs poses`"
 )
+
+Features: TypeAlias = tuple[np.ndarray, np.ndarray]
+"""Of one photo: points (P, 2) x, y in pixels, and SIFT's descriptors (P, 128)."""
+Pairs: TypeAlias = Sequence[tuple[tuple[int, int], float]]
+"""Two frames, and the median distance of their matches from where the poses want them, of the
+diagonal."""
 
 
 @dataclass(frozen=True)
 class Geometry:
     """How well the poses of a scene explain its photos.
 
-    unjudged: why there are no `pairs`. pairs: the worst first; photos: both of that one, (H, W, 3)
-    uint8. diagonal: of the files, in pixels. labels: what messages call the photos. left_out:
-    frames that were not matched.
+    unjudged: why there are no `pairs`. diagonal: of the files, in pixels.
     """
 
     unjudged: str = ""
-    pairs: Sequence[Pair] = ()
-    photos: tuple[np.ndarray, ...] = ()
+    pairs: Pairs = field(default_factory=list)
     diagonal: float = 0.0
-    labels: tuple[str, ...] = ()
-    left_out: int = 0
 
     @property
     def fraction(self) -> float:
         """Median over pairs of their distance, of the diagonal; 0 for none."""
-        return float(np.median([pair.distance for pair in self.pairs])) if self.pairs else 0.0
+        return float(np.median([distance for _, distance in self.pairs])) if self.pairs else 0.0
 
     @property
     def pixels(self) -> float:
         """The same in pixels of the files."""
         return self.fraction * self.diagonal
 
-    @property
-    def agrees(self) -> bool:
-        """Whether the poses explain the photos."""
-        return self.fraction <= TOLERANCE
+
+def detect(picture: np.ndarray) -> Features:
+    """Find features of a photo (H, W, 3) uint8."""
+    # kornia's SIFT finds as much, and takes one and a half times as long or more
+    sift: Any = SIFT()
+    try:
+        # on grey, as SIFT is defined
+        sift.detect_and_extract((picture @ _RGB_TO_GREY).astype(np.float32))
+    except RuntimeError:
+        # an image without any feature, such as a plain wall
+        return np.zeros((0, 2)), np.zeros((0, 128))
+    return sift.keypoints[:, ::-1] + 0.5, sift.descriptors
+
+
+def match(first: Features, second: Features) -> np.ndarray | None:
+    """Return points (2, P, 2) of one epipolar geometry, found without any pose; None if too few."""
+    one, two = (torch.from_numpy(descriptors).float() for _, descriptors in (first, second))
+    _, found = match_smnn(one, two, _RATIO)
+    if len(found) < MIN_MATCHES:
+        return None
+    rows = found.numpy().T
+    points = np.stack([first[0][rows[0]], second[0][rows[1]]])
+    ransac = RANSAC("fundamental", inl_th=_INLIER_PIXELS, seed=0)
+    _, inliers = ransac(*torch.from_numpy(points))
+    return points[:, inliers.numpy()] if inliers.sum() >= MIN_MATCHES else None
+
+
+def off_lines(matches: np.ndarray, poses: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Return distances (P,) of the second photo's points from where they may be seen, in pixels.
+
+    These are half-lines: the parts of epipolar lines before both cameras. matches: (2, P, 2).
+    poses: (2, 4, 4) camera-to-world, OpenCV. intrinsics: (2, 4) fx, fy, cx, cy.
+    """
+    # kornia has whole lines; two poses that are exchanged, or inverted ones, leave those as they
+    # are where no camera turns
+    points, seen = matches
+    lens, own = intrinsics
+    relative = np.linalg.inv(poses[1]) @ poses[0]
+    rays = np.concatenate([(points - lens[2:]) / lens[:2], np.ones((len(points), 1))], 1)
+    far = rays @ relative[:3, :3].T
+    near = relative[:3, 3]
+    infinity = far[:, :2] / far[:, 2:]
+    toward = (near[:2] - near[2] * infinity) / far[:, 2:] * own[:2]
+    length = np.linalg.norm(toward, axis=1, keepdims=True)
+    # 0 without a baseline
+    directions = toward / np.where(length > 0, length, 1)
+    off = seen - (infinity * own[:2] + own[2:])
+    across = off[:, 0] * directions[:, 1] - off[:, 1] * directions[:, 0]
+    along = (off * directions).sum(1)
+    # of points behind the first camera all of the line counts
+    before = np.where(far[:, 2] > 0, np.minimum(along, 0), 0)
+    return np.hypot(across, before)
 
 
 def judge_scene(scene: DecodedScene, usable: Sequence[int], most: int) -> Geometry:
@@ -70,19 +130,13 @@ def judge_scene(scene: DecodedScene, usable: Sequence[int], most: int) -> Geomet
     # no baseline, no epipolar lines
     if not np.ptp(matcher.centres, axis=0).any():
         return Geometry("all cameras on one point")
-    pairs = sorted(matcher.pairs(), key=lambda pair: -pair.distance)
+    pairs = matcher.pairs()
     if not pairs:
         return Geometry(TOO_FEW)
-    frames = pairs[0].frames
-    size = scene.decoded[frames[0]].size
+    (first, _), _ = pairs[0]
+    size = scene.decoded[first].size
     assert size is not None
-    return Geometry(
-        pairs=pairs,
-        photos=tuple(matcher.picture(frame)[0] for frame in frames),
-        diagonal=float(np.hypot(*size)),
-        labels=tuple(map(scene.label, frames)),
-        left_out=len(usable) - len(matcher.frames),
-    )
+    return Geometry(pairs=pairs, diagonal=float(np.hypot(*size)))
 
 
 def _runs(frames: Sequence[int], most: int) -> list[Sequence[int]]:
@@ -102,49 +156,46 @@ class _Matcher:
         self.frames = frames
         self.poses = np.stack([scene.photos[frame].listed.c2w for frame in frames])
         self.centres = self.poses[:, :3, 3]
-        self._known: dict[int, tuple[Features, np.ndarray, tuple[int, int]]] = {}
+        self._known: dict[int, tuple[Features, np.ndarray, float]] = {}
 
-    def picture(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the photo as it is matched, and its intrinsics; by its number in the scene."""
-        return self.scene.photos[frame].picture(self.scene.decoded[frame].size, SIDE)
-
-    def pairs(self) -> list[Pair]:
+    def pairs(self) -> Pairs:
         """Pair each frame with the next, and with the first of its partners that shares enough."""
-        found: dict[frozenset[int], Pair | None] = {}
+        found: dict[tuple[int, int], float | None] = {}
         for start in range(len(self.frames)):
             # the next shares most and says least; a farther one has a baseline
             partners = list(self.partners(start))
             for group in ([p for p in partners if p == start + 1], partners):
                 for place in group:
-                    both = frozenset((start, place))
+                    both = (min(start, place), max(start, place))
                     if both not in found:
-                        found[both] = self.pair(min(both), max(both))
-                    if found[both]:
+                        found[both] = self.distance(*both)
+                    if found[both] is not None:
                         break
-        return [pair for pair in found.values() if pair]
+        return [
+            ((self.frames[one], self.frames[two]), distance)
+            for (one, two), distance in found.items()
+            if distance is not None
+        ]
 
-    def pair(self, first: int, second: int) -> Pair | None:
+    def distance(self, first: int, second: int) -> float | None:
         """Match two photos; None where too little is shared."""
-        one, lens_of_one, size = self._features(first)
+        one, lens_of_one, diagonal = self._features(first)
         two, lens_of_two, _ = self._features(second)
-        found = match(one, two)
-        if found is None:
+        matches = match(one, two)
+        if matches is None:
             return None
-        rows = found.T
-        return Pair(
-            frames=(self.frames[first], self.frames[second]),
-            matches=np.stack([one.points[rows[0]], two.points[rows[1]]]),
-            colors=np.stack([one.colors[rows[0]], two.colors[rows[1]]]),
-            poses=self.poses[[first, second]],
-            intrinsics=np.stack([lens_of_one, lens_of_two]),
-            size=size,
-        )
+        poses = self.poses[[first, second]]
+        lenses = np.stack([lens_of_one, lens_of_two])
+        there = off_lines(matches, poses, lenses)
+        back = off_lines(matches[::-1], poses[::-1], lenses[::-1])
+        return float(np.median(there + back) / 2 / diagonal)
 
-    def _features(self, place: int) -> tuple[Features, np.ndarray, tuple[int, int]]:
+    def _features(self, place: int) -> tuple[Features, np.ndarray, float]:
         if place not in self._known:
-            picture, intrinsics = self.picture(self.frames[place])
-            height, width, _ = picture.shape
-            self._known[place] = detect(picture), intrinsics, (height, width)
+            frame = self.frames[place]
+            photo = self.scene.photos[frame]
+            picture, intrinsics = photo.picture(self.scene.decoded[frame].size, SIDE)
+            self._known[place] = detect(picture), intrinsics, float(np.hypot(*picture.shape[:2]))
         return self._known[place]
 
     def partners(self, start: int) -> Iterator[int]:
@@ -164,25 +215,23 @@ def geometry_findings(scene: DecodedScene, geometry: Geometry) -> Iterator[Findi
     """Yield what the distances mean for the scene; a warning where there are none."""
     if geometry.unjudged:
         reason = f"the poses are not judged against the photos: {geometry.unjudged}"
-        fix = "look at the cameras yourself, in the picture that --report draws"
-        yield Finding(scene.name, reason, fix, severity="warning")
+        yield Finding(scene.name, reason, "look at the cameras yourself", severity="warning")
         return
     # what moves lies off its lines, however good the poses are
     moves = len({photo.listed.time for photo in scene.photos}) > 1
-    distances = [(pair.frames, pair.distance) for pair in geometry.pairs]
 
     def severity(fraction: float) -> Severity:
         return "error" if fraction > _NONSENSE and not moves else "warning"
 
-    better = float(np.quantile([distance for _, distance in distances], 0.25))
-    off = frames_above(distances, max(min(_FAR * better, _NONSENSE), TOLERANCE))
-    rest = [distance for frames, distance in distances if off.keys().isdisjoint(frames)]
+    better = float(np.quantile([distance for _, distance in geometry.pairs], 0.25))
+    off = frames_above(geometry.pairs, max(min(_FAR * better, _NONSENSE), TOLERANCE))
+    rest = [distance for frames, distance in geometry.pairs if off.keys().isdisjoint(frames)]
     # a few wrong frames are in most of the pairs of a short scene: without them it must agree
     if off and rest and np.median(rest) <= TOLERANCE:
         reason = "the pose or the intrinsics do not fit those of the other frames"
         fix = "check that they belong to the photo, correct them, or remove the frame"
         yield scene.finding(sorted(off), reason, fix, severity(min(off.values())))
-    elif not geometry.agrees:
+    elif geometry.fraction > TOLERANCE:
         reason = (
             f"the poses do not fit the photos: matches lie {geometry.pixels:.1f} pixels from where "
             f"they may be seen, median of {counted(len(geometry.pairs), 'pair')}; good poses leave "
@@ -190,8 +239,22 @@ def geometry_findings(scene: DecodedScene, geometry: Geometry) -> Iterator[Findi
         )
         every = range(len(scene.photos))
         yield scene.finding(every, reason, _ADVICE, severity(geometry.fraction))
-    differ = [(pair.frames, float(pair.channels_differ)) for pair in geometry.pairs]
-    if exchanged := frames_above(differ, 0.5):
-        reason = "red and blue look exchanged: what other photos show too has their colours so"
-        fix = "write the photo as RGB, not as BGR"
-        yield scene.finding(sorted(exchanged), reason, fix, "warning")
+
+
+def frames_above(values: Pairs, limit: float) -> dict[int, float]:
+    """Return frames of two pairs or more whose values are all above `limit`, and the least of each.
+
+    The worst goes first with its pairs, so that its partners are not blamed.
+    """
+    found = dict[int, float]()
+    while True:
+        of_frame = defaultdict[int, list[float]](list)
+        for frames, value in values:
+            for frame in frames:
+                of_frame[frame].append(value)
+        above = {f: v for f, v in of_frame.items() if len(v) > 1 and min(v) > limit}
+        if not above:
+            return found
+        worst = max(above, key=lambda frame: (len(above[frame]), sum(above[frame])))
+        found[worst] = min(above[worst])
+        values = [item for item in values if worst not in item[0]]

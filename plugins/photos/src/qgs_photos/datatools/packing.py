@@ -6,21 +6,21 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import IO, Any, TypeAlias, get_args
+from typing import IO, Any, TypeAlias
 
 import torch
 from upath import UPath
 
 from qgs.contracts import SceneSource, Split
 from qgs.files import replacing
-from qgs.paths import is_local
+from qgs.paths import is_local, read_json
 from qgs.wording import listed
-from qgs_photos.datasets.chunk_files import INDEX, SUFFIX
+from qgs_photos.datasets.chunk_files import INDEX, SUFFIX, load_chunk
 from qgs_photos.datatools.entries import ChunkEntry, Encoding, chunk_entry, encoded_frames
 
 CHUNK_BYTES = 100 * 2**20
-JOURNAL = "packing.json"
-_VERSION = 1
+SETTINGS = "packing.json"
+"""What decides the result of a packing that is not finished."""
 
 Places: TypeAlias = Mapping[str, tuple[Split, int]]
 """Scenes by name: the split of the source that has each, and its index there."""
@@ -29,40 +29,31 @@ Places: TypeAlias = Mapping[str, tuple[Split, int]]
 Splits: TypeAlias = Mapping[Split, Places]
 
 
-def own_splits(source: SceneSource) -> Splits:
-    """Return the source's own splits; scenes in both are packed once, for training."""
+def chosen_splits(
+    source: SceneSource, test: Collection[str] | None = None, every: int | None = None
+) -> Splits:
+    """Return the source's own splits; scenes in both are packed once, for training.
+
+    test: names of those for testing instead, of all scenes. every: or every n-th of them, beginning
+    with scene n - 1. Raises ValueError for names of no scene.
+    """
     train = _places(source, "train")
-    test = _places(source, "test")
-    return {"train": train, "test": {name: test[name] for name in test if name not in train}}
-
-
-def splits_by_list(source: SceneSource, test_scenes: Collection[str]) -> Splits:
-    """Split all scenes, those named for testing. Raises ValueError for names of no scene."""
-    places = _every_place(source)
-    if absent := [name for name in test_scenes if name not in places]:
-        raise ValueError(
-            f"{len(absent)} of {len(test_scenes)} test scenes are not there: {listed(absent)}; the "
-            f"{len(places)} scenes are called {listed(places)}. Correct the list, or take them out "
-            "of it"
-        )
-    return _split(places, {*test_scenes})
-
-
-def splits_by_number(source: SceneSource, every: int) -> Splits:
-    """Split all scenes, every n-th of them for testing, beginning with scene n - 1."""
-    places = _every_place(source)
-    return _split(places, {*[*places][every - 1 :: every]})
-
-
-def _every_place(source: SceneSource) -> Places:
-    splits = own_splits(source)
-    return {**splits["train"], **splits["test"]}
-
-
-def _split(places: Places, test: Collection[str]) -> Splits:
+    places = {**train, **_places(source, "test"), **train}
+    if test is not None:
+        if absent := [name for name in test if name not in places]:
+            raise ValueError(
+                f"{len(absent)} of {len(test)} test scenes are not there: {listed(absent)}; the "
+                f"{len(places)} scenes are called {listed(places)}. Correct the list, or take them "
+                "out of it"
+            )
+        wanted = {*test}
+    elif every is not None:
+        wanted = {*[*places][every - 1 :: every]}
+    else:
+        wanted = places.keys() - train.keys()
     return {
-        "train": {name: place for name, place in places.items() if name not in test},
-        "test": {name: place for name, place in places.items() if name in test},
+        "train": {name: place for name, place in places.items() if name not in wanted},
+        "test": {name: place for name, place in places.items() if name in wanted},
     }
 
 
@@ -77,65 +68,44 @@ def _places(source: SceneSource, split: Split) -> dict[str, tuple[Split, int]]:
     return places
 
 
-@dataclass
-class Journal:
-    """A packing. settings: what decides its result. files: a scene's key to its whole chunk."""
+def _begin(folder: UPath, settings: Mapping[str, Any]) -> None:
+    """Begin a packing in `folder`, or go on with one of the same settings.
 
-    folder: UPath
-    settings: Mapping[str, Any]
-    files: dict[Split, dict[str, str]] = field(default_factory=lambda: {"train": {}, "test": {}})
-
-    def save(self) -> None:
-        """Write it beside the chunks, whole or not at all."""
-        content = {"version": _VERSION, "settings": self.settings, "files": self.files}
-        write_bytes(self.folder / JOURNAL, json.dumps(content).encode())
-
-
-def open_journal(folder: UPath, settings: Mapping[str, Any]) -> Journal:
-    """Open the journal in `folder`, a new one where nothing is there yet.
-
-    Raises FileExistsError for other content, ValueError for other settings or a strange journal.
+    Raises FileExistsError for other content, ValueError for other settings.
     """
     settings = json.loads(json.dumps(settings))
-    file = folder / JOURNAL
-    if not file.is_file():
-        inside = folder.iterdir() if folder.is_dir() else ()
-        if held := sorted(item.name for item in inside if not _is_unfinished(item)):
-            raise FileExistsError(
-                f"{folder} is not empty ({listed(held)}), and packing never overwrites: "
-                "give a new folder"
+    file = folder / SETTINGS
+    if file.is_file():
+        before = read_json(file, "move it away if you know it, or give a new folder")
+        if before != settings:
+            raise ValueError(
+                f"{folder} holds an unfinished packing with other settings ({before}): give those "
+                "again to finish it, or give a new folder"
             )
-        return Journal(folder, settings)
-    content = _read(file)
-    before = content["settings"]
-    other = [key for key in {**before, **settings} if before.get(key) != settings.get(key)]
-    if content.get("version") != _VERSION or other:
-        changed = "; ".join(f"{key} was {before.get(key)}, is {settings.get(key)}" for key in other)
-        raise ValueError(
-            f"{folder} holds an unfinished packing with other settings ({changed}): give those "
-            "again to finish it, or give a new folder"
+        return
+    inside = folder.iterdir() if folder.is_dir() else ()
+    if held := sorted(item.name for item in inside if not _is_unfinished(item)):
+        raise FileExistsError(
+            f"{folder} is not empty ({listed(held)}), and packing never overwrites: "
+            "give a new folder"
         )
-    return Journal(folder, settings, content["files"])
-
-
-def _read(file: UPath) -> Mapping[str, Any]:
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-        files = content["files"]
-        parts = [content["settings"], *(files[split] for split in get_args(Split))]
-        if all(isinstance(part, dict) for part in parts):
-            return content
-        reason = "was not written by a packing"
-    except ValueError as error:
-        reason = f"is not valid JSON ({error})"
-    except (KeyError, TypeError):
-        reason = "was not written by a packing"
-    raise ValueError(f"{file} {reason}: move it away if you know it, or give a new folder")
+    write_bytes(file, json.dumps(settings).encode())
 
 
 def _is_unfinished(path: UPath) -> bool:
     """Return whether a process was writing `path` by `opened_replacing` when it was killed."""
     return path.name.startswith(".") and path.suffix == ".tmp"
+
+
+def _packed_before(folder: UPath) -> dict[str, str]:
+    """Return the file of each scene in the whole chunks of a folder; removes unfinished ones."""
+    files: dict[str, str] = {}
+    for item in sorted(folder.iterdir(), key=str) if folder.is_dir() else ():
+        if _is_unfinished(item):
+            item.unlink()
+        elif item.suffix == SUFFIX:
+            files |= {entry["key"]: item.name for entry in load_chunk(item)}
+    return files
 
 
 @dataclass
@@ -173,9 +143,7 @@ def pack(
     """
     encoding = encoding or Encoding()
     # chunks of two settings in one folder would be a data set that nobody asked for
-    decides = {**settings, **asdict(encoding), "chunk_bytes": chunk_bytes}
-    journal = open_journal(folder, decides)
-    journal.save()
+    _begin(folder, {**settings, **asdict(encoding), "chunk_bytes": chunk_bytes})
     packed = Packed()
 
     def entries(places: Places, done: Collection[str]) -> Iterator[ChunkEntry]:
@@ -191,27 +159,22 @@ def pack(
                 packed.left_out[name] = str(error)
             progress(name)
 
+    written: dict[Split, dict[str, str]] = {}
     for split, places in splits.items():
-        done = journal.files[split]
-        inside = folder / split
-        for item in inside.iterdir() if inside.is_dir() else ():
-            if _is_unfinished(item):
-                item.unlink()
-        for chunk in _chunks(entries(places, frozenset(done)), chunk_bytes):
-            file = f"{len(set(done.values())):06d}{SUFFIX}"
-            # first the chunk, then the journal: what it names is whole
-            with opened_replacing(inside / file) as opened:
+        files = written[split] = _packed_before(folder / split)
+        for chunk in _chunks(entries(places, frozenset(files)), chunk_bytes):
+            file = f"{len({*files.values()}):06d}{SUFFIX}"
+            with opened_replacing(folder / split / file) as opened:
                 torch.save(chunk, opened)
-            done.update({entry["key"]: file for entry in chunk})
-            journal.save()
-    if not any(journal.files.values()):
+            files |= {entry["key"]: file for entry in chunk}
+    if not any(written.values()):
         reasons = listed((f"{n}: {why}" for n, why in packed.left_out.items()), 3, "; ")
         raise ValueError(f"there is no scene to pack{': ' if reasons else ''}{reasons}")
-    for split, files in journal.files.items():
+    for split, files in written.items():
         packed.scenes[split] = len(files)
         if files:
             write_bytes(folder / split / INDEX, json.dumps(files, indent=1).encode())
-    (folder / JOURNAL).unlink()
+    (folder / SETTINGS).unlink()
     return packed
 
 

@@ -11,8 +11,8 @@ from qgs.contracts import Component, Scene, SceneSource, Split
 from qgs.data.photos.reader import PhotoFrame
 from qgs.data.recognition import recognised
 from qgs.recipe.registry import Registry, load_registry, load_usable_plugins
-from qgs_photos.datatools.candidates import Candidate, Photo
 from qgs_photos.datatools.entries import bytes_of, png
+from qgs_photos.datatools.photos import Candidate, Photo
 
 OF_FILES = ("qgs", "datasets")
 """Plugins whose sources are checked by their files, not by what they deliver."""
@@ -44,9 +44,9 @@ def left_out(format: str = "auto") -> list[str]:
     return [f"left out: {problem}" for problem in _imported(format)[1]]
 
 
-def kind_of(path: UPath, format: str = "auto") -> str:
+def kind_of(path: UPath) -> str:
     """Return PLUGIN/NAME of the source that reads `path`, or NAME for one of OF_FILES."""
-    kind = recognised(path, sources(format))
+    kind = recognised(path, sources())
     plugin, _, name = kind.partition("/")
     return name if plugin in OF_FILES else kind
 
@@ -62,9 +62,9 @@ def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candid
         raise ValueError(f"{kind} has no option `images`: leave --images out")
     config = source.config_for(str(path), _SIZE, None)
     opened = source(config if images is None else config.model_copy(update={"images": images}))
-    # a scene in both splits is checked once
+    # a scene in both splits is checked once, and may be in an index
     known: set[str] = set()
-    for split in get_args(Split):
+    for split in reversed(get_args(Split)):
         for place, name in enumerate(opened.names(split)):
             if name not in known:
                 yield Candidate(
@@ -88,7 +88,7 @@ def _photos(source: SceneSource, split: Split, place: int) -> list[Photo]:
         Photo(
             listed=_frame(scene, frame),
             read=partial(_image_file, scene, frame),
-            read_mask=partial(_read_mask, scene, frame),
+            maps={"mask": partial(_read_mask, scene, frame)},
         )
         for frame in range(len(scene))
     ]

@@ -1,0 +1,90 @@
+"""Faults of the photos of a scene: each by itself, and poses that photos share."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from qgs.data.photos.checks import intrinsics_problems, pose_problems, size_problems
+from qgs_photos.datatools.findings import Finding
+from qgs_photos.datatools.photos import DecodedScene
+
+# Of a rotation's entries.
+_SAME = 2e-6
+# Of coordinates that were float32 before they were written.
+_FLOAT32 = 5e-7
+# Of the cameras' extent: the largest distance that counts as none.
+_OF_EXTENT = 1e-4
+
+
+def photo_findings(scene: DecodedScene) -> Iterator[Finding]:
+    """Yield faults of files, of their listed sizes, of intrinsics and of masks."""
+    for frame, (photo, result) in enumerate(zip(scene.photos, scene.decoded, strict=True)):
+        listed = photo.listed
+        for reason, fix in result.errors:
+            yield scene.finding([frame], reason, fix)
+        for reason, fix in result.warnings:
+            yield scene.finding([frame], reason, fix, "warning")
+        problems = list(listed.problems)
+        # a wrong size makes intrinsics look wrong
+        problems += size_problems(result.size, listed.size) if result.size else ()
+        problems = problems or intrinsics_problems(listed.intrinsics, listed.size or result.size)
+        for problem in problems:
+            yield scene.finding([frame], problem.reason, problem.fix)
+    empty = [frame for frame, result in enumerate(scene.decoded) if result.empty_mask]
+    if empty:
+        every = all(result.empty_mask in (True, None) for result in scene.decoded)
+        reason = "the mask is black, so that nothing of the photo is modelled"
+        fix = "make masks white on what is modelled, or list none"
+        yield scene.finding(empty, reason, fix, "error" if every else "warning")
+
+
+def pose_findings(scene: DecodedScene) -> Iterator[Finding]:
+    """Yield faults of poses, each by itself."""
+    for frame, photo in enumerate(scene.photos):
+        listed = photo.listed
+        if not listed.problems or np.isfinite(listed.c2w).all():
+            for problem in pose_problems(listed.c2w):
+                yield scene.finding([frame], problem.reason, problem.fix)
+
+
+def sharing_findings(scene: DecodedScene, usable: Sequence[int]) -> Iterator[Finding]:
+    """Yield frames of `usable` that share a pose or a place."""
+    if len(usable) < 2:
+        return
+    poses = np.stack([scene.photos[frame].listed.c2w for frame in usable])
+    centres = poses[:, :3, 3]
+    extent = np.ptp(centres, axis=0).max()
+    # far from the origin, as on maps, float32 cannot tell centres apart
+    rounding = _FLOAT32 * np.abs(centres).max()
+    if extent <= rounding:
+        reason = f"all {len(usable)} cameras stand on one point, so that depth is undetermined"
+        yield scene.finding(usable, reason, "export the poses with their translations")
+        return
+    told = set[int]()
+    for pair in sorted(KDTree(centres).query_pairs(min(rounding, _OF_EXTENT * extent))):
+        first, frame = (usable[place] for place in pair)
+        if frame in told:
+            continue
+        told.add(frame)
+        one, other = poses[[*pair], :3, :3]
+        if np.abs(one - other).max() <= _SAME:
+            yield from _repeated(scene, first, frame)
+        else:
+            reason = f"the camera stands on the same point as that of {scene.label(first)}"
+            fix = "correct the position, or remove one of the frames: this shows no depth"
+            yield scene.finding([frame], reason, fix)
+
+
+def _repeated(scene: DecodedScene, first: int, frame: int) -> Iterator[Finding]:
+    # a camera that stands still may film what moves
+    if scene.photos[first].listed.time != scene.photos[frame].listed.time:
+        return
+    label = scene.label(first)
+    digest = scene.decoded[first].digest
+    if digest and digest == scene.decoded[frame].digest:
+        reason = f"the photo and its pose repeat {label}"
+        yield scene.finding([frame], reason, "remove one of the two", "warning")
+    else:
+        reason = f"the pose repeats that of {label}, whose photo is another one"
+        yield scene.finding([frame], reason, "correct the pose, or remove one of the frames")

@@ -1,0 +1,170 @@
+"""Scenes to check: their photos as they are listed, and what decoding each of them gives."""
+
+import hashlib
+import io
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from PIL import Image
+
+from qgs.data.images import TURN, TURNED, decode_rgb, eight_bits, opened_image, orientation
+from qgs.data.lenses import Size, undistorted
+from qgs.data.photos.checks import size_problems
+from qgs.data.photos.reader import PhotoFrame
+from qgs.data.photos.turning import turned, turned_size
+from qgs.wording import numbered, one_line
+from qgs_photos.datatools.findings import Finding, Severity
+
+_ERRORS = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
+# Asks JPEG for its coarsest picture: all bytes are read, few pixels are made.
+_SMALLEST = (8, 8)
+# Of 255: a covered lens has noise.
+_BLACK = 4
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A listed photo, what reads its bytes, and whether it exists.
+
+    maps: by kind, what reads its mask or depth map, (H, W); None for none.
+    """
+
+    listed: PhotoFrame
+    read: Callable[[], bytes]
+    maps: Mapping[str, Callable[[], np.ndarray | None]] = field(default_factory=dict)
+    exists: bool = True
+
+    def picture(self, size: Size | None, side: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return pinhole RGB, at most `side` pixels long, and intrinsics (4,). Raises OSError."""
+        frame = self.listed if self.listed.size else replace(self.listed, size=size)
+        image = turned(decode_rgb(io.BytesIO(self.read()), (1.0, 1.0, 1.0)), frame)
+        scale = min(1.0, side / max(image.size))
+        width, height = (max(1, round(extent * scale)) for extent in image.size)
+        pixels = np.array(image.resize((width, height), Image.Resampling.LANCZOS))
+        intrinsics = frame.at_size((height, width))
+        if frame.lens is not None:
+            pixels = undistorted(pixels, intrinsics, frame.lens)
+        return pixels, np.array(intrinsics)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A scene to check. scene: its name in indices. photos: raises ValueError or OSError.
+
+    missing: names of listed images that do not exist and are none of `photos`; raises the same.
+    """
+
+    name: str
+    scene: str
+    kind: str
+    photos: Callable[[], Sequence[Photo]]
+    split: str = ""
+    missing: Callable[[], Sequence[str]] = tuple
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """What decoding a photo gave. size: (H, W), None for none. digest: of the bytes.
+
+    errors, warnings: reasons with remedies. empty_mask: whether its mask leaves out everything,
+    None without one.
+    """
+
+    size: Size | None = None
+    digest: bytes = b""
+    errors: Sequence[tuple[str, str]] = ()
+    warnings: Sequence[tuple[str, str]] = ()
+    empty_mask: bool | None = None
+
+
+@dataclass(frozen=True)
+class DecodedScene:
+    """The photos of a scene, and what decoding each of them gave."""
+
+    name: str
+    photos: Sequence[Photo]
+    decoded: Sequence[Decoded]
+
+    def finding(
+        self, frames: Sequence[int], reason: str, fix: str, severity: Severity = "error"
+    ) -> Finding:
+        """Return a finding about some of the frames."""
+        return Finding(
+            scene=self.name,
+            reason=reason,
+            fix=fix,
+            frames=tuple(frames),
+            names=tuple(self.photos[frame].listed.name for frame in frames),
+            severity=severity,
+            numbers=tuple(self.numbers[frame] for frame in frames),
+        )
+
+    @cached_property
+    def numbers(self) -> Sequence[int | None]:
+        """The number that readers give each photo; None for those that they leave out."""
+        count = itertools.count()
+        return [next(count) if _is_read(photo) else None for photo in self.photos]
+
+    def label(self, frame: int) -> str:
+        """Return what messages call a photo: its number and name, or its name alone."""
+        name = self.photos[frame].listed.name
+        number = self.numbers[frame]
+        return name if number is None else f"frame {numbered(number, name)}"
+
+
+def _is_read(photo: Photo) -> bool:
+    # a photo without a name is refused, not left out
+    return (photo.exists or not photo.listed.name) and photo.listed.split != "unused"
+
+
+def decode(photo: Photo, headers_only: bool) -> Decoded:
+    """Try a photo, or its header alone, then its mask and depth map."""
+    if not photo.listed.name:
+        return Decoded()
+    if not photo.exists:
+        return Decoded(errors=[("the image does not exist", "add it, or remove its frame")])
+    try:
+        data = photo.read()
+        digest = hashlib.blake2b(data, digest_size=16).digest()
+        with opened_image(io.BytesIO(data)) as image:
+            size = turned_size((image.height, image.width), photo.listed)
+            if headers_only:
+                return Decoded(size=size, digest=digest)
+            image.draft(None, _SMALLEST)
+            image.load()
+            black = _is_black(eight_bits(image))
+            # EXIF may stand behind the pixels
+            by_exif = orientation(image) != 1 and not photo.listed.turns
+    except Exception as error:
+        # whatever a reader raises; the other photos go on
+        reason = f"the image cannot be decoded ({error_text(error)})"
+        return Decoded(errors=[(reason, "replace it, or remove its frame")])
+    errors = [("the image is black", "replace it, or remove its frame")] if black else []
+    empty: bool | None = None
+    for kind, read in photo.maps.items():
+        try:
+            found = read()
+            if found is None:
+                continue
+            own = turned_size(found.shape[:2], photo.listed)
+            reasons = [f"the {kind}: {problem.reason}" for problem in size_problems(own, size)]
+            empty = not found.any() if kind == "mask" else empty
+        except Exception as error:
+            reasons = [error_text(error)]
+        errors += [(reason, f"replace the {kind}") for reason in reasons]
+    turns = [(f"photos {TURNED}", TURN)] if by_exif else []
+    return Decoded(size, digest, errors, warnings=turns, empty_mask=empty)
+
+
+def _is_black(image: Image.Image) -> bool:
+    """Return whether nothing of it is brighter than _BLACK, or transparent."""
+    rgba = np.array(image.resize((96, 96)).convert("RGBA"))
+    return bool(rgba[..., :3].max() <= _BLACK and rgba[..., 3].min() == 255)
+
+
+def error_text(error: Exception) -> str:
+    """Return the message of an exception, with its type unless it is one of reading a file."""
+    return str(error) if isinstance(error, _ERRORS) and str(error) else one_line(error)
