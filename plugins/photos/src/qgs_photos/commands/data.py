@@ -27,6 +27,9 @@ Quality: TypeAlias = Annotated[
     int | None,
     typer.Option(help="Quality of images written anew, as JPEG instead of PNG.", min=1, max=100),
 ]
+EveryNth: TypeAlias = Annotated[
+    int | None, typer.Option(help="Every n-th scene is a test scene.", min=2)
+]
 
 
 @app.command("check")
@@ -119,9 +122,7 @@ def pack(
     test_scenes: Annotated[
         str | None, typer.Option(help="File that names the test scenes: an index, a list.")
     ] = None,
-    test_every: Annotated[
-        int | None, typer.Option(help="Every n-th scene is a test scene.", min=2)
-    ] = None,
+    test_every: EveryNth = None,
     leave_out_broken: Annotated[
         bool, typer.Option(help="Leave out scenes that cannot be read, and name them.")
     ] = False,
