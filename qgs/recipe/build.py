@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
-from fnmatch import fnmatchcase
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,8 +26,8 @@ from qgs.contracts.component import MissingExtraError
 from qgs.machine import is_out_of_memory
 from qgs.model import QueryGaussianModel
 from qgs.recipe.decode import Chosen
-from qgs.recipe.errors import Problems, RecipeError
-from qgs.recipe.places import near_pattern
+from qgs.recipe.errors import Problems, RecipeError, did_you_mean
+from qgs.recipe.places import matches
 from qgs.recipe.registry import BUILTIN, component_failure
 from qgs.recipe.slots import AFTER_LAYERS
 from qgs.recipe.yaml_text import KeyPath
@@ -148,7 +148,7 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
             raise
         failure = component_failure(chosen.type, "__init__", error, chosen.installed)
         problems = Problems()
-        problems.add(chosen.place.origin, chosen.path, failure.reason, failure.fix)
+        problems.add(chosen.origin, chosen.source, failure.reason, failure.fix)
         raise RecipeError(problems.found) from error
     if chosen.schedules:
         built.schedules = chosen.schedules
@@ -178,29 +178,19 @@ def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
     paths = {name: _paths(name.removeprefix("model."), model) for name in factors}
     problems = Problems()
     for pattern, factor in config.parts.items() if isinstance(config, OptimizerConfig) else ():
+        fits = partial(matches, pattern, below=True)
+        named = [name for name in factors if any(map(fits, paths[name]))]
+        factors |= dict.fromkeys(named, factor)
         # What is trained holds the model as `model`, a recipe its parts in the section `model`.
         wanted = pattern.removeprefix("model.").split(".")
-        named = [name for name in factors if any(_is_below(path, wanted) for path in paths[name])]
-        factors |= dict.fromkeys(named, factor)
         if not named and (module is not model or wanted[0] != "losses"):
-            # Only for the fix of a pattern that matches nothing.
-            known = {part for below in paths.values() for path in below for part in _heads(path)}
+            known = {".".join(path[: len(wanted)]) for below in paths.values() for path in below}
             reason = f"the pattern `{pattern}` matches no parameter of the model"
-            outermost = ", ".join(dict.fromkeys(below[0][0] for below in paths.values()))
-            fix = near_pattern(pattern, known) or f"its parts: {outermost}"
             origin = optimizer.node.child("parts").origin_of(pattern)
+            fix = did_you_mean(pattern.removeprefix("model."), known, "parts")
             problems.add(origin, f"optimizer.parts.{pattern}", reason, fix)
     problems.raise_any()
     return factors
-
-
-def _is_below(path: KeyPath, wanted: Sequence[str]) -> bool:
-    return len(path) >= len(wanted) and all(map(fnmatchcase, path, wanted))
-
-
-def _heads(path: KeyPath) -> Iterator[KeyPath]:
-    """A path and all that it lies below."""
-    return (path[:end] for end in range(1, len(path) + 1))
 
 
 def _paths(name: str, model: QueryGaussianModel) -> list[KeyPath]:

@@ -10,7 +10,7 @@ from qgs.recipe.errors import Origin, Problems
 from qgs.recipe.files import merge
 from qgs.recipe.places import apply_swaps, expand
 from qgs.recipe.registry import Registry, load_plugins
-from qgs.recipe.sections import check_keys, decode_settings, dims_of
+from qgs.recipe.sections import check_keys, decode_settings
 from qgs.recipe.slots import SECTIONS
 from qgs.recipe.yaml_text import KeyPath, MapNode, from_plain
 
@@ -19,40 +19,37 @@ from qgs.recipe.yaml_text import KeyPath, MapNode, from_plain
 class Draft:
     """A recipe that has been read.
 
-    written: all files and overrides merged. tree: that with the default losses and metrics, without
-        unknown keys. settings: of each section. sizes_known: whether those of the model are valid.
-    parts: what stands at each place, decoder layers numbered.
+    tree: all files and overrides merged, with the default losses and metrics. settings: of each
+    section. parts: what stands at each place, decoder layers numbered.
     """
 
-    written: MapNode
     tree: MapNode
     settings: Mapping[KeyPath, Any]
-    sizes_known: bool
     registry: Registry
     parts: Parts
 
     @property
     def dims(self) -> ModelDims:
         """Width, heads and depth of the model."""
-        return dims_of(self.settings)
+        model = self.settings["model",]
+        return ModelDims(model.width, model.heads, self.settings["model", "decoder"].depth)
 
 
 def draft_of(written: MapNode, problems: Problems, plugins: Sequence[Plugin]) -> Draft:
-    """Choose the components of a merged recipe; mistakes go to `problems`.
+    """Choose the components of a merged recipe; raises RecipeError with all that it finds.
 
     plugins: those that it may name although they are not installed.
     """
-    tree = check_keys(written, problems)
-    # What a file that cannot be read would have set is not missing from the recipe.
-    problems.raise_if_stopped()
     # Under what is written: `losses: {}` has none, a recipe without `losses` the default ones.
-    tree = _with_defaults(tree)
-    settings, sizes_known = decode_settings(tree, problems)
-    registry = load_plugins(tree, problems, plugins)
-    depth = dims_of(settings).depth
-    places = apply_swaps(tree.child("swap"), expand(tree, depth, problems), problems)
-    parts = {path: decode_place(place, registry, problems) for path, place in places.items()}
-    return Draft(written, tree, settings, sizes_known, registry, parts)
+    tree = _with_defaults(check_keys(written, problems))
+    settings = decode_settings(tree, problems)
+    registry = load_plugins(settings[()].plugins or (), tree, problems, plugins)
+    expanded = expand(tree, settings["model", "decoder"].depth, problems)
+    places = apply_swaps(tree.child("swap"), expanded, problems)
+    found = [decode_place(place, registry, problems) for place in places.values()]
+    # Components that are not known cannot be checked beside each other.
+    problems.raise_any()
+    return Draft(tree, settings, registry, {part.path: part for part in found if part})
 
 
 def _with_defaults(tree: MapNode) -> MapNode:

@@ -1,10 +1,12 @@
 """Problems of a recipe, each with its place, its reason and a fix."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from typing import NoReturn
 
 from qgs.contracts import Problem
+from qgs.wording import listed
 
 
 @dataclass(frozen=True)
@@ -62,13 +64,12 @@ class Problems:
     def __init__(self, what: str = "recipe") -> None:
         self.what = what
         self.found: list[RecipeProblem] = []
-        self._stopped = False
 
-    def stop(self, origin: Origin, path: str | Iterable[str], reason: str, fix: str) -> None:
-        """Note a mistake that hides part of the recipe: checks of the rest would mislead."""
+    def stop(self, origin: Origin, path: str | Iterable[str], reason: str, fix: str) -> NoReturn:
+        """Raise RecipeError for a mistake that hides part of the recipe, and for those before."""
+        # Checks of the rest would mislead.
         self.add(origin, path, reason, fix)
-        # The caller goes on until all files are read, so that all of them are reported.
-        self._stopped = True
+        raise RecipeError(self.found, self.what)
 
     def add(
         self,
@@ -81,11 +82,6 @@ class Problems:
         """Note a mistake and go on. path: of the option, with dots or in parts."""
         option = path if isinstance(path, str) else ".".join(path)
         self.found.append(RecipeProblem(option, reason, fix, origin.file, origin.line, cause))
-
-    def raise_if_stopped(self) -> None:
-        """Raise RecipeError if part of the recipe could not be read."""
-        if self._stopped:
-            self.raise_any()
 
     def raise_any(self) -> None:
         """Raise RecipeError if anything was found, chained to what plugins raised."""
@@ -102,10 +98,7 @@ def nearest(word: str, choices: Iterable[str]) -> str | None:
     return found[0] if found else None
 
 
-def did_you_mean(word: str, choices: Iterable[str], noun: str) -> str:
-    """A fix: the nearest choice, or all of them."""
-    choices = sorted(choices)
+def did_you_mean(word: str, choices: Collection[str], noun: str) -> str:
+    """A fix: the nearest choice, or the choices."""
     near = nearest(word, choices)
-    if near is not None:
-        return f"did you mean `{near}`?"
-    return f"{noun}: {', '.join(choices)}" if choices else f"there are no {noun} here: remove it"
+    return f"did you mean `{near}`?" if near else f"{noun}: {listed(sorted(choices), 30) or 'none'}"

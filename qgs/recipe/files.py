@@ -4,7 +4,7 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from qgs.paths import open_file
 from qgs.recipe.errors import Origin, Problems, nearest
@@ -21,6 +21,9 @@ from qgs.recipe.yaml_text import (
     load_text,
 )
 
+_Trees: TypeAlias = dict[Path, MapNode | None]
+"""Merged trees by resolved path; None for one that is being read."""
+
 
 def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
     """`over` laid over `base`, both at `path`.
@@ -34,7 +37,6 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
     if _replaces(base, over, path):
         return over
     merged = MapNode(over.origin, base.entries())
-    merged.under = base
     for key, value, origin in over.entries():
         below = (*path, key)
         old = base.get(key)
@@ -84,97 +86,70 @@ def found_recipe(file: Path, name: str | Path) -> Path:
 
 def read_recipe(recipe: str | Path | Mapping[str, Any], problems: Problems) -> MapNode:
     """The merged tree of `recipe`, without its `extends`."""
-    files = _Files(problems)
     if not isinstance(recipe, Mapping):
-        return files.read(found_recipe(Path(recipe), recipe), (), None)
+        return _read(found_recipe(Path(recipe), recipe), {}, problems)
     origin = Origin("<mapping>")
     try:
         # A study's variant is a mapping that knows where it was written.
         node = recipe if isinstance(recipe, MapNode) else from_plain(recipe, origin)
     except (ValueError, TypeError, RecursionError) as error:
         problems.stop(origin, "", str(error), "give mappings, lists, strings, numbers, bools, None")
-        return MapNode(origin)
-    return files.with_bases(node, Path(), ())
+    return _with_bases(node, Path(), {}, problems)
 
 
 def files_of(recipe: Path) -> list[Path]:
     """A recipe file and all that it extends, each once, links resolved; raises RecipeError."""
-    problems = Problems()
-    files = _Files(problems)
-    files.read(recipe, (), None)
-    problems.raise_any()
-    return [*files.trees]
+    trees: _Trees = {}
+    _read(recipe, trees, Problems())
+    return [*trees]
 
 
-class _Files:
-    """Reads the files of one recipe, each once. trees: by resolved path."""
-
-    def __init__(self, problems: Problems) -> None:
-        self.problems = problems
-        self.trees: dict[Path, MapNode] = {}
-
-    def read(self, file: Path, chain: tuple[Path, ...], extended_at: Origin | None) -> MapNode:
-        """The merged tree of `file`, an empty one, and a problem, where that fails.
-
-        chain: the files that extend each other down to `file`. extended_at: the last `extends`.
-        """
-        # Two files may extend the same third one, by links as well.
-        place = Path(os.path.realpath(file))
-        if place in self.trees:
-            return self.trees[place]
-        origin = Origin(str(file))
-        try:
-            with open_file(file) as opened:
-                text = opened.read().decode("utf-8")
-        except UnicodeDecodeError:
-            self.problems.stop(origin, "", "this is no UTF-8 text", "save it as UTF-8")
-            return MapNode(origin)
-        # ValueError: no name that a file can have.
-        except (OSError, ValueError) as error:
-            reason, fix = _why_unreadable(file, error, chain)
-            if extended_at:
-                home = "the file it stands in" if chain else "the working directory"
-                fix += f" (`extends` is relative to {home})"
-            option = "extends" if extended_at else ""
-            self.problems.stop(extended_at or origin, option, reason, fix)
-            return MapNode(origin)
-        node = load_mapping(text, str(file), self.problems)
-        self.trees[place] = self.with_bases(node, file.parent, (*chain, file))
-        return self.trees[place]
-
-    def with_bases(self, node: MapNode, folder: Path, chain: tuple[Path, ...]) -> MapNode:
-        """`node` laid over the files that it extends, the later ones over the earlier ones."""
-        at = node.origin_of("extends")
-        layers: list[MapNode] = []
-        for name, origin in items_of(node.get("extends"), at):
-            if not isinstance(name, str):
-                reason = "`extends` names one recipe file or a list of them"
-                fix = "write `extends: base.yaml`, relative to this file"
-                self.problems.stop(at, "extends", reason, fix)
-                continue
-            # `..` must not follow links: a recipe names its base as it is written.
-            file = found_recipe(Path(os.path.normpath(folder / name)), name)
-            above = [os.path.realpath(link) for link in chain]
-            place = os.path.realpath(file)
-            if place in above:
-                circle = " -> ".join(map(str, [*chain[above.index(place) :], file]))
-                reason = f"recipes extend each other in a circle: {circle}"
-                self.problems.stop(origin, "extends", reason, "remove one `extends` of the circle")
-            else:
-                layers.append(self.read(file, chain, origin))
-        return reduce(merge, [*layers, node.without("extends")])
-
-
-def _why_unreadable(file: Path, error: Exception, chain: Sequence[Path]) -> tuple[str, str]:
-    """Reason and fix."""
-    if not isinstance(error, FileNotFoundError):
-        why = getattr(error, "strerror", None) or error
-        return f"{file} cannot be read: {why}", "check the path, or take one of `qgs recipes`"
-    # A file that extends itself would be a poor advice.
-    neighbours = [path.stem for path in file.parent.glob("*.yaml") if path not in chain]
-    near = nearest(file.stem, neighbours)
+def _read(file: Path, trees: _Trees, problems: Problems, at: Origin | None = None) -> MapNode:
+    """The merged tree of `file`. at: where it is extended."""
+    # Two files may extend the same third one, by links as well.
+    place = Path(os.path.realpath(file))
+    if known := trees.get(place):
+        return known
+    option = "extends" if at else ""
+    at = at or Origin(str(file))
     fix = "check the path, or take one of `qgs recipes`"
-    return f"{file} does not exist", f"did you mean `{file.parent / near}.yaml`?" if near else fix
+    try:
+        with open_file(file) as opened:
+            text = opened.read().decode("utf-8")
+    except FileNotFoundError:
+        # A file that extends itself would be a poor advice.
+        neighbours = [x.stem for x in file.parent.glob("*.yaml") if x.resolve() not in trees]
+        if near := nearest(file.stem, neighbours):
+            fix = f"did you mean `{file.parent / near}.yaml`?"
+        problems.stop(at, option, f"{file} does not exist", fix)
+    # ValueError: no name that a file can have, or no UTF-8.
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        problems.stop(at, option, f"{file} cannot be read: {why}", fix)
+    trees[place] = None
+    trees[place] = tree = _with_bases(
+        load_mapping(text, str(file), problems), file.parent, trees, problems
+    )
+    return tree
+
+
+def _with_bases(node: MapNode, folder: Path, trees: _Trees, problems: Problems) -> MapNode:
+    """`node` laid over the files that it extends, the later ones over the earlier ones."""
+    layers: list[MapNode] = []
+    for name, origin in items_of(node.get("extends"), node.origin_of("extends")):
+        if not isinstance(name, str):
+            reason = "`extends` names one recipe file or a list of them"
+            fix = "write `extends: base.yaml`, relative to this file"
+            problems.stop(origin, "extends", reason, fix)
+        # `..` must not follow links: a recipe names its base as it is written.
+        file = found_recipe(Path(os.path.normpath(folder / name)), name)
+        place = Path(os.path.realpath(file))
+        if place in (above := [path for path, tree in trees.items() if tree is None]):
+            circle = [*above[above.index(place) :], place]
+            reason = f"recipes extend each other: {' -> '.join(path.name for path in circle)}"
+            problems.stop(origin, "extends", reason, "remove one `extends` of the circle")
+        layers.append(_read(file, trees, problems, origin))
+    return reduce(merge, [*layers, node.without("extends")])
 
 
 def apply_overrides(tree: MapNode, overrides: Sequence[str], problems: Problems) -> MapNode:

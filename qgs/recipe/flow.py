@@ -8,6 +8,7 @@ from qgs.contracts import LAYER_SLOTS, Refinement
 from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpec
 from qgs.recipe.decode import Chosen, Parts
 from qgs.recipe.errors import Problems
+from qgs.recipe.places import DECODER
 from qgs.recipe.registry import Registry, default_config
 from qgs.recipe.slots import AFTER_LAYERS
 from qgs.recipe.yaml_text import KeyPath
@@ -17,56 +18,42 @@ _FLOW = ("encoder", "queries", *LAYER_SLOTS, *AFTER_LAYERS, "losses", "objective
 
 
 def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems) -> None:
-    """Report fields that are read before they are written, or not as they are written.
-
-    After a component that failed to decode, which might have provided it, nothing is missing. A
-    template of the decoder is reported once, not for each of its layers.
-    """
-    reported = set[tuple[str, ...]]()
-    complete = True
+    """Report fields that are read before they are written, or not as they are written."""
     state: dict[str, tuple[FieldSpec, Chosen]] = {}
     for turns, decodes in _execution_order(parts, depth):
         # What is decoded of a layer is not there for the next one.
         fields = dict(state) if decodes else state
         for chosen in turns:
-            if chosen is None:
-                complete = False
-                continue
             needed = chosen.component.fields_read(chosen.config)
             missing = {name: spec for name, spec in needed.items() if name not in fields}
-            # All layers made of a template have its path.
-            key = (chosen.path, *missing)
-            if missing and complete and key not in reported:
-                reported.add(key)
+            if missing:
                 reason, fix = _unmet(missing, chosen, parts, registry)
-                problems.add(chosen.place.origin, chosen.path, reason, fix)
+                problems.add(chosen.origin, chosen.source, reason, fix)
             for name in needed.keys() - missing.keys():
                 written, writer = fields[name]
                 if written != needed[name]:
                     reason = (
                         f"`{chosen.type}` reads {name} as {needed[name]}, `{writer.type}` at "
-                        f"{writer.path} ({writer.chosen_at}) writes it as {written}"
+                        f"{writer.shown_path} ({writer.chosen_at}) writes it as {written}"
                     )
                     both = f"`{chosen.type}` or `{writer.type}`"
                     fix = f"change the options of {both} until they agree"
-                    problems.add(chosen.place.origin, chosen.path, reason, fix)
+                    problems.add(chosen.origin, chosen.source, reason, fix)
             provided = chosen.component.fields_written(chosen.config)
             # Who changes a field that was never written has not provided it.
             fields |= {n: (spec, chosen) for n, spec in provided.items() if n not in missing}
 
 
-def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[list[Chosen | None], bool]]:
+def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[list[Chosen], bool]]:
     """Components in the order of a training step; whether they decode and judge a layer."""
-    decoded = {depth}
     supervision: Any = parts["model", "supervision"]
-    if supervision is not None:
-        # A supervised layer is decoded and judged right after it.
-        decoded |= supervision.component(supervision.config).weights().keys()
+    # A supervised layer is decoded and judged right after it.
+    decoded = {depth, *supervision.component(supervision.config).weights()}
     decode = [parts["model", name] for name in ("head", "centers", "renderer")]
     decode += [part for path, part in parts.items() if path[0] in ("losses", "objective")]
     yield [parts["model", "encoder"], parts["model", "queries"]], False
     for layer in range(depth + 1):
-        places = [("model", "decoder", "layers", str(layer - 1), name) for name in LAYER_SLOTS]
+        places = [(*DECODER, "layers", str(layer - 1), name) for name in LAYER_SLOTS]
         yield [parts[place] for place in places if place in parts], False
         if layer in decoded:
             yield decode, True
@@ -78,12 +65,14 @@ def _unmet(missing: Fields, reader: Chosen, parts: Parts, registry: Registry) ->
     named = " and ".join(f"{name} ({spec})" for name, spec in missing.items())
     reason = f"`{reader.type}` needs {named}, which nothing before it provides"
     for name in missing:
-        late = [part for part in parts.values() if part and name in _offers(part)]
+        late = [part for part in parts.values() if name in _offers(part)]
         if late:
-            reason += f"; `{late[0].type}` at {late[0].path} provides {name} too late"
+            reason += f"; `{late[0].type}` at {late[0].shown_path} provides {name} too late"
+    # Whoever replaced a component that provided them finds the line here.
+    now = {part.slot: f"`{part.type}`, {part.chosen_at}" for part in parts.values()}
     known = [
-        f"`{kind}` in the slot `{slot}`"
-        for slot in _FLOW[: _FLOW.index(reader.place.slot.name)]
+        f"`{kind}` in the slot `{slot}` (now {now.get(slot, 'empty')})"
+        for slot in _FLOW[: _FLOW.index(reader.slot)]
         for kind, component in registry.components(slot).items()
         if missing.keys() <= _offered(component, default_config(component)).keys()
     ]
@@ -113,7 +102,7 @@ def keys_are_read(parts: Mapping[KeyPath, Chosen]) -> bool:
 
 def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
     """A sentence for each learnable field of the queries that only refinements read."""
-    used = [part for path, part in parts.items() if path[:-1] != ("model", "decoder")]
+    used = [part for path, part in parts.items() if path[:-1] != DECODER]
     # A refinement reads what it updates, which alone makes no use of it.
     readers = [part for part in used if not issubclass(part.component, Refinement)]
     read = {name for part in readers for name in part.component.fields_read(part.config)}
@@ -129,10 +118,10 @@ def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
 def unfinished(parts: Mapping[KeyPath, Chosen], steps: int, seconds: float | None) -> Iterator[str]:
     """A sentence for each schedule that goes on after `steps` steps, or may after `seconds`."""
     # Once for the template of a decoder, not for each layer.
-    for part in {part.path: part for part in parts.values()}.values():
+    for part in {part.source: part for part in parts.values()}.values():
         for option, schedule in part.schedules.items():
             last = max(schedule.corners, default=0)
-            told = f"{part.path}.{option} changes until step {last}"
+            told = f"{part.shown_path}.{option} changes until step {last}"
             if last > steps:
                 yield f"{told}, training ends at {steps}"
             # How many steps fit into a time budget depends on the machine.

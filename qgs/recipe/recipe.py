@@ -15,7 +15,6 @@ from qgs.contracts.schedule import Schedule
 from qgs.machine import refuse_more_than_memory
 from qgs.model import QueryGaussianModel
 from qgs.recipe.build import build, build_model, load_pretrained, rate_factors
-from qgs.recipe.causes import at_their_causes
 from qgs.recipe.checks import check
 from qgs.recipe.decode import Chosen
 from qgs.recipe.draft import draft_of
@@ -149,20 +148,15 @@ def resolve(
     problems = Problems()
     written = apply_overrides(read_recipe(recipe, problems), overrides, problems)
     draft = draft_of(written, problems, plugins)
-    # A component that could not be decoded is reported at its own line.
-    together = Problems()
-    parts = check(draft, together)
-    problems.found += at_their_causes(draft, together.found, plugins)
-    problems.raise_any()
+    parts = check(draft, problems)
     settings = draft.settings
-    chosen = {path: part for path, part in parts.items() if part is not None}
-    spelled = spell_out(draft, chosen)
+    spelled = spell_out(draft, parts)
     used = [draft.registry.plugins[name] for name in ("qgs", *spelled["plugins"])]
     return Recipe(
         # A plain mapping: a checkpoint stores it, and nobody changes the draft through it.
         tree=json.loads(json.dumps(spelled)),
         provenance=provenance(spelled),
-        parts=chosen,
+        parts=parts,
         dims=draft.dims,
         layer_scale=settings["model", "decoder"].layer_scale,
         seed=settings[()].seed,

@@ -14,9 +14,9 @@ import qgs.tokengs
 from qgs import extensions
 from qgs.contracts import Component, ComponentConfig, OptionError
 from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
-from qgs.recipe.errors import Origin, Problems
+from qgs.recipe.errors import Problems
 from qgs.recipe.slots import SLOTS
-from qgs.recipe.yaml_text import MapNode, items_of, kind_of
+from qgs.recipe.yaml_text import MapNode, items_of
 from qgs.version import __version__
 
 BUILTIN = Plugin(
@@ -63,10 +63,9 @@ class InstalledPlugin:
 
 @dataclass(frozen=True)
 class Registry:
-    """The plugins that one recipe uses. unusable: those that could not be loaded."""
+    """The plugins that one recipe uses."""
 
     plugins: Mapping[str, InstalledPlugin]
-    unusable: frozenset[str] = frozenset()
 
     def components(self, slot: str) -> dict[str, type[Component]]:
         """`PLUGIN/NAME` to component, of one slot."""
@@ -96,32 +95,26 @@ def load_registry(names: Iterable[str]) -> Registry:
     return Registry({"qgs": builtin(), **{name: load_plugin(name) for name in names}})
 
 
-def load_plugins(tree: MapNode, problems: Problems, given: Sequence[Plugin] = ()) -> Registry:
-    """The components of the recipe's `plugins`; a problem for each that cannot be used."""
+def load_plugins(
+    names: Sequence[str], tree: MapNode, problems: Problems, given: Sequence[Plugin]
+) -> Registry:
+    """The components of the plugins `names` of a recipe; raises RecipeError where one is unusable.
+
+    given: plugins that need not be installed.
+    """
     at_hand = {plugin.name: InstalledPlugin(plugin) for plugin in given}
     plugins = {"qgs": builtin()}
-    seen = dict[str, Origin]()
-    written = tree.get("plugins")
-    at = tree.origin_of("plugins")
-    if not isinstance(written, list | None):
-        reason = f"`plugins` is a list, this is {kind_of(written)}"
-        problems.add(at, "plugins", reason, "write `plugins: [NAME]`")
-        written = None
-    for index, (name, origin) in enumerate(items_of(written, at)):
-        path = f"plugins.{index}"
-        if not isinstance(name, str):
-            reason = f"a plugin is a name, this is {kind_of(name)}"
-            problems.add(origin, path, reason, "write `plugins: [NAME]`")
-        elif name in seen:
-            reason = f"the plugin `{name}` is already listed at {seen[name]}"
-            problems.add(origin, path, reason, "list it once")
-        else:
-            seen[name] = origin
-            try:
-                plugins[name] = at_hand.get(name) or load_plugin(name)
-            except PluginError as error:
-                problems.add(origin, path, error.reason, error.fix, error)
-    return Registry(plugins, unusable=frozenset(seen.keys() - plugins.keys()))
+    written = items_of(tree.get("plugins"), tree.origin_of("plugins"))
+    for index, name in enumerate(names):
+        try:
+            plugins[name] = at_hand.get(name) or load_plugin(name)
+        except PluginError as error:
+            origin = written[index][1]
+            problems.add(origin, f"plugins.{index}", error.reason, error.fix, error)
+    if not plugins.keys() >= {*names}:
+        # Each of their components would be a problem more.
+        problems.raise_any()
+    return Registry(plugins)
 
 
 def load_usable_plugins() -> tuple[Registry, list[str]]:
@@ -161,14 +154,8 @@ def load_plugin(name: str) -> InstalledPlugin:
     # A plug-in's module may do anything, `sys.exit` included.
     except (Exception, SystemExit) as error:
         message = f"cannot be imported from `{entry.value}`: {type(error).__name__}: {error}"
-        missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
-        fix = f"update or correct {release}"
-        # Metadata without modules is what an interrupted uninstall leaves.
-        if missing == entry.module:
-            fix = f"install {release} again, its files are gone"
-        elif missing.partition(".")[0] not in ("", "qgs", entry.module.partition(".")[0]):
-            fix = f"install `{missing.partition('.')[0]}`, which {release} needs"
-        raise PluginError(f"{named} {message}", f"{fix}, or do without the plugin") from error
+        fix = f"install what it needs, update or correct {release}, or do without the plugin"
+        raise PluginError(f"{named} {message}", fix) from error
     if fault := _plugin_fault(plugin, name):
         raise PluginError(f"{named} {fault}", f"update or correct {release}, or do without it")
     folder = Path(sys.modules[entry.module].__file__ or "").parent

@@ -18,10 +18,6 @@ _WRITTEN = """
 extends:
   description: Recipe file or files that this one is laid over, relative to it.
   anyOf: [{type: string}, {type: array, items: {type: string}}]
-plugins:
-  description: Plugins whose components the recipe may name.
-  type: array
-  items: {type: string}
 swap:
   description: Components by pattern of the places that they take, such as
     `decoder.layers.*.feed_forward`; null drops an inherited swap.

@@ -1,22 +1,22 @@
 """The sections of a recipe: their settings, and what else may stand beside these."""
 
-from collections.abc import Mapping
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 
 from qgs.contracts import (
     LAYER_SLOTS,
     ComponentConfig,
     EvaluationConfig,
-    ModelDims,
+    OptionError,
     TrainingConfig,
     ViewsConfig,
 )
 from qgs.recipe.decode import decode_config
-from qgs.recipe.errors import Problems, did_you_mean
+from qgs.recipe.errors import Problems, nearest
 from qgs.recipe.slots import MODEL_SLOTS, SECTIONS
 from qgs.recipe.yaml_text import KeyPath, MapNode, kind_of
+from qgs.wording import listed
 
 
 class ModelSettings(ComponentConfig):
@@ -24,8 +24,18 @@ class ModelSettings(ComponentConfig):
 
     width: int = Field(default=1024, ge=1, le=65_536)
     """Features of a token and of a query (D in the papers)."""
-    heads: int = Field(default=16, ge=1)
+    heads: int = Field(default=16, ge=1, validate_default=True)
     """Attention heads (h in the papers), a divisor of the width."""
+
+    @field_validator("heads")
+    @classmethod
+    def _divides_the_width(cls, heads: int, info: ValidationInfo) -> int:
+        # A width that is refused itself is not among the data.
+        width = info.data.get("width", heads)
+        if width % heads:
+            reason = f"{heads} heads do not divide the width {width}"
+            raise OptionError(reason, f"set model.heads to a divisor of {width}")
+        return heads
 
 
 class DecoderSettings(ComponentConfig):
@@ -47,6 +57,8 @@ class RecipeSettings(ComponentConfig):
     init_from: str | None = None
     """Checkpoint whose weights training starts from, its queries made as many as this recipe has
     (LocusGS release: finetuning); null to start from the initial parameters."""
+    plugins: tuple[str, ...] | None = ()
+    """Plugins whose components the recipe may name."""
 
 
 SETTINGS: dict[KeyPath, type[ComponentConfig]] = {
@@ -58,34 +70,29 @@ SETTINGS: dict[KeyPath, type[ComponentConfig]] = {
     ("evaluation",): EvaluationConfig,
 }
 _BESIDE: dict[KeyPath, tuple[str, ...]] = {
-    (): ("plugins", "swap", "model", *SECTIONS, "views", "training", "evaluation"),
+    (): ("swap", "model", *SECTIONS, "views", "training", "evaluation"),
     ("model",): (*MODEL_SLOTS, "decoder"),
     ("model", "decoder"): (*LAYER_SLOTS, "layers"),
 }
 """Keys that stand beside the settings of a section."""
 _KEYS = {path: {*SETTINGS[path].model_fields, *keys} for path, keys in _BESIDE.items()}
+_HOMES = {key: ".".join((*path, key)) for path, keys in _KEYS.items() for key in keys}
 _LAYERS: KeyPath = ("model", "decoder", "layers")
 _NAMED = [(name,) for name, section in SECTIONS.items() if section.named]
 _MAPPINGS: set[KeyPath] = {("swap",), _LAYERS, *SETTINGS, *_NAMED}
 
 
-def dims_of(settings: Mapping[KeyPath, Any]) -> ModelDims:
-    """Width, heads and depth."""
-    model = settings["model",]
-    return ModelDims(model.width, model.heads, settings["model", "decoder"].depth)
-
-
 def check_keys(tree: MapNode, problems: Problems, path: KeyPath = ()) -> MapNode:
     """Report unknown keys and sections that are no mappings; the tree without them."""
     # Options of components are checked where their Config is known.
-    known = {*LAYER_SLOTS} if path[:-1] == _LAYERS else _KEYS.get(path)
+    known = LAYER_SLOTS if path[:-1] == _LAYERS else _KEYS.get(path)
     checked = MapNode(tree.origin)
     for key, node, origin in tree.entries():
         below = (*path, key)
         if known is not None and key not in known:
             # A key that stands somewhere else is no typing error: name its section.
-            homes = [".".join((*home, key)) for home, keys in _KEYS.items() if key in keys]
-            fix = f"did you mean `{homes[0]}`?" if homes else did_you_mean(key, known, "keys")
+            near = nearest(key, _HOMES)
+            fix = f"did you mean `{_HOMES[near]}`?" if near else f"keys: {listed(sorted(known))}"
             problems.add(origin, below, f"there is no key `{key}` here", fix)
         elif below not in _MAPPINGS and path != _LAYERS:
             checked.put(key, node, origin)
@@ -98,20 +105,11 @@ def check_keys(tree: MapNode, problems: Problems, path: KeyPath = ()) -> MapNode
     return checked
 
 
-def decode_settings(tree: MapNode, problems: Problems) -> tuple[dict[KeyPath, Any], bool]:
-    """Settings by section, defaults for one with problems; whether the model's sizes are valid."""
+def decode_settings(tree: MapNode, problems: Problems) -> dict[KeyPath, Any]:
+    """Settings by section, defaults for one with problems."""
     settings: dict[KeyPath, Any] = {}
-    sizes_known = True
     for path, config in SETTINGS.items():
         written = tree.child(*path).without(*_BESIDE.get(path, ()))
-        found = decode_config(config, written, path, problems)
         # Go on with defaults, so that problems of other sections are reported as well.
-        settings[path] = found or config.model_construct()
-        sizes_known &= bool(found) or path[:1] != ("model",)
-    dims = dims_of(settings)
-    if dims.width % dims.heads:
-        reason = f"{dims.heads} heads do not divide the width {dims.width}"
-        fix = f"set model.heads to a divisor of {dims.width}"
-        origin = tree.child("model").origin_of("heads", "width")
-        problems.add(origin, "model.heads", reason, fix)
-    return settings, sizes_known
+        settings[path] = decode_config(config, written, path, problems) or config.model_construct()
+    return settings

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from qgs import contracts
-from qgs.contracts import LAYER_SLOTS
 from qgs.recipe.yaml_text import KeyPath, MapNode
 
 
@@ -66,14 +65,8 @@ SECTIONS = {name: SLOTS[name] for name in _SECTIONS}
 
 def slot_at(path: KeyPath) -> Slot | None:
     """The slot at a place of a recipe; None where no component belongs."""
-    match path:
-        case ("model", name) if name in MODEL_SLOTS:
-            return SLOTS[name]
-        case ("model", "decoder", name) | ("model", "decoder", "layers", _, name):
-            return SLOTS[name] if name in LAYER_SLOTS else None
-        case (name, *below) if name in SECTIONS and len(below) == SECTIONS[name].named:
-            return SLOTS[name]
-    return None
+    # That of a section stands first, that of a part of the model last.
+    return next((SLOTS[key] for key in (*path[:1], *path[-1:]) if key in SLOTS), None)
 
 
 def type_at(node: Any, path: KeyPath) -> Any:

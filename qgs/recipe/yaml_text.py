@@ -34,17 +34,12 @@ _TAGS = {_STANDARD + kind for kind in (*_SCALARS, "str", "map", "seq")}
 
 
 class MapNode(dict[str, Any]):
-    """A mapping. origin: where it begins. origins: where each key was written.
-
-    under: of what `qgs.recipe.files.merge` made, the mapping that it was laid over.
-    """
+    """A mapping. origin: where it begins. origins: where each key was written."""
 
     def __init__(self, origin: Origin, items: Iterable[tuple[str, Any, Origin]] = ()) -> None:
         super().__init__()
         self.origin = origin
         self.origins: dict[str, Origin] = {}
-        # Causes of problems are found in what a recipe was before its last layer.
-        self.under: MapNode | None = None
         for key, value, written in items:
             self.put(key, value, written)
 
@@ -125,9 +120,8 @@ def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Ori
     for step in path:
         # Pydantic names the tag of a union as a step, which nobody writes.
         key: Any = str(step) if isinstance(node, MapNode) else step
-        inside = isinstance(node, MapNode) and key in node
-        inside |= isinstance(node, list) and isinstance(step, int) and step < len(node)
-        if inside:
+        keys = range(len(node)) if isinstance(node, list) else ()
+        if key in (node if isinstance(node, MapNode) else keys):
             # Lists of Python mappings know no lines.
             origin = node.origins[key] if isinstance(node, MapNode | ListNode) else origin
             node = node[key]
@@ -178,55 +172,35 @@ def inline(value: Any) -> str:
 
 
 def load_mapping(text: str, file: str, problems: Problems) -> MapNode:
-    """The mapping in `text`; an empty one, and a problem, where there is something else."""
+    """The mapping in `text`; raises RecipeError where there is something else."""
     node = load_text(text, file, problems)
     if isinstance(node, MapNode):
         return node
-    origin = node.origin if isinstance(node, ListNode) else Origin(file, 1)
-    if node is None:
-        problems.stop(origin, "", "the file is empty", "write a recipe, at least `recipe: 1`")
-    else:
-        fix = "write `key: value` lines, the first of them `recipe: 1`"
-        problems.stop(origin, "", f"a recipe is a mapping, this is {kind_of(node)}", fix)
-    return MapNode(origin)
+    fix = "write `key: value` lines, the first of them `recipe: 1`"
+    problems.stop(Origin(file, 1), "", f"a recipe is a mapping, this is {kind_of(node)}", fix)
 
 
 def load_text(
     text: str, file: str, problems: Problems, line: int | None = None, path: KeyPath = ()
 ) -> Node:
-    """The value of `text`; an empty mapping, and a problem, where it is no YAML.
+    """The value of `text`; raises RecipeError where it is no YAML.
 
     line: given to every node in place of its own line. path: where the text belongs.
     """
     try:
         root = _composed(text)
         return None if root is None else _Reader(file, problems, line).read(root, path)
+    # Python's stack ends while PyYAML composes, before `_Reader` counts levels.
     except (yaml.YAMLError, RecursionError) as error:
-        number, reason, fix = _syntax_fault(text, error)
-    problems.stop(Origin(file, number if line is None else line), path, reason, fix)
-    return MapNode(Origin(file, number))
+        mark = getattr(error, "problem_mark", None)
+        found = mark.line + 1 if mark else 1
+        reason = f"this is no valid YAML: {getattr(error, 'problem', error)}"
+        fix = "correct the line; check indentation (spaces, no tabs), brackets, quotes and `: `"
+        problems.stop(Origin(file, found if line is None else line), path, reason, fix)
 
 
 # The variants of a study extend the same files over and over.
 _composed = lru_cache(maxsize=128)(partial(yaml.compose, Loader=Yaml12Loader))
-
-
-def _syntax_fault(text: str, error: yaml.YAMLError | RecursionError) -> tuple[int, str, str]:
-    """The line at which `text` is no YAML, the reason and a fix."""
-    if isinstance(error, yaml.reader.ReaderError):
-        line = 1 + text.count("\n", 0, error.position)
-        return line, f"the character {chr(error.character)!r} is not allowed in YAML", "remove it"
-    if not isinstance(error, yaml.MarkedYAMLError):
-        # Python's stack ends while PyYAML composes, before `_Reader` counts levels.
-        return 1, "mappings or lists are nested too deep", "write the recipe flatter"
-    mark = error.problem_mark or error.context_mark
-    line = 1 + (mark.line if mark else 0)
-    written = "".join(text.splitlines()[line - 1 : line])
-    indentation = written[: len(written) - len(written.lstrip())]
-    if "\t" in indentation or "'\\t'" in str(error):
-        return line, "a tab stands where YAML wants spaces", "indent with spaces"
-    fix = "correct the line; check indentation, brackets, quotes and `: ` before it"
-    return line, f"this is no valid YAML: {error.problem}", fix
 
 
 class _Reader:
@@ -250,7 +224,7 @@ class _Reader:
         if node.tag not in _TAGS:
             reason = f"the tag {node.tag!r} is not allowed in a recipe"
             fix = "remove the tag; components are named with `type`"
-            return self.problems.stop(origin, path, reason, fix)
+            self.problems.stop(origin, path, reason, fix)
         if isinstance(node, yaml.MappingNode):
             return self.read_mapping(node, path)
         if isinstance(node, yaml.SequenceNode):
@@ -262,7 +236,7 @@ class _Reader:
             return _scalar(kind, node.value)
         except ValueError:
             reason = f"{node.value!r:.100} is no {kind} of 64 bits"
-            return self.problems.stop(origin, path, reason, "correct it")
+            self.problems.stop(origin, path, reason, "correct it")
 
     def read_mapping(self, node: yaml.MappingNode, path: KeyPath) -> MapNode:
         read = MapNode(self.origin(node))
@@ -275,9 +249,6 @@ class _Reader:
                 below = path
                 reason = "a key is a mapping or a list"
                 fix = "use a plain word as the key"
-            elif key == "<<" and key_node.style is None:
-                reason = "merge keys (`<<`) are not part of YAML 1.2"
-                fix = "write the keys out, or share them between files with `extends`"
             elif key in read:
                 reason = f"the key `{key}` is already given at {read.origins[key]}"
                 fix = "keep one of the two"

@@ -123,5 +123,5 @@ def test_tabs_and_what_is_nested_deeper_than_pythons_stack(write):
     tab = refused(write("recipe: 1\nmodel:\n\twidth: 64\n"))
     deep = refused(write(f"recipe: 1\nseed: {'[' * 700}"))
     assert (tab.line, deep.line) == (3, 1)
-    assert "tab" in tab.reason
-    assert "deep" in deep.reason
+    assert "tabs" in tab.fix
+    assert "recursion" in deep.reason

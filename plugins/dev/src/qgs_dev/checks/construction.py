@@ -8,14 +8,13 @@ from unittest.mock import patch
 
 import numpy
 import torch
-from pydantic import BaseModel
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from qgs.containers import map_tensors
 from qgs.contracts import ComponentConfig
 from qgs.recipe.build import OnMeta
-from qgs.recipe.decode import decode_config, models_in
+from qgs.recipe.decode import configs_in, decode_config
 from qgs.recipe.errors import Problems, RecipeError
 from qgs.recipe.yaml_text import dump, load_mapping
 from qgs_dev.case import Case
@@ -62,19 +61,9 @@ def _expect_strict_options(case: Case) -> None:
     config, message = _decoded(case, {**options, wrong: 1})
     expect(config is None, f"the option `{wrong}` is accepted")
     expect(not names or f"did you mean `{names[0]}`" in message, f"the message is: {message}")
-    for model in _nested(type(case.config), set()):
+    for model in configs_in(type(case.config)):
         strict = model.model_config.get("extra") == "forbid"
         expect(strict, f"{model.__qualname__} accepts any option; derive it from ComponentConfig")
-
-
-def _nested(config: type[BaseModel], found: set[type[BaseModel]]) -> set[type[BaseModel]]:
-    """Return `found` with the models that options of `config`, or options in these, can hold."""
-    for field in config.model_fields.values():
-        for model in models_in(field.annotation):
-            if model not in found:
-                found.add(model)
-                _nested(model, found)
-    return found
 
 
 def _decoded(case: Case, options: dict[str, Any]) -> tuple[ComponentConfig | None, str]:

@@ -183,8 +183,6 @@ def read_study(file: str | Path) -> Study:
     problems = Problems("study")
     found = found_recipe(Path(file), str(file))
     tree = _read(found, problems, ())
-    # A file that cannot be read hides what else is wrong.
-    problems.raise_if_stopped()
     for name, written, origin in tree.child("variants").entries():
         # A file name is a recipe that changes nothing of that file.
         if isinstance(written, str):
@@ -208,7 +206,6 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
     except (OSError, ValueError) as error:
         fix = "check the path, or take one such as studies/tiny/structural.yaml"
         problems.stop(Origin(str(file)), "study", f"{file} cannot be read: {error}", fix)
-        return MapNode(Origin(str(file)))
     tree = load_mapping(text, str(file), problems)
     extended = tree.get("extends")
     if extended is None:
@@ -217,7 +214,6 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
         reason = "`extends` names one other study, and no circle of them"
         fix = "write `extends: other.yaml`, relative to this file"
         problems.stop(tree.origins["extends"], "extends", reason, fix)
-        return tree
     base = _read(found_recipe(file.parent / extended, extended), problems, (*chain, file))
     for key, value, origin in tree.without("extends").entries():
         old = base.get(key)
