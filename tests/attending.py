@@ -3,19 +3,18 @@
 import torch
 
 
-def case(sizes, middle=(), factor=1.0, lower=-6.0):
-    """sizes: scenes, heads, queries, tokens, numbers of a head. Biases by rays read of a query its
-    place, `middle`, here with noise, a factor of the squared distance, and the least bias."""
+def case(sizes, factor=1.0, lower=-6.0):
+    """sizes: scenes, heads, queries, tokens, numbers of a head. LocusGS's bias reads of a query its
+    place, a factor of the squared distance, and the least bias."""
     scenes, heads, queries, tokens, each = sizes
-    place, matrices = torch.randn(scenes, queries, 3 + len(middle)).tensor_split([3], -1)
     factor = factor * (0.1 + torch.rand(scenes, queries, 1))
-    read = [place, torch.tensor(middle) + 0.3 * matrices, factor, torch.ones_like(factor) * lower]
+    read = [torch.randn(scenes, queries, 3), factor, torch.ones_like(factor) * lower]
     return {
         "q": torch.randn(scenes, queries, heads, each).transpose(1, 2),
         "k": torch.randn(scenes, heads, tokens, each),
         "v": torch.randn(scenes, tokens, heads, each).transpose(1, 2),
         "queries": torch.cat(read, -1),
-        "tokens": torch.randn(scenes, 9 if middle else 6, tokens),
+        "tokens": torch.randn(scenes, 6, tokens),
         "gradient": torch.randn(scenes, heads, queries, each),
     }
 

@@ -10,19 +10,11 @@ from qgs_locus.kernels.attention_choice import SHARE, attention_kernel, chosen_k
 from qgs_locus.ray_bias import RayBias
 
 
-class InTriton(RayBias):
-    """With functions that nothing calls here."""
-
-    def triton_functions(self):
-        return object(), object()
-
-
 class NotInTriton(RayBias):
-    def triton_functions(self):
-        return None
+    in_triton = False
 
 
-def case(kind=InTriton, dtype=torch.float32, width=8):
+def case(kind=RayBias, dtype=torch.float32, width=8):
     """q and a bias that learns."""
     center = torch.randn(2, 5, 3, requires_grad=True)
     bias = kind.of(center, 1.0, torch.randn(2, 6, 7), -20.0, torch.ones(()))

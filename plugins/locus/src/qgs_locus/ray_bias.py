@@ -4,7 +4,7 @@
 same for blocks of queries, in a form that kernels can take; the tests hold it against `dense_bias`.
 """
 
-from typing import Any, Self
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -59,6 +59,8 @@ class RayBias(AttentionBias):
     token m and d. What does not depend on the pair is thus computed once.
     """
 
+    in_triton = True
+
     @classmethod
     @full_precision
     def of(
@@ -94,11 +96,6 @@ class RayBias(AttentionBias):
         from qgs_locus.kernels import ray_bias_numba as kernels  # needs numba
 
         return kernels.write, kernels.gradients
-
-    def triton_functions(self) -> tuple[Any, Any]:
-        from qgs_locus.kernels import ray_bias_triton as functions  # needs triton
-
-        return functions.value, functions.gradients
 
 
 def clamped(bias_nM: Tensor, lower_n1: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ centre cof(W) (m - mu x d), as W a x W b = cof(W) (a x b). The minimum is
 |cof(W) (m - mu x d)|^2 / |W d|^2.
 """
 
-from typing import Any, Self
+from typing import Self
 
 import torch
 from qgs_locus.kernels.attention_bias import AttentionBias, Kernel
@@ -75,14 +75,9 @@ class EllipsoidBias(AttentionBias):
         return clamped(-factor_n1 * moment_nM / along_nM, lower_n1)
 
     def compiled(self) -> tuple[Kernel, Kernel]:
-        from qgs_anchors.ellipsoid.kernels import ray_bias_numba as kernels  # needs numba
+        from qgs_anchors.ellipsoid import ray_bias_numba as kernels  # needs numba
 
         return kernels.write, kernels.gradients
-
-    def triton_functions(self) -> tuple[Any, Any]:
-        from qgs_anchors.ellipsoid.kernels import ray_bias_triton as functions  # needs triton
-
-        return functions.value, functions.gradients
 
 
 def _times(matrix_n33: Tensor, vectors: Tensor) -> Tensor:

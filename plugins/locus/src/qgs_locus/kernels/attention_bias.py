@@ -48,6 +48,9 @@ class AttentionBias(ABC):
     Gradients flow into both, and into nothing else that `value` reads. Float32 or float64.
     """
 
+    in_triton = False
+    """Whether `attention_triton` computes it."""
+
     def __init__(self, queries: Tensor, tokens: Tensor) -> None:
         self.queries = queries
         self.tokens = tokens
@@ -63,10 +66,6 @@ class AttentionBias(ABC):
         with (queries, tokens, gradient, out) and writes the gradient (n, F) of the queries, given
         that of the bias. They may share rows among threads.
         """
-        return None
-
-    def triton_functions(self) -> tuple[Any, Any] | None:
-        """`value` and `gradients` for `qgs_locus.kernels.attention_triton`; None for none."""
         return None
 
     @full_precision
@@ -181,8 +180,7 @@ def biased_attention(
     if chosen == "triton":
         from qgs_locus.kernels.attention_triton import TritonAttention  # needs triton
 
-        functions = bias.triton_functions()
-        return _outside_graphs(TritonAttention.apply)(*qkv, *of_bias, functions)
+        return _outside_graphs(TritonAttention.apply)(*qkv, *of_bias)
     return _outside_graphs(_BiasedAttention.apply)(*qkv, *of_bias, bias)
 
 

@@ -47,7 +47,7 @@ def chosen_kernel(
     kernel = _forced[-1] if kernel == "auto" and _forced else kernel
     if kernel == "triton" and not fits_triton(q_BhNd, bias):
         raise ValueError(
-            "Triton kernels need triton 3.5, a GPU, a bias with `triton_functions`, tokens "
+            "Triton kernels need triton 3.5, a GPU, LocusGS's bias, tokens "
             "without gradient, heads of at most 256 channels, and no float64"
         )
     if kernel != "auto":
@@ -79,7 +79,7 @@ def fits_triton(q_BhNd: Tensor, bias: "AttentionBias") -> bool:
     return (
         there
         and triton_version() >= (3, 5)
-        and bias.triton_functions() is not None
+        and bias.in_triton
         and not (bias.tokens.requires_grad and torch.is_grad_enabled())
         and q_BhNd.dtype in (torch.float32, torch.bfloat16, torch.float16)
         and q_BhNd.shape[-1] <= 256

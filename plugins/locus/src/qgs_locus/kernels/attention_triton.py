@@ -5,13 +5,9 @@ the result, one for the gradients of the queries, and one over the queries of a 
 those of keys and values. The bias and all sums are in float32. Each number is summed by one program
 in one order, so results have the same bits each time.
 
-A bias brings two `jit` functions (`AttentionBias.triton_functions`), for a block of n queries and m
-tokens, of which it gets pointers (n, 1) and (1, m). The F numbers of a query are at `queries + f`,
-the G numbers of a token at `tokens + g * step`:
-
-- `value(queries, tokens, step)`: the bias (n, m);
-- `gradients(queries, tokens, step, gradient, sums)`: the F tensors (n,) of the tuple `sums`, with
-  the gradients of the queries' numbers added, given that of the bias (n, m).
+The bias is `RayBias` of `qgs_locus.ray_bias`. It reads five numbers of a query, x, y, z,
+gamma / (2 sigma^2), gamma * bias_min, and six of a token, m and d. Its functions get pointers
+(n, 1) to the first of queries, (1, m) to the first of tokens; `step` leads to a token's next one.
 
 Axes: as `qgs_locus.kernels.attention_bias`; W: the least power of two from d on.
 """
@@ -25,6 +21,59 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 jit: Any = triton.jit
+F = tl.constexpr(5)
+G = tl.constexpr(6)
+
+
+@jit
+def _moment(queries, tokens, step):
+    """mu x d - m, (n, m) each."""
+    x = tl.load(queries)
+    y = tl.load(queries + 1)
+    z = tl.load(queries + 2)
+    m0 = tl.load(tokens)
+    m1 = tl.load(tokens + step)
+    m2 = tl.load(tokens + 2 * step)
+    d0 = tl.load(tokens + 3 * step)
+    d1 = tl.load(tokens + 4 * step)
+    d2 = tl.load(tokens + 5 * step)
+    return y * d2 - z * d1 - m0, z * d0 - x * d2 - m1, x * d1 - y * d0 - m2
+
+
+@jit
+def _bias(queries, tokens, step):
+    """max(-factor |mu x d - m|^2, lower), (n, m)."""
+    e0, e1, e2 = _moment(queries, tokens, step)
+    bias = -tl.load(queries + 3) * (e0 * e0 + e1 * e1 + e2 * e2)
+    lower = tl.load(queries + 4)
+    return tl.where(bias <= lower, lower, bias)
+
+
+@jit
+def _bias_gradients(queries, tokens, step, gradient, sums):
+    """The five `sums` (n,), with gradients of the queries' numbers added, given that of the bias.
+
+    With e = mu x d - m, the gradient of |e|^2 to mu is 2 d x e.
+    """
+    e0, e1, e2 = _moment(queries, tokens, step)
+    d0 = tl.load(tokens + 3 * step)
+    d1 = tl.load(tokens + 4 * step)
+    d2 = tl.load(tokens + 5 * step)
+    factor = tl.load(queries + 3)
+    lower = tl.load(queries + 4)
+    distance_sq = e0 * e0 + e1 * e1 + e2 * e2
+    at_bound = -factor * distance_sq <= lower
+    inside = tl.where(at_bound, 0.0, gradient)
+    # gradient - inside would be fused with the product in `gradient`, and leave its rounding error.
+    to_bound = tl.where(at_bound, gradient, 0.0)
+    to_center = -2 * factor * inside
+    return (
+        sums[0] + tl.sum(to_center * (d1 * e2 - d2 * e1), 1),
+        sums[1] + tl.sum(to_center * (d2 * e0 - d0 * e2), 1),
+        sums[2] + tl.sum(to_center * (d0 * e1 - d1 * e0), 1),
+        sums[3] - tl.sum(inside * distance_sq, 1),
+        sums[4] + tl.sum(to_bound, 1),
+    )
 
 
 @jit
@@ -52,17 +101,16 @@ def _at(x, scene, head, rows, count, width, WIDTH: tl.constexpr):
 
 
 @jit
-def _logits(q, k, queries, tokens, m, M, scale, VALUE: tl.constexpr):
+def _logits(q, k, queries, tokens, m, M, scale):
     """q k / sqrt(d) + b, (n, m); -inf outside."""
     products = tl.dot(q, tl.trans(k), input_precision="ieee") * scale
-    return tl.where((m < M)[None, :], products + VALUE(queries, tokens, M), float("-inf"))
+    return tl.where((m < M)[None, :], products + _bias(queries, tokens, M), float("-inf"))
 
 
 @jit
 def _forward(
-    q, k, v, read_q, read_k, out, lse, heads, N, M, width, scale, VALUE: tl.constexpr,
-    F: tl.constexpr, G: tl.constexpr, BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr,
-    WIDTH: tl.constexpr,
+    q, k, v, read_q, read_k, out, lse, heads, N, M, width, scale,
+    BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
     """The result, and the log-sum-exp of each query (B, h, N)."""
     # Offsets exceed 2^31 for large batches.
@@ -80,7 +128,7 @@ def _forward(
         of_k = _load(k, scene, head, m, M, width, WIDTH)
         of_v = _load(v, scene, head, m, M, width, WIDTH)
         tokens = read_k + scene * G * M + tl.minimum(m, M - 1)[None, :]
-        logits = _logits(of_q, of_k, queries, tokens, m, M, scale, VALUE)
+        logits = _logits(of_q, of_k, queries, tokens, m, M, scale)
         # The running maximum keeps exp in range; sums so far shrink by how much it rose.
         above = tl.maximum(greatest, tl.max(logits, 1))
         p = tl.exp(logits - above[:, None])
@@ -95,7 +143,6 @@ def _forward(
 @jit
 def _backward_queries(
     q, k, v, read_q, read_k, g, lse, rowsum, dq, of_bias, heads, N, M, width, scale,
-    VALUE: tl.constexpr, GRADIENTS: tl.constexpr, F: tl.constexpr, G: tl.constexpr,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
     """Gradients of q, and of what the bias reads of queries by heads, (B, h, N, F); or None."""
@@ -116,13 +163,13 @@ def _backward_queries(
         of_k = _load(k, scene, head, m, M, width, WIDTH)
         of_v = _load(v, scene, head, m, M, width, WIDTH)
         tokens = read_k + scene * G * M + tl.minimum(m, M - 1)[None, :]
-        logits = _logits(of_q, of_k, queries, tokens, m, M, scale, VALUE)
+        logits = _logits(of_q, of_k, queries, tokens, m, M, scale)
         of_p = tl.dot(of_g, tl.trans(of_v), input_precision="ieee")
         ds = tl.exp(logits - of_lse[:, None]) * (of_p - of_rowsum[:, None])
         if dq is not None:
             sums += tl.dot(ds.to(of_k.dtype), of_k, input_precision="ieee")
         if of_bias is not None:
-            bias_sums = GRADIENTS(queries, tokens, M, ds, bias_sums)
+            bias_sums = _bias_gradients(queries, tokens, M, ds, bias_sums)
     _store(dq, scene, head, n, N, width, sums * scale, WIDTH)
     if of_bias is not None:
         for f in tl.static_range(F):
@@ -132,7 +179,6 @@ def _backward_queries(
 @jit
 def _backward_tokens(
     q, k, v, read_q, read_k, g, lse, rowsum, dk, dv, heads, N, M, width, scale,
-    VALUE: tl.constexpr, F: tl.constexpr, G: tl.constexpr,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
     """Gradients of k and v, or None. Queries outside have log-sum-exp inf, so weights of 0."""
@@ -152,7 +198,7 @@ def _backward_tokens(
         of_lse = tl.load(lse + each * N + n, mask=n < N, other=float("inf"))
         of_rowsum = tl.load(rowsum + each * N + n, mask=n < N, other=0.0)
         queries = read_q + (scene * N + tl.minimum(n, N - 1))[:, None] * F
-        logits = _logits(of_q, of_k, queries, tokens, m, M, scale, VALUE)
+        logits = _logits(of_q, of_k, queries, tokens, m, M, scale)
         p = tl.exp(logits - of_lse[:, None])
         if dv is not None:
             v_sums += tl.dot(tl.trans(p.to(of_g.dtype)), of_g, input_precision="ieee")
@@ -165,55 +211,54 @@ def _backward_tokens(
 
 class TritonAttention(torch.autograd.Function):
     """See `biased_attention`. queries (B, N, F) and tokens (B, G, M): what the bias reads, float32;
-    tokens get no gradient. functions: the bias's `triton_functions`.
+    tokens get no gradient.
     """
 
     @staticmethod
     def forward(
-        ctx: Any, q: Tensor, k: Tensor, v: Tensor, queries: Tensor, tokens: Tensor, functions: Any
+        ctx: Any, q: Tensor, k: Tensor, v: Tensor, queries: Tensor, tokens: Tensor
     ) -> Tensor:
         out = torch.empty_like(q)
         lse = q.new_empty(q.shape[:3], dtype=torch.float32)
         # Kernels step through rows of these without strides.
         saved = q, k, v, queries.contiguous(), tokens.contiguous()
-        _launch(_forward, *saved, out, lse, VALUE=functions[0])
+        _launch(_forward, *saved, out, lse)
         ctx.save_for_backward(*saved, out, lse)
-        ctx.functions = functions
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         *saved, out, lse = ctx.saved_tensors
-        (q, k, v, queries, _), (value, of_bias) = saved, ctx.functions
+        q, k, v, queries, _ = saved
         needs = ctx.needs_input_grad
         shape = (q.shape[0] * q.shape[1], *queries.shape[1:])
         dq, dk, dv = (torch.empty_like(x) if needs[n] else None for n, x in enumerate((q, k, v)))
         by_head = queries.new_empty(shape) if needs[3] else None
         given = *saved, gradients[0], lse, (gradients[0].float() * out.float()).sum(-1)
         if dq is not None or by_head is not None:
-            _launch(_backward_queries, *given, dq, by_head, VALUE=value, GRADIENTS=of_bias)
+            _launch(_backward_queries, *given, dq, by_head)
         if dk is not None or dv is not None:
-            _launch(_backward_tokens, *given, dk, dv, VALUE=value)
+            _launch(_backward_tokens, *given, dk, dv)
         # By head first: adding in the kernel would need atomics, whose order changes the bits.
         summed = None if by_head is None else by_head.unflatten(0, q.shape[:2]).sum(1)
-        return dq, dk, dv, summed, None, None
+        return dq, dk, dv, summed, None
 
 
-def _launch(kernel: Any, *tensors: Any, **functions: Any) -> None:
+def _launch(kernel: Any, *tensors: Any) -> None:
     """Run a kernel for each head and block; tensors (B, h, ., d) go with their strides."""
-    q, k, _, queries, tokens = tensors[:5]
+    q, k = tensors[:2]
     (scenes, heads, N, width), M = q.shape, k.shape[2]
-    sizes = {"F": queries.shape[2], "G": tokens.shape[1], **_blocks(kernel, q, queries.shape[2])}
+    sizes = _blocks(q)
     over = (M, "BLOCK_M") if kernel is _backward_tokens else (N, "BLOCK_N")
     # One program a block and head; the tokens' kernel divides the tokens instead.
     grid = -(-over[0] // sizes[over[1]]), scenes * heads
     arguments = [(x, x.stride()) if x is not None and x.ndim == 4 else x for x in tensors]
     with torch.cuda.device_of(q):
-        kernel[grid](*arguments, heads, N, M, width, width**-0.5, **sizes, **functions)
+        kernel[grid](*arguments, heads, N, M, width, width**-0.5, **sizes)
 
 
-def _blocks(kernel: Any, q: Tensor, numbers: int) -> dict[str, int]:
+def _blocks(q: Tensor) -> dict[str, int]:
     """Queries and tokens of a block, and its threads: what nearly fits into 255 registers each.
 
     Products in float32 run outside the matrix units, where loading ahead takes registers.
@@ -223,12 +268,10 @@ def _blocks(kernel: Any, q: Tensor, numbers: int) -> dict[str, int]:
     exact = q.dtype == torch.float32
     wide = width > 128
     rows = 16 if exact and wide else 32 if exact or width > 64 else 64
-    sizes = {"BLOCK_N": rows, "BLOCK_M": min(rows, 32), "WIDTH": width}
-    if kernel is _backward_queries and numbers > 8:
-        # Sums of all numbers of each query stay in registers.
-        sizes["BLOCK_N"] = 16
     return {
-        **sizes,
+        "BLOCK_N": rows,
+        "BLOCK_M": min(rows, 32),
+        "WIDTH": width,
         "num_warps": 8 if exact or wide else 4,
         "num_stages": 1 if exact or wide else 2,
     }

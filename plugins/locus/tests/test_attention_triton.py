@@ -1,4 +1,4 @@
-"""The Triton kernels of attention with the biases of LocusGS and of ellipsoids, against float64.
+"""The Triton kernels of attention with a bias against float64; on a GPU the other ways too.
 
 They run on a GPU, or on a CPU under Triton's interpreter, for which TRITON_INTERPRET=1 must be set
 before triton is imported: without a GPU, the first test runs this file again in a process with it.
@@ -20,7 +20,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 from attending import case, exact, found, wrong
-from qgs_anchors.ellipsoid.ray_bias import EllipsoidBias
 from qgs_locus.kernels.attention_bias import biased_attention
 from qgs_locus.ray_bias import RayBias
 from torch.testing import assert_close
@@ -36,12 +35,11 @@ runs = pytest.mark.skipif(
     DEVICE == "cpu" and not INTERPRETED, reason="runs on a GPU, or with TRITON_INTERPRET=1"
 )
 compiles = pytest.mark.skipif(INTERPRETED, reason="the interpreter compiles nothing")
-kinds = pytest.mark.parametrize(
-    ("kind", "middle"), [(RayBias, ()), (EllipsoidBias, 2 * (1.0, 0, 0, 0, 1, 0, 0, 0, 1))]
+kernels = pytest.mark.parametrize(
+    "kernel", ["triton", "plain", "blocks"] if DEVICE == "cuda" else ["triton"]
 )
 
 LEARNT = ("q", "k", "v", "queries")
-IN_TRITON = partial(biased_attention, kernel="triton")
 
 
 def _on_device(given):
@@ -52,7 +50,7 @@ def _on_device(given):
 def test_kernels_pass_under_the_interpreter():
     result = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-m", "slow", "-p", "no:cacheprovider", __file__],
-        cwd=Path(__file__).parents[4],
+        cwd=Path(__file__).parents[3],
         env={**os.environ, "TRITON_INTERPRET": "1"},
         capture_output=True,
         text=True,
@@ -63,42 +61,42 @@ def test_kernels_pass_under_the_interpreter():
 
 
 @runs
-@kinds
-def test_gradients_are_those_of_float64(kind, middle):
+@kernels
+def test_gradients_are_those_of_float64(kernel):
     """Bounds of 0 and -1e9 hold for all pairs and for none; a factor of 100 is a thin anchor."""
     for number in range(24):
         torch.manual_seed(number)
         pick = Random(number).choice
         sizes = pick((1, 2)), pick((1, 3)), pick((1, 9, 67)), pick((1, 33, 131))
         sizes = *sizes, pick((3, 8, 24, 80))
-        given = case(sizes, middle, *pick(((1, -6), (1, -0.5), (1, 0), (0.01, -1e9), (100, -6))))
-        seen = found(IN_TRITON, kind, _on_device(given), LEARNT)
+        given = case(sizes, *pick(((1, -6), (1, -0.5), (1, 0), (0.01, -1e9), (100, -6))))
+        seen = found(partial(biased_attention, kernel=kernel), RayBias, _on_device(given), LEARNT)
         assert seen.keys() == {"read", *LEARNT}
-        assert not wrong(seen, exact(kind, given, LEARNT)), (number, sizes)
+        assert not wrong(seen, exact(RayBias, given, LEARNT)), (number, sizes)
 
 
 @runs
-@kinds
-def test_bits_are_the_same_each_time_and_what_is_frozen_gets_no_gradient(kind, middle):
-    given = _on_device(case((1, 2, 70, 70, 16), middle))
-    whole, again = (found(IN_TRITON, kind, given, LEARNT) for _ in range(2))
+def test_bits_are_the_same_each_time_and_what_is_frozen_gets_no_gradient():
+    attention = partial(biased_attention, kernel="triton")
+    given = _on_device(case((1, 2, 70, 70, 16)))
+    whole, again = (found(attention, RayBias, given, LEARNT) for _ in range(2))
     assert_close(again, whole, rtol=0, atol=0)
     for learnt in (*zip(LEARNT, strict=True), ("k", "v"), ("q", "queries")):
         expected = {name: whole[name] for name in ("read", *learnt)}
         # on a GPU other products and sums are fused
-        seen = found(IN_TRITON, kind, given, learnt)
+        seen = found(attention, RayBias, given, learnt)
         assert_close(seen, expected, rtol=1e-5, atol=1e-6)
 
 
 @runs
-@kinds
+@kernels
 @pytest.mark.skipif(DEVICE == "cpu", reason="the interpreter computes bfloat16 wrongly")
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_half_precision(dtype, kind, middle):
-    given = case((2, 3, 130, 200, 64), middle)
+def test_half_precision(dtype, kernel):
+    given = case((2, 3, 130, 200, 64))
     halved = {name: x.to(dtype) if len(name) == 1 else x for name, x in _on_device(given).items()}
-    seen = found(lambda *read: IN_TRITON(*read).float(), kind, halved, LEARNT)
-    assert not wrong(seen, exact(kind, given, LEARNT), 2e-2)
+    seen = found(lambda *read: biased_attention(*read, kernel).float(), RayBias, halved, LEARNT)
+    assert not wrong(seen, exact(RayBias, given, LEARNT), 2e-2)
 
 
 SHARED = {80: 166_912, 89: 101_376, 90: 232_448}
@@ -107,7 +105,6 @@ USUAL = (2, 4, 1000, 2000, 64)
 
 
 @compiles
-@kinds
 @pytest.mark.parametrize(
     ("arch", "dtype", "sizes", "learnt"),
     [
@@ -121,7 +118,7 @@ USUAL = (2, 4, 1000, 2000, 64)
     ids=str,
 )
 def test_kernels_compile_for_gpus_that_are_not_here(
-    kind, middle, arch, dtype, sizes, learnt, monkeypatch, tmp_path
+    arch, dtype, sizes, learnt, monkeypatch, tmp_path
 ):
     jit = import_module("triton.runtime.jit").JITFunction
     driver = import_module("triton.runtime.driver").driver
@@ -144,10 +141,10 @@ def test_kernels_compile_for_gpus_that_are_not_here(
 
     def halved(q, k, v, bias):
         halves = (x.to(dtype) for x in (q, k, v))
-        read = attention.apply(*halves, bias.queries, bias.tokens, bias.triton_functions())
+        read = attention.apply(*halves, bias.queries, bias.tokens)
         return read.float()
 
-    found(halved, kind, case(sizes, middle), learnt)
+    found(halved, RayBias, case(sizes), learnt)
     needed = {"_backward_queries": {"q", "queries"}, "_backward_tokens": {"k", "v"}}
     passes = [name for name, inputs in needed.items() if inputs & {*learnt}]
     assert [kernel.metadata.name for kernel in compiled] == ["_forward", *passes]

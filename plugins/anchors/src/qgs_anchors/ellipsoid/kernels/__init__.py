@@ -1,1 +1,0 @@
-"""`EllipsoidBias` compiled, for CPUs and GPUs; the formula is in its module."""
