@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from guide_hooks import filled
+from guide import filled
 from qgs_dev import checks_for, run_check
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from importlib import import_module
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -102,8 +103,8 @@ def report(out: Path, words: Sequence[str]) -> bool:
 
 def time_attention() -> None:
     """Print time and memory of each kernel of attention at published size."""
-    from attending import case  # of the tests, which are on the path of a step
-
+    # Of the tests, which are on the path of a step.
+    case: Any = import_module("attending").case
     given = {name: x.cuda() for name, x in case((1, 16, 4096, 7168, 64)).items()}
     q, k, v = (given[name].requires_grad_() for name in "qkv")
     bias = RayBias(given["queries"], given["tokens"])

@@ -4,7 +4,7 @@ import re
 from functools import cache
 from pkgutil import resolve_name
 
-import guide_reference
+import guide
 import yaml
 from guide_pages import DOCS, all_pages
 
@@ -66,7 +66,7 @@ ROWS = rows_of(EQUATIONS)
 
 @cache
 def configs(slot):
-    components = guide_reference.REGISTRY.components(slot)
+    components = guide.REGISTRY.components(slot)
     return {name: component.Config for name, component in components.items()}
 
 
@@ -77,7 +77,7 @@ def owners(option, where):
     """
     section, _, name = option.rpartition(".")
     if section:
-        places = {t.removeprefix("model."): c for t, c in guide_reference.SECTIONS.items()}
+        places = {t.removeprefix("model."): c for t, c in guide.SECTIONS.items()}
         places |= {s: configs(s)[slot.default] for s, slot in SLOTS.items() if slot.default}
         found = [places[section]]
     elif name in RecipeSettings.model_fields:

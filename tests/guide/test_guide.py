@@ -4,7 +4,7 @@ import re
 from importlib import import_module
 from pathlib import Path
 
-import guide_reference
+import guide
 import pytest
 import torch
 import yaml
@@ -65,11 +65,11 @@ def test_recipes_of_the_five_ideas():
 
 
 def test_the_reference_explains_every_option():
-    registry = guide_reference.REGISTRY
-    configs = [*guide_reference.SECTIONS.values()]
+    registry = guide.REGISTRY
+    configs = [*guide.SECTIONS.values()]
     configs += [c.Config for slot in SLOTS for c in registry.components(slot).values()]
     for config in configs:
-        rows = guide_reference.option_table(config).splitlines()[2:]
+        rows = guide.option_table(config).splitlines()[2:]
         cells = [[x.strip().strip("`") for x in re.split(r"(?<!\\)\|", row)] for row in rows]
         shown = {option: default for _, option, _, default, *_ in cells}
         assert shown.keys() == config.model_fields.keys()

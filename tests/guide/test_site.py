@@ -10,7 +10,7 @@ from posixpath import normpath
 
 import pytest
 import qgs_dev
-from guide_hooks import written
+from guide import written
 from guide_pages import DOCS, all_pages, text_of
 
 import qgs
@@ -88,12 +88,12 @@ def test_the_site_is_built_without_a_warning(tmp_path):
 
 
 def test_pages_are_readable_in_the_repository():
-    """They are as `python tools/guide_hooks.py` writes them, and links lead to files."""
+    """They are as `python tools/guide.py` writes them, and links lead to files."""
     for path in PAGES:
         text = text_of(path)
         folder = (DOCS / path).parent
         plain = re.sub("<!--.*?-->", "", CODE.sub("code", text), flags=re.DOTALL)
-        assert written(text, folder) == text, f"{path}: run python tools/guide_hooks.py"
+        assert written(text, folder) == text, f"{path}: run python tools/guide.py"
         # what mkdocs would fill; a heading with nothing below it but one of its level or a higher
         for pattern in (r"^:::|^!!!|\{%|\{\{", r"^(#+) [^\n]*\s+(?!\1#)#{1,6} "):
             assert not re.search(pattern, f"{plain}\n# ", re.MULTILINE), path

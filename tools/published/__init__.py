@@ -1,5 +1,5 @@
-"""Comparing this framework with files of numbers computed by the published code.
+"""Computing here what files of numbers of the published code hold.
 
-files: reading them. recording: what a model computes on the way. losses: what losses compute.
-comparison: the largest errors and whether they are small enough.
+files: reading them. models, splats, losses: their tensors by our components. recording: what
+modules compute on the way.
 """

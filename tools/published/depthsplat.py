@@ -10,17 +10,25 @@ from qgs_zoo.mvsplat.depthsplat_head import WorldHead
 from qgs_zoo.mvsplat.mvsplat import Sweep, expected_disparity
 from qgs_zoo.mvsplat.pixels import OnRays
 from qgs_zoo.mvsplat.sweep import (
-    feature_lenses,
     inverse_depth_candidates,
     relative_poses,
-    warp_grid,
 )
 from qgs_zoo.mvsplat.two_depths import Exchange
 from qgs_zoo.mvsplat.windows import shift_mask
 from torch import Tensor
 
 from published.files import GoldenFile
-from published.splats import Recorder, gaussians, pixel_state, views_of, weights_of
+from published.recording import Recorder
+from published.splats import (
+    gaussians,
+    of_views,
+    pixel_state,
+    views_of,
+    warps,
+    watch_transformer,
+    watch_unet,
+    weights_of,
+)
 from qgs.contracts import LayerParts, ModelDims
 from qgs.types import ImageMemory, Views
 
@@ -57,7 +65,7 @@ features_mono.1   mono_pyramid.stages.1
 
 def encoder_of(golden: GoldenFile) -> DepthSplatEncoder:
     """The encoder with the options and the weights of a file."""
-    options = golden.options("options")
+    options = golden.config["options"]
     config = DepthSplatEncoder.Config(
         near=0.5,
         far=100.0,
@@ -72,14 +80,13 @@ def encoder_of(golden: GoldenFile) -> DepthSplatEncoder:
     return encoder
 
 
-@torch.no_grad()
 def depthsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     """Every output of a golden file."""
     encoder = encoder_of(golden)
     views = views_of(golden)
     near = golden.input("near")
     far = golden.input("far")
-    kept = Recorder(near.shape[1])
+    kept = of_views(near.shape[1])
     watch(kept, encoder, views.cameras.size)
     numbers = encoder.predict(views, near, far)
     found = kept.found
@@ -94,7 +101,7 @@ def depthsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     found["shift_mask"] = shift_mask(
         *(side // encoder.config.stride for side in size), device=near.device
     )
-    swept(found, predictor, sweep)
+    swept(found, predictor, views, sweep)
     numbers = numbers.movedim(2, -1)
     # Behind the harmonics stands the coarse depth, of models that have one.
     found |= gaussians(views, numbers[..., :38], *outputs_of(DIMS[1]))
@@ -110,37 +117,34 @@ def watch(kept: Recorder, encoder: DepthSplatEncoder, size: tuple[int, int]) -> 
     network = encoder.network
     predictor = encoder.network.depth_predictor
     low = (size[0] // encoder.config.stride, size[1] // encoder.config.stride)
-    kept.table(network, OUTPUTS)
-    kept.transformer(predictor.transformer, low, "features_mv.0")
+    kept.outputs(network, OUTPUTS)
+    watch_transformer(kept, predictor.transformer, low, "features_mv.0")
     vit = predictor.pretrained
     if encoder.config.scales > 1:
-        kept.table(predictor, FINER_OUTPUTS)
+        kept.outputs(predictor, FINER_OUTPUTS)
     kept.input("dino_input", vit)
-
-    def keep_all(_: Any, __: Any, out: list[Tensor]) -> None:
-        for index, x in enumerate(out):
-            kept.keep(f"dino_features.{index}", x)
-
-    vit.register_forward_hook(keep_all)
+    vit.register_forward_hook(
+        lambda _, __, out: kept.found.update(
+            {f"dino_features.{index}": kept.shaped(x) for index, x in enumerate(out)}
+        )
+    )
     network.feature_upsampler.register_forward_pre_hook(
-        lambda _, given: kept.keep("features_mono_eighth.3", given[0][-1])
+        lambda _, given: kept.found.update({"features_mono_eighth.3": kept.shaped(given[0][-1])})
     )
     for scale in range(encoder.config.scales):
         regressor: Any = predictor.regressor[scale]
         head = predictor.depth_head[scale]
         kept.input(f"cost_volume.{scale}", regressor, slice(predictor.candidates(scale)))
         kept.output(f"cost_unet.{scale}.stem", regressor[2])
-        kept.unet(f"cost_unet.{scale}", regressor[3])
+        watch_unet(kept, f"cost_unet.{scale}", regressor[3])
         kept.output(f"cost_unet_out.{scale}", regressor)
         kept.input(f"cost_volume_refined.{scale}", head)
         kept.output(f"match_logits.{scale}", head)
-    network.gaussian_head.register_forward_hook(
-        lambda _, __, out: kept.keep("raw_gaussians", out.movedim(1, -1))
-    )
+    kept.output("raw_gaussians", network.gaussian_head, lambda x: kept.shaped(x).movedim(2, -1))
     kept.input("match_probability_max", network.gaussian_regressor, slice(4, 5))
 
 
-def swept(found: dict[str, Tensor], predictor: DepthPredictor, sweep: Sweep) -> None:
+def swept(found: dict[str, Tensor], predictor: DepthPredictor, views: Views, sweep: Sweep) -> None:
     """What the sweeps compute between modules."""
     shape = sweep.near.shape
     poses = relative_poses(sweep.cameras.c2w, sweep.neighbours)
@@ -148,10 +152,7 @@ def swept(found: dict[str, Tensor], predictor: DepthPredictor, sweep: Sweep) -> 
     candidates = inverse_depth_candidates(sweep.near, sweep.far, counts[0])
     found["inverse_depth_candidates.0"] = candidates
     low = found["cost_volume.0"].shape[-2:]
-    lens = feature_lenses(sweep.cameras, (low[0], low[1]))[:, :, None].expand(*poses.shape[:3], 4)
-    depth = (1 / candidates[..., ::8])[:, :, None, :, None, None].expand(*poses.shape[:3], -1, *low)
-    grid = warp_grid(*(x.flatten(0, 2) for x in (depth, lens, poses)))
-    found["warp_grid.0"] = grid.unflatten(0, poses.shape[:3])
+    found["warp_grid.0"] = warps(views, poses, low, candidates[..., ::8])
     candidates = candidates.flatten(0, 1)[..., None, None]
     for scale, count in enumerate(counts):
         if scale:

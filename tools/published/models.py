@@ -1,21 +1,34 @@
-"""The model of a golden file: composed from the published options, filled with its weights."""
+"""The model of a golden file: composed from the published options, filled with its weights.
+
+tokens.l, anchor_*.l: the state after l layers. *.i: inside the 0-based layer i.
+"""
 
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import torch
+from qgs_locus.anchors import AnchoredQueries
+from qgs_locus.cross_attention import RayBiasedCrossAttention
+from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
+from qgs_locus.self_attention import AnchorAwareSelfAttention
 from qgs_research.published.layouts import names_of
+from qgs_zoo.tokengs2026.latents import LatentBottleneck
+from qgs_zoo.tokengs2026.times import time_features
 from torch import Tensor
 
 from published.depthsplat import depthsplat_tensors
-from published.files import GoldenFile, GoldenFileError
-from published.locus import locusgs_recipe
+from published.files import GoldenFile
 from published.mvsplat import mvsplat_tensors
-from published.recording import model_tensors
-from published.splat_cases import cases_tensors
-from published.tokengs import tokengs_recipe
+from published.recipes import locusgs_recipe, tokengs_recipe
+from published.recording import Recorder
+from published.splats import cases_tensors
 from qgs.contracts.weights import real_ratio
+from qgs.geometry.rays import camera_rays, plucker_rays
+from qgs.model import QueryGaussianModel
 from qgs.recipe import resolve
-from qgs.types import Cameras, Views
+from qgs.tokengs import CrossSelfMlp
+from qgs.tokengs.encoder import PatchViT, imagenet_normalised
+from qgs.types import Cameras, Gaussians, ImageMemory, QueryState, Views
 
 RECIPES: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
     "tokengs": tokengs_recipe,
@@ -37,13 +50,13 @@ READ_NORM = "enc_dec_backbone.multiscale_norms.0."
 DECODER_MLP = "enc_dec_backbone.decoder_blocks.0.mlp.mlp.fc1.weight"
 
 
+@torch.no_grad()
 def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     """All tensors that the file may hold, computed by its model on its photos and cameras.
 
-    Raises GoldenFileError for a file that contradicts itself or lacks something, and ValueError
-    for options that no recipe can express.
+    Raises ValueError for options that no recipe can express.
     """
-    if golden.config.get("kind") in COMPUTED:
+    if golden.config["kind"] in COMPUTED:
         return COMPUTED[golden.config["kind"]](golden)
     recipe = resolve(recipe_of(golden))
     model = recipe.build_model().eval()
@@ -52,35 +65,105 @@ def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     if hasattr(model.encoder, "norms"):
         weights = {name.replace(LAST_NORM, READ_NORM): x for name, x in weights.items()}
     model.load_state_dict(names_of(recipe).from_published(weights), strict=True)
-    cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), golden.size)
+    size = golden.config["options"]["img_size"]
+    cameras = Cameras(golden.input("c2w"), golden.input("intrinsics"), tuple(size))
     times = (golden.input(name) if name in golden.tensors else None for name in TIMES)
     views = Views(golden.input("rgb"), cameras, None, *times)
-    tuned = golden.input(TUNED) if TUNED in golden.tensors else None
-    return model_tensors(model, views, tuned)
+    kept = Recorder()
+    watch(kept, model)
+    memory = model.encoder(views)
+    state = model.queries(memory, views)
+    prediction = model.predict(views, memory, state, range(1, model.depth + 1))
+    found = kept.found | of_views(views, model) | {"gaussians": packed(prediction.gaussians)}
+    found |= {"keys": memory["keys"], "values": memory["values"]}
+    if memory.patch_rays is not None:
+        # Then its features are those of image tokens.
+        found |= {"encoder_features": memory.features, "plucker_patch": memory.patch_rays}
+    states = {0: state}
+    for number, layer in prediction.layers.items():
+        found[f"gaussians_layer.{number}"] = packed(layer.gaussians)
+        states[number] = layer.state
+    for number, after in states.items():
+        found |= of_state(model, memory, after, number)
+    if TUNED in golden.tensors:
+        # Latents to decode in place of those that the photos give.
+        memory = model.encoder.project(golden.input(TUNED), memory)
+        tuned = model.predict(views, memory, state)
+        found["gaussians_of_tuned_latents"] = packed(tuned.gaussians)
+    return found
 
 
 def recipe_of(golden: GoldenFile) -> dict[str, Any]:
     """The recipe of the model that a file was computed with; raises as `golden_tensors` does."""
-    kind = golden.config.get("kind")
-    if not isinstance(kind, str) or kind not in RECIPES:
-        known = ", ".join([*RECIPES, *COMPUTED])
-        raise GoldenFileError(f"the kind of model is {kind!r}; known are {known}")
     constants = {name: golden.config[name] for name in ("geo_sigma",) if name in golden.config}
-    recipe = RECIPES[kind](golden.options("options", constants))
-    model = recipe["model"]
-    _expect_agreement(golden, "gaussians_per_token", model["head"]["gaussians_per_query"])
-    _expect_agreement(golden, "anchor_radius_min", model["queries"].get("radius_min"))
+    recipe = RECIPES[golden.config["kind"]](golden.config["options"] | constants)
     weights = golden.weights()
     # The releases have no option for it.
     if DECODER_MLP in weights:
         hidden, width = weights[DECODER_MLP].shape
-        model["decoder"]["feed_forward"] = {"ratio": real_ratio(hidden, width, DECODER_MLP)}
+        ratio = real_ratio(hidden, width, DECODER_MLP)
+        recipe["model"]["decoder"]["feed_forward"] = {"ratio": ratio}
     return recipe
 
 
-def _expect_agreement(golden: GoldenFile, name: str, from_options: Any) -> None:
-    stated = golden.config.get(name)
-    if None not in (stated, from_options) and stated != from_options:
-        raise GoldenFileError(
-            f"the metadata contradicts itself: {name} is {stated}, by its options {from_options}"
-        )
+def watch(kept: Recorder, model: QueryGaussianModel) -> None:
+    """Record what happens inside the encoder and the layers."""
+    encoder = model.encoder
+    assert isinstance(encoder, PatchViT)
+    first = encoder.blocks[0] if len(encoder.blocks) else encoder.get_submodule("norm")
+    kept.input("encoder_in", first)
+    if isinstance(encoder, LatentBottleneck):
+        kept.input("encoder_features", encoder.feature_kv_proj)
+        kept.input("scene_latents.0", encoder.latent_blocks[0])
+        for index, block in enumerate(encoder.latent_blocks):
+            kept.output(f"latent_cross_attn_out.{index}", block.get_submodule("cross_attention"))
+            kept.output(f"latent_self_attn_out.{index}", block.get_submodule("self_attention"))
+            kept.output(f"scene_latents.{index + 1}", block)
+    for index, layer in enumerate(model.decoder):
+        assert isinstance(layer, CrossSelfMlp)
+        kept.output(f"cross_attn_out.{index}", layer.cross_attention)
+        kept.output(f"self_attn_out.{index}", layer.self_attention)
+        if isinstance(layer.self_attention, AnchorAwareSelfAttention):
+            kept.input(f"anchor_sine.{index}", layer.self_attention.position_mlp)
+            kept.output(f"anchor_pe.{index}", layer.self_attention.position_mlp)
+
+
+def of_views(views: Views, model: QueryGaussianModel) -> dict[str, Tensor]:
+    """What an encoder makes of photos, cameras and times before its network."""
+    origins, directions = camera_rays(views.cameras)
+    found = {
+        "images": imagenet_normalised(views.images),
+        "rays_o": origins.movedim(-1, -3),  # channels before pixels
+        "rays_d": directions.movedim(-1, -3),
+        "plucker": plucker_rays(views.cameras),
+    }
+    channels = getattr(model.encoder.config, "time_channels", 0)
+    for name, times in (("input", views.times), ("target", views.target_time)):
+        if times is not None and channels:
+            found[f"time_embedding_{name}"] = time_features(times, channels)
+    return found
+
+
+def of_state(
+    model: QueryGaussianModel, memory: ImageMemory, state: QueryState, number: int
+) -> dict[str, Tensor]:
+    """The state after `number` layers, and the bias of the next one."""
+    found = {f"tokens.{number}": state.features}
+    queries = model.queries
+    if isinstance(queries, AnchoredQueries):
+        found[f"anchor_center.{number}"] = state[CENTER]
+        if queries.config.radius:
+            radius = support_radius(state[RAW_RADIUS], queries.config)
+            found[f"anchor_radius.{number}"] = radius
+    following: Any = model.decoder[number] if number < len(model.decoder) else None
+    attention = getattr(following, "cross_attention", None)
+    if isinstance(attention, RayBiasedCrossAttention):
+        found[f"geo_gamma.{number}"] = attention.gamma
+        bias = attention.bias(state, memory).dense()
+        found[f"geo_bias.{number}"] = bias / attention.gamma
+    return found
+
+
+def packed(g: Gaussians) -> Tensor:
+    """Attributes side by side, as the releases have them."""
+    return torch.cat([g.means, g.opacities[..., None], g.scales, g.quats, g.colors], -1)

@@ -1,21 +1,27 @@
 """Every tensor of a golden file of MVSplat, computed by the components."""
 
-import torch
 from qgs_zoo.mvsplat.head import RayHead
 from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder, Sweep
 from qgs_zoo.mvsplat.pixels import OnRays
 from qgs_zoo.mvsplat.sweep import (
     cyclic_neighbours,
-    feature_lenses,
     inverse_depth_candidates,
     relative_poses,
-    warp_grid,
 )
 from qgs_zoo.mvsplat.windows import shift_mask
 from torch import Tensor
 
 from published.files import GoldenFile
-from published.splats import Recorder, gaussians, views_of, weights_of
+from published.recording import Recorder
+from published.splats import (
+    gaussians,
+    of_views,
+    views_of,
+    warps,
+    watch_transformer,
+    watch_unet,
+    weights_of,
+)
 from qgs.contracts import ModelDims
 
 OUTPUTS = """
@@ -33,7 +39,7 @@ delta_disparity_and_density_logit   depth_predictor.to_disparity
 
 def encoder_of(golden: GoldenFile) -> MVSplatEncoder:
     """The encoder with the options and the weights of a file."""
-    options = golden.options("options")
+    options = golden.config["options"]
     config = MVSplatEncoder.Config(
         candidates=options["num_depth_candidates"],
         cost_width=options["costvolume_unet_feat_dim"],
@@ -50,7 +56,6 @@ def encoder_of(golden: GoldenFile) -> MVSplatEncoder:
     return encoder
 
 
-@torch.no_grad()
 def mvsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     """Every output of a golden file."""
     encoder = encoder_of(golden)
@@ -58,7 +63,7 @@ def mvsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     near = golden.input("near")
     far = golden.input("far")
     low = tuple(side // 4 for side in views.cameras.size)
-    kept = Recorder(near.shape[1])
+    kept = of_views(near.shape[1])
     watch(kept, encoder, low)
     raw = encoder.predict(views, near, far)
     found = kept.found
@@ -70,10 +75,7 @@ def mvsplat_tensors(golden: GoldenFile) -> dict[str, Tensor]:
     coarse = encoder.depth_predictor.match(found["features"], sweep)[0]
     found["coarse_disparity"] = coarse.unflatten(0, near.shape)
     found["relative_pose"] = poses = relative_poses(views.cameras.c2w, neighbours)
-    lens = feature_lenses(views.cameras, low)[:, :, None].expand(*poses.shape[:3], 4)
-    depth = (1 / disparity)[:, :, None, :, None, None].expand(*poses.shape[:3], -1, *low)
-    grid = warp_grid(*(x.flatten(0, 2) for x in (depth, lens, poses)))
-    found["warp_grid"] = grid.unflatten(0, poses.shape[:3])
+    found["warp_grid"] = warps(views, poses, low, disparity)
     found["shift_mask"] = shift_mask(*low, device=near.device)
     numbers = raw.movedim(2, -1)
     head = RayHead(RayHead.Config(), encoder.dims)
@@ -90,11 +92,11 @@ def watch(kept: Recorder, encoder: MVSplatEncoder, low: tuple[int, ...]) -> None
     """Hooks on all modules whose output or input a file has."""
     predictor = encoder.depth_predictor
     refined = predictor.corr_refine_net
-    kept.table(encoder, OUTPUTS)
-    kept.transformer(encoder.backbone.transformer, low, "features")
+    kept.outputs(encoder, OUTPUTS)
+    watch_transformer(kept, encoder.backbone.transformer, low, "features")
     kept.input("cost_volume", refined, slice(encoder.config.candidates))
-    kept.unet("cost_unet", refined[3])
+    watch_unet(kept, "cost_unet", refined[3])
     kept.input("cost_volume_refined", predictor.depth_head_lowres)
     kept.input("fullres_disparity", predictor.refine_unet, slice(-2, -1))
     kept.input("pdf_max_fullres", predictor.refine_unet, slice(-1, None))
-    kept.unet("depth_unet", predictor.refine_unet[3])
+    watch_unet(kept, "depth_unet", predictor.refine_unet[3])

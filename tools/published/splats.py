@@ -1,20 +1,31 @@
-"""What golden files of MVSplat and DepthSplat share: views, weights, a recorder of modules."""
+"""What golden files of MVSplat and DepthSplat share, and their files of cases."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from qgs_zoo.mvsplat.adapter import band_mask, camera_quaternions, turn_of_harmonics
-from qgs_zoo.mvsplat.pixels import PixelQueries
+from qgs_zoo.mvsplat.depthsplat_head import WorldHead
+from qgs_zoo.mvsplat.head import RayHead, mapped_opacity
+from qgs_zoo.mvsplat.pixels import (
+    PIXEL,
+    OnRays,
+    PixelQueries,
+    in_world,
+    pixel_fields,
+    ray_directions,
+)
+from qgs_zoo.mvsplat.sweep import feature_lenses, warp_grid, warped
 from qgs_zoo.mvsplat.windows import out_of_windows
-from torch import Tensor, nn
+from torch import Tensor
 
-from published.files import GoldenFile, GoldenFileError
-from published.seeded_weights import seeded_state_dict, weights_check
+from published.files import GoldenFile
+from published.recording import Recorder
+from published.seeded_weights import seeded_weight
 from qgs.contracts import ModelDims
+from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.transforms import quat_to_matrix
-from qgs.types import Cameras, ImageMemory, QueryState, Views
+from qgs.types import Cameras, GaussianAttributes, ImageMemory, QueryState, Views
 
 
 def views_of(golden: GoldenFile) -> Views:
@@ -32,16 +43,54 @@ def lens_of(k: Tensor, size: tuple[int, int] = (1, 1)) -> Tensor:
 
 
 def weights_of(golden: GoldenFile) -> dict[str, Tensor]:
-    """The state dict under its published names, without the prefix of checkpoints.
-
-    Raises GoldenFileError where the file was made with other weights.
-    """
+    """The state dict under its published names, without the prefix of checkpoints."""
     rule = golden.config["weights"]
-    arrays = seeded_state_dict(golden.config["state_dict"], rule["seed"], rule["factors"])
-    if not np.allclose(weights_check(arrays), golden.tensors["weights_check"].numpy()):
-        raise GoldenFileError("the file was not made with the weights of its metadata")
+    # Sums of the weights, with which whoever recorded the file checked the rule.
     golden.read.add("weights_check")
-    return {name: torch.from_numpy(x) for name, x in arrays.items()}
+    return {
+        name: torch.from_numpy(
+            seeded_weight(name, shape, rule["seed"], rule["factors"].get(name, 1.0))
+        )
+        for name, shape in golden.config["state_dict"]
+    }
+
+
+def of_views(views: int) -> Recorder:
+    """A recorder of modules with scenes and views in one axis, which become two."""
+    return Recorder(lambda x: x.detach().unflatten(0, (-1, views)))
+
+
+def watch_transformer(kept: Recorder, transformer: Any, size: Sequence[int], last: str) -> None:
+    """The stream before and behind each attention in windows; `last` names the result."""
+    transformer.register_forward_pre_hook(
+        lambda _, given: kept.found.update({"transformer.0": given[0]})
+    )
+    for index, layer in enumerate(transformer.layers):
+        shift = (size[0] // 4, size[1] // 4) if index % 2 else (0, 0)
+
+        def whole(out: Tensor, shift: tuple[int, int] = shift) -> Tensor:
+            return out_of_windows(out, (size[0], size[1]), shift).permute(0, 1, 4, 2, 3)
+
+        kept.output(f"transformer_self.{index}", layer.self_attn, whole)
+        kept.output(f"transformer.{index + 1}", layer, whole)
+    kept.output(last, transformer, Tensor.detach)
+
+
+def watch_unet(kept: Recorder, name: str, unet: Any) -> None:
+    """All modules, and what attentions have before their projection."""
+    for path, module in unet.named_modules():
+        kept.output(f"{name}.{path}", module)
+        if hasattr(module, "qkv"):
+            kept.input(f"{name}.{path}.attention", module.proj_out)
+
+
+def warps(views: Views, poses_BVJ44: Tensor, low: Sequence[int], inverse_BVD: Tensor) -> Tensor:
+    """Where pixels of maps of size `low` stand in neighbours, (B, V, J, D, h, w, 2)."""
+    pairs = poses_BVJ44.shape[:3]
+    lens = feature_lenses(views.cameras, low)[:, :, None].expand(*pairs, 4)
+    depth = (1 / inverse_BVD)[:, :, None, :, None, None].expand(*pairs, -1, *low)
+    grid = warp_grid(*(x.flatten(0, 2) for x in (depth, lens, poses_BVJ44)))
+    return grid.unflatten(0, pairs)
 
 
 def gaussians(views: Views, numbers: Tensor, head: Any, centers: Any) -> dict[str, Tensor]:
@@ -50,21 +99,18 @@ def gaussians(views: Views, numbers: Tensor, head: Any, centers: Any) -> dict[st
     numbers: (B, V, H, W, C), what the networks give for each pixel.
     """
     cameras = views.cameras
-    count = cameras.shape[1]
     state = pixel_state(views, numbers)
     out = head(state)
-    factors = quat_to_matrix(out.quats) * out.scales[..., None, :]
     sh = numbers[..., 11:].unflatten(-1, (3, -1))
-    degree = round(sh.shape[-1] ** 0.5) - 1
-    turn = turn_of_harmonics(cameras.c2w[..., :3, :3], degree) * band_mask(degree, cameras.c2w)
+    turn = turn_of(cameras.c2w, sh)
     row, column = torch.meshgrid(*(torch.arange(side) for side in cameras.size), indexing="ij")
     place = torch.stack([column, row], -1) + numbers[..., 2:4].sigmoid()
     return {
         "ray_xy": place / torch.tensor([cameras.size[1], cameras.size[0]]),
         "means": centers(out.offsets, state)[:, :, 0],
-        "covariances": (factors @ factors.mT)[:, :, 0],
+        "covariances": covariances(out)[:, :, 0],
         "opacities": out.opacities[..., 0],
-        "scales": out.scales.unflatten(1, (count, *cameras.size)),
+        "scales": out.scales.unflatten(1, (cameras.shape[1], *cameras.size)),
         "rotations": camera_quaternions(numbers[..., 7:11]),
         "harmonics": torch.einsum("bvkl,bvhwxl->bvhwxk", turn, sh).flatten(1, 3),
     }
@@ -77,68 +123,70 @@ def pixel_state(views: Views, numbers: Tensor) -> QueryState:
     return PixelQueries(PixelQueries.Config(), dims)(memory, views)
 
 
-class Recorder:
-    """Outputs of modules by name, (B, V, ...)."""
-
-    def __init__(self, views: int) -> None:
-        self.views = views
-        self.found: dict[str, Tensor] = {}
-
-    def keep(self, name: str, x: Tensor) -> None:
-        """A tensor with scenes and views in one axis."""
-        self.found[name] = x.detach().unflatten(0, (-1, self.views))
-
-    def output(self, name: str, module: nn.Module) -> None:
-        """What a module returns."""
-
-        def keep(_: Any, __: Any, out: Tensor) -> None:
-            self.keep(name, out)
-
-        module.register_forward_hook(keep)
-
-    def input(self, name: str, module: nn.Module, channels: slice = slice(None)) -> None:
-        """What a module is given."""
-        module.register_forward_pre_hook(lambda _, given: self.keep(name, given[0][:, channels]))
-
-    def table(self, root: nn.Module, text: str) -> None:
-        """Keep outputs of modules: a name and the path of a module below `root` a line."""
-        for line in text.strip().splitlines():
-            name, path = line.split()
-            self.output(name, root.get_submodule(path))
-
-    def transformer(self, transformer: Any, size: Sequence[int], last: str) -> None:
-        """The stream before and behind each attention in windows; `last` names the result."""
-        found = self.found
-        transformer.register_forward_pre_hook(
-            lambda _, given: found.update({"transformer.0": given[0]})
-        )
-        for index, layer in enumerate(transformer.layers):
-            self._windows(f"transformer_self.{index}", layer.self_attn, size, bool(index % 2))
-            self._windows(f"transformer.{index + 1}", layer, size, bool(index % 2))
-        transformer.register_forward_hook(lambda _, __, out: found.update({last: out}))
-
-    def _windows(self, name: str, module: nn.Module, size: Sequence[int], shifted: bool) -> None:
-        shift = (size[0] // 4, size[1] // 4) if shifted else (0, 0)
-
-        def keep(_: Any, __: Any, out: Tensor) -> None:
-            whole = out_of_windows(out, (size[0], size[1]), shift)
-            self.found[name] = whole.permute(0, 1, 4, 2, 3)
-
-        module.register_forward_hook(keep)
-
-    def unet(self, name: str, unet: Any) -> None:
-        """Blocks, and each attention with what it has before its projection."""
-        for place, block in _blocks(unet):
-            self.output(f"{name}.{place}", block)
-            if hasattr(block, "qkv"):
-                self.input(f"{name}.{place}.attention", block.proj_out)
-        self.output(f"{name}.out", unet.out)
+def covariances(given: GaussianAttributes) -> Tensor:
+    """(..., 3, 3)."""
+    factors = quat_to_matrix(given.quats) * given.scales[..., None, :]
+    return factors @ factors.mT
 
 
-def _blocks(unet: Any) -> Iterator[tuple[str, Any]]:
-    for part in ("input_blocks", "middle_block", "output_blocks"):
-        for index, block in enumerate(getattr(unet, part)):
-            yield f"{part}.{index}", block
-            inside = list(block) if part != "middle_block" else []
-            if len(inside) > 1 and hasattr(inside[1], "qkv"):
-                yield f"{part}.{index}.1", inside[1]
+def turn_of(c2w: Tensor, sh: Tensor) -> Tensor:
+    """Matrices (..., K, K) that turn raw coefficients (..., K) into the world, in e3nn's basis."""
+    degree = round(sh.shape[-1] ** 0.5) - 1
+    return turn_of_harmonics(c2w[..., :3, :3], degree) * band_mask(degree, c2w)
+
+
+def cases_tensors(golden: GoldenFile) -> dict[str, Tensor]:
+    """Every output of a file of cases: a warp, opacities, single Gaussians."""
+    lens = lens_of(golden.input("warp.intrinsics"))
+    grid = warp_grid(golden.input("warp.depth"), lens, golden.input("warp.pose"))
+    found = {"warp.grid": grid, "warp.warped": warped(golden.input("warp.features"), grid)}
+    if "opacity.pdf" in golden.tensors:
+        # First and last exponent, length, step of each schedule.
+        first, last, length, step = golden.input("opacity.schedule").unbind(1)
+        exponents = first + (step / length).clamp(max=1) * (last - first)
+        pdf = golden.input("opacity.pdf")
+        mapped = [mapped_opacity(pdf, exponent) for exponent in exponents.tolist()]
+        found["opacity.mapped"] = torch.stack(mapped)
+    return found | {f"adapter.{name}": x for name, x in single_gaussians(golden).items()}
+
+
+def single_gaussians(golden: GoldenFile) -> dict[str, Tensor]:
+    """Gaussians each with a camera of its own; some have rotations and numbers that trouble."""
+    of_rays = golden.config["kind"] == "mvsplat_cases"
+    names = ("depths", "opacities", "raw", "extrinsics")
+    depth, opacity, raw, c2w = (golden.input(f"adapter.{name}") for name in names)
+    fields = rays(golden)
+    sh = raw[:, 7:].unflatten(1, (3, -1)).clone()
+    if not of_rays:
+        sh[..., 0] += (golden.input("adapter.rgb") - 0.5) / SH_C0
+    numbers = [depth.log()[:, None], opacity.logit()[:, None], raw.new_zeros(len(raw), 2)]
+    numbers = torch.cat([*numbers, raw[:, :7], sh.flatten(1)], 1)[:, None]
+    dims = ModelDims(numbers.shape[-1], 1, 0)
+    state = QueryState(in_world(numbers, c2w[:, None, :3, :3]), fields)
+    head = RayHead(RayHead.Config(), dims) if of_rays else WorldHead(WorldHead.Config(), dims)
+    out = head(state)
+    centers = OnRays(OnRays.Config(measure="distance" if of_rays else "depth"), dims)
+    directions = ray_directions(numbers[:, :, None, 2:4], fields[PIXEL], unit=of_rays)
+    return {
+        "origins": fields[PIXEL][:, 0, 0],
+        "directions": directions[:, 0, 0],
+        "means": centers(out.offsets, state)[:, 0, 0],
+        "covariances": covariances(out)[:, 0, 0],
+        "scales": out.scales[:, 0, 0],
+        "rotations": camera_quaternions(raw[:, 3:7]),
+        "harmonics": torch.einsum("nkl,nxl->nxk", turn_of(c2w, sh), sh),
+    }
+
+
+def rays(golden: GoldenFile) -> dict[str, Tensor]:
+    """Fields of pixels in whose middles the Gaussians stand, outside of the image too."""
+    height, width = golden.config["image_shape"]
+    c2w = golden.input("adapter.extrinsics")[:, None]
+    lens = lens_of(golden.input("adapter.intrinsics"), (height, width))[:, None]
+    # Of the image as one pixel.
+    fields = pixel_fields(Cameras(c2w, lens, (height, width)), 1, 1)
+    origin, corner, across, down = fields[PIXEL].unbind(2)
+    x, y = golden.input("adapter.coordinates")[:, None, :, None].unbind(2)
+    own = across / width, down / height
+    place = corner + x * across + y * down - (own[0] + own[1]) / 2
+    return {**fields, PIXEL: torch.stack([origin, place, *own], 2)}

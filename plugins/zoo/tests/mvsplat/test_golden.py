@@ -7,7 +7,6 @@ import parity
 import pytest
 import torch
 import torch.nn.functional as F
-from published.comparison import ATOL, RTOL
 from published.files import read_golden
 from published.splats import views_of, weights_of
 from qgs_research.published.layouts import fitting_recipe, names_of
@@ -80,7 +79,7 @@ def test_a_published_file_gives_the_released_gaussians(name, monkeypatch):
     found = (ours.means, factors @ factors.mT, ours.opacities, colours)
     wanted = [theirs[name] for name in ("means", "covariances", "opacities")]
     wanted.append(0.5 + SH_C0 * sh[..., None, :, 0] + turned)
-    assert_close(found, (*wanted,), rtol=RTOL, atol=ATOL)
+    assert_close(found, (*wanted,), rtol=parity.RTOL, atol=parity.ATOL)
 
 
 def test_both_ways_to_correlate_agree(monkeypatch):

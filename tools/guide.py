@@ -1,0 +1,230 @@
+"""The parts of the guide that are written from the code, and the hook of mkdocs that adds them.
+
+Pages are readable in the repository too. A module or name is documented where its entry stands, a
+link to its file with the first sentence of its docstring; the site has all its documentation there,
+by mkdocstrings. A link from a name in code to its file leads to this documentation on the site.
+Between `<!-- from the code: NAME -->` and `<!-- end -->` stands what is read in
+the repository in place of the part NAME.
+
+`python tools/guide.py` writes entries and tables of the pages anew; for a new entry write
+`::: NAME`, for a new link ``[`LABEL`][NAME]``. `python tools/guide.py reference` prints the recipe
+reference, of the Configs of what is installed; building the guide puts it on the site.
+"""
+
+import inspect
+import re
+import sys
+from collections.abc import Collection, Mapping
+from itertools import groupby
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any
+
+from jinja2 import Template
+from qgs_dev import CHECKS
+
+from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
+from qgs.recipe import slots
+from qgs.recipe.registry import load_usable_plugins
+from qgs.recipe.sections import DecoderSettings, ModelSettings, RecipeSettings
+from qgs.recipe.yaml_text import dump
+
+ROOT = Path(__file__).parents[1]
+PART = re.compile(r"^<!-- from the code: (.*) -->\n(.*?)^<!-- end -->$", re.MULTILINE | re.DOTALL)
+ENTRY = re.compile(
+    r"^\[`([\w.]+)`\]\(\.\./\.\./\S+\).*(?:\n<!-- (options: .*) -->)?$", re.MULTILINE
+)
+DOCUMENTED = re.compile(r"^::: ([\w.]+)(?:\n    (options: .*))?$", re.MULTILINE)
+CROSS = re.compile(r"\[`[\w.]+`\]\[([a-z_]+(?:\.\w+)+)\]")
+TO_FILE = re.compile(
+    r"\[`([\w.]+)`\]\((?:\.\./)+(?:plugins/\w+/src/)?((?:qgs|qgs_\w+)/[\w/]+)\.py\)"
+)
+REGISTRY = load_usable_plugins()[0]
+SECTIONS: Mapping[str, type[ComponentConfig]] = {
+    "Top level": RecipeSettings,
+    "model": ModelSettings,
+    "model.decoder": DecoderSettings,
+    "views": ViewsConfig,
+    "training": TrainingConfig,
+    "evaluation": EvaluationConfig,
+}
+"""Settings that are no components, by their place in a recipe."""
+TYPES = {
+    "number": "number",
+    "integer": "integer",
+    "string": "text",
+    "null": "`null`",
+    "boolean": "true or false",
+}
+BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
+
+
+def filled(page: str) -> str:
+    """`page` as the site needs it, with all parts that are written from the code."""
+    parts = {"recipe reference": reference, "checks": check_list}
+    page = PART.sub(lambda found: parts[found[1]](), page)
+    page = ENTRY.sub(lambda found: _block(found[1], found[2]), page)
+    return TO_FILE.sub(_cross_reference, page)
+
+
+def written(page: str, folder: Path) -> str:
+    """`page` as it should be in the repository, in `folder`: links to files, the list of checks."""
+    up = "../" * len(folder.relative_to(ROOT).parts)
+    page = CROSS.sub(lambda found: _link(found[1], up), page)
+    page = DOCUMENTED.sub(lambda found: _entry(found[1], found[2]), page)
+    page = ENTRY.sub(lambda found: _entry(found[1], found[2]), page)
+    return PART.sub(lambda found: _part(found[1], found[2]), page)
+
+
+def _block(name: str, options: str | None) -> str:
+    return f"::: {name}" + (f"\n    {options}" if options else "")
+
+
+def _cross_reference(found: re.Match[str]) -> str:
+    label, file = found.groups()
+    return f"[`{label}`][{file.replace('/', '.').removesuffix('.__init__')}.{label}]"
+
+
+def _link(name: str, up: str) -> str:
+    """A link to the module that has `name`, labelled with the rest of it."""
+    module = name
+    while not inspect.ismodule(found := resolve_name(module)):
+        module = module.rpartition(".")[0]
+    return f"[`{name.removeprefix(f'{module}.')}`]({up}{_file(found)})"
+
+
+def _file(found: Any) -> str:
+    file = Path(inspect.getsourcefile(inspect.unwrap(found)) or "").resolve()
+    return file.relative_to(ROOT).as_posix()
+
+
+def _entry(name: str, options: str | None) -> str:
+    """A link from docs/api/ to the file of `name`, with the first paragraph of its docstring."""
+    found = resolve_name(name)
+    line = f"[`{name}`](../../{_file(found)}): {_summary(found)}"
+    return line + (f"\n<!-- {options} -->" if options else "")
+
+
+def _summary(documented: Any) -> str:
+    return " ".join((inspect.getdoc(documented) or "").split("\n\n")[0].split())
+
+
+def _part(name: str, text: str) -> str:
+    # The recipe reference is long, and every new option changes it: the repository links to it.
+    text = check_list() if name == "checks" else text
+    return f"<!-- from the code: {name} -->\n{text}<!-- end -->"
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Called by mkdocs for each page."""
+    return filled(markdown)
+
+
+def check_list() -> str:
+    """Return tables of all checks by subject, Markdown."""
+    return filled_template(
+        "guide_checks.md.jinja",
+        modules=groupby(CHECKS.values(), key=lambda check: check.function.__module__),
+        title=lambda module: module.rpartition(".")[2].capitalize(),
+        summary=lambda module: _summary(sys.modules[module]),
+        in_words=_slots_in_words,
+    )
+
+
+def _slots_in_words(of: Collection[str]) -> str:
+    named = [f"`{slot}`" for slot in slots.SLOTS if slot in of]
+    others = [f"`{slot}`" for slot in slots.SLOTS if slot not in of]
+    if len(others) < len(named):
+        return f"all but {', '.join(others)}" if others else "all"
+    return ", ".join(named)
+
+
+def filled_template(name: str, **values: Any) -> str:
+    """Return what a template beside this file gives."""
+    text = Path(__file__).with_name(name).read_text("utf-8")
+    return Template(text, trim_blocks=True).render(values)
+
+
+def reference() -> str:
+    """Return tables of all sections and of all components by slot, Markdown."""
+    return filled_template(
+        "guide_reference.md.jinja",
+        sections=SECTIONS,
+        slots=slots.SLOTS,
+        own_sections=slots.SECTIONS,
+        model_slots=slots.MODEL_SLOTS,
+        registry=REGISTRY,
+        option_table=option_table,
+        fields_of=fields_of,
+        paragraphs=lambda documented: inspect.cleandoc(documented.__doc__ or "").split("\n\n"),
+        is_attribute=lambda text: re.match(r"\w+: ", text),
+    )
+
+
+def option_table(config: type[ComponentConfig]) -> str:
+    """Return a table of all options of `config`: values, default, meaning."""
+    schema = config.model_json_schema()
+    if not schema.get("properties"):
+        return "No options."
+    rows = ["| option | values | default | meaning |", "|---|---|---|---|"]
+    for name, option in schema["properties"].items():
+        values = values_of(option, schema.get("$defs", {}))
+        if config.__component__ and name in config.__component__.scheduled:
+            values += ", or a [schedule](#schedules)"
+        default = "must be given"
+        if "default" in option:
+            text = dump(option["default"], flow=True)
+            default = f"`{text.splitlines()[0]}`"
+        meaning = " ".join((config.model_fields[name].description or "").split())
+        cells = (cell.replace("|", "\\|") for cell in (f"`{name}`", values, default, meaning))
+        rows.append(f"| {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
+def values_of(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
+    """Return the values that a JSON Schema allows, in words."""
+
+    def several(schemas: Any) -> list[str]:
+        return [values_of(each, definitions) for each in schemas]
+
+    match schema:
+        case {"$ref": place}:
+            return values_of(definitions[place.rpartition("/")[2]], definitions)
+        case {"const": value}:
+            return f"`{value}`"
+        case {"enum": values}:
+            return ", ".join(f"`{value}`" for value in values)
+        case {"anyOf": options} | {"oneOf": options}:
+            return " or ".join(several(options))
+        case {"type": "array", "prefixItems": items}:
+            return f"[{', '.join(several(items))}]"
+        case {"type": "array", "items": item}:
+            return f"list of: {values_of(item, definitions)}"
+        case {"properties": options}:
+            pairs = zip(options, several(options.values()), strict=True)
+            return f"{{{', '.join(f'{name}: {values}' for name, values in pairs)}}}"
+        case {"type": "object", "additionalProperties": value}:
+            return f"name to {values_of(value, definitions)}"
+    bounds = [f"{sign} {schema[key]:g}" for key, sign in BOUNDS.items() if key in schema]
+    return f"{TYPES[schema.get('type', 'boolean')]} {', '.join(bounds)}".rstrip()
+
+
+def fields_of(component: type[Component]) -> Mapping[str, Mapping[str, Any]]:
+    """Return the fields that a component reads and writes by default; none if it has no default."""
+    if any(field.is_required() for field in component.Config.model_fields.values()):
+        return {}
+    config = component.Config()
+    return {"reads": component.fields_read(config), "writes": component.fields_written(config)}
+
+
+def main() -> None:
+    """Write all pages of the guide anew, or print the reference."""
+    if sys.argv[1:] == ["reference"]:
+        print(reference())
+        return
+    for path in (ROOT / "docs").rglob("*.md"):
+        path.write_text(written(path.read_text("utf-8"), path.parent), "utf-8")
+
+
+if __name__ == "__main__":
+    main()
