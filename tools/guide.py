@@ -23,11 +23,12 @@ from typing import Any
 from jinja2 import Template
 from qgs_dev import CHECKS
 
-from qgs.contracts import Component, ComponentConfig, EvaluationConfig, TrainingConfig, ViewsConfig
+from qgs.cli.tables import option_rows
+from qgs.contracts import Component, ComponentConfig
 from qgs.recipe import slots
-from qgs.recipe.registry import load_usable_plugins
-from qgs.recipe.sections import DecoderSettings, ModelSettings, RecipeSettings
-from qgs.recipe.yaml_text import dump
+from qgs.recipe.registry import default_config, load_usable_plugins
+from qgs.recipe.schema import settings_schema, summary_of
+from qgs.recipe.sections import SETTINGS
 
 ROOT = Path(__file__).parents[1]
 PART = re.compile(r"^<!-- from the code: (.*) -->\n(.*?)^<!-- end -->$", re.MULTILINE | re.DOTALL)
@@ -40,23 +41,8 @@ TO_FILE = re.compile(
     r"\[`([\w.]+)`\]\((?:\.\./)+(?:plugins/\w+/src/)?((?:qgs|qgs_\w+)/[\w/]+)\.py\)"
 )
 REGISTRY = load_usable_plugins()[0]
-SECTIONS: Mapping[str, type[ComponentConfig]] = {
-    "Top level": RecipeSettings,
-    "model": ModelSettings,
-    "model.decoder": DecoderSettings,
-    "views": ViewsConfig,
-    "training": TrainingConfig,
-    "evaluation": EvaluationConfig,
-}
+SECTIONS = {".".join(path) or "Top level": config for path, config in SETTINGS.items()}
 """Settings that are no components, by their place in a recipe."""
-TYPES = {
-    "number": "number",
-    "integer": "integer",
-    "string": "text",
-    "null": "`null`",
-    "boolean": "true or false",
-}
-BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 
 
 def filled(page: str) -> str:
@@ -101,12 +87,8 @@ def _file(found: Any) -> str:
 def _entry(name: str, options: str | None) -> str:
     """A link from docs/api/ to the file of `name`, with the first paragraph of its docstring."""
     found = resolve_name(name)
-    line = f"[`{name}`](../../{_file(found)}): {_summary(found)}"
+    line = f"[`{name}`](../../{_file(found)}): {summary_of(found)}"
     return line + (f"\n<!-- {options} -->" if options else "")
-
-
-def _summary(documented: Any) -> str:
-    return " ".join((inspect.getdoc(documented) or "").split("\n\n")[0].split())
 
 
 def _part(name: str, text: str) -> str:
@@ -126,7 +108,7 @@ def check_list() -> str:
         "guide_checks.md.jinja",
         modules=groupby(CHECKS.values(), key=lambda check: check.function.__module__),
         title=lambda module: module.rpartition(".")[2].capitalize(),
-        summary=lambda module: _summary(sys.modules[module]),
+        summary=lambda module: summary_of(sys.modules[module]),
         in_words=_slots_in_words,
     )
 
@@ -163,57 +145,20 @@ def reference() -> str:
 
 def option_table(config: type[ComponentConfig]) -> str:
     """Return a table of all options of `config`: values, default, meaning."""
-    schema = config.model_json_schema()
-    if not schema.get("properties"):
-        return "No options."
-    rows = ["| option | values | default | meaning |", "|---|---|---|---|"]
-    for name, option in schema["properties"].items():
-        values = values_of(option, schema.get("$defs", {}))
-        if config.__component__ and name in config.__component__.scheduled:
-            values += ", or a [schedule](#schedules)"
-        default = "must be given"
-        if "default" in option:
-            text = dump(option["default"], flow=True)
-            default = f"`{text.splitlines()[0]}`"
-        meaning = " ".join((config.model_fields[name].description or "").split())
-        cells = (cell.replace("|", "\\|") for cell in (f"`{name}`", values, default, meaning))
-        rows.append(f"| {' | '.join(cells)} |")
-    return "\n".join(rows)
-
-
-def values_of(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
-    """Return the values that a JSON Schema allows, in words."""
-
-    def several(schemas: Any) -> list[str]:
-        return [values_of(each, definitions) for each in schemas]
-
-    match schema:
-        case {"$ref": place}:
-            return values_of(definitions[place.rpartition("/")[2]], definitions)
-        case {"const": value}:
-            return f"`{value}`"
-        case {"enum": values}:
-            return ", ".join(f"`{value}`" for value in values)
-        case {"anyOf": options} | {"oneOf": options}:
-            return " or ".join(several(options))
-        case {"type": "array", "prefixItems": items}:
-            return f"[{', '.join(several(items))}]"
-        case {"type": "array", "items": item}:
-            return f"list of: {values_of(item, definitions)}"
-        case {"properties": options}:
-            pairs = zip(options, several(options.values()), strict=True)
-            return f"{{{', '.join(f'{name}: {values}' for name, values in pairs)}}}"
-        case {"type": "object", "additionalProperties": value}:
-            return f"name to {values_of(value, definitions)}"
-    bounds = [f"{sign} {schema[key]:g}" for key, sign in BOUNDS.items() if key in schema]
-    return f"{TYPES[schema.get('type', 'boolean')]} {', '.join(bounds)}".rstrip()
+    rows = [("option", "values", "default", "meaning"), ("---",) * 4]
+    scheduled = config.__component__.scheduled if config.__component__ else ()
+    for name, values, default, meaning in option_rows(settings_schema(config)["properties"]):
+        more = ", or a [schedule](#schedules)" if name in scheduled else ""
+        rows.append((f"`{name}`", values + more, f"`{default.splitlines()[0]}`", meaning))
+    cells = ([cell.replace("|", "\\|") for cell in row] for row in rows)
+    return "\n".join(f"| {' | '.join(row)} |" for row in cells) if rows[2:] else "No options."
 
 
 def fields_of(component: type[Component]) -> Mapping[str, Mapping[str, Any]]:
     """Return the fields that a component reads and writes by default; none if it has no default."""
-    if any(field.is_required() for field in component.Config.model_fields.values()):
+    config = default_config(component)
+    if config is None:
         return {}
-    config = component.Config()
     return {"reads": component.fields_read(config), "writes": component.fields_written(config)}
 
 

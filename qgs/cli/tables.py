@@ -133,19 +133,22 @@ def _options(properties: Mapping[str, Schema]) -> Table | str:
     if not properties:
         return "  no options"
     table = folded_table("", "option", "type", "default", "meaning")
-    for cells in _rows(properties):
+    for cells in option_rows(properties):
         table.add_row(*map(escape, cells))
     return table
 
 
-def _rows(properties: Mapping[str, Schema], above: str = "") -> Iterator[tuple[str, ...]]:
-    """Yield an option a row; those inside a mapping follow it, `option.inner`."""
+def option_rows(properties: Mapping[str, Schema], above: str = "") -> Iterator[tuple[str, ...]]:
+    """Yield name, values, default and meaning of each option.
+
+    Those inside a mapping follow it, `option.inner`.
+    """
     for name, option in properties.items():
         default = inline(option["default"]) if "default" in option else "required"
         meaning = " ".join(option.get("description", "").split())
         yield above + name, _type(option), default, meaning
         for variant in option.get("oneOf", [option]):
-            yield from _rows(variant.get("properties", {}), f"{above}{name}.")
+            yield from option_rows(variant.get("properties", {}), f"{above}{name}.")
 
 
 def _type(option: Schema) -> str:

@@ -57,7 +57,7 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
         slot: {"anyOf": [_type(name, c) for name, c in registry.components(slot).items()]}
         for slot in SLOTS
     }
-    kinds = [_settings(kind) for kind in dict.fromkeys(SCHEDULES.values())]
+    kinds = [settings_schema(kind) for kind in dict.fromkeys(SCHEDULES.values())]
     definitions["schedule"] = {"anyOf": kinds, "description": summary_of(Schedule)}
     dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "qgs recipe"}
     return {**dialect, **_section((), beside), "$defs": definitions}
@@ -66,7 +66,7 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
 def _type(name: str, component: type[Component]) -> dict[str, Any]:
     """The options of `component`, and the `type` that chooses it."""
     description = summary_of(component)
-    schema = _settings(component.Config)
+    schema = settings_schema(component.Config)
     properties = {"type": {"const": name, "description": description}, **schema["properties"]}
     for option in component.scheduled:
         number = dict(properties[option])
@@ -79,11 +79,12 @@ def _type(name: str, component: type[Component]) -> dict[str, Any]:
 
 def _section(path: KeyPath, beside: dict[str, Any] | None = None) -> dict[str, Any]:
     """The settings of a section. beside: what else stands in it."""
-    schema = _settings(SETTINGS[path])
+    schema = settings_schema(SETTINGS[path])
     return schema | {"properties": schema["properties"] | (beside or {})}
 
 
-def _settings(config: type[ComponentConfig]) -> dict[str, Any]:
+def settings_schema(config: type[ComponentConfig]) -> dict[str, Any]:
+    """Options of a section or a component, without references."""
     schema = {"properties": {}} | config.model_json_schema()
     definitions = schema.pop("$defs", {})
     # An overlay sets an option and leaves the rest to its base.
@@ -114,6 +115,6 @@ def _ref(slot: str) -> dict[str, Any]:
     return {"$ref": f"#/$defs/{slot}"}
 
 
-def summary_of(described: type) -> str:
+def summary_of(described: object) -> str:
     """The first paragraph of a docstring, on one line."""
     return " ".join((inspect.getdoc(described) or "").split("\n\n")[0].split())
