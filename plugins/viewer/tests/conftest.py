@@ -9,11 +9,10 @@ __all__ = ["cameras", "gaussians", "model"]
 
 @pytest.fixture(autouse=True, scope="module")
 def _short_loops():
-    """Files beside the point take no time: loops of reconstructions and pages, overviews."""
+    """Files beside the point take no time: loops of reconstructions, overviews."""
     from qgs.reconstruction import saving
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(saving.orbit_path, "__defaults__", (2, 32))
         patch.setattr(saving, "overview", lambda result: np.zeros((8, 8, 3), np.uint8))
-        patch.setattr("qgs_viewer.sections.ORBIT_FRAMES", 2)
         yield

@@ -7,8 +7,8 @@ import torch
 import torch.nn.functional as F
 import yaml
 from commands import MODEL
+from qgs_viewer.opening import ModelSource
 from qgs_viewer.scenes import scenes_of
-from qgs_viewer.sources import ModelSource
 from walk import Walk
 
 import qgs

@@ -13,10 +13,9 @@ import yaml
 from commands import done
 from photo_formats import noisy_photos
 from qgs_viewer.commands import new_folder
-from qgs_viewer.compare import compare_models
-from qgs_viewer.comparison import checkpoints, judge, open_models, resolve_fairly
+from qgs_viewer.compare import ON_PHOTOS, RECIPES, compare_models
+from qgs_viewer.comparison import open_models, resolve_fairly
 from qgs_viewer.curves import curves_of
-from qgs_viewer.options import ON_PHOTOS, RECIPES
 from qgs_viewer.scenes import model_scenes
 from small import RECIPE, stand_in
 
@@ -27,7 +26,7 @@ import qgs
 def test_recipes_are_trained_compared_and_reported(tmp_path):
     done("demo", "--train", *RECIPES, "--seconds", 1, "--out", tmp_path)
     for name in ("tokengs", "locus"):
-        for file in ("checkpoint.safetensors", "example.ply", "evaluation/summary.json"):
+        for file in ("checkpoint.safetensors", "evaluation/summary.json"):
             assert (tmp_path / name / file).is_file()
     assert "type: locus/" in (tmp_path / "report.html").read_text()
 
@@ -54,8 +53,8 @@ def models(tmp_path_factory):
     return [stand_in(folder / f"{name}.safetensors") for name in ("few", "more")]
 
 
-def judged(names, photos):
-    return judge(open_models(checkpoints(names), str(photos), "cpu"))
+def opened(names, photos):
+    return open_models(names, str(photos), "cpu")
 
 
 def test_a_report_on_photos_says_what_was_printed_and_what_to_do_next(
@@ -90,18 +89,18 @@ def test_a_report_on_photos_says_what_was_printed_and_what_to_do_next(
 
 
 def test_a_checkpoint_has_a_history_of_its_own_or_of_its_run(tmp_path):
-    assert curves_of(tmp_path / "other.safetensors") is None
+    assert not curves_of(tmp_path / "other.safetensors")
     for step, name in enumerate(["own.history.jsonl", "history.jsonl"]):
         record = {"step": step, "seconds": 1.0, "loss": 1.0, "psnr": 9.0}
         (tmp_path / name).write_text(json.dumps(record) + "\n")
-    found = [curves_of(tmp_path / f"{name}.safetensors").steps for name in ("own", "other")]
-    assert found == [[0], [1]]
+    found = [curves_of(tmp_path / f"{name}.safetensors") for name in ("own", "other")]
+    assert [[record["step"] for record in records] for records in found] == [[0], [1]]
 
 
 def test_small_scenes_keep_their_photos_and_others_every_eighth(models, tmp_path):
     for name, count in (("large", 20), ("small", 3), ("tiny", 2)):
         noisy_photos(tmp_path / name, count)
-    (result,) = judged(models[:1], tmp_path)
+    (result,) = opened(models[:1], tmp_path)
     compared = {
         score.scene: {frame for _, frames in score.views for frame in frames}
         for score in result.evaluation.scores
@@ -123,7 +122,7 @@ def test_a_model_tuned_on_the_photos_is_compared_on_those_it_never_saw(models, t
     data = f"data={{type: qgs/photos, path: {photos}, image_size: [16, 16], holdout: 5}}"
     tuned = str(tmp_path / "tuned.safetensors")
     qgs.save(qgs.compose(RECIPE, [data, "views.gap=[1, 3]", "views.scale=auto"]), tuned)
-    results = judged([models[0], tuned], photos)
+    results = opened([models[0], tuned], photos)
     assert [result.recipe.views.scale for result in results] == ["search", "auto"]
     before, after = ([score.views for score in r.evaluation.scores] for r in results)
     assert before == after
@@ -135,11 +134,11 @@ def test_a_model_tuned_on_the_photos_is_compared_on_those_it_never_saw(models, t
 
 def test_photos_meet_models_of_their_size(tmp_path, monkeypatch):
     refusing = Mock(side_effect=FileNotFoundError)
-    monkeypatch.setattr("qgs_viewer.compare.checkpoints", refusing)
+    monkeypatch.setattr("qgs_viewer.compare.open_models", refusing)
     for size, side in ((None, 128), ("128x192", 128), ("64x64", 64)):
         with pytest.raises(FileNotFoundError):
             compare_models(None, str(tmp_path), tmp_path, "cpu", size)
-        refusing.assert_called_with(ON_PHOTOS[side])
+        assert refusing.call_args.args[0] == ON_PHOTOS[side]
 
 
 def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):

@@ -7,15 +7,15 @@ import pytest
 import torch
 from commands import done
 from PIL import Image
+from qgs_viewer.commands import FigureName
 from qgs_viewer.figures import DPI, FIGURES, WIDTH, grid, write_figure
-from qgs_viewer.options import FigureName
-from qgs_viewer.pictures import attention_pictures_of, error_picture
-from qgs_viewer.sections import Detail, anchors, attention, novel_views
+from qgs_viewer.queries import attention_pictures_of
+from qgs_viewer.sections import LAYERS, Detail, anchors, attention, novel_views
 from small import PAIR, QUERIES, model_of, model_scenes_of
 from walk import SIDE
 
 import qgs
-from qgs.drawing.images import depth_picture, depth_range, rgb_picture, side_by_side
+from qgs.drawing.images import depth_picture, depth_range, rgb_picture, shaded, side_by_side
 
 
 @torch.no_grad()
@@ -26,45 +26,44 @@ def test_novel_views_show_the_middle_target_with_its_score_error_and_depths_on_o
     known = replace(first, targets=replace(first.targets, depths=true))
     models[0] = replace(models[0], samples=[known, second])
     rows = novel_views(models, Detail()).rows
-    assert [*rows] == [f"{place}: walk, {kind}" for place in (1, 2) for kind in PAIR]
+    kinds = ("render", "error", "depth")
+    assert [*rows] == [f"{place}: walk, {kind}" for place in (1, 2) for kind in kinds]
     truth = first.targets.images[0, 1]
     camera = first.targets.cameras[:, 1:2]
     renders = [model.network.render(model.gaussians[0], camera) for model in models]
-    images = [render.rgb[0, 0].clamp(0, 1) for render in renders]
-    errors = [(image - truth).abs().mean(0, keepdim=True) for image in images]
-    depths = [render.depth[0, 0] for render in renders]
+    images = [truth, *(render.rgb[0, 0].clamp(0, 1) for render in renders)]
+    errors = [(image - truth).abs().mean(0, keepdim=True) for image in images[1:]]
+    depths = [true[0, 1], *(render.depth[0, 0] for render in renders)]
     most = depth_range(torch.stack(errors))[1]
-    near, far = depth_range(torch.cat([true[0, 1], *depths]))
-    # the rows of other models do not repeat what all share
-    shared = [rgb_picture(truth), depth_picture(true[0, 1], near, far)]
-    for row, image, error, depth in zip([*rows.values()][:2], images, errors, depths, strict=True):
-        own = [rgb_picture(image), error_picture(error, most), depth_picture(depth, near, far)]
-        pictures = [tile.image for tile in row[1:] if tile]
-        assert [*map(np.array_equal, pictures, shared + own)] == [True] * len(shared + own)
-        assert len(pictures) == len(shared + own)
-        score = -10 * (image - truth).square().mean().log10()
-        assert row[3].caption == f"render, {score:.2f} dB"
-        shared = []
+    near, far = depth_range(torch.cat(depths))
+    given = [rgb_picture(photo) for photo in first.inputs.images[0]]
+    for kind, expected in (
+        ("render", [*given, *map(rgb_picture, images)]),
+        ("error", [None, None, None, *(shaded(error, 0, most, "inferno") for error in errors)]),
+        ("depth", [None, None, *(depth_picture(depth, near, far) for depth in depths)]),
+    ):
+        found = [tile and tile.image for tile in rows[f"1: walk, {kind}"]]
+        assert [*map(np.array_equal, found, expected)] == [True] * 5, kind
+    score = -10 * (images[1] - truth).square().mean().log10()
+    assert rows["1: walk, render"][3].caption == f"tokengs {score:.2f} dB"
 
 
 def test_anchors_are_shown_layer_by_layer_of_models_that_have_them():
-    rows = anchors([model_scenes_of(kind) for kind in PAIR], Detail(layers=2)).rows
+    rows = anchors([model_scenes_of(kind) for kind in PAIR], Detail()).rows
+    assert [*rows] == ["locus"]
+    captions = [tile.caption for tile in rows["locus"]]
     depth = model_scenes_of("locus").scene.depth
-    captions = {name: [tile.caption for tile in tiles] for name, tiles in rows.items()}
-    assert captions["locus"][0] == "learned start"
-    assert captions["locus"][-1] == f"after layer {depth}"
-    assert [*captions] == ["locus"]
-    assert not anchors([model_scenes_of("tokengs")], Detail()).rows
+    assert (captions[0], captions[-1]) == ("learned start", f"after layer {depth}")
+    assert len(captions) <= LAYERS + 1
 
 
 def test_attention_is_that_of_the_query_that_was_asked_for():
     models = [model_scenes_of(kind) for kind in PAIR]
-    rows = attention(models, Detail(layers=2, query=5)).rows
-    depth = models[0].scene.depth
-    assert [*rows] == [f"{kind}, query 5, layer {n}" for kind in PAIR for n in (1, depth)]
-    assert [tile is None for tile in rows["tokengs, query 5, layer 1"]] == [False, True, False]
-    found = attention_pictures_of(models[1].scene, 5, depth, Detail.side // 2)
-    drawn = [tile.image for tile in rows[f"locus, query 5, layer {depth}"]]
+    rows = attention(models, Detail(query=5)).rows
+    assert [*rows] == [f"{kind}, query 5" for kind in PAIR]
+    assert [tile is None for tile in rows["tokengs, query 5"]] == [False, True, False]
+    found = attention_pictures_of(models[1].scene, 5, models[1].scene.depth, Detail.side // 2)
+    drawn = [tile.image for tile in rows["locus, query 5"]]
     for picture, part in zip(drawn, ("content", "geometry", "result"), strict=True):
         assert np.array_equal(picture, side_by_side(found[part]))
 

@@ -5,7 +5,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 from qgs_viewer import queries
-from qgs_viewer.curves import Curves, curves_figure
 
 from qgs.drawing.figures import CATEGORICAL
 from qgs.drawing.images import NOTHING, finer
@@ -105,12 +104,3 @@ def test_attention_maps_share_one_scale_and_show_what_a_mask_hides_as_nothing():
     colors = np.ptp(pictures.astype(int), axis=-1)[:, ::8, ::8].ravel()
     assert colors[[5, 6]].min() > 100 > colors[1] > 0
     assert not colors[[0, 2, 4, 7]].any()
-
-
-def test_curves_of_hours_which_may_hold_pauses_are_drawn_by_steps():
-    run = Curves([0.0, 1.0, 7000.0], [1.0, 0.5, 0.4], [8.0, 12.0, 13.0], [100, 200, 300])
-    paused = replace(run, seconds=[0.0, 1.0, 9000.0])
-    for curves, unit in (({"a": run}, "seconds"), ({"a": run, "b": paused}, "steps")):
-        for axis in curves_figure(curves).axes:
-            assert axis.get_xlabel() == unit
-            assert all(list(line.get_xdata()) == getattr(run, unit) for line in axis.lines)

@@ -3,7 +3,7 @@ from itertools import product
 import numpy as np
 import torch
 from numpy.testing import assert_allclose
-from qgs_viewer.placement import Placement, Splats, hit, near_ray, on_photo, splats
+from qgs_viewer.placement import Placement, Splats, hit, on_photo, splats
 from scipy.spatial.transform import Rotation
 from small import cloud
 from walk import arc, pinhole
@@ -44,12 +44,6 @@ def test_a_click_hits_what_the_renderer_shows_there():
             checked += 1
     assert checked > 20
     assert hit(found, np.array([9.0, 0, 0]), AHEAD) is None
-
-
-def test_the_nearest_point_ahead_within_reach_is_taken():
-    points = np.array([[0.05, 0, 5], [0.05, 0, 2], [0, 0, -1], [0.5, 0, 1]])
-    assert near_ray(points, np.zeros(3), AHEAD, 0.1) == 1
-    assert near_ray(points, np.array([3.0, 0, 0]), AHEAD, 0.1) is None
 
 
 def test_small_gaussians_beside_large_ones_survive_half_precision():

@@ -6,16 +6,14 @@ import re
 
 import pytest
 from commands import done
-from plyfile import PlyData
-from qgs_viewer.sections import scene_to_turn
-from small import PAIR, model_scenes_of, stand_in
+from small import stand_in
 
 RUN = "<script>alert(1)"
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory):
-    """The folder of `qgs demo` for RUN, which has a history and a card, and for another model."""
+def page(tmp_path_factory):
+    """The page of `qgs demo` for RUN, which has a history and a card, and for another model."""
     folder = tmp_path_factory.mktemp("models")
     stand_in(folder / RUN / "checkpoint.safetensors")
     (folder / RUN / "checkpoint.md").write_text("Small, see https://example.org/small.")
@@ -25,12 +23,7 @@ def demo(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         done("demo", "--model", RUN, "--model", more)
-    return folder / "demo"
-
-
-@pytest.fixture(scope="module")
-def page(demo):
-    return (demo / "report.html").read_text()
+    return (folder / "demo/report.html").read_text()
 
 
 def tags(page, name=r"\w+"):
@@ -39,13 +32,10 @@ def tags(page, name=r"\w+"):
     return [dict(re.findall(r'([\w-]+)(?:="([^"]*)")?', start)) for start in starts]
 
 
-def test_trained_models_are_shown_on_rooms_they_never_saw(demo, page):
-    for name, queries in ((RUN, 8), ("more", 12)):
-        assert [file.name for file in (demo / name).iterdir()] == ["example.ply"]
-        assert PlyData.read(demo / name / "example.ply")["vertex"].count == 4 * queries
+def test_trained_models_are_shown_on_rooms_they_never_saw(page):
     text = html.unescape(page)
     assert "test/000001" in text
-    assert f"{RUN}: step 7,000 of 150,000; more: step 7,000 of 150,000" in text
+    assert f"{RUN}: step 7000; more: step 7000" in text
     assert "<h2>Training</h2>" in page
 
 
@@ -77,14 +67,5 @@ def test_the_page_needs_nothing_else(page):
     assert [link["href"] for link in tags(page, "a")] == ["https://example.org/small"]
     assert not tags(page, "link")
     pages = [found["data-page"] for found in tags(page, "button") if "data-page" in found]
-    assert ["&lt;script" in page for page in pages] == [True]
-
-
-def test_the_section_has_all_models_and_the_code_of_the_viewer_once():
-    both = [model_scenes_of(kind) for kind in PAIR]
-    (tile,), (one,) = (scene_to_turn(shown).rows[""] for shown in (both, both[:1]))
-    assert tile.caption == "tokengs, locus"
-    assert tile.image.shape == (256, 2 * 256 + 4, 3)
-    assert len(tile.page) - len(one.page) < 100_000 < len(one.page)
-    assert tile.page.index('["tokengs"') < tile.page.index('["locus"')
-    assert not re.search(r"(src|href)=.?http", tile.page)
+    assert ["&lt;script" in page for page in pages] == [True, True]
+    assert not any(re.search(r"(src|href)=.?http", page) for page in pages)

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 from commands import done
 from photo_formats import PhotoSet, write_nerfstudio
-from qgs_viewer.comparison import checkpoints, judge, open_models
-from qgs_viewer.opening import ViewOptions, open_source
+from qgs_viewer.comparison import open_models
+from qgs_viewer.opening import open_source
 from qgs_viewer.remarks import summary
 
 import qgs
@@ -36,16 +36,16 @@ def room(tmp_path_factory):
 
 def test_a_room_in_another_unit_has_its_own_scale_in_all_commands(room, tmp_path):
     """With the same score too, of the one window that is judged."""
-    (result,) = judge(open_models(checkpoints([MODEL]), str(room), "cpu"))
+    (result,) = open_models([MODEL], str(room), "cpu")
+    (score,) = result.evaluation.scores
     (_, inputs, compared), found = next(iter(result.search.found.items()))
     done("reconstruct", MODEL, room, "--out", tmp_path / "out")
     record = json.loads((tmp_path / "out/cameras.json").read_text())
     assert record["to_photos"]["scale"] == pytest.approx(found.factor)
     assert record["to_photos"]["search"] == found.record
-    opened = open_source(MODEL, ViewOptions(photos=str(room)))
+    opened = open_source(MODEL, photos=str(room))
     assert tuple(opened.frames) == inputs
     assert opened.views.scale_factor == pytest.approx(found.factor)
-    (score,) = result.evaluation.scores
     quality = [view["psnr"] for view in record["views"] if view["kind"] == "novel"]
     assert sum(quality) / len(quality) == pytest.approx(score.values["model_psnr"], abs=0.01)
     trained = resolve(qgs.load(MODEL).recipe).views.scale_factor
@@ -61,8 +61,8 @@ def test_all_commands_choose_the_same_inputs_of_photos_that_the_model_knows(room
     data = f"data={{type: qgs/photos, path: {room}, holdout: 4}}"
     qgs.save(qgs.compose(qgs.load(MODEL).recipe, [data]), name)
     sample = qgs.reconstruct(qgs.load(name), room).sample
-    opened = open_source(name, ViewOptions(photos=str(room)))
-    (result,) = judge(open_models(checkpoints([name]), str(room), "cpu"))
+    opened = open_source(name, photos=str(room))
+    (result,) = open_models([name], str(room), "cpu")
     inputs, compared = result.evaluation.scores[0].views[0]
     assert tuple(opened.frames) == sample.input_frames == inputs
     assert sample.target_frames == compared
@@ -70,7 +70,7 @@ def test_all_commands_choose_the_same_inputs_of_photos_that_the_model_knows(room
 
 
 def test_a_scale_can_be_set(room, tmp_path):
-    source = open_source(MODEL, ViewOptions(photos=str(room), overrides=["views.scale=auto"]))
+    source = open_source(MODEL, photos=str(room), overrides=["views.scale=auto"])
     assert source.views.scale == "auto"
     out = ("--out", tmp_path / "out")
     for words in (

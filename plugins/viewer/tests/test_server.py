@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import pytest
 import viser
-from qgs_viewer.server import quiet_server
+from qgs_viewer.page import quiet_server
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 

@@ -4,11 +4,9 @@ import json
 import shutil
 
 import pytest
-import torch
-from qgs_viewer.opening import ViewOptions, open_source
+from qgs_viewer.opening import ModelSource, open_source
 from qgs_viewer.query_scene import NEUTRAL
-from qgs_viewer.sources import ModelSource
-from small import BY_DISTANCE, VIEWS, model_of
+from small import VIEWS, model_of
 from walk import Walk
 
 import qgs
@@ -17,19 +15,14 @@ from qgs.reconstruction.reconstruct import choose_sample
 from qgs.reconstruction.result import reconstruct_sample
 
 
-def finish(folder, views, *settings):
-    """What `qgs reconstruct` leaves in folder/scene, by a model whose checkpoint lies beside it."""
-    qgs.save(model_of("locus", *settings), folder / "model.safetensors")
-    model = qgs.load(folder / "model.safetensors")
-    sample, world = choose_sample(Walk(), views, 2, (1, 4), (0, 2, 3, 5))
-    reconstruct_sample(model, sample, world).save(folder / "scene")
-    return model
-
-
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
+    """What `qgs reconstruct` leaves, by a model whose checkpoint lies beside it."""
     folder = tmp_path_factory.mktemp("finished")
-    finish(folder, VIEWS)
+    qgs.save(model_of("locus"), folder / "model.safetensors")
+    model = qgs.load(folder / "model.safetensors")
+    sample, world = choose_sample(Walk(), VIEWS, 2, (1, 4), (0, 2, 3, 5))
+    reconstruct_sample(model, sample, world).save(folder / "scene")
     return folder / "scene"
 
 
@@ -42,13 +35,13 @@ def opened(finished, tmp_path):
     def opened(*names, **changes):
         record = {name: told[name] for name in names} if names else {**told, **changes}
         (folder / "cameras.json").write_text(json.dumps(record))
-        return open_source(str(folder), ViewOptions())
+        return open_source(str(folder))
 
     return opened
 
 
 def test_a_finished_reconstruction_has_its_queries(finished):
-    source = open_source(str(finished), ViewOptions())
+    source = open_source(str(finished))
     assert isinstance(source, ModelSource)
     assert ([*source.frames], [*source.notes]) == ([0, 1], [])
     assert source.labels == [f"photos/0{frame}.png" for frame in (1, 4, 0, 2, 3, 5)]
@@ -64,11 +57,11 @@ def test_without_its_model_it_is_shown_as_it_is(opened):
     """Nothing is fetched on the word of a file."""
     url = "https://example.org/model.safetensors"
     for record, said in (
-        ({"model": ""}, "no model"),
-        ({"tuning": {"steps": 3}}, "tuned"),
-        ({"tuning": {"steps": 3}, "refinement": {"steps": 3}}, "refined"),
+        ({"model": ""}, "not known"),
+        ({"tuning": {"steps": 3}}, "tuning"),
+        ({"refinement": {"steps": 3}}, "refinement"),
         ({"model": "gone/model.safetensors"}, "gone/model.safetensors"),
-        ({"model": url}, f"`qgs view {url} PHOTOS`"),
+        ({"model": url}, url),
     ):
         source = opened(**record)
         scene = source.scene_of(source.frames)
@@ -85,15 +78,6 @@ def test_a_reconstruction_keeps_its_background(opened):
 
 def test_a_ply_shows_gaussians_alone(finished):
     file = finished / "gaussians.ply"
-    found = open_source(str(file), ViewOptions()).scene_of(())
+    found = open_source(str(file)).scene_of(())
     assert (found.queries, found.views) == (0, None)
     assert found.gaussians.count == load_ply(file).count
-
-
-def test_changed_inputs_have_the_scale_of_their_own_distance(tmp_path):
-    model = finish(tmp_path, BY_DISTANCE, "views.scale=distance", "views.scale_factor=0.7")
-    source = open_source(str(tmp_path / "scene"), ViewOptions())
-    frames = [source.labels.index(f"photos/0{frame}.png") for frame in (1, 2)]
-    own = ModelSource(model, Walk(), BY_DISTANCE, (1, 4), "of the photos")
-    seen, true = (s.scene_of(f).views.cameras.c2w for s, f in ((source, frames), (own, (1, 2))))
-    torch.testing.assert_close(seen, true, atol=1e-4, rtol=1e-4)

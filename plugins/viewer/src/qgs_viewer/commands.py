@@ -5,9 +5,10 @@ from __future__ import annotations
 import socket
 import webbrowser
 from contextlib import suppress
-from itertools import chain, count
+from enum import StrEnum, auto
+from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -26,11 +27,89 @@ from qgs.cli.options import (
     use_threads,
 )
 from qgs.wording import listed
-from qgs_viewer import options
-from qgs_viewer.options import RECIPES
 
 if TYPE_CHECKING:
-    from qgs_viewer.sources import Source
+    from qgs_viewer.opening import Source
+
+
+class FigureName(StrEnum):
+    """Names of the figures, in the order of figures.md."""
+
+    NOVEL_VIEWS = auto()
+    QUERIES = auto()
+    ANCHORS = auto()
+    CROSS_ATTENTION = auto()
+    CURVES = auto()
+
+
+SourceName = Annotated[
+    str,
+    typer.Argument(help="Run folder, checkpoint, PLUGIN/NAME, PLY, or what qgs reconstruct wrote."),
+]
+ModelPhotos = Annotated[
+    str | None,
+    typer.Argument(
+        help="Photos or a video for a model; default: its recipe's data, of shipped models an "
+        "unseen room."
+    ),
+]
+Query = Annotated[
+    int | None,
+    typer.Option(
+        min=0, help="Query to show; default: none in the viewer, notable ones in figures."
+    ),
+]
+Page = Annotated[
+    Path | None,
+    typer.Option(
+        help="Write the scene as one new HTML page to turn; serve nothing. Queries cannot be "
+        "picked in it: --query chooses one."
+    ),
+]
+Host = Annotated[str, typer.Option(help="Address to serve at; 0.0.0.0 lets other machines see it.")]
+Port = Annotated[int, typer.Option(min=0, max=65535, help="Port, or the next free one.")]
+OpenBrowser = Annotated[
+    bool, typer.Option("--open/--no-open", help="Open it in the browser of this machine.")
+]
+Runs = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="RUN...", help="Run folders, checkpoints, their URLs, or shipped models."
+    ),
+]
+Photos = Annotated[
+    str | None,
+    typer.Option(
+        help="Photos and cameras; default: the recipe's data, of shipped models unseen rooms."
+    ),
+]
+NewFolder = Annotated[
+    Path | None,
+    typer.Option(
+        help="New folder; default: named like the command, with -2, -3, ... if it exists."
+    ),
+]
+PhotosOrRecipes = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="[PHOTOS]",
+        help="Folder of your own photos, or a video; with --train, recipe files to compare.",
+    ),
+]
+Models = Annotated[
+    list[str] | None,
+    typer.Option("--model", help="Trained model, as in qgs eval; repeatable; default: three."),
+]
+Train = Annotated[
+    bool, typer.Option("--train", help="Train and compare recipes instead, the tiny two.")
+]
+Seconds = Annotated[
+    float | None, typer.Option(min=1, help="With --train: time of each recipe; default 120.")
+]
+Seed = Annotated[
+    int | None, typer.Option(min=0, help="With --train: seed of every recipe; default 0.")
+]
+Only = Annotated[list[FigureName] | None, typer.Option(help="Draw this figure; repeatable.")]
 
 view_app = typer.Typer(help="See a reconstruction in the browser.")
 demo_app = typer.Typer(help="Trained models on unseen rooms, or on your photos.")
@@ -40,19 +119,19 @@ figures_app = typer.Typer(help="Figures for a paper.")
 
 @view_app.command()
 def view(
-    source: options.Source,
-    photos: options.ModelPhotos = None,
+    source: SourceName,
+    photos: ModelPhotos = None,
     scene: SceneName = None,
     inputs: Inputs = None,
     frames: Frames = None,
     size: Size = None,
     scale: Scale = None,
     overrides: ViewsSettings = None,
-    query: options.Query = None,
-    html: options.Page = None,
-    host: options.Host = "127.0.0.1",
-    port: options.Port = 8080,
-    show: options.Open = True,
+    query: Query = None,
+    html: Page = None,
+    host: Host = "127.0.0.1",
+    port: Port = 8080,
+    show: OpenBrowser = True,
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
@@ -68,22 +147,20 @@ def view(
     from qgs.evaluate.results import print_lines
     from qgs.files import refuse_existing
     from qgs.train.distributed import choose_device
-    from qgs_viewer.opening import ViewOptions, open_source
+    from qgs_viewer.opening import open_source
 
     if html is not None:
         refuse_existing(html)
     use_threads(threads)
     opened = open_source(
         source,
-        ViewOptions(
-            photos=photos,
-            scene=scene,
-            frames=frames,
-            inputs=inputs,
-            size=pixels,
-            overrides=[*(overrides or ()), *scale_settings(scale)],
-            device=choose_device(device),
-        ),
+        choose_device(device),
+        photos=photos,
+        scene=scene,
+        frames=frames,
+        inputs=inputs,
+        size=pixels,
+        overrides=[*(overrides or ()), *scale_settings(scale)],
     )
     console = Console()
     print_lines(console, opened.notes)
@@ -95,7 +172,7 @@ def view(
 
 def _write_page(source: Source, query: int | None, file: Path, console: Console) -> None:
     from qgs.files import refuse_existing, write_text
-    from qgs_viewer.choice import Choice
+    from qgs_viewer.drawing import Choice
     from qgs_viewer.page import scene_html
 
     scene = source.scene_of(source.frames)
@@ -113,8 +190,8 @@ def _serve(
     source: Source, query: int | None, host: str, port: int, show: bool, console: Console
 ) -> None:
     from qgs.evaluate.results import print_lines
+    from qgs_viewer.page import quiet_server
     from qgs_viewer.panel import Panel
-    from qgs_viewer.server import quiet_server
 
     with quiet_server(host, port, source.title) as server:
         panel = Panel(server, source)
@@ -134,12 +211,12 @@ def _serve(
 
 @demo_app.command()
 def demo(
-    given: options.PhotosOrRecipes = None,
-    models: options.Models = None,
-    train: options.Train = False,
-    seconds: options.Seconds = None,
-    seed: options.Seed = None,
-    out: options.NewFolder = None,
+    given: PhotosOrRecipes = None,
+    models: Models = None,
+    train: Train = False,
+    seconds: Seconds = None,
+    seed: Seed = None,
+    out: NewFolder = None,
     size: Size = None,
     scale: Scale = None,
     threads: Threads = None,
@@ -154,14 +231,12 @@ def demo(
         raise ValueError("--model names trained models; leave out --train, or name recipes")
     if not train and (seconds is not None or seed is not None):
         raise ValueError("--seconds and --seed are for training: add --train")
-    if not train and given and given[0].endswith((".yaml", ".yml")):
-        raise ValueError(f"{given[0]} is a recipe, no folder of photos: add --train to train it")
     if not train and len(given or ()) > 1:
         raise ValueError(f"one folder of photos is shown at a time, got {', '.join(given or ())}")
     # an option without effect would look as if it had one
     if (size, scale) != (None, None) and (train or not given):
         raise ValueError("--size and --scale are for photos: name a folder, or leave them out")
-    from qgs_viewer.compare import compare_models, compare_trainings
+    from qgs_viewer.compare import RECIPES, compare_models, compare_trainings
 
     use_threads(threads)
     target = new_folder(out, "demo")
@@ -173,9 +248,9 @@ def demo(
 
 @report_app.command()
 def report(
-    runs: options.Runs,
-    photos: options.Photos = None,
-    out: options.NewFolder = None,
+    runs: Runs,
+    photos: Photos = None,
+    out: NewFolder = None,
     size: Size = None,
     scale: Scale = None,
     threads: Threads = None,
@@ -192,12 +267,12 @@ def report(
 
 @figures_app.command()
 def figures(
-    runs: options.Runs,
-    photos: options.Photos = None,
+    runs: Runs,
+    photos: Photos = None,
     scene: SceneName = None,
-    query: options.Query = None,
-    only: options.Only = None,
-    out: options.NewFolder = None,
+    query: Query = None,
+    only: Only = None,
+    out: NewFolder = None,
     device: Device = "auto",
 ) -> None:
     """Draw figures of trained models for a paper, as PDF and PNG.
@@ -206,19 +281,19 @@ def figures(
     """
     from qgs.evaluate.results import print_lines
     from qgs.train.distributed import choose_device
-    from qgs_viewer.comparison import checkpoints, open_models
+    from qgs_viewer.comparison import open_models
     from qgs_viewer.figures import write_figures
-    from qgs_viewer.remarks import domain_remarks, scale_remarks
+    from qgs_viewer.remarks import scale_remarks
     from qgs_viewer.scenes import model_scenes
 
     folder = new_folder(out, "figures")
-    models = open_models(checkpoints(runs), photos, choose_device(device))
+    models = open_models(runs, photos, choose_device(device))
     shown = model_scenes(models, scene=scene)
     # before the first figure is drawn, which may take minutes
     for model in shown:
         model.scene.refuse_missing(query)
     console = Console()
-    notes = [*domain_remarks(models, shown), *scale_remarks(models, option="")]
+    notes = [*scale_remarks(models)]
     print_lines(console, notes)
     print_lines(console, write_figures(shown, folder, only or (), query, notes))
 
@@ -229,7 +304,7 @@ def new_folder(out: Path | None, name: str) -> Path:
     Raises FileExistsError where `out` holds anything.
     """
     if out is None:
-        names = map(Path, chain([name], (f"{name}-{number}" for number in count(2))))
+        names = (Path(f"{name}-{number}" if number > 1 else name) for number in count(1))
         return next(name for name in names if not name.exists())
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(f"{out} is not empty; choose another --out, or delete it yourself")

@@ -72,7 +72,7 @@ class PhotoWindows(Span):
         return self._known[scene.name]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Model:
     """A trained model by its short name.
 
@@ -84,40 +84,28 @@ class Model:
     file: Path
     recipe: Recipe
     search: ScaleSearch
-    step: int | None = None
-    windows: PhotoWindows | None = None
+    step: int | None
+    windows: PhotoWindows | None
 
     @property
     def network(self) -> QueryGaussianModel:
         """The model itself."""
         return self.search.model
 
-    @property
-    def training(self) -> str:
-        """How far its training has come."""
-        if self.step is None:
-            return "not known"
-        training = self.recipe.training
-        # where seconds end a training, its number of steps is no goal
-        goal = "" if training.seconds else f" of {training.steps:,}"
-        return f"step {self.step:,}{goal}"
+    @cached_property
+    def evaluation(self) -> Evaluation:
+        """Scores on the test views of its recipe; the model moves to the CPU for them."""
+        found = evaluate(
+            self.network, self.recipe, self.step, views_of=self.search, sampler=self.windows
+        )
+        # the next model needs the memory of the accelerator
+        self.network.cpu()
+        return found
 
     @property
     def about(self) -> str:
         """The first paragraph of its card, or else its sizes."""
         return about(self.file) or heading(self.network)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Result(Model):
-    """A model with its evaluation."""
-
-    evaluation: Evaluation
-
-    @cached_property
-    def scores(self) -> Mapping[str, float | None]:
-        """Means over scenes by column."""
-        return self.evaluation.means()
 
     @property
     def parameters(self) -> int:
@@ -136,16 +124,14 @@ def checkpoints(names: Sequence[str]) -> dict[str, Path]:
 
 
 def open_models(
-    files: Mapping[str, Path],
+    names: Sequence[str],
     photos: str | None,
     device: str,
     size: Size | None = None,
     overrides: Sequence[str] = (),
 ) -> list[Model]:
-    """Load the models in `files` for unseen scenes, or for held-out photos.
-
-    Raises as `recipes_alike`.
-    """
+    """Load models for unseen scenes, or for held-out photos. Raises as `recipes_alike`."""
+    files = checkpoints(names)
     recipes = recipes_alike(files, photos, size, overrides)
     windows: PhotoWindows | None = None
     models = []
@@ -157,34 +143,8 @@ def open_models(
             # those of the first model for all, so that one protocol judges them
             windows = PhotoWindows(network.trained_on or Domain())
         search = ScaleSearch(network, recipes[name].views)
-        models.append(
-            Model(
-                name=name,
-                file=path,
-                recipe=recipes[name],
-                search=search,
-                step=step,
-                windows=windows,
-            )
-        )
+        models.append(Model(name, path, recipes[name], search, step, windows))
     return models
-
-
-def judge(models: Sequence[Model]) -> list[Result]:
-    """Evaluate models on the test views of their recipes; each moves to the CPU afterwards."""
-    results = []
-    for model in models:
-        evaluation = evaluate(
-            model.network,
-            model.recipe,
-            model.step,
-            views_of=model.search,
-            sampler=model.windows,
-        )
-        # the next model needs the memory of the accelerator
-        model.network.cpu()
-        results.append(Result(**vars(model), evaluation=evaluation))
-    return results
 
 
 def resolve_fairly(files: Sequence[Path], seconds: float, seed: int) -> dict[str, Recipe]:

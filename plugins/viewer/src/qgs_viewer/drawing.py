@@ -1,6 +1,8 @@
-"""Drawing into a scene of viser: Gaussians, photos, anchors, a query and what it reads."""
+"""Drawing into a scene of viser, as a user chooses: Gaussians, photos, anchors, a query."""
 
-from typing import Any
+import colorsys
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -8,23 +10,102 @@ import viser
 from torch import Tensor
 from viser.transforms import SO3
 
+from qgs.drawing.figures import INK, Color
 from qgs.drawing.images import enlarged, rgb_picture
 from qgs.geometry.transforms import to_camera, to_pixels
-from qgs.types import Cameras
-from qgs_viewer.choice import Choice, anchor_colors, faded, ink, painted, query_color
-from qgs_viewer.placement import corners, on_photo
+from qgs_viewer.placement import Splats, corners, on_photo
 from qgs_viewer.query_scene import QueryScene
 
+Others = Literal["shown", "faint", "hidden"]
+# Mean of a background below which dark lines could not be seen.
+DARK = 0.3
+# Opacity of the Gaussians of other queries, as a part of their own.
+FAINT = 0.12
+# Part of the background in the colours of Gaussians that are not picked.
+PALE = 0.4
 # Pixels on the longer side of photos: small ones are enlarged, large reduced.
 PHOTO_SIDE = 256
 # Depth of a camera's frustum, per distance from the input cameras to the scene.
 FRUSTUM = 0.12
-# Shares of the most that is read from which lines are broader.
-WIDER = (0.25, 0.6)
-# Strength of the colour of lines up to these shares and above.
-STRENGTHS = (0.2, 0.6, 1.0)
 # Opacity of the Gaussians that count for the size of a scene.
 SOLID = 0.1
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is shown. query: the picked one. layer: of supports and attention, 0 the start.
+
+    others: how Gaussians of other queries look. patches: number of lines to those that are read.
+    """
+
+    query: int | None = None
+    by_query: bool = False
+    layer: int = 0
+    others: Others = "faint"
+    patches: int = 24
+    anchors: bool = True
+    photos: bool = True
+
+
+def query_color(query: int) -> Color:
+    """Return a colour for a query; neighbours in number differ much."""
+    # multiples of the golden ratio spread over the circle of hues however many there are
+    hue = (query * 0.61803398875) % 1
+    light = (0.45, 0.6, 0.52)[query % 3]
+    red, green, blue = colorsys.hls_to_rgb(hue, light, 0.8)
+    return round(red * 255), round(green * 255), round(blue * 255)
+
+
+def query_colors(scene: QueryScene) -> np.ndarray:
+    """Return `query_color` of every query, uint8 (N, 3)."""
+    colors = [query_color(query) for query in range(scene.queries)]
+    return np.array(colors, np.uint8).reshape(-1, 3)
+
+
+def anchor_colors(scene: QueryScene, choice: Choice) -> np.ndarray:
+    """Return the colours of all anchors, uint8; pale but for the picked one, if there is one."""
+    colors = query_colors(scene)
+    if choice.query is None or choice.others == "shown":
+        return colors
+    # anchors of others stay visible, so that they can still be clicked
+    paled = faded(colors, 0.3, scene)
+    paled[choice.query] = colors[choice.query]
+    return paled
+
+
+def faded(
+    colors: np.ndarray | Color, strength: float | np.ndarray, scene: QueryScene
+) -> np.ndarray:
+    """Mix uint8 colours with the background of `scene`; strength 0 is the background alone."""
+    mixed = strength * np.array(colors) + (1 - strength) * 255 * np.array(scene.background)
+    return mixed.round().astype(np.uint8)
+
+
+def ink(scene: QueryScene) -> Color:
+    """Return the colour of lines that stand out from the background of `scene`."""
+    return INK if np.mean(scene.background) > DARK else (235, 235, 235)
+
+
+def painted(scene: QueryScene, choice: Choice) -> Splats:
+    """Return the Gaussians of `scene`, coloured and faded as was chosen."""
+    found = scene.splats
+    if not scene.queries:
+        return found
+    colors = found.colors
+    opacities = found.opacities
+    # Gaussians are ordered by query, so colours repeat in blocks
+    if choice.by_query:
+        each = len(colors) // scene.queries
+        colors = query_colors(scene).repeat(each, 0) / 255
+    if choice.query is not None and choice.others != "shown":
+        mine = np.zeros((len(colors), 1), bool)
+        mine[scene.members(choice.query)] = True
+        part = FAINT if choice.others == "faint" else 0.0
+        # nearly clear Gaussians of the picked query would not be seen
+        opacities = np.where(mine, np.maximum(opacities, 0.5), opacities * part)
+        greys = colors.mean(1, keepdims=True) * (1 - PALE) + np.array(scene.background) * PALE
+        colors = np.where(mine, colors, greys)
+    return replace(found, colors=colors.astype(np.float32), opacities=opacities.astype(np.float32))
 
 
 class Drawing:
@@ -35,29 +116,18 @@ class Drawing:
 
     def __init__(self, api: viser.SceneApi) -> None:
         self.api = api
-        self.photo_depth = FRUSTUM
-        self.anchor_radius = 0.01
         self._gaussians: viser.GaussianSplatHandle | None = None
-        self._painted: tuple[QueryScene, Choice] | None = None
+        self._painted: tuple[Any, ...] = ()
 
-    def put(
-        self,
-        scene: QueryScene,
-        choice: Choice,
-        every: Cameras | None = None,
-        unit: float | None = None,
-    ) -> None:
-        """Draw a new scene. every: cameras of all frames, drawn thin.
-
-        unit: length that sizes photos and anchors, by default `distance_to` the scene.
-        """
-        unit = unit or distance_to(scene)
+    def put(self, scene: QueryScene, choice: Choice) -> None:
+        """Draw a new scene."""
+        unit = distance_to(scene)
         self.photo_depth = FRUSTUM * unit
         self.anchor_radius = 0.01 * unit
         # viser has a background picture, and no background colour
         plain = np.full((8, 8, 3), 255.0) * scene.background
         self.api.set_background_image(plain.round().astype(np.uint8), "png")
-        self._draw_photos(scene, every)
+        self._draw_photos(scene)
         self.update(scene, choice)
 
     def update(self, scene: QueryScene, choice: Choice) -> None:
@@ -74,12 +144,10 @@ class Drawing:
             self._draw_reading(scene, choice.query, choice)
 
     def _draw_gaussians(self, scene: QueryScene, choice: Choice) -> None:
-        paint = Choice(by_query=choice.by_query, query=choice.query, others=choice.others)
-        if self._painted is not None:
-            before, painted_as = self._painted
-            # Gaussians are megabytes to send; most choices leave them as they are
-            if before is scene and painted_as == paint:
-                return
+        paint = (scene, choice.by_query, choice.query, choice.others)
+        # Gaussians are megabytes to send; most choices leave them as they are
+        if paint == self._painted:
+            return
         shown = painted(scene, choice)
         factor = shown.magnification
         centers = shown.centers * factor
@@ -92,9 +160,9 @@ class Drawing:
             self._gaussians.set_gaussians(centers, covariances, shown.colors, shown.opacities)
         # centres and covariances are magnified, see `Splats.magnification`
         self._gaussians.scale = 1 / factor
-        self._painted = scene, paint
+        self._painted = paint
 
-    def _draw_photos(self, scene: QueryScene, every: Cameras | None) -> None:
+    def _draw_photos(self, scene: QueryScene) -> None:
         self.api.remove_by_name("/views")
         if scene.views is None:
             return
@@ -119,21 +187,16 @@ class Drawing:
                 wxyz=SO3.from_matrix(turned.numpy()).wxyz,
                 position=ends[view].mean(0).numpy(),
             )
-        if every is not None:
-            ends = on_photo(every, corners(every.size), self.photo_depth / 2)
-            lines = frustum_lines(every.c2w[:, :3, 3], ends)
-            self._lines("/views/others", lines, faded(ink(scene), 0.6, scene), 1.0)
 
     def _draw_anchors(self, scene: QueryScene, choice: Choice) -> None:
         found = scene.support(choice.layer)
         if found is None or not choice.anchors:
             self.api.remove_by_name("/anchors")
             return
-        numbers, colors = anchor_colors(scene, choice)
         self.api.add_point_cloud(
             "/anchors",
-            found.centers[0].float().numpy()[numbers],
-            colors,
+            found.centers[0].float().numpy(),
+            anchor_colors(scene, choice),
             point_size=self.anchor_radius,
             point_shape="circle",
             precision="float32",
@@ -169,8 +232,8 @@ class Drawing:
     def _draw_reading(self, scene: QueryScene, query: int, choice: Choice) -> None:
         """Draw lines from where the query was when it read to the patches that it read most.
 
-        Colour and width grow with the share of the most that is read. A square of half its width
-        marks each patch.
+        Colours grow with the share of the most that is read. A square of half its width marks each
+        patch.
         """
         if not choice.layer or not choice.patches:
             return
@@ -180,27 +243,21 @@ class Drawing:
         if reading is None:
             return
         hub = scene.hub(query, choice.layer - 1).expand_as(reading.points)
-        lines = torch.stack([hub, reading.points], 1)
         shares = (reading.shares / reading.shares.max().clamp_min(1e-30)).numpy()
-        color = query_color(query)
-        self.api.add_frame("/reading", show_axes=False)
-        # viser's lines have one width and colour for all segments of a name
-        for step, strength in enumerate(STRENGTHS):
-            among = np.digitize(shares, WIDER) == step
-            if among.any():
-                part = lines[torch.from_numpy(among)]
-                self._lines(f"/reading/{step}", part, faded(color, strength, scene), 1 + 1.5 * step)
+        colors = faded(query_color(query), shares[:, None], scene)
+        ends = torch.stack([hub, reading.points], 1)
+        self._lines("/reading", ends, colors[:, None].repeat(2, 1), 2.5)
         self.api.add_point_cloud(
             "/patches",
             reading.points.float().numpy(),
-            faded(color, shares[:, None], scene),
+            colors,
             point_size=reading.side / 4,
             point_shape="square",
             precision="float32",
         )
 
     def _lines(self, name: str, lines: Tensor, color: Any, width: float) -> None:
-        """Draw segments (n, 2, 3), `width` pixels wide. color: uint8 RGB."""
+        """Draw segments (n, 2, 3), `width` pixels wide. color: uint8 RGB, of all or (n, 2, 3)."""
         points = lines.float().cpu().numpy()
         self.api.add_line_segments(name, points, color, thickness=width, thickness_units="screen")
 

@@ -14,7 +14,7 @@ from qgs.drawing.figures import figure_style, hex_color
 from qgs.files import replacing, write_text
 from qgs.wording import listed
 from qgs_viewer import sections
-from qgs_viewer.options import FigureName
+from qgs_viewer.commands import FigureName
 from qgs_viewer.scenes import ModelScenes
 from qgs_viewer.sections import Detail, Section
 
@@ -23,7 +23,6 @@ WIDTH = 7.0
 DPI = 220
 # Pixels on the longer side of pictures that models render.
 SIDE = 512
-LAYERS = 3
 LISTING = "figures.md"
 FIGURES: Mapping[FigureName, Callable[[Sequence[ModelScenes], Detail], Section]] = {
     FigureName.NOVEL_VIEWS: sections.novel_views,
@@ -46,7 +45,7 @@ def write_figures(
 
     notes: sentences for figures.md.
     """
-    detail = Detail(SIDE, LAYERS, query)
+    detail = Detail(SIDE, query)
     first = models[0].samples[0]
     scene = (
         f"Scene of the figures of one scene: {first.scene}, inputs {listed(first.input_frames)}."

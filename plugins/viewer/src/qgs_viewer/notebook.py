@@ -2,51 +2,21 @@
 
 import torch
 
-from qgs.contracts import LearnedQueries
 from qgs.drawing import page_environment
 from qgs.drawing.images import depth_picture, depth_range, png_bytes, rgb_picture, side_by_side
 from qgs.model import QueryGaussianModel
-from qgs.model_text import heading, parameter_counts, slot_rows
+from qgs.model_text import heading, slot_rows
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Prediction
 
-# Pixels of the picture of a prediction.
+# Pixels of the picture of a prediction, and the focal length of its lens.
 SIDE = 192
-# Share of the Gaussians that it may leave out at its sides.
-OUTSIDE = 0.04
-# Tangent of half the widest view.
-WIDEST = 1.2
 
 
 def model_html(model: QueryGaussianModel) -> str:
-    """Draw the path from views to Gaussians as boxes and arrows, and the same as a table."""
-    rows = slot_rows(model)
-    kinds = {slot: kind for slot, kind, _ in rows}
-    counts = parameter_counts(model)
-
-    def box(*slots: str) -> list[str]:
-        lines = [f"{slot.split('.')[-1]}: {kinds[slot]}" for slot in slots if kinds[slot]]
-        return [*lines, f"{sum(counts[slot] for slot in slots):,} parameters"]
-
-    layers = box(*(slot for slot in counts if slot.startswith("decoder.")))
-    columns = [
-        [["views", "photos", "cameras"]],
-        [box("encoder"), box("queries")],
-        [[f"{model.depth} decoder layers", *layers]],
-        [box("head", "centers")],
-        [["Gaussians"]],
-    ]
-    return (
-        page_environment("qgs_viewer")
-        .get_template("model.html")
-        .render(
-            heading=heading(model),
-            columns=columns,
-            rows=rows,
-            # such queries start from parameters alone, and only the decoder reads photos
-            learned=isinstance(model.queries, LearnedQueries),
-        )
-    )
+    """Return sizes, and a table of all slots: components and parameters."""
+    template = page_environment("qgs_viewer").get_template("model.html")
+    return template.render(heading=heading(model), rows=slot_rows(model))
 
 
 @torch.no_grad()
@@ -59,13 +29,9 @@ def prediction_png(prediction: Prediction) -> bytes | None:
     means = gaussians.means[0].float()
     if means.is_meta or not means.isfinite().all():
         return None
-    before = means[(means[:, 2] > 0) & (gaussians.opacities[0] > 0.05)]
-    if len(before) == 0:
+    if not (means[:, 2] > 0).any():
         return None
-    # the view is as wide as what lies before the origin, less outliers
-    slopes = (before[:, :2] / before[:, 2:]).abs().amax(-1)
-    focal = SIDE / 2 / float(slopes.quantile(1 - OUTSIDE).clamp(0.1, WIDEST))
-    lens = means.new_tensor([[[focal, focal, SIDE / 2, SIDE / 2]]])
+    lens = means.new_tensor([[[SIDE, SIDE, SIDE / 2, SIDE / 2]]])
     camera = Cameras(torch.eye(4).to(means)[None, None], lens, (SIDE, SIDE))
     seen = AutoRenderer(AutoRenderer.Config())(gaussians, camera)
     depth = depth_picture(seen.depth[0, 0], *depth_range(seen.depth))

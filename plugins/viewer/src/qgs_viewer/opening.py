@@ -1,99 +1,275 @@
-"""From what a user names to a source of scenes: a PLY, a finished reconstruction, a model."""
+"""From what a user names to a scene: a PLY, a finished reconstruction, a model with photos."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
 
 from qgs.checkpoint.gaussians import load_ply
 from qgs.checkpoint.model_file import CheckpointFile
-from qgs.contracts import Scene
-from qgs.data.images import framing
+from qgs.contracts import Scene, ViewsConfig
+from qgs.data.images import framing, open_rgb, to_tensor
 from qgs.data.recognition import is_training_data
+from qgs.data.samples import make_sample, own_world, views_in
 from qgs.domain import Domain, verdict
+from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
-from qgs.reconstruction.reconstruct import choice, choose_sample
-from qgs.reconstruction.scale import ScaleSearch, photo_settings
-from qgs.reconstruction.scenes import chosen_scene, frame_list, named_scene
+from qgs.reconstruction.reconstruct import checked_window, choice, choose_sample
+from qgs.reconstruction.scale import ScaleSearch, constant_scale, photo_settings
+from qgs.reconstruction.scenes import Size, chosen_scene, frame_list, named_scene
+from qgs.types import Cameras
 from qgs.wording import listed
-from qgs_viewer.finished import is_finished, open_finished
-from qgs_viewer.query_scene import QueryScene
+from qgs_viewer.placement import Placement
+from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
 from qgs_viewer.remarks import summary
-from qgs_viewer.sources import ModelSource, Source
+
+PLY = "gaussians.ply"
+CAMERAS = "cameras.json"
+"""Files in the folder of a finished reconstruction, as `qgs reconstruct --out` writes it."""
+REFINED = "refined"
+"""The folder in it with the result of `--refine`."""
+# Median distance of means, per spread of the scene, up to which a model made a PLY's Gaussians.
+#
+# A finished reconstruction keeps its photos in 8 bits, which moves means by some thousandths.
+SAME = 0.02
 
 
-@dataclass(frozen=True)
-class ViewOptions:
-    """Options of `qgs view` for a model and its photos."""
+@dataclass
+class Source:
+    """Gaussians of no known model, whose inputs cannot be changed.
 
-    photos: str | None = None
-    scene: str | None = None
-    frames: str | None = None
-    inputs: int | None = None
-    size: tuple[int, int] | None = None
-    overrides: Sequence[str] = ()
-    device: str = "cpu"
+    notes: remarks for the user. frames: of the inputs at first. labels: of all frames; none where
+    the inputs cannot be changed.
+    """
+
+    title: str
+    notes: Sequence[str] = ()
+    fixed: QueryScene | None = None
+    frames: Sequence[int] = ()
+    labels: Sequence[str] = ()
+
+    def scene_of(self, frames: Sequence[int]) -> QueryScene:
+        """Return the scene as made of these frames. Raises ValueError where they do not fit."""
+        assert self.fixed is not None
+        return self.fixed
 
 
-def open_source(name: str, options: ViewOptions) -> Source:
-    """Open a PLY, a reconstruction's folder, a run folder or a model.
+class ModelSource(Source):
+    """A model with a scene, of any number of its frames. The first frames' world is shown."""
 
-    Raises ValueError for options that do not apply to it, and as the readers do.
+    def __init__(
+        self,
+        model: QueryGaussianModel,
+        scene: Scene,
+        views: ViewsConfig,
+        frames: Sequence[int],
+        title: str,
+        notes: Sequence[str] = (),
+    ) -> None:
+        labels = [scene.label(frame) for frame in range(len(scene))]
+        super().__init__(title, notes, frames=tuple(frames), labels=labels)
+        self.model = model
+        self.scene = scene
+        self.views = views
+        self.world = own_world(scene, tuple(frames), views)
+
+    def scene_of(self, frames: Sequence[int]) -> QueryScene:
+        """Reconstruct from these frames, and place the result in the shown world."""
+        if not frames:
+            raise ValueError("a reconstruction needs an input photo: choose one at least")
+        # refuses frames that are not there, twice or too many
+        picked, _ = checked_window(len(self.scene), frames)
+        world = own_world(self.scene, picked, self.views)
+        device = next(self.model.parameters()).device
+        inputs = make_sample(self.scene, picked, (), self.views, mirror=False).inputs.to(device)
+        # other inputs have another world, while the user's view stays
+        place = Placement.between(world, self.world)
+        return explained(self.model, inputs, picked, place)
+
+
+def open_source(name: str, device: str = "cpu", **options: Any) -> Source:
+    """Open a PLY, a reconstruction's folder, or a run folder or a model with `options`.
+
+    options: see `open_model`. Raises ValueError for options that do not apply to it, and as the
+    readers do.
     """
     path = Path(name).expanduser()
     finished = is_finished(path)
     if not finished and path.suffix.lower() != ".ply":
-        return open_model(name, options)
-    if given := [field for field, value in vars(replace(options, device="")).items() if value]:
+        return open_model(name, device, **options)
+    if given := [option for option, value in options.items() if value]:
         raise ValueError(
             f"{listed(given)}: only for a model, and {name} holds Gaussians; leave that out"
         )
     if finished:
-        return open_finished(path, options.device)
+        return open_finished(path, device)
     note = "A PLY file holds neither queries nor photos; name the model to see them."
     return Source(path.name, (note,), QueryScene(load_ply(path)))
 
 
-def open_model(name: str, options: ViewOptions) -> Source:
-    """Open a model with the photos of `options`, or else with the data of its recipe."""
+def open_model(
+    name: str,
+    device: str = "cpu",
+    photos: str | None = None,
+    scene: str | None = None,
+    frames: str | None = None,
+    inputs: int | None = None,
+    size: Size | None = None,
+    overrides: Sequence[str] = (),
+) -> Source:
+    """Open a model with `photos`, or else with the data of its recipe.
+
+    scene, frames, inputs, size, overrides: options of `qgs view`.
+    """
     with CheckpointFile(name) as file:
-        model = file.model(options.device)
+        model = file.model(device)
         recipe = file.recipe
-    if options.overrides:
-        recipe = resolve(recipe.tree, options.overrides)
-    scene = _scene(recipe, options)
-    chosen = None if options.frames is None else frame_list(options.frames, "--frames", scene)
+    if overrides:
+        recipe = resolve(recipe.tree, overrides)
+    shown = _scene(recipe, photos, size, scene)
+    chosen = None if frames is None else frame_list(frames, "--frames", shown)
     trained = model.trained_on or Domain()
-    own = options.photos is None or is_training_data(options.photos, recipe.data_config)
+    own = photos is None or is_training_data(photos, recipe.data_config)
     # photos of a user have a unit of their own
-    search = ScaleSearch(model, photo_settings(recipe.views, own, options.overrides))
-    sample, _ = choose_sample(scene, recipe.views, options.inputs, chosen, None, trained, search)
-    frames = sample.input_frames
+    search = ScaleSearch(model, photo_settings(recipe.views, own, overrides))
+    sample, _ = choose_sample(shown, recipe.views, inputs, chosen, None, trained, search)
     scales = list(search.found.values())
     # users learn if their photos are like those of the training
     seen = Domain()
     seen.see(sample.inputs.cameras, sample.targets.cameras)
     notes = [
         summary(scales) if scales else "",
-        choice(sample, scene, compares=False) if options.photos else "",
+        choice(sample, shown, compares=False) if photos else "",
         verdict(trained, seen, ["scale"] if scales else []),
         *(scale.poor for scale in scales),
-        framing(scene, frames[0]),
+        framing(shown, sample.input_frames[0]),
     ]
     # inputs that are chosen later keep the scale
-    views = search(scene, frames, sample.target_frames)
-    title = f"{name}: {scene.name}"
-    return ModelSource(model, scene, views, frames, title, [note for note in notes if note])
+    views = search(shown, sample.input_frames, sample.target_frames)
+    title = f"{name}: {shown.name}"
+    given = [note for note in notes if note]
+    return ModelSource(model, shown, views, sample.input_frames, title, given)
 
 
-def _scene(recipe: Recipe, options: ViewOptions) -> Scene:
+def _scene(recipe: Recipe, photos: str | None, size: Size | None, name: str | None) -> Scene:
     """Return the scene of the photos, or the named or first test scene of the recipe's data."""
-    if options.photos is not None:
-        return chosen_scene(recipe, options.photos, options.size, options.scene).scene
+    if photos is not None:
+        return chosen_scene(recipe, photos, size, name).scene
     if recipe.data_config is None:
         raise ValueError("the checkpoint's recipe has no data: name a folder of photos after it")
     data = recipe.build_data()
-    if options.size is not None:
+    if size is not None:
         raise ValueError("--size is for photos: name a folder of them, or leave it out")
-    if options.scene is not None:
-        return named_scene(data, "the data of the recipe", options.scene)
+    if name is not None:
+        return named_scene(data, "the data of the recipe", name)
     return data.scenes("test" if data.names("test") else "train")[0]
+
+
+def is_finished(folder: Path) -> bool:
+    """Return if `folder` holds a finished reconstruction."""
+    return (folder / CAMERAS).is_file() and (folder / PLY).is_file()
+
+
+class FinishedScene(Scene):
+    """The views that a reconstruction was compared with, as frames in its world."""
+
+    def __init__(self, name: str, folder: Path, views: Sequence[dict[str, Any]]) -> None:
+        self.name = name
+        self._folder = folder
+        self._views = views
+
+    @property
+    def cameras(self) -> Cameras:
+        """All views of cameras.json."""
+        c2w = torch.tensor([view["c2w"] for view in self._views], dtype=torch.float64)
+        lenses = torch.tensor([view["intrinsics"] for view in self._views], dtype=torch.float64)
+        height, width = self._views[0]["size"]
+        return Cameras(c2w, lenses, (height, width))
+
+    def images(self, frames: Sequence[int]) -> Tensor:
+        """Photos, the left part of the pictures in views/."""
+        height, width = self.cameras.size
+        pictures = []
+        for view in (self._views[frame] for frame in frames):
+            name = f"{view['frame']:05d}_{view['kind'].split()[0]}.png"
+            image = open_rgb(self._folder / "views" / name, NEUTRAL)
+            # the render stands to the right of the photo
+            pictures.append(np.asarray(image)[:height, :width])
+        return to_tensor(np.stack(pictures))
+
+    def label(self, frame: int) -> str:
+        """The photo's file, or its number in the scene, not its place in cameras.json."""
+        view = self._views[frame]
+        return str(view.get("photo") or f"frame {view['frame']}")
+
+
+def read_finished(folder: Path) -> tuple[QueryScene, FinishedScene, Mapping[str, Any]]:
+    """Read a reconstruction without its queries, its photos, and cameras.json.
+
+    Raises ValueError with the file that is broken.
+    """
+    path = folder / CAMERAS
+    gaussians = load_ply(folder / PLY)
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        views = record["views"]
+        scene = FinishedScene(str(record["scene"]), folder, views)
+        inputs = tuple(place for place, view in enumerate(views) if view["kind"] == "input")
+        # a missing picture fails now, not when a user asks for another input
+        scene.images(range(len(views)))
+        red, green, blue = (min(max(float(c), 0), 1) for c in record.get("background") or NEUTRAL)
+        photos = views_in((torch.eye(4).double(), torch.ones(())), scene, inputs)
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise ValueError(
+            f"{path} is no record of a reconstruction ({type(error).__name__}: {error}); make it "
+            "again with `qgs reconstruct`, or view the PLY alone"
+        ) from error
+    plain = QueryScene(gaussians, photos, inputs, background=(red, green, blue))
+    return plain, scene, record
+
+
+def open_finished(folder: Path, device: str) -> Source:
+    """Open a reconstruction, with its queries where its model still makes the same Gaussians."""
+    plain, scene, record = read_finished(folder)
+    title = f"{scene.name} ({folder.name})"
+    notes = []
+    if is_finished(folder / REFINED):
+        notes.append(f"refined on photos: `qgs view {folder / REFINED}`.")
+    try:
+        source = _with_queries(plain, scene, record, device)
+    except (ValueError, OSError) as error:
+        return Source(title, [f"Its queries are not shown: {error}", *notes], plain)
+    source.title = title
+    source.notes = notes
+    return source
+
+
+def _with_queries(
+    plain: QueryScene, scene: FinishedScene, record: Mapping[str, Any], device: str
+) -> ModelSource:
+    """Return the model that made a reconstruction. Raises ValueError and OSError without it."""
+    for change in ("refinement", "tuning"):
+        if record.get(change):
+            raise ValueError(f"{change} on photos changed the Gaussians of its model.")
+    name = str(record.get("model") or "")
+    # nothing is fetched because a file says so
+    if not name or "://" in name:
+        raise ValueError(f"its model is {name or 'not known'}: `qgs view MODEL PHOTOS` shows them.")
+    with CheckpointFile(name) as file:
+        model = file.model(device)
+        # the stored cameras are in the model's world already
+        views = constant_scale(file.recipe.views, 1.0)
+    source = ModelSource(model, scene, views, plain.frames, "")
+    # a model file may have changed since, so what it makes is compared
+    made = source.scene_of(plain.frames).gaussians.means.cpu().double()
+    means = plain.gaussians.means.cpu().double()
+    # medians: a few far Gaussians would hide any difference
+    spread = (means - means.median(1, keepdim=True).values).norm(dim=-1).median()
+    if made.shape != means.shape or (made - means).norm(dim=-1).median() > SAME * spread:
+        raise ValueError(f"{name} makes other Gaussians today.")
+    return source

@@ -1,62 +1,149 @@
-"""The scene as one HTML page that needs no network: for reports, mails, talks."""
+"""A viser server that prints nothing, where its viewers stand, and scenes as single pages."""
 
-from collections.abc import Iterable, Mapping
+import http
+import io
+import ipaddress
+import logging
+import socket
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
+from functools import partial
 from importlib.resources import files
+from typing import Any
+from urllib.parse import urlsplit
 
-from qgs.drawing import page_environment
+import numpy as np
+import torch
+import torch.nn.functional as F
+import viser
+import websockets.asyncio.server as sockets
+
+from qgs.geometry.poses import look_at_depth
 from qgs.types import Gaussians, Views
-from qgs_viewer.choice import Choice
-from qgs_viewer.drawing import Drawing, distance_to
+from qgs_viewer.drawing import FRUSTUM, Choice, Drawing, distance_to
 from qgs_viewer.query_scene import NEUTRAL, Background, QueryScene
-from qgs_viewer.server import quiet_server, stand
 
-DATA = '__VISER_EMBED_DATA__="'
+# Vertical angle of the viewer's window, radians.
+FIELD_OF_VIEW = 0.95
 
 
-def scene_html(
-    scene: QueryScene,
-    choice: Choice | None = None,
-    start: QueryScene | None = None,
-) -> str:
+@contextmanager
+def quiet_server(
+    host: str = "127.0.0.1", port: int = 0, label: str | None = None
+) -> Iterator[viser.ViserServer]:
+    """Run a server, at the next free port from `port` on; 0 takes any.
+
+    Only its own page may connect to it, see `foreign`.
+    """
+    # a message that is none ends its connection, which is no news
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+    serve = sockets.serve
+    sockets.serve = partial(_guarded, serve, host)  # viser has no option for this
+    try:
+        # viser prints a box of addresses, whatever it is asked
+        with redirect_stdout(io.StringIO()):
+            server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+    finally:
+        # other servers of this process are not to be guarded by this host
+        sockets.serve = serve
+    try:
+        yield server
+    finally:
+        with redirect_stdout(io.StringIO()):
+            server.stop()
+
+
+def foreign(headers: Mapping[str, str], host: str) -> bool:
+    """Return if a request comes from another page, or by a name that is not the server's.
+
+    Another page that is open in the browser could read the scene; under a name of its own that
+    resolves to this machine (DNS rebinding) it would look like this one. Addresses in digits, the
+    names of this machine and `host` are the server's.
+    """
+    named = headers.get("Host", "")
+    origin = headers.get("Origin")
+    # browsers send it with every request of a page's script
+    if origin is not None and urlsplit(origin).netloc != named:
+        return True
+    name = urlsplit(f"//{named}").hostname or ""
+    if name in {"localhost", host.lower(), socket.gethostname().lower()}:
+        return False
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return True
+    return False
+
+
+def _guarded(serve: Any, host: str, *where: Any, process_request: Any, **options: Any) -> Any:
+    """`websockets.asyncio.server.serve` that refuses `foreign` requests."""
+
+    def checked(connection: Any, request: Any) -> Any:
+        if foreign(request.headers, host):
+            text = "Open the address that qgs view printed.\n"
+            return connection.respond(http.HTTPStatus.FORBIDDEN, text)
+        return process_request(connection, request)
+
+    return serve(*where, process_request=checked, **options)
+
+
+def stand(server: viser.ViserServer, scene: QueryScene) -> None:
+    """Have new viewers stand at `first_eye`."""
+    eye, target = first_eye(scene)
+    up = up_of(scene).numpy()
+    server.scene.set_up_direction(up)
+    camera = server.initial_camera
+    camera.position = eye
+    camera.look_at = target
+    camera.up = up
+    camera.fov = FIELD_OF_VIEW
+
+
+def up_of(scene: QueryScene) -> torch.Tensor:
+    """Return up for the input cameras together, unit (3,), shown world; -y without cameras."""
+    if scene.views is None:
+        return torch.tensor([0.0, -1.0, 0.0]).double()
+    down = scene.views.cameras.c2w[0, :, :3, 1].cpu().double().mean(0)
+    return -(scene.placement.rotation @ F.normalize(down, dim=0))
+
+
+def first_eye(scene: QueryScene) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the viewer stands at first and what it looks at, both (3,), shown world.
+
+    Behind the camera in the middle; of a walk before its photo, since walls may stand behind it.
+    """
+    unit = distance_to(scene)
+    if scene.views is None:
+        middle = scene.placement.points(scene.gaussians.means[0]).median(0).values
+        return (middle - torch.tensor([0.0, 0.0, 2.5 * unit])).numpy(), middle.numpy()
+    c2w = scene.views.cameras.c2w[0].cpu().double()
+    eyes = scene.placement.points(c2w[:, :3, 3])
+    apart = (eyes - eyes.mean(0)).norm(dim=-1)
+    nearest = apart.argmin()
+    eye = eyes[nearest]
+    aside, _, forward = (scene.placement.rotation @ c2w[nearest, :3, :3]).unbind(-1)
+    target = eye + unit * forward
+    if apart.max() > unit and not look_at_depth(c2w):
+        return torch.lerp(eye, target, 2 * FRUSTUM).numpy(), target.numpy()
+    # from a little behind, above and beside, depth is seen
+    place = eye + unit * (0.2 * aside + 0.2 * up_of(scene) - 0.3 * forward)
+    return place.numpy(), target.numpy()
+
+
+def scene_html(scene: QueryScene, choice: Choice | None = None) -> str:
     """Return a page to turn `scene` and to record it: 0.8 MB, and 40 bytes a Gaussian.
 
-    choice: by default the scene with the anchors of the last layer. start: scene that gives the
-    first view and the size of photos, by default its own.
+    choice: by default the scene with the anchors of the last layer.
     """
-    start = start or scene
     with quiet_server() as server:
-        stand(server, start)
-        choice = choice or Choice(layer=scene.depth)
-        Drawing(server.scene).put(scene, choice, unit=distance_to(start))
+        stand(server, scene)
+        Drawing(server.scene).put(scene, choice or Choice(layer=scene.depth))
         page = server.get_scene_serializer().as_html()
     head = files("qgs_viewer") / "template" / "head.html"
     # before viser's code, which reads what it changes
     return page.replace("<head>", f"<head>{head.read_text(encoding='utf-8')}", 1)
 
 
-def scenes_html(scenes: Mapping[str, QueryScene], choices: Mapping[str, Choice]) -> str:
-    """Return a page of scenes side by side, by name, all seen from `shared_start` at first.
-
-    choices: for scenes without one as in `scene_html`. The page is dark where the page or the
-    system around it is.
-    """
-    start = shared_start(scenes.values())
-    data = {}
-    shell = ("", "")
-    for name, scene in scenes.items():
-        before, _, rest = scene_html(scene, choices.get(name), start=start).partition(DATA)
-        data[name], after = rest.split('"', 1)
-        # all pages have the same code of viser, so one page holds it once
-        shell = (before + DATA, '"' + after)
-    template = page_environment("qgs_viewer").get_template("scenes.html")
-    return template.render(shell=shell, scenes=[*data.items()])
-
-
 def gaussians_html(gaussians: Gaussians, views: Views, background: Background = NEUTRAL) -> str:
     """Return a page of Gaussians (1, G) and the cameras of some photos (1, V) in their world."""
     return scene_html(QueryScene(gaussians, views, background=background))
-
-
-def shared_start(scenes: Iterable[QueryScene]) -> QueryScene:
-    """Return the scene whose first view shows all well: the one nearest to its cameras."""
-    return min(scenes, key=distance_to)

@@ -10,16 +10,14 @@ from typing import Any, get_args
 import numpy as np
 import viser
 
-from qgs.reconstruction.scenes import frame_list
-from qgs_viewer.choice import Choice, Others, anchor_colors, painted
-from qgs_viewer.drawing import Drawing
-from qgs_viewer.pictures import PARTS, attention_pictures_of, sheet
-from qgs_viewer.placement import hit, near_ray
+from qgs_viewer.drawing import Choice, Drawing, Others, painted
+from qgs_viewer.opening import Source
+from qgs_viewer.page import stand
+from qgs_viewer.placement import Splats, hit
+from qgs_viewer.queries import PARTS, attention_pictures_of, sheet
 from qgs_viewer.query_scene import QueryScene
-from qgs_viewer.server import stand
-from qgs_viewer.sources import ModelSource, Source
 
-# Photos that each have a check box; more are named in a line of text.
+# Photos whose check boxes are seen at once; more would hide the other controls.
 MOST_BOXES = 24
 # Pixels on the longer side of photos that show attention.
 PHOTO_SIDE = 192
@@ -38,7 +36,6 @@ class Panel:
         self.choice = Choice(layer=self.scene.depth)
         # viser calls back from several threads, also while a control is set here
         self._lock = RLock()
-        self._resetting = False
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
         stand(server, self.scene)
@@ -51,7 +48,7 @@ class Panel:
         if source.notes:
             with server.gui.add_folder("remarks", expand_by_default=False):
                 server.gui.add_markdown("\n\n".join(map(plain, source.notes)))
-        self.drawing.put(self.scene, self.choice, source.cameras())
+        self.drawing.put(self.scene, self.choice)
         if self.scene.queries:
             server.scene.on_click()(self._clicked)
 
@@ -76,8 +73,6 @@ class Panel:
             hint = f"0 to {last}, or {NONE} for all"
             self.number = gui.add_number("query", NONE, min=NONE, max=last, step=1, hint=hint)
             self.number.on_update(self._typed)
-            self.everything = gui.add_button("Show all (Esc)", visible=False)
-            self.everything.on_click(lambda _: self.pick(None))
             escape = gui.add_command("Show all queries", hotkey="escape")
             escape.on_trigger(lambda _: self.pick(None))
             self._bind(
@@ -87,7 +82,7 @@ class Panel:
             hint = "Supports are those after this layer; 0 is the start."
             self.layer = gui.add_slider("layer", 0, depth, 1, depth, hint=hint)
             self._bind("layer", self.layer)
-            hint = "Lines to the patches that the query attends to most; broad and strong is much."
+            hint = "Lines to the patches that the query attends to most; strong is much."
             patches = gui.add_slider("patches", 0, 96, 1, self.choice.patches, hint=hint)
             self._bind("patches", patches)
             if self.scene.has_anchors:
@@ -101,19 +96,12 @@ class Panel:
         gui = self.server.gui
         labels = self.source.labels
         self.boxes: list[Any] = []
-        with gui.add_folder("reconstructed from"):
-            if len(labels) <= MOST_BOXES:
-                gui.add_markdown("Ticked photos are the inputs. Tick others to change them.")
-                for frame, label in enumerate(labels):
-                    box = gui.add_checkbox(label, frame in self.source.frames)
-                    box.on_update(self._reframed)
-                    self.boxes.append(box)
-            else:
-                # hundreds of boxes would hide the other controls
-                text = ",".join(map(str, self.source.frames))
-                hint = f"Numbers or file names, commas between; 0 to {len(labels) - 1}."
-                self.frames = gui.add_text("input photos", text, hint=hint)
-                gui.add_button("Reconstruct").on_click(self._reframed)
+        with gui.add_folder("reconstructed from", expand_by_default=len(labels) <= MOST_BOXES):
+            gui.add_markdown("Ticked photos are the inputs. Tick others to change them.")
+            for frame, label in enumerate(labels):
+                box = gui.add_checkbox(label, frame in self.source.frames)
+                box.on_update(self._reframed)
+                self.boxes.append(box)
 
     def _bind(self, name: str, control: Any) -> None:
         """Have `control` set a field of the choice."""
@@ -143,8 +131,7 @@ class Panel:
         """Reconstruct from these frames. Raises ValueError where they do not fit, and OSError."""
         with self._lock:
             if tuple(frames) != tuple(self.scene.frames):
-                put = partial(self.drawing.put, every=self.source.cameras())
-                self._show(put, self.source.scene_of(frames), self.choice)
+                self._show(self.drawing.put, self.source.scene_of(frames), self.choice)
 
     def _show(self, draw: Callable[..., None], scene: QueryScene, choice: Choice) -> None:
         """Draw by `draw`, and describe the picked query; a failure leaves all as it was."""
@@ -161,27 +148,15 @@ class Panel:
             handle.visible = part in found
             if part in found:
                 handle.image = sheet(found[part])
-        self.everything.visible = query is not None
         self._text.content = "" if query is None else description(scene, query, layer)
 
     def _reframed(self, event: Any) -> None:
-        """Reconstruct from the chosen photos; if they do not fit, reset the boxes, not the text."""
-        with self._lock:
-            if self._resetting:
-                return
-            try:
-                if self.boxes:
-                    self.take([frame for frame, box in enumerate(self.boxes) if box.value])
-                else:
-                    assert isinstance(self.source, ModelSource)
-                    self.take(frame_list(self.frames.value, "frames", self.source.scene))
-            except (ValueError, OSError) as error:
-                self._resetting = True
-                for frame, box in enumerate(self.boxes):
-                    box.value = frame in self.scene.frames
-                self._resetting = False
-                if event.client is not None:
-                    event.client.add_notification("Not reconstructed", str(error), color="red")
+        """Reconstruct from the ticked photos; where they do not fit, the last scene stays."""
+        try:
+            self.take([frame for frame, box in enumerate(self.boxes) if box.value])
+        except (ValueError, OSError) as error:
+            if event.client is not None:
+                event.client.add_notification("Not reconstructed", str(error), color="red")
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         with self._lock:
@@ -193,11 +168,14 @@ class Panel:
         # anchors are drawn over Gaussians, so they are hit first
         found = self.scene.support(self.choice.layer) if self.choice.anchors else None
         if found is not None:
-            numbers, _ = anchor_colors(self.scene, self.choice)
-            centers = found.centers[0].numpy()[numbers]
-            anchor = near_ray(centers, origin, direction, self.drawing.anchor_radius)
+            centers = found.centers[0].numpy()
+            # opaque, and nearly clear at the rim of their dots
+            spread = (self.drawing.anchor_radius / 3) ** 2 * np.eye(3)
+            covariances = np.broadcast_to(spread, (len(centers), 3, 3))
+            dots = Splats(centers, covariances, np.ones((len(centers), 1)), centers)
+            anchor = hit(dots, origin, direction)
             if anchor is not None:
-                return int(numbers[anchor])
+                return anchor
         gaussian = hit(painted(self.scene, self.choice), origin, direction)
         return None if gaussian is None else self.scene.query_of(gaussian)
 
@@ -214,15 +192,9 @@ def description(scene: QueryScene, query: int, layer: int) -> str:
     lines.append(f"Gaussians {members.start} to {members.stop - 1}")
     found = scene.support(layer)
     if found is not None:
-        x, y, z = found.centers[0, query].tolist()
-        sizes = found.axes[0, query].norm(dim=0).tolist()
-        shape = f"radius {sizes[0]:.3f}"
-        if max(sizes) > 1.001 * min(sizes):
-            shape = "semi-axes " + ", ".join(f"{size:.3f}" for size in sizes)
-        lines.append(f"anchor at {x:.3f}, {y:.3f}, {z:.3f}; {shape}")
-        if layer and (before := scene.support(layer - 1)) is not None:
-            moved = (found.centers[0, query] - before.centers[0, query]).norm()
-            lines.append(f"moved by {float(moved):.3f} in this layer")
+        place = ", ".join(f"{x:.3f}" for x in found.centers[0, query].tolist())
+        sizes = ", ".join(f"{x:.3f}" for x in found.axes[0, query].norm(dim=0).tolist())
+        lines.append(f"anchor at {place}; semi-axes {sizes}")
     if layer and scene.attention(query, layer) is None:
         patches = scene.inside is None or scene.inside.memory.grid is not None
         silent = "this component does not report its attention"

@@ -131,15 +131,3 @@ def patch_centers(grid: tuple[int, int, int], size: tuple[int, int]) -> Tensor:
     height, width = size
     places = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).double() + 0.5
     return places.flip(-1) * torch.tensor([width / columns, height / rows])
-
-
-def near_ray(
-    points: np.ndarray, origin: np.ndarray, direction: np.ndarray, radius: float
-) -> int | None:
-    """Return the first of points (N, 3) that a ray passes within `radius`; None without."""
-    offsets = points - origin
-    depths = offsets @ direction
-    distances = np.linalg.norm(offsets - depths[:, None] * direction, axis=1)
-    reached = np.where((depths > 0) & (distances <= radius), depths, np.inf)
-    nearest = int(reached.argmin())
-    return nearest if np.isfinite(reached[nearest]) else None

@@ -9,14 +9,16 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from qgs.drawing.figures import INK, Color, categorical
-from qgs.drawing.images import NOTHING, Picture, enlarged, rgb_picture
+from qgs.drawing.images import NOTHING, Picture, enlarged, rgb_picture, side_by_side
 from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.metrics.dispersion import token_dispersion
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians, SpatialSupport
+from qgs_viewer.query_scene import QueryScene
 
 ATTENTION_COLOR = categorical(0)
+PARTS = {"content": "content logits", "geometry": "geometry bias", "result": "attention"}
 # Lines are drawn on pictures so many times as large, which smooths them.
 OVERSAMPLING = 3
 # Part of a picture along its border, where no query is chosen to be shown.
@@ -176,9 +178,17 @@ def notable_queries(
     weights_N = weights_NK.sum(1)
     seen_N3 = (means_NK3 * weights_NK[..., None]).sum(1) / weights_N[:, None].clamp_min(1e-12)
     places_N2 = _pixels(seen_N3.to(gaussians.means), cameras) / torch.tensor(cameras.size[::-1])
-    small_N = (_widths(gaussians, cameras).view_as(weights_NK) < 0.5).all(1) & (weights_N > 0)
-    order = weights_N.argsort(descending=True).tolist()
-    chosen = _spread(order, places_N2, small_N, count)
+    outside_N = ((places_N2 - 0.5).abs() >= 0.5 - MARGIN).any(1)
+    wide_N = (_widths(gaussians, cameras).view_as(weights_NK) >= 0.5).any(1)
+    faults_N = (2 * outside_N + wide_N).tolist()
+    order = sorted(weights_N.argsort(descending=True).tolist(), key=lambda n: faults_N[n])
+    chosen = list[int]()
+    # those that are apart first, then any
+    for least in (0.6 / count**0.5, 0.0):
+        for n in order:
+            far = all((places_N2[n] - places_N2[other]).norm() >= least for other in chosen)
+            if far and n not in chosen and len(chosen) < count:
+                chosen.append(n)
     return colored_queries(gaussians, len(weights_N), chosen)
 
 
@@ -191,22 +201,6 @@ def _widths(gaussians: Gaussians, cameras: Cameras) -> Tensor:
     focal = cameras.intrinsics[0, 0, :2].mean()
     pixels = 4 * gaussians.scales[0].amax(-1) * focal / depths.clamp_min(1e-3)
     return torch.where(depths > 0, pixels / max(cameras.size), 0).cpu()
-
-
-def _spread(order: Sequence[int], places_N2: Tensor, small_N: Tensor, count: int) -> list[int]:
-    """Return the first `count` of `order` well inside [0, 1]^2 and apart; others if few are."""
-    inside = [i for i in order if ((places_N2[i] - 0.5).abs() < 0.5 - MARGIN).all()]
-    small = [i for i in inside if small_N[i]]
-    distance = 0.6 / count**0.5
-    chosen = list[int]()
-    # each try asks for less than the one before
-    tries = ((small, distance), (inside, distance), (inside, distance / 2), (order, 0.0))
-    for candidates, least in tries:
-        for i in candidates:
-            far = all((places_N2[i] - places_N2[j]).norm() >= least for j in chosen)
-            if far and i not in chosen and len(chosen) < count:
-                chosen.append(i)
-    return chosen
 
 
 def query_picture(
@@ -240,3 +234,30 @@ def query_picture(
             draw.line([*hub, *end], fill=(*query.color, 200), width=OVERSAMPLING)
             draw.circle(end, 1.6 * OVERSAMPLING, fill=(*query.color, 255), outline=(*INK, 160))
     return _reduced(image)
+
+
+def attention_pictures_of(
+    scene: QueryScene, query: int, layer: int, side: int
+) -> dict[str, list[Picture]]:
+    """Colour photos by what a query attends to, by PARTS; less those it lacks; means over heads.
+
+    side: pixels on the longer side of each photo.
+    """
+    found = scene.attention(query, layer)
+    if found is None or scene.views is None:
+        return {}
+    photos = [enlarged(rgb_picture(image), side) for image in scene.views.images[0]]
+    values = {"result": found.weights, "content": found.content, "geometry": found.geometry}
+    return {
+        part: attention_pictures(photos, patch_maps(value[0, :, 0], scene.grid))
+        for part, value in values.items()
+        if value is not None
+    }
+
+
+def sheet(pictures: list[Picture]) -> Picture:
+    """Put all pictures into one, two in a row."""
+    # the last row may lack one
+    padded = [*pictures, np.full_like(pictures[0], 255)]
+    rows = [side_by_side(padded[first : first + 2]) for first in range(0, len(pictures), 2)]
+    return np.concatenate(rows)

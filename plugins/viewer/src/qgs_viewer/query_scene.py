@@ -36,7 +36,7 @@ class Reading:
     side: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class QueryScene:
     """Gaussians (1, G), the input views (1, V), and the placement in the shown world.
 

@@ -31,7 +31,7 @@ class ModelScenes:
     samples: Sequence[Sample]
     gaussians: Sequence[Gaussians]
     scene: QueryScene
-    curves: Curves | None = None
+    curves: Curves = ()
 
     @property
     def input_camera(self) -> Cameras:
@@ -109,7 +109,7 @@ def scenes_of(
     ]
     scene = explained(network, own[0].inputs, own[0].input_frames)
     others = [network(sample.inputs).gaussians for sample in own[1:]]
-    curves = curves_of(file) if file else None
+    curves = curves_of(file) if file else ()
     return ModelScenes(name, network, own, [scene.gaussians, *others], scene, curves)
 
 

@@ -3,7 +3,6 @@
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from importlib.resources import files
 from typing import Any
 
@@ -16,34 +15,45 @@ from qgs.contracts import LearnedQueries
 from qgs.data.frames import evenly
 from qgs.drawing import images
 from qgs.drawing.figures import figure_picture
-from qgs.drawing.images import Picture, depth_picture, depth_range, rgb_picture, side_by_side
+from qgs.drawing.images import (
+    Picture,
+    depth_picture,
+    depth_range,
+    rgb_picture,
+    shaded,
+    side_by_side,
+)
 from qgs.metrics.images import Psnr, psnr
-from qgs.reconstruction.saving import orbit_path
-from qgs.wording import listed
-from qgs_viewer.choice import Choice
 from qgs_viewer.curves import curves_figure
-from qgs_viewer.page import scenes_html
-from qgs_viewer.pictures import PARTS, attention_pictures_of, color_error, error_picture
-from qgs_viewer.placement import Placement
-from qgs_viewer.queries import DrawnQuery, query_picture, support_picture
+from qgs_viewer.drawing import Choice
+from qgs_viewer.page import scene_html
+from qgs_viewer.queries import (
+    PARTS,
+    DrawnQuery,
+    attention_pictures_of,
+    query_picture,
+    support_picture,
+)
 from qgs_viewer.scenes import ModelScenes, ratio
 
+ERROR_MAP = "inferno"
 QUERIES = 5
 ANCHORS = 12
+# Decoder layers after which anchors are shown.
+LAYERS = 3
 NOVEL_SCENES = 3
-ORBIT_FRAMES = 32
 Shown = Sequence[ModelScenes]
 
 
 @dataclass(frozen=True)
 class Tile:
-    """A picture, or the frames of an animation. legend: queries in it, in their colours.
+    """A picture. legend: queries in it, in their colours.
 
     page: HTML without network that a reader can open in its place, in a frame without access to
-    the report, dark where `prefers-color-scheme` is.
+    the report.
     """
 
-    image: Picture | list[Picture]
+    image: Picture
     caption: str = ""
     legend: Sequence[DrawnQuery] = ()
     page: str = ""
@@ -64,57 +74,33 @@ class Section:
     @property
     def words(self) -> Mapping[str, str]:
         """Its `title` and `text`, and what is said where no model has data for it: `empty`."""
-        return _words()[self.name]
-
-
-@cache
-def _words() -> Mapping[str, Mapping[str, str]]:
-    file = files("qgs_viewer") / "template" / "sections.toml"
-    return tomllib.loads(file.read_text(encoding="utf-8"))
+        file = files("qgs_viewer") / "template" / "sections.toml"
+        return tomllib.loads(file.read_text(encoding="utf-8"))[self.name]
 
 
 @dataclass(frozen=True)
 class Detail:
     """How sections show models.
 
-    side: pixels on the longer side of pictures. layers: how many are shown; by default anchors
-    after all layers and attention in the last. query: the one to show; by default notable ones.
+    side: pixels on the longer side of pictures. query: the one to show; by default notable ones.
     """
 
     side: int = 256
-    layers: int | None = None
     query: int | None = None
 
 
-def orbit(models: Shown) -> Section:
-    """A loop past the input cameras, around what they see."""
+def scene_to_turn(models: Shown) -> Section:
+    """The first scene as every model makes it, each with a page to turn it."""
     tiles = []
     for model in models:
-        cameras = model.samples[0].inputs.cameras
-        gaussians = model.gaussians[0]
-        depths = model.network.render(gaussians, cameras).depth
-        path = orbit_path(cameras, depths, ORBIT_FRAMES, Detail.side)
-        renders = model.network.render(gaussians, path).rgb[0]
-        tiles.append(Tile([rgb_picture(image) for image in renders], model.name))
-    return Section("orbit", {"": tiles})
-
-
-def scene_to_turn(models: Shown) -> Section:
-    """The first scene as every model makes it, side by side, on a page to turn it."""
-    scenes = {}
-    pictures = []
-    choices = {}
-    for model in models:
-        # one camera looks at all of them, so they need one scale
-        place = replace(Placement.identity(), scale=ratio(models[0].samples[0], model.samples[0]))
-        scenes[model.name] = replace(model.scene, placement=place)
         camera = images.finer(model.target_camera, Detail.side)
-        pictures.append(rgb_picture(model.network.render(model.gaussians[0], camera).rgb[0, 0]))
+        picture = rgb_picture(model.network.render(model.gaussians[0], camera).rgb[0, 0])
+        choice = None
         if model.scene.has_anchors:
             (query,) = model.notable(1, camera)
-            choices[model.name] = Choice(query.index, layer=model.scene.depth, others="shown")
-    tile = Tile(side_by_side(pictures), ", ".join(scenes), page=scenes_html(scenes, choices))
-    return Section("scene", {"": [tile]}, width=600)
+            choice = Choice(query.index, layer=model.scene.depth, others="shown")
+        tiles.append(Tile(picture, model.name, page=scene_html(model.scene, choice)))
+    return Section("scene", {"": tiles})
 
 
 def queries(models: Shown, detail: Detail) -> Section:
@@ -142,7 +128,7 @@ def anchors(models: Shown, detail: Detail) -> Section:
         learned = isinstance(model.network.queries, LearnedQueries)
         layers = range(model.scene.depth + 1)
         tiles = []
-        for layer in evenly(layers, len(layers) if detail.layers is None else detail.layers + 1):
+        for layer in evenly(layers, LAYERS + 1):
             support = map_tensors(Tensor.float, model.scene.support(layer))
             picture = support_picture(photo, support, camera.to("cpu"), colors)
             start = "learned start" if learned else "start of these photos"
@@ -156,17 +142,13 @@ def attention(models: Shown, detail: Detail) -> Section:
     rows = {}
     for model in models:
         (query,) = model.notable(1, model.target_camera, detail.query)
-        depth = model.scene.depth
-        layers = [depth] if detail.layers is None else evenly(range(1, depth + 1), detail.layers)
-        for layer in layers:
-            # half the side: photos stand side by side in one picture
-            found = attention_pictures_of(model.scene, query.index, layer, detail.side // 2)
-            tiles: list[Tile | None] = []
-            for part in ("content", "geometry", "result"):
-                seen = part in found
-                tiles.append(Tile(side_by_side(found[part]), PARTS[part]) if seen else None)
-            if found:
-                rows[f"{model.name}, query {query.index}, layer {layer}"] = tiles
+        # half the side: photos stand side by side in one picture
+        found = attention_pictures_of(model.scene, query.index, model.scene.depth, detail.side // 2)
+        if found:
+            rows[f"{model.name}, query {query.index}"] = [
+                Tile(side_by_side(found[part]), title) if part in found else None
+                for part, title in PARTS.items()
+            ]
     return Section("attention", rows, width=240)
 
 
@@ -185,26 +167,16 @@ def novel_views(models: Shown, detail: Detail) -> Section:
     rows: dict[str, Sequence[Tile | None]] = {}
     for place, sample in enumerate(models[0].samples[:NOVEL_SCENES]):
         scene = pictured_scene(models, place, [len(sample.target_frames) // 2])
-        kinds = scene["kinds"]
-        inputs = scene["inputs"]
-        (truth,) = kinds["Render"]["Truth"]
-        (depth,) = kinds["Depth"].get("Truth", [None])
-        for number, model in enumerate(models):
-            # what all models share stands in the rows of the first ones
-            tiles = {"input": inputs[number] if number < len(inputs) else None}
-            tiles["truth"] = None if number else truth
-            tiles["true depth"] = None if number else depth
-            for kind, columns in kinds.items():
-                (tiles[kind.lower()],) = columns[model.name]
-            row = f"{place + 1}: {scene['name']}, {model.name}"
-            rows[row] = [_titled(tile, title) for title, tile in tiles.items()]
+        given: list[Tile | None] = scene["inputs"]
+        for kind, columns in scene["kinds"].items():
+            tiles = [*given]
+            for name in ("Truth", *(model.name for model in models)):
+                (tile,) = columns.get(name, [None])
+                tiles.append(tile and replace(tile, caption=f"{name} {tile.caption}"))
+            rows[f"{place + 1}: {sample.scene}, {kind.lower()}"] = tiles
+            # inputs stand in the first row of their scene alone
+            given = [None] * len(given)
     return Section("novel_views", rows)
-
-
-def _titled(tile: Tile | None, title: str) -> Tile | None:
-    if tile is None:
-        return None
-    return replace(tile, caption=f"{title}, {tile.caption}" if tile.caption else title)
 
 
 def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[str, Any]:
@@ -217,9 +189,7 @@ def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[st
     truth = views.images[0]
     captions = [f"frame {sample.label(sample.target_frames[target])}" for target in targets]
     colors = {"Truth": _photos(truth, captions)}
-    depths = {}
-    if views.depths is not None:
-        depths["Truth"] = views.depths[0]
+    depths = {} if views.depths is None else {"Truth": views.depths[0]}
     errors = {}
     for model in models:
         own = model.samples[place]
@@ -229,7 +199,7 @@ def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[st
         scores = psnr(rgb, truth).tolist()
         quality = [f"{Psnr.column.shown(score)} {Psnr.column.unit}" for score in scores]
         colors[model.name] = _photos(rgb, quality)
-        errors[model.name] = color_error(rgb, truth)
+        errors[model.name] = (rgb.clamp(0, 1) - truth.to(rgb)).abs().mean(1, keepdim=True)
         # models may see the scene in worlds of different units
         depths[model.name] = rendering.depth[0] * ratio(sample, own)
     # one scale for truth and models, or pictures could not be compared
@@ -237,14 +207,12 @@ def pictured_scene(models: Shown, place: int, targets: Sequence[int]) -> dict[st
     most = depth_range(torch.cat(list(errors.values())))[1]
     kinds: dict[str, dict[str, list[Tile]]] = {"Render": colors, "Error": {}, "Depth": {}}
     for name, maps in errors.items():
-        kinds["Error"][name] = [Tile(error_picture(error, most)) for error in maps]
+        kinds["Error"][name] = [Tile(shaded(error, 0.0, most, ERROR_MAP)) for error in maps]
     for name, maps in depths.items():
         kinds["Depth"][name] = [Tile(depth_picture(depth, near, far)) for depth in maps]
-    frames = sample.input_frames
-    inputs = [f"frame {sample.label(frame)}" for frame in frames]
+    inputs = [f"frame {sample.label(frame)}" for frame in sample.input_frames]
     return {
         "name": sample.scene,
-        "frames": f"input frame{'s' if len(frames) > 1 else ''} {listed(sorted(frames))}",
         "inputs": _photos(sample.inputs.images[0], inputs),
         "kinds": kinds,
         "most": most,

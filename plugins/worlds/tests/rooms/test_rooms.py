@@ -59,5 +59,5 @@ def test_cameras_are_rigid_and_keep_clear_of_every_surface():
 @pytest.mark.parametrize("name", ["locus-64", "tokengs-64"])
 def test_models_come_with_their_training_curves(name):
     curves = curves_of(checkpoint_path(f"rooms/{name}"))
-    assert list(curves.steps) == list(range(100, 40_001, 100))
-    assert curves.psnr[0] + 5 < curves.psnr[-1]
+    assert [record["step"] for record in curves] == list(range(100, 40_001, 100))
+    assert curves[0]["psnr"] + 5 < curves[-1]["psnr"]
