@@ -106,32 +106,27 @@ def _asked(times: Tensor, inputs: int) -> Tensor | None:
 def with_noise(
     cameras: Cameras, inputs: int, views: ViewsConfig, rng: np.random.Generator
 ) -> Cameras:
-    """Return cameras (1, F), the first `inputs` of them with `views.pose_noise`."""
-    c2w = cameras.c2w[0].clone()
-    c2w[:inputs] = shaken(c2w[:inputs], math.radians(views.pose_noise), rng)
-    return replace(cameras, c2w=c2w[None])
+    """Return cameras (1, F), the first `inputs` of them, but for the first, with noise.
 
-
-def shaken(c2w: Tensor, angle: float, rng: np.random.Generator) -> Tensor:
-    """Move poses (F, 4, 4), all but the first, by `angle` radians: `ViewsConfig.pose_noise`."""
-    turns, moves = torch.from_numpy(rng.normal(0, angle, (2, len(c2w), 3))).to(c2w)
+    They turn and move by `ViewsConfig.pose_noise`.
+    """
+    c2w = cameras.c2w[0, :inputs]
+    angle = math.radians(views.pose_noise)
+    turns, moves = torch.from_numpy(rng.normal(0, angle, (2, inputs, 3))).to(c2w)
     # The matrix of the cross product with a turn; its exponential is the rotation.
     cross = torch.linalg.cross(turns[:, None], torch.eye(3).to(c2w)[None]).mT
     distances = (c2w[:, :3, 3] - c2w[0, :3, 3]).norm(dim=-1, keepdim=True)
     # The first pose sets the world and stays exact; farther cameras are off by more.
-    off = c2w.clone()
-    off[1:, :3, :3] = (c2w[:, :3, :3] @ torch.linalg.matrix_exp(cross))[1:]
-    off[1:, :3, 3] += (moves * distances)[1:]
-    return off
+    off = cameras.c2w.clone()
+    off[0, 1:inputs, :3, :3] = (c2w[:, :3, :3] @ torch.linalg.matrix_exp(cross))[1:]
+    off[0, 1:inputs, :3, 3] += (moves * distances)[1:]
+    return replace(cameras, c2w=off)
 
 
 def views_in(
     world: tuple[Tensor, Tensor], scene: Scene, frames: Frames, depths: bool = False
 ) -> Views:
-    """Read views (1, F) of these frames in a world as of `own_world`, float32; times are 0 to 1.
-
-    Raises ValueError where all masks of `scene` are black.
-    """
+    """Read views (1, F) of these frames in a world as of `own_world`, float32; times are 0 to 1."""
     refuse_too_many(len(frames), scene)
     # A frame that is input and target, or target twice, is decoded once.
     wanted = sorted(set(frames))
@@ -140,9 +135,6 @@ def views_in(
     def in_order(maps: Tensor | None) -> Tensor | None:
         return None if maps is None else torch.from_numpy(maps.numpy()[order])[None]
 
-    masks = scene.masks(wanted)
-    if masks is not None and not masks.numpy().any():
-        _refuse_black_masks(scene)
     surface = scene.depths(wanted) if depths else None
     if surface is not None:
         # The z of cameras scales with their translations.
@@ -151,20 +143,10 @@ def views_in(
     return Views(
         images=torch.from_numpy(scene.images(wanted).numpy()[order])[None],
         cameras=cameras_in(world, scene, frames),
-        masks=in_order(masks),
+        masks=in_order(scene.masks(wanted)),
         times=None if times is None else times[None].float(),
         depths=in_order(surface),
     )
-
-
-def _refuse_black_masks(scene: Scene) -> None:
-    """Raise ValueError where no mask of `scene` is white anywhere; some views may show nothing."""
-    for frame in range(len(scene)):
-        mask = scene.masks([frame])
-        if mask is not None and mask.any():
-            return
-    fix = "make them white on what is modelled, or list none"
-    raise ValueError(f"all masks of scene {scene.name!r} are black: {fix}")
 
 
 def cameras_in(world: tuple[Tensor, Tensor], scene: Scene, frames: Frames) -> Cameras:

@@ -11,7 +11,7 @@ from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, partial
 from itertools import count, islice
 from typing import Any
 
@@ -22,6 +22,7 @@ from torch.utils.data import DataLoader, Dataset
 from qgs.containers import concatenated
 from qgs.contracts import Frames, Scene, SceneSource, ViewSampler, ViewsConfig
 from qgs.data.samples import Batch, Sample, cameras_in, collate, make_sample, own_world, with_noise
+from qgs.data.scenes import BoundedCache
 from qgs.data.view_samplers import Span
 from qgs.domain import Domain
 from qgs.machine import is_out_of_memory
@@ -74,18 +75,13 @@ def training_batches(
     them. skips, sampler, depths: see `SampleStream`. accumulate: batches of an optimiser step.
     Raises ValueError without training scenes or with too few frames, SampleError and WorkerError.
     """
-    batches = _Batches(
-        source,
-        batch_size,
-        share,
-        views=views,
-        seed=seed,
-        skips=skips,
-        sampler=sampler,
-        per_step=batch_size * share.processes * accumulate,
-        depths=depths,
+    stream = SampleStream(
+        source, views, seed, skips, sampler, batch_size * share.processes * accumulate, depths
     )
-    return _from_workers(batches, start, workers) if workers else _from_thread(batches, start)
+    every = batch_size * share.processes
+    firsts = count(start * every + share.rank * batch_size, every)
+    numbers = (range(first, first + batch_size) for first in firsts)
+    return _from_workers(stream, numbers, workers) if workers else _from_thread(stream, numbers)
 
 
 def trained_domain(
@@ -122,8 +118,10 @@ def scenes_fingerprint(source: SceneSource) -> str:
     return digest.hexdigest()[:16]
 
 
-class SampleStream:
+class SampleStream(Dataset[Batch | Exception]):
     """Samples by number, each a function of (seed, number) alone. Raises ValueError without scenes.
+
+    A copy in a worker opens the data itself on first use.
 
     Each epoch visits the groups (see `SceneSource.groups`) in a random order, and the scenes of
     each at random.
@@ -143,6 +141,7 @@ class SampleStream:
         per_step: int = 1,
         depths: bool = False,
     ) -> None:
+        self._open = partial(type(source), source.config)
         self._views = views
         self._seed = seed
         self._skips = skips
@@ -156,11 +155,20 @@ class SampleStream:
         every = np.sort(np.concatenate([np.empty(0, np.int64), *self._groups]))
         whole = np.arange(len(self._scenes))
         assert np.array_equal(every, whole), "groups hold every scene once"
-        self._epoch = lru_cache(maxsize=2)(self._draw_epoch)
+        self._orders: BoundedCache[np.ndarray] = BoundedCache(2)
+
+    # Open scenes hold files and caches, which cannot be sent to a worker.
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_scenes"}
+
+    @cached_property
+    def _scenes(self) -> Sequence[Scene]:
+        return self._open().scenes("train")
 
     def _scene(self, number: int) -> Scene:
         epoch, place = divmod(number, len(self._scenes))
-        return self._scenes[int(self._epoch(epoch)[place])]
+        order = self._orders.get(epoch, lambda: self._draw_epoch(epoch))
+        return self._scenes[int(order[place])]
 
     def _draw_epoch(self, epoch: int) -> np.ndarray:
         rng = np.random.default_rng([self._seed, 0, epoch])
@@ -174,6 +182,17 @@ class SampleStream:
         left_out: list[str] = []
         batch = collate([self._sample(number, left_out) for number in numbers])
         return replace(batch, left_out=tuple(left_out))
+
+    def __getitem__(self, numbers: Sequence[int]) -> Batch | Exception:
+        """As `batch`, for a worker, which returns failures."""
+        try:
+            return self.batch(numbers)
+        except Exception as error:
+            # Exceptions with arguments of their own cannot be pickled.
+            kind = MemoryError if is_out_of_memory(error) else SampleError
+            failure = kind(str(error) or one_line(error))
+            failure.add_note(f"In a process that decodes data:\n{traceback.format_exc()}")
+            return failure
 
     def _sample(self, number: int, left_out: list[str]) -> Sample:
         for attempt in range(MAX_REPLACED + 1):
@@ -220,57 +239,27 @@ class SampleStream:
             raise SampleError(f"scene {scene.name!r}: {one_line(error)}") from error
 
 
-class _Batches(Dataset[Batch | Exception]):
-    """The batches of one process; a copy in a worker opens the data itself on first use."""
-
-    def __init__(self, source: SceneSource, batch_size: int, share: Share, **options: Any) -> None:
-        self._kind = type(source)
-        self._config = source.config
-        self._options = options
-        self._stream: SampleStream | None = SampleStream(source, **options)
-        self._size = batch_size
-        self._share = share
-
-    # Open scenes hold files and caches, which cannot be sent to a worker.
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_stream": None}
-
-    def batch(self, number: int) -> Batch:
-        """Make this process's slice of global batch `number`."""
-        if self._stream is None:
-            self._stream = SampleStream(self._kind(self._config), **self._options)
-        first = (number * self._share.processes + self._share.rank) * self._size
-        return self._stream.batch(range(first, first + self._size))
-
-    def __getitem__(self, number: int) -> Batch | Exception:
-        """As `batch`, for a worker, which returns failures."""
-        try:
-            return self.batch(number)
-        except Exception as error:
-            # Exceptions with arguments of their own cannot be pickled.
-            kind = MemoryError if is_out_of_memory(error) else SampleError
-            failure = kind(str(error) or one_line(error))
-            failure.add_note(f"In a process that decodes data:\n{traceback.format_exc()}")
-            return failure
-
-
-def _from_thread(batches: _Batches, start: int) -> Generator[Batch, None, None]:
-    """Yield batches start, start + 1, ..., each made while the one before is in use."""
+def _from_thread(
+    stream: SampleStream, numbers: Iterator[Sequence[int]]
+) -> Generator[Batch, None, None]:
+    """Yield batches of these samples, each made while the one before is in use."""
     with ThreadPoolExecutor(1, thread_name_prefix="qgs-loader") as pool:
-        pending = pool.submit(batches.batch, start)
-        for number in count(start + 1):
+        pending = pool.submit(stream.batch, next(numbers))
+        for following in numbers:
             # Taken before the next is begun: one thread reads, as files and caches expect.
             ready = pending.result()
-            pending = pool.submit(batches.batch, number)
+            pending = pool.submit(stream.batch, following)
             yield ready
 
 
-def _from_workers(batches: _Batches, start: int, workers: int) -> Generator[Batch, None, None]:
-    """Yield batches from `start` on, of spawned processes: numba and torch survive no fork."""
+def _from_workers(
+    stream: SampleStream, numbers: Iterator[Sequence[int]], workers: int
+) -> Generator[Batch, None, None]:
+    """Yield batches of these samples, of spawned processes: numba and torch survive no fork."""
     loader = DataLoader(
-        batches,
+        stream,
         batch_size=None,
-        sampler=count(start),
+        sampler=numbers,
         num_workers=workers,
         multiprocessing_context="spawn",
         worker_init_fn=_prepare_worker,

@@ -66,11 +66,6 @@ def test_targets_are_novel_while_there_are_enough():
         assert len({*inputs, *targets}) == 5
 
 
-def test_only_a_scene_whose_masks_are_all_black_is_refused():
-    sample(MaskedLine(2), (0,), (0,))
-    must_refuse("line1", sample, MaskedLine(1), (0,), (0,))
-
-
 def test_normalised_poses():
     scene = Line(9)
 
