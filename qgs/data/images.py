@@ -119,7 +119,7 @@ def encoded_size(file: IO[bytes]) -> tuple[int, int]:
 def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Image.Image:
     """Read the file as RGB, over `background` in [0, 1]. Raises ValueError where it is unreadable.
 
-    Pixels stay where they are stored; `qgs.data.photos.turning` follows EXIF.
+    Pixels stay where they are stored, whatever EXIF says.
     """
     with _readable(path, "an image") as file:
         return decode_rgb(file, background)

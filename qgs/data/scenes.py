@@ -19,9 +19,9 @@ Value = TypeVar("Value")
 class EncodedFrame:
     """A photo as it is stored, and the camera that took it.
 
-    data, mask: bytes of image files. c2w: (4, 4) float64, OpenCV axes. intrinsics: fx, fy, cx, cy
-    in pixels of the photo, whose size is (H, W). lens: None for a pinhole. background: RGB in
-    [0, 1] behind transparent pixels.
+    data: bytes of the image file. mask: (H, W) uint8. c2w: (4, 4) float64, OpenCV axes. intrinsics:
+    fx, fy, cx, cy in pixels of the photo, whose size is (H, W). lens: None for a pinhole.
+    background: RGB in [0, 1] behind transparent pixels.
     """
 
     name: str
@@ -30,7 +30,7 @@ class EncodedFrame:
     intrinsics: Intrinsics
     size: Size
     lens: Lens | None = None
-    mask: bytes | None = None
+    mask: np.ndarray | None = None
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 

@@ -1,6 +1,5 @@
-"""One scene of photos with their cameras: cropped, resized, upright and without distortion."""
+"""One scene of photos with their cameras: cropped, resized and without distortion."""
 
-import io
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -33,7 +32,6 @@ from qgs.data.photos import readers
 from qgs.data.photos.checks import size_problems
 from qgs.data.photos.present import present_frames
 from qgs.data.photos.reader import PhotoFrame
-from qgs.data.photos.turning import turned, turned_size, upright
 from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene
 from qgs.paths import is_local, read_file
 from qgs.types import Cameras
@@ -89,7 +87,7 @@ class PhotoScene(EncodedScene):
         self._config = config
         self._cache = cache
         frames, self.missing = present_frames(folder, config.format, config.images, config.outside)
-        self._frames = frames = [*map(upright, frames[: config.max_frames or None])]
+        self._frames = frames = frames[: config.max_frames or None]
         times = [frame.time for frame in frames if frame.time is not None]
         self.times = torch.tensor(times, dtype=torch.float64) if len({*times}) > 1 else None
         # What a listing says of its splits goes before the option.
@@ -110,7 +108,7 @@ class PhotoScene(EncodedScene):
         sizes: dict[object, Size] = {}
         intrinsics: list[Tensor] = []
         for frame in self._frames:
-            alike = (frame.path.parent, frame.size, frame.turns) if frame.size else frame.path
+            alike = (frame.path.parent, frame.size) if frame.size else frame.path
             if alike not in sizes:
                 sizes[alike] = _stored_size(frame)
             stored = torch.tensor(frame.at_size(sizes[alike]), dtype=torch.float64)
@@ -151,22 +149,15 @@ class PhotoScene(EncodedScene):
         """See `EncodedScene`."""
         photo = self._frames[frame]
         size = self.stored_size(frame)
-        background = self._config.background
-        # Pixels are stored again only where EXIF turns them.
-        if photo.turns:
-            data = _upright_png(open_rgb(photo.path, background), photo)
-        else:
-            data = read_file(photo.path)
-        mask = photo.mask and _upright_png(Image.fromarray(_whole_mask(photo)), photo)
         return EncodedFrame(
             name=photo.name,
-            data=data,
+            data=read_file(photo.path),
             c2w=photo.c2w,
             intrinsics=photo.at_size(size),
             size=size,
             lens=photo.lens,
-            mask=mask,
-            background=background,
+            mask=photo.mask and _whole_mask(photo),
+            background=self._config.background,
         )
 
     def _stacked(
@@ -187,7 +178,7 @@ class PhotoScene(EncodedScene):
 
     def _image(self, frame: PhotoFrame) -> np.ndarray:
         image = open_rgb(frame.path, self._config.background)
-        if not frame.turns and orientation(image) != 1:
+        if orientation(image) != 1:
             warn_once(f"photos in {frame.path.parent} {TURNED}: {TURN}")
         return self._delivered(image, frame, frame.path)
 
@@ -205,12 +196,11 @@ class PhotoScene(EncodedScene):
     def _delivered(
         self, image: Image.Image, frame: PhotoFrame, file: UPath, mode: Mode = "bilinear"
     ) -> np.ndarray:
-        """Return the content of `file`, upright without distortion, at the delivered size."""
+        """Return the content of `file`, without distortion, at the delivered size."""
         # A mask or depth map follows the photo.
         if file != frame.path and frame.size is None:
             frame = replace(frame, size=image_size(frame.path))
         size = _checked((image.height, image.width), frame, file)
-        image = turned(image, frame)
         if frame.lens is not None:
             pixels = undistorted(np.array(image), frame.at_size(size), frame.lens, mode)
             image = Image.fromarray(pixels)
@@ -230,19 +220,12 @@ def _whole_mask(frame: PhotoFrame) -> np.ndarray:
     return alpha_mask(frame.path) if frame.mask == frame.path else open_mask(frame.mask)
 
 
-def _upright_png(image: Image.Image, frame: PhotoFrame) -> bytes:
-    file = io.BytesIO()
-    turned(image, frame).save(file, "png")
-    return file.getvalue()
-
-
 def _stored_size(frame: PhotoFrame) -> Size:
     return _checked(image_size(frame.path), frame, frame.path)
 
 
 def _checked(size: Size, frame: PhotoFrame, file: UPath) -> Size:
-    """Return (H, W) of a frame's `file`, upright; ValueError where the listing says otherwise."""
-    size = turned_size(size, frame)
+    """Return (H, W) of a frame's `file`; ValueError where the listing says otherwise."""
     for problem in size_problems(size, frame.size):
         raise ValueError(f"{file}: {problem}")
     return size

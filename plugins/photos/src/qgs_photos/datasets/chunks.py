@@ -125,14 +125,13 @@ class ChunkScene(EncodedScene):
         """See `EncodedScene`."""
         record = self._record
         size = record.stored_size(frame)
-        mask = None if record.masks is None else record.masks[frame].numpy().tobytes()
         return EncodedFrame(
             name=record.names[frame],
             data=record.images[frame].numpy().tobytes(),
             c2w=torch.linalg.inv(record.w2c[frame]).numpy(),
             intrinsics=record.intrinsics(frame, size),
             size=size,
-            mask=mask or None,
+            mask=read_mask(record, frame),
             background=self._config.background,
         )
 

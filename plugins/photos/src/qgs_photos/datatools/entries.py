@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from qgs.contracts import Scene
-from qgs.data.images import CropResize, decode_mask, decode_rgb
+from qgs.data.images import CropResize, decode_rgb
 from qgs.data.lenses import undistorted, whole_zoom
 from qgs.data.scenes import EncodedFrame, EncodedScene
 
@@ -62,7 +62,6 @@ def _stored(scene: EncodedScene, index: int, encoding: Encoding) -> tuple[Encode
     frame = scene.encoded(index)
     try:
         pixels = np.array(decode_rgb(io.BytesIO(frame.data), frame.background))
-        mask = None if frame.mask is None else decode_mask(io.BytesIO(frame.mask))
     except OSError as error:
         raise ValueError(
             f"scene {scene.name!r}, frame {index} ({frame.name}) cannot be read as an image "
@@ -74,14 +73,11 @@ def _stored(scene: EncodedScene, index: int, encoding: Encoding) -> tuple[Encode
         if frame.lens is None and plain and image.format in _KEPT_FORMATS:
             return frame, True
     if frame.lens is not None:
-        return _straightened(frame, pixels, mask, encoding), False
-    mask_file = None if mask is None else png(mask)
-    return replace(frame, data=encoding.image(pixels), mask=mask_file), False
+        return _straightened(frame, pixels, encoding), False
+    return replace(frame, data=encoding.image(pixels)), False
 
 
-def _straightened(
-    frame: EncodedFrame, pixels: np.ndarray, mask: np.ndarray | None, encoding: Encoding
-) -> EncodedFrame:
+def _straightened(frame: EncodedFrame, pixels: np.ndarray, encoding: Encoding) -> EncodedFrame:
     """Return the frame as a pinhole's, without edges that straightening leaves black."""
     assert frame.lens is not None
     zoom = whole_zoom(frame.intrinsics, frame.lens, frame.size, frame.size)
@@ -99,7 +95,7 @@ def _straightened(
         data=encoding.image(straight(pixels)),
         intrinsics=(fx, fy, cx, cy),
         lens=None,
-        mask=None if mask is None else png(straight(mask)),
+        mask=None if frame.mask is None else straight(frame.mask),
     )
 
 
@@ -113,7 +109,7 @@ def _delivered(scene: Scene, index: int, encoding: Encoding) -> EncodedFrame:
         c2w=cameras.c2w.double().numpy(),
         intrinsics=(fx, fy, cx, cy),
         size=cameras.size,
-        mask=None if masks is None else png(bytes_of(masks[0])[..., 0]),
+        mask=None if masks is None else bytes_of(masks[0])[..., 0],
     )
 
 
@@ -132,7 +128,8 @@ def chunk_entry(
         "sizes": torch.tensor([frame.size for frame in frames], dtype=torch.int32),
     }
     if any(frame.mask is not None for frame in frames):
-        entry["masks"] = [_bytes(frame.mask or b"") for frame in frames]
+        masks = [b"" if frame.mask is None else png(frame.mask) for frame in frames]
+        entry["masks"] = [*map(_bytes, masks)]
     if held_out:
         entry["held_out"] = torch.tensor(list(held_out), dtype=torch.int64)
     if times is not None:
