@@ -1,11 +1,11 @@
 """Image, mask and depth files as arrays, and crops with their intrinsics."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, TypeVar
 
 import numpy as np
 import torch
@@ -28,6 +28,10 @@ _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "DIB", "GIF", "PPM", "JPEG2000
 _MOST_PIXELS = 120_000_000
 # A tag of EXIF.
 _ORIENTATION = 0x0112
+# The first bytes of a file of NumPy's.
+_NPY = b"\x93NUMPY"
+
+Decoded = TypeVar("Decoded")
 
 
 @dataclass(frozen=True)
@@ -87,42 +91,26 @@ def framing(scene: Scene, frame: int) -> str:
     )
 
 
-@contextmanager
-def _readable(path: Path | UPath, kind: str) -> Iterator[IO[bytes]]:
-    """Open `path`. Raises ValueError for whatever a decoder raises inside."""
+def read_image(path: Path | UPath, decode: Callable[[IO[bytes]], Decoded]) -> Decoded:
+    """Return what `decode` makes of the file at `path`. Raises ValueError for what that raises."""
     try:
         with open_file(path) as file:
-            yield file
+            return decode(file)
     except Exception as error:
         # No fault of the file.
         if is_out_of_memory(error):
             raise
         reason = str(error) or type(error).__name__
         raise ValueError(
-            f"{name_shown(str(path))} cannot be read as {kind} ({reason}): replace the file, or "
+            f"{name_shown(str(path))} cannot be read as an image ({reason}): replace the file, or "
             "remove its frame"
         ) from error
 
 
-def image_size(path: UPath) -> tuple[int, int]:
-    """Return (H, W) in the header of an image file. Raises ValueError for no image."""
-    with _readable(path, "an image") as file:
-        return encoded_size(file)
-
-
-def encoded_size(file: IO[bytes]) -> tuple[int, int]:
-    """Return (H, W) in the header of an open file. Raises OSError for no image."""
+def image_size(file: IO[bytes]) -> tuple[int, int]:
+    """Return (H, W) in the header of an image file. Raises OSError for no image."""
     with opened_image(file) as image:
         return image.height, image.width
-
-
-def open_rgb(path: Path | UPath, background: tuple[float, float, float]) -> Image.Image:
-    """Read the file as RGB, over `background` in [0, 1]. Raises ValueError where it is unreadable.
-
-    Pixels stay where they are stored, whatever EXIF says.
-    """
-    with _readable(path, "an image") as file:
-        return decode_rgb(file, background)
 
 
 def orientation(image: Image.Image) -> int:
@@ -134,34 +122,25 @@ def orientation(image: Image.Image) -> int:
         return 1
 
 
-def open_mask(path: UPath) -> np.ndarray:
-    """Read a mask as (H, W) uint8, 255 for what is modelled; 0/1 files too. Raises ValueError."""
-    with _readable(path, "the mask of a photo") as file:
-        return decode_mask(file)
-
-
-def alpha_mask(path: UPath) -> np.ndarray:
-    """Read the alpha channel of a photo as (H, W) uint8; 255 for none. Raises as `open_mask`."""
-    with _readable(path, "an image") as file:
-        image = eight_bits(_decoded(file))
+def decode_alpha(file: IO[bytes]) -> np.ndarray:
+    """Decode the alpha channel of a photo as (H, W) uint8; 255 for none. Raises OSError."""
+    image = eight_bits(_decoded(file))
     if not image.has_transparency_data:
         return np.full((image.height, image.width), 255, np.uint8)
     return np.array(image.convert("RGBA").getchannel("A"))
 
 
-def open_depth(path: UPath, unit: float) -> np.ndarray:
-    """Read a depth map as (H, W) float32, 0 where unknown. Raises ValueError.
+def decode_depth(file: IO[bytes], unit: float = 1.0) -> np.ndarray:
+    """Decode a depth map, .npy too, as (H, W) float32, 0 where unknown. Raises OSError, ValueError.
 
     unit: world units per number of the file.
     """
-    with _readable(path, "a depth map") as file:
-        if path.suffix.lower() == ".npy":
-            depth = load_array(file).squeeze()
-        else:
-            depth = np.array(_decoded(file))
-        if depth.ndim != 2 or depth.dtype.kind not in "fiu":
-            wanted = "it must hold one number for each pixel, as 16-bit images do"
-            raise OSError(f"{wanted}, got {depth.dtype} {depth.shape}")
+    plain = file.read(len(_NPY)) == _NPY
+    file.seek(0)
+    depth = load_array(file).squeeze() if plain else np.array(_decoded(file))
+    if depth.ndim != 2 or depth.dtype.kind not in "fiu":
+        wanted = "a depth map must hold one number for each pixel, as 16-bit images do"
+        raise OSError(f"{wanted}, got {depth.dtype} {depth.shape}")
     with np.errstate(over="ignore", invalid="ignore"):
         metric = (depth * unit).astype(np.float32)
     return np.where(np.isfinite(metric), metric, np.float32(0))
@@ -181,8 +160,13 @@ def load_array(file: IO[bytes]) -> np.ndarray:
     return np.load(file, allow_pickle=False)
 
 
-def decode_rgb(file: IO[bytes], background: tuple[float, float, float]) -> Image.Image:
-    """Decode as `open_rgb`, of an open file. Raises OSError for no readable image."""
+def decode_rgb(
+    file: IO[bytes], background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> Image.Image:
+    """Decode as RGB, over `background` in [0, 1]. Raises OSError for no readable image.
+
+    Pixels stay where they are stored, whatever EXIF says.
+    """
     image = eight_bits(_decoded(file))
     if image.has_transparency_data:
         color = tuple(round(255 * channel) for channel in background)
@@ -206,7 +190,10 @@ def eight_bits(image: Image.Image) -> Image.Image:
 
 
 def decode_mask(file: IO[bytes]) -> np.ndarray:
-    """Decode as `open_mask`, of an open file. Raises OSError for no image, or one with colours."""
+    """Decode a mask as (H, W) uint8, 255 for what is modelled; files of 0 and 1 too.
+
+    Raises OSError for no image, or one with colours.
+    """
     image = eight_bits(_decoded(file))
     if image.mode in ("1", "L") and not image.has_transparency_data:
         grey = np.array(image.convert("L"))

@@ -48,7 +48,7 @@ def test_running_out_of_memory_is_no_bad_sample(tmp_path, monkeypatch):
     def full(*_):
         raise MemoryError
 
-    monkeypatch.setattr("qgs.data.images.decode_rgb", full)
+    monkeypatch.setattr("qgs.data.images.eight_bits", full)
     with pytest.raises(MemoryError):
         batches(photos(tmp_path / "shelf"), 1, 2, skips=True)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from upath import UPath
 
-from qgs.data.photos.checks import with_equal_times
+from qgs.data.photos.checks import refuse_fatal_problems, refuse_outside, with_equal_times
 from qgs.data.photos.colmap import Colmap
 from qgs.data.photos.nerfstudio import Nerfstudio
-from qgs.data.photos.reader import Listing, PhotoReader
+from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, existing
 from qgs.extensions import ExtensionError, installed, load
 from qgs.paths import is_local, listing
 from qgs.wording import listed, warn_once
@@ -88,3 +88,44 @@ def read_listing(folder: UPath, format: str = "auto", images: str | None = None)
             f"{held[0]}; in a recipe, data.format: {held[1]} reads the other"
         )
     return with_equal_times(known[held[0] if format == "auto" else format].read(folder, images))
+
+
+def present_frames(
+    folder: UPath, format: str = "auto", images: str | None = None, outside: bool = False
+) -> tuple[list[PhotoFrame], list[str]]:
+    """Return the frames of a listing's splits whose images exist, and the paths of the others.
+
+    What is left out is logged. Raises FileNotFoundError when fewer than two images or a mask do not
+    exist, ValueError for poses and intrinsics that cannot be right.
+    """
+    found = read_listing(folder, format, images)
+    # A listing of a stranger must not name other files of this machine.
+    if not outside:
+        refuse_outside(folder, found)
+    frames = [frame for frame in found.frames if frame.split != "unused"]
+    count = len(frames)
+    if count < len(found.frames):
+        warn_once(
+            f"{len(found.frames) - count} of {len(found.frames)} frames of {found.file} are "
+            "in none of its splits and are left out"
+        )
+    there = existing(frame.path for frame in frames)
+    present = [frame for frame in frames if frame.path in there]
+    missing = [str(frame.path) for frame in frames if frame.path not in there]
+    # Before the count: a wrong listing explains missing images.
+    refuse_fatal_problems(found.file, present if len(present) > 1 else frames)
+    if len(present) < 2:
+        raise FileNotFoundError(
+            f"{found.file} names {count} images, but {len(present)} exist and 2 are needed: add "
+            f"{listed(missing, 3) or 'photos'}"
+        )
+    if missing:
+        warn_once(f"{len(missing)} of {count} images of {folder} are missing: {listed(missing, 3)}")
+    masks = [frame.mask for frame in present if frame.mask is not None]
+    absent = sorted({*map(str, masks)} - {*map(str, existing(masks))})
+    if absent:
+        raise FileNotFoundError(
+            f"{found.file} names {len(masks)} masks, but {len(absent)} do not exist: "
+            f"{listed(absent, 3)}. Add them, or remove their 'mask_path'"
+        )
+    return present, missing

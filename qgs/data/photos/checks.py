@@ -20,8 +20,10 @@ _FARTHEST = 1e12
 _RIGID = 1e-3
 # Relative difference between the file's and the listing's aspect ratio.
 _SAME_ASPECT = 0.01
-# Relative difference of sides, or of fx and fy, that counts as equal.
-_SQUARE = 0.1
+# Ratio of fx and fy up to which pixels are about square.
+_SQUARE = 1.4
+# Of a side, of the principal point from the middle.
+_OFF_CENTRE = 0.25
 # A focal length below is in units of the image, not of its pixels.
 _NORMALISED = 5.0
 # Focal lengths per longer side: angles of view of 157 and 2 degrees.
@@ -41,87 +43,64 @@ def refuse_outside(folder: UPath, found: Listing) -> None:
 
 def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
     """Yield problems of a pose (4, 4): NaN, mirrored, sheared or scaled."""
-    if not np.isfinite(c2w).all():
-        yield FrameProblem("c2w", "the pose has NaN or infinite numbers", "remove the frame")
-        return
-    if np.abs(c2w).max() > _FARTHEST:
-        reason = f"the pose has a number larger than {_FARTHEST:.0e}"
-        yield FrameProblem("c2w", reason, "correct it, or remove the frame")
+    # NaN is not at most anything.
+    if not np.abs(c2w).max() <= _FARTHEST:
+        reason = f"the pose has NaN or numbers larger than {_FARTHEST:.0e}"
+        yield FrameProblem(reason, "correct it, or remove the frame")
         return
     # Mirrored is told from sheared: the remedies differ.
     rotation = c2w[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    determinant = float(np.linalg.det(rotation))
-    if error <= _RIGID and determinant < 0:
+    if error > _RIGID or np.abs(c2w[3] - [0, 0, 0, 1]).max() > _RIGID:
         yield FrameProblem(
-            "c2w",
-            f"the pose mirrors and so is not rigid (determinant {determinant:.3g})",
-            "negate one axis of the camera, or export the poses again",
-        )
-    elif error > _RIGID or np.abs(c2w[3] - [0, 0, 0, 1]).max() > _RIGID:
-        yield FrameProblem(
-            "c2w",
-            f"the pose is not rigid (rotation off by {error:.2g}, determinant {determinant:.3g}, "
-            f"last row {c2w[3].tolist()})",
+            f"the pose is not rigid (rotation off by {error:.2g}, last row {c2w[3].tolist()})",
             "poses must rotate and translate only; divide the rotation by its scale",
         )
+    elif np.linalg.det(rotation) < 0:
+        fix = "negate one axis of the camera, or export the poses again"
+        yield FrameProblem("the pose mirrors and so is not rigid", fix)
 
 
 def intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> Iterator[FrameProblem]:
     """Yield problems of fx, fy, cx, cy in pixels of `size` (H, W); not all are fatal."""
-
-    def problem(reason: str, fix: str, *, fatal: bool = True) -> FrameProblem:
-        values = f"fx {fx:.6g}, fy {fy:.6g}, cx {cx:.6g}, cy {cy:.6g}"
-        pixels = "" if size is None or fatal else f", {size[1]} x {size[0]} pixels"
-        return FrameProblem("intrinsics", f"{reason} ({values}{pixels})", fix, fatal)
-
     fx, fy, cx, cy = intrinsics
+    values = f"(fx {fx:.6g}, fy {fy:.6g}, cx {cx:.6g}, cy {cy:.6g})"
     if not all(map(math.isfinite, intrinsics)) or fx <= 0 or fy <= 0:
-        fix = "export the intrinsics again"
-        yield problem("intrinsics are not finite, or focal lengths not positive", fix)
+        reason = f"intrinsics are not finite, or focal lengths not positive {values}"
+        yield FrameProblem(reason, "export the intrinsics again")
         return
     in_pixels = size is not None and max(size) > 20 * _NORMALISED
     if max(fx, fy) < _NORMALISED and (in_pixels or max(abs(cx), abs(cy)) <= 1):
         fix = "they must be in pixels; multiply fx and cx by the width, fy and cy by the height"
-        yield problem("the intrinsics look normalised", fix)
+        yield FrameProblem(f"the intrinsics look normalised {values}", fix)
         return
     if size is None:
         return
     height, width = size
-    if not (0 < cx < width and 0 < cy < height):
-        fix = "correct cx and cy, unless the photo is cut from a larger one"
-        yield problem("the principal point lies off the image", fix, fatal=False)
-    aspect = width / height
-    # fx / fy is the square of the aspect ratio where the sides of square pixels were swapped.
-    if abs(aspect - 1) > _SQUARE and abs(fx / fy / aspect**2 - 1) < _SQUARE:
-        yield problem(
-            "fx and fy differ as if divided by the wrong side of the image",
-            "width and height are swapped; divide fx and cx by the width, fy and cy by the height",
+    nearest, farthest = (limit * max(size) for limit in _FOCAL)
+    off_centre = max(abs(cx / width - 0.5), abs(cy / height - 0.5))
+    plausible = nearest <= min(fx, fy) and max(fx, fy) <= farthest and off_centre <= _OFF_CENTRE
+    if not plausible or not 1 / _SQUARE < fx / fy < _SQUARE:
+        yield FrameProblem(
+            f"the intrinsics {values} are implausible for {width} x {height} pixels",
+            "correct them, unless the photo is cut from a larger one; fx and cx go with the width, "
+            "fy and cy with the height",
             fatal=False,
         )
-        return
-    nearest, farthest = (limit * max(size) for limit in _FOCAL)
-    if min(fx, fy) < nearest or max(fx, fy) > farthest or not 0.5 < fx / fy < 2:
-        fix = "correct them, or the size that goes with them"
-        yield problem("the focal lengths are implausible", fix, fatal=False)
 
 
 def size_problems(size: Size, listed: Size | None) -> Iterator[FrameProblem]:
     """Yield problems of an image file of `size` (H, W); a scaled copy of `listed` has none."""
     if listed is None or _alike(size, listed):
         return
-    if _alike(size, (listed[1], listed[0])):
-        fix = (
-            "width and height are swapped; swap them back, or turn the photos' pixels where EXIF "
-            "does (`mogrify -auto-orient`)"
-        )
-    else:
-        fix = "give the original image, or correct the listed size"
+    swapped = _alike(size, (listed[1], listed[0]))
     yield FrameProblem(
-        "size",
         f"the image is {size[1]} x {size[0]} pixels, but listed as {listed[1]} x {listed[0]}, "
         "another aspect ratio, so that the intrinsics cannot be scaled",
-        fix,
+        "width and height are swapped; swap them back, or turn the photos' pixels where EXIF does "
+        "(`mogrify -auto-orient`)"
+        if swapped
+        else "give the original image, or correct the listed size",
     )
 
 
@@ -136,7 +115,7 @@ def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FramePr
         return (round(height), round(width)), ()
     size = f"{str(width)[:12]} x {str(height)[:12]}"
     reason = f"the listed size, {size} pixels, is impossible for a photo"
-    return None, (FrameProblem("size", reason, "correct the width and height"),)
+    return None, (FrameProblem(reason, "correct the width and height"),)
 
 
 def with_equal_times(listing: Listing) -> Listing:
@@ -146,7 +125,7 @@ def with_equal_times(listing: Listing) -> Listing:
     if without in (0, count):
         return listing
     reason = f"it has no 'time', like {without} of {count} frames, and the others have"
-    problem = FrameProblem("time", reason, "write it for each, or for none where nothing moves")
+    problem = FrameProblem(reason, "write it for each, or for none where nothing moves")
     frames = [
         replace(frame, problems=frame.problems or (problem,)) if frame.time is None else frame
         for frame in listing.frames
@@ -154,19 +133,14 @@ def with_equal_times(listing: Listing) -> Listing:
     return replace(listing, frames=frames)
 
 
-def frame_problems(frame: PhotoFrame) -> Iterator[FrameProblem]:
-    """Yield all problems of `frame` as listed; its image is not opened."""
-    yield from frame.problems
-    if not frame.problems:
-        yield from pose_problems(frame.c2w)
-        yield from intrinsics_problems(frame.intrinsics, frame.size)
-
-
 def refuse_fatal_problems(listing: object, frames: Sequence[PhotoFrame]) -> None:
     """Raise ValueError for the first fatal problem, with its frame; log the others."""
     doubtful: list[str] = []
     for index, frame in enumerate(frames):
-        problems = list(frame_problems(frame))
+        problems = frame.problems or (
+            *pose_problems(frame.c2w),
+            *intrinsics_problems(frame.intrinsics, frame.size),
+        )
         where = f"frame {numbered(index, frame.name)}"
         for problem in problems:
             if problem.fatal:

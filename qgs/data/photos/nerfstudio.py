@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 from upath import UPath
 
-from qgs.data.images import image_size
+from qgs.data.images import image_size, read_image
 from qgs.data.lenses import Fisheye, Intrinsics, Lens, RadialTangential, Size, bending
 from qgs.data.photos.checks import FrameProblem, listed_size
 from qgs.data.photos.reader import (
@@ -23,8 +23,6 @@ from qgs.data.photos.reader import (
 )
 from qgs.paths import read_json
 
-# DL3DV ships reduced copies alone, under the listing of the full size.
-_REDUCED = ("images_2", "images_4", "images_8")
 _PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 _FISHEYE = "OPENCV_FISHEYE"
 # Coefficients of camera models that are not known here.
@@ -46,15 +44,11 @@ class Nerfstudio(PhotoReader):
         """See `PhotoReader`: the frames in the file's order."""
         file = folder / cls.listing
         frames = read_transforms(file)
-        if images is not None:
-            return Listing(file, with_images(frames, folder, images))
         top = {PurePosixPath(frame.name).parts[:1] for frame in frames}
-        if top == {("images",)} and not (folder / "images").is_dir():
-            for copy in _REDUCED:
-                if (folder / copy).is_dir():
-                    moved = with_images(frames, folder, copy)
-                    if existing(frame.path for frame in moved):
-                        return Listing(file, moved)
+        # DL3DV ships reduced copies alone, under the listing of the full size.
+        reduced = top == {("images",)} and not (folder / "images").is_dir()
+        if images is not None or reduced:
+            frames = with_images(frames, folder, images)
         return Listing(file, frames)
 
 
@@ -71,7 +65,7 @@ def read_transforms(file: UPath) -> list[PhotoFrame]:
         if any(frame.problems and not frame.size for frame in frames):
             present = existing(frame.path for frame in frames)
             first = [frame.path for frame in frames if frame.path in present][:1]
-            size = image_size(first[0]) if first else None
+            size = read_image(first[0], image_size) if first else None
             frames = [_frame(folder, data, entry, size) for entry in entries]
         return _with_splits(frames, data)
     except ValueError as error:
@@ -85,7 +79,7 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
     """
     path = entry.get("file_path") if isinstance(entry, Mapping) else None
     if not isinstance(path, str) or not PurePosixPath(path).name or "://" in path:
-        problem = FrameProblem("path", "its 'file_path' names no file", "correct or remove it")
+        problem = FrameProblem("its 'file_path' names no file", "correct or remove it")
         return PhotoFrame("", folder, _NO_POSE, _NO_INTRINSICS, problems=(problem,))
     values = _Values({**data, **entry})
     height = values.number("h")
@@ -107,7 +101,7 @@ def _frame(folder: UPath, data: Mapping[str, Any], entry: Any, size: Size | None
         mask=folder / mask if isinstance(mask, str) and mask else None,
         depth=folder / depth if isinstance(depth, str) and depth else None,
         # A time at the top of the file would be that of no photo.
-        time=values.finite("time", "time") if "time" in entry else None,
+        time=values.number("time") if "time" in entry else None,
         problems=tuple(values.problems),
     )
 
@@ -119,24 +113,17 @@ class _Values(dict[str, Any]):
         super().__init__(values)
         self.problems: list[FrameProblem] = []
 
-    def problem(self, field: str, reason: str, fix: str) -> None:
-        """Note that a `field` of `PhotoFrame` cannot be read."""
-        self.problems.append(FrameProblem(field, reason, fix))
+    def problem(self, reason: str, fix: str) -> None:
+        """Note what cannot be read."""
+        self.problems.append(FrameProblem(reason, fix))
 
     def number(self, key: str) -> float | None:
-        """Return a number, NaN included; None where it is absent, null or something else."""
+        """Return a finite number; None where it is absent or null, or a problem."""
         value = self.get(key)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            return None
-        return float(value)
-
-    def finite(self, key: str, field: str) -> float | None:
-        """Return a finite number for `field`; None where it is absent or null, or a problem."""
-        number = self.number(key)
-        if number is not None and math.isfinite(number):
-            return number
-        if self.get(key) is not None:
-            self.problem(field, f"{key!r} must be a finite number, got {self[key]!r}", "correct it")
+        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+            return float(value)
+        if value is not None:
+            self.problem(f"{key!r} must be a finite number, got {value!r}", "correct it")
         return None
 
 
@@ -153,18 +140,17 @@ def _pose(matrix: object, values: _Values) -> np.ndarray:
     if c2w.shape == (3, 4):
         c2w = np.vstack([c2w, [0, 0, 0, 1]])
     if c2w.shape != (4, 4):
-        values.problem("c2w", "'transform_matrix' must be 4 x 4 numbers", "export the pose again")
+        values.problem("'transform_matrix' must be 4 x 4 numbers", "export the pose again")
         return _NO_POSE
     return c2w * _OPENGL_TO_OPENCV
 
 
 def _intrinsics(values: _Values, size: Size | None) -> Intrinsics:
-    fx = _focal(values, "fl_x", "camera_angle_x", size and size[1])
+    fx = _focal(values, "x", size and size[1])
     # Pixels are square unless listed.
-    fy = _focal(values, "fl_y", "camera_angle_y", size and size[0]) or fx
+    fy = _focal(values, "y", size and size[0]) or fx
     if fx is None or fy is None:
         values.problem(
-            "intrinsics",
             "there is no focal length",
             "expected 'fl_x' (pixels), or 'camera_angle_x' (radians) with 'w' and 'h', in the "
             "frame or at the top of the file",
@@ -174,16 +160,16 @@ def _intrinsics(values: _Values, size: Size | None) -> Intrinsics:
     cy = values.number("cy")
     if size is None and (cx is None or cy is None):
         reason = "neither 'cx' and 'cy' nor 'w' and 'h' are given"
-        values.problem("intrinsics", reason, "add either pair")
+        values.problem(reason, "add either pair")
         return _NO_INTRINSICS
     height, width = size or (0, 0)
     return fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy
 
 
-def _focal(values: _Values, key: str, angle_key: str, side: int | None) -> float | None:
+def _focal(values: _Values, axis: str, side: int | None) -> float | None:
     """Return a focal length in pixels, as given or from the angle of view of a `side`."""
-    angle = values.number(angle_key)
-    given = values.number(key)
+    angle = values.number(f"camera_angle_{axis}")
+    given = values.number(f"fl_{axis}")
     if given or angle is None or side is None or not 0 < angle < math.pi:
         return given or None
     return side / 2 / math.tan(angle / 2)
@@ -195,16 +181,16 @@ def _lens(values: _Values) -> Lens | None:
     if model not in _PINHOLE and not fisheye:
         known = ", ".join(sorted((*_PINHOLE, _FISHEYE)))
         fix = f"undistort the photos first, or export one of {known}"
-        values.problem("lens", f"the camera model {model!r} is not known", fix)
+        values.problem(f"the camera model {model!r} is not known", fix)
         return None
     # An ignored coefficient would shift pixels against the poses without an error.
     for key in _OTHER if fisheye else (*_OTHER, "k4"):
-        if values.finite(key, "lens"):
+        if values.number(key):
             reason = f"{key!r} is set, which belongs to another camera model"
-            values.problem("lens", reason, "undistort the photos first, or export without it")
+            values.problem(reason, "undistort the photos first, or export without it")
     kind = Fisheye if fisheye else RadialTangential
     names = (field.name for field in fields(kind))
-    return bending(kind(**{name: values.finite(name, "lens") or 0.0 for name in names}))
+    return bending(kind(**{name: values.number(name) or 0.0 for name in names}))
 
 
 def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[PhotoFrame]:
@@ -224,9 +210,7 @@ def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[
     train = named("train")
     test = named("test") | named("val")
     splits = {**dict.fromkeys(test, "test"), **dict.fromkeys(train, "train")}
-    rest = None
+    rest = "train" if test else None
     if train:
         rest = "unused" if test else "test"
-    elif test:
-        rest = "train"
     return [replace(frame, split=splits.get(frame.name, rest)) for frame in frames]

@@ -10,7 +10,6 @@ from typing import ClassVar, Literal
 import numpy as np
 from upath import UPath
 
-from qgs.contracts import Problem
 from qgs.data.lenses import Intrinsics, Lens, Size
 from qgs.paths import listing
 
@@ -19,9 +18,11 @@ _COPY = re.compile(r"images(_\d+)?")
 
 
 @dataclass(frozen=True)
-class FrameProblem(Problem):
-    """A fault of a `PhotoFrame`'s field. fatal: see `refuse_fatal_problems`."""
+class FrameProblem:
+    """A fault of a `PhotoFrame`. fatal: see `refuse_fatal_problems`."""
 
+    reason: str
+    fix: str
     fatal: bool = True
 
     def __str__(self) -> str:
@@ -147,13 +148,16 @@ def image_folder(folder: UPath, wanted: str | None) -> UPath:
     return min(copies, key=lambda item: int(item.name.partition("_")[2] or 1))
 
 
-def with_images(frames: Sequence[PhotoFrame], folder: UPath, wanted: str) -> list[PhotoFrame]:
-    """Return `frames` with photos from `folder`/`wanted`. Raises FileNotFoundError without it."""
-    image_folder(folder, wanted)
+def with_images(
+    frames: Sequence[PhotoFrame], folder: UPath, wanted: str | None
+) -> list[PhotoFrame]:
+    """Return `frames` with photos from the `image_folder`. Raises as that."""
+    photos = image_folder(folder, wanted)
+    inside = wanted or photos.name
 
     def moved(frame: PhotoFrame) -> PhotoFrame:
         parts = PurePosixPath(frame.name).parts
-        name = str(PurePosixPath(wanted, *(parts[1:] or parts)))
+        name = str(PurePosixPath(inside, *(parts[1:] or parts)))
         mask = folder / name if frame.mask == frame.path else frame.mask
         return replace(frame, name=name, path=folder / name, mask=mask)
 

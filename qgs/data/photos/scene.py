@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from operator import attrgetter
 
 import numpy as np
@@ -19,18 +19,18 @@ from qgs.data.images import (
     TURN,
     TURNED,
     CropResize,
-    alpha_mask,
+    decode_alpha,
+    decode_depth,
+    decode_mask,
+    decode_rgb,
     image_size,
-    open_depth,
-    open_mask,
-    open_rgb,
     orientation,
+    read_image,
     to_tensor,
 )
 from qgs.data.lenses import Mode, Size, undistorted, whole_zoom
-from qgs.data.photos import readers
+from qgs.data.photos import present_frames, readers
 from qgs.data.photos.checks import size_problems
-from qgs.data.photos.present import present_frames
 from qgs.data.photos.reader import PhotoFrame
 from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene
 from qgs.paths import is_local, read_file
@@ -177,7 +177,7 @@ class PhotoScene(EncodedScene):
             return np.stack([*pool.map(cached, frames)])
 
     def _image(self, frame: PhotoFrame) -> np.ndarray:
-        image = open_rgb(frame.path, self._config.background)
+        image = read_image(frame.path, partial(decode_rgb, background=self._config.background))
         if orientation(image) != 1:
             warn_once(f"photos in {frame.path.parent} {TURNED}: {TURN}")
         return self._delivered(image, frame, frame.path)
@@ -190,7 +190,7 @@ class PhotoScene(EncodedScene):
     def _depth(self, frame: PhotoFrame) -> np.ndarray:
         if frame.depth is None:
             return np.zeros(self._config.image_size, np.float32)
-        depth = open_depth(frame.depth, self._config.depth_unit)
+        depth = read_image(frame.depth, partial(decode_depth, unit=self._config.depth_unit))
         return self._delivered(Image.fromarray(depth), frame, frame.depth, "nearest")
 
     def _delivered(
@@ -199,7 +199,7 @@ class PhotoScene(EncodedScene):
         """Return the content of `file`, without distortion, at the delivered size."""
         # A mask or depth map follows the photo.
         if file != frame.path and frame.size is None:
-            frame = replace(frame, size=image_size(frame.path))
+            frame = replace(frame, size=read_image(frame.path, image_size))
         size = _checked((image.height, image.width), frame, file)
         if frame.lens is not None:
             pixels = undistorted(np.array(image), frame.at_size(size), frame.lens, mode)
@@ -217,11 +217,11 @@ class PhotoScene(EncodedScene):
 
 def _whole_mask(frame: PhotoFrame) -> np.ndarray:
     assert frame.mask is not None
-    return alpha_mask(frame.path) if frame.mask == frame.path else open_mask(frame.mask)
+    return read_image(frame.mask, decode_alpha if frame.mask == frame.path else decode_mask)
 
 
 def _stored_size(frame: PhotoFrame) -> Size:
-    return _checked(image_size(frame.path), frame, frame.path)
+    return _checked(read_image(frame.path, image_size), frame, frame.path)
 
 
 def _checked(size: Size, frame: PhotoFrame, file: UPath) -> Size:

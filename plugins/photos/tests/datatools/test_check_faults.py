@@ -11,7 +11,7 @@ from planted import ALL, FLIP, HASH, INTRINSICS, SIZE, alike, record, save, told
 from qgs_photos.datatools.check import Options, check
 from upath import UPath
 
-from qgs.data.photos.present import present_frames
+from qgs.data.photos import present_frames
 
 FX, FY, CX, CY = INTRINSICS
 
@@ -54,7 +54,7 @@ def test_faults_of_cameras(planted):
     opencv.poses @= FLIP
     planted("error: frame 1 (images/1.jpg): the pose mirrors*").poses[1, :, 0] *= -1
     planted("error: frame 4 (images/4.jpg): the pose has NaN*").poses[4] = np.nan
-    off = planted("error: frame 1 (images/1.jpg): the principal point lies off the image*")
+    off = planted("error: frame 1 (images/1.jpg): the intrinsics *are implausible*")
     off.frames[1]["cx"] = 200.0
     normalised = {"fl_x": 0.8, "fl_y": 1.2, "cx": 0.5, "cy": 0.5}
     planted(f"error: {ALL}*look normalised*").camera |= normalised
@@ -116,8 +116,8 @@ def test_faults_of_masks(planted, shots):
     masks[[0, 1, 3, 4, 5], 40:] = 255
     planted("warning: frame 2 (images/2.jpg): the mask is black*").mask(masks)
     damaged = planted(
-        "error: frame 0 (images/0.jpg): *0.png cannot be read as the mask of a photo*",
-        "error: frame 1 (images/1.jpg): *1.png cannot be read as the mask of a photo*",
+        "error: frame 0 (images/0.jpg): *masks/0.png cannot be read*",
+        "error: frame 1 (images/1.jpg): *masks/1.png cannot be read*",
     )
     masks[2] = 255
     damaged.mask(masks)
@@ -170,7 +170,7 @@ def test_faults_of_a_scene_in_a_chunk(shots, tmp_path):
         "error: b, frames 0-5 (0 to 5): *on one point*",
         "error: c, frame 4 (4): the image cannot be decoded*",
         "error: d, frames 0-5 (0 to 5): the poses do not fit the photos: *",
-        "error: e, frames 0-5 (0 to 5): *width and height are swapped*",
+        "error: e, frames 0-5 (0 to 5): *are implausible*",
         "error: f, frames 0-5 (0 to 5): *look like pixels*",
     )
     assert alike(found, expected), found

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from upath import UPath
 
-from qgs.data.images import image_size
+from qgs.data.images import image_size, read_image
 from qgs.data.lenses import Size
 from qgs.data.photos.checks import FrameProblem, listed_size
 from qgs.data.photos.reader import (
@@ -154,13 +154,13 @@ class _Camera:
             self.size, wrong = listed_size(*plain)
             self.problems += wrong
         if not name:
-            self._wrong("path", "no image is named")
+            self._wrong("no image is named")
         self.pose, pose = self._pose()
         self.intrinsics, matrix = self._intrinsics()
         self.meaning = f"{pose} and {matrix}"
 
-    def _wrong(self, field: str, reason: str) -> None:
-        self.problems.append(FrameProblem(field, reason, f"write {_FORM}"))
+    def _wrong(self, reason: str) -> None:
+        self.problems.append(FrameProblem(reason, f"write {_FORM}"))
 
     def _pose(self) -> tuple[np.ndarray, str]:
         """Return OpenCV camera-to-world (4, 4), and what was read as that."""
@@ -176,12 +176,12 @@ class _Camera:
         elif not key:
             unclear = _first(values, _OPEN)
             reason = f"{unclear!r} may map from or to the world" if unclear else "it has no pose"
-            self._wrong("c2w", f"{reason}: expected {listed([*_C2W[:1], *_W2C[:1]])}")
+            self._wrong(f"{reason}: expected {listed([*_C2W[:1], *_W2C[:1]])}")
             return np.full((4, 4), np.nan), meaning
         if pose.shape == (3, 4):
             pose = np.vstack([pose, [0, 0, 0, 1]])
         if pose.shape != (4, 4):
-            self._wrong("c2w", f"{key or 'rotation'!r} has the shape {pose.shape}")
+            self._wrong(f"{key or 'rotation'!r} has the shape {pose.shape}")
             return np.full((4, 4), np.nan), meaning
         if key in _W2C:
             meaning = f"{key} (world-to-camera)"
@@ -208,7 +208,7 @@ class _Camera:
             matrix = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
         if matrix.shape != (4,):
             reason = f"{key!r} has the shape {matrix.shape}" if key else "it has no intrinsics"
-            self._wrong("intrinsics", f"{reason}: expected 'K', 3 x 3")
+            self._wrong(f"{reason}: expected 'K', 3 x 3")
             return np.full(4, np.nan), "no intrinsics"
         if np.abs(matrix).max() <= _NORMALISED and (size := self._photo_size()):
             height, width = size
@@ -220,7 +220,7 @@ class _Camera:
         """Return (H, W) as listed, else that of the file; None of one that cannot be read."""
         if self.size is None and self.name:
             with suppress(ValueError):
-                self.size = image_size(self.place / self.name)
+                self.size = read_image(self.place / self.name, image_size)
         return self.size
 
     def frame(self, folder: UPath) -> PhotoFrame:

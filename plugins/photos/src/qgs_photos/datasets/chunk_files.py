@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 from upath import UPath
 
-from qgs.data.images import decode_mask, encoded_size
+from qgs.data.images import decode_mask, image_size
 from qgs.data.lenses import Intrinsics, Size
 from qgs.data.photos.checks import (
     LARGEST_SIDE,
@@ -85,7 +85,7 @@ class Record:
     def stored_size(self, frame: int) -> Size:
         """Return (H, W) in the header of an image. Raises ValueError for no readable image."""
         try:
-            return encoded_size(io.BytesIO(self.images[frame].numpy().tobytes()))
+            return image_size(io.BytesIO(self.images[frame].numpy().tobytes()))
         except OSError as error:
             raise ValueError(
                 f"{self.place(frame)}: the bytes are no readable image ({error}): pack the data "
@@ -238,7 +238,6 @@ def unit_problems(record: Record, frame: int) -> Iterator[FrameProblem]:
         numbers = ", ".join(f"{value:.6g}" for value in values)
         unit = "divided twice" if divided_twice else "like pixels"
         yield FrameProblem(
-            "intrinsics",
             f"the intrinsics ({numbers}) look {unit}",
             "chunks hold fx and cx divided once by the image's width, fy and cy by its height",
         )

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 from upath import UPath
 
-from qgs.data.images import alpha_mask, open_depth, open_mask
+from qgs.data.images import decode_alpha, decode_depth, decode_mask, read_image
 from qgs.data.photos import formats_of, read_listing
 from qgs.data.photos.checks import refuse_outside
 from qgs.data.photos.reader import PhotoFrame, existing
@@ -77,8 +77,8 @@ def _photos(folder: UPath, kind: str, images: str | None) -> list[Photo]:
 def _mask(frame: PhotoFrame) -> np.ndarray | None:
     if frame.mask is None:
         return None
-    return alpha_mask(frame.path) if frame.mask == frame.path else open_mask(frame.mask)
+    return read_image(frame.mask, decode_alpha if frame.mask == frame.path else decode_mask)
 
 
 def _depth(frame: PhotoFrame) -> np.ndarray | None:
-    return None if frame.depth is None else open_depth(frame.depth, 1.0)
+    return None if frame.depth is None else read_image(frame.depth, decode_depth)

@@ -39,7 +39,7 @@ class Photo:
     def picture(self, size: Size | None, side: int) -> tuple[np.ndarray, np.ndarray]:
         """Return pinhole RGB, at most `side` pixels long, and intrinsics (4,). Raises OSError."""
         frame = self.listed if self.listed.size else replace(self.listed, size=size)
-        image = decode_rgb(io.BytesIO(self.read()), (1.0, 1.0, 1.0))
+        image = decode_rgb(io.BytesIO(self.read()))
         scale = min(1.0, side / max(image.size))
         width, height = (max(1, round(extent * scale)) for extent in image.size)
         pixels = np.array(image.resize((width, height), Image.Resampling.LANCZOS))
