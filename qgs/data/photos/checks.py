@@ -23,7 +23,7 @@ _SAME_ASPECT = 0.01
 # Ratio of fx and fy up to which pixels are about square.
 _SQUARE = 1.4
 # Of a side, of the principal point from the middle.
-_OFF_CENTRE = 0.25
+_OFF_CENTRE = 0.3
 # A focal length below is in units of the image, not of its pixels.
 _NORMALISED = 5.0
 # Focal lengths per longer side: angles of view of 157 and 2 degrees.
