@@ -13,7 +13,7 @@ from torch import Tensor
 from qgs.checkpoint.gaussians import load_ply
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.contracts import Scene, ViewsConfig
-from qgs.data.images import framing, open_rgb, to_tensor
+from qgs.data.images import decode_rgb, framing, read_image, to_tensor
 from qgs.data.recognition import is_training_data
 from qgs.data.samples import make_sample, own_world, views_in
 from qgs.domain import Domain, verdict
@@ -197,7 +197,7 @@ class FinishedScene(Scene):
         pictures = []
         for view in (self._views[frame] for frame in frames):
             name = f"{view['frame']:05d}_{view['kind'].split()[0]}.png"
-            image = open_rgb(self._folder / "views" / name, NEUTRAL)
+            image = read_image(self._folder / "views" / name, decode_rgb)
             # the render stands to the right of the photo
             pictures.append(np.asarray(image)[:height, :width])
         return to_tensor(np.stack(pictures))
