@@ -49,5 +49,6 @@ def walk(images, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def made(walk, tmp_path_factory):
-    """Of copies of the photos that are smaller than they are."""
-    return make_poses(walk, tmp_path_factory.mktemp("made") / "poses", Options(side=240), quiet())
+    """A folder, and its poses, of copies of the photos that are smaller than they are."""
+    folder = tmp_path_factory.mktemp("made") / "poses"
+    return folder, make_poses(walk, folder, Options(side=240), quiet())

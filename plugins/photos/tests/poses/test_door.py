@@ -2,14 +2,12 @@
 
 import re
 import shutil
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from photo_formats import opened
 from qgs_photos.poses import door, making
-from qgs_photos.poses.making import locked
 from qgs_photos.poses.photos import PosesError
 from walked import PHOTOS
 
@@ -21,10 +19,14 @@ def calls(made, monkeypatch):
     """Each time that poses are made; what COLMAP finds is there already."""
     calls = []
 
-    def found(source, held, out, *rest):
+    folder, poses = made
+
+    def found(source, out, working, *rest):
         calls.append(source)
-        shutil.copytree(made.folder, out, dirs_exist_ok=True)
-        return made
+        time.sleep(0.2)
+        for part in ("images", "sparse"):
+            shutil.copytree(folder / part, out / part)
+        return poses
 
     monkeypatch.setattr(making, "_made", found)
     return calls
@@ -74,48 +76,17 @@ def test_a_folder_whose_photos_are_elsewhere_is_none(tmp_path):
         photos_of(tmp_path / "a")
 
 
-def waiting(folder, monkeypatch):
-    """A call that has seen no poses of `folder`, and waits for the lock that the caller holds."""
-    came = threading.Event()
-
-    def late(*words, **options):
-        came.set()
-        return locked(*words, **options)
-
-    monkeypatch.setattr(door, "locked", late)
-    call = ThreadPoolExecutor(1).submit(door.posed_folder, folder)
-    assert came.wait(20)
-    return call
-
-
-def test_one_that_waits_takes_what_the_other_made(folder, calls, made, monkeypatch):
-    out = door.beside(folder)
-    with locked(folder, out, wait=False):
-        call = waiting(folder, monkeypatch)
-        shutil.copytree(made.folder, out)
-    assert call.result(20) == out
-    assert not calls
-
-
-def test_one_that_waits_for_a_failed_call_makes_them_alone(folder, made, monkeypatch):
-    out = door.beside(folder)
-
-    def checked(*rest):
-        with pytest.raises(FileExistsError, match="another process"), locked(folder, out, False):
-            pass
-        return made
-
-    monkeypatch.setattr(making, "_made", checked)
-    with locked(folder, out, wait=False):
-        call = waiting(folder, monkeypatch)
-        time.sleep(0.2)  # it waits for the file that is deleted now
-    assert call.result(20) == out
+def test_of_several_calls_at_once_one_makes_them_and_the_others_wait(folder, calls):
+    with ThreadPoolExecutor(3) as pool:
+        found = [*pool.map(door.posed_folder, [folder] * 3)]
+    assert found == [door.beside(folder)] * 3
+    assert len(calls) == 1
 
 
 def test_a_read_only_place_names_the_command_for_another(folder, monkeypatch):
     def refused(*rest, **options):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(making.Path, "mkdir", refused)
+    monkeypatch.setattr(door, "FileLock", refused)
     with pytest.raises(OSError, match=re.escape(f"qgs poses {folder} --out")):
         door.posed_folder(folder)

@@ -1,13 +1,12 @@
 """Poses of a textured room against the ones that its photos were rendered with."""
 
-from dataclasses import replace
+import json
 
 import numpy as np
 import pytest
 import textured_room
 from PIL import Image
-from qgs_photos.poses import making
-from qgs_photos.poses.making import Options, make_poses, read_record
+from qgs_photos.poses.making import Options, make_poses
 from qgs_photos.poses.photos import PosesError
 from scipy.spatial.transform import Rotation
 from upath import UPath
@@ -36,20 +35,27 @@ def assert_close(folder, shots):
     assert np.median(distances) / extent < 0.02
 
 
+def record_in(folder):
+    return json.loads((folder / "poses.json").read_text())
+
+
 def test_photos_get_the_poses_they_were_taken_with(made, shots, walk):
+    folder, poses = made
     names = ["0 Fo’to #{} %20 'ä'.JPG", "1.jpg", "2.png", "3.tif.png", "4.webp.png", "5.png"]
-    assert made.posed == names
-    assert made.without == ["other.png"]
-    assert made.faulty.keys() == {"broken.png", "empty.jpg"}
-    assert formats_of(UPath(made.folder)) == ["colmap"]
-    assert_close(made.folder, shots)
-    assert next(made.summary) == f"{PHOTOS} of {PHOTOS + 1} photos have poses"
-    assert "a.HEIC" in made.remarks[0]
-    assert "3.tif" in read_record(made.folder)["source"]
-    assert not (made.folder / "working").exists()
+    assert poses.posed == names
+    assert poses.without == ["other.png"]
+    assert poses.faulty.keys() == {"broken.png", "empty.jpg"}
+    assert formats_of(UPath(folder)) == ["colmap"]
+    assert_close(folder, shots)
+    counts, remark, *_, advice = poses.summary
+    assert counts == f"{PHOTOS} of {PHOTOS + 1} photos have poses"
+    assert "a.HEIC" in remark
+    assert "other.png; to get more" in advice
+    assert "3.tif" in record_in(folder)["source"]
+    assert {file.name for file in folder.iterdir()} == {"images", "poses.json", "sparse"}
     # points of the model lie on the photos as they are kept, not on the copies that COLMAP saw
     size = shots[0].image.shape[:2]
-    frames = read_listing(UPath(made.folder)).frames
+    frames = read_listing(UPath(folder)).frames
     assert {Image.open(frame.path).size[::-1] for frame in frames} == {size}
     assert {frame.size for frame in frames} == {size}
     assert frames[0].intrinsics[0] == pytest.approx(145 * SCALE, rel=0.05)
@@ -58,49 +64,17 @@ def test_photos_get_the_poses_they_were_taken_with(made, shots, walk):
 def test_a_video_gets_poses_of_its_frames_where_it_is_read(shots, images, tmp_path):
     views = qgs.read_photos(write_video(tmp_path / "phone.mp4", images), size=(36, 54))
     assert views.images.shape == (1, PHOTOS, 3, 36, 54)
-    assert read_record(tmp_path / "phone_poses")["made_by"] == "qgs poses"
+    assert record_in(tmp_path / "phone_poses")["made_by"] == "qgs poses"
     assert_close(tmp_path / "phone_poses", shots)
-
-
-def test_an_interrupted_call_goes_on_where_it_was_but_for_other_options(
-    images, tmp_path, monkeypatch
-):
-    def interrupted(*rest):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(making, "run", interrupted)
-    photos = write_photos(tmp_path / "photos", images[:3])
-    out = tmp_path / "out"
-    done = out / "working/done"
-    # another number of threads wipes nothing
-    for options, kept in ((Options(), False), (Options(threads=7), True), (Options(seed=1), False)):
-        with pytest.raises(KeyboardInterrupt):
-            make_poses(photos, out, options, quiet())
-        assert done.exists() == kept
-        done.touch()
-    assert read_record(out) is None
 
 
 def test_other_folders_are_left_alone(walk, made, tmp_path):
     notes = tmp_path / "notes.txt"
     notes.write_text("keep")
-    for taken in (tmp_path, notes, made.folder):
+    for taken in (tmp_path, notes, made[0]):
         with pytest.raises(FileExistsError):
             make_poses(walk, taken, Options(), quiet())
     assert notes.read_text() == "keep"
-
-
-def test_a_photo_of_several_models_is_in_the_largest_alone():
-    models = ["abcd", "bc", "def", "eg"]
-    assert making.apart(models) == [["a", "b", "c", "d"], ["e", "f"]]
-
-
-def test_the_summary_says_what_to_do_where_some_have_none_and_what_differs(made):
-    whole = replace(made, threads=1, without=[])
-    few = replace(whole, without=["a"])
-    several = replace(whole, threads=2)
-    for word, one in (("between", few), ("another run", several)):
-        assert [word in " ".join(each.summary) for each in (whole, one)] == [False, True]
 
 
 @pytest.mark.slow

@@ -125,10 +125,10 @@ def test_a_film_shows_the_pictures(tmp_path):
 
 def test_a_scene_of_photos_is_filmed_from_their_cameras(made, tmp_path):
     """What is rendered in the film's world is what the photos' world shows."""
-    views = qgs.read_photos(made.folder, size=SIZE)
+    views = qgs.read_photos(made[0], size=SIZE)
     gaussians = moved(wall(1.5), views.cameras.c2w[0, 0], 1.0)
     save_ply(gaussians, tmp_path / "scene.ply")
-    opened = open_film_scene(tmp_path / "scene.ply", str(made.folder), None)
+    opened = open_film_scene(tmp_path / "scene.ply", str(made[0]), None)
     third = opened.cameras[:, 2:3]
     lens = third.intrinsics * SIZE[0] / third.size[0]
     renderer = TorchRenderer(TorchRenderer.Config())
@@ -140,7 +140,7 @@ def test_a_scene_of_photos_is_filmed_from_their_cameras(made, tmp_path):
 def test_the_command_films_and_overwrites_nothing(made, tmp_path):
     save_ply(wall(3.0), tmp_path / "scene.ply")
     out = tmp_path / "a.mp4"
-    film = f"{tmp_path} {made.folder} --out {out} --path walk --seconds 0.4 --rate 5 --size 32x48"
+    film = f"{tmp_path} {made[0]} --out {out} --path walk --seconds 0.4 --rate 5 --size 32x48"
     result = run_qgs("video", *film.split())
     assert result.exit_code == 0, result.output
     assert len(frames(out)) == 2

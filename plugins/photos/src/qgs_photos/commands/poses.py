@@ -1,18 +1,13 @@
 """`qgs poses`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
 from qgs.cli.options import Threads
 from qgs_photos.printing import say
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 app = typer.Typer(help="Camera poses of photos or a video.")
 
@@ -52,10 +47,12 @@ def poses(
 ) -> None:
     """Find camera poses of photos or a video, by COLMAP: sparse/0 and images, checked at once.
 
-    The photos stay where they are. An interrupted call goes on where it was when it is repeated.
+    The photos stay where they are.
     """
     from rich.console import Console
 
+    from qgs.paths import opened_path
+    from qgs_photos.datatools import check
     from qgs_photos.poses.door import beside
     from qgs_photos.poses.making import Options, make_poses
 
@@ -70,21 +67,13 @@ def poses(
     # none given: all cores, as `Options` has them
     if threads:
         options = replace(options, threads=threads)
-    made = make_poses(source, out or beside(source), options, console)
-    for line in made.summary:
+    folder = out or beside(source)
+    for line in make_poses(source, folder, options, console).summary:
         say(console, line)
-    show_verdict(made.folder, console)
-    say(console, f"wrote {made.folder}; next: qgs demo {made.folder}")
-
-
-def show_verdict(folder: Path, console: Console) -> None:
-    """Print what `qgs data check` finds in `folder`."""
-    from qgs.paths import opened_path
-    from qgs_photos.datatools.check import Options, check
-
     with console.status("checking"):
-        report = check(opened_path(folder), Options())
+        report = check.check(opened_path(folder), check.Options())
     for finding in report.findings:
         say(console, str(finding))
     (scene,) = report.scenes
     say(console, f"matched points lie {scene.epipolar} pixels from their epipolar lines")
+    say(console, f"wrote {folder}; next: qgs demo {folder}")

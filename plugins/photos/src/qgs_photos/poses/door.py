@@ -1,14 +1,15 @@
 """Photos without cameras and videos that a command opens: COLMAP makes their poses first."""
 
-from collections.abc import Mapping
+import json
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
+from filelock import FileLock
 from rich.console import Console
 from upath import UPath
 
 from qgs.data.photos.reader import Listing, PhotoReader, image_files
-from qgs_photos.poses.making import Options, fingerprint, locked, make_locked, read_record
+from qgs_photos.poses.making import RECORD, Options, fingerprint, make_poses
 from qgs_photos.poses.photos import PosesError
 from qgs_photos.printing import say
 
@@ -45,37 +46,43 @@ def posed_folder(source: Path) -> Path:
     """Return the poses of the photos or the video `source`, beside it in NAME_poses.
 
     Makes them if need be. Raises PosesError where they belong to other photos than are there now,
-    and as `make_poses`.
+    OSError where they cannot be kept, and as `make_poses`.
     """
-    held = fingerprint(source)
     out = beside(source)
-    if is_made(source, held, out):
-        return out
+    lock = out.with_name(f".{out.name}.lock")
     console = Console(stderr=True)
-    with locked(source, out, wait=True):
+    try:
         # of several processes that open the same photos the first makes poses, the others wait
-        if not is_made(source, held, out):
-            say(
-                console,
-                f"{source} has no camera poses: they are made first, once, and kept in {out}",
-            )
-            for line in make_locked(source, held, out, Options(), console).summary:
-                say(console, line)
+        if not is_made(source, out):
+            with FileLock(lock):
+                if not is_made(source, out):
+                    text = "has no camera poses: they are made first, once, and kept in"
+                    say(console, f"{source} {text} {out}")
+                    for line in make_poses(source, out, Options(), console).summary:
+                        say(console, line)
+                # Windows keeps it
+                with suppress(OSError):
+                    lock.unlink()
+    except PermissionError as error:
+        raise OSError(
+            f"{out} cannot be made ({error.strerror}): run `qgs poses {source} --out FOLDER`, and "
+            "give that folder"
+        ) from error
     return out
 
 
-def is_made(source: Path, held: Mapping[str, Any], out: Path) -> bool:
-    """Return whether `out` has the poses of `source`. Raises PosesError for those of others.
-
-    held: fingerprint of `source`.
-    """
-    record = read_record(out)
-    if record and record.get("source") != held:
+def is_made(source: Path, out: Path) -> bool:
+    """Return whether `out` has the poses of `source`. Raises PosesError for those of others."""
+    held = fingerprint(source)
+    with suppress(OSError, json.JSONDecodeError):
+        record = json.loads((out / RECORD).read_text(encoding="utf-8"))
+        if record["source"] == held:
+            return True
         raise PosesError(
             f"{out} has the poses of what {source} held before: delete it, so that they are made "
             f"anew, or run `qgs poses {source} --out FOLDER` and give that folder"
         )
-    return record is not None
+    return False
 
 
 def beside(source: Path) -> Path:

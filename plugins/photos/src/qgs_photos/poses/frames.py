@@ -12,7 +12,7 @@ from av.error import FFmpegError
 from PIL import Image
 
 from qgs.wording import counted
-from qgs_photos.poses.photos import LEAST, PosesError, laplacian_variance
+from qgs_photos.poses.photos import LEAST, PosesError
 
 # 120 at even steps of time are too few where the camera turns fast: of a walk through an office as
 # a video, 42 of 120 frames got poses, and 143 of the 143 that follow the motion.
@@ -33,14 +33,14 @@ def extract(
     video: Path,
     folder: Path,
     count: int | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> list[str]:
     """Write the sharpest frame of each interval as JPEG, upright, numbered from 0 on.
 
     count: of even intervals of time; by default as `Intervals` has them, and where these are more
-    than MOST, the sharpest of each few neighbours. progress: seconds done and in all. Returns
-    remarks. What cannot be decoded is left out. Raises PosesError for no video, and for fewer than
-    LEAST frames.
+    than MOST, the sharpest of each few neighbours. progress: stage, seconds done and in all.
+    Returns remarks. What cannot be decoded is left out. Raises PosesError for no video, and for
+    fewer than LEAST frames.
     """
     times, damaged = _times(video)
     if len(times) < LEAST:
@@ -62,7 +62,7 @@ def extract(
             continue
         last = max(last, time)
         place = intervals.place(float(time), frame)
-        progress(int(time - start), int(length))
+        progress("seconds of the video", int(time - start), int(length))
         path = folder / f"{place:05d}.jpg"
         if path in scores and number % every:
             continue
@@ -197,7 +197,11 @@ def _sharpness(frame: Any) -> float:
     scale = _SIDE / max(frame.width, frame.height)
     # FFmpeg wants even sides
     height, width = (max(round(side * scale) // 2 * 2, 4) for side in (frame.height, frame.width))
-    return laplacian_variance(_grey(frame, (height, width)))
+    pixels = _grey(frame, (height, width))
+    # the variance of the Laplacian
+    inner = pixels[1:-1, 1:-1]
+    around = pixels[:-2, 1:-1] + pixels[2:, 1:-1] + pixels[1:-1, :-2] + pixels[1:-1, 2:]
+    return float((around - 4 * inner).var())
 
 
 def _grey(frame: Any, size: tuple[int, int]) -> np.ndarray:

@@ -2,10 +2,6 @@
 
 from dataclasses import dataclass
 
-FEATURES = "features"
-MATCHING = "matching"
-MAPPING = "mapping"
-
 
 @dataclass(frozen=True)
 class Job:

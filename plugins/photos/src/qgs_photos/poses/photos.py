@@ -1,7 +1,4 @@
-"""Photos of a user, made ready for COLMAP: upright, RGB with 8 bits, no larger than wanted.
-
-What no poses can be made of is refused here, before minutes are spent.
-"""
+"""Photos of a user, made ready for COLMAP: upright, RGB with 8 bits, no larger than wanted."""
 
 import json
 import os
@@ -12,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from PIL import Image, ImageOps
 from upath import UPath
 
@@ -29,35 +25,19 @@ _PLAIN = ("JPEG", "MPO", "PNG")
 _ORIENTATION, _SUB, _MAKE, _MODEL = 0x0112, 0x8769, 0x010F, 0x0110
 # Focal length, its equivalent of 35 mm film, lens.
 _LENS = (0x920A, 0xA405, 0xA434)
-# Pixels of the longer side at which sharpness is measured.
-_JUDGED = 640
-_THUMB = (48, 48)
-ALIKE = 1.2
-"""Mean difference of thumbnails in 1/255 up to which two photos show the same; noise gives .5."""
-BLURRED = 4.0
-"""Variance of the Laplacian, of grey in 1/255, up to which no photo of a folder has edges."""
 
 
 class PosesError(ValueError):
     """Photos or a video of which no poses can be made; the message says what to do."""
 
 
-class ColmapError(PosesError):
-    """COLMAP ended early, so that the same call may go on from there."""
-
-
 @dataclass(frozen=True)
 class Photo:
-    """A photo that is ready. name: in both folders. size: (H, W) upright. camera: of EXIF.
-
-    sharpness: variance of the Laplacian at _JUDGED pixels. thumb: (48, 48) grey.
-    """
+    """A photo that is ready. name: in both folders. size: (H, W) upright. camera: of EXIF."""
 
     name: str
     size: tuple[int, int]
     camera: str
-    sharpness: float
-    thumb: np.ndarray
 
 
 def photo_files(folder: Path) -> list[Path]:
@@ -95,7 +75,7 @@ def prepare(
     kept: Path,
     working: Path,
     side: int,
-    progress: Callable[[int], None] = lambda done: None,
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> tuple[list[Photo], dict[str, str]]:
     """Put `files` upright into `kept`, and no longer than `side` into `working`.
 
@@ -118,7 +98,7 @@ def prepare(
             if isinstance(error, OSError) and error.errno is not None:
                 raise
             faulty[file.name] = str(error)
-        progress(number + 1)
+        progress("photos", number + 1, len(files))
     return ready, faulty
 
 
@@ -141,23 +121,12 @@ def _prepared(file: Path, name: str, kept: Path, working: Path, side: int) -> Ph
         _save(rgb, kept / name, exif)
     scale = min(side / max(rgb.size), 1.0)
     if scale < 1 or not plain:
-        _save(_scaled(rgb, scale, Image.Resampling.LANCZOS), working / name, exif)
+        width, height = (max(round(extent * scale), 3) for extent in rgb.size)
+        scaled = rgb.resize((width, height), Image.Resampling.LANCZOS)
+        _save(scaled, working / name, exif)
     else:
         _link(kept / name, working / name)
-    grey = rgb.convert("L")
-    judged = _scaled(grey, _JUDGED / max(grey.size), Image.Resampling.BOX)
-    return Photo(
-        name=name,
-        size=(rgb.height, rgb.width),
-        camera=camera,
-        sharpness=laplacian_variance(np.asarray(judged, np.float32)),
-        thumb=np.array(grey.resize(_THUMB, Image.Resampling.BOX), np.float32),
-    )
-
-
-def _scaled(image: Image.Image, scale: float, filter: Image.Resampling) -> Image.Image:
-    width, height = (max(round(extent * scale), 3) for extent in image.size)
-    return image.resize((width, height), filter)
+    return Photo(name, (rgb.height, rgb.width), camera)
 
 
 def _exif(image: Image.Image) -> tuple[bytes, str]:
@@ -178,8 +147,6 @@ def _exif(image: Image.Image) -> tuple[bytes, str]:
 
 
 def _save(image: Image.Image, path: Path, exif: bytes) -> None:
-    # an earlier call may have linked the user's own file there
-    path.unlink(missing_ok=True)
     if path.suffix.lower() == ".png":
         image.save(path, "PNG", exif=exif)
     else:
@@ -187,40 +154,11 @@ def _save(image: Image.Image, path: Path, exif: bytes) -> None:
 
 
 def _link(file: Path, path: Path) -> None:
-    path.unlink(missing_ok=True)
     try:
         os.link(file.resolve(), path)
     except OSError:
         # another file system, or one without links
         shutil.copyfile(file, path)
-
-
-def laplacian_variance(pixels: np.ndarray) -> float:
-    """Return the sharpness of grey pixels (H, W) float32, without the border."""
-    inner = pixels[1:-1, 1:-1]
-    around = pixels[:-2, 1:-1] + pixels[2:, 1:-1] + pixels[1:-1, :-2] + pixels[1:-1, 2:]
-    return float((around - 4 * inner).var())
-
-
-def refuse_hopeless(photos: Sequence[Photo], faulty: dict[str, str], what: str) -> None:
-    """Raise PosesError for fewer than LEAST photos, for blurred ones, and where nothing moves."""
-    if len(photos) < LEAST:
-        why = "; ".join(f"{name}: {reason}" for name, reason in list(faulty.items())[:3])
-        raise PosesError(
-            f"{what} has {counted(len(photos), 'photo')} that can be read, and poses need {LEAST} "
-            f"at least ({why}): replace them"
-        )
-    if max(photo.sharpness for photo in photos) < BLURRED:
-        raise PosesError(
-            f"{what} shows no edges: the photos are blurred or bare, and COLMAP finds no points in "
-            "them. Take sharp ones, in more light, of something with texture"
-        )
-    first = photos[0].thumb
-    if all(np.abs(photo.thumb - first).mean() < ALIKE for photo in photos):
-        raise PosesError(
-            f"all photos of {what} show the same view: walk while you take them, a step between "
-            "two photos; turning on the spot gives no depth either"
-        )
 
 
 def camera_groups(photos: Sequence[Photo]) -> list[list[str]]:

@@ -9,13 +9,13 @@ import json
 import os
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pycolmap
 
-from qgs_photos.poses.job import FEATURES, MAPPING, MATCHING, Job
+from qgs_photos.poses.job import Job
 
 # Takes dictionaries for options, which its types do not say.
 COLMAP: Any = pycolmap
@@ -37,11 +37,10 @@ FREE_CENTRE = 20
 
 
 def main() -> None:
-    """Read a job, do it, and write the result beside the models."""
+    """Read a job, do it, and print its result."""
     job = Job(**json.loads(sys.stdin.readline()))
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    result = mapped(job)
-    Path(job.models, "result.json").write_text(json.dumps(result), encoding="utf-8")
+    print(json.dumps(mapped(job)), flush=True)
 
 
 def _end_with_parent() -> None:
@@ -57,12 +56,12 @@ def tell(stage: str, done: int, total: int) -> None:
 def mapped(job: Job) -> Mapping[str, Any]:
     """Find features, matches, poses; models go to `job.models`/0, 1, ..., the largest to `best`.
 
-    Returns "refused" with a word and numbers where there is nothing to go on with, else the names
-    of the photos of each model, largest first.
+    Returns "refused" with a reason where there is nothing to go on with, else "posed" with the
+    names of the photos of the largest model.
     """
     COLMAP.set_random_seed(job.seed)
-    names = [name for group in job.groups for name in group]
-    tell(FEATURES, 0, len(names))
+    total = len(job.sizes)
+    tell("features", 0, total)
     for group in job.groups:
         # octave -1 is twice the size of the photo
         small = max(job.sizes[group[0]]) <= SMALL_SIDE
@@ -73,17 +72,20 @@ def mapped(job: Job) -> Mapping[str, Any]:
             job.images,
             image_names=group,
             camera_mode=COLMAP.CameraMode.SINGLE,
-            reader_options={
-                "camera_model": "SIMPLE_RADIAL",
-                "existing_camera_id": _camera(job.database, group),
-            },
+            reader_options={"camera_model": "SIMPLE_RADIAL"},
             extraction_options=extraction,
             device=COLMAP.Device.cpu,
         )
-    found = _features(job.database)
-    if sum(count >= FEW_FEATURES for count in found.values()) < 3:
-        return {"refused": "features", "counts": found}
-    tell(MATCHING, 0, len(names))
+    with COLMAP.Database.open(job.database) as opened:
+        images = opened.read_all_images()
+        counts = [opened.num_keypoints_for_image(image.image_id) for image in images]
+    if sum(count >= FEW_FEATURES for count in counts) < 3:
+        reason = (
+            f"fewer than three of {total} photos have enough points to match: they are blurred, or "
+            "what they show is bare. Take sharp ones of something with texture"
+        )
+        return {"refused": reason}
+    tell("matching", 0, total)
     settings = {
         "matching_options": {"num_threads": job.threads},
         "verification_options": {"ransac": {"random_seed": job.seed}},
@@ -96,34 +98,17 @@ def mapped(job: Job) -> Mapping[str, Any]:
     else:
         # blocks of 5 for steps of progress
         COLMAP.match_exhaustive(job.database, pairing_options={"block_size": 5}, **settings)
-    # a model needs three photos, so two pairs
-    pairs = _pairs(job.database)
-    if pairs < 2:
-        return {"refused": "overlap", "pairs": pairs}
-    return _models(job, len(names))
-
-
-def _camera(database: str, group: Sequence[str]) -> int:
-    """Return the camera that an interrupted process gave to `group`; -1 for a new one."""
-    with COLMAP.Database.open(database) as opened:
-        images = opened.read_all_images()
-    return next((image.camera_id for image in images if image.name in group), -1)
-
-
-def _features(database: str) -> dict[str, int]:
-    """Return the number of features by photo."""
-    with COLMAP.Database.open(database) as opened:
-        return {
-            image.name: opened.num_keypoints_for_image(image.image_id)
-            for image in opened.read_all_images()
-        }
-
-
-def _pairs(database: str) -> int:
-    """Return how many pairs of photos share FEW_MATCHES features that one motion explains."""
-    with COLMAP.Database.open(database) as opened:
+    with COLMAP.Database.open(job.database) as opened:
         _, counts = opened.read_two_view_geometry_num_inliers()
-    return sum(count >= FEW_MATCHES for count in counts)
+    pairs = sum(count >= FEW_MATCHES for count in counts)
+    # a model needs three photos, so two pairs
+    if pairs < 2:
+        reason = (
+            f"of {total} photos, {pairs} pairs share enough points. Take more photos, a step "
+            "apart, so that each shows half of what the one before shows"
+        )
+        return {"refused": reason}
+    return _models(job, total)
 
 
 def _models(job: Job, total: int) -> Mapping[str, Any]:
@@ -133,14 +118,13 @@ def _models(job: Job, total: int) -> Mapping[str, Any]:
         nonlocal done
         # the first two come together
         done = 2
-        tell(MAPPING, done, total)
 
     def further() -> None:
         nonlocal done
         done += 1
-        tell(MAPPING, min(done, total), total)
+        tell("mapping", min(done, total), total)
 
-    tell(MAPPING, 0, total)
+    tell("mapping", 0, total)
     options = {"num_threads": job.threads, "random_seed": job.seed, "min_model_size": 3}
     # COLMAP's own limits first: easier ones accept first pairs with little parallax
     for mapper in ({}, SMALL):
@@ -156,14 +140,16 @@ def _models(job: Job, total: int) -> Mapping[str, Any]:
         if solid:
             break
     else:
-        return {"refused": "motion"}
-    ordered = sorted(solid, key=lambda model: -model.num_reg_images())
+        reason = (
+            f"{total} photos match, but no two of them show the same from places far enough apart. "
+            "Walk around what you take, do not turn on the spot, and take more photos"
+        )
+        return {"refused": reason}
+    largest = max(solid, key=lambda model: model.num_reg_images())
     best = Path(job.models, "best")
     best.mkdir()
-    _scaled(_centred(ordered[0], job.threads), job.sizes).write(best)
-    names = [sorted(image.name for image in model.images.values()) for model in ordered]
-    error = ordered[0].compute_mean_reprojection_error()
-    return {"models": names, "error": error, "points": ordered[0].num_points3D()}
+    _scaled(_centred(largest, job.threads), job.sizes).write(best)
+    return {"posed": sorted(image.name for image in largest.images.values())}
 
 
 def _centred(model: Any, threads: int) -> Any:
