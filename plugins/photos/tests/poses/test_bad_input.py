@@ -42,7 +42,7 @@ def test_hopeless_ones_are_refused_in_a_sentence(images, tmp_path):
     write_photos(given / "GIF", images, "{}.gif")
     (write_photos(given / "HEIC", []) / "a.heic").touch()
     write_video(given / "one frame.mp4", images[:1])
-    write_video(given / "still.mp4", images[:1] * 40)
+    write_video(given / "still.mp4", images[:1] * 4)
     cut(write_video(given / "cut off.mp4", images * 8), 0.5)  # without its index, at the end
     (given / "empty.mp4").touch()
     (given / "text.mp4").write_bytes(b"no video" * 40)
