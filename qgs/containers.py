@@ -20,10 +20,9 @@ class TensorContainer:
     def __repr__(self) -> str:
         """Shapes, and types and devices that are not float32 on the CPU; no numbers."""
         # Numbers of a million Gaussians help nobody.
-        parts = [f"{name}: {_described(item)}" for name, item in _items(self)]
-        several = any(isinstance(item, TensorContainer) for _, item in _items(self))
-        lines = "\n  ".join(["", *(part.replace("\n", "\n  ") for part in parts)]) + "\n"
-        return f"{type(self).__name__}({lines if several else ', '.join(parts)})"
+        parts = [f"{name}: {_described(tensor)}" for name, tensor in named_tensors(self)]
+        lines = "\n  ".join(["", *parts])
+        return f"{type(self).__name__}({lines}\n)"
 
     def replace(self, **changes: Any) -> Self:
         """A new container with other values in some fields."""
@@ -76,17 +75,10 @@ def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
             yield from named_tensors(item, f"{name}.{key}" if name else str(key))
 
 
-def _described(item: Any) -> str:
-    if isinstance(item, Tensor):
-        unusual = [str(item.dtype).removeprefix("torch.")] * (item.dtype != torch.float32)
-        unusual += [str(item.device)] * (item.device.type != "cpu")
-        return " ".join([str(tuple(item.shape)), *unusual])
-    # Of containers the name alone: their own lines would be many.
-    if isinstance(item, Mapping):
-        named = isinstance(next(iter(item.values()), None), TensorContainer)
-        parts = (f"{k}: {type(x).__name__ if named else _described(x)}" for k, x in item.items())
-        return f"{{{', '.join(parts)}}}"
-    return repr(item)
+def _described(tensor: Tensor) -> str:
+    unusual = [str(tensor.dtype).removeprefix("torch.")] * (tensor.dtype != torch.float32)
+    unusual += [str(tensor.device)] * (tensor.device.type != "cpu")
+    return " ".join([str(tuple(tensor.shape)), *unusual])
 
 
 def _items(value: Any) -> Iterator[tuple[Any, Any]]:

@@ -53,25 +53,18 @@ def heading(model: Any) -> str:
 
 
 def slot_rows(model: Any) -> list[tuple[str, str, str]]:
-    """Slot, types of its components (without a recipe their classes) and parameters."""
+    """Slot, types of its components (without a recipe classes, outside the decoder), parameters."""
     counts = {name: f"{count:,}" for name, count in parameter_counts(model).items()}
     counts |= {"supervision": "", "renderer": ""}
-    # The recipe knows types; a model built by hand only classes.
     kinds = {name: _types(model, name.removeprefix("decoder.")) for name in counts}
     return [(name, ", ".join(dict.fromkeys(kinds[name])), count) for name, count in counts.items()]
 
 
 def _types(model: Any, slot: str) -> list[str]:
     """What stands in a slot, in one of the decoder by layer."""
-    tree = model.recipe["model"] if model.recipe else None
-    if slot not in LAYER_SLOTS:
-        return [tree[slot]["type"] if tree else type(getattr(model, slot)).__name__]
-    if tree is None:
-        modules = model.refinements if slot == "refinement" else model.decoder
-        if slot in SUBLAYER_SLOTS:
-            modules = [getattr(layer, slot) for layer in model.decoder if hasattr(layer, slot)]
-        return [type(module).__name__ for module in modules]
-    own = tree["decoder"].get("layers", {})
-    layers = [own.get(str(index), {}) for index in range(len(model.decoder))]
-    chosen = [layer.get(slot, tree["decoder"].get(slot)) for layer in layers]
-    return [one["type"] for one in chosen if one]
+    if model.recipe is None:
+        return [type(getattr(model, slot)).__name__] if hasattr(model, slot) else []
+    tree = model.recipe["model"]
+    layers = tree["decoder"].get("layers", {}).values()
+    places = [*layers, tree["decoder"]] if slot in LAYER_SLOTS else [tree]
+    return [place[slot]["type"] for place in places if place.get(slot)]

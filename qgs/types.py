@@ -118,7 +118,8 @@ class Views(TensorContainer):
     def joined(self, other: Self) -> Self:
         """These views, then `other` ones of the same scenes, of one size, with the same parts."""
         if self.cameras.size != other.cameras.size:
-            raise ValueError(f"views of different sizes cannot be joined: {self}, {other}")
+            sizes = (self.cameras.size, other.cameras.size)
+            raise ValueError(f"views of different sizes cannot be joined: {sizes}")
         both = concatenated([x.replace(target_time=None) for x in (self, other)], 1)
         return both.replace(target_time=self.target_time)
 
@@ -158,8 +159,6 @@ class ImageMemory(TensorContainer):
     def __getitem__(self, name: str) -> Tensor:
         """A tensor that a component `reads`, such as "keys"; KeyError where there is none."""
         part = getattr(self, name, None)
-        if name == "grid" and part is not None:
-            raise KeyError("the grid of an image memory is no tensor: read `memory.grid`")
         if not isinstance(part, Tensor):
             raise KeyError(f"the image memory has no {name}; its encoder does not provide it")
         return part

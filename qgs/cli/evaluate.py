@@ -35,7 +35,6 @@ def evaluate(
         str | None, typer.Option(help="JSON file of scenes and frames; sets evaluation.index.")
     ] = None,
     tune: Tune = None,
-    batch: Annotated[int, typer.Option(min=1, help="Scenes passed through the model at once.")] = 1,
     out: Out = None,
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit with 1 when a scene has no score.")
@@ -76,7 +75,7 @@ def evaluate(
     # Results are written beside a checkpoint of the user's own, not into a cache.
     own = Path(run).expanduser().exists()
     folder = out or evaluation_folder(checkpoint, bool(settings), own)
-    evaluation = evaluate_into(model, recipe, step, folder, console, batch)
+    evaluation = evaluate_into(model, recipe, step, folder, console)
     averaged = RunFolder(checkpoint.parent).checkpoint_ema
     if checkpoint.name == "checkpoint.safetensors" and averaged.is_file():
         console.print(f"averaged weights: qgs eval {averaged}", soft_wrap=True, markup=False)
@@ -106,7 +105,6 @@ def evaluate_into(
     step: int | None,
     folder: Path,
     console: Console,
-    batch: int = 1,
 ) -> Evaluation:
     """Evaluate `model` as `recipe` says, write the results into `folder` and show them."""
     from qgs.evaluate.evaluation import evaluate as judge
@@ -117,7 +115,7 @@ def evaluate_into(
         def observe(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        evaluation = judge(model, recipe, step, batch, observe)
+        evaluation = judge(model, recipe, step, observe)
     evaluation.write(folder)
     evaluation.show(console)
     console.print(f"written to {folder}", soft_wrap=True)

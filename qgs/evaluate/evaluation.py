@@ -3,20 +3,18 @@
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from itertools import groupby, islice
-from pathlib import Path
 
 import torch
 
 from qgs.contracts import Column, Metric, MetricInput, ViewSampler
-from qgs.data.samples import Sample, stack_views
+from qgs.data.samples import Sample
 from qgs.domain import Domain, remedies, verdict
 from qgs.evaluate.plan import EvaluationPlan, SceneFailure, ViewsOf
 from qgs.evaluate.protocol import index_of, protocol_of
 from qgs.evaluate.results import TUNING, Evaluation, SceneScore
-from qgs.evaluate.tuning import Tuning, tuner
+from qgs.evaluate.tuning import tune, tuning_loss
 from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.dispersion import OPACITY_USED
 from qgs.model import QueryGaussianModel
@@ -33,7 +31,6 @@ def evaluate(
     model: QueryGaussianModel,
     recipe: Recipe,
     step: int | None = None,
-    batch: int = 1,
     observe: Callable[[int, int], None] | None = None,
     views_of: ViewsOf | None = None,
     sampler: ViewSampler | None = None,
@@ -41,9 +38,8 @@ def evaluate(
     """Evaluate `model` by the metrics of `recipe` on its test views, where the model is.
 
     A scene that fails is named in the result with the reason, and the others go on. Restores the
-    model's mode. step: optimiser steps behind the weights. batch: scenes in one forward pass; with
-    tuning each passes alone. observe: called with (scenes done, all scenes). views_of: see
-    `EvaluationPlan`. sampler: of views, by default the recipe's.
+    model's mode. step: optimiser steps behind the weights. observe: called with (scenes done, all
+    scenes). views_of: see `EvaluationPlan`. sampler: of views, by default the recipe's.
 
     Raises what opening the data source or the index and `Measures` raise, and ValueError when no
     scene could be scored.
@@ -60,18 +56,15 @@ def evaluate(
         # Depth maps cost as much as photos to decode.
         depths="true_depth" in measures.needed,
     )
-    tune = tuner(model, recipe) if recipe.evaluation.tuning_steps else None
-    scorer = _Scorer(model, measures, tune)
+    scorer = _Scorer(model, measures, recipe)
     training = model.training
     # Components draw random numbers in training mode only.
     model.eval()
     try:
-        scores, failures = _by_scene(
-            scorer.scores(plan.samples(), batch), len(plan.wanted), observe
-        )
+        results = map(scorer.score, plan.samples())
+        scores, missing = _by_scene(results, len(plan.wanted), observe)
     finally:
         model.train(training)
-    missing = [SceneFailure(f.scene, _without_folder(f.reason, recipe)) for f in failures]
     if not scores:
         first = f"{missing[0].scene}: {missing[0].reason}"
         raise ValueError(f"none of {len(missing)} scenes could be judged; the first, {first}")
@@ -150,8 +143,6 @@ class Measures:
             with self._named(label, "forward"):
                 found = metric(given)
                 found = found if isinstance(found, Mapping) else {"": found}
-                if found.keys() != metric.columns().keys():
-                    raise ValueError(f"gives {[*found]}, its columns are {[*metric.columns()]}")
                 for key in metric.columns():
                     # float64, so that the mean adds no rounding of its own.
                     values[f"{method}_{_name(label, key)}"] = float(found[key].double().mean())
@@ -190,56 +181,34 @@ class _Scorer:
 
     model: QueryGaussianModel
     measures: Measures
-    tune: Callable[[Views], Tuning] | None
+    recipe: Recipe
     seen: Domain = field(default_factory=Domain)
     gaussians: int = 0
 
     def __post_init__(self) -> None:
         self.device = next(self.model.parameters()).device
+        tunes = self.recipe.evaluation.tuning_steps
+        self.tuning_loss = tuning_loss(self.recipe) if tunes else None
         for metric in self.measures.metrics.values():
             metric.to(self.device)
 
-    def scores(
-        self, samples: Iterable[Sample | SceneFailure], batch: int
-    ) -> Iterator[SceneScore | SceneFailure]:
-        """Score every sample, up to `batch` with inputs of one shape at a time."""
-
-        # Scenes with other numbers of views cannot be stacked. Failures keep their place: a failed
-        # scene is reported where it would have been scored.
-        def shape(sample: Sample | SceneFailure) -> torch.Size | None:
-            return sample.inputs.images.shape if isinstance(sample, Sample) else None
-
-        for _, alike in groupby(samples, shape):
-            while some := list(islice(alike, batch)):
-                ready = [sample for sample in some if isinstance(sample, Sample)]
-                yield from self._together(ready)
-                yield from (failure for failure in some if isinstance(failure, SceneFailure))
-
     @torch.no_grad()
-    def _together(self, samples: Sequence[Sample]) -> Iterable[SceneScore | SceneFailure]:
-        # Tuning changes the state of one scene, so tuned scenes run one by one.
-        if len(samples) > 1 and not self.tune:
-            # If it fails, each runs by itself, to find the one that fails.
-            with suppress(Exception):
-                inputs = stack_views([sample.inputs for sample in samples]).to(self.device)
-                gaussians = self.model(inputs).gaussians
-                return [self._score(s, gaussians[i : i + 1]) for i, s in enumerate(samples)]
-        return [self._score(sample) for sample in samples]
-
-    def _score(
-        self, sample: Sample, gaussians: Gaussians | None = None
-    ) -> SceneScore | SceneFailure:
+    def score(self, sample: Sample | SceneFailure) -> SceneScore | SceneFailure:
+        """Return the score of a sample, or the reason why it has none."""
+        if isinstance(sample, SceneFailure):
+            return sample
         tuned: dict[str, float] = {}
         try:
             # Seen before the model runs: a failing scene counts among the cameras too.
             self.seen.see(sample.inputs.cameras, sample.targets.cameras)
             inputs = sample.inputs.to(self.device)
-            if self.tune:
-                tuning = self.tune(inputs)
-                gaussians = tuning.prediction.gaussians
-                tuned = dict(zip(TUNING, (tuning.losses[0], tuning.losses[-1]), strict=True))
-            found: Gaussians = gaussians or self.model(inputs).gaussians
-            values = self._values(sample, inputs, found) | tuned
+            if self.tuning_loss:
+                settings = self.recipe.evaluation
+                gaussians, record = tune(self.model, inputs, self.tuning_loss, settings)
+                tuned = {name: record[key] for name, key in TUNING.items()}
+            else:
+                gaussians = self.model(inputs).gaussians
+            values = self._values(sample, inputs, gaussians) | tuned
         except Exception as error:  # reported in the result; the other scenes go on
             return SceneFailure(sample.scene, one_line(error))
         # One NaN would spoil every mean over scenes.
@@ -308,12 +277,3 @@ def _held_out(plan: EvaluationPlan, scores: Sequence[SceneScore]) -> tuple[int, 
         targets = {frame for _, frames in score.views for frame in frames}
         count += len(held_out & targets)
     return (count, total) if total else None
-
-
-def _without_folder(reason: str, recipe: Recipe) -> str:
-    """`reason` with paths relative to the data's folder, so that results do not depend on it."""
-    path = recipe.tree["data"].get("path")
-    if isinstance(path, str):
-        for folder in (path, str(Path(path).expanduser().resolve())):
-            reason = reason.replace(folder.rstrip("/") + "/", "")
-    return reason

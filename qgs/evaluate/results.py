@@ -4,7 +4,7 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,8 @@ from qgs.metrics.dispersion import OPACITY_USED
 from qgs.wording import counted, listed, numbered
 
 METHODS = ("model", *BASELINES)
-TUNING = ("tuning_loss_before", "tuning_loss_after")
-FRAME_COLUMNS = ("scene", "input_frames", "target_frames")
-NAME_COLUMNS = ("input_names", "target_names")
-"""Columns of scenes.csv before the values, the second if frames have names; `problem` is last."""
+TUNING = {"tuning_loss_before": "loss_before", "tuning_loss_after": "loss_after"}
+"""Values of a tuned scene, and how the record of its tuning calls them."""
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
@@ -54,15 +52,12 @@ class SceneScore:
         both = [given_targets(*frames) for frames in self.views]
         return sorted(set().union(*both))
 
-    def cells(self, named: bool) -> dict[str, str | float]:
-        """Return what scenes.csv says of it, by column; named: with the names of its frames."""
+    def cells(self) -> dict[str, str | float]:
+        """Return what scenes.csv says of it, by column; frames by name where they have any."""
         cells: dict[str, str | float] = {}
-        for place, column in enumerate(FRAME_COLUMNS[1:]):
-            sides = [[str(frame) for frame in frames[place]] for frames in self.views]
-            cells[column] = "; ".join(map(" ".join, sides))
-        for place, column in enumerate(NAME_COLUMNS if named else ()):
+        for place, column in enumerate(("input_frames", "target_frames")):
             sides = [[self.names.get(f, str(f)) for f in frames[place]] for frames in self.views]
-            cells[column] = "; ".join(map(", ".join, sides))
+            cells[column] = "; ".join(map(" ".join, sides))
         return {**cells, **self.values}
 
 
@@ -179,30 +174,21 @@ class Evaluation:
         settings = self.protocol.content["tuning"]
         if settings is None:
             return None
-        losses = (spread(self._values(name))["mean"] for name in TUNING)
-        return {**settings, **dict(zip(("loss_before", "loss_after"), losses, strict=True))}
+        losses = {key: spread(self._values(name))["mean"] for name, key in TUNING.items()}
+        return {**settings, **losses}
 
     def _rows(self) -> list[list[str]]:
-        """Return the means of all methods, then the model's variance and median over scenes."""
+        """Return the means of all methods."""
         judged = self._of_wanted(len(self.scores))
         rows = [["method", *(column.title for column in self.columns.values()), "scenes"]]
         for method in METHODS:
             cells = [self.columns[name].shown(v) for name, v in self.means(method).items()]
             rows.append([method.replace("_", " "), *cells, judged])
-        for kind in ("variance", "median"):
-            cells = []
-            for name, column in self.columns.items():
-                values = self._values(f"model_{name}")
-                # A variance is small beside the values: one digit more.
-                finer = replace(column, digits=column.digits + (kind == "variance"))
-                cells.append(finer.shown(spread(values)[kind] if values else None))
-            rows.append([f"model, {kind}", *cells, judged])
         return rows
 
     def _csv(self) -> str:
         reasons = {failure.scene: failure.reason for failure in self.missing}
-        named = any(score.names for score in self.scores)
-        judged = {score.scene: score.cells(named) for score in self.scores}
+        judged = {score.scene: score.cells() for score in self.scores}
         columns = dict.fromkeys(column for cells in judged.values() for column in cells)
         text = io.StringIO()
         writer = csv.DictWriter(text, ["scene", *columns, "problem"], lineterminator="\n")
@@ -225,10 +211,8 @@ class Evaluation:
             f"{' or '.join(map(str, counts))} input views of {width} x {height} pixels, poses "
             f"{poses['frame']}, scale {poses['scale']} {poses.get('scale_factor', '')}".rstrip()
         )
-        # A broken data set would bury the table.
+        # A broken data set would bury the table; scenes.csv has every reason.
         yield from (f"missing {f.scene}: {f.reason}" for f in self.missing[:10])
-        if more := self.missing[10:]:
-            yield f"{len(more)} more missing scenes are in scenes.csv"
         # Whatever an index leaves out is named: scores over other scenes are no comparison.
         if null := self.null:
             yield f"null entries of the index, not judged ({len(null)}): {listed(null)}"

@@ -1,29 +1,18 @@
 """Tuning at test time: the queries or latents of a scene, fitted to its input views (TokenGS)."""
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from qgs.containers import map_tensors, named_tensors
+from qgs.contracts import EvaluationConfig
 from qgs.contracts.schedule import END, follow
-from qgs.contracts.settings import Tuned
 from qgs.losses import Photometric
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
 from qgs.types import Gaussians, Prediction, Views
-
-
-@dataclass(frozen=True)
-class Tuning:
-    """prediction: of what was tuned. losses: before each step, and after the last one."""
-
-    prediction: Prediction
-    losses: Sequence[float]
 
 
 def tuning_settings(tune: str | None) -> list[str]:
@@ -55,59 +44,19 @@ def tuning_loss(recipe: Recipe) -> Photometric:
     return Photometric(Photometric.Config())
 
 
-def tuner(model: QueryGaussianModel, recipe: Recipe) -> Callable[[Views], Tuning]:
-    """Return `tune` with the options of `recipe`'s `evaluation`."""
-    settings = recipe.evaluation
-    return partial(
-        tune,
-        model,
-        loss=tuning_loss(recipe),
-        steps=settings.tuning_steps,
-        rate=settings.rate,
-        what=settings.tuning,
-    )
-
-
-def tuned_gaussians(
-    model: QueryGaussianModel, recipe: Recipe, inputs: Views
-) -> tuple[Gaussians, dict[str, Any]]:
-    """Return the Gaussians of what was tuned on `inputs`, and a record of the tuning."""
-    settings = recipe.evaluation
-    device = next(model.parameters()).device
-    tuning = tuner(model, recipe)(inputs.to(device))
-    record = {
-        "what": settings.tuning,
-        "steps": settings.tuning_steps,
-        "rate": settings.rate,
-        "loss_before": tuning.losses[0],
-        "loss_after": tuning.losses[-1],
-    }
-    return tuning.prediction.gaussians, record
-
-
 def tune(
-    model: QueryGaussianModel,
-    views: Views,
-    loss: Photometric,
-    steps: int,
-    rate: float = 1e-4,
-    what: Tuned = "queries",
-) -> Tuning:
+    model: QueryGaussianModel, views: Views, loss: Photometric, settings: EvaluationConfig
+) -> tuple[Gaussians, dict[str, Any]]:
     """Fit what the model holds of the scenes `views` (B, V) to these views; weights stay.
 
-    what: "queries", all features and floating fields of the initial state, so LocusGS's anchors
-    too; or "latents", the features of the image memory; the encoder makes keys and values of them
-    anew in every step. `loss` compares the last layer with the photos; the optimiser is Adam.
-    TokenGS takes 50 steps, at a rate of 1e-4 of queries and 1e-2 of latents.
-    Raises ValueError for less than one step, and for latents of an encoder that has none to tune.
+    settings.tuning: "queries", all features and floating fields of the initial state, so LocusGS's
+    anchors too; or "latents", the features of the image memory; the encoder makes keys and values
+    of them anew in every step. `loss` compares the last layer with the photos; the optimiser is
+    Adam. TokenGS takes 50 steps, at a rate of 1e-4 of queries and 1e-2 of latents.
+
+    Returns the Gaussians of what was tuned, and a record of the tuning.
     """
-    if steps < 1:
-        raise ValueError(f"tuning takes at least one step, got {steps}")
-    if what == "latents" and not model.encoder.tunable:
-        raise ValueError(
-            f"there are no latents to tune: the encoder, {type(model.encoder).__name__}, makes no "
-            "memory of other features; tune the queries instead"
-        )
+    what = settings.tuning
     # Encoded once: weights and photos stay, so the memory does too.
     with torch.no_grad():
         memory = model.encoder(views)
@@ -118,7 +67,7 @@ def tune(
     )
     leaves = [tensor for _, tensor in named_tensors(tuned) if tensor.requires_grad]
     # As published: no schedule, no weight decay.
-    optimizer = torch.optim.Adam(leaves, lr=rate)
+    optimizer = torch.optim.Adam(leaves, lr=settings.rate)
     losses: list[float] = []
 
     def predicted() -> tuple[Prediction, Tensor]:
@@ -134,7 +83,7 @@ def tune(
         return prediction, value
 
     with torch.enable_grad():
-        for _ in range(steps):
+        for _ in range(settings.tuning_steps):
             _, value = predicted()
             # Not backward(): that would leave gradients in the model's weights.
             gradients = torch.autograd.grad(value, leaves, allow_unused=True)
@@ -143,4 +92,11 @@ def tune(
             optimizer.step()
     with torch.no_grad():
         prediction, _ = predicted()
-    return Tuning(prediction, losses)
+    record = {
+        "what": what,
+        "steps": settings.tuning_steps,
+        "rate": settings.rate,
+        "loss_before": losses[0],
+        "loss_after": losses[-1],
+    }
+    return prediction.gaussians, record

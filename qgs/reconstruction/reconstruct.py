@@ -13,7 +13,8 @@ from qgs.data.inputs import NOVEL, Frusta, Window, choose_windows
 from qgs.data.samples import Sample, make_sample, own_world
 from qgs.domain import Domain, verdict
 from qgs.evaluate.plan import ViewsOf
-from qgs.evaluate.tuning import tuned_gaussians, tuning_settings
+from qgs.evaluate.tuning import tune as tuned_on
+from qgs.evaluate.tuning import tuning_loss, tuning_settings
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.result import Reconstruction, reconstruct_sample
@@ -82,8 +83,10 @@ def reconstruct(
     training = model.training
     try:
         model.eval()
-        steps = recipe.evaluation.tuning_steps if tune else 0
-        tuned, record = tuned_gaussians(model, recipe, sample.inputs) if steps else (None, None)
+        tuned = record = None
+        if tune and recipe.evaluation.tuning_steps:
+            given = sample.inputs.to(next(model.parameters()).device)
+            tuned, record = tuned_on(model, given, tuning_loss(recipe), recipe.evaluation)
         result = reconstruct_sample(model, sample, world, chosen.seen, tuned, record)
     finally:
         model.train(training)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -14,7 +13,6 @@ from importlib.util import find_spec
 from types import FrameType
 from typing import Any
 
-import numpy as np
 import torch
 from accelerate import Accelerator
 from accelerate.utils import (
@@ -70,19 +68,13 @@ def gathered(accelerator: Accelerator, own: Any) -> list[Any]:
 
 @dataclass
 class RandomStates:
-    """The generators of Python, NumPy and torch, of every process by its rank."""
+    """Torch's generators, of every process by its rank; components draw from no others."""
 
     accelerator: Accelerator
 
     def state(self) -> dict[str, Any]:
-        """Return tensors and JSON values; all processes must call this."""
-        version, words, gauss = random.getstate()
-        kind, twister, *rest = np.random.get_state()
-        own: dict[str, Any] = {
-            "python": [version, list(words), gauss],
-            "numpy": [kind, np.asarray(twister).tolist(), *rest],
-            "torch": torch.get_rng_state(),
-        }
+        """Return the states; all processes must call this."""
+        own = {"torch": torch.get_rng_state()}
         if self.accelerator.device.type == "cuda":
             own["cuda"] = torch.cuda.get_rng_state(self.accelerator.device)
         ranks = enumerate(gathered(self.accelerator, own))
@@ -90,17 +82,14 @@ class RandomStates:
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore this process's generators; a rank that `state` lacks keeps its own."""
-        prefix = f"{self.accelerator.process_index}/"
-        own = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
-        if not own:
+        rank = self.accelerator.process_index
+        # A run may go on in more processes than it was saved by.
+        if rank and f"{rank}/torch" not in state:
             return
-        version, words, gauss = own["python"]
-        random.setstate((version, tuple(words), gauss))
-        np.random.set_state(own["numpy"])
-        torch.set_rng_state(own["torch"])
-        device = self.accelerator.device
-        if device.type == "cuda" and "cuda" in own:
-            torch.cuda.set_rng_state(own["cuda"], device)
+        torch.set_rng_state(state[f"{rank}/torch"])
+        on_device = state.get(f"{rank}/cuda")
+        if self.accelerator.device.type == "cuda" and on_device is not None:
+            torch.cuda.set_rng_state(on_device, self.accelerator.device)
 
 
 DEVICES = ("auto", "cpu", "cuda")

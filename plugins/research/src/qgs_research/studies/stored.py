@@ -9,7 +9,7 @@ from typing import Any
 
 from qgs.contracts import Column
 from qgs.evaluate.protocol import Protocol
-from qgs.evaluate.results import FRAME_COLUMNS, NAME_COLUMNS
+from qgs.evaluate.results import METHODS
 from qgs.recipe.errors import Problems
 from qgs.recipe.yaml_text import load_mapping
 
@@ -94,8 +94,7 @@ def _read(folder: Path, name: str) -> StoredResults:
                 continue
             scene = row["scene"]
             frames[scene] = (row["input_frames"], row["target_frames"])
-            texts = (*FRAME_COLUMNS, *NAME_COLUMNS)
-            scenes[scene] = {k: float(v) for k, v in row.items() if k not in texts and v}
+            scenes[scene] = {k: float(v) for k, v in row.items() if k.startswith(METHODS) and v}
     return StoredResults(
         name=name,
         protocol=Protocol(summary["protocol"]["name"], protocol),
