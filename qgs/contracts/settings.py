@@ -79,7 +79,7 @@ class TrainingConfig(ComponentConfig):
     ema: float | None = Field(default=None, gt=0, lt=1)
     """Decay of a moving average of the weights, saved and evaluated beside them; null for none."""
     on_nonfinite: Literal["stop", "skip"] = "stop"
-    """What a step with a NaN or infinite loss or gradient does; its batch and weights are saved."""
+    """What a step with a NaN or infinite loss or gradient does; its first bad tensor is named."""
     on_bad_sample: Literal["stop", "skip"] = "stop"
     """What a sample that cannot be made does, of a damaged image for example; "skip" takes one of
     the next scenes instead, counts it, and names it in the end."""

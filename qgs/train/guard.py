@@ -1,7 +1,6 @@
 """Ends of a run by itself: a model that died, and steps that are not finite."""
 
 import logging
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -17,14 +16,7 @@ from qgs.data.samples import Batch
 from qgs.machine import is_out_of_memory
 from qgs.train.distributed import gathered
 from qgs.train.folder import Saver
-from qgs.train.incidents import (
-    blames_data,
-    described,
-    first_bad_tensor,
-    report_of,
-    save_batches,
-    save_incident,
-)
+from qgs.train.nonfinite import first_bad_tensor
 from qgs.train.training_pass import TrainingPass
 from qgs.wording import listed
 
@@ -44,9 +36,6 @@ LOSS_OF_QUALITY = 1.0
 
 MAX_SKIPPED = 10
 """Steps in a row that may be skipped; after them training stops."""
-
-MAX_SAVED = 20
-"""Incidents of a run that are saved; later ones are logged and counted."""
 
 _TOO_FAST = (
     "a learning rate too high for this model (lower optimizer.learning_rate, lengthen "
@@ -70,7 +59,7 @@ COLLAPSE_CAUSES = (
 NONFINITE_CAUSES = (
     _TOO_FAST,
     "a range that bfloat16 does not hold (training.precision: float32)",
-    "data that is not finite: images, poses or intrinsics (look at the scenes of `data`; with "
+    "data that is not finite: images, poses or intrinsics (look at it with `qgs data check`; with "
     "views.scale distance, at input cameras that almost stand on one point)",
 )
 
@@ -98,7 +87,7 @@ class Guard:
     All processes must call each of its methods together; `step` counts finished optimiser steps.
 
     training_pass: not wrapped by accelerate. repeat: computes the gradients of a step again.
-    incidents: steps that were not finite. skipped: how many of them came last, without a good one.
+    skipped: the latest steps in a row that were not finite.
     """
 
     accelerator: Accelerator
@@ -106,7 +95,6 @@ class Guard:
     saver: Saver
     config: TrainingConfig
     repeat: Callable[[Sequence[Batch]], Any]
-    incidents: int = 0
     skipped: int = 0
 
     def __post_init__(self) -> None:
@@ -115,14 +103,9 @@ class Guard:
         self.good = GoodWeights(self.training_pass.model, keep)
 
     def state(self) -> dict[str, Any]:
-        return {
-            "incidents": self.incidents,
-            "skipped": self.skipped,
-            "detector": asdict(self.signs),
-        }
+        return {"skipped": self.skipped, "detector": asdict(self.signs)}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        self.incidents = state["incidents"]
         self.skipped = state["skipped"]
         self.signs = SignsOfLife(**state["detector"])
 
@@ -133,11 +116,16 @@ class Guard:
         self.good.observe(numbers)
 
     def leave_out(self, step: int, batches: Sequence[Batch], symptom: str) -> None:
-        """Look into the step after `step`, which is not finite; return to go on without it.
+        """Repeat the step after `step`, which is not finite, to say why; return to leave it out.
 
         Raises NonFiniteError, the run saved as before that step, or CollapseError.
         """
-        found, from_data = self.look_into(step + 1, batches, symptom)
+        self.skipped += 1
+        # All processes repeat the step: its collective operations need everyone.
+        first = first_bad_tensor(self.training_pass, lambda: self.repeat(batches))
+        words = first.described(batches) if first else ""
+        told = list(filter(None, gathered(self.accelerator, words)))
+        found = "; ".join([symptom, *(told or ["repeating the step gave finite numbers"])])
         skips = self.config.on_nonfinite == "skip"
         if skips and self.skipped <= MAX_SKIPPED:
             _log.warning("step %d is skipped: %s", step + 1, found)
@@ -149,38 +137,10 @@ class Guard:
         remedy = "; continue without it by `--resume --set training.on_nonfinite=skip`"
         if skips:
             remedy = f", after {MAX_SKIPPED} steps in a row were skipped; continue with --resume"
-        causes = f"Likely causes:{_as_list(NONFINITE_CAUSES)}"
-        if from_data:
-            causes = "The data is to blame: look at it with `qgs data check`"
         raise NonFiniteError(
             f"step {step + 1} is not finite, and the run is saved as it was before this "
-            f"step{remedy}.\n{found}.\n{causes}"
+            f"step{remedy}.\n{found}.\nLikely causes:{_as_list(NONFINITE_CAUSES)}"
         )
-
-    def look_into(self, step: int, batches: Sequence[Batch], symptom: str) -> tuple[str, bool]:
-        """Repeat a step to find its first bad tensor; save what it takes to see it again.
-
-        Returns a description of what was found, and whether it came with the data of a batch.
-        """
-        self.incidents += 1
-        self.skipped += 1
-        # All processes repeat the step: its collective operations need everyone.
-        first = first_bad_tensor(self.training_pass, lambda: self.repeat(batches))
-        process = self.accelerator.process_index
-        reports = gathered(self.accelerator, report_of(process, first, batches))
-        found = [report for report in reports if report["first"]] or reports[:1]
-        words = f"{symptom}; {'; '.join(map(described, found))}"
-        from_data = all(map(blames_data, found))
-        if self.incidents > MAX_SAVED:
-            return f"{words}; not saved, as {MAX_SAVED} incidents of this run are", from_data
-        place = self.saver.folder.path / "incidents" / f"step-{step}"
-        if self.accelerator.is_main_process:
-            save_incident(place, self.saver.model, step, symptom, reports)
-            save_batches(place / "batch.safetensors", batches)
-        elif first:
-            save_batches(place / f"batch-{process}.safetensors", batches)
-        self.accelerator.wait_for_everyone()
-        return f"{words}; batch and weights are in {place}", from_data
 
     def check(self, step: int) -> None:
         """Copy the weights if they are good and a copy is due.
@@ -359,13 +319,3 @@ class GoodWeights:
             prefix = f"{number}/"
             copy = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
             self.copies.append((step, copy))
-
-
-def not_finite(numbers: Mapping[str, float]) -> str:
-    """Name what is NaN or infinite of a step: loss terms, else the gradient; "" if nothing is."""
-    # PSNR is infinite for a perfect image; the gradient follows the terms.
-    terms = {name: n for name, n in numbers.items() if name not in ("gradient", "psnr")}
-    bad = [f"loss term {name} is {n}" for name, n in terms.items() if not math.isfinite(n)]
-    if not bad and not math.isfinite(numbers["gradient"]):
-        bad = [f"the gradient norm is {numbers['gradient']}"]
-    return ", ".join(bad)

@@ -40,8 +40,9 @@ from qgs.train.distributed import (
     true_anywhere,
 )
 from qgs.train.folder import RunFolder, SavedState, Saver, saved_state
-from qgs.train.guard import Guard, not_finite
+from qgs.train.guard import Guard
 from qgs.train.initial import initialise
+from qgs.train.nonfinite import not_finite
 from qgs.train.parameters import MovingAverage, OptimizerState, make_optimizer
 from qgs.train.periodic import PeriodicEvaluation
 from qgs.train.precision import autocast
@@ -278,7 +279,7 @@ class Trainer:
             self.feed.fetch()
         numbers = counters.read(measured)
         if symptom := not_finite(numbers):
-            self._open_folder()  # an incident is saved in it
+            self._open_folder()  # the run may be saved in it
             self.guard.leave_out(counters.step, batches, symptom)
             numbers["skipped"] = True
         else:

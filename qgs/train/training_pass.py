@@ -1,6 +1,6 @@
 """The forward pass of a training step: the objective with the model and the losses it calls."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -31,8 +31,6 @@ class TrainingPass(nn.Module):
     `render_views` target views at a time (0: all views), and frees each part's graph before the
     next; the backward pass starts from their sums. Memory thus grows neither with layers nor with
     views. Where a loss needs all renderings at once, only the renderer's graphs are in parts.
-
-    hook: called with the name and value (tensors, or a nest of them) of each intermediate result.
     """
 
     def __init__(self, recipe: Recipe, model: QueryGaussianModel) -> None:
@@ -49,7 +47,6 @@ class TrainingPass(nn.Module):
         self._owners: dict[str, str] = {}  # names of terms to those of their losses
         self.render_views = recipe.training.render_views
         self.judge_inputs = recipe.training.judge_inputs
-        self.hook: Callable[[str, Any], None] = lambda name, value: None
 
     def forward(self, inputs: Views, targets: Views) -> Outcome:
         """Return what the objective makes of a batch.
@@ -89,24 +86,19 @@ class TrainingPass(nn.Module):
         signs: list[tuple[float, Mapping[str, Tensor]]] = []
         rounds = [number for number in prediction.layers if number > len(self.model.decoder)]
         for number, weight in self.model.supervision.weights(rounds).items():
-            self.hook(f"prediction of layer {number}", prediction.layers[number])
             layer = DetachedLayer(prediction.layers[number], parameters)
             # Of this layer: those of the last one remain.
             signs = []
             for part in self._parts(targets):
                 views = part.images.shape[1]
                 rendering = self.render(layer.prediction.gaussians, part.cameras)
-                self.hook(f"rendering of layer {number}", rendering)
                 signs.append((views / count, self._signs(rendering, part)))
                 found = self._terms(self._of_images, layer.prediction, rendering, part, inputs)
-                self.hook(f"loss of layer {number}", found)
                 layer.add(found, weight * views / count)
             # Losses of the Gaussians run once for all parts, with a rendering of no view.
             no_views = map_tensors(lambda x: x[:, :0].detach(), rendering)
             found = self._terms(self._of_gaussians, layer.prediction, no_views, targets, inputs)
-            self.hook(f"loss of layer {number}", found)
             layer.add(found, weight)
-            self.hook(f"gradient of layer {number}", layer.gradients)
             # Layers meet here: one backward pass through the network serves them all.
             total = total + layer.total()
             _add(layer.terms, terms)

@@ -7,7 +7,7 @@ from training_runs import run, run_calling, tiny
 import qgs
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.train.folder import RunFolder
-from qgs.train.guard import EMPTY_ALPHA, CollapseError, GoodWeights, SignsOfLife, not_finite
+from qgs.train.guard import EMPTY_ALPHA, CollapseError, GoodWeights, SignsOfLife
 from qgs.train.training_pass import measure
 
 ALIVE = {"alpha": 0.5, "deviation": 0.3, "gradient": 0.1}
@@ -61,13 +61,6 @@ def test_good_weights_are_the_older_of_two_copies_made_before_the_images_got_wor
     step, weights = good.last
     assert step == 50
     assert (weights["weight"] == 50).all()
-
-
-def test_what_is_not_finite_is_named():
-    perfect = float("inf")
-    assert not not_finite({"mse": 1.0, "gradient": 0.5, "psnr": perfect})
-    assert not_finite({"mse": float("nan"), "gradient": 0.5}) == "loss term mse is nan"
-    assert not_finite({"mse": 1.0, "gradient": float("inf")}) == "the gradient norm is inf"
 
 
 def test_gaussians_invisible_from_the_start_end_a_run_at_the_window_or_its_end(tmp_path):

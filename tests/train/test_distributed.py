@@ -1,13 +1,11 @@
 """Two processes on one machine train the model that one would train; which device `auto` takes."""
 
-import json
 import signal
 from unittest.mock import Mock
 
 import pytest
 import torch
 import yaml
-from safetensors.torch import load_file
 from training_runs import TWO, losses, parts_of, read_jsonl, run, run_calling, tiny
 from two_processes import told_by_two
 
@@ -68,11 +66,6 @@ def test_all_processes_leave_out_a_step_that_one_found_bad(tmp_path):
     train_in_two_processes(recipe, tmp_path, 3, True)
     records = read_jsonl(tmp_path / "history.jsonl")
     assert ["loss" in record for record in records] == [True, False, True]
-    incident = tmp_path / "incidents/step-2"
-    found = json.loads((incident / "report.json").read_text())["found"]
-    assert [bool(report["first"]) for report in found] == [False, True]
-    seen = [load_file(incident / f"batch{n}.safetensors")["targets.images"] for n in ("", "-1")]
-    assert [int(images.isnan().sum()) for images in seen] == [0, 1]
     judged = read_jsonl(tmp_path / "evaluations.jsonl")
     assert [record["step"] for record in judged] == [2, 2, 3, 3]
 

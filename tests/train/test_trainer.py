@@ -142,13 +142,11 @@ def test_bad_steps_are_skipped_on_demand(tmp_path, monkeypatch, caplog):
     assert ["skipped" in r for r in records] == [False, True, False, True]
     curves = curves_of(through / "checkpoint.safetensors")
     assert [record["step"] for record in curves] == [1, 3]
-    assert {path.name for path in (through / "incidents").iterdir()} == {"step-2", "step-4"}
-    counted = parts_of(through)["guard"]
-    assert (counted["incidents"], counted["skipped"]) == (2, 1)  # a good step lies between the two
+    assert parts_of(through)["guard"]["skipped"] == 1  # a good step lies between the two
     for resume in (False, True):
         with pytest.raises(NonFiniteError, match=r"targets\.images \(1 NaN of") as error:
             run(tiny("locus", *options), stopped, resume)
-    for part in ("step 2 is not finite", "mse is nan", str(stopped / "incidents/step-2")):
+    for part in ("step 2 is not finite", "mse is nan"):
         assert part in str(error.value)
     assert len(losses(stopped)) == 1
     assert run(skipping, stopped, resume=True).resumed_at == 1
