@@ -75,10 +75,7 @@ def evaluate(
         wanted=plan.wanted,
         gaussians=scorer.gaussians,
         missing=missing,
-        null=plan.null,
-        unlisted=plan.unlisted,
         incomplete=measures.incomplete(scores),
-        held_out=None if index else _held_out(plan, scores),
         step=step,
     )
     return replace(evaluation, remarks=_remarks(evaluation, model, recipe, plan, scorer.seen))
@@ -265,15 +262,3 @@ def _mean(samples: Sequence[SceneScore]) -> SceneScore:
     views = [frames for sample in samples for frames in sample.views]
     names = {frame: name for sample in samples for frame, name in sample.names.items()}
     return SceneScore(samples[0].scene, views, means, names)
-
-
-def _held_out(plan: EvaluationPlan, scores: Sequence[SceneScore]) -> tuple[int, int] | None:
-    """Held-out frames that were targets, and all of them, over the scenes with a score."""
-    count = 0
-    total = 0
-    for score in scores:
-        held_out = plan.held_out[score.scene]
-        total += len(held_out)
-        targets = {frame for _, frames in score.views for frame in frames}
-        count += len(held_out & targets)
-    return (count, total) if total else None

@@ -90,9 +90,8 @@ class EvaluationPlan:
     frames of the span, or of one time. Targets of T times are T samples. views_of: makes the
     settings of a sample, such as its scale. depths: targets have true depth where scenes do.
 
-    wanted, null, unlisted: see `qgs.evaluate.results.Evaluation`. framing: of the first photo;
-    held_out: held-out frames by scene; both once `samples` has run. Raises ValueError without
-    scenes.
+    wanted: names of the scenes. framing: of the first photo, once `samples` has run. Raises
+    ValueError without scenes.
     """
 
     source: SceneSource
@@ -105,17 +104,14 @@ class EvaluationPlan:
 
     def __post_init__(self) -> None:
         self.framing: str | None = None
-        self.held_out: dict[str, set[int]] = {}
         self._scenes = self.source.scenes("test")
         if not len(self._scenes):
             raise ValueError(f"the data source {type(self.source).name!r} has no test scenes")
         names = self.source.names("test")
         self._places = {name: place for place, name in enumerate(names)}
-        first = dict.fromkeys(names[: self.evaluation.scenes], True)
-        entries = first if self.index is None else self.index
-        self.unlisted = tuple(n for n in names if self.index and n not in self.index)
-        self.wanted = tuple(name for name, entry in entries.items() if entry)
-        self.null = tuple(name for name, entry in entries.items() if not entry)
+        self.wanted = tuple(names[: self.evaluation.scenes])
+        if self.index is not None:
+            self.wanted = tuple(name for name, entry in self.index.items() if entry)
 
     def samples(self) -> Iterator[Sample | SceneFailure]:
         """Yield the samples, one decoded at a time; a scene that fails ends with its failure."""
@@ -125,7 +121,6 @@ class EvaluationPlan:
                     raise ValueError("not among the test scenes of the data")
                 place = self._places[name]
                 scene = self._scenes[place]
-                self.held_out[name] = set(scene.held_out)
                 # a generator for each scene: a failing one changes no noise of the others
                 noise = np.random.default_rng([self.evaluation.seed, place])
                 for inputs, targets in self._choices(scene, place):

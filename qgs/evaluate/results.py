@@ -66,11 +66,8 @@ class Evaluation:
     """All scenes and what they amount to; the same weights and recipe give the same numbers.
 
     columns: by name of the value. scores: of the judged scenes. wanted: names of all scenes of the
-    protocol. missing: those without a score. null: scenes that the index lists without frames.
-    unlisted: scenes of the data that the index lacks. gaussians: of a scene, the most of any.
-    incomplete: values that scenes lack, and why. held_out: how many held-out frames were judged,
-    and how many there are; None where the test scenes hold none out. step: optimiser steps behind
-    the weights.
+    protocol. missing: those without a score. gaussians: of a scene, the most of any.
+    incomplete: values that scenes lack, and why. step: optimiser steps behind the weights.
     remarks: sentences on what was judged and what came of it.
     """
 
@@ -80,10 +77,7 @@ class Evaluation:
     wanted: Sequence[str]
     gaussians: int
     missing: Sequence[SceneFailure] = ()
-    null: Sequence[str] = ()
-    unlisted: Sequence[str] = ()
     incomplete: Mapping[str, str] = field(default_factory=dict)
-    held_out: tuple[int, int] | None = None
     step: int | None = None
     remarks: Sequence[str] = ()
 
@@ -128,8 +122,6 @@ class Evaluation:
             "scenes_in_protocol": len(self.wanted),
             "samples": sum(len(score.views) for score in self.scores),
             "missing": {failure.scene: failure.reason for failure in self.missing},
-            "null_entries": list(self.null),
-            "not_in_index": list(self.unlisted),
             "context_and_target": {s.scene: s.given for s in self.scores if s.given},
             "columns": {name: asdict(column) for name, column in self.columns.items()},
             **{method: self.means(method) for method in METHODS},
@@ -138,7 +130,6 @@ class Evaluation:
             "gaussians": self.gaussians,
             "gaussians_used": {"opacity_above": OPACITY_USED, **used},
             "tuning": self._tuning(),
-            "held_out_frames": self.held_out,
             "remarks": list(self.remarks),
         }
 
@@ -213,11 +204,6 @@ class Evaluation:
         )
         # A broken data set would bury the table; scenes.csv has every reason.
         yield from (f"missing {f.scene}: {f.reason}" for f in self.missing[:10])
-        # Whatever an index leaves out is named: scores over other scenes are no comparison.
-        if null := self.null:
-            yield f"null entries of the index, not judged ({len(null)}): {listed(null)}"
-        if names := self.unlisted:
-            yield f"scenes that the index lacks, not judged ({len(names)}): {listed(names)}"
         if given := [score for score in self.scores if score.given]:
             named = [
                 f"{s.scene} ({listed(numbered(f, s.names.get(f, '')) for f in s.given)})"
@@ -231,8 +217,6 @@ class Evaluation:
             count = len(self._values(f"model_{name}"))
             over = f"over {self._of_wanted(count)} scenes" if count else "empty"
             yield f"{self.columns[name].heading} is {over}: {why}"
-        if self.held_out:
-            yield "judged on {} of {} held-out frames".format(*self.held_out)
         used = spread(self._values("gaussians_used"))
         yield (
             f"{self.gaussians:,} Gaussians a scene, {used['mean']:,.0f} of them used (opacity "

@@ -24,15 +24,13 @@ class Splats:
     """Gaussians as cameras see them, each field (B, V, G, ...).
 
     means: (..., 2) pixels. conics: (..., 3) entries xx, xy, yy of the inverse covariance, pixel^-2.
-    depths: camera-frame z. deviations: (..., 2) standard deviations along x and y, pixels, without
-    gradient. visible: False for what near, far or an overflow drops; the other fields are finite
-    placeholders there, with zero gradients.
+    depths: camera-frame z. visible: False for what near, far or an overflow drops; the other fields
+    are finite placeholders there, with zero gradients.
     """
 
     means: Tensor
     conics: Tensor
     depths: Tensor
-    deviations: Tensor
     visible: Tensor
 
 
@@ -75,11 +73,7 @@ def project(
     determinant = torch.where(usable, determinant, 1.0)
     conics = torch.stack([yy + dilation, -xy, xx + dilation], -1) / determinant[..., None]
     conics = torch.where(usable[..., None], conics, 0.0)
-    visible = in_range & usable
-    # Without gradient: they only say how far a splat reaches.
-    deviations = torch.stack([xx, yy], -1).detach().add(dilation).sqrt()
-    deviations = torch.where(visible[..., None], deviations, 0.0)
-    return Splats(means, conics, z, deviations, visible)
+    return Splats(means, conics, z, in_range & usable)
 
 
 def _clamped(slope: Tensor, focal: Tensor, principal: Tensor, size: int) -> Tensor:

@@ -26,7 +26,7 @@ from qgs.evaluate.protocol import index_of
 from qgs.files import read_records, write_text
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
-from qgs.train.distributed import RandomStates, StopRequest
+from qgs.train.distributed import StopRequest
 from qgs.train.parameters import MovingAverage
 from qgs.train.tracking import Trackers
 
@@ -34,7 +34,6 @@ SAMPLES = 4
 """Samples that are drawn, the same ones each time."""
 
 _GAP = 4
-_COUNTS = ("statement", "scenes", "scenes_in_protocol", "samples")
 
 _log = logging.getLogger(__name__)
 
@@ -74,12 +73,12 @@ class PeriodicEvaluation:
         """
         self.latest = step
         self.stop = stop
-        # An evaluation must not change what the training draws afterwards.
-        random = RandomStates(self.accelerator)
-        states = random.state()
+        device = self.accelerator.device
         try:
-            if self.accelerator.is_main_process:
-                self._evaluate(step)
+            # An evaluation must not change what the training draws afterwards.
+            with torch.random.fork_rng([device] if device.type == "cuda" else []):
+                if self.accelerator.is_main_process:
+                    self._evaluate(step)
         except _StoppedError:
             _log.warning("the evaluation at step %d is given up: training was asked to stop", step)
         except Exception as error:  # the run is saved, and worth more than an evaluation
@@ -88,7 +87,6 @@ class PeriodicEvaluation:
             _log.debug("where it failed", exc_info=True)
         # The others wait here, see TIMEOUT in `distributed`.
         self.accelerator.wait_for_everyone()
-        random.load_state(states)
 
     def _evaluate(self, step: int) -> None:
         records = [self._record("raw", step)]
@@ -114,12 +112,11 @@ class PeriodicEvaluation:
 
     def _record(self, weights: str, step: int) -> dict[str, Any]:
         evaluation = evaluate(self.model, self.recipe, step, observe=self._between_scenes)
-        summary = evaluation.summary()
         return {
             "step": step,
             "weights": weights,
-            "protocol": summary["protocol"]["sha256"],
-            **{name: summary[name] for name in _COUNTS},
+            "protocol": evaluation.protocol.sha256,
+            "scenes": len(evaluation.scores),
             "scores": {n: score for n, score in evaluation.means().items() if score is not None},
         }
 

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 from accelerate.tracking import TensorBoardTracker, WandBTracker
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from qgs.contracts import MissingExtraError
 from qgs.extensions import installed, load
@@ -179,47 +179,32 @@ def _warn(name: str, error: Exception) -> None:
 
 
 class TrainingProgress(Progress):
-    """A bar with loss, PSNR, images/s and time left; a line now and then where no terminal is."""
+    """A bar with loss, PSNR and time left; a line now and then where no terminal is."""
 
     def __init__(self, console: Console) -> None:
         super().__init__(
             TextColumn("step {task.fields[step]}"),
             BarColumn(),
             TextColumn("{task.fields[line]}"),
+            TimeRemainingColumn(),
             console=console,
             auto_refresh=False,
             transient=True,
+            speed_estimate_period=300,
             disable=not console.is_terminal,
         )
         self._task = self.add_task("training", total=1.0, step=0, line="")
         self._next = 0.0
-        self._begun: tuple[int, float, float] | None = None
 
-    def show(
-        self, step: int, loss: float, psnr: float, images: int, seconds: float, used: float
-    ) -> None:
-        """Show a step, unless the last one was shown a moment ago.
-
-        images, seconds: of the whole run so far; the speed shown is that of this session. used:
-        fraction of the budget.
-        """
-        # Speed is of this session: a resumed run may be on another machine.
-        if self._begun is None:
-            self._begun = (images, seconds, used)
+    def show(self, step: int, loss: float, psnr: float, used: float) -> None:
+        """Show a step, unless the last one was shown a moment ago. used: part of the budget."""
         now = time.monotonic()
         if now < self._next:
             return
         self._next = now + (_LOG_SECONDS if self.disable else _REFRESH_SECONDS)
-        first_images, first_seconds, first_used = self._begun
-        shown = images - first_images
-        spent = seconds - first_seconds
         line = f"loss {loss:.4f}  {Psnr.column.heading} {Psnr.column.shown(psnr):>5}"
-        if shown and spent:
-            line += f"  {shown / spent:.{0 if shown > 10 * spent else 1}f} images/s"
-        if gained := used - first_used:
-            left = max(spent * (1 - used) / gained, 0)
-            line += f"  {timedelta(seconds=round(left))} left"
+        self.update(self._task, completed=used, step=step, line=line, refresh=not self.disable)
         if self.disable:
+            if (left := self.tasks[0].time_remaining) is not None:
+                line += f"  {timedelta(seconds=round(left))} left"
             self.console.print(f"step {step}  {line}", highlight=False)
-        else:
-            self.update(self._task, completed=used, step=step, line=line, refresh=True)

@@ -325,16 +325,7 @@ class Trainer:
             finite = {name: value for name, value in record.items() if math.isfinite(value)}
             self.folder.append(finite)
             self.trackers.log(finite, counters.step)
-        views = self.recipe.views
-        judged = views.targets + self.config.judge_inputs * views.inputs
-        progress.show(
-            counters.step,
-            record["loss"],
-            record["psnr"],
-            counters.samples * judged,
-            counters.seconds,
-            counters.used,
-        )
+        progress.show(counters.step, record["loss"], record["psnr"], counters.used)
 
     def _evaluate(self, stop: StopRequest) -> None:
         with self.counters.clock_stopped():

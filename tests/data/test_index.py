@@ -96,8 +96,6 @@ def test_what_is_not_judged_is_named():
     }
     plan = EvaluationPlan(source, VIEWS, EvaluationConfig(), index)
     assert plan.wanted == ("gone", "good", "short")
-    assert plan.null == ("nil",)
-    assert plan.unlisted == ("spare",)
     failures = {s.scene: s.reason for s in plan.samples() if isinstance(s, SceneFailure)}
     assert failures.keys() == {"gone", "short"}
     assert "4, -1" in failures["short"]
