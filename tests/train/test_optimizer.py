@@ -107,22 +107,12 @@ def test_a_pattern_names_a_part_and_all_below_it():
             assert found == wanted != set(), pattern
 
 
-FIXES = """
-encodr: `encoder`
-decoder.9.self_attention: `decoder.*.self_attention`
-decoder.1.self_atention: `decoder.1.self_attention`
-decoder.refinment.x: `decoder.refinement`
-*.*.*.*.*.*.*.*: encoder, queries, decoder, refinements, head
-"""
-
-
 def test_a_pattern_that_matches_nothing_ends_the_start(tmp_path):
-    for line in FIXES.strip().splitlines():
-        pattern, fix = line.split(": ")
-        recipe = tiny("locus", f'optimizer.parts={{"{pattern}": 0.1}}')
-        problem = refused(recipe, tmp_path / "run", by=run)
-        assert (problem.file[:5], problem.option) == ("--set", f"optimizer.parts.{pattern}")
-        assert fix in problem.fix
+    pattern = "decoder.1.self_atention"
+    recipe = tiny("locus", f'optimizer.parts={{"{pattern}": 0.1}}')
+    problem = refused(recipe, tmp_path / "run", by=run)
+    assert (problem.file[:5], problem.option) == ("--set", f"optimizer.parts.{pattern}")
+    assert "`decoder.1.self_attention`" in problem.fix
     assert not (tmp_path / "run").exists()
 
 
