@@ -170,8 +170,8 @@ def find_scale(
     )
 
 
-def further_photos(scene: Scene, inputs: Frames, compared: Frames, most: int = FURTHER) -> Frames:
-    """Return at most `most` photos in the middle of the inputs, none held out or compared with.
+def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
+    """Return at most FURTHER photos in the middle of the inputs, none held out or compared with.
 
     The middle has the smallest largest distance from inputs: of centres, over that between inputs,
     plus the angle between axes. None of scenes that move.
@@ -186,7 +186,7 @@ def further_photos(scene: Scene, inputs: Frames, compared: Frames, most: int = F
     extent = float(torch.cdist(own[:, :3, 3], own[:, :3, 3]).max() or apart.max()) or 1.0
     turn = (other[:, :3, 2] @ own[:, :3, 2].T).clamp(-1, 1).acos()
     far = (apart / extent + turn).amax(1).tolist()
-    return tuple(sorted(frame for _, frame in sorted(zip(far, left, strict=True))[:most]))
+    return tuple(sorted(frame for _, frame in sorted(zip(far, left, strict=True))[:FURTHER]))
 
 
 def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, float, float]:

@@ -61,19 +61,11 @@ def refine(
     from qgs_photos.refine.reconstruction import opened_reconstruction, refine_reconstruction
 
     console = Console()
-    opened = opened_reconstruction(
+    start, chosen = opened_reconstruction(
         reconstruction, photos, pixels, scene_name, choose_device(device)
     )
-    show(opened.start, console)
-    result = refine_reconstruction(
-        opened.start,
-        opened.scene,
-        seconds,
-        count=gaussians,
-        inputs_only=inputs_only,
-        seen=opened.seen,
-        console=console,
-    )
+    show(start, console)
+    result = refine_reconstruction(start, chosen, seconds, gaussians, inputs_only, console)
     show(result, console)
     for file in result.save(target):
         say(console, f"wrote {file}")

@@ -26,8 +26,8 @@ Minutes: TypeAlias = Annotated[
 Model: TypeAlias = Annotated[
     str | None,
     typer.Option(
-        help="Trained model of the start, or none; default: of fewer than four photos the best one "
-        "that is installed, else none."
+        help="Trained model of the start, or none; default: of fewer than four photos a shipped "
+        "one, else none."
     ),
 ]
 PhotoSize: TypeAlias = Annotated[

@@ -1,7 +1,6 @@
 """A reconstruction in a folder, refined on the photos of its scene."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -11,10 +10,9 @@ from qgs.checkpoint.model_file import load
 from qgs.contracts import Frames, Scene
 from qgs.data.frames import training_frames
 from qgs.data.samples import Sample, cameras_in, views_in
-from qgs.metrics.images import Psnr
 from qgs.recipe import resolve
 from qgs.reconstruction.result import Reconstruction, reconstruct_sample
-from qgs.reconstruction.scenes import Size, chosen_scene
+from qgs.reconstruction.scenes import ChosenScene, Size, chosen_scene
 from qgs.types import Views
 from qgs.wording import listed
 from qgs_photos.record import Record, has_record, read_record
@@ -24,24 +22,12 @@ from qgs_photos.refine.refining import RefinedScene, refine
 _SAME_POSE = 1e-3
 
 
-@dataclass(frozen=True)
-class OpenedReconstruction:
-    """A reconstruction and its photos. scene: at the size to refine at.
-
-    seen: frames that the model was trained on.
-    """
-
-    start: Reconstruction
-    scene: Scene
-    seen: Sequence[int]
-
-
 def opened_reconstruction(
     folder: Path, photos: str, size: Size | None, name: str | None, device: str
-) -> OpenedReconstruction:
-    """Open what `qgs reconstruct` wrote into `folder`, with its photos.
+) -> tuple[Reconstruction, ChosenScene]:
+    """Open what `qgs reconstruct` wrote into `folder`, and its photos at the size to refine at.
 
-    size: (H, W) of the photos to refine on, by default the recorded one. name: of the scene, by
+    size: (H, W) of these, by default the recorded one. name: of the scene, by
     default the recorded one. Raises FileNotFoundError for another folder, ValueError for a
     reconstruction without a model and for other photos, and as the model and the data do.
     """
@@ -77,7 +63,7 @@ def opened_reconstruction(
     )
     if size is not None:
         chosen = chosen_scene(recipe, photos, size, wanted, holdout=default)
-    return OpenedReconstruction(start=start, scene=chosen.scene, seen=chosen.seen)
+    return start, chosen
 
 
 def refuse_other_photos(record: Record, scene: Scene, photos: str) -> None:
@@ -110,20 +96,18 @@ def _sample(record: Record, scene: Scene) -> Sample:
 
 def refine_reconstruction(
     start: Reconstruction,
-    scene: Scene,
+    chosen: ChosenScene,
     seconds: float,
-    *,
-    count: int | None = None,
-    inputs_only: bool = False,
-    seen: Sequence[int] = (),
+    count: int | None,
+    inputs_only: bool,
     console: Console,
 ) -> Reconstruction:
-    """Refine the Gaussians of `start` on photos of `scene`, at the size of these photos.
+    """Refine the Gaussians of `start` on photos of the chosen scene, at the size of these photos.
 
     seconds, count: see `refine`. inputs_only: optimise on the input photos alone; otherwise on all
-    photos that are neither compared with nor held out of training. seen: frames that the model was
-    trained on.
+    photos that are neither compared with nor held out of training.
     """
+    scene = chosen.scene
     frames, targets = _chosen_frames(scene, start, inputs_only)
     every = views_in(start.world, scene, (*frames, *targets)).to(start.gaussians.means.device)
     photos = every.select(slice(len(frames)))
@@ -133,7 +117,6 @@ def refine_reconstruction(
         photos,
         seconds,
         count=count,
-        compared=compared if targets else None,
         renderer=start.model.renderer,
         console=console,
     )
@@ -152,13 +135,11 @@ def refine_reconstruction(
         "frames": frames,
         "photos": [scene.frame_name(frame) for frame in frames],
         "stopped_by": refined.stopped_by,
-        "curve": [asdict(point) for point in refined.curve],
     }
     found = reconstruct_sample(
-        start.model, sample, start.world, seen, refined.gaussians, start.tuning, record
+        start.model, sample, start.world, chosen.seen, refined.gaussians, start.tuning, record
     )
-    remarks = [found.worse_than_nearest, _worse_than_before(start, found)]
-    return replace(found, remarks=[remark for remark in remarks if remark])
+    return replace(found, remarks=list(filter(None, [found.worse_than_nearest])))
 
 
 def _chosen_frames(
@@ -186,24 +167,3 @@ def _tell(start: Reconstruction, refined: RefinedScene, photos: Views, console: 
         highlight=False,
         soft_wrap=True,
     )
-
-
-def _worse_than_before(start: Reconstruction, found: Reconstruction) -> str:
-    """Return a remark where the prediction is nearer to the compared photos than its refinement."""
-    # PSNR falls with resolution, so photos of another --size are not compared.
-    if start.rendering.rgb.shape != found.rendering.rgb.shape:
-        return ""
-    before = _novel_psnr(start)
-    after = _novel_psnr(found)
-    if before is None or after is None or not Psnr.column.beats(before, after):
-        return ""
-    shown = Psnr.column.shown
-    return (
-        f"the prediction is better on the compared photos, {shown(before)} against "
-        f"{shown(after)} dB: refine for longer (--seconds), or keep the prediction"
-    )
-
-
-def _novel_psnr(result: Reconstruction) -> float | None:
-    novel = [score.psnr for score in result.scores if score.kind != "input"]
-    return sum(novel) / len(novel) if novel else None

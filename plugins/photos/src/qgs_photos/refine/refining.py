@@ -6,7 +6,6 @@ steps, which are short, cannot repair.
 """
 
 import math
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -17,7 +16,6 @@ from torch import Tensor, nn
 
 from qgs.containers import concatenated, map_tensors, named_tensors
 from qgs.losses.photometric import mean_squared_error
-from qgs.metrics.images import psnr
 from qgs.renderers import AutoRenderer
 from qgs.similarity import mean_ssim
 from qgs.train.distributed import StopRequest, stop_requests
@@ -55,32 +53,19 @@ _STEPS_BETWEEN_GROWTHS = 40
 _LEVELS = ((4, 0.2), (2, 0.5), (1, 1.0))
 # No level is smaller, in pixels: SSIM and the sweep need some.
 _LEAST_SIDE = 64
-# Points of the curve.
-_POINTS = 12
 # Part of the budget from which on a degree of harmonics is used.
 _DEGREES_FROM = (0.1, 0.35, 0.6)
 
 
 @dataclass(frozen=True)
-class CurvePoint:
-    """State of a refinement. psnr: dB, mean over the `compared` photos."""
-
-    seconds: float
-    step: int
-    gaussians: int
-    psnr: float
-
-
-@dataclass(frozen=True)
 class RefinedScene:
-    """Refined Gaussians (1, G). curve: from the start on; empty without photos to compare with.
+    """Refined Gaussians (1, G).
 
-    seconds: of optimisation, without evaluations. cameras: (1, V) of the photos, corrected where
-    that was wanted. stopped_by: the signal that ended it early.
+    seconds: of optimisation. cameras: (1, V) of the photos, corrected where that was wanted.
+    stopped_by: the signal that ended it early.
     """
 
     gaussians: Gaussians
-    curve: Sequence[CurvePoint]
     steps: int
     seconds: float
     cameras: Cameras
@@ -110,7 +95,6 @@ def refine(
     *,
     count: int | None = None,
     swept: float = 0.5,
-    compared: Views | None = None,
     renderer: nn.Module | None = None,
     console: Console | None = None,
     extras: Extras = NO_EXTRAS,
@@ -120,11 +104,10 @@ def refine(
     seconds: of optimisation, counted after the first step, in which kernels compile. count:
     Gaussians at the end, by default as many as given; they grow in the first part of the time.
     The optimisation starts from the most opaque of the given Gaussians and, as the part `swept` of
-    all, from others at pixels, where the photos agree on a depth. compared: photos (1, W) for the
-    curve, never optimised on, whose cameras stay. renderer: `qgs/auto` by default. console: where
-    progress is shown; nowhere by default. extras: what else is optimised. The first Ctrl-C finishes
-    the step and returns the result so far. Works in any world: its size is measured by the distance
-    of the Gaussians from the cameras.
+    all, from others at pixels, where the photos agree on a depth. renderer: `qgs/auto` by default.
+    console: where progress is shown; nowhere by default. extras: what else is optimised. The first
+    Ctrl-C finishes the step and returns the result so far. Works in any world: its size is measured
+    by the distance of the Gaussians from the cameras.
 
     Raises ValueError for more than one scene, no photo, no time, and Gaussians that are not finite.
     """
@@ -135,10 +118,9 @@ def refine(
     progress = TrainingProgress(console or Console(quiet=True))
     with progress, stopping as stop, torch.enable_grad():
         run = _Run(gaussians, views, seconds, wanted, renderer, swept, extras)
-        curve = list(run.curve(compared, progress, stop))
+        run.until_spent(progress, stop)
         return RefinedScene(
             gaussians=map_tensors(Tensor.detach, run.free.gaussians()),
-            curve=curve,
             steps=run.step,
             seconds=run.spent,
             cameras=run.adjustments.every_camera(views.cameras),
@@ -181,8 +163,6 @@ class _Run:
         began = perf_counter()
         self.renderer = renderer
         self.wanted = wanted
-        # the curve begins with what was given, before pixels replaced half of it
-        self.given = gaussians
         self.seconds = seconds
         self.generator = torch.Generator().manual_seed(0)
         side = min(views.cameras.size)
@@ -211,19 +191,9 @@ class _Run:
         self.spent = min(perf_counter() - began, seconds / 2)
         self.order: list[int] = []
 
-    def curve(
-        self, compared: Views | None, progress: TrainingProgress, stop: StopRequest
-    ) -> Iterator[CurvePoint]:
-        """Optimise until the time is used or a stop is requested; yield points of the curve."""
-        if compared is not None:
-            quality = mean_psnr(self.given, compared, self.renderer)
-            yield CurvePoint(0.0, 0, self.given.count, quality)
-        between = self.seconds / _POINTS
-        due = between
+    def until_spent(self, progress: TrainingProgress, stop: StopRequest) -> None:
+        """Optimise until the time is used or a stop is requested."""
         while self.spent < self.seconds and not stop:
-            if compared is not None and self.spent >= due:
-                due = (self.spent // between + 1) * between
-                yield self._point(compared)
             began = perf_counter()
             loss, quality = self.optimise()
             # the first step compiles kernels
@@ -234,12 +204,6 @@ class _Run:
         # a budget of a few steps ends before growth is due
         if not stop and self.free.count < self.wanted:
             self.free.grow(self.wanted, self.generator)
-        if compared is not None:
-            yield self._point(compared)
-
-    def _point(self, compared: Views) -> CurvePoint:
-        quality = mean_psnr(self.free.gaussians(), compared, self.renderer)
-        return CurvePoint(self.spent, self.step, self.free.count, quality)
 
     def optimise(self) -> tuple[float, float]:
         """Take one step on one photo, then grow if due; return the loss and PSNR before it."""
@@ -325,13 +289,6 @@ def resized(views: Views, part: int) -> Views:
     intrinsics = views.cameras.intrinsics * views.cameras.intrinsics.new_tensor(factors * 2)
     cameras = Cameras(views.cameras.c2w, intrinsics, size)
     return replace(views, images=images, cameras=cameras, masks=masks)
-
-
-@torch.no_grad()
-def mean_psnr(gaussians: Gaussians, views: Views, renderer: nn.Module) -> float:
-    """Return the mean PSNR in dB of renderings against `views` (1, V)."""
-    rgb: Tensor = renderer(replace(gaussians, features=None), views.cameras).rgb
-    return float(psnr(rgb[0], views.images[0]).mean())
 
 
 def _refuse_unusable(gaussians: Gaussians, views: Views, seconds: float, count: int) -> None:

@@ -1,7 +1,7 @@
 """`qgs scene`: from photos to the files of the best scene in a given time."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
@@ -13,11 +13,11 @@ from qgs.data.samples import views_in
 from qgs.renderers import AutoRenderer
 from qgs.types import Gaussians, Views
 from qgs_photos.printing import say
-from qgs_photos.refine.initial import TIMED, chosen_initialisation, photos_start
+from qgs_photos.refine.initial import chosen_initialisation, photos_start
 from qgs_photos.refine.options import NONE, Options
 from qgs_photos.refine.refining import refine, seconds_of_step
 from qgs_photos.refine.result import Result, page_writer, write_scene
-from qgs_photos.refine.scene_photos import ScenePhotos, StepTime, affordable
+from qgs_photos.refine.scene_photos import TIMED, ScenePhotos, affordable
 from qgs_photos.refine.sweeping import swept
 
 END, PART_OF_END = 4.0, 0.03
@@ -28,51 +28,35 @@ SWEEP = 0.12
 """Part of the time in which pixels get a depth."""
 
 
-@dataclass(frozen=True)
-class Deadline:
-    """When `qgs scene` must end. began: on the clock of `perf_counter`. seconds: for everything.
-
-    optimising: seconds of the optimisation, where these are given instead.
-    """
-
-    began: float
-    seconds: float
-    optimising: float | None
-
-    def left(self) -> float:
-        """Return the seconds that are left for the optimisation."""
-        if self.optimising is not None:
-            return self.optimising
-        spent = perf_counter() - self.began
-        rest = self.seconds - spent - END - PART_OF_END * self.seconds
-        return max(rest, _LEAST_PART * self.seconds)
-
-
 def make_scene(
     path: str, out: Path, options: Options, began: float, seconds: float, console: Console
 ) -> None:
-    """Choose, optimise, judge and write. began, seconds: see `Deadline`."""
+    """Choose, optimise, judge and write.
+
+    began: on the clock of `perf_counter`. seconds: for everything from then on.
+    """
     # its remark comes first, before minutes of bars
     page = page_writer(console)
-    deadline = Deadline(began=began, seconds=seconds, optimising=options.seconds)
+    ends = began + seconds - END - PART_OF_END * seconds
+
+    def left() -> float:
+        """Return the seconds that are left for the optimisation, or were given for it."""
+        return options.seconds or max(ends - perf_counter(), _LEAST_PART * seconds)
+
     photos = ScenePhotos(path, options)
-    start = chosen_initialisation(photos, options, deadline.left(), console)
+    start = chosen_initialisation(photos, options)
     background = backdrop(photos.small, photos.frames)
     renderer = AutoRenderer(AutoRenderer.Config(background=background))
     small = views_in(start.world, photos.small, photos.frames).to(options.device)
     few, seconds_of_pixel = timed_sweep(small)
     # on this machine, with these options: exposure and harmonics cost time too
-    time = StepTime(
-        seconds=seconds_of_step(few, small, renderer, options.extras),
-        size=small.cameras.size,
-        gaussians=few.count,
-    )
-    size, count = affordable(time, photos, deadline.left(), options)
+    step = seconds_of_step(few, small, renderer, options.extras)
+    size, count = affordable(step, small.cameras.size, photos, left(), options)
     scene = photos.at(size)
     every = views_in(start.world, scene, (*photos.frames, *photos.held_out)).to(options.device)
     if options.masks:
         every = masked(every, background)
-    budget = deadline.left()
+    budget = left()
     # what was chosen is printed before the optimisation: an interrupted one can be repeated
     chosen = replace(options, model=start.model, size=size, gaussians=count, seconds=budget)
     if start.model != NONE:
@@ -82,15 +66,13 @@ def make_scene(
     say(console, command)
     gaussians = start.gaussians
     if gaussians is None:
-        sweeping = perf_counter()
         most = int(SWEEP * budget / seconds_of_pixel)
         gaussians = photos_start(photos.small, start.world, small, count, most)
-        budget = max(budget - (perf_counter() - sweeping), _LEAST_PART * budget)
     views = every.select(slice(len(photos.frames)))
     refined = refine(
         gaussians,
         views,
-        budget,
+        left(),
         count=count,
         # a model's Gaussians leave holes that pixels fill; the others are at pixels already
         swept=0.0 if start.gaussians is None else 0.5,

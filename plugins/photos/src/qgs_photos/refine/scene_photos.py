@@ -1,8 +1,6 @@
 """The photos of `qgs scene`: which are held out, and how large they may be in a given time."""
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
 
 from qgs.contracts import Frames, Scene
 from qgs.data.frames import held_out_frames
@@ -11,6 +9,8 @@ from qgs.machine import available_bytes
 from qgs.reconstruction.scenes import Size, installed_sources, named_scene
 from qgs_photos.refine.options import NONE, Options
 
+TIMED = 2048
+"""Pixels whose depth is found at least, and Gaussians with which a step is timed."""
 SIZES = range(96, 2161, 16)
 """Shorter sides that are considered, pixels."""
 # 1,600 steps on 320 x 320 pixels gave less, at any size, than 2,000 on 128 x 128 did in a fifth of
@@ -79,42 +79,26 @@ def sized(scene: Scene, side: int) -> Size:
     return height, width
 
 
-@dataclass(frozen=True)
-class StepTime:
-    """Seconds of a step on a photo of `size` (H, W) with `gaussians` of them."""
-
-    seconds: float
-    size: Size
-    gaussians: int
-
-    def at(self, size: Size, gaussians: int) -> float:
-        """Return the seconds of a step with others, in the mean over an optimisation."""
-        pixels = (math.prod(size) / math.prod(self.size)) ** _OF_PIXELS
-        return _COARSE * self.seconds * pixels * (gaussians / self.gaussians) ** _OF_GAUSSIANS
-
-
 def affordable(
-    time: StepTime, photos: ScenePhotos, seconds: float, options: Options
+    step: float, timed: Size, photos: ScenePhotos, seconds: float, options: Options
 ) -> tuple[Size, int]:
     """Return photo size and number of Gaussians for which `seconds` and the memory are enough.
 
-    What the options set stays. The smallest size is taken where nothing is enough.
+    step: seconds of one with TIMED Gaussians on a photo of the size `timed` (H, W). What the
+    options set stays. The smallest size is taken where nothing is enough.
     """
     steps = max(LEAST_STEPS, STEPS_OF_PHOTO * len(photos.frames))
     available = available_bytes()
     best: tuple[Size, int] | None = None
-    for size in _sizes(photos.small, options.size):
-        count = options.gaussians or min(round(DENSITY * math.prod(size)), MOST_GAUSSIANS)
-        memory = 3 * math.prod(size) * len(photos.frames) * _BYTES
+    for size in [options.size] if options.size else [sized(photos.small, side) for side in SIZES]:
+        pixels = math.prod(size)
+        count = options.gaussians or min(round(DENSITY * pixels), MOST_GAUSSIANS)
+        slower = (pixels / math.prod(timed)) ** _OF_PIXELS * (count / TIMED) ** _OF_GAUSSIANS
+        memory = 3 * pixels * len(photos.frames) * _BYTES
         # sizes ascend: the first that takes too long ends the search
-        if best is not None and (steps * time.at(size, count) > seconds or memory > available):
+        too_slow = steps * _COARSE * step * slower > seconds
+        if best is not None and (too_slow or memory > available):
             break
         best = size, count
     assert best is not None
     return best
-
-
-def _sizes(scene: Scene, wanted: Size | None) -> Iterator[Size]:
-    """Yield the wanted size, else those of SIZES up to the stored one, ascending."""
-    own = dict.fromkeys(sized(scene, side) for side in SIZES)
-    yield from own if wanted is None else (wanted,)
