@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -35,14 +35,8 @@ WORDS = {
     "fov": "their field of view is {} degrees wide",
 }
 """What is measured of a sample, lengths in the model's units."""
-REMEDIES = {
-    "scale": ("another scale of the world", {"baseline", "depth", "fov"}),
-    "frames": ("other input views", {"baseline", "turn", "depth"}),
-    "inputs": ("another number of them", {"views"}),
-}
-"""What may bring views into the trained range, by option, and which of WORDS it helps.
-
-The scale comes first: it costs nothing and moves baseline and depth together."""
+REMEDY = "try another scale of the world, other input views, or train on views like these"
+"""What may bring views into the trained range."""
 
 
 @dataclass
@@ -106,36 +100,22 @@ class Domain:
         return phrases
 
 
-def verdict(trained: Domain, found: Domain, fixed: Collection[str] = ()) -> str:
+def verdict(trained: Domain, found: Domain) -> str:
     """Return a sentence that compares views with the training's, and what may help.
 
-    trained: empty if unknown. fixed: as in `remedies`.
+    trained: empty if unknown.
     """
     if not trained.values:
         return "the checkpoint does not record the views on which this model was trained"
     if outside := trained.differences(found):
         return (
             f"the views lie outside what this model was trained on: {', '.join(outside.values())}. "
-            f"Expect a worse result than inside: {remedies(outside, fixed)}"
+            f"Expect a worse result than inside: {REMEDY}"
         )
     return (
         "the cameras lie within what this model was trained on, in distance, direction, depth and "
         "field of view; what they show may still be new to it"
     )
-
-
-def remedies(outside: Collection[str], fixed: Collection[str] = ()) -> str:
-    """Return what to try where views leave the trained range in `outside`, of WORDS.
-
-    fixed: options of REMEDIES that cannot help, such as a scale that was searched.
-    """
-    tries = [
-        f"{what} ({option})"
-        for option, (what, helped) in REMEDIES.items()
-        if helped & {*outside} and option not in fixed
-    ]
-    last = "train on views like these"
-    return f"try {', then '.join(tries)}, or {last}" if tries else last
 
 
 def value_range_problem(images: Tensor) -> str:

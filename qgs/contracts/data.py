@@ -63,10 +63,6 @@ class Scene(ABC):
         """(H, W) of the photo before it is delivered; None where images are made to measure."""
         return None
 
-    def zoom(self, frame: int) -> float:
-        """Factor by which a photo is enlarged past its crop, to hide what its lens did not see."""
-        return 1.0
-
     def depths(self, frames: Sequence[int]) -> Tensor | None:
         """Camera-frame z (len(frames), 1, H, W), world units, 0 where unknown; None without."""
         return None

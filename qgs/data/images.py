@@ -13,7 +13,6 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 from upath import UPath
 
-from qgs.contracts import Scene
 from qgs.machine import is_out_of_memory, with_unit
 from qgs.paths import LARGEST, open_file
 from qgs.wording import name_shown
@@ -71,24 +70,6 @@ class CropResize:
     ) -> np.ndarray:
         """Return `image`, of the source's size, as (H, W, 3) uint8; (H, W) for one channel."""
         return np.array(image.resize((self.target[1], self.target[0]), kernel, box=self.box))
-
-
-def framing(scene: Scene, frame: int) -> str:
-    """Return a sentence on crop and scale of a photo; "" for one that is delivered as stored."""
-    stored = scene.stored_size(frame)
-    size = scene.cameras.size
-    zoom = scene.zoom(frame)
-    if stored is None or (stored == size and zoom == 1):
-        return ""
-    left, top, right, bottom = CropResize(stored, size, zoom).box
-    cut = 1 - (right - left) * (bottom - top) / (stored[0] * stored[1])
-    part = "all"
-    if cut >= 0.01:
-        part = f"the middle {right - left:.0f} x {bottom - top:.0f} ({cut:.0%} is cut off)"
-    return (
-        f"the model sees {part} of photos such as frame {scene.label(frame)}, "
-        f"{stored[1]} x {stored[0]} pixels, at {size[1]} x {size[0]}"
-    )
 
 
 def read_image(path: Path | UPath, decode: Callable[[IO[bytes]], Decoded]) -> Decoded:

@@ -10,7 +10,7 @@ import torch
 
 from qgs.contracts import Column, Metric, MetricInput, ViewSampler
 from qgs.data.samples import Sample
-from qgs.domain import Domain, remedies, verdict
+from qgs.domain import REMEDY, Domain, verdict
 from qgs.evaluate.plan import EvaluationPlan, SceneFailure, ViewsOf
 from qgs.evaluate.protocol import index_of, protocol_of
 from qgs.evaluate.results import TUNING, Evaluation, SceneScore
@@ -90,15 +90,12 @@ def _remarks(
 ) -> list[str]:
     """Return sentences on how far the model can be expected to do well, and on how it did."""
     remarks: list[str] = []
-    fixed = ["scale"] if recipe.views.scale == "search" else []
     if model.trained_on is not None:
-        remarks.append(verdict(model.trained_on, seen, fixed))
-    if plan.framing:
-        remarks.append(plan.framing)
+        remarks.append(verdict(model.trained_on, seen))
     # Where a model sees what it is judged on, a copy of it is perfect.
     if evaluation.columns and not any(score.given for score in evaluation.scores):
         own = recipe.tree["data"] == (model.recipe or {}).get("data")
-        remedy = "train for longer" if own else remedies(("baseline", "depth"), fixed)
+        remedy = "train for longer" if own else REMEDY
         name, column = next(iter(evaluation.columns.items()))
         nearest = evaluation.mean(name, "nearest_input")
         if worse := worse_than_nearest(column, evaluation.mean(name), nearest, remedy):

@@ -10,7 +10,6 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewSampler, ViewsConfig
 from qgs.contracts.schedule import END
 from qgs.data.frames import evenly, gap_range, moments, spread
-from qgs.data.images import framing
 from qgs.data.samples import Frames, Sample, make_sample
 from qgs.data.view_samplers import Span
 from qgs.paths import opened_path, read_json
@@ -90,8 +89,7 @@ class EvaluationPlan:
     frames of the span, or of one time. Targets of T times are T samples. views_of: makes the
     settings of a sample, such as its scale. depths: targets have true depth where scenes do.
 
-    wanted: names of the scenes. framing: of the first photo, once `samples` has run. Raises
-    ValueError without scenes.
+    wanted: names of the scenes. Raises ValueError without scenes.
     """
 
     source: SceneSource
@@ -103,7 +101,6 @@ class EvaluationPlan:
     depths: bool = False
 
     def __post_init__(self) -> None:
-        self.framing: str | None = None
         self._scenes = self.source.scenes("test")
         if not len(self._scenes):
             raise ValueError(f"the data source {type(self.source).name!r} has no test scenes")
@@ -124,8 +121,6 @@ class EvaluationPlan:
                 # a generator for each scene: a failing one changes no noise of the others
                 noise = np.random.default_rng([self.evaluation.seed, place])
                 for inputs, targets in self._choices(scene, place):
-                    if self.framing is None:
-                        self.framing = framing(scene, inputs[0])
                     views = self.views
                     if self.views_of:
                         views = self.views_of(scene, inputs, targets)

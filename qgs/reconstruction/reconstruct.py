@@ -8,7 +8,6 @@ from torch import Tensor
 
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.frames import evenly, moments, spread
-from qgs.data.images import framing
 from qgs.data.inputs import NOVEL, Frusta, Window, choose_windows
 from qgs.data.samples import Sample, make_sample, own_world
 from qgs.domain import Domain, verdict
@@ -181,9 +180,8 @@ def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
     found.see(sample.inputs.cameras, sample.targets.cameras)
     remarks = (
         choice(sample, scene),
-        verdict(result.model.trained_on or Domain(), found, ["scale"] if result.scale else []),
+        verdict(result.model.trained_on or Domain(), found),
         result.scale.poor if result.scale else "",
-        framing(scene, sample.input_frames[0]),
         result.worse_than_nearest,
     )
     return [*filter(None, remarks)]

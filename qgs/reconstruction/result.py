@@ -11,7 +11,7 @@ from torch import Tensor
 
 from qgs.containers import concatenated
 from qgs.data.samples import Sample
-from qgs.domain import remedies
+from qgs.domain import REMEDY
 from qgs.geometry.poses import relative_to, scaled
 from qgs.geometry.transforms import moved
 from qgs.metrics.baselines import BASELINES, worse_than_nearest
@@ -63,11 +63,7 @@ class Reconstruction:
             return ""
         model = sum(score.psnr for score in compared) / len(compared)
         nearest = sum(score.baselines["nearest_input"] for score in compared) / len(compared)
-        if self.refinement:
-            remedy = "refine for longer, or on more photos"
-        else:
-            tries = remedies(("baseline", "depth"), ["scale"] if self.scale else [])
-            remedy = f"{tries}; `qgs refine` fits the result to its photos"
+        remedy = f"{REMEDY}; `qgs refine` fits the result to its photos, or longer to more of them"
         return worse_than_nearest(Psnr.column, model, nearest, remedy)
 
     @property

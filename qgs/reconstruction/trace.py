@@ -24,13 +24,12 @@ ATTENTIONS = ("cross_attention", "self_attention")
 
 @dataclass
 class LayerTrace:
-    """A layer's Q queries: states (B, Q, ...), attention, and why one is `absent`."""
+    """A layer's Q queries: states (B, Q, ...) and attention."""
 
     before: QueryState
     after: QueryState | None = None
     cross_attention: AttentionWeights | None = None
     self_attention: AttentionWeights | None = None
-    absent: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -102,20 +101,14 @@ class _Recorder:
             found = _checked(self._queries, range(state.features.shape[1]), "queries")
             self.trace.queries = torch.tensor(found, dtype=torch.long)
         if self.current in self._layers:
-            lacking = [part for part in ATTENTIONS if not hasattr(module, part)]
-            absent = {part: f"{type(module).__name__} has no slot `{part}`" for part in lacking}
-            self.trace.layers[self.current] = LayerTrace(self._chosen(state), absent=absent)
+            self.trace.layers[self.current] = LayerTrace(self._chosen(state))
 
     @torch.no_grad()
     def explain(self, part: str, module: Any, args: tuple[Any, ...]) -> None:
         """Keep the weights of an attention that begins."""
-        if self.current not in self._layers:
-            return
-        layer = self.trace.layers[self.current]
-        weights = module.explain(*args, self.trace.queries.to(args[0].features.device))
-        setattr(layer, part, weights)
-        if weights is None:
-            layer.absent[part] = f"{type(module).__name__}.explain returned None"
+        if self.current in self._layers:
+            weights = module.explain(*args, self.trace.queries.to(args[0].features.device))
+            setattr(self.trace.layers[self.current], part, weights)
 
     def leave(self, module: nn.Module, args: Any, state: QueryState) -> None:
         """Keep the queries of a layer, which ends with its refinement."""

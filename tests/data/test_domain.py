@@ -100,16 +100,6 @@ def test_the_sentence():
     assert "checkpoint does not record" in verdict(Domain(), within)
 
 
-def test_what_helps_is_named_and_the_scale_comes_first():
-    """A baseline that is too wide, and a field of view that is."""
-    for half, focal, options in ((0.9, 8.0, ["scale", "frames"]), (0.1, 4.0, ["scale"])):
-        trained = domain(around(1, (-0.1, 0.1)))
-        found = domain(around(1, (-half, half), focal))
-        assert re.findall(r"\((scale|frames|inputs)\)", verdict(trained, found)) == options
-        left = re.findall(r"\((scale|frames|inputs)\)", verdict(trained, found, ["scale"]))
-        assert left == options[1:]
-
-
 GROWING = "view_sampler.max_gap={schedule: linear, values: [4, 20], at: [0, 10]}"
 
 

@@ -25,7 +25,6 @@ def test_chosen_layers_and_queries_are_recorded_of_a_pass_that_predicts_the_same
     torch.testing.assert_close(read.sum(-1), torch.ones(1, 2, 2))
     assert last.self_attention.weights.shape == (1, 2, 2, 12)
     assert last.cross_attention.geometry is None
-    assert not last.absent
 
 
 def test_hooks_go_away_even_on_errors(model, views):

@@ -141,10 +141,6 @@ class PhotoScene(EncodedScene):
         """See `Scene`."""
         return _stored_size(self._frames[frame])
 
-    def zoom(self, frame: int) -> float:
-        """See `Scene`."""
-        return self._crop(self._frames[frame], self.stored_size(frame)).zoom
-
     def encoded(self, frame: int) -> EncodedFrame:
         """See `EncodedScene`."""
         photo = self._frames[frame]

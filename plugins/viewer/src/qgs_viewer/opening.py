@@ -13,7 +13,7 @@ from torch import Tensor
 from qgs.checkpoint.gaussians import load_ply
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.contracts import Scene, ViewsConfig
-from qgs.data.images import decode_rgb, framing, read_image, to_tensor
+from qgs.data.images import decode_rgb, read_image, to_tensor
 from qgs.data.recognition import is_training_data
 from qgs.data.samples import make_sample, own_world, views_in
 from qgs.domain import Domain, verdict
@@ -145,9 +145,8 @@ def open_model(
     notes = [
         summary(scales) if scales else "",
         choice(sample, shown, compares=False) if photos else "",
-        verdict(trained, seen, ["scale"] if scales else []),
+        verdict(trained, seen),
         *(scale.poor for scale in scales),
-        framing(shown, sample.input_frames[0]),
     ]
     # inputs that are chosen later keep the scale
     views = search(shown, sample.input_frames, sample.target_frames)
