@@ -40,36 +40,29 @@ class CommandGroup(TyperGroup):
 
 
 def offered_command(name: str, offers: list[EntryPoint]) -> Any:
-    """Import the command `name` of a distribution; one that cannot be used says why."""
-    releases = listed(
-        sorted({f"{entry.dist.name} {entry.dist.version}" for entry in offers if entry.dist})
-    )
-    named = f"the command `qgs {name}` of {releases}"
-    if len(offers) > 1:
-        return _unusable(name, f"{named} is offered several times; uninstall all but one")
-    entry = offers[0]
+    """Import the command `name` of a distribution; one that cannot be used says why when called."""
     try:
-        app = entry.load()
-        assert isinstance(app, typer.Typer), f"it is a {type(app)}, not a typer.Typer"
+        (entry,) = offers
+        offered = entry.load()
+        assert isinstance(offered, typer.Typer), f"it is a {type(offered)}, not a typer.Typer"
     # Importing runs the distribution's code.
     except (Exception, SystemExit) as error:
-        reason = f"cannot be used: `{entry.value}`: {type(error).__name__}: {error}"
-        return _unusable(name, f"{named} {reason}; update {releases}")
+        releases = [f"{entry.dist.name} {entry.dist.version}" for entry in offers if entry.dist]
+        reason = (
+            f"the command `qgs {name}` of {listed(sorted(releases))} cannot be used: "
+            f"{type(error).__name__}: {error}; update it, or uninstall all of these but one"
+        )
+
+        def refuse() -> None:
+            raise ValueError(reason)
+
+        anything = {"ignore_unknown_options": True, "allow_extra_args": True}
+        return TyperCommand(name, help=reason, callback=refuse, context_settings=anything)
     # What it would install completes no command of qgs.
-    app._add_completion = False
-    command = typer.main.get_command(app)
+    offered._add_completion = False
+    command = typer.main.get_command(offered)
     command.name = name
     return command
-
-
-def _unusable(name: str, reason: str) -> TyperCommand:
-    """Return a command that raises ValueError; its help is the reason."""
-
-    def refuse() -> None:
-        raise ValueError(reason)
-
-    anything = {"ignore_unknown_options": True, "allow_extra_args": True}
-    return TyperCommand(name, help=reason, callback=refuse, context_settings=anything)
 
 
 app = typer.Typer(

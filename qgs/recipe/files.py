@@ -14,7 +14,6 @@ from qgs.recipe.yaml_text import (
     KeyPath,
     ListNode,
     MapNode,
-    Node,
     from_plain,
     items_of,
     load_mapping,
@@ -163,22 +162,12 @@ def apply_overrides(tree: MapNode, overrides: Sequence[str], problems: Problems)
 
 def _read_override(text: str, origin: Origin, problems: Problems) -> MapNode:
     name, equals, value = text.partition("=")
-    name = name.strip()
-    path = tuple(name.split("."))
-    reason = f"an override cannot set `{name}`"
+    path = tuple(name.strip().split("."))
     if not equals or not all(path) or len(path) > MAX_DEPTH:
-        reason = f"{text!r:.100} is no override"
         fix = "write `path.to.option=value`, such as `model.queries.count=128`"
-    elif path[0] == "extends":
-        fix = "write a recipe that extends both, or set single options"
-    # Patterns have dots as well, so that the path would end nobody knows where.
-    elif path[0] == "swap" and len(path) > 1:
-        fix = "set the option itself, or give all swaps as `swap={PATTERN: {type: NAME}}`"
-    else:
-        node: Node = load_text(value, origin.file, problems, 0, path)
-        for key in reversed(path):
-            node = MapNode(origin, [(key, node, origin)])
-        assert isinstance(node, MapNode)
-        return node
-    problems.add(origin, name, reason, fix)
-    return MapNode(origin)
+        problems.add(origin, path, f"{text!r:.100} is no override", fix)
+        return MapNode(origin)
+    node: Any = load_text(value, origin.file, problems, 0, path)
+    for key in reversed(path):
+        node = MapNode(origin, [(key, node, origin)])
+    return node

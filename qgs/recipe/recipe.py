@@ -11,7 +11,6 @@ import torch
 from torch import nn
 
 from qgs import contracts
-from qgs.contracts.schedule import Schedule
 from qgs.machine import refuse_more_than_memory
 from qgs.model import QueryGaussianModel
 from qgs.recipe.build import build, build_model, load_pretrained, rate_factors
@@ -21,7 +20,7 @@ from qgs.recipe.draft import draft_of
 from qgs.recipe.errors import Problems
 from qgs.recipe.files import apply_overrides, read_recipe
 from qgs.recipe.flow import idle_fields, unfinished
-from qgs.recipe.spell_out import flat, provenance, spell_out
+from qgs.recipe.spell_out import flat, leaves, spell_out
 from qgs.recipe.yaml_text import KeyPath, inline
 
 
@@ -60,11 +59,6 @@ class Recipe:
         training = self.training
         late = unfinished(self.parts, training.steps, training.seconds)
         return [*idle_fields(self.parts), *late]
-
-    @property
-    def schedules(self) -> dict[KeyPath, Mapping[str, Schedule]]:
-        """Scheduled options by place."""
-        return {path: part.schedules for path, part in self.parts.items() if part.schedules}
 
     def build_model(
         self, device: torch.device | str | None = None, pretrained: bool = True
@@ -155,7 +149,7 @@ def resolve(
     return Recipe(
         # A plain mapping: a checkpoint stores it, and nobody changes the draft through it.
         tree=json.loads(json.dumps(spelled)),
-        provenance=provenance(spelled),
+        provenance={path: str(at.origins[key]) for path, at, key in leaves(spelled)},
         parts=parts,
         dims=draft.dims,
         layer_scale=settings["model", "decoder"].layer_scale,

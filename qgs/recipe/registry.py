@@ -121,10 +121,8 @@ def load_usable_plugins() -> tuple[Registry, list[str]]:
     """The components of every installed plugin that can be used, and why the others cannot."""
     plugins = {"qgs": builtin()}
     broken = []
-    available = available_plugins()
-    for release in map(_release, available.pop("qgs", [])):
-        broken.append(f"{release} offers a plugin `qgs`, the framework's name; uninstall {release}")
-    for name in sorted(available):
+    # A plug-in of the framework's own name hides nothing.
+    for name in sorted(available_plugins().keys() - {"qgs"}):
         try:
             plugins[name] = load_plugin(name)
         except PluginError as error:

@@ -1,6 +1,6 @@
 """A recipe with every default written out, each value with where it comes from."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from qgs.recipe.decode import Chosen
@@ -81,10 +81,11 @@ def _spelled(values: Mapping[str, Any], written: MapNode, default: Origin) -> Ma
     """`values`, with `default` as the origin of those that are not written."""
     spelled = MapNode(written.origin)
     for name, value in values.items():
-        inner = written.get(name)
-        if isinstance(value, dict) and isinstance(inner, MapNode):
-            value = _spelled(value, inner, default)
-        spelled.put(name, value, written.origins.get(name, default))
+        origin = written.origins.get(name, default)
+        if isinstance(value, dict):
+            known = isinstance(written.get(name), MapNode)
+            value = _spelled(value, written.child(name), default if known else origin)
+        spelled.put(name, value, origin)
     return spelled
 
 
@@ -102,24 +103,16 @@ def _put_plugins(whole: MapNode, draft: Draft, used: set[str]) -> None:
     whole.put("plugins", kept, origin)
 
 
-def provenance(tree: MapNode, path: KeyPath = ()) -> dict[str, str]:
-    """Dotted path of each value to where it comes from."""
-    found: dict[str, str] = {}
-    for key, value in tree.items():
-        if isinstance(value, MapNode) and value:
-            found |= provenance(value, (*path, key))
-        else:
-            found |= dict.fromkeys(flat({key: value}, path), str(tree.origins[key]))
-    return found
-
-
-def flat(tree: Mapping[str, Any], path: KeyPath = ()) -> dict[str, Any]:
-    """Dotted path to value, mappings opened."""
-    values: dict[str, Any] = {}
+def leaves(tree: Mapping[str, Any], path: KeyPath = ()) -> Iterator[tuple[str, Any, str]]:
+    """Dotted path of each value, mappings opened; the mapping that holds it, and its key there."""
     for key, value in tree.items():
         below = (*path, key)
         if isinstance(value, Mapping) and value:
-            values |= flat(value, below)
+            yield from leaves(value, below)
         else:
-            values[".".join(below)] = value
-    return values
+            yield ".".join(below), tree, key
+
+
+def flat(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Dotted path to value, mappings opened."""
+    return {path: holder[key] for path, holder, key in leaves(tree)}
