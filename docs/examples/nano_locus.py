@@ -20,11 +20,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-WIDTH, HEADS, PATCH = 128, 4, 8  # published: 1024, 16, 8
-ENCODER_DEPTH, DECODER_DEPTH, QUERIES, PER_QUERY = 1, 4, 256, 8  # published: 3, 12, 1024, 64
-SCALE_CAP = 0.15  # largest standard deviation of a Gaussian, world units
+WIDTH = 128  # published: 1024
+HEADS = 4  # 16
+PATCH = 8
+ENCODER_DEPTH = 1  # 3
+DECODER_DEPTH = 4  # 12
+QUERIES = 256  # 1024
+PER_QUERY = 8  # Gaussians; 64
 LAYER_WEIGHTS = {2: 1 / 3, 4: 2 / 3}  # decoder layers that the loss sees, and how much
-OPACITY_BIAS, NEAR, FAR, BACKGROUND = -1.0, 0.025, 125.0, 0.5
+NEAR = 0.025  # world units
 Gaussians = dict[str, Tensor]
 
 
@@ -32,25 +36,28 @@ Gaussians = dict[str, Tensor]
 class Weights(dict[str, Tensor]):
     """Parameters by name. One that is missing is made where it is first used."""
 
-    def need(self, name: str, shape: tuple[int, ...], low: float, high: float) -> Tensor:
-        if name not in self:  # uniform from low to high
-            self[name] = torch.empty(shape).uniform_(low, high).requires_grad_()
+    def need(self, name: str, *shape: int, start: float | Tensor | None = None) -> Tensor:
+        if name not in self:
+            bound = math.prod(shape[1:]) ** -0.5  # of a uniform start: by the number of inputs
+            made = torch.empty(shape).uniform_(-bound, bound) if start is None else start
+            self[name] = (torch.zeros(shape) + made).requires_grad_()
         return self[name]
+
+    def pair(self, name: str, *shape: int) -> tuple[Tensor, Tensor]:
+        weight = self.need(f"{name}.weight", *shape, start=None if shape[1:] else 1.0)
+        return weight, self.need(f"{name}.bias", shape[0], start=0.0)
 
 
 def linear(p: Weights, name: str, x: Tensor, outputs: int) -> Tensor:
-    bound = x.shape[-1] ** -0.5
-    weight = p.need(f"{name}.weight", (outputs, x.shape[-1]), -bound, bound)
-    return F.linear(x, weight, p.need(f"{name}.bias", (outputs,), 0, 0))
+    return F.linear(x, *p.pair(name, outputs, x.shape[-1]))
 
 
 def norm(p: Weights, name: str, x: Tensor) -> Tensor:
-    weight = p.need(f"{name}.weight", x.shape[-1:], 1, 1)
-    return F.layer_norm(x, x.shape[-1:], weight, p.need(f"{name}.bias", x.shape[-1:], 0, 0))
+    return F.layer_norm(x, x.shape[-1:], *p.pair(name, x.shape[-1]))
 
 
 def scaled(p: Weights, name: str, update: Tensor) -> Tensor:  # LayerScale
-    return p.need(f"{name}.gamma", update.shape[-1:], 0.3, 0.3) * update
+    return p.need(f"{name}.gamma", WIDTH, start=0.3) * update
 
 
 def mlp(p: Weights, name: str, x: Tensor, hidden: int, outputs: int) -> Tensor:
@@ -76,19 +83,17 @@ def self_attention(p: Weights, name: str, x: Tensor) -> Tensor:
 def plucker_map(c2w: Tensor, intrinsics: Tensor, height: int, width: int) -> Tensor:
     """Moment o x d and unit direction d of the ray through each pixel: (B, V, 6, H, W)."""
     v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    fx, fy, cx, cy = (intrinsics[..., i, None, None] for i in range(4))
-    x, y = (u - cx) / fx, (v - cy) / fy
-    in_camera = F.normalize(torch.stack([x, y, torch.ones_like(x)], -1), dim=-1)
+    fx, fy, cx, cy = intrinsics[..., None, None].unbind(-3)
+    x = (u - cx) / fx
+    in_camera = F.normalize(torch.stack([x, (v - cy) / fy, torch.ones_like(x)], -1), dim=-1)
     d = in_camera @ c2w[..., None, :3, :3].transpose(-1, -2)
     o = c2w[..., None, None, :3, 3].expand_as(d)
     return torch.cat([torch.linalg.cross(o, d, dim=-1), d], -1).movedim(-1, -3)
 
 
 def patches(p: Weights, name: str, images: Tensor) -> Tensor:  # (B*V, C, H, W) -> (B*V, M/V, D)
-    shape = (WIDTH, images.shape[1], PATCH, PATCH)
-    bound = math.prod(shape[1:]) ** -0.5
-    kernel = p.need(f"{name}.proj.weight", shape, -bound, bound)
-    x = F.conv2d(images, kernel, p.need(f"{name}.proj.bias", (WIDTH,), 0, 0), stride=PATCH)
+    kernel = p.pair(f"{name}.proj", WIDTH, images.shape[1], PATCH, PATCH)
+    x = F.conv2d(images, *kernel, stride=PATCH)
     return norm(p, f"{name}.norm", x.flatten(2).transpose(1, 2))
 
 
@@ -111,7 +116,7 @@ def encode(p: Weights, images: Tensor, c2w: Tensor, intrinsics: Tensor) -> Seque
 
 # ---- Decoder layer: qgs/tokengs/decoder.py, qgs_locus/{fields,ray_bias,*_attention}.py ----
 def support_radius(rho: Tensor) -> Tensor:
-    # At r = 0 all Gaussians of an anchor would lie on one point and their offsets get no gradient.
+    # At 0 all Gaussians of an anchor would be one point, and their offsets get no gradient.
     return F.softplus(rho).clamp_min(1e-3)
 
 
@@ -130,7 +135,7 @@ def ray_bias(mu: Tensor, rho: Tensor, rays: Tensor) -> Tensor:
 def cross_attention(p: Weights, name: str, x: Tensor, b: Tensor, k: Tensor, v: Tensor) -> Tensor:
     """softmax(q k / sqrt(d) + gamma b) v, with one gamma for each layer."""
     q = split(linear(p, f"{name}.core.q_proj", norm(p, f"{name}.core.norm", x), WIDTH))
-    bias = F.softplus(p.need(f"{name}.raw_gamma", (), 0.54, 0.54)) * b[:, None]
+    bias = F.softplus(p.need(f"{name}.raw_gamma", start=0.54)) * b[:, None]
     read = attend(norm(p, f"{name}.core.q_norm", q), k, v, bias)
     return linear(p, f"{name}.core.out_proj", read, WIDTH)
 
@@ -158,25 +163,23 @@ def decode(p: Weights, x: Tensor, mu: Tensor, rho: Tensor) -> Gaussians:
     offset, rgb, scale, quat, opacity = raw.split(sizes, -1)
     parts = {
         "means": mu[:, :, None] + support_radius(rho)[:, :, None] * posact(offset),
-        "scales": (scale.clamp(-10, 10) - 1).exp().clamp_max(1) * SCALE_CAP,  # starts below the cap
+        "scales": (scale.clamp(-10, 10) - 1).exp().clamp_max(1) * 0.15,  # at most 0.15, world units
         "quats": F.normalize(quat, dim=-1, eps=1e-4),
-        "opacities": torch.sigmoid(opacity[..., 0] + OPACITY_BIAS),
+        "opacities": torch.sigmoid(opacity[..., 0] - 1),
         "colors": (torch.tanh(rgb) + 1) / 2,
     }
     return {name: part.flatten(1, 2) for name, part in parts.items()}
 
 
-def forward(p: Weights, images: Tensor, c2w: Tensor, intrinsics: Tensor) -> dict[int, Gaussians]:
-    """After each layer (1 is the first): anchors "mu" (B, N, 3), "rho" (B, N, 1), Gaussians."""
-    k, v, rays = encode(p, images, c2w, intrinsics)
-    features = p.need("queries.features", (QUERIES, WIDTH), -0.5, 0.5)
-    if "queries.center" not in p:  # in the first camera's frustum, uniform in log depth
-        z = 0.3 * (2.5 / 0.3) ** torch.rand(QUERIES, 1)
-        p["queries.center"] = torch.cat([(2 * torch.rand(QUERIES, 2) - 1) * 0.6 * z, z], -1)
-        p["queries.center"].requires_grad_()
-    raw = p.need("queries.raw_radius", (QUERIES, 1), -1.05, -1.05)  # softplus: 0.3
-    x, mu, rho = (y.expand(len(images), -1, -1) for y in (features, p["queries.center"], raw))
-    layers = {}
+def forward(p: Weights, *views: Tensor) -> list[tuple[Tensor, Gaussians]]:
+    """views: images, c2w, intrinsics. After each layer: centres (B, N, 3) and Gaussians."""
+    k, v, rays = encode(p, *views)
+    features = p.need("queries.features", QUERIES, WIDTH)
+    box = torch.rand(QUERIES, 3) + torch.tensor([-0.5, -0.5, 0.5])  # before the first camera
+    center = p.need("queries.center", QUERIES, 3, start=box)
+    raw = p.need("queries.raw_radius", QUERIES, 1, start=-1.05)  # softplus: 0.3
+    x, mu, rho = (y.expand(len(k), -1, -1) for y in (features, center, raw))
+    layers = []
     for i in range(DECODER_DEPTH):
         layer = f"decoder.{i}"
         b = ray_bias(mu, rho, rays)
@@ -188,51 +191,52 @@ def forward(p: Weights, images: Tensor, c2w: Tensor, intrinsics: Tensor) -> dict
         x = x + scaled(p, f"{layer}.feed_forward_scale", update)
         mu = mu + posact(mlp(p, "refinements.0.center_mlp", x, WIDTH, 3))  # one for all layers
         rho = rho + mlp(p, "refinements.0.radius_mlp", x, WIDTH, 1)
-        layers[i + 1] = {"mu": mu, "rho": rho, **decode(p, x, mu, rho)}
+        layers.append((mu, decode(p, x, mu, rho)))
     return layers
 
 
 # ---- Renderer: qgs/renderers/reference.py, qgs/geometry/transforms.py ----
 def rotation(quats: Tensor) -> Tensor:  # (..., 4) w x y z -> (..., 3, 3)
-    w, v = quats[..., :1, None], quats[..., None, 1:].expand(*quats.shape[:-1], 3, 3)
+    v = quats[..., None, 1:].expand(*quats.shape[:-1], 3, 3)
     cross = torch.linalg.cross(v, torch.eye(3).expand_as(v), dim=-1).mT  # cross @ y is v x y
-    return torch.eye(3) + 2 * (w * cross + cross @ cross)
+    return torch.eye(3) + 2 * (quats[..., :1, None] * cross + cross @ cross)
 
 
-def render(g: Gaussians, b: int, c2w: Tensor, intrinsics: Tensor, size: tuple[int, ...]) -> Tensor:
-    """RGB (3, H, W) of the Gaussians of scene b from one camera: EWA splatting, front to back."""
-    (fx, fy, cx, cy), (height, width) = intrinsics, size
+def render(g: Gaussians, c2w: Tensor, intrinsics: Tensor, size: tuple[int, ...]) -> Tensor:
+    """RGB (3, H, W) of a scene's Gaussians from one camera: EWA splatting, front to back."""
+    fx, fy, cx, cy = intrinsics
+    height, width = size
     turn = c2w[:3, :3].T  # from the world's axes to the camera's
-    in_camera = (g["means"][b] - c2w[:3, 3]) @ turn.T
-    seen = ((in_camera[:, 2] >= NEAR) & (in_camera[:, 2] <= FAR)).nonzero()[:, 0]
+    in_camera = (g["means"] - c2w[:3, 3]) @ turn.T
+    seen = ((in_camera[:, 2] >= NEAR) & (in_camera[:, 2] <= 125)).nonzero()[:, 0]
     i = seen[in_camera[seen, 2].argsort(stable=True)]  # front to back
+    g = {name: part[i] for name, part in g.items()}
     x, y, z = in_camera[i].unbind(-1)
-    u, v = fx * x / z + cx, fy * y / z + cy
     # The Jacobian of the projection grows without bound outside the image: slopes stop 15 % out.
     slope_x = (x / z).clamp((-0.15 * width - cx) / fx, (1.15 * width - cx) / fx)
     slope_y = (y / z).clamp((-0.15 * height - cy) / fy, (1.15 * height - cy) / fy)
     rows = [fx / z, 0 * z, -fx / z * slope_x, 0 * z, fy / z, -fy / z * slope_y]
-    spread = torch.stack(rows, -1).unflatten(-1, (2, 3)) @ turn @ rotation(g["quats"][b, i])
-    spread = spread * g["scales"][b, i, None]
+    spread = torch.stack(rows, -1).unflatten(-1, (2, 3)) @ turn @ rotation(g["quats"])
+    spread = spread * g["scales"][:, None]
     inverse = (spread @ spread.mT + 0.3 * torch.eye(2)).inverse()  # low-pass of 3DGS, pixel^2
-    du = (torch.arange(width) + 0.5 - u[:, None])[:, None]  # (G, 1, W)
-    dv = (torch.arange(height) + 0.5 - v[:, None])[..., None]  # (G, H, 1)
-    xx, xy, yy = (inverse[:, r, c, None, None] for r, c in ((0, 0), (0, 1), (1, 1)))
+    du = (torch.arange(width) + 0.5 - (fx * x / z + cx)[:, None])[:, None]  # (G, 1, W)
+    dv = (torch.arange(height) + 0.5 - (fy * y / z + cy)[:, None])[..., None]  # (G, H, 1)
+    xx, xy, _, yy = inverse.flatten(1)[..., None, None].unbind(1)
     power = -0.5 * (xx * du * du + yy * dv * dv) - xy * du * dv
-    alpha = g["opacities"][b, i, None, None] * power.clamp_max(0).exp()
+    alpha = g["opacities"][:, None, None] * power.clamp_max(0).exp()
     alpha = torch.where(alpha >= 1 / 255, alpha.clamp_max(0.999), 0.0)  # steps of 8 bits
     after = torch.cumprod(1 - alpha, 0)
     before = torch.cat([torch.ones_like(after[:1]), after])[:-1]
     weight = torch.where(after > 1e-4, alpha * before, 0.0)  # 3DGS stops before 1e-4 is reached
-    rgb = torch.einsum("gc,ghw->chw", g["colors"][b, i], weight)
-    return rgb + BACKGROUND * (1 - weight.sum(0))
+    rgb = torch.einsum("gc,ghw->chw", g["colors"], weight)
+    return rgb + 0.5 * (1 - weight.sum(0))  # over grey
 
 
 # ---- Losses: qgs/losses, qgs_locus/visibility.py ----
 def ssim(x: Tensor, y: Tensor) -> Tensor:
     """Mean structural similarity of (X, 3, H, W), Gaussian windows of 11 pixels, zero padding."""
-    line = torch.exp(-(torch.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
-    window = torch.outer(line / line.sum(), line / line.sum()).expand(15, 1, 11, 11)
+    line = torch.softmax(-(torch.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2), 0)
+    window = torch.outer(line, line).expand(15, 1, 11, 11)
     moments = torch.cat([x, y, x * x, y * y, x * y], 1)
     mx, my, xx, yy, xy = F.conv2d(moments, window, padding=5, groups=15).chunk(5, 1)
     alike = (2 * mx * my + 0.01**2) * (2 * (xy - mx * my) + 0.03**2)
@@ -253,42 +257,49 @@ def out_of_view(points: Tensor, c2w: Tensor, intrinsics: Tensor, size: tuple[int
 def loss(p: Weights, inputs: Sequence[Tensor], targets: Sequence[Tensor]) -> Tensor:
     """inputs and targets: images (B, V, 3, H, W), c2w, intrinsics."""
     truth, c2w, intrinsics = targets
-    size, total, y = tuple(truth.shape[-2:]), torch.zeros(()), truth.flatten(0, 1)
-    views = [(b, v) for b in range(truth.shape[0]) for v in range(truth.shape[1])]
+    size = tuple(truth.shape[-2:])
     layers = forward(p, *inputs)
+    total = torch.zeros(())
     for number, weight in LAYER_WEIGHTS.items():
-        g = layers[number]
-        rgb = torch.stack([render(g, b, c2w[b, v], intrinsics[b, v], size) for b, v in views])
+        mu, gaussians = layers[number - 1]
+        images = []
+        for b, scene in enumerate(c2w):
+            g = {name: part[b] for name, part in gaussians.items()}
+            images += [render(g, pose, intrinsics[b, v], size) for v, pose in enumerate(scene)]
+        rgb = torch.stack(images)
+        y = truth.flatten(0, 1)
         term = F.mse_loss(rgb, y) + 0.2 * (1 - ssim(rgb, y)) / 2
-        for name, factor in (("means", 0.1), ("mu", 0.01)):
-            term = term + factor * out_of_view(g[name], c2w, intrinsics, size)
+        for points, factor in ((gaussians["means"], 0.1), (mu, 0.01)):
+            term = term + factor * out_of_view(points, c2w, intrinsics, size)
         total = total + weight * term
     return total
 
 
 # ---- Data and the loop: qgs/data/samples.py, qgs/train/training.py ----
-def blobs(views: int, size: int = 32) -> tuple[Tensor, Tensor, Tensor]:
+def blobs(views: int, size: int = 32) -> list[Tensor]:
     """A scene of 40 random blobs from cameras side by side; the first is the world's frame."""
-    g = {"means": torch.rand(1, 40, 3) * 1.6 + torch.tensor([-0.8, -0.8, 1])}
-    g |= {"scales": torch.rand(1, 40, 3) * 0.15 + 0.03, "opacities": torch.ones(1, 40)}
-    g |= {"quats": F.normalize(torch.randn(1, 40, 4), dim=-1), "colors": torch.rand(1, 40, 3)}
-    c2w = torch.eye(4).repeat(1, views, 1, 1)
-    c2w[0, 1:, :2, 3] = torch.rand(views - 1, 2) * 0.6 - 0.3
-    intrinsics = torch.tensor([size, size, size / 2, size / 2]).float().expand(1, views, 4)
-    images = [render(g, 0, c2w[0, v], intrinsics[0, v], (size, size)) for v in range(views)]
-    return torch.stack(images)[None], c2w, intrinsics
+    g = {
+        "means": torch.rand(40, 3) * 1.6 + torch.tensor([-0.8, -0.8, 1]),
+        "scales": torch.rand(40, 3) * 0.15 + 0.03,
+        "quats": F.normalize(torch.randn(40, 4), dim=-1),
+        "opacities": torch.ones(40),
+        "colors": torch.rand(40, 3),
+    }
+    c2w = torch.eye(4).repeat(views, 1, 1)
+    c2w[1:, :2, 3] = torch.rand(views - 1, 2) * 0.6 - 0.3
+    intrinsics = torch.tensor([size, size, size / 2, size / 2]).expand(views, 4)
+    images = [render(g, camera, intrinsics[0], (size, size)) for camera in c2w]
+    return [x[None] for x in (torch.stack(images), c2w, intrinsics)]
 
 
 def main(steps: int) -> None:
     torch.manual_seed(0)
-    p, optimizer = Weights(), None
+    p = Weights()
+    forward(p, *blobs(views=2))  # makes all weights
+    optimizer = torch.optim.AdamW(p.values(), lr=1e-3, betas=(0.9, 0.95))
     for step in range(steps):
         scene = blobs(views=4)
         value = loss(p, [x[:, :2] for x in scene], [x[:, 2:] for x in scene])
-        if optimizer is None:  # now all weights exist; biases, norms and LayerScale do not decay
-            groups = [{"params": [x for x in p.values() if x.ndim != 1], "weight_decay": 0.05}]
-            groups += [{"params": [x for x in p.values() if x.ndim == 1], "weight_decay": 0.0}]
-            optimizer = torch.optim.AdamW(groups, lr=1e-3, betas=(0.9, 0.95))
         optimizer.zero_grad()
         value.backward()
         torch.nn.utils.clip_grad_norm_(p.values(), 1.0)
@@ -297,4 +308,4 @@ def main(steps: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if sys.argv[1:] else 500)
+    main(int(sys.argv[1]))

@@ -1,6 +1,6 @@
 """Train a model without the framework's engine, and save a scene that it reconstructs.
 
-    python docs/examples/train_by_hand.py recipes/tiny/locus.yaml --steps 200 --out scene.ply
+    python docs/examples/train_by_hand.py recipes/tiny/locus.yaml 200 scene.ply
 
 The recipe gives the model, the data with its sampler of views, and the losses; the loop is plain
 PyTorch, to copy and change. It ignores the recipe's optimiser, its schedules and its section
@@ -8,7 +8,7 @@ PyTorch, to copy and change. It ignores the recipe's optimiser, its schedules an
 several processes, mixed precision, evaluation, and a watch for steps that are not finite.
 """
 
-import argparse
+import sys
 from itertools import islice
 from pathlib import Path
 
@@ -39,11 +39,9 @@ def loss_of(model: qgs.QueryGaussianModel, losses: dict[str, Loss], batch: Batch
 def train(recipe: Recipe, steps: int) -> qgs.QueryGaussianModel:
     """`steps` of AdamW at a constant rate after a short warm-up."""
     torch.manual_seed(recipe.seed)
-    model, losses = recipe.build_model().train(), recipe.build_losses()
-    decayed = [p for p in model.parameters() if p.ndim != 1]  # neither biases nor norms
-    others = [p for p in model.parameters() if p.ndim == 1]
-    groups = [{"params": decayed, "weight_decay": 0.05}, {"params": others, "weight_decay": 0.0}]
-    optimizer = torch.optim.AdamW(groups, lr=1e-3, betas=(0.9, 0.95))
+    model = recipe.build_model().train()
+    losses = recipe.build_losses()
+    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-3, betas=(0.9, 0.95))
     warmup = torch.optim.lr_scheduler.LinearLR(optimizer, 0.01, total_iters=20)
     # Batches are endless; batch k depends on the seed and k alone.
     batches = training_batches(
@@ -69,20 +67,15 @@ def train(recipe: Recipe, steps: int) -> qgs.QueryGaussianModel:
 
 def main() -> None:
     """Train, reconstruct the first test scene, write its Gaussians and the model's checkpoint."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("recipe", nargs="?", default="recipes/tiny/locus.yaml")
-    parser.add_argument("--steps", type=int, default=200)
-    parser.add_argument("--out", type=Path, default=Path("scene.ply"))
-    options = parser.parse_args()
-    recipe = resolve(options.recipe)
-    model = train(recipe, options.steps)
+    name, steps, out = sys.argv[1:]
+    recipe = resolve(name)
+    model = train(recipe, int(steps))
     scene = recipe.build_data().scenes("test")[0]
     frames = list(range(recipe.views.inputs))
     photos = qgs.Views(scene.images(frames)[None], scene.cameras[frames][None])
     result = qgs.reconstruct(model, photos)  # normalises the poses as in training
-    qgs.save_ply(result.in_photos_world, options.out)
-    qgs.save(model, options.out.with_suffix(".safetensors"))
-    print(f"{result.in_photos_world.count} Gaussians in {options.out}")
+    qgs.save_ply(result.in_photos_world, out)
+    qgs.save(model, Path(out).with_suffix(".safetensors"))
 
 
 if __name__ == "__main__":

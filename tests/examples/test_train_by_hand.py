@@ -17,7 +17,7 @@ def test_it_is_short_trains_and_saves_a_scene(tmp_path, monkeypatch, capsys):
     out = tmp_path / "scene.ply"
     smaller = ["model.queries.count=64", "data.image_size=[32, 32]"]
     recipe.write_text(annotated(resolve("tiny/locus.yaml", smaller)))
-    command = [EXAMPLE, recipe, "--steps", "11", "--out", out]
+    command = [EXAMPLE, recipe, 11, out]
     monkeypatch.setattr("sys.argv", [str(argument) for argument in command])
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     first, last = re.findall(r"loss (\S+)", capsys.readouterr().out)
