@@ -7,7 +7,7 @@ from qgs.geometry.poses import look_at
 from qgs.types import Cameras
 
 
-def circle(angles: torch.Tensor, radius: float) -> torch.Tensor:
+def circle(angles, radius):
     """Poses (V, 4, 4) on a circle about the origin that look at it, at 0 along z."""
     eyes = radius * torch.stack([angles.sin(), 0 * angles, -angles.cos()], -1)
     return look_at(eyes, -eyes, torch.tensor([0.0, 1, 0]).to(eyes).expand_as(eyes))

@@ -2,7 +2,6 @@
 
 import ast
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import size
@@ -24,15 +23,15 @@ comments that say why at least. They only get stricter: a change that adds remov
 MACHINE_PATH = re.compile(r"(?<![\w.$}])/(?:home|root|work|Users|opt|mnt|tmp)/\w")
 
 
-def files(directories: tuple[str, ...], suffixes: set[str]) -> Iterator[Path]:
+def files(directories, suffixes):
     for directory in directories:
         for path in sorted((ROOT / directory).rglob("*")):
             if path.is_file() and path.suffix in suffixes and "__pycache__" not in path.parts:
                 yield path
 
 
-def test_files_and_functions_are_short() -> None:
-    long: dict[str, int] = {}
+def test_files_and_functions_are_short():
+    long = {}
     for name, text in size.sources().items():
         lines = len(text.splitlines())
         if lines > MAX_FILE_LINES:
@@ -45,7 +44,7 @@ def test_files_and_functions_are_short() -> None:
     assert long == {}, "divide by subject: one a file, one idea a function"
 
 
-def test_sizes_only_fall() -> None:
+def test_sizes_only_fall():
     measured = size.sizes()
     exceeded = {}
     for group, limits in LIMITS.items():
@@ -56,7 +55,7 @@ def test_sizes_only_fall() -> None:
     assert exceeded == {}, "see LIMITS: remove as much as you add, unfold lines, say why"
 
 
-def lines_with(pattern: re.Pattern[str]) -> list[str]:
+def lines_with(pattern):
     """FILE:LINE: TEXT of lines that match, in all texts of the repository."""
     suffixes = {"", ".py", ".md", ".yaml", ".yml", ".toml", ".sh", ".jinja"}
     at_root = [path for path in sorted(ROOT.iterdir()) if path.is_file() and path.name != ".git"]
@@ -69,5 +68,5 @@ def lines_with(pattern: re.Pattern[str]) -> list[str]:
     ]
 
 
-def test_no_path_of_one_machine() -> None:
+def test_no_path_of_one_machine():
     assert lines_with(MACHINE_PATH) == [], "write a relative path, or one below `~`"

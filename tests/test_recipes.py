@@ -5,10 +5,8 @@ And the studies: each composes, at both sizes, from the same changes.
 
 import json
 import re
-from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import jsonschema
 import pytest
@@ -19,8 +17,7 @@ from qgs_research.studies.plan import composed, planned
 from qgs_research.studies.runs import differences
 from qgs_research.studies.study import read_study
 
-import qgs
-from qgs.recipe import Recipe, registry, resolve
+from qgs.recipe import resolve
 
 ROOT = Path(__file__).parents[1]
 RECIPES = ROOT / "recipes"
@@ -77,7 +74,7 @@ EQUALS = {
 """Other models, and the one whose budget they have."""
 
 
-def document(name: str) -> str:
+def document(name):
     return (ROOT / name).read_text(encoding="utf-8")
 
 
@@ -89,59 +86,37 @@ TINY = set(
 SHOWN = dict(re.findall(r"`(ablations/\w+\.yaml)`.* \| ([\d,]+) \|$", PAGE, re.MULTILINE))
 
 
-def once(build: Callable[..., Any], section: str) -> Callable[..., Any]:
-    """`build` for the first of all recipes with an equal section."""
-    made: dict[str, Any] = {}
-
-    def build_once(ours: Recipe, *device: str) -> Any:
-        key = json.dumps([ours.tree[section], device])
-        if key not in made:
-            made[key] = build(ours, *device)
-        return made[key]
-
-    return build_once
-
-
-@pytest.fixture(scope="module", autouse=True)
-def what_recipes_share_is_made_once() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(registry, "load_plugin", cache(registry.load_plugin))
-        patch.setattr(Recipe, "build_model", once(Recipe.build_model, "model"))
-        patch.setattr(Recipe, "build_data", once(Recipe.build_data, "data"))
-        yield
-
-
 @cache
-def recipe(file: str) -> Recipe:
+def recipe(file):
     return resolve(RECIPES / file)
 
 
-def model(file: str) -> qgs.QueryGaussianModel:
+def model(file):
     return recipe(file).build_model("meta")
 
 
-def parameters(file: str) -> int:
+def parameters(file):
     return sum(parameter.numel() for parameter in model(file).parameters())
 
 
-def broken(promises: dict[str, bool]) -> list[str]:
+def broken(promises):
     return [promise for promise, kept in promises.items() if not kept]
 
 
-def changed(file: str, other: str) -> dict[str, tuple[Any, Any]]:
+def changed(file, other):
     """Options of `other` that `file` changes: old value, new value."""
     found = differences(recipe(other), recipe(file))
     return {p: tuple(x and yaml.safe_load(x) for x in both) for p, both in found.items()}
 
 
-def keeps(file: str, other: str, *parts: str) -> dict[str, bool]:
+def keeps(file, other, *parts):
     paths = [path for path in changed(file, other) if path.startswith(parts)]
     return {f"has what {other} has, not another {paths}": paths == []}
 
 
-def alone(file: str) -> dict[str, bool]:
+def alone(file):
     ours = recipe(file)
-    following = [part for part in ours.schedules.values() if ours.training.seconds]
+    following = [part for part in ours.parts.values() if part.schedules and ours.training.seconds]
     losses = ours.build_losses(pretrained=False)
     return {
         "resolves to itself": resolve(json.loads(json.dumps(ours.tree))).tree == ours.tree,
@@ -152,7 +127,7 @@ def alone(file: str) -> dict[str, bool]:
     }
 
 
-def as_published(file: str, wanted: int) -> dict[str, bool]:
+def as_published(file, wanted):
     """The number of parameters, and the structure of ablations without sizes and initial values."""
     golden = ""
     without = 0
@@ -174,7 +149,7 @@ def as_published(file: str, wanted: int) -> dict[str, bool]:
     return kept
 
 
-def structure(node: Any) -> Any:
+def structure(node):
     sizes = ("width", "heads", "count", "depth", "gaussians_per_query", "layers")
     if not isinstance(node, dict):
         return node
@@ -182,7 +157,7 @@ def structure(node: Any) -> Any:
     return {key: structure(node[key]) for key in kept}
 
 
-def beside_its_twin(file: str, twin: str) -> dict[str, bool]:
+def beside_its_twin(file, twin):
     """LocusGS is compared with TokenGS at one budget."""
     sections = ("data", "views", "optimizer", "training", "evaluation", "metrics")
     parts = ("model.width", "model.heads", "model.encoder", "model.renderer")
@@ -197,13 +172,13 @@ def beside_its_twin(file: str, twin: str) -> dict[str, bool]:
     }
 
 
-def beside_its_equal(file: str) -> dict[str, bool]:
+def beside_its_equal(file):
     other = EQUALS[file]
     near = parameters(file) == pytest.approx(parameters(other), rel=0.1)
     return {**keeps(file, other, "data", "views", "training.seconds"), "is as large": near}
 
 
-def beside_its_base(file: str) -> dict[str, bool]:
+def beside_its_base(file):
     """A finetune changes no more than it says, beside the data and how they are seen and judged."""
     run = re.sub("_4096.*", "", file)
     changes = changed(file, f"{run}.yaml").items()

@@ -4,7 +4,6 @@ import json
 import os
 import pickle  # noqa: TID251
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 import torch
@@ -14,7 +13,6 @@ from safetensors.torch import load_file, save_file
 from tables import must_refuse
 
 import qgs
-from qgs.checkpoint import tensors as tensors_module
 from qgs.checkpoint.model_file import (
     CheckpointFile,
     load_weights,
@@ -237,19 +235,3 @@ def test_forged_metadata_is_one_error_with_the_file_and_no_file_is_followed(
         assert told.startswith(str(saved)), entries
         assert "the: secret" not in told
         assert len(told) < 2000
-
-
-def test_errors_of_the_system_are_no_damage(saved, monkeypatch):
-    for error in (PermissionError(13, "no"), OSError(5, "disk"), MemoryError()):
-        monkeypatch.setattr(tensors_module, "safe_open", Mock(side_effect=error))
-        with pytest.raises(type(error)) as raised:
-            CheckpointFile(saved)
-        assert raised.value is error
-
-
-def test_loading_opens_the_file_once(saved, monkeypatch):
-    opened = Mock(wraps=tensors_module.safe_open)
-    monkeypatch.setattr(tensors_module, "safe_open", opened)
-    with CheckpointFile(saved) as file:
-        _ = file.model(), file.recipe, file.tensors, file.step, file.domain, file.extra
-    assert opened.call_count == 1

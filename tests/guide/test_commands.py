@@ -67,14 +67,3 @@ def test_extras_that_are_named_exist():
             known = (PLUGIN if in_plugin else PROJECT)["optional-dependencies"]
             assert {*(word or several).split(",")} <= known.keys(), page
     assert seen >= {"index.md", "plugin.md"}
-
-
-def test_a_plugin_depends_on_qgs_and_on_what_qgs_depends_on():
-    ours, theirs = (
-        {re.match(r"[\w-]+", entry)[0] for entry in sum(extras, project["dependencies"])}
-        for project in (PROJECT, PLUGIN)
-        for extras in [project["optional-dependencies"].values()]
-    )
-    of_ours = {"query-gaussians", "query-gaussians-dev"}
-    assert theirs - of_ours == {"pydantic", "torch", "pytest"} <= ours
-    assert of_ours <= theirs

@@ -110,12 +110,3 @@ def test_what_fails_when_it_is_built_names_its_distribution_but_missing_data(wri
     assert isinstance(caught.value.__cause__, TypeError)
     with pytest.raises(FileNotFoundError, match="photos/"):
         recipe.build_data()
-
-
-def test_a_plugin_in_memory_has_no_distribution():
-    names = {}
-    exec(FAULTY, names)
-    model = {"decoder": {"refinement": {"type": "faulty/silent"}}}
-    recipe = {"recipe": 1, "plugins": ["faulty"], "model": model}
-    problem = refused(recipe, plugins=[names["plugin"]])
-    assert problem.reason.startswith("the plugin `faulty` fails: `fields_written` of")

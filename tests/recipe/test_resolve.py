@@ -10,7 +10,6 @@ from refusals import refused
 
 from qgs.recipe import compose, resolve
 from qgs.recipe.errors import Problems
-from qgs.recipe.recipe import annotated
 from qgs.recipe.yaml_text import dump, inline, load_text
 
 SMALL = yaml.safe_load("""
@@ -68,14 +67,6 @@ def test_what_is_dumped_is_read_back():
     assert load_text(inline(value), "f", Problems()) == value
 
 
-def test_an_annotated_recipe_shows_where_each_line_comes_from(write):
-    recipe = resolve(write("recipe: 1\nmodel:\n  head: {norm: true}\nlosses: {}\n"))
-    shown = [" ".join(line.split()) for line in annotated(recipe).splitlines()]
-    assert "norm: true # recipe.yaml:3" in shown
-    assert "losses: {} # recipe.yaml:4" in shown
-    assert "width: 1024 # default" in shown
-
-
 def test_a_layers_override_lies_over_the_template():
     changes = "{feed_forward: {ratio: 2}, layers: {1: {feed_forward: {ratio: 5}}}}"
     built = compose(SMALL, [f"model.decoder={changes}"])
@@ -111,12 +102,6 @@ def test_mappings_and_files_that_hold_no_recipe(tmp_path):
         assert refused(path).file == str(path)
     with pytest.raises(ValueError, match="this recipe has no data"):
         resolve(SMALL).build_data()
-
-
-def test_a_missing_file_suggests_its_neighbour(write):
-    write("recipe: 1\n", "base.yaml")
-    for recipe in ("bas.yaml", {"recipe": 1, "extends": "bas.yaml"}):
-        assert "`base.yaml`" in refused(recipe).fix
 
 
 def test_tabs_and_what_is_nested_deeper_than_pythons_stack(write):

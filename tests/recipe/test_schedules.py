@@ -9,8 +9,7 @@ import yaml
 from refusals import refused
 
 import qgs
-from qgs.contracts import ComponentConfig
-from qgs.contracts.schedule import at_step, follow, number_kinds
+from qgs.contracts.schedule import follow
 from qgs.recipe import resolve
 from qgs.recipe.recipe import annotated
 from qgs.tokengs import MlpFeedForward
@@ -77,12 +76,3 @@ def test_components_of_layers_follow_too_and_whole_numbers_are_rounded():
     assert configs[0].share == 1
     overrides[1] = options.replace("[1, 4]", "[1, 4.5]")
     assert "valid integer" in refused(TINY, overrides, plugins).reason
-
-
-def test_kinds_of_numbers():
-    assert number_kinds(float | None) == {float}
-    assert number_kinds(int) == {int}
-    assert not number_kinds(bool)
-    assert not number_kinds(tuple[float, ...])
-    config = ComponentConfig()
-    assert at_step(config, {}, 3) == config

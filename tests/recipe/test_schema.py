@@ -54,21 +54,6 @@ def test_the_committed_schema_is_fresh_and_a_schema(schema):
     jsonschema.Draft202012Validator.check_schema(schema)
 
 
-def undescribed(schema, path=()):
-    """Paths of the properties in `schema` that have no description."""
-    if not isinstance(schema, dict | list):
-        return
-    for key, value in schema.items() if isinstance(schema, dict) else enumerate(schema):
-        below = (*path, str(key))
-        if path and path[-1] == "properties" and not value.get("description"):
-            yield ".".join(below)
-        yield from undescribed(value, below)
-
-
-def test_every_key_is_described(schema):
-    assert not list(undescribed(schema))
-
-
 def test_nulls_and_schedules_are_valid_and_mistakes_are_not(schema):
     is_valid = jsonschema.Draft202012Validator(schema).is_valid
     recipes = yaml.safe_load_all(f"{SOUND}---{MISTAKEN}")
