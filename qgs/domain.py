@@ -12,18 +12,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from qgs.geometry.poses import largest_distance, look_at_depth, reference_pose
-from qgs.types import Cameras, Views
-from qgs.wording import warn_once
+from qgs.geometry.poses import look_at_depth
+from qgs.types import Cameras
 
 OUTLIERS = 0.05
 """Share of the values at either end of a range that does not count, such as parallel axes."""
 TOLERANCE = 1.25
 """Views are outside where they leave the trained range by more than this factor."""
-GROSS = 5.0
-"""The first views give a warning where their baseline is this many times that of the training."""
 KEY = "trained_on"
 """Key of `Domain.text` in the extra metadata of a checkpoint."""
 
@@ -116,70 +113,6 @@ def verdict(trained: Domain, found: Domain) -> str:
         "the cameras lie within what this model was trained on, in distance, direction, depth and "
         "field of view; what they show may still be new to it"
     )
-
-
-def value_range_problem(images: Tensor) -> str:
-    """Return an error where `images` (..., H, W) leave [0, 1], else ""; reads each 8th pixel."""
-    # Resampling overshoots [0, 1] a little at edges.
-    low, high = map(float, images[..., ::8, ::8].aminmax())
-    if low >= -0.5 and high <= 1.5:
-        return ""
-    return (
-        f"images have values from {low:.3g} to {high:.3g} and must lie in [0, 1]: divide 8-bit "
-        "values by 255, undo a subtracted mean"
-    )
-
-
-class FirstViews:
-    """Forward pre-hook that warns where the first views in evaluation cannot be as in training.
-
-    settings: `views` of the model's recipe. Later views are not checked: looking at values waits
-    for the device.
-    """
-
-    def __init__(self, settings: Mapping[str, Any] | None, trained: Domain | None) -> None:
-        self.settings = settings
-        self.trained = trained
-        self.pending = True
-
-    def __call__(self, model: nn.Module, args: tuple[Any, ...]) -> None:
-        """Check the first argument if it is Views, but not while a CUDA graph is captured."""
-        if model.training or not self.pending or torch.compiler.is_compiling():
-            return
-        # Before anything can raise: a check that fails once would fail in every pass.
-        self.pending = False
-        views = args[0] if args else None
-        if not isinstance(views, Views) or views.cameras.c2w.is_meta or not views.images.numel():
-            return
-        # A graph cannot wait for the device, which a look at values does.
-        if views.cameras.c2w.is_cuda and torch.cuda.is_current_stream_capturing():
-            return
-        if faults := [*filter(None, self._faults(views))]:
-            warn_once(
-                f"{'; '.join(faults)}. Expect a poor result. `qgs.reconstruct(model, views)` "
-                "brings cameras in any frame and unit to those of the model"
-            )
-
-    def _faults(self, views: Views) -> Iterator[str]:
-        c2w = views.cameras.c2w
-        yield value_range_problem(views.images)
-        if self.settings is not None:
-            frame = self.settings["frame"]
-            place = reference_pose(frame, c2w)
-            # Exact up to the rounding of poses; worlds of other conventions differ by far more.
-            if float((place - torch.eye(4).to(place)).abs().max()) > 0.05:
-                distance = float(place[..., :3, 3].norm(dim=-1).max())
-                yield (
-                    f"the {frame.removesuffix('_cam')} camera is not at the origin of the "
-                    f"model's world, looking along +z, but {distance:.3g} away or turned; cameras "
-                    "are OpenCV camera-to-world (x right, y down, z forward; of OpenGL axes negate "
-                    "columns 1, 2)"
-                )
-        trained = self.trained or Domain()
-        _, reach = trained.ranges.get("baseline", (0.0, math.inf))
-        baseline = float(largest_distance(c2w).max())
-        if baseline > GROSS * reach:
-            yield f"the baseline of the inputs is {baseline:.3g}, in training at most {reach:.3g}"
 
 
 def _measured(inputs: Cameras, targets: Cameras) -> Iterator[tuple[str, Tensor]]:

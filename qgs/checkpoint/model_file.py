@@ -22,7 +22,7 @@ from qgs.checkpoint.tensors import (
     write_tensors,
 )
 from qgs.contracts.schedule import END, follow, steps_followed
-from qgs.domain import KEY, Domain, FirstViews
+from qgs.domain import KEY, Domain
 from qgs.machine import TooLargeError
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, RecipeError
@@ -133,8 +133,6 @@ class CheckpointFile(TensorFile):
         model.trained_on = self.domain
         local = Path(self.name).expanduser().exists()
         model.loaded_from = str(self.path.resolve()) if local else self.name
-        first_views = FirstViews(self.recipe.tree.get("views"), self.domain)
-        model.register_forward_pre_hook(first_views)
         return (model if device is None else model.to(device)).eval()
 
 

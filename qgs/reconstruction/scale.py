@@ -250,8 +250,7 @@ class _Trial:
         for start in range(0, len(new), each):
             part = new[start : start + each]
             factors = self._inputs.images.new_tensor([self.factor(place) for place in part])
-            # Not through its hooks: one warns of views unlike the training's, as are tried here.
-            gaussians = self._model.forward(at_factors(self._inputs, factors)).gaussians
+            gaussians = self._model(at_factors(self._inputs, factors)).gaussians
             columns = []
             for views in (self._inputs, self._further):
                 cameras = at_factors(views, factors).cameras

@@ -13,7 +13,6 @@ from qgs.contracts import Component, Encoder, Scene, SceneSource, SceneSourceCon
 from qgs.data.frames import training_frames
 from qgs.data.recognition import open_for
 from qgs.data.samples import views_in
-from qgs.domain import value_range_problem
 from qgs.recipe import Recipe
 from qgs.recipe.registry import load_usable_plugins
 from qgs.types import Cameras, Views
@@ -198,8 +197,13 @@ class GivenScene(Scene):
                 f"one scene is reconstructed at a time, got {views.images.shape[0]}; of several "
                 "take one, such as map_tensors(lambda x: x[:1], views)"
             )
-        if fault := value_range_problem(views.images):
-            raise ValueError(fault)
+        # Resampling overshoots [0, 1] a little at edges.
+        low, high = map(float, views.images.aminmax())
+        if low < -0.5 or high > 1.5:
+            raise ValueError(
+                f"images have values from {low:.3g} to {high:.3g} and must lie in [0, 1]: divide "
+                "8-bit values by 255, undo a subtracted mean"
+            )
         if views.target_time is not None:
             raise ValueError(
                 "a target_time is the time of compared photos: name those by `compare`"

@@ -107,32 +107,3 @@ def test_photos_are_read_in_their_own_world_and_size(photos):
     assert few.cameras.c2w[0, :, 0, 3].tolist() == [10, 0]
     with pytest.raises(FileNotFoundError):
         qgs.read_photos(photos / "nothing")
-
-
-def test_a_loaded_model_checks_the_first_views_that_it_reconstructs(tmp_path, far, caplog):
-    """One whose training saw baselines of 0.1 to 0.5."""
-    file = tmp_path / "m.safetensors"
-    ranges = '{"samples": 4, "ranges": {"baseline": [0.1, 0.5]}}'
-    qgs.save(qgs.compose(RECIPE), file, extra={"trained_on": ranges})
-    model = qgs.load(file).train()
-    model(far)
-    assert not caplog.text  # in training nothing is looked at
-    model.eval()
-    model(far)
-    model(far)
-    assert caplog.text.count("not at the origin of the model's world") == 1
-    caplog.clear()
-    own = qgs.reconstruct(qgs.load(file), far).sample.inputs
-    qgs.load(file)(own)
-    assert not caplog.text
-    c2w = own.cameras.c2w
-    wide = c2w.clone()
-    wide[..., :3, 3] *= 200
-    for given, words in (
-        (posed(own, c2w * torch.tensor([1.0, -1, -1, 1])), "negate columns 1, 2"),
-        (posed(own, wide), "in training at most 0.5"),
-        (Views(own.images * 255, own.cameras), "images have values from"),
-    ):
-        caplog.clear()
-        qgs.load(file)(given)
-        assert words in caplog.text
