@@ -39,12 +39,6 @@ def test_intrinsics_follow_the_crop_the_copy_and_the_frame(tmp_path):
     assert half.intrinsics[0].tolist() == pytest.approx([50, 55, 15.5, 12.5])
 
 
-def test_held_out_frames(tmp_path):
-    assert read(folder(tmp_path)).held_out == (4,)
-    assert read(tmp_path, holdout=3).held_out == (1, 4, 7)
-    assert read(tmp_path, holdout=0).held_out == ()
-
-
 def test_missing_images_are_counted_and_named(tmp_path, caplog):
     folder(tmp_path)
     (tmp_path / "images/3.png").unlink()

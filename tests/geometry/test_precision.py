@@ -1,8 +1,6 @@
 """What `full_precision` raises, and when it leaves autocast."""
 
-from contextlib import nullcontext
 from typing import NamedTuple
-from unittest.mock import Mock, call
 
 import torch
 from odd_views import odd_views
@@ -76,22 +74,3 @@ def test_a_method_leaves_autocast_for_a_state_and_compiles_without_a_break():
         assert torch.is_autocast_enabled("cpu")
     assert found[0].dtype == torch.float32
     assert_close(found, (expected, expected), rtol=0, atol=0)
-
-
-def test_autocast_is_left_for_the_device_of_the_tensors(monkeypatch):
-    autocast = Mock(return_value=nullcontext())
-    monkeypatch.setattr(torch, "is_autocast_enabled", lambda device: True)
-    monkeypatch.setattr(torch, "autocast", autocast)
-    elsewhere = QueryState(torch.ones(1, 2, 3, device="meta"))
-    here = torch.ones(1)
-    for args, left in (
-        ((elsewhere,), []),
-        (({"a": [here]},), ["cpu"]),
-        ((here, elsewhere), ["cpu"]),
-        ((elsewhere, here), ["cpu"]),
-        ((), ["cuda"]),
-        ((nn.Linear(2, 2), 3), ["cuda"]),
-    ):
-        autocast.reset_mock()
-        same(*args)
-        assert autocast.mock_calls == [call(device_type=device, enabled=False) for device in left]
