@@ -1,6 +1,6 @@
 """`qgs poses`."""
 
-from dataclasses import replace
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -57,16 +57,11 @@ def poses(
     from qgs_photos.poses.making import Options, make_poses
 
     if not source.exists():
-        raise FileNotFoundError(
-            f"{source} (from {Path.cwd()}) does not exist: give photos or a video"
-        )
+        raise FileNotFoundError(f"{source} does not exist: give photos or a video")
     if frames is not None and not source.is_file():
         raise ValueError("--frames is for a video: leave it out")
     console = Console()
-    options = Options(frames=frames, side=side, matching=matching, features=features, seed=seed)
-    # none given: all cores, as `Options` has them
-    if threads:
-        options = replace(options, threads=threads)
+    options = Options(frames, side, matching, features, threads or os.cpu_count() or 1, seed)
     folder = out or beside(source)
     for line in make_poses(source, folder, options, console).summary:
         say(console, line)

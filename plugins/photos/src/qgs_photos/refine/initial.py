@@ -1,6 +1,5 @@
 """Where the optimisation of `qgs scene` begins: a model's Gaussians, or some at the photos."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -29,13 +28,13 @@ ENOUGH = 4
 class Initialisation:
     """A model's Gaussians (1, G), or none for Gaussians at the photos, and their world.
 
-    world: reference pose (4, 4) and scale, as of `own_world`. frames: names of the inputs.
+    world: reference pose (4, 4) and scale, as of `own_world`. frames: names of the inputs, as text.
     """
 
     model: str
     world: tuple[Tensor, Tensor]
     gaussians: Gaussians | None = None
-    frames: Sequence[str] = ()
+    frames: str | None = None
 
 
 def chosen_initialisation(photos: ScenePhotos, options: Options) -> Initialisation:
@@ -58,7 +57,7 @@ def chosen_initialisation(photos: ScenePhotos, options: Options) -> Initialisati
         scene=photos.name,
         overrides=scale_settings(options.scale),
     )
-    inputs = [photos.small.frame_name(frame) for frame in result.sample.input_frames]
+    inputs = ",".join(map(photos.small.frame_name, result.sample.input_frames))
     return Initialisation(name, result.world, result.gaussians, inputs)
 
 

@@ -14,7 +14,7 @@ from qgs.renderers import AutoRenderer
 from qgs.types import Gaussians, Views
 from qgs_photos.printing import say
 from qgs_photos.refine.initial import chosen_initialisation, photos_start
-from qgs_photos.refine.options import NONE, Options
+from qgs_photos.refine.options import Options
 from qgs_photos.refine.refining import refine, seconds_of_step
 from qgs_photos.refine.result import Result, page_writer, write_scene
 from qgs_photos.refine.scene_photos import TIMED, ScenePhotos, affordable
@@ -52,17 +52,21 @@ def make_scene(
     # on this machine, with these options: exposure and harmonics cost time too
     step = seconds_of_step(few, small, renderer, options.extras)
     size, count = affordable(step, small.cameras.size, photos, left(), options)
-    scene = photos.at(size)
-    every = views_in(start.world, scene, (*photos.frames, *photos.held_out)).to(options.device)
-    if options.masks:
-        every = masked(every, background)
+    frames = (*photos.frames, *photos.held_out)
+    every = views_in(start.world, photos.at(size), frames).to(options.device)
+    every = masked(every, background) if options.masks else every
     budget = left()
-    # what was chosen is printed before the optimisation: an interrupted one can be repeated
-    chosen = replace(options, model=start.model, size=size, gaussians=count, seconds=budget)
-    if start.model != NONE:
-        inputs = ",".join(start.frames)
-        chosen = replace(chosen, frames=inputs, scale=float(start.world[1]))
+    chosen = replace(
+        options,
+        model=start.model,
+        frames=start.frames,
+        scale=float(start.world[1]) if start.frames else None,
+        size=size,
+        gaussians=count,
+        seconds=budget,
+    )
     command = chosen.command(path, str(out))
+    # before the optimisation: an interrupted one can be repeated
     say(console, command)
     gaussians = start.gaussians
     if gaussians is None:
@@ -80,15 +84,8 @@ def make_scene(
         console=console,
         extras=options.extras,
     )
-    result = Result(
-        command=command,
-        world=start.world,
-        refined=refined,
-        renderer=renderer,
-        photos=photos,
-        views=views,
-        judged=every.select(slice(len(photos.frames), None)),
-    )
+    judged = every.select(slice(len(photos.frames), None))
+    result = Result(command, start.world, refined, renderer, photos, views, judged)
     write_scene(result, out, page, began, console)
 
 
