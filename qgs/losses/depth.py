@@ -7,6 +7,7 @@ from torch import Tensor
 
 from qgs.contracts import Loss
 from qgs.geometry.precision import full_precision
+from qgs.geometry.transforms import to_camera
 from qgs.types import LayerPrediction, Rendering, Views
 from qgs.wording import warn_once
 
@@ -75,9 +76,9 @@ def surface_errors(
     pixel is constant for the gradient, which moves a point along the view's axis.
     """
     assert views.depths is not None
-    w2c = views.cameras.w2c  # (B, V, 4, 4)
-    local = points[:, None] @ w2c[..., :3, :3].mT + w2c[..., None, :3, 3]  # (B, V, G, 3)
-    z, (height, width) = local[..., 2], views.cameras.size
+    local = to_camera(points, views.cameras)  # (B, V, G, 3)
+    z = local[..., 2]
+    height, width = views.cameras.size
     with torch.no_grad():
         focal, centre = views.cameras.intrinsics[:, :, None].split(2, -1)
         # Points behind are left out below.

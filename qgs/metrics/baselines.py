@@ -11,10 +11,9 @@ from qgs.types import Cameras, Views
 def nearest_input(inputs: Views, targets: Cameras) -> Tensor:
     """For every target camera (B, T) the image of the nearest input view -> (B, T, 3, H, W).
 
-    Nearest by the distance of camera centres over the spread of the input cameras plus the angle
-    between viewing directions, in radians.
+    Nearest by `pose_distance`.
     """
-    index = _distance(inputs.cameras.c2w, targets.c2w).argmin(-1)
+    index = pose_distance(inputs.cameras.c2w, targets.c2w).argmin(-1)
     scene = torch.arange(index.shape[0], device=index.device)[:, None]
     return inputs.images[scene, index]
 
@@ -42,8 +41,11 @@ def worse_than_nearest(
 
 
 @full_precision
-def _distance(inputs: Tensor, targets: Tensor) -> Tensor:
-    """Distances (B, T, V) of poses inputs (B, V, 4, 4) and targets (B, T, 4, 4)."""
+def pose_distance(inputs: Tensor, targets: Tensor) -> Tensor:
+    """Distances (B, T, V) of poses inputs (B, V, 4, 4) and targets (B, T, 4, 4).
+
+    Of camera centres, over the spread of the inputs, plus the angle of the axes in radians.
+    """
     centres = inputs[..., :3, 3]
     seen_from = targets[..., :3, 3]
     # In units of the inputs' spread, so that a distance counts in any world.

@@ -19,6 +19,7 @@ from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.data.samples import Sample, make_sample
 from qgs.domain import TOLERANCE, Domain
 from qgs.geometry.poses import look_at_depth, scaled
+from qgs.metrics.baselines import pose_distance
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.types import Views
@@ -173,19 +174,13 @@ def find_scale(
 def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
     """Return at most FURTHER photos in the middle of the inputs, none held out or compared with.
 
-    The middle has the smallest largest distance from inputs: of centres, over that between inputs,
-    plus the angle between axes. None of scenes that move.
+    The middle has the smallest largest `pose_distance` from inputs. None of scenes that move.
     """
     left = [f for f in range(len(scene)) if f not in {*inputs, *compared, *scene.held_out}]
     if scene.times is not None or not left:
         return ()
     c2w = scene.cameras.c2w.double()
-    own = c2w[list(inputs)]
-    other = c2w[left]
-    apart = torch.cdist(other[:, :3, 3], own[:, :3, 3])
-    extent = float(torch.cdist(own[:, :3, 3], own[:, :3, 3]).max() or apart.max()) or 1.0
-    turn = (other[:, :3, 2] @ own[:, :3, 2].T).clamp(-1, 1).acos()
-    far = (apart / extent + turn).amax(1).tolist()
+    far = pose_distance(c2w[None, list(inputs)], c2w[None, left])[0].amax(1).tolist()
     return tuple(sorted(frame for _, frame in sorted(zip(far, left, strict=True))[:FURTHER]))
 
 

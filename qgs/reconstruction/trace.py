@@ -7,12 +7,12 @@ trace.layers[4].cross_attention.weights         # (B, h, Q, M)
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from qgs.containers import map_tensors
 from qgs.contracts import AttentionWeights
@@ -32,13 +32,54 @@ class LayerTrace:
     self_attention: AttentionWeights | None = None
 
 
-@dataclass
 class Trace:
-    """The last forward pass: indices (Q,), `layers` by number from 1, grid (V, H/P, W/P)."""
+    """The last forward pass: indices (Q,), `layers` by number from 1, grid (V, H/P, W/P).
 
-    queries: Tensor
-    grid: tuple[int, int, int] | None = None
-    layers: dict[int, LayerTrace] = field(default_factory=dict)
+    Filled by hooks; layers run in order, though rounds and refinements share modules.
+    """
+
+    def __init__(self, wanted: Sequence[int], queries: Sequence[int] | None) -> None:
+        self.queries = torch.tensor([], dtype=torch.long)
+        self.grid: tuple[int, int, int] | None = None
+        self.layers: dict[int, LayerTrace] = {}
+        self._wanted = wanted
+        self._wanted_queries = queries
+        # Number of the layer that runs.
+        self._current = 0
+
+    def _start(self, module: nn.Module, args: Any) -> None:
+        """Forget the pass before, when the model begins."""
+        self.layers.clear()
+        self.grid = None
+        self._current = 0
+
+    def _enter(self, module: nn.Module, args: tuple[QueryState, ImageMemory]) -> None:
+        """Note a layer that begins, and the queries that it gets."""
+        state, memory = args
+        self._current += 1
+        self.grid = memory.grid
+        # Some queries are known only now, such as those that a model makes of the photos.
+        if self._current == 1:
+            found = _checked(self._wanted_queries, range(state.features.shape[1]), "queries")
+            self.queries = torch.tensor(found, dtype=torch.long)
+        if self._current in self._wanted:
+            self.layers[self._current] = LayerTrace(self._chosen(state))
+
+    @torch.no_grad()
+    def _explain(self, part: str, module: Any, args: tuple[Any, ...]) -> None:
+        """Keep the weights of an attention that begins."""
+        if self._current in self._wanted:
+            weights = module.explain(*args, self.queries.to(args[0].features.device))
+            setattr(self.layers[self._current], part, weights)
+
+    def _leave(self, module: nn.Module, args: Any, state: QueryState) -> None:
+        """Keep the queries of a layer, which ends with its refinement."""
+        if self._current in self._wanted:
+            self.layers[self._current].after = self._chosen(state)
+
+    def _chosen(self, state: QueryState) -> QueryState:
+        index = self.queries.to(state.features.device)
+        return map_tensors(lambda tensor: tensor.detach()[:, index], state)
 
 
 @contextmanager
@@ -57,67 +98,20 @@ def trace(
     numbers = _checked(layers, range(1, model.depth + 1), "layers")
     if model.queries.count is not None:
         _checked(queries, range(model.queries.count), "queries")
-    recorder = _Recorder(numbers, queries)
-    handles = [model.register_forward_pre_hook(recorder.start)]
+    recorded = Trace(numbers, queries)
+    handles = [model.register_forward_pre_hook(recorded._start)]
     for layer in model.decoder:
-        handles.append(layer.register_forward_pre_hook(recorder.enter))
+        handles.append(layer.register_forward_pre_hook(recorded._enter))
         for part in ATTENTIONS:
             if hasattr(layer, part):
-                hook = partial(recorder.explain, part)
+                hook = partial(recorded._explain, part)
                 handles.append(getattr(layer, part).register_forward_pre_hook(hook))
-    handles += [part.register_forward_hook(recorder.leave) for part in model.refinements]
+    handles += [part.register_forward_hook(recorded._leave) for part in model.refinements]
     try:
-        yield recorder.trace
+        yield recorded
     finally:
         for handle in handles:
             handle.remove()
-
-
-class _Recorder:
-    """Hooks that fill a `Trace`; layers run in order, though rounds and refinements share modules.
-
-    current: number of the layer that runs.
-    """
-
-    def __init__(self, layers: Sequence[int], queries: Sequence[int] | None) -> None:
-        self.trace = Trace(torch.tensor([], dtype=torch.long))
-        self.current = 0
-        self._layers = layers
-        self._queries = queries
-
-    def start(self, module: nn.Module, args: Any) -> None:
-        """Forget the pass before, when the model begins."""
-        self.trace.layers.clear()
-        self.trace.grid = None
-        self.current = 0
-
-    def enter(self, module: nn.Module, args: tuple[QueryState, ImageMemory]) -> None:
-        """Note a layer that begins, and the queries that it gets."""
-        state, memory = args
-        self.current += 1
-        self.trace.grid = memory.grid
-        # Some queries are known only now, such as those that a model makes of the photos.
-        if self.current == 1:
-            found = _checked(self._queries, range(state.features.shape[1]), "queries")
-            self.trace.queries = torch.tensor(found, dtype=torch.long)
-        if self.current in self._layers:
-            self.trace.layers[self.current] = LayerTrace(self._chosen(state))
-
-    @torch.no_grad()
-    def explain(self, part: str, module: Any, args: tuple[Any, ...]) -> None:
-        """Keep the weights of an attention that begins."""
-        if self.current in self._layers:
-            weights = module.explain(*args, self.trace.queries.to(args[0].features.device))
-            setattr(self.trace.layers[self.current], part, weights)
-
-    def leave(self, module: nn.Module, args: Any, state: QueryState) -> None:
-        """Keep the queries of a layer, which ends with its refinement."""
-        if self.current in self._layers:
-            self.trace.layers[self.current].after = self._chosen(state)
-
-    def _chosen(self, state: QueryState) -> QueryState:
-        index = self.trace.queries.to(state.features.device)
-        return map_tensors(lambda tensor: tensor.detach()[:, index], state)
 
 
 def _checked(wanted: Collection[int] | None, existing: range, what: str) -> list[int]:

@@ -59,12 +59,10 @@ def read_listing(folder: UPath, format: str = "auto", images: str | None = None)
     """Read the photos that `folder` lists in `format`, or in the first of `readers` that it holds.
 
     images: another folder of photos, such as images_4. Raises FileNotFoundError for no folder or no
-    listing, ValueError for an unknown format and for a listing that cannot be read.
+    listing, ValueError for a listing that cannot be read.
     """
     known = readers()
     listings = ", ".join(f"{reader.listing} ({name})" for name, reader in known.items())
-    if format not in ("auto", *known):
-        raise ValueError(f"there is no photo format {format!r}: use auto, {', '.join(known)}")
     if not folder.is_dir():
         raise FileNotFoundError(
             f"photo folder {folder} (from {UPath.cwd()}) does not exist or is no folder: give the "

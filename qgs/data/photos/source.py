@@ -1,16 +1,231 @@
 """`qgs/photos`: a folder of photos with their cameras, or a folder of such folders."""
 
-from functools import partial
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import cached_property, partial
+from operator import attrgetter
 from typing import ClassVar
 
+import numpy as np
+import torch
+from PIL import Image
+from pydantic import Field, field_validator
+from torch import Tensor
 from upath import UPath
 
-from qgs.contracts import SceneSourceConfig
-from qgs.data.photos import formats_of
-from qgs.data.photos.scene import PhotoScene, PhotosConfig, image_cache
-from qgs.data.scenes import LazyScenes, LazySource
-from qgs.paths import listing, opened_path
+from qgs.contracts import OptionError, SceneSource, SceneSourceConfig
+from qgs.data.frames import held_out_frames
+from qgs.data.images import (
+    TURN,
+    TURNED,
+    CropResize,
+    decode_alpha,
+    decode_depth,
+    decode_mask,
+    decode_rgb,
+    image_size,
+    orientation,
+    read_image,
+    to_tensor,
+)
+from qgs.data.lenses import Mode, Size, undistorted, whole_zoom
+from qgs.data.photos import formats_of, present_frames, readers
+from qgs.data.photos.checks import size_problems
+from qgs.data.photos.reader import PhotoFrame
+from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, LazySource
+from qgs.paths import is_local, listing, opened_path, read_file
+from qgs.types import Cameras
 from qgs.wording import listed, warn_once
+
+
+class PhotosConfig(SceneSource.Config):
+    """Options of `qgs/photos`."""
+
+    path: str
+    """Folder of one scene, of folders of scenes, or with such folders in train and test: absolute,
+    relative to the working directory, or an fsspec URL. Photos without cameras and videos need
+    `qgs poses` first."""
+    format: str = "auto"
+    """How cameras are listed: nerfstudio, colmap, or a format of a plug-in; auto is the first that
+    a folder holds."""
+    images: str | None = None
+    """Folder of photos to read instead of the listed one, such as images_4."""
+    outside: bool = False
+    """Read photos outside of the folder too, by absolute paths or `..`; links are followed."""
+    holdout: int = Field(default=8, ge=0)
+    """Every n-th frame is kept for evaluation, from frame n // 2 on, or the middle one of fewer; 0
+    for none. A listing's own split goes first."""
+    max_frames: int = Field(default=0, ge=0)
+    """Only the first frames of a listing; 0 for all."""
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """RGB in [0, 1] behind transparent pixels."""
+    depth_unit: float = Field(default=1e-3, gt=0)
+    """World units per number of a depth map; nerfstudio writes millimetres (0.001)."""
+
+    @field_validator("format")
+    @classmethod
+    def _format_is_known(cls, format: str) -> str:
+        known = ("auto", *readers())
+        if format not in known:
+            raise OptionError(f"must be a format of photos, got {format!r}", f"use {listed(known)}")
+        return format
+
+
+def image_cache(limit: int = 512 * 2**20) -> BoundedCache[np.ndarray]:
+    """Return a cache of decoded images, with a limit in bytes."""
+    return BoundedCache(limit, attrgetter("nbytes"))
+
+
+class PhotoScene(EncodedScene):
+    """A listing's photos, in its world and order. cache: shared. Raises as `present_frames`."""
+
+    def __init__(
+        self, name: str, folder: UPath, config: PhotosConfig, cache: BoundedCache[np.ndarray]
+    ) -> None:
+        self.name = name
+        self.folder = folder
+        self._config = config
+        self._cache = cache
+        frames, self.missing = present_frames(folder, config.format, config.images, config.outside)
+        self._frames = frames = frames[: config.max_frames or None]
+        times = [frame.time for frame in frames if frame.time is not None]
+        self.times = torch.tensor(times, dtype=torch.float64) if len({*times}) > 1 else None
+        # What a listing says of its splits goes before the option.
+        if any(frame.split for frame in frames):
+            self.held_out = tuple(i for i, frame in enumerate(frames) if frame.split == "test")
+        else:
+            self.held_out = held_out_frames(len(frames), config.holdout)
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    @cached_property
+    def cameras(self) -> Cameras:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """See `Scene`; float64. Raises ValueError where a photo and its listed size disagree.
+
+        The header of one photo stands for those of its folder that are listed with the same size.
+        """
+        sizes: dict[object, Size] = {}
+        intrinsics: list[Tensor] = []
+        for frame in self._frames:
+            alike = (frame.path.parent, frame.size) if frame.size else frame.path
+            if alike not in sizes:
+                sizes[alike] = _stored_size(frame)
+            stored = torch.tensor(frame.at_size(sizes[alike]), dtype=torch.float64)
+            intrinsics.append(self._crop(frame, sizes[alike]).intrinsics(stored))
+        c2w = torch.from_numpy(np.stack([frame.c2w for frame in self._frames]))
+        return Cameras(c2w, torch.stack(intrinsics), self._config.image_size)
+
+    def images(self, frames: Sequence[int]) -> Tensor:
+        """See `Scene`. Raises ValueError for a file that cannot be decoded."""
+        return to_tensor(self._stacked(self._image, frames))
+
+    def masks(self, frames: Sequence[int]) -> Tensor | None:
+        """See `Scene`; 1 everywhere for a photo without a mask in a scene that has some."""
+        if all(frame.mask is None for frame in self._frames):
+            return None
+        masks = self._stacked(self._mask, frames)
+        return torch.from_numpy(masks)[:, None].float().div_(255)
+
+    def depths(self, frames: Sequence[int]) -> Tensor | None:
+        """See `Scene`; 0 in frames without a map. None where none of `frames` has one."""
+        if all(self._frames[i].depth is None for i in frames):
+            return None
+        return torch.from_numpy(self._stacked(self._depth, frames))[:, None]
+
+    def frame_name(self, frame: int) -> str:
+        """See `Scene`: the image file, relative to the scene's folder."""
+        return self._frames[frame].name
+
+    def stored_size(self, frame: int) -> Size:
+        """See `Scene`."""
+        return _stored_size(self._frames[frame])
+
+    def encoded(self, frame: int) -> EncodedFrame:
+        """See `EncodedScene`."""
+        photo = self._frames[frame]
+        size = self.stored_size(frame)
+        return EncodedFrame(
+            name=photo.name,
+            data=read_file(photo.path),
+            c2w=photo.c2w,
+            intrinsics=photo.at_size(size),
+            size=size,
+            lens=photo.lens,
+            mask=photo.mask and _whole_mask(photo),
+            background=self._config.background,
+        )
+
+    def _stacked(
+        self, read: Callable[[PhotoFrame], np.ndarray], frames: Sequence[int]
+    ) -> np.ndarray:
+        """Return (F, H, W, ...) of what `read` makes of the frames, or made before."""
+
+        def cached(frame: int) -> np.ndarray:
+            key = (self.name, read.__name__, frame)
+            return self._cache.get(key, lambda: read(self._frames[frame]))
+
+        paths = [self._frames[frame].path for frame in frames]
+        if all(is_local(path) or path.protocol == "zip" for path in paths):
+            return np.stack([*map(cached, frames)])
+        # A store answers slowly, but several requests at a time.
+        with ThreadPoolExecutor(8) as pool:
+            return np.stack([*pool.map(cached, frames)])
+
+    def _image(self, frame: PhotoFrame) -> np.ndarray:
+        image = read_image(frame.path, partial(decode_rgb, background=self._config.background))
+        if orientation(image) != 1:
+            warn_once(f"photos in {frame.path.parent} {TURNED}: {TURN}")
+        return self._delivered(image, frame, frame.path)
+
+    def _mask(self, frame: PhotoFrame) -> np.ndarray:
+        if frame.mask is None:
+            return np.full(self._config.image_size, 255, np.uint8)
+        return self._delivered(Image.fromarray(_whole_mask(frame)), frame, frame.mask)
+
+    def _depth(self, frame: PhotoFrame) -> np.ndarray:
+        if frame.depth is None:
+            return np.zeros(self._config.image_size, np.float32)
+        depth = read_image(frame.depth, partial(decode_depth, unit=self._config.depth_unit))
+        return self._delivered(Image.fromarray(depth), frame, frame.depth, "nearest")
+
+    def _delivered(
+        self, image: Image.Image, frame: PhotoFrame, file: UPath, mode: Mode = "bilinear"
+    ) -> np.ndarray:
+        """Return the content of `file`, without distortion, at the delivered size."""
+        # A mask or depth map follows the photo.
+        if file != frame.path and frame.size is None:
+            frame = replace(frame, size=read_image(frame.path, image_size))
+        size = _checked((image.height, image.width), frame, file)
+        if frame.lens is not None:
+            pixels = undistorted(np.array(image), frame.at_size(size), frame.lens, mode)
+            image = Image.fromarray(pixels)
+        # A mean of depths at an edge would be a surface that is not there.
+        kernel = Image.Resampling.NEAREST if mode == "nearest" else Image.Resampling.LANCZOS
+        return self._crop(frame, size).image(image, kernel)
+
+    def _crop(self, frame: PhotoFrame, size: Size) -> CropResize:
+        """Return the crop of a photo of `size` without what the lens did not see."""
+        target = self._config.image_size
+        zoom = whole_zoom(frame.at_size(size), frame.lens, size, target)
+        return CropResize(size, target, zoom)
+
+
+def _whole_mask(frame: PhotoFrame) -> np.ndarray:
+    assert frame.mask is not None
+    return read_image(frame.mask, decode_alpha if frame.mask == frame.path else decode_mask)
+
+
+def _stored_size(frame: PhotoFrame) -> Size:
+    return _checked(read_image(frame.path, image_size), frame, frame.path)
+
+
+def _checked(size: Size, frame: PhotoFrame, file: UPath) -> Size:
+    """Return (H, W) of a frame's `file`; ValueError where the listing says otherwise."""
+    for problem in size_problems(size, frame.size):
+        raise ValueError(f"{file}: {problem}")
+    return size
 
 
 class PhotosSource(LazySource):

@@ -11,7 +11,7 @@ from upath import UPath
 
 from qgs.contracts import SceneSource
 from qgs.data.photos import formats_of
-from qgs.data.photos.scene import PhotoScene, PhotosConfig, image_cache
+from qgs.data.photos.source import PhotoScene, PhotosConfig, image_cache
 from qgs.data.scenes import LazyScenes, LazySource
 from qgs.paths import opened_path, read_file, read_json
 from qgs.wording import listed, warn_once
