@@ -1,6 +1,9 @@
 #!/bin/bash
-#SBATCH --job-name=locus
-#SBATCH --output=./runs/locus.slurm-%j.log
+# A training on 8 GPUs of one node: sbatch train_8_gpus.sh RECIPE --out RUN
+# Change time, memory, partition and GPUs to those of your cluster. Five minutes before its time is over,
+# or when it is preempted, the job saves; Slurm then starts it again, and it goes on.
+#SBATCH --job-name=qgs
+#SBATCH --output=slurm-%j.log
 #SBATCH --ntasks=1
 #SBATCH --nodes=1
 #SBATCH --cpus-per-task=64
@@ -9,8 +12,8 @@
 #SBATCH --signal=B:TERM@300
 #SBATCH --requeue
 #SBATCH --open-mode=append
-# Change time, memory, partition and GPUs to those of your cluster.
-cd .
+# The trainings, not torchrun, which would kill them after 30 s, perhaps while they save.
 trap 'pkill -TERM -P "$job"; wait "$job"; scontrol requeue "$SLURM_JOB_ID"' TERM
-python -m torch.distributed.run --standalone --nproc-per-node=8 -m qgs train locus/re10k.yaml --out runs/locus --set training.workers=7 --resume & job=$!
+# In the background: bash runs a trap only after a command in the foreground has ended.
+torchrun --standalone --nproc-per-node="${SLURM_GPUS_ON_NODE:-8}" -m qgs train "$@" --resume & job=$!
 wait "$job"

@@ -115,12 +115,7 @@ def training(folder: Path, count: int) -> int:
 def workers_of(queue: Popen[bytes]) -> list[psutil.Process]:
     """Return the processes that train for a queue."""
     with suppress(psutil.Error):
-        # The queue has a process that keeps books of resources, too.
-        return [
-            child
-            for child in psutil.Process(queue.pid).children()
-            if "spawn_main" in str(child.cmdline())
-        ]
+        return psutil.Process(queue.pid).children()
     return []
 
 

@@ -83,6 +83,11 @@ def test_trainings_of_one_recipe_are_one_side_paired_by_seed():
     assert (apart.sample, apart.mean) == ("2 seeds x 2 scenes", pytest.approx(-0.75))
     assert scores.models() == ["r/a", "r/b"]
     assert "r/b: nothing to pair with (1): r/a/1" in summary(scores).notes
+    # Nothing is said of those that do not tell how they were trained.
+    longer = [replace(run, trained={"steps": "190", "data": "rooms"}) for run in theirs]
+    known = [replace(run, trained={"steps": "100", "data": "rooms"}) for run in ours]
+    said = summary(compare([*known, *longer])).notes
+    assert "r/b was not trained as r/a: steps differ" in said
     alone = compare([*ours, results("r/c/7", "C", 7, a=9.0, b=11.0), results("d", a=1.0, b=1.0)])
     assert [apart.mean for apart in alone.differences().values()] == [-1.0, -10.0]
 

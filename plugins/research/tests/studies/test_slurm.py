@@ -1,4 +1,4 @@
-"""A Slurm job of a training, run without Slurm."""
+"""The Slurm job of the examples, run without Slurm."""
 
 import os
 import subprocess
@@ -7,27 +7,9 @@ import time
 from pathlib import Path
 
 import pytest
-from commands import done, run_qgs, sets
+from commands import sets
 
-RECIPE = Path(__file__).parents[4] / "recipes/tiny/locus.yaml"
-
-
-def test_a_slurm_job_is_that_of_the_example(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    index = tmp_path / "datasets/re10k/evaluation_2views.json"
-    index.parent.mkdir(parents=True)
-    index.write_text('{"a": {"context": [0, 2], "target": [1]}}')
-    words = ("locus/re10k.yaml", "--out", "runs/locus", "--set", "training.workers=7")
-    done("slurm", "train", *words, "--gpus", "8")
-    script = (tmp_path / "runs/locus.slurm.sh").read_text()
-    shown = script.replace(sys.executable, "python").replace(str(tmp_path), ".")
-    assert shown == (RECIPE.parents[2] / "docs/examples/train_8_gpus.sh").read_text()
-    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["locus.slurm.sh"]
-    with pytest.raises(ValueError, match=r"training\.batch_size"):
-        done("slurm", "train", *words, "--gpus", "5")
-    mistaken = run_qgs("slurm", "train", *words, "--gpu", "8")
-    assert mistaken.exit_code == 2
-    assert "No such option: --gpu" in mistaken.output
+ROOT = Path(__file__).parents[4]
 
 
 @pytest.mark.slow
@@ -42,14 +24,16 @@ def test_a_slurm_job_saves_at_the_signal_and_goes_on(tmp_path):
         "training={seconds: null, steps: 300, save_every: 0, batch_size: 2}",
         "optimizer.warmup=1",
     )
-    done("slurm", "train", RECIPE, "--out", out, "--gpus", "2", "--device", "cpu", *words)
     stub = tmp_path / "bin/scontrol"
     stub.parent.mkdir()
     stub.write_text(f'#!/bin/sh\necho "$@" >> {asked}\n')
     stub.chmod(0o755)
-    paths = f"{stub.parent}:{os.environ['PATH']}"
-    environment = {**os.environ, "PATH": paths, "SLURM_JOB_ID": "7", "OMP_NUM_THREADS": "1"}
-    command = ["bash", str(tmp_path / "run.slurm.sh")]
+    paths = f"{stub.parent}:{Path(sys.executable).parent}:{os.environ['PATH']}"
+    of_slurm = {"SLURM_JOB_ID": "7", "SLURM_GPUS_ON_NODE": "2"}
+    environment = {**os.environ, **of_slurm, "PATH": paths, "OMP_NUM_THREADS": "1"}
+    recipe = ROOT / "recipes/tiny/locus.yaml"
+    script = ["bash", ROOT / "docs/examples/train_8_gpus.sh", recipe, "--out", out]
+    command = [*script, "--device", "cpu", *words]
     history = out / "history.jsonl"
     job = subprocess.Popen(command, env=environment)
     while not history.exists() or len(history.read_bytes().splitlines()) < 3:

@@ -13,7 +13,13 @@ from qgs_research.studies.hypotheses import MAIN
 from qgs_research.studies.intervals import CONFIDENCE, RESAMPLES, SEED
 from qgs_research.studies.scores import Scores
 from qgs_research.studies.stored import StoredResults, common_scenes, moved_scenes
-from qgs_research.studies.tables import Summary, interval_notes, table_records, table_rows
+from qgs_research.studies.tables import (
+    Summary,
+    interval_notes,
+    table_records,
+    table_rows,
+    training_notes,
+)
 
 
 def compare(results: Sequence[StoredResults], across_protocols: bool = False) -> Scores:
@@ -115,6 +121,7 @@ def _notes(scores: Scores) -> Iterator[str]:
     """Yield what is to be known beside the tables."""
     yield f"difference: minus {scores.reference}, over the scenes that both have"
     yield from interval_notes([*scores.differences().values()])
+    yield from training_notes(scores)
     for name in scores.models():
         protocol = next(iter(scores.stored[name, MAIN].values())).protocol
         yield f"{name}: protocol {protocol.name}, sha256 {protocol.sha256}"

@@ -86,17 +86,15 @@ class Results(Scores):
             reason=", ".join(reasons),
         )
 
-    def rank_correlation(self) -> tuple[float | None, int]:
-        """Return Spearman's, of our means by `shared` with the published ones; number of variants.
+    def rank_correlation(self) -> float | None:
+        """Return Spearman's, of our means by the recipes' own evaluation with the published ones.
 
-        None for fewer than five.
+        None for fewer than five variants, or those of unlike protocols.
         """
         published = self.settings.published
-        ours: dict[str, float] = {}
-        for variant in published if self.shared is not None else ():
-            if score := self.score(variant, self.metric, self.shared or MAIN):
-                ours[variant] = score.mean
-        if len(ours) < _RANKED:
-            return None, len(ours)
+        scores = {variant: self.score(variant, self.metric) for variant in published}
+        ours = {variant: score.mean for variant, score in scores.items() if score}
+        if len(ours) < _RANKED or len(self.protocols(MAIN)) > 1:
+            return None
         found = spearmanr([published[variant] for variant in ours], [*ours.values()])
-        return float(found[0]), len(ours)  # type: ignore[arg-type]  # a named tuple
+        return float(found[0])  # type: ignore[arg-type]  # a named tuple

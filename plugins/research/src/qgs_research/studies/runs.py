@@ -11,7 +11,6 @@ from qgs.recipe.errors import Origin
 from qgs.recipe.files import merge
 from qgs.recipe.recipe import annotated, differing_options
 from qgs.recipe.yaml_text import MapNode, from_plain
-from qgs.train.guard import CollapseError, NonFiniteError
 from qgs.wording import counted
 from qgs_research.studies.hypotheses import MAIN
 from qgs_research.studies.study import Study
@@ -47,17 +46,12 @@ class Run:
 
     @property
     def failed(self) -> str:
-        """Why it failed, the first sentence; "" where it did not."""
+        """Why it failed, the first sentence, until that file is deleted; "" where it did not."""
         if not self.failure.is_file():
             return ""
         # The rest of the file is advice, and tables have no room for it.
         first_line = self.failure.read_text(encoding="utf-8").strip().split("\n")[0]
         return first_line.partition(". ")[0]
-
-    @property
-    def ended(self) -> bool:
-        """True if the training itself went wrong, as it would each time: it is not tried again."""
-        return self.failed.startswith((CollapseError.__name__, NonFiniteError.__name__))
 
     def evaluation(self, name: str) -> Path:
         """The folder of its results by one evaluation."""
@@ -94,11 +88,6 @@ class Plan:
         """Such as "4 variants x 3 seeds"."""
         variants = counted(len(self.recipes), "variant")
         return f"{variants} x {counted(len(self.study.settings.seeds), 'seed')}"
-
-    @property
-    def ended(self) -> list[Run]:
-        """Runs that are not tried again, without results."""
-        return [run for run in self.runs if run.ended and not self.done(run)]
 
     def evaluation_recipe(self, variant: str, evaluation: str) -> Recipe:
         """The recipe of a variant as an evaluation changes it."""

@@ -3,7 +3,7 @@
 import csv
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ class StoredResults:
     scenes: `SceneScore.values` of the evaluated scenes. frames: their input and target frames, as
     scenes.csv writes them. columns, missing and step as in
     `Evaluation`. recipe, seed: of a run folder; its resolved recipe as JSON without seed and
-    evaluation.
+    evaluation. trained: what decides how much a training learns, by name.
     """
 
     name: str
@@ -33,6 +33,7 @@ class StoredResults:
     step: int | None = None
     recipe: str = ""
     seed: int | None = None
+    trained: Mapping[str, str] = field(default_factory=dict)
 
     def scores(self, metric: str, scenes: Iterable[str]) -> list[float]:
         """Return values of the model in these scenes; raises KeyError where one has none."""
@@ -108,11 +109,14 @@ def _read(folder: Path, name: str) -> StoredResults:
 
 
 def _training(recipe: Path) -> dict[str, Any]:
-    """Return recipe and seed of the run of a resolved recipe; {} without the file."""
+    """Return recipe, seed and `trained` of the run of a resolved recipe; {} without the file."""
     if not recipe.is_file():
         return {}
     tree = load_mapping(recipe.read_text(encoding="utf-8"), str(recipe), Problems())
     # Trainings that differ in nothing but these are one side of a comparison.
     seed = tree.pop("seed")
     del tree["evaluation"]
-    return {"recipe": json.dumps(tree), "seed": seed}
+    names = ("steps", "seconds", "batch_size")
+    trained = {name: str(tree["training"][name]) for name in names}
+    trained["data"] = json.dumps(tree.get("data"))
+    return {"recipe": json.dumps(tree), "seed": seed, "trained": trained}

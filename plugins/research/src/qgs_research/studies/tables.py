@@ -8,12 +8,8 @@ from rich import box
 from rich.console import Console
 
 from qgs.evaluate.results import bullets, markdown_table, print_lines, print_table
-from qgs_research.studies.estimates import (
-    Estimate,
-    count_better,
-    interval_shown,
-    shown,
-)
+from qgs.wording import listed
+from qgs_research.studies.estimates import Estimate, count_better, interval_shown, shown
 from qgs_research.studies.hypotheses import MAIN
 from qgs_research.studies.scores import Scores
 from qgs_research.studies.stored import StoredResults
@@ -108,6 +104,21 @@ def table_records(scores: Scores, evaluation: str = MAIN) -> Iterator[dict[str, 
                     "difference": apart.record() if apart else {},
                     "steps": steps_shown(scores.stored[model, evaluation].values()),
                 }
+
+
+def training_notes(scores: Scores) -> Iterator[str]:
+    """Yield which models were trained on other data than the reference, or longer."""
+
+    def facts(model: str) -> set[tuple[str, str]]:
+        return {fact for run in scores.stored[model, MAIN].values() for fact in run.trained.items()}
+
+    theirs = facts(scores.reference)
+    for model in scores.models():
+        ours = facts(model)
+        # Results without a run folder do not say how they were trained.
+        known = dict(ours).keys() & dict(theirs).keys()
+        if unequal := sorted(known & dict(ours ^ theirs).keys()):
+            yield f"{model} was not trained as {scores.reference}: {listed(unequal)} differ"
 
 
 def interval_notes(differences: Iterable[Estimate]) -> Iterator[str]:

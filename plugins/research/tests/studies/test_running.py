@@ -5,20 +5,18 @@ import multiprocessing
 import os
 import re
 import signal
+import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from commands import done
 from fuzzing import kill
-from qgs_research.studies import queue as queue_module
+from qgs_research.studies import running
 from qgs_research.studies.plan import planned
-from qgs_research.studies.queue import Queue
 from qgs_research.studies.results import Results
 from qgs_research.studies.runs import run_of
 from qgs_research.studies.study import read_study
-from qgs_research.studies.work import is_free, lock_of, work
 from rich.console import Console
 
 RECIPES = Path(__file__).parents[4] / "recipes"
@@ -66,68 +64,43 @@ def test_two_queues_share_a_folder_and_additions_run_alone(study):
         done("study", study, "--out", out, "--workers", 0)
 
 
-def queue_of(plan, workers=1, runs=None):
+def trained(plan, runs=None, workers=1):
     console = Console(file=io.StringIO())
-    return Queue(plan, runs or plan.runs, workers, threads=1, device="cpu", console=console)
+    runs = runs or plan.runs
+    ended = running.train_missing(
+        plan, runs, workers=workers, threads=1, device="cpu", console=console
+    )
+    return *ended, console.file.getvalue()
 
 
-def test_what_failed_comes_last_and_a_collapse_is_final(study, plan, monkeypatch):
-    first, second, third, fourth = plan.runs
+def stub(monkeypatch, code):
+    """In place of a training, with its arguments in `words`."""
+    start = f"import os, sys, time; folder, variant, seed, *words = sys.argv[1:]; {code}"
+    monkeypatch.setattr(running, "WORK", (sys.executable, "-c", start))
+
+
+def test_each_run_is_tried_once_a_call_and_a_failed_one_when_its_file_is_deleted(plan, monkeypatch):
+    first, second, *_ = plan.runs
     first.failure.parent.mkdir(parents=True)
-    first.failure.write_text("CollapseError: training collapsed at step 7\n")
-    second.failure.parent.mkdir(parents=True, exist_ok=True)
-    second.failure.write_text("OSError: no space left\n")
-    started = []
-
-    def start(queue, run):
-        started.append(run)
-        if len(started) == 3:
-            queue._stop(signal.SIGTERM, None)
-        return SimpleNamespace(exitcode=None, terminate=int, join=float, kill=int)
-
-    monkeypatch.setattr(Queue, "_start", start)
-    queue = queue_of(plan, workers=4)
-    assert queue.work() == "SIGTERM"
-    assert started == [third, fourth, second]
-    assert not queue.failures  # what failed before is no failure of this call
-    assert str(first.failure) in queue.console.file.getvalue()
-    done("slurm", "study", study, "--out", plan.folder)
-    assert "#SBATCH --array=1,2,3" in (plan.folder / "slurm.sh").read_text()
+    first.failure.write_text("CollapseError: training collapsed at step 7: it\nLikely causes")
+    stub(
+        monkeypatch,
+        "print('threads', os.environ['OMP_NUM_THREADS'], words, flush=True); os.kill(os.getpid(), 9)",
+    )
+    failed, stopped, told = trained(plan, workers=2)
+    assert {*failed} == {*plan.runs}
+    assert stopped is None
+    assert str(first.failure) in told
+    assert told.count("ended with -9") == 3
+    assert not first.log.exists()
+    assert second.log.read_text() == "threads 1 ['cpu', '', 'more']\n"
+    assert Results(plan).failed == [first]
 
 
-def die(*_):
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def test_a_run_that_is_killed_again_and_again_says_so_in_the_results(plan, monkeypatch):
-    monkeypatch.setattr(queue_module, "work", die)
-    killed = plan.runs[0]
-    queue = queue_of(plan, runs=[killed])
-    assert queue.work() is None
-    assert queue.failures == [killed]
-    assert "ended 3 times without a save between" in killed.failed
-    assert not killed.ended
-    assert Results(plan).failed == [killed]
-
-
-def told(*given):
-    """What a process of a run does, as far as it prepares for it."""
-    print(f"threads {os.environ['OMP_NUM_THREADS']}, {given}", flush=True)
-    os.write(1, b"and a library\n")
-
-
-def test_a_process_has_its_threads_and_prints_into_the_log(plan, monkeypatch):
-    monkeypatch.setattr(queue_module, "work", told)
-    run = plan.runs[0]
-    queue = queue_of(plan, runs=[run])
-    queue._gpu_of[run] = ""
-    process = queue._start(run)
-    process.join()
-    assert process.exitcode == 0
-    text = run.log.read_text()
-    assert "threads 1" in text
-    assert str((plan.folder.absolute(), run.variant, run.seed, ["", "more"], "cpu", 1)) in text
-    assert text.endswith("and a library\n")
+def test_a_signal_ends_the_processes_and_the_call(plan, monkeypatch):
+    stub(monkeypatch, f"os.kill({os.getpid()}, 15); time.sleep(600)")
+    failed, stopped, _ = trained(plan, workers=1)
+    assert (failed, stopped) == ([], signal.SIGTERM)
 
 
 @pytest.mark.slow
@@ -136,7 +109,7 @@ def test_a_killed_study_has_the_table_of_a_quiet_one(tmp_path):
 
 
 def hold(run, pipe):
-    with lock_of(run):
+    with running.lock_of(run):
         pipe.send(True)
         time.sleep(600)
 
@@ -148,9 +121,9 @@ def test_one_process_has_a_run_until_it_dies(tmp_path):
     holder = fork.Process(target=hold, args=(run, there))
     holder.start()
     assert here.recv()
-    assert not is_free(run)
-    work(tmp_path, run.variant, run.seed, [""], "cpu", 1)
+    assert not running.is_free(run)
+    running.main(str(tmp_path), run.variant, str(run.seed), "cpu", "")
     assert not run.failed
     holder.kill()
     holder.join()
-    assert is_free(run)
+    assert running.is_free(run)

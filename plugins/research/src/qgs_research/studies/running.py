@@ -1,0 +1,201 @@
+"""Runs of a study, a process each: as many at a time as there are workers.
+
+A killed process takes nothing with it but its own run's last steps since they were saved.
+"""
+
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from subprocess import Popen
+
+import torch
+from filelock import FileLock, Timeout
+from rich.console import Console
+
+from qgs.evaluate.evaluation import evaluate
+from qgs.evaluate.results import print_lines
+from qgs.files import write_text
+from qgs.recipe import Recipe, resolve
+from qgs.train.distributed import stop_requests
+from qgs.train.training import train
+from qgs.wording import counted
+from qgs_research.studies.hypotheses import MAIN
+from qgs_research.studies.plan import planned
+from qgs_research.studies.report import study_summary, write_files
+from qgs_research.studies.results import Results
+from qgs_research.studies.runs import Plan, Run, recipe_file, run_of, write_plan
+from qgs_research.studies.study import read_study
+
+WORK = (sys.executable, "-m", "qgs_research.studies.running")
+"""The command of a run's process, before the arguments that `main` takes."""
+
+_SECONDS = 0.3
+"""Between two looks at the processes."""
+
+
+def run_study(
+    file: str, out: Path, workers: int, threads: int | None, only: int | None, device: str
+) -> int:
+    """Do what `qgs study` says; return its exit code."""
+    console = Console()
+    with console.status("composing and checking all variants"):
+        plan = planned(read_study(file), out)
+        write_plan(plan)
+    for name, recipe in plan.recipes.items():
+        print_lines(console, [f"warning: {name}: {warning}" for warning in recipe.warnings])
+    missing = sum(not plan.done(run) for run in plan.runs)
+    print_lines(console, [f"{plan.size}: {counted(len(plan.runs), 'run')}, {missing} missing"])
+    failed: Sequence[Run] = ()
+    stopped = None
+    if workers:
+        runs = plan.runs if only is None else [plan.runs[only]]
+        failed, stopped = train_missing(
+            plan, runs, workers=workers, threads=threads, device=device, console=console
+        )
+    results = Results(plan)
+    if results.columns:
+        table = write_files(results)
+        study_summary(results).show(console)
+        print_lines(console, [f"written to {table}"])
+    if stopped:
+        print_lines(console, [f"stopped by {stopped.name}; the same command goes on"])
+        return 128 + stopped
+    return int(bool(failed))
+
+
+def train_missing(
+    plan: Plan,
+    runs: Sequence[Run],
+    *,
+    workers: int,
+    threads: int | None,
+    device: str,
+    console: Console,
+) -> tuple[list[Run], signal.Signals | None]:
+    """Train what is missing of `runs`; return those that failed, and the signal that ended it.
+
+    Waits for runs that another call on this machine has, and continues them if it dies. threads: of
+    each run; None for its share. The workers share the GPUs.
+    """
+    threads = threads or max(torch.get_num_threads() // workers, 1)
+    # Set by Slurm, for example: other GPUs belong to others.
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    every = map(str, range(torch.cuda.device_count()))
+    gpus = [*every] if visible is None else visible.split(",")
+    failed = [run for run in runs if run.failed]
+    for run in failed:
+        again = f"to train it again, delete {run.failure}, and {run.folder} to begin anew"
+        print_lines(console, [f"{run} failed before: {run.failed}; {again}"])
+    processes: dict[Run, Popen[bytes]] = {}
+    gpu_of: dict[Run, str] = {}
+    left = list(runs)
+    with stop_requests(quiet=True) as stop:
+        while (left or processes) and not stop:
+            for run, process in [*processes.items()]:
+                if process.poll() is not None:
+                    del processes[run]
+                    # Without either it was stopped, and has saved, or another process has it.
+                    if plan.done(run) or run.failed or process.returncode:
+                        print_lines(console, [_ended(plan, run, process.returncode)])
+                    # One try a call: what failed would most likely fail again at once.
+                    failed += [run] * bool(run.failed or process.returncode)
+            left = [run for run in runs if run not in failed and not plan.done(run)]
+            for run in left:
+                # A process that finds its run taken has imported torch for nothing.
+                if len(processes) < workers and run not in processes and is_free(run):
+                    used = [gpu_of[other] for other in processes]
+                    gpu_of[run] = min(gpus, key=used.count, default="")
+                    processes[run] = started(plan, run, threads, device, gpu_of[run])
+            time.sleep(_SECONDS)
+        for process in processes.values():
+            process.terminate()
+        for process in processes.values():
+            process.wait()
+    return failed, stop.signal
+
+
+def started(plan: Plan, run: Run, threads: int, device: str, gpu: str) -> Popen[bytes]:
+    """Train `run` in a process of its own, which prints into its log. gpu: "" for any."""
+    # Before the process imports what reads them. A log has no width of its own.
+    names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")
+    environment = {**os.environ, **dict.fromkeys(names, str(threads)), "COLUMNS": "100"}
+    if gpu:
+        environment["CUDA_VISIBLE_DEVICES"] = gpu
+    words = (str(plan.folder), run.variant, str(run.seed), device, *plan.evaluations)
+    with run.log.open("ab") as log:
+        return Popen([*WORK, *words], stdout=log, stderr=log, env=environment)
+
+
+def _ended(plan: Plan, run: Run, code: int) -> str:
+    if plan.done(run):
+        return f"{run} is done, {sum(map(plan.done, plan.runs))} of {len(plan.runs)} runs"
+    if run.failed:
+        return f"{run} failed: {run.failed} (see {run.log})"
+    return f"{run}: its process ended with {code} (see {run.log}); the same command continues it"
+
+
+def lock_of(run: Run) -> FileLock:
+    """Return the lock of a run; entering it raises Timeout if another process has the run."""
+    run.folder.parent.mkdir(parents=True, exist_ok=True)
+    # The kernel releases the lock of a process that dies, so a killed run is free at once.
+    return FileLock(run.beside("lock"), blocking=False)
+
+
+def is_free(run: Run) -> bool:
+    """Return True if no process has `run`."""
+    try:
+        with lock_of(run):
+            return True
+    except Timeout:
+        return False
+
+
+def main(folder: str, variant: str, seed: str, device: str, *evaluations: str) -> None:
+    """Train a run of the study in `folder`, and evaluate it; what is there already is kept.
+
+    Does nothing where another process has the run. An error is written beside the run.
+    """
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    run = run_of(Path(folder), variant, int(seed))
+    try:
+        with lock_of(run):
+            _train_and_evaluate(Path(folder), run, device, evaluations)
+    except Timeout:
+        return
+    except Exception as error:
+        traceback.print_exc()
+        write_text(run.failure, f"{type(error).__name__}: {error}\n")
+
+
+def _end_with(parent: int) -> None:
+    """Stop, as SIGTERM does, when the process that started this one is gone."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _train_and_evaluate(folder: Path, run: Run, device: str, evaluations: Sequence[str]) -> None:
+    """Do what `run` lacks. Raises whatever training and evaluating raise."""
+
+    def recipe_of(evaluation: str) -> Recipe:
+        return resolve(recipe_file(folder, run.variant, evaluation), [f"seed={run.seed}"])
+
+    console = Console()
+    result = train(recipe_of(MAIN), run.folder, console=console, device=device, resume=True)
+    # It has saved, and the next call goes on from there.
+    if result.stopped_by:
+        return
+    for name in evaluations:
+        if not run.evaluated(name):
+            evaluation = evaluate(result.model, recipe_of(name), result.steps)
+            evaluation.write(run.evaluation(name))
+            print(f"{name or 'evaluation'}: {evaluation.statement}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
