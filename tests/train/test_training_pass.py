@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from qgs_research.bench.memory import peak_memory
-from qgs_research.bench.work import workload_of
+from qgs_research.bench.work import peak_memory, workload_of
 from torch import nn
 from training_runs import TWO, first_batch, tiny
 from varying_head import VaryingHead

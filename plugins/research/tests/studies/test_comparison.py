@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from commands import done
 from qgs_research.studies.comparison import compare, summary
-from qgs_research.studies.estimates import count_better
-from qgs_research.studies.intervals import crossed_error, crossed_interval, paired_interval
+from qgs_research.studies.estimates import crossed_error, interval
 from qgs_research.studies.stored import StoredResults
 from scipy import stats
 
@@ -31,20 +30,19 @@ def results(name, recipe="", seed=None, step=None, **psnr):
 def test_the_bootstrap_interval_is_that_of_scipy():
     differences = np.random.default_rng(1).normal(0.3, 1.0, 60)
     expected = stats.bootstrap((differences,), np.mean, method="percentile").confidence_interval
-    found = paired_interval(differences)
+    found = interval(differences[None])
     assert found == pytest.approx(tuple(expected), abs=0.02)
-    assert found == paired_interval(differences)
-    assert paired_interval(np.ones(1)) is None
+    assert found == interval(differences[None])
+    assert interval(np.ones((1, 1))) is interval(np.ones((4, 1))) is None
 
 
-def test_scenes_pair_by_name_and_lower_is_better_for_lpips():
+def test_scenes_pair_by_name():
     first = results("first", c=11.0, b=10.0, a=9.0, other=1.0, another=2.0)
     second = results("second", a=10.0, b=12.0, c=11.0, only=50.0)
     scores = compare([first, second])
     psnr, lpips = (scores.difference("second", metric) for metric in COLUMNS)
     assert (psnr.mean, psnr.scenes) == (pytest.approx(1.0), 3)
-    assert count_better(COLUMNS["psnr"], psnr) == "2 of 3"
-    assert count_better(COLUMNS["lpips"], lpips) == "0 of 3"
+    assert lpips.mean == pytest.approx(0.01)
     assert "second: scenes not in both (3): another, only, other" in summary(scores).notes
 
 
@@ -79,15 +77,15 @@ def test_trainings_of_one_recipe_are_one_side_paired_by_seed():
     ours = [results(f"r/a/{s}", "A", s, 100, a=10.0 + s, b=12.0) for s in range(3)]
     theirs = [results(f"r/b/{s}", "B", s, 190, a=9.0 + s, b=11.5) for s in (2, 0)]
     scores = compare([*ours, *theirs])
-    apart = scores.difference("r/b", "psnr")
+    apart = scores.difference("r/b/2 x 2 seeds", "psnr")
     assert (apart.sample, apart.mean) == ("2 seeds x 2 scenes", pytest.approx(-0.75))
-    assert scores.models() == ["r/a", "r/b"]
-    assert "r/b: nothing to pair with (1): r/a/1" in summary(scores).notes
+    assert scores.models() == ["r/a/0 x 3 seeds", "r/b/2 x 2 seeds"]
+    assert "r/b/2 x 2 seeds: nothing to pair with (1): r/a/1" in summary(scores).notes
     # Nothing is said of those that do not tell how they were trained.
     longer = [replace(run, trained={"steps": "190", "data": "rooms"}) for run in theirs]
     known = [replace(run, trained={"steps": "100", "data": "rooms"}) for run in ours]
     said = summary(compare([*known, *longer])).notes
-    assert "r/b was not trained as r/a: steps differ" in said
+    assert "r/b/2 x 2 seeds was not trained as r/a/0 x 3 seeds: steps differ" in said
     alone = compare([*ours, results("r/c/7", "C", 7, a=9.0, b=11.0), results("d", a=1.0, b=1.0)])
     assert [apart.mean for apart in alone.differences().values()] == [-1.0, -10.0]
 
@@ -100,11 +98,12 @@ def test_two_runs_compare_scene_by_scene(tmp_path):
         done("eval", f"rooms/{run.name}", "--set", "evaluation.scenes=2", "--out", folder)
         means.append(json.loads((folder / "summary.json").read_text())["model"]["psnr"])
     shown = done("compare", *runs, "--out", tmp_path).output
-    assert "better in" in shown
+    assert "95 % interval" in shown
     table = json.loads((tmp_path / "comparison.json").read_text())["table"]
     apart = next(row["difference"] for row in table if row["variant"] == str(runs[1]))
     assert apart["mean"] == pytest.approx(means[1] - means[0])
-    assert apart["low"] <= apart["mean"] <= apart["high"]
+    low, high = apart["interval"]
+    assert low <= apart["mean"] <= high
     assert apart["scenes"] == 2
     assert "| PSNR ↑ |" in (tmp_path / "comparison.md").read_text()
 
@@ -121,7 +120,7 @@ def test_the_interval_over_trainings_and_scenes_holds_the_truth():
         values = values + rng.normal(0, rest, (count, trainings, scenes))
         error, freedom = crossed_error(values)
         half = stats.t.ppf(0.975, freedom) * error
-        low, high = crossed_interval(values[0])
+        low, high = interval(values[0])
         assert high - low == pytest.approx(2 * half[0])
         assert 0.93 <= (np.abs(values.mean((1, 2))) <= half).mean() <= 0.985, case
         truth = of_training**2 / trainings + of_scene**2 / scenes + rest**2 / (trainings * scenes)
@@ -129,10 +128,9 @@ def test_the_interval_over_trainings_and_scenes_holds_the_truth():
         assert np.median(half) <= 1.25 * least, case
 
 
-def test_an_interval_needs_two_of_each_and_widens_with_confidence():
-    assert crossed_interval(np.full((3, 4), 2.0)) == (2.0, 2.0)
-    assert crossed_interval(np.ones((1, 4))) is crossed_interval(np.ones((4, 1))) is None
+def test_an_interval_widens_with_confidence():
+    assert interval(np.full((3, 4), 2.0)) == (2.0, 2.0)
     values = np.random.default_rng(0).normal(size=(3, 8))
-    usual = crossed_interval(values)
-    sure = crossed_interval(values, 0.99)
+    usual = interval(values)
+    sure = interval(values, 0.99)
     assert sure[0] < usual[0] < usual[1] < sure[1]

@@ -8,9 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from qgs_research.studies.intervals import crossed_interval
-from qgs_research.studies.report import answer, notes, record, study_summary, write_files
-from qgs_research.studies.results import Results
+from qgs_research.studies.estimates import interval
+from qgs_research.studies.results import Results, answer, notes, record, study_summary, write_files
 from qgs_research.studies.runs import Plan, run_of
 from qgs_research.studies.study import read_study
 
@@ -89,7 +88,7 @@ def test_numbers_are_those_of_the_definition(plain):
     assert mean.mean == pytest.approx(less.mean())
     assert mean.deviation == pytest.approx(less.mean(1).std(ddof=1))
     assert apart.mean == pytest.approx((less - full).mean())
-    assert (apart.low, apart.high) == pytest.approx(crossed_interval(less - full))
+    assert apart.interval == pytest.approx(interval(less - full))
     assert apart.sample == "3 seeds x 8 scenes"
     assert plain.judgements()[2].estimate.mean == pytest.approx(-0.5, abs=0.15)
 
@@ -135,7 +134,7 @@ def test_the_best_of_one_needs_no_correction(tmp_path):
 def test_one_seed_leaves_it_open_however_sure_the_scenes_are(tmp_path):
     found = results(tmp_path, [1])
     judged = found.judgements()[1]
-    assert judged.estimate.low > 0
+    assert judged.estimate.interval[0] > 0
     assert (judged.verdict, judged.reason) == ("undecided", "one training a side")
     assert answer(found).startswith("Not known: other, +1.0")
     assert answer(found).endswith("one training a side. Missing: 6 of 9 runs.")
@@ -161,9 +160,9 @@ def test_numbers_of_unlike_protocols_are_not_compared(tmp_path):
     views = {"full": "two", "less": "two", "other": "six"}
     found = results(tmp_path, views=lambda variant, evaluation: evaluation or views[variant])
     assert answer(found).startswith("Undecided (evaluation `noisy`): other, ")
-    cells = {row[0]: row[3:6] for row in table_of(found)[1:]}
-    assert cells["full"] == ["reference", "–", "–"]
-    assert cells["other"] == ["–", "–", "–"]
+    cells = {row[0]: row[3:5] for row in table_of(found)[1:]}
+    assert cells["full"] == ["reference", "–"]
+    assert cells["other"] == ["–", "–"]
     assert cells["less"][0].startswith("-0.9")
     assert any("protocols differ" in note for note in notes(found))
     reasons = [j.reason for j in found.judgements()]
@@ -178,7 +177,7 @@ def test_a_variant_without_the_metric_is_a_row_of_dashes(plain, tmp_path):
         file.write_text(re.sub(r"(,1 2),[^,]*", r"\1,", file.read_text()))
     found = Results(plain.plan)
     row = next(row for row in table_of(found) if row[0] == "less")
-    assert row[1:6] == ["–"] * 5
+    assert row[1:5] == ["–"] * 4
     write_files(found)
     table = json.loads((tmp_path / "results.json").read_text())["table"]
     assert not any(row["variant"] == "less" and not row["evaluation"] for row in table)

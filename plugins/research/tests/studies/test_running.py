@@ -55,7 +55,7 @@ def test_two_queues_share_a_folder_and_additions_run_alone(study):
 
     study.write_text(study.read_text().replace("seeds: [0, 1]", "seeds: [0, 1, 2]"))
     told = done("study", study, "--out", out, "--only", 4, "--device", "cpu").output
-    assert "6 runs, 2 of them missing" in told
+    assert "6 runs, 2 missing" in told
     assert begun(out) == {**runs, "locus/seed-2": 1}
 
     changed = study.read_text().replace("qgs/content}", "locus/ray_biased, bandwidth: fixed}")
@@ -83,10 +83,8 @@ def test_each_run_is_tried_once_a_call_and_a_failed_one_when_its_file_is_deleted
     first, second, *_ = plan.runs
     first.failure.parent.mkdir(parents=True)
     first.failure.write_text("CollapseError: training collapsed at step 7: it\nLikely causes")
-    stub(
-        monkeypatch,
-        "print('threads', os.environ['OMP_NUM_THREADS'], words, flush=True); os.kill(os.getpid(), 9)",
-    )
+    say = "print('threads', os.environ['OMP_NUM_THREADS'], words, flush=True)"
+    stub(monkeypatch, f"{say}; os.kill(os.getpid(), 9)")
     failed, stopped, told = trained(plan, workers=2)
     assert {*failed} == {*plan.runs}
     assert stopped is None

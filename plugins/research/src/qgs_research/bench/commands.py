@@ -15,7 +15,7 @@ InputViews: TypeAlias = Annotated[
     int | None, typer.Option(min=1, help="Input views; default: the recipe's.")
 ]
 Report: TypeAlias = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Write a report with every sample.")
+    Path | None, typer.Option(metavar="FILE", help="Write a report with every sample, a new file.")
 ]
 
 
@@ -46,14 +46,16 @@ def bench(
     """
     from rich.console import Console
 
+    from qgs.evaluate.results import as_json
+    from qgs.files import refuse_existing, write_text
     from qgs.train.distributed import choose_device
-    from qgs_research.bench.output import refuse_other_file, show, write
+    from qgs_research.bench.output import show
     from qgs_research.bench.run import measure_recipes
 
     if precision not in ("float32", "bf16"):
         raise ValueError(f"--precision must be float32 or bf16, got {precision!r}")
     if json is not None:
-        refuse_other_file(json)
+        refuse_existing(json)
     use_threads(threads)
     console = Console()
     work = {
@@ -76,7 +78,7 @@ def bench(
             say=status.update,
         )
     if json is not None:
-        write(report, json)
+        write_text(json, as_json(report))
     show(report, console)
     if json is not None:
         console.print(f"written to {json}")

@@ -1,17 +1,13 @@
-"""Tables of what was measured, and the report's file."""
+"""Tables of what was measured."""
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 
-from qgs.evaluate.results import as_json, print_table
-from qgs.files import write_text
-from qgs.wording import counted, short_names
-from qgs_research.bench.run import KIND
+from qgs.evaluate.results import print_table
+from qgs.wording import short_names
 
 MEBIBYTE = 2**20
 TITLES = {
@@ -25,8 +21,9 @@ def show(report: Mapping[str, Any], console: Console) -> None:
     """Print the models, then one table for each thing that was measured of them."""
     entries = report["recipes"]
     base = entries[0]
-    settings = f"{base['precision']}, {_conditions(report)}, ratios to the first recipe"
-    console.print(settings, markup=False)
+    of = "{device} ({processor}, {threads} threads), torch {torch}".format(**report["machine"])
+    rounds = "{rounds} rounds after {warmup} of warm-up".format(**report)
+    console.print(f"{base['precision']}, {of}; {rounds}, ratios to the first recipe", markup=False)
     names = [escape(name) for name in short_names([entry["recipe"] for entry in entries])]
 
     def table(title: str, headers: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
@@ -80,33 +77,3 @@ def _cells(found: Mapping[str, float], scale: float) -> tuple[str, str]:
         shown.append(f"{value:,.{digits}f}")
     lower, median, upper = shown
     return median, f"{lower} .. {upper}"
-
-
-def _conditions(report: Mapping[str, Any]) -> str:
-    """Machine and rounds."""
-    machine = report["machine"]
-    threads = "" if machine["device"] == "cuda" else f", {counted(machine['threads'], 'thread')}"
-    return (
-        f"{machine['device']} ({machine['processor']}{threads}), torch {machine['torch']}; "
-        f"{report['rounds']} rounds after {report['warmup']} of warm-up"
-    )
-
-
-def refuse_other_file(path: Path) -> None:
-    """Raise FileExistsError when `path` holds anything but an earlier report."""
-    if not path.exists():
-        return
-    # The name is also that of a user's own data: nothing but an earlier report is overwritten.
-    try:
-        is_report = json.loads(path.read_text(encoding="utf-8"))["report"] == KIND
-    except (OSError, ValueError, TypeError, KeyError):
-        is_report = False
-    if not is_report:
-        raise FileExistsError(
-            f"{path} exists and is no report of `{KIND}`; choose another name for the report"
-        )
-
-
-def write(report: Mapping[str, Any], path: Path) -> None:
-    """Write the report as JSON."""
-    write_text(path, as_json(report))

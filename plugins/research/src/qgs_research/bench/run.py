@@ -1,6 +1,5 @@
 """Measuring recipes: memory first, in processes of their own, then seconds, all in turn."""
 
-import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
@@ -16,17 +15,15 @@ from torch.utils.flop_counter import FlopCounterMode
 import qgs
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
-from qgs_research.bench.memory import peak_memory
 from qgs_research.bench.work import (
     Operation,
     Task,
     Workload,
     make_task,
+    peak_memory,
     posed_photos,
     workload_of,
 )
-
-KIND = "qgs bench"
 
 
 def measure_recipes(
@@ -81,14 +78,15 @@ def measure_recipes(
         entry["parameters"]["ratio"] = entry["parameters"]["count"] / first["count"]
     for operation in operations:
         tasks = [make_task(operation, *given) for given in zip(recipes, models, works, strict=True)]
-        columns = in_turn(tasks, rounds, warmup, say, f"{operation}: ")
+        say(f"seconds of the {operation}")
+        columns = in_turn(tasks, rounds, warmup)
         for entry, samples in zip(entries, columns, strict=True):
             # Round by round, so that the machine's load cancels.
             ratios = list(map(truediv, samples, columns[0]))
             found = {**quartiles(samples), "samples": samples, "ratio": quartiles(ratios)}
             entry["seconds"][operation] = found
     settings = {"overrides": list(overrides), "rounds": rounds, "warmup": warmup}
-    return {"report": KIND, "machine": machine(work["device"]), **settings, "recipes": entries}
+    return {"machine": machine(work["device"]), **settings, "recipes": entries}
 
 
 def _sizes(model: QueryGaussianModel) -> dict[str, Any]:
@@ -124,10 +122,7 @@ def machine(device: str) -> dict[str, Any]:
     return {
         "device": device,
         "processor": torch.cuda.get_device_name() if device == "cuda" else _processor(),
-        "cores": os.cpu_count() or 0,
         "threads": torch.get_num_threads(),
-        "system": platform.platform(),
-        "python": platform.python_version(),
         "torch": torch.__version__,
         "qgs": qgs.__version__,
     }
@@ -143,22 +138,18 @@ def in_turn(
     tasks: Sequence[Task],
     rounds: int,
     warmup: int,
-    say: Callable[[str], None] = lambda _: None,
-    label: str = "",
 ) -> list[list[float]]:
     """Seconds of each task: `warmup` calls of each unmeasured, then all of them in every round.
 
-    torch.utils.benchmark's clock waits for a GPU. say: called before each round.
+    torch.utils.benchmark's clock waits for a GPU.
     """
     columns: list[list[float]] = [[] for _ in tasks]
-    for what, count in (("warm-up", warmup), ("round", rounds)):
-        for number in range(count):
-            say(f"{label}{what} {number + 1} of {count}")
-            # All tasks in each round: a slow moment of the machine meets every recipe.
-            for task, column in zip(tasks, columns, strict=True):
-                start = timer()
-                task()
-                column.append(timer() - start)
+    for _ in range(warmup + rounds):
+        # All tasks in each round: a slow moment of the machine meets every recipe.
+        for task, column in zip(tasks, columns, strict=True):
+            start = timer()
+            task()
+            column.append(timer() - start)
     return [column[warmup:] for column in columns]
 
 

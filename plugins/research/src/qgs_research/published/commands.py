@@ -21,10 +21,6 @@ def import_(
     ],
     out: Annotated[Path, typer.Option(help="New checkpoint; never overwritten.")],
     overrides: Overrides = None,
-    to_float32: Annotated[
-        bool,
-        typer.Option("--to-float32", help="Convert other precisions instead of refusing them."),
-    ] = False,
 ) -> None:
     """Turn published weights into a checkpoint; every tensor is accounted for.
 
@@ -36,20 +32,8 @@ def import_(
     from qgs_research.published.importing import import_weights
 
     resolved = None if recipe == "auto" else resolve(recipe, overrides or ())
-    done = import_weights(weights, resolved, out, overrides=overrides or (), to_float32=to_float32)
-    name = done.layout.name
-    lines = [*done.notes, f"{name} ({done.layout.source}): {done.count} tensors used"]
-    if done.unused:
-        lines.append(f"knowingly dropped, {name} never reads these {len(done.unused)}:")
-        lines += [f"  {tensor}" for tensor in done.unused]
-    if done.settings:
-        lines.append(f"the recipe differs from {name} in options that no weight shows:")
-        lines += [f"  {path}: {a} ({name}: {b})" for path, (a, b) in done.settings.items()]
-    lines.append(f"wrote {out}")
-    if done.recipe_file:
-        lines.append(f"wrote {done.recipe_file}; names and shapes do not determine:")
-        lines += [f"  {choice}" for choice in done.layout.undecided]
-    typer.echo("\n".join(lines))
+    done = import_weights(weights, resolved, out, overrides=overrides or ())
+    typer.echo("\n".join(done.report))
 
 
 @export_app.command()
@@ -61,7 +45,7 @@ def export(
     ] = False,
 ) -> None:
     """Write a checkpoint as one new file, with --half at half the size."""
-    from qgs_research.published.exporting import export_checkpoint
+    from qgs_research.published.importing import export_checkpoint
 
     export_checkpoint(checkpoint, out, half)
     typer.echo(f"wrote {out}: {out.stat().st_size / 1e6:.1f} MB")

@@ -1,22 +1,21 @@
-"""A checkpoint from published weights: every tensor used, dropped by name, or an error."""
+"""Checkpoints from published weights: every tensor used, dropped by name, or an error. Exports."""
 
+import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from qgs.checkpoint.model_file import refuse_nonfinite, write_checkpoint
-from qgs.checkpoint.tensors import shapes_of
-from qgs.contracts import WeightLayout
+from qgs.checkpoint.model_file import CheckpointFile, refuse_nonfinite, write_checkpoint
+from qgs.checkpoint.tensors import CheckpointError, nonfinite, shapes_of
 from qgs.files import refuse_existing, write_text
 from qgs.recipe import Recipe, resolve
 from qgs.recipe.recipe import differing_predictions
 from qgs.recipe.yaml_text import dump
 from qgs.wording import listed
-from qgs_research.published.exporting import new_checkpoint_path
 from qgs_research.published.layouts import (
     Names,
     PublishedError,
@@ -27,23 +26,15 @@ from qgs_research.published.layouts import (
 from qgs_research.published.weight_files import WeightFile, read_weight_file
 
 
-@dataclass(frozen=True)
-class Transfer:
-    """What `import_weights` did.
+class Transfer(NamedTuple):
+    """What `import_weights` did. report: in lines.
 
-    count: parameters in the checkpoint. unused: names in the file that the published code never
-    reads. settings: paths of options that weights do not determine and in which the model differs
-    from the published one, to both values. notes: how the file was read and converted.
-    recipe_file: the recipe that was written; None where one was given.
+    How the file was read and converted, which tensors are unused, which options weights do not
+    determine, and in which of these the model differs from the published one.
     """
 
-    layout: WeightLayout
     recipe: Recipe
-    count: int
-    unused: tuple[str, ...]
-    settings: Mapping[str, tuple[str, str]]
-    notes: tuple[str, ...] = ()
-    recipe_file: Path | None = None
+    report: list[str]
 
 
 def import_weights(
@@ -52,14 +43,12 @@ def import_weights(
     out: str | Path,
     *,
     overrides: Sequence[str] = (),
-    to_float32: bool = False,
 ) -> Transfer:
     """Write a checkpoint of `recipe` with published weights.
 
     recipe: None for the one that fits, changed by `overrides` (such as "data.image_size=[64, 64]"),
         which is then also written beside `out`, as .yaml.
     out: a new .safetensors file.
-    to_float32: convert weights of other floating-point types instead of refusing them.
     Raises FileNotFoundError, FileExistsError, ValueError for another suffix, RecipeError about
     `overrides`, CheckpointError and PublishedError; nothing is written then.
     """
@@ -86,10 +75,11 @@ def import_weights(
         names = names_of(recipe)
     except PublishedError as error:
         raise PublishedError(f"{file.path} does not fit the recipe: {error}") from error
-    tensors, converted = _as_float32(file, names, to_float32)
+    tensors, converted = _as_float32(file, names)
     # Weights show no activations: tell where the recipe differs from what was published.
     settings = differing_predictions(recipe.tree, resolve(names.layout.read(shapes)).tree)
-    imported = f"{names.layout.name} weights {file.path.name}"
+    name = names.layout.name
+    imported = f"{name} weights {file.path.name}"
     write_checkpoint(out, tensors, recipe.tree, recipe.releases, {"imported": imported})
     if recipe_file:
         try:
@@ -98,9 +88,20 @@ def import_weights(
             # A checkpoint of an unknown recipe would be of no use.
             out.unlink()
             raise
-    dropped = tuple(name for name in names.unused if name in file.tensors)
-    notes = (*file.notes, *converted)
-    return Transfer(names.layout, recipe, len(tensors), dropped, settings, notes, recipe_file)
+    used = f"{name} ({names.layout.source}): {len(tensors)} tensors used"
+    report = [*file.notes, *converted, used]
+    dropped = [tensor for tensor in names.unused if tensor in file.tensors]
+    if dropped:
+        report.append(f"knowingly dropped, {name} never reads these {len(dropped)}:")
+        report += [f"  {tensor}" for tensor in dropped]
+    if settings:
+        report.append(f"the recipe differs from {name} in options that no weight shows:")
+        report += [f"  {path}: {a} ({name}: {b})" for path, (a, b) in settings.items()]
+    report.append(f"wrote {out}")
+    if recipe_file:
+        report.append(f"wrote {recipe_file}; names and shapes do not determine:")
+        report += [f"  {choice}" for choice in names.layout.undecided]
+    return Transfer(recipe, report)
 
 
 def _without_prefix(file: WeightFile) -> WeightFile:
@@ -122,12 +123,10 @@ def _without_prefix(file: WeightFile) -> WeightFile:
     return file
 
 
-def _as_float32(
-    file: WeightFile, names: Names, allowed: bool
-) -> tuple[dict[str, Tensor], list[str]]:
+def _as_float32(file: WeightFile, names: Names) -> tuple[dict[str, Tensor], list[str]]:
     """Contiguous float32 tensors under our names, and a note of what was converted.
 
-    Raises PublishedError for other types, where they are not `allowed`, and for NaN and infinity.
+    Raises PublishedError for numbers that are not real, and for NaN and infinity.
     """
     given = names.from_published(file.tensors, file.path)
     others = {name: t.dtype for name, t in given.items() if t.dtype != torch.float32}
@@ -139,11 +138,6 @@ def _as_float32(
         raise PublishedError(
             f"{file.path} holds weights that are no real numbers: {listed(strange)} ({report})"
         )
-    if others and not allowed:
-        raise PublishedError(
-            f"{file.path} holds weights that are not float32 ({report}); take the float32 file, or "
-            "convert with --to-float32"
-        )
     tensors: dict[str, Tensor] = {}
     stored: set[int] = set()
     for name, tensor in given.items():
@@ -153,3 +147,33 @@ def _as_float32(
         stored.add(tensor.data_ptr())
     refuse_nonfinite({names.published[name]: t for name, t in tensors.items()}, file.path)
     return tensors, [f"converted to float32: {report}"] if others else []
+
+
+def export_checkpoint(name: str | os.PathLike[str], out: str | Path, half: bool = False) -> None:
+    """Write a checkpoint again. half: its real numbers as float16; all else stays as it is.
+
+    Raises as `CheckpointFile`, and CheckpointError where float16 cannot hold a weight.
+    """
+    out = new_checkpoint_path(out)
+    with CheckpointFile(name) as file:
+        tensors = file.tensors
+        refuse_nonfinite(tensors, file.path)
+        if half:
+            real = {name: t.half() for name, t in tensors.items() if t.is_floating_point()}
+            tensors = {**tensors, **real}
+        # Finite in float32, they may be infinite now.
+        if broken := nonfinite(tensors.items()):
+            raise CheckpointError(
+                f"{file.path} has weights that float16 cannot hold (larger than 65504): "
+                f"{listed(broken)}; ship it as it is"
+            )
+        write_checkpoint(out, tensors, file.recipe.tree, file.recipe.releases, file.extra)
+
+
+def new_checkpoint_path(path: str | Path) -> Path:
+    """`path`; raises ValueError for another suffix, FileExistsError where something lies."""
+    path = Path(path)
+    if path.suffix.lower() != ".safetensors":
+        raise ValueError(f"{path}: weights are written as safetensors; name it .safetensors")
+    refuse_existing(path)
+    return path

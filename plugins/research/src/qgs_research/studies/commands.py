@@ -1,4 +1,4 @@
-"""`qgs study` and `qgs compare`."""
+"""`qgs study`, `qgs compare` and `qgs diff`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from qgs.cli.inspect import RecipeFile
 from qgs.cli.options import Device
 
 app = typer.Typer(help="Train variants of a model by seeds, and compare them.")
 compare_app = typer.Typer(help="Compare results of evaluations.")
+diff_app = typer.Typer(help="Compare recipes.")
 
 
 @compare_app.command()
@@ -78,7 +80,7 @@ def study(
           mine: {model: {decoder: {cross_attention: {sigma0: 0.2}}}}
         reference: locus
         seeds: [0, 1, 2]
-        budget: {steps: 2100}   # or seconds, or images
+        budget: {steps: 2100}   # or seconds
         hypotheses:
           - mine > locus
 
@@ -90,3 +92,49 @@ def study(
     from qgs_research.studies.running import run_study
 
     raise typer.Exit(run_study(file, out, workers, threads, only, device))
+
+
+@diff_app.command()
+def diff(
+    first: RecipeFile,
+    second: RecipeFile,
+    set_a: Annotated[
+        list[str] | None, typer.Option("--set-a", help="Override of the first; repeatable.")
+    ] = None,
+    set_b: Annotated[
+        list[str] | None, typer.Option("--set-b", help="Override of the second; repeatable.")
+    ] = None,
+) -> None:
+    """Show which slots and options of two recipes differ, and what that costs in parameters.
+
+    "-" stands for an option that a recipe's component does not have.
+    """
+    from rich.markup import escape
+
+    from qgs.evaluate.results import print_table
+    from qgs.model_text import parameter_counts
+    from qgs.recipe import resolve
+    from qgs.recipe.recipe import differing_options
+    from qgs.wording import short_names
+
+    ours = resolve(first, set_a or ())
+    theirs = resolve(second, set_b or ())
+    names = short_names([first, second])
+    slots = [["slot", *names]]
+    options = [["option", *names]]
+    for path, values in differing_options(ours.tree, theirs.tree).items():
+        # Another component has other options: first which one it is.
+        rows = slots if path.endswith(".type") else options
+        rows.append([path.removesuffix(".type"), *(escape(value or "-") for value in values)])
+    before = parameter_counts(ours.build_model("meta"))
+    after = parameter_counts(theirs.build_model("meta"))
+    before["total"] = sum(before.values())
+    after["total"] = sum(after.values())
+    parameters = [["component", *names, "difference"]]
+    for name, count in before.items():
+        change = f"{after[name] - count:+,}" if after[name] != count else ""
+        parameters.append([name, f"{count:,}", f"{after[name]:,}", change])
+    console = Console()
+    print_table(console, "slots that differ", slots)
+    print_table(console, "options that differ", options)
+    print_table(console, "parameters", parameters)

@@ -3,14 +3,12 @@
 Several trainings of one recipe count as one side, whose interval then covers trainings too.
 """
 
-import os
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 from qgs.wording import listed
 from qgs_research.studies.estimates import Runs
 from qgs_research.studies.hypotheses import MAIN
-from qgs_research.studies.intervals import CONFIDENCE, RESAMPLES, SEED
 from qgs_research.studies.scores import Scores
 from qgs_research.studies.stored import StoredResults, common_scenes, moved_scenes
 from qgs_research.studies.tables import (
@@ -54,7 +52,6 @@ def _sides(results: Sequence[StoredResults]) -> dict[str, Runs]:
         # Results without a run folder have no recipe: each is a side of its own.
         key = (result.recipe, result.protocol.sha256) if result.recipe else number
         groups.setdefault(key, []).append(result)
-    folders = [os.path.dirname(result.name) for result in results]
     sides: dict[str, Runs] = {}
     for group in groups.values():
         by_seed = {run.seed or 0: run for run in group}
@@ -62,11 +59,7 @@ def _sides(results: Sequence[StoredResults]) -> dict[str, Runs]:
         if len(groups) == 1 or len(by_seed) < len(group) or len(group) == 1:
             sides |= {run.name: {run.seed or 0: run} for run in group}
             continue
-        folder = os.path.dirname(group[0].name)
-        # A folder is the name of a side if all of its runs, and no other, lie in it.
-        alone = all(os.path.dirname(run.name) == folder for run in group)
-        named = alone and folders.count(folder) == len(group)
-        sides[folder if named else ", ".join(run.name for run in group)] = by_seed
+        sides[f"{group[0].name} x {len(group)} seeds"] = by_seed
     return sides
 
 
@@ -111,7 +104,6 @@ def record(scores: Scores) -> dict[str, Any]:
     """Return plain values for JSON."""
     return {
         "reference": scores.reference,
-        "bootstrap": {"resamples": RESAMPLES, "confidence": CONFIDENCE, "seed": SEED},
         "table": [*table_records(scores)],
         "notes": [*_notes(scores)],
     }

@@ -1,7 +1,7 @@
 """Means over seeds and scenes, their intervals, and how tables show both.
 
 An interval takes trainings and scenes as random, both: it holds for other seeds and other scenes
-of the kind (`intervals.crossed_interval`). Differences are paired: a seed with the same seed of the
+of the kind (`interval`). Differences are paired: a seed with the same seed of the
 reference, which saw the same data in the same order, and a scene with the same scene.
 """
 
@@ -10,11 +10,16 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
+from scipy.stats import bootstrap
+from scipy.stats import t as student
 
 from qgs.contracts import Column
 from qgs.wording import counted
-from qgs_research.studies.intervals import CONFIDENCE, interval
 from qgs_research.studies.stored import StoredResults, scenes_with
+
+RESAMPLES = 10_000
+CONFIDENCE = 0.95
+SEED = 0
 
 Runs: TypeAlias = Mapping[int, StoredResults]
 """Results of the trainings of one model, by seed."""
@@ -24,24 +29,18 @@ Runs: TypeAlias = Mapping[int, StoredResults]
 class Estimate:
     """A mean, or a sum of means, over the seeds and scenes that all of its parts have.
 
-    values: (S, C) of the seeds and scenes. low, high: see the module; None without an interval, as
-    of one scene. Of one seed the interval covers scenes alone.
+    values: (S, C) of the seeds and scenes. interval: see the module; None of one scene. Of one seed
+    it covers scenes alone.
     """
 
     seeds: Sequence[int]
     values: np.ndarray
-    low: float | None
-    high: float | None
+    interval: tuple[float, float] | None
 
     @property
     def mean(self) -> float:
         """The mean over seeds, each once."""
         return float(self.values.mean(1).mean())
-
-    @property
-    def by_seed(self) -> dict[int, float]:
-        """Means over scenes."""
-        return dict(zip(self.seeds, map(float, self.values.mean(1)), strict=True))
 
     @property
     def deviation(self) -> float | None:
@@ -68,19 +67,17 @@ class Estimate:
     def clear(self, sign: int) -> bool:
         """Return True if the interval is over trainings and scenes, and all on a side of 0."""
         # An interval over scenes alone says nothing of other trainings.
-        if self.too_small or self.low is None or self.high is None:
-            return False
-        return min(sign * self.low, sign * self.high) > 0
+        ends = () if self.too_small else self.interval or ()
+        return min((sign * end for end in ends), default=0.0) > 0
 
     def record(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
+        """Return plain values for JSON; `by_seed` has means over scenes."""
         return {
             "mean": self.mean,
             "sd": self.deviation,
-            "by_seed": self.by_seed,
+            "by_seed": dict(zip(self.seeds, self.values.mean(1).tolist(), strict=True)),
             "scenes": self.scenes,
-            "low": self.low,
-            "high": self.high,
+            "interval": self.interval,
         }
 
 
@@ -96,22 +93,12 @@ def estimate(
     for runs, weight in parts:
         # Paired before any mean is taken: what a seed or a scene adds to all models cancels.
         values += weight * np.array([runs[seed].scores(metric, scenes) for seed in seeds])
-    low, high = interval(values, confidence)
-    return Estimate(seeds=seeds, values=values, low=low, high=high)
+    return Estimate(seeds=seeds, values=values, interval=interval(values, confidence))
 
 
 def sign_of(column: Column) -> int:
     """Return 1 where more of a metric is better, else -1."""
     return 1 if column.better == "higher" else -1
-
-
-def count_better(column: Column, difference: Estimate | None) -> str:
-    """Return in how many seeds a difference is better than 0, of one seed in how many scenes."""
-    if difference is None:
-        return "–"
-    # The mean of a single seed would only repeat the sign of the difference.
-    means = difference.values.mean(1) if len(difference.seeds) > 1 else difference.values[0]
-    return f"{(sign_of(column) * means > 0).sum()} of {len(means)}"
 
 
 def shown(column: Column, value: float | None, sign: str = "") -> str:
@@ -122,6 +109,58 @@ def shown(column: Column, value: float | None, sign: str = "") -> str:
 
 def interval_shown(column: Column, estimate: Estimate | None) -> str:
     """Return "[low, high]", a dash without an interval."""
-    if estimate is None or estimate.low is None:
+    if estimate is None or estimate.interval is None:
         return "–"
-    return f"[{shown(column, estimate.low, '+')}, {shown(column, estimate.high, '+')}]"
+    return f"[{', '.join(shown(column, end, '+') for end in estimate.interval)}]"
+
+
+def interval(values: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float, float] | None:
+    """Return the interval of the mean of differences (S, C) of S trainings on the same C scenes.
+
+    Both are random: it holds for other trainings and for other scenes; see `crossed_error`. Of one
+    training it covers scenes alone, at 95 %: the percentile bootstrap, whose resamples are seeded,
+    so that equal numbers give equal intervals. None for one scene.
+    """
+    trainings, scenes = values.shape
+    if scenes < 2:
+        return None
+    if trainings > 1:
+        error, freedom = crossed_error(values)
+        half = float(student.ppf((1 + confidence) / 2, freedom) * error)
+        return float(values.mean() - half), float(values.mean() + half)
+    found = bootstrap(
+        values,
+        np.mean,
+        n_resamples=RESAMPLES,
+        # In parts, because 10,000 resamples of many scenes would fill memory.
+        batch=100,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        rng=SEED,
+    )
+    low, high = found.confidence_interval
+    return float(low), float(high)
+
+
+def crossed_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the standard error of the means of `values` (..., S, C), and its degrees of freedom.
+
+    Both have the shape (...). The variance is that of two-way analysis of variance, a sum of mean
+    squares; its degrees of freedom are those of Satterthwaite 1946 (doi.org/10.2307/3002019), at
+    least those of the smaller side. Without the scenes' own (Hillis 2007, doi.org/10.1002/sim.2532)
+    it is too narrow for few.
+    """
+    *_, trainings, scenes = values.shape
+    of_training = values.mean(-1, keepdims=True)
+    of_scene = values.mean(-2, keepdims=True)
+    # The interaction, which is also the noise of a single score.
+    rest = values - of_training - of_scene + values.mean((-2, -1), keepdims=True)
+    noise = (rest**2).sum((-2, -1)) / ((trainings - 1) * (scenes - 1))
+    first = scenes * of_training.var((-2, -1), ddof=1)
+    second = trainings * of_scene.var((-2, -1), ddof=1)
+    # Otherwise the scenes add no variance of their own, and the difference would be negative.
+    own = second > noise
+    whole = first + own * (second - noise)
+    spread = first**2 + own * (second**2 * (trainings - 1) + noise**2) / (scenes - 1)
+    freedom = (trainings - 1) * whole**2 / np.where(spread, spread, 1.0)
+    return np.sqrt(whole / (trainings * scenes)), np.maximum(freedom, min(trainings, scenes) - 1)

@@ -1,16 +1,30 @@
-"""The results of a study: scores of its runs, verdicts on its hypotheses."""
+"""The results of a study: verdicts, what they say in a line, and the files with all numbers."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
+from typing import Any
 
 from scipy.stats import spearmanr
 
-from qgs_research.studies.estimates import Estimate
+from qgs.evaluate.results import as_json
+from qgs.files import read_records, write_text
+from qgs.wording import listed
+from qgs_research.studies.estimates import CONFIDENCE, Estimate, interval_shown, shown, sign_of
 from qgs_research.studies.hypotheses import MAIN, Contrast
 from qgs_research.studies.runs import Plan
 from qgs_research.studies.scores import Scores
 from qgs_research.studies.stored import read_results
 from qgs_research.studies.study import Hypothesis
+from qgs_research.studies.tables import (
+    Rows,
+    Summary,
+    interval_notes,
+    table_records,
+    table_rows,
+    training_notes,
+)
 
 SEEN = "seen"
 CONTRADICTED = "contradicted"
@@ -98,3 +112,143 @@ class Results(Scores):
             return None
         found = spearmanr([published[variant] for variant in ours], [*ours.values()])
         return float(found[0])  # type: ignore[arg-type]  # a named tuple
+
+
+def write_files(results: Results) -> Path:
+    """Write results.json and table.md, and return the latter; equal runs differ by `times`."""
+    study = results.plan.study
+    head = "\n\n".join(filter(None, [f"# {study.title}", study.settings.question]))
+    table = results.plan.folder / "table.md"
+    write_text(table, f"{head}\n\n{study_summary(results).markdown}")
+    write_text(results.plan.folder / "results.json", as_json(record(results)))
+    return table
+
+
+def answer(results: Results) -> str:
+    """Return in one line if a variant is better than the reference, and how sure that is."""
+    text = _verdict(results)
+    if results.failed:
+        text += f" Failed: {listed(results.failed)}."
+    if waiting := len(results.missing) - len(results.failed):
+        text += f" Missing: {waiting} of {len(results.plan.runs)} runs."
+    return text
+
+
+def _verdict(results: Results) -> str:
+    """Return the verdict by scores alone, of the first evaluation by one protocol.
+
+    The best of n is better where the interval at 1 - 0.05 / n says so (Bonferroni): chance has n
+    tries. That all are worse needs no correction, as each must be (an intersection-union test).
+    """
+    if results.metric not in results.columns:
+        return "Not known yet: no run is finished."
+    evaluation = results.shared
+    if evaluation is None:
+        return "Not known: no evaluation has one protocol for all; add one to `evaluations`."
+    found = results.differences(evaluation)
+    if not found:
+        return f"Not known yet: {results.reference} and another variant share no finished seed."
+    # One training a side cannot tell a better model from a better seed.
+    tested = [name for name, estimate in found.items() if not estimate.too_small]
+    sign = sign_of(results.column)
+    worse = all(found[name].clear(-sign) for name in tested)
+    tries = 1 if worse else len(tested)
+    judged = results.differences(evaluation, 1 - (1 - CONFIDENCE) / tries)
+    better = [name for name in tested if judged[name].clear(sign)]
+    word = "No" if worse else "Undecided"
+    if better:
+        word = "Yes"
+    best = max(better or tested or found, key=lambda name: sign * found[name].mean)
+    small = f", {found[best].too_small}" if not tested else ""
+    if small:
+        word = "Not known"
+    where = f" (evaluation `{evaluation}`)" if evaluation else ""
+    # Metrics without a unit are named.
+    unit = results.column.unit or results.column.heading
+    value = f"{shown(results.column, found[best].mean, '+')} {unit}"
+    interval = interval_shown(results.column, judged[best])
+    of = f" (Bonferroni, {tries} variants)" if tries > 1 else ""
+    return f"{word}{where}: {best}, {value}, interval {interval}{of}{small}."
+
+
+def notes(results: Results) -> list[str]:
+    """Return what is to be known beside the table."""
+    # The table of the recipes' own evaluation is what readers see first.
+    found = [*interval_notes([*results.differences().values()]), *training_notes(results)]
+    if (count := len(results.settings.hypotheses)) > 1:
+        found.append(f"each of {count} verdicts is at 95 % on its own")
+    if results.missing:
+        found.append(f"missing runs: {listed(results.missing)}")
+    found += [f"{run} failed: {run.failed}" for run in results.failed]
+    # The order of variants can be as published where sizes cannot.
+    if (rank := results.rank_correlation()) is not None:
+        found.append(f"rank correlation with the published order: {rank:+.2f}")
+    for evaluation in results.plan.evaluations:
+        where = evaluation or "the recipes' own evaluation"
+        if len(results.protocols(evaluation)) > 1:
+            found.append(f"{where}: protocols differ, and no difference is shown between them")
+        unscored = {s for result in results.results_of(evaluation) for s in result.missing}
+        if unscored:
+            found.append(f"{where}: no score in some run of {listed(sorted(unscored))}")
+    return found
+
+
+def study_summary(results: Results) -> Summary:
+    """Return the answer, the verdicts, the table of every evaluation that has results, notes."""
+    head = ["hypothesis", "metric", "left - right", "95 % interval", "verdict", "of", "note"]
+    judged = [_hypothesis_row(results, judgement) for judgement in results.judgements()]
+    tables: list[tuple[str, Rows]] = [("", [head, *judged])] if judged else []
+    others = [name for name in results.columns if name != results.metric]
+    for name in results.plan.evaluations:
+        if results.models(name):
+            published = results.settings.published
+            rows = table_rows(results, name, results.metric, others, published)
+            tables.append((name, rows))
+    return Summary(answer=answer(results), tables=tables, notes=notes(results))
+
+
+def _hypothesis_row(results: Results, judgement: Judgement) -> list[str]:
+    column = results.columns.get(judgement.metric, results.column)
+    estimate = judgement.estimate
+    reason = f" ({judgement.reason})" if judgement.reason else ""
+    return [
+        judgement.hypothesis.claim,
+        column.heading,
+        shown(column, estimate.mean if estimate else None, "+"),
+        interval_shown(column, estimate),
+        judgement.verdict + reason,
+        estimate.sample if estimate else "–",
+        judgement.hypothesis.note,
+    ]
+
+
+def record(results: Results) -> dict[str, Any]:
+    """Return everything that the tables say, as plain values, and the times of every run."""
+    table = [row for name in results.plan.evaluations for row in table_records(results, name)]
+    return {
+        "answer": answer(results),
+        "reference": results.reference,
+        "metric": results.metric,
+        "table": table,
+        "hypotheses": [
+            {
+                **judgement.hypothesis.model_dump(),
+                "metric": judgement.metric,
+                "verdict": judgement.verdict,
+                "reason": judgement.reason,
+                **(judgement.estimate.record() if judgement.estimate else {}),
+            }
+            for judgement in results.judgements()
+        ],
+        "notes": notes(results),
+        "times": [*_times(results)],
+    }
+
+
+def _times(results: Results) -> Iterator[dict[str, Any]]:
+    """Yield how long every run has trained, which no other machine or day repeats."""
+    for run in results.plan.runs:
+        # Of the clock of training, which pauses between sessions do not move.
+        for last in read_records(run.folder / "history.jsonl")[-1:]:
+            times = {name: last[name] for name in ("step", "seconds")}
+            yield {"variant": run.variant, "seed": run.seed, **times}

@@ -26,8 +26,7 @@ from qgs.train.training import train
 from qgs.wording import counted
 from qgs_research.studies.hypotheses import MAIN
 from qgs_research.studies.plan import planned
-from qgs_research.studies.report import study_summary, write_files
-from qgs_research.studies.results import Results
+from qgs_research.studies.results import Results, study_summary, write_files
 from qgs_research.studies.runs import Plan, Run, recipe_file, run_of, write_plan
 from qgs_research.studies.study import read_study
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from qgs.contracts import Column
 from qgs.metrics.baselines import BASELINES
-from qgs_research.studies.estimates import Estimate, Runs, estimate
+from qgs_research.studies.estimates import CONFIDENCE, Estimate, Runs, estimate
 from qgs_research.studies.hypotheses import MAIN
-from qgs_research.studies.intervals import CONFIDENCE
 from qgs_research.studies.stored import StoredResults
 
 Terms: TypeAlias = Mapping[tuple[str, str], int]

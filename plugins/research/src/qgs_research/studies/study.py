@@ -51,23 +51,17 @@ Section: TypeAlias = Annotated[str, AfterValidator(_evaluation_section)]
 
 
 class Budget(ComponentConfig):
-    """What each run may use: one of the three."""
+    """What each run may use: one of the two."""
 
     steps: int | None = Field(default=None, ge=1)
     """Optimiser steps: the only budget that a busy machine does not change."""
     seconds: float | None = Field(default=None, gt=0)
     """Seconds on the clock of training; how many steps that were is shown."""
-    images: int | None = Field(default=None, ge=1)
-    """Target images that are rendered and judged in training, all steps together."""
 
     @model_validator(mode="after")
     def _is_one(self) -> "Budget":
-        given = self.model_dump(exclude_none=True)
-        if len(given) != 1:
-            raise OptionError(
-                f"a budget is one of steps, seconds and images, got {len(given)} of them",
-                "write `budget: {steps: 2000}`",
-            )
+        if (self.steps is None) == (self.seconds is None):
+            raise OptionError("a budget is steps or seconds", "write `budget: {steps: 2000}`")
         return self
 
 

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from qgs.evaluate.results import bullets, markdown_table, print_lines, print_table
 from qgs.wording import listed
-from qgs_research.studies.estimates import Estimate, count_better, interval_shown, shown
+from qgs_research.studies.estimates import Estimate, interval_shown, shown
 from qgs_research.studies.hypotheses import MAIN
 from qgs_research.studies.scores import Scores
 from qgs_research.studies.stored import StoredResults
@@ -52,7 +52,7 @@ def table_rows(
 ) -> Rows:
     """Return a row for each model and baseline: a metric in full, means of `others`."""
     column = scores.columns[metric]
-    head = [column.title, "sd", "difference", "95 % interval", "better in"]
+    head = [column.title, "sd", "difference", "95 % interval"]
     head += ["published"] if published else []
     head += [scores.columns[name].title for name in others]
     rows = [["variant", *head, "seeds", "steps"]]
@@ -66,7 +66,6 @@ def table_rows(
             shown(column, score.deviation if score else None),
             "reference" if model == scores.reference else difference,
             interval_shown(column, apart),
-            count_better(column, apart),
         ]
         if published:
             row.append(shown(column, published.get(model)))
@@ -128,5 +127,3 @@ def interval_notes(differences: Iterable[Estimate]) -> Iterator[str]:
         yield "intervals: 95 %, over trainings and scenes; sd: over seeds"
     if 1 in seeds:
         yield "one training a side: its interval covers scenes alone"
-    if any(estimate.scenes == 1 for estimate in differences):
-        yield "one scene is too few for an interval"
