@@ -67,7 +67,7 @@ def bench(
     }
     with console.status("composing") as status:
         report = measure_recipes(
-            [str(path) for path in recipes],
+            [*map(str, recipes)],
             work,
             step=step,
             memory=memory,
@@ -77,8 +77,6 @@ def bench(
             overrides=overrides or (),
             say=status.update,
         )
-    if json is not None:
-        write_text(json, as_json(report))
     show(report, console)
     if json is not None:
-        console.print(f"written to {json}")
+        write_text(json, as_json(report))

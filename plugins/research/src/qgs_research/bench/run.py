@@ -51,7 +51,7 @@ def measure_recipes(
         say: called with what is measured next.
 
     Returns the report, plain values for JSON: seconds with every sample, bytes, and ratios to the
-    first recipe, those of latencies round by round. Raises as the models and `peak_memory` do.
+    first, those of latencies round by round. Raises as the models and `peak_memory` do.
     """
     recipes = [resolve(name, overrides) for name in names]
     works = [workload_of(recipe, **work) for recipe in recipes]
@@ -82,10 +82,9 @@ def measure_recipes(
         columns = in_turn(tasks, rounds, warmup)
         for entry, samples in zip(entries, columns, strict=True):
             # Round by round, so that the machine's load cancels.
-            ratios = list(map(truediv, samples, columns[0]))
-            found = {**quartiles(samples), "samples": samples, "ratio": quartiles(ratios)}
-            entry["seconds"][operation] = found
-    settings = {"overrides": list(overrides), "rounds": rounds, "warmup": warmup}
+            ratio = quartiles([*map(truediv, samples, columns[0])])
+            entry["seconds"][operation] = {**quartiles(samples), "samples": samples, "ratio": ratio}
+    settings = {"overrides": [*overrides], "rounds": rounds, "warmup": warmup}
     return {"machine": machine(work["device"]), **settings, "recipes": entries}
 
 

@@ -63,18 +63,14 @@ def import_weights(
     if recipe is None:
         layout, tree = fitting_recipe(shapes, str(weights))
         recipe = resolve(tree, overrides)
-        origin = f"{file.path.name}, weights of {layout.name} ({layout.source})"
         lines = [
-            f"# Derived from the names and shapes of {origin}.",
+            f"# Derived from {file.path.name}, weights of {layout.name} ({layout.source}).",
             "# Shapes do not determine the following, which is as published:",
             *(f"#   {choice}" for choice in layout.undecided),
             *(f"# Overridden: {override}" for override in overrides),
         ]
-        text = "\n".join(lines) + "\n" + dump(dict(recipe.tree if overrides else tree))
-    try:
-        names = names_of(recipe)
-    except PublishedError as error:
-        raise PublishedError(f"{file.path} does not fit the recipe: {error}") from error
+        text = "\n".join([*lines, dump(dict(recipe.tree if overrides else tree))])
+    names = names_of(recipe)
     tensors, converted = _as_float32(file, names)
     # Weights show no activations: tell where the recipe differs from what was published.
     settings = differing_predictions(recipe.tree, resolve(names.layout.read(shapes)).tree)
@@ -99,8 +95,7 @@ def import_weights(
         report += [f"  {path}: {a} ({name}: {b})" for path, (a, b) in settings.items()]
     report.append(f"wrote {out}")
     if recipe_file:
-        report.append(f"wrote {recipe_file}; names and shapes do not determine:")
-        report += [f"  {choice}" for choice in names.layout.undecided]
+        report.append(f"wrote {recipe_file}, which says what shapes do not determine")
     return Transfer(recipe, report)
 
 
