@@ -90,22 +90,8 @@ def test_reduced_photos_are_chosen(tmp_path):
         scene(tmp_path, images="images_2")
 
 
-def test_distortion_is_undone(tmp_path):
-    write(tmp_path / "abc", scene_files(k1=-0.5, k2=0.01, p1=1e-3, p2=-2e-3))
-    write(tmp_path / "pinhole", scene_files())
-    bent, straight = opened(tmp_path).scenes("train")
-    assert torch.equal(bent.cameras.intrinsics, straight.cameras.intrinsics)
-    difference = (bent.images([0]) - straight.images([0]))[0, 2].abs()
-    assert difference[3:6, 7:9].max() < 0.01 < difference[:, 13].min()
-
-
 def length(path):
     return len(scene(path).cameras.c2w)
-
-
-def test_photos_of_another_aspect_are_refused(tmp_path):
-    write(tmp_path / "abc", {**scene_files(), "images_4/0.png": photo(0, (18, 32))})
-    must_refuse(r"0\.png.*swapped", length, tmp_path)
 
 
 def test_missing_photos_are_counted_and_named(tmp_path, caplog):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from line_scenes import Line
 from qgs_photos.datasets.bounded import Bounded
-from qgs_photos.datasets.farthest import Farthest, farthest_points
+from qgs_photos.datasets.farthest import Farthest
 
 from qgs.contracts import ViewsConfig
 from qgs.contracts.schedule import END
@@ -127,13 +127,6 @@ def test_inputs_stand_where_cameras_move():
     sampler = farthest(max_gap=20)
     four = ViewsConfig(inputs=4, targets=8)
     assert sampler.draw(Bend(21), four, seeded(), END)[0][1:] == (18, 19, 20)
-
-
-def test_points_farthest_from_each_other():
-    points = torch.zeros(6, 3)
-    points[:, 0] = torch.tensor([0, 1, 5, 5, 2, 9])
-    # the mean is at 3.7: 9 is farthest, then 0, then 5, then 2; 5 again only after 1
-    assert farthest_points(points, 6) == [5, 0, 2, 4, 1, 3]
 
 
 def test_more_inputs_than_views():

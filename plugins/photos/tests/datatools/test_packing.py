@@ -2,11 +2,7 @@
 
 import io
 import json
-import os
-import signal
-from contextlib import contextmanager
 from functools import partial
-from itertools import count
 
 import numpy as np
 import photo_formats
@@ -157,14 +153,9 @@ def test_chunks_are_bounded_in_size_and_order_is_kept(six, tmp_path):
     assert all(file.stat().st_size < 2.5 * one_scene + 20_000 for file in files)
 
 
-def test_splits(six):
-    def found(splits):
-        return [*map(list, splits.values())]
-
-    named = packing.chosen_splits(six, ["s4", "s1"])
-    assert found(named) == [["s0", "s2", "s3", "s5"], ["s1", "s4"]]
-    numbered = packing.chosen_splits(six, every=3)
-    assert found(numbered) == [["s0", "s1", "s3", "s4"], ["s2", "s5"]]
+def test_named_scenes_are_for_testing(six):
+    train, test = packing.chosen_splits(six, ["s4", "s1"]).values()
+    assert ([*train], [*test]) == (["s0", "s2", "s3", "s5"], ["s1", "s4"])
     absent = "1 of 2 test scenes are not there: gone"
     must_refuse(absent, packing.chosen_splits, six, ["s1", "gone"])
 
@@ -202,39 +193,24 @@ def test_scenes_that_cannot_be_read_stop_a_packing_or_are_left_out(six, tmp_path
     same(six, packed(out))
 
 
-def packed_until_killed(before, out, moment):
-    """How a process of its own ends that packs, killed when it has written or moved a file."""
-    process = os.fork()
-    if process:
-        return os.waitpid(process, 0)[1]
-    moments = count(1)
-    opened = packing.opened_replacing
-
-    @contextmanager
-    def opened_until_killed(path):
-        with opened(path) as file:
-            yield file
-            next(moments) == moment and os.kill(os.getpid(), signal.SIGKILL)
-        next(moments) == moment and os.kill(os.getpid(), signal.SIGKILL)
-
-    packing.opened_replacing = opened_until_killed
-    try:
-        pack(before, out, chunk_bytes=1)
-        os._exit(0)
-    finally:
-        os._exit(1)
-
-
-def test_a_killed_packing_goes_on(tmp_path):
+def test_an_interrupted_packing_goes_on(tmp_path):
     before = scenes(tmp_path, 4)
     out = tmp_path / "chunks"
-    moments = count(1)
-    while (ended := packed_until_killed(before, out, next(moments))) == signal.SIGKILL:
+    for last in range(1, 4):
+
+        def interrupted(scene, last=last):
+            if scene == f"s{last}":
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            pack(before, out, chunk_bytes=1, progress=interrupted)
+        assert len([*out.rglob("*.torch")]) == last
         assert not list(out.rglob("index.json"))
-    assert ended == 0
-    assert next(moments) > 5
-    assert not (out / "packing.json").exists()
-    assert not list((out / "train").glob(".*"))
+        (out / "train/.000009.torch.1.tmp").touch()  # as a killed process leaves
+    result = pack(before, out, chunk_bytes=1)
+    assert (result.resumed, result.frames) == (3, 2)
+    names = sorted(file.name for file in out.rglob("*.*"))
+    assert names == [*(f"00000{number}.torch" for number in range(4)), "index.json"]
     same(before, packed(out))
 
 

@@ -3,9 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image, ImageFilter
-from qgs_photos.poses.frames import FEWEST, extract, shift, thinned
+from qgs_photos.poses.frames import FEWEST, extract, thinned
 from walked import cut, write_turned, write_video
 
 
@@ -59,13 +58,6 @@ def test_of_more_frames_than_wanted_the_sharpest_of_neighbours_are_kept():
     assert [int(path.stem) for path in thinned(scores, 10)] == [*range(2, 50, 5)]
     assert thinned(scores, 50) == [*scores]
     assert len(thinned(scores, 33)) == 33
-
-
-def test_the_shift_of_a_picture():
-    rng = np.random.default_rng(0)
-    wide = np.kron(rng.random((12, 40)), np.ones((4, 4))).astype(np.float32)
-    assert shift(wide[:, :64], wide[:, 8:72]) == pytest.approx(8 / 64)
-    assert shift(wide[:, :64], wide[:, :64]) == 0
 
 
 def test_a_varying_rate_counts_by_time(tmp_path):

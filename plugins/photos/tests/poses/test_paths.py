@@ -137,7 +137,7 @@ def test_a_scene_of_photos_is_filmed_from_their_cameras(made, tmp_path):
     assert torch.allclose(found, expected, 0, 0.02)
 
 
-def test_the_command_films_and_overwrites_nothing(made, tmp_path):
+def test_the_command_films(made, tmp_path):
     save_ply(wall(3.0), tmp_path / "scene.ply")
     out = tmp_path / "a.mp4"
     film = f"{tmp_path} {made[0]} --out {out} --path walk --seconds 0.4 --rate 5 --size 32x48"
@@ -145,9 +145,7 @@ def test_the_command_films_and_overwrites_nothing(made, tmp_path):
     assert result.exit_code == 0, result.output
     assert len(frames(out)) == 2
     for refused, error in (
-        (film, FileExistsError),
         (f"{tmp_path}", ValueError),
-        (f"{tmp_path} --out {tmp_path}/a.gif", ValueError),
         ("nothing", FileNotFoundError),
         (film.replace("a.mp4", "b.mp4").replace("walk", "walks"), ValueError),
     ):
