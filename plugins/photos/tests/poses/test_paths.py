@@ -8,13 +8,13 @@ import pytest
 import torch
 from commands import run_qgs
 from PIL import Image, ImageSequence
-from qgs_photos.poses.film import write_film
 from qgs_photos.poses.filming import (
     FilmOptions,
     FilmScene,
     cameras_of,
     open_film_scene,
     seen_depth,
+    write_film,
 )
 from qgs_photos.poses.paths import path_of, read_path, walk
 from tables import must_refuse

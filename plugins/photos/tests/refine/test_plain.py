@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import torch
-from qgs_photos.refine.plain import plain
+from qgs_photos.refine.result import plain
 from test_refining import RENDERER, cloud, ring
 
 

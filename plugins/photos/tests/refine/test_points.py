@@ -5,7 +5,7 @@ import struct
 import pytest
 import torch
 from photo_formats import synthetic, write_colmap
-from qgs_photos.refine.points import from_points, sparse_points
+from qgs_photos.refine.initial import from_points, sparse_points
 from test_refining import ring
 from torch.testing import assert_close
 from upath import UPath

@@ -45,8 +45,7 @@ def video(
     from rich.console import Console
 
     from qgs.files import refuse_existing
-    from qgs_photos.poses.film import refuse_suffix
-    from qgs_photos.poses.filming import FilmOptions, film, open_film_scene
+    from qgs_photos.poses.filming import FilmOptions, film, open_film_scene, refuse_suffix
 
     # before the scene is opened, which takes seconds
     refuse_existing(out)

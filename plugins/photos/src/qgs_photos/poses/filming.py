@@ -1,26 +1,35 @@
-"""What is filmed, from where, how large and how long."""
+"""What is filmed, from where, how large and how long; rendered pictures as mp4 or WebP."""
 
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
+import av
+import numpy as np
 import torch
+from PIL import Image
 from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor
 
 from qgs.checkpoint.gaussians import load_ply
 from qgs.contracts import Renderer
+from qgs.drawing.images import rgb_picture
+from qgs.files import replacing
 from qgs.geometry.poses import relative_to, scaled
 from qgs.geometry.transforms import moved
 from qgs.reconstruction.scenes import photo_scene
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians
-from qgs_photos.poses.film import pictures, write_film
 from qgs_photos.poses.paths import KINDS, path_of, read_path
 from qgs_photos.record import GAUSSIANS, has_record, read_record
 
+SUFFIXES = (".mp4", ".webp")
+# Of x264; 0 loses nothing, 23 is its default.
+_QUALITY = "18"
 # Pixels of the shorter side, where the photos have fewer.
 _HEIGHT = 480
 
@@ -53,13 +62,52 @@ def film(scene: FilmScene, options: FilmOptions, file: Path, console: Console) -
     """Render the path and write `file`. Raises ValueError for a path that is none."""
     path = cameras_of(scene, options).to(scene.gaussians.means.device)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("rendering", total=path.shape[1])
+        cameras = bar.track(range(path.shape[1]), description="rendering")
+        write_film((_picture(scene, path[:, [place]]) for place in cameras), file, options.rate)
 
-        def progress(done: int) -> None:
-            bar.update(task, completed=done)
 
-        frames = pictures(scene.gaussians, path, scene.renderer, progress)
-        write_film(frames, file, options.rate)
+@torch.no_grad()
+def _picture(scene: FilmScene, camera: Cameras) -> np.ndarray:
+    return rgb_picture(scene.renderer(scene.gaussians, camera).rgb[0, 0])
+
+
+def write_film(frames: Iterator[np.ndarray], file: Path, rate: int) -> None:
+    """Write pictures of one size, `rate` a second, as H.264 in mp4, or as an endless WebP."""
+    refuse_suffix(file)
+    with replacing(file) as temporary:
+        if file.suffix.lower() == ".webp":
+            _write_webp(frames, temporary, rate)
+        else:
+            _write_mp4(frames, temporary, rate)
+
+
+def refuse_suffix(file: Path) -> None:
+    """Raise ValueError for a file of another kind."""
+    if file.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"{file} is no name of a video: it must end with {' or '.join(SUFFIXES)}")
+
+
+def _write_mp4(frames: Iterator[np.ndarray], path: Path, rate: int) -> None:
+    # browsers show it before all is there
+    options = {"movflags": "+faststart"}
+    with av.open(str(path), "w", format="mp4", options=options) as container:
+        stream = container.add_stream("libx264", rate=rate, options={"crf": _QUALITY})
+        stream.pix_fmt = "yuv420p"
+        stream.time_base = Fraction(1, rate)
+        for number, picture in enumerate(frames):
+            # its colours have half the resolution
+            even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
+            if not number:
+                stream.height, stream.width = even.shape[:2]
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def _write_webp(frames: Iterator[np.ndarray], path: Path, rate: int) -> None:
+    first, *rest = map(Image.fromarray, frames)
+    options = {"duration": round(1000 / rate), "loop": 0, "quality": 85, "method": 2}
+    first.save(path, "WEBP", save_all=True, append_images=rest, **options)
 
 
 def cameras_of(scene: FilmScene, options: FilmOptions) -> Cameras:

@@ -17,13 +17,13 @@ from qgs.drawing.figures import figure_picture, grid_figure
 from qgs.drawing.images import rgb_picture
 from qgs.extensions import INSTALL_ALL
 from qgs.files import replacing_entries, write_text
-from qgs.geometry.transforms import moved
+from qgs.geometry.harmonics import seen_colors
+from qgs.geometry.transforms import moved, to_camera, to_pixels
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.renderers import AutoRenderer
-from qgs.types import Gaussians, Views
+from qgs.types import Cameras, Gaussians, Views
 from qgs_photos.printing import say
-from qgs_photos.refine.plain import plain
 from qgs_photos.refine.refining import RefinedScene
 from qgs_photos.refine.scene_photos import ScenePhotos
 
@@ -164,3 +164,31 @@ def page_writer(console: Console) -> PageWriter | None:
         )
         return None
     return gaussians_html
+
+
+@torch.no_grad()
+def plain(gaussians: Gaussians, cameras: Cameras) -> Gaussians:
+    """Return Gaussians (1, G) without `sh`, in the mean colour that cameras (1, V) see of each.
+
+    Those count that have its mean in their image; where none has, all do.
+    """
+    if gaussians.sh is None:
+        return gaussians
+    views = cameras.shape[1]
+    total = torch.zeros_like(gaussians.colors)
+    mean_of_all = torch.zeros_like(total)
+    count = torch.zeros_like(gaussians.opacities)[..., None]
+    size = gaussians.means.new_tensor(cameras.size[::-1])
+    # all views at once would take gigabytes
+    for view in range(views):
+        camera = cameras[:, view : view + 1]
+        points = to_camera(gaussians.means, camera)
+        pixels = to_pixels(points, camera.intrinsics)
+        inside = (points[..., 2] > 0) & ((pixels >= 0) & (pixels <= size)).all(-1)
+        seen = inside[:, 0, :, None].float()
+        colors = seen_colors(gaussians, camera)[:, 0]
+        total += seen * colors
+        count += seen
+        mean_of_all += colors / views
+    mean = total / count.clamp_min(1)
+    return replace(gaussians, colors=torch.where(count > 0, mean, mean_of_all), sh=None)
