@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from upath import UPath
 
-from qgs.data.photos.checks import refuse_fatal_problems, refuse_outside, with_equal_times
+from qgs.data.photos.checks import refuse_fatal_problems, refuse_outside
 from qgs.data.photos.colmap import Colmap
 from qgs.data.photos.nerfstudio import Nerfstudio
 from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, existing
@@ -85,7 +85,14 @@ def read_listing(folder: UPath, format: str = "auto", images: str | None = None)
             f"{folder} holds photos in {len(held)} formats ({', '.join(held)}) and is read as "
             f"{held[0]}; in a recipe, data.format: {held[1]} reads the other"
         )
-    return with_equal_times(known[held[0] if format == "auto" else format].read(folder, images))
+    found = known[held[0] if format == "auto" else format].read(folder, images)
+    still = [frame.name for frame in found.frames if frame.time is None and not frame.problems]
+    if still and len({frame.time is None for frame in found.frames}) > 1:
+        raise ValueError(
+            f"{found.file} gives no 'time' for {listed(still)}, and one for other frames: write it "
+            "for each, or for none where nothing moves"
+        )
+    return found
 
 
 def present_frames(

@@ -3,7 +3,6 @@
 import math
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 from upath import UPath
@@ -116,21 +115,6 @@ def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FramePr
     size = f"{str(width)[:12]} x {str(height)[:12]}"
     reason = f"the listed size, {size} pixels, is impossible for a photo"
     return None, (FrameProblem(reason, "correct the width and height"),)
-
-
-def with_equal_times(listing: Listing) -> Listing:
-    """Return `listing`, with a problem for each frame that lacks the time that others have."""
-    count = len(listing.frames)
-    without = sum(frame.time is None for frame in listing.frames)
-    if without in (0, count):
-        return listing
-    reason = f"it has no 'time', like {without} of {count} frames, and the others have"
-    problem = FrameProblem(reason, "write it for each, or for none where nothing moves")
-    frames = [
-        replace(frame, problems=frame.problems or (problem,)) if frame.time is None else frame
-        for frame in listing.frames
-    ]
-    return replace(listing, frames=frames)
 
 
 def refuse_fatal_problems(listing: object, frames: Sequence[PhotoFrame]) -> None:

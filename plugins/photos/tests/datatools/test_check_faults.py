@@ -129,12 +129,7 @@ def test_faults_of_masks(planted, shots):
 def test_a_camera_that_stands_still_may_film_what_moves(planted):
     """Two frames have one pose; times tell them apart, but are wrong in the last room."""
     repeats = "error: frame 5 (images/5.jpg): the pose repeats *"
-    wrong = (
-        "error: frame 2 (images/2.jpg): 'time' must be a finite number, got '2': correct it",
-        "error: frames 4-5 (images/4.jpg to images/5.jpg): it has no 'time', like 3 of 6 frames, "
-        "and the others have: write it for each, or for none where nothing moves",
-        repeats,
-    )
+    wrong = ["error: *gives no 'time' for images/4.jpg, images/5.jpg, and one for other frames*"]
     cases = (([], [repeats]), ([0.5] * 6, [repeats]), (range(6), []), ([0, 1, "2", 3], wrong))
     for times, lines in cases:
         room = planted(*lines)
