@@ -7,7 +7,6 @@ import io
 import json
 import math
 import shutil
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -145,16 +144,31 @@ def write_llff(folder, photos):
 
 
 def write_colmap(folder, photos, kind, camera=None, model="sparse/0", images="images", names=None):
-    """kind: text or binary. camera: name, number and parameters of a model of COLMAP's.
+    """kind: text or binary, which pycolmap makes of it. camera: name and parameters of a model.
 
     Images are listed backwards, with two observations each.
     """
     names = copied(photos, folder / images, names)
-    (folder / model).mkdir(parents=True, exist_ok=True)
-    poses = map(world_to_camera, photos.c2w)
-    entries = list(zip(range(1, len(names) + 1), poses, names, strict=True))[::-1]
-    write = {"text": _write_text, "binary": _write_binary}[kind]
-    write(folder / model, entries, camera or ("PINHOLE", 1, photos.intrinsics), photos.size)
+    place = folder / model
+    place.mkdir(parents=True, exist_ok=True)
+    name, parameters = camera or ("PINHOLE", photos.intrinsics)
+    height, width = photos.size
+    numbers = " ".join(map(repr, map(float, parameters)))
+    line = f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n7 {name} {width} {height} {numbers}\n"
+    (place / "cameras.txt").write_text(line)
+    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
+    for number in range(len(names), 0, -1):
+        pose = map(repr, map(float, world_to_camera(photos.c2w[number - 1])))
+        lines += [f"{number} {' '.join(pose)} 7 {names[number - 1]}"]
+        lines += ["3.5 4.5 11 8.0 9.0 -1"]
+    (place / "images.txt").write_text("\n".join(lines) + "\n")
+    (place / "points3D.txt").write_text("11 0 0 5 1 2 3 0.5 1 0 2 0\n")
+    if kind == "binary":
+        import pycolmap  # not where only text is written
+
+        pycolmap.Reconstruction(str(place)).write_binary(str(place))
+        for file in place.glob("*.txt"):
+            file.unlink()
     return folder
 
 
@@ -163,32 +177,6 @@ def world_to_camera(c2w):
     w2c = np.linalg.inv(c2w)
     x, y, z, w = Rotation.from_matrix(w2c[:3, :3]).as_quat()
     return w, x, y, z, *w2c[:3, 3]
-
-
-def _write_text(folder, entries, camera, size):
-    name, _, parameters = camera
-    numbers = " ".join(map(repr, map(float, parameters)))
-    line = f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n7 {name} {size[1]} {size[0]} {numbers}\n"
-    (folder / "cameras.txt").write_text(line)
-    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
-    for number, pose, image in entries:
-        lines += [f"{number} {' '.join(map(repr, map(float, pose)))} 7 {image}"]
-        lines += ["3.5 4.5 11 8.0 9.0 -1"]
-    (folder / "images.txt").write_text("\n".join(lines) + "\n")
-    (folder / "points3D.txt").write_text("11 0 0 5 1 2 3 0.5 1 0 2 0\n")
-
-
-def _write_binary(folder, entries, camera, size):
-    _, model, parameters = camera
-    head = struct.pack("<QIiQQ", 1, 7, model, size[1], size[0])
-    (folder / "cameras.bin").write_bytes(head + struct.pack(f"<{len(parameters)}d", *parameters))
-    content = struct.pack("<Q", len(entries))
-    for number, pose, image in entries:
-        content += struct.pack("<I7dI", number, *pose, 7) + image.encode() + b"\0"
-        content += struct.pack("<QddqddQ", 2, 3.5, 4.5, 11, 8.0, 9.0, 2**64 - 1)
-    (folder / "images.bin").write_bytes(content)
-    point = struct.pack("<Q3d3BdQ2I2I", 11, 0, 0, 5, 1, 2, 3, 0.5, 2, 1, 0, 2, 0)
-    (folder / "points3D.bin").write_bytes(struct.pack("<Q", 1) + point)
 
 
 def noisy_photos(folder, count=7, step=0.1):
