@@ -23,7 +23,7 @@ from qgs.data.photos.reader import (
     numbers,
 )
 from qgs.paths import open_file, read_json
-from qgs.wording import listed, warn_once
+from qgs.wording import warn_once
 
 _LISTS = ("frames", "cameras", "views")
 _NAMES = ("image", "image_path", "file_path", "filename", "file_name", "file", "name", "img_name")
@@ -95,8 +95,8 @@ class CamerasJson(PhotoReader):
                 )
         pairs = zip(cameras, names, strict=True)
         read = [_Camera(camera, place, name) for camera, name in pairs]
-        if meant := sorted({camera.meaning for camera in read} - {"c2w and K in pixels"}):
-            warn_once(f"{file} is read as {listed(meant, 3)}")
+        if any(camera.in_parts for camera in read):
+            warn_once(f"intrinsics in {file} are read as parts of width and height")
         return Listing(file, [camera.frame(folder) for camera in read])
 
 
@@ -155,45 +155,39 @@ class _Camera:
             self.problems += wrong
         if not name:
             self._wrong("no image is named")
-        self.pose, pose = self._pose()
-        self.intrinsics, matrix = self._intrinsics()
-        self.meaning = f"{pose} and {matrix}"
+        self.in_parts = False
+        self.pose = self._pose()
+        self.intrinsics = self._intrinsics()
 
     def _wrong(self, reason: str) -> None:
         self.problems.append(FrameProblem(reason, f"write {_FORM}"))
 
-    def _pose(self) -> tuple[np.ndarray, str]:
-        """Return OpenCV camera-to-world (4, 4), and what was read as that."""
+    def _pose(self) -> np.ndarray:
+        """Return OpenCV camera-to-world (4, 4), NaN for none."""
         values = self.values
         key = _first(values, (*_C2W, *_W2C, *_OPENGL))
         pose = numbers(values.get(key))
-        meaning = key
         if not key and {"position", "rotation"} <= values.keys():
             rotation, position = (numbers(values[k]) for k in ("rotation", "position"))
-            meaning = "position and rotation (camera-to-world, as 3DGS writes them)"
             if rotation.shape == (3, 3) and position.shape == (3,):
                 pose = np.c_[rotation, position]
         elif not key:
             unclear = _first(values, _OPEN)
             reason = f"{unclear!r} may map from or to the world" if unclear else "it has no pose"
-            self._wrong(f"{reason}: expected {listed([*_C2W[:1], *_W2C[:1]])}")
-            return np.full((4, 4), np.nan), meaning
+            self._wrong(f"{reason}: expected {_C2W[0]} or {_W2C[0]}")
+            return np.full((4, 4), np.nan)
         if pose.shape == (3, 4):
             pose = np.vstack([pose, [0, 0, 0, 1]])
         if pose.shape != (4, 4):
             self._wrong(f"{key or 'rotation'!r} has the shape {pose.shape}")
-            return np.full((4, 4), np.nan), meaning
+            return np.full((4, 4), np.nan)
         if key in _W2C:
-            meaning = f"{key} (world-to-camera)"
             singular = not np.isfinite(pose).all() or abs(np.linalg.det(pose)) < 1e-9
-            pose = np.full((4, 4), np.nan) if singular else np.linalg.inv(pose)
-        if key in _OPENGL:
-            meaning = f"{key} (OpenGL camera-to-world)"
-            pose = pose * [1, -1, -1, 1]
-        return pose, f"{key} (camera-to-world)" if key in _C2W[1:] else meaning
+            return np.full((4, 4), np.nan) if singular else np.linalg.inv(pose)
+        return pose * [1, -1, -1, 1] if key in _OPENGL else pose
 
-    def _intrinsics(self) -> tuple[np.ndarray, str]:
-        """Return fx, fy, cx, cy in pixels, and what was read as that."""
+    def _intrinsics(self) -> np.ndarray:
+        """Return fx, fy, cx, cy in pixels, NaN for none."""
         key = _first(self.values, _K)
         matrix = numbers(self.values.get(key))
         names = [_first(self.values, names) for names in _FOCAL]
@@ -209,12 +203,12 @@ class _Camera:
         if matrix.shape != (4,):
             reason = f"{key!r} has the shape {matrix.shape}" if key else "it has no intrinsics"
             self._wrong(f"{reason}: expected 'K', 3 x 3")
-            return np.full(4, np.nan), "no intrinsics"
+            return np.full(4, np.nan)
         if np.abs(matrix).max() <= _NORMALISED and (size := self._photo_size()):
+            self.in_parts = True
             height, width = size
-            scaled = matrix * [width, height, width, height]
-            return scaled, f"{key or 'fx'} in parts of width and height"
-        return matrix, f"{key or names[0]} in pixels"
+            return matrix * [width, height, width, height]
+        return matrix
 
     def _photo_size(self) -> Size | None:
         """Return (H, W) as listed, else that of the file; None of one that cannot be read."""
