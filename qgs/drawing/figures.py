@@ -3,16 +3,16 @@
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from io import BytesIO
-from typing import Any
+from pathlib import Path
 
 import numpy as np
-from matplotlib import colormaps, rc_context
+from matplotlib import colormaps, style
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from PIL import Image
 
-from qgs.drawing.images import DEPTH_MAP, NOTHING, Picture
+from qgs.drawing.images import DEPTH_MAP, Picture
 
 Color = tuple[int, int, int]
 
@@ -43,32 +43,7 @@ def categorical(index: int) -> Color:
 
 def figure_style() -> AbstractContextManager[None]:
     """Return Matplotlib settings of every figure, for the `with` block only."""
-    ink = hex_color(INK)
-    muted = hex_color(MUTED)
-    style: dict[Any, Any] = {
-        "font.family": "sans-serif",
-        "font.size": 9,
-        "text.color": ink,
-        "axes.labelcolor": ink,
-        "axes.edgecolor": muted,
-        "axes.linewidth": 0.7,
-        "axes.titlesize": 9,
-        "axes.titlelocation": "left",
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.grid": True,
-        "grid.color": hex_color(NOTHING),
-        "grid.linewidth": 0.7,
-        "axes.axisbelow": True,
-        "xtick.color": muted,
-        "ytick.color": muted,
-        "xtick.labelcolor": ink,
-        "ytick.labelcolor": ink,
-        "lines.linewidth": 1.6,
-        "legend.frameon": False,
-        "figure.facecolor": "white",
-    }
-    return rc_context(style)
+    return style.context(Path(__file__).with_name("figures.mplstyle"))
 
 
 def figure_picture(figure: Figure, dpi: int = 120) -> Picture:
