@@ -94,15 +94,6 @@ def length(path):
     return len(scene(path).cameras.c2w)
 
 
-def test_missing_photos_are_counted_and_named(tmp_path, caplog):
-    files = scene_files("abc/")
-    del files["abc/images_4/2.png"]
-    write(tmp_path / "abc.zip", files)
-    assert length(tmp_path) == 3
-    assert "1 of 4 images" in caplog.text
-    assert "abc/images_4/2.png" in caplog.text
-
-
 def test_incomplete_and_broken_archives_are_told(tmp_path):
     for files, file in (
         ({"abc/images_4/0.png": b""}, r"abc\.zip"),

@@ -8,7 +8,6 @@ import textured_room
 from PIL import Image
 from qgs_photos.poses.making import Options, make_poses
 from qgs_photos.poses.photos import PosesError
-from scipy.spatial.transform import Rotation
 from upath import UPath
 from walked import PHOTOS, SCALE, quiet, write_photos, write_video
 
@@ -16,23 +15,19 @@ import qgs
 from qgs.data.photos import formats_of, read_listing
 
 
+def relative(c2w):
+    """Poses in the first one's frame, positions in parts of the farthest one's distance."""
+    found = np.linalg.inv(c2w[0]) @ c2w
+    found[:, :3, 3] /= np.linalg.norm(found[:, :3, 3], axis=1).max()
+    return found
+
+
 def assert_close(folder, shots):
-    """After a similarity: positions in parts of the largest distance of two cameras."""
+    """Within a degree, .0175, and two hundredths of the extent."""
     frames = read_listing(UPath(folder)).frames
     assert len(frames) == PHOTOS
-    found = np.stack([frame.c2w for frame in frames])
-    true = np.stack([shot.c2w for shot in shots])
-    axes = [poses[:, :3, :3].swapaxes(1, 2).reshape(-1, 3) for poses in (true, found)]
-    turn = Rotation.align_vectors(*axes)[0]
-    turned = turn * Rotation.from_matrix(found[:, :3, :3])
-    off = Rotation.from_matrix(true[:, :3, :3]).inv() * turned
-    assert np.median(np.degrees(off.magnitude())) < 1
-    centers = true[:, :3, 3] - true[:, :3, 3].mean(0)
-    placed = turn.apply(found[:, :3, 3] - found[:, :3, 3].mean(0))
-    scale = (placed * centers).sum() / (placed**2).sum()
-    distances = np.linalg.norm(scale * placed - centers, axis=-1)
-    extent = np.linalg.norm(centers[:, None] - centers[None], axis=-1).max()
-    assert np.median(distances) / extent < 0.02
+    found, true = (relative(np.stack([one.c2w for one in each])) for each in (frames, shots))
+    assert np.median(np.abs(found - true).max((1, 2))) < 0.0175
 
 
 def record_in(folder):

@@ -195,14 +195,6 @@ def test_colors_beside_harmonics_may_have_any_value():
     assert (given.gaussians().colors[:, :20] < colors).all()
 
 
-def test_where_none_is_alive_none_is_moved():
-    start = cloud(6)
-    given = free(replace(start, opacities=0 * start.opacities))
-    given.grow(9, generator())
-    assert given.count == 9
-    assert torch.equal(given.values["means"][:6], start.means[0])
-
-
 def test_growth_leaves_the_rendering_as_it_is():
     """Also of fog, Gaussians that are all faint, of which many copies are made at once."""
     fog = 0.01 + 0.05 * torch.rand(1, 200)
