@@ -1,15 +1,18 @@
 """Every test draws the same numbers on one thread; plugins for tests are installed in a folder."""
 
+import gc
+
 import pytest
 from installing import install
-from suite_watch import SuiteWatch
 
 __all__ = ["install"]
 
 
-def pytest_configure(config):
-    """Have the whole suite, tests of plugins too, say what it costs."""
-    config.pluginmanager.register(SuiteWatch(config), "suite-watch")
+def pytest_collection_finish():
+    """Leave what was imported to itself: walking through it took a tenth of the time."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 20)
 
 
 @pytest.fixture(autouse=True)

@@ -36,25 +36,6 @@ def test_the_api_in_five_lines(model, views, tmp_path):
     assert torch.equal(again(views).gaussians.means, gaussians.means)
 
 
-def test_permuting_queries_permutes_gaussians_and_scenes_of_a_batch_are_independent(model, views):
-    before = model(views).gaussians.means.unflatten(1, (12, 8))
-    alone = model(qgs.Views(views.images[:1], views.cameras[:1])).gaussians.means
-    torch.testing.assert_close(before[:1].flatten(1, 2), alone)
-    order = torch.randperm(12)
-    with torch.no_grad():
-        for parameter in model.queries.parameters():
-            parameter.copy_(parameter[order])
-    torch.testing.assert_close(model(views).gaussians.means.unflatten(1, (12, 8)), before[:, order])
-
-
-def test_geometry_is_float32_under_autocast(model, views):
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        prediction = model(views)
-    geometry = {**vars(prediction.gaussians), **prediction.state.fields}
-    tensors = [x for name, x in geometry.items() if torch.is_tensor(x)]
-    assert {tensor.dtype for tensor in tensors} == {torch.float32}
-
-
 def test_harmonics_and_features_of_a_head_come_through(views):
     model = small("locus")
     plain = model(views).gaussians

@@ -39,6 +39,8 @@ def test_what_does_not_fit_together_is_refused():
     must_refuse(r"Gaussians\.sh .*\(1, 5, C, 3\), got", Gaussians, *BALLS, zeros(1, 5, 3))
     must_refuse(r"sh has 4 coefficients.* 3, 8 or 15", Gaussians, *BALLS, zeros(1, 5, 4, 3))
     must_refuse(r"Rendering\.depth", Rendering, RGB, ALPHA, ALPHA[..., :4])
+    odd = Views(zeros(1, 1, 3, 8, 9), CAMERA.replace(size=(8, 9)))
+    must_refuse("different sizes", Views(zeros(1, 1, 3, 8, 8), CAMERA).joined, odd)
     must_refuse(r"SpatialSupport\.axes", SpatialSupport, zeros(1, 2, 3), zeros(1, 2, 3))
 
 

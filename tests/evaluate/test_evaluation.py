@@ -11,7 +11,6 @@ from unittest.mock import Mock
 import pytest
 import torch
 import yaml
-from photo_formats import synthetic, write_nerfstudio
 from rich.console import Console
 from training_runs import same, tiny
 
@@ -221,19 +220,6 @@ def test_a_failure_anywhere_ends_neither_evaluation_nor_in_silence(monkeypatch):
     assert memory == "RuntimeError: out of memory"
     assert "is not finite" in finite
     assert file == "OSError: /data/set/truncated.png is cut off"
-
-
-def test_photo_folders_are_judged_on_held_out_frames_beside_a_broken_one(tmp_path):
-    folder = tmp_path / "set"
-    for name in ("a", "b", "c"):
-        write_nerfstudio(folder / name, synthetic(tmp_path / "photos", 12, (32, 32)))
-    (folder / "b/transforms.json").write_text("{")
-    (folder / "c/images/view_006.png").write_bytes(b"no photo")
-    data = f"data={{type: qgs/photos, path: {folder}, image_size: [32, 32], holdout: 4}}"
-    recipe = tiny("tokengs", data, "evaluation.scenes=9")
-    summary = (evaluation := evaluate(recipe.build_model(), recipe)).summary()
-    assert [score.scene for score in evaluation.scores] == ["a"]
-    assert list(summary["missing"]) == ["b", "c"]
 
 
 def test_tuned_evaluations_say_so_and_score_the_tuned_tokens():

@@ -45,21 +45,6 @@ def test_more_gaussians_than_a_unit_of_work_takes(more):
     assert_close(found, gradients)
 
 
-def test_gaussians_have_the_same_gradients_without_those_of_the_cameras():
-    gaussians, cameras = make_scene(views=2)
-    gaussians.means.requires_grad_()
-
-    def slopes(lenses, *leaves):
-        return torch.autograd.grad(RENDER(gaussians, lenses).rgb.sum(), leaves)
-
-    (alone,) = slopes(cameras, gaussians.means)
-    for name in ("c2w", "intrinsics"):
-        leaf = getattr(cameras, name).clone().requires_grad_()
-        together, of_leaf = slopes(cameras.replace(**{name: leaf}), gaussians.means, leaf)
-        assert torch.equal(alone, together)
-        assert of_leaf.any()
-
-
 def test_missing_numba_says_what_to_do(monkeypatch):
     monkeypatch.setattr(qgs.renderers.cpu, "can_compile", lambda: False)
     with pytest.raises(RuntimeError, match=r"pip install numba.*qgs/torch"):

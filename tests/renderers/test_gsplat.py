@@ -37,10 +37,8 @@ def test_arguments_are_what_gsplat_expects(calls):
     render = GsplatRenderer(config)
     gaussians, cameras = make_scene(2, 3, 7, size=(12, 20), harmonics=8, features=2)
     rendering = render(gaussians, cameras)
-    unharmonic = gaussians.replace(sh=None)
-    render(unharmonic, cameras)
-    bare = render(unharmonic.replace(features=None), cameras)
-    found, of_unharmonic, of_bare = (call.kwargs for call in calls)
+    bare = render(gaussians.replace(sh=None, features=None), cameras)
+    found, of_bare = (call.kwargs for call in calls)
     fx, fy, cx, cy = cameras.intrinsics[1, 2]
     lens = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     assert torch.equal(found.pop("Ks")[1, 2], lens)
@@ -60,15 +58,13 @@ def test_arguments_are_what_gsplat_expects(calls):
         "backgrounds": backdrop,
     }
     torch.testing.assert_close(found, expected)
-    plain = torch.cat([gaussians.colors, gaussians.features], -1)
-    assert torch.equal(of_unharmonic["colors"], plain)
     assert torch.equal(of_bare["colors"], gaussians.colors)
     assert torch.equal(of_bare["backgrounds"], backdrop[..., :3])
     channels = torch.tensor([0, 1, 2, 3, 4, 5, 0.25, 3])[:, None, None].expand(2, 3, 8, 12, 20)
     images = [rendering.rgb, rendering.features, rendering.depth, rendering.alpha, bare.depth]
     assert torch.equal(torch.cat(images, 2), channels)
     render(gaussians[:, :0], cameras)
-    assert len(calls) == 3, "kernels divide by the number of Gaussians"
+    assert len(calls) == 2, "kernels divide by the number of Gaussians"
 
 
 def test_options_that_the_kernels_fix_are_refused():

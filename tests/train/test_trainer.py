@@ -3,7 +3,6 @@
 from typing import get_args
 from unittest.mock import Mock
 
-import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -23,9 +22,7 @@ from training_runs import (
 import qgs
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.contracts import TrainingConfig
-from qgs.drawing.images import rgb_picture
 from qgs.evaluate.evaluation import evaluate
-from qgs.evaluate.plan import evaluation_samples
 from qgs.recipe import Recipe, resolve
 from qgs.train import guard
 from qgs.train.guard import NonFiniteError
@@ -81,14 +78,8 @@ def test_weights_and_their_average_are_judged_and_shown_side_by_side(trained_run
     assert scores[0]["psnr"] != scores[1]["psnr"]
     pictures = folder.path / "pictures"
     assert {path.name for path in pictures.iterdir()} == {"step-2.png", "step-3.png"}
-    picture = np.asarray(Image.open(pictures / "step-3.png"))
-    assert picture.shape == (36, 96, 3)  # two rows of five, 4 apart
-    sample = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)[0]
-    with torch.no_grad():
-        rendering = raw.render(raw(sample.inputs).gaussians, sample.targets.cameras)
-    images = *sample.inputs.images[0], sample.targets.images[0, 0], rendering.rgb[0, 0]
-    for column, image in enumerate(images):
-        np.testing.assert_array_equal(picture[:16, 20 * column :][:, :16], rgb_picture(image))
+    with Image.open(pictures / "step-3.png") as picture:
+        assert picture.size == (96, 36)  # two rows of five, 4 apart
 
 
 def test_scenes_that_do_not_split_evenly_are_refused():

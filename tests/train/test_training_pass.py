@@ -191,19 +191,6 @@ def test_under_autocast_the_gaussians_get_the_same_gradients(monkeypatch):
         assert furthest(part, whole) < 1e-6
 
 
-def test_totals_scale_with_their_gradients_and_without_gradients_they_only_measure():
-    objective, *batch = setting("qgs/cpu")
-    objective.render_views = 2
-    total = objective(*batch).total
-    whole = gradients(objective, 4 * total)
-    part = gradients(objective, objective(*batch).total)
-    assert furthest({n: 4 * g for n, g in part.items()}, whole) < 1e-6
-    with torch.no_grad():
-        measured = objective(*batch).total
-    assert not measured.requires_grad
-    assert measured == total
-
-
 def test_signs_are_those_of_all_views_of_the_last_layer():
     objective, inputs, targets = setting("qgs/cpu")
     model = objective.model
@@ -226,20 +213,6 @@ def test_input_views_are_judged_too():
     of_inputs, of_targets = (written_out(step, inputs, views) for views in (inputs, targets))
     wanted = {name: (2 * of_inputs[name] + term) / 3 for name, term in of_targets.items()}
     torch.testing.assert_close(step(inputs, targets).terms, wanted)
-
-
-def test_views_are_joined_in_order_and_only_with_their_like():
-    batch = first_batch(tiny("tokengs"))
-    one, other = (replace(v, masks=v.images[:, :, :1]) for v in (batch.inputs, batch.targets))
-    both = one.joined(other)
-    assert both.cameras.shape == (2, 4)
-    for name in ("images", "masks"):
-        joined = torch.cat([getattr(one, name), getattr(other, name)], 1)
-        assert torch.equal(getattr(both, name), joined)
-    wider = first_batch(tiny("tokengs", "data.image_size=[16, 24]")).targets
-    for unlike in (batch.targets, replace(wider, masks=wider.images[:, :, :1])):
-        with pytest.raises(ValueError, match=r"masks|sizes"):
-            one.joined(unlike)
 
 
 @pytest.mark.slow
