@@ -12,7 +12,6 @@ from rich.console import Console
 
 from qgs.cli.evaluate import evaluate_into
 from qgs.cli.options import Device, Overrides, Threads, use_threads
-from qgs.wording import listed
 
 if TYPE_CHECKING:
     from qgs.recipe import Recipe
@@ -70,15 +69,10 @@ def train(
 
 
 def _report(result: TrainingResult, console: Console) -> None:
-    """Say what training made, what it left out, and how to go on."""
+    """Say what training made, and how to go on."""
     before = "was already finished: " if result.resumed_at == result.steps else ""
     made = f"{result.steps} steps in {result.seconds:.0f} s, {result.folder.checkpoint}"
     console.print(f"{before}{made}")
-    if bad := result.left_out:
-        lines = [f"{count} x {reason}" for reason, count in bad.items()]
-        first = f"{sum(bad.values())} samples were left out (training.on_bad_sample: skip):"
-        text = "\n  ".join([first, listed(lines, 20, "\n  ")])
-        console.print(text, highlight=False, markup=False, soft_wrap=True)
     if result.stopped_by:
         console.print(f"stopped early by {result.stopped_by}; not evaluated")
         console.print("continue with the same command and --resume", highlight=False)

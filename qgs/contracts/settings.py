@@ -82,7 +82,7 @@ class TrainingConfig(ComponentConfig):
     """What a step with a NaN or infinite loss or gradient does; its first bad tensor is named."""
     on_bad_sample: Literal["stop", "skip"] = "stop"
     """What a sample that cannot be made does, of a damaged image for example; "skip" takes one of
-    the next scenes instead, counts it, and names it in the end."""
+    the next scenes instead, with a warning."""
     evaluate_every: int = Field(default=0, ge=0)
     """Steps between evaluations with pictures; 0 for none."""
     trackers: tuple[str, ...] = ()

@@ -2,8 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -19,7 +18,6 @@ from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.dispersion import OPACITY_USED
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
-from qgs.recipe.registry import BUILTIN, component_failure
 from qgs.types import Gaussians, Views
 from qgs.wording import one_line
 
@@ -107,20 +105,17 @@ class Measures:
     """The metrics of a recipe. columns: name of every value to how it is shown.
 
     Making one finds what is wrong with the metrics before any scene is scored: raises ValueError
-    when two values have one name, PluginError for the code of a plugin that fails.
+    when two values have one name.
     """
 
     def __init__(self, recipe: Recipe) -> None:
-        self._parts = recipe.parts
         # eval(): layers of a learned metric may differ in training.
         self.metrics = {name: metric.eval() for name, metric in recipe.build_metrics().items()}
         self.needed = {need for metric in self.metrics.values() for need in metric.needs}
         self.columns: dict[str, Column] = {}
         self._owners: dict[str, Metric] = {}
         for label, metric in self.metrics.items():
-            with self._named(label, "columns"):
-                columns = metric.columns()
-            for key, column in columns.items():
+            for key, column in metric.columns().items():
                 name = _name(label, key)
                 if name in self.columns:
                     raise ValueError(f"two values of the metrics are called {name}; rename one")
@@ -134,24 +129,15 @@ class Measures:
             # A baseline has no Gaussians and no depth: it has a dash in that column.
             if metric.unavailable or any(getattr(given, need) is None for need in metric.needs):
                 continue
-            with self._named(label, "forward"):
+            try:
                 found = metric(given)
                 found = found if isinstance(found, Mapping) else {"": found}
                 for key in metric.columns():
                     # float64, so that the mean adds no rounding of its own.
                     values[f"{method}_{_name(label, key)}"] = float(found[key].double().mean())
+            except Exception as error:
+                raise ValueError(f"metrics.{label} fails: {one_line(error)}") from error
         return values
-
-    @contextmanager
-    def _named(self, label: str, function: str) -> Iterator[None]:
-        """Name a plugin's metric and its distribution in what its code raises."""
-        try:
-            yield
-        except Exception as error:
-            chosen = self._parts["metrics", label]
-            if chosen.installed.plugin is BUILTIN:
-                raise
-            raise component_failure(chosen.type, function, error, chosen.installed) from error
 
     def incomplete(self, scores: Sequence[SceneScore]) -> dict[str, str]:
         """Return why values are missing from `scores`, by name."""

@@ -238,16 +238,9 @@ def as_json(value: Mapping[str, Any]) -> str:
 
 def markdown_table(rows: Sequence[Sequence[str]]) -> str:
     """Return rows of equal length, headers first, as a Markdown table; numbers to the right."""
-    columns: list[list[str]] = []
-    for place, column in enumerate(zip(*rows, strict=True)):
-        cells = [cell.replace("|", "\\|") for cell in column]
-        # Padded: the file is read in a terminal too.
-        width = max(map(len, cells))
-        padded = [cell.rjust(width) if place else cell.ljust(width) for cell in cells]
-        header, *values = (f" {cell} " for cell in padded)
-        rule = "-" * (width + 1)
-        columns.append([header, f"{rule}:" if place else f":{rule}", *values])
-    return "\n".join(f"|{'|'.join(line)}|" for line in zip(*columns, strict=True))
+    rule = [":---", *["---:"] * (len(rows[0]) - 1)]
+    lines = [[cell.replace("|", "\\|") for cell in row] for row in (rows[0], rule, *rows[1:])]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def bullets(lines: Iterable[str]) -> str:

@@ -46,14 +46,11 @@ class LayerSupervision(Supervision):
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         depth = context.dims.depth
         missing = [n for n in config.layers if n > depth or (n == 0 and depth)]
-        if missing and not depth:
-            reason = f"layers {missing} do not exist in a decoder of depth 0"
-            yield Problem("layers", reason, "write [0], the queries as they start")
-        elif missing:
+        if missing:
+            reason = f"layers {missing} do not exist in a decoder of depth {depth}"
+            fix = f"choose layers from 1 to {depth}, or raise model.decoder.depth"
             yield Problem(
-                "layers",
-                f"layers {missing} do not exist in a decoder of depth {context.dims.depth}",
-                f"choose layers from 1 to {context.dims.depth}, or raise model.decoder.depth",
+                "layers", reason, fix if depth else "write [0], the queries as they start"
             )
 
     def weights(self, rounds: Sequence[int] = ()) -> Mapping[int, float]:

@@ -2,7 +2,6 @@
 
 import logging
 import time
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from qgs.contracts import TrainingConfig
 from qgs.data.samples import Batch
-from qgs.train.distributed import gathered, mean
+from qgs.train.distributed import mean
 from qgs.train.folder import OtherRunError
 
 _log = logging.getLogger(__name__)
@@ -25,8 +24,8 @@ class Counters:
     """Steps, samples and time of a run so far, in all sessions.
 
     step, samples, seconds: optimiser steps, samples over all processes, and time spent; a session's
-    clock starts after its first step, in which kernels compile. left_out: of this process, how
-    often a sample could not be made, by reason.
+    clock starts after its first step, in which kernels compile. left_out: why samples of this
+    process could not be made in this session.
     """
 
     accelerator: Accelerator
@@ -36,7 +35,7 @@ class Counters:
     step: int = 0
     samples: int = 0
     seconds: float = 0.0
-    left_out: Counter[str] = field(default_factory=Counter)
+    left_out: set[str] = field(default_factory=set)
     last_tick: float = 0.0
 
     @property
@@ -76,14 +75,9 @@ class Counters:
         self.step += 1
         self.samples += self.config.batch_size
         for batch in batches:
-            for reason in batch.left_out:
-                if reason not in self.left_out:
-                    _log.warning("a sample is left out: %s", reason)
-                self.left_out[reason] += 1
-
-    def all_left_out(self) -> dict[str, int]:
-        """Return the samples left out by all processes, which must all call this."""
-        return dict(sum(gathered(self.accelerator, self.left_out), Counter[str]()))
+            for reason in {*batch.left_out} - self.left_out:
+                _log.warning("a sample is left out: %s", reason)
+                self.left_out.add(reason)
 
     def state(self) -> dict[str, Any]:
         """Return the counts, and what must not change for them to mean the same."""
@@ -91,7 +85,6 @@ class Counters:
             "step": self.step,
             "samples": self.samples,
             "seconds": self.seconds,
-            "left_out": self.all_left_out(),
             "step_size": self.config.batch_size,
             "scenes": self.scenes,
         }
@@ -116,6 +109,3 @@ class Counters:
         self.step = state["step"]
         self.samples = state["samples"]
         self.seconds = state["seconds"]
-        # These are of all processes: one counts on.
-        if self.accelerator.is_main_process:
-            self.left_out = Counter(state["left_out"])

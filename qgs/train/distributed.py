@@ -23,8 +23,6 @@ from accelerate.utils import (
 )
 from torch import Tensor
 
-from qgs.train.precision import ACCELERATE
-
 TIMEOUT = timedelta(hours=24)
 """How long processes wait while one evaluates or saves. NCCL's default of 10 minutes would end such
 runs; a process that died is noticed by the launcher, which ends the others."""
@@ -40,8 +38,9 @@ def make_accelerator(device: str, unread: bool = False) -> Accelerator:
     """
     group = InitProcessGroupKwargs(timeout=TIMEOUT)
     parallel = DistributedDataParallelKwargs(find_unused_parameters=unread)
+    # Its own mixed precision would run geometry and losses in half precision too.
     accelerator = Accelerator(
-        cpu=device == "cpu", mixed_precision=ACCELERATE, kwargs_handlers=[group, parallel]
+        cpu=device == "cpu", mixed_precision="no", kwargs_handlers=[group, parallel]
     )
     if accelerator.distributed_type not in _PARALLEL:
         kind = accelerator.distributed_type.value
@@ -61,9 +60,9 @@ def true_anywhere(accelerator: Accelerator, flag: object) -> bool:
     return bool(mean(accelerator, own))
 
 
-def gathered(accelerator: Accelerator, own: Any) -> list[Any]:
+def gathered(own: Any) -> list[Any]:
     """Return the `own` of every process, by rank."""
-    return gather_object([own]) if accelerator.num_processes > 1 else [own]
+    return gather_object([own])
 
 
 @dataclass
@@ -77,7 +76,7 @@ class RandomStates:
         own = {"torch": torch.get_rng_state()}
         if self.accelerator.device.type == "cuda":
             own["cuda"] = torch.cuda.get_rng_state(self.accelerator.device)
-        ranks = enumerate(gathered(self.accelerator, own))
+        ranks = enumerate(gathered(own))
         return {f"{rank}/{key}": value for rank, found in ranks for key, value in found.items()}
 
     def load_state(self, state: Mapping[str, Any]) -> None:

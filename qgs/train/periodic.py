@@ -33,8 +33,6 @@ from qgs.train.tracking import Trackers
 SAMPLES = 4
 """Samples that are drawn, the same ones each time."""
 
-_GAP = 4
-
 _log = logging.getLogger(__name__)
 
 
@@ -122,7 +120,7 @@ class PeriodicEvaluation:
 
     @torch.no_grad()
     def _picture(self) -> Picture:
-        """Draw a row per sample: input views, first target view, its rendering and its depth."""
+        """Draw a row per sample: the first target view, its rendering and its depth."""
         recipe = self.recipe
         plan = EvaluationPlan(
             recipe.build_data(),
@@ -138,19 +136,13 @@ class PeriodicEvaluation:
             rows = [_row(self.model, sample) for sample in islice(usable, SAMPLES)]
         finally:
             self.model.train()
-        # Scenes of an index may have different numbers of input views.
-        width = max(row.shape[1] for row in rows)
-        padded = [
-            np.pad(row, ((0, _GAP), (0, width - row.shape[1]), (0, 0)), constant_values=255)
-            for row in rows
-        ]
-        return np.concatenate(padded)[:-_GAP]
+        return np.concatenate(rows)
 
 
 def _row(model: QueryGaussianModel, sample: Sample) -> Picture:
     device = next(model.parameters()).device
     target = sample.targets.select(slice(0, 1)).to(device)
     rendering = model.render(model(sample.inputs.to(device)).gaussians, target.cameras)
-    photos = [rgb_picture(image) for image in (*sample.inputs.images[0], target.images[0, 0])]
     depth = depth_picture(rendering.depth[0, 0], *depth_range(rendering.depth))
-    return side_by_side([*photos, rgb_picture(rendering.rgb[0, 0]), depth], _GAP)
+    images = (target.images[0, 0], rendering.rgb[0, 0])
+    return side_by_side([*map(rgb_picture, images), depth])

@@ -10,19 +10,8 @@ import torch
 DTYPES: dict[str, torch.dtype | None] = {"float32": None, "bf16": torch.bfloat16}
 """Values of `training.precision` to the dtype of autocast, None without autocast."""
 
-ACCELERATE = "no"
-"""accelerate's own mixed precision, off: it would run geometry and losses in half precision too."""
-
 
 def autocast(precision: str, device: str) -> torch.autocast:
     """Return the autocast of a forward pass. precision: of DTYPES; device: such as "cuda"."""
     dtype = DTYPES[precision]
     return torch.autocast(device, dtype, enabled=dtype is not None)
-
-
-def no_autocast(device: str) -> torch.autocast:
-    """Switch autocast off, for gradients that are taken inside the forward pass.
-
-    A backward pass runs in the dtypes of the forward operations; autocast would cast it again.
-    """
-    return torch.autocast(device, enabled=False)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -58,8 +58,6 @@ class TrainingResult:
 
     stopped_by: name of the signal that ended it early, else None. main: whether this process writes
     the files. resumed_at: the step from which a run was continued, None for one that began here.
-    left_out: samples that could not be made (`training.on_bad_sample`), of all processes and
-    sessions: how often.
     """
 
     model: QueryGaussianModel
@@ -69,7 +67,6 @@ class TrainingResult:
     stopped_by: str | None
     main: bool
     resumed_at: int | None = None
-    left_out: Mapping[str, int] = field(default_factory=dict)
 
 
 def train(
@@ -141,6 +138,7 @@ class Trainer:
             self._build_parts(source)
             if saved:
                 self.saver.restore(saved.parts)
+                self.guard.good.resume(self.counters.step, self.folder.checkpoint)
             self.resumed_at = self.counters.step if saved else None
             self._follow_schedules()
             batches = self._open_data(source)
@@ -208,7 +206,6 @@ class Trainer:
         # Beside the weights, all that continues the run.
         parts = {
             "guard": self.guard,
-            "good": self.guard.good,
             "counters": self.counters,
             "moments": OptimizerState(self.training_pass, self.torch_optimizer),
             "schedule": self.optimizer,
@@ -355,7 +352,6 @@ class Trainer:
             stopped_by=stopped_by,
             main=self.accelerator.is_main_process,
             resumed_at=self.resumed_at,
-            left_out=self.counters.all_left_out(),
         )
 
 

@@ -14,7 +14,6 @@ from qgs.geometry.constants import constant
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
-from qgs.train.precision import no_autocast
 from qgs.types import Cameras, Gaussians, LayerPrediction, Prediction, Rendering, Views
 
 RECORDED = {"step", "seconds", "lr", "loss", "psnr", "alpha", "deviation", "gradient", "skipped"}
@@ -172,7 +171,8 @@ class DetachedLayer:
         loss = _sum(weighted)
         if not loss.requires_grad:
             return
-        with no_autocast(loss.device.type):
+        # A backward pass runs in the dtypes of the forward one; autocast would cast it again.
+        with torch.autocast(loss.device.type, enabled=False):
             found = torch.autograd.grad(loss, list(self._copies.values()), allow_unused=True)
         gradients = zip(self._copies, found, strict=True)
         _add(

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from training_runs import run, run_calling, tiny
+from training_runs import TRAINED, run, run_calling, same, tiny
 
 import qgs
 from qgs.checkpoint.model_file import CheckpointFile
@@ -56,11 +56,21 @@ def test_good_weights_are_the_older_of_two_copies_made_before_the_images_got_wor
         good.observe({"psnr": 20.0 if step <= 60 else 10.0})
         if good.due(step, 50):
             good.refresh(step)
-    assert good.state()["steps"] == [50, 60]
+    assert [step for step, _ in good.copies] == [50, 60]
     assert not good.due(61, 50)
     step, weights = good.last
     assert step == 50
     assert (weights["weight"] == 50).all()
+
+
+def test_a_resumed_run_falls_back_on_the_weights_of_its_checkpoint(copied):
+    before = qgs.load(copied / "checkpoint.safetensors").state_dict()
+    recipe = tiny("locus", *TRAINED, "training.steps=4")
+    seen = []
+    run_calling(lambda trainer, _: seen.append(trainer.guard.good.last), recipe, copied, True)
+    step, weights = seen[0]
+    assert step == 3
+    assert same(dict(weights), before)
 
 
 def test_gaussians_invisible_from_the_start_end_a_run_at_the_window_or_its_end(tmp_path):

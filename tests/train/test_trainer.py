@@ -33,7 +33,6 @@ def test_training_lowers_the_loss(tmp_path):
     options = ("training.steps=20", "optimizer.warmup=4", "data.scenes=1", "views.mirror=0.0")
     more = ("optimizer.learning_rate=4e-3", "training.collapse_window=10")
     run(tiny("locus", *options, *more), tmp_path, device="auto")
-    assert parts_of(tmp_path)["good"]["steps"] == [18, 20]
     falling = losses(tmp_path)
     assert sum(falling[-5:]) < 0.95 * sum(falling[:5])
 
@@ -79,7 +78,7 @@ def test_weights_and_their_average_are_judged_and_shown_side_by_side(trained_run
     pictures = folder.path / "pictures"
     assert {path.name for path in pictures.iterdir()} == {"step-2.png", "step-3.png"}
     with Image.open(pictures / "step-3.png") as picture:
-        assert picture.size == (96, 36)  # two rows of five, 4 apart
+        assert picture.size == (56, 32)  # two rows of three, 4 apart
 
 
 def test_scenes_that_do_not_split_evenly_are_refused():
