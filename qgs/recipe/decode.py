@@ -17,7 +17,7 @@ from qgs.recipe.errors import Problems, did_you_mean, nearest
 from qgs.recipe.places import Place
 from qgs.recipe.registry import InstalledPlugin, Registry, available_plugins, component_failure
 from qgs.recipe.slots import SLOTS, type_at
-from qgs.recipe.yaml_text import KeyPath, MapNode, find, inline, kind_of
+from qgs.recipe.yaml_text import KeyPath, MapNode, brief, find, inline
 from qgs.tokengs.schedules import SCHEDULES
 
 ConfigT = TypeVar("ConfigT", bound=ComponentConfig)
@@ -71,7 +71,7 @@ def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen
     """The component of a place; None, with a problem, where there is none to be had."""
     node = place.node
     if not isinstance(node, MapNode):
-        reason = f"a component is a mapping, this is {kind_of(node)}"
+        reason = f"a component is a mapping, this is {brief(node)}"
         fix = "write `{type: PLUGIN/NAME, option: value}`"
         return problems.add(place.origin, place.source, reason, fix)
     name = type_at(node, place.path)
@@ -138,7 +138,7 @@ def _why_no_component(name: object, slot: str, registry: Registry) -> tuple[str,
         reason = f"no `type` is given, and the slot `{slot}` has no default component"
         return reason, f"add `type:`; {choice}"
     if not isinstance(name, str):
-        return f"`type` names a component, got {kind_of(name)}", choice
+        return f"`type` names a component, got {brief(name)}", choice
     plugin, slash, _ = name.partition("/")
     if slash and plugin not in registry.plugins:
         used = [*registry.plugins][1:]
@@ -196,7 +196,7 @@ def _explain(error: ErrorDetails, given: Any, config: type[BaseModel]) -> tuple[
     reason = re.sub(r"^\w+ should ", "must ", error["msg"].split(", got")[0])
     reason = reason.replace(" after validation", "")
     if kind not in ("too_long", "too_short"):
-        reason += f", got {kind_of(given)}"
+        reason += f", got {brief(given)}"
     if kind == "literal_error":
         return reason, did_you_mean(written, re.findall(r"'([^']*)'", context["expected"]), "words")
     if kind == "bool_type":

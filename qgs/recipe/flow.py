@@ -115,18 +115,12 @@ def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
             )
 
 
-def unfinished(parts: Mapping[KeyPath, Chosen], steps: int, seconds: float | None) -> Iterator[str]:
-    """A sentence for each schedule that goes on after `steps` steps, or may after `seconds`."""
+def unfinished(parts: Mapping[KeyPath, Chosen], steps: int) -> Iterator[str]:
+    """A sentence for each schedule that goes on after `steps` steps."""
     # Once for the template of a decoder, not for each layer.
     for part in {part.source: part for part in parts.values()}.values():
         for option, schedule in part.schedules.items():
             last = max(schedule.corners, default=0)
-            told = f"{part.shown_path}.{option} changes until step {last}"
             if last > steps:
-                yield f"{told}, training ends at {steps}"
-            # How many steps fit into a time budget depends on the machine.
-            elif last and seconds is not None:
-                yield (
-                    f"{told}, and training.seconds may end training before, after {seconds:g} s: "
-                    "schedules count steps"
-                )
+                changes = f"{part.shown_path}.{option} changes until step {last}"
+                yield f"{changes}, training ends at {steps}"

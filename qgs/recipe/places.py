@@ -8,7 +8,7 @@ from qgs.contracts import LAYER_SLOTS
 from qgs.recipe.errors import Origin, Problems, did_you_mean
 from qgs.recipe.files import merge
 from qgs.recipe.slots import AFTER_LAYERS, SECTIONS, slot_at
-from qgs.recipe.yaml_text import KeyPath, MapNode, Node, kind_of
+from qgs.recipe.yaml_text import KeyPath, MapNode, Node, brief
 
 DECODER: KeyPath = ("model", "decoder")
 
@@ -92,7 +92,7 @@ def apply_swaps(
         hits = {path: result[path] for path in swappable if matches(pattern, path)}
         set_before = [x for x in hits.values() if x.source[0] == "swap" or "layers" in x.source]
         if not isinstance(node, MapNode) or node.get("type") is None:
-            reason = f"a swap puts a component, this is {kind_of(node)} without a `type`"
+            reason = f"a swap puts a component, this is {brief(node)} without a `type`"
             fix = "write `PATTERN: {type: PLUGIN/NAME, ...}`; null drops an inherited swap"
         elif not hits:
             reason = f"the pattern `{pattern}` matches no place"

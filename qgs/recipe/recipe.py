@@ -56,9 +56,7 @@ class Recipe:
     @property
     def warnings(self) -> list[str]:
         """A sentence for each thing that works and is probably not what was meant."""
-        training = self.training
-        late = unfinished(self.parts, training.steps, training.seconds)
-        return [*idle_fields(self.parts), *late]
+        return [*idle_fields(self.parts), *unfinished(self.parts, self.training.steps)]
 
     def build_model(
         self, device: torch.device | str | None = None, pretrained: bool = True

@@ -15,7 +15,7 @@ from qgs.contracts import (
 from qgs.recipe.decode import decode_config
 from qgs.recipe.errors import Problems, nearest
 from qgs.recipe.slots import MODEL_SLOTS, SECTIONS
-from qgs.recipe.yaml_text import KeyPath, MapNode, kind_of
+from qgs.recipe.yaml_text import KeyPath, MapNode, brief
 from qgs.wording import listed
 
 
@@ -99,7 +99,7 @@ def check_keys(tree: MapNode, problems: Problems, path: KeyPath = ()) -> MapNode
         elif isinstance(node, MapNode):
             checked.put(key, check_keys(node, problems, below), origin)
         elif node is not None:
-            reason = f"`{key}` is a mapping, this is {kind_of(node)}"
+            reason = f"`{key}` is a mapping, this is {brief(node)}"
             fix = f"write `key: value` lines below `{key}:`"
             problems.add(origin, below, reason, fix)
     return checked

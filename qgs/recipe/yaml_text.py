@@ -129,17 +129,9 @@ def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Ori
     return taken, origin, node
 
 
-def kind_of(value: Any) -> str:
-    """The kind of a node's value, for messages."""
-    if isinstance(value, dict):
-        return "a mapping"
-    if isinstance(value, list):
-        return "a list"
-    if value is None:
-        return "nothing (null)"
-    if isinstance(value, bool):
-        return f"the truth value {str(value).lower()}"
-    return f"the {'string' if isinstance(value, str) else 'number'} {value!r:.200}"
+def brief(value: Any) -> str:
+    """A node's value for messages, as JSON, of at most 200 characters."""
+    return f"`{json.dumps(value):.200}`"
 
 
 class Yaml12Loader(yaml.SafeLoader):
@@ -177,7 +169,7 @@ def load_mapping(text: str, file: str, problems: Problems) -> MapNode:
     if isinstance(node, MapNode):
         return node
     fix = "write `key: value` lines, the first of them `recipe: 1`"
-    problems.stop(Origin(file, 1), "", f"a recipe is a mapping, this is {kind_of(node)}", fix)
+    problems.stop(Origin(file, 1), "", f"a recipe is a mapping, this is {brief(node)}", fix)
 
 
 def load_text(
@@ -189,12 +181,12 @@ def load_text(
     """
     try:
         root = _composed(text)
-        return None if root is None else _Reader(file, problems, line).read(root, path)
+        return None if root is None else _Reader(file, line).read(root)
     # Python's stack ends while PyYAML composes, before `_Reader` counts levels.
     except (yaml.YAMLError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         found = mark.line + 1 if mark else 1
-        reason = f"this is no valid YAML: {getattr(error, 'problem', error)}"
+        reason = f"this is no YAML of a recipe: {getattr(error, 'problem', error)}"
         fix = "correct the line; check indentation (spaces, no tabs), brackets, quotes and `: `"
         problems.stop(Origin(file, found if line is None else line), path, reason, fix)
 
@@ -206,57 +198,44 @@ _composed = lru_cache(maxsize=128)(partial(yaml.compose, Loader=Yaml12Loader))
 class _Reader:
     """Turns PyYAML's nodes into ours. line: see `load_text`."""
 
-    def __init__(self, file: str, problems: Problems, line: int | None) -> None:
+    def __init__(self, file: str, line: int | None) -> None:
         self.file = file
-        self.problems = problems
         self.line = line
         self.count = 0
 
     def origin(self, node: yaml.Node) -> Origin:
         return Origin(self.file, node.start_mark.line + 1 if self.line is None else self.line)
 
-    def read(self, node: yaml.Node, path: KeyPath) -> Node:
+    def read(self, node: yaml.Node, depth: int = 0) -> Node:
+        """Our node; raises YAMLError for what no recipe may hold."""
         self.count += 1
-        if len(path) > MAX_DEPTH or self.count > MAX_NODES:
+        if depth > MAX_DEPTH or self.count > MAX_NODES:
             what = f"more than {MAX_DEPTH} levels or {MAX_NODES:,} values, aliases written out"
-            raise yaml.MarkedYAMLError(problem=what, problem_mark=node.start_mark)
-        origin = self.origin(node)
+            raise _fault(what, node)
         if node.tag not in _TAGS:
-            reason = f"the tag {node.tag!r} is not allowed in a recipe"
-            fix = "remove the tag; components are named with `type`"
-            self.problems.stop(origin, path, reason, fix)
+            raise _fault(f"the tag {node.tag!r} is not allowed in a recipe", node)
+        origin = self.origin(node)
         if isinstance(node, yaml.MappingNode):
-            return self.read_mapping(node, path)
+            read = MapNode(origin)
+            for key_node, value_node in node.value:
+                key = key_node.value
+                # The last of two equal keys would win in silence.
+                if not isinstance(key_node, yaml.ScalarNode) or key in read:
+                    raise _fault(f"the key {key!r:.100} is no word, or comes twice", key_node)
+                read.put(key, self.read(value_node, depth + 1), self.origin(key_node))
+            return read
         if isinstance(node, yaml.SequenceNode):
-            numbered = enumerate(node.value)
-            items = ((self.read(x, (*path, str(n))), self.origin(x)) for n, x in numbered)
+            items = ((self.read(item, depth + 1), self.origin(item)) for item in node.value)
             return ListNode(origin, items)
         kind = node.tag.removeprefix(_STANDARD)
         try:
             return _scalar(kind, node.value)
         except ValueError:
-            reason = f"{node.value!r:.100} is no {kind} of 64 bits"
-            self.problems.stop(origin, path, reason, "correct it")
+            raise _fault(f"{node.value!r:.100} is no {kind} of 64 bits", node) from None
 
-    def read_mapping(self, node: yaml.MappingNode, path: KeyPath) -> MapNode:
-        read = MapNode(self.origin(node))
-        for key_node, value_node in node.value:
-            key = key_node.value
-            origin = self.origin(key_node)
-            below = (*path, key)
-            # The last of two equal keys would win in silence.
-            if not isinstance(key_node, yaml.ScalarNode):
-                below = path
-                reason = "a key is a mapping or a list"
-                fix = "use a plain word as the key"
-            elif key in read:
-                reason = f"the key `{key}` is already given at {read.origins[key]}"
-                fix = "keep one of the two"
-            else:
-                read.put(key, self.read(value_node, below), origin)
-                continue
-            self.problems.add(origin, below, reason, fix)
-        return read
+
+def _fault(reason: str, node: yaml.Node) -> yaml.YAMLError:
+    return yaml.MarkedYAMLError(problem=reason, problem_mark=node.start_mark)
 
 
 def _scalar(kind: str, text: str) -> Any:
