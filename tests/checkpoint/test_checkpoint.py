@@ -15,7 +15,6 @@ from tables import must_refuse
 import qgs
 from qgs.checkpoint.model_file import (
     CheckpointFile,
-    load_weights,
     save,
     unique_tensors,
     write_checkpoint,
@@ -111,16 +110,6 @@ def test_a_model_without_a_step_is_saved_without_one(tmp_path):
     save(recipe.build_model(), first, extra={"note": "ä = b"})
     assert CheckpointFile(first).step == 0
     assert CheckpointFile(first).extra == {"step": "0", "note": "ä = b"}
-
-
-def test_shared_tensors_are_stored_once_and_stay_shared():
-    module = torch.nn.ModuleDict({"a": torch.nn.Linear(3, 3), "b": torch.nn.Linear(3, 3)})
-    module["b"].weight = module["a"].weight
-    tensors = unique_tensors(module)
-    assert sorted(tensors) == ["a.bias", "a.weight", "b.bias"]
-    load_weights(module, {name: torch.ones_like(t) for name, t in tensors.items()}, "test")
-    assert module["b"].weight is module["a"].weight
-    assert (module["b"].weight == 1).all()
 
 
 def test_weights_that_are_not_finite_are_refused(saved):

@@ -7,18 +7,12 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-import torch
 from guide_pages import blocks, contract_failures
-from qgs_dev import Case, cases_of
-from qgs_dev.inputs import inputs_of
+from qgs_dev import cases_of
 from qgs_dev.new_command import rendered
-from qgs_locus.cross_attention import RayBiasedCrossAttention
-from torch.testing import assert_close
 
-from qgs.contracts import ModelDims
 from qgs.recipe import RecipeError, resolve
 from qgs.recipe.registry import InstalledPlugin
-from qgs.types import QueryState
 
 
 @pytest.fixture(scope="module")
@@ -52,44 +46,6 @@ def test_components_keep_their_contracts(package):
     cases = cases_of(InstalledPlugin(package.plugin))
     assert len(cases) == 8  # one of each component, and one more of its examples
     assert not contract_failures(*cases)
-
-
-def test_the_second_component_computes_its_formula(package):
-    config = package.FrustumCenters.Config(near=0.5, far=8.0, slope=2.0)
-    centers = package.FrustumCenters(config, ModelDims(16, 2, 1))
-    offsets = torch.tensor([[[[0.0, 0.0, 0.0], [50.0, -50.0, 50.0]]]])
-    middle, corner = centers(offsets, QueryState(torch.zeros(1, 1, 16)))[0, 0]
-    assert middle.tolist() == [0.0, 0.0, 2.0]  # depth is the geometric mean of near and far
-    assert corner.tolist() == [16.0, -16.0, 8.0]  # the far corner of the frustum
-
-
-def test_the_field_starts_changes_and_places(package):
-    depth = package.depth
-    dims = ModelDims(16, 2, 1)
-    queries = depth.DepthQueries(depth.DepthQueries.Config(count=4), dims)
-    refinement = depth.DepthRefinement(depth.DepthRefinement.Config(), dims)
-    centers = depth.DepthCenters(depth.DepthCenters.Config(), dims)
-    state = refinement(queries.start(2))
-    learned = queries.log_depth + refinement.step(queries.features)
-    means = centers(torch.zeros(2, 4, 1, 3), state)
-    assert_close(means[1, :, 0, 2:], learned.clamp(-4, 4).exp())
-    assert not means[..., :2].any()
-
-
-@torch.no_grad()
-def test_every_second_head_reads_close_rays_alone_and_says_so(package):
-    case = Case(package.NearbyAttention.Config(reach=0.5))
-    inputs = inputs_of(case)
-    attention = case.build()
-    explained = attention.explain(*inputs.values(), torch.arange(6))
-    shared = RayBiasedCrossAttention.bias(attention, *inputs.values()).dense()
-    assert torch.equal(explained.geometry[:, 0], shared)
-    hidden = explained.geometry[:, 1].isinf()
-    kept = shared >= -0.5 * attention.gamma * 0.25
-    assert hidden.any()
-    assert (~hidden).any(-1).all()
-    assert not (hidden & kept).any()
-    assert not explained.weights[:, 1][hidden].any()
 
 
 def test_the_recipes_work_and_what_the_page_says_is_refused(package):
