@@ -33,8 +33,11 @@ from qgs.wording import listed
 FORMAT_VERSION = 3
 """Raised when the metadata of checkpoints change."""
 
-_RECIPE, _FORMAT, _EXTRA = "qgs.recipe", "qgs.format_version", "qgs.extra."
-_PLUGINS, _DISTRIBUTIONS, _VERSION = "qgs.plugins", "qgs.distributions", "qgs.version"
+_RECIPE = "qgs.recipe"
+_FORMAT = "qgs.format_version"
+_EXTRA = "qgs.extra."
+_PLUGINS = "qgs.plugins"
+_DISTRIBUTIONS = "qgs.distributions"
 
 
 class CheckpointFile(TensorFile):
@@ -59,7 +62,14 @@ class CheckpointFile(TensorFile):
                 "qgs.save or `qgs train` can be loaded. Published weights become a checkpoint by "
                 f"`qgs import {self.path} --recipe auto --out CHECKPOINT.safetensors`"
             )
-        if self.refuse_newer(_FORMAT, FORMAT_VERSION) > 2 and SEAL not in self.metadata:
+        with self.entry(_FORMAT) as text:
+            written = int(text[:20])
+        if written > FORMAT_VERSION:
+            raise CheckpointError(
+                f"{self.path} has {_FORMAT} {written}, and qgs {__version__} reads "
+                f"{FORMAT_VERSION}: install the newer qgs that wrote it"
+            )
+        if written > 2 and SEAL not in self.metadata:
             raise self.damaged(f"its metadata lack {SEAL}")
         self.extra = {
             key.removeprefix(_EXTRA): value
@@ -188,7 +198,7 @@ def write_checkpoint(
         _PLUGINS: json.dumps({name: version for name, (_, version) in releases.items()}),
         _DISTRIBUTIONS: json.dumps({name: origin for name, (origin, _) in releases.items()}),
         _FORMAT: str(FORMAT_VERSION),
-        _VERSION: __version__,
+        "qgs.version": __version__,
         **{_EXTRA + key: value for key, value in extra.items()},
     }
     write_tensors(path, tensors, metadata)

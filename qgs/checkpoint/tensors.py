@@ -17,7 +17,6 @@ from torch import Tensor
 from qgs.contracts.weights import Shapes
 from qgs.files import replacing
 from qgs.recipe import Recipe, RecipeError, resolve
-from qgs.version import __version__
 from qgs.wording import name_shown
 
 SEAL = "qgs.seal"
@@ -115,17 +114,6 @@ class TensorFile:
             raise self.damaged(f"its recipe has `{unresolved[0]}`, and qgs writes resolved recipes")
         with self.entry(key):
             return resolve(tree)
-
-    def refuse_newer(self, key: str, ours: int) -> int:
-        """Return the format version in the entry `key`; CheckpointError if it is above `ours`."""
-        with self.entry(key) as text:
-            written = int(text[:20])
-        if written > ours:
-            raise CheckpointError(
-                f"{self.path} has {key} {written}, and qgs {__version__} reads {ours}: "
-                "install the newer qgs that wrote it"
-            )
-        return written
 
 
 def write_tensors(

@@ -90,16 +90,17 @@ def recipes(
     home = recipe_folder().resolve()
     found = {path.relative_to(home).as_posix(): path for path in sorted(home.rglob("*.yaml"))}
     known = {label: path for label, path in found.items() if not label.startswith("studies/")}
-    if name is None and out is None:
-        width = max(map(len, known), default=0)
+    if name is None:
+        if out:
+            raise ValueError("give the name of a recipe before --out")
         for label, path in known.items():
             lines = path.read_text(encoding="utf-8").splitlines()
             comment = takewhile(lambda line: line.startswith("#"), lines)
             first = " ".join(line.lstrip("# ") for line in comment).partition(". ")[0]
-            typer.echo(f"{label:<{width}}  {first.rstrip('.')}".rstrip())
+            typer.echo(f"{label:<40}  {first.rstrip('.')}".rstrip())
     elif name not in known:
-        hint = did_you_mean(name, known, "recipes") if name else "give its name before --out"
-        raise ValueError(f"there is no recipe `{name}` in {home}; {hint}" if name else hint)
+        hint = did_you_mean(name, known, "recipes")
+        raise ValueError(f"there is no recipe `{name}` in {home}; {hint}")
     elif out is None:
         typer.echo(known[name].read_text(encoding="utf-8"), nl=False)
     else:

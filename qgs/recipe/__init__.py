@@ -6,11 +6,11 @@ of a recipe, each step in a file of its own:
 | step | file |
 |---|---|
 | read it with what it extends, lay overrides over it | `files.py`, `yaml_text.py` |
-| decode its sections and settings | `sections.py` |
+| decode its sections and settings, draft the whole | `sections.py` |
 | find what stands at each place: defaults, layers, swaps | `places.py`, `slots.py` |
-| choose components and decode their options | `registry.py`, `decode.py`, together `draft.py` |
-| check them beside each other, follow fields from writer to reader | `checks.py`, `flow.py` |
-| write out every default | `spell_out.py`, `recipe.py` |
+| choose components and decode their options | `registry.py`, `decode.py` |
+| check them beside each other, follow fields from writer to reader | `checks.py` |
+| write out every default | `recipe.py` |
 | build the model | `build.py` |
 """
 

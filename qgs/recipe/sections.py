@@ -1,5 +1,7 @@
-"""The sections of a recipe: their settings, and what else may stand beside these."""
+"""The sections of a recipe, and a draft: components chosen, not yet checked beside each other."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from pydantic import Field, ValidationInfo, field_validator
@@ -8,14 +10,19 @@ from qgs.contracts import (
     LAYER_SLOTS,
     ComponentConfig,
     EvaluationConfig,
+    ModelDims,
     OptionError,
+    Plugin,
     TrainingConfig,
     ViewsConfig,
 )
-from qgs.recipe.decode import decode_config
-from qgs.recipe.errors import Problems, nearest
+from qgs.recipe.decode import Parts, decode_config, decode_place
+from qgs.recipe.errors import Origin, Problems, nearest
+from qgs.recipe.files import merge
+from qgs.recipe.places import apply_swaps, expand
+from qgs.recipe.registry import Registry, load_plugins
 from qgs.recipe.slots import MODEL_SLOTS, SECTIONS
-from qgs.recipe.yaml_text import KeyPath, MapNode, brief
+from qgs.recipe.yaml_text import KeyPath, MapNode, brief, from_plain
 from qgs.wording import listed
 
 
@@ -113,3 +120,50 @@ def decode_settings(tree: MapNode, problems: Problems) -> dict[KeyPath, Any]:
         # Go on with defaults, so that problems of other sections are reported as well.
         settings[path] = decode_config(config, written, path, problems) or config.model_construct()
     return settings
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A recipe that has been read.
+
+    tree: all files and overrides merged, with the default losses and metrics. settings: of each
+    section. parts: what stands at each place, decoder layers numbered.
+    """
+
+    tree: MapNode
+    settings: Mapping[KeyPath, Any]
+    registry: Registry
+    parts: Parts
+
+    @property
+    def dims(self) -> ModelDims:
+        """Width, heads and depth of the model."""
+        model = self.settings["model",]
+        return ModelDims(model.width, model.heads, self.settings["model", "decoder"].depth)
+
+
+def draft_of(written: MapNode, problems: Problems, plugins: Sequence[Plugin]) -> Draft:
+    """Choose the components of a merged recipe; raises RecipeError with all that it finds.
+
+    plugins: those that it may name although they are not installed.
+    """
+    # Under what is written: `losses: {}` has none, a recipe without `losses` the default ones.
+    tree = _with_defaults(check_keys(written, problems))
+    settings = decode_settings(tree, problems)
+    registry = load_plugins(settings[()].plugins or (), tree, problems, plugins)
+    expanded = expand(tree, settings["model", "decoder"].depth, problems)
+    places = apply_swaps(tree.child("swap"), expanded, problems)
+    found = [decode_place(place, registry, problems) for place in places.values()]
+    # Components that are not known cannot be checked beside each other.
+    problems.raise_any()
+    return Draft(tree, settings, registry, {part.path: part for part in found if part})
+
+
+def _with_defaults(tree: MapNode) -> MapNode:
+    """`tree` with the default components of sections such as `losses` under what is written."""
+    missing = {
+        name: {key: {"type": kind} for key, kind in section.defaults.items()}
+        for name, section in SECTIONS.items()
+        if section.named and (section.defaults_stay or name not in tree)
+    }
+    return merge(from_plain(missing, Origin("default")), tree)

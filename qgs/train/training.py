@@ -28,7 +28,7 @@ from qgs.data.stream import (
 from qgs.files import write_text
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
-from qgs.recipe.flow import keys_are_read
+from qgs.recipe.checks import keys_are_read
 from qgs.recipe.recipe import annotated, flat
 from qgs.train.counters import Counters
 from qgs.train.distributed import (
