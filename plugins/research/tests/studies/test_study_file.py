@@ -75,7 +75,7 @@ study: 1 | study: true | :1: study | true
 variants:\n | variants:\nMANY | :3: variants | 200
 reference | published: {full: good}\nreference | :7: published.full | number
 qgs/content} | qgs/contents} | :5: variants.flat: model.decoder.cross_attention.type | `qgs/content`
-  full:\n |   full: 3\n | :4: variants.full | number 3
+  full:\n |   full: 3\n | :4: variants.full | `3`
   tokengs: |   ../up: | :6: variants.../up | letters
 tiny/tokengs.yaml | tiny/tokens.yaml | :6: variants.tokengs | tokens.yaml
 tiny/locus.yaml | tiny/locuss.yaml | :2: base | locuss.yaml
