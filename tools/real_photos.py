@@ -4,7 +4,8 @@
         [--distances .5 1 2] [--refine 10] [--windows 12] [--out JSON]
 
 For each window: PSNR and SSIM of novel views with the found scale, with `views.scale: auto`, of the
-nearest photo, and after a refinement on the inputs. Prints Markdown of means. Windows are those
+nearest photo, of that photo as a plane at the depth of the scene, and after a refinement on the
+inputs. Prints Markdown of means. Windows are those
 that `qgs demo` chooses for the model --like, the first one by default. Every eighth photo is held
 out. --distances: how far inputs are apart, in distances of the training of --like.
 """
@@ -18,18 +19,22 @@ from statistics import mean
 from typing import Any
 
 import torch
+import torch.nn.functional as F
+from kornia.geometry.transform import warp_perspective
 from qgs_photos.datasets.overlapping import apart
 from qgs_photos.refine import refine
 from qgs_viewer.comparison import checkpoints, recipes_alike
 from torch import Tensor
 
 from qgs.checkpoint.model_file import CheckpointFile, load
+from qgs.data.depth import scene_depth
 from qgs.data.inputs import choose_windows
 from qgs.data.samples import Sample, make_sample, own_world
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.model import QueryGaussianModel
 from qgs.reconstruction.scale import ScaleSearch, at_factors, constant_scale
+from qgs.types import Cameras, Views
 
 SYSTEMS = ("landmark", "locus", "tokengs")
 MODELS = [f"{data}/{system}-64" for data in ("worlds", "rooms") for system in SYSTEMS]
@@ -85,6 +90,7 @@ def scene_rows(
             "found": rendered(model, sample, found),
             "auto": rendered(model, sample, auto),
             "nearest": nearest_input(sample.inputs, sample.targets.cameras),
+            "plane": on_a_plane(sample.inputs, sample.targets.cameras, scene_depth(scene)),
         }
         if options.refine:
             shown["refined"] = rendered(model, sample, found, options.refine)
@@ -112,6 +118,31 @@ def rendered(
         gaussians = refine(gaussians, inputs, seconds, renderer=model.renderer).gaussians
     with torch.no_grad():
         return model.render(gaussians, cameras).rgb
+
+
+def on_a_plane(inputs: Views, targets: Cameras, depth: float) -> Tensor:
+    """Return nearest inputs (1, T, 3, H, W) as seen by targets, were all they show at `depth`."""
+    numbers = torch.arange(inputs.images.shape[1]).view(1, -1, 1, 1, 1)
+    by_number = Views(numbers.float().expand_as(inputs.images), inputs.cameras)
+    nearest = inputs.select(nearest_input(by_number, targets)[0, :, 0, 0, 0].int().tolist())
+    pose_T44 = nearest.cameras.w2c[0] @ targets.c2w[0]
+    step_T3 = pose_T44[:, :3, 3]
+    # Of the points of a ray, which the nearest camera turns and shifts, the one at this depth.
+    plane_T33 = (depth - step_T3[:, 2, None, None]) * torch.eye(3) + F.pad(
+        step_T3[..., None], (2, 0)
+    )
+    onto_T33 = lenses(nearest.cameras) @ plane_T33 @ pose_T44[:, :3, :3] @ lenses(targets).inverse()
+    size = targets.size
+    return warp_perspective(nearest.images[0], onto_T33.inverse(), size, padding_mode="border")[
+        None
+    ]
+
+
+def lenses(cameras: Cameras) -> Tensor:
+    """Return matrices (V, 3, 3) to pixels, whose middles are whole numbers, of cameras (1, V)."""
+    k_V33 = torch.diag_embed(F.pad(cameras.intrinsics[0, :, :2], (0, 1), value=1.0))
+    k_V33[:, :2, 2] = cameras.intrinsics[0, :, 2:] - 0.5
+    return k_V33
 
 
 def table(rows: Sequence[Row]) -> str:

@@ -1,6 +1,7 @@
 """Checkpoints and PLY files, damaged in many ways: each is used, or refused by its name.
 
-Half of the checkpoints are sealed anew, as by somebody who means harm.
+Half of the checkpoints are sealed anew, as by somebody who means harm. Metadata that are not, and
+are used, must give the numbers of the undamaged file; nothing seals the tensors.
 """
 
 import json
@@ -13,9 +14,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors.torch import save
 
 import qgs
-from fuzzing.cases import JUNK, TABLES, Use, other_bytes, other_leaf, refused
+from fuzzing.cases import JUNK, TABLES, FaultError, Use, other_bytes, other_leaf, refused
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.checkpoint.tensors import SEAL, seal
 from qgs.contracts import LearnedQueries
@@ -79,14 +81,15 @@ def damage_checkpoint(file: Path) -> str:
     data = bytearray(whole[end:])
     change = choice((other_tensor, other_tensor, other_metadata, other_metadata, other_recipe))
     change(header, data)
-    if random.random() < 0.5:
+    sealed = random.random() < 0.5
+    if sealed:
         # Else hardly anything behind the seal would be tried.
         header["__metadata__"][SEAL] = seal(header["__metadata__"])
     if random.random() < 0.05:
         header["__metadata__"] = choice(TABLES["metadata"])
     text = json.dumps(header).encode()
     file.write_bytes(len(text).to_bytes(8, "little") + text + data)
-    return change.__name__
+    return f"{change.__name__}, sealed" if sealed else change.__name__
 
 
 def damage_ply(file: Path) -> str:
@@ -101,8 +104,8 @@ def damage_ply(file: Path) -> str:
     return "other words and numbers"
 
 
-def decode(file: Path) -> None:
-    """Load a checkpoint and make Gaussians of its queries."""
+def decode(file: Path) -> bytes:
+    """Load a checkpoint and make Gaussians of its queries; return them as PLY."""
     with CheckpointFile(file) as checkpoint:
         model = checkpoint.model()
         _ = checkpoint.extra
@@ -110,13 +113,17 @@ def decode(file: Path) -> None:
     with torch.no_grad():
         gaussians = model.decode(model.queries.start(1))
     # Weights may be any numbers; Gaussians that are none must not be written.
-    qgs.save_ply(gaussians, file.with_suffix(".ply"))
+    ply = file.with_suffix(".ply")
+    qgs.save_ply(gaussians, ply)
+    return ply.read_bytes()
 
 
-def start_from(file: Path) -> None:
-    """Start a training from a checkpoint."""
+def start_from(file: Path) -> bytes:
+    """Start a training from a checkpoint; return its weights."""
     recipe = resolve(RECIPE, [*SMALL, "model.queries.count=9", f"init_from={file}"])
-    initialise(recipe.build_model(), recipe)
+    model = recipe.build_model()
+    initialise(model, recipe)
+    return save(model.state_dict())
 
 
 def convert(file: Path) -> None:
@@ -124,15 +131,17 @@ def convert(file: Path) -> None:
     qgs.save_ply(qgs.load_ply(file), file.with_name("again.ply"))
 
 
-def judged(use: Callable[[Path], None], path: Path) -> str:
-    """Return how `use` ended."""
-    end = "success"
+def judged(use: Callable[[Path], bytes | None], path: Path, whole: bytes | None) -> str:
+    """Return how `use` ended. whole: what it must return; None for anything."""
     try:
-        use(path)
+        made = use(path)
     except (ValueError, OSError) as error:
         # Numbers that are not finite are found when Gaussians are written, under another name.
-        end = refused(error, "" if "not finite" in str(error) else str(path))
-    return f"{use.__name__} {end}"
+        named = "" if "not finite" in str(error) else str(path)
+        return f"{use.__name__} {refused(error, named)}"
+    if whole not in (None, made):
+        raise FaultError("other numbers than those of the undamaged file")
+    return f"{use.__name__} success"
 
 
 def prepare(scratch: Path) -> None:
@@ -145,9 +154,12 @@ def prepare(scratch: Path) -> None:
 def case_in(scratch: Path, folder: Path) -> tuple[str, Use]:
     """Damage a copy of one of the files."""
     use = choice((decode, start_from, convert))
-    path = folder / ("a.ply" if use is convert else "a.safetensors")
-    path.write_bytes((scratch / path.name).read_bytes())
+    original = scratch / ("a.ply" if use is convert else "a.safetensors")
+    path = folder / original.name
+    path.write_bytes(original.read_bytes())
     damage = damage_ply if use is convert else damage_checkpoint
     if random.random() < 0.15:
         damage = other_bytes
-    return f"{use.__name__}, {damage(path)}", partial(judged, use, path)
+    what = damage(path)
+    whole = use(original) if what == other_metadata.__name__ else None
+    return f"{use.__name__}, {what}", partial(judged, use, path, whole)
