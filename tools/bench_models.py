@@ -1,12 +1,11 @@
 """LocusGS and ellipsoid against TokenGS, in turn, in one run: forward, and forward and backward.
 
-    python tools/bench_models.py [--size first|small] [--precision bf16] [--rounds 9]
+    python tools/bench_models.py [--size first|small] [--rounds 9] [--threads 2]
 
 Two sizes: "first" has width 384, 6 heads, 3 + 12 layers, 1,024 queries and 4 photos of 256 x 256;
 "small" has width 256, 8 heads, 3 + 6 layers, 512 queries and 4 photos of 128 x 128. Gradients go to
-all parameters from the Gaussians of the supervised layers, without renderer or losses: of the last
-layer, or with --layers 2 of the half and the last, as the recipes of LocusGS have it.
-Prints medians, and medians of the ratios to TokenGS round by round.
+all parameters from the Gaussians of the last layer, without renderer or losses. Prints medians, and
+medians of the ratios to TokenGS round by round.
 """
 
 import argparse
@@ -18,11 +17,10 @@ from operator import truediv
 import torch
 from qgs_research.bench.run import in_turn
 from qgs_research.bench.work import posed_photos
-from torch import Tensor
 
 from qgs.model import QueryGaussianModel
 from qgs.recipe import resolve
-from qgs.types import Prediction, Views
+from qgs.types import Views
 
 SIZES = {
     "first": ({"width": 384, "heads": 6, "queries": 1024, "depth": 12}, (256, 256)),
@@ -38,37 +36,26 @@ MODELS = {
 least that it can cost beside TokenGS."""
 
 
-def build(name: str, size: str, layers: int) -> QueryGaussianModel:
+def build(name: str, size: str) -> QueryGaussianModel:
     """A published model, made smaller."""
     options, _ = SIZES[size]
-    depth = options["depth"]
-    supervised = [depth // 2, depth] if layers == 2 else [depth]
     changes = [
         f"model.width={options['width']}",
         f"model.heads={options['heads']}",
         f"model.queries.count={options['queries']}",
-        f"model.decoder.depth={depth}",
-        f"model.supervision.layers={supervised}",
+        f"model.decoder.depth={options['depth']}",
+        f"model.supervision.layers=[{options['depth']}]",
         *MODELS[name][1],
     ]
     return resolve(f"{MODELS[name][0]}/dl3dv_4096_4views.yaml", changes).build_model()
 
 
-def forward(model: QueryGaussianModel, photos: Views, bf16: bool = False) -> Prediction:
-    """The Gaussians of the last layer, or in training of the supervised ones."""
-    with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-        return model(photos)
-
-
-def backward(model: QueryGaussianModel, photos: Views, bf16: bool = False) -> None:
+def backward(model: QueryGaussianModel, photos: Views) -> None:
     """Forward, and gradients of all parameters."""
     model.zero_grad(set_to_none=True)
-    total = torch.zeros(())
-    for layer in forward(model, photos, bf16).layers.values():
-        gaussians = layer.gaussians
-        parts: list[Tensor] = [gaussians.means, gaussians.scales, gaussians.quats]
-        total = total + sum(x.square().mean() for x in [*parts, gaussians.opacities])
-    total.backward()
+    found = model(photos).gaussians
+    parts = (found.means, found.scales, found.quats, found.opacities)
+    torch.stack([x.square().mean() for x in parts]).sum().backward()
 
 
 def compare(runs: Mapping[str, Callable[[], object]], rounds: int) -> None:
@@ -83,21 +70,19 @@ def compare(runs: Mapping[str, Callable[[], object]], rounds: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description="LocusGS and ellipsoid against TokenGS.")
     parser.add_argument("--size", choices=[*SIZES], action="append")
-    parser.add_argument("--precision", choices=["float32", "bf16"], default="float32")
-    parser.add_argument("--layers", type=int, choices=[1, 2], default=1, help="supervised")
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     for size in options.size or SIZES:
         photos = posed_photos(1, 4, SIZES[size][1], 0)
-        bf16 = options.precision == "bf16"
-        runs = {name: (build(name, size, options.layers), photos, bf16) for name in MODELS}
+        models = {name: build(name, size) for name in MODELS}
         print(f"{size}, {options.threads} threads; forward", flush=True)
         with torch.inference_mode():
-            compare({n: partial(forward, *run) for n, run in runs.items()}, options.rounds)
-        print(f"forward and backward, supervised layers: {options.layers}", flush=True)
-        compare({n: partial(backward, *run) for n, run in runs.items()}, options.rounds)
+            compare({n: partial(model, photos) for n, model in models.items()}, options.rounds)
+        print("forward and backward", flush=True)
+        runs = {name: partial(backward, model, photos) for name, model in models.items()}
+        compare(runs, options.rounds)
 
 
 if __name__ == "__main__":

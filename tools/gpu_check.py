@@ -11,7 +11,6 @@ results and times, OUT/logs all output.
 import json
 import os
 import shlex
-import signal
 import subprocess
 import sys
 import time
@@ -61,24 +60,13 @@ def run_step(step: Step, out: Path) -> tuple[bool, str, str]:
     env = {**os.environ, "PYTHONPATH": str(ROOT / "tests")}
     env["PATH"] = f"{Path(sys.executable).parent}:{env['PATH']}"
     started = time.perf_counter()
+    # Its own processes end with it.
+    command = ["timeout", "--signal=KILL", str(step["limit"]), *shlex.split(step["command"])]
+    folder = ROOT if "pytest" in step["command"] else out
     with log.open("w") as file:
-        process = subprocess.Popen(
-            shlex.split(step["command"]),
-            cwd=ROOT if "pytest" in step["command"] else out,
-            env=env,
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-        try:
-            code = process.wait(step["limit"])
-        except subprocess.TimeoutExpired as error:
-            # Its own processes too.
-            os.killpg(process.pid, signal.SIGKILL)
-            code = str(error)
-            file.write(f"\n{error}\n")
+        code = subprocess.run(command, cwd=folder, env=env, stdout=file, stderr=file).returncode
     verdict = "passed" if code == 0 else "FAILED"
-    row = f"| {step['name']} | {verdict} | {time.perf_counter() - started:.0f} |"
+    row = f"| {step['name']} | {verdict}, {code} | {time.perf_counter() - started:.0f} |"
     print(row, flush=True)
     end = "\n".join(log.read_text(errors="replace").splitlines()[-40:])
     return code == 0, row, f"## {step['name']}\n\n`{step['command']}`\n\n```\n{end}\n```"

@@ -1,13 +1,13 @@
 """How models do on photos of real scenes, over many windows, with the scale that search finds.
 
-    python tools/real_photos.py PHOTOS ... [--model rooms/locus-64 ...] [--like MODEL]
+    python tools/real_photos.py PHOTOS ... [--model rooms/locus-64 ...]
         [--distances .5 1 2] [--refine 10] [--windows 12] [--out JSON]
 
 For each window: PSNR and SSIM of novel views with the found scale, with `views.scale: auto`, of the
 nearest photo, of that photo as a plane at the depth of the scene, and after a refinement on the
 inputs. Prints Markdown of means. Windows are those
-that `qgs demo` chooses for the model --like, the first one by default. Every eighth photo is held
-out. --distances: how far inputs are apart, in distances of the training of --like.
+that `qgs demo` chooses for the first model. Every eighth photo is held
+out. --distances: how far inputs are apart, in distances of its training.
 """
 
 import argparse
@@ -60,7 +60,6 @@ def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("photos", nargs="+", type=Path, help="folders of photos with cameras")
     parser.add_argument("--model", nargs="+", default=MODELS, help=f"default: {', '.join(MODELS)}")
-    parser.add_argument("--like", metavar="MODEL", help="that has the windows; default: the first")
     parser.add_argument("--distances", type=float, nargs="+", default=[1.0], metavar="FACTOR")
     parser.add_argument("--refine", type=float, default=0.0, metavar="SECONDS", help="on inputs")
     parser.add_argument("--windows", type=int, default=12, help="of a scene, at most")
@@ -79,7 +78,7 @@ def scene_rows(
     scene = recipe.build_data().scenes("test")[0]
     views = recipe.views
     # Its weights are not read: only the cameras that it was trained on are asked for.
-    with CheckpointFile(options.like or options.model[0]) as file:
+    with CheckpointFile(options.model[0]) as file:
         domain = apart(file.domain, distance)
     search = ScaleSearch(model, views.model_copy(update={"scale": "search"}))
     for inputs, targets in choose_windows(scene, views, domain, options.windows):

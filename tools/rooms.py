@@ -7,7 +7,9 @@ they import. An arrow leads to a room that is imported and that no other arrow l
 """
 
 import ast
+import re
 from pathlib import Path
+from textwrap import shorten
 
 import networkx as nx
 from jinja2 import Template
@@ -24,15 +26,11 @@ COLUMNS = 7
 
 def rooms() -> dict[str, list[Path]]:
     """Return the name of every room, and its files."""
-    found: dict[str, list[Path]] = {}
-    for path in sorted((ROOT / "qgs").iterdir()):
-        if path.is_dir() and (path / "__init__.py").is_file():
-            found[path.name] = sorted(path.rglob("*.py"))
-        elif path.suffix == ".py" and not path.name.startswith("__"):
-            found[path.stem] = [path]
-    for folder in sorted((ROOT / "plugins").glob("*/src/*")):
-        found[folder.name] = sorted(folder.rglob("*.py"))
-    return found
+    folders = sorted((ROOT / "qgs").iterdir()) + sorted((ROOT / "plugins").glob("*/src/*"))
+    found = {x.stem: sorted(x.rglob("*.py")) if x.is_dir() else [x] for x in folders}
+    # Neither `__main__`, nor what tells type checkers that there are types, nor old folders.
+    python = {name: [f for f in files if f.suffix == ".py"] for name, files in found.items()}
+    return {name: files for name, files in python.items() if files and "__" not in name}
 
 
 def imports(files: list[Path]) -> set[str]:
@@ -49,27 +47,19 @@ def imports(files: list[Path]) -> set[str]:
     return own | {part[0] for part in parts if part[0].startswith("qgs_")}
 
 
-def graph() -> nx.DiGraph:
-    """Return every room, with an edge to each other room that it imports."""
-    found = rooms()
-    arrows = nx.DiGraph()
-    for name, files in found.items():
-        arrows.add_node(name)
-        arrows.add_edges_from((name, to) for to in imports(files) & found.keys() - {name})
-    return arrows
-
-
-def title(files: list[Path]) -> str:
-    """Return the first words of a room's docstring."""
-    text = ast.get_docstring(ast.parse(files[0].read_text(encoding="utf-8"))) or ""
-    words = text.splitlines()[0].split(":")[0].split(",")[0].rstrip(".").replace("`", "")
-    return words if len(words) <= 30 else words[:29].rsplit(" ", 1)[0] + " ..."
+def title(file: Path) -> str:
+    """Return the first words of a docstring."""
+    text = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or ""
+    return shorten(re.split("[:,.]", text.replace("`", ""))[0], 30, placeholder=" ...")
 
 
 def drawn() -> str:
     """Return the picture as SVG."""
-    arrows = graph()
     files = rooms()
+    arrows = nx.DiGraph()
+    arrows.add_nodes_from(files)
+    for name, own in files.items():
+        arrows.add_edges_from((name, to) for to in imports(own) & files.keys() - {name})
     lines: list[list[str]] = []
     # The first generation is imported by no other; reversed, it imports none.
     ground, *upper = nx.topological_generations(arrows.reverse())
@@ -87,7 +77,7 @@ def drawn() -> str:
         width=COLUMNS * ACROSS + GAP,
         height=len(lines) * ROW,
         arrows=[(*places[name], *places[other]) for name, other in edges],
-        rooms=[(name, *place, title(files[name])) for name, place in places.items()],
+        rooms=[(name, *place, title(files[name][0])) for name, place in places.items()],
     )
 
 

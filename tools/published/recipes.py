@@ -17,6 +17,31 @@ UNSUPPORTED_BUT = {
 }
 """Parts of LocusGS that its published models and ablations do not use."""
 
+BOTH = """
+enc_embed_dim       width
+enc_num_heads       heads
+patch_size          encoder.patch_size
+enc_depth           encoder.depth
+mlp_ratio           encoder.mlp_ratio
+dec_depth           decoder.depth
+gaussian_scale_cap  head.scale_cap
+num_gs_tokens       queries.count
+gs_token_std        queries.std
+"""
+TOKENGS = """
+gaussian_z_offset   centers.z_offset
+"""
+LATENT = """
+num_latents              encoder.latents
+latent_cross_attn_depth  encoder.latent_depth
+"""
+LOCUS = """
+num_gaussians_per_token     head.gaussians_per_query
+anchor_radius_refinement    decoder.refinement.radius
+anchor_supervision_layers   supervision.layers
+use_anchor_radius           queries.radius
+"""
+"""Released options, and what they are in the model's part of a recipe."""
 SELF_ATTENTION = {"content_only": "qgs/content", "learned_positional": "locus/anchor_aware"}
 CROSS_ATTENTION = {"content_only": "qgs/content", "geometric_positional": "locus/ray_biased"}
 CENTERS = {
@@ -35,84 +60,55 @@ def only(options: Options, expected: Options) -> None:
             raise ValueError(f"the option {name} is {options[name]!r}; only {value!r} is supported")
 
 
+def model_of(options: Options, *tables: str) -> dict[str, Any]:
+    """The model's part of a recipe, as far as `tables` tell it."""
+    model: dict[str, Any] = {}
+    for line in "".join(tables).split("\n"):
+        if line:
+            option, path = line.split()
+            *sections, name = path.split(".")
+            section = model
+            for key in sections:
+                section = section.setdefault(key, {})
+            section[name] = options[option]
+    return model
+
+
 def tokengs_recipe(options: Options) -> dict[str, Any]:
     """The recipe of the model that TokenGS builds from `options`."""
-    model = backbone(options)
-    model["encoder"] |= encoder_options(options)
+    multiscale, latent = (options.get(name) for name in OF_2026_6)
+    moving, timed = (options.get(name, 0) for name in OF_MOTION)
+    model = model_of(options, BOTH, TOKENGS, LATENT if latent else "")
+    model["encoder"]["type"] = "qgs/multiview_vit"
+    if multiscale or latent or timed:
+        # The release numbers blocks from 0; without the readout it reads the last one.
+        last = [options["enc_depth"] - 1]
+        read = sorted(set(options["multiscale_encoder_layers"])) if multiscale else last
+        model["encoder"]["blocks"] = [n + 1 for n in read]
+        kind = "latent_bottleneck" if latent else "multiscale_vit"
+        model["encoder"]["type"] = f"tokengs2026/{kind}"
     model["head"] |= {
-        "gaussians_per_query": int(options["dec_patch_size"]) ** 2,
+        "gaussians_per_query": options["dec_patch_size"] ** 2,
         "opacity_bias": -options["opacity_bias"],
         "scale_input_limit": None,
         "quat_eps": 1e-12,
     }
-    model["queries"] = {"type": "qgs/latent", **query_options(options)}
-    model |= motion_options(options, model)
-    model["centers"] = {
-        "type": "qgs/free",
-        "z_offset": options["gaussian_z_offset"],
-        "input_limit": None,
-        "output_limit": None,
-    }
-    model["supervision"] = {"layers": [int(options["dec_depth"])]}
+    if moving or timed:
+        channels = options["time_embedding_dim"] if timed else 0
+        model["encoder"]["time_channels"] = channels
+        model["queries"] |= {
+            "type": "tokengs2026/dynamic",
+            "count": model["queries"]["count"] + moving,
+            "dynamic": moving,
+            "time_channels": channels,
+            "patch_size": options["patch_size"],
+        }
+    if moving:
+        model["decoder"]["self_attention"] = {"type": "tokengs2026/block_causal"}
+    model["centers"] |= {"type": "qgs/free", "input_limit": None, "output_limit": None}
+    model["supervision"] = {"layers": [options["dec_depth"]]}
     views = {"frame": options["camera_normalization_method"]}
     return {"recipe": 1, "plugins": ["tokengs2026"], "model": model, "views": views}
-
-
-def backbone(options: Options) -> dict[str, Any]:
-    """What TokenGS and LocusGS share: sizes, encoder, decoder depth, scale cap."""
-    width = int(options["enc_embed_dim"])
-    only(options, {"token_dim": width})
-    return {
-        "width": width,
-        "heads": int(options["enc_num_heads"]),
-        "encoder": {
-            "patch_size": int(options["patch_size"]),
-            "depth": int(options["enc_depth"]),
-            "mlp_ratio": options["mlp_ratio"],
-        },
-        "decoder": {"depth": int(options["dec_depth"])},
-        "head": {"scale_cap": options["gaussian_scale_cap"]},
-    }
-
-
-def query_options(options: Options) -> dict[str, Any]:
-    """Number and initial spread of the queries."""
-    return {"count": int(options["num_gs_tokens"]), "std": options["gs_token_std"]}
-
-
-def encoder_options(options: Options) -> dict[str, Any]:
-    """Which encoder it is, and the options that only the encoders of TokenGS 2026.6 have."""
-    multiscale, latent = (options.get(name) for name in OF_2026_6)
-    if not (multiscale or latent or options.get("time_embedding")):
-        return {"type": "qgs/multiview_vit"}
-    depth = int(options["enc_depth"])
-    # The release numbers blocks from 0; without the readout it reads the last one.
-    read = sorted(set(options["multiscale_encoder_layers"])) if multiscale else [depth - 1]
-    found: dict[str, Any] = {"type": "tokengs2026/multiscale_vit", "blocks": [n + 1 for n in read]}
-    if latent:
-        found |= {
-            "type": "tokengs2026/latent_bottleneck",
-            "latents": int(options["num_latents"]),
-            "latent_depth": int(options["latent_cross_attn_depth"]),
-        }
-    return found
-
-
-def motion_options(options: Options, model: dict[str, Any]) -> dict[str, Any]:
-    """The parts of `model` that times and dynamic tokens change."""
-    count, timed = (options.get(name, 0) for name in OF_MOTION)
-    if not (count or timed):
-        return {}
-    channels = int(options["time_embedding_dim"]) if timed else 0
-    queries = {**model["queries"], "type": "tokengs2026/dynamic", "dynamic": int(count)}
-    queries |= {"count": queries["count"] + int(count), "time_channels": channels}
-    queries |= {"patch_size": model["encoder"]["patch_size"]}
-    own = {"self_attention": {"type": "tokengs2026/block_causal"}} if count else {}
-    return {
-        "encoder": {**model["encoder"], "time_channels": channels},
-        "queries": queries,
-        "decoder": {**model["decoder"], **own},
-    }
 
 
 def locusgs_recipe(options: Options) -> dict[str, Any]:
@@ -121,29 +117,24 @@ def locusgs_recipe(options: Options) -> dict[str, Any]:
     `geo_sigma`, a constant of the release, may stand among the options.
     """
     only(options, {**UNSUPPORTED_BUT, **OF_2026_6, **OF_MOTION})
-    model = backbone(options)
-    model["head"]["gaussians_per_query"] = int(options["num_gaussians_per_token"])
+    model = model_of(options, BOTH, LOCUS)
     least = {"radius_min": options["anchor_radius_min"]}
     mean = [0.0, 0.0, options["gaussian_z_offset"]]
-    start = {"center_init": {"kind": "normal", "mean": mean}}
-    radius = {"radius": False}
+    model["queries"] |= {"type": "locus/anchored", "center_init": {"kind": "normal", "mean": mean}}
     if options["use_anchor_radius"]:
-        radius = {**least, "init_radius": options["anchor_radius_init"]}
-    model["queries"] = {"type": "locus/anchored", **query_options(options), **start, **radius}
+        model["queries"] |= {**least, "init_radius": options["anchor_radius_init"]}
     attention = {"type": CROSS_ATTENTION[options["cross_attn_variant"]]}
     if attention["type"] == "locus/ray_biased":
         by_radius = options["anchor_radius_affects_bias"]
         attention["bandwidth"] = "radius" if by_radius else "fixed"
         attention["sigma0"] = options.get("geo_sigma", 0.1)
         attention |= least if by_radius else {}
-    refined = options["anchor_radius_refinement"]
-    model["decoder"] |= {
-        "cross_attention": attention,
-        "self_attention": {"type": SELF_ATTENTION[options["self_attn_variant"]]},
-        "refinement": {"type": "locus/refine", "radius": refined, **(least if refined else {})},
-    }
+    decoder = model["decoder"]
+    decoder["cross_attention"] = attention
+    decoder["self_attention"] = {"type": SELF_ATTENTION[options["self_attn_variant"]]}
+    refined = decoder["refinement"]["radius"]
+    decoder["refinement"] |= {"type": "locus/refine", **(least if refined else {})}
     centers = CENTERS[options["gaussian_center_variant"]]
     of_centers = {"qgs/free": {"z_offset": 0.0}, "locus/radius_scaled": least}
     model["centers"] = {"type": centers, **of_centers.get(centers, {})}
-    model["supervision"] = {"layers": sorted(set(options["anchor_supervision_layers"]))}
     return {"recipe": 1, "plugins": ["locus"], "model": model}
