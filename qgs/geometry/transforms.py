@@ -1,10 +1,12 @@
 """Points into cameras and pixels, quaternions and their matrices, worlds to worlds."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import rotated
 from qgs.geometry.precision import full_precision
 from qgs.types import Cameras, Gaussians
@@ -21,6 +23,14 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+@full_precision
+def unit(vectors: Tensor, otherwise: Sequence[float] = (1.0, 0.0, 0.0, 0.0)) -> Tensor:
+    """Vectors (..., C) of length 1; `otherwise`, the identity as a quaternion, for zeros."""
+    length = vectors.norm(dim=-1, keepdim=True)
+    divisor = torch.where(length > 0, length, 1)
+    return torch.where(length > 0, vectors / divisor, constant(otherwise, vectors))
 
 
 @full_precision

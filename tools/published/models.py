@@ -12,8 +12,7 @@ from qgs_locus.cross_attention import RayBiasedCrossAttention
 from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
 from qgs_locus.self_attention import AnchorAwareSelfAttention
 from qgs_research.published.layouts import names_of
-from qgs_zoo.tokengs2026.latents import LatentBottleneck
-from qgs_zoo.tokengs2026.times import time_features
+from qgs_zoo.tokengs2026.multiscale import LatentBottleneck, time_features
 from torch import Tensor
 
 from published.depthsplat import depthsplat_tensors

@@ -5,8 +5,7 @@ from typing import Any
 
 import torch
 from qgs_zoo.mvsplat.adapter import band_mask, camera_quaternions, turn_of_harmonics
-from qgs_zoo.mvsplat.depthsplat_head import WorldHead
-from qgs_zoo.mvsplat.head import RayHead, mapped_opacity
+from qgs_zoo.mvsplat.head import RayHead, WorldHead, mapped_opacity
 from qgs_zoo.mvsplat.pixels import (
     PIXEL,
     OnRays,

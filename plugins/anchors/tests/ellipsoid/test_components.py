@@ -7,11 +7,10 @@ import torch.nn.functional as F
 import yaml
 from qgs_anchors.ellipsoid.anchors import EllipsoidQueries
 from qgs_anchors.ellipsoid.cross_attention import EllipsoidCrossAttention
-from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_rotation
+from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_rotation, turned
 from qgs_anchors.ellipsoid.head import AxisScaledCenters, EllipsoidHead, radii_along
 from qgs_anchors.ellipsoid.ray_bias import EllipsoidBias, ray_tokens
 from qgs_anchors.ellipsoid.refinement import EllipsoidRefinement
-from qgs_anchors.ellipsoid.rotations import turned
 from qgs_locus.anchors import FrustumCenters
 from qgs_locus.fields import CENTER
 from refusals import wrong_refusals

@@ -4,7 +4,7 @@ import pytest
 import torch
 import yaml
 from odd_views import odd_views
-from qgs_anchors.ellipsoid.conversion import from_locus
+from qgs_anchors.ellipsoid.anchors import from_locus
 from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION
 from qgs_locus.fields import CENTER, RAW_RADIUS
 from torch.testing import assert_close

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from contract_mutants.mutant import mutant
 from contract_mutants.sound import StridedConvolutions
-from qgs_zoo.tokengs2026.latents import LatentBottleneck
+from qgs_zoo.tokengs2026.multiscale import LatentBottleneck
 from torch import Tensor, nn
 
 from qgs.contracts import (

@@ -124,7 +124,7 @@ def test_a_checkpoint_needs_no_file_of_weights(weights, tmp_path):
     loaded = qgs.load(tmp_path / "checkpoint.safetensors")
     given = odd_views(3, 28, 42)
     assert torch.equal(loaded(given).gaussians.means, model(given).gaussians.means)
-    with pytest.raises(MissingExtraError, match="there are no weights"):
+    with pytest.raises(MissingExtraError, match="cannot read weights"):
         recipe.build_model()
 
 

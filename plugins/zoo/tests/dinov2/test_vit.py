@@ -4,7 +4,6 @@ import pytest
 import torch
 from qgs_zoo.dinov2 import DinoMultiViewViT
 from qgs_zoo.dinov2.vit import GRID, DinoV2, VitConfig
-from qgs_zoo.dinov2.weight_file import load_weights
 from safetensors.torch import save_file
 from small_parts import Code
 from torch.testing import assert_close
@@ -47,4 +46,4 @@ def test_other_files_are_refused(tmp_path):
         if content:
             torch.save(content, tmp_path / name)
         with pytest.raises(MissingExtraError, match=name):
-            load_weights(vit, str(tmp_path / name))
+            vit.load(str(tmp_path / name))

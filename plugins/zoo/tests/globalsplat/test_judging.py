@@ -9,8 +9,14 @@ from globalsplat_inputs import SMALL, TINY
 from odd_views import odd_views
 from qgs_dev import Case
 from qgs_dev.inputs import Sizes, inputs_of
-from qgs_zoo.globalsplat.losses import Frustum, Regularisers, beyond_frusta
-from qgs_zoo.globalsplat.objective import TwoPasses, disagreement, subset
+from qgs_zoo.globalsplat.losses import (
+    Frustum,
+    Regularisers,
+    TwoPasses,
+    beyond_frusta,
+    disagreement,
+    subset,
+)
 from torch.testing import assert_close
 
 from qgs.recipe import resolve

@@ -7,7 +7,8 @@ import torch
 import torch.nn.functional as F
 from odd_views import odd_views
 from qgs_zoo.gslrm.encoder import Transformer
-from qgs_zoo.gslrm.pixels import PATCH, AlongRays, PixelHead, PixelQueries, patch_rays_at, patches
+from qgs_zoo.gslrm.pixels import PATCH, AlongRays, PixelHead, PixelQueries, patch_rays_at
+from qgs_zoo.parts import pixel_rays
 from small_parts import attended, made
 from torch.testing import assert_close
 
@@ -32,7 +33,7 @@ def test_rays_of_a_patch_are_spread_evenly():
     """They are those of its pixels, or of pixels of another size where their number differs."""
     given = odd_views(3, 8, 12).cameras
     for count, rows, columns in ((16, 4, 4), (4, 2, 2), (2, 1, 2), (8, 2, 4), (3, 1, 3)):
-        seen = patch_rays_at(patches(given, ROWS, COLUMNS), count)[1]
+        seen = patch_rays_at(pixel_rays(given, ROWS, COLUMNS), count)[1]
         factor = torch.tensor([columns / P, rows / P] * 2)
         fine = Cameras(given.c2w, given.intrinsics * factor, (rows * ROWS, columns * COLUMNS))
         assert_close(F.normalize(seen, dim=-1), in_patches(camera_rays(fine)[1]))

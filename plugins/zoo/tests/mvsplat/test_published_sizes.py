@@ -1,8 +1,7 @@
 """Parameters counted part by part, and recipes read from names and shapes."""
 
 import pytest
-from qgs_zoo.mvsplat.depthsplat_weights import DEPTHSPLAT
-from qgs_zoo.mvsplat.weights import MVSPLAT
+from qgs_zoo.mvsplat.weights import DEPTHSPLAT, MVSPLAT
 
 from qgs.contracts import LayoutError
 from qgs.recipe import resolve

@@ -6,8 +6,7 @@ import pytest
 import torch
 from odd_views import odd_views
 from qgs_zoo.tokengs2026.dynamic import MOVES, DynamicQueries
-from qgs_zoo.tokengs2026.multiscale import MultiscaleViT
-from qgs_zoo.tokengs2026.times import TimeEmbedding, time_features
+from qgs_zoo.tokengs2026.multiscale import MultiscaleViT, TimeEmbedding, time_features
 from refusals import problems_of
 from small_parts import made
 from torch.testing import assert_close

@@ -1,5 +1,9 @@
-"""`ellipsoid/anchored`: every query has a 3D anchor, a centre with an ellipsoid around it."""
+"""`ellipsoid/anchored`: every query has a 3D anchor, a centre with an ellipsoid around it.
 
+LocusGS is a special case: its weights become an ellipsoid of three equal radii.
+"""
+
+from collections.abc import Mapping
 from typing import Annotated
 
 import torch
@@ -7,7 +11,7 @@ import torch.nn.functional as F
 from pydantic import Field
 from qgs_locus.anchors import FrustumCenters, NormalCenters
 from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, raw_radius_of
-from torch import nn
+from torch import Tensor, nn
 
 from qgs.contracts import Fields, LearnedQueries, ModelDims
 from qgs.types import QueryState, SpatialSupport
@@ -66,3 +70,33 @@ class EllipsoidQueries(LearnedQueries):
     def support(self, state: QueryState) -> SpatialSupport:
         """The ellipsoids."""
         return SpatialSupport(centers=state[CENTER], axes=anchor_axes(state, self.config))
+
+
+def from_locus(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The state dict of a LocusGS for the same recipe with ellipsoidal anchors and LocusGS's head.
+
+    A radius becomes three equal ones, with equal steps in the refinement; rotations are the
+    identity. A model with `rotation: false` computes what LocusGS does. The result has no weights
+    of a refinement of rotations (load with `strict=False`). Raises ValueError for weights without
+    radii.
+    """
+    if "queries.raw_radius" not in weights:
+        raise ValueError(
+            "there is no `queries.raw_radius`: the weights are of no LocusGS whose anchors have a "
+            "radius; give the state dict of a model with `locus/anchored` and `radius: true`"
+        )
+    converted = {name: _tripled(name, values) for name, values in weights.items()}
+    converted["queries.raw_radii"] = converted.pop("queries.raw_radius")
+    # A ball has no orientation, so any rotation would do.
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0]).to(weights["queries.raw_radius"])
+    converted["queries.rotation"] = identity.repeat(len(weights["queries.raw_radius"]), 1)
+    return converted
+
+
+def _tripled(name: str, values: Tensor) -> Tensor:
+    if name == "queries.raw_radius":
+        return values.repeat(1, 3)
+    # Rows of the last layer are the radii: three equal ones step together.
+    if name.startswith("refinements.0.radius_mlp.fc2."):
+        return values.repeat(3, *(1 for _ in values.shape[1:]))
+    return values.clone()

@@ -6,11 +6,10 @@ from torch import Tensor
 
 from qgs.contracts import Fields
 from qgs.geometry.precision import full_precision
-from qgs.geometry.transforms import quat_product, quat_to_matrix
+from qgs.geometry.transforms import quat_product, quat_to_matrix, unit
 from qgs.tokengs import GaussianHead
 from qgs.types import GaussianAttributes, QueryState
 from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_axes, shape_fields
-from qgs_anchors.ellipsoid.rotations import unit_quats
 
 
 class EllipsoidHead(GaussianHead):
@@ -35,9 +34,9 @@ class EllipsoidHead(GaussianHead):
     def forward(self, state: QueryState) -> GaussianAttributes:
         """(B, N, D) and the anchors' shapes -> attributes of (B, N, K) Gaussians."""
         local = super().forward(state)
-        quats = unit_quats(local.quats)
+        quats = unit(local.quats)
         # The anchor's rotation comes after the Gaussian's own.
-        turn = unit_quats(state[ROTATION])[:, :, None].expand_as(quats)
+        turn = unit(state[ROTATION])[:, :, None].expand_as(quats)
         scales = local.scales * radii_along(support_radius(state[RAW_RADII], self.config), quats)
         return local.replace(quats=quat_product(turn, quats), scales=scales)
 
@@ -61,13 +60,9 @@ class AxisScaledCenters(RadiusScaledCenters):
         """Centres and shapes."""
         return {**CENTER_FIELD, **shape_fields(config)}
 
+    @full_precision
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """(B, N, K, 3) -> (B, N, K, 3)."""
         # Offsets are along the axes of the ellipsoid, in its radii.
         displaced = self.config.displacement(offsets)
-        return _placed(state[CENTER], anchor_axes(state, self.config), displaced)
-
-
-@full_precision
-def _placed(center_BN3: Tensor, axes_BN33: Tensor, offsets_BNK3: Tensor) -> Tensor:
-    return center_BN3[:, :, None] + offsets_BNK3 @ axes_BN33.mT
+        return state[CENTER][:, :, None] + displaced @ anchor_axes(state, self.config).mT

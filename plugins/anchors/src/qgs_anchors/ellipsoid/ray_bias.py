@@ -15,7 +15,7 @@ from qgs_locus.ray_bias import clamped, normalised_rays
 from torch import Tensor
 
 from qgs.geometry.precision import full_precision
-from qgs_anchors.ellipsoid.rotations import unit
+from qgs.geometry.transforms import unit
 
 UPWARD = (0.0, 0.0, 1.0)
 """The direction of a ray that has none."""

@@ -4,8 +4,7 @@ from qgs_locus.refinement import AnchorRefinement
 
 from qgs.contracts import Fields, ModelDims
 from qgs.types import QueryState
-from qgs_anchors.ellipsoid.fields import ROTATION, ROTATION_FIELD, radii_field
-from qgs_anchors.ellipsoid.rotations import turned
+from qgs_anchors.ellipsoid.fields import ROTATION, ROTATION_FIELD, radii_field, turned
 
 
 class EllipsoidRefinement(AnchorRefinement):

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from qgs.contracts import ComponentConfig, DecoderLayer, LayerParts, memory_fields
 from qgs.tokengs import NORM_EPS, Mlp
-from qgs.tokengs.blocks import merge_heads, split_heads
 from qgs.types import ImageMemory, QueryState
+from qgs_zoo.parts import self_attention
 
 
 class JointLayer(DecoderLayer):
@@ -59,14 +59,10 @@ class JointLayer(DecoderLayer):
 
     def attention(self, x_BTD: Tensor, mask_BN: Tensor | None) -> Tensor:
         """softmax(q k / sqrt(d)) v over all tokens but masked queries, (B, T, D)."""
-        q_BhTd, k_BhTd, v_BhTd = (
-            split_heads(part_BTD, self.dims.heads) for part_BTD in self.qkv(x_BTD).chunk(3, -1)
-        )
         # Without a mask torch takes its fastest kernel.
         mask_B11T = None
         if mask_BN is not None:
             images = x_BTD.shape[1] - mask_BN.shape[1]
             mask_B11T = F.pad(mask_BN, (images, 0), value=True)[:, None, None]
-        read_BhTd = F.scaled_dot_product_attention(q_BhTd, k_BhTd, v_BhTd, attn_mask=mask_B11T)
         # Queries that the mask leaves out still read: only nobody reads them.
-        return self.proj(merge_heads(read_BhTd))
+        return self.proj(self_attention(self.qkv(x_BTD), self.dims.heads, mask_B11T))

@@ -5,18 +5,17 @@ Neither is free, so this distribution holds and downloads none of them. What is 
 (B, V, P, 2048), one for each of its layers, and the index of the first that belongs to a patch.
 """
 
+from collections.abc import Mapping
 from importlib import import_module
-from pathlib import Path
 from typing import Any, Literal
 
-import torch
 from einops import rearrange
 from pydantic import Field
-from safetensors.torch import load_file
-from torch import nn
+from torch import Tensor, nn
 
 from qgs.contracts import MissingExtraError, ModelDims, PatchEncoder, memory_fields
 from qgs.types import ImageMemory, Views
+from qgs_zoo.parts import load_weights
 
 WIDTH = 2048
 """Of a token of the last layer (VGGT-1B)."""
@@ -26,11 +25,6 @@ MODULE = "vggt.models.aggregator"
 
 PREFIX = "aggregator."
 """Of the weights that are read, in the file of all of VGGT."""
-
-SUFFIXES = {
-    ".safetensors": load_file,
-    ".pt": lambda path: torch.load(path, map_location="cpu", weights_only=True, mmap=True),
-}
 
 
 class VggtFeatures(PatchEncoder):
@@ -74,27 +68,17 @@ class VggtFeatures(PatchEncoder):
         return ImageMemory(features=self.proj(tokens_BMC), grid=grid)
 
     def load_pretrained(self) -> None:
-        file = Path(self.config.weights).expanduser()
-        if file.suffix not in SUFFIXES:
-            known = " or ".join(SUFFIXES)
-            raise MissingExtraError(f"{file.name} is no file of weights: name one of {known}")
-        if not file.is_file():
-            raise MissingExtraError(
-                f"there are no weights at {file}: download VGGT-1B's model.safetensors, whose "
-                "licence is not ours to give, and name it in the option `weights`"
-            )
-        try:
-            # The file holds all of VGGT.
-            own = {
-                n.removeprefix(PREFIX): x
-                for n, x in SUFFIXES[file.suffix](file).items()
-                if n.startswith(PREFIX)
-            }
-            self.aggregator.load_state_dict(own)
-        except Exception as error:
-            # Whatever torch and safetensors raise about a damaged file.
-            what = f"{file.name} does not hold VGGT's weights ({type(error).__name__}: {error})"
-            raise MissingExtraError(what) from error
+        load_weights(
+            self.config.weights,
+            self._fill,
+            "download VGGT-1B's model.safetensors, whose licence is not ours to give, and name it "
+            "in the option `weights`",
+        )
+
+    def _fill(self, weights: Mapping[str, Tensor]) -> None:
+        # The file holds all of VGGT.
+        own = {n.removeprefix(PREFIX): x for n, x in weights.items() if n.startswith(PREFIX)}
+        self.aggregator.load_state_dict(own)
 
 
 def _aggregator_class() -> Any:

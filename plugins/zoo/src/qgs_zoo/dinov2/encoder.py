@@ -8,7 +8,6 @@ from qgs.contracts import ModelDims
 from qgs.tokengs import NORM_EPS
 from qgs.tokengs.encoder import MultiViewViT
 from qgs_zoo.dinov2.vit import PATCH, DinoV2, VitConfig
-from qgs_zoo.dinov2.weight_file import load_weights
 
 
 class Tokens(nn.Module):
@@ -52,5 +51,4 @@ class DinoMultiViewViT(MultiViewViT):
         self.rgb_embedding = Tokens(config.vit, dims.width, config.patch_size)
 
     def load_pretrained(self) -> None:
-        if self.config.vit.weights is not None:
-            load_weights(self.rgb_embedding.vit, self.config.vit.weights)
+        self.rgb_embedding.vit.load(self.config.vit.weights)

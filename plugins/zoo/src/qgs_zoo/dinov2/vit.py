@@ -15,7 +15,8 @@ from pydantic import Field, ValidationInfo, field_validator
 from torch import Tensor, nn
 
 from qgs.contracts import ComponentConfig, OptionError
-from qgs.tokengs.blocks import LayerScale, Mlp, merge_heads, split_heads
+from qgs.tokengs.blocks import LayerScale, Mlp
+from qgs_zoo.parts import load_weights, self_attention
 
 PATCH = 14
 """Side of a patch, pixels."""
@@ -60,9 +61,7 @@ class Attention(nn.Module):
         self.proj = nn.Linear(width, width)
 
     def forward(self, x_XTC: Tensor) -> Tensor:
-        parts = self.qkv(x_XTC).chunk(3, -1)
-        q_XhTd, k_XhTd, v_XhTd = (split_heads(part, self.heads) for part in parts)
-        return self.proj(merge_heads(F.scaled_dot_product_attention(q_XhTd, k_XhTd, v_XhTd)))
+        return self.proj(self_attention(self.qkv(x_XTC), self.heads))
 
 
 class Block(nn.Module):
@@ -146,12 +145,21 @@ class DinoV2(nn.Module):
         resized_1PC = resized_1Chw.flatten(2).mT.to(own_1PC.dtype)
         return torch.cat([self.pos_embed[:, :1], resized_1PC], 1)
 
-    def load_published(self, weights: Mapping[str, Tensor]) -> None:
-        """Copy the hub's state dict, or one in which its names follow a prefix.
+    def load(self, file: str | None) -> None:
+        """Read pretrained weights from a file that the user has; None leaves what there is.
 
-        `pretrained.` is that of Depth Anything V2; other tensors of the file are not read. Raises
-        ValueError for a file without these names, RuntimeError for other shapes.
+        Names are the hub's, or follow a prefix: `pretrained.` is that of Depth Anything V2. Other
+        tensors of the file are not read. Raises MissingExtraError for a file that does not fit.
         """
+        if file is not None:
+            load_weights(
+                file,
+                self._fill,
+                "download DINOv2's, such as dinov2_vits14_pretrain.pth, and name the file in the "
+                "option `weights`, with its `width`, `depth` and `heads`",
+            )
+
+    def _fill(self, weights: Mapping[str, Tensor]) -> None:
         own = self.state_dict()
         mark = "patch_embed.proj.weight"
         prefix = next((n.removesuffix(mark) for n in weights if n.endswith(mark)), None)

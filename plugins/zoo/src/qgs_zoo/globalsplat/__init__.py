@@ -3,8 +3,7 @@
 from qgs.contracts import Plugin
 from qgs_zoo.globalsplat.encoder import PosedPatches
 from qgs_zoo.globalsplat.head import MergingHead
-from qgs_zoo.globalsplat.losses import Frustum, Regularisers
-from qgs_zoo.globalsplat.objective import TwoPasses
+from qgs_zoo.globalsplat.losses import Frustum, Regularisers, TwoPasses
 from qgs_zoo.globalsplat.streams import Round, SlotQueries
 
 plugin = Plugin(

@@ -25,7 +25,7 @@ from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.precision import full_precision
 from qgs.types import GaussianAttributes, QueryState
 from qgs_zoo.globalsplat.streams import TEXTURE, TEXTURE_FIELD
-from qgs_zoo.rotations import quaternions
+from qgs_zoo.parts import quaternions
 
 CHANNELS = (3, 3, 6, 1)
 """Of geometry, per candidate: position, log scale, rotation, opacity; then the gate."""

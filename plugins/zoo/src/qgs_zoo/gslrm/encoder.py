@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from qgs.contracts import ModelDims, PatchEncoder, memory_fields
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.tokengs import NORM_EPS
-from qgs.tokengs.blocks import merge_heads, split_heads
 from qgs.types import ImageMemory, Views
+from qgs_zoo.parts import self_attention
 
 CHANNELS = 9
 """Per pixel: 2 RGB - 1, moment o x d and unit direction d of its ray (paper, section 3.1)."""
@@ -31,10 +31,7 @@ class Block(nn.Module):
         self.fc2 = nn.Linear(hidden, width, bias=False)
 
     def forward(self, x_BMD: Tensor) -> Tensor:
-        parts = self.qkv(self.norm1(x_BMD)).chunk(3, -1)
-        q_BhMd, k_BhMd, v_BhMd = (split_heads(part, self.heads) for part in parts)
-        read_BhMd = F.scaled_dot_product_attention(q_BhMd, k_BhMd, v_BhMd)
-        x_BMD = x_BMD + self.proj(merge_heads(read_BhMd))
+        x_BMD = x_BMD + self.proj(self_attention(self.qkv(self.norm1(x_BMD)), self.heads))
         return x_BMD + self.fc2(F.gelu(self.fc1(self.norm2(x_BMD))))
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from einops import rearrange, repeat
+from einops import rearrange
 from pydantic import Field
 from torch import Tensor, nn
 
@@ -22,22 +22,16 @@ from qgs.contracts import (
     RecipeContext,
     memory_fields,
 )
-from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.precision import at_least_float32, full_precision
+from qgs.geometry.transforms import unit
 from qgs.tokengs import NORM_EPS
-from qgs.types import Cameras, GaussianAttributes, ImageMemory, QueryState, Views
+from qgs.types import GaussianAttributes, ImageMemory, QueryState, Views
+from qgs_zoo.parts import PIXEL_ENCODING, pixel_rays
 
 PATCH = "gslrm.patch"
 
-PATCH_FIELD: Fields = {
-    PATCH: FieldSpec(
-        (4, 3),
-        frame="world",
-        encoding="camera centre; directions of z = 1: upper left corner, step across, step down",
-    )
-}
-"""The rays of all points of a patch (B, N, 4, 3): they are affine in the place on the patch."""
+PATCH_FIELD: Fields = {PATCH: FieldSpec((4, 3), frame="world", encoding=PIXEL_ENCODING)}
 
 
 class PixelQueries(Queries):
@@ -51,30 +45,8 @@ class PixelQueries(Queries):
         """Features (B, M, D) of the tokens, `gslrm.patch` (B, M, 4, 3)."""
         assert memory.grid is not None
         _, rows, columns = memory.grid
-        fields = {PATCH: patches(views.cameras, rows, columns)}
+        fields = {PATCH: pixel_rays(views.cameras, rows, columns)}
         return QueryState(features=memory.features, fields=fields)
-
-
-@full_precision
-def patches(cameras: Cameras, rows: int, columns: int) -> Tensor:
-    """`gslrm.patch` of images (B, V) cut into rows x columns patches: (B, V*rows*columns, 4, 3)."""
-    (height, width), c2w = cameras.size, cameras.c2w
-    options = {"dtype": c2w.dtype, "device": c2w.device}
-    left = torch.arange(columns, **options) * (width / columns)
-    upper = torch.arange(rows, **options) * (height / rows)
-    fx, fy, cx, cy = (x_BV[..., None] for x_BV in cameras.intrinsics.unbind(-1))
-    x_BVRC = repeat((left - cx) / fx, "b v c -> b v r c", r=rows)
-    y_BVRC = repeat((upper - cy) / fy, "b v r -> b v r c", c=columns)
-    zero = torch.zeros_like(x_BVRC)
-    one = torch.ones_like(x_BVRC)
-    # Steps for one patch: its rays are affine in the place on it.
-    across = (width / columns / fx)[..., None]
-    down = (height / rows / fy)[..., None]
-    parts = ((x_BVRC, y_BVRC, one), (across + zero, zero, zero), (zero, down + zero, zero))
-    local_BVRC33 = torch.stack([torch.stack(part, -1) for part in parts], -2)
-    world_BVRC33 = torch.einsum("bvij,bvrckj->bvrcki", c2w[..., :3, :3], local_BVRC33)
-    origin_BVRC13 = c2w[:, :, None, None, None, :3, 3].expand_as(world_BVRC33[..., :1, :])
-    return torch.cat([origin_BVRC13, world_BVRC33], -2).flatten(1, 3)
 
 
 @full_precision
@@ -128,21 +100,16 @@ class AlongRays(Centers):
             reason = f"far must be beyond near, got near {config.near:g} and far {config.far:g}"
             yield Problem("far", reason, "give the distances at which the scene begins and ends")
 
+    @full_precision
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """(B, N, K, 3) -> (B, N, K, 3)."""
+        config = self.config
         origins, directions = patch_rays_at(state[PATCH], offsets.shape[2])
-        return _placed(origins, directions, offsets, self.config)
-
-
-@full_precision
-def _placed(
-    origins: Tensor, directions: Tensor, offsets: Tensor, config: AlongRays.Config
-) -> Tensor:
-    if config.measure == "distance":
-        directions = F.normalize(directions, dim=-1)
-    # A sigmoid keeps every Gaussian between near and far, so that none starts behind its camera.
-    w_BNK1 = offsets.mean(-1, keepdim=True).sigmoid()
-    return origins + ((1 - w_BNK1) * config.near + w_BNK1 * config.far) * directions
+        if config.measure == "distance":
+            directions = F.normalize(directions, dim=-1)
+        # A sigmoid keeps every Gaussian between near and far: none starts behind its camera.
+        w_BNK1 = offsets.mean(-1, keepdim=True).sigmoid()
+        return origins + ((1 - w_BNK1) * config.near + w_BNK1 * config.far) * directions
 
 
 class PixelHead(Head):
@@ -193,14 +160,7 @@ class PixelHead(Head):
         return GaussianAttributes(
             offsets=position.expand(*position.shape[:-1], 3),
             scales=scale.exp(),
-            quats=_unit(rotation),
+            quats=unit(rotation),
             opacities=torch.sigmoid(opacity[..., 0] + self.config.opacity_bias),
             colors=(0.5 + SH_C0 * rgb).clamp(0, 1),
         )
-
-
-def _unit(quats: Tensor) -> Tensor:
-    """Quaternions (..., 4) of length 1; the identity for those of length 0."""
-    length = quats.norm(dim=-1, keepdim=True)
-    identity = constant([1.0, 0.0, 0.0, 0.0], quats)
-    return torch.where(length > 0, quats / torch.where(length > 0, length, 1), identity)

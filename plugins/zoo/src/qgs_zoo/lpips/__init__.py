@@ -1,7 +1,6 @@
 """LPIPS for qgs: how different rendered and true images look to VGG-16, as a loss and a metric."""
 
 from qgs.contracts import Plugin
-from qgs_zoo.lpips.loss import LpipsLoss
-from qgs_zoo.lpips.metric import Lpips
+from qgs_zoo.lpips.network import Lpips, LpipsLoss
 
 plugin = Plugin(name="lpips", contract_version=1, components=(LpipsLoss, Lpips))

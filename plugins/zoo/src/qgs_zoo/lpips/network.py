@@ -1,21 +1,34 @@
-"""LPIPS with a VGG-16 (Zhang et al., 2018, arXiv 1801.03924, version 0.1 of the release).
+"""`lpips/vgg16`, a loss and a metric: LPIPS with a VGG-16 (Zhang et al., 2018, arXiv 1801.03924).
+
+It is version 0.1 of the release.
 
 The `lpips` package supplies the learned weights of the layers. Its own network is not imported: it
 takes VGG-16 from torchvision, whose wheels work with CUDA builds of torch only.
 """
 
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Iterable, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from safetensors.torch import load_file
+from pydantic import Field
 from torch import Tensor, nn
 
-from qgs.contracts import MissingExtraError
+from qgs.contracts import (
+    Column,
+    ComponentConfig,
+    Loss,
+    Metric,
+    MetricInput,
+    MissingExtraError,
+    Problem,
+    RecipeContext,
+)
 from qgs.geometry.precision import full_precision
+from qgs.losses.photometric import too_small
+from qgs.types import LayerPrediction, Rendering, Views
+from qgs_zoo.parts import load_weights
 
 # torchvision's VGG-16 in torch's cache.
 _VGG_FILE = "vgg16-397923af.pth"
@@ -75,29 +88,21 @@ class PerceptualDistance(nn.Module):
                 'pip install "query-gaussians-zoo[weights]"'
             )
         linear = Path(package.submodule_search_locations[0]) / "weights" / "v0.1" / "vgg.pth"
-        vgg = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / _VGG_FILE
-        if not vgg.is_file():
-            place = f"at {vgg.name}" if weights else "in the cache of torch.hub"
-            raise MissingExtraError(
-                f"there are no VGG-16 weights {place}: download torchvision's {_VGG_FILE} and name "
-                "it in the option `weights` of lpips/vgg16"
-            )
-        try:
-            read = load_file if vgg.suffix == ".safetensors" else _load_pickled
-            tensors = read(vgg)
-            factors = _load_pickled(linear)
-            self.blocks = nn.ModuleList(
-                nn.Sequential(*(layer for number in block for layer in _layers(tensors, number)))
-                for block in _BLOCKS
-            )
-            names = (f"lin{index}.model.1.weight" for index in range(len(_BLOCKS)))
-            self.linear = nn.ParameterList([factors[name].float() for name in names])
-        except (KeyError, RuntimeError, ValueError, OSError) as error:
-            raise MissingExtraError(
-                f"{vgg.name} or {linear.name} does not hold the weights of VGG-16 and LPIPS 0.1 "
-                f"({type(error).__name__}: {error})"
-            ) from error
+        vgg = weights or str(Path(torch.hub.get_dir()) / "checkpoints" / _VGG_FILE)
+        remedy = f"download torchvision's {_VGG_FILE} and name it in the option `weights`"
+        load_weights(vgg, self._fill_blocks, remedy)
+        load_weights(str(linear), self._fill_linear, "install lpips 0.1 again")
         self.requires_grad_(False)
+
+    def _fill_blocks(self, vgg: Mapping[str, Tensor]) -> None:
+        self.blocks = nn.ModuleList(
+            nn.Sequential(*(layer for number in block for layer in _layers(vgg, number)))
+            for block in _BLOCKS
+        )
+
+    def _fill_linear(self, factors: Mapping[str, Tensor]) -> None:
+        names = (f"lin{index}.model.1.weight" for index in range(len(_BLOCKS)))
+        self.linear = nn.ParameterList([factors[name].float() for name in names])
 
 
 def _layers(vgg: Mapping[str, Tensor], number: int) -> tuple[nn.Conv2d, nn.ReLU]:
@@ -108,4 +113,72 @@ def _layers(vgg: Mapping[str, Tensor], number: int) -> tuple[nn.Conv2d, nn.ReLU]
     return convolution, nn.ReLU(inplace=True)
 
 
-_load_pickled = partial(torch.load, map_location="cpu", weights_only=True)
+class LpipsLoss(Loss):
+    """Mean LPIPS of the views, of VGG-16 (TokenGS 2026.6); nothing is downloaded."""
+
+    name = "vgg16"
+    renderings = "each"
+
+    class Config(Loss.Config):
+        weight: float = Field(default=0.5, ge=0)
+        """Factor of the term in the objective."""
+        weights: str | None = None
+        """File of VGG-16 weights (safetensors, or torchvision's vgg16-397923af.pth); null takes
+        the one in torch's cache."""
+
+    config: Config
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self.network = PerceptualDistance()
+
+    def load_pretrained(self) -> None:
+        self.network.load(self.config.weights)
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        yield from too_small(context, SMALLEST_SIDE, "", "LPIPS")
+
+    def term(
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
+    ) -> Tensor:
+        """Raises ValueError for images below 16 pixels a side."""
+        images = rendering.rgb.flatten(0, 1)
+        truth = target.images.flatten(0, 1)
+        return self.network(images, truth).mean()
+
+
+class Lpips(Metric):
+    """LPIPS, distance of each view to the truth in features of VGG-16; nothing is downloaded."""
+
+    name = "vgg16"
+    definition = "VGG-16, version 0.1, images in [-1, 1]"
+    not_in_protocol = frozenset({"weights"})
+    column = Column("LPIPS", "lower")
+
+    class Config(ComponentConfig):
+        """Options of LPIPS."""
+
+        weights: str | None = None
+        """File of VGG-16 weights (safetensors, or torchvision's vgg16-397923af.pth); null takes
+        the one in torch's cache."""
+
+    config: Config
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self.network = PerceptualDistance()
+
+    def load_pretrained(self) -> None:
+        """See `Component`."""
+        self.network.load(self.config.weights)
+
+    def forward(self, given: MetricInput) -> Tensor:
+        """(1, T). Raises ValueError when a side is shorter than 16 pixels."""
+        return self.distance(given.images, given.targets.images)
+
+    @torch.no_grad()
+    def distance(self, images: Tensor, truth: Tensor) -> Tensor:
+        """LPIPS of images (..., 3, H, W), clipped to [0, 1] -> (...), 0 for equal ones."""
+        pairs = zip(*(x.clamp(0, 1).flatten(0, -4).split(1) for x in (images, truth)), strict=True)
+        return torch.cat([self.network(*pair) for pair in pairs]).reshape(images.shape[:-3])

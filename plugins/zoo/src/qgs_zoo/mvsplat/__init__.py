@@ -2,15 +2,12 @@
 
 from qgs.contracts import Plugin
 from qgs_zoo.dinov2.vit import VitConfig
-from qgs_zoo.mvsplat.depth_error import DepthError
 from qgs_zoo.mvsplat.depthsplat_encoder import DepthSplatEncoder
-from qgs_zoo.mvsplat.depthsplat_head import WorldHead
-from qgs_zoo.mvsplat.depthsplat_weights import DEPTHSPLAT
-from qgs_zoo.mvsplat.head import RayHead
+from qgs_zoo.mvsplat.head import RayHead, WorldHead
 from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder
 from qgs_zoo.mvsplat.pixels import OnRays, PixelQueries
-from qgs_zoo.mvsplat.two_depths import DecayedSupervision, Exchange
-from qgs_zoo.mvsplat.weights import MVSPLAT
+from qgs_zoo.mvsplat.two_depths import DecayedSupervision, DepthError, Exchange
+from qgs_zoo.mvsplat.weights import DEPTHSPLAT, MVSPLAT
 
 _SMALL = DepthSplatEncoder.Config(
     near=0.2,

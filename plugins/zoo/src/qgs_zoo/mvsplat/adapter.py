@@ -10,7 +10,7 @@ from torch import Tensor
 from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import rotated
 from qgs.geometry.precision import full_precision
-from qgs.geometry.transforms import quat_product
+from qgs.geometry.transforms import quat_product, unit
 
 SH_DEGREE = 3
 """Largest degree that the rasteriser of the released code and ours read."""
@@ -122,9 +122,4 @@ def camera_quaternions(raw_xyzw: Tensor) -> Tensor:
 
 def world_quaternions(camera_xyzw: Tensor, turn_wxyz: Tensor) -> Tensor:
     """Unit quaternions (..., 4), w x y z, in the world; a zero one is no rotation at all."""
-    own = camera_xyzw.roll(1, -1)
-    length = own.norm(dim=-1, keepdim=True)
-    identity = constant([1.0, 0.0, 0.0, 0.0], own)
-    # The smallest number keeps the division of unused zeros finite, and its gradient too.
-    own = torch.where(length > 0, own / length.clamp_min(torch.finfo(own.dtype).tiny), identity)
-    return F.normalize(quat_product(turn_wxyz, own), dim=-1)
+    return F.normalize(quat_product(turn_wxyz, unit(camera_xyzw.roll(1, -1))), dim=-1)

@@ -17,11 +17,6 @@ from qgs.tokengs.encoder import imagenet_normalised
 from qgs.types import Cameras
 from qgs_zoo.dinov2.vit import PATCH, DinoV2, VitConfig
 from qgs_zoo.mvsplat.cnn import CNN, WIDTHS, Stages
-from qgs_zoo.mvsplat.convolutions import (
-    conv3,
-    resized,
-    two_convolutions,
-)
 from qgs_zoo.mvsplat.dpt import LEVELS, DptHead
 from qgs_zoo.mvsplat.mvsplat import Sweep, expected_disparity
 from qgs_zoo.mvsplat.sweep import (
@@ -31,7 +26,13 @@ from qgs_zoo.mvsplat.sweep import (
     inverse_depth_candidates,
     relative_poses,
 )
-from qgs_zoo.mvsplat.unet import OverViews, UNet
+from qgs_zoo.mvsplat.unet import (
+    OverViews,
+    UNet,
+    conv3,
+    resized,
+    two_convolutions,
+)
 from qgs_zoo.mvsplat.windows import WindowTransformer, with_positions
 
 Width: TypeAlias = Annotated[int, Field(ge=1)]

@@ -10,11 +10,10 @@ from qgs.contracts import ModelDims, Problem, RecipeContext
 from qgs.geometry.harmonics import SH_C0
 from qgs.geometry.precision import at_least_float32
 from qgs.types import Views
-from qgs_zoo.dinov2.weight_file import load_weights
 from qgs_zoo.mvsplat.adapter import coefficients
 from qgs_zoo.mvsplat.depthsplat import GAUSSIAN_CHANNELS, DepthSplat, DepthSplatConfig
-from qgs_zoo.mvsplat.encoder import DepthRange, SweepEncoder
 from qgs_zoo.mvsplat.pixels import WIDTHS, degree_of
+from qgs_zoo.mvsplat.sweep import DepthRange, SweepEncoder
 
 
 class DepthSplatEncoder(SweepEncoder):
@@ -59,8 +58,7 @@ class DepthSplatEncoder(SweepEncoder):
         self.network = DepthSplat(config, coefficients(degree_of(dims.width)))
 
     def load_pretrained(self) -> None:
-        if self.config.vit.weights is not None:
-            load_weights(self.network.depth_predictor.pretrained, self.config.vit.weights)
+        self.network.depth_predictor.pretrained.load(self.config.vit.weights)
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
         """Weight decay on everything (released code)."""

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from qgs_zoo.mvsplat.convolutions import resized, two_convolutions, zeroed
+from qgs_zoo.mvsplat.unet import resized, two_convolutions, zeroed
 
 LEVELS = 3
 """Resolutions at which other features join: 1/2, 1/4, 1/8."""

@@ -1,9 +1,11 @@
-"""`mvsplat/gaussians`: the activations of MVSplat's numbers for each pixel."""
+"""`mvsplat/gaussians`, `mvsplat/depthsplat_gaussians`: activations of the numbers of each pixel."""
 
+from abc import abstractmethod
 from collections.abc import Iterable
 from typing import ClassVar
 
 import torch
+import torch.nn.functional as F
 from einops import rearrange
 from pydantic import Field
 from torch import Tensor
@@ -26,10 +28,49 @@ from qgs_zoo.mvsplat.pixels import (
 )
 
 SCALE_FACTOR = 0.1
+SCALE_SHIFT = 4.0
+"""Taken off a raw scale of DepthSplat, so that scales start at softplus(-4) = 0.018."""
 
 
-class RayHead(Head):
-    """One Gaussian for each query of `mvsplat/pixels`; it has no parameters.
+class PixelHead(Head):
+    """One Gaussian for each query of `mvsplat/pixels`; it has no parameters."""
+
+    writes: ClassVar[Fields] = {"gaussians.sh": GAUSSIAN_FIELDS["gaussians.sh"]}
+
+    @abstractmethod
+    def scales(self, raw: Tensor, log_depth: Tensor, state: QueryState) -> Tensor:
+        """World units (B, N, 1, 3)."""
+
+    def opacities(self, p: Tensor) -> Tensor:
+        """Of the sigmoids p of the logits."""
+        return p
+
+    @property
+    def gaussians_per_query(self) -> int:
+        return 1
+
+    @classmethod
+    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
+        return width_problems(context)
+
+    @full_precision
+    def forward(self, state: QueryState) -> GaussianAttributes:
+        raw_BN1C = numbers_of(state.features)[:, :, None, : sum(CHANNELS)]
+        sh = harmonics_of(state.features)[:, :, None]
+        log_depth, logit, place, scale, rotation = raw_BN1C.split(CHANNELS, -1)
+        return GaussianAttributes(
+            offsets=torch.cat([place, log_depth], -1),
+            scales=self.scales(scale, log_depth, state),
+            quats=world_quaternions(camera_quaternions(rotation), state[TURN][:, :, None]),
+            opacities=self.opacities(logit[..., 0].sigmoid()),
+            # Zeros are grey in MVSplat; DepthSplat's have the colour of the photo in them already.
+            colors=0.5 + SH_C0 * sh[..., 0, :],
+            sh=sh[..., 1:, :].clone(),
+        )
+
+
+class RayHead(PixelHead):
+    """MVSplat's activations.
 
     Scales are (min + (max - min) sigmoid) * t * .1 * (1 / fx + 1 / fy), focal lengths in pixels:
     a sum over both axes, no mean. The opacity p is that of a sigmoid, then
@@ -38,9 +79,7 @@ class RayHead(Head):
 
     name = "gaussians"
     scheduled = frozenset({"opacity_exponent"})
-
     reads = PIXEL_FIELDS
-    writes: ClassVar[Fields] = {"gaussians.sh": GAUSSIAN_FIELDS["gaussians.sh"]}
 
     class Config(ComponentConfig):
         scale_min: float = Field(default=0.5, gt=0)
@@ -52,38 +91,34 @@ class RayHead(Head):
 
     config: Config
 
-    @property
-    def gaussians_per_query(self) -> int:
-        return 1
+    def scales(self, raw: Tensor, log_depth: Tensor, state: QueryState) -> Tensor:
+        # Between scale_min and scale_max pixels at the Gaussian's own depth.
+        least = self.config.scale_min
+        factor = least + (self.config.scale_max - least) * raw.sigmoid()
+        # The lengths of the steps across and down a pixel, at depth 1.
+        size = SCALE_FACTOR * state[PIXEL][:, :, 2:].norm(dim=-1).sum(-1)[..., None, None]
+        return factor * depths(log_depth) * size
 
-    @classmethod
-    def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        return width_problems(context)
-
-    def forward(self, state: QueryState) -> GaussianAttributes:
-        return _decoded(state.features, state[PIXEL], state[TURN], self.config)
+    def opacities(self, p: Tensor) -> Tensor:
+        return mapped_opacity(p, self.config.opacity_exponent)
 
 
-@full_precision
-def _decoded(
-    features_BND: Tensor, pixel_BN43: Tensor, turn_BN4: Tensor, config: RayHead.Config
-) -> GaussianAttributes:
-    raw_BN1C = numbers_of(features_BND)[:, :, None, : sum(CHANNELS)]
-    sh = harmonics_of(features_BND)[:, :, None]
-    log_depth, logit, place, scale, rotation = raw_BN1C.split(CHANNELS, -1)
-    # Between scale_min and scale_max pixels at the Gaussian's own depth.
-    factor = config.scale_min + (config.scale_max - config.scale_min) * scale.sigmoid()
-    # The lengths of the steps across and down a pixel, at depth 1.
-    size = SCALE_FACTOR * pixel_BN43[:, :, 2:].norm(dim=-1).sum(-1)[..., None, None]
-    return GaussianAttributes(
-        offsets=torch.cat([place, log_depth], -1),
-        scales=factor * depths(log_depth) * size,
-        quats=world_quaternions(camera_quaternions(rotation), turn_BN4[:, :, None]),
-        opacities=mapped_opacity(logit[..., 0].sigmoid(), config.opacity_exponent),
-        # Nothing is added for the colour of the photo: zeros are grey.
-        colors=0.5 + SH_C0 * sh[..., 0, :],
-        sh=sh[..., 1:, :].clone(),
-    )
+class WorldHead(PixelHead):
+    """DepthSplat's: scales are softplus(x - 4), whatever the depth and the size of a pixel."""
+
+    name = "depthsplat_gaussians"
+    reads: ClassVar[Fields] = {TURN: PIXEL_FIELDS[TURN]}
+
+    class Config(ComponentConfig):
+        scale_min: float = Field(default=1e-10, gt=0)
+        """Least standard deviation, world units."""
+        scale_max: float = Field(default=3.0, gt=0)
+        """Largest standard deviation, world units; 0.1 in the demos at 512 x 960."""
+
+    config: Config
+
+    def scales(self, raw: Tensor, log_depth: Tensor, state: QueryState) -> Tensor:
+        return F.softplus(raw - SCALE_SHIFT).clamp(self.config.scale_min, self.config.scale_max)
 
 
 def harmonics_of(features_BND: Tensor) -> Tensor:

@@ -12,16 +12,16 @@ from qgs.geometry.precision import full_precision
 from qgs.tokengs.encoder import imagenet_normalised
 from qgs.types import Cameras, Views
 from qgs_zoo.mvsplat.cnn import CNN, WIDTHS
-from qgs_zoo.mvsplat.convolutions import conv3, resized, two_convolutions
-from qgs_zoo.mvsplat.encoder import DepthRange, SweepEncoder
 from qgs_zoo.mvsplat.sweep import (
+    DepthRange,
+    SweepEncoder,
     cost_volume,
     cyclic_neighbours,
     feature_lenses,
     inverse_depth_candidates,
     relative_poses,
 )
-from qgs_zoo.mvsplat.unet import OverViews, UNet, group_norm
+from qgs_zoo.mvsplat.unet import OverViews, UNet, conv3, group_norm, resized, two_convolutions
 from qgs_zoo.mvsplat.windows import WindowTransformer, with_positions
 
 FACTOR = 4

@@ -5,7 +5,6 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from einops import repeat
 from torch import Tensor
 
 from qgs.contracts import (
@@ -21,16 +20,12 @@ from qgs.contracts import (
 from qgs.geometry.precision import full_precision
 from qgs.types import Cameras, ImageMemory, QueryState, Views
 from qgs_zoo.mvsplat.adapter import coefficients, world_harmonics
-from qgs_zoo.rotations import quaternions
+from qgs_zoo.parts import PIXEL_ENCODING, pixel_rays, quaternions
 
 PIXEL = "mvsplat.pixel"
 TURN = "mvsplat.turn"
 PIXEL_FIELDS: Fields = {
-    PIXEL: FieldSpec(
-        (4, 3),
-        frame="world",
-        encoding="camera centre; directions of z = 1: upper left corner, step across, step down",
-    ),
+    PIXEL: FieldSpec((4, 3), frame="world", encoding=PIXEL_ENCODING),
     TURN: FieldSpec((4,), frame="world", encoding="unit quaternion w x y z, camera to world"),
 }
 """The rays through a pixel, and the rotation of its camera."""
@@ -103,29 +98,10 @@ def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
     return changed[..., : features_BMD.shape[-1]]
 
 
-@full_precision
 def pixel_fields(cameras: Cameras, rows: int, columns: int) -> dict[str, Tensor]:
     """PIXEL_FIELDS of images (B, V) seen as rows x columns pixels: (B, V*rows*columns, ...)."""
-    (height, width), c2w = cameras.size, cameras.c2w
-    left = torch.arange(columns, device=c2w.device).to(c2w) * (width / columns)
-    upper = torch.arange(rows, device=c2w.device).to(c2w) * (height / rows)
-    fx, fy, cx, cy = (x_BV[..., None] for x_BV in cameras.intrinsics.unbind(-1))
-    x_BVRC = repeat((left - cx) / fx, "b v c -> b v r c", r=rows)
-    y_BVRC = repeat((upper - cy) / fy, "b v r -> b v r c", c=columns)
-    right_BV3, down_BV3, ahead_BV3 = c2w[..., :3, :3].unbind(-1)
-
-    def each(x_BV3: Tensor) -> Tensor:
-        return x_BV3[:, :, None, None]
-
-    corner = x_BVRC[..., None] * each(right_BV3) + y_BVRC[..., None] * each(down_BV3)
-    corner = corner + each(ahead_BV3)
-    across = right_BV3 * (width / columns / fx)
-    below = down_BV3 * (height / rows / fy)
-    others = (each(x).expand_as(corner) for x in (c2w[..., :3, 3], across, below))
-    origin, across, below = others
-    pixel = torch.stack([origin, corner, across, below], -2).flatten(1, 3)
-    turn = each(quaternions(c2w[..., :3, :3])).expand(*corner.shape[:-1], 4).flatten(1, 3)
-    return {PIXEL: pixel, TURN: turn}
+    turn = quaternions(cameras.c2w[..., :3, :3]).repeat_interleave(rows * columns, 1)
+    return {PIXEL: pixel_rays(cameras, rows, columns), TURN: turn}
 
 
 class OnRays(Centers):
@@ -145,14 +121,11 @@ class OnRays(Centers):
 
     config: Config
 
+    @full_precision
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        return _placed(offsets, state[PIXEL], self.config.measure == "distance")
-
-
-@full_precision
-def _placed(offsets_BNK3: Tensor, pixel_BN43: Tensor, distance: bool) -> Tensor:
-    directions = ray_directions(offsets_BNK3[..., :2], pixel_BN43, distance)
-    return pixel_BN43[:, :, None, 0] + depths(offsets_BNK3[..., 2:]) * directions
+        unit = self.config.measure == "distance"
+        directions = ray_directions(offsets[..., :2], state[PIXEL], unit)
+        return state[PIXEL][:, :, None, 0] + depths(offsets[..., 2:]) * directions
 
 
 def ray_directions(place_BNK2: Tensor, pixel_BN43: Tensor, unit: bool) -> Tensor:

@@ -1,15 +1,16 @@
 """Supervision of both of DepthSplat's depths: Gaussians of all other numbers at either of them.
 
 `mvsplat/exchange` is a decoder layer that exchanges the depths, so that layer 1 has the coarse and
-layer 2 the final depth; `mvsplat/decayed` weighs them.
+layer 2 the final depth; `mvsplat/decayed` weighs them. `mvsplat/depth_error` measures depths.
 """
 
 from collections.abc import Mapping, Sequence
 
 import torch
 from pydantic import Field
+from torch import Tensor
 
-from qgs.contracts import DecoderLayer
+from qgs.contracts import Column, DecoderLayer, Metric, MetricInput
 from qgs.tokengs.supervision import LayerSupervision
 from qgs.types import ImageMemory, QueryState
 
@@ -49,3 +50,21 @@ class DecayedSupervision(LayerSupervision):
         layers = (*self.config.layers, *rounds)
         each = [self.config.decay**n for n in range(len(layers) - 1, -1, -1)]
         return {layer: weight / sum(each) for layer, weight in zip(layers, each, strict=True)}
+
+
+class DepthError(Metric):
+    """AbsRel, mean of |z - true z| / true z over pixels whose depth is known: 0 is the surface."""
+
+    name = "depth_error"
+    definition = "|rendered - true| / true camera-frame z, mean over known pixels of all views"
+    needs = ("depth", "true_depth")
+    column = Column("AbsRel", "lower")
+
+    def forward(self, given: MetricInput) -> Tensor:
+        """One number for each pixel with a true depth; where nothing is rendered it is 1."""
+        assert given.depth is not None
+        assert given.true_depth is not None
+        # Zero stands for no measurement.
+        known = given.true_depth > 0
+        true = given.true_depth[known]
+        return (given.depth[known] - true).abs() / true

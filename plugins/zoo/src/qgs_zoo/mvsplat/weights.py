@@ -1,22 +1,47 @@
-"""The weights of MVSplat: published names, and the recipe that fits a state dict."""
+"""The weights of MVSplat and DepthSplat: published names, and the recipes that fit state dicts."""
 
 from typing import Any
 
-from qgs.contracts.weights import LayoutError, Rename, Shapes, WeightLayout, size_at
-from qgs_zoo.mvsplat.cnn import WIDTHS
+from qgs.contracts.weights import (
+    LayoutError,
+    Rename,
+    Shapes,
+    WeightLayout,
+    layer_count,
+    size_at,
+    whole_ratio,
+)
+from qgs_zoo.mvsplat.cnn import WIDTHS as CNN_WIDTHS
+from qgs_zoo.mvsplat.depthsplat import GAUSSIAN_CHANNELS
+from qgs_zoo.mvsplat.pixels import WIDTHS
 
-_BACKBONE = "encoder.backbone.backbone."
 _PREDICTOR = "encoder.depth_predictor."
-_PARTS: dict[str, Any] = {
-    "queries": {"type": "mvsplat/pixels"},
-    "decoder": {
-        "depth": 0,
-        **dict.fromkeys(("cross_attention", "self_attention", "feed_forward", "refinement")),
-    },
-    "head": {"type": "mvsplat/gaussians"},
-    "centers": {"type": "mvsplat/on_rays"},
-    "supervision": {"type": "qgs/layers", "layers": [0]},
-}
+_VIT = _PREDICTOR + "pretrained."
+_UPSAMPLER = "encoder.feature_upsampler."
+_HEAD = "encoder.gaussian_head.2.weight"
+HEAD_WIDTH = 64
+"""Channels of a head of every DINOv2."""
+BLOCKS = {12: [2, 5, 8, 11], 24: [4, 11, 17, 23]}
+"""Depth of the ViT to the blocks that are read."""
+_EMPTY = dict.fromkeys(("cross_attention", "self_attention", "feed_forward", "refinement"))
+_ENDS = {"queries": ("mvsplat/pixels",), "centers": ("mvsplat/on_rays",)}
+
+
+def _recipe(model: dict[str, Any]) -> dict[str, Any]:
+    fixed = {"heads": 1, "queries": {"type": "mvsplat/pixels"}}
+    photometric = {"type": "qgs/photometric", "mse_weight": 1.0, "ssim_weight": 0.0}
+    return {
+        "recipe": 1,
+        "plugins": ["mvsplat"],
+        "model": fixed | model,
+        "views": {"frame": "given", "scale": "constant", "scale_factor": 1.0},
+        "losses": {"photometric": photometric},
+    }
+
+
+def _stages(shapes: Shapes, cnn: str) -> list[int]:
+    """Channels of the three stages of the CNN stored as `cnn`."""
+    return [size_at(shapes, f"{cnn}layer{n}.0.conv1.weight", 0) for n in (1, 2, 3)]
 
 
 def unet_levels(shapes: Shapes, name: str) -> int:
@@ -27,28 +52,89 @@ def unet_levels(shapes: Shapes, name: str) -> int:
     return len(numbers) // 2
 
 
-def _read(shapes: Shapes) -> dict[str, Any]:
-    stages = [size_at(shapes, f"{_BACKBONE}layer{n}.0.conv1.weight", 0) for n in (1, 2, 3)]
+def _read_mvsplat(shapes: Shapes) -> dict[str, Any]:
+    backbone = "encoder.backbone.backbone."
     raw = size_at(shapes, _PREDICTOR + "to_gaussians.2.weight", 0)
     encoder = {
         "type": "mvsplat/mvsplat",
         "near": 1.0,
         "far": 100.0,
-        "features": size_at(shapes, _BACKBONE + "conv2.weight", 0),
+        "features": size_at(shapes, backbone + "conv2.weight", 0),
         "candidates": size_at(shapes, _PREDICTOR + "regressor_residual.weight", 0),
         "cost_width": size_at(shapes, _PREDICTOR + "corr_refine_net.0.weight", 0),
         "cost_levels": unet_levels(shapes, _PREDICTOR + "corr_refine_net.3."),
         "depth_width": size_at(shapes, _PREDICTOR + "refine_unet.0.weight", 0),
         "depth_levels": unet_levels(shapes, _PREDICTOR + "refine_unet.3."),
     }
-    if tuple(stages) != WIDTHS:
+    stages = _stages(shapes, backbone)
+    if tuple(stages) != CNN_WIDTHS:
         encoder["cnn_widths"] = stages
-    mse = {"type": "qgs/photometric", "mse_weight": 1.0, "ssim_weight": 0.0}
-    # The memory has depth and opacity in front of what the release calls a raw Gaussian.
-    model = {"width": raw + 2, "heads": 1, "encoder": encoder, **_PARTS}
-    views = {"frame": "given", "scale": "constant", "scale_factor": 1.0}
-    parts = {"model": model, "views": views, "losses": {"photometric": mse}}
-    return {"recipe": 1, "plugins": ["mvsplat"], **parts}
+    return _recipe(
+        {
+            # The memory has depth and opacity in front of what the release calls a raw Gaussian.
+            "width": raw + 2,
+            "encoder": encoder,
+            "decoder": {"depth": 0, **_EMPTY},
+            "head": {"type": "mvsplat/gaussians"},
+            "centers": {"type": "mvsplat/on_rays"},
+            "supervision": {"type": "qgs/layers", "layers": [0]},
+        }
+    )
+
+
+def _encoder(shapes: Shapes) -> dict[str, Any]:
+    scales = layer_count(shapes, _PREDICTOR + "regressor.")
+    width = size_at(shapes, _VIT + "norm.weight", 0)
+    depth = layer_count(shapes, _VIT + "blocks.")
+    if scales not in (1, 2) or depth not in BLOCKS:
+        raise LayoutError(f"{scales} scales and a ViT of {depth} blocks are not published")
+    dpt = [size_at(shapes, f"{_UPSAMPLER}projects.{n}.weight", 0) for n in range(4)]
+    joined = size_at(shapes, _UPSAMPLER + "concat_projects.2.weight", 1)
+    # Sizes are read off the weights: the releases differ in them alone.
+    return {
+        "type": "mvsplat/depthsplat",
+        "near": 0.5,
+        "far": 100.0,
+        "features": size_at(shapes, _PREDICTOR + "backbone.conv2.weight", 0),
+        "cnn": _stages(shapes, _PREDICTOR + "backbone."),
+        "candidates": size_at(shapes, _PREDICTOR + "depth_head.0.2.weight", 0),
+        "scales": scales,
+        # At 1/8 other features join only where the CNN goes down to it.
+        "stride": 4 if joined == dpt[2] else 8,
+        "vit": {
+            "width": width,
+            "depth": depth,
+            "heads": whole_ratio(width, HEAD_WIDTH, "width of the ViT over that of a head"),
+        },
+        "blocks": BLOCKS[depth],
+        "dpt": dpt,
+        "full_features": size_at(shapes, _UPSAMPLER + "scratch.layer1_rn.weight", 0),
+        "regressor": size_at(shapes, "encoder.gaussian_regressor.0.weight", 0),
+        "coarse_depth": scales == 2,
+    }
+
+
+def _read_depthsplat(shapes: Shapes) -> dict[str, Any]:
+    encoder = _encoder(shapes)
+    raw = size_at(shapes, _HEAD, 0)
+    # the depth stands in front
+    two = encoder["scales"] == 2
+    numbers = raw + 1
+    if numbers not in WIDTHS:
+        raise LayoutError(f"{_HEAD}: {raw} is not {GAUSSIAN_CHANNELS} and harmonics of a degree")
+    # A layer for each depth, so that both can be supervised.
+    decoder = {"depth": 2, "layer": {"type": "mvsplat/exchange"}} if two else {"depth": 0}
+    supervision = {"type": "mvsplat/decayed", "layers": [1, 2]}
+    return _recipe(
+        {
+            "width": numbers + two,
+            "encoder": encoder,
+            "decoder": {**decoder, **_EMPTY},
+            "head": {"type": "mvsplat/depthsplat_gaussians"},
+            "centers": {"type": "mvsplat/on_rays", "measure": "depth"},
+            "supervision": supervision if two else {"type": "qgs/layers", "layers": [0]},
+        }
+    )
 
 
 MVSPLAT = WeightLayout(
@@ -56,13 +142,12 @@ MVSPLAT = WeightLayout(
     source="donydchen/mvsplat",
     components={
         "encoder": ("mvsplat/mvsplat",),
-        "queries": ("mvsplat/pixels",),
         "head": ("mvsplat/gaussians",),
-        "centers": ("mvsplat/on_rays",),
+        **_ENDS,
     },
     renames=(Rename("encoder.", "encoder."),),
     marks=(_PREDICTOR + "corr_refine_net.0.weight", _PREDICTOR + "to_disparity.2.weight"),
-    read=_read,
+    read=_read_mvsplat,
     undecided=(
         "near and far: 1 and 100, of RealEstate10K and ACID (DTU: 2.125 and 4.525)",
         "bounds of the scales, opacity map: the release's",
@@ -71,3 +156,25 @@ MVSPLAT = WeightLayout(
     ),
 )
 """The released MVSplat, in files of Lightning or of a bare state dict."""
+
+DEPTHSPLAT = WeightLayout(
+    name="DepthSplat",
+    source="cvg/depthsplat",
+    components={
+        "encoder": ("mvsplat/depthsplat",),
+        "head": ("mvsplat/depthsplat_gaussians",),
+        **_ENDS,
+    },
+    renames=(Rename("encoder.network.", "encoder."),),
+    marks=(_PREDICTOR + "pretrained.norm.weight", _UPSAMPLER + "projects.0.weight", _HEAD),
+    read=_read_depthsplat,
+    undecided=(
+        "near and far: 0.5 and 100, of RealEstate10K (DL3DV: 0.5 and 200)",
+        "views that each is matched with: the nearest 2",
+        "bounds of the scales: the release's",
+        "losses: mean squared error of both depths where there are two, to which the release adds "
+        "0.05 LPIPS (plugin `lpips`)",
+        "frame and scale of the world: as given; renderer, training: the framework's defaults",
+    ),
+)
+"""The released DepthSplat, in files of Lightning or of a bare state dict."""

@@ -2,8 +2,7 @@
 
 from qgs.contracts import Plugin
 from qgs_zoo.tokengs2026.dynamic import BlockCausalSelfAttention, DynamicObjective, DynamicQueries
-from qgs_zoo.tokengs2026.latents import LatentBottleneck
-from qgs_zoo.tokengs2026.multiscale import MultiscaleViT
+from qgs_zoo.tokengs2026.multiscale import LatentBottleneck, MultiscaleViT
 from qgs_zoo.tokengs2026.weights import TOKENGS_2026_6
 
 plugin = Plugin(

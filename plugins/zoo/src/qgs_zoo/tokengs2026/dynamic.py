@@ -22,7 +22,7 @@ from qgs.contracts import (
 )
 from qgs.tokengs.decoder import ContentSelfAttention
 from qgs.types import ImageMemory, LayerPrediction, Prediction, QueryState, Views
-from qgs_zoo.tokengs2026.times import TimeEmbedding, without_times
+from qgs_zoo.tokengs2026.multiscale import TimeEmbedding, without_times
 
 MOVES = "dynamic.moves"
 """Field (B, N), bool: True for dynamic queries, which stand for the requested time."""

@@ -1,0 +1,85 @@
+"""Parts that several systems share: attention, rays of pixels, rotations, files of weights."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from einops import repeat
+from safetensors.torch import load_file
+from torch import Tensor
+
+from qgs.contracts import MissingExtraError
+from qgs.geometry.precision import full_precision
+from qgs.tokengs.blocks import merge_heads, split_heads
+from qgs.types import Cameras
+
+PIXEL_ENCODING = "camera centre; directions of z = 1: upper left corner, step across, step down"
+"""Of the rays of all points of a pixel or patch (B, N, 4, 3), which are affine in the place."""
+
+
+def self_attention(qkv_BTX: Tensor, heads: int, mask: Tensor | None = None) -> Tensor:
+    """softmax(q k / sqrt(d)) v (B, T, D) of queries, keys and values side by side (B, T, 3 D)."""
+    q_BhTd, k_BhTd, v_BhTd = (split_heads(part, heads) for part in qkv_BTX.chunk(3, -1))
+    return merge_heads(F.scaled_dot_product_attention(q_BhTd, k_BhTd, v_BhTd, attn_mask=mask))
+
+
+@full_precision
+def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
+    """Rays of images (B, V) cut into rows x columns parts: (B, V * rows * columns, 4, 3).
+
+    See PIXEL_ENCODING.
+    """
+    (height, width), c2w = cameras.size, cameras.c2w
+    left = torch.arange(columns, device=c2w.device).to(c2w) * (width / columns)
+    upper = torch.arange(rows, device=c2w.device).to(c2w) * (height / rows)
+    fx, fy, cx, cy = (x_BV[..., None] for x_BV in cameras.intrinsics.unbind(-1))
+    x_BVRC1 = repeat((left - cx) / fx, "b v c -> b v r c 1", r=rows)
+    y_BVRC1 = repeat((upper - cy) / fy, "b v r -> b v r c 1", c=columns)
+    right, down, ahead = (x_BV3[:, :, None, None] for x_BV3 in c2w[..., :3, :3].unbind(-1))
+    corner = x_BVRC1 * right + y_BVRC1 * down + ahead
+    # Steps of one part.
+    across = right * (width / columns / fx)[..., None, None]
+    below = down * (height / rows / fy)[..., None, None]
+    origin = c2w[:, :, None, None, :3, 3]
+    parts = [x.expand_as(corner) for x in (origin, corner, across, below)]
+    return torch.stack(parts, -2).flatten(1, 3)
+
+
+@full_precision
+def quaternions(rotations: Tensor) -> Tensor:
+    """Unit quaternions w x y z (..., 4), up to sign, of rotation matrices (..., 3, 3)."""
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotations.unbind(-2))
+    # 4 q q^T: every row is the quaternion times four of its numbers; the longest loses no digits.
+    outer = [
+        1 + a + e + i, h - f, c - g, d - b,
+        h - f, 1 + a - e - i, d + b, c + g,
+        c - g, d + b, 1 - a + e - i, h + f,
+        d - b, c + g, h + f, 1 - a - e + i,
+    ]  # fmt: skip
+    rows = torch.stack(outer, -1).unflatten(-1, (4, 4))
+    longest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None]
+    row = rows.gather(-2, longest.expand(*longest.shape[:-1], 4)).squeeze(-2)
+    return F.normalize(row, dim=-1)
+
+
+def load_weights(file: str, fill: Callable[[Mapping[str, Tensor]], object], remedy: str) -> None:
+    """Call `fill` with the tensors of a file that the user has; none are shipped or downloaded.
+
+    file: of safetensors, or of torch, whose tensors may stand below `model` or `state_dict`.
+    Raises MissingExtraError with the `remedy` where it is not there or `fill` cannot take it.
+    """
+    path = Path(file).expanduser()
+    try:
+        if path.suffix == ".safetensors":
+            tensors = load_file(path)
+        else:
+            # No code of strangers.
+            tensors = torch.load(path, map_location="cpu", weights_only=True)
+            for key in ("model", "state_dict"):
+                tensors = tensors.get(key, tensors)
+        fill(tensors)
+    except Exception as error:
+        # Whatever torch and safetensors raise about an absent, a damaged or another file.
+        what = f"cannot read weights of {path.name} ({type(error).__name__}: {error})"
+        raise MissingExtraError(f"{what}; {remedy}") from error
