@@ -78,8 +78,6 @@ model.queries.center_init={kind: frustum, depth: [2, 1]}
     model.queries.center_init.depth: near
 model.queries.center_init={kind: frustum, depth: [-1, 1]}
     model.queries.center_init.depth: near
-model.queries.center_init={kind: frustum, depth: [1]}
-    model.queries.center_init.depth:
 """
 
 

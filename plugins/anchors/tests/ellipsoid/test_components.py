@@ -87,16 +87,6 @@ def test_the_step_of_a_centre_is_linear_on_demand():
     assert_close(refinement(state)[CENTER], expected)
 
 
-def test_a_refinement_that_starts_at_zero_can_learn():
-    refinement = made(EllipsoidRefinement, zero_init=True)
-    state = _state()
-    refined = refinement(state)
-    assert_close(refined.fields, state.fields)
-    sum((field * torch.randn_like(field)).sum() for field in refined.fields.values()).backward()
-    for mlp in (refinement.center_mlp, refinement.rotation_mlp, refinement.radius_mlp):
-        assert mlp.fc2.weight.grad.any()
-
-
 def test_centers_follow_their_formula():
     state = _state()
     offsets = torch.randn(2, 6, 3, 3)

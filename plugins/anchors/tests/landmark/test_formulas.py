@@ -82,12 +82,6 @@ def test_anchors_of_all_tokens_stand_on_the_rays_of_their_patches():
         assert_close((z, places, radii), wanted)
 
 
-def test_anchors_start_between_near_and_far_in_the_logarithm():
-    queries = made(ObservedQueries, count=None, near=0.2, far=3.2).double()
-    z, _ = in_photos(queries(MEMORY, VIEWS), BY_PHOTO)
-    assert_close(z, torch.full_like(z, math.sqrt(0.2 * 3.2)))
-
-
 def in_tiles(maps_BVHWC, rows, columns, in_turn=True):
     """(B, N, K, C): tiles of so many rows and columns of all photos, in turn or one by one."""
     parts = maps_BVHWC.unflatten(3, (-1, columns)).unflatten(2, (-1, rows))

@@ -10,7 +10,6 @@ import yaml
 from odd_views import odd_views
 from qgs_anchors.landmark.places import (
     aspect_of,
-    cells,
     colors_at,
     patch_centres,
     rays_at,
@@ -104,12 +103,6 @@ def test_cells_of_tiles_are_squares():
     assert [*map(rows_in_square, counts)] == [1, 1, 2, 2, 2, 3]
     assert [*map(rows_in_tile, counts)] == [1, 1, 2, 2, 2, 2]
     assert [*map(aspect_of, counts)] == pytest.approx([1, 0.5, 1, 1, 2 / 3, 0.5])
-
-
-def test_cells_divide_a_square():
-    rows = torch.tensor([[-3, -3], [3, -3], [-4, 3], [0, 3], [4, 3]]) / 12
-    assert_close(cells(5, 2, rows), rows)
-    assert_close(cells(9, 3, rows), torch.cartesian_prod(*[torch.arange(-1, 2) / 3] * 2).flip(-1))
 
 
 def within(pixels, at, side):

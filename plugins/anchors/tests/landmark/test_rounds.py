@@ -14,7 +14,6 @@ from qgs.checkpoint.tensors import CheckpointError
 from qgs.recipe import resolve
 from qgs.train.initial import initialise
 from qgs.train.training_pass import TrainingPass
-from qgs.types import Photos
 
 RECIPE = yaml.safe_load("""
 recipe: 1
@@ -148,11 +147,6 @@ def test_rounds_are_traced_as_layers_are():
     assert_close(after, expected)
 
 
-def test_rounds_need_cameras():
-    with pytest.raises(ValueError, match="RenderedFeedback"):
-        built()(Photos(views().images))
-
-
 REFUSED = """
 model.feedback.layers=4
     model.feedback.layers:
@@ -162,8 +156,6 @@ model.head.gaussians_per_query=2
     model.head:
 model.centers.radius_min=0.1
     model.centers:
-model.queries.cells=null
-    model.queries.cells: model.head:
 model.queries.far=0.1
     model.queries.far:
 """

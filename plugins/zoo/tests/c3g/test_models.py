@@ -3,27 +3,13 @@
 import pytest
 import torch
 from odd_views import odd_views
-from qgs_dev import Case
-from qgs_dev.checks.fields import run_training_step
-from qgs_zoo.c3g.joint import JointLayer
-from refusals import refused
 
 from qgs.containers import named_tensors
 from qgs.contracts.schedule import follow
 from qgs.recipe import resolve
 
-TINY = "tiny/c3g.yaml"
 NARROW = ("model.width=16", "model.heads=2", "model.queries.count=6")
 SHALLOW = ("model.decoder.depth=2", "model.supervision.layers=[2]")
-SMALL = (
-    *NARROW,
-    *SHALLOW,
-    "plugins=[c3g, rooms, locus, tokengs2026]",
-    "optimizer.parts={}",
-    "model.head.gaussians_per_query=1",
-)
-ANCHORED = "model.queries={type: locus/anchored, count: 6}"
-CASE = Case(JointLayer.Config())
 
 
 def size(module):
@@ -43,56 +29,6 @@ def test_the_published_recipe():
         follow([model.renderer], step)
         found[step] = model.renderer.config.dilation
     assert found == pytest.approx({step: max(0.3, 10 / 3 ** (step // 1000)) for step in found})
-
-
-def ran(*overrides):
-    recipe = resolve(TINY, [*SMALL, *overrides])
-    run_training_step(recipe, CASE)
-    return recipe.build_model()
-
-
-def test_anchors_move_and_place_gaussians_beside_joint_attention():
-    model = ran(
-        ANCHORED,
-        "model.decoder.refinement={type: locus/refine}",
-        "model.centers={type: locus/radius_scaled}",
-        "model.supervision.layers=[1, 2]",
-        "losses.anchors={type: locus/anchor_visibility}",
-    )
-    first, last = model(odd_views()).layers.values()
-    assert not torch.equal(first.state["anchor.center"], last.state["anchor.center"])
-    off = last.gaussians.means - last.state["anchor.center"]
-    assert off.norm(dim=-1).max() < 5
-
-
-def test_what_stands_in_another_layer_is_refused():
-    for slot, part in {
-        "cross_attention": "locus/ray_biased",
-        "self_attention": "locus/anchor_aware",
-        "feed_forward": "qgs/mlp",
-    }.items():
-        problem = refused(TINY, [*SMALL, ANCHORED, f"model.decoder.{slot}={{type: {part}}}"])
-        assert problem.reason.startswith("`c3g/joint` ")
-        assert f"has no slot `{slot}`" in problem.reason
-        assert problem.fix.startswith("remove it")
-
-
-def test_tokens_of_another_width_are_refused_and_of_the_models_run():
-    wide = "model.encoder={type: tokengs2026/multiscale_vit, depth: 2, blocks: [1, 2]}"
-    problem = refused(TINY, [*SMALL, wide])
-    assert problem.option == "model.encoder"
-    assert "`c3g/joint` reads memory.features as D float32" in problem.reason
-    assert "writes it as 2*D float32" in problem.reason
-    ran(wide.replace("[1, 2]", "[2]"))
-    latents = "depth: 1, blocks: [1], latents: 5, latent_depth: 1"
-    ran(f"model.encoder={{type: tokengs2026/latent_bottleneck, {latents}}}")
-
-
-def test_layers_of_both_kinds_may_alternate():
-    rays = "cross_attention: {type: locus/ray_biased}"
-    second = f"{{layer: {{type: qgs/cross_self_mlp}}, {rays}}}"
-    model = ran(ANCHORED, f"model.decoder.layers={{1: {second}}}")
-    assert [type(layer).__name__ for layer in model.decoder] == ["JointLayer", "CrossSelfMlp"]
 
 
 def test_every_parameter_that_trains_is_read():

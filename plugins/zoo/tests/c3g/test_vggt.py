@@ -10,7 +10,6 @@ import torch.nn.functional as F
 from odd_views import odd_views
 from qgs_dev import Case, checks_for, run_check
 from qgs_zoo.c3g.vggt import MODULE, VggtFeatures
-from refusals import refused
 from safetensors.torch import load_file, save_file
 from small_parts import Code
 from torch import nn
@@ -126,21 +125,6 @@ def test_a_checkpoint_needs_no_file_of_weights(weights, tmp_path):
     assert torch.equal(loaded(given).gaussians.means, model(given).gaussians.means)
     with pytest.raises(MissingExtraError, match="cannot read weights"):
         recipe.build_model()
-
-
-def test_images_must_consist_of_patches(weights):
-    with pytest.raises(ValueError, match="27 x 42"):
-        encoder(weights)(odd_views(3, 27, 42))
-    problem = refused(TINY, [*overrides(weights), "data.image_size=[256, 224]"])
-    assert "patches of 14 do not divide images of 256 x 224" in problem.reason
-    assert "[252, 224]" in problem.fix
-
-
-def test_what_needs_rays_or_keys_is_refused_with_it(weights):
-    attention = "model.decoder.cross_attention={type: qgs/content}"
-    layer = "model.decoder.layer={type: qgs/cross_self_mlp}"
-    problem = refused(TINY, [*overrides(weights), layer, attention])
-    assert "`qgs/content` needs memory.keys" in problem.reason
 
 
 def test_it_keeps_the_contract_of_encoders(weights):

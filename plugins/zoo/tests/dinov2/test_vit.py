@@ -37,7 +37,6 @@ def test_other_files_are_refused(tmp_path):
     state = vit.state_dict()
     for name, content in {
         "absent.pth": None,
-        "vit.npz": state,
         "other_names.pth": {"weight": torch.ones(2)},
         "other_sizes.pth": DinoV2(16, 2, 2).state_dict(),
         "too_few.pth": dict([*state.items()][:5]),

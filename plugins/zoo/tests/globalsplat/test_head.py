@@ -64,14 +64,6 @@ def test_a_blend_shows_both_levels():
     assert_close(1 - blend.opacities, clear)
 
 
-def test_the_published_level_grows_with_the_steps():
-    head = made(MergingHead)
-    for level, count in ((0.0, 1), (0.5, 3), (1.0, 2), (2.875, 12), (3.0, 8)):
-        head.config = head.config.model_copy(update={"level": level})
-        assert head.gaussians_per_query == count
-        assert head(STATE).offsets.shape == (2, 5, count, 3)
-
-
 def test_quaternions_of_all_rotations():
     """Of the 24 that map axes to axes, and of others."""
     axes = torch.cat([torch.eye(3), -torch.eye(3)])
@@ -108,8 +100,3 @@ def test_weights_start_as_told():
     for weights, std in ((rows[:, :3], 0.5), (rows[:, 3:], 0.1), (head.texture.weight, 0.1)):
         assert weights.std().item() == pytest.approx(std * 0.99, rel=0.05)
     assert not head.geometry.bias.any() | head.texture.bias.any()
-
-
-def test_degrees():
-    for degree, count in ((1, 3), (2, 8), (3, 15)):
-        assert made(MergingHead, sh_degree=degree)(STATE).sh.shape == (2, 5, 8, count, 3)

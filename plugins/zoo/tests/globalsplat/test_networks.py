@@ -1,7 +1,6 @@
 """Memory tokens and both streams at the start, channel by channel; a round by its sums."""
 
 import math
-from collections import Counter
 
 import pytest
 import torch
@@ -40,15 +39,6 @@ def test_a_token_is_its_colours_beside_its_rays_and_its_camera():
     waves = [f(k * math.pi * x) for f in (torch.sin, torch.cos) for k in (1, 2)]
     camera = torch.cat([encoder.lens_mlp(told), x, *waves])
     assert_close(token[6:], rays + encoder.camera_proj(camera))
-
-
-def test_a_grid_stands_where_there_are_no_registers():
-    assert made(PosedPatches, patch_size=4, registers=0)(odd_views(2, 16, 24)).grid == (2, 4, 6)
-
-
-def test_images_that_patches_do_not_divide_are_refused():
-    with pytest.raises(ValueError, match="16 x 24 cannot be cut into patches of 5; resize"):
-        made(PosedPatches, patch_size=5)(odd_views(2, 16, 24))
 
 
 def test_two_streams_of_one_token():
@@ -103,13 +93,3 @@ def test_a_round_is_two_streams_and_a_mixer():
     update = layer.mixer_scale.gamma * mlp(both, layer.mixer)
     assert_close(after.features, x + update[..., :16])
     assert_close(after[TEXTURE], y + update[..., 16:])
-
-
-def test_scales_start_as_published():
-    layer = made(Round, LayerParts(DIMS, {}, 1e-3))
-    found = Counter(
-        (".blocks." in name, f"{parameter.unique().item():.3f}")
-        for name, parameter in layer.named_parameters()
-        if name.endswith("gamma")
-    )
-    assert found == {(True, "0.010"): 2 * 2 * 2, (False, "0.001"): 2 * 2 + 1}

@@ -4,7 +4,6 @@ import pytest
 import torch
 import yaml
 from globalsplat_inputs import SMALL, TINY
-from odd_views import odd_views
 from training_runs import first_batch, run
 
 import qgs
@@ -64,17 +63,6 @@ def test_what_cannot_work_is_refused():
         with pytest.raises(RecipeError) as caught:
             resolve(TINY, [override])
         assert named in str(caught.value)
-
-
-def test_parts_of_other_models_stand_beside_it():
-    for overrides in (
-        ["model.centers={type: qgs/free}"],
-        ["model.encoder={type: qgs/multiview_vit}", "model.decoder.layer.memory_width=null"],
-        ["model.head={type: qgs/gaussian_head, gaussians_per_query: 8}"],
-        ["plugins=[locus, rooms]", "losses.visibility={type: qgs/visibility}"],
-    ):
-        model = qgs.compose(TINY, overrides=overrides)
-        assert model(odd_views(2, 16, 24)).gaussians.count == 2048
 
 
 def test_it_learns():

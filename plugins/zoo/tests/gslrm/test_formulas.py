@@ -9,6 +9,7 @@ from odd_views import odd_views
 from qgs_zoo.gslrm.encoder import Transformer
 from qgs_zoo.gslrm.pixels import PATCH, AlongRays, PixelHead, PixelQueries, patch_rays_at
 from qgs_zoo.parts import pixel_rays
+from refusals import refused
 from small_parts import attended, made
 from torch.testing import assert_close
 
@@ -60,6 +61,11 @@ def test_means_lie_on_the_rays_of_their_pixels():
             assert_close(placed, origins + along * directions)
     state[PATCH].sum().backward()
     assert c2w.grad[..., :3, :].any(-1).all()
+
+
+def test_the_end_is_beyond_the_beginning():
+    override = "model.centers={type: gslrm/along_rays, near: 4, far: 4}"
+    assert refused("tiny/gslrm.yaml", [override]).option == "model.centers.far"
 
 
 def by_formula(block, x):

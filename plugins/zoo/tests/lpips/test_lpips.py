@@ -114,7 +114,7 @@ def test_weights_that_are_not_there_or_do_not_fit_are_named(tmp_path, monkeypatc
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     resnet = tmp_path / "resnet.safetensors"
     save_file({"conv1.weight": torch.zeros(1)}, resnet)
-    for weights, named in ((None, "cache"), (Path("mine.pth"), "mine.pth"), (resnet, "resnet")):
+    for weights, named in ((None, "vgg16-397"), (Path("mine.pth"), "mine.pth"), (resnet, "resnet")):
         with pytest.raises(MissingExtraError, match=named):
             lpips_of(weights)
 

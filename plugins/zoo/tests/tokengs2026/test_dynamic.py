@@ -70,18 +70,6 @@ def test_the_target_time_is_added_to_the_dynamic_queries_or_to_all():
         assert fields == ({MOVES: [moving] * 2} if dynamic else {})
 
 
-def test_that_nothing_reads_which_queries_move_is_no_warning():
-    content = ("model.decoder.self_attention={type: qgs/content}", "objective={type: qgs/one_pass}")
-    for dynamic in (3, 0):
-        assert small(*content, f"model.queries.dynamic={dynamic}").warnings == []
-
-
-def test_what_reads_dynamic_queries_is_refused_without_them():
-    (problem,) = problems_of(PUBLISHED, ["model.queries.dynamic=0"])
-    for reader in ("block_causal", "dynamic"):
-        assert f"`tokengs2026/{reader}` needs {MOVES}" in problem.reason
-
-
 @pytest.fixture
 def model():
     model = small().build_model().eval()

@@ -37,9 +37,5 @@ plugin = Plugin(
             "view_permutation": "its registers are of no view, so that its memory has no grid to "
             "permute by; its patches are permuted with their views, as without registers"
         },
-        TwoPasses: {
-            "objective_gives_an_outcome": "it refuses two input views, of which both passes would "
-            "be the same"
-        },
     },
 )

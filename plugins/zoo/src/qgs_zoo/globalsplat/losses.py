@@ -127,16 +127,15 @@ class TwoPasses(Objective):
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
         """Fewer input views than two different passes need."""
         if context.inputs is not None and context.inputs < LEAST_VIEWS:
-            yield Problem("", _too_few(context.inputs), FIX)
+            reason = (
+                f"it needs at least {LEAST_VIEWS} input views, got {context.inputs}: its passes "
+                "share the first and the last, and would both be the same"
+            )
+            yield Problem("", reason, FIX)
 
     def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
-        """Adds the terms `alpha_consistency` and `depth_consistency`.
-
-        Raises ValueError for fewer than 3 input views: both passes would see the same ones.
-        """
+        """Adds the terms `alpha_consistency` and `depth_consistency`."""
         count = inputs.images.shape[1]
-        if count < LEAST_VIEWS:
-            raise ValueError(f"{_too_few(count)}; {FIX}")
         outcomes = list[Outcome]()
         renderings = list[Rendering]()
         for part in (0, 1):
@@ -151,13 +150,6 @@ class TwoPasses(Objective):
             alpha_consistency=self.config.alpha_weight * disagreement(one.alpha, other.alpha),
             depth_consistency=self.config.depth_weight * disagreement(one.depth, other.depth),
         )
-
-
-def _too_few(count: int) -> str:
-    return (
-        f"the objective globalsplat/two_passes needs at least {LEAST_VIEWS} input views, got "
-        f"{count}: its passes share the first and the last, and would both be the same"
-    )
 
 
 def subset(count: int, part: int) -> list[int]:
