@@ -7,15 +7,19 @@ from line_scenes import Line, Lines, circle
 from odd_views import odd_views
 from tables import must_refuse
 from torch.testing import assert_close
+from training_runs import tiny
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
+from qgs.contracts.schedule import END
 from qgs.data.frames import draw_frames
 from qgs.data.samples import collate, make_sample, mirrored_views, stack_views
+from qgs.data.view_samplers import Span
 from qgs.evaluate.plan import evaluation_samples, held_out_windows
 from qgs.evaluate.protocol import protocol_of
 from qgs.geometry.poses import look_at, look_at_depth
 from qgs.geometry.transforms import to_camera, to_pixels
-from qgs.recipe import resolve
+from qgs.recipe import RecipeError, resolve
+from qgs.tokengs.schedules import Linear
 from qgs.types import Cameras
 
 
@@ -227,3 +231,18 @@ def test_times_of_photos_are_kept():
     for name in ("times", "target_time"):
         assert torch.equal(getattr(both, name), getattr(timed, name).repeat(2, 1))
     must_refuse("target_time, times", stack_views, [timed, plain])
+
+
+def test_a_schedule_moves_the_gap_of_the_default():
+    sampler = Span(Span.Config(min_gap=2))
+    sampler.schedules = {"max_gap": Linear(schedule="linear", values=(2, 10), at=(0, 100))}
+    views = ViewsConfig(inputs=2, targets=3, gap=(2, 5))
+    for step, largest in ((0, 2), (50, 6), (100, 10), (END, 10)):
+        drawn = [sampler.draw(Line(30), views, np.random.default_rng(k), step) for k in range(200)]
+        assert max(right - left for (left, right), _ in drawn) == largest
+
+
+def test_a_least_gap_above_the_largest_is_refused():
+    tiny("tokengs", "view_sampler.min_gap=4", "view_sampler.max_gap=9")
+    with pytest.raises(RecipeError, match=r"view_sampler\.min_gap"):
+        tiny("tokengs", "view_sampler.min_gap=9", "view_sampler.max_gap=4")
