@@ -58,8 +58,7 @@ def reconstruct(
     overrides: of the recipe's `views`, such as "views.scale=auto".
     tune: fit queries or latents to the inputs first, see `qgs.evaluate.tuning.tuning_settings`.
 
-    Raises ValueError for a model without a recipe, several scenes, and images out of range, and as
-    the data do.
+    Raises ValueError without a recipe, for several scenes, for images out of range, as the data do.
     """
     recipe = _recipe(model, overrides, tune)
     if isinstance(photos, Views):
@@ -75,8 +74,7 @@ def reconstruct(
     against = [] if compare == "none" else compare
     against = None if against is None else frame_list(against, "compare", found)
     # A model's own data keep its scale; photos of a user have any unit.
-    views = photo_settings(recipe.views, chosen.is_training_data, overrides)
-    search = ScaleSearch(model, views)
+    search = ScaleSearch(model, photo_settings(recipe.views, chosen.is_training_data, overrides))
     domain = model.trained_on
     sample, world = choose_sample(found, recipe.views, inputs, wanted, against, domain, search)
     training = model.training
