@@ -8,8 +8,8 @@ import pytest
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.intervals import clearances
 from qgs_worlds.caster.raycast import trace
+from qgs_worlds.caster.shapes import Primitive, Shape, any_turn, packed, rod
 from qgs_worlds.worlds.materials import height_maps
-from qgs_worlds.worlds.shapes import Primitive, Shape, any_turn, packed, rod
 from scipy.ndimage import map_coordinates
 
 MAPS = height_maps(3, 2)

@@ -7,9 +7,9 @@ from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.casting import cast
 from qgs_worlds.caster.shading import paint
 from qgs_worlds.caster.shadows import shadow_maps
+from qgs_worlds.caster.shapes import Primitive, Shape, packed
 from qgs_worlds.caster.textures import color
 from qgs_worlds.worlds.cameras import Rig
-from qgs_worlds.worlds.shapes import Primitive, Shape, packed
 
 GROUND = Shape(Primitive(s.BOX, (0.0, 0.0, -1.0), (50.0, 50.0, 1.0)))
 WALL = Primitive(s.BOX, (1.0, 0.0, 1.0), (0.1, 5.0, 2.0))
@@ -39,7 +39,7 @@ def seen_from_above(shapes, points, sun=(), ambient=0.0):
     c2w[:, :3, 3] = [(x, y, 1.0) for x, y in points]
     lens = np.array([100.0, 100.0, 0.5, 0.5])
     images = np.empty((len(points), 1, 1, 3), np.float32)
-    cast(world, paint, images, c2w, lens, 1)
+    cast(world, c2w, lens, (1, 1), 1, paint, images)
     return images[:, 0, 0, 0].tolist()
 
 

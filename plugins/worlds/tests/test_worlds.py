@@ -7,9 +7,9 @@ import pytest
 import torch
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.intervals import clearances
+from qgs_worlds.caster.shapes import packed
 from qgs_worlds.rooms.source import RoomScene, RoomsConfig, RoomsSource
 from qgs_worlds.worlds.places import KINDS
-from qgs_worlds.worlds.shapes import packed
 from qgs_worlds.worlds.source import WorldsSource
 from test_intervals import met
 from torch.testing import assert_close

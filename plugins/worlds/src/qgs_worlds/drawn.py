@@ -2,8 +2,8 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from functools import partial
-from typing import ClassVar
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
@@ -12,6 +12,10 @@ from torch import Tensor
 
 from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.scenes import LazyScenes, LazySource
+from qgs.types import Cameras
+
+if TYPE_CHECKING:
+    from qgs_worlds.caster.tables import Room, World
 
 ImageCache = dict[tuple[str, int], np.ndarray]
 """Images (H, W, 3) uint8 by scene and frame; once it is full, what it holds stays."""
@@ -37,8 +41,13 @@ class DrawnConfig(SceneSource.Config):
 class DrawnScene(Scene):
     """Scene `index` of a split. config: of its source; `views_per_scene` cameras see it.
 
-    key: seed, split and index, of which all that is drawn is a function.
+    key: seed, split and index, of which all that is drawn is a function. c2w: OpenCV (F, 4, 4), in
+    metres of `tables`. lens: fx, fy, cx, cy in pixels. scale: factor of all lengths.
     """
+
+    c2w: np.ndarray
+    lens: np.ndarray
+    scale = 1.0
 
     def __init__(
         self, name: str, index: int, config: DrawnConfig, split: Split, cache: ImageCache
@@ -51,6 +60,26 @@ class DrawnScene(Scene):
 
     def __len__(self) -> int:
         return self._config.views_per_scene
+
+    @property
+    @abstractmethod
+    def tables(self) -> "World | Room":
+        """What is there, for the ray caster."""
+
+    @cached_property
+    def cameras(self) -> Cameras:
+        """See `Scene`."""
+        intrinsics = torch.from_numpy(self.lens).float().expand(len(self), 4)
+        c2w = torch.from_numpy(self.c2w).float()
+        c2w[:, :3, 3] *= self.scale
+        return Cameras(c2w, intrinsics, self._config.image_size)
+
+    def depths(self, frames: Sequence[int]) -> Tensor:
+        """See `Scene`: z along the ray through the pixel's centre; the sky is unknown."""
+        from qgs_worlds.caster.casting import cast
+
+        depths = cast(self.tables, self.c2w[list(frames)], self.lens, self._config.image_size)
+        return torch.from_numpy(np.where(np.isfinite(depths), depths, 0))[:, None] * self.scale
 
     @abstractmethod
     def cast(self, frames: list[int]) -> Sequence[np.ndarray]:

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
-from qgs_worlds.caster.casting import cast_depths
+from qgs_worlds.caster.casting import cast
 from qgs_worlds.caster.intervals import hit
 from qgs_worlds.caster.tables import LIGHT, TEXTURE, Room
+from qgs_worlds.rooms.furniture import box, cylinder, packed, sphere
 from qgs_worlds.rooms.plan import NO_HEIGHTS
-from qgs_worlds.rooms.shapes import box, cylinder, packed, sphere
 
 
 def hits(shape, x, y):
@@ -32,5 +32,5 @@ def test_depth_is_z_along_the_camera():
     shapes = packed(size, [box(1.75, 0, 0.9, 0.5, 0.2, 0.2, 0)])
     nothing = np.zeros((2, 2))
     room = Room(shapes, NO_HEIGHTS, np.zeros(7, TEXTURE), size, np.zeros(2, LIGHT), nothing)
-    (depth,) = cast_depths(room, c2w[None], np.array([20.0, 20.0, 10.5, 10.5]), (21, 21))
+    (depth,) = cast(room, c2w[None], np.array([20.0, 20.0, 10.5, 10.5]), (21, 21))
     assert depth[[10, 4, 4], [10, 3, 17]] == pytest.approx([1.5, 4, 4])

@@ -53,7 +53,7 @@ def test_cameras_are_rigid_and_keep_clear_of_every_surface():
         assert torch.linalg.det(turn).min() > 0.99
         assert turn[:, 2, 1].max() < 0  # the image's y axis points down
         assert (torch.tensor(scene.size[:2]) / 2 - eyes[:, :2].abs()).min() > 0.2
-        assert clearances(scene.room.shapes[1:], eyes.double().numpy()).min() > 0.2
+        assert clearances(scene.tables.shapes[1:], eyes.double().numpy()).min() > 0.2
 
 
 @pytest.mark.parametrize("name", ["locus-64", "tokengs-64"])

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import product
 
 import numpy as np
 import torch
@@ -18,52 +19,37 @@ Size = tuple[int, int]
 
 def cast(
     scene: World | Room,
-    paint: Callable[..., None],
-    images: np.ndarray,
     c2w: np.ndarray,
     intrinsics: np.ndarray,
-    samples: int,
-    depths: np.ndarray | None = None,
-) -> None:
-    """Write images (F, H, W, 3), means of samples^2 rays. c2w: OpenCV. intrinsics: in pixels.
-
-    paint: kernel that colours a band of an image. depths: (F, samples H, samples W), to write z of
-    the rays, inf in the sky.
-    """
-
-    def band(frame: int, top: int, bottom: int) -> None:
-        rows = (bottom - top, images.shape[2], top, samples)
-        t, code, rays = trace(*rows, scene.shapes, scene.heights, c2w[frame], intrinsics)
-        if depths is not None:
-            depths[frame, samples * top : samples * bottom] = t
-        paint(images[frame, top:bottom], t, code, top, samples, scene, c2w[frame], rays)
-
-    _in_bands(band, len(c2w), images.shape[1])
-
-
-def cast_depths(
-    scene: World | Room, c2w: np.ndarray, intrinsics: np.ndarray, size: Size
+    size: Size,
+    samples: int = 1,
+    paint: Callable[..., None] | None = None,
+    images: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return depths (F, H, W) float32: z of the ray through each pixel's centre, 0 in the sky."""
-    depths = np.empty((len(c2w), *size), np.float32)
+    """Return depths (F, samples H, samples W) float32: z of the rays, inf in the sky.
 
-    def band(frame: int, top: int, bottom: int) -> None:
-        rows = (bottom - top, size[1], top, 1)
-        t, _, _ = trace(*rows, scene.shapes, scene.heights, c2w[frame], intrinsics)
-        depths[frame, top:bottom] = np.where(np.isfinite(t), t, 0)
+    c2w: OpenCV. intrinsics: in pixels. paint: kernel that colours a band of `images` (F, H, W, 3)
+    by the means of samples^2 rays.
+    """
+    height, width = size
+    depths = np.empty((len(c2w), samples * height, samples * width), np.float32)
 
-    _in_bands(band, len(c2w), size[0])
-    return depths
+    def band(place: tuple[int, int]) -> None:
+        frame, top = place
+        rows = min(_BAND, height - top)
+        area = (rows, width, top, samples)
+        t, code, rays = trace(*area, scene.shapes, scene.heights, c2w[frame], intrinsics)
+        depths[frame, samples * top : samples * (top + rows)] = t
+        if paint and images is not None:
+            painted = images[frame, top : top + rows]
+            paint(painted, t, code, top, samples, scene, c2w[frame], rays)
 
-
-def _in_bands(draw: Callable[[int, int, int], None], frames: int, height: int) -> None:
-    """Call `draw(frame, top, bottom)` for all rows of all frames, on torch's number of threads."""
-    tops = range(0, height, _BAND)
-    bands = [(frame, top, min(top + _BAND, height)) for frame in range(frames) for top in tops]
+    bands = [*product(range(len(c2w)), range(0, height, _BAND))]
     if torch.get_num_threads() == 1:
-        for band in bands:
-            draw(*band)
-        return
+        for place in bands:
+            band(place)
+        return depths
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         # the list raises what a thread raised
-        list(pool.map(lambda band: draw(*band), bands))
+        list(pool.map(band, bands))
+    return depths

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from PIL import Image
 
-from qgs_worlds.caster.kernels import INNER, OPTIONS
+from qgs_worlds.caster.vectors import INNER, OPTIONS
 
 # Of full brightness, from where on highlights are compressed.
 _SHOULDER = 0.6

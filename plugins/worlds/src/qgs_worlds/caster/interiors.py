@@ -7,11 +7,9 @@ from numba import njit
 
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.intervals import hit, upright
-from qgs_worlds.caster.kernels import INNER, OPTIONS
 from qgs_worlds.caster.patterns import mixture, smooth
-from qgs_worlds.caster.shading import TAKEN
-from qgs_worlds.caster.surfaces import on_axis, to_world
-from qgs_worlds.caster.vectors import along, dot, minus, mix, times, triple
+from qgs_worlds.caster.shading import TAKEN, on_axis, to_world
+from qgs_worlds.caster.vectors import INNER, OPTIONS, along, dot, minus, mix, narrow, times, triple
 
 # How much of the light the lamp's shadow takes.
 _SHADOW = 0.36
@@ -50,7 +48,7 @@ def _darken(darkness, body, size, lamp):
     reach = lamp[2] / (lamp[2] - top)
     i0, i1 = _range(x - ex, x + ex, lamp[0], reach, size[0], cells)
     j0, j1 = _range(y - ey, y + ey, lamp[1], reach, size[1], cells)
-    source = (np.float32(lamp[0]), np.float32(lamp[1]), np.float32(lamp[2]))
+    source = narrow(lamp)
     below = 0.55 * math.exp(-3 * bottom)
     for i in range(i0, i1):
         x = (i / (cells - 1) - 0.5) * size[0]
@@ -259,7 +257,6 @@ def paint_room(image, t, code, top, samples, room, c2w, rays):
                     n = _gather(t, code, i, j, own, samples, top, eye, rays, points)
                     seen = _shade(room, int(own), points, n, spread * t[i + a, j + b])
                     total = along(total, n, seen)
-            red, green, blue = times(gain, total)
-            image[row, column, 0] = int(red + 0.5)
-            image[row, column, 1] = int(green + 0.5)
-            image[row, column, 2] = int(blue + 0.5)
+            total = times(gain, total)
+            for c in range(3):
+                image[row, column, c] = int(total[c] + 0.5)

@@ -10,8 +10,7 @@ import numpy as np
 from numba import njit
 
 from qgs_worlds.caster import tables as s
-from qgs_worlds.caster.kernels import INNER, OPTIONS
-from qgs_worlds.caster.vectors import along, dot, minus
+from qgs_worlds.caster.vectors import INNER, OPTIONS, along, dot, minus
 
 # Metres before which nothing is met: a camera never stands so near to a surface.
 NEAR = np.float32(0.01)

@@ -4,8 +4,8 @@ import math
 
 from numba import njit
 
-from qgs_worlds.caster.kernels import INNER
 from qgs_worlds.caster.textures import eased
+from qgs_worlds.caster.vectors import INNER
 
 (PLAIN, CHECKER, STRIPES, PLANKS, TILES, BRICKS, CLOUDS, GRADIENT, PICTURE, RUG, WINDOW, DOTS,
  BOOKS) = range(13)  # fmt: skip

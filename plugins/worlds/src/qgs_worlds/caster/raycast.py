@@ -28,8 +28,7 @@ from qgs_worlds.caster.intervals import (
     torus,
     upright,
 )
-from qgs_worlds.caster.kernels import INNER, OPTIONS
-from qgs_worlds.caster.vectors import along, dot, minus, over, triple
+from qgs_worlds.caster.vectors import INNER, OPTIONS, along, dot, minus, narrow, over, triple
 
 # Part p of shape i has code 8 i + p; codes are float32, so that they lie beside t in loops.
 SKY = -1
@@ -111,14 +110,9 @@ def ray_basis(c2w, intrinsics):
 
 
 @njit(**INNER)
-def _narrow(a):
-    return np.float32(a[0]), np.float32(a[1]), np.float32(a[2])
-
-
-@njit(**INNER)
 def _row_base(rays, v):
     """Return the direction of the ray at u = 0 of row v."""
-    return _narrow(along(rays[0], v, rays[2]))
+    return narrow(along(rays[0], v, rays[2]))
 
 
 @njit(**INNER)
@@ -230,7 +224,7 @@ def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
     extent = triple(body.extent)
     along_row = steps[first:last]
     lo = upright(body, minus(o, body.center))
-    ls = upright(body, _narrow(rays[1]))
+    ls = upright(body, narrow(rays[1]))
     for row in range(above, below):
         lb = upright(body, _row_base(rays, top + (row + 0.5) / samples))
         depths = t[row, first:last]
@@ -242,7 +236,7 @@ def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
 def _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, area, scratch):
     """Let a shape cover what lies behind it in an area of the samples."""
     above, below, first, last = area
-    step = _narrow(rays[1])
+    step = narrow(rays[1])
     along_row = steps[first:last]
     spans = scratch[:, :, : last - first]
     # without a second primitive nothing is taken away
@@ -269,7 +263,7 @@ def trace(rows, columns, top, samples, shapes, heights, c2w, intrinsics):
     steps = np.empty(columns * samples, np.float32)
     for j in range(columns * samples):
         steps[j] = (j + 0.5) / samples
-    o = _narrow(c2w[:, 3])
+    o = narrow(c2w[:, 3])
     corners = np.empty((8, 3))
     points = np.empty((20, 3))
     # one for all shapes, as allocating takes longer than small shapes do

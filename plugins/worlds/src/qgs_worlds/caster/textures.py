@@ -6,8 +6,7 @@ import numpy as np
 from numba import njit
 
 from qgs_worlds.caster import tables as s
-from qgs_worlds.caster.kernels import INNER
-from qgs_worlds.caster.vectors import mix, times
+from qgs_worlds.caster.vectors import INNER, mix, times
 
 # Side of the table of random numbers, which noise repeats; a power of two, for `chance`.
 _SIDE = 64

@@ -1,16 +1,48 @@
-"""Points, directions and colours in kernels: tuples of three numbers, or anything indexed alike."""
+"""How kernels are compiled; points, directions and colours in them: tuples of three numbers.
+
+Anything indexed alike will do.
+"""
 
 import math
+from typing import Any
 
+import numpy as np
 from numba import njit
 
-from qgs_worlds.caster.kernels import INNER
+OPTIONS: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract", "reassoc", "arcp", "nsz"},
+    # Cached kernels share the functions that they call by name, so that one loaded from the cache
+    # may run another kernel's build of them, with other roundings; what is inlined is its own.
+    "forceinline": True,
+}
+"""For functions that Python calls, and for those that allocate arrays."""
+
+INNER: dict[str, Any] = {
+    **OPTIONS,
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+    # Counting references to the arrays that are passed takes longer than what is done with them.
+    "_nrt": False,
+}
+"""For functions that kernels alone call and that allocate no arrays."""
+
+REDUCING: dict[str, Any] = {**INNER, "fastmath": {"contract", "reassoc", "arcp", "nsz", "nnan"}}
+"""For least values over a loop, which LLVM vectorises if no number is NaN."""
 
 
 @njit(**INNER)
 def triple(a):
     """Return the three numbers of an array as a tuple."""
     return a[0], a[1], a[2]
+
+
+@njit(**INNER)
+def narrow(a):
+    """Return the three numbers in float32."""
+    return np.float32(a[0]), np.float32(a[1]), np.float32(a[2])
 
 
 @njit(**INNER)

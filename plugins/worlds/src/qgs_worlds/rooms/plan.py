@@ -7,9 +7,18 @@ import numpy as np
 
 from qgs_worlds.caster.interiors import floor_shadows
 from qgs_worlds.caster.tables import LIGHT, Room
-from qgs_worlds.rooms.furniture import AGAINST_WALLS, CENTRAL, LOOSE, Furniture, Piece
+from qgs_worlds.rooms.furniture import (
+    AGAINST_WALLS,
+    CENTRAL,
+    LOOSE,
+    Furniture,
+    Piece,
+    Shape,
+    box,
+    cylinder,
+    packed,
+)
 from qgs_worlds.rooms.materials import Materials
-from qgs_worlds.rooms.shapes import Shape, box, cylinder, packed
 
 # metres between a camera and the nearest shape
 CLEARANCE = 0.4

@@ -3,24 +3,28 @@
 Kernels are imported when the first room is drawn: numba takes longer to load than a recipe does.
 """
 
-from collections.abc import Sequence
+import math
 from functools import cached_property
 from random import Random
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from pydantic import model_validator
-from torch import Tensor
 
 from qgs.contracts import Split
-from qgs.types import Cameras
-from qgs_worlds.caster.lens import lens
+from qgs_worlds.caster.lens import lens, look_along
 from qgs_worlds.drawn import DrawnConfig, DrawnScene, DrawnSource, ImageCache
-from qgs_worlds.rooms.path import camera_path
 
 if TYPE_CHECKING:
     from qgs_worlds.caster.tables import Room
+
+
+# metres above the floor
+EYE = (1.25, 1.65)
+# least distance from a camera to a wall
+WALL = 0.45
+# metres from the first to the last camera
+TRAVEL = (0.65, 1.2)
 
 
 class RoomsConfig(DrawnConfig):
@@ -51,38 +55,26 @@ class RoomScene(DrawnScene):
         self._plan_seed = int(rng.integers(1 << 62))
         sizes = rng.uniform((4.2, 4.2, 2.45), (5.8, 5.8, 2.9))
         self.size: tuple[float, float, float] = tuple(map(float, sizes))  # type: ignore[assignment]
-        self._c2w = camera_path(rng, self.size, config.views_per_scene)
-        self._intrinsics = lens(float(rng.uniform(*config.fov)), config.image_size)
+        self.c2w = camera_path(rng, self.size, config.views_per_scene)
+        self.lens = lens(float(rng.uniform(*config.fov)), config.image_size)
 
     @cached_property
-    def cameras(self) -> Cameras:
-        """See `Scene`."""
-        intrinsics = torch.from_numpy(self._intrinsics).float().expand(len(self), 4)
-        return Cameras(torch.from_numpy(self._c2w).float(), intrinsics, self._config.image_size)
-
-    @cached_property
-    def room(self) -> "Room":
+    def tables(self) -> "Room":
         """The furnished room."""
         from qgs_worlds.rooms.plan import furnish
 
-        return furnish(Random(self._plan_seed), self.size, self._c2w[:, :3, 3])
+        return furnish(Random(self._plan_seed), self.size, self.c2w[:, :3, 3])
 
     def cast(self, frames: list[int]) -> np.ndarray:
         """See `DrawnScene`."""
         from qgs_worlds.caster.casting import cast
         from qgs_worlds.caster.interiors import paint_room
 
-        config = self._config
-        images = np.empty((len(frames), *config.image_size, 3), np.uint8)
-        cast(self.room, paint_room, images, self._c2w[frames], self._intrinsics, config.samples)
+        size = self._config.image_size
+        images = np.empty((len(frames), *size, 3), np.uint8)
+        c2w = self.c2w[frames]
+        cast(self.tables, c2w, self.lens, size, self._config.samples, paint_room, images)
         return images
-
-    def depths(self, frames: Sequence[int]) -> Tensor:
-        """See `Scene`: z along the ray through the pixel's centre."""
-        from qgs_worlds.caster.casting import cast_depths
-
-        cameras = (self._c2w[list(frames)], self._intrinsics)
-        return torch.from_numpy(cast_depths(self.room, *cameras, self._config.image_size))[:, None]
 
 
 class RoomsSource(DrawnSource):
@@ -91,3 +83,44 @@ class RoomsSource(DrawnSource):
     name = "procedural"
     Config = RoomsConfig
     scene = RoomScene
+
+
+def camera_path(
+    rng: np.random.Generator, size: tuple[float, float, float], count: int
+) -> np.ndarray:
+    """Return OpenCV c2w (count, 4, 4) of cameras that look across the room."""
+    # drawn along one wall, then turned, so that all four are alike
+    side = int(rng.integers(4))
+    across = size[0] if side % 2 == 0 else size[1]
+    along = size[1] if side % 2 == 0 else size[0]
+    travel = float(rng.uniform(*TRAVEL))
+    back = float(rng.uniform(WALL + 0.1, 0.25 * across)) - across / 2
+    middle = float(rng.uniform(-1, 1)) * max(along / 2 - WALL - travel / 2 - 0.1, 0.0)
+    s = np.linspace(-0.5, 0.5, count) if count > 1 else np.zeros(1)
+    sway, lift = rng.uniform(-0.12, 0.12, 2)
+    phase = rng.uniform(0, math.pi)
+    eyes = np.stack(
+        [
+            back + sway * np.cos(3 * s + phase) + abs(sway),
+            middle + travel * s,
+            rng.uniform(*EYE) + lift * np.sin(3 * s + phase),
+        ],
+        -1,
+    )
+    drift = float(rng.uniform(-0.3, 0.5)) * travel
+    target = np.stack(
+        [
+            np.full(count, 0.25 * across),
+            float(rng.uniform(-0.25, 0.25)) * along - 0.35 * middle + drift * s,
+            rng.uniform(0.7, 1.15) + 0.1 * np.sin(2 * s + phase),
+        ],
+        -1,
+    )
+    # walks go both ways
+    if rng.random() < 0.5:
+        eyes = eyes[::-1]
+        target = target[::-1]
+    cos = math.cos(side * math.pi / 2)
+    sin = math.sin(side * math.pi / 2)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    return look_along(eyes @ turn.T, (target - eyes) @ turn.T)

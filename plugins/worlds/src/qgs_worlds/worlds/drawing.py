@@ -1,5 +1,6 @@
-"""Scenes drawn from a seed, and photos of them."""
+"""Scenes drawn from a seed: place, light and camera; photos of them."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from random import Random
@@ -7,22 +8,28 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from qgs_worlds.caster.casting import Size, cast, cast_depths
+from qgs_worlds.caster import tables as s
+from qgs_worlds.caster.casting import Size, cast
 from qgs_worlds.caster.effects import Effects
 from qgs_worlds.caster.intervals import clearances
 from qgs_worlds.caster.shading import paint
 from qgs_worlds.caster.shadows import shadow_maps
+from qgs_worlds.caster.shapes import packed
 from qgs_worlds.caster.tables import World
 from qgs_worlds.worlds import materials
 from qgs_worlds.worlds.cameras import CLEARANCE, Rig, draw_cameras
-from qgs_worlds.worlds.lights import draw_effects, draw_lights
 from qgs_worlds.worlds.places import KINDS, SHARES, Place, draw_place
-from qgs_worlds.worlds.shapes import packed
 from qgs_worlds.worlds.things import PLAIN, VARIED, Things, spread
 
 if TYPE_CHECKING:
     from qgs_worlds.worlds.source import WorldsConfig
 
+# Least and largest number of lamps, and how often the sun shines.
+_LAMPS = {"indoors": (1, 2), "outdoors": (0, 1), "objects": (0, 2)}
+_SUNNY = {"indoors": 0.5, "outdoors": 0.75, "objects": 0.45}
+
+Light = tuple[float, Sequence[float], np.ndarray, int]
+"""A row of LIGHT."""
 # Height maps of a world.
 _MAPS = 4
 # Pixels of the pictures by which a scene is exposed, and its depth known.
@@ -42,16 +49,11 @@ class Drawn:
     effects: Effects
     scale: float
 
-    def photos(self, frames: Sequence[int], size: Size, samples: int) -> list[np.ndarray]:
+    def photos(self, frames: list[int], size: Size, samples: int) -> list[np.ndarray]:
         """Return images (H, W, 3) uint8."""
         light = np.empty((len(frames), *size, 3), np.float32)
-        c2w = self.rig.c2w[list(frames)]
-        cast(self.world, paint, light, c2w, self.rig.lens(size), samples)
+        cast(self.world, self.rig.c2w[frames], self.rig.lens(size), size, samples, paint, light)
         return [self.effects.photo(seen, frame) for seen, frame in zip(light, frames, strict=True)]
-
-    def depths(self, frames: Sequence[int], size: Size) -> np.ndarray:
-        """Return depths (F, H, W) float32, 0 in the sky."""
-        return cast_depths(self.world, self.rig.c2w[list(frames)], self.rig.lens(size), size)
 
 
 def draw(key: list[int], config: "WorldsConfig") -> Drawn:
@@ -78,8 +80,7 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
     lights, shadows = shadow_maps(shapes, maps, lights, *rig.sight(place))
     world = World(shapes, maps, skins, lights, air, shadows)
     light = np.empty((len(rig.c2w), *_THUMB, 3), np.float32)
-    depths = np.empty((len(rig.c2w), *_THUMB), np.float32)
-    cast(world, paint, light, rig.c2w, rig.lens(_THUMB), 1, depths)
+    depths = cast(world, rig.c2w, rig.lens(_THUMB), _THUMB, 1, paint, light)
     effects = draw_effects(camera, light, config.effects)
     scale = 1.0
     if config.depth is not None:
@@ -88,3 +89,83 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
         median = float(np.median(seen)) if len(seen) else rig.distance
         scale = spread(Random(str(key)), *config.depth) / median
     return Drawn(place, world, rig, effects, scale)
+
+
+def _tinted(rng: Random, by: float) -> np.ndarray:
+    """Return a colour of mean 1, from warm to cool, a little green or magenta."""
+    warm = rng.gauss(0, by)
+    green = rng.gauss(0, 0.3 * by)
+    color = np.array([2**warm, 2**green, 2**-warm])
+    return color / color.mean()
+
+
+def draw_lights(rng: Random, place: Place, varied: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return tables of LIGHT and, with one row, of AIR. Lamps may be inside of things.
+
+    Not varied: one white lamp above the middle, which throws no shadows, as in a studio.
+    """
+    if not varied:
+        lamp = (1.0, (0.3, 0.2, place.top - 0.3), np.full(3, 1.2), 0)
+        return np.array([lamp], s.LIGHT), _air(rng, np.full(3, 0.5), np.full(3, 0.35), 0.5)
+    outdoors = place.kind == "outdoors"
+    sunny = rng.random() < _SUNNY[place.kind]
+    tint = _tinted(rng, 0.25)
+    lights = [_sun(rng)] if sunny else []
+    low, high = _LAMPS[place.kind]
+    # a scene that is not outdoors has one light at least
+    low = low if sunny or outdoors else 1
+    for number in range(rng.randint(low, high)):
+        # shadow maps are slow to cast: only the first lamp has them
+        lights.append(_lamp(rng, place, number == 0 and not outdoors))
+    above = spread(rng, 0.07, 0.5) * (1 if place.kind == "indoors" else 1.5) * tint
+    below = rng.uniform(0.3, 0.9) * above * _tinted(rng, 0.15)
+    return np.array(lights, s.LIGHT), _air(rng, above, below, rng.uniform(0.4, 0.9))
+
+
+def _sun(rng: Random) -> Light:
+    up = math.radians(rng.uniform(12, 70))
+    angle = rng.uniform(0, math.tau)
+    way = (math.cos(up) * math.cos(angle), math.cos(up) * math.sin(angle), math.sin(up))
+    return 0.0, way, spread(rng, 1.2, 5) * _tinted(rng, 0.2), 1
+
+
+def _lamp(rng: Random, place: Place, shadows: bool) -> Light:
+    x, y, _ = (rng.uniform(low, high) for low, high in zip(place.low, place.high, strict=True))
+    z = min(rng.uniform(0.6, 1.0) * place.top, place.top - 0.15)
+    return 1.0, (x, y, z), spread(rng, 0.6, 4) * _tinted(rng, 0.4), int(shadows)
+
+
+def _air(rng: Random, above: np.ndarray, below: np.ndarray, occlusion: float) -> np.ndarray:
+    air = np.zeros(1, s.AIR)
+    blue = np.array([0.45, 0.7, 1.15]) if rng.random() < 0.7 else _tinted(rng, 0.3)
+    bright = spread(rng, 0.6, 2.2)
+    air["above"] = above
+    air["below"] = below
+    air["zenith"] = bright * rng.uniform(0.4, 1) * blue
+    air["horizon"] = bright * (0.6 + 0.4 * blue)
+    air["fog"] = rng.choice((0.0005, spread(rng, 0.0005, 0.02)))
+    air["clouds"] = rng.choice((0.0, rng.uniform(0.2, 1.0), rng.uniform(0.2, 1.0)))
+    air["seed"] = rng.randrange(1 << 16)
+    air["occlusion"] = occlusion
+    air["reach"] = rng.uniform(0.12, 0.4)
+    return air
+
+
+def draw_effects(rng: Random, light: np.ndarray, varied: bool) -> Effects:
+    """Return the camera of a scene. light: of small pictures of all its views, which expose it."""
+    luminance = light.reshape(-1, 3) @ (0.3, 0.6, 0.1)
+    # the mean of logarithms, so that a bright sky leaves the rest visible
+    grey = math.exp(float(np.log(luminance + 0.02).mean()))
+    # the exponent of middle tones, which cameras' curves make steeper than that of displays
+    gamma = rng.uniform(1.15, 2.0) if varied else 1.6
+    gains = np.full(3, 0.43**gamma / grey)
+    if not varied:
+        return Effects(gains, gamma)
+    return Effects(
+        gains=gains * (2 ** rng.uniform(-0.8, 0.8) * _tinted(rng, 0.12)),
+        gamma=gamma,
+        vignette=rng.choice((0.0, rng.uniform(0, 0.5))),
+        noise=rng.choice((0.0, spread(rng, 0.003, 0.03))),
+        seed=rng.randrange(1 << 16),
+        quality=rng.choice((0, 0, rng.randint(60, 98))),
+    )

@@ -10,8 +10,8 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from qgs_worlds.caster import tables as s
-from qgs_worlds.caster.kernels import OPTIONS
 from qgs_worlds.caster.textures import chance, noise
+from qgs_worlds.caster.vectors import OPTIONS
 from qgs_worlds.worlds.things import spread
 
 # textures of a world

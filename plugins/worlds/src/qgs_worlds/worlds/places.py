@@ -10,7 +10,7 @@ import numpy as np
 
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.intervals import height_of
-from qgs_worlds.worlds.shapes import Point, Primitive, Shape, about_z, rod
+from qgs_worlds.caster.shapes import Point, Primitive, Shape, about_z, rod
 from qgs_worlds.worlds.things import Thing, Things, placed, spread
 
 Kind = Literal["indoors", "outdoors", "objects"]
@@ -235,7 +235,7 @@ def _far(rng: Random, things: Things, angle: float) -> Thing:
     for _ in range(rng.randint(1, 4)):
         aside, behind = (rng.uniform(-0.5, 0.5) * high for _ in range(2))
         half = tuple(rng.uniform(0.35, 0.9) * high for _ in range(3))
-        leaves = Primitive(s.ELLIPSOID, (x + aside, y + behind, rng.uniform(1.7, 2.6) * high), half)  # type: ignore[arg-type]
+        leaves = Primitive(s.ELLIPSOID, (x + aside, y + behind, rng.uniform(1.7, 2.6) * high), half)
         tree.append(Shape(leaves, None, crown, 1, 0, rng.uniform(0.5, 2)))
     return tree
 

@@ -10,16 +10,14 @@ from random import Random
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
-import torch
 from pydantic import Field, field_validator
-from torch import Tensor
 
 from qgs.contracts import Split
-from qgs.types import Cameras
 from qgs_worlds.drawn import DrawnConfig, DrawnScene, DrawnSource, ImageCache
 from qgs_worlds.rooms.source import RoomScene, RoomsConfig
 
 if TYPE_CHECKING:
+    from qgs_worlds.caster.tables import World
     from qgs_worlds.worlds.drawing import Drawn
 
 Variety: TypeAlias = Literal["plain", "varied"]
@@ -80,26 +78,29 @@ class WorldScene(DrawnScene):
 
         return draw(self.key, self._config)
 
-    @cached_property
-    def _intrinsics(self) -> np.ndarray:
-        return self.drawn.rig.lens(self._config.image_size)
+    @property
+    def tables(self) -> "World":
+        """See `DrawnScene`."""
+        return self.drawn.world
 
-    @cached_property
-    def cameras(self) -> Cameras:
-        """See `Scene`."""
-        intrinsics = torch.from_numpy(self._intrinsics).float().expand(len(self), 4)
-        c2w = torch.from_numpy(self.drawn.rig.c2w).float()
-        c2w[:, :3, 3] *= self.drawn.scale
-        return Cameras(c2w, intrinsics, self._config.image_size)
+    @property
+    def scale(self) -> float:
+        """See `DrawnScene`."""
+        return self.drawn.scale
+
+    @property
+    def c2w(self) -> np.ndarray:
+        """See `DrawnScene`."""
+        return self.drawn.rig.c2w
+
+    @property
+    def lens(self) -> np.ndarray:
+        """See `DrawnScene`."""
+        return self.drawn.rig.lens(self._config.image_size)
 
     def cast(self, frames: list[int]) -> Sequence[np.ndarray]:
         """See `DrawnScene`."""
         return self.drawn.photos(frames, self._config.image_size, self._config.samples)
-
-    def depths(self, frames: Sequence[int]) -> Tensor:
-        """See `Scene`: z along the ray through the pixel's centre; the sky is unknown."""
-        depths = self.drawn.depths(frames, self._config.image_size)
-        return torch.from_numpy(depths)[:, None] * self.drawn.scale
 
 
 def world_or_room(

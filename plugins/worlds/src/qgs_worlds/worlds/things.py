@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from random import Random
 
 from qgs_worlds.caster import tables as s
-from qgs_worlds.worlds.shapes import (
+from qgs_worlds.caster.shapes import (
     UPRIGHT,
     Point,
     Primitive,
@@ -115,12 +115,12 @@ class Things:
         if body.kind in (s.TORUS, s.HEIGHT):
             return None
         rng = self.rng
-        way = rotated(body.turn, tuple(rng.uniform(-0.8, 0.8) * h for h in body.half))  # type: ignore[arg-type]
+        way = rotated(body.turn, tuple(rng.uniform(-0.8, 0.8) * h for h in body.half))
         center = tuple(a + b for a, b in zip(body.center, way, strict=True))
         kind = rng.choice((s.BOX, s.ELLIPSOID, s.FRUSTUM))
         half = tuple(h * rng.uniform(0.35, 0.9) for h in body.half)
         turn = body.turn if rng.random() < 0.5 else any_turn(rng)
-        return Primitive(kind, center, half, turn, rng.uniform(0.2, 1))  # type: ignore[arg-type]
+        return Primitive(kind, center, half, turn, rng.uniform(0.2, 1))
 
     def _composite(self) -> Thing:
         rng = self.rng
@@ -181,7 +181,7 @@ class Things:
         else:
             points = [tuple(rng.uniform(-1, 1) for _ in range(3)) for _ in range(count)]
         pairs = [(k, k + 1) for k in range(count - 1)]
-        return self._rods(points, pairs, spread(rng, 0.008, 0.05))  # type: ignore[arg-type]
+        return self._rods(points, pairs, spread(rng, 0.008, 0.05))
 
     def _bars(self) -> Thing:
         """Draw parallel bars between two rails, like a fence or a ladder."""

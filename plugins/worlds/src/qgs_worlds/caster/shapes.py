@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import chain
 from random import Random
 from typing import NamedTuple
 
@@ -9,8 +10,9 @@ import numpy as np
 
 from qgs_worlds.caster import tables as s
 
-Point = tuple[float, float, float]
-Turn = tuple[float, float, float, float, float, float, float, float, float]
+Point = tuple[float, ...]
+Turn = tuple[float, ...]
+"""A rotation, row by row."""
 UPRIGHT: Turn = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 ROUND = (s.ELLIPSOID, s.CAPSULE, s.TORUS)
 
@@ -72,10 +74,8 @@ def rotated(turn: Turn, p: Point) -> Point:
 
 def product(a: Turn, b: Turn) -> Turn:
     """Return the rotation by b, then by a."""
-    x = rotated(a, (b[0], b[3], b[6]))
-    y = rotated(a, (b[1], b[4], b[7]))
-    z = rotated(a, (b[2], b[5], b[8]))
-    return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
+    columns = [rotated(a, b[axis::3]) for axis in range(3)]
+    return tuple(chain(*zip(*columns, strict=True)))
 
 
 def about_z(angle: float) -> Turn:
@@ -111,7 +111,7 @@ def rod(start: Point, end: Point, radius: float, square: bool = False) -> Primit
     middle = tuple(0.5 * (a + b) for a, b in zip(start, end, strict=True))
     half = (radius, radius, 0.5 * length if square else radius)
     kind = s.BOX if square else s.CAPSULE
-    return Primitive(kind, middle, half, turn, 0.0 if square else 0.5 * length / radius)  # type: ignore[arg-type]
+    return Primitive(kind, middle, half, turn, 0.0 if square else 0.5 * length / radius)
 
 
 def packed(shapes: Sequence[Shape]) -> np.ndarray:
