@@ -9,7 +9,7 @@ from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.intervals import clearances
 from qgs_worlds.caster.shapes import packed
 from qgs_worlds.rooms.source import RoomScene, RoomsConfig, RoomsSource
-from qgs_worlds.worlds.places import KINDS
+from qgs_worlds.worlds.places import PLACES
 from qgs_worlds.worlds.source import WorldsSource
 from test_intervals import met
 from torch.testing import assert_close
@@ -88,7 +88,7 @@ def test_what_is_drawn_is_spread(scenes):
     assert 0.1 < middle < 2
     assert {rig.motion for rig in rigs} >= {"walk", "orbit", "round", "gather"}
     kinds = [scene.drawn.place.kind for scene in scenes]
-    assert all(kinds.count(kind) > 10 for kind in KINDS)
+    assert all(kinds.count(kind) > 10 for kind in PLACES)
     shapes = np.concatenate([scene.drawn.world.shapes for scene in scenes])
     assert {*shapes["body"]["kind"]} == {*range(6)}
     assert (shapes["cut"]["kind"] >= 0).mean() > 0.05

@@ -80,11 +80,9 @@ class Effects:
         # the sum of two numbers of 0 to 31 has a standard deviation of 13.06
         grain = 255 / 13.06 * self.noise
         _develop(image, light, self.gains, self.gamma, self.vignette, grain, self.seed, frame)
-        return _through_jpeg(image, self.quality) if self.quality else image
-
-
-def _through_jpeg(image: np.ndarray, quality: int) -> np.ndarray:
-    """Return the image (H, W, 3) uint8 as a JPEG file of that quality keeps it."""
-    file = io.BytesIO()
-    Image.fromarray(image).save(file, "JPEG", quality=quality)
-    return np.asarray(Image.open(file))
+        if not self.quality:
+            return image
+        # as a JPEG file of that quality keeps it
+        file = io.BytesIO()
+        Image.fromarray(image).save(file, "JPEG", quality=self.quality)
+        return np.asarray(Image.open(file))

@@ -227,38 +227,32 @@ def paint(image, t, code, top, samples, world, c2w, rays):
     """
     # kept over the band, as neighbouring points have the same boxes near
     around = surroundings(world.shapes)
-    for row in range(image.shape[0]):
-        for column in range(image.shape[1]):
-            rgb = _pixel(t, code, row, column, top, samples, world, around, c2w, rays)
-            for c in range(3):
-                image[row, column, c] = rgb[c]
-
-
-@njit(**INNER)
-def _pixel(t, code, row, column, top, samples, world, around, c2w, rays):
-    """Return the mean light of a pixel's rays."""
     step = 1.0 / samples
     eye = triple(c2w[:, 3])
     spread = math.sqrt(dot(rays[1], rays[1]))
-    total = (0.0, 0.0, 0.0)
-    i = row * samples
-    j = column * samples
-    for a in range(samples):
-        for b in range(samples):
-            own = code[i + a, j + b]
-            if own == TAKEN:
-                continue
-            n, depth, u, v = _gather(t, code, i, j, own, samples)
-            u = column + (u + 0.5) * step
-            v = top + row + (v + 0.5) * step
-            d = along(along(rays[0], u, rays[1]), v, rays[2])
-            long = math.sqrt(dot(d, d))
-            view = over(d, long)
-            if own == SKY:
-                seen = _sky(world.air[0], world.lights, view)
-            else:
-                place = along(eye, depth, d)
-                footprint = spread * depth
-                seen = _shade(world, around, int(own), place, view, footprint, depth * long)
-            total = along(total, n, seen)
-    return times(step * step, total)
+    for row in range(image.shape[0]):
+        for column in range(image.shape[1]):
+            total = (0.0, 0.0, 0.0)
+            i = row * samples
+            j = column * samples
+            for a in range(samples):
+                for b in range(samples):
+                    own = code[i + a, j + b]
+                    if own == TAKEN:
+                        continue
+                    n, depth, u, v = _gather(t, code, i, j, own, samples)
+                    u = column + (u + 0.5) * step
+                    v = top + row + (v + 0.5) * step
+                    d = along(along(rays[0], u, rays[1]), v, rays[2])
+                    long = math.sqrt(dot(d, d))
+                    view = over(d, long)
+                    if own == SKY:
+                        seen = _sky(world.air[0], world.lights, view)
+                    else:
+                        place = along(eye, depth, d)
+                        size = spread * depth
+                        seen = _shade(world, around, int(own), place, view, size, depth * long)
+                    total = along(total, n, seen)
+            rgb = times(step * step, total)
+            for c in range(3):
+                image[row, column, c] = rgb[c]

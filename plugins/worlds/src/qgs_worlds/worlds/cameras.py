@@ -139,7 +139,7 @@ def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shri
         return Rig(c2w, float(rng.uniform(*PLAIN_FOV)), distance, "walk")
     low, high = np.log(BASELINE)
     length = distance * math.exp(rng.uniform(low, high)) * shrink
-    motion = ("walk", "orbit", "round", "gather")[rng.choice(4, p=(0.35, 0.3, 0.1, 0.25))]
+    motion = [*_MOTIONS][rng.choice(4, p=(0.35, 0.3, 0.1, 0.25))]
     fov = float(rng.uniform(*FOV))
     eyes, targets = _MOTIONS[motion](rng, Path(base, target, length, s, fov))
     # hands are not steady

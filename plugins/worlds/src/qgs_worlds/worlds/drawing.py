@@ -18,8 +18,8 @@ from qgs_worlds.caster.shapes import packed
 from qgs_worlds.caster.tables import World
 from qgs_worlds.worlds import materials
 from qgs_worlds.worlds.cameras import CLEARANCE, Rig, draw_cameras
-from qgs_worlds.worlds.places import KINDS, SHARES, Place, draw_place
-from qgs_worlds.worlds.things import PLAIN, VARIED, Things, spread
+from qgs_worlds.worlds.places import PLACES, SHARES, Place
+from qgs_worlds.worlds.things import PLAIN, VARIED, Things, any_angle, spread
 
 if TYPE_CHECKING:
     from qgs_worlds.worlds.source import WorldsConfig
@@ -63,10 +63,10 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
     plan, skin, shine, camera = (Random(int(numbers.integers(1 << 62))) for _ in range(4))
     maps = materials.height_maps(int(numbers.integers(1 << 31)), _MAPS)
     varied = config.shapes == "varied"
-    kind = plan.choices(KINDS, SHARES)[0] if varied else "indoors"
+    kind = plan.choices([*PLACES], SHARES)[0] if varied else "indoors"
     things = Things(plan, VARIED if varied else PLAIN, materials.COUNT, _MAPS)
     count = round(spread(plan, 4, config.complexity))
-    place = draw_place(kind, plan, things, count, maps)
+    place = PLACES[kind](plan, things, count, maps)
     shapes = packed(place.shapes)
     moving = config.cameras == "varied"
     rig = draw_cameras(numbers, place, (shapes, maps), config.views_per_scene, moving)
@@ -124,7 +124,7 @@ def draw_lights(rng: Random, place: Place, varied: bool) -> tuple[np.ndarray, np
 
 def _sun(rng: Random) -> Light:
     up = math.radians(rng.uniform(12, 70))
-    angle = rng.uniform(0, math.tau)
+    angle = any_angle(rng)
     way = (math.cos(up) * math.cos(angle), math.cos(up) * math.sin(angle), math.sin(up))
     return 0.0, way, spread(rng, 1.2, 5) * _tinted(rng, 0.2), 1
 

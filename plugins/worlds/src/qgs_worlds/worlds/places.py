@@ -4,18 +4,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from random import Random
-from typing import Literal
 
 import numpy as np
 
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.intervals import height_of
 from qgs_worlds.caster.shapes import Point, Primitive, Shape, about_z, rod
-from qgs_worlds.worlds.things import Thing, Things, placed, spread
-
-Kind = Literal["indoors", "outdoors", "objects"]
-KINDS: tuple[Kind, ...] = ("indoors", "outdoors", "objects")
-SHARES = (0.45, 0.3, 0.25)
+from qgs_worlds.worlds.things import Thing, Things, any_angle, placed, spread
 
 # half of a wall's thickness, metres
 _WALL = 0.1
@@ -34,7 +29,7 @@ class Place:
     distance: least and largest one from an eye to its target. top: where lamps hang.
     """
 
-    kind: Kind
+    kind: str
     shapes: list[Shape]
     fixed: int
     low: Point
@@ -43,15 +38,6 @@ class Place:
     targets: list[Point]
     distance: tuple[float, float]
     top: float
-
-
-def draw_place(kind: Kind, rng: Random, things: Things, count: int, maps: np.ndarray) -> Place:
-    """Draw a scene of a kind with `count` things. maps: height maps, which terrains may take."""
-    if kind == "indoors":
-        return _indoors(rng, things, count)
-    return (
-        _outdoors(rng, things, count, maps) if kind == "outdoors" else _objects(rng, things, count)
-    )
 
 
 def _level(x: float, y: float) -> float:
@@ -76,7 +62,7 @@ def _middles(shapes: list[Shape]) -> list[Point]:
     return [shape.body.center for shape in shapes]
 
 
-def _indoors(rng: Random, things: Things, count: int) -> Place:
+def _indoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place:
     size = (rng.uniform(2.6, 7.5), rng.uniform(2.6, 7.5), rng.uniform(2.2, 3.8))
     plain = things.style.tilted == 0
     shapes = [_ground(things, spread(rng, 0.4, 1.5)), *_walls(rng, things, size, 0 if plain else 3)]
@@ -114,7 +100,7 @@ def _put(rng: Random, things: Things, at: Point, size: float, ceiling: float) ->
     lift = 0.0
     if things.style.tilted and pick < 0.3:
         lift = rng.uniform(0.2, max(ceiling - 2.2 * size, 0.3))
-    return placed(thing, (at[0], at[1], lift), rng.uniform(0, math.tau), size, _level)
+    return placed(thing, (at[0], at[1], lift), any_angle(rng), size, _level)
 
 
 def _beam(rng: Random, things: Things, x: float, y: float, z: float) -> Shape:
@@ -187,14 +173,14 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
     fixed = len(shapes)
     # far things give the horizon an outline
     for _ in range(2 + count // 4):
-        shapes += _far(rng, things, rng.uniform(0, math.tau))
+        shapes += _far(rng, things, any_angle(rng))
     near: list[Shape] = []
     for _ in range(count):
         # denser in the middle, where cameras look
         away = 9 * rng.random() ** 0.7
-        x, y = _toward(rng.uniform(0, math.tau), away)
+        x, y = _toward(any_angle(rng), away)
         at = (x, y, 0.0 if rng.random() < 0.85 else rng.uniform(0.3, 3))
-        near += placed(things.draw(), at, rng.uniform(0, math.tau), spread(rng, 0.25, 2), ground)
+        near += placed(things.draw(), at, any_angle(rng), spread(rng, 0.25, 2), ground)
     shapes += near
     low = (-12.0, -12.0, level + 0.3)
     high = (12.0, 12.0, level + 7)
@@ -217,7 +203,7 @@ def _far(rng: Random, things: Things, angle: float) -> Thing:
         size = rng.uniform(15, 60)
         x, y = _toward(angle, away)
         half = (size, size * rng.uniform(0.6, 1.8), size * rng.uniform(0.2, 0.6))
-        body = Primitive(s.ELLIPSOID, (x, y, 0.0), half, about_z(rng.uniform(0, math.tau)))
+        body = Primitive(s.ELLIPSOID, (x, y, 0.0), half, about_z(any_angle(rng)))
         return [things.skinned(body, size / 2)]
     x, y = _toward(angle, spread(rng, 11, 70))
     if pick < 0.65:
@@ -225,7 +211,7 @@ def _far(rng: Random, things: Things, angle: float) -> Thing:
         deep = rng.uniform(2, 7)
         high = spread(rng, 2, 14)
         half = (wide, deep, high + 1)
-        body = Primitive(s.BOX, (x, y, high - 1), half, about_z(rng.uniform(0, math.tau)))
+        body = Primitive(s.BOX, (x, y, high - 1), half, about_z(any_angle(rng)))
         return [things.skinned(body, spread(rng, 2, 9))]
     high = rng.uniform(1, 3)
     crown = things.texture()[0]
@@ -240,12 +226,12 @@ def _far(rng: Random, things: Things, angle: float) -> Thing:
     return tree
 
 
-def _objects(rng: Random, things: Things, count: int) -> Place:
+def _objects(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place:
     shapes = [_ground(things, spread(rng, 0.3, 1.5))]
     if rng.random() < 0.3:
         wall = _box((rng.uniform(1.5, 3), 0.0, 3.0), (0.1, 30.0, 4.0))
         wall = things.skinned(wall, spread(rng, 0.3, 1.5))
-        shapes.append(wall.moved((0.0, 0.0, 0.0), about_z(rng.uniform(0, math.tau))))
+        shapes.append(wall.moved((0.0, 0.0, 0.0), about_z(any_angle(rng))))
     level = wide = 0.0
     if rng.random() < 0.4:
         level = rng.uniform(0.02, 0.8)
@@ -262,14 +248,19 @@ def _objects(rng: Random, things: Things, count: int) -> Place:
             y = rng.gauss(0, 0.7)
         else:
             away = 0.5 * math.sqrt(rng.random())
-            x, y = _toward(rng.uniform(0, math.tau), away)
+            x, y = _toward(any_angle(rng), away)
             x += spot[0]
             y += spot[1]
         at = (x, y, level if math.hypot(x, y) < wide else 0.0)
         size = spread(rng, 0.1, 0.5)
-        shapes += placed(things.draw(), at, rng.uniform(0, math.tau), size, _level)
+        shapes += placed(things.draw(), at, any_angle(rng), size, _level)
     low = (-3.5, -3.5, level + 0.2)
     high = (3.5, 3.5, level + 3)
     eyes = (level + 0.25, level + 1.6)
     targets = _middles(shapes[fixed:])
     return Place("objects", shapes, fixed, low, high, eyes, targets, (0.6, 2.5), level + 2.5)
+
+
+PLACES = {"indoors": _indoors, "outdoors": _outdoors, "objects": _objects}
+"""By kind, what draws it with a number of things; terrains take one of the height maps."""
+SHARES = (0.45, 0.3, 0.25)

@@ -26,6 +26,11 @@ def spread(rng: Random, low: float, high: float) -> float:
     return low * (high / low) ** rng.random()
 
 
+def any_angle(rng: Random) -> float:
+    """Draw a direction, radians."""
+    return rng.uniform(0, math.tau)
+
+
 @dataclass(frozen=True)
 class Style:
     """What things are made of.
@@ -87,7 +92,7 @@ class Things:
     def _turn(self) -> Turn:
         if self.rng.random() < self.style.tilted:
             return any_turn(self.rng)
-        return about_z(self.rng.uniform(0, math.tau)) if self.rng.random() < 0.5 else UPRIGHT
+        return about_z(any_angle(self.rng)) if self.rng.random() < 0.5 else UPRIGHT
 
     def _primitive(self, center: Point, size: float) -> Primitive:
         rng = self.rng
