@@ -8,7 +8,6 @@ import math
 import re
 import tomllib
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple
@@ -90,9 +89,6 @@ Piece = list[Shape]
 Sizes = dict[str, Any]
 """Lengths in metres and indices of materials, by the names that `furniture.toml` gives them."""
 
-# The file says what its keys mean.
-_KINDS: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
-_MAKERS: dict[str, Any] = {"box": box, "cylinder": cylinder, "sphere": sphere}
 _ORNAMENTS = ("vase", "globe", "table_lamp", "pile", "cube")
 # what is named twice is drawn more often
 AGAINST_WALLS = (
@@ -105,24 +101,37 @@ LOOSE = ("balls", "chair", "crates", "plant", "floor_lamp", "round_table")
 _LEVEL = 0.38
 
 
-@cache
-def _terms(text: str) -> list[tuple[float, str]]:
+def _terms(value: float | str) -> float | list[tuple[float, str]]:
     """Return factors and names of a sum such as "h-0.3r"; a number alone has no name."""
-    found = re.findall(r"([+-]?)(?=[\d.a-z])([\d.]*)([a-z]*)", text)
+    if not isinstance(value, str):
+        return value
+    found = re.findall(r"([+-]?)(?=[\d.a-z])([\d.]*)([a-z]*)", value)
     return [(float(f"{sign}{factor or 1}"), name) for sign, factor, name in found]
 
 
-def _length(value: float | str, sizes: Sizes) -> float:
-    if not isinstance(value, str):
-        return value
-    return sum(factor * sizes.get(name, 1.0) for factor, name in _terms(value))
+def _lengths(values: list[Any], sizes: Sizes) -> list[float]:
+    return [
+        sum([factor * sizes.get(name, 1.0) for factor, name in value])
+        if isinstance(value, list)
+        else value
+        for value in values
+    ]
+
+
+# The file says what its keys mean; sums are read once, as rooms are drawn often.
+_KINDS: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
+_MAKERS: dict[str, Any] = {"box": box, "cylinder": cylinder, "sphere": sphere}
+for _kind in _KINDS.values():
+    for _row in _kind.setdefault("parts", []):
+        _row[:3] = _MAKERS[_row[0]], [*map(_terms, (*_row[1], *_row[2]))]
+    for _row in _kind.setdefault("tops", []):
+        _row[1:] = map(_terms, _row[1:])
 
 
 def _part(row: list[Any], sizes: Sizes) -> Shape:
     """Return a part of a piece by its row in the file."""
-    shape, at, size, material, *turn = row
-    numbers = [_length(value, sizes) for value in (*at, *size)]
-    part = _MAKERS[shape](*numbers, sizes[material])
+    make, lengths, material, *turn = row
+    part = make(*_lengths(lengths, sizes), sizes[material])
     return part._replace(turn=sizes[turn[0]]) if turn else part
 
 
@@ -139,15 +148,15 @@ class Furniture:
         for size, how in kind.get("draws", {}).items():
             if size not in sizes:
                 sizes[size] = self._drawn(how)
-        piece = [_part(row, sizes) for row in kind.get("parts", [])]
+        piece = [_part(row, sizes) for row in kind["parts"]]
         if "some" in kind:
             for _ in range(self.rng.choice(kind["some"]["count"])):
                 piece += self.piece(kind["some"]["piece"], **sizes)
         if name in _MORE:
             piece += _MORE[name](self, sizes)
-        for chance, *at in kind.get("tops", []):
+        for chance, *at in kind["tops"]:
             if chance == 1 or self.rng.random() < chance:
-                piece += self.ornament(*[_length(value, sizes) for value in at])
+                piece += self.ornament(*_lengths(at, sizes))
         return piece
 
     def ornament(self, x: float, y: float, z: float) -> Piece:
