@@ -131,7 +131,7 @@ def show(result: Reconstruction, console: Console) -> None:
             highlight=False,
         )
     if scale := result.scale:
-        found = f"{scale.text}, in {scale.seconds:.1f} s; --scale FACTOR sets another"
+        found = f"{scale.text}; --scale FACTOR sets another"
         console.print(found, soft_wrap=True, highlight=False, markup=False)
     for remark in result.remarks:
         console.print(remark, soft_wrap=True, highlight=False, markup=False)

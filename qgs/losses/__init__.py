@@ -1,8 +1,7 @@
 """What training minimises."""
 
 from qgs.losses.depth import DepthSurface
-from qgs.losses.opacity import Mask, Opacity, mean_of_gaussians
-from qgs.losses.photometric import Photometric
+from qgs.losses.photometric import Mask, Opacity, Photometric, mean_of_gaussians
 from qgs.losses.visibility import Visibility, VisibilityOptions, view_visibility
 
 COMPONENTS = (Photometric, Visibility, Mask, Opacity, DepthSurface)

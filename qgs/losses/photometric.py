@@ -1,4 +1,4 @@
-"""`qgs/photometric`: MSE, L1 and SSIM of rendered against true images (TokenGS, LocusGS)."""
+"""Losses of images and opacities: `photometric` (TokenGS, LocusGS), `mask`, `opacity` (TokenGS)."""
 
 from collections.abc import Iterable, Iterator
 
@@ -7,7 +7,7 @@ from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import Loss, Problem, RecipeContext
-from qgs.geometry.precision import full_precision
+from qgs.geometry.precision import at_least_float32, full_precision
 from qgs.similarity import WINDOW, Padding, mean_ssim
 from qgs.types import LayerPrediction, Rendering, Views
 
@@ -57,6 +57,52 @@ class Photometric(Loss):
         return terms
 
 
+class Opacity(Loss):
+    """Mean over Gaussians of -ln(opacity + eps) (TokenGS release, weight 0 in its recipes)."""
+
+    name = "opacity"
+    renderings = "none"
+
+    class Config(Loss.Config):
+        weight: float = Field(default=0.1, ge=0)
+        """Factor of the term in the objective."""
+        eps: float = Field(default=1e-6, gt=0)
+        """Added to the opacity, so that the logarithm is finite (TokenGS release)."""
+
+    config: Config
+
+    def term(
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
+    ) -> Tensor:
+        # The logarithm of a half precision number near 0 jumps.
+        opacities = at_least_float32(prediction.gaussians.opacities)
+        return -mean_of_gaussians((opacities + self.config.eps).log(), prediction)
+
+
+class Mask(Loss):
+    """Mean of (alpha - mask)^2 over all pixels (TokenGS, LocusGS releases; no published recipe)."""
+
+    name = "mask"
+    renderings = "each"
+
+    class Config(Loss.Config):
+        weight: float = Field(default=0.5, ge=0)
+        """Factor of the term in the objective."""
+
+    config: Config
+
+    def term(
+        self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
+    ) -> Tensor:
+        """Raises ValueError for views without masks."""
+        if target.masks is None:
+            raise ValueError(
+                "the loss qgs/mask needs views with masks and these have none; "
+                "choose data with masks, or take the loss out of the recipe"
+            )
+        return mean_squared_error(rendering.alpha, target.masks)
+
+
 def too_small(context: RecipeContext, side: int, option: str, measure: str) -> Iterator[Problem]:
     """A problem of `option` where the data's images have a side below `side` pixels."""
     if context.image_size and min(context.image_size) < side:
@@ -69,3 +115,14 @@ def too_small(context: RecipeContext, side: int, option: str, measure: str) -> I
 def mean_squared_error(images: Tensor, truth: Tensor) -> Tensor:
     """Mean over everything of (images - truth)^2."""
     return F.mse_loss(images, truth)
+
+
+def mean_of_gaussians(values: Tensor, prediction: LayerPrediction) -> Tensor:
+    """Values (B, G), averaged over the Gaussians of queries that exist, then over scenes; 0-d."""
+    values = at_least_float32(values)
+    mask = prediction.state.mask
+    if mask is None:
+        return values.mean()
+    # Scenes count alike, however many queries they have.
+    there = mask.repeat_interleave(values.shape[1] // mask.shape[1], 1)
+    return ((values * there).sum(1) / there.sum(1).clamp_min(1)).mean()

@@ -10,7 +10,7 @@ from torch import Tensor
 from qgs.contracts import Loss, Problem, RecipeContext, without_effect
 from qgs.geometry.constants import constant
 from qgs.geometry.precision import full_precision
-from qgs.losses.opacity import mean_of_gaussians
+from qgs.losses.photometric import mean_of_gaussians
 from qgs.types import Cameras, LayerPrediction, Rendering, Views
 
 _TINY_Z = 1e-8

@@ -6,9 +6,8 @@ too small, surfaces close to the cameras render them well, so further photos are
 """
 
 import math
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -62,7 +61,6 @@ class FoundScale:
     further: Frames
     names: Sequence[str]
     tried: Sequence[tuple[float, float]]
-    seconds: float = field(compare=False)
 
     @property
     def poor(self) -> str:
@@ -137,7 +135,6 @@ def find_scale(
     factors that bring what the cameras look at nearer than in training lose PENALTY. Where the
     model is; restores its mode.
     """
-    began = time.perf_counter()
     training = model.training
     given = tuple(inputs)
     further = further_photos(scene, inputs, compared)
@@ -167,7 +164,6 @@ def find_scale(
         further=further,
         names=[scene.frame_name(frame) for frame in further],
         tried=sorted((trial.factor(place), trial.psnr(place)) for place in trial.tried),
-        seconds=time.perf_counter() - began,
     )
 
 

@@ -84,7 +84,7 @@ def test_a_scale_can_be_set(room, tmp_path):
 
 
 def test_words_of_several_windows():
-    one = scale.FoundScale(0.4, 20.0, (3,), ["3.png"], [(0.4, 20.0)], 0.5)
+    one = scale.FoundScale(0.4, 20.0, (3,), ["3.png"], [(0.4, 20.0)])
     bad = replace(one, factor=0.6, psnr=12.3)
     assert "0.4 to 0.6" in summary([one, bad])
     assert "3.png" in summary([one])

@@ -28,7 +28,7 @@ def summary(found: Collection[FoundScale]) -> str:
         )
         if poor := sum(bool(scale.poor) for scale in found):
             text += f", no scale fits {counted(poor, 'window')}"
-    return f"{text}, in {sum(scale.seconds for scale in found):.1f} s; --scale sets another"
+    return f"{text}; --scale sets another"
 
 
 def scale_remarks(models: Sequence[Model]) -> Iterator[str]:
