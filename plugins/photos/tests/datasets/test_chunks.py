@@ -3,7 +3,6 @@ import math
 import os
 import pickle  # noqa: TID251  as multiprocessing does
 import zipfile
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
@@ -144,15 +143,6 @@ def test_scenes_travel_to_other_processes_without_open_files(tmp_path):
     source, scene = pickle.loads(data)  # noqa: S301
     for copy in (scene, source.scenes("train")[0]):
         assert torch.equal(copy.images([1]), before)
-
-
-def test_threads_share_few_open_chunks(tmp_path):
-    write(tmp_path / "train", **{f"c{i}": [record(f"s{i}", 2)] for i in range(8)})
-    scenes = opened(tmp_path).scenes("train")
-    with ThreadPoolExecutor(4) as pool:
-        images = list(pool.map(lambda k: scenes[k % 8].images([1])[0, 0, 0, 0] * 255, range(64)))
-    assert images == pytest.approx([10] * 64)
-    assert len(scenes[0]._chunks._kept) == 4
 
 
 def test_masks_names_sizes_and_backgrounds(tmp_path):

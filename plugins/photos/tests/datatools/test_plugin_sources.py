@@ -6,7 +6,6 @@ import numpy as np
 import photo_formats
 import pytest
 import tape_source
-import torch
 from commands import run_qgs
 from qgs_photos.datasets.chunks import ChunksSource
 from qgs_photos.datatools import sources
@@ -72,13 +71,6 @@ def test_a_source_that_fails_is_told_and_the_others_go_on(tapes, monkeypatch):
         assert f"error: {line}" in output
         assert re.search("b +tapes/tape +6 +6 +0 ", output)
         assert "2 scenes, 1 error" in output
-
-
-def test_masks_are_looked_at(tapes, monkeypatch):
-    monkeypatch.setattr(Tape, "masks", lambda self, frames: torch.ones(len(frames), 1, 8, 8))
-    output = run(f"check {tapes} --geometry 0").output
-    reason = "its mask (1, 1, 8, 8) is not of shape (1, 1, 16, 16) and in [0, 1]: replace the mask"
-    assert f"error: b, frames 0-5 (0 to 5): {reason}" in output
 
 
 def test_pack(tapes):

@@ -4,6 +4,7 @@ import struct
 from dataclasses import dataclass
 
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 from upath import UPath
 
@@ -27,10 +28,8 @@ from qgs_photos.refine.sweeping import swept
 ENOUGH = 4
 """Photos from which on a start at their pixels is as good as a model's, see docs/refine.md."""
 _OPACITY = 0.1
-# Nearest points that give a size, of this many drawn ones.
-_NEIGHBOURS, _COMPARED = 3, 8192
-# Points at once, so that memory stays within 0.1 GB.
-_AT_ONCE = 1024
+# Nearest points that give a size.
+_NEIGHBOURS = 3
 # Number, position, colour, error, length of the track.
 _FIXED = struct.Struct("<Q3d3BdQ")
 
@@ -167,13 +166,10 @@ def from_points(
     drawn = torch.randperm(len(means), generator=torch.Generator().manual_seed(seed))[:most]
     w2c = torch.linalg.inv(reference.double())
     means = ((means[drawn] @ w2c[:3, :3].T + w2c[:3, 3]) * scale.double()).float()
-    few = means[:_COMPARED]
-    nearest = [
-        torch.cdist(part, few).topk(min(_NEIGHBOURS + 1, len(few)), largest=False).values
-        for part in means.split(_AT_ONCE)
-    ]
-    # the nearest is the point itself; gaps on a surface shrink with the root of the number
-    gaps = torch.cat(nearest)[:, 1:].mean(1) * (len(few) / len(means)) ** 0.5
+    # the nearest is the point itself
+    near, _ = KDTree(means.numpy()).query(means.numpy(), _NEIGHBOURS + 1)
+    gaps = torch.from_numpy(near).float()[:, 1:].mean(1)
+    gaps = gaps.where(gaps.isfinite(), torch.nan)
     # a point that stands alone, or on others, is as large as the usual one
     middle = gaps.nanmedian().nan_to_num(1.0)
     gaps = gaps.nan_to_num(float(middle)).clamp(0.1 * middle, 5 * middle).clamp_min(1e-6)
