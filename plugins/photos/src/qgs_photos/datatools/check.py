@@ -74,7 +74,7 @@ def check(
         most = max(PHOTOS // len(judged), FEWEST) if number in judged else 0
         report = check_scene(candidate, options, most)
         scenes.append(report)
-        held[report.scene].append(report)
+        held[report.name].append(report)
     for file in dict.fromkeys(file.resolve() for file in (*indices, *found_indices(path))):
         general += index_findings(file, held)
         notes.append(f"compared with the index {file}")
@@ -120,7 +120,7 @@ def check_scene(candidate: Candidate, options: Options, most_photos: int) -> Sce
 
     most_photos: that are matched with each other, to judge its cameras.
     """
-    report = SceneReport(candidate.name, candidate.scene, candidate.kind, candidate.split)
+    report = SceneReport(candidate.name, candidate.kind, candidate.split)
     try:
         photos = candidate.photos()
         missing = candidate.missing()

@@ -92,7 +92,7 @@ def _file_scenes(split: str, file: UPath, found: dict[str, str]) -> Iterator[Can
             found[key] = file.name
             scenes += 1
             photos = partial(_photos, file, place)
-            yield Candidate(name=key, scene=key, kind="chunks", photos=photos, split=split)
+            yield Candidate(key, "chunks", photos, split)
     if scenes < len(entries) or not entries:
         reason = f"{scenes} of its {len(entries)} entries are mappings with a 'key' of their own"
         yield Finding(label, reason, _REPACK)

@@ -94,7 +94,6 @@ class SceneReport:
     """
 
     name: str
-    scene: str
     kind: str
     split: str = ""
     listed: int = 0

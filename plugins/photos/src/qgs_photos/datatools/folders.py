@@ -20,12 +20,12 @@ from qgs_photos.datatools.photos import Candidate, Photo
 def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Candidate | Finding]:
     """Yield scenes of a format in `root`: itself, its folders, or those in train and test."""
     if formats_of(root):
-        yield from _listings(root, folder_name(root), wanted, images)
+        yield from _listed(root, folder_name(root), wanted, images)
         return
     inside = sorted((item for item in root.iterdir() if item.is_dir()), key=lambda item: item.name)
     scenes = [item for item in inside if formats_of(item)]
     for folder in scenes:
-        yield from _listings(folder, folder.name, wanted, images)
+        yield from _listed(folder, folder.name, wanted, images)
     for folder in inside:
         if folder in scenes or folder.name.startswith("."):
             continue
@@ -37,21 +37,19 @@ def photo_folders(root: UPath, wanted: str, images: str | None) -> Iterator[Cand
             yield from photo_folders(folder, wanted, images)
 
 
-def _listings(folder: UPath, name: str, wanted: str, images: str | None) -> Iterator[Candidate]:
-    """Yield a candidate for each of the listings that a folder holds, or for the wanted one."""
-    held = [kind for kind in formats_of(folder) if wanted in ("auto", kind)]
-    for kind in held:
-        label = f"{name} ({kind})" if len(held) > 1 else name
-        photos = partial(_photos, folder, kind, images)
-        yield Candidate(name=label, scene=name, kind=kind, photos=photos)
+def _listed(folder: UPath, name: str, wanted: str, images: str | None) -> Iterator[Candidate]:
+    """Yield the scene that a folder lists in the wanted format, or in the first that it holds."""
+    held = formats_of(folder)
+    kind = held[0] if wanted == "auto" else wanted
+    if kind in held:
+        yield Candidate(name, kind, partial(_photos, folder, kind, images))
 
 
 def dl3dv_scenes(path: UPath, images: str | None) -> Iterator[Candidate]:
     """Yield the scenes below `path`. Raises FileNotFoundError when there is none."""
     for name, place in find_scenes(path).items():
         # an archive is opened when its scene's turn comes
-        photos = partial(_archived_photos, place, images)
-        yield Candidate(name=name, scene=name, kind="dl3dv", photos=photos)
+        yield Candidate(name, "dl3dv", partial(_archived_photos, place, images))
 
 
 def _archived_photos(place: UPath, images: str | None) -> list[Photo]:

@@ -51,13 +51,12 @@ class Photo:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A scene to check. scene: its name in indices. photos: raises ValueError or OSError.
+    """A scene to check. photos: raises ValueError or OSError.
 
     missing: names of listed images that do not exist and are none of `photos`; raises the same.
     """
 
     name: str
-    scene: str
     kind: str
     photos: Callable[[], Sequence[Photo]]
     split: str = ""

@@ -67,14 +67,9 @@ def source_scenes(kind: str, path: UPath, images: str | None) -> Iterator[Candid
     for split in reversed(get_args(Split)):
         for place, name in enumerate(opened.names(split)):
             if name not in known:
-                yield Candidate(
-                    name=name,
-                    scene=name,
-                    kind=kind,
-                    photos=partial(_photos, opened, split, place),
-                    split=split,
-                    missing=partial(_missing, opened, split, place),
-                )
+                photos = partial(_photos, opened, split, place)
+                missing = partial(_missing, opened, split, place)
+                yield Candidate(name, kind, photos, split, missing)
             known.add(name)
 
 

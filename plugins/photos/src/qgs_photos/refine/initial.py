@@ -155,7 +155,7 @@ def _binary(content: bytes) -> list[list[float]]:
 
 @torch.no_grad()
 def from_points(
-    points: tuple[Tensor, Tensor], world: tuple[Tensor, Tensor], most: int, seed: int = 0
+    points: tuple[Tensor, Tensor], world: tuple[Tensor, Tensor], most: int
 ) -> Gaussians:
     """Return at most `most` Gaussians (1, G) at points, as large as the gaps to their neighbours.
 
@@ -163,7 +163,7 @@ def from_points(
     """
     means, colors = points
     reference, scale = world
-    drawn = torch.randperm(len(means), generator=torch.Generator().manual_seed(seed))[:most]
+    drawn = torch.randperm(len(means), generator=torch.Generator().manual_seed(0))[:most]
     w2c = torch.linalg.inv(reference.double())
     means = ((means[drawn] @ w2c[:3, :3].T + w2c[:3, 3]) * scale.double()).float()
     # the nearest is the point itself
