@@ -5,15 +5,12 @@ from __future__ import annotations
 from upath import UPath
 
 from qgs.data.photos.checks import refuse_fatal_problems, refuse_outside
-from qgs.data.photos.colmap import Colmap
 from qgs.data.photos.nerfstudio import Nerfstudio
 from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, existing
 from qgs.extensions import ExtensionError, installed, load
 from qgs.paths import is_local, listing
 from qgs.wording import listed, warn_once
 
-READERS: tuple[type[PhotoReader], ...] = (Nerfstudio, Colmap)
-"""The built-in formats. Where a folder holds several listings, the first of this order is read."""
 GROUP = "qgs.photo_readers"
 """Entry point group of further readers: format name = module:subclass of `PhotoReader`."""
 
@@ -24,12 +21,12 @@ _SMALLEST = (
 
 
 def readers() -> dict[str, type[PhotoReader]]:
-    """Return readers by format name: READERS, then those of installed distributions.
+    """Return readers by format name: `Nerfstudio`, then those of installed distributions.
 
-    The latter come last, so that installing one changes no folder that could be read before. One
-    that cannot be loaded is left out and logged.
+    Where a folder holds several listings, the first of this order is read. One that cannot be
+    loaded is left out and logged.
     """
-    found = {reader.name: reader for reader in READERS}
+    found: dict[str, type[PhotoReader]] = {Nerfstudio.name: Nerfstudio}
     for entry in installed(GROUP):
         # A broken distribution must not hinder folders of other formats.
         try:
@@ -78,7 +75,8 @@ def read_listing(folder: UPath, format: str = "auto", images: str | None = None)
         inside = listed(sorted(item.name for item in folder.iterdir()))
         raise FileNotFoundError(
             f"{folder} lists no cameras; it holds {inside or 'nothing'}. Make some by `qgs poses`, "
-            f"or give a folder that holds one of {listings}. A minimal transforms.json: {_SMALLEST}"
+            f"or give a folder that holds one of {listings}; query-gaussians-photos "
+            f"reads more, such as COLMAP's. A minimal transforms.json: {_SMALLEST}"
         )
     if format == "auto" and len(held) > 1:
         warn_once(

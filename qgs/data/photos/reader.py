@@ -71,7 +71,7 @@ class Listing:
 
 
 class PhotoReader(ABC):
-    """A format that lists posed photos; subclasses are listed in `qgs.data.photos.READERS`."""
+    """A format that lists posed photos; subclasses are entry points of `qgs.data.photos.GROUP`."""
 
     name: ClassVar[str]
     """What the option `format` calls it."""

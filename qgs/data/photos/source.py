@@ -47,8 +47,8 @@ class PhotosConfig(SceneSource.Config):
     relative to the working directory, or an fsspec URL. Photos without cameras and videos need
     `qgs poses` first."""
     format: str = "auto"
-    """How cameras are listed: nerfstudio, colmap, or a format of a plug-in; auto is the first that
-    a folder holds."""
+    """How cameras are listed: nerfstudio, or a format of a plug-in, such as colmap; auto is the
+    first that a folder holds."""
     images: str | None = None
     """Folder of photos to read instead of the listed one, such as images_4."""
     outside: bool = False

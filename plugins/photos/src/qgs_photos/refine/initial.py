@@ -14,13 +14,13 @@ from qgs.containers import concatenated
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.depth import scene_depth
 from qgs.data.photos import formats_of
-from qgs.data.photos.colmap import Colmap
 from qgs.data.photos.source import PhotoScene
 from qgs.data.samples import own_world
 from qgs.paths import read_file
 from qgs.recipe.registry import load_usable_plugins
 from qgs.reconstruction.reconstruct import reconstruct
 from qgs.types import Gaussians, Views
+from qgs_photos.datasets.colmap import Colmap
 from qgs_photos.refine.options import NONE, Options
 from qgs_photos.refine.scene_photos import TIMED, ScenePhotos
 from qgs_photos.refine.sweeping import swept

@@ -3,6 +3,7 @@
 import struct
 
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from numpy.testing import assert_allclose
@@ -13,8 +14,6 @@ from tables import must_refuse
 
 from qgs.data.photos import read_listing
 from qgs.paths import opened_path
-
-pycolmap = pytest.importorskip("pycolmap")
 
 SIZE = (60, 80)
 KINDS = ("text", "binary")
