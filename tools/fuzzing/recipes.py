@@ -15,10 +15,9 @@ from typing import Any
 from fuzzing.cases import TABLES, FaultError, Use, refused
 from qgs.contracts import MissingExtraError
 from qgs.recipe import PluginError, RecipeError, resolve
-from qgs.recipe.recipe import annotated
+from qgs.recipe.recipe import annotated, flat
 from qgs.recipe.registry import load_usable_plugins
 from qgs.recipe.slots import SLOTS
-from qgs.recipe.spell_out import flat
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 PARTS = ("finetune/dl3dv", "rooms/budget", "studies/")

@@ -6,7 +6,7 @@ import pytest
 import torch
 from qgs_locus.kernels import attention_choice
 from qgs_locus.kernels.attention_bias import biased_attention
-from qgs_locus.kernels.attention_choice import SHARE, attention_kernel, chosen_kernel
+from qgs_locus.kernels.attention_choice import SHARE, chosen_kernel
 from qgs_locus.ray_bias import RayBias
 
 
@@ -80,13 +80,3 @@ def test_on_a_cpu_blocks_are_taken_and_triton_is_refused(monkeypatch):
     assert chosen_kernel(q, bias, "auto") == "blocks"
     with pytest.raises(ValueError, match="a GPU"):
         biased_attention(q, q, q, bias, "triton")
-
-
-def test_a_kernel_is_forced_through_the_whole_model(chosen):
-    with attention_kernel("plain"):
-        assert chosen() == "plain"
-        assert chosen("blocks") == "blocks"
-        with attention_kernel("blocks"):
-            assert chosen() == "blocks"
-        assert chosen() == "plain"
-    assert chosen() == "triton"

@@ -83,8 +83,3 @@ def test_a_trained_locusgs_is_where_a_model_that_turns_can_start():
     photos = odd_views(2, 32, 40)
     theirs, ours = (model(photos).gaussians.means for model in (locus, turning))
     assert_close(ours, theirs)
-
-
-def test_weights_without_a_radius_are_refused():
-    with pytest.raises(ValueError, match=r"no `queries.raw_radius`.*`radius: true`"):
-        from_locus({"queries.center": torch.zeros(4, 3)})

@@ -1,26 +1,21 @@
 """Places in photos against loops over pixels, and against torch's own sampling."""
 
-import math
 from itertools import product
 
 import pytest
 import torch
 import torch.nn.functional as F
 import yaml
-from odd_views import odd_views
 from qgs_anchors.landmark.places import (
     aspect_of,
     colors_at,
     patch_centres,
-    rays_at,
     rows_in_square,
     rows_in_tile,
     sampled,
     spread,
 )
 from torch.testing import assert_close
-
-from qgs.geometry.rays import camera_rays
 
 GRID = (3, 4, 6)
 """Views, rows, columns."""
@@ -36,19 +31,6 @@ def test_bilinear_features_are_those_of_torch():
     at = 2 * place.view(100, 1, 1, 2) - 1
     expected = F.grid_sample(images, at, padding_mode="border", align_corners=False)
     assert_close(sampled(maps, GRID, view, place), expected.view(2, 50, 5))
-
-
-def test_rays_are_those_of_pixels():
-    cameras = odd_views(3, *SIZE).cameras.to(torch.float64)
-    view_N = torch.arange(3).repeat_interleave(math.prod(SIZE))
-    place = patch_centres(*SIZE, CPU).double().repeat(3, 1).expand(2, -1, -1)
-    origin, direction = rays_at(cameras, view_N, place)
-    origins, directions = (x.flatten(1, 3) for x in camera_rays(cameras))
-    assert_close(origin, origins)
-    depth = (direction * cameras.c2w[:, view_N, :3, 2]).sum(-1)
-    found = F.normalize(direction, dim=-1), depth
-    expected = directions, torch.ones_like(depth)
-    assert_close(found, expected, rtol=0, atol=1e-6)  # rotations are float32
 
 
 def test_points_are_spread_evenly_over_all_photos():

@@ -75,17 +75,6 @@ def test_rounds_run_the_last_layers_on_the_first_memory():
     assert not torch.allclose(found.layers[3].gaussians.means, found.gaussians.means)
 
 
-@torch.no_grad()
-def test_a_built_model_makes_other_numbers_of_rounds():
-    model = built()
-    given = views()
-    for rounds in (0, 1, 4):
-        model.feedback.rounds = rounds
-        assert list(model(given).layers) == [3 + 2 * n for n in range(rounds + 1)]
-        with pytest.raises(ValueError, match=f"layers 1..{3 + 2 * rounds}"):
-            model(given, layers=[4 + 2 * rounds])
-
-
 def test_an_evaluation_sets_the_number_of_rounds(tmp_path):
     """The scores of N rounds are those of a model whose recipe has N."""
     rooms = (

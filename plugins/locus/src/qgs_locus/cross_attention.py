@@ -30,7 +30,7 @@ from qgs_locus.fields import (
     support_radius,
 )
 from qgs_locus.kernels.attention_bias import AttentionBias, biased_attention
-from qgs_locus.ray_bias import RayBias, dense_bias, ray_tokens
+from qgs_locus.ray_bias import RayBias, ray_tokens
 
 
 class RayBiasedCrossAttention(CrossAttention):
@@ -101,7 +101,7 @@ class RayBiasedCrossAttention(CrossAttention):
     def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias:
         """gamma b, of the state before this layer."""
         config = self.config
-        eps = self.config.direction_eps
+        eps = config.direction_eps
         # The rays of a scene are the same in all layers.
         rays_B6M = memory.once(
             f"locus.ray_tokens.{eps:g}", lambda: ray_tokens(memory["patch_rays"], eps)
@@ -121,15 +121,5 @@ class RayBiasedCrossAttention(CrossAttention):
     def explain(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> AttentionWeights:
         # Norms are over channels, so choosing queries after the projection is exact.
         q_BhQd = self.core.project(state.features)[:, :, queries]
-        bias_BQM = self.explained_bias(state, memory, queries)
+        bias_BQM = self.bias(state, memory).dense(queries)
         return attention_weights(q_BhQd, memory["keys"], bias_BQM[:, None])
-
-    def explained_bias(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> Tensor:
-        """gamma b (B, Q, M) of some queries, by the formula as it is written."""
-        sigma_sq = self.sigma_sq(state)
-        config = self.config
-        chosen = sigma_sq[:, queries] if isinstance(sigma_sq, Tensor) else sigma_sq
-        # Dense: pictures ask for few queries, and the text of the formula is easiest to trust.
-        rays = memory["patch_rays"]
-        limits = (config.bias_min, config.direction_eps)
-        return self.gamma * dense_bias(state[CENTER][:, queries], chosen, rays, *limits)

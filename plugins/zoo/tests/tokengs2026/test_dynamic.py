@@ -95,15 +95,6 @@ def test_what_reads_times_is_refused_beside_data_that_tell_none():
     }
 
 
-def test_views_keep_the_time_that_is_asked_for():
-    both = views(torch.tensor([[0.1, 0.9]] * 2), torch.zeros(2, 1))
-    chosen = both.select([1])
-    assert torch.equal(chosen.times, both.times[:, 1:])
-    assert chosen.target_time is both.target_time
-    with pytest.raises(ValueError, match=r"Views.times must have shape \(2, 2\), got \(2, 3\)"):
-        views(torch.zeros(2, 3))
-
-
 def test_the_objective_judges_dynamic_gaussians_again(model):
     gaussians = model(INPUTS).gaussians[:, 4 * 2 :]
     rendering = model.render(gaussians, TARGETS.cameras)

@@ -77,14 +77,9 @@ def from_locus(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
     A radius becomes three equal ones, with equal steps in the refinement; rotations are the
     identity. A model with `rotation: false` computes what LocusGS does. The result has no weights
-    of a refinement of rotations (load with `strict=False`). Raises ValueError for weights without
+    of a refinement of rotations (load with `strict=False`). Raises KeyError for weights without
     radii.
     """
-    if "queries.raw_radius" not in weights:
-        raise ValueError(
-            "there is no `queries.raw_radius`: the weights are of no LocusGS whose anchors have a "
-            "radius; give the state dict of a model with `locus/anchored` and `radius: true`"
-        )
     converted = {name: _tripled(name, values) for name, values in weights.items()}
     converted["queries.raw_radii"] = converted.pop("queries.raw_radius")
     # A ball has no orientation, so any rotation would do.

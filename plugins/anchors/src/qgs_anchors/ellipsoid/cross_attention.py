@@ -39,6 +39,3 @@ class EllipsoidCrossAttention(RayBiasedCrossAttention):
         )
         place = state[CENTER], anchor_rotation(state[ROTATION]), sigma_sq_BN3
         return EllipsoidBias.of(*place, tokens_B9M, config.bias_min, self.gamma)
-
-    def explained_bias(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> Tensor:
-        return self.bias(state, memory).dense(queries)

@@ -8,8 +8,6 @@ choice depends on sizes alone, so that all layers, steps and processes of a trai
 
 import logging
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -26,25 +24,11 @@ AttentionKernel: TypeAlias = Literal["auto", "plain", "blocks", "triton"]
 
 SHARE = 16
 
-_forced: list[AttentionKernel] = []
-
-
-@contextmanager
-def attention_kernel(kernel: AttentionKernel) -> Iterator[None]:
-    """What computes attention that leaves it open ("auto"), in all threads: to measure models."""
-    _forced.append(kernel)
-    try:
-        yield
-    finally:
-        _forced.pop()
-
 
 def chosen_kernel(
     q_BhNd: Tensor, bias: "AttentionBias", kernel: AttentionKernel
 ) -> AttentionKernel:
     """One that is not "auto". ValueError for "triton" where it cannot compute this."""
-    # Measurements force a kernel from outside, so that models need no option for it.
-    kernel = _forced[-1] if kernel == "auto" and _forced else kernel
     if kernel == "triton" and not fits_triton(q_BhNd, bias):
         raise ValueError(
             "Triton kernels need triton 3.5, a GPU, LocusGS's bias, tokens "
