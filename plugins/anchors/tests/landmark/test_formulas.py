@@ -4,10 +4,9 @@ import math
 
 import torch
 import torch.nn.functional as F
-from qgs_anchors.landmark.footprint import ColoredHead, FootprintCenters
+from qgs_anchors.landmark.footprint import ColoredHead, FootprintCenters, FramedRefinement
 from qgs_anchors.landmark.neighbours import NeighbourAttention, nearest
 from qgs_anchors.landmark.observed import ObservedQueries
-from qgs_anchors.landmark.refinement import FramedRefinement
 from qgs_anchors.landmark.rendered import RenderedFeedback
 from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
 from qgs_locus.refinement import AnchorRefinement

@@ -2,8 +2,7 @@
 
 import torch
 import torch.nn.functional as F
-from qgs_zoo.c3g.head import C3GHead
-from qgs_zoo.c3g.joint import JointLayer
+from qgs_zoo.c3g.joint import C3GHead, JointLayer
 from small_parts import DIMS, attended, made, shaken
 from torch.testing import assert_close
 

@@ -6,8 +6,14 @@ import pytest
 import torch
 import torch.nn.functional as F
 from odd_views import odd_views
-from qgs_zoo.gslrm.encoder import Transformer
-from qgs_zoo.gslrm.pixels import PATCH, AlongRays, PixelHead, PixelQueries, patch_rays_at
+from qgs_zoo.gslrm.pixels import (
+    PATCH,
+    AlongRays,
+    PixelHead,
+    PixelQueries,
+    Transformer,
+    patch_rays_at,
+)
 from qgs_zoo.parts import pixel_rays
 from refusals import refused
 from small_parts import attended, made

@@ -1,10 +1,9 @@
 """Landmark for qgs: LocusGS whose anchors start at what the photos see."""
 
 from qgs.contracts import Plugin
-from qgs_anchors.landmark.footprint import ColoredHead, FootprintCenters
+from qgs_anchors.landmark.footprint import ColoredHead, FootprintCenters, FramedRefinement
 from qgs_anchors.landmark.neighbours import NeighbourAttention
 from qgs_anchors.landmark.observed import ObservedQueries
-from qgs_anchors.landmark.refinement import FramedRefinement
 from qgs_anchors.landmark.rendered import RenderedFeedback
 
 plugin = Plugin(

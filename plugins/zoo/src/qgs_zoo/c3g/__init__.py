@@ -1,8 +1,7 @@
 """C3G for qgs: image tokens and queries attend to each other, one Gaussian per query."""
 
 from qgs.contracts import Plugin
-from qgs_zoo.c3g.head import C3GHead
-from qgs_zoo.c3g.joint import JointLayer
+from qgs_zoo.c3g.joint import C3GHead, JointLayer
 from qgs_zoo.c3g.vggt import VggtFeatures
 
 plugin = Plugin(

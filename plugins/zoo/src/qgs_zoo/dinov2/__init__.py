@@ -1,8 +1,7 @@
 """DINOv2 for qgs: its vision transformer, and an encoder that puts it before any queries."""
 
 from qgs.contracts import Plugin
-from qgs_zoo.dinov2.encoder import DinoMultiViewViT
-from qgs_zoo.dinov2.vit import VitConfig
+from qgs_zoo.dinov2.vit import DinoMultiViewViT, VitConfig
 
 _SMALL = VitConfig(width=32, depth=2, heads=2)
 

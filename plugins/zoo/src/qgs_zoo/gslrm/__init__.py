@@ -1,8 +1,7 @@
 """GS-LRM for qgs: a transformer over the tokens of all photos, one Gaussian per pixel."""
 
 from qgs.contracts import Plugin
-from qgs_zoo.gslrm.encoder import Transformer
-from qgs_zoo.gslrm.pixels import AlongRays, PixelHead, PixelQueries
+from qgs_zoo.gslrm.pixels import AlongRays, PixelHead, PixelQueries, Transformer
 
 plugin = Plugin(
     name="gslrm",
