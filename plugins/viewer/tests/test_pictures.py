@@ -30,27 +30,12 @@ def test_an_outline_touches_the_outermost_of_the_projected_surface_points(camera
         )
 
 
-def test_supports_around_or_behind_the_camera_have_no_outline(cameras):
-    centers = torch.tensor([[[0.0, 0.0, 0.1], [0.0, 0.0, -2.0], [0.0, 0.0, 2.0]]])
-    support = SpatialSupport(centers, torch.eye(3).expand(1, 3, 3, 3) / 2)
-    outlines = [queries.outline(support, query, cameras[:, :1]) for query in range(3)]
-    assert outlines[:2] == [None, None]
-    assert outlines[2].isfinite().all()
-
-
 def test_a_centre_is_drawn_where_it_lies_though_its_support_reaches_behind_the_camera(cameras):
     photo = np.full((128, 128, 3), 255, np.uint8)  # of 32 pixels, focal length 32
     support = SpatialSupport(torch.tensor([[[0.1, 0.0, 0.5]]]), torch.eye(3)[None, None])
     drawn = queries.support_picture(photo, support, cameras[:, :1], {0: CATEGORICAL[0]})
     places = np.argwhere(drawn[..., 0] != drawn[0, 0, 0])
     assert places.mean(0) == pytest.approx((63.5, 89.1), abs=1)
-
-
-def test_rendered_weights_add_up_to_the_coverage(model, gaussians, cameras):
-    weights = queries.rendered_weights(model, gaussians, cameras)
-    assert weights.shape == (1, gaussians.count)
-    coverage = model.render(gaussians, cameras).alpha.sum()
-    torch.testing.assert_close(weights.sum(), coverage, rtol=1e-4, atol=0)
 
 
 def test_notable_queries_are_heavy_well_inside_the_picture_apart_and_small(

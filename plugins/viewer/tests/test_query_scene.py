@@ -5,7 +5,7 @@ import pytest
 import torch
 from numpy.testing import assert_allclose
 from qgs_viewer.drawing import FAINT, Choice, painted, query_color
-from qgs_viewer.page import first_eye, quiet_server, stand, up_of
+from qgs_viewer.page import first_eye, up_of
 from qgs_viewer.placement import Placement
 from qgs_viewer.queries import attention_pictures_of
 from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
@@ -127,8 +127,5 @@ def test_up_is_that_of_the_cameras():
         up = up_of(scene)
         assert up[2] > 0.95
         assert up.norm() == pytest.approx(1)
-    with quiet_server() as server:
-        stand(server, few)
-        assert server.initial_camera.up[2] > 0.95
     eye, target = first_eye(few)
     assert (target - eye) @ ([0, 0, 5] - eye) > 0

@@ -1,19 +1,16 @@
 """The scale of photos in another unit is found, and is the same in all commands."""
 
 import json
-from dataclasses import replace
 
 import pytest
 from commands import done
 from photo_formats import PhotoSet, write_nerfstudio
 from qgs_viewer.comparison import open_models
 from qgs_viewer.opening import open_source
-from qgs_viewer.remarks import summary
 
 import qgs
 from qgs.drawing.images import rgb_picture, write_png
 from qgs.recipe import resolve
-from qgs.reconstruction import scale
 
 MODEL = "rooms/tokengs-64"
 UNIT = 7.0
@@ -56,19 +53,6 @@ def test_a_room_in_another_unit_has_its_own_scale_in_all_commands(room, tmp_path
     assert not found.poor
 
 
-def test_all_commands_choose_the_same_inputs_of_photos_that_the_model_knows(room, tmp_path):
-    name = str(tmp_path / "own.safetensors")
-    data = f"data={{type: qgs/photos, path: {room}, holdout: 4}}"
-    qgs.save(qgs.compose(qgs.load(MODEL).recipe, [data]), name)
-    sample = qgs.reconstruct(qgs.load(name), room).sample
-    opened = open_source(name, photos=str(room))
-    (result,) = open_models([name], str(room), "cpu")
-    inputs, compared = result.evaluation.scores[0].views[0]
-    assert tuple(opened.frames) == sample.input_frames == inputs
-    assert sample.target_frames == compared
-    assert {*compared} <= {2, 6, 10}
-
-
 def test_a_scale_can_be_set(room, tmp_path):
     source = open_source(MODEL, photos=str(room), overrides=["views.scale=auto"])
     assert source.views.scale == "auto"
@@ -81,12 +65,3 @@ def test_a_scale_can_be_set(room, tmp_path):
     ):
         with pytest.raises(ValueError, match="--scale"):
             done(*words, "--scale", "0")
-
-
-def test_words_of_several_windows():
-    one = scale.FoundScale(0.4, 20.0, (3,), ["3.png"], [(0.4, 20.0)])
-    bad = replace(one, factor=0.6, psnr=12.3)
-    assert "0.4 to 0.6" in summary([one, bad])
-    assert "3.png" in summary([one])
-    assert "12.3 dB" in bad.poor
-    assert not one.poor

@@ -221,7 +221,7 @@ def read_finished(folder: Path) -> tuple[QueryScene, FinishedScene, Mapping[str,
         inputs = tuple(place for place, view in enumerate(views) if view["kind"] == "input")
         # a missing picture fails now, not when a user asks for another input
         scene.images(range(len(views)))
-        red, green, blue = (min(max(float(c), 0), 1) for c in record.get("background") or NEUTRAL)
+        red, green, blue = map(float, record.get("background") or NEUTRAL)
         photos = views_in((torch.eye(4).double(), torch.ones(())), scene, inputs)
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise ValueError(

@@ -13,8 +13,6 @@ from qgs.wording import counted, listed
 if TYPE_CHECKING:
     from qgs_viewer.comparison import Model
 
-AUTO_SCALE = "Each scene is scaled until what its cameras look at is 1 away (views.scale: auto)."
-
 
 def summary(found: Collection[FoundScale]) -> str:
     """Return one line on the scales of one or several windows."""
@@ -36,8 +34,6 @@ def scale_remarks(models: Sequence[Model]) -> Iterator[str]:
     for model in models:
         if found := model.search.found.values():
             yield f"{model.name}: {summary(found)}."
-    if models[0].recipe.views.scale == "auto":
-        yield AUTO_SCALE
 
 
 def remarks(models: Sequence[Model]) -> list[str]:

@@ -72,18 +72,8 @@ def show_scores(comparison: Comparison, console: Console) -> None:
     for name, row in score_rows(comparison.models).items():
         cells = [f"[green]{cell}[/green]" if best else cell for cell, best in row]
         lines.append([escape(name), *cells])
-    print_table(console, f"{comparison.scenes}, best in green", lines, box=box.SIMPLE_HEAD)
-
-
-def facts_of(model: Model) -> dict[str, str]:
-    """Return what was judged, by headings."""
-    recipe = model.recipe
-    height, width = recipe.tree["data"]["image_size"]
-    judged = "beside" if model.windows else "between"
-    return {
-        "Data": f"{recipe.tree['data']['type']}, {width} × {height} pixels",
-        "Views": f"{recipe.views.inputs} inputs, judged on views {judged} them",
-    }
+    look = {"box": box.SIMPLE_HEAD, "pad_edge": False, "collapse_padding": True}
+    print_table(console, f"{comparison.scenes}, best in green", lines, **look)
 
 
 @torch.no_grad()
@@ -102,6 +92,10 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
         sections.attention(shown, detail),
         sections.training_curves(shown, detail),
     ]
+    height, width = first.recipe.tree["data"]["image_size"]
+    data = f"{first.recipe.tree['data']['type']}, {width} × {height} pixels"
+    judged = "beside" if first.windows else "between"
+    views = f"{first.recipe.views.inputs} inputs, judged on views {judged} them"
     names = listed((model.name for model in models), most=3)
     metrics = [part for place, part in first.recipe.parts.items() if place[0] == "metrics"]
     environment = page_environment("qgs_viewer", uri=images.data_uri, hex=hex_color)
@@ -110,7 +104,7 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
         title=f"{names}: {comparison.scenes.lower()}",
         columns=first.evaluation.columns.values(),
         rows=score_rows(models),
-        facts={**facts_of(first), **comparison.facts},
+        facts={"Data": data, "Views": views, **comparison.facts},
         meanings=[summary_of(metric.component) for metric in metrics],
         scenes=[
             sections.pictured_scene(shown, place, range(len(sample.target_frames))[:TARGETS])

@@ -34,11 +34,6 @@ class ModelScenes:
     curves: Curves = ()
 
     @property
-    def input_camera(self) -> Cameras:
-        """The camera (1, 1) of the first input of the first scene."""
-        return self.samples[0].inputs.cameras[:, :1]
-
-    @property
     def target_camera(self) -> Cameras:
         """The camera (1, 1) of the first target of the first scene."""
         return self.samples[0].targets.cameras[:, :1]

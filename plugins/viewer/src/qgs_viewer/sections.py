@@ -120,7 +120,8 @@ def anchors(models: Shown, detail: Detail) -> Section:
     for model in models:
         if not model.scene.has_anchors:
             continue
-        camera = model.input_camera
+        # of the first input
+        camera = model.samples[0].inputs.cameras[:, :1]
         drawn = model.notable(ANCHORS, camera, detail.query)
         colors = {query.index: query.color for query in drawn}
         photo = images.enlarged(rgb_picture(model.samples[0].inputs.images[0, 0]), detail.side)
