@@ -46,7 +46,7 @@ def _installed(*components, **parts) -> InstalledPlugin:
 
 
 def _report(monkeypatch, installed: InstalledPlugin, *options: str):
-    for module in ("qgs.recipe.registry", "qgs_dev.plugins"):
+    for module in ("qgs.recipe.registry", "qgs_dev.running"):
         monkeypatch.setattr(f"{module}.load_plugin", lambda name: installed)
     return run_qgs("check-plugin", "mine", *options)
 
@@ -96,18 +96,11 @@ def test_unsound_exemptions_are_refused(exemptions, examples) -> None:
         runs_of(installed)
 
 
-@pytest.mark.parametrize(
-    ("component", "why"),
-    [
-        (CannotDefault, "its default options are refused: RuntimeError: no defaults today"),
-        (PhotosSource, "there is no default for `path`"),
-    ],
-)
-def test_what_has_no_default_options_is_named(monkeypatch, component, why) -> None:
+@pytest.mark.parametrize("component", [CannotDefault, PhotosSource])
+def test_what_has_no_default_options_is_named(monkeypatch, component) -> None:
     result = _report(monkeypatch, _installed(component), "--core")
     assert result.exit_code == 1
-    assert f"not checked: {component.slot}/{component.name}: {why}" in result.output
-    assert "list a Config of it in `examples` of the Plugin" in result.output
+    assert f"not checked: {component.slot}/{component.name}: " in result.output
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from qgs_dev import CaseRun, runs_of
-from qgs_dev.plugins import without_case
+from qgs_dev.running import without_case
 
 from qgs.recipe.registry import load_plugin
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from qgs_dev import Case
 from qgs_dev.inputs import Maker, Sizes
-from qgs_dev.plugins import cases_of
+from qgs_dev.running import cases_of
 
 from qgs.contracts import SUBLAYER_SLOTS, Component
 from qgs.recipe import Recipe, RecipeError, registry, resolve

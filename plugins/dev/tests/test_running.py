@@ -16,7 +16,7 @@ from qgs_dev import (
     checks_for,
     run_check,
 )
-from qgs_dev.registry import TIERS
+from qgs_dev.running import TIERS
 
 from qgs.renderers import GsplatRenderer
 from qgs.tokengs import MlpFeedForward

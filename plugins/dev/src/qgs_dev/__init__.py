@@ -15,9 +15,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from qgs_dev.case import CannotCheck, Case, ContractError
-    from qgs_dev.plugins import cases_of, check_plugin, runs_of
-    from qgs_dev.registry import CHECKS, checks_for
-    from qgs_dev.running import CaseRun, CheckResult, run_check
+    from qgs_dev.running import (
+        CHECKS,
+        CaseRun,
+        CheckResult,
+        cases_of,
+        check_plugin,
+        checks_for,
+        run_check,
+        runs_of,
+    )
 
 __all__ = [
     "CHECKS",
@@ -38,7 +45,5 @@ def __getattr__(name: str) -> Any:
     """Import public names on first use: help of the commands needs neither torch nor pydantic."""
     if name not in __all__:
         raise AttributeError(f"module 'qgs_dev' has no attribute {name!r}")
-    homes = [
-        import_module(f"qgs_dev.{home}") for home in ("plugins", "case", "registry", "running")
-    ]
-    return next(getattr(home, name) for home in homes if hasattr(home, name))
+    # It imports the names of the other modules, too.
+    return getattr(import_module("qgs_dev.running"), name)

@@ -1,22 +1,33 @@
 """A component with options and sizes, as the checks see it, and the errors that checks raise."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import torch
 from pydantic_core import to_jsonable_python
-from torch import Tensor, nn
+from torch import nn
+from torch.nn import Module
 
 from qgs import contracts
-from qgs.contracts import ComponentConfig, Fields, ModelDims
+from qgs.contracts import (
+    Component,
+    ComponentConfig,
+    Fields,
+    Metric,
+    ModelDims,
+    Objective,
+    Optimizer,
+    Renderer,
+    ViewSampler,
+)
+from qgs.contracts.schedule import number_kinds
 from qgs.recipe.build import load_pretrained
-from qgs.recipe.errors import did_you_mean
 from qgs.recipe.yaml_text import dump
 from qgs.tokengs import ContentCrossAttention, ContentSelfAttention, MlpFeedForward
 from qgs_dev.modules import seeded
-from qgs_dev.soundness import component_fault
 
 # The least that has two heads and a layer after the first: checks take seconds for a plugin.
 SMALL = ModelDims(width=32, heads=2, depth=2)
@@ -52,30 +63,20 @@ class Case:
 
     config: options of a component; the class that nests it is the one checked.
     dims: sizes to build it with. image_size: (H, W) of the views; None tries a few small ones.
-    fields: for state fields that cannot hold just any number, name -> what makes a valid field
-        of normally distributed numbers, such as `{"my.quat": lambda x: F.normalize(x, dim=-1)}`.
     state_dict: name -> shape of every entry, pinned, so that saved weights stay loadable; None
         pins nothing.
-    Raises TypeError for anything but the options of a complete component, ValueError for `fields`
-    that the component neither requires nor provides.
+    Raises TypeError for anything but the options of a complete component.
     """
 
     config: ComponentConfig
     dims: ModelDims = SMALL
     image_size: tuple[int, int] | None = None
-    fields: Mapping[str, Callable[[Tensor], Tensor]] = field(default_factory=dict)
     state_dict: Mapping[str, tuple[int, ...]] | None = None
 
     def __post_init__(self) -> None:
         fault = component_fault(self.component)
         if fault:
             raise TypeError(f"{self.component.__qualname__} cannot be checked: {fault}")
-        known = {*self.reads, *self.writes}
-        for name in self.fields.keys() - known:
-            raise ValueError(
-                f"fields names {name!r}, which this component neither requires nor provides; "
-                f"{did_you_mean(name, known, 'fields')}"
-            )
 
     @property
     def component(self) -> type[contracts.Component]:
@@ -189,3 +190,37 @@ class Case:
     def with_dims(self, **sizes: int) -> "Case":
         """Return the same component in a model of other sizes."""
         return replace(self, dims=replace(self.dims, **sizes))
+
+
+# Types of the devices that a renderer can render on.
+DEVICES = ("cpu", "cuda", "mps")
+
+
+def component_fault(component: type[Component]) -> str:
+    """Why a recipe cannot use the class `component`, as a relative clause; "" if it can."""
+    name = getattr(component, "name", None)
+    if not isinstance(name, str):
+        return "which has no `name`"
+    # Else `type: PLUGIN/NAME` would be ambiguous.
+    if not re.fullmatch(r"[^\s/]+", name):
+        return f"whose name {name!r} is empty or has a slash or a blank"
+    if issubclass(component, Renderer):
+        given: object = component.devices
+        if not (isinstance(given, tuple) and given and set(given) <= set(DEVICES)):
+            return f"whose `devices` is {given!r}; give some of {DEVICES} as a tuple"
+    if issubclass(component, Metric) and not getattr(component, "definition", ""):
+        return "which gives no `definition`; describe what it measures, since protocols hash it"
+    config = component.Config
+    if not config.model_config.get("frozen"):
+        return "whose Config is not frozen; leave `frozen` of its `model_config` at True"
+    if "type" in config.model_fields:
+        return "whose Config has an option `type`, which names the component itself"
+    fields: Mapping[str, Any] = config.model_fields
+    scheduled: object = component.scheduled
+    known = {n for n, option in fields.items() if number_kinds(option.annotation)}
+    if not (isinstance(scheduled, frozenset) and scheduled <= known):
+        return f"whose `scheduled` is {scheduled!r}, not a frozenset of options that are numbers"
+    # Others are built once, and have no step to follow.
+    if scheduled and not issubclass(component, Module | Objective | Optimizer | ViewSampler):
+        return f"which lists `scheduled` options; those of the slot `{component.slot}` stay"
+    return ""

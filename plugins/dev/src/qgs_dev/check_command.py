@@ -28,7 +28,7 @@ def check_plugin(
     import torch
 
     from qgs.recipe.registry import load_plugin
-    from qgs_dev import plugins, registry
+    from qgs_dev import running
 
     # The tensors are small: more threads would wait for each other.
     torch.set_num_threads(1)
@@ -36,16 +36,17 @@ def check_plugin(
     version = installed.plugin.contract_version
     typer.echo(f"plugin {name} of {installed.released_as}, contract version {version}")
     results: list[CheckResult] = []
-    running = plugins.check_plugin(name, ("core", "construction") if core else registry.TIERS)
+    tiers = ("core", "construction") if core else running.TIERS
     # Each case is reported as soon as it is done.
-    for _, group in groupby(running, key=lambda result: id(result.case)):
+    checked = running.check_plugin(name, tiers)
+    for _, group in groupby(checked, key=lambda result: id(result.case)):
         of_case = list(group)
         _print_case(of_case)
         results += of_case
-    unchecked = plugins.without_case(installed)
-    for component, why in unchecked.items():
-        fix = "list a Config of it in `examples` of the Plugin"
-        typer.echo(f"not checked: {component.slot}/{component.name}: {why}; {fix}")
+    unchecked = running.without_case(installed)
+    for component in unchecked:
+        fix = "it has no usable default options; list a Config of it in `examples` of the Plugin"
+        typer.echo(f"not checked: {component.slot}/{component.name}: {fix}")
     typer.echo(_total(results))
     good = all(result.ok and not result.leaves_unchecked for result in results)
     if not _models_load(installed) or unchecked or not good:

@@ -118,23 +118,18 @@ class Maker:
         """Normally distributed points (..., 3), brought in front of the cameras."""
         return 0.4 * points + torch.tensor([0.0, 0.0, 1.5]).to(points)
 
-    def field(self, name: str, spec: FieldSpec) -> Tensor:
+    def field(self, spec: FieldSpec) -> Tensor:
         """A state field; points of the world frame stand in front of the cameras."""
         values = self.normal("BN", *sizes_of(spec, self.case.dims))
         # Points behind the cameras are the subject of one check alone.
         if is_place(spec):
             values = self.in_front(values)
-        if name in self.case.fields:
-            values = self.case.fields[name](values)
-        elif not spec.dtype.is_floating_point:
-            values = values > 0
-        return values.to(spec.dtype)
+        return (values if spec.dtype.is_floating_point else values > 0).to(spec.dtype)
 
     def state(self) -> QueryState:
         """Features, and the fields that the case requires."""
-        required = required_fields(self.case).items()
-        fields = {name: self.field(name, spec) for name, spec in required}
-        return QueryState(self.features(), fields)
+        required = required_fields(self.case)
+        return QueryState(self.features(), {n: self.field(spec) for n, spec in required.items()})
 
     def features(self) -> Tensor:
         """(B, N, D)."""

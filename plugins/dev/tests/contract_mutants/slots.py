@@ -180,7 +180,7 @@ class OrdersTokensByColumn(ChangedEncoder):
         return replace(memory, keys=keys, values=values, features=turned(memory.features, 1))
 
 
-@mutant("tokens_are_those_of_the_grid", "if tokens were ordered by view, column, row")
+@mutant("tokens_are_those_of_the_grid", "of what changes a token comes from its own patch")
 class ConvolvesAndOrdersByColumn(StridedConvolutions):
     def ordered(self, x_BVDHW):
         return x_BVDHW.mT.reshape(x_BVDHW.shape)
@@ -258,7 +258,7 @@ def explained_twice_as_sharply(given: AttentionWeights) -> AttentionWeights:
     return AttentionWeights(content, given.geometry, logits.softmax(-1))
 
 
-@mutant("explanation_is_of_the_forward_pass", "the weights change otherwise")
+@mutant("updates_are_explained", "of them is left")
 class ExplainsCrossAttentionTooSharply(ContentCrossAttention):
     def explain(self, state, memory, queries):
         return explained_twice_as_sharply(super().explain(state, memory, queries))

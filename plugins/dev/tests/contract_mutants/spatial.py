@@ -178,7 +178,7 @@ class BiasesInHalf(ContentCrossAttention):
         return self.core.explain(state.features, memory.keys, queries, bias)
 
 
-@mutant("explanation_is_of_the_forward_pass", "the weights change otherwise")
+@mutant("updates_are_explained", "of them is left")
 class ExplainsNoBias(BiasesInHalf):
     """What it says of itself leaves out what geometry adds."""
 

@@ -1,15 +1,20 @@
-"""Promises of attention alone: memos, masks and explanations."""
+"""Promises of encoders, and of attention: its memos, masks and explanations."""
 
+import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from qgs.types import QueryState
-from qgs_dev.case import Case
+from qgs.containers import map_tensors
+from qgs.contracts import Encoder, Queries
+from qgs.geometry.rays import patch_rays, plucker_rays
+from qgs.types import ImageMemory, Photos, QueryState, Views
+from qgs_dev.case import CannotCheck, Case
 from qgs_dev.inputs import Inputs, Sizes, inputs_of
-from qgs_dev.vocabulary import Trial, cast, expect, expect_same, floating, mapped, masked
+from qgs_dev.vocabulary import Trial, cast, difference, expect, expect_same, floating, masked, scene
 
 # Queries of a state in which each is masked in turn.
 QUERIES = 6
@@ -77,79 +82,32 @@ def check_explanation_is_a_softmax(case: Case) -> None:
     expect(off < 1e-3, f"weights are off the softmax of content and geometry by up to {off:.3g}")
 
 
-def check_explanation_is_of_the_forward_pass(case: Case) -> None:
-    """The weights that `explain` gives are those by which a forward pass reads the values.
-
-    The gradient of a query's update in the value of a token is the weight, times what all tokens
-    share, times what all queries share where values are rescaled. So from one query to the next,
-    the lengths of these gradients change as the weights do, but for a factor. Where no geometry is
-    given, queries of equal features look at the same.
-    """
-    trial = Trial(case)
-    given = explanation(trial.module, trial.inputs)
-    if given is None or "memory.values" not in case.reads:
-        return
-    _expect_read_by_weights(trial)
-    if given.geometry is None:
-        # Without geometry the weights are of content alone, so equal content has equal weights.
-        state = trial.inputs["state"]
-        equal = state.features[:, :1].expand_as(state.features).clone()
-        trial.inputs["state"] = state.replace(features=equal)
-        _expect_read_by_weights(trial)
-
-
-def _expect_read_by_weights(trial: Trial) -> None:
-    weights = explanation(trial.module, trial.inputs).weights
-    inputs = mapped(trial.inputs, lambda n, x: x.requires_grad_(n == "memory.values"))
-    update = trial(inputs)
-    values = inputs["memory"].values
-    lengths = [_lengths(update[:, query], values) for query in range(update.shape[1])]
-    log_lengths = torch.stack(lengths, 2).log()
-    if log_lengths.isneginf().all():
-        # It reads no values, as another check says.
-        return
-    off = (log_lengths - weights.log()).diff(dim=2)
-    # Smaller weights are no more than rounding errors.
-    visible = torch.minimum(weights[:, :, 1:], weights[:, :, :-1]) > 1e-6
-    # A factor that all tokens share is an offset of the logarithms: only their spread counts.
-    high = off.where(visible, -torch.inf).amax(-1)
-    low = off.where(visible, torch.inf).amin(-1)
-    worst = (high - low).where(visible.any(-1), 0.0).max().item()
-    seen = "the weights change otherwise than the forward pass from one query to the next"
-    expect(worst < 1e-3, f"{seen}, in their logarithms by up to {worst:.3g}")
-
-
-def _lengths(update: Tensor, values: Tensor) -> Tensor:
-    """(B, h, M) of the gradients of a query's `update` (B, D) in `values` (B, h, M, d)."""
-    direction = torch.randn(update.shape, generator=torch.Generator().manual_seed(0))
-    total = (direction.to(update) * update).sum()
-    (found,) = torch.autograd.grad(total, values, retain_graph=True, materialize_grads=True)
-    return found.norm(dim=-1)
-
-
 def check_updates_are_explained(case: Case) -> None:
-    """Updates are what the weights that `explain` gives make of one value for each query and head.
+    """Updates are what the weights that `explain` gives make of one value for each head and token.
 
-    Whichever queries are masked, the values stay. So the updates under several masks are linear in
-    unknown values, of which there are fewer: they are solved for, and must leave no rest.
+    So the updates of many queries, or under several masks, are linear in unknown values, of which
+    there are fewer: they are solved for, and must leave no rest.
     """
+    count = QUERIES if case.slot == "self_attention" else 60
     module = case.lively().double()
-    inputs = cast(inputs_of(case, Sizes(batch=1, queries=QUERIES)), torch.float64)
-    masks = torch.ones(1 + QUERIES, QUERIES, dtype=torch.bool)
-    masks[1:] ^= torch.eye(QUERIES, dtype=torch.bool)
+    inputs = cast(inputs_of(case, Sizes(batch=1, queries=count)), torch.float64)
+    masks = torch.ones(1, count, dtype=torch.bool)
+    if case.slot == "self_attention":
+        # Whichever queries are masked, the values of the others stay.
+        masks = torch.cat([masks, ~torch.eye(count, dtype=torch.bool)])
     factors = []
     updates = []
     for mask in masks:
-        state = replace(inputs["state"], mask=mask[None])
-        given = explanation(module, {"state": state})
-        if given is None:
+        given = {**inputs, "state": replace(inputs["state"], mask=mask[None])}
+        found = explanation(module, given)
+        if found is None:
             return
-        weights = given.weights[0, :, mask].double()  # (h, Q, N)
+        weights = found.weights[0, :, mask].double()  # (h, Q, N)
         # The output layer of an attention has a bias, one more unknown.
         bias = torch.ones(weights.shape[1], 1, dtype=torch.float64)
         factors.append(torch.cat([*weights, bias], 1))
         with torch.no_grad():
-            updates.append(module(state)[0, mask])
+            updates.append(module(*given.values())[0, mask])
     factor = torch.cat(factors)
     update = torch.cat(updates)
     # What no values explain is the rest of the least squares.
@@ -163,3 +121,164 @@ def explanation(module: Any, inputs: Inputs, queries: list[int] | None = None) -
     """AttentionWeights of `queries`, by default all; None of a component that explains nothing."""
     chosen = queries or range(inputs["state"].features.shape[1])
     return module.explain(*inputs.values(), torch.tensor([*chosen]))
+
+
+# Rows and columns of patches that are changed, a scene each; 4 where a token is a pixel.
+_SIDE = 6
+
+# Of the largest mean share at one displacement. Strided 3 x 3 convolutions, whose centres are
+# nearly half a patch off, have 0.75 to 1.5; tokens shifted by one at most 0.5.
+_LEAST_SHARE = 0.6
+
+# Share of a token's own patch over the mean of a view's. Strided convolutions have at least 6, a
+# random ViT of 8 blocks 11.
+_LEAST_GAIN = 1.5
+
+_ORDER = (
+    'order the tokens by view, then row, then column: `rearrange(x, "b v d h w -> b (v h w) d")`'
+)
+
+
+def check_patch_rays_are_those_of_the_grid(case: Case) -> None:
+    """`grid` counts the patches of each view, `patch_rays` are their mean rays, in its order.
+
+    A memory without rays may have no grid.
+    """
+    module = case.lively()
+    for where, views in _wide_and_tall(case, case.size):
+        memory = module(views)
+        if memory.patch_rays is None:
+            raise CannotCheck("it gives no patch rays")
+        patch = _patch_size(where, views, memory)
+        rays = patch_rays(plucker_rays(views.cameras), patch)
+        where = f"{where}, against the mean rays of patches of {patch} pixels"
+        expect_same({"patch_rays": memory.patch_rays}, {"patch_rays": rays}, where, 1e-4, 1e-5)
+
+
+def check_tokens_are_those_of_the_grid(case: Case) -> None:
+    """A change of what one patch shows is largest in its own token: that of its place in `grid`.
+
+    In the mean over the patches, and half a patch off is allowed: the centres of strided
+    convolutions stand there. Keys may be those of the rays alone. A memory may have no grid.
+    """
+    # Initial parameters, not noise: in a random network a token shows what all patches show.
+    module = case.build().eval()
+    size = case.size
+    grid = module(inputs_of(case)["views"]).grid
+    large = (2 * size[0], 2 * size[1])
+    # In a small grid most tokens are at a border.
+    if grid and min(grid[1:]) <= 3 and not case.image_size and not case.problems(large):
+        size = large
+    for where, views in _wide_and_tall(case, size):
+        views = scene(views, 0)
+        memory = module(views)
+        if memory.grid is None:
+            declared = "memory.grid" in case.writes
+            expect(not declared, "`writes` has memory.grid, but `grid` of the ImageMemory is None")
+            continue
+        patch = _patch_size(where, views, memory)
+        side = _SIDE if patch > 1 else 4
+        tokens = torch.arange(math.prod(memory.grid)).view(memory.grid)
+        tokens = tokens[:, :side, :side].flatten()
+        places = torch.stack(torch.unravel_index(tokens, memory.grid), -1)
+        changed = module(_one_patch_each(views, places, patch))
+        for name in ("keys", "values", "features"):
+            if getattr(memory, name) is None:
+                continue
+            change = (changed[name] - memory[name]).square().sum(-1)
+            # Keys and values have heads.
+            change = change.sum(1) if change.ndim == 3 else change
+            if not change.any():
+                expect(name == "keys", f"{where}, `{name}` stays as it is when the images change")
+                continue
+            found = _misplaced(change, tokens, places, memory.grid)
+            expect(not found, f"{where}, of `{name}`, {found}")
+
+
+def check_project_makes_the_memory_again(case: Case) -> None:
+    """From its own features, a `tunable` encoder makes the memory that they came with.
+
+    From others it makes another one. An encoder that is not tunable refuses.
+    """
+    trial = Trial(case)
+    module = trial.module
+    memory = trial()
+    try:
+        again = module.project(memory.features, memory)
+        other = module.project(memory.features.roll(1, 1), memory)
+    except NotImplementedError:
+        expect(not module.tunable, "it is declared `tunable`, but `project` is not implemented")
+        return
+    expect(module.tunable, "it has `project`, but does not declare `tunable`")
+    expect_same(memory, again, "made anew from its own features")
+    expect(difference(memory, other), "other features make the same memory")
+
+
+def _wide_and_tall(case: Case, size: tuple[int, int]) -> Iterator[tuple[str, Views]]:
+    """Views of `size` (H, W), and turned by 90 degrees if the component accepts that."""
+    for image in dict.fromkeys([size, (size[1], size[0])]):
+        if image == size or not case.problems(image):
+            where = f"with images of {image[0]} x {image[1]}"
+            yield where, inputs_of(case, Sizes(image=image))["views"]
+
+
+def _patch_size(where: str, views: Views, memory: ImageMemory) -> int:
+    """Pixels along a patch, as the grid of `memory` says."""
+    grid = memory.grid
+    if grid is None:
+        raise CannotCheck("its tokens are no patches: the memory has no grid")
+    count = views.images.shape[1]
+    height, width = views.cameras.size
+    patch = max(height // max(grid[1], 1), 1)
+    seen = f"{where} of {count} views, `grid` is {grid}, which is not (V, H/P, W/P) for any P"
+    expect(grid == (count, height / patch, width / patch), seen)
+    return patch
+
+
+def _misplaced(change: Tensor, changed: Tensor, places: Tensor, grid: tuple[int, int, int]) -> str:
+    """How tokens of the `grid` stand off their patches, with the remedy; "" if they do not.
+
+    change: (T, M), of each token by each of the patches that were `changed` (T,), at `places`.
+    """
+    # Shares of what changes a token: near borders, and after norms, some tokens change more.
+    share = change / change.sum(0).clamp_min(1e-30)
+    # From the patch to the token.
+    steps = (places - places[:, None]).flatten(0, 1)
+    known, kind = steps.unique(dim=0, return_inverse=True)
+    mean = share.new_zeros(len(known)).index_add(0, kind, share[:, changed].flatten())
+    mean = mean / kind.bincount()
+    own = mean[(known == 0).all(-1)].item()
+    most, at = mean.max(0)
+    seen = f"{own:.0%} of what changes a token comes from its own patch"
+    of_view = len(changed) / grid[0]
+    if of_view > 4 and max(own, most / 2) * of_view < _LEAST_GAIN:
+        return f"{seen}, hardly more than from others: a token must show its patch; {_ORDER}"
+    if own < _LEAST_SHARE * most:
+        step = ", ".join(f"{-x:+d}" for x in known[at].tolist())
+        return (
+            f"{seen}, {most:.0%} from the patch at view, row, column ({step}) of it; "
+            f"{_ORDER}, and pad so that the pixels which a token sees are centred on its patch"
+        )
+    return ""
+
+
+def _one_patch_each(views: Views, places: Tensor, patch: int) -> Views:
+    """A scene for each of `places`: the one given, with other noise in this one patch."""
+    scenes = map_tensors(lambda x: x.repeat(len(places), *[1] * (x.ndim - 1)), views)
+    generator = torch.Generator().manual_seed(1)
+    for images, (view, row, column) in zip(scenes.images, (places * patch).tolist(), strict=True):
+        # In place: these scenes are copies, and another patch of each is changed.
+        seen = images[view // patch, :, row : row + patch, column : column + patch]
+        seen.copy_(torch.rand(seen.shape, generator=generator))
+    return scenes
+
+
+def check_unread_cameras_make_no_difference(case: Case) -> None:
+    """A component that declares `reads_cameras = False` gives the same without any cameras."""
+    component = case.component
+    if not issubclass(component, Encoder | Queries) or component.reads_cameras:
+        raise CannotCheck("it reads cameras")
+    trial = Trial(case)
+    views = trial.inputs["views"]
+    bare = Photos(views.images, views.times, views.target_time)
+    expect_same(trial(), trial(views=bare), "without cameras")

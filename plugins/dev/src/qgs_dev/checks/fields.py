@@ -268,7 +268,7 @@ def _queries_with(case: Case, given: Fields) -> Any:
 
     def start(self: LatentQueries, batch_size: int) -> QueryState:
         maker = Maker(case, Sizes(batch=1, queries=self.count))
-        fields = {name: maker.field(name, spec) for name, spec in given.items()}
+        fields = {name: maker.field(spec) for name, spec in given.items()}
         fields = map_tensors(lambda x: x.expand(batch_size, *x.shape[1:]), fields)
         return LatentQueries.start(self, batch_size).replace(fields=fields)
 

@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from qgs.contracts import ComponentConfig
 from qgs_dev.case import Case
-from qgs_dev.checks.construction import other_generators
+from qgs_dev.checks.basics import other_generators
 from qgs_dev.checks.judging import rehearsed
 from qgs_dev.inputs import Inputs, inputs_of
 from qgs_dev.modules import attributes, each_mode, seeded, tensors_of
