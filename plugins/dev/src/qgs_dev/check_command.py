@@ -94,13 +94,11 @@ def _total(results: list[CheckResult]) -> str:
     from qgs.wording import counted
 
     verdicts = Counter(result.verdict for result in results)
-    counts = {
-        "failed": verdicts["failed"] + verdicts["unexpected pass"],
-        "expected to fail": verdicts["expected failure"],
-        "skipped": verdicts["skipped"],
-    }
-    if unchecked := {result.case.label for result in results if result.leaves_unchecked}:
-        counts["not checked"] = len(unchecked)
-    summary = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
+    unchecked = {result.case.label for result in results if result.leaves_unchecked}
     components = {result.case.component for result in results}
-    return f"{counted(len(components), 'component')}, {counted(len(results), 'check')}, {summary}"
+    return (
+        f"{counted(len(components), 'component')}, {counted(len(results), 'check')}, "
+        f"{verdicts['failed'] + verdicts['unexpected pass']} failed, "
+        f"{verdicts['expected failure']} expected to fail, {verdicts['skipped']} skipped, "
+        f"{len(unchecked)} not checked"
+    )

@@ -51,8 +51,6 @@ def check_name(name: str) -> None:
             f"`{name}` is no name of a plugin: lower-case letters and digits, a letter first, "
             "words joined by single hyphens or _, and no word of Python's own"
         )
-    if re.match(r"qgs([-_]|$)", name):
-        raise ValueError(f"`{name}`: the distribution is called qgs-NAME; leave `qgs` out")
     # The package must not hide, or be hidden by, an installed one.
     other = f"choose another, such as `{name}-things`"
     if module in sys.stdlib_module_names or module in packages_distributions():

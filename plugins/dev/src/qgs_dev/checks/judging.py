@@ -8,10 +8,11 @@ from torch import Tensor, nn
 
 from qgs.containers import map_tensors
 from qgs.contracts import Metric, MetricInput, Outcome
-from qgs.renderers import TorchRenderer
-from qgs.types import Cameras, Gaussians, LayerPrediction, Prediction, Rendering, Views
+from qgs.train.training_pass import TrainingPass
+from qgs.types import LayerPrediction
 from qgs_dev.case import CannotCheck, Case
-from qgs_dev.inputs import Maker, Sizes, inputs_of
+from qgs_dev.checks.fields import resolved
+from qgs_dev.inputs import Maker, Sizes, inputs_of, required_fields
 from qgs_dev.modules import seeded
 from qgs_dev.vocabulary import (
     Trial,
@@ -20,6 +21,7 @@ from qgs_dev.vocabulary import (
     expect_finite,
     expect_none,
     expect_same,
+    gradients,
     masked,
     scene,
 )
@@ -135,39 +137,6 @@ def _values(module: Metric, given: MetricInput) -> dict[str, Tensor]:
 SIGNS = {"psnr", "alpha", "deviation"}
 
 
-class Rehearsal:
-    """`Passes` whose model is one parameter, `gain`: Gaussians as bright as the inputs are."""
-
-    def __init__(self, maker: Maker) -> None:
-        self.gain = nn.Parameter(torch.ones(()))
-        self.called: set[str] = set()
-        self._layer = maker.prediction()
-        self._renderer = TorchRenderer(TorchRenderer.Config())
-
-    def predict(self, inputs: Views) -> Prediction:
-        """See `Passes`."""
-        expect(inputs.images.shape[1] > 0, "it predicts from no view")
-        self.called.add("predict")
-        # The gain reaches every number that the objective may judge.
-        bright = self.gain * inputs.images.mean((1, 2, 3, 4))[:, None]
-        given = self._layer.gaussians
-        gaussians = replace(given, opacities=given.opacities * bright)
-        layer = LayerPrediction(gaussians, self._layer.state)
-        return Prediction(gaussians, layer.state, {1: layer})
-
-    def judge(self, prediction: Prediction, targets: Views, inputs: Views) -> Outcome:
-        """See `Passes`."""
-        self.called.add("judge")
-        rendering = self.render(prediction.gaussians, targets.cameras)
-        error = (rendering.rgb - targets.images).square().mean()
-        signs = {"psnr": -error, "alpha": rendering.alpha.mean(), "deviation": error}
-        return Outcome(error, {"error": error.detach()}, map_tensors(Tensor.detach, signs))
-
-    def render(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """See `Passes`."""
-        return self._renderer(gaussians, cameras)
-
-
 def check_objective_gives_an_outcome(case: Case) -> None:
     """An objective predicts and judges; its total is the sum of its terms, and trains the model.
 
@@ -179,10 +148,9 @@ def check_objective_gives_an_outcome(case: Case) -> None:
     # Objectives may split the views in halves; 2 is the least, 3 and 5 are odd.
     for views in (2, 3, 5):
         where = f"with {views} input views"
-        outcome, passes = _outcome(case, module, views)
+        outcome, model = _outcome(case, module, views)
         kind = type(outcome).__name__
         expect(isinstance(outcome, Outcome), f"{where} it gives {kind}, not an Outcome")
-        expect(passes.called == {"predict", "judge"}, f"{where} it judges no prediction")
         parts = {**outcome.terms, **outcome.signs}
         numbers = {"total": outcome.total, **parts}
         odd = [n for n, x in numbers.items() if not isinstance(x, Tensor) or x.ndim]
@@ -194,7 +162,8 @@ def check_objective_gives_an_outcome(case: Case) -> None:
         total = outcome.total
         of_terms = sum(outcome.terms.values())
         expect_same(of_terms, total.detach(), f"{where}, against the sum of the terms", 1e-4, 1e-6)
-        reached = total.requires_grad and torch.autograd.grad(total, passes.gain)[0]
+        found = gradients(total, dict(model.named_parameters()))
+        reached = any(x.any() for x in found.values())
         expect(reached, f"{where} its total has no gradient in the model's parameters")
 
 
@@ -205,13 +174,15 @@ def check_objective_repeats(case: Case) -> None:
 
 
 def rehearsed(case: Case, module: Any) -> dict[str, Tensor]:
-    """Numbers that an objective gives in a rehearsal."""
+    """Numbers that an objective gives with a small model."""
     outcome, _ = _outcome(case, module, 3)
     return cloned({"total": outcome.total, **outcome.terms, **outcome.signs})
 
 
-def _outcome(case: Case, module: Any, views: int) -> tuple[Outcome, Rehearsal]:
+def _outcome(case: Case, module: Any, views: int) -> tuple[Outcome, nn.Module]:
+    """What an objective gives, and the model that it was given."""
+    recipe = resolved(case, required_fields(case))
     maker = Maker(case, Sizes(views=views))
-    passes = Rehearsal(maker)
     with seeded(0):
+        passes = TrainingPass(recipe, recipe.build_model())
         return module.forward(maker.inputs(), maker.target(), passes), passes
