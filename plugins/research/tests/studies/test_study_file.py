@@ -71,7 +71,6 @@ budget: {steps: 200} | budget: {steps: 200, seconds: 3} | :8: budget | steps or 
 [flat < full] | [flat < fulll] | :10: hypotheses.0 | `full`
 study: 1\n | study: 1\nsead: [0]\n | :2: sead | `seeds`
 study: 1 | study: true | :1: study | true
-  flat: |   FULL: | :3: variants | `FULL`
 variants:\n | variants:\nMANY | :3: variants | 200
 reference | published: {full: good}\nreference | :7: published.full | number
 qgs/content} | qgs/contents} | :5: variants.flat: model.decoder.cross_attention.type | `qgs/content`

@@ -32,7 +32,7 @@ def compare(
 
     Nothing is evaluated. Runs of one recipe with several seeds count as one side.
     """
-    from qgs.evaluate.results import as_json, print_lines
+    from qgs.evaluate.results import as_json
     from qgs.files import write_text
     from qgs_research.studies.comparison import compare as compared
     from qgs_research.studies.comparison import record, summary
@@ -44,8 +44,6 @@ def compare(
     if out:
         write_text(out / "comparison.json", as_json(record(scores)))
         write_text(out / "comparison.md", summary(scores).markdown)
-    end = f"written to {out}" if out else "add --out FOLDER to keep this as JSON and Markdown"
-    print_lines(console, [end])
 
 
 @app.command()

@@ -114,9 +114,9 @@ def _notes(scores: Scores) -> Iterator[str]:
     yield f"difference: minus {scores.reference}, over the scenes that both have"
     yield from interval_notes([*scores.differences().values()])
     yield from training_notes(scores)
+    for sha256 in sorted(scores.protocols(MAIN)):
+        yield f"protocol with sha256 {sha256}"
     for name in scores.models():
-        protocol = next(iter(scores.stored[name, MAIN].values())).protocol
-        yield f"{name}: protocol {protocol.name}, sha256 {protocol.sha256}"
         for words, names in _left_out(scores, name).items():
             if names:
                 yield f"{name}: {words} ({len(names)}): {listed(sorted(names))}"

@@ -123,17 +123,6 @@ class StudySettings(ComponentConfig):
     published: dict[VariantName, float] = Field(default_factory=dict)
     """The metric as published, by variant: shown beside ours, with the rank correlation."""
 
-    @field_validator("variants", "evaluations")
-    @classmethod
-    def _folders_differ(cls, named: dict[str, Any]) -> dict[str, Any]:
-        names = {name.lower(): name for name in named}
-        for name in named:
-            other = names[name.lower()]
-            if other != name:
-                reason = f"`{name}` and `{other}` are one folder where file names have no case"
-                raise OptionError(reason, "give them other names")
-        return named
-
     @field_validator("seeds")
     @classmethod
     def _seeds_differ(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
