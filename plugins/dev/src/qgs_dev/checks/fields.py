@@ -22,7 +22,6 @@ from qgs.recipe.recipe import Recipe, resolve
 from qgs.recipe.slots import MODEL_SLOTS, SECTIONS
 from qgs.recipe.yaml_text import inline
 from qgs.tokengs import GaussianHead, LatentQueries, MultiViewViT
-from qgs.train.training_pass import TrainingPass
 from qgs.types import QueryState
 from qgs_dev.case import Case
 from qgs_dev.inputs import FACTS, Inputs, Maker, Sizes, inputs_of, memory_width, required_fields
@@ -38,6 +37,7 @@ from qgs_dev.vocabulary import (
     gradients,
     leaves,
     mapped,
+    scalar,
 )
 
 PLUGIN = "under_test"
@@ -277,17 +277,26 @@ def _queries_with(case: Case, given: Fields) -> Any:
 
 @seeded(0)
 def run_training_step(recipe: Recipe, case: Case, sizes: Sizes | None = None) -> None:
-    """The forward pass of a training step, with one view as the target, and the backward pass.
+    """A forward pass, one view rendered and compared with the target, and the backward pass.
 
     sizes: of the views; None for the usual ones.
-    Raises ContractError for predictions, losses or gradients that are not finite.
+    Raises ContractError for predictions, images, losses or gradients that are not finite.
     """
     model = recipe.build_model().train()
+    losses = recipe.build_losses().values()
     views = Maker(case, sizes or Sizes()).target()
+    target = views.select([0])
+    total = torch.zeros((), dtype=torch.float64)
     for prediction in model(views).layers.values():
         expect_finite(prediction, "in a prediction of a model that has it")
-    outcome = TrainingPass(recipe, model)(views, views.select([0]))
-    expect_finite(outcome.terms, "as a loss of a model that has it")
-    found = gradients(outcome.total, dict(model.named_parameters()))
+        rendering = model.render(prediction.gaussians, target.cameras)
+        expect_finite(rendering, "in a rendering of a model that has it")
+        for loss in losses:
+            unseen = loss.renderings == "none"
+            seen = map_tensors(lambda x: x[:, :0], rendering) if unseen else rendering
+            terms = loss(prediction, seen, target, views)
+            expect_finite(terms, "as a loss of a model that has it")
+            total = total + scalar(terms)
+    found = gradients(total, dict(model.named_parameters()))
     expect(found, "in the model that it is composed into nothing gets a gradient")
     expect_finite(found, "in its gradient in a model that has it")
