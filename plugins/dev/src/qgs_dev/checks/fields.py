@@ -276,15 +276,14 @@ def _queries_with(case: Case, given: Fields) -> Any:
 
 
 @seeded(0)
-def run_training_step(recipe: Recipe, case: Case, sizes: Sizes | None = None) -> None:
+def run_training_step(recipe: Recipe, case: Case) -> None:
     """A forward pass, one view rendered and compared with the target, and the backward pass.
 
-    sizes: of the views; None for the usual ones.
     Raises ContractError for predictions, images, losses or gradients that are not finite.
     """
     model = recipe.build_model().train()
     losses = recipe.build_losses().values()
-    views = Maker(case, sizes or Sizes()).target()
+    views = Maker(case).target()
     target = views.select([0])
     total = torch.zeros((), dtype=torch.float64)
     for prediction in model(views).layers.values():
