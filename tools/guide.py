@@ -146,10 +146,9 @@ def reference() -> str:
 def option_table(config: type[ComponentConfig]) -> str:
     """Return a table of all options of `config`: values, default, meaning."""
     rows = [("option", "values", "default", "meaning"), ("---",) * 4]
-    scheduled = config.__component__.scheduled if config.__component__ else ()
     for name, values, default, meaning in option_rows(settings_schema(config)["properties"]):
-        more = ", or a [schedule](#schedules)" if name in scheduled else ""
-        rows.append((f"`{name}`", values + more, f"`{default.splitlines()[0]}`", meaning))
+        values = values.replace("or schedule", "or a [schedule](#schedules)")
+        rows.append((f"`{name}`", values, f"`{default.splitlines()[0]}`", meaning))
     cells = ([cell.replace("|", "\\|") for cell in row] for row in rows)
     return "\n".join(f"| {' | '.join(row)} |" for row in cells) if rows[2:] else "No options."
 

@@ -74,12 +74,12 @@ def use_threads(threads: int | None) -> None:
         torch.set_num_threads(threads)
 
 
-def parse_size(text: str | None, option: str = "--size") -> tuple[int, int] | None:
+def parse_size(text: str | None) -> tuple[int, int] | None:
     """Return (H, W) of "HxW"; raises ValueError for anything else."""
     if text is None:
         return None
     # Height first, as in recipes and tensors.
     match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
     if match is None:
-        raise ValueError(f"{option} must be HxW in pixels, such as 256x448, got {text!r}")
+        raise ValueError(f"--size must be HxW in pixels, such as 256x448, got {text!r}")
     return int(match[1]), int(match[2])

@@ -9,13 +9,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from qgs.checkpoint.models import about, card_of, checkpoint_path
-from qgs.contracts import LAYER_SLOTS
+from qgs.contracts import LAYER_SLOTS, ComponentConfig
 from qgs.model import QueryGaussianModel
 from qgs.model_text import parameter_counts
 from qgs.recipe import Recipe
 from qgs.recipe.errors import did_you_mean
 from qgs.recipe.registry import Registry, default_config
-from qgs.recipe.schema import recipe_schema
+from qgs.recipe.schema import settings_schema, summary_of
 from qgs.recipe.sections import SETTINGS
 from qgs.recipe.slots import MODEL_SLOTS, SLOTS
 from qgs.recipe.yaml_text import inline
@@ -37,12 +37,11 @@ def folded_table(title: str, *columns: str, right: int = 0) -> Table:
 
 def overview(registry: Registry) -> Iterator[Table]:
     """Yield a table per slot: installed components, what they are, where they come from."""
-    definitions = recipe_schema(registry)["$defs"]
     for name, slot in SLOTS.items():
         default = f" (default {slot.default})" if slot.default else ""
         table = folded_table(recipe_path(name) + default, "type", "meaning", "origin")
-        for kind, schema in _by_type(definitions[name]).items():
-            table.add_row(*map(escape, (kind, schema["description"], _release(kind, registry))))
+        for kind, component in registry.components(name).items():
+            table.add_row(*map(escape, (kind, summary_of(component), _release(kind, registry))))
         yield table
     if models := _models(registry):
         table = folded_table("trained models", "name", "meaning", "origin")
@@ -63,7 +62,8 @@ def details(name: str, registry: Registry) -> Iterator[Group]:
     components = [(s, kind) for s in SLOTS for kind in registry.components(s)]
     shown = [(s, kind) for s, kind in components if name == kind or slot == s]
     if name in settings:
-        yield _section(name, settings[name], recipe_schema(registry))
+        config = SETTINGS[settings[name]]
+        yield _explained(name, config, config)
     elif name in models:
         file = checkpoint_path(name)
         heading = f"[bold]{escape(name)}[/bold], {escape(_release(name, registry))}"
@@ -77,18 +77,20 @@ def details(name: str, registry: Registry) -> Iterator[Group]:
         yield _component(place, kind, registry)
 
 
-def _section(name: str, path: tuple[str, ...], schema: Schema) -> Group:
-    for key in path:
-        schema = schema["properties"][key]
-    options = {key: schema["properties"][key] for key in SETTINGS[path].model_fields}
-    return Group(f"[bold]{name}[/bold]", escape(schema.get("description", "")), _options(options))
+def _explained(heading: str, described: type, config: type[ComponentConfig], *more: str) -> Group:
+    """What `described` is, the options of `config`, and more lines."""
+    options = settings_schema(config)["properties"]
+    table = folded_table("", "option", "type", "default", "meaning")
+    for cells in option_rows(options):
+        table.add_row(*map(escape, cells))
+    summary = escape(summary_of(described))
+    shown = table if options else "  no options"
+    return Group(f"[bold]{escape(heading)}[/bold]", summary, shown, *more)
 
 
 def _component(slot: str, kind: str, registry: Registry) -> Group:
     """Explain the options of a component, and the fields that it needs and makes by default."""
     component = registry.components(slot)[kind]
-    schema = _by_type(recipe_schema(registry)["$defs"][slot])[kind]
-    options = {key: option for key, option in schema["properties"].items() if key != "type"}
     heading = f"{recipe_path(slot)}: {kind}, {_release(kind, registry)}"
     config = default_config(component)
     fields = []
@@ -101,8 +103,7 @@ def _component(slot: str, kind: str, registry: Registry) -> Group:
             if specs:
                 text = "; ".join(f"{name} ({spec})" for name, spec in specs.items())
                 fields.append(escape(f"  {word}: {text}"))
-    described = escape(schema["description"])
-    return Group(f"[bold]{escape(heading)}[/bold]", described, _options(options), *fields, "")
+    return _explained(heading, component, component.Config, *fields, "")
 
 
 def _models(registry: Registry) -> dict[str, Path]:
@@ -111,10 +112,6 @@ def _models(registry: Registry) -> dict[str, Path]:
     for plugin in registry.plugins.values():
         found |= plugin.models
     return found
-
-
-def _by_type(definition: Schema) -> dict[str, Schema]:
-    return {one["properties"]["type"]["const"]: one for one in definition["anyOf"]}
 
 
 def _release(kind: str, registry: Registry) -> str:
@@ -126,16 +123,6 @@ def recipe_path(slot: str) -> str:
     if slot in MODEL_SLOTS:
         return f"model.{slot}"
     return f"model.decoder.{slot}" if slot in LAYER_SLOTS else slot
-
-
-def _options(properties: Mapping[str, Schema]) -> Table | str:
-    """Return a table of options, given as properties of a JSON Schema."""
-    if not properties:
-        return "  no options"
-    table = folded_table("", "option", "type", "default", "meaning")
-    for cells in option_rows(properties):
-        table.add_row(*map(escape, cells))
-    return table
 
 
 def option_rows(properties: Mapping[str, Schema], above: str = "") -> Iterator[tuple[str, ...]]:

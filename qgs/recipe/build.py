@@ -92,9 +92,6 @@ def _assemble(recipe: Recipe) -> QueryGaussianModel:
     )
 
 
-_ARITHMETIC = ("add", "sub", "mul", "div", "pow", "__pow__", "__rsub__", "__rdiv__", "__rpow__")
-
-
 class OnMeta(TorchFunctionMode):
     """The meta device as constructors need it.
 
@@ -102,7 +99,7 @@ class OnMeta(TorchFunctionMode):
     arithmetic give float32 tensors by shape alone: for these torch imports its compiler, 1 to 3 s.
     """
 
-    arithmetic = frozenset(getattr(Tensor, name) for name in _ARITHMETIC)
+    arithmetic = frozenset({Tensor.add, Tensor.sub, Tensor.mul, Tensor.__rpow__})
     # torch turns the mode off inside of its initialisers, so that they are caught as well.
     draws = frozenset({nn.init.normal_, Tensor.normal_})
 

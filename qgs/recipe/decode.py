@@ -13,9 +13,9 @@ from pydantic_core import ErrorDetails, PydanticUndefinedType, to_jsonable_pytho
 
 from qgs.contracts import Component, ComponentConfig, OptionError
 from qgs.contracts.schedule import Schedule, at_step
-from qgs.recipe.errors import Problems, did_you_mean, nearest
+from qgs.recipe.errors import Problems, did_you_mean
 from qgs.recipe.places import Place
-from qgs.recipe.registry import InstalledPlugin, Registry, available_plugins, component_failure
+from qgs.recipe.registry import InstalledPlugin, Registry, component_failure
 from qgs.recipe.slots import SLOTS, type_at
 from qgs.recipe.yaml_text import KeyPath, MapNode, brief, find, inline
 from qgs.tokengs.schedules import SCHEDULES
@@ -134,18 +134,13 @@ def _why_no_component(name: object, slot: str, registry: Registry) -> tuple[str,
     """Reason and fix for a `type` that names no component of `slot`."""
     known = registry.components(slot)
     choice = f"choose {', '.join(sorted(known))}"
-    if name is None:
-        reason = f"no `type` is given, and the slot `{slot}` has no default component"
-        return reason, f"add `type:`; {choice}"
     if not isinstance(name, str):
-        return f"`type` names a component, got {brief(name)}", choice
+        # The slot has no default component.
+        return f"`type` must name a component of the slot `{slot}`, got {brief(name)}", choice
     plugin, slash, _ = name.partition("/")
     if slash and plugin not in registry.plugins:
-        used = [*registry.plugins][1:]
         reason = f"`{name}` is of the plugin `{plugin}`, which this recipe does not use"
-        fix = f"add `plugins: [{', '.join([*used, plugin])}]`"
-        near = nearest(plugin, [*used, *available_plugins()])
-        return reason, fix if near in (None, plugin) else f"did you mean the plugin `{near}`?"
+        return reason, f"add `plugins: [{plugin}]`, which joins those of its base"
     # The same name may stand in several slots, such as `qgs/none`.
     for other in SLOTS:
         if name in registry.components(other):

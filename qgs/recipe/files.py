@@ -153,7 +153,6 @@ def _with_bases(node: MapNode, folder: Path, trees: _Trees, problems: Problems) 
 
 def apply_overrides(tree: MapNode, overrides: Sequence[str], problems: Problems) -> MapNode:
     """`tree` with every override laid over it in order; the n-th has the origin `--set #n`."""
-    assert not isinstance(overrides, str), f"overrides are a list of strings: [{overrides!r}]"
     for number, text in enumerate(overrides, start=1):
         # One by one: an override may set an option of a component that the one before chose.
         tree = merge(tree, _read_override(text, Origin(f"--set #{number}"), problems))

@@ -68,12 +68,6 @@ def _type(name: str, component: type[Component]) -> dict[str, Any]:
     description = summary_of(component)
     schema = settings_schema(component.Config)
     properties = {"type": {"const": name, "description": description}, **schema["properties"]}
-    for option in component.scheduled:
-        number = dict(properties[option])
-        # What editors show of an option stands beside its alternatives, not inside of one.
-        apart = [key for key in ("description", "title", "default") if key in number]
-        shown = {key: number.pop(key) for key in apart}
-        properties[option] = {**shown, "anyOf": [number, {"$ref": "#/$defs/schedule"}]}
     return schema | {"description": description, "properties": properties}
 
 
@@ -90,7 +84,15 @@ def settings_schema(config: type[ComponentConfig]) -> dict[str, Any]:
     # An overlay sets an option and leaves the rest to its base.
     for key in ("required", "title"):
         schema.pop(key, None)
-    return _inlined(schema, definitions)
+    schema = _inlined(schema, definitions)
+    options = schema["properties"]
+    for option in config.__component__.scheduled if config.__component__ else ():
+        number = dict(options[option])
+        # What editors show of an option stands beside its alternatives, not inside of one.
+        apart = [key for key in ("description", "title", "default") if key in number]
+        shown = {key: number.pop(key) for key in apart}
+        options[option] = {**shown, "anyOf": [number, {"$ref": "#/$defs/schedule"}]}
+    return schema
 
 
 def _inlined(schema: Any, definitions: dict[str, Any]) -> Any:
