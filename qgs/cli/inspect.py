@@ -51,7 +51,7 @@ def compose(recipe: RecipeFile, overrides: Overrides = None) -> None:
     # Patterns that name no parameter are refused.
     resolved.rate_factors(model)
     typer.echo(annotated(resolved))
-    Console(stderr=True).print(parameter_table(resolved, model))
+    Console(stderr=True).print(parameter_table(model))
     for warning in resolved.warnings:
         typer.echo(f"warning: {warning}", err=True)
 

@@ -11,8 +11,7 @@ from rich.table import Table
 from qgs.checkpoint.models import about, card_of, checkpoint_path
 from qgs.contracts import LAYER_SLOTS, ComponentConfig
 from qgs.model import QueryGaussianModel
-from qgs.model_text import parameter_counts
-from qgs.recipe import Recipe
+from qgs.model_text import parameter_counts, slot_rows
 from qgs.recipe.errors import did_you_mean
 from qgs.recipe.registry import Registry, default_config
 from qgs.recipe.schema import settings_schema, summary_of
@@ -162,20 +161,11 @@ def _type(option: Schema) -> str:
     return f"{_WORDS.get(kind, kind)} {', '.join(bounds)}".strip()
 
 
-def parameter_table(recipe: Recipe, model: QueryGaussianModel) -> Table:
-    """Return the parameters of each component of `model`, built from `recipe`."""
+def parameter_table(model: QueryGaussianModel) -> Table:
+    """Return the parameters of each component of `model`."""
     table = folded_table("parameters", "component", "type", "parameters", right=1)
-    counts = parameter_counts(model)
-    for name, count in counts.items():
-        slot = name.removeprefix("decoder.")
-        # Of the decoder, the types in all layers.
-        path = ("model", slot) if slot == name else ("model", "decoder", "layers")
-        kinds = dict.fromkeys(
-            part.type
-            for place, part in recipe.parts.items()
-            if place[: len(path)] == path and place[-1] == slot
-        )
-        table.add_row(name, ", ".join(kinds), f"{count:,}")
+    for row in slot_rows(model):
+        table.add_row(*row)
     table.add_section()
-    table.add_row("total", "", f"{sum(counts.values()):,}")
+    table.add_row("total", "", f"{sum(parameter_counts(model).values()):,}")
     return table

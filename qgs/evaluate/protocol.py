@@ -38,13 +38,6 @@ class Protocol:
     def __str__(self) -> str:
         return f"{self.name} ({self.sha256[:12]})"
 
-    def settings(self) -> dict[str, Any]:
-        """Return `content` with size and hash in place of the index, which may be long."""
-        views = self.content["views"]
-        if index := views.get("index"):
-            views = {"index": {"scenes": len(index), "sha256": _sha256(index)}}
-        return {**self.content, "views": views}
-
 
 def index_of(recipe: Recipe) -> EvaluationIndex | None:
     """Read the index that `recipe` names; None where views are drawn. Raises as `read_index`."""

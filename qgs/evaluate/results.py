@@ -107,15 +107,10 @@ class Evaluation:
 
         over_scenes: of each value of the model the mean, variance and median over scenes.
         """
-        protocol = self.protocol
         values = {name: self._values(f"model_{name}") for name in self.columns}
-        used = spread(self._values("gaussians_used"))
+        used = spread(self._values("gaussians_used"))["mean"]
         return {
-            "protocol": {
-                "name": protocol.name,
-                "sha256": protocol.sha256,
-                "settings": protocol.settings(),
-            },
+            "protocol": {"name": self.protocol.name, "sha256": self.protocol.sha256},
             "step": self.step,
             "statement": self.statement,
             "scenes": len(self.scores),
@@ -128,7 +123,7 @@ class Evaluation:
             "incomplete": dict(self.incomplete),
             "over_scenes": {n: {**spread(v), "scenes": len(v)} for n, v in values.items() if v},
             "gaussians": self.gaussians,
-            "gaussians_used": {"opacity_above": OPACITY_USED, **used},
+            "gaussians_used": {"opacity_above": OPACITY_USED, "mean": used},
             "tuning": self._tuning(),
             "remarks": list(self.remarks),
         }
@@ -217,10 +212,10 @@ class Evaluation:
             count = len(self._values(f"model_{name}"))
             over = f"over {self._of_wanted(count)} scenes" if count else "empty"
             yield f"{self.columns[name].heading} is {over}: {why}"
-        used = spread(self._values("gaussians_used"))
+        used = spread(self._values("gaussians_used"))["mean"]
         yield (
-            f"{self.gaussians:,} Gaussians a scene, {used['mean']:,.0f} of them used (opacity "
-            f"above {OPACITY_USED:.4f}; mean over scenes, median {used['median']:,.0f})"
+            f"{self.gaussians:,} Gaussians a scene, {used:,.0f} of them used (opacity above "
+            f"{OPACITY_USED:.4f}; mean over scenes)"
         )
         if tuning := self._tuning():
             yield (

@@ -22,12 +22,11 @@ def tuning_settings(tune: str | None) -> list[str]:
     """
     if tune is None:
         return []
-    match = re.fullmatch(r"(?:(queries|latents):)?(\d+)|(queries|latents)", tune)
-    if match is None:
+    match = re.fullmatch(r"(?:(queries|latents)(?::|$))?(\d*)", tune)
+    if match is None or not tune:
         raise ValueError(f"tuning is STEPS, queries[:STEPS] or latents[:STEPS], got {tune!r}")
-    what = match[1] or match[3]
-    steps = f"evaluation.tuning_steps={match[2] or 50}"
-    return [steps, f"evaluation.tuning={what}"] if what else [steps]
+    what = [f"evaluation.tuning={match[1]}"] if match[1] else []
+    return [f"evaluation.tuning_steps={match[2] or 50}", *what]
 
 
 def tuning_loss(recipe: Recipe) -> Photometric:

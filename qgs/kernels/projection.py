@@ -68,12 +68,14 @@ def _vector(array):
 
 
 @kernel
+def _four(row):
+    return row[0], row[1], row[2], row[3]
+
+
+@kernel
 def _rotation(quat):
     """Rows of the rotation matrix, the unit quaternion and the norm it was divided by."""
-    w = quat[0]
-    x = quat[1]
-    y = quat[2]
-    z = quat[3]
+    w, x, y, z = _four(quat)
     norm = max(np.sqrt(w * w + x * x + y * y + z * z), _SHORTEST)
     w = w / norm
     x = x / norm
@@ -105,11 +107,6 @@ def _seen(c2w, mean):
 
 
 @kernel
-def _four(row):
-    return row[0], row[1], row[2], row[3]
-
-
-@kernel
 def _clamp(slope, focal, principal, size, margin):
     """`slope` held within `margin` of the image, and whether it was held."""
     low = (-margin * size - principal) / focal
@@ -125,14 +122,18 @@ def _image_factor(turned, axis, slope, focal, z):
 
 
 @kernel
+def _dots(a, rows):
+    return (_dot(rows[0], a), _dot(rows[1], a), _dot(rows[2], a))
+
+
+@kernel
 def _turn(pose, factor_columns):
     """Rows of C^T F."""
     axes = _columns(pose)
-    f0, f1, f2 = factor_columns
     return (
-        (_dot(axes[0], f0), _dot(axes[0], f1), _dot(axes[0], f2)),
-        (_dot(axes[1], f0), _dot(axes[1], f1), _dot(axes[1], f2)),
-        (_dot(axes[2], f0), _dot(axes[2], f1), _dot(axes[2], f2)),
+        _dots(axes[0], factor_columns),
+        _dots(axes[1], factor_columns),
+        _dots(axes[2], factor_columns),
     )
 
 
@@ -329,7 +330,7 @@ def project_backward_unit(
             )
             of_seen = (of_x, of_y, z_x + z_y + slopes[5])
             of_turned = (of_turned_x, of_turned_y, _plus(turned_z_x, _ONE, turned_z_y))
-            of_offset = (_dot(pose[0], of_seen), _dot(pose[1], of_seen), _dot(pose[2], of_seen))
+            of_offset = _dots(of_seen, pose)
             of_mean = _plus(of_mean, _ONE, of_offset)
             of_factor = _added(of_factor, pose, of_turned)
             if wants_cameras:

@@ -96,13 +96,15 @@ class PeriodicEvaluation:
         # A resumed run evaluates again what lies after its last save.
         kept = [record for record in read_records(place) if record["step"] < step]
         write_text(place, "".join(json.dumps(record) + "\n" for record in (*kept, *records)))
-        for record in records:
-            group = f"evaluation/{record['weights']}"
-            scores = {f"{group}/{name}": score for name, score in record["scores"].items()}
-            self.trackers.log(scores, step)
+        scores = {
+            f"evaluation/{record['weights']}/{name}": score
+            for record in records
+            for name, score in record["scores"].items()
+        }
+        self.trackers.tell(lambda tracker: tracker.log(scores, step))
         picture = self._picture()
         write_png(picture, self.folder / "pictures" / f"step-{step}.png")
-        self.trackers.picture("evaluation", picture, step)
+        self.trackers.tell(lambda tracker: tracker.picture("evaluation", picture, step))
 
     def _between_scenes(self, done: int, wanted: int) -> None:
         if self.stop:

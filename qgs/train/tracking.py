@@ -148,20 +148,13 @@ class Trackers:
             except Exception as error:
                 _warn(name, error)
 
-    def log(self, values: Mapping[str, float], step: int) -> None:
-        """Pass on the numbers of a step, by name."""
-        self._each(lambda tracker: tracker.log(values, step))
-
-    def picture(self, name: str, picture: np.ndarray, step: int) -> None:
-        """Pass on a uint8 (H, W, 3) picture."""
-        self._each(lambda tracker: tracker.picture(name, picture, step))
-
     def close(self) -> None:
         """End tracking."""
-        self._each(lambda tracker: tracker.close())
+        self.tell(lambda tracker: tracker.close())
         self._open.clear()
 
-    def _each(self, act: Callable[[Tracker], None]) -> None:
+    def tell(self, act: Callable[[Tracker], None]) -> None:
+        """Have each tracker take something."""
         for name, tracker in list(self._open.items()):
             # A service may be down, and a distribution may raise anything.
             try:

@@ -321,7 +321,7 @@ class Trainer:
             # JSON has no NaN: a skipped step leaves only its finite numbers.
             finite = {name: value for name, value in record.items() if math.isfinite(value)}
             self.folder.append(finite)
-            self.trackers.log(finite, counters.step)
+            self.trackers.tell(lambda tracker: tracker.log(finite, counters.step))
         progress.show(counters.step, record["loss"], record["psnr"], counters.used)
 
     def _evaluate(self, stop: StopRequest) -> None:

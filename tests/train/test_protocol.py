@@ -38,7 +38,6 @@ def test_the_content_of_the_index_is_hashed_and_neither_its_place_nor_its_form(f
     first = indexed(file)
     assert first.name == "published"
     assert str(tmp_path) not in first.canonical
-    assert first.settings()["views"]["index"].keys() == {"scenes", "sha256"}
     named = indexed(file, "evaluation.protocol=mine")
     assert (named.name, named.sha256) == ("mine", first.sha256)
     copy = tmp_path / "renamed.json"

@@ -82,7 +82,7 @@ def test_tensorboard_gets_what_the_history_gets_and_drops_what_was_lost(copied):
     lost = Trackers(("tensorboard",))
     lost.open(copied, flat(recipe.tree))
     for step in range(1, 6):
-        lost.log({"loss": float(step)}, step)
+        lost.tell(lambda tracker, step=step: tracker.log({"loss": float(step)}, step))
     lost.close()
     time.sleep(1.1)  # files of one second are read in the order of a number in their names
     last = run(recipe, copied, resume=True).folder.history()[-1]
@@ -101,7 +101,7 @@ def test_a_resumed_run_goes_on_in_its_run_of_wandb(tmp_path, monkeypatch):
     for step in (0, 4):
         trackers = Trackers(("wandb",))
         trackers.open(tmp_path, {}, step)
-        trackers.log({"loss": 0.5}, step + 1)
+        trackers.tell(lambda tracker, step=step: tracker.log({"loss": 0.5}, step + 1))
     first, second = (call.kwargs["id"] for call in wandb.init.call_args_list)
     assert first == second != ""
     logged = [call.kwargs["step"] for call in wandb.init.return_value.log.call_args_list]
