@@ -64,8 +64,7 @@ class TrainingConfig(ComponentConfig):
     clip: float = Field(default=1.0, gt=0)
     """Largest norm of the gradient; a larger one is scaled down to it."""
     precision: Literal["float32", "bf16"] = "bf16"
-    """What the model computes in; bf16 is torch's autocast, weights stay float32. See
-    `qgs.train.precision`."""
+    """What the model computes in; bf16 is torch's autocast, weights stay float32."""
     save_every: int = Field(default=1000, ge=0)
     """Steps between checkpoints; 0 saves at the end and before evaluations only."""
     collapse_window: int = Field(default=50, ge=10, le=100)

@@ -56,6 +56,7 @@ def tune(
     Returns the Gaussians of what was tuned, and a record of the tuning.
     """
     what = settings.tuning
+    views = views.to(next(model.parameters()).device)
     # Encoded once: weights and photos stay, so the memory does too.
     with torch.no_grad():
         memory = model.encoder(views)

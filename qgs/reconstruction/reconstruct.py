@@ -82,8 +82,7 @@ def reconstruct(
         model.eval()
         tuned = record = None
         if tune and recipe.evaluation.tuning_steps:
-            given = sample.inputs.to(next(model.parameters()).device)
-            tuned, record = tuned_on(model, given, tuning_loss(recipe), recipe.evaluation)
+            tuned, record = tuned_on(model, sample.inputs, tuning_loss(recipe), recipe.evaluation)
         result = reconstruct_sample(model, sample, world, chosen.seen, tuned, record)
     finally:
         model.train(training)

@@ -2,19 +2,18 @@
 
 from qgs.contracts import Component
 from qgs.tokengs.blocks import NORM_EPS, CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
-from qgs.tokengs.centers import FreeCenters, OffsetCenters, posact
 from qgs.tokengs.decoder import (
     ContentCrossAttention,
     ContentSelfAttention,
     CrossSelfMlp,
+    LatentQueries,
     MlpFeedForward,
     NoFeedback,
     NoRefinement,
 )
 from qgs.tokengs.encoder import MultiViewViT
-from qgs.tokengs.head import GaussianHead
+from qgs.tokengs.head import FreeCenters, GaussianHead, OffsetCenters, posact
 from qgs.tokengs.optimizer import OneCycleAdamW
-from qgs.tokengs.queries import LatentQueries
 from qgs.tokengs.supervision import LayerSupervision, OnePass
 
 COMPONENTS: tuple[type[Component], ...] = (

@@ -45,7 +45,6 @@ from qgs.train.initial import initialise
 from qgs.train.nonfinite import not_finite
 from qgs.train.parameters import MovingAverage, OptimizerState, make_optimizer
 from qgs.train.periodic import PeriodicEvaluation
-from qgs.train.precision import autocast
 from qgs.train.tracking import Trackers, TrainingProgress
 from qgs.train.training_pass import TrainingPass
 
@@ -372,7 +371,10 @@ def compute_gradients(
         # Only the last batch exchanges gradients between processes.
         last = number == len(batches)
         with nullcontext() if last else accelerator.no_sync(training_pass):
-            with autocast(config.precision, device.type):
+            # Geometry leaves autocast by itself; bfloat16 has float32's exponents, so that no
+            # gradients need scaling.
+            in_half = config.precision == "bf16"
+            with torch.autocast(device.type, torch.bfloat16, enabled=in_half):
                 outcome: Outcome = training_pass(batch.inputs.to(device), batch.targets.to(device))
             accelerator.backward(outcome.total / len(batches))
         found = {"loss": outcome.total.detach(), **outcome.terms, **outcome.signs}
