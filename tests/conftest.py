@@ -3,9 +3,15 @@
 import gc
 
 import pytest
+import suite_watch
 from installing import install
 
 __all__ = ["install"]
+
+
+def pytest_configure(config):
+    """Have the whole suite, tests of plugins too, say what it costs."""
+    config.pluginmanager.register(suite_watch)
 
 
 def pytest_collection_finish():
