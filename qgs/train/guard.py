@@ -4,13 +4,12 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, NoReturn
 
 from accelerate import Accelerator
 from torch import Tensor, nn
 
-from qgs.checkpoint.model_file import CheckpointFile, unique_tensors
+from qgs.checkpoint.model_file import unique_tensors
 from qgs.checkpoint.tensors import nonfinite
 from qgs.contracts import TrainingConfig
 from qgs.data.samples import Batch
@@ -305,11 +304,18 @@ class GoodWeights:
         copy = {name: tensor.detach().to("cpu", copy=True) for name, tensor in present.items()}
         self.copies = [*self.copies, (step, copy)][-2:]
 
-    def resume(self, step: int, checkpoint: Path) -> None:
-        """Go on from the good weights in `checkpoint`; without one from those of `step`."""
+    def state(self) -> dict[str, Any]:
+        found: dict[str, Any] = {"psnr": self.psnr, "best": self.best}
+        found["steps"] = [step for step, _ in self.copies]
+        for number, (_, copy) in enumerate(self.copies):
+            found |= {f"{number}/{name}": tensor for name, tensor in copy.items()}
+        return found
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        self.psnr = state["psnr"]
+        self.best = state["best"]
         self.copies = []
-        if checkpoint.is_file():
-            with CheckpointFile(checkpoint) as file:
-                self.copies.append((file.step or 0, file.tensors if self.keep else {}))
-        else:
-            self.refresh(step)
+        for number, step in enumerate(state["steps"]):
+            prefix = f"{number}/"
+            copy = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
+            self.copies.append((step, copy))

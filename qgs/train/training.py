@@ -137,7 +137,6 @@ class Trainer:
             self._build_parts(source)
             if saved:
                 self.saver.restore(saved.parts)
-                self.guard.good.resume(self.counters.step, self.folder.checkpoint)
             self.resumed_at = self.counters.step if saved else None
             self._follow_schedules()
             batches = self._open_data(source)
@@ -205,6 +204,7 @@ class Trainer:
         # Beside the weights, all that continues the run.
         parts = {
             "guard": self.guard,
+            "good": self.guard.good,
             "counters": self.counters,
             "moments": OptimizerState(self.training_pass, self.torch_optimizer),
             "schedule": self.optimizer,

@@ -1,8 +1,10 @@
 """Runs that die are noticed, said so, and leave good weights."""
 
+import signal
+
 import pytest
 import torch
-from training_runs import TRAINED, run, run_calling, same, tiny
+from training_runs import run, run_calling, same, tiny
 
 import qgs
 from qgs.checkpoint.model_file import CheckpointFile
@@ -63,14 +65,24 @@ def test_good_weights_are_the_older_of_two_copies_made_before_the_images_got_wor
     assert (weights["weight"] == 50).all()
 
 
-def test_a_resumed_run_falls_back_on_the_weights_of_its_checkpoint(copied):
-    before = qgs.load(copied / "checkpoint.safetensors").state_dict()
-    recipe = tiny("locus", *TRAINED, "training.steps=4")
-    seen = []
-    run_calling(lambda trainer, _: seen.append(trainer.guard.good.last), recipe, copied, True)
-    step, weights = seen[0]
-    assert step == 3
-    assert same(dict(weights), before)
+def test_a_run_stopped_while_it_dies_and_resumed_still_ends_with_good_weights(tmp_path):
+    recipe = tiny("tokengs", "training.steps=40", "training.collapse_window=10")
+    after = {}
+
+    def die(trainer, stop):
+        step = trainer.counters.step
+        after[step] = {name: x.clone() for name, x in trainer.model.state_dict().items()}
+        if step == 5:
+            trainer.model.head.linear.bias.data.fill_(-20)
+        if step == 8:
+            stop.signal = signal.SIGTERM
+
+    checkpoint = run_calling(die, recipe, tmp_path).folder.checkpoint
+    assert CheckpointFile(checkpoint).step == 8  # in doubt: saved as it is
+    with pytest.raises(CollapseError, match="at step 15: for 10 steps"):
+        run(recipe, tmp_path, resume=True)
+    assert CheckpointFile(checkpoint).step == 2
+    assert same(qgs.load(checkpoint).state_dict(), after[2])
 
 
 def test_gaussians_invisible_from_the_start_end_a_run_at_the_window_or_its_end(tmp_path):
