@@ -1,4 +1,6 @@
-"""The model as a whole, composed from the tiny recipes made smaller still."""
+"""The model as a whole, composed from the tiny recipes made smaller still, and printed."""
+
+import re
 
 import pytest
 import torch
@@ -59,3 +61,17 @@ def test_layers_that_are_decoded_and_refined(views):
         model(views, layers=[5])
     override = "model.decoder.layers.0.refinement={type: locus/refine, radius: false}"
     assert [len(x.refinements) for x in (model, small("locus", override))] == [1, 2]
+
+
+LAYER = "model.decoder.layers={0: {cross_attention: {type: qgs/content}}}"
+
+
+def test_a_model_says_its_slots_in_a_few_lines():
+    model = small("locus", LAYER)
+    heading, *lines = repr(model).splitlines()
+    total = sum(parameter.numel() for parameter in model.parameters())
+    assert f"{total:,} parameters" in heading
+    assert "12 queries of 8 Gaussians" in heading
+    cells = r"^  decoder\.cross_attention +qgs/content, locus/ray_biased +[\d,]+$"
+    assert re.search(cells, repr(model), re.M)
+    assert sum(int(line.split()[-1].replace(",", "")) for line in lines[:10]) == total

@@ -1,7 +1,5 @@
 """Containers refuse what does not fit together, where it is made."""
 
-from dataclasses import replace
-
 import torch
 from tables import must_refuse
 
@@ -38,6 +36,8 @@ def test_what_does_not_fit_together_is_refused():
     must_refuse(r"Attributes\.quats", GaussianAttributes, THREE, THREE, THREE, ONE, THREE)
     must_refuse(r"Gaussians\.sh .*\(1, 5, C, 3\), got", Gaussians, *BALLS, zeros(1, 5, 3))
     must_refuse(r"sh has 4 coefficients.* 3, 8 or 15", Gaussians, *BALLS, zeros(1, 5, 4, 3))
+    both = [Gaussians(*BALLS), Gaussians(*BALLS, zeros(1, 5, 3, 3))]
+    must_refuse("sh", concatenated, both, 1)
     must_refuse(r"Rendering\.depth", Rendering, RGB, ALPHA, ALPHA[..., :4])
     odd = Views(zeros(1, 1, 3, 8, 9), CAMERA.replace(size=(8, 9)))
     must_refuse("different sizes", Views(zeros(1, 1, 3, 8, 8), CAMERA).joined, odd)
@@ -79,31 +79,3 @@ def test_every_nested_tensor_is_mapped_and_named():
     assert doubled[3][1] == "text"
     assert doubled[3][2] is value[3][2]  # no tensor in it changed
     assert map_tensors(lambda x: x, value) is value
-
-
-def rich_gaussians(count, seed=0):
-    """Gaussians (2, count) with everything that they may have."""
-    generator = torch.Generator().manual_seed(seed)
-    shapes = ((3,), (3,), (4,), (), (3,), (8, 3), (2,))
-    return Gaussians(*(torch.rand(2, count, *shape, generator=generator) for shape in shapes))
-
-
-def test_the_most_opaque_keep_all_that_they_have():
-    gaussians = rich_gaussians(9)
-    kept = vars(gaussians.most_opaque(4))
-    for scene in range(2):
-        index = gaussians.opacities[scene].topk(4).indices.sort().values
-        for name, tensor in vars(gaussians).items():
-            assert torch.equal(kept[name][scene], tensor[scene, index]), name
-    assert gaussians[0].sh.shape == (9, 8, 3)
-    assert gaussians[:, :3].features.shape == (2, 3, 2)
-
-
-def test_containers_are_put_together_tensor_by_tensor():
-    one = rich_gaussians(3)
-    other = rich_gaussians(4, seed=1)
-    both = concatenated([one, other], 1)
-    assert both.count == 7
-    assert torch.equal(both.sh[:, 3:], other.sh)
-    assert torch.equal(both.opacities[:, :3], one.opacities)
-    must_refuse("sh", concatenated, [replace(one, sh=None), other], 1)

@@ -23,25 +23,6 @@ def texts(folder):
     return {str(path.relative_to(folder)): path.read_text() for path in files}
 
 
-def replace(folder, mark, *names):
-    with replacing_entries(folder, mark) as fresh:
-        put(fresh, "new", *names)
-
-
-def test_entries_are_replaced_whole_and_the_rest_stays(tmp_path):
-    put(tmp_path / "out", "old", "views/old.png", "notes.txt")
-    replace(tmp_path / "out", "views", "views/new.png")
-    assert texts(tmp_path) == {"out/views/new.png": "new", "out/notes.txt": "old"}
-
-
-def test_entries_of_no_earlier_result_stay(tmp_path):
-    put(tmp_path / "out", "old", "depth/sensor.png")
-    names = "scene.ply", "depth/0.png"
-    with pytest.raises(FileExistsError, match="depth"):
-        replace(tmp_path / "out", "scene.ply", *names)
-    assert texts(tmp_path) == {"out/depth/sensor.png": "old"}
-
-
 def test_entries_come_back_where_moving_fails(tmp_path, monkeypatch):
     put(tmp_path / "out", "old", "a/x", "b/x")
     rename = Path.rename
@@ -52,8 +33,8 @@ def test_entries_come_back_where_moving_fails(tmp_path, monkeypatch):
         return rename(self, target)
 
     monkeypatch.setattr(Path, "rename", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        replace(tmp_path / "out", "a", "a/x", "b/x")
+    with pytest.raises(KeyboardInterrupt), replacing_entries(tmp_path / "out", "a") as fresh:
+        put(fresh, "new", "a/x", "b/x")
     assert texts(tmp_path) == {"out/a/x": "old", "out/b/x": "old"}
 
 

@@ -1,12 +1,15 @@
-"""`qgs list`, `compose`, `schema`, and what the command does with mistakes."""
+"""`qgs list`, `compose`, `recipes`, names of recipes, options of all commands, mistakes."""
 
 import sys
+from pathlib import Path
 
 import pytest
+import typer
+import yaml
 from commands import done
 
-from qgs.cli import main
-from qgs.recipe import resolve
+from qgs.cli import app, main
+from qgs.recipe import RecipeError, files, resolve
 
 SMALL = """recipe: 1
 model:
@@ -79,3 +82,82 @@ def test_mistakes_are_printed_without_a_traceback(tmp_path, monkeypatch, capsys)
         assert reason in shown.err
         assert "Traceback" not in shown.err
         assert not shown.out
+
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def test_all_are_listed_with_what_they_are():
+    lines = done("recipes").stdout.splitlines()
+    assert len(lines) == len({*RECIPES.rglob("*.yaml")} - {*RECIPES.glob("studies/**/*")})
+    meanings = dict(line.split(None, 1) for line in lines)
+    assert "TokenGS" in meanings["tiny/tokengs.yaml"]
+    assert all(" " in meaning for meaning in meanings.values())
+
+
+@pytest.mark.parametrize("name", ["tiny/locus.yaml", "recipes/tiny/locus.yaml"])
+def test_a_name_stands_for_a_recipe_that_no_file_hides(name):
+    recipe = resolve(RECIPES / "tiny/locus.yaml").tree
+    assert resolve(name).tree == recipe
+    Path("mine.yaml").write_text("recipe: 1\nextends: tiny/locus.yaml\nseed: 5\n")
+    assert resolve("mine.yaml").tree == {**recipe, "seed": 5}
+    Path(name).parent.mkdir(parents=True)
+    Path(name).write_text("recipe: 1\nseed: 7\n")
+    assert resolve(name).tree["seed"] == 7
+
+
+def test_other_names_are_refused():
+    for name in ("tiny/lotus.yaml", "../README.md", "../recipes/../README.md"):
+        with pytest.raises(RecipeError, match=r"does not exist[^?]*or take one of `qgs recipes`"):
+            resolve(name)
+
+
+def test_a_copy_brings_what_it_extends_and_overwrites_nothing():
+    words = ("recipes", "rooms/locus_64.yaml", "--out", "mine")
+    done(*words)
+    copies = sorted(path.name for path in Path("mine").rglob("*.*"))
+    assert copies == ["budget_64.yaml", "locus.yaml", "locus_64.yaml", "tokengs.yaml"]
+    copy = Path("mine/rooms/locus_64.yaml")
+    own = resolve(copy)
+    assert own.tree == resolve("rooms/locus_64.yaml").tree
+    assert str(RECIPES) not in "".join(own.provenance.values())
+    copy.unlink()
+    other = Path("mine/tiny/locus.yaml")
+    other.write_text("mine")
+    with pytest.raises(FileExistsError):
+        done(*words)
+    assert other.read_text() == "mine"
+    assert not copy.exists()
+
+
+def test_the_recipes_of_a_wheel_come_first(tmp_path, monkeypatch):
+    inside = tmp_path / "qgs" / "recipes" / "tiny"
+    inside.mkdir(parents=True)
+    (inside / "locus.yaml").write_text("recipe: 1\nseed: 9\n")
+    monkeypatch.setattr(files, "__file__", str(tmp_path / "qgs/recipe/files.py"))
+    assert resolve("tiny/locus.yaml").tree["seed"] == 9
+
+
+FROZEN = Path(__file__).parent / "options.yaml"
+
+
+def options_of(command, path=()):
+    """Command to the options that it takes, subcommands by `name subcommand`."""
+    if hasattr(command, "commands"):
+        found = {}
+        context = typer.Context(command)
+        for name in command.list_commands(context):
+            found |= options_of(command.get_command(context, name), (*path, name))
+        return found
+    options = [option for part in command.params for option in part.opts if option[:2] == "--"]
+    return {" ".join(path): [option for option in options if option != "--help"]}
+
+
+def test_options_are_those_of_the_list():
+    """A new one is a decision, not an accident."""
+    assert options_of(typer.main.get_command(app)) == yaml.safe_load(FROZEN.read_text())

@@ -66,13 +66,3 @@ def test_a_view_sees_the_direction_from_its_camera_to_the_mean():
     assert found.max() > 1
     with pytest.raises(ValueError, match="no spherical harmonics"):
         seen_colors(gaussians.replace(sh=None), cameras)
-
-
-def test_half_precision_is_raised_and_autocast_left():
-    gaussians, cameras = make_scene(2, 3, 5, harmonics=8)
-    outside = seen_colors(gaussians, cameras)
-    with torch.autocast("cpu", torch.bfloat16):
-        inside = seen_colors(gaussians, cameras)
-        assert seen_colors(gaussians.to(torch.bfloat16), cameras).dtype == torch.float32
-        assert rotated(gaussians.sh, TURN).dtype == torch.float32
-    assert_close(inside, outside)
