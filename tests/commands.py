@@ -34,7 +34,7 @@ def done(*words):
 def saved(file, kind, **data):
     """A model of data of such a kind, in `file`."""
     overrides = [
-        "plugins=[rooms, tapes]" if "tapes" in kind else "plugins=[rooms]",
+        "plugins=[rooms]",
         "views={inputs: 2, targets: 2, gap: [2, 4], scale: constant}",
         f"data={{type: {kind}, image_size: [16, 16]}}",
         *(f"data.{name}={value}" for name, value in data.items()),

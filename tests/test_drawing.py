@@ -1,18 +1,9 @@
 """Pictures of tensors keep what they show, and pages hold them."""
 
-import numpy as np
 import pytest
 import torch
 
-from qgs.drawing.images import (
-    EXACT,
-    NOTHING,
-    data_uri,
-    depth_picture,
-    depth_range,
-    enlarged,
-    rgb_picture,
-)
+from qgs.drawing.images import NOTHING, depth_picture, depth_range, rgb_picture
 
 
 def test_depth_pictures_share_a_scale_and_show_where_nothing_is():
@@ -29,11 +20,3 @@ def test_pictures_keep_their_pixels():
     image = torch.rand(3, 4, 6)
     picture = rgb_picture(image)
     assert abs(picture / 255 - image.permute(1, 2, 0).numpy()).max() < 0.51 / 255
-    assert enlarged(picture, 24).shape == (16, 24, 3)
-    assert (enlarged(np.full_like(picture, 90), 24) == 90).all()
-
-
-def test_large_photos_are_compressed_and_small_ones_exact():
-    small, large = (np.zeros((side, 9, 3), np.uint8) for side in (EXACT, EXACT + 1))
-    kinds = [data_uri(small, photo=True), data_uri(large, photo=True), data_uri(large)]
-    assert [uri[11:15] for uri in kinds] == ["png;", "webp", "png;"]

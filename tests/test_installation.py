@@ -1,4 +1,4 @@
-"""One line installs all distributions, another `qgs` is refused, only our environment is deleted."""
+"""All distributions by one line; another `qgs` is refused; no environment is deleted but ours."""
 
 import shutil
 import subprocess

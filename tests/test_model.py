@@ -5,7 +5,6 @@ import re
 import pytest
 import torch
 from odd_views import odd_views
-from varying_head import VaryingHead
 
 import qgs
 
@@ -36,20 +35,6 @@ def test_the_api_in_five_lines(model, views, tmp_path):
     qgs.save(model, tmp_path / "model.safetensors")
     again = qgs.load(tmp_path / "model.safetensors")
     assert torch.equal(again(views).gaussians.means, gaussians.means)
-
-
-def test_harmonics_and_features_of_a_head_come_through(views):
-    model = small("locus")
-    plain = model(views).gaussians
-    model.head = VaryingHead(model.head).eval()
-    found = model(views)
-    attributes = model.head(found.state)
-    for name in ("sh", "features"):
-        assert torch.equal(getattr(found.gaussians, name), getattr(attributes, name).flatten(1, 2))
-    assert torch.equal(found.gaussians.colors, plain.colors)
-    rendering = model.render(found.gaussians, views.cameras)
-    assert rendering.features.shape == (2, 2, 4, 16, 24)
-    assert not torch.equal(rendering.rgb, model.render(plain, views.cameras).rgb)
 
 
 def test_layers_that_are_decoded_and_refined(views):

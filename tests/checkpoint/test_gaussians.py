@@ -193,16 +193,10 @@ def test_an_installed_distribution_adds_a_format(install, tmp_path):
 
 def test_a_format_that_cannot_be_imported_is_refused_before_the_work(install, tmp_path):
     install("qgs-xyz", "xyz", "import no_such_package", group="qgs.scene_writers")
-    must_refuse(
-        r"qgs-xyz 1\.2",
-        save_gaussians,
-        random_gaussians(5),
-        tmp_path / "a.xyz",
-        kind=ExtensionError,
-    )
     missing = tmp_path / "missing.safetensors"  # not even read
     error = run_qgs("reconstruct", missing, tmp_path, "--out", tmp_path / "a.xyz").exception
     assert isinstance(error, ExtensionError)
+    assert "qgs-xyz 1.2" in str(error)
 
 
 def test_the_bytes_of_a_splat_file(tmp_path):

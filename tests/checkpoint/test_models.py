@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from commands import run_qgs
+from commands import done, run_qgs
 from safetensors.torch import load_file
 from training_runs import tiny
 
@@ -39,10 +39,9 @@ def shipped(install, tmp_path, monkeypatch):
 def test_a_name_stands_for_the_path_wherever_one_is_taken(shipped):
     assert checkpoint_path("box/small") == checkpoint_path("box/small-1.5") == shipped
     assert qgs.load("box/small").recipe == qgs.load(shipped).recipe
-    result = run_qgs("eval", "box/small")
-    assert result.exit_code == 0, result.output
+    done("eval", "box/small")
     assert Path("evaluation_small/summary.json").is_file()
-    run_qgs("eval", "box/small")
+    done("eval", "box/small")
     assert Path("evaluation_small-2/summary.json").is_file()
     assert {path.name for path in shipped.parent.iterdir()} == {"small.md", shipped.name}
     started = tiny("tokengs", "init_from=box/small")
@@ -70,8 +69,7 @@ def test_models_are_listed_and_checked(shipped):
 
 
 def test_half_precision_is_stored_and_loads_as_float32(shipped):
-    result = run_qgs("export", "box/small", "--half", "--out", "half.safetensors")
-    assert result.exit_code == 0, result.output
+    done("export", "box/small", "--half", "--out", "half.safetensors")
     half = load_file("half.safetensors")
     whole = load_file(shipped)
     for name, tensor in half.items():

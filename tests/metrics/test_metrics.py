@@ -7,6 +7,7 @@ import pytest
 import torch
 import yaml
 from skimage.metrics import structural_similarity
+from tables import must_refuse
 from torch.testing import assert_close
 
 from qgs.contracts import Column, MetricInput
@@ -36,8 +37,7 @@ def test_ssim_equals_scikit_image():
             ]
             found = ssim(images, truth, covariance).double()
             assert_close(found, torch.tensor(expected), rtol=0, atol=1e-6)
-    with pytest.raises(ValueError, match="at least 11 pixels a side, got 10 x 20"):
-        ssim(*pair(0.1, (10, 20)))
+    must_refuse("at least 11 pixels a side, got 10 x 20", ssim, *pair(0.1, (10, 20)))
 
 
 def test_psnr_is_that_of_clipped_images():
@@ -77,18 +77,13 @@ def test_the_nearest_view_is_copied_whatever_the_scale_of_the_scene():
         assert torch.equal(found, inputs.images[:, nearest]), targets
 
 
-def test_each_scene_copies_its_own_views():
+def test_each_scene_has_its_own_views_and_mean_colour():
     both = stack_views([views([0, 1.0]), views([1.0, 0])])
     targets = Cameras(both.cameras.c2w[:1, :1].repeat(2, 1, 1, 1), torch.ones(2, 1, 4), (8, 8))
-    found = nearest_input(both, targets)
-    assert torch.equal(found, torch.stack([both.images[0, :1], both.images[1, 1:]]))
-
-
-def test_mean_colour_is_flat():
-    inputs = views([0, 1.0])
-    found = mean_colour(inputs, cameras([0.5, 2.0]))
-    mean = inputs.images.mean((1, 3, 4))[:, None, :, None, None]
-    assert_close(found, mean.expand(1, 2, 3, 8, 8))
+    expected = torch.stack([both.images[0, :1], both.images[1, 1:]])
+    assert torch.equal(nearest_input(both, targets), expected)
+    mean = both.images.mean((1, 3, 4))[:, None, :, None, None]
+    assert_close(mean_colour(both, targets), mean.expand(2, 1, 3, 8, 8))
 
 
 FIGURES = """
@@ -112,8 +107,7 @@ def test_distances_to_the_centroid_of_each_token():
     tokens = [token - token.mean(0) for scene in means for token in scene.split(4)]
     expected = torch.cat([token.norm(dim=1) for token in tokens]).view(2, 20)
     assert_close(token_dispersion(means, 4), expected)
-    with pytest.raises(ValueError, match="20 Gaussians"):
-        token_dispersion(means, 6)
+    must_refuse("20 Gaussians", token_dispersion, means, 6)
     for scene, distances in zip(means, expected, strict=True):
         scene = scene[None]
         given = MetricInput(scene, None, SimpleNamespace(means=scene), 4)

@@ -7,7 +7,6 @@ import torch
 from photo_formats import noisy_photos
 
 from qgs.contracts import ViewsConfig
-from qgs.data.frames import held_out_frames
 from qgs.reconstruction.reconstruct import checked_window, choose_sample
 from qgs.reconstruction.scenes import GivenScene, read_photos
 
@@ -45,21 +44,3 @@ def test_frames_that_are_given_are_taken_as_they_are_or_refused(photos):
     for compared, *frames in ((0, 1, 5), (0, -1, 2), (0, 1, 1), (3, 0, 3)):
         with pytest.raises(ValueError, match="frames"):
             checked_window(5, frames, [compared])
-
-
-HELD_OUT = """
-20 8: 4 12
-7 8: 3
-3 8: 1
-2 8:
-7 3: 1 4
-9 0:
-"""
-"""How many photos there are, every which is held out, and which these are."""
-
-
-def test_every_nth_photo_is_held_out_or_the_middle_one():
-    for line in HELD_OUT.strip().splitlines():
-        given, _, expected = line.partition(":")
-        held_out = held_out_frames(*map(int, given.split()))
-        assert [*held_out] == [*map(int, expected.split())], line

@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 from renderers.scenes import differentiate, make_scene
+from tables import must_refuse
 from torch.testing import assert_close
 
 import qgs.renderers.cpu
@@ -47,17 +48,14 @@ def test_more_gaussians_than_a_unit_of_work_takes(more):
 
 def test_missing_numba_says_what_to_do(monkeypatch):
     monkeypatch.setattr(qgs.renderers.cpu, "can_compile", lambda: False)
-    with pytest.raises(RuntimeError, match=r"pip install numba.*qgs/torch"):
-        CpuRenderer(RendererConfig())
+    must_refuse(r"pip install numba.*qgs/torch", CpuRenderer, RendererConfig(), kind=RuntimeError)
 
 
 def test_tensors_elsewhere_are_refused():
     gaussians, cameras = make_scene()
     away = gaussians.to("meta")
-    with pytest.raises(ValueError, match="renders CPU tensors, got Gaussians on meta"):
-        RENDER(away, cameras.to("meta"))
-    with pytest.raises(ValueError, match="Gaussians are on meta, cameras on cpu"):
-        RENDER(away, cameras)
+    must_refuse("renders CPU tensors, got Gaussians on meta", RENDER, away, cameras.to("meta"))
+    must_refuse("Gaussians are on meta, cameras on cpu", RENDER, away, cameras)
 
 
 def test_a_forked_process_can_render_after_its_parent_has():

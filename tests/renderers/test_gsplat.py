@@ -85,8 +85,9 @@ ON_CUDA = SimpleNamespace(means=SimpleNamespace(is_cuda=True, dtype=torch.float3
 
 def test_tensors_elsewhere_and_intrinsics_that_want_a_gradient_are_refused():
     gaussians, cameras = make_scene()
-    with pytest.raises(ValueError, match="CUDA tensors, got Gaussians on cpu"):
-        GsplatRenderer(RendererConfig())(gaussians, cameras)
+    must_refuse(
+        "CUDA tensors, got Gaussians on cpu", GsplatRenderer(RendererConfig()), gaussians, cameras
+    )
     cameras.intrinsics.requires_grad_()
     must_refuse("no gradient for intrinsics", gsplat_module._check_supported, ON_CUDA, cameras)
 
