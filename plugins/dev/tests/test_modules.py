@@ -40,12 +40,3 @@ def test_what_contains_itself_comes_to_an_end() -> None:
     circle: list[object] = []
     circle.append(circle)
     assert attributes(Keeper(circle))["part._kept"] == [None]
-
-
-def test_what_torch_keeps_is_left_to_it() -> None:
-    module = Keeper(None)
-    before = attributes(module)
-    module.train(False)
-    module.register_forward_hook(lambda *_: None)
-    module.part.weight.data.add_(1)
-    assert attributes(module) == before

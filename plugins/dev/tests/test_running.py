@@ -1,6 +1,5 @@
 """How checks are run and reported: causes, places of errors, expected failures, arguments."""
 
-import re
 import subprocess
 import sys
 from importlib import import_module
@@ -16,7 +15,6 @@ from qgs_dev import (
     checks_for,
     run_check,
 )
-from qgs_dev.running import TIERS
 
 from qgs.renderers import GsplatRenderer
 from qgs.tokengs import MlpFeedForward
@@ -33,12 +31,6 @@ def test_an_error_is_reported_with_its_place_in_the_component() -> None:
     line = 1 + [culprit in text for text in file.read_text().splitlines()].index(True)
     result = run_check(CHECKS["builds"], Case(RaisesWhenBuilt.Config()))
     assert f" (raised under {file}:{line})\n" in result.message
-
-
-def test_one_cause_is_one_failure() -> None:
-    results = list(CaseRun(Case(RaisesWhenBuilt.Config())).results(["core"]))
-    assert [r.check.name for r in results if not r.ok] == ["builds"]
-    assert {r.verdict for r in results[1:]} == {"skipped"}
 
 
 def test_a_test_of_a_case_names_all_that_fails_and_skips_what_cannot_run(monkeypatch) -> None:
@@ -59,14 +51,6 @@ def test_further_options_of_a_class_have_the_checks_that_see_options() -> None:
     assert variant < {check.name for check in checks_for(CASE)}
 
 
-def test_tiers_divide_the_checks_and_likely_causes_come_first() -> None:
-    core, construction, extended = (checks_for(CASE, [tier]) for tier in TIERS)
-    assert [check.name for check in core[:4]] == ["builds", "runs", STATE, "eval_repeats_bitwise"]
-    assert FROZEN in {check.name for check in construction}
-    assert [check.name for check in extended] == ["compiles"]
-    assert len(core) + len(construction) + len(extended) == len(checks_for(CASE))
-
-
 def test_every_check_is_in_the_table() -> None:
     modules = {import_module(check.function.__module__) for check in CHECKS.values()}
     written = {name for module in modules for name in vars(module) if name.startswith("check_")}
@@ -78,11 +62,3 @@ def test_commands_load_no_torch() -> None:
     code = f"import sys, qgs_dev.check_command, qgs_dev.new_command; sys.exit(str({heavy} or ''))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stderr.strip() == ""
-
-
-def test_expected_failures_are_strict() -> None:
-    run = CaseRun(CACHES, expected={STATE: "a cache", FROZEN: "it might"})
-    verdicts = {result.check.name: result for result in run.results(["core", "construction"])}
-    assert re.search(r"a cache \(seen: _cache: changed by", verdicts[STATE].message)
-    assert verdicts[STATE].ok
-    assert verdicts[FROZEN].verdict == "unexpected pass"

@@ -1,10 +1,12 @@
 """What rooms and worlds have in common, as both are drawn from a seed."""
 
+import numpy as np
 import pytest
 import torch
 import yaml
 from pydantic import ValidationError
-from qgs_worlds.rooms.source import RoomsSource
+from qgs_worlds.caster.intervals import clearances
+from qgs_worlds.rooms.source import RoomScene, RoomsSource
 from qgs_worlds.worlds.source import WorldsSource
 
 SIZE = 16, 24
@@ -24,6 +26,22 @@ def test_a_scene_is_a_function_of_seed_split_and_index(source):
     assert torch.equal(first.images([1]), first.images([3, 1])[1:])
     for other in (source().scenes("test")[7], source(seed=1).scenes("train")[7]):
         assert not torch.equal(first.images([1]), other.images([1]))
+
+
+def test_cameras_are_rigid_and_keep_clear_of_every_surface(source):
+    for scene in source().scenes("train")[:50]:
+        if isinstance(scene, RoomScene):
+            shapes = scene.tables.shapes[1:]
+            c2w = scene.cameras.c2w.double().numpy()
+            assert (np.array(scene.size[:2]) / 2 - abs(c2w[:, :2, 3])).min() > 0.2
+        else:
+            shapes = scene.drawn.world.shapes
+            c2w = scene.drawn.rig.c2w
+        turn = c2w[:, :3, :3]
+        assert clearances(shapes, c2w[:, :3, 3]).min() > 0.15
+        assert np.linalg.inv(turn) == pytest.approx(turn.transpose(0, 2, 1), abs=1e-5)
+        assert np.linalg.det(turn).min() > 0.99
+        assert turn[:, 2, 1].max() < 0, "the image's y axis points down"
 
 
 @pytest.mark.parametrize("size", [(17, 33), (130, 5)])

@@ -5,7 +5,7 @@ import math
 import torch
 import torch.nn.functional as F
 from qgs_anchors.landmark.footprint import ColoredHead, FootprintCenters, FramedRefinement
-from qgs_anchors.landmark.neighbours import NeighbourAttention, nearest
+from qgs_anchors.landmark.neighbours import NeighbourAttention
 from qgs_anchors.landmark.observed import ObservedQueries
 from qgs_anchors.landmark.rendered import RenderedFeedback
 from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
@@ -169,22 +169,11 @@ STEPS = CLOUD[CENTER][:, None] - CLOUD[CENTER][:, :, None]
 """From each anchor to each."""
 
 
-def test_neighbours_are_the_nearest(monkeypatch):
-    for pairs in (1 << 22, 100):
+def test_what_an_anchor_reads_of_the_nearest_is_written_out(monkeypatch):
+    for count, pairs in ((6, 1 << 22), (6, 100), (100, 1 << 22)):
         monkeypatch.setattr("qgs_anchors.landmark.neighbours.MAX_PAIRS", pairs)
-        index, seen = nearest(CLOUD[CENTER], 5, None)
-        assert seen is None
-        assert torch.equal(index, STEPS.norm(dim=-1).argsort(-1)[..., :5])
-
-
-def attention(count):
-    return shaken(made(NeighbourAttention, count=count), 0.1)
-
-
-def test_what_an_anchor_reads_is_written_out():
-    for count in (6, 100):
-        module = attention(count)
-        index, _ = nearest(CLOUD[CENTER], count, None)
+        module = shaken(made(NeighbourAttention, count=count), 0.1)
+        index = STEPS.norm(dim=-1).argsort(-1)[..., :count]
         scene = torch.arange(2)[:, None, None]
         steps = STEPS[scene, torch.arange(40)[:, None], index]
         reach = steps.norm(dim=-1, keepdim=True).amax(2, keepdim=True)
@@ -199,15 +188,6 @@ def test_what_an_anchor_reads_is_written_out():
         )
         expected = module.attention.proj(read) + module.place_proj(where)
         assert_close(module(CLOUD), expected, rtol=1e-4, atol=1e-3)
-
-
-def test_nobody_reads_what_is_no_query():
-    module = attention(6)
-    mask = drawn(0, 2, 40) < 0.2
-    read = module(CLOUD.replace(mask=mask))
-    for scene, held in enumerate(mask):
-        features, center = (x[scene, held][None] for x in (CLOUD.features, CLOUD[CENTER]))
-        assert_close(read[scene, held], module(QueryState(features, {CENTER: center}))[0])
 
 
 def test_errors_are_added_to_keys_and_values():

@@ -7,11 +7,8 @@ import torch
 import torch.nn.functional as F
 import yaml
 from qgs_anchors.landmark.places import (
-    aspect_of,
     colors_at,
     patch_centres,
-    rows_in_square,
-    rows_in_tile,
     sampled,
     spread,
 )
@@ -78,13 +75,6 @@ def test_points_are_in_tiles_where_these_divide_the_photos():
                 assert_close(place[view == of], patch_centres(*grid, CPU))
         else:
             assert wide == pytest.approx(high, rel=1e-5)
-
-
-def test_cells_of_tiles_are_squares():
-    counts = 1, 2, 3, 4, 6, 8
-    assert [*map(rows_in_square, counts)] == [1, 1, 2, 2, 2, 3]
-    assert [*map(rows_in_tile, counts)] == [1, 1, 2, 2, 2, 2]
-    assert [*map(aspect_of, counts)] == pytest.approx([1, 0.5, 1, 1, 2 / 3, 0.5])
 
 
 def within(pixels, at, side):

@@ -52,14 +52,6 @@ def test_two_streams_of_one_token():
     assert made(SlotQueries, count=4, extra=0).start(2).mask is None
 
 
-def test_extra_tokens_stay_extra_when_slots_are_added():
-    few, many = (made(SlotQueries, count=n, extra=2) for n in (6, 12))
-    many.load_state_dict(many.resized(few.state_dict(), torch.Generator()))
-    assert torch.equal(many.extra, few.extra)
-    assert torch.equal(many.slots[:4], few.slots)
-    assert_close(many.slots[4:8], few.slots, atol=0.06, rtol=0)
-
-
 def mlp(x, layers):
     return layers.fc2(gelu(layers.fc1(x)))
 
