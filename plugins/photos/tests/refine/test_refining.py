@@ -13,6 +13,7 @@ from line_scenes import circle
 from qgs_photos.refine import refine
 from qgs_photos.refine.growth import DEAD, FreeGaussians
 from qgs_photos.refine.refining import Extras, resized
+from qgs_photos.refine.result import plain
 from qgs_photos.refine.scene import masked
 from tables import must_refuse
 
@@ -270,3 +271,30 @@ def test_what_masks_leave_out_is_background():
     assert torch.equal(found[..., :12], views.images[..., :12])
     assert torch.allclose(found[..., 12:], background[:, None, None])
     must_refuse("--masks", masked, views, background.tolist())
+
+
+def coloured():
+    return replace(cloud(60), sh=0.3 * torch.randn(1, 60, 3, 3))
+
+
+def test_one_photo_is_rendered_as_with_harmonics():
+    gaussians = coloured()
+    cameras = ring(1, 48)
+    found = plain(gaussians, cameras)
+    assert found.sh is None
+    full, same, flat = (
+        RENDERER(g, cameras).rgb for g in (gaussians, found, replace(gaussians, sh=None))
+    )
+    assert torch.allclose(same, full, 0, 1e-4)
+    assert (flat - full).abs().max() > 0.05
+
+
+def test_photos_that_do_not_show_a_gaussian_do_not_count():
+    gaussians = coloured()
+    cameras = ring(2, 48)
+    away = cameras.c2w.clone()
+    away[:, 1, :3, [0, 2]] *= -1
+    one = plain(gaussians, cameras[:, :1]).colors
+    alike = (plain(gaussians, replace(cameras, c2w=away)).colors - one).abs().amax(-1) < 1e-5
+    assert alike.float().mean() > 0.95  # but for those that no photo shows
+    assert not torch.allclose(plain(gaussians, cameras).colors, one, atol=0.01)

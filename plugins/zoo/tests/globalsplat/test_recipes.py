@@ -1,9 +1,22 @@
-"""Recipes: published sizes, what is refused, and trainings of small ones."""
+"""Recipes, losses and the objective: sizes, what is refused, what is judged, small trainings."""
+
+from functools import partial
 
 import pytest
 import torch
+import torch.nn.functional as F
 import yaml
-from globalsplat_inputs import SMALL, TINY
+from odd_views import odd_views
+from qgs_dev import Case
+from qgs_dev.inputs import Sizes, inputs_of
+from qgs_zoo.globalsplat.losses import (
+    Frustum,
+    Regularisers,
+    beyond_frusta,
+    disagreement,
+    subset,
+)
+from torch.testing import assert_close
 from training_runs import first_batch, run
 
 import qgs
@@ -11,6 +24,11 @@ from qgs.recipe import RecipeError, resolve
 from qgs.train.training_pass import TrainingPass
 
 PUBLISHED = "globalsplat/re10k.yaml"
+TINY = "tiny/globalsplat.yaml"
+SMALL = (
+    *("model.width=32", "model.heads=2", "model.decoder.depth=1", "model.supervision.layers=[1]"),
+    *("model.queries.count=40", "model.encoder.patch_size=4", "data.image_size=[16, 16]"),
+)
 
 
 def test_parameters_of_the_published_size():
@@ -95,3 +113,82 @@ def test_two_passes_train_and_their_terms_are_recorded(tmp_path):
     model = qgs.load(folder.checkpoint)
     assert model.head.gaussians_per_query == 8  # those of the last step
     assert qgs.compose(TINY, overrides=[growing]).head.gaussians_per_query == 1  # of the first one
+
+
+SOFT = 0.1
+NEAR = 0.2
+VIEWS = odd_views(2, 16, 24)
+
+
+def beyond_one(points, c2w, lens):
+    """Softplus of the distances beyond five planes, each through the centre and two corners."""
+    local = (points - c2w[:3, 3]) @ c2w[:3, :3]
+    pixels = torch.tensor([[0, 0], [24, 0], [24, 16], [0, 16]])
+    corners = F.pad((pixels - lens[2:]) / lens[:2], (0, 1), value=1.0)
+    planes = F.normalize(torch.linalg.cross(corners, corners.roll(-1, 0)), dim=1)
+    beyond = local @ (planes * planes[:, 2:].sign()).T
+    return F.softplus(torch.cat([NEAR - local[:, 2:], -beyond], 1) / SOFT).sum(1)
+
+
+def test_the_frustum_of_each_view():
+    """Of points in front, at the sides, behind."""
+    seen = odd_views(3, 16, 24).cameras
+    points = torch.randn(2, 9, 3) * torch.tensor([0.6, 0.6, 2.0])
+    found = beyond_frusta(points, seen, SOFT, NEAR)
+    for scene, cameras in enumerate(zip(seen.c2w, seen.intrinsics, strict=True)):
+        each = torch.stack([*map(partial(beyond_one, points[scene]), *cameras)])
+        assert_close(found[scene], -SOFT * (-each).exp().mean(0).log())
+
+
+GIVEN, NOTHING, _, _ = inputs_of(Case(Frustum.Config()), Sizes(queries=3, gaussians=2)).values()
+"""A prediction of three queries, two Gaussians each; no rendering."""
+
+
+def test_losses_are_means_over_gaussians_of_tokens_that_decode_some():
+    mask = torch.tensor([[True, True, False], [True, False, False]])
+    rest = (GIVEN.replace(state=GIVEN.state.replace(mask=mask)), NOTHING, VIEWS, VIEWS)
+
+    def mean(x):
+        return (x[0, :4].mean() + x[1, :2].mean()) / 2
+
+    terms = Regularisers(Regularisers.Config(opacity_weight=0.5, scale_weight=2.0))(*rest)
+    assert_close(terms["mean_opacity"], 0.5 * mean(GIVEN.gaussians.opacities))
+    assert_close(terms["mean_scale"], 2.0 * mean(GIVEN.gaussians.scales))
+    terms = Frustum(Frustum.Config(weight=3.0))(*rest)
+    per_point = beyond_frusta(GIVEN.gaussians.means, VIEWS.cameras, 0.05, 0.05)
+    assert_close(terms["frustum"], 3.0 * mean(per_point))
+
+
+def test_passes_share_the_ends_and_part_the_rest():
+    for count in range(3, 13):
+        one = subset(count, 0)
+        other = subset(count, 1)
+        assert {*one} & {*other} == {0, count - 1}
+        assert {*one} | {*other} == {*range(count)}
+        assert [sorted(one), sorted(other)] == [[*one], [*other]]
+        assert 0 <= len(one) - len(other) <= 1
+
+
+def test_both_are_judged_and_compared():
+    two = "objective={type: globalsplat/two_passes, alpha_weight: 0.1, depth_weight: 0.2}"
+    small = (*SMALL, "losses.frustum.weight=10")  # which tells by whose cameras it judges
+    recipe = resolve(TINY, [*small, "views.inputs=5", two])
+    model = recipe.build_model()
+    inputs = odd_views(5, 16, 24)
+    outcome = TrainingPass(recipe, model)(inputs, VIEWS)
+    parts = [inputs.select(part) for part in ([0, 1, 3, 4], [0, 2, 4])]
+    alone = TrainingPass(resolve(TINY, small), model)
+    one, other = (alone(part, VIEWS).terms for part in parts)
+    wanted = {name: (one[name] + other[name]) / 2 for name in one}
+    one, other = (model.render(model(part).gaussians, VIEWS.cameras) for part in parts)
+    wanted["alpha_consistency"] = 0.1 * (one.alpha - other.alpha).abs().mean()
+    wanted["depth_consistency"] = 0.2 * (one.depth - other.depth).abs().mean()
+    assert_close(outcome.terms, wanted)
+    assert_close(outcome.total, sum(wanted.values()))
+
+
+def test_each_is_pulled_to_the_other_that_stands_still():
+    one, other = (torch.tensor([x], requires_grad=True) for x in (1.0, 4.0))
+    apart = disagreement(one, other)
+    apart.backward()
+    assert (apart, one.grad, other.grad) == (3, -0.5, 0.5)
