@@ -4,6 +4,7 @@ import math
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -17,10 +18,13 @@ from qgs.recipe.errors import Problems
 from qgs.recipe.yaml_text import load_mapping
 from qgs.types import ImageMemory, QueryState
 
+LISTED = cache(packages_distributions)
+
 
 @pytest.fixture(autouse=True)
 def _in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("qgs_dev.new_command.packages_distributions", LISTED)
 
 
 def test_it_writes_a_complete_distribution(tmp_path: Path) -> None:
@@ -56,13 +60,6 @@ WORDS = ["no", "on", "yes", "off", "n", "inf", "nan"]
 """What other readers of YAML take for values."""
 
 
-@pytest.fixture
-def _packages_are_listed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    listed = packages_distributions()
-    monkeypatch.setattr("qgs_dev.new_command.packages_distributions", lambda: listed)
-
-
-@pytest.mark.usefixtures("_packages_are_listed_once")
 def test_names_that_are_taken_as_they_are() -> None:
     for name in ("a", "wide", "far-sighted", "far_sighted", "view2d", *WORDS):
         check_name(name)
@@ -70,7 +67,6 @@ def test_names_that_are_taken_as_they_are() -> None:
         assert load_mapping(text, "recipe.yaml", Problems())["plugins"][-1] == name
 
 
-@pytest.mark.usefixtures("_packages_are_listed_once")
 def test_names_that_are_refused(tmp_path: Path) -> None:
     names = ("Far Sighted", "../escape", "", "locus", "class", "torch")
     errors = {name: run_qgs("new-plugin", "--", name).exception for name in names}

@@ -11,15 +11,18 @@ from unittest.mock import Mock
 import pytest
 import yaml
 from commands import done
-from photo_formats import noisy_photos
+from photo_formats import PhotoSet, noisy_photos, write_nerfstudio
 from qgs_viewer.commands import new_folder
 from qgs_viewer.compare import ON_PHOTOS, RECIPES, compare_models
 from qgs_viewer.comparison import open_models, resolve_fairly
 from qgs_viewer.curves import curves_of
+from qgs_viewer.opening import open_source
 from qgs_viewer.scenes import model_scenes
 from small import RECIPE, stand_in
 
 import qgs
+from qgs.drawing.images import rgb_picture, write_png
+from qgs.recipe import resolve
 
 
 @pytest.mark.slow
@@ -149,3 +152,121 @@ def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
     (tmp_path / "demo/report.html").touch()
     with pytest.raises(FileExistsError, match="not empty"):
         new_folder(tmp_path / "demo", "demo")
+
+
+RUN = "<script>alert(1)"
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """The page of `qgs demo` for RUN, which has a history and a card, and for another model."""
+    folder = tmp_path_factory.mktemp("models")
+    stand_in(folder / RUN / "checkpoint.safetensors")
+    (folder / RUN / "checkpoint.md").write_text("Small, see https://example.org/small.")
+    steps = [{"step": n, "seconds": n / 2, "loss": 1 / n, "psnr": 10.0 + n} for n in range(1, 9)]
+    (folder / RUN / "history.jsonl").write_text("\n".join(map(json.dumps, steps)))
+    more = stand_in(folder / "more.safetensors", queries=12)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        done("demo", "--model", RUN, "--model", more)
+    return (folder / "demo/report.html").read_text()
+
+
+def tags(page, name=r"\w+"):
+    """The attributes of each start tag."""
+    starts = re.findall(rf"<{name}\b([^>]*)>", page)
+    return [dict(re.findall(r'([\w-]+)(?:="([^"]*)")?', start)) for start in starts]
+
+
+def test_trained_models_are_shown_on_rooms_they_never_saw(page):
+    text = html.unescape(page)
+    assert "test/000001" in text
+    assert f"{RUN}: step 7000; more: step 7000" in text
+    assert "<h2>Training</h2>" in page
+
+
+def test_names_cannot_break_the_page(page):
+    assert "<script>alert" not in page
+    assert page.count("<script>") == 1
+    assert html.escape(RUN) in page
+
+
+def test_every_scene_can_be_chosen_and_is_there_without_choosing(page):
+    radios = [found for found in tags(page, "input") if found["type"] == "radio"]
+    assert len(radios) == len(tags(page, "article")) == 3
+    assert [label["for"] for label in tags(page, "label")] == [radio["id"] for radio in radios]
+    assert ["checked" in radio for radio in radios] == [True, False, False]
+
+
+def test_pictures_are_in_the_page_and_have_words(page):
+    alts = [picture["alt"] for picture in tags(page, "img") if "src" in picture]
+    assert alts.count("") == 3  # thumbnails beside their names
+    assert {f"{html.escape(RUN)}, error", "more, depth", "Truth, depth"} <= {*alts}
+    sliders = [found["aria-label"] for found in tags(page, "input") if found["type"] == "range"]
+    assert [html.escape(RUN) in label for label in sliders] == [True, False] * 3
+
+
+def test_the_page_needs_nothing_else(page):
+    for found in tags(page):
+        outward = found.keys() & {"src", "srcset", "data", "poster", "action"}
+        assert all(found[name].startswith("data:") for name in outward)
+    assert [link["href"] for link in tags(page, "a")] == ["https://example.org/small"]
+    assert not tags(page, "link")
+    pages = [found["data-page"] for found in tags(page, "button") if "data-page" in found]
+    assert ["&lt;script" in page for page in pages] == [True, True]
+    assert not any(re.search(r"(src|href)=.?http", page) for page in pages)
+
+
+MODEL = "rooms/tokengs-64"
+UNIT = 7.0
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """Photos of a room of the training's kind, UNIT times as large."""
+    folder = tmp_path_factory.mktemp("room")
+    recipe = resolve(qgs.load(MODEL).recipe, ["data.views_per_scene=12"])
+    scene = recipe.build_data().scenes("test")[0]
+    files = [folder / f"{number:02d}.png" for number in range(12)]
+    for file, image in zip(files, scene.images(range(12)), strict=True):
+        write_png(rgb_picture(image), file)
+    c2w = scene.cameras.c2w.double().numpy()
+    c2w[:, :3, 3] *= UNIT
+    photos = PhotoSet(files, c2w, scene.cameras.intrinsics[0].tolist(), scene.cameras.size)
+    return write_nerfstudio(folder / "photos", photos)
+
+
+def test_a_room_in_another_unit_has_its_own_scale_in_all_commands(room, tmp_path):
+    """With the same score too, of the one window that is judged."""
+    (result,) = open_models([MODEL], str(room), "cpu")
+    (score,) = result.evaluation.scores
+    (_, inputs, compared), found = next(iter(result.search.found.items()))
+    done("reconstruct", MODEL, room, "--out", tmp_path / "out")
+    record = json.loads((tmp_path / "out/cameras.json").read_text())
+    assert record["to_photos"]["scale"] == pytest.approx(found.factor)
+    assert record["to_photos"]["search"] == found.record
+    opened = open_source(MODEL, photos=str(room))
+    assert tuple(opened.frames) == inputs
+    assert opened.views.scale_factor == pytest.approx(found.factor)
+    quality = [view["psnr"] for view in record["views"] if view["kind"] == "novel"]
+    assert sum(quality) / len(quality) == pytest.approx(score.values["model_psnr"], abs=0.01)
+    trained = resolve(qgs.load(MODEL).recipe).views.scale_factor
+    assert found.factor == pytest.approx(trained / UNIT, rel=0.15)
+    assert found.further
+    assert {*inputs, *compared}.isdisjoint(found.further)
+    assert found.psnr == max(psnr for _, psnr in found.tried)
+    assert not found.poor
+
+
+def test_a_scale_can_be_set(room, tmp_path):
+    source = open_source(MODEL, photos=str(room), overrides=["views.scale=auto"])
+    assert source.views.scale == "auto"
+    out = ("--out", tmp_path / "out")
+    for words in (
+        ("reconstruct", MODEL, room, *out),
+        ("demo", room, "--model", MODEL, *out),
+        ("report", MODEL, "--photos", room, *out),
+        ("view", MODEL, room),
+    ):
+        with pytest.raises(ValueError, match="--scale"):
+            done(*words, "--scale", "0")

@@ -1,4 +1,4 @@
-"""The panel and its scene, without a browser, and pages of scenes."""
+"""The panel and its scene, without a browser; pages of scenes, notebooks, `qgs view`."""
 
 import re
 from dataclasses import replace
@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 import torch
 import viser
+from commands import done
 from PIL import Image
 from qgs_viewer.drawing import Choice, Drawing
+from qgs_viewer.notebook import prediction_png, show_pictures
 from qgs_viewer.page import quiet_server, scene_html
 from qgs_viewer.panel import Panel, plain
 from qgs_viewer.query_scene import QueryScene
-from small import cloud, model_scenes_of, source_of
+from small import QUERIES, cloud, model_of, model_scenes_of, sample_of, source_of
 from viser.transforms import SO3
+
+import qgs
 
 
 @pytest.fixture(scope="module")
@@ -154,3 +158,77 @@ def test_a_page_is_small_and_asks_for_nothing():
     assert len(without_data) < len(page) < 2_000_000
     outside = r"""(?:src|href)\s*=\s*["']?(https?:)?//|<link rel="stylesheet"""
     assert not re.search(outside, without_data)
+
+
+show_pictures()
+
+
+def test_a_model_shows_its_components_and_their_sizes():
+    html = qgs.compose("tiny/locus.yaml")._repr_html_()
+    cells = re.findall("<td>(.*?)</td>", html)
+    assert {"encoder", "qgs/multiview_vit", "locus/ray_biased"} <= {*cells}
+    assert "parameters" in html.partition("<table>")[0]
+
+
+def test_a_prediction_shows_its_picture_where_something_lies_before_the_origin():
+    """A red and a green Gaussian, left and right of the axis."""
+    prediction = model_of("tokengs")(sample_of().inputs)
+    means = torch.tensor([[[-0.5, 0.0, 1.0], [0.5, 0.0, 1.0]]])
+    colors = torch.eye(3)[None, :2]
+    two = replace(cloud(2), means=means, opacities=torch.full((1, 2), 0.99), colors=colors)
+    png = replace(prediction, gaussians=two)._repr_png_()
+    picture = np.asarray(Image.open(BytesIO(png)))[:, :192].astype(int)
+    redder = picture[..., 0] - picture[..., 1]
+    red = np.nonzero(redder > 70)[1]
+    green = np.nonzero(redder < -70)[1]
+    assert red.max() < 96 < green.min()
+    assert prediction_png(prediction.to("meta")) is None
+
+
+@pytest.fixture
+def ply(tmp_path):
+    qgs.save_ply(cloud(5), tmp_path / "a.ply")
+    return tmp_path / "a.ply"
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """Addresses that would have been opened; the server ends at once."""
+    found = []
+    monkeypatch.setattr("webbrowser.open", found.append)
+    monkeypatch.setattr(viser.ViserServer, "sleep_forever", lambda self: None)
+    return found
+
+
+def view(*words):
+    return done("view", *words, "--device", "cpu").output
+
+
+def test_it_opens_the_browser_unless_told_not_to(ply, opened):
+    told = view(ply, "--port", 0)
+    assert [address in told for address in opened] == [True]
+    view(ply, "--port", 0, "--no-open")
+    assert len(opened) == 1
+
+
+def test_a_page_shows_the_query_that_was_asked_for(opened, tmp_path):
+    model, plain, picked, none = (tmp_path / name for name in ("m.safetensors", *"abc"))
+    qgs.save(model_of("locus", "data.image_size=[16, 16]"), model)
+    view(model, "--html", plain)
+    for where in (["--html", picked], ["--port", 0]):
+        view(model, *where, "--query", 3)
+    assert picked.read_text() != plain.read_text()
+    for where in (["--html", none], ["--port", 0]):
+        with pytest.raises(ValueError, match=f"--query {QUERIES}"):
+            view(model, *where, "--query", QUERIES)
+    assert not none.exists()
+
+
+def test_a_page_never_replaces_a_file(ply, opened, tmp_path):
+    page = tmp_path / "page.html"
+    view(ply, "--html", page)
+    page.write_text("mine")
+    with pytest.raises(FileExistsError):
+        view(ply, "--html", page)
+    assert page.read_text() == "mine"
+    assert not opened

@@ -134,11 +134,6 @@ def test_quaternions_of_no_use_become_the_identity():
     assert_close(out.quats.norm(dim=-1), torch.ones(2, 6, 2))
 
 
-RECIPE = yaml.safe_load("""
-recipe: 1
-plugins: [locus, ellipsoid]
-model: {queries: {type: ellipsoid/anchored}}
-""")
 REFUSED = """
 model.decoder.refinement={type: ellipsoid/refine, center: false, rotation: false, radius: false}
     model.decoder.refinement: nothing is
@@ -150,7 +145,7 @@ model.centers={type: ellipsoid/axis_scaled, radius_bound: offset}
 
 
 def test_options_without_effect_or_sense_are_refused():
-    assert wrong_refusals(RECIPE, REFUSED) == []
+    assert wrong_refusals(yaml.safe_load(ELLIPSOID), REFUSED) == []
 
 
 ELLIPSOID = """
