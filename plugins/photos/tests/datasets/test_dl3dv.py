@@ -172,8 +172,9 @@ def test_other_processes_and_threads_read_one_archive(tmp_path):
     source = opened(tmp_path)
     first = scene(tmp_path)
     before = first.images([1])
-    source, first = pickle.loads(pickle.dumps((source, first)))  # noqa: S301
+    other, first = pickle.loads(pickle.dumps((source, first)))  # noqa: S301
     assert torch.equal(first.images([1]), before)
+    assert torch.equal(other.scenes("train")[0].images([1]), before)
     scenes = source.scenes("train")
     with ThreadPoolExecutor(4) as threads:
         red = list(threads.map(lambda k: scenes[k % 4].images([k % 3])[0, 0, 0, 0], range(24)))
