@@ -91,8 +91,6 @@ class Domain:
             low, high = seen.get(name, trained)
             if low * TOLERANCE < trained[0] or high > trained[1] * TOLERANCE:
                 words = WORDS[name].format(_shown((low, high)))
-                if low == math.inf:
-                    words = "their axes meet at no point before them"
                 phrases[name] = f"{words} (trained: {_shown(trained)})"
         return phrases
 

@@ -42,14 +42,10 @@ def model_text(model: Any) -> str:
 
 
 def heading(model: Any) -> str:
-    """Class, parameters, decoder layers, queries and device."""
-    tree = (model.recipe or {}).get("model", {})
-    options = {**tree.get("queries", {}), **tree.get("head", {})}
-    parts = [f"{_count(model):,} parameters", f"{len(model.decoder)} decoder layers"]
-    if {"count", "gaussians_per_query"} <= options.keys():
-        parts.append(f"{options['count']:,} queries of {options['gaussians_per_query']} Gaussians")
+    """Class, parameters, decoder layers and device."""
     device = next((parameter.device for parameter in model.parameters()), "cpu")
-    return f"{type(model).__name__}: {', '.join(parts)}, on {device}"
+    sizes = f"{_count(model):,} parameters, {len(model.decoder)} decoder layers"
+    return f"{type(model).__name__}: {sizes}, on {device}"
 
 
 def slot_rows(model: Any) -> list[tuple[str, str, str]]:

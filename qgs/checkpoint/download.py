@@ -24,8 +24,6 @@ LARGEST = 20 * 10**9
 PATIENCE = 60.0
 """Seconds that a server may stay silent."""
 
-_FIXES = {401: "it needs a login", 403: "it needs a login", 404: "check the URL"}
-
 
 def downloaded(url: str) -> Path:
     """Return the file of `url`, as downloaded before or now; print its SHA-256 to standard error.
@@ -70,18 +68,13 @@ def _download(url: str, file: Path) -> None:
         with replacing(file) as temporary:
             with _opened(url) as stream, temporary.open("wb") as local:
                 _copy(stream, local, file.parent)
-            with safe_open(temporary, "pt"):
-                pass
+            if not _is_whole(temporary):
+                raise ValueError("what came is no whole safetensors file, or a web page")
     # The file system of the URL may raise anything.
     except Exception as error:
         cause = str(getattr(error, "reason", error)) or type(error).__name__
         if isinstance(error, HTTPError):
-            fix = _FIXES.get(error.code, "try again later")
-            cause = f"the server answers {error.code} ({error.reason}), {fix}"
-        elif isinstance(error, FileNotFoundError):
-            cause = "there is no such file"
-        elif isinstance(error, SafetensorError):
-            cause = f"what came is no whole safetensors file, or a web page ({error})"
+            cause = f"the server answers {error.code} ({error.reason})"
         text = f"{url} could not be downloaded, nothing was kept: {cause}"
         # `from None`: the error itself may show a password.
         raise OSError(without_secrets(text)) from None

@@ -208,9 +208,6 @@ def one_scene(gaussians: Gaussians, kind: str, *lost: str) -> Gaussians:
 
 def _used_degrees(sh: Tensor) -> Tensor | None:
     """Return the coefficients (G, C, 3) without degrees that are zeros; None without any."""
-    for count in reversed(SH_COUNTS):
-        # The degree below ends where this one's last coefficients begin.
-        below = max((fewer for fewer in SH_COUNTS if fewer < count), default=0)
-        if sh[:, below:count].any():
-            return sh[:, :count]
-    return None
+    used = sh.any(0).any(-1).nonzero().flatten().tolist()
+    count = next(count for count in (0, *SH_COUNTS) if count > max(used, default=-1))
+    return sh[:, :count] if count else None

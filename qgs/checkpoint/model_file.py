@@ -26,7 +26,6 @@ from qgs.domain import KEY, Domain
 from qgs.machine import TooLargeError
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, RecipeError
-from qgs.recipe.registry import available_plugins
 from qgs.version import __version__
 from qgs.wording import listed
 
@@ -88,15 +87,13 @@ class CheckpointFile(TensorFile):
             return self.stored_recipe(_RECIPE)
         except RecipeError as error:
             names = {**self.mapping(_DISTRIBUTIONS), "qgs": "query-gaussians"}
-            releases = {
-                plugin: f"{names.get(plugin, plugin)} {version}"
-                for plugin, version in self.mapping(_PLUGINS).items()
-            }
-            available = {"qgs", *available_plugins()}
-            absent = [releases[plugin] for plugin in releases if plugin not in available]
+            versions = self.mapping(_PLUGINS).items()
+            releases = listed(
+                f"{names.get(plugin, plugin)} {version}" for plugin, version in versions
+            )
             raise CheckpointError(
-                f"{self.path} was made with {listed(releases.values())}, and its recipe fails "
-                f"here; install {listed(absent) or 'those releases'}:\n{error}"
+                f"{self.path} was made with {releases}, and its recipe fails here; install those "
+                f"releases:\n{error}"
             ) from error
 
     @cached_property

@@ -42,11 +42,8 @@ def checkpoint_path(name: str | os.PathLike[str]) -> Path:
 def _shipped(plugin: str, name: str) -> Path:
     installed = load_plugin(plugin)
     if name not in installed.models:
-        hint = did_you_mean(name, installed.models, "models") if installed.models else "it has none"
-        raise FileNotFoundError(
-            f"there is no file {name}, and {installed.released_as} ships no model of that name; "
-            f"{hint}"
-        )
+        hint = did_you_mean(name, installed.models, "models")
+        raise FileNotFoundError(f"{installed.released_as} ships no model {name}; {hint}")
     file = installed.models[name]
     if not file.is_file():
         raise FileNotFoundError(

@@ -32,5 +32,4 @@ def convert(
     gaussians = load_ply(source)
     kept = gaussians if count is None else gaussians.most_opaque(count)
     save_gaussians(kept, out)
-    size = f"{out.stat().st_size / 1e6:.2f} MB"
-    typer.echo(f"wrote {out}: {kept.count:,} of {gaussians.count:,} Gaussians, {size}")
+    typer.echo(f"wrote {out}: {kept.count:,} of {gaussians.count:,} Gaussians")

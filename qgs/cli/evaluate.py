@@ -53,7 +53,6 @@ def evaluate(
     from qgs.evaluate.tuning import tuning_settings
     from qgs.recipe import resolve
     from qgs.train.distributed import choose_device
-    from qgs.train.folder import RunFolder
 
     options.use_threads(threads)
     settings += tuning_settings(tune)
@@ -76,9 +75,6 @@ def evaluate(
     own = Path(run).expanduser().exists()
     folder = out or evaluation_folder(checkpoint, bool(settings), own)
     evaluation = evaluate_into(model, recipe, step, folder, console)
-    averaged = RunFolder(checkpoint.parent).checkpoint_ema
-    if checkpoint.name == "checkpoint.safetensors" and averaged.is_file():
-        console.print(f"averaged weights: qgs eval {averaged}", soft_wrap=True, markup=False)
     # For scripts: a mean over fewer scenes is another number.
     if strict and evaluation.missing:
         raise typer.Exit(1)

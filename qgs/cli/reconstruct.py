@@ -101,37 +101,31 @@ def _refuse_unusable(out: Path, overwrite: bool) -> None:
 
 def show(result: Reconstruction, console: Console) -> None:
     """Print PSNR of all views and of the baselines, means by kind, and the remarks."""
-    from rich.table import Table
-
+    from qgs.evaluate.results import print_lines, print_table
     from qgs.metrics.baselines import BASELINES
     from qgs.metrics.images import Psnr
     from qgs.reconstruction.result import KINDS
 
-    count = f"{result.gaussians.count:,} Gaussians"
-    table = Table(title=f"{result.sample.scene}: {count}")
-    table.add_column("view", no_wrap=True)
+    title = f"{result.sample.scene}: {result.gaussians.count:,} Gaussians"
     shown = Psnr.column.shown
-    for name in ("photo", Psnr.column.heading, *BASELINES):
-        table.add_column(name.replace("_", " "), justify="right")
+    baselines = [name.replace("_", " ") for name in BASELINES]
+    table = [["view", "photo", Psnr.column.heading, *baselines]]
     for kind in KINDS:
         scores = [score for score in result.scores if score.kind == kind]
         rows = [[score.psnr, *score.baselines.values()] for score in scores]
         for score, row in zip(scores, rows, strict=True):
             file = Path(result.sample.names.get(score.frame, "")).name
-            table.add_row(kind, numbered(score.frame, file), *map(shown, row))
+            table.append([kind, numbered(score.frame, file), *map(shown, row)])
         if rows:
             means = [shown(sum(values) / len(rows)) for values in zip(*rows, strict=True)]
-            table.add_row(f"{kind}, mean", str(len(rows)), *means, style="bold")
-            table.add_section()
-    console.print(table)
+            table.append([f"{kind}, mean", str(len(rows)), *means])
+    print_table(console, title, table)
     if tuning := result.tuning:
-        console.print(
+        text = (
             "{steps} steps of tuning the {what}: photometric loss of the inputs "
-            "{loss_before:.5f} -> {loss_after:.5f}".format(**tuning),
-            highlight=False,
+            "{loss_before:.5f} -> {loss_after:.5f}"
         )
-    if scale := result.scale:
-        found = f"{scale.text}; --scale FACTOR sets another"
-        console.print(found, soft_wrap=True, highlight=False, markup=False)
-    for remark in result.remarks:
-        console.print(remark, soft_wrap=True, highlight=False, markup=False)
+        print_lines(console, [text.format(**tuning)])
+    if result.scale:
+        print_lines(console, [f"{result.scale.text}; --scale FACTOR sets another"])
+    print_lines(console, result.remarks)

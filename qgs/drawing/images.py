@@ -18,6 +18,8 @@ Picture = np.ndarray
 # Where there is nothing to show: no depth, no attention.
 NOTHING = (232, 233, 235)
 DEPTH_MAP = "viridis_r"
+# Pixels between pictures in a row.
+GAP = 4
 # Pixels on the longer side up to which photos in pages are not compressed with loss.
 EXACT = 128
 
@@ -53,20 +55,17 @@ def depth_range(depths: Tensor) -> tuple[float, float]:
     return near, far
 
 
-def side_by_side(pictures: list[Picture], gap: int = 4) -> Picture:
+def side_by_side(pictures: list[Picture]) -> Picture:
     """Join pictures of one height in a row, white between them."""
-    first, *others = pictures
-    spacer = np.full((len(first), gap, 3), 255, np.uint8)
-    parts = [first]
-    for picture in others:
-        parts += [spacer, picture]
-    return np.concatenate(parts, 1)
+    left = ((0, 0), (GAP, 0), (0, 0))
+    padded = [np.pad(picture, left, constant_values=255) for picture in pictures]
+    return np.concatenate(padded, 1)[:, GAP:]
 
 
 def png_bytes(picture: Picture) -> bytes:
     """Return a picture as the bytes of a PNG file."""
     buffer = BytesIO()
-    checked(picture).save(buffer, format="PNG", optimize=True)
+    Image.fromarray(picture).save(buffer, format="PNG", optimize=True)
     return buffer.getvalue()
 
 
@@ -79,9 +78,11 @@ def write_png(picture: Picture, path: str | Path) -> None:
 def write_gif(frames: Sequence[Picture], path: str | Path, frames_per_second: float) -> None:
     """Write frames of one size as an endless GIF with one palette."""
     # One palette for all: others would make still pixels flicker.
-    sample = checked(np.concatenate(frames[:: max(1, len(frames) // 8)]))
+    sample = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 8)]))
     palette = sample.quantize(256, method=Image.Quantize.MEDIANCUT)
-    images = [checked(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
+    images = [
+        Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames
+    ]
     milliseconds = round(1000 / frames_per_second)
     first, *rest = images
     with replacing(path) as temporary:
@@ -96,20 +97,13 @@ def data_uri(image: Picture | list[Picture], photo: bool = False) -> str:
     if len(frames) == 1 and not (photo and max(frames[0].shape) > EXACT):
         return "data:image/png;base64," + base64.b64encode(png_bytes(frames[0])).decode()
     buffer = BytesIO()
-    first, *rest = map(checked, frames)
+    first, *rest = map(Image.fromarray, frames)
     quality = 90 if photo else 80
     first.save(
         buffer, "WEBP", save_all=True, append_images=rest,
         duration=90, loop=0, quality=quality, method=2,
     )  # fmt: skip
     return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
-
-
-def checked(picture: Picture) -> Image.Image:
-    """Return the picture for Pillow."""
-    assert picture.dtype == np.uint8, picture.dtype
-    assert picture.shape[2:] == (3,), picture.shape
-    return Image.fromarray(picture)
 
 
 def enlarged(picture: Picture, side: int) -> Picture:

@@ -28,12 +28,15 @@ class Protocol:
     @property
     def canonical(self) -> str:
         """`content` as JSON with sorted keys and no spaces, which is hashed."""
-        return _canonical(self.content)
+        # Sorted and without spaces: the hash must not depend on who wrote the mapping.
+        return json.dumps(
+            self.content, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+        )
 
     @property
     def sha256(self) -> str:
         """Hash of `canonical` in UTF-8, hexadecimal."""
-        return _sha256(self.content)
+        return hashlib.sha256(self.canonical.encode()).hexdigest()
 
     def __str__(self) -> str:
         return f"{self.name} ({self.sha256[:12]})"
@@ -129,14 +132,3 @@ def _data_and_views(
     if sampler.options != Span.Config().model_dump() or sampler.type != "qgs/span":
         drawn["sampler"] = {"type": sampler.type, **sampler.options}
     return data, {"drawn": drawn}
-
-
-def _canonical(value: Any) -> str:
-    # Sorted and without spaces: the hash must not depend on who wrote the mapping.
-    return json.dumps(
-        value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
-    )
-
-
-def _sha256(value: Any) -> str:
-    return hashlib.sha256(_canonical(value).encode()).hexdigest()

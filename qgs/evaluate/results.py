@@ -218,10 +218,8 @@ class Evaluation:
             f"{OPACITY_USED:.4f}; mean over scenes)"
         )
         if tuning := self._tuning():
-            yield (
-                f"{tuning['what']} tuned on the input views: {tuning['steps']} steps of Adam at "
-                f"{tuning['rate']}, photometric loss {tuning['loss_before']:.4f} -> "
-                f"{tuning['loss_after']:.4f}"
+            yield "{what} tuned on the input views: {steps} steps of Adam at {rate}".format(
+                **tuning
             )
         yield from self.remarks
 

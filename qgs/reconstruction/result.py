@@ -102,7 +102,7 @@ class Reconstruction:
         from qgs.drawing.images import png_bytes
         from qgs.reconstruction.saving import overview
 
-        return png_bytes(overview(self, dpi=72))
+        return png_bytes(overview(self))
 
 
 @torch.no_grad()

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from qgs.checkpoint.gaussians import save_gaussians, save_ply, scene_writers
 from qgs.drawing import images
@@ -25,14 +24,6 @@ FRAMES_PER_SECOND = 16
 SWAY = 0.12
 """Motion to the side of an orbit, per distance to what is seen."""
 OVERVIEW_COLUMNS = 8
-
-
-def orbit_path(
-    inputs: Cameras, depths: Tensor, frames: int = ORBIT_FRAMES, side: int = ORBIT_SIDE
-) -> Cameras:
-    """Return an `orbit` about the middle of the rendered `depths`, at least `side` pixels large."""
-    near, far = depth_range(depths)
-    return images.finer(orbit(inputs, (near + far) / 2, frames), side)
 
 
 def orbit(inputs: Cameras, depth: float, frames: int) -> Cameras:
@@ -68,7 +59,8 @@ def write_reconstruction(result: Reconstruction, out: Path) -> list[Path]:
     if out.suffix.lower() in scene_writers():
         save_gaussians(result.in_photos_world, out)
         return [out]
-    path = orbit_path(result.sample.inputs.cameras, result.rendering.depth)
+    middle = sum(depth_range(result.rendering.depth)) / 2
+    path = images.finer(orbit(result.sample.inputs.cameras, middle, ORBIT_FRAMES), ORBIT_SIDE)
     # Rendered before the folder is touched: an earlier result stays where this fails.
     with torch.no_grad():
         frames = result.model.render(result.gaussians, path).rgb[0]
@@ -100,7 +92,7 @@ def _pictures(result: Reconstruction) -> dict[str, list[Picture]]:
     }
 
 
-def overview(result: Reconstruction, dpi: int = 120) -> Picture:
+def overview(result: Reconstruction) -> Picture:
     """Draw photos over renders and depth, of at most OVERVIEW_COLUMNS views, inputs first."""
     scores = result.scores
     # Inputs come first in `scores`, so they stay where the row is too long.
@@ -113,7 +105,7 @@ def overview(result: Reconstruction, dpi: int = 120) -> Picture:
         titles.append(f"frame {numbered(score.frame, file)}\n{score.kind.split()[0]}, {quality}")
     rows = {kind: [pictures[i] for i in shown] for kind, pictures in _pictures(result).items()}
     figure = grid_figure(rows, titles, depth_range(result.rendering.depth))
-    return figure_picture(figure, dpi)
+    return figure_picture(figure)
 
 
 def _camera_record(result: Reconstruction, path: Cameras) -> dict[str, Any]:

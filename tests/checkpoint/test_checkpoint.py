@@ -87,8 +87,7 @@ def test_only_plugins_that_are_used_are_needed(tmp_path, monkeypatch):
     path = tmp_path / "photos.safetensors"
     save(qgs.compose(RECIPES / "photos.yaml", SMALL), path)
     without_rooms = {n: e for n, e in available_plugins().items() if n != "rooms"}
-    for module in ("qgs.recipe.registry", "qgs.checkpoint.model_file"):
-        monkeypatch.setattr(f"{module}.available_plugins", lambda: without_rooms)
+    monkeypatch.setattr("qgs.recipe.registry.available_plugins", lambda: without_rooms)
     assert set(CheckpointFile(path).recipe.releases) == {"qgs", "locus", "datasets"}
     assert qgs.load(path).queries.count == 8
     must_refuse(

@@ -1,6 +1,5 @@
 """A run of `qgs train` made once, and pictures so small that a reconstruction takes no time."""
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +34,8 @@ def trained(tmp_path_factory):
 
 @pytest.fixture
 def short_orbit(monkeypatch):
-    monkeypatch.setattr(saving, "orbit_path", partial(saving.orbit_path, frames=2, side=16))
+    monkeypatch.setattr(saving, "ORBIT_FRAMES", 2)
+    monkeypatch.setattr(saving, "ORBIT_SIDE", 16)
 
 
 @pytest.fixture
