@@ -53,11 +53,6 @@ def test_a_forward_pass_never_waits(tmp_path):
         with HostWaits() as waits:
             model(views)
         assert not waits.found, name
-
-
-def test_waits_are_found():
-    x = torch.ones(3)
-    with HostWaits() as waits:
-        _ = float(x.sum()), x[x > 0], x.new_tensor([1.0]), torch.arange(3)
-        _ = torch.arange(3, device=x.device), x[:, None]
-    assert waits.found == ["__float__", "__getitem__", "new_tensor", "arange"]
+    with waits:
+        float(views.images[views.images > 0].sum())
+    assert waits.found == ["__getitem__", "__float__"]

@@ -23,13 +23,6 @@ comments that say why at least. They only get stricter: a change that adds remov
 MACHINE_PATH = re.compile(r"(?<![\w.$}])/(?:home|root|work|Users|opt|mnt|tmp)/\w")
 
 
-def files(directories, suffixes):
-    for directory in directories:
-        for path in sorted((ROOT / directory).rglob("*")):
-            if path.is_file() and path.suffix in suffixes and "__pycache__" not in path.parts:
-                yield path
-
-
 def test_files_and_functions_are_short():
     long = {}
     for name, text in size.sources().items():
@@ -55,18 +48,14 @@ def test_sizes_only_fall():
     assert exceeded == {}, "see LIMITS: remove as much as you add, unfold lines, say why"
 
 
-def lines_with(pattern):
-    """FILE:LINE: TEXT of lines that match, in all texts of the repository."""
-    suffixes = {"", ".py", ".md", ".yaml", ".yml", ".toml", ".sh", ".jinja"}
-    at_root = [path for path in sorted(ROOT.iterdir()) if path.is_file() and path.name != ".git"]
-    assert ROOT / "README.md" in at_root
-    return [
-        f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
-        for path in [*at_root, *files(TEXTS, suffixes)]
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)
-        if pattern.search(line)
-    ]
-
-
 def test_no_path_of_one_machine():
-    assert lines_with(MACHINE_PATH) == [], "write a relative path, or one below `~`"
+    """In all texts of the repository."""
+    suffixes = {"", ".py", ".md", ".yaml", ".yml", ".toml", ".sh", ".jinja"}
+    paths = [*ROOT.iterdir(), *(path for folder in TEXTS for path in (ROOT / folder).rglob("*"))]
+    found = []
+    for path in paths:
+        if path.is_file() and path.suffix in suffixes and path.name != ".git":
+            for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+                if MACHINE_PATH.search(line):
+                    found.append(f"{path.relative_to(ROOT)}:{number}: {line.strip()}")
+    assert found == [], "write a relative path, or one below `~`"

@@ -3,7 +3,7 @@
 import torch
 from tables import must_refuse
 
-from qgs.containers import concatenated, map_tensors, named_tensors
+from qgs.containers import concatenated
 from qgs.types import (
     Cameras,
     GaussianAttributes,
@@ -60,22 +60,3 @@ def test_memo_does_not_leak_between_gradient_modes():
         assert doubled().is_inference()
     assert doubled().requires_grad
     assert doubled() is doubled()
-
-
-def test_every_nested_tensor_is_mapped_and_named():
-    state = QueryState(torch.zeros(1, 2, 4), {"place": torch.ones(1, 2, 3)})
-    assert "place" in state
-    assert "elsewhere" not in state
-    value = {"state": state, 3: [torch.ones(2), "text", (torch.zeros(1), None)]}
-    assert [name for name, _ in named_tensors(value, "value")] == [
-        "value.state.features",
-        "value.state.fields.place",
-        "value.3.0",
-        "value.3.2.0",
-    ]
-    doubled = map_tensors(lambda x: 2 * x if x.any() else x, value)
-    assert torch.equal(doubled["state"]["place"], torch.full((1, 2, 3), 2.0))
-    assert doubled["state"].features is state.features
-    assert doubled[3][1] == "text"
-    assert doubled[3][2] is value[3][2]  # no tensor in it changed
-    assert map_tensors(lambda x: x, value) is value

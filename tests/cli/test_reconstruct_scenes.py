@@ -1,10 +1,8 @@
 """Which scene of photos in any format, or of chunks, is reconstructed, and what it holds out."""
 
 import shutil
-from unittest.mock import Mock
 
 import pytest
-import yaml
 from commands import MODEL
 from photo_formats import centred, opened, synthetic, write_llff, write_nerfstudio
 from PIL import Image
@@ -13,7 +11,7 @@ from tables import must_refuse
 from upath import UPath
 
 from qgs.recipe import resolve
-from qgs.reconstruction.scenes import chosen_scene, whole_size
+from qgs.reconstruction.scenes import chosen_scene
 
 SIZE = (16, 16)
 WHOLE = (16, 24)
@@ -65,24 +63,6 @@ def test_a_scene_of_a_trained_set_is_known_for_what_it_is(folders):
         assert chosen(trained, path, name=name) == ((1,), (0, 2, 3), SIZE)
     for other in (folders / "test/c", folders.parent / "llff"):
         assert chosen(trained, other)[:2] == ((2,), ())
-
-
-WHOLE_SIZES = """
-- [[1280, 720], 4, [112, 64]]
-- [[360, 540], 4, [64, 96]]
-- [[30, 40], 16, [64, 80]]
-- [[30, 40], null, [64, 64]]
-- [null, 4, [64, 64]]
-"""
-"""Stored size, multiple, size of what is seen."""
-
-
-def test_photos_of_another_kind_are_seen_whole():
-    scene = Mock()
-    scene.cameras.size = (64, 64)
-    for stored, multiple, whole in yaml.safe_load(WHOLE_SIZES):
-        scene.stored_size.return_value = stored
-        assert [*whole_size(scene, multiple)] == whole
 
 
 def test_one_scene_of_chunks(folders, tmp_path):
