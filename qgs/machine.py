@@ -17,15 +17,13 @@ class TooLargeError(ValueError):
     """A request that does not fit into memory; the message has the numbers."""
 
 
-def refuse_more_than_memory(
-    what: str, needed: Mapping[str, int], advice: str, available: int | None = None
-) -> None:
+def refuse_more_than_memory(what: str, needed: Mapping[str, int], advice: str) -> None:
     """Raise TooLargeError when the sum of `needed` is more than the available memory.
 
-    needed: name to bytes, a lower bound. available: bytes; None for this machine's.
+    needed: name to bytes, a lower bound.
     """
     total = sum(needed.values())
-    limit = available_bytes() if available is None else available
+    limit = available_bytes()
     if total > limit:
         parts = sorted(needed.items(), key=lambda part: -part[1])[:3]
         raise TooLargeError(

@@ -42,7 +42,8 @@ def compose(recipe: RecipeFile, overrides: Overrides = None) -> None:
 
     The recipe goes to standard output and is valid YAML; the parameters go to standard error.
     """
-    from qgs.cli.tables import parameter_table
+    from qgs.evaluate.results import print_table
+    from qgs.model_text import parameter_counts, slot_rows
     from qgs.recipe import resolve
     from qgs.recipe.recipe import annotated
 
@@ -51,7 +52,9 @@ def compose(recipe: RecipeFile, overrides: Overrides = None) -> None:
     # Patterns that name no parameter are refused.
     resolved.rate_factors(model)
     typer.echo(annotated(resolved))
-    Console(stderr=True).print(parameter_table(model))
+    total = f"{sum(parameter_counts(model).values()):,}"
+    rows = [("component", "type", "parameters"), *slot_rows(model), ("total", "", total)]
+    print_table(Console(stderr=True), "parameters", rows)
     for warning in resolved.warnings:
         typer.echo(f"warning: {warning}", err=True)
 

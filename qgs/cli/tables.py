@@ -1,4 +1,4 @@
-"""Tables of `qgs list` and `qgs compose`."""
+"""Tables of `qgs list`."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -10,8 +10,6 @@ from rich.table import Table
 
 from qgs.checkpoint.models import about, card_of, checkpoint_path
 from qgs.contracts import LAYER_SLOTS, ComponentConfig
-from qgs.model import QueryGaussianModel
-from qgs.model_text import parameter_counts, slot_rows
 from qgs.recipe.errors import did_you_mean
 from qgs.recipe.registry import Registry, default_config
 from qgs.recipe.schema import settings_schema, summary_of
@@ -25,12 +23,11 @@ _WORDS = {"string": "text", "boolean": "true or false", "object": "mapping"}
 _BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
 
 
-def folded_table(title: str, *columns: str, right: int = 0) -> Table:
-    """Return a table with folded cells; its last `right` columns are aligned to the right."""
+def folded_table(title: str, *columns: str) -> Table:
+    """Return a table with folded cells."""
     table = Table(title=title or None, title_justify="left")
-    for index, column in enumerate(columns):
-        justify = "right" if index >= len(columns) - right else "left"
-        table.add_column(escape(column), overflow="fold", justify=justify)
+    for column in columns:
+        table.add_column(escape(column), overflow="fold")
     return table
 
 
@@ -159,13 +156,3 @@ def _type(option: Schema) -> str:
     bounds = [f"{sign} {option[key]}" for key, sign in _BOUNDS.items() if key in option]
     kind = option.get("type", "any")
     return f"{_WORDS.get(kind, kind)} {', '.join(bounds)}".strip()
-
-
-def parameter_table(model: QueryGaussianModel) -> Table:
-    """Return the parameters of each component of `model`."""
-    table = folded_table("parameters", "component", "type", "parameters", right=1)
-    for row in slot_rows(model):
-        table.add_row(*row)
-    table.add_section()
-    table.add_row("total", "", f"{sum(parameter_counts(model).values()):,}")
-    return table

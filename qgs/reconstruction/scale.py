@@ -7,7 +7,7 @@ too small, surfaces close to the cameras render them well, so further photos are
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -202,6 +202,7 @@ def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, 
     return min(found, default=1.0), max(found, default=1.0), nearest
 
 
+@dataclass
 class _Trial:
     """PSNR of `sample`, whose factor is 1, at the factors low * step ** place.
 
@@ -209,20 +210,20 @@ class _Trial:
     goes off the score.
     """
 
-    def __init__(
-        self, model: QueryGaussianModel, sample: Sample, low: float, step: float, nearest: float
-    ) -> None:
-        self._model = model
-        self._low = low
-        self._step = step
-        self._nearest = nearest
-        device = next(model.parameters()).device
-        self._inputs = sample.inputs.to(device)
-        self._further = sample.targets.to(device)
-        self.tried: dict[float, tuple[float, float]] = {}
+    model: QueryGaussianModel
+    sample: Sample
+    low: float
+    step: float
+    nearest: float
+    tried: dict[float, tuple[float, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        device = next(self.model.parameters()).device
+        self.inputs = self.sample.inputs.to(device)
+        self.further = self.sample.targets.to(device)
 
     def factor(self, place: float) -> float:
-        return self._low * self._step**place
+        return self.low * self.step**place
 
     def psnr(self, place: float) -> float:
         # Photos that are not given count twice: inputs alone mislead.
@@ -230,23 +231,23 @@ class _Trial:
         return own if math.isnan(further) else (own + 2 * further) / 3
 
     def score(self, place: float) -> float:
-        below = self._nearest / self.factor(place)
+        below = self.nearest / self.factor(place)
         found = self.psnr(place) - PENALTY * math.log(max(below, 1.0))
         return -math.inf if math.isnan(found) else found
 
     def best(self, places: Sequence[float]) -> float:
         """Try these places; return the best of all so far."""
         new = [place for place in places if place not in self.tried]
-        each = max(PIXELS // self._inputs.images[:, :, 0].numel(), 1)
+        each = max(PIXELS // self.inputs.images[:, :, 0].numel(), 1)
         for start in range(0, len(new), each):
             part = new[start : start + each]
-            factors = self._inputs.images.new_tensor([self.factor(place) for place in part])
-            gaussians = self._model(at_factors(self._inputs, factors)).gaussians
+            factors = self.inputs.images.new_tensor([self.factor(place) for place in part])
+            gaussians = self.model(at_factors(self.inputs, factors)).gaussians
             columns = []
-            for views in (self._inputs, self._further):
+            for views in (self.inputs, self.further):
                 cameras = at_factors(views, factors).cameras
                 empty = not views.images.shape[1]
-                seen = views.images if empty else self._model.render(gaussians, cameras).rgb
+                seen = views.images if empty else self.model.render(gaussians, cameras).rgb
                 columns.append(psnr(seen, views.images).mean(1).expand(len(part)).tolist())
             self.tried.update(zip(part, zip(*columns, strict=True), strict=True))
         return max(self.tried, key=self.score)
