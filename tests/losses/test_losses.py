@@ -1,12 +1,10 @@
 """Options, gradients and values by hand; golden/test_files.py compares with the released code."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 import yaml
-from safetensors.torch import load_file
+from losses.judging import CAMERAS, GOLDEN, PREDICTED, TRUTH, judged
 from torch.testing import assert_close
 from training_runs import run, tiny
 
@@ -15,28 +13,11 @@ from qgs.data.samples import make_sample, stack_views
 from qgs.losses import Mask, Photometric, Visibility, view_visibility
 from qgs.losses.depth import DepthSurface
 from qgs.metrics.images import ssim
-from qgs.types import Cameras, Gaussians, LayerPrediction, QueryState, Rendering, Views
+from qgs.types import Cameras, Views
 from qgs.wording import warn_once
 
-GOLDEN = load_file(Path(__file__).parents[1] / "golden" / "loss_a.safetensors")
-"""Inputs and results of the released losses."""
-CAMERAS = Cameras(GOLDEN["c2w"], GOLDEN["intrinsics"], (16, 24))
-PREDICTED = GOLDEN["images_pred"]
-TRUTH = GOLDEN["images_gt"]
 VIEWS = Views(TRUTH, CAMERAS)
 POINTS = GOLDEN["points"]
-NO_POINTS = torch.zeros(2, 0, 3)
-
-
-def judged(loss, views, means=NO_POINTS, opacities=None, rgb=None):
-    """The terms of `loss`; what is not given is nothing, opaque or black."""
-    quats = torch.ones(*means.shape[:2], 4)
-    opacities = quats[..., 0] if opacities is None else opacities
-    gaussians = Gaussians(means, quats[..., 1:], quats, opacities, means.sigmoid())
-    prediction = LayerPrediction(gaussians, QueryState(means, {"anchor.center": means}))
-    rgb = torch.zeros_like(views.images) if rgb is None else rgb
-    alpha = rgb[:, :, :1]
-    return loss(prediction, Rendering(rgb, alpha, alpha), views, views)
 
 
 def photometric(rgb=PREDICTED, truth=TRUTH, **options):
