@@ -1,6 +1,9 @@
-"""The panel and its scene, without a browser; pages of scenes, notebooks, `qgs view`."""
+"""The panel, its scene and its server without a browser; pages, notebooks, `qgs view`."""
 
+import http.client
 import re
+import time
+from contextlib import suppress
 from dataclasses import replace
 from html import unescape
 from io import BytesIO
@@ -19,6 +22,8 @@ from qgs_viewer.panel import Panel, plain
 from qgs_viewer.query_scene import QueryScene
 from small import QUERIES, cloud, model_of, model_scenes_of, sample_of, source_of
 from viser.transforms import SO3
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
 
 import qgs
 
@@ -232,3 +237,48 @@ def test_a_page_never_replaces_a_file(ply, opened, tmp_path):
         view(ply, "--html", page)
     assert page.read_text() == "mine"
     assert not opened
+
+
+@pytest.fixture(scope="module")
+def port():
+    with quiet_server() as server:
+        yield server.get_port()
+
+
+def connected(port, origin=None):
+    protocol = f"viser-v{viser.__version__}"
+    return connect(f"ws://127.0.0.1:{port}", origin=origin, subprotocols=[protocol])
+
+
+def status(port, host):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request("GET", "/", headers={"Host": host.format(port)})
+    return connection.getresponse().status
+
+
+def test_the_page_is_served_under_names_of_this_machine_alone(port):
+    for host in ("localhost:{}", "127.0.0.1:{}", "[::1]:{}", "192.168.1.7:{}"):
+        assert status(port, host) == 200, host
+    for host in ("rebound.example:{}", "127.0.0.1.example:{}", ""):
+        assert status(port, host) == 403, host
+
+
+def test_its_own_page_alone_reads_the_scene(port):
+    with connected(port, f"http://127.0.0.1:{port}") as socket:
+        assert socket.recv(10)
+    for origin in ("http://127.0.0.1:1", "https://page.example", "null"):
+        with pytest.raises(InvalidStatus):
+            connected(port, origin)
+
+
+def test_a_broken_message_ends_its_connection_alone(port, capfd, caplog):
+    for message in (b"\xc1", b"", b"\x81\xa4type\xa4None", "text", b"\x00" * 99):
+        with connected(port) as socket, suppress(TimeoutError, ConnectionClosed):
+            socket.send(message)
+            while True:
+                socket.recv(0.5)
+        time.sleep(0.1)
+        with connected(port) as socket:
+            assert socket.recv(10)
+    assert "Traceback" not in "".join(capfd.readouterr())
+    assert not [record for record in caplog.records if record.exc_info]

@@ -1,9 +1,10 @@
-"""`qgs scene` on a tiny folder: its files, what it chooses, and the command that it prints."""
+"""`qgs scene` on a tiny folder: its files, what it chooses, and the points that it starts from."""
 
 import io
 import json
 import re
 import shutil
+import struct
 import sys
 from functools import partial
 from unittest.mock import MagicMock
@@ -12,10 +13,10 @@ import numpy as np
 import pytest
 import torch
 from commands import run_qgs
-from photo_formats import PhotoSet, write_colmap, write_nerfstudio
+from photo_formats import PhotoSet, synthetic, write_colmap, write_nerfstudio
 from PIL import Image
 from plyfile import PlyData
-from qgs_photos.refine.initial import photos_start, photos_world
+from qgs_photos.refine.initial import from_points, photos_start, photos_world, sparse_points
 from qgs_photos.refine.options import NONE, Options
 from qgs_photos.refine.refining import Extras
 from qgs_photos.refine.result import page_writer
@@ -29,7 +30,9 @@ from qgs_photos.refine.scene_photos import (
 from rich.console import Console
 from test_refining import RENDERER
 from textured_room import INTRINSICS, walk
+from torch.testing import assert_close
 from training_runs import tiny
+from upath import UPath
 
 import qgs
 from qgs.data.samples import views_in
@@ -169,3 +172,46 @@ def test_points_of_colmap_are_part_of_the_start(taken, photos_of_scene, photos, 
     assert torch.allclose(point, torch.tensor([0.0, 0, 5]), 0, 1e-4)
     found = photos_start(photos_of_scene.small, photos_world(photos_of_scene), views, 100, 40)
     assert found.count == TIMED
+
+
+POINTS = [(1.0, 2.0, 3.5, 255, 0, 51), (-1.0, 0.25, 4.0, 0, 102, 255), (0.5, 0.5, 5.0, 10, 20, 30)]
+TEXT = "# points\n" + "".join(f"7 {' '.join(map(str, row))} 0.5 1 7\n" for row in POINTS)
+BINARY = struct.pack("<Q", 3) + b"".join(
+    struct.pack("<Q3d3BdQ", n, *row, 0.5, n) + bytes(8 * n) for n, row in enumerate(POINTS)
+)
+"""Tracks of 0, 1 and 2 images."""
+
+
+def test_points_of_a_model(tmp_path):
+    folder = UPath(tmp_path)
+    assert sparse_points(folder) is None
+    (tmp_path / "transforms.json").write_text("{}")
+    model = write_colmap(tmp_path, synthetic(tmp_path / "files"), "text") / "sparse/0"
+    assert sparse_points(folder) is None  # the other format's cameras have another world
+    (tmp_path / "transforms.json").unlink()
+    (model / "points3D.txt").write_text("# no points\n")
+    assert sparse_points(folder) is None
+    expected = torch.tensor(POINTS).double()
+    for name, content in (("txt", TEXT.encode()), ("bin", BINARY)):
+        file = model / f"points3D.{name}"
+        file.write_bytes(content)
+        points, colors = sparse_points(folder)
+        file.unlink()
+        assert_close(points, expected[:, :3])
+        assert_close(colors, expected[:, 3:] / 255)
+    assert sparse_points(folder) is None
+    for cut in (4, 40, -3):
+        file.write_bytes(BINARY[:cut])
+        with pytest.raises(ValueError, match=r"points3D\.bin"):
+            sparse_points(folder)
+
+
+def test_gaussians_are_as_large_as_the_gaps_between_points():
+    world = torch.eye(4), torch.tensor(0.5)
+    grid = torch.cartesian_prod(*[torch.arange(4.0).double()] * 3)
+    found = from_points((grid, grid / 3), world, 64)
+    assert torch.allclose(found.scales, torch.tensor(0.5))
+    assert torch.allclose(found.colors, found.means / 1.5)
+    assert from_points((grid, grid), world, 10).count == 10
+    alone = from_points((grid[:1], grid[:1]), world, 10).scales
+    assert 0 < alone.min() <= alone.max() < torch.inf
