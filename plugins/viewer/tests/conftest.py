@@ -13,6 +13,7 @@ def _short_loops():
     from qgs.reconstruction import saving
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(saving.orbit_path, "__defaults__", (2, 32))
+        patch.setattr(saving, "ORBIT_FRAMES", 2)
+        patch.setattr(saving, "ORBIT_SIDE", 32)
         patch.setattr(saving, "overview", lambda result: np.zeros((8, 8, 3), np.uint8))
         yield

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from functools import partial
 
 import numpy as np
 import pytest
@@ -27,7 +26,8 @@ def checkpoint(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch):
     """Pictures take most of the time, and are tested with `qgs reconstruct`."""
-    monkeypatch.setattr(saving, "orbit_path", partial(saving.orbit_path, frames=2, side=16))
+    monkeypatch.setattr(saving, "ORBIT_FRAMES", 2)
+    monkeypatch.setattr(saving, "ORBIT_SIDE", 16)
     monkeypatch.setattr(saving, "overview", lambda result: np.zeros((4, 4, 3), np.uint8))
 
 
