@@ -10,6 +10,7 @@ of a recipe, each step in a file of its own:
 | find what stands at each place: defaults, layers, swaps | `places.py`, `slots.py` |
 | choose components and decode their options | `registry.py`, `decode.py` |
 | check them beside each other, follow fields from writer to reader | `checks.py` |
+| find the line that caused a problem | `causes.py` |
 | write out every default | `recipe.py` |
 | build the model | `build.py` |
 """

@@ -36,6 +36,7 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
     if _replaces(base, over, path):
         return over
     merged = MapNode(over.origin, base.entries())
+    merged.under = base
     for key, value, origin in over.entries():
         below = (*path, key)
         old = base.get(key)

@@ -14,9 +14,10 @@ from qgs import contracts
 from qgs.machine import refuse_more_than_memory
 from qgs.model import QueryGaussianModel
 from qgs.recipe.build import build, build_model, load_pretrained, rate_factors
+from qgs.recipe.causes import at_their_causes
 from qgs.recipe.checks import check, idle_fields, unfinished
 from qgs.recipe.decode import Chosen
-from qgs.recipe.errors import Origin, Problems
+from qgs.recipe.errors import Origin, Problems, RecipeError
 from qgs.recipe.files import apply_overrides, read_recipe
 from qgs.recipe.sections import SETTINGS, Draft, draft_of
 from qgs.recipe.slots import SECTIONS
@@ -139,7 +140,11 @@ def resolve(
     problems = Problems()
     written = apply_overrides(read_recipe(recipe, problems), overrides, problems)
     draft = draft_of(written, problems, plugins)
-    parts = check(draft, problems)
+    try:
+        parts = check(draft, problems)
+    except RecipeError as error:
+        found = at_their_causes(draft, written, error.problems, plugins)
+        raise RecipeError(found) from error.__cause__
     settings = draft.settings
     spelled = spell_out(draft, parts)
     used = [draft.registry.plugins[name] for name in ("qgs", *spelled["plugins"])]

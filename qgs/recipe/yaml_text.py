@@ -34,7 +34,12 @@ _TAGS = {_STANDARD + kind for kind in (*_SCALARS, "str", "map", "seq")}
 
 
 class MapNode(dict[str, Any]):
-    """A mapping. origin: where it begins. origins: where each key was written."""
+    """A mapping. origin: where it begins. origins: where each key was written.
+
+    under: what it was laid over, if anything.
+    """
+
+    under: "MapNode | None" = None
 
     def __init__(self, origin: Origin, items: Iterable[tuple[str, Any, Origin]] = ()) -> None:
         super().__init__()
