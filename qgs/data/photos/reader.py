@@ -37,7 +37,8 @@ class PhotoFrame:
     itself for its alpha channel. depth: its depth map. c2w: (4, 4) float64 OpenCV camera-to-world.
     intrinsics: fx, fy, cx, cy in pixels of an image of `size` (H, W), or of the file where the
     listing gives no size. lens: None for a pinhole. split: as listed, None without splits. time:
-    when it was taken, in the listing's unit; None where nothing moves.
+    when it was taken, in the listing's unit; None where nothing moves. turns: clockwise quarters
+    from the stored pixels to those of the camera, see `qgs.data.photos.turning`.
     problems: what the listing says that cannot be read; a pose or intrinsics concerned are NaN.
     """
 
@@ -51,6 +52,7 @@ class PhotoFrame:
     depth: UPath | None = None
     split: Literal["train", "test", "unused"] | None = None
     time: float | None = None
+    turns: int = 0
     problems: tuple[FrameProblem, ...] = ()
 
     def at_size(self, size: Size) -> Intrinsics:

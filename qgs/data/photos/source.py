@@ -1,5 +1,6 @@
 """`qgs/photos`: a folder of photos with their cameras, or a folder of such folders."""
 
+import io
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -33,6 +34,7 @@ from qgs.data.lenses import Mode, Size, undistorted, whole_zoom
 from qgs.data.photos import formats_of, present_frames, readers
 from qgs.data.photos.checks import size_problems
 from qgs.data.photos.reader import PhotoFrame
+from qgs.data.photos.turning import turned, turned_size, upright
 from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, LazySource
 from qgs.paths import is_local, listing, opened_path, read_file
 from qgs.types import Cameras
@@ -88,7 +90,7 @@ class PhotoScene(EncodedScene):
         self._config = config
         self._cache = cache
         frames, self.missing = present_frames(folder, config.format, config.images, config.outside)
-        self._frames = frames = frames[: config.max_frames or None]
+        self._frames = frames = [*map(upright, frames[: config.max_frames or None])]
         times = [frame.time for frame in frames if frame.time is not None]
         self.times = torch.tensor(times, dtype=torch.float64) if len({*times}) > 1 else None
         # What a listing says of its splits goes before the option.
@@ -109,7 +111,7 @@ class PhotoScene(EncodedScene):
         sizes: dict[object, Size] = {}
         intrinsics: list[Tensor] = []
         for frame in self._frames:
-            alike = (frame.path.parent, frame.size) if frame.size else frame.path
+            alike = (frame.path.parent, frame.size, frame.turns) if frame.size else frame.path
             if alike not in sizes:
                 sizes[alike] = _stored_size(frame)
             stored = torch.tensor(frame.at_size(sizes[alike]), dtype=torch.float64)
@@ -146,14 +148,21 @@ class PhotoScene(EncodedScene):
         """See `EncodedScene`."""
         photo = self._frames[frame]
         size = self.stored_size(frame)
+        data = read_file(photo.path)
+        # Pixels are stored again only where EXIF turns them.
+        if photo.turns:
+            file = io.BytesIO()
+            image = decode_rgb(io.BytesIO(data), self._config.background)
+            turned(image, photo).save(file, "png")
+            data = file.getvalue()
         return EncodedFrame(
             name=photo.name,
-            data=read_file(photo.path),
+            data=data,
             c2w=photo.c2w,
             intrinsics=photo.at_size(size),
             size=size,
             lens=photo.lens,
-            mask=photo.mask and _whole_mask(photo),
+            mask=photo.mask and np.array(turned(_whole_mask(photo), photo)),
             background=self._config.background,
         )
 
@@ -175,14 +184,14 @@ class PhotoScene(EncodedScene):
 
     def _image(self, frame: PhotoFrame) -> np.ndarray:
         image = read_image(frame.path, partial(decode_rgb, background=self._config.background))
-        if orientation(image) != 1:
+        if not frame.turns and orientation(image) != 1:
             warn_once(f"photos in {frame.path.parent} {TURNED}: {TURN}")
         return self._delivered(image, frame, frame.path)
 
     def _mask(self, frame: PhotoFrame) -> np.ndarray:
         if frame.mask is None:
             return np.full(self._config.image_size, 255, np.uint8)
-        return self._delivered(Image.fromarray(_whole_mask(frame)), frame, frame.mask)
+        return self._delivered(_whole_mask(frame), frame, frame.mask)
 
     def _depth(self, frame: PhotoFrame) -> np.ndarray:
         if frame.depth is None:
@@ -193,11 +202,12 @@ class PhotoScene(EncodedScene):
     def _delivered(
         self, image: Image.Image, frame: PhotoFrame, file: UPath, mode: Mode = "bilinear"
     ) -> np.ndarray:
-        """Return the content of `file`, without distortion, at the delivered size."""
+        """Return the content of `file`, upright without distortion, at the delivered size."""
         # A mask or depth map follows the photo.
         if file != frame.path and frame.size is None:
             frame = replace(frame, size=read_image(frame.path, image_size))
         size = _checked((image.height, image.width), frame, file)
+        image = turned(image, frame)
         if frame.lens is not None:
             pixels = undistorted(np.array(image), frame.at_size(size), frame.lens, mode)
             image = Image.fromarray(pixels)
@@ -212,9 +222,10 @@ class PhotoScene(EncodedScene):
         return CropResize(size, target, zoom)
 
 
-def _whole_mask(frame: PhotoFrame) -> np.ndarray:
+def _whole_mask(frame: PhotoFrame) -> Image.Image:
     assert frame.mask is not None
-    return read_image(frame.mask, decode_alpha if frame.mask == frame.path else decode_mask)
+    decode = decode_alpha if frame.mask == frame.path else decode_mask
+    return Image.fromarray(read_image(frame.mask, decode))
 
 
 def _stored_size(frame: PhotoFrame) -> Size:
@@ -222,7 +233,8 @@ def _stored_size(frame: PhotoFrame) -> Size:
 
 
 def _checked(size: Size, frame: PhotoFrame, file: UPath) -> Size:
-    """Return (H, W) of a frame's `file`; ValueError where the listing says otherwise."""
+    """Return (H, W) of a frame's `file`, upright; ValueError where the listing says otherwise."""
+    size = turned_size(size, frame)
     for problem in size_problems(size, frame.size):
         raise ValueError(f"{file}: {problem}")
     return size

@@ -11,6 +11,7 @@ from qgs.data.photos import formats_of, read_listing
 from qgs.data.photos.checks import refuse_outside
 from qgs.data.photos.reader import PhotoFrame, existing
 from qgs.data.photos.source import folder_name
+from qgs.data.photos.turning import upright
 from qgs.paths import read_file
 from qgs_photos.datasets.dl3dv import find_scenes, scene_folder
 from qgs_photos.datatools.findings import Finding
@@ -59,7 +60,7 @@ def _archived_photos(place: UPath, images: str | None) -> list[Photo]:
 def _photos(folder: UPath, kind: str, images: str | None) -> list[Photo]:
     listing = read_listing(folder, kind, images)
     refuse_outside(folder, listing)
-    frames = listing.frames
+    frames = [*map(upright, listing.frames)]
     there = existing(frame.path for frame in frames if frame.name)
     return [
         Photo(

@@ -14,6 +14,7 @@ from qgs.data.images import TURN, TURNED, decode_rgb, eight_bits, opened_image, 
 from qgs.data.lenses import Size, undistorted
 from qgs.data.photos.checks import size_problems
 from qgs.data.photos.reader import PhotoFrame
+from qgs.data.photos.turning import turned, turned_size
 from qgs.wording import numbered, one_line
 from qgs_photos.datatools.findings import Finding, Severity
 
@@ -39,7 +40,7 @@ class Photo:
     def picture(self, size: Size | None, side: int) -> tuple[np.ndarray, np.ndarray]:
         """Return pinhole RGB, at most `side` pixels long, and intrinsics (4,). Raises OSError."""
         frame = self.listed if self.listed.size else replace(self.listed, size=size)
-        image = decode_rgb(io.BytesIO(self.read()))
+        image = turned(decode_rgb(io.BytesIO(self.read())), frame)
         scale = min(1.0, side / max(image.size))
         width, height = (max(1, round(extent * scale)) for extent in image.size)
         pixels = np.array(image.resize((width, height), Image.Resampling.LANCZOS))
@@ -128,14 +129,14 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
         data = photo.read()
         digest = hashlib.blake2b(data, digest_size=16).digest()
         with opened_image(io.BytesIO(data)) as image:
-            size = (image.height, image.width)
+            size = turned_size((image.height, image.width), photo.listed)
             if headers_only:
                 return Decoded(size=size, digest=digest)
             image.draft(None, _SMALLEST)
             image.load()
             black = _is_black(eight_bits(image))
             # EXIF may stand behind the pixels
-            by_exif = orientation(image) != 1
+            by_exif = orientation(image) != 1 and not photo.listed.turns
     except Exception as error:
         # whatever a reader raises; the other photos go on
         reason = f"the image cannot be decoded ({error_text(error)})"
@@ -147,8 +148,8 @@ def decode(photo: Photo, headers_only: bool) -> Decoded:
             found = read()
             if found is None:
                 continue
-            problems = size_problems(found.shape[:2], size)
-            reasons = [f"the {kind}: {problem.reason}" for problem in problems]
+            own = turned_size(found.shape[:2], photo.listed)
+            reasons = [f"the {kind}: {problem.reason}" for problem in size_problems(own, size)]
             empty = not found.any() if kind == "mask" else empty
         except Exception as error:
             reasons = [error_text(error)]

@@ -1,0 +1,100 @@
+"""Photos whose EXIF turns them: their cameras turn with them."""
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose
+from photo_formats import encoded, scene
+from PIL import Image
+from planted import Room
+from qgs_photos.datatools.check import Options, check
+from qgs_photos.datatools.entries import Encoding, encoded_frames
+from textured_room import INTRINSICS, SIZE
+from upath import UPath
+
+from qgs.data.photos.reader import PhotoFrame
+from qgs.data.photos.turning import upright
+
+FX, FY, CX, CY = INTRINSICS
+HEIGHT, WIDTH = SIZE
+SIDES = {"fl_x": FY, "fl_y": FX, "w": HEIGHT, "h": WIDTH}
+STORED = {
+    6: (np.pi / 2, Image.Transpose.ROTATE_90, {**SIDES, "cx": CY, "cy": WIDTH - CX}),
+    8: (-np.pi / 2, Image.Transpose.ROTATE_270, {**SIDES, "cx": HEIGHT - CY, "cy": CX}),
+    3: (np.pi, Image.Transpose.ROTATE_180, {"cx": WIDTH - CX, "cy": HEIGHT - CY}),
+}
+"""By EXIF's orientation: the angle by which it turns a picture clockwise, how an upright one is
+stored, and the camera of the stored pixels."""
+
+
+@pytest.fixture
+def written(shots, tmp_path):
+    """Writes stored photos. listed: of which pixels the cameras are, "stored" or "upright"."""
+
+    def written(orientation, listed, **lens):
+        room = Room(shots[:4])
+        angle, transpose, camera = STORED[orientation]
+        if listed == "stored":
+            room.camera |= camera
+            stored_axes = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+            room.poses[:, :, :2] @= stored_axes
+        room.camera |= lens
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        masks = []
+        for name, shot in zip(list(room.files), shots, strict=False):
+            image = Image.fromarray(shot.image).transpose(transpose)
+            room.files[name] = encoded(image, exif=exif)
+            masks.append(255 * (np.array(image)[..., 0] > 128).astype(np.uint8))
+        room.mask(masks)
+        room.write(tmp_path / f"{orientation} {listed}")
+        return tmp_path / f"{orientation} {listed}"
+
+    return written
+
+
+def test_cameras_and_pixels_are_the_upright_ones(written, shots):
+    """Nothing tells a half turn: its cameras are those of the stored pixels."""
+    for case in ((6, "stored"), (8, "stored"), (3, "stored"), (6, "upright"), (8, "upright")):
+        folder = written(*case)
+        read = scene(folder, SIZE)
+        assert_allclose(read.cameras.c2w, [s.c2w for s in shots[:4]], 1e-7, 1e-7)
+        assert_allclose(read.cameras.intrinsics, [INTRINSICS] * 4, 1e-7)
+        image = read.images([1])[0].permute(1, 2, 0) * 255
+        assert_allclose(image, shots[1].image, 1e-6)
+        assert_allclose(read.masks([1])[0, 0], shots[1].image[..., 0] > 128)
+        assert read.stored_size(0) == SIZE
+        report = check(UPath(folder), Options(threads=1))
+        assert not report.findings
+        assert float(report.scenes[0].epipolar) < 1
+
+
+def test_a_lens_turns_with_its_photo(written, shots):
+    """The tangential part (p2, p1) is a vector in the image: x to y, y to -x."""
+    stored = scene(written(6, "stored", k1=0.05, p1=0.004, p2=-0.003), SIZE)
+    folder = written(6, "upright", k1=0.05, p1=-0.003, p2=-0.004)
+    (folder / "images/0.jpg").write_bytes(encoded(shots[0].image))
+    upright = scene(folder, SIZE)
+    found, expected = (read.images([0]) for read in (stored, upright))
+    assert torch.allclose(found, expected, 0, 1.5 / 255)
+
+
+def test_packed_photos_are_upright(written, shots, tmp_path):
+    (frame, kept), *_ = encoded_frames(scene(written(8, "stored"), SIZE), Encoding())
+    np.testing.assert_array_equal(frame.mask, 255 * (shots[0].image[..., 0] > 128))
+    assert frame.size == SIZE
+    assert_allclose(frame.c2w, shots[0].c2w, atol=1e-12)
+    path = tmp_path / "packed.png"
+    path.write_bytes(frame.data)
+    image = Image.open(path)
+    np.testing.assert_array_equal(image, shots[0].image)
+    assert kept == (not image.getexif().get(0x0112))
+
+
+def test_of_squares_a_warning_says_whose_cameras_they_have(tmp_path, caplog):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    path = UPath(tmp_path / "square.png")
+    path.write_bytes(encoded(np.zeros((4, 4, 3), np.uint8), exif=exif))
+    assert upright(PhotoFrame("square.png", path, np.eye(4), INTRINSICS)).turns == 1
+    assert "poses must be of the stored pixels" in caplog.text
