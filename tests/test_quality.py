@@ -12,11 +12,11 @@ TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
 LIMITS = {
-    "all": {"tokens": 553_300},
-    "qgs": {"tokens": 120_600, "parallel": 1, "why": 3},
-    "plugins": {"tokens": 217_400, "parallel": 1, "why": 3.5},
-    "tests": {"tokens": 187_000, "parallel": 1},
-    "tools": {"tokens": 23_700, "parallel": 1},
+    "all": {"tokens": 499_700},
+    "qgs": {"tokens": 111_200, "parallel": 1, "why": 3},
+    "plugins": {"tokens": 196_700, "parallel": 1, "why": 3.5},
+    "tests": {"tokens": 168_100, "parallel": 1},
+    "tools": {"tokens": 19_600, "parallel": 1},
 }
 """Limits of each group, as `python tools/size.py` counts: tokens and parallel assignments at most,
 comments that say why at least. They only get stricter: a change that adds removes as much."""
