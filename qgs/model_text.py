@@ -42,10 +42,14 @@ def model_text(model: Any) -> str:
 
 
 def heading(model: Any) -> str:
-    """Class, parameters, decoder layers and device."""
+    """Class, parameters, decoder layers, queries and device."""
+    tree = (model.recipe or {}).get("model", {})
+    options = {**tree.get("queries", {}), **tree.get("head", {})}
+    parts = [f"{_count(model):,} parameters", f"{len(model.decoder)} decoder layers"]
+    if {"count", "gaussians_per_query"} <= options.keys():
+        parts.append(f"{options['count']:,} queries of {options['gaussians_per_query']} Gaussians")
     device = next((parameter.device for parameter in model.parameters()), "cpu")
-    sizes = f"{_count(model):,} parameters, {len(model.decoder)} decoder layers"
-    return f"{type(model).__name__}: {sizes}, on {device}"
+    return f"{type(model).__name__}: {', '.join(parts)}, on {device}"
 
 
 def slot_rows(model: Any) -> list[tuple[str, str, str]]:
@@ -61,6 +65,10 @@ def _types(model: Any, slot: str) -> list[str]:
     if model.recipe is None:
         return [type(getattr(model, slot)).__name__] if hasattr(model, slot) else []
     tree = model.recipe["model"]
-    layers = tree["decoder"].get("layers", {}).values()
-    places = [*layers, tree["decoder"]] if slot in LAYER_SLOTS else [tree]
+    places = [tree]
+    if slot in LAYER_SLOTS:
+        # A layer has a component of its own, or else that of all layers.
+        decoder = tree["decoder"]
+        own = decoder.get("layers", {})
+        places = [decoder | own.get(str(index), {}) for index in range(len(model.decoder))]
     return [place[slot]["type"] for place in places if place.get(slot)]

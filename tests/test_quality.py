@@ -13,7 +13,7 @@ MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
 LIMITS = {
     "all": {"tokens": 499_700},
-    "qgs": {"tokens": 111_200, "parallel": 1, "why": 3},
+    "qgs": {"tokens": 111_220, "parallel": 1, "why": 3},
     "plugins": {"tokens": 196_700, "parallel": 1, "why": 3.5},
     "tests": {"tokens": 168_100, "parallel": 1},
     "tools": {"tokens": 19_600, "parallel": 1},

@@ -60,11 +60,6 @@ def true_anywhere(accelerator: Accelerator, flag: object) -> bool:
     return bool(mean(accelerator, own))
 
 
-def gathered(own: Any) -> list[Any]:
-    """Return the `own` of every process, by rank."""
-    return gather_object([own])
-
-
 @dataclass
 class RandomStates:
     """Torch's generators, of every process by its rank; components draw from no others."""
@@ -76,7 +71,7 @@ class RandomStates:
         own = {"torch": torch.get_rng_state()}
         if self.accelerator.device.type == "cuda":
             own["cuda"] = torch.cuda.get_rng_state(self.accelerator.device)
-        ranks = enumerate(gathered(own))
+        ranks = enumerate(gather_object([own]))
         return {f"{rank}/{key}": value for rank, found in ranks for key, value in found.items()}
 
     def load_state(self, state: Mapping[str, Any]) -> None:

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, NoReturn
 
 from accelerate import Accelerator
+from accelerate.utils import gather_object
 from torch import Tensor, nn
 
 from qgs.checkpoint.model_file import unique_tensors
@@ -14,7 +15,6 @@ from qgs.checkpoint.tensors import nonfinite
 from qgs.contracts import TrainingConfig
 from qgs.data.samples import Batch
 from qgs.machine import is_out_of_memory
-from qgs.train.distributed import gathered
 from qgs.train.folder import Saver
 from qgs.train.nonfinite import first_bad_tensor
 from qgs.train.training_pass import TrainingPass
@@ -124,7 +124,7 @@ class Guard:
         # All processes repeat the step: its collective operations need everyone.
         first = first_bad_tensor(self.training_pass, lambda: self.repeat(batches))
         words = first.described(batches) if first else ""
-        told = list(filter(None, gathered(words)))
+        told = list(filter(None, gather_object([words])))
         found = "; ".join([symptom, *(told or ["repeating the step gave finite numbers"])])
         skips = self.config.on_nonfinite == "skip"
         if skips and self.skipped <= MAX_SKIPPED:
