@@ -1,45 +1,13 @@
-"""What sources of scenes share: lists opened on demand, stored photos, a cache."""
+"""What sources of scenes share: lists opened on demand, a cache."""
 
-from abc import abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
 from threading import Lock
 from typing import Any, Generic, TypeVar
 
-import numpy as np
-
 from qgs.contracts import Scene, SceneSource, Split
-from qgs.data.lenses import Intrinsics, Lens, Size
 
 Value = TypeVar("Value")
-
-
-@dataclass(frozen=True)
-class EncodedFrame:
-    """A photo as it is stored, and the camera that took it.
-
-    data: bytes of the image file. mask: (H, W) uint8. c2w: (4, 4) float64, OpenCV axes. intrinsics:
-    fx, fy, cx, cy in pixels of the photo, whose size is (H, W). lens: None for a pinhole.
-    background: RGB in [0, 1] behind transparent pixels.
-    """
-
-    name: str
-    data: bytes
-    c2w: np.ndarray
-    intrinsics: Intrinsics
-    size: Size
-    lens: Lens | None = None
-    mask: np.ndarray | None = None
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
-
-
-class EncodedScene(Scene):
-    """A scene that is stored as image files."""
-
-    @abstractmethod
-    def encoded(self, frame: int) -> EncodedFrame:
-        """Return a frame as it is stored. Raises ValueError for a file that cannot be read."""
 
 
 class BoundedCache(Generic[Value]):

@@ -24,6 +24,7 @@ from upath import UPath
 
 from qgs.data import PhotosSource
 from qgs.data import photos as formats
+from qgs.data.photos.reader import GROUP
 from qgs.wording import warn_once
 
 
@@ -139,7 +140,7 @@ def test_a_distribution_adds_a_format(install, tmp_path, caplog):
     with pytest.raises(ValidationError, match="csv"):
         PhotosSource.Config(path="photos", format="csv")
     for name, source in (("csv", CSV), ("nerfstudio", CSV), ("none", "")):
-        install(f"{name}-photos", name, source, group=formats.GROUP)
+        install(f"{name}-photos", name, source, group=GROUP)
     assert PhotosSource.Config(path="photos", format="csv").format == "csv"
     (folder := UPath(tmp_path / "photos")).mkdir()
     with pytest.raises(FileNotFoundError, match=r"transforms\.json.*poses\.csv \(csv\)"):

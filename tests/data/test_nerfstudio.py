@@ -1,4 +1,4 @@
-"""nerfstudio's masks, depth maps, splits, lenses and scaled copies."""
+"""nerfstudio's masks, depth maps, splits and scaled copies."""
 
 import json
 
@@ -11,9 +11,7 @@ from photo_formats import synthetic, write_nerfstudio
 from PIL import Image
 from tables import must_refuse
 
-from qgs.data.lenses import Fisheye, RadialTangential
-from qgs.data.photos.nerfstudio import image_name, read_transforms
-from qgs.paths import opened_path
+from qgs.data.photos.nerfstudio import image_name
 
 
 @pytest.fixture
@@ -90,15 +88,6 @@ def test_splits(folder, caplog):
 def test_a_split_that_names_no_frame_is_told(folder):
     change(folder, train_filenames=["images/other.png"])
     must_refuse(r"transforms\.json: 'train_filenames' names .*other\.png", read, folder)
-
-
-def test_lenses(folder):
-    change(folder, k1=0.1, p2=0.01, k3=0.002)
-    change(folder, 1, camera_model="OPENCV_FISHEYE", k3=0.0, p2=0.0, k4=0.3)
-    change(folder, 2, k1=0, p2=0, k3=None)
-    frames = read_transforms(opened_path(folder) / "transforms.json")
-    lenses = [frame.lens for frame in frames[:3]]
-    assert lenses == [RadialTangential(0.1, p2=0.01, k3=0.002), Fisheye(0.1, k4=0.3), None]
 
 
 LISTED = r"""

@@ -1,17 +1,12 @@
 import json
-import math
 import re
 from functools import partial
 
-import numpy as np
 import photo_formats
 import pytest
-import torch
 from photo_formats import row_of_frames
 from PIL import Image
 from tables import must_refuse
-
-from qgs.data.lenses import Fisheye, RadialTangential, undistorted
 
 GLOBAL = {"fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
 
@@ -96,45 +91,3 @@ def test_files_outside_of_the_folder_are_read_only_if_allowed(tmp_path):
             folder(mine, frame={of: place})
             must_refuse(r"other/images/1\.png", opened, mine)
             assert of != "file_path" or read(mine, outside=True)
-
-
-def test_where_the_lens_would_fold_the_photo_it_sees_nothing(tmp_path):
-    """x (1 - 0.6 x^2) is largest at 0.745, and x of its angle's polynomial at an angle of it."""
-    largest = math.sqrt(1 / 1.8)
-    wide = {"fl_x": 30.0, "fl_y": 30.0, "cx": 32.0, "cy": 24.0}
-    for model, lens, turn in (
-        ("OPENCV", RadialTangential, largest),
-        ("OPENCV_FISHEYE", Fisheye, math.tan(largest)),
-    ):
-        image = undistorted(np.ones((48, 64), np.uint8), (*wide.values(),), lens(k1=-0.6))
-        reach = math.ceil(30 * turn - 0.5)
-        assert not image[24, 32 + reach :].any()
-        assert image[24, 32 : 32 + reach].all()
-        path = folder(tmp_path, camera_model=model, k1=-0.6, **wide)
-        assert (read(path, size=(48, 64)).images([2])[0, 2] > 0).all()
-
-
-def test_black_edges_of_undistorted_photos_are_cut_off(tmp_path):
-    distorted = folder(tmp_path, k1=0.9, cx=36.0, cy=24.0)
-    pixels = np.full((48, 64, 3), 255, np.uint8)
-    pixels[:, :, 0] = np.arange(64) * 3 + 9
-    Image.fromarray(pixels).save(tmp_path / "images/0.png")
-    for size in ((48, 64), (24, 24)):
-        scene = read(distorted, size=size)
-        image = scene.images([0])[0] * 255
-        assert (image[1] > 240).all()  # resampling overshoots a little
-        # a pixel still shows what its camera says
-        row = size[0] // 2
-        column = size[1] - 4
-        fx, fy, cx, cy = scene.cameras.intrinsics[0].tolist()
-        x = (column + 0.5 - cx) / fx
-        y = (row + 0.5 - cy) / fy
-        expected = 36 + 100 * x * (1 + 0.9 * (x * x + y * y)) - 0.5
-        assert image[0, row, column].item() == pytest.approx(3 * expected + 9, abs=3)
-
-
-def test_the_sixth_power_bends_rays_as_opencv_writes_it():
-    """The other coefficients are compared with those of pycolmap's cameras."""
-    bent = RadialTangential(k3=0.15).distorted(torch.tensor([0.3, -0.4]).double())
-    factor = 1 + 0.15 * 0.5**6
-    assert bent.tolist() == pytest.approx([0.3 * factor, -0.4 * factor])

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from upath import UPath
 
-from qgs.data.photos.checks import refuse_fatal_problems, refuse_outside
 from qgs.data.photos.nerfstudio import Nerfstudio
-from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, existing
-from qgs.extensions import ExtensionError, installed, load
+from qgs.data.photos.reader import (
+    Listing,
+    PhotoFrame,
+    PhotoReader,
+    existing,
+    installed_readers,
+    refuse_fatal_problems,
+    refuse_outside,
+)
 from qgs.paths import is_local, listing
 from qgs.wording import listed, warn_once
-
-GROUP = "qgs.photo_readers"
-"""Entry point group of further readers: format name = module:subclass of `PhotoReader`."""
 
 _SMALLEST = (
     '{"fl_x": FOCAL_LENGTH_IN_PIXELS, "w": WIDTH, "h": HEIGHT, "frames": [{"file_path": '
@@ -21,19 +24,12 @@ _SMALLEST = (
 
 
 def readers() -> dict[str, type[PhotoReader]]:
-    """Return readers by format name: `Nerfstudio`, then those of installed distributions.
+    """Return readers by format name: `Nerfstudio`, then `installed_readers`.
 
-    Where a folder holds several listings, the first of this order is read. One that cannot be
-    loaded is left out and logged.
+    Where a folder holds several listings, the first of this order is read.
     """
-    found: dict[str, type[PhotoReader]] = {Nerfstudio.name: Nerfstudio}
-    for entry in installed(GROUP):
-        # A broken distribution must not hinder folders of other formats.
-        try:
-            found.setdefault(entry.name, load(entry, PhotoReader))
-        except ExtensionError as error:
-            warn_once(str(error))
-    return found
+    own = {Nerfstudio.name: Nerfstudio}
+    return {**own, **installed_readers(), **own}
 
 
 def formats_of(folder: UPath) -> list[str]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -11,22 +11,26 @@ from PIL import Image
 from upath import UPath
 
 from qgs.data.images import image_size, read_image
-from qgs.data.lenses import Fisheye, Intrinsics, Lens, RadialTangential, Size, bending
-from qgs.data.photos.checks import FrameProblem, listed_size
 from qgs.data.photos.reader import (
+    FrameProblem,
+    Intrinsics,
+    Lens,
     Listing,
     PhotoFrame,
     PhotoReader,
+    Size,
     existing,
+    installed_readers,
+    listed_size,
     numbers,
     with_images,
 )
 from qgs.paths import read_json
 
-_PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
-_FISHEYE = "OPENCV_FISHEYE"
-# Coefficients of camera models that are not known here.
-_OTHER = ("k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "sx1", "sy1", "b1", "b2")
+PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+"""Camera models that are a pinhole where no coefficient bends rays."""
+_BENDING = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
+_OTHER = ("tau_x", "tau_y", "sx1", "sy1", "b1", "b2")
 _NO_POSE = np.full((4, 4), np.nan)
 _NO_INTRINSICS: Intrinsics = (math.nan, math.nan, math.nan, math.nan)
 # Of a pose's columns: the camera's y and z axes change sign.
@@ -176,21 +180,20 @@ def _focal(values: _Values, axis: str, side: int | None) -> float | None:
 
 
 def _lens(values: _Values) -> Lens | None:
-    model = values.get("camera_model", "PINHOLE")
-    fisheye = model == _FISHEYE or bool(values.get("is_fisheye"))
-    if model not in _PINHOLE and not fisheye:
-        known = ", ".join(sorted((*_PINHOLE, _FISHEYE)))
-        fix = f"undistort the photos first, or export one of {known}"
-        values.problem(f"the camera model {model!r} is not known", fix)
-        return None
+    fisheye = values.get("is_fisheye")
+    model = "OPENCV_FISHEYE" if fisheye else values.get("camera_model", "PINHOLE")
     # An ignored coefficient would shift pixels against the poses without an error.
-    for key in _OTHER if fisheye else (*_OTHER, "k4"):
-        if values.number(key):
-            reason = f"{key!r} is set, which belongs to another camera model"
-            values.problem(reason, "undistort the photos first, or export without it")
-    kind = Fisheye if fisheye else RadialTangential
-    names = (field.name for field in fields(kind))
-    return bending(kind(**{name: values.number(name) or 0.0 for name in names}))
+    found = {key: number for key in (*_BENDING, *_OTHER) if (number := values.number(key))}
+    if model in PINHOLE and not found:
+        return None
+    lenses = (reader.lens(str(model), found) for reader in installed_readers().values())
+    if (lens := next(filter(None, lenses), None)) is None:
+        values.problem(
+            f"no installed format knows the lens of camera model {model!r} with {found}",
+            "install query-gaussians-photos, which knows OPENCV (k1 to k3, p1, p2) and "
+            "OPENCV_FISHEYE (k1 to k4), or undistort the photos first",
+        )
+    return lens
 
 
 def _with_splits(frames: Sequence[PhotoFrame], data: Mapping[str, Any]) -> list[PhotoFrame]:

@@ -1,20 +1,43 @@
-"""Base of readers of photos, and the frames that they give: poses, intrinsics, lenses, files."""
+"""Base of readers of photos, the frames that they give, and the problems of these."""
 
+import math
+import os
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 from upath import UPath
 
-from qgs.data.lenses import Intrinsics, Lens, Size
+from qgs.extensions import ExtensionError, installed, load
 from qgs.paths import listing
+from qgs.wording import listed, name_shown, numbered, warn_once
 
+Intrinsics: TypeAlias = tuple[float, float, float, float]
+Size: TypeAlias = tuple[int, int]
+GROUP = "qgs.photo_readers"
+"""Entry point group of further readers: format name = module:subclass of `PhotoReader`."""
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _COPY = re.compile(r"images(_\d+)?")
+# Pixels of a listed photo.
+LARGEST_SIDE = 10**6
+# Largest coordinate of a camera: the square of larger ones overflows float32.
+_FARTHEST = 1e12
+# Tolerance of rotations against orthonormality.
+_RIGID = 1e-3
+# Relative difference between the file's and the listing's aspect ratio.
+_SAME_ASPECT = 0.01
+# Ratio of fx and fy up to which pixels are about square.
+_SQUARE = 1.4
+# Of a side, of the principal point from the middle.
+_OFF_CENTRE = 0.3
+# A focal length below is in units of the image, not of its pixels.
+_NORMALISED = 5.0
+# Focal lengths per longer side: angles of view of 157 and 2 degrees.
+_FOCAL = (0.1, 30.0)
 
 
 @dataclass(frozen=True)
@@ -29,9 +52,35 @@ class FrameProblem:
         return f"{self.reason}: {self.fix}"
 
 
+class Lens(ABC):
+    """A lens that bends rays, hashable, as `PhotoReader.lens` gives it; a pinhole has none."""
+
+    @abstractmethod
+    def undistorted(
+        self, pixels: np.ndarray, intrinsics: Intrinsics, nearest: bool = False
+    ) -> np.ndarray:
+        """Return the photo as a pinhole camera with the same intrinsics would have taken it.
+
+        pixels: (H, W) or (H, W, C), returned in the same shape and dtype. intrinsics: in pixels of
+        it. nearest: take the nearest pixel, no mean. What the lens did not see is 0.
+        """
+
+    @abstractmethod
+    def whole_zoom(self, intrinsics: Intrinsics, size: Size, target: Size) -> float:
+        """Return the least zoom at which the middle of an undistorted photo has no black edges.
+
+        intrinsics: in pixels of the photo, of `size` (H, W), whose middle of the aspect of `target`
+        is shown.
+        """
+
+    @abstractmethod
+    def turned(self) -> Self:
+        """Return the lens of a camera turned by a quarter, clockwise."""
+
+
 @dataclass(frozen=True)
 class PhotoFrame:
-    """One photo as listed; nothing of it is judged yet (see `qgs.data.photos.checks`).
+    """One photo as listed; nothing of it is judged yet (see `refuse_fatal_problems`).
 
     name: the image file relative to the scene's folder. path: that file. mask: its mask; the image
     itself for its alpha channel. depth: its depth map. c2w: (4, 4) float64 OpenCV camera-to-world.
@@ -73,7 +122,7 @@ class Listing:
 
 
 class PhotoReader(ABC):
-    """A format that lists posed photos; subclasses are entry points of `qgs.data.photos.GROUP`."""
+    """A format that lists posed photos; subclasses are entry points of `GROUP`."""
 
     name: ClassVar[str]
     """What the option `format` calls it."""
@@ -96,6 +145,14 @@ class PhotoReader(ABC):
         return None
 
     @classmethod
+    def lens(cls, model: str, coefficients: Mapping[str, float]) -> Lens | None:
+        """Return the lens of a camera model as nerfstudio and COLMAP name it; None if unknown.
+
+        coefficients: those that are not 0, such as k1.
+        """
+        return None
+
+    @classmethod
     @abstractmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:
         """Read the photos that `folder` lists; neighbours in the list should be so in space.
@@ -103,6 +160,21 @@ class PhotoReader(ABC):
         images: folder of photos to read instead of the listed one, such as images_4. Raises
         FileNotFoundError where it does not exist, ValueError for a listing that cannot be read.
         """
+
+
+def installed_readers() -> dict[str, type[PhotoReader]]:
+    """Return readers of installed distributions by format name; of equal names the first.
+
+    One that cannot be loaded is left out and logged.
+    """
+    found: dict[str, type[PhotoReader]] = {}
+    for entry in installed(GROUP):
+        # A broken distribution must not hinder folders of other formats.
+        try:
+            found.setdefault(entry.name, load(entry, PhotoReader))
+        except ExtensionError as error:
+            warn_once(str(error))
+    return found
 
 
 def numbers(value: object) -> np.ndarray:
@@ -164,3 +236,110 @@ def with_images(
         return replace(frame, name=name, path=folder / name, mask=mask)
 
     return [moved(frame) if frame.name else frame for frame in frames]
+
+
+def refuse_outside(folder: UPath, found: Listing) -> None:
+    """Raise ValueError for a listed file that is not in `folder`; a link there is."""
+    for frame in found.frames:
+        for file in filter(None, (frame.path, frame.mask, frame.depth)):
+            if os.path.relpath(file.path, folder.path or ".").split(os.sep)[0] == "..":
+                raise ValueError(
+                    f"{found.file} names {name_shown(str(file))}, which is outside of {folder}: "
+                    "move it into the folder, or train with data.outside=true"
+                )
+
+
+def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
+    """Yield problems of a pose (4, 4): NaN, mirrored, sheared or scaled."""
+    # NaN is not at most anything.
+    if not np.abs(c2w).max() <= _FARTHEST:
+        reason = f"the pose has NaN or numbers larger than {_FARTHEST:.0e}"
+        yield FrameProblem(reason, "correct it, or remove the frame")
+        return
+    # Mirrored is told from sheared: the remedies differ.
+    rotation = c2w[:3, :3]
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if error > _RIGID or np.abs(c2w[3] - [0, 0, 0, 1]).max() > _RIGID:
+        yield FrameProblem(
+            f"the pose is not rigid (rotation off by {error:.2g}, last row {c2w[3].tolist()})",
+            "poses must rotate and translate only; divide the rotation by its scale",
+        )
+    elif np.linalg.det(rotation) < 0:
+        fix = "negate one axis of the camera, or export the poses again"
+        yield FrameProblem("the pose mirrors and so is not rigid", fix)
+
+
+def intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> Iterator[FrameProblem]:
+    """Yield problems of fx, fy, cx, cy in pixels of `size` (H, W); not all are fatal."""
+    fx, fy, cx, cy = intrinsics
+    values = f"(fx {fx:.6g}, fy {fy:.6g}, cx {cx:.6g}, cy {cy:.6g})"
+    if not all(map(math.isfinite, intrinsics)) or fx <= 0 or fy <= 0:
+        reason = f"intrinsics are not finite, or focal lengths not positive {values}"
+        yield FrameProblem(reason, "export the intrinsics again")
+        return
+    in_pixels = size is not None and max(size) > 20 * _NORMALISED
+    if max(fx, fy) < _NORMALISED and (in_pixels or max(abs(cx), abs(cy)) <= 1):
+        fix = "they must be in pixels; multiply fx and cx by the width, fy and cy by the height"
+        yield FrameProblem(f"the intrinsics look normalised {values}", fix)
+        return
+    if size is None:
+        return
+    height, width = size
+    nearest, farthest = (limit * max(size) for limit in _FOCAL)
+    off_centre = max(abs(cx / width - 0.5), abs(cy / height - 0.5))
+    plausible = nearest <= min(fx, fy) and max(fx, fy) <= farthest and off_centre <= _OFF_CENTRE
+    if not plausible or not 1 / _SQUARE < fx / fy < _SQUARE:
+        yield FrameProblem(
+            f"the intrinsics {values} are implausible for {width} x {height} pixels",
+            "correct them, unless the photo is cut from a larger one; fx and cx go with the width, "
+            "fy and cy with the height",
+            fatal=False,
+        )
+
+
+def size_problems(size: Size, listed: Size | None) -> Iterator[FrameProblem]:
+    """Yield problems of an image file of `size` (H, W); a scaled copy of `listed` has none."""
+    if listed is None or _alike(size, listed):
+        return
+    swapped = _alike(size, (listed[1], listed[0]))
+    yield FrameProblem(
+        f"the image is {size[1]} x {size[0]} pixels, but listed as {listed[1]} x {listed[0]}, "
+        "another aspect ratio, so that the intrinsics cannot be scaled",
+        "width and height are swapped; swap them back, or turn the photos' pixels where EXIF does "
+        "(`mogrify -auto-orient`)"
+        if swapped
+        else "give the original image, or correct the listed size",
+    )
+
+
+def _alike(size: Size, other: Size) -> bool:
+    """Return whether two sizes have about the same aspect ratio."""
+    return abs(size[1] * other[0] / (size[0] * other[1]) - 1) <= _SAME_ASPECT
+
+
+def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FrameProblem, ...]]:
+    """Return the listed size (H, W); None, and the problem, where no photo can have it."""
+    if all(1 <= side <= LARGEST_SIDE for side in (height, width)):
+        return (round(height), round(width)), ()
+    size = f"{str(width)[:12]} x {str(height)[:12]}"
+    reason = f"the listed size, {size} pixels, is impossible for a photo"
+    return None, (FrameProblem(reason, "correct the width and height"),)
+
+
+def refuse_fatal_problems(listing: object, frames: Sequence[PhotoFrame]) -> None:
+    """Raise ValueError for the first fatal problem, with its frame; log the others."""
+    doubtful: list[str] = []
+    for index, frame in enumerate(frames):
+        problems = frame.problems or (
+            *pose_problems(frame.c2w),
+            *intrinsics_problems(frame.intrinsics, frame.size),
+        )
+        where = f"frame {numbered(index, frame.name)}"
+        for problem in problems:
+            if problem.fatal:
+                raise ValueError(f"{listing}: {where}: {problem}")
+        if problems:
+            doubtful.append(f"{where}: {problems[0]}")
+    if doubtful:
+        shown = listed(doubtful, 3, "; ")
+        warn_once(f"{listing}: {len(doubtful)} of {len(frames)} frames are doubtful: {shown}")

@@ -1,6 +1,5 @@
 """`qgs/photos`: a folder of photos with their cameras, or a folder of such folders."""
 
-import io
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -15,7 +14,7 @@ from pydantic import Field, field_validator
 from torch import Tensor
 from upath import UPath
 
-from qgs.contracts import OptionError, SceneSource, SceneSourceConfig
+from qgs.contracts import OptionError, Scene, SceneSource, SceneSourceConfig
 from qgs.data.frames import held_out_frames
 from qgs.data.images import (
     TURN,
@@ -30,13 +29,11 @@ from qgs.data.images import (
     read_image,
     to_tensor,
 )
-from qgs.data.lenses import Mode, Size, undistorted, whole_zoom
 from qgs.data.photos import formats_of, present_frames, readers
-from qgs.data.photos.checks import size_problems
-from qgs.data.photos.reader import PhotoFrame
+from qgs.data.photos.reader import PhotoFrame, Size, size_problems
 from qgs.data.photos.turning import turned, turned_size, upright
-from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, LazySource
-from qgs.paths import is_local, listing, opened_path, read_file
+from qgs.data.scenes import BoundedCache, LazyScenes, LazySource
+from qgs.paths import is_local, listing, opened_path
 from qgs.types import Cameras
 from qgs.wording import listed, warn_once
 
@@ -79,7 +76,7 @@ def image_cache(limit: int = 512 * 2**20) -> BoundedCache[np.ndarray]:
     return BoundedCache(limit, attrgetter("nbytes"))
 
 
-class PhotoScene(EncodedScene):
+class PhotoScene(Scene):
     """A listing's photos, in its world and order. cache: shared. Raises as `present_frames`."""
 
     def __init__(
@@ -87,10 +84,10 @@ class PhotoScene(EncodedScene):
     ) -> None:
         self.name = name
         self.folder = folder
-        self._config = config
+        self.config = config
         self._cache = cache
         frames, self.missing = present_frames(folder, config.format, config.images, config.outside)
-        self._frames = frames = [*map(upright, frames[: config.max_frames or None])]
+        self.photos = frames = [*map(upright, frames[: config.max_frames or None])]
         times = [frame.time for frame in frames if frame.time is not None]
         self.times = torch.tensor(times, dtype=torch.float64) if len({*times}) > 1 else None
         # What a listing says of its splits goes before the option.
@@ -100,7 +97,7 @@ class PhotoScene(EncodedScene):
             self.held_out = held_out_frames(len(frames), config.holdout)
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return len(self.photos)
 
     @cached_property
     def cameras(self) -> Cameras:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -110,14 +107,14 @@ class PhotoScene(EncodedScene):
         """
         sizes: dict[object, Size] = {}
         intrinsics: list[Tensor] = []
-        for frame in self._frames:
+        for frame in self.photos:
             alike = (frame.path.parent, frame.size, frame.turns) if frame.size else frame.path
             if alike not in sizes:
                 sizes[alike] = _stored_size(frame)
             stored = torch.tensor(frame.at_size(sizes[alike]), dtype=torch.float64)
             intrinsics.append(self._crop(frame, sizes[alike]).intrinsics(stored))
-        c2w = torch.from_numpy(np.stack([frame.c2w for frame in self._frames]))
-        return Cameras(c2w, torch.stack(intrinsics), self._config.image_size)
+        c2w = torch.from_numpy(np.stack([frame.c2w for frame in self.photos]))
+        return Cameras(c2w, torch.stack(intrinsics), self.config.image_size)
 
     def images(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`. Raises ValueError for a file that cannot be decoded."""
@@ -125,46 +122,24 @@ class PhotoScene(EncodedScene):
 
     def masks(self, frames: Sequence[int]) -> Tensor | None:
         """See `Scene`; 1 everywhere for a photo without a mask in a scene that has some."""
-        if all(frame.mask is None for frame in self._frames):
+        if all(frame.mask is None for frame in self.photos):
             return None
         masks = self._stacked(self._mask, frames)
         return torch.from_numpy(masks)[:, None].float().div_(255)
 
     def depths(self, frames: Sequence[int]) -> Tensor | None:
         """See `Scene`; 0 in frames without a map. None where none of `frames` has one."""
-        if all(self._frames[i].depth is None for i in frames):
+        if all(self.photos[i].depth is None for i in frames):
             return None
         return torch.from_numpy(self._stacked(self._depth, frames))[:, None]
 
     def frame_name(self, frame: int) -> str:
         """See `Scene`: the image file, relative to the scene's folder."""
-        return self._frames[frame].name
+        return self.photos[frame].name
 
     def stored_size(self, frame: int) -> Size:
         """See `Scene`."""
-        return _stored_size(self._frames[frame])
-
-    def encoded(self, frame: int) -> EncodedFrame:
-        """See `EncodedScene`."""
-        photo = self._frames[frame]
-        size = self.stored_size(frame)
-        data = read_file(photo.path)
-        # Pixels are stored again only where EXIF turns them.
-        if photo.turns:
-            file = io.BytesIO()
-            image = decode_rgb(io.BytesIO(data), self._config.background)
-            turned(image, photo).save(file, "png")
-            data = file.getvalue()
-        return EncodedFrame(
-            name=photo.name,
-            data=data,
-            c2w=photo.c2w,
-            intrinsics=photo.at_size(size),
-            size=size,
-            lens=photo.lens,
-            mask=photo.mask and np.array(turned(_whole_mask(photo), photo)),
-            background=self._config.background,
-        )
+        return _stored_size(self.photos[frame])
 
     def _stacked(
         self, read: Callable[[PhotoFrame], np.ndarray], frames: Sequence[int]
@@ -173,9 +148,9 @@ class PhotoScene(EncodedScene):
 
         def cached(frame: int) -> np.ndarray:
             key = (self.name, read.__name__, frame)
-            return self._cache.get(key, lambda: read(self._frames[frame]))
+            return self._cache.get(key, lambda: read(self.photos[frame]))
 
-        paths = [self._frames[frame].path for frame in frames]
+        paths = [self.photos[frame].path for frame in frames]
         if all(is_local(path) or path.protocol == "zip" for path in paths):
             return np.stack([*map(cached, frames)])
         # A store answers slowly, but several requests at a time.
@@ -183,24 +158,24 @@ class PhotoScene(EncodedScene):
             return np.stack([*pool.map(cached, frames)])
 
     def _image(self, frame: PhotoFrame) -> np.ndarray:
-        image = read_image(frame.path, partial(decode_rgb, background=self._config.background))
+        image = read_image(frame.path, partial(decode_rgb, background=self.config.background))
         if not frame.turns and orientation(image) != 1:
             warn_once(f"photos in {frame.path.parent} {TURNED}: {TURN}")
         return self._delivered(image, frame, frame.path)
 
     def _mask(self, frame: PhotoFrame) -> np.ndarray:
         if frame.mask is None:
-            return np.full(self._config.image_size, 255, np.uint8)
-        return self._delivered(_whole_mask(frame), frame, frame.mask)
+            return np.full(self.config.image_size, 255, np.uint8)
+        return self._delivered(whole_mask(frame), frame, frame.mask)
 
     def _depth(self, frame: PhotoFrame) -> np.ndarray:
         if frame.depth is None:
-            return np.zeros(self._config.image_size, np.float32)
-        depth = read_image(frame.depth, partial(decode_depth, unit=self._config.depth_unit))
-        return self._delivered(Image.fromarray(depth), frame, frame.depth, "nearest")
+            return np.zeros(self.config.image_size, np.float32)
+        depth = read_image(frame.depth, partial(decode_depth, unit=self.config.depth_unit))
+        return self._delivered(Image.fromarray(depth), frame, frame.depth, nearest=True)
 
     def _delivered(
-        self, image: Image.Image, frame: PhotoFrame, file: UPath, mode: Mode = "bilinear"
+        self, image: Image.Image, frame: PhotoFrame, file: UPath, nearest: bool = False
     ) -> np.ndarray:
         """Return the content of `file`, upright without distortion, at the delivered size."""
         # A mask or depth map follows the photo.
@@ -209,20 +184,22 @@ class PhotoScene(EncodedScene):
         size = _checked((image.height, image.width), frame, file)
         image = turned(image, frame)
         if frame.lens is not None:
-            pixels = undistorted(np.array(image), frame.at_size(size), frame.lens, mode)
+            pixels = frame.lens.undistorted(np.array(image), frame.at_size(size), nearest)
             image = Image.fromarray(pixels)
         # A mean of depths at an edge would be a surface that is not there.
-        kernel = Image.Resampling.NEAREST if mode == "nearest" else Image.Resampling.LANCZOS
+        kernel = Image.Resampling.NEAREST if nearest else Image.Resampling.LANCZOS
         return self._crop(frame, size).image(image, kernel)
 
     def _crop(self, frame: PhotoFrame, size: Size) -> CropResize:
         """Return the crop of a photo of `size` without what the lens did not see."""
-        target = self._config.image_size
-        zoom = whole_zoom(frame.at_size(size), frame.lens, size, target)
+        target = self.config.image_size
+        lens = frame.lens
+        zoom = 1.0 if lens is None else lens.whole_zoom(frame.at_size(size), size, target)
         return CropResize(size, target, zoom)
 
 
-def _whole_mask(frame: PhotoFrame) -> Image.Image:
+def whole_mask(frame: PhotoFrame) -> Image.Image:
+    """Return the mask of a photo that has one, as it is stored. Raises ValueError."""
     assert frame.mask is not None
     decode = decode_alpha if frame.mask == frame.path else decode_mask
     return Image.fromarray(read_image(frame.mask, decode))

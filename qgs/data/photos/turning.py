@@ -7,9 +7,7 @@ import numpy as np
 from PIL import Image
 
 from qgs.data.images import TURN, opened_image, orientation
-from qgs.data.lenses import RadialTangential, Size
-from qgs.data.photos.checks import size_problems
-from qgs.data.photos.reader import PhotoFrame
+from qgs.data.photos.reader import PhotoFrame, Size, size_problems
 from qgs.paths import is_local
 from qgs.wording import warn_once
 
@@ -79,14 +77,10 @@ def _quarter(frame: PhotoFrame) -> PhotoFrame:
     assert frame.size is not None
     height, width = frame.size
     fx, fy, cx, cy = frame.intrinsics
-    lens = frame.lens
-    if isinstance(lens, RadialTangential):
-        # (p2, p1) is a vector in the image.
-        lens = replace(lens, p1=lens.p2, p2=-lens.p1)
     return replace(
         frame,
         size=(width, height),
         c2w=frame.c2w @ _QUARTER,
         intrinsics=(fy, fx, height - cy, cx),
-        lens=lens,
+        lens=frame.lens and frame.lens.turned(),
     )

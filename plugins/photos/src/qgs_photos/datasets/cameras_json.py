@@ -12,14 +12,15 @@ import numpy as np
 from upath import UPath
 
 from qgs.data.images import image_size, read_image
-from qgs.data.lenses import Size
-from qgs.data.photos.checks import FrameProblem, listed_size
 from qgs.data.photos.reader import (
+    FrameProblem,
     Listing,
     PhotoFrame,
     PhotoReader,
+    Size,
     existing,
     image_files,
+    listed_size,
     numbers,
 )
 from qgs.paths import open_file, read_json

@@ -26,10 +26,11 @@ from torch import Tensor
 from upath import UPath
 
 from qgs.data.images import decode_mask, image_size
-from qgs.data.lenses import Intrinsics, Size
-from qgs.data.photos.checks import (
+from qgs.data.photos.reader import (
     LARGEST_SIDE,
     FrameProblem,
+    Intrinsics,
+    Size,
     intrinsics_problems,
     pose_problems,
     size_problems,

@@ -12,11 +12,11 @@ from pydantic import Field
 from torch import Tensor
 from upath import UPath
 
-from qgs.contracts import SceneSource, Split
+from qgs.contracts import Scene, SceneSource, Split
 from qgs.data.frames import held_out_frames
 from qgs.data.images import CropResize, decode_rgb, to_tensor
-from qgs.data.lenses import Size
-from qgs.data.scenes import BoundedCache, EncodedFrame, EncodedScene, LazyScenes, LazySource
+from qgs.data.photos.reader import Size
+from qgs.data.scenes import BoundedCache, LazyScenes, LazySource
 from qgs.paths import opened_path
 from qgs.types import Cameras
 from qgs.wording import listed, warn_once
@@ -29,6 +29,7 @@ from qgs_photos.datasets.chunk_files import (
     read_mask,
     require_usable,
 )
+from qgs_photos.datasets.encoded import EncodedFrame
 
 # Chunks kept open.
 _OPEN = 4
@@ -53,7 +54,7 @@ class ChunksConfig(SceneSource.Config):
     """RGB in [0, 1] behind transparent pixels."""
 
 
-class ChunkScene(EncodedScene):
+class ChunkScene(Scene):
     """One scene of a chunk, read from the file when it is wanted. World: that of its poses."""
 
     def __init__(
@@ -122,7 +123,7 @@ class ChunkScene(EncodedScene):
         return torch.from_numpy(masks)[:, None].float().div_(255)
 
     def encoded(self, frame: int) -> EncodedFrame:
-        """See `EncodedScene`."""
+        """Return a frame as it is stored. Raises ValueError for a file that cannot be read."""
         record = self._record
         size = record.stored_size(frame)
         return EncodedFrame(

@@ -7,7 +7,8 @@ offers neither. The formats are described at colmap.github.io/format.html.
 import io
 import math
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
 from pathlib import PurePosixPath
 from typing import IO, Any, TypeAlias
 
@@ -15,15 +16,22 @@ import numpy as np
 import torch
 from upath import UPath
 
-from qgs.data.lenses import Fisheye, Lens, RadialTangential, bending
-from qgs.data.photos.checks import listed_size
-from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_folder
+from qgs.data.photos.nerfstudio import PINHOLE
+from qgs.data.photos.reader import (
+    Lens,
+    Listing,
+    PhotoFrame,
+    PhotoReader,
+    image_folder,
+    listed_size,
+)
 from qgs.geometry.transforms import quat_to_matrix
 from qgs.paths import open_file
 from qgs.wording import name_shown
+from qgs_photos.datasets.lenses import BendingLens, Fisheye, RadialTangential, bending
 
 _PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
-_MODELS: dict[str, tuple[int, str, type[Lens] | None]] = {
+_MODELS: dict[str, tuple[int, str, type[BendingLens] | None]] = {
     "SIMPLE_PINHOLE": (0, "f cx cy", None),
     "PINHOLE": (1, "fx fy cx cy", None),
     "SIMPLE_RADIAL": (2, "f cx cy k1", RadialTangential),
@@ -49,6 +57,17 @@ class Colmap(PhotoReader):
     def recognises(cls, folder: UPath) -> bool:
         """See `PhotoReader`."""
         return any(_models(folder))
+
+    @classmethod
+    def lens(cls, model: str, coefficients: Mapping[str, float]) -> Lens | None:
+        """See `PhotoReader`."""
+        kind = Fisheye if model == "OPENCV_FISHEYE" else RadialTangential
+        known = {field.name: coefficients.get(field.name, 0.0) for field in fields(kind)}
+        # files with several cameras have these at the top, for all models
+        others = coefficients.keys() - known.keys() - {"p1", "p2"}
+        if others or not (kind is Fisheye or model in PINHOLE):
+            return None
+        return bending(kind(**known))
 
     @classmethod
     def read(cls, folder: UPath, images: str | None) -> Listing:

@@ -4,8 +4,14 @@ import numpy as np
 from upath import UPath
 
 from qgs.data.images import load_array
-from qgs.data.photos.checks import listed_size
-from qgs.data.photos.reader import Listing, PhotoFrame, PhotoReader, image_files, image_folder
+from qgs.data.photos.reader import (
+    Listing,
+    PhotoFrame,
+    PhotoReader,
+    image_files,
+    image_folder,
+    listed_size,
+)
 from qgs.paths import open_file
 
 

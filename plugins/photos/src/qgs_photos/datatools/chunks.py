@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from upath import UPath
 
-from qgs.data.lenses import Size
-from qgs.data.photos.reader import PhotoFrame
+from qgs.data.photos.reader import PhotoFrame, Size
 from qgs.wording import counted, listed
 from qgs_photos.datasets.chunk_files import (
     INDEX,

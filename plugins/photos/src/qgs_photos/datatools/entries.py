@@ -12,8 +12,9 @@ from torch import Tensor
 
 from qgs.contracts import Scene
 from qgs.data.images import CropResize, decode_rgb
-from qgs.data.lenses import undistorted, whole_zoom
-from qgs.data.scenes import EncodedFrame, EncodedScene
+from qgs.data.photos.source import PhotoScene
+from qgs_photos.datasets.chunks import ChunkScene
+from qgs_photos.datasets.encoded import EncodedFrame, encoded_photo
 
 ChunkEntry: TypeAlias = dict[str, Any]
 
@@ -52,14 +53,17 @@ def bytes_of(image: Tensor) -> np.ndarray:
 def encoded_frames(scene: Scene, encoding: Encoding) -> Iterator[tuple[EncodedFrame, bool]]:
     """Yield the decodable frames, and whether each keeps its bytes. Raises as the scene."""
     for index in range(len(scene)):
-        if isinstance(scene, EncodedScene) and not encoding.resized:
+        if isinstance(scene, PhotoScene | ChunkScene) and not encoding.resized:
             yield _stored(scene, index, encoding)
         else:
             yield _delivered(scene, index, encoding), False
 
 
-def _stored(scene: EncodedScene, index: int, encoding: Encoding) -> tuple[EncodedFrame, bool]:
-    frame = scene.encoded(index)
+def _stored(
+    scene: PhotoScene | ChunkScene, index: int, encoding: Encoding
+) -> tuple[EncodedFrame, bool]:
+    photos = isinstance(scene, PhotoScene)
+    frame = encoded_photo(scene, index) if photos else scene.encoded(index)
     try:
         pixels = np.array(decode_rgb(io.BytesIO(frame.data), frame.background))
     except OSError as error:
@@ -80,12 +84,12 @@ def _stored(scene: EncodedScene, index: int, encoding: Encoding) -> tuple[Encode
 def _straightened(frame: EncodedFrame, pixels: np.ndarray, encoding: Encoding) -> EncodedFrame:
     """Return the frame as a pinhole's, without edges that straightening leaves black."""
     assert frame.lens is not None
-    zoom = whole_zoom(frame.intrinsics, frame.lens, frame.size, frame.size)
-    crop = CropResize(frame.size, frame.size, zoom)
     lens = frame.lens
+    zoom = lens.whole_zoom(frame.intrinsics, frame.size, frame.size)
+    crop = CropResize(frame.size, frame.size, zoom)
 
     def straight(image: np.ndarray) -> np.ndarray:
-        whole = undistorted(image, frame.intrinsics, lens)
+        whole = lens.undistorted(image, frame.intrinsics)
         return crop.image(Image.fromarray(whole)) if zoom > 1 else whole
 
     own = torch.tensor(frame.intrinsics, dtype=torch.float64)

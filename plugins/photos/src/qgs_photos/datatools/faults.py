@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from scipy.spatial import KDTree
 
-from qgs.data.photos.checks import intrinsics_problems, pose_problems, size_problems
+from qgs.data.photos.reader import intrinsics_problems, pose_problems, size_problems
 from qgs_photos.datatools.findings import Finding
 from qgs_photos.datatools.photos import DecodedScene
 

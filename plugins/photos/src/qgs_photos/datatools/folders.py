@@ -8,8 +8,7 @@ from upath import UPath
 
 from qgs.data.images import decode_alpha, decode_depth, decode_mask, read_image
 from qgs.data.photos import formats_of, read_listing
-from qgs.data.photos.checks import refuse_outside
-from qgs.data.photos.reader import PhotoFrame, existing
+from qgs.data.photos.reader import PhotoFrame, existing, refuse_outside
 from qgs.data.photos.source import folder_name
 from qgs.data.photos.turning import upright
 from qgs.paths import read_file

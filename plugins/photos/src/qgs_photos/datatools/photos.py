@@ -11,9 +11,7 @@ import numpy as np
 from PIL import Image
 
 from qgs.data.images import TURN, TURNED, decode_rgb, eight_bits, opened_image, orientation
-from qgs.data.lenses import Size, undistorted
-from qgs.data.photos.checks import size_problems
-from qgs.data.photos.reader import PhotoFrame
+from qgs.data.photos.reader import PhotoFrame, Size, size_problems
 from qgs.data.photos.turning import turned, turned_size
 from qgs.wording import numbered, one_line
 from qgs_photos.datatools.findings import Finding, Severity
@@ -46,7 +44,7 @@ class Photo:
         pixels = np.array(image.resize((width, height), Image.Resampling.LANCZOS))
         intrinsics = frame.at_size((height, width))
         if frame.lens is not None:
-            pixels = undistorted(pixels, intrinsics, frame.lens)
+            pixels = frame.lens.undistorted(pixels, intrinsics)
         return pixels, np.array(intrinsics)
 
 

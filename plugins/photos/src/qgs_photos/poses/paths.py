@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 from upath import UPath
 
-from qgs.data.photos.checks import pose_problems
 from qgs.data.photos.nerfstudio import read_transforms
-from qgs.data.photos.reader import PhotoFrame
+from qgs.data.photos.reader import PhotoFrame, pose_problems
 from qgs.geometry.poses import look_at, mean_camera
 from qgs.reconstruction.saving import SWAY, orbit
 from qgs.types import Cameras

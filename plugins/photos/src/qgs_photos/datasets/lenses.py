@@ -1,25 +1,66 @@
 """Lenses that bend rays, and photos without their distortion."""
 
 import math
-from dataclasses import dataclass
+from abc import abstractmethod
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal, TypeAlias
+from typing import Self
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-Intrinsics: TypeAlias = tuple[float, float, float, float]
-Size: TypeAlias = tuple[int, int]
-Mode: TypeAlias = Literal["bilinear", "nearest"]
+from qgs.data.photos.reader import Intrinsics, Lens, Size
+
 MOST_ZOOM = 2.0
 # Rows that are undistorted at once: photos of phones would take gigabytes.
 _ROWS = 64
 
 
+class BendingLens(Lens):
+    """A lens by its function from the pinhole's plane z = 1 to its own."""
+
+    @abstractmethod
+    def distorted(self, points: Tensor) -> Tensor:
+        """Return where the lens puts points (..., 2) of the plane z = 1."""
+
+    @abstractmethod
+    def sees(self, points: Tensor) -> Tensor:
+        """Return whether points (..., 2) lie before where the function turns back."""
+
+    def undistorted(
+        self, pixels: np.ndarray, intrinsics: Intrinsics, nearest: bool = False
+    ) -> np.ndarray:
+        """See `Lens`."""
+        height, width = pixels.shape[:2]
+        focal, centre = torch.tensor(intrinsics).split(2)
+        x = (torch.arange(width) + 0.5 - centre[0]) / focal[0]
+        y = (torch.arange(height)[:, None] + 0.5 - centre[1]) / focal[1]
+        planes = torch.from_numpy(pixels.reshape(height, width, -1)).permute(2, 0, 1).float()
+        mode = "nearest" if nearest else "bilinear"
+        result = np.empty_like(pixels)
+        for top in range(0, height, _ROWS):
+            block = slice(top, top + _ROWS)
+            directions = torch.stack(torch.broadcast_tensors(x, y[block]), -1)
+            grid, seen = _in_photo(directions, intrinsics, self, (height, width))
+            flat = F.grid_sample(
+                planes[None], grid[None], mode=mode, padding_mode="border", align_corners=False
+            )[0]
+            part = (flat * seen).permute(1, 2, 0).numpy().reshape(result[block].shape)
+            result[block] = part.round() if pixels.dtype.kind in "iu" else part
+        return result
+
+    def whole_zoom(self, intrinsics: Intrinsics, size: Size, target: Size) -> float:
+        """See `Lens`. As COLMAP's undistorter chooses cameras by default (blank_pixels 0).
+
+        1 where even MOST_ZOOM leaves some.
+        """
+        return _whole_zoom(intrinsics, self, size, target)
+
+
 @dataclass(frozen=True)
-class RadialTangential:
+class RadialTangential(BendingLens):
     """OpenCV's plumb-bob model (Brown, 1966), also COLMAP's SIMPLE_RADIAL, RADIAL and OPENCV."""
 
     k1: float = 0.0
@@ -29,7 +70,7 @@ class RadialTangential:
     k3: float = 0.0
 
     def distorted(self, points: Tensor) -> Tensor:
-        """Return where the lens puts points (..., 2) of the plane z = 1."""
+        """See `BendingLens`."""
         # kornia's distort_points takes half as long again, and this is most of undistorting.
         x, y = points.unbind(-1)
         r2 = x * x + y * y
@@ -42,9 +83,14 @@ class RadialTangential:
         """Return whether points (..., 2) lie before where the radial polynomial turns back."""
         return (points * points).sum(-1) < _turn(self.k1, self.k2, self.k3)
 
+    def turned(self) -> Self:
+        """See `Lens`."""
+        # (p2, p1) is a vector in the image.
+        return replace(self, p1=self.p2, p2=-self.p1)
+
 
 @dataclass(frozen=True)
-class Fisheye:
+class Fisheye(BendingLens):
     """OpenCV's fisheye model (Kannala and Brandt, 2006); equidistant without coefficients."""
 
     k1: float = 0.0
@@ -53,7 +99,7 @@ class Fisheye:
     k4: float = 0.0
 
     def distorted(self, points: Tensor) -> Tensor:
-        """Return where the lens puts points (..., 2) of the plane z = 1."""
+        """See `BendingLens`."""
         radius = points.norm(dim=-1, keepdim=True)
         theta = radius.atan()
         t2 = theta * theta
@@ -64,11 +110,12 @@ class Fisheye:
         """Return whether points (..., 2) lie before where the polynomial of angles turns back."""
         return points.norm(dim=-1).atan().square() < _turn(self.k1, self.k2, self.k3, self.k4)
 
+    def turned(self) -> Self:
+        """See `Lens`: it is the same all around."""
+        return self
 
-Lens: TypeAlias = RadialTangential | Fisheye
 
-
-def bending(lens: Lens) -> Lens | None:
+def bending(lens: BendingLens) -> BendingLens | None:
     """Return `lens`, or None where it leaves every ray as a pinhole would."""
     return lens if isinstance(lens, Fisheye) or any(vars(lens).values()) else None
 
@@ -86,7 +133,7 @@ def _turn(*coefficients: float) -> float:
 
 
 def _in_photo(
-    directions: Tensor, intrinsics: Intrinsics, lens: Lens, size: Size
+    directions: Tensor, intrinsics: Intrinsics, lens: BendingLens, size: Size
 ) -> tuple[Tensor, Tensor]:
     """Return where the photo shows directions (..., 2), -1 to 1 across it, and whether it does."""
     focal, centre = torch.tensor(intrinsics).to(directions).split(2)
@@ -97,15 +144,7 @@ def _in_photo(
 
 
 @lru_cache(maxsize=4096)
-def whole_zoom(intrinsics: Intrinsics, lens: Lens | None, size: Size, target: Size) -> float:
-    """Return the least zoom at which the middle of an undistorted photo has no black edges.
-
-    intrinsics: in pixels of the photo, of `size` (H, W), whose middle of the aspect of `target` is
-    shown. As COLMAP's undistorter chooses cameras by default (blank_pixels 0). 1 where even
-    MOST_ZOOM leaves some.
-    """
-    if lens is None:
-        return 1.0
+def _whole_zoom(intrinsics: Intrinsics, lens: BendingLens, size: Size, target: Size) -> float:
     side = torch.linspace(-1, 1, 65).double()
     ends = torch.ones_like(side)
     edges = [(side, ends), (side, -ends), (ends, side), (-ends, side)]
@@ -131,31 +170,3 @@ def whole_zoom(intrinsics: Intrinsics, lens: Lens | None, size: Size, target: Si
         else:
             low = mean
     return high
-
-
-def undistorted(
-    pixels: np.ndarray, intrinsics: Intrinsics, lens: Lens | None, mode: Mode = "bilinear"
-) -> np.ndarray:
-    """Return the photo as a pinhole camera with the same intrinsics would have taken it.
-
-    pixels: (H, W) or (H, W, C), returned in the same shape and dtype. intrinsics: in pixels of it.
-    What the lens did not see is 0. Without a lens, `pixels` themselves.
-    """
-    if lens is None:
-        return pixels
-    height, width = pixels.shape[:2]
-    focal, centre = torch.tensor(intrinsics).split(2)
-    x = (torch.arange(width) + 0.5 - centre[0]) / focal[0]
-    y = (torch.arange(height)[:, None] + 0.5 - centre[1]) / focal[1]
-    planes = torch.from_numpy(pixels.reshape(height, width, -1)).permute(2, 0, 1).float()
-    result = np.empty_like(pixels)
-    for top in range(0, height, _ROWS):
-        block = slice(top, top + _ROWS)
-        directions = torch.stack(torch.broadcast_tensors(x, y[block]), -1)
-        grid, seen = _in_photo(directions, intrinsics, lens, (height, width))
-        flat = F.grid_sample(
-            planes[None], grid[None], mode=mode, padding_mode="border", align_corners=False
-        )[0]
-        part = (flat * seen).permute(1, 2, 0).numpy().reshape(result[block].shape)
-        result[block] = part.round() if pixels.dtype.kind in "iu" else part
-    return result

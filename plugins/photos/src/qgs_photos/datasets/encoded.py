@@ -1,0 +1,54 @@
+"""Photos as they are stored."""
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+
+from qgs.data.images import decode_rgb
+from qgs.data.photos.reader import Intrinsics, Lens, Size
+from qgs.data.photos.source import PhotoScene, whole_mask
+from qgs.data.photos.turning import turned
+from qgs.paths import read_file
+
+
+@dataclass(frozen=True)
+class EncodedFrame:
+    """A photo as it is stored, and the camera that took it.
+
+    data: bytes of the image file. mask: (H, W) uint8. c2w: (4, 4) float64, OpenCV axes. intrinsics:
+    fx, fy, cx, cy in pixels of the photo, whose size is (H, W). lens: None for a pinhole.
+    background: RGB in [0, 1] behind transparent pixels.
+    """
+
+    name: str
+    data: bytes
+    c2w: np.ndarray
+    intrinsics: Intrinsics
+    size: Size
+    lens: Lens | None = None
+    mask: np.ndarray | None = None
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+def encoded_photo(scene: PhotoScene, frame: int) -> EncodedFrame:
+    """Return a photo as it is stored. Raises ValueError for a file that cannot be read."""
+    photo = scene.photos[frame]
+    size = scene.stored_size(frame)
+    background = scene.config.background
+    data = read_file(photo.path)
+    # pixels are stored again only where EXIF turns them
+    if photo.turns:
+        file = io.BytesIO()
+        turned(decode_rgb(io.BytesIO(data), background), photo).save(file, "png")
+        data = file.getvalue()
+    return EncodedFrame(
+        name=photo.name,
+        data=data,
+        c2w=photo.c2w,
+        intrinsics=photo.at_size(size),
+        size=size,
+        lens=photo.lens,
+        mask=photo.mask and np.array(turned(whole_mask(photo), photo)),
+        background=background,
+    )
