@@ -1,4 +1,4 @@
-"""The look of all figures: colours, type, grids of pictures with a depth scale."""
+"""The look of all figures: type, grids of pictures with a depth scale."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -14,31 +14,7 @@ from PIL import Image
 
 from qgs.drawing.images import DEPTH_MAP, Picture
 
-Color = tuple[int, int, int]
-
-CATEGORICAL: tuple[Color, ...] = (
-    (213, 94, 0),
-    (0, 114, 178),
-    (0, 158, 115),
-    (204, 121, 167),
-    (230, 159, 0),
-    (86, 180, 233),
-)
-"""Distinct for colour-blind readers, on light ground and on photos."""
-
-INK: Color = (32, 36, 42)
-MUTED: Color = (122, 128, 136)
 COLUMN_INCHES = 1.9
-
-
-def hex_color(color: Color) -> str:
-    """Return #rrggbb."""
-    return "#{:02x}{:02x}{:02x}".format(*color)
-
-
-def categorical(index: int) -> Color:
-    """Return the colour of the `index`-th series or token; they repeat after six."""
-    return CATEGORICAL[index % len(CATEGORICAL)]
 
 
 def figure_style() -> AbstractContextManager[None]:
@@ -82,10 +58,3 @@ def grid_figure(
             bar.set_label("depth, world units")
             bar.outline.set_visible(False)  # type: ignore[operator]
     return figure
-
-
-def running_mean(values: Sequence[float], share: float = 0.05) -> np.ndarray:
-    """Return the mean over a centred window of `share` of the values, cut off at both ends."""
-    window = np.ones(2 * int(len(values) * share / 2) + 1)
-    sums = np.convolve(values, window, "same")
-    return sums / np.convolve(np.ones(len(values)), window, "same")

@@ -1,6 +1,5 @@
 """Tensors to pictures (H, W, 3) uint8, of RGB, depth and other sizes; PNG and GIF files."""
 
-import base64
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -20,8 +19,6 @@ NOTHING = (232, 233, 235)
 DEPTH_MAP = "viridis_r"
 # Pixels between pictures in a row.
 GAP = 4
-# Pixels on the longer side up to which photos in pages are not compressed with loss.
-EXACT = 128
 
 
 def rgb_picture(image: Tensor) -> Picture:
@@ -89,29 +86,6 @@ def write_gif(frames: Sequence[Picture], path: str | Path, frames_per_second: fl
         first.save(
             temporary, "GIF", save_all=True, append_images=rest, duration=milliseconds, loop=0
         )
-
-
-def data_uri(image: Picture | list[Picture], photo: bool = False) -> str:
-    """Encode a picture as PNG, a large `photo` as WebP, frames as an endless WebP animation."""
-    frames = image if isinstance(image, list) else [image]
-    if len(frames) == 1 and not (photo and max(frames[0].shape) > EXACT):
-        return "data:image/png;base64," + base64.b64encode(png_bytes(frames[0])).decode()
-    buffer = BytesIO()
-    first, *rest = map(Image.fromarray, frames)
-    quality = 90 if photo else 80
-    first.save(
-        buffer, "WEBP", save_all=True, append_images=rest,
-        duration=90, loop=0, quality=quality, method=2,
-    )  # fmt: skip
-    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
-
-
-def enlarged(picture: Picture, side: int) -> Picture:
-    """Return the picture with its longer side at `side` pixels, smooth."""
-    height, width = picture.shape[:2]
-    factor = side / max(height, width)
-    size = (round(width * factor), round(height * factor))
-    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC))
 
 
 def finer(cameras: Cameras, side: int) -> Cameras:

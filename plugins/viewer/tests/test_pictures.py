@@ -7,12 +7,12 @@ import torch
 import torch.nn.functional as F
 from numpy.testing import assert_allclose
 from qgs_viewer import queries
+from qgs_viewer.look import CATEGORICAL
 from qgs_viewer.placement import Placement, Splats, hit, on_photo, splats
 from scipy.spatial.transform import Rotation
 from small import cloud
 from walk import arc, pinhole
 
-from qgs.drawing.figures import CATEGORICAL
 from qgs.drawing.images import NOTHING, finer
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.renderers.reference import TorchRenderer

@@ -6,9 +6,10 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from qgs.drawing.figures import MUTED, categorical, figure_style, hex_color, running_mean
+from qgs.drawing.figures import figure_style
 from qgs.files import read_records
 from qgs.metrics.images import Psnr
+from qgs_viewer.look import MUTED, categorical, hex_color, running_mean
 
 Curves = Sequence[Mapping[str, Any]]
 """Records of a training: each a step, seconds since its start, loss, PSNR of supervised views."""

@@ -10,9 +10,9 @@ import viser
 from torch import Tensor
 from viser.transforms import SO3
 
-from qgs.drawing.figures import INK, Color
-from qgs.drawing.images import enlarged, rgb_picture
+from qgs.drawing.images import rgb_picture
 from qgs.geometry.transforms import to_camera, to_pixels
+from qgs_viewer.look import INK, Color, enlarged
 from qgs_viewer.placement import Splats, corners, on_photo
 from qgs_viewer.query_scene import QueryScene
 

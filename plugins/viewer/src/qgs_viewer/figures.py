@@ -10,11 +10,12 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
 
-from qgs.drawing.figures import figure_style, hex_color
+from qgs.drawing.figures import figure_style
 from qgs.files import replacing, write_text
 from qgs.wording import listed
 from qgs_viewer import sections
 from qgs_viewer.commands import FigureName
+from qgs_viewer.look import hex_color
 from qgs_viewer.scenes import ModelScenes
 from qgs_viewer.sections import Detail, Section
 

@@ -2,12 +2,12 @@
 
 import torch
 
-from qgs.drawing import page_environment
 from qgs.drawing.images import depth_picture, depth_range, png_bytes, rgb_picture, side_by_side
 from qgs.model import QueryGaussianModel
 from qgs.model_text import heading, slot_rows
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Prediction
+from qgs_viewer.look import page_environment
 
 # Pixels of the picture of a prediction, and the focal length of its lens.
 SIDE = 192
@@ -15,7 +15,7 @@ SIDE = 192
 
 def model_html(model: QueryGaussianModel) -> str:
     """Return sizes, and a table of all slots: components and parameters."""
-    template = page_environment("qgs_viewer").get_template("model.html")
+    template = page_environment().get_template("model.html")
     return template.render(heading=heading(model), rows=slot_rows(model))
 
 

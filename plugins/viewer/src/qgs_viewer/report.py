@@ -9,8 +9,6 @@ from rich import box
 from rich.console import Console
 from rich.markup import escape
 
-from qgs.drawing import images, page_environment
-from qgs.drawing.figures import hex_color
 from qgs.evaluate.results import print_lines, print_table
 from qgs.files import write_text
 from qgs.metrics.baselines import BASELINES
@@ -18,6 +16,7 @@ from qgs.recipe.schema import summary_of
 from qgs.wording import listed
 from qgs_viewer import sections
 from qgs_viewer.comparison import Model
+from qgs_viewer.look import data_uri, hex_color, page_environment
 from qgs_viewer.remarks import remarks
 from qgs_viewer.scenes import ModelScenes, model_scenes
 from qgs_viewer.sections import Detail
@@ -98,7 +97,7 @@ def report_html(comparison: Comparison, shown: Sequence[ModelScenes]) -> str:
     views = f"{first.recipe.views.inputs} inputs, judged on views {judged} them"
     names = listed((model.name for model in models), most=3)
     metrics = [part for place, part in first.recipe.parts.items() if place[0] == "metrics"]
-    environment = page_environment("qgs_viewer", uri=images.data_uri, hex=hex_color)
+    environment = page_environment(uri=data_uri, hex=hex_color)
     return environment.get_template("report.html").render(
         comparison=comparison,
         title=f"{names}: {comparison.scenes.lower()}",

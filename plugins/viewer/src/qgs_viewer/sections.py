@@ -26,6 +26,7 @@ from qgs.drawing.images import (
 from qgs.metrics.images import Psnr, psnr
 from qgs_viewer.curves import curves_figure
 from qgs_viewer.drawing import Choice
+from qgs_viewer.look import enlarged
 from qgs_viewer.page import scene_html
 from qgs_viewer.queries import (
     PARTS,
@@ -124,7 +125,7 @@ def anchors(models: Shown, detail: Detail) -> Section:
         camera = model.samples[0].inputs.cameras[:, :1]
         drawn = model.notable(ANCHORS, camera, detail.query)
         colors = {query.index: query.color for query in drawn}
-        photo = images.enlarged(rgb_picture(model.samples[0].inputs.images[0, 0]), detail.side)
+        photo = enlarged(rgb_picture(model.samples[0].inputs.images[0, 0]), detail.side)
         # others start from the photos, so their start differs by scene
         learned = isinstance(model.network.queries, LearnedQueries)
         layers = range(model.scene.depth + 1)

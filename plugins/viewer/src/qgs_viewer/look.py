@@ -1,0 +1,81 @@
+"""The look of pages and figures: colours, Jinja templates, pictures inside pages."""
+
+import base64
+from collections.abc import Callable, Sequence
+from io import BytesIO
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from PIL import Image
+
+from qgs.drawing.images import Picture, png_bytes
+
+Color = tuple[int, int, int]
+
+CATEGORICAL: tuple[Color, ...] = (
+    (213, 94, 0),
+    (0, 114, 178),
+    (0, 158, 115),
+    (204, 121, 167),
+    (230, 159, 0),
+    (86, 180, 233),
+)
+"""Distinct for colour-blind readers, on light ground and on photos."""
+
+INK: Color = (32, 36, 42)
+MUTED: Color = (122, 128, 136)
+# Pixels on the longer side up to which photos in pages are not compressed with loss.
+EXACT = 128
+
+
+def hex_color(color: Color) -> str:
+    """Return #rrggbb."""
+    return "#{:02x}{:02x}{:02x}".format(*color)
+
+
+def categorical(index: int) -> Color:
+    """Return the colour of the `index`-th series or token; they repeat after six."""
+    return CATEGORICAL[index % len(CATEGORICAL)]
+
+
+def running_mean(values: Sequence[float], share: float = 0.05) -> np.ndarray:
+    """Return the mean over a centred window of `share` of the values, cut off at both ends."""
+    window = np.ones(2 * int(len(values) * share / 2) + 1)
+    sums = np.convolve(values, window, "same")
+    return sums / np.convolve(np.ones(len(values)), window, "same")
+
+
+def page_environment(**filters: Callable[..., str]) -> Environment:
+    """Jinja for pages that need no other file."""
+    environment = Environment(
+        loader=PackageLoader("qgs_viewer", "template"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(filters)
+    return environment
+
+
+def data_uri(image: Picture | list[Picture], photo: bool = False) -> str:
+    """Encode a picture as PNG, a large `photo` as WebP, frames as an endless WebP animation."""
+    frames = image if isinstance(image, list) else [image]
+    if len(frames) == 1 and not (photo and max(frames[0].shape) > EXACT):
+        return "data:image/png;base64," + base64.b64encode(png_bytes(frames[0])).decode()
+    buffer = BytesIO()
+    first, *rest = map(Image.fromarray, frames)
+    quality = 90 if photo else 80
+    first.save(
+        buffer, "WEBP", save_all=True, append_images=rest,
+        duration=90, loop=0, quality=quality, method=2,
+    )  # fmt: skip
+    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def enlarged(picture: Picture, side: int) -> Picture:
+    """Return the picture with its longer side at `side` pixels, smooth."""
+    height, width = picture.shape[:2]
+    factor = side / max(height, width)
+    size = (round(width * factor), round(height * factor))
+    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC))
