@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 from qgs.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from qgs.checkpoint.gaussians import load_ply, save_ply
     from qgs.checkpoint.model_file import load, save
     from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
     from qgs.model import QueryGaussianModel
     from qgs.recipe import compose
     from qgs.reconstruction.reconstruct import reconstruct
     from qgs.reconstruction.result import Reconstruction
+    from qgs.reconstruction.scene_formats import load_ply, save_ply
     from qgs.reconstruction.scenes import read_photos
     from qgs.reconstruction.trace import trace
     from qgs.types import Cameras, Gaussians, Prediction, QueryState, Rendering, Views
@@ -47,11 +47,11 @@ _ELSEWHERE = {
     "Reconstruction": "qgs.reconstruction.result",
     "compose": "qgs.recipe",
     "load": "qgs.checkpoint.model_file",
-    "load_ply": "qgs.checkpoint.gaussians",
+    "load_ply": "qgs.reconstruction.scene_formats",
     "read_photos": "qgs.reconstruction.scenes",
     "reconstruct": "qgs.reconstruction.reconstruct",
     "save": "qgs.checkpoint.model_file",
-    "save_ply": "qgs.checkpoint.gaussians",
+    "save_ply": "qgs.reconstruction.scene_formats",
     "trace": "qgs.reconstruction.trace",
 }
 """Where public names come from that are not of `qgs.types`."""

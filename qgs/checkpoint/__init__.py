@@ -1,1 +1,1 @@
-"""Files: checkpoints, PLY, pictures; each whole or not at all."""
+"""Checkpoints: weights with the recipe of their model, by path, name or URL."""

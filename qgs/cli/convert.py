@@ -24,8 +24,8 @@ def convert(
 
     With --count the most opaque ones alone.
     """
-    from qgs.checkpoint.gaussians import load_ply, save_gaussians
     from qgs.files import refuse_existing
+    from qgs.reconstruction.scene_formats import load_ply, save_gaussians
 
     # Before the file is read, which may take a while.
     refuse_existing(out)

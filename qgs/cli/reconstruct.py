@@ -92,7 +92,7 @@ def _refuse_unusable(out: Path, overwrite: bool) -> None:
     if not overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
         raise FileExistsError(f"{out} is not empty: choose another --out, or add --overwrite")
 
-    from qgs.checkpoint.gaussians import scene_writers
+    from qgs.reconstruction.scene_formats import scene_writers
 
     # A writer of another distribution may fail to import.
     if find := scene_writers().get(out.suffix.lower()):

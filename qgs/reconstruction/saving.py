@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 
-from qgs.checkpoint.gaussians import save_gaussians, save_ply, scene_writers
 from qgs.drawing import images
 from qgs.drawing.figures import figure_picture, grid_figure
 from qgs.drawing.images import Picture, depth_picture, depth_range, rgb_picture
@@ -15,6 +14,7 @@ from qgs.files import replacing_entries, write_text
 from qgs.geometry.poses import look_at
 from qgs.metrics.images import Psnr
 from qgs.reconstruction.result import Reconstruction, sample_cameras
+from qgs.reconstruction.scene_formats import save_gaussians, save_ply, scene_writers
 from qgs.types import Cameras
 from qgs.wording import numbered
 

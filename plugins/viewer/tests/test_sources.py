@@ -10,9 +10,9 @@ from small import VIEWS, model_of
 from walk import Walk
 
 import qgs
-from qgs.checkpoint.gaussians import load_ply
 from qgs.reconstruction.reconstruct import choose_sample
 from qgs.reconstruction.result import reconstruct_sample
+from qgs.reconstruction.scene_formats import load_ply
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from qgs.checkpoint.gaussians import load_ply
+from qgs.reconstruction.scene_formats import load_ply
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians
 

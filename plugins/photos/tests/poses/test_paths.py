@@ -24,10 +24,10 @@ from training_runs import tiny
 from walked import frames
 
 import qgs
-from qgs.checkpoint.gaussians import save_ply
 from qgs.cli.options import scale_settings
 from qgs.geometry.transforms import moved
 from qgs.reconstruction.reconstruct import reconstruct
+from qgs.reconstruction.scene_formats import save_ply
 from qgs.renderers import AutoRenderer, TorchRenderer
 from qgs.types import Cameras, Gaussians
 

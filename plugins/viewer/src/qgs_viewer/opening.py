@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from qgs.checkpoint.gaussians import load_ply
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.images import decode_rgb, read_image, to_tensor
@@ -21,6 +20,7 @@ from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.reconstruct import checked_window, choice, choose_sample
 from qgs.reconstruction.scale import ScaleSearch, constant_scale, photo_settings
+from qgs.reconstruction.scene_formats import load_ply
 from qgs.reconstruction.scenes import Size, chosen_scene, frame_list, named_scene
 from qgs.types import Cameras
 from qgs.wording import listed

@@ -15,12 +15,12 @@ from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor
 
-from qgs.checkpoint.gaussians import load_ply
 from qgs.contracts import Renderer
 from qgs.drawing.images import rgb_picture
 from qgs.files import replacing
 from qgs.geometry.poses import relative_to, scaled
 from qgs.geometry.transforms import moved
+from qgs.reconstruction.scene_formats import load_ply
 from qgs.reconstruction.scenes import photo_scene
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians

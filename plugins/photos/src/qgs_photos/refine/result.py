@@ -11,7 +11,6 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from qgs.checkpoint.gaussians import save_ply, save_splat
 from qgs.drawing import images
 from qgs.drawing.figures import figure_picture, grid_figure
 from qgs.drawing.images import rgb_picture
@@ -21,6 +20,7 @@ from qgs.geometry.harmonics import seen_colors
 from qgs.geometry.transforms import moved, to_camera, to_pixels
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
+from qgs.reconstruction.scene_formats import save_ply, save_splat
 from qgs.renderers import AutoRenderer
 from qgs.types import Cameras, Gaussians, Views
 from qgs_photos.printing import say

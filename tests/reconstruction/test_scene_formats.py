@@ -14,9 +14,9 @@ from tables import must_refuse
 from torch.testing import assert_close
 
 import qgs
-from qgs.checkpoint.gaussians import PROPERTIES, SPLAT, load_ply, save_gaussians, save_ply
 from qgs.containers import named_tensors
 from qgs.extensions import ExtensionError
+from qgs.reconstruction.scene_formats import PROPERTIES, SPLAT, load_ply, save_gaussians, save_ply
 from qgs.types import Gaussians
 
 
