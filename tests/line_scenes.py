@@ -3,6 +3,8 @@
 import torch
 
 from qgs.contracts import Scene, SceneSource, SceneSourceConfig
+from qgs.data.view_samplers import Span
+from qgs.evaluate.plan import EvaluationPlan
 from qgs.geometry.poses import look_at
 from qgs.types import Cameras
 
@@ -42,3 +44,14 @@ class Lines(SceneSource):
 
     def scenes(self, split):
         return self._scenes
+
+
+def plan_of(source, views, evaluation, sampler=None, **options):
+    """A plan, by default with the default sampler."""
+    return EvaluationPlan(source, views, evaluation, sampler or Span(Span.Config()), **options)
+
+
+def samples_of(*given, **options):
+    """All samples of a plan; a scene that fails raises."""
+    plan = plan_of(*given, **options)
+    return [sample for scene in plan.wanted for sample in plan.samples(scene)]

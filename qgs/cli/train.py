@@ -38,7 +38,7 @@ def train(
         torchrun --standalone --nproc-per-node=8 -m qgs train RECIPE --out RUN
     """
     # Here, so that the help of all commands needs no torch.
-    from qgs.evaluate.protocol import index_of
+    from qgs.evaluate.plan import read_index
     from qgs.recipe import resolve
     from qgs.train.guard import TrainingError
     from qgs.train.training import train as train_model
@@ -47,7 +47,7 @@ def train(
     console = Console()
     resolved = with_absolute_path(resolve(recipe, overrides or ()))
     # A missing index raises now, not after the training.
-    index_of(resolved)
+    read_index(resolved.evaluation.index)
     try:
         result = train_model(resolved, out, console=console, device=device, resume=resume)
     # It names causes and remedies itself; a traceback would hide them.

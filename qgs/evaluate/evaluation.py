@@ -1,24 +1,22 @@
 """Scores of a model on the test views of a recipe, and of two baselines without a model."""
 
 import math
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 
-from qgs.contracts import Column, Metric, MetricInput, ViewSampler
+from qgs.contracts import Column, Frames, Metric, MetricInput, ViewSampler
 from qgs.data.samples import Sample
 from qgs.domain import REMEDY, Domain, verdict
-from qgs.evaluate.plan import EvaluationPlan, SceneFailure, ViewsOf
-from qgs.evaluate.protocol import index_of, protocol_of
-from qgs.evaluate.results import TUNING, Evaluation, SceneScore
+from qgs.evaluate.plan import EvaluationPlan, ViewsOf
+from qgs.evaluate.protocol import protocol_of
+from qgs.evaluate.results import TUNED, Evaluation, SceneScore
 from qgs.evaluate.tuning import tune, tuning_loss
 from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.dispersion import OPACITY_USED
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
-from qgs.types import Gaussians, Views
 from qgs.wording import one_line
 
 SECTIONS = ("plugins", "data", "views", "evaluation", "metrics")
@@ -42,49 +40,51 @@ def evaluate(
     Raises what opening the data source or the index and `Measures` raise, and ValueError when no
     scene could be scored.
     """
-    index = index_of(recipe)
     measures = Measures(recipe)
     plan = EvaluationPlan(
         recipe.build_data(),
         recipe.views,
         recipe.evaluation,
-        index,
         sampler or recipe.build_view_sampler(),
         views_of,
         # Depth maps cost as much as photos to decode.
         depths="true_depth" in measures.needed,
     )
     scorer = _Scorer(model, measures, recipe)
+    scores: list[SceneScore] = []
+    missing: dict[str, str] = {}
     training = model.training
     # Components draw random numbers in training mode only.
     model.eval()
     try:
-        results = map(scorer.score, plan.samples())
-        scores, missing = _by_scene(results, len(plan.wanted), observe)
+        for done, name in enumerate(plan.wanted, 1):
+            try:
+                scores.append(scorer.score(name, plan.samples(name)))
+            except Exception as error:  # whatever a reader or model raises; other scenes go on
+                missing[name] = one_line(error)
+            if observe:
+                observe(done, len(plan.wanted))
     finally:
         model.train(training)
     if not scores:
-        first = f"{missing[0].scene}: {missing[0].reason}"
-        raise ValueError(f"none of {len(missing)} scenes could be judged; the first, {first}")
+        name, reason = next(iter(missing.items()))
+        raise ValueError(
+            f"none of {len(missing)} scenes could be judged; the first, {name}: {reason}"
+        )
     evaluation = Evaluation(
-        protocol=protocol_of(recipe, index, plan.wanted, model.renderer.followed),
+        protocol=protocol_of(recipe, plan.index, plan.wanted, model.renderer.followed),
         columns=measures.columns,
         scores=scores,
-        wanted=plan.wanted,
         gaussians=scorer.gaussians,
         missing=missing,
         incomplete=measures.incomplete(scores),
         step=step,
     )
-    return replace(evaluation, remarks=_remarks(evaluation, model, recipe, plan, scorer.seen))
+    return replace(evaluation, remarks=_remarks(evaluation, model, recipe, scorer.seen))
 
 
 def _remarks(
-    evaluation: Evaluation,
-    model: QueryGaussianModel,
-    recipe: Recipe,
-    plan: EvaluationPlan,
-    seen: Domain,
+    evaluation: Evaluation, model: QueryGaussianModel, recipe: Recipe, seen: Domain
 ) -> list[str]:
     """Return sentences on how far the model can be expected to do well, and on how it did."""
     remarks: list[str] = []
@@ -173,33 +173,32 @@ class _Scorer:
             metric.to(self.device)
 
     @torch.no_grad()
-    def score(self, sample: Sample | SceneFailure) -> SceneScore | SceneFailure:
-        """Return the score of a sample, or the reason why it has none."""
-        if isinstance(sample, SceneFailure):
-            return sample
-        tuned: dict[str, float] = {}
-        try:
-            # Seen before the model runs: a failing scene counts among the cameras too.
-            self.seen.see(sample.inputs.cameras, sample.targets.cameras)
-            inputs = sample.inputs.to(self.device)
-            if self.tuning_loss:
-                settings = self.recipe.evaluation
-                gaussians, record = tune(self.model, inputs, self.tuning_loss, settings)
-                tuned = {name: record[key] for name, key in TUNING.items()}
-            else:
-                gaussians = self.model(inputs).gaussians
-            values = self._values(sample, inputs, gaussians) | tuned
-        except Exception as error:  # reported in the result; the other scenes go on
-            return SceneFailure(sample.scene, one_line(error))
-        # One NaN would spoil every mean over scenes.
-        broken = [name for name, value in values.items() if not math.isfinite(value)]
-        if broken:
-            return SceneFailure(sample.scene, f"{', '.join(broken)} is not finite")
-        frames = (sample.input_frames, sample.target_frames)
-        return SceneScore(sample.scene, [frames], values, sample.names)
+    def score(self, scene: str, samples: Iterable[Sample]) -> SceneScore:
+        """Return the score of a scene; one failed sample fails it. ValueError for NaN."""
+        found: list[dict[str, float]] = []
+        views: list[tuple[Frames, Frames]] = []
+        names: dict[int, str] = {}
+        for sample in samples:
+            found.append(self._values(sample))
+            views.append((sample.input_frames, sample.target_frames))
+            names |= sample.names
+        # A value that one sample lacks would be a mean over other samples.
+        common = [key for key in found[0] if all(key in values for values in found)]
+        means = {key: sum(values[key] for values in found) / len(found) for key in common}
+        return SceneScore(scene, views, means, names)
 
-    def _values(self, sample: Sample, inputs: Views, gaussians: Gaussians) -> dict[str, float]:
+    def _values(self, sample: Sample) -> dict[str, float]:
+        # Seen before the model runs: a failing scene counts among the cameras too.
+        self.seen.see(sample.inputs.cameras, sample.targets.cameras)
+        inputs = sample.inputs.to(self.device)
         targets = sample.targets.to(self.device)
+        tuned: dict[str, float] = {}
+        if self.tuning_loss:
+            settings = self.recipe.evaluation
+            gaussians, record = tune(self.model, inputs, self.tuning_loss, settings)
+            tuned = {f"tuning_{key}": record[key] for key in TUNED}
+        else:
+            gaussians = self.model(inputs).gaussians
         self.gaussians = max(self.gaussians, gaussians.count)
         rendering = self.model.render(gaussians, targets.cameras)
         shown = MetricInput(
@@ -214,34 +213,8 @@ class _Scorer:
         for name, baseline in BASELINES.items():
             values |= self.measures(name, MetricInput(baseline(inputs, targets.cameras), targets))
         values["gaussians_used"] = float((gaussians.opacities > OPACITY_USED).sum())
+        values |= tuned
+        # One NaN would spoil every mean over scenes.
+        if broken := [name for name, value in values.items() if not math.isfinite(value)]:
+            raise ValueError(f"{', '.join(broken)} is not finite")
         return values
-
-
-def _by_scene(
-    results: Iterable[SceneScore | SceneFailure],
-    count: int,
-    observe: Callable[[int, int], None] | None,
-) -> tuple[list[SceneScore], list[SceneFailure]]:
-    """Gather the results of samples by scene, of `count`; one failed sample fails its scene."""
-    samples = defaultdict[str, list[SceneScore]](list)
-    failures: dict[str, SceneFailure] = {}
-    for result in results:
-        if isinstance(result, SceneFailure):
-            failures.setdefault(result.scene, result)
-        else:
-            samples[result.scene].append(result)
-        if observe:
-            observe(len(samples.keys() | failures.keys()), count)
-    scores = [_mean(found) for scene, found in samples.items() if scene not in failures]
-    return scores, list(failures.values())
-
-
-def _mean(samples: Sequence[SceneScore]) -> SceneScore:
-    """Return the score of a scene from those of its samples."""
-    found = [sample.values for sample in samples]
-    # A value that one sample lacks would be a mean over other samples.
-    common = [key for key in found[0] if all(key in values for values in found)]
-    means = {key: sum(values[key] for values in found) / len(found) for key in common}
-    views = [frames for sample in samples for frames in sample.views]
-    names = {frame: name for sample in samples for frame, name in sample.names.items()}
-    return SceneScore(samples[0].scene, views, means, names)

@@ -1,8 +1,8 @@
 """Which views an evaluation compares: drawn by seed, or named by an index file."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, TypeAlias
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -11,9 +11,8 @@ from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewSampler, Vie
 from qgs.contracts.schedule import END
 from qgs.data.frames import evenly, gap_range, moments, spread
 from qgs.data.samples import Frames, Sample, make_sample
-from qgs.data.view_samplers import Span
 from qgs.paths import opened_path, read_json
-from qgs.wording import listed, one_line
+from qgs.wording import listed
 
 FrameList: TypeAlias = Annotated[list[Annotated[int, Field(strict=True)]], Field(min_length=1)]
 
@@ -47,11 +46,13 @@ def given_targets(inputs: Iterable[int], targets: Iterable[int]) -> tuple[int, .
 _FORM = '{"scene": null or {"context": [frames], "target": [frames]}}'
 
 
-def read_index(path: str) -> EvaluationIndex:
-    """Read the index in the JSON file `path`, which may be an fsspec URL.
+def read_index(path: str | None) -> EvaluationIndex | None:
+    """Read the index in the JSON file `path`, which may be an fsspec URL; None for no path.
 
     Raises FileNotFoundError, and ValueError for another form and for no scene to judge.
     """
+    if path is None:
+        return None
     file = opened_path(path)
     if not file.is_file():
         raise FileNotFoundError(
@@ -70,37 +71,29 @@ def read_index(path: str) -> EvaluationIndex:
     return index
 
 
-@dataclass(frozen=True)
-class SceneFailure:
-    """A scene that could not be judged, and why."""
-
-    scene: str
-    reason: str
-
-
 @dataclass
 class EvaluationPlan:
     """The scenes of a test split that are judged, and on which views; never mirrored.
 
-    With an index, its scenes and frames. Without one, of the first `evaluation.scenes` scenes:
-    the windows of `sampler` (default: `Span`), else of a scene with held-out frames
-    `held_out_windows`, evenly thinned to `evaluation.scenes`; else `evaluation.samples` samples,
-    inputs drawn by `sampler` as at the end of training with `evaluation.seed`, targets the other
-    frames of the span, or of one time. Targets of T times are T samples. views_of: makes the
-    settings of a sample, such as its scale. depths: targets have true depth where scenes do.
+    With `evaluation.index`, its scenes and frames. Without one, of the first `evaluation.scenes`
+    scenes: the windows of `sampler`, else of a scene with held-out frames `held_out_windows`,
+    evenly thinned to `evaluation.scenes`; else `evaluation.samples` samples, inputs drawn by
+    `sampler` as at the end of training with `evaluation.seed`, targets the other frames of the
+    span, or of one time. Targets of T times are T samples. views_of: makes the settings of a
+    sample, such as its scale. depths: targets have true depth where scenes do.
 
-    wanted: names of the scenes. Raises ValueError without scenes.
+    wanted: names of the scenes. Raises ValueError without scenes, and as `read_index`.
     """
 
     source: SceneSource
     views: ViewsConfig
     evaluation: EvaluationConfig
-    index: EvaluationIndex | None = None
-    sampler: ViewSampler | None = None
+    sampler: ViewSampler
     views_of: ViewsOf | None = None
     depths: bool = False
 
     def __post_init__(self) -> None:
+        self.index = read_index(self.evaluation.index)
         self._scenes = self.source.scenes("test")
         if not len(self._scenes):
             raise ValueError(f"the data source {type(self.source).name!r} has no test scenes")
@@ -110,28 +103,25 @@ class EvaluationPlan:
         if self.index is not None:
             self.wanted = tuple(name for name, entry in self.index.items() if entry)
 
-    def samples(self) -> Iterator[Sample | SceneFailure]:
-        """Yield the samples, one decoded at a time; a scene that fails ends with its failure."""
-        for name in self.wanted:
-            try:
-                if name not in self._places:
-                    raise ValueError("not among the test scenes of the data")
-                place = self._places[name]
-                scene = self._scenes[place]
-                # a generator for each scene: a failing one changes no noise of the others
-                noise = np.random.default_rng([self.evaluation.seed, place])
-                for inputs, targets in self._choices(scene, place):
-                    views = self.views
-                    if self.views_of:
-                        views = self.views_of(scene, inputs, targets)
-                    for part in [targets] if scene.times is None else moments(scene, targets):
-                        yield make_sample(scene, inputs, part, views, False, noise, self.depths)
-            except Exception as error:  # whatever a reader raises; the other scenes go on
-                yield SceneFailure(name, one_line(error))
+    def samples(self, name: str) -> Iterator[Sample]:
+        """Yield the samples of a wanted scene, one decoded at a time. Raises what a reader raises.
+
+        ValueError for a scene that is not there.
+        """
+        if name not in self._places:
+            raise ValueError("not among the test scenes of the data")
+        place = self._places[name]
+        scene = self._scenes[place]
+        # a generator for each scene: a failing one changes no noise of the others
+        noise = np.random.default_rng([self.evaluation.seed, place])
+        for inputs, targets in self._choices(scene, place):
+            views = self.views_of(scene, inputs, targets) if self.views_of else self.views
+            for part in [targets] if scene.times is None else moments(scene, targets):
+                yield make_sample(scene, inputs, part, views, False, noise, self.depths)
 
     def _choices(self, scene: Scene, place: int) -> Iterator[tuple[Frames, Frames]]:
         """Yield input and target frames of each sample."""
-        sampler = self.sampler or Span(Span.Config())
+        sampler = self.sampler
         # What somebody chose comes first: an index, then windows of the sampler's own. Held-out
         # photos are scarce, so all of them are compared before any frame is drawn by chance.
         if self.index is not None:
@@ -147,22 +137,6 @@ class EvaluationPlan:
                 inputs, drawn = sampler.draw(scene, self.views, rng, END)
                 every = range(inputs[0], inputs[-1] + 1) if scene.times is None else drawn
                 yield inputs, tuple(sorted({*every} - {*inputs} or {*drawn}))
-
-
-def evaluation_samples(
-    source: SceneSource,
-    views: ViewsConfig,
-    evaluation: EvaluationConfig,
-    sampler: ViewSampler | None = None,
-    **options: Any,
-) -> Sequence[Sample]:
-    """Return samples of a plan without an index; ValueError for the first scene that fails."""
-    samples: list[Sample] = []
-    for sample in EvaluationPlan(source, views, evaluation, None, sampler, **options).samples():
-        if isinstance(sample, SceneFailure):
-            raise ValueError(f"scene {sample.scene!r} cannot be judged: {sample.reason}")
-        samples.append(sample)
-    return samples
 
 
 def held_out_windows(scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:

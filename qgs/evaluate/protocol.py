@@ -9,7 +9,7 @@ from typing import Any
 from qgs.contracts import Metric, SceneSource, SceneSourceConfig
 from qgs.contracts.schedule import END, at_step
 from qgs.data.view_samplers import Span
-from qgs.evaluate.plan import EvaluationIndex, read_index
+from qgs.evaluate.plan import EvaluationIndex
 from qgs.evaluate.tuning import tuning_loss
 from qgs.recipe import Recipe
 
@@ -40,11 +40,6 @@ class Protocol:
 
     def __str__(self) -> str:
         return f"{self.name} ({self.sha256[:12]})"
-
-
-def index_of(recipe: Recipe) -> EvaluationIndex | None:
-    """Read the index that `recipe` names; None where views are drawn. Raises as `read_index`."""
-    return read_index(recipe.evaluation.index) if recipe.evaluation.index else None
 
 
 def protocol_of(

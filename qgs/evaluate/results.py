@@ -9,22 +9,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.box import MARKDOWN
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from qgs.contracts import Column
 from qgs.data.samples import Frames
-from qgs.evaluate.plan import GIVEN, SceneFailure, given_targets
+from qgs.evaluate.plan import GIVEN, given_targets
 from qgs.evaluate.protocol import Protocol
 from qgs.files import write_text
 from qgs.metrics.baselines import BASELINES
 from qgs.metrics.dispersion import OPACITY_USED
-from qgs.wording import counted, listed, numbered
+from qgs.wording import counted, listed
 
 METHODS = ("model", *BASELINES)
-TUNING = {"tuning_loss_before": "loss_before", "tuning_loss_after": "loss_after"}
-"""Values of a tuned scene, and how the record of its tuning calls them."""
+TUNED = ("loss_before", "loss_after")
+"""Of the record of a tuning, what is a value of its scene, with `tuning_` before it."""
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
@@ -37,7 +38,7 @@ def spread(values: Sequence[float]) -> dict[str, float]:
 class SceneScore:
     """One scene. views: input and target frames of each of its samples; names: as in `Sample`.
 
-    values: means over the samples of METHOD_METRIC, "gaussians_used", of tuned scenes TUNING; less
+    values: means over the samples of METHOD_METRIC, "gaussians_used", of tuned scenes TUNED; less
     those whose metric needs what the method or the scene lacks.
     """
 
@@ -65,26 +66,24 @@ class SceneScore:
 class Evaluation:
     """All scenes and what they amount to; the same weights and recipe give the same numbers.
 
-    columns: by name of the value. scores: of the judged scenes. wanted: names of all scenes of the
-    protocol. missing: those without a score. gaussians: of a scene, the most of any.
-    incomplete: values that scenes lack, and why. step: optimiser steps behind the weights.
+    columns: by name of the value. scores: of the judged scenes. missing: the other scenes of the
+    protocol, and why they have none. gaussians: of a scene, the most of any. incomplete: values
+    that scenes lack, and why. step: optimiser steps behind the weights.
     remarks: sentences on what was judged and what came of it.
     """
 
     protocol: Protocol
     columns: Mapping[str, Column]
     scores: Sequence[SceneScore]
-    wanted: Sequence[str]
     gaussians: int
-    missing: Sequence[SceneFailure] = ()
+    missing: Mapping[str, str]
     incomplete: Mapping[str, str] = field(default_factory=dict)
     step: int | None = None
     remarks: Sequence[str] = ()
 
     def mean(self, metric: str, method: str = "model") -> float | None:
         """Return the mean over scenes of one of `columns`; None if none has this value."""
-        values = self._values(f"{method}_{metric}")
-        return sum(values) / len(values) if values else None
+        return self._mean(f"{method}_{metric}")
 
     def means(self, method: str = "model") -> dict[str, float | None]:
         """Return the `mean` of all `columns`."""
@@ -93,14 +92,13 @@ class Evaluation:
     @property
     def statement(self) -> str:
         """The model's first value, usually PSNR, and over how many scenes, in one line."""
-        line = f"over {self._of_wanted(len(self.scores))} scene{'s' * (len(self.wanted) != 1)}"
+        line = f"over {self._judged} scene{'s' * (self._wanted != 1)}"
         for name, value in self.means().items():
             if value is not None:
                 column = self.columns[name]
                 line = f"{column.heading} {column.shown(value)} {line}"
                 break
-        missing = listed([failure.scene for failure in self.missing])
-        return f"{line}; missing: {missing}" if missing else line
+        return f"{line}; missing: {listed(self.missing)}" if self.missing else line
 
     def summary(self) -> dict[str, Any]:
         """Return everything but the scores of single scenes, as plain values for JSON.
@@ -108,24 +106,23 @@ class Evaluation:
         over_scenes: of each value of the model the mean, variance and median over scenes.
         """
         values = {name: self._values(f"model_{name}") for name in self.columns}
-        used = spread(self._values("gaussians_used"))["mean"]
         return {
             "protocol": {"name": self.protocol.name, "sha256": self.protocol.sha256},
             "step": self.step,
             "statement": self.statement,
             "scenes": len(self.scores),
-            "scenes_in_protocol": len(self.wanted),
+            "scenes_in_protocol": self._wanted,
             "samples": sum(len(score.views) for score in self.scores),
-            "missing": {failure.scene: failure.reason for failure in self.missing},
+            "missing": self.missing,
             "context_and_target": {s.scene: s.given for s in self.scores if s.given},
             "columns": {name: asdict(column) for name, column in self.columns.items()},
             **{method: self.means(method) for method in METHODS},
-            "incomplete": dict(self.incomplete),
+            "incomplete": self.incomplete,
             "over_scenes": {n: {**spread(v), "scenes": len(v)} for n, v in values.items() if v},
             "gaussians": self.gaussians,
-            "gaussians_used": {"opacity_above": OPACITY_USED, "mean": used},
+            "gaussians_used": {"opacity_above": OPACITY_USED, "mean": self._mean("gaussians_used")},
             "tuning": self._tuning(),
-            "remarks": list(self.remarks),
+            "remarks": self.remarks,
         }
 
     def write(self, folder: str | Path) -> None:
@@ -133,11 +130,13 @@ class Evaluation:
 
         protocol.json is `Protocol.canonical`: its SHA-256 is the protocol's hash.
         """
-        table = f"{markdown_table(self._rows())}\n\n{bullets(self._notes())}\n"
+        table = io.StringIO()
+        # As wide as the lines are; without the colours that the environment may ask for.
+        self.show(Console(file=table, width=10_000, color_system=None))
         files = {
             "scenes.csv": self._csv(),
             "summary.json": as_json(self.summary()),
-            "table.md": table,
+            "table.md": table.getvalue(),
             # Last: `qgs train --resume` takes it as the sign of a whole evaluation.
             "protocol.json": self.protocol.canonical,
         }
@@ -145,44 +144,49 @@ class Evaluation:
             write_text(Path(folder, name), text)
 
     def show(self, console: Console) -> None:
-        """Print the table and the notes of table.md."""
-        print_table(console, str(self.protocol), self._rows())
-        print_lines(console, self._notes())
+        """Print the table and the notes as Markdown."""
+        print_table(console, str(self.protocol), self._rows(), box=MARKDOWN)
+        print_lines(console, (f"- {note}" for note in self._notes()))
 
     def _values(self, name: str) -> list[float]:
         return [score.values[name] for score in self.scores if name in score.values]
 
-    def _of_wanted(self, count: int) -> str:
-        wanted = len(self.wanted)
-        return str(count) if count == wanted else f"{count} of {wanted}"
+    def _mean(self, name: str) -> float | None:
+        values = self._values(name)
+        return sum(values) / len(values) if values else None
+
+    @property
+    def _wanted(self) -> int:
+        return len(self.scores) + len(self.missing)
+
+    @property
+    def _judged(self) -> str:
+        judged = len(self.scores)
+        return f"{judged} of {self._wanted}" if self.missing else str(judged)
 
     def _tuning(self) -> dict[str, Any] | None:
         settings = self.protocol.content["tuning"]
         if settings is None:
             return None
-        losses = {key: spread(self._values(name))["mean"] for name, key in TUNING.items()}
-        return {**settings, **losses}
+        return {**settings, **{key: self._mean(f"tuning_{key}") for key in TUNED}}
 
     def _rows(self) -> list[list[str]]:
         """Return the means of all methods."""
-        judged = self._of_wanted(len(self.scores))
         rows = [["method", *(column.title for column in self.columns.values()), "scenes"]]
         for method in METHODS:
             cells = [self.columns[name].shown(v) for name, v in self.means(method).items()]
-            rows.append([method.replace("_", " "), *cells, judged])
+            rows.append([method.replace("_", " "), *cells, self._judged])
         return rows
 
     def _csv(self) -> str:
-        reasons = {failure.scene: failure.reason for failure in self.missing}
-        judged = {score.scene: score.cells() for score in self.scores}
-        columns = dict.fromkeys(column for cells in judged.values() for column in cells)
+        rows = [{"scene": score.scene, **score.cells()} for score in self.scores]
+        columns = dict.fromkeys(column for row in rows for column in row)
+        # A scene that is missing has a row too, so that it shows in the file.
+        rows += [{"scene": scene, "problem": reason} for scene, reason in self.missing.items()]
         text = io.StringIO()
-        writer = csv.DictWriter(text, ["scene", *columns, "problem"], lineterminator="\n")
+        writer = csv.DictWriter(text, [*columns, "problem"], lineterminator="\n")
         writer.writeheader()
-        # Every wanted scene has a row, so that a missing one shows in the file.
-        for name in self.wanted:
-            row = {"scene": name, "problem": reasons.get(name, "")}
-            writer.writerow(row | judged.get(name, {}))
+        writer.writerows(rows)
         return text.getvalue()
 
     def _notes(self) -> Iterator[str]:
@@ -198,21 +202,17 @@ class Evaluation:
             f"{poses['frame']}, scale {poses['scale']} {poses.get('scale_factor', '')}".rstrip()
         )
         # A broken data set would bury the table; scenes.csv has every reason.
-        yield from (f"missing {f.scene}: {f.reason}" for f in self.missing[:10])
-        if given := [score for score in self.scores if score.given]:
-            named = [
-                f"{s.scene} ({listed(numbered(f, s.names.get(f, '')) for f in s.given)})"
-                for s in given
-            ]
+        yield from (f"missing {scene}: {why}" for scene, why in [*self.missing.items()][:10])
+        if given := [score.scene for score in self.scores if score.given]:
             yield (
-                f"{counted(len(given), 'scene')} with {GIVEN}, on which the "
-                f"nearest input view is perfect: {listed(named)}"
+                f"{counted(len(given), 'scene')} with {GIVEN}, on which the nearest input view is "
+                f"perfect: {listed(given)}"
             )
         for name, why in self.incomplete.items():
             count = len(self._values(f"model_{name}"))
-            over = f"over {self._of_wanted(count)} scenes" if count else "empty"
+            over = f"over {count} of {self._wanted} scenes" if count else "empty"
             yield f"{self.columns[name].heading} is {over}: {why}"
-        used = spread(self._values("gaussians_used"))["mean"]
+        used = self._mean("gaussians_used")
         yield (
             f"{self.gaussians:,} Gaussians a scene, {used:,.0f} of them used (opacity above "
             f"{OPACITY_USED:.4f}; mean over scenes)"
@@ -227,18 +227,6 @@ class Evaluation:
 def as_json(value: Mapping[str, Any]) -> str:
     """Return a file's text; raises ValueError for NaN and infinities."""
     return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def markdown_table(rows: Sequence[Sequence[str]]) -> str:
-    """Return rows of equal length, headers first, as a Markdown table; numbers to the right."""
-    rule = [":---", *["---:"] * (len(rows[0]) - 1)]
-    lines = [[cell.replace("|", "\\|") for cell in row] for row in (rows[0], rule, *rows[1:])]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def bullets(lines: Iterable[str]) -> str:
-    """Return lines as a Markdown list."""
-    return "\n".join(f"- {line}" for line in lines)
 
 
 def print_table(

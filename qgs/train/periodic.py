@@ -2,6 +2,8 @@
 
 import json
 import logging
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -22,7 +24,6 @@ from qgs.drawing.images import (
 )
 from qgs.evaluate.evaluation import Measures, evaluate
 from qgs.evaluate.plan import EvaluationPlan
-from qgs.evaluate.protocol import index_of
 from qgs.files import read_records, write_text
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
@@ -128,17 +129,21 @@ class PeriodicEvaluation:
             recipe.build_data(),
             recipe.views,
             recipe.evaluation,
-            index_of(recipe),
             recipe.build_view_sampler(),
         )
-        # A broken test scene has been reported by the scores; pictures take the next one.
-        usable = (sample for sample in plan.samples() if isinstance(sample, Sample))
         self.model.eval()
         try:
-            rows = [_row(self.model, sample) for sample in islice(usable, SAMPLES)]
+            rows = [_row(self.model, sample) for sample in islice(_usable(plan), SAMPLES)]
         finally:
             self.model.train()
         return np.concatenate(rows)
+
+
+def _usable(plan: EvaluationPlan) -> Iterator[Sample]:
+    for name in plan.wanted:
+        # A broken test scene has been reported by the scores; pictures take the next one.
+        with suppress(Exception):
+            yield from plan.samples(name)
 
 
 def _row(model: QueryGaussianModel, sample: Sample) -> Picture:

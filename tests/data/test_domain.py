@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from line_scenes import samples_of
 from training_runs import run, tiny
 
 from qgs.checkpoint.model_file import CheckpointFile, save
@@ -14,7 +15,6 @@ from qgs.checkpoint.tensors import CheckpointError
 from qgs.data import stream
 from qgs.data.stream import trained_domain
 from qgs.domain import KEY, Domain, verdict
-from qgs.evaluate.plan import evaluation_samples
 from qgs.geometry.poses import look_at
 from qgs.recipe import resolve
 from qgs.types import Cameras
@@ -113,7 +113,7 @@ def test_the_own_test_data_of_a_recipe_lie_inside(name, options, monkeypatch):
     sampler = recipe.build_view_sampler()
     trained = trained_domain(source, recipe.views, recipe.seed, sampler, recipe.training.steps)
     test = Domain()
-    for sample in evaluation_samples(source, recipe.views, recipe.evaluation, sampler):
+    for sample in samples_of(source, recipe.views, recipe.evaluation, sampler):
         test.see(sample.inputs.cameras, sample.targets.cameras)
     assert not trained.differences(test)
 

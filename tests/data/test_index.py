@@ -5,13 +5,12 @@ import re
 
 import pytest
 import torch
-from line_scenes import Line, Lines
+from line_scenes import Line, Lines, plan_of, samples_of
 from photo_formats import opened, synthetic, write_nerfstudio
 from tables import must_refuse
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
-from qgs.data.samples import Sample
-from qgs.evaluate.plan import EvaluationPlan, IndexEntry, SceneFailure, read_index
+from qgs.evaluate.plan import read_index
 
 VIEWS = ViewsConfig(inputs=2, gap=(2, 5))
 
@@ -38,14 +37,29 @@ class Strips(Lines):
 
 
 def entry(context, target):
-    return IndexEntry(context=list(context), target=list(target))
+    return {"context": context, "target": target}
+
+
+def indexed(folder, index, **options):
+    """Settings of an evaluation on the views of an index."""
+    file = folder / "index.json"
+    file.write_text(json.dumps(index))
+    return EvaluationConfig(index=str(file), **options)
+
+
+def refused(plan, scene):
+    with pytest.raises((ValueError, OSError)) as refusal:
+        list(plan.samples(scene))
+    return str(refusal.value)
 
 
 def test_a_published_index_is_read(tmp_path):
     file = tmp_path / "index.json"
     told = {"a": {"context": [0, 12], "target": [3, 6], "overlap": 0.5}, "b": None}
     file.write_text(json.dumps(told))
-    assert read_index(str(file)) == {"a": entry([0, 12], [3, 6]), "b": None}
+    index = read_index(str(file))
+    assert index["a"].model_dump() == entry([0, 12], [3, 6])
+    assert index["b"] is None
 
 
 REFUSED = """
@@ -76,17 +90,17 @@ def test_a_missing_index_is_told_with_its_path():
     )
 
 
-def test_samples_are_those_of_the_index_in_its_order():
+def test_samples_are_those_of_the_index_in_its_order(tmp_path):
     source = Strips(Strip("one"), Strip("two"), Strip("three"))
     index = {"three": entry([4, 1], [2, 3, 2]), "one": entry([0, 7], [5])}
-    first, second = EvaluationPlan(source, VIEWS, EvaluationConfig(scenes=1), index).samples()
+    first, second = samples_of(source, VIEWS, indexed(tmp_path, index, scenes=1))
     assert (first.scene, second.scene) == ("three", "one")
     assert (first.input_frames, first.target_frames) == ((4, 1), (2, 3, 2))
     assert first.targets.images[0, :, 0, 0, 0].tolist() == pytest.approx([0.02, 0.03, 0.02])
     assert first.inputs.cameras.c2w[0, 0].tolist() == torch.eye(4).tolist()
 
 
-def test_what_is_not_judged_is_named():
+def test_what_is_not_judged_is_named(tmp_path):
     source = Strips(Strip("good"), Strip("short", 4), Strip("spare"))
     index = {
         "gone": entry([0, 1], [2]),
@@ -94,19 +108,19 @@ def test_what_is_not_judged_is_named():
         "nil": None,
         "short": entry([0, 4], [-1]),
     }
-    plan = EvaluationPlan(source, VIEWS, EvaluationConfig(), index)
+    plan = plan_of(source, VIEWS, indexed(tmp_path, index))
     assert plan.wanted == ("gone", "good", "short")
-    failures = {s.scene: s.reason for s in plan.samples() if isinstance(s, SceneFailure)}
-    assert failures.keys() == {"gone", "short"}
-    assert "4, -1" in failures["short"]
+    assert "not among the test scenes" in refused(plan, "gone")
+    assert len(list(plan.samples("good"))) == 1
+    assert "4, -1" in refused(plan, "short")
 
 
 def test_scenes_that_do_not_decode_are_told_and_the_rest_goes_on():
     broken = Strip("broken")
     broken.broken = OSError("truncated file")
-    plan = EvaluationPlan(Strips(broken, Strip("good")), VIEWS, EvaluationConfig())
-    failure, sample = plan.samples()
-    assert failure == SceneFailure("broken", "OSError: truncated file")
+    plan = plan_of(Strips(broken, Strip("good")), VIEWS, EvaluationConfig())
+    assert refused(plan, "broken") == "truncated file"
+    (sample,) = plan.samples("good")
     assert sample.scene == "good"
 
 
@@ -120,22 +134,21 @@ def test_damaged_photo_folders_are_named_and_positions_never_move_in_silence(tmp
     photo = sets / "cut/images/view_002.png"
     photo.write_bytes(photo.read_bytes()[:200])
     (sets / "gap/images/view_001.png").unlink()
-    plan = EvaluationPlan(opened(sets, (16, 16)), VIEWS, EvaluationConfig(), index)
-    *failures, good = plan.samples()
-    assert isinstance(good, Sample)
-    assert [failure.scene for failure in (*failures, good)] == [*index]
-    reasons = (
-        r"transforms\.json",
-        r"view_002\.png",
-        r"1 of its listed images do not exist.*view_001\.png",
-    )
-    for reason, failure in zip(reasons, failures, strict=True):
-        assert re.search(reason, failure.reason)
+    plan = plan_of(opened(sets, (16, 16)), VIEWS, indexed(tmp_path, index))
+    assert plan.wanted == tuple(index)
+    assert len(list(plan.samples("good"))) == 1
+    reasons = {
+        "broken": r"transforms\.json",
+        "cut": r"view_002\.png",
+        "gap": r"1 of its listed images do not exist.*view_001\.png",
+    }
+    for scene, reason in reasons.items():
+        assert re.search(reason, refused(plan, scene))
 
 
 def test_scenes_are_decoded_one_at_a_time():
     scenes = [Strip(f"scene{n}") for n in range(4)]
-    samples = EvaluationPlan(Strips(*scenes), VIEWS, EvaluationConfig()).samples()
-    for number in range(4):
-        next(samples)
+    plan = plan_of(Strips(*scenes), VIEWS, EvaluationConfig())
+    for number, name in enumerate(plan.wanted):
+        assert len(list(plan.samples(name))) == 1
         assert [scene.decoded for scene in scenes] == [1] * (number + 1) + [0] * (3 - number)

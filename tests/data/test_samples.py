@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from line_scenes import Line, Lines, circle
+from line_scenes import Line, Lines, circle, samples_of
 from odd_views import odd_views
 from tables import must_refuse
 from torch.testing import assert_close
@@ -14,7 +14,7 @@ from qgs.contracts.schedule import END
 from qgs.data.frames import draw_frames
 from qgs.data.samples import collate, make_sample, mirrored_views, stack_views
 from qgs.data.view_samplers import Span
-from qgs.evaluate.plan import evaluation_samples, held_out_windows
+from qgs.evaluate.plan import held_out_windows
 from qgs.evaluate.protocol import protocol_of
 from qgs.geometry.poses import look_at, look_at_depth
 from qgs.geometry.transforms import to_camera, to_pixels
@@ -146,7 +146,7 @@ def test_evaluation_is_deterministic_novel_and_never_mirrored():
     def found(**options):
         views = ViewsConfig(inputs=2, gap=(3, 5), mirror=1.0)
         config = EvaluationConfig(scenes=2, samples=3, **options)
-        return evaluation_samples(Lines(Line(8), Line(9), Line(10)), views, config)
+        return samples_of(Lines(Line(8), Line(9), Line(10)), views, config)
 
     drawn, again, others = ([s.input_frames for s in found(**o)] for o in ({}, {}, {"seed": 1}))
     assert drawn == again != others
@@ -214,7 +214,7 @@ def test_pose_noise_moves_inputs_but_the_first_and_nothing_else():
 def test_pose_noise_of_an_evaluation_is_the_same_each_time_and_in_its_protocol():
     def first_inputs(recipe):
         source = recipe.build_data()
-        return evaluation_samples(source, recipe.views, recipe.evaluation)[0].inputs.cameras.c2w
+        return samples_of(source, recipe.views, recipe.evaluation)[0].inputs.cameras.c2w
 
     exact = resolve("recipes/tiny/tokengs.yaml", ["evaluation.scenes=1"])
     noisy = resolve(exact.tree, ["views.pose_noise=3"])

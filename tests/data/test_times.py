@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from line_scenes import Line, Lines
+from line_scenes import Line, Lines, samples_of
 from photo_formats import scene, synthetic, write_blender
 from tables import must_refuse
 from torch.testing import assert_close
@@ -11,7 +11,7 @@ from training_runs import run
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.data.frames import draw_frames
 from qgs.data.samples import collate, make_sample
-from qgs.evaluate.plan import evaluation_samples, held_out_windows
+from qgs.evaluate.plan import held_out_windows
 from qgs.recipe import RecipeError, resolve
 
 VIEWS = ViewsConfig(inputs=2, targets=2, gap=(2, 4))
@@ -84,7 +84,7 @@ def test_times_go_from_0_to_1_and_ask_for_that_of_the_targets():
 def test_targets_of_two_times_are_judged_apart():
     scene = Moving(10, 2, held_out=(6, 7, 9))
     assert [targets for _, targets in held_out_windows(scene, VIEWS)] == [(6, 7, 9)]
-    samples = evaluation_samples(Lines(scene), VIEWS, EvaluationConfig(scenes=5))
+    samples = samples_of(Lines(scene), VIEWS, EvaluationConfig(scenes=5))
     assert [sample.target_frames for sample in samples] == [(6, 7), (9,)]
     assert all(sample.inputs.target_time is not None for sample in samples)
 

@@ -11,12 +11,12 @@ from unittest.mock import Mock
 import pytest
 import torch
 import yaml
+from line_scenes import samples_of
 from rich.console import Console
 from training_runs import same, tiny
 
 from qgs.contracts import CONTRACT_VERSION, Column, ComponentConfig, Metric, Plugin
 from qgs.evaluate.evaluation import evaluate
-from qgs.evaluate.plan import evaluation_samples
 from qgs.evaluate.protocol import protocol_of
 from qgs.evaluate.results import METHODS
 from qgs.metrics.baselines import mean_colour, nearest_input
@@ -115,7 +115,7 @@ def test_scores_are_the_metrics_of_model_and_baselines(judged):
     recipe, evaluation, _ = judged
     model = recipe.build_model().eval()
     data = recipe.build_data()
-    sample = evaluation_samples(data, recipe.views, recipe.evaluation, depths=True)[0]
+    sample = samples_of(data, recipe.views, recipe.evaluation, depths=True)[0]
     inputs = sample.inputs
     targets = sample.targets
     with torch.no_grad():
@@ -161,7 +161,7 @@ def test_evaluations_write_the_same_files(judged, tmp_path):
     protocol = summary["protocol"]
     assert protocol["name"] == "rooms-2view"
     assert hashlib.sha256(files["protocol.json"]).hexdigest() == protocol["sha256"]
-    assert "| MAE ↓ |" in files["table.md"].decode()
+    assert " MAE ↓ |" in files["table.md"].decode()
     told = "masked is over 1 of 2 scenes: it needs masks, not known for 1 of 2 scenes"
     for text in ("MAE ↓", f" {summary['model']['mae']:.5f} ", told):
         assert text in shown(evaluation)
@@ -216,7 +216,7 @@ def test_a_failure_anywhere_ends_neither_evaluation_nor_in_silence(monkeypatch):
     monkeypatch.setattr(encoder, "forward", encode)
     evaluation = evaluate(model, recipe)
     assert [(score.scene, len(score.views)) for score in evaluation.scores] == [("test/000003", 2)]
-    memory, finite, file = (failure.reason for failure in evaluation.missing)
+    memory, finite, file = evaluation.missing.values()
     assert memory == "RuntimeError: out of memory"
     assert "is not finite" in finite
     assert file == "OSError: /data/set/truncated.png is cut off"

@@ -4,10 +4,10 @@ import copy
 
 import pytest
 import torch
+from line_scenes import samples_of
 from training_runs import tiny
 
 from qgs.containers import map_tensors
-from qgs.evaluate.plan import evaluation_samples
 from qgs.evaluate.tuning import tune, tuning_loss
 
 LATENTS = (
@@ -22,7 +22,7 @@ MSE = ("losses.photometric.ssim_weight=0.0", "evaluation.tuning_steps=8")
 def opened(*words):
     """The recipe, its model and the input views of a scene."""
     recipe = tiny(*words)
-    samples = evaluation_samples(recipe.build_data(), recipe.views, recipe.evaluation)
+    samples = samples_of(recipe.build_data(), recipe.views, recipe.evaluation)
     return recipe, recipe.build_model().eval(), samples[0].inputs
 
 

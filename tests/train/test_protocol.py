@@ -6,7 +6,8 @@ from functools import partial
 import pytest
 from training_runs import tiny
 
-from qgs.evaluate.protocol import index_of, protocol_of
+from qgs.evaluate.plan import read_index
+from qgs.evaluate.protocol import protocol_of
 from qgs.recipe import resolve
 
 INDEX = {"a": {"context": [0, 3], "target": [1, 2]}, "b": None}
@@ -20,7 +21,7 @@ OTHERS = """
 
 def indexed(file, *overrides):
     recipe = tiny("tokengs", f"evaluation.index={file}", *overrides)
-    return protocol_of(recipe, index_of(recipe))
+    return protocol_of(recipe, read_index(str(file)))
 
 
 def drawn(*overrides, scenes=("x",)):
@@ -77,7 +78,7 @@ def test_whatever_decides_the_numbers_is_hashed_and_nothing_else(file):
 
 
 def test_splits_count_only_where_no_index_names_the_frames(file):
-    index = index_of(tiny("tokengs", f"evaluation.index={file}"))
+    index = read_index(str(file))
     photos = tiny("tokengs").tree | {"plugins": ["datasets"]}
     for kind_and_split in (
         "qgs/photos data.holdout=4",

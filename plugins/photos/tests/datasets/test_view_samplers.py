@@ -5,7 +5,7 @@ from itertools import islice
 import numpy as np
 import pytest
 import torch
-from line_scenes import Line, Lines, circle
+from line_scenes import Line, Lines, circle, samples_of
 from qgs_photos.datasets.bounded import Bounded
 from qgs_photos.datasets.farthest import Farthest
 from qgs_photos.datasets.overlapping import Overlapping
@@ -13,7 +13,6 @@ from qgs_photos.datasets.overlapping import Overlapping
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.contracts.schedule import END
 from qgs.data.stream import trained_domain, training_batches
-from qgs.evaluate.plan import EvaluationPlan, evaluation_samples
 from qgs.recipe import RecipeError, resolve
 from qgs.types import Cameras
 
@@ -88,7 +87,7 @@ def test_a_training_widens_the_gap_and_resumes_where_it_was():
     for number, gap in enumerate(whole):
         low, high = sampler.gaps(number // 4)
         assert low <= gap <= high
-    samples = evaluation_samples(source, recipe.views, recipe.evaluation, sampler)
+    samples = samples_of(source, recipe.views, recipe.evaluation, sampler)
     found = [sample.input_frames[-1] - sample.input_frames[0] for sample in samples]
     assert min(found) in {3, 7}
     assert max(found) > 3
@@ -202,8 +201,7 @@ def test_apart_moves_inputs_apart():
 
 def test_every_held_out_photo_is_judged_with_inputs_beside_it():
     scene = Arc(40, held_out=(0, 8, 16))
-    plan = EvaluationPlan(Lines(scene), VIEWS, EvaluationConfig(), sampler=SAMPLER)
-    samples = [*plan.samples()]
+    samples = samples_of(Lines(scene), VIEWS, EvaluationConfig(), SAMPLER)
     assert [sample.target_frames for sample in samples] == [(0,), (8,), (16,)]
     for sample in samples:
         first, last = steps(sample.input_frames)

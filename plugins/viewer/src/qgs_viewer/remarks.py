@@ -41,7 +41,7 @@ def remarks(models: Sequence[Model]) -> list[str]:
     names: dict[str, list[str]] = {}
     for model in models:
         evaluation = model.evaluation
-        missing = [f"{f.scene} is not judged: {f.reason}" for f in evaluation.missing]
+        missing = [f"{scene} is not judged: {why}" for scene, why in evaluation.missing.items()]
         for remark in (*evaluation.remarks, *missing):
             # the same remark on three models stands once, with their names
             names.setdefault(remark, []).append(model.name)

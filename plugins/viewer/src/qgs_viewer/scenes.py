@@ -7,11 +7,11 @@ from pathlib import Path
 import torch
 
 from qgs.data.samples import Sample
-from qgs.evaluate.plan import evaluation_samples
+from qgs.evaluate.plan import EvaluationPlan
 from qgs.geometry.poses import largest_distance
 from qgs.model import QueryGaussianModel
 from qgs.types import Cameras, Gaussians
-from qgs.wording import listed
+from qgs.wording import listed, one_line
 from qgs_viewer.comparison import Model
 from qgs_viewer.curves import Curves, curves_of
 from qgs_viewer.queries import DrawnQuery, colored_queries, notable_queries
@@ -59,7 +59,8 @@ def model_scenes(
     comes first. Raises ValueError for a scene that is not judged.
     """
     first = models[0].recipe
-    evaluation = first.evaluation
+    # Scenes are drawn, whatever index the scores are of.
+    evaluation = first.evaluation.model_copy(update={"index": None})
     if most is not None:
         evaluation = evaluation.model_copy(update={"scenes": most, "samples": 1})
     source = first.build_data()
@@ -69,17 +70,29 @@ def model_scenes(
         views = model.recipe.views
         # models in worlds of one unit share the samples: photos take long to decode
         if not samples or views.scale == "search" or views != first.views:
-            samples = evaluation_samples(
+            plan = EvaluationPlan(
                 source,
                 views,
                 evaluation,
-                views_of=model.search,
-                sampler=model.windows or model.recipe.build_view_sampler(),
+                model.windows or model.recipe.build_view_sampler(),
+                model.search,
                 # true depths cost as much as photos to decode, and one copy is enough
                 depths=not shown,
-            )[:most]
+            )
+            samples = _samples(plan)[:most]
         shown.append(scenes_of(model.name, model.network, _with_first(samples, scene), model.file))
     return shown
+
+
+def _samples(plan: EvaluationPlan) -> list[Sample]:
+    """Return the samples of all scenes. Raises ValueError for the first scene that fails."""
+    samples: list[Sample] = []
+    for scene in plan.wanted:
+        try:
+            samples += plan.samples(scene)
+        except Exception as error:  # whatever a reader raises
+            raise ValueError(f"scene {scene!r} cannot be judged: {one_line(error)}") from error
+    return samples
 
 
 def _with_first(samples: Sequence[Sample], scene: str | None) -> Sequence[Sample]:

@@ -13,8 +13,7 @@ from qgs.checkpoint.models import checkpoint_path
 from qgs.cli.train import with_absolute_path
 from qgs.contracts import OptionError
 from qgs.evaluate.evaluation import Measures
-from qgs.evaluate.plan import EvaluationPlan
-from qgs.evaluate.protocol import index_of
+from qgs.evaluate.plan import EvaluationPlan, read_index
 from qgs.recipe import Recipe, RecipeError, resolve
 from qgs.recipe.errors import Origin, Problems
 from qgs.recipe.yaml_text import dump
@@ -130,7 +129,8 @@ def check_equal(study: Study, recipes: Mapping[str, Recipe], problems: Problems)
             if section not in EQUAL or allowed or option in reported:
                 continue
             # Variants of several files may name one index by different paths.
-            if path == INDEX and index_of(recipe) == index_of(first):
+            index = read_index(recipe.evaluation.index)
+            if path == INDEX and index == read_index(first.evaluation.index):
                 continue
             reported.add(option)
             reason = (
@@ -182,7 +182,8 @@ def check_data(plan: Plan) -> None:
                     f"{unavailable.get(metric, 'no recipe has it')}",
                     f"choose one of {', '.join(available)}, or add it to `overlay.metrics`",
                 )
-        EvaluationPlan(recipe.build_data(), recipe.views, recipe.evaluation, index_of(recipe))
+        sampler = recipe.build_view_sampler()
+        EvaluationPlan(recipe.build_data(), recipe.views, recipe.evaluation, sampler)
 
 
 def refuse_changed(plan: Plan) -> None:
@@ -198,7 +199,7 @@ def refuse_changed(plan: Plan) -> None:
         changed = differences(resolve(file), recipe) if made and file.is_file() else {}
         # Where the index lies is no matter, but which scenes and frames it names.
         changed.pop(INDEX, None)
-        index = index_of(recipe)
+        index = read_index(recipe.evaluation.index)
         protocols = [run.evaluation(name) / "protocol.json" for run in evaluated]
         stored = [json.loads(file.read_text(encoding="utf-8"))["views"] for file in protocols]
         if any(views.get("index") != to_jsonable_python(index) for views in stored):

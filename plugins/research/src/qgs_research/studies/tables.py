@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 from rich import box
 from rich.console import Console
 
-from qgs.evaluate.results import bullets, markdown_table, print_lines, print_table
+from qgs.evaluate.results import print_lines, print_table
 from qgs.wording import listed
 from qgs_research.studies.estimates import Estimate, interval_shown, shown
 from qgs_research.studies.hypotheses import MAIN
@@ -40,7 +40,15 @@ class Summary:
         parts = [self.answer]
         for title, rows in self.tables:
             parts += [f"**{title}**" if title else "", markdown_table(rows)]
-        return "\n\n".join(filter(None, [*parts, bullets(self.notes)])) + "\n"
+        notes = "\n".join(f"- {note}" for note in self.notes)
+        return "\n\n".join(filter(None, [*parts, notes])) + "\n"
+
+
+def markdown_table(rows: Rows) -> str:
+    """Return rows of equal length as a Markdown table; numbers to the right."""
+    rule = [":---", *["---:"] * (len(rows[0]) - 1)]
+    lines = [[cell.replace("|", "\\|") for cell in row] for row in (rows[0], rule, *rows[1:])]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def table_rows(
