@@ -79,7 +79,9 @@ def stub(monkeypatch, code):
     monkeypatch.setattr(running, "WORK", (sys.executable, "-c", start))
 
 
-def test_each_run_is_tried_once_a_call_and_a_failed_one_when_its_file_is_deleted(plan, monkeypatch):
+def test_each_run_is_tried_once_a_call_and_a_failed_one_when_its_file_is_deleted(
+    study, plan, monkeypatch
+):
     first, second, *_ = plan.runs
     first.failure.parent.mkdir(parents=True)
     first.failure.write_text("CollapseError: training collapsed at step 7: it\nLikely causes")
@@ -93,6 +95,8 @@ def test_each_run_is_tried_once_a_call_and_a_failed_one_when_its_file_is_deleted
     assert not first.log.exists()
     assert second.log.read_text() == "threads 1 ['cpu', '', 'more']\n"
     assert Results(plan).failed == [first]
+    done("slurm", "study", study, "--out", plan.folder)
+    assert "#SBATCH --array=1,2,3\n" in (plan.folder / "slurm.sh").read_text()
 
 
 def test_a_signal_ends_the_processes_and_the_call(plan, monkeypatch):

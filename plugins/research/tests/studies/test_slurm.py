@@ -1,15 +1,31 @@
-"""The Slurm job of the examples, run without Slurm."""
+"""Jobs for Slurm, without Slurm."""
 
 import os
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
-from commands import sets
+from commands import done, run_qgs, sets
 
-ROOT = Path(__file__).parents[4]
+RECIPE = Path(__file__).parents[4] / "recipes/tiny/locus.yaml"
+
+
+def test_a_job_has_the_words_of_the_command_and_wrong_ones_are_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ("slurm", "train", RECIPE, *sets("training.workers=3", "training.batch_size=8"))
+    done(*words, "--gpus", 2, "--out", "my runs/a", "--threads", 2)
+    script = (tmp_path / "my runs/a.slurm.sh").read_text()
+    assert "--cpus-per-task=10\n#SBATCH --gpus-per-node=2\n" in script
+    assert f"cd {tmp_path} || exit\n" in script
+    assert f"--output='{tmp_path}/my runs/a.slurm-%j.log'\n" in script
+    assert "training.batch_size=8 --out 'my runs/a' --threads 2 --resume & job=$!\n" in script
+    with pytest.raises(ValueError, match=r"training\.batch_size"):
+        done(*words, "--out", "b", "--gpus", 3)
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        done(*words, "--out", "b", *sets("data={type: qgs/photos, path: nowhere}"))
+    assert run_qgs(*words, "--out", "b", "--gpu", 2).exit_code == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["my runs"]
 
 
 @pytest.mark.slow
@@ -24,16 +40,14 @@ def test_a_slurm_job_saves_at_the_signal_and_goes_on(tmp_path):
         "training={seconds: null, steps: 300, save_every: 0, batch_size: 2}",
         "optimizer.warmup=1",
     )
+    done("slurm", "train", RECIPE, "--out", out, "--gpus", 2, "--device", "cpu", *words)
     stub = tmp_path / "bin/scontrol"
     stub.parent.mkdir()
     stub.write_text(f'#!/bin/sh\necho "$@" >> {asked}\n')
     stub.chmod(0o755)
-    paths = f"{stub.parent}:{Path(sys.executable).parent}:{os.environ['PATH']}"
-    of_slurm = {"SLURM_JOB_ID": "7", "SLURM_GPUS_ON_NODE": "2"}
-    environment = {**os.environ, **of_slurm, "PATH": paths, "OMP_NUM_THREADS": "1"}
-    recipe = ROOT / "recipes/tiny/locus.yaml"
-    script = ["bash", ROOT / "docs/examples/train_8_gpus.sh", recipe, "--out", out]
-    command = [*script, "--device", "cpu", *words]
+    paths = f"{stub.parent}:{os.environ['PATH']}"
+    environment = {**os.environ, "PATH": paths, "SLURM_JOB_ID": "7", "OMP_NUM_THREADS": "1"}
+    command = ["bash", tmp_path / "run.slurm.sh"]
     history = out / "history.jsonl"
     job = subprocess.Popen(command, env=environment)
     while not history.exists() or len(history.read_bytes().splitlines()) < 3:

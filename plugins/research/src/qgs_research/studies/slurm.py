@@ -1,0 +1,98 @@
+"""`qgs slurm`: jobs that save before their time is over; started again, they go on."""
+
+import shlex
+import sys
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from qgs.cli.options import Device
+
+app = typer.Typer(help="Write jobs for Slurm that save before their time ends, and go on.")
+
+
+# Options that this command does not have are those of `qgs train`.
+@app.command(context_settings={"ignore_unknown_options": True})
+def train(
+    words: Annotated[
+        list[str], typer.Argument(metavar="RECIPE --out RUN ...", help="As `qgs train` takes them.")
+    ],
+    gpus: Annotated[int, typer.Option(min=1, help="GPUs of one node, a process each.")] = 1,
+) -> None:
+    """Write RUN.slurm.sh, which trains on the GPUs of a node. RECIPE and options: `qgs train`."""
+    from qgs.cli import app as qgs
+    from qgs.evaluate.protocol import index_of
+    from qgs.recipe import resolve
+
+    group: Any = typer.main.get_command(qgs)
+    # Parsed as `qgs train` does: what it would refuse is refused now, not when the job starts.
+    given = group.commands["train"].make_context("qgs train", [*words]).params
+    recipe = resolve(given["recipe"], given["overrides"] or ())
+    index_of(recipe)
+    recipe.build_data()
+    recipe.training.scenes_per_batch(gpus)
+    run = given["out"].resolve()
+    launcher = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={gpus}"]
+    _write_job(
+        run.with_name(f"{run.name}.slurm.sh"),
+        [*launcher, "-m", "qgs", "train", *words, "--resume"],
+        template="train.sh",
+        name=run.name,
+        log=run.with_name(f"{run.name}.slurm-%j.log"),
+        cores=gpus * ((given["threads"] or 1) + recipe.training.workers),
+        gpu_line="" if given["device"] == "cpu" else f"\n#SBATCH --gpus-per-node={gpus}",
+    )
+
+
+@app.command()
+def study(
+    file: Annotated[
+        str, typer.Argument(metavar="STUDY", help="Study file, or one that comes with qgs.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder of the study.")],
+    threads: Annotated[int, typer.Option(min=1, help="CPU threads of a run.")] = 1,
+    device: Device = "auto",
+) -> None:
+    """Write OUT/slurm.sh, an array with a task for each missing run of a study."""
+    from qgs_research.studies.plan import planned
+    from qgs_research.studies.study import read_study
+
+    plan = planned(read_study(file), out.resolve())
+    missing = [
+        str(number) for number, run in enumerate(plan.runs) if not plan.done(run) and not run.failed
+    ]
+    if not missing:
+        raise ValueError(f"{out} lacks no run: `qgs study` with --workers 0 writes its tables")
+    words = ["study", file, "--out", str(plan.folder), "--threads", str(threads)]
+    workers = max(recipe.training.workers for recipe in plan.recipes.values())
+    _write_job(
+        plan.folder / "slurm.sh",
+        ["-m", "qgs", *words, "--device", device],
+        template="study.sh",
+        array=",".join(missing),
+        name=plan.folder.name,
+        log=plan.folder / "slurm-%A_%a.log",
+        cores=threads + workers,
+        gpu_line="" if device == "cpu" else "\n#SBATCH --gpus-per-task=1",
+    )
+
+
+def _write_job(
+    script: Path, words: Sequence[str], *, template: str, name: str, log: Path, **values: Any
+) -> None:
+    """Write `script` for sbatch, which runs Python with `words` in this folder."""
+    from qgs.files import write_text
+
+    text = files("qgs_research.studies").joinpath("template", template).read_text(encoding="utf-8")
+    filled = text.format(
+        name=shlex.quote(name),
+        log=shlex.quote(str(log)),
+        folder=shlex.quote(str(Path.cwd())),
+        command=shlex.join([sys.executable, *words]),
+        **values,
+    )
+    write_text(script, filled)
+    typer.echo(f"wrote {script}; submit it with: sbatch {shlex.quote(str(script))}")
