@@ -27,8 +27,7 @@ from qgs_viewer.comparison import checkpoints, recipes_alike
 from torch import Tensor
 
 from qgs.checkpoint.model_file import CheckpointFile, load
-from qgs.data.depth import scene_depth
-from qgs.data.inputs import choose_windows
+from qgs.data.inputs import choose_windows, scene_depth
 from qgs.data.samples import Sample, make_sample, own_world
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim

@@ -1,4 +1,4 @@
-"""Which frames of a scene are held out, and which a training sample shows.
+"""Which frames of a scene are held out, and which a training sample shows: the sampler `qgs/span`.
 
 Source: TokenGS release (gap, targets from the span of the inputs).
 """
@@ -10,8 +10,10 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from pydantic import Field
 
-from qgs.contracts import Frames, Scene, ViewsConfig
+from qgs.contracts import Frames, Problem, RecipeContext, Scene, ViewSampler, ViewsConfig
+from qgs.contracts.component import ComponentConfig
 from qgs.machine import refuse_more_than_memory
 from qgs.wording import warn_once
 
@@ -76,42 +78,6 @@ def refuse_too_many(frames: int, scene: Scene) -> None:
     )
 
 
-def draw_frames(
-    scene: Scene, views: ViewsConfig, rng: np.random.Generator
-) -> tuple[Frames, Frames]:
-    """Draw input frames, ascending, and target frames of a training sample from a span.
-
-    Targets are no inputs, where there are enough frames; then inputs join, then frames repeat.
-    Where times are known, the span is of times, each input is of another one and of another camera,
-    as far as there are, and all targets are of one (TokenGS 2026.6).
-    """
-    refuse_too_many(views.inputs + views.targets, scene)
-    usable = moments(scene)
-    low, high = gap_range(len(usable), views, scene)
-    gap = int(rng.integers(low, high + 1))
-    # The order of draws is that of the release: another one would change all trainings.
-    first = int(rng.integers(0, len(usable) - gap))
-    span = usable[first : first + gap + 1]
-    if views.inputs == 1:
-        places = [int(rng.choice(gap + 1))]
-    else:
-        more = views.inputs - 2
-        between = rng.choice(range(1, gap), more, replace=False) if more else ()
-        places = [0, *sorted(map(int, between)), gap]
-    # Permuting one camera draws nothing: static scenes have the same numbers after it.
-    cameras = rng.permutation(max(map(len, span))).tolist()
-    inputs = one_of_each([span[place] for place in places], cameras)
-    pool = [frame for moment in span for frame in moment]
-    if scene.times is not None:
-        novel = [moment for moment in span if {*moment} - {*inputs}] or span
-        pool = novel[rng.integers(len(novel))]
-    # New views first, then inputs, then repetitions, so that short scenes can be used too.
-    targets = [*rng.permutation([frame for frame in pool if frame not in inputs])]
-    targets += [*rng.permutation([frame for frame in inputs if frame in pool])]
-    targets += list(rng.choice(pool, max(views.targets - len(targets), 0)))
-    return inputs, tuple(map(int, targets[: views.targets]))
-
-
 def one_of_each(chosen: Sequence[Frames], cameras: Sequence[int]) -> Frames:
     """Return one frame per moment, cycling through the cameras."""
     turns = zip(chosen, cycle(cameras), strict=False)
@@ -129,3 +95,65 @@ def evenly(items: Sequence[_T], count: int) -> list[_T]:
 def spread(span: Sequence[Frames], count: int) -> Frames:
     """Return frames of `count` moments, spaced by `evenly`."""
     return one_of_each(evenly(span, count), range(count))
+
+
+class Span(ViewSampler):
+    """Inputs at both ends of a random span and within it, targets from the span (TokenGS release).
+
+    The span has min_gap to max_gap frames from its first to its last. Targets are no inputs, where
+    there are enough frames; then inputs join, then frames repeat. Where times are known, the span
+    is of times, each input is of another one and of another camera, as far as there are, and all
+    targets are of one (TokenGS 2026.6).
+    """
+
+    name = "span"
+    scheduled = frozenset({"min_gap", "max_gap"})
+
+    class Config(ComponentConfig):
+        min_gap: int | None = Field(default=None, ge=1)
+        """Least gap; null for that of `views.gap`."""
+        max_gap: int | None = Field(default=None, ge=1)
+        """Largest gap; null for that of `views.gap`. A schedule lets it grow with training."""
+
+    config: Config
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """See `Component`."""
+        if config.min_gap and config.max_gap and config.min_gap > config.max_gap:
+            yield Problem("min_gap", "it is larger than `max_gap`", "raise `max_gap`")
+
+    def draw(
+        self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
+    ) -> tuple[Frames, Frames]:
+        """See `ViewSampler`."""
+        options = self.options(step)
+        high = options.max_gap or views.gap[1]
+        # A schedule may bring the largest gap below the least one of the recipe.
+        low = min(options.min_gap or views.gap[0], high)
+        views = views.model_copy(update={"gap": (low, high)})
+        refuse_too_many(views.inputs + views.targets, scene)
+        usable = moments(scene)
+        low, high = gap_range(len(usable), views, scene)
+        gap = int(rng.integers(low, high + 1))
+        # The order of draws is that of the release: another one would change all trainings.
+        first = int(rng.integers(0, len(usable) - gap))
+        span = usable[first : first + gap + 1]
+        if views.inputs == 1:
+            places = [int(rng.choice(gap + 1))]
+        else:
+            more = views.inputs - 2
+            between = rng.choice(range(1, gap), more, replace=False) if more else ()
+            places = [0, *sorted(map(int, between)), gap]
+        # Permuting one camera draws nothing: static scenes have the same numbers after it.
+        cameras = rng.permutation(max(map(len, span))).tolist()
+        inputs = one_of_each([span[place] for place in places], cameras)
+        pool = [frame for moment in span for frame in moment]
+        if scene.times is not None:
+            novel = [moment for moment in span if {*moment} - {*inputs}] or span
+            pool = novel[rng.integers(len(novel))]
+        # New views first, then inputs, then repetitions, so that short scenes can be used too.
+        targets = [*rng.permutation([frame for frame in pool if frame not in inputs])]
+        targets += [*rng.permutation([frame for frame in inputs if frame in pool])]
+        targets += list(rng.choice(pool, max(views.targets - len(targets), 0)))
+        return inputs, tuple(map(int, targets[: views.targets]))

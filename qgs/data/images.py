@@ -146,7 +146,7 @@ def decode_rgb(
 ) -> Image.Image:
     """Decode as RGB, over `background` in [0, 1]. Raises OSError for no readable image.
 
-    Pixels stay where they are stored; `qgs.data.photos.turning` follows EXIF.
+    Pixels stay where they are stored; `PhotoScene` follows EXIF.
     """
     image = eight_bits(_decoded(file))
     if image.has_transparency_data:

@@ -6,11 +6,10 @@ import os
 import signal
 import threading
 import traceback
-from collections import defaultdict
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from itertools import count, islice
 from typing import Any
@@ -19,25 +18,15 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from qgs.containers import concatenated
 from qgs.contracts import Frames, Scene, SceneSource, ViewSampler, ViewsConfig
+from qgs.data.frames import Span
 from qgs.data.samples import Batch, Sample, cameras_in, collate, make_sample, own_world, with_noise
 from qgs.data.scenes import BoundedCache
-from qgs.data.view_samplers import Span
 from qgs.domain import Domain
 from qgs.machine import is_out_of_memory
 from qgs.terminal import show_safely
 from qgs.types import Cameras
 from qgs.wording import one_line
-
-
-@dataclass(frozen=True)
-class Share:
-    """The part of every global batch that one process makes: slice `rank` of `processes`."""
-
-    rank: int = 0
-    processes: int = 1
-
 
 MEASURED = 512
 """Samples whose cameras `trained_domain` measures."""
@@ -60,7 +49,8 @@ def training_batches(
     seed: int,
     start: int = 0,
     *,
-    share: Share = Share(),
+    rank: int = 0,
+    processes: int = 1,
     workers: int = 0,
     skips: bool = False,
     sampler: ViewSampler | None = None,
@@ -70,16 +60,17 @@ def training_batches(
     """Batches start, start + 1, ... of an endless sequence, of `batch_size` samples each.
 
     Sample k depends on (seed, k) alone. Global batch n is the samples from n * batch_size *
-    processes on; every process gets its slice. `start` resumes exactly, and processes and
-    workers change nothing. workers: processes that decode; 0 decodes in a thread. Closing ends
-    them. skips, sampler, depths: see `SampleStream`. accumulate: batches of an optimiser step.
+    processes on; every process gets the slice of its `rank`. `start` resumes exactly, and
+    processes and workers change nothing. workers: processes that decode; 0 decodes in a thread.
+    Closing ends them. skips, sampler, depths: see `SampleStream`. accumulate: batches of an
+    optimiser step.
     Raises ValueError without training scenes or with too few frames, SampleError and WorkerError.
     """
     stream = SampleStream(
-        source, views, seed, skips, sampler, batch_size * share.processes * accumulate, depths
+        source, views, seed, skips, sampler, batch_size * processes * accumulate, depths
     )
-    every = batch_size * share.processes
-    firsts = count(start * every + share.rank * batch_size, every)
+    every = batch_size * processes
+    firsts = count(start * every + rank * batch_size, every)
     numbers = (range(first, first + batch_size) for first in firsts)
     return _from_workers(stream, numbers, workers) if workers else _from_thread(stream, numbers)
 
@@ -98,15 +89,11 @@ def trained_domain(
     out: training itself reports it.
     """
     stream = SampleStream(source, views, seed, sampler=sampler)
-    drawn = defaultdict[int, list[tuple[Cameras, Cameras]]](list)
+    domain = Domain()
     for number in range(MEASURED):
         # A reader may raise anything.
         with suppress(Exception):
-            inputs, targets = stream.cameras(number, round(number / (MEASURED - 1) * steps))
-            drawn[inputs.shape[1]].append((inputs, targets))
-    domain = Domain()
-    for alike in drawn.values():
-        domain.see(*concatenated(alike, 0))
+            domain.see(*stream.cameras(number, round(number / (MEASURED - 1) * steps)))
     return domain
 
 
@@ -152,9 +139,6 @@ class SampleStream(Dataset[Batch | Exception]):
         if not len(self._scenes):
             raise ValueError(f"the data source {type(source).name!r} has no training scenes")
         self._groups = [np.asarray(group, np.int64) for group in source.groups("train")]
-        every = np.sort(np.concatenate([np.empty(0, np.int64), *self._groups]))
-        whole = np.arange(len(self._scenes))
-        assert np.array_equal(every, whole), "groups hold every scene once"
         self._orders: BoundedCache[np.ndarray] = BoundedCache(2)
 
     # Open scenes hold files and caches, which cannot be sent to a worker.

@@ -20,7 +20,6 @@ from qgs.data.samples import Batch
 from qgs.data.stream import (
     Feed,
     SampleError,
-    Share,
     scenes_fingerprint,
     trained_domain,
     training_batches,
@@ -225,7 +224,8 @@ class Trainer:
             self.recipe.seed,
             # A step that accumulates takes several batches.
             start=self.counters.samples * self.config.accumulate // self.config.batch_size,
-            share=Share(self.accelerator.process_index, processes),
+            rank=self.accelerator.process_index,
+            processes=processes,
             workers=self.config.workers,
             skips=self.config.on_bad_sample == "skip",
             sampler=self.recipe.build_view_sampler(),

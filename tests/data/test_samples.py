@@ -11,9 +11,8 @@ from training_runs import tiny
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.contracts.schedule import END
-from qgs.data.frames import draw_frames
+from qgs.data.frames import Span
 from qgs.data.samples import collate, make_sample, mirrored_views, stack_views
-from qgs.data.view_samplers import Span
 from qgs.evaluate.plan import held_out_windows
 from qgs.evaluate.protocol import protocol_of
 from qgs.geometry.poses import look_at, look_at_depth
@@ -38,7 +37,7 @@ class MaskedLine(Line):
 
 def drawn(scene, seed, **views):
     """Inputs and targets as they are drawn for a training."""
-    return draw_frames(scene, ViewsConfig(**views), np.random.default_rng(seed))
+    return Span(Span.Config()).draw(scene, ViewsConfig(**views), np.random.default_rng(seed), 0)
 
 
 def sample(scene, inputs=(1, 4), targets=(3,), mirror=False, rng=None, **views):

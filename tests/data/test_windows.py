@@ -7,8 +7,7 @@ import yaml
 from walk import arc, pinhole
 
 from qgs.contracts import ViewsConfig
-from qgs.data.depth import scene_depth
-from qgs.data.inputs import choose_windows, trained_ratios
+from qgs.data.inputs import choose_windows, scene_depth, trained_ratios
 from qgs.domain import Domain
 from qgs.reconstruction.scenes import GivenScene
 from qgs.types import Views

@@ -20,7 +20,6 @@ Intrinsics: TypeAlias = tuple[float, float, float, float]
 Size: TypeAlias = tuple[int, int]
 GROUP = "qgs.photo_readers"
 """Entry point group of further readers: format name = module:subclass of `PhotoReader`."""
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _COPY = re.compile(r"images(_\d+)?")
 # Pixels of a listed photo.
 LARGEST_SIDE = 10**6
@@ -87,7 +86,7 @@ class PhotoFrame:
     intrinsics: fx, fy, cx, cy in pixels of an image of `size` (H, W), or of the file where the
     listing gives no size. lens: None for a pinhole. split: as listed, None without splits. time:
     when it was taken, in the listing's unit; None where nothing moves. turns: clockwise quarters
-    from the stored pixels to those of the camera, see `qgs.data.photos.turning`.
+    from the stored pixels to those of the camera, see `qgs.data.photos.source.upright`.
     problems: what the listing says that cannot be read; a pose or intrinsics concerned are NaN.
     """
 
@@ -196,13 +195,6 @@ def existing(paths: Iterable[UPath]) -> set[UPath]:
         if path.name in names[folder]:
             held.add(path)
     return held
-
-
-def image_files(folder: UPath) -> list[UPath]:
-    """Return the photos in a folder, by name."""
-    files = [item for item in listing(folder) if not item.name.startswith(".")]
-    photos = [item for item in files if item.name.lower().endswith(IMAGE_SUFFIXES)]
-    return sorted(photos, key=lambda item: item.name)
 
 
 def image_folder(folder: UPath, wanted: str | None) -> UPath:

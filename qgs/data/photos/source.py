@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from operator import attrgetter
 from typing import ClassVar
 
@@ -25,17 +25,24 @@ from qgs.data.images import (
     decode_mask,
     decode_rgb,
     image_size,
+    opened_image,
     orientation,
     read_image,
     to_tensor,
 )
 from qgs.data.photos import formats_of, present_frames, readers
 from qgs.data.photos.reader import PhotoFrame, Size, size_problems
-from qgs.data.photos.turning import turned, turned_size, upright
 from qgs.data.scenes import BoundedCache, LazyScenes, LazySource
 from qgs.paths import is_local, listing, opened_path
 from qgs.types import Cameras
 from qgs.wording import listed, warn_once
+
+_CACHED = 512 * 2**20
+"""Bytes of decoded images that a split keeps."""
+_TURNS = {3: 2, 6: 1, 8: 3}
+"""EXIF orientation to quarter turns clockwise; the others mirror, which no camera does."""
+_QUARTER = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+"""Axes of a camera turned clockwise, in those of the camera before: its x was -y, its y was x."""
 
 
 class PhotosConfig(SceneSource.Config):
@@ -69,11 +76,6 @@ class PhotosConfig(SceneSource.Config):
         if format not in known:
             raise OptionError(f"must be a format of photos, got {format!r}", f"use {listed(known)}")
         return format
-
-
-def image_cache(limit: int = 512 * 2**20) -> BoundedCache[np.ndarray]:
-    """Return a cache of decoded images, with a limit in bytes."""
-    return BoundedCache(limit, attrgetter("nbytes"))
 
 
 class PhotoScene(Scene):
@@ -235,7 +237,8 @@ class PhotosSource(LazySource):
         root = opened_path(config.path)
 
         def scenes(folders: dict[str, UPath]) -> LazyScenes:
-            return LazyScenes(folders, partial(PhotoScene, config=config, cache=image_cache()))
+            cache = BoundedCache[np.ndarray](_CACHED, attrgetter("nbytes"))
+            return LazyScenes(folders, partial(PhotoScene, config=config, cache=cache))
 
         folders = {folder_name(root): root}
         if root.is_dir() and not formats_of(root):
@@ -295,3 +298,72 @@ def _folders(root: UPath, config: PhotosConfig) -> dict[str, UPath]:
 def folder_name(folder: UPath) -> str:
     """Return the name of the scene in `folder`."""
     return folder.resolve().name or "photos"
+
+
+def upright(frame: PhotoFrame) -> PhotoFrame:
+    """Return `frame` as EXIF turns its photo, camera and lens included; of a store as it is.
+
+    Where the listed size is the upright one, so are the listed cameras; where size does not tell,
+    as of squares and half turns, they are those of the stored pixels.
+    """
+    # Of a store each header would be a request.
+    if not is_local(frame.path) or not frame.path.is_file():
+        return frame
+    size, turns = _header(str(frame.path), frame.path.stat().st_mtime_ns)
+    if not turns:
+        return frame
+    frame = replace(frame, turns=turns)
+    if not _quarters(_swapped(size), frame):
+        return frame
+    if turns % 2 and size[0] == size[1]:
+        warn_once(f"square photos in {frame.path.parent} are turned by EXIF: {TURN}")
+    frame = replace(frame, size=frame.size or size)
+    for _ in range(turns):
+        frame = _quarter(frame)
+    return frame
+
+
+def turned_size(size: Size, frame: PhotoFrame) -> Size:
+    """Return (H, W) of a stored photo of `frame`, its mask or depth map, when it is upright."""
+    return _swapped(size) if _quarters(size, frame) % 2 else size
+
+
+def turned(image: Image.Image, frame: PhotoFrame) -> Image.Image:
+    """Return the stored photo, mask or depth map, upright; one that was drawn upright stays."""
+    quarters = _quarters((image.height, image.width), frame)
+    # Pixels are moved, not interpolated; the angle is counterclockwise.
+    return image.rotate(-90 * quarters, expand=True) if quarters else image
+
+
+def _swapped(size: Size) -> Size:
+    return size[1], size[0]
+
+
+def _quarters(size: Size, frame: PhotoFrame) -> int:
+    """Return the turns of a file of `size` (H, W); 0 where the listing says that it is upright."""
+    fits, fits_turned = (not any(size_problems(own, frame.size)) for own in (size, _swapped(size)))
+    return 0 if frame.turns % 2 and fits and not fits_turned else frame.turns
+
+
+@lru_cache(maxsize=2**16)
+def _header(path: str, changed: int) -> tuple[Size, int]:
+    """Return (H, W) as stored and quarter turns; none of a file that is no image."""
+    try:
+        with open(path, "rb") as file, opened_image(file) as image:
+            return (image.height, image.width), _TURNS.get(orientation(image), 0)
+    except OSError:
+        return (1, 1), 0
+
+
+def _quarter(frame: PhotoFrame) -> PhotoFrame:
+    """Turn camera, size and lens of `frame` by a quarter, clockwise."""
+    assert frame.size is not None
+    height, width = frame.size
+    fx, fy, cx, cy = frame.intrinsics
+    return replace(
+        frame,
+        size=(width, height),
+        c2w=frame.c2w @ _QUARTER,
+        intrinsics=(fy, fx, height - cy, cx),
+        lens=frame.lens and frame.lens.turned(),
+    )

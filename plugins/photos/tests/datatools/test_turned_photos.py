@@ -13,7 +13,7 @@ from textured_room import INTRINSICS, SIZE
 from upath import UPath
 
 from qgs.data.photos.reader import PhotoFrame
-from qgs.data.photos.turning import upright
+from qgs.data.photos.source import upright
 
 FX, FY, CX, CY = INTRINSICS
 HEIGHT, WIDTH = SIZE

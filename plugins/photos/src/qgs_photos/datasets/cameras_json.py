@@ -19,12 +19,12 @@ from qgs.data.photos.reader import (
     PhotoReader,
     Size,
     existing,
-    image_files,
     listed_size,
     numbers,
 )
 from qgs.paths import open_file, read_json
 from qgs.wording import warn_once
+from qgs_photos.image_files import image_files
 
 _LISTS = ("frames", "cameras", "views")
 _NAMES = ("image", "image_path", "file_path", "filename", "file_name", "file", "name", "img_name")

@@ -11,8 +11,8 @@ from upath import UPath
 
 from qgs.contracts import SceneSource
 from qgs.data.photos import formats_of
-from qgs.data.photos.source import PhotoScene, PhotosConfig, image_cache
-from qgs.data.scenes import LazyScenes, LazySource
+from qgs.data.photos.source import PhotoScene, PhotosConfig
+from qgs.data.scenes import BoundedCache, LazyScenes, LazySource
 from qgs.paths import opened_path, read_file, read_json
 from qgs.wording import listed, warn_once
 
@@ -71,7 +71,7 @@ class Dl3dvSource(LazySource):
                 warn_once(f"{count} test scenes are missing in the data: {listed(absent, 3)}")
         same = config.model_dump(include={"path", "images", "holdout", "background", "image_size"})
         photos = PhotosConfig(format="nerfstudio", **same)
-        opener = partial(_opened, config=photos, cache=image_cache(0))
+        opener = partial(_opened, config=photos, cache=BoundedCache(0))
         self.splits = {
             "train": LazyScenes(train, opener, config.max_scenes),
             "test": LazyScenes(test, opener, config.max_scenes),

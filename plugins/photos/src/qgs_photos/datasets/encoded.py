@@ -7,8 +7,7 @@ import numpy as np
 
 from qgs.data.images import decode_rgb
 from qgs.data.photos.reader import Intrinsics, Lens, Size
-from qgs.data.photos.source import PhotoScene, whole_mask
-from qgs.data.photos.turning import turned
+from qgs.data.photos.source import PhotoScene, turned, whole_mask
 from qgs.paths import read_file
 
 

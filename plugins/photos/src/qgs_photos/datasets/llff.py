@@ -8,11 +8,11 @@ from qgs.data.photos.reader import (
     Listing,
     PhotoFrame,
     PhotoReader,
-    image_files,
     image_folder,
     listed_size,
 )
 from qgs.paths import open_file
+from qgs_photos.image_files import image_files
 
 
 class Llff(PhotoReader):

@@ -9,8 +9,7 @@ from upath import UPath
 from qgs.data.images import decode_alpha, decode_depth, decode_mask, read_image
 from qgs.data.photos import formats_of, read_listing
 from qgs.data.photos.reader import PhotoFrame, existing, refuse_outside
-from qgs.data.photos.source import folder_name
-from qgs.data.photos.turning import upright
+from qgs.data.photos.source import folder_name, upright
 from qgs.paths import read_file
 from qgs_photos.datasets.dl3dv import find_scenes, scene_folder
 from qgs_photos.datatools.findings import Finding

@@ -12,7 +12,7 @@ from PIL import Image
 
 from qgs.data.images import TURN, TURNED, decode_rgb, eight_bits, opened_image, orientation
 from qgs.data.photos.reader import PhotoFrame, Size, size_problems
-from qgs.data.photos.turning import turned, turned_size
+from qgs.data.photos.source import turned, turned_size
 from qgs.wording import numbered, one_line
 from qgs_photos.datatools.findings import Finding, Severity
 

@@ -8,7 +8,8 @@ from filelock import FileLock
 from rich.console import Console
 from upath import UPath
 
-from qgs.data.photos.reader import Listing, PhotoReader, image_files
+from qgs.data.photos.reader import Listing, PhotoReader
+from qgs_photos.image_files import image_files
 from qgs_photos.poses.making import RECORD, Options, fingerprint, make_poses
 from qgs_photos.poses.photos import PosesError
 from qgs_photos.printing import say

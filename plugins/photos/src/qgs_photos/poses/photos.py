@@ -13,8 +13,8 @@ from PIL import Image, ImageOps
 from upath import UPath
 
 from qgs.data.images import eight_bits, opened_image, orientation
-from qgs.data.photos.reader import image_files
 from qgs.wording import counted, listed
+from qgs_photos.image_files import image_files
 
 LEAST = 3
 # Pixels of a side.

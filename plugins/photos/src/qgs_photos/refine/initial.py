@@ -12,7 +12,7 @@ from qgs.checkpoint.model_file import load
 from qgs.cli.options import scale_settings
 from qgs.containers import concatenated
 from qgs.contracts import Scene, ViewsConfig
-from qgs.data.depth import scene_depth
+from qgs.data.inputs import scene_depth
 from qgs.data.photos import formats_of
 from qgs.data.photos.source import PhotoScene
 from qgs.data.samples import own_world
