@@ -6,16 +6,14 @@ import re
 import shlex
 import shutil
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 import yaml
 from commands import done
 from photo_formats import PhotoSet, noisy_photos, write_nerfstudio
 from qgs_viewer.commands import new_folder
-from qgs_viewer.compare import ON_PHOTOS, RECIPES, compare_models
+from qgs_viewer.compare import RECIPES
 from qgs_viewer.comparison import open_models, resolve_fairly
-from qgs_viewer.curves import curves_of
 from qgs_viewer.opening import open_source
 from qgs_viewer.scenes import model_scenes
 from small import RECIPE, stand_in
@@ -91,15 +89,6 @@ def test_a_report_on_photos_says_what_was_printed_and_what_to_do_next(
     assert (record["scale"], record["search"]) == (0.5, None)
 
 
-def test_a_checkpoint_has_a_history_of_its_own_or_of_its_run(tmp_path):
-    assert not curves_of(tmp_path / "other.safetensors")
-    for step, name in enumerate(["own.history.jsonl", "history.jsonl"]):
-        record = {"step": step, "seconds": 1.0, "loss": 1.0, "psnr": 9.0}
-        (tmp_path / name).write_text(json.dumps(record) + "\n")
-    found = [curves_of(tmp_path / f"{name}.safetensors") for name in ("own", "other")]
-    assert [[record["step"] for record in records] for records in found] == [[0], [1]]
-
-
 def test_small_scenes_keep_their_photos_and_others_every_eighth(models, tmp_path):
     for name, count in (("large", 20), ("small", 3), ("tiny", 2)):
         noisy_photos(tmp_path / name, count)
@@ -133,15 +122,6 @@ def test_a_model_tuned_on_the_photos_is_compared_on_those_it_never_saw(models, t
     shown = model_scenes(results, 2)
     ends = {float(own.samples[0].inputs.cameras.c2w[0, -1, :3, 3].norm()) for own in shown}
     assert len(ends) == 2
-
-
-def test_photos_meet_models_of_their_size(tmp_path, monkeypatch):
-    refusing = Mock(side_effect=FileNotFoundError)
-    monkeypatch.setattr("qgs_viewer.compare.open_models", refusing)
-    for size, side in ((None, 128), ("128x192", 128), ("64x64", 64)):
-        with pytest.raises(FileNotFoundError):
-            compare_models(None, str(tmp_path), tmp_path, "cpu", size)
-        assert refusing.call_args.args[0] == ON_PHOTOS[side]
 
 
 def test_an_earlier_demo_is_never_touched(tmp_path, monkeypatch):
@@ -189,13 +169,6 @@ def test_names_cannot_break_the_page(page):
     assert "<script>alert" not in page
     assert page.count("<script>") == 1
     assert html.escape(RUN) in page
-
-
-def test_every_scene_can_be_chosen_and_is_there_without_choosing(page):
-    radios = [found for found in tags(page, "input") if found["type"] == "radio"]
-    assert len(radios) == len(tags(page, "article")) == 3
-    assert [label["for"] for label in tags(page, "label")] == [radio["id"] for radio in radios]
-    assert ["checked" in radio for radio in radios] == [True, False, False]
 
 
 def test_pictures_are_in_the_page_and_have_words(page):

@@ -8,8 +8,8 @@ from qgs_viewer.drawing import FAINT, Choice, painted, query_color
 from qgs_viewer.page import first_eye, up_of
 from qgs_viewer.placement import Placement
 from qgs_viewer.queries import attention_pictures_of
-from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
-from small import BY_DISTANCE, KINDS, cloud, model_of, model_scenes_of, source_of
+from qgs_viewer.query_scene import QueryScene
+from small import BY_DISTANCE, KINDS, cloud, model_scenes_of, source_of
 from torch.testing import assert_close
 from walk import SIDE, arc, pinhole
 
@@ -83,13 +83,6 @@ def test_a_picked_query_stands_out():
         assert (shown.colors[mine] == plain.colors[mine]).all()
     colored = painted(scene, Choice(by_query=True))
     assert_allclose(colored.colors[mine] * 255, [query_color(4)] * mine.sum(), atol=0.1)
-
-
-def test_the_background_is_that_of_the_model():
-    scene = model_scenes_of("locus").scene
-    assert scene.background == NEUTRAL
-    model = model_of("locus", "model.renderer.background=[0.1, 0.2, 0.3]")
-    assert explained(model, scene.views).background == (0.1, 0.2, 0.3)
 
 
 TURN = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).double()

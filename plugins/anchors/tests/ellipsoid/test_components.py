@@ -12,7 +12,6 @@ from qgs_anchors.ellipsoid.cross_attention import EllipsoidCrossAttention
 from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_rotation, turned
 from qgs_anchors.ellipsoid.head import AxisScaledCenters, EllipsoidHead, radii_along
 from qgs_anchors.ellipsoid.ray_bias import EllipsoidBias, ray_tokens
-from qgs_anchors.ellipsoid.refinement import EllipsoidRefinement
 from qgs_locus.anchors import FrustumCenters
 from qgs_locus.fields import CENTER, RAW_RADIUS
 from refusals import wrong_refusals
@@ -82,13 +81,6 @@ def test_attention_and_pictures_speak_of_one_ellipsoid():
     assert_close(bias, expected, rtol=1e-4, atol=1e-4)
     assert bias.min() == -7.0 * gamma
     assert bias.max() > -1.0
-
-
-def test_the_step_of_a_centre_is_linear_on_demand():
-    refinement = made(EllipsoidRefinement, center_step="linear")
-    state = _state()
-    expected = state[CENTER] + refinement.center_mlp(state.features)
-    assert_close(refinement(state)[CENTER], expected)
 
 
 def test_centers_follow_their_formula():

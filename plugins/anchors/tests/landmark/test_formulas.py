@@ -132,12 +132,6 @@ def test_a_head_of_more_gaussians_starts_from_those_of_the_nearest_cells():
     assert_close(sixteen, four.repeat_interleave(2, 2).repeat_interleave(2, 3))
 
 
-def test_a_head_leaves_weights_that_are_not_its_own():
-    """They are then refused by their names and shapes."""
-    theirs = {"linear.weight": torch.zeros(13, 8), "fc.weight": torch.zeros(28, 8)}
-    assert_close(made(ColoredHead).adapted(theirs), theirs)
-
-
 def test_the_recipe_of_larger_photos_starts_from_the_shipped_model():
     recipe = resolve("rooms/landmark_128.yaml")
     changes = initialise(recipe.build_model(), recipe)

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import torch
-import torch.nn.functional as F
 from contract_mutants.mutant import mutant
 from contract_mutants.sound import StridedConvolutions
 from qgs_zoo.tokengs2026.multiscale import LatentBottleneck
@@ -178,18 +177,6 @@ class OrdersTokensByColumn(ChangedEncoder):
         keys = turned(memory.keys, 2)
         values = turned(memory.values, 2)
         return replace(memory, keys=keys, values=values, features=turned(memory.features, 1))
-
-
-@mutant("tokens_are_those_of_the_grid", "of what changes a token comes from its own patch")
-class ConvolvesAndOrdersByColumn(StridedConvolutions):
-    def ordered(self, x_BVDHW):
-        return x_BVDHW.mT.reshape(x_BVDHW.shape)
-
-
-@mutant("tokens_are_those_of_the_grid", "(+0, +0, -1) of it", options={"kernel": 4})
-class ConvolvesAndShiftsByAColumn(StridedConvolutions):
-    def ordered(self, x_BVDHW):
-        return F.pad(x_BVDHW, (1, -1))
 
 
 @mutant("tokens_are_those_of_the_grid", "of what changes a token comes from its own patch")

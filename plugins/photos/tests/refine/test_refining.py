@@ -13,7 +13,7 @@ import torch
 from line_scenes import circle
 from qgs_photos.refine import refine
 from qgs_photos.refine.growth import DEAD, FreeGaussians
-from qgs_photos.refine.refining import Extras, partly_swept, resized
+from qgs_photos.refine.refining import Extras, resized
 from qgs_photos.refine.result import plain
 from qgs_photos.refine.scene import masked
 from qgs_photos.refine.sweeping import swept
@@ -339,13 +339,3 @@ def test_without_evidence_the_depth_is_the_size():
     found = swept(views, 50, 3.0, generator())
     depths = to_camera(found.means, views.cameras)[0, ..., 2].amax(0)  # from the one that shows it
     assert (depths / 3 - 1).abs().max() < 0.04  # half of a step between the depths that are tried
-
-
-def test_half_makes_room_and_the_most_opaque_stay():
-    given = cloud(11)
-    views = walked(3)
-    mixed = partly_swept(given, views, 9, 0.5, generator())
-    assert mixed.count == 9
-    assert torch.equal(mixed.means[:, :5], given.most_opaque(5).means)
-    alone = partly_swept(given, views.select([1]), 9, 0.5, generator())
-    assert torch.equal(alone.means, given.most_opaque(9).means)

@@ -18,7 +18,6 @@ from PIL import Image
 from plyfile import PlyData
 from qgs_photos.refine.initial import from_points, photos_start, photos_world, sparse_points
 from qgs_photos.refine.options import NONE, Options
-from qgs_photos.refine.refining import Extras
 from qgs_photos.refine.result import page_writer
 from qgs_photos.refine.scene_photos import (
     TIMED,
@@ -149,14 +148,6 @@ def test_more_time_buys_larger_photos_and_more_gaussians(photos_of_scene):
     assert sizes[::3] == [(96, 171), (720, 1280)]
     assert len({*sizes}) == 4
     assert chosen(1, Options(size=(90, 160), gaussians=77)) == ((90, 160), 77)
-
-
-def test_chosen_options_are_a_command_line():
-    extras = Extras(degree=2, exposure=True, poses=True)
-    options = Options(size=(64, 112), seconds=30.4, scene="walk", extras=extras, masks=True)
-    words = "--scene walk --size 64x112 --seconds 30 --holdout 8 --degree 2"
-    end = "--adjust poses --adjust exposure --masks"
-    assert options.command("my photos", "out") == f"qgs scene 'my photos' --out out {words} {end}"
 
 
 def test_points_of_colmap_are_part_of_the_start(taken, photos_of_scene, photos, tmp_path):

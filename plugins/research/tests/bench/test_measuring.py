@@ -11,7 +11,7 @@ from unittest.mock import Mock, call
 import pytest
 import torch
 import torch.nn.functional as F
-from qgs_research.bench.run import forward_flops, in_turn, quartiles
+from qgs_research.bench.run import forward_flops, in_turn
 from qgs_research.bench.work import (
     Workload,
     make_task,
@@ -23,16 +23,11 @@ from qgs_research.bench.work import (
 from torch import nn
 from torch.testing import assert_close
 
-from qgs.geometry.transforms import to_camera
 from qgs.recipe import resolve
 
 TOKENGS = "tiny/tokengs.yaml"
 SMALL = ["model.width=32", "model.heads=2", "model.queries.count=12"]
 MODEST = Workload(views=2, targets=2, size=(16, 24))
-
-
-def test_quartiles():
-    assert [*quartiles((2.0, 8.0, 6.0, 4.0, 10.0)).values()] == [4.0, 6.0, 8.0]
 
 
 def test_tasks_take_turns():
@@ -48,15 +43,6 @@ def test_the_recipe_says_how_much_work_there_is():
     assert workload_of(recipe, views=6, size=(64, 32)) == Workload(6, 4, (64, 32))
     with pytest.raises(ValueError, match=r"no data\.image_size.*--size HxW"):
         workload_of(resolve("locus/overlay.yaml"))
-
-
-def test_random_photos_have_poses_that_look_at_one_point():
-    views, again, others = (posed_photos(2, 5, (48, 64), seed) for seed in (0, 0, 1))
-    assert torch.equal(views.images, again.images)
-    assert not torch.equal(views.images, others.images)
-    point = torch.eye(3)[2].expand(2, 1, 3)
-    assert_close(to_camera(point, views.cameras), point[:, None].expand(2, 5, 1, 3))
-    assert views.cameras.intrinsics[0, 0].tolist() == [64, 64, 32, 24]
 
 
 def test_inference_leaves_the_model_alone_and_a_step_trains_every_part():

@@ -27,15 +27,6 @@ def results(name, recipe="", seed=None, step=None, **psnr):
     return replace(stored, recipe=recipe, seed=seed, step=step)
 
 
-def test_the_bootstrap_interval_is_that_of_scipy():
-    differences = np.random.default_rng(1).normal(0.3, 1.0, 60)
-    expected = stats.bootstrap((differences,), np.mean, method="percentile").confidence_interval
-    found = interval(differences[None])
-    assert found == pytest.approx(tuple(expected), abs=0.02)
-    assert found == interval(differences[None])
-    assert interval(np.ones((1, 1))) is interval(np.ones((4, 1))) is None
-
-
 def test_scenes_pair_by_name():
     first = results("first", c=11.0, b=10.0, a=9.0, other=1.0, another=2.0)
     second = results("second", a=10.0, b=12.0, c=11.0, only=50.0)
@@ -126,11 +117,3 @@ def test_the_interval_over_trainings_and_scenes_holds_the_truth():
         truth = of_training**2 / trainings + of_scene**2 / scenes + rest**2 / (trainings * scenes)
         least = stats.t.ppf(0.975, min(trainings, scenes) - 1) * truth**0.5
         assert np.median(half) <= 1.25 * least, case
-
-
-def test_an_interval_widens_with_confidence():
-    assert interval(np.full((3, 4), 2.0)) == (2.0, 2.0)
-    values = np.random.default_rng(0).normal(size=(3, 8))
-    usual = interval(values)
-    sure = interval(values, 0.99)
-    assert sure[0] < usual[0] < usual[1] < sure[1]
