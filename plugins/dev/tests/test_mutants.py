@@ -4,7 +4,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-from contract_mutants import sound, spatial
+from contract_mutants import sound
 from contract_mutants.mutant import MUTANTS, Mutant
 from qgs_dev import CHECKS, Case, checks_for, run_check
 
@@ -40,7 +40,7 @@ SOUND = [
 ]
 
 
-@pytest.mark.parametrize("component", [*SOUND, spatial.TurnsInFull])
+@pytest.mark.parametrize("component", SOUND)
 def test_a_sound_component_passes(component: type[Component]) -> None:
     case = Case(component.Config())
     results = [run_check(check, case) for check in checks_for(case, ["core"])]

@@ -239,22 +239,11 @@ class ExplainsBySigmoid(ContentSelfAttention):
         return AttentionWeights(content, None, torch.sigmoid(content))
 
 
-def explained_twice_as_sharply(given: AttentionWeights) -> AttentionWeights:
-    content = 2 * given.content
-    logits = content if given.geometry is None else content + given.geometry
-    return AttentionWeights(content, given.geometry, logits.softmax(-1))
-
-
 @mutant("updates_are_explained", "of them is left")
-class ExplainsCrossAttentionTooSharply(ContentCrossAttention):
+class ExplainsTooSharply(ContentCrossAttention):
     def explain(self, state, memory, queries):
-        return explained_twice_as_sharply(super().explain(state, memory, queries))
-
-
-@mutant("updates_are_explained", "of them is left")
-class ExplainsSelfAttentionTooSharply(ContentSelfAttention):
-    def explain(self, state, queries):
-        return explained_twice_as_sharply(super().explain(state, queries))
+        content = 2 * super().explain(state, memory, queries).content
+        return AttentionWeights(content, None, content.softmax(-1))
 
 
 @mutant("explanation_is_a_softmax", "content is not finite: a mask is geometry")

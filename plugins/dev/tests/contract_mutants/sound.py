@@ -14,14 +14,9 @@ from torch import nn
 
 from qgs.contracts import (
     MEMORY_FIELDS,
-    ComponentConfig,
-    FieldSpec,
-    LearnedQueries,
     PatchEncoder,
-    SelfAttention,
 )
 from qgs.geometry.rays import patch_rays, plucker_rays
-from qgs.losses import Opacity
 from qgs.tokengs import (
     ContentCrossAttention,
     MlpFeedForward,
@@ -29,21 +24,13 @@ from qgs.tokengs import (
 )
 from qgs.tokengs.blocks import merge_heads
 from qgs.tokengs.encoder import keys_and_values
-from qgs.types import ImageMemory, QueryState
+from qgs.types import ImageMemory
 
 
 @named
 class DropsOut(MlpFeedForward):
     def forward(self, features):
         return F.dropout(super().forward(features), 0.2, self.training)
-
-
-@named
-class LooksNowhere(SelfAttention):
-    """The ablation of a slot: queries exchange nothing."""
-
-    def forward(self, state):
-        return torch.zeros_like(state.features)
 
 
 @named
@@ -73,38 +60,6 @@ class FusesInHalf(ContentCrossAttention):
         else:
             read = (query @ keys.mT * query.shape[-1] ** -0.5).softmax(-1) @ values
         return self.core.out_proj(merge_heads(read))
-
-
-@named
-class DecodesItsQueries(LearnedQueries):
-    """Codes of each query, and what all share: a layer, and the logarithm of a size."""
-
-    class Config(ComponentConfig):
-        count: int = 8
-
-    def __init__(self, config, dims):
-        super().__init__(config, dims)
-        self.code = nn.Parameter(torch.randn(config.count, 16))
-        self.log_size = nn.Parameter(torch.zeros(()))
-        self.up = nn.Linear(16, dims.width)
-
-    @property
-    def count(self) -> int:
-        return self.code.shape[0]
-
-    @classmethod
-    def fields_written(cls, config):
-        return {"place.size": FieldSpec((1,))}
-
-    def start(self, batch_size):
-        size = self.log_size.exp().expand(batch_size, self.count, 1)
-        return QueryState(
-            self.up(self.code).expand(batch_size, -1, -1), {"place.size": size.clone()}
-        )
-
-    def resized(self, learned, generator):
-        codes = super().resized({"code": learned["code"]}, generator)
-        return {**learned, **codes}
 
 
 @named
@@ -163,16 +118,6 @@ class ConvolvesByThree(StridedConvolutions):
 class ConvolvesByFour(StridedConvolutions):
     class Config(StridedConvolutions.Config):
         kernel: int = 4
-
-
-@named
-class WeighsNothing(Opacity):
-    """The ablation of a loss."""
-
-    class Config(Opacity.Config):
-        """A weight of 0."""
-
-        weight: float = 0.0
 
 
 @named

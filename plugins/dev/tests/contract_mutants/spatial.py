@@ -3,8 +3,7 @@
 from dataclasses import replace
 
 import torch
-import torch.nn.functional as F
-from contract_mutants.mutant import mutant, named
+from contract_mutants.mutant import mutant
 from contract_mutants.renderers import ChangedRenderer
 from torch import Tensor, nn
 
@@ -132,21 +131,6 @@ class TurnsInHalf(Steps):
 
     def moved(self, center, step):
         return super().moved(center, self.turned(step, center))
-
-
-@mutant(CHECK, "place.center: values")
-class TurnsByALayerInHalf(TurnsInHalf):
-    def turned(self, step, center):
-        return step.to(center) + F.linear(center, TURN.to(center)).to(center)
-
-
-@named
-class TurnsInFull(TurnsInHalf):
-    """Sound: its layer runs in half precision, and what it does in space does not."""
-
-    def turned(self, step, center):
-        step *= 2
-        return (step.to(center)[..., None, :] * TURN.T.to(center)).sum(-1)
 
 
 @mutant(CHECK, "opacities: values differ")
