@@ -10,8 +10,6 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
-import torch
-from accelerate import Accelerator
 from training_runs import (
     TRAINED,
     TWO,
@@ -27,7 +25,6 @@ from training_runs import (
 
 import qgs
 from qgs.checkpoint.model_file import CheckpointFile
-from qgs.train.distributed import RandomStates
 from qgs.train.folder import OtherRunError, RunFolder, read_state, write_state
 
 SCHEDULED = """
@@ -174,14 +171,6 @@ def test_a_finished_run_is_left_as_it_is_and_others_are_refused(trained_run, cop
     change_counters(copied, scenes="others")
     with pytest.raises(OtherRunError, match="other training scenes"):
         resumed(copied)
-
-
-def test_random_states_come_back():
-    states = RandomStates(Accelerator(cpu=True))
-    saved = states.state()
-    first = torch.rand(3)
-    states.load_state(saved)
-    assert torch.equal(torch.rand(3), first)
 
 
 @pytest.mark.slow
