@@ -62,8 +62,11 @@ def open_file(path: Path | UPath) -> IO[bytes]:
 
 def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
     """Return the bytes of `path`. Raises OSError for more than `most` and damaged archives."""
+    # Held while it is read: a thread that uses `path` at the same moment may replace its archive,
+    # which closes once nobody holds it.
+    system: Any = getattr(path, "fs", None)
     try:
-        with open_file(path) if is_local(path) else path.open("rb") as file:
+        with open_file(path) if is_local(path) else system.open(UPath(path).path) as file:
             # The header of an archive may promise less than it holds.
             content: bytes = file.read(most + 1)
     except _DAMAGED as error:

@@ -105,10 +105,7 @@ def orientation(image: Image.Image) -> int:
 
 def decode_alpha(file: IO[bytes]) -> np.ndarray:
     """Decode the alpha channel of a photo as (H, W) uint8; 255 for none. Raises OSError."""
-    image = eight_bits(_decoded(file))
-    if not image.has_transparency_data:
-        return np.full((image.height, image.width), 255, np.uint8)
-    return np.array(image.convert("RGBA").getchannel("A"))
+    return np.array(eight_bits(_decoded(file)).convert("RGBA").getchannel("A"))
 
 
 def decode_depth(file: IO[bytes], unit: float = 1.0) -> np.ndarray:
@@ -175,14 +172,10 @@ def decode_mask(file: IO[bytes]) -> np.ndarray:
 
     Raises OSError for no image, or one with colours.
     """
-    image = eight_bits(_decoded(file))
-    if image.mode in ("1", "L") and not image.has_transparency_data:
-        grey = np.array(image.convert("L"))
-    else:
-        rgba = np.array(image.convert("RGBA"))
-        grey = rgba[..., 0]
-        if (rgba[..., 1:3] != rgba[..., :1]).any() or (rgba[..., 3] != 255).any():
-            raise OSError("it has colours or transparency: give a grey image, white on the object")
+    rgba = np.array(eight_bits(_decoded(file)).convert("RGBA"))
+    grey = rgba[..., 0]
+    if (rgba[..., 1:3] != rgba[..., :1]).any() or (rgba[..., 3] != 255).any():
+        raise OSError("it has colours or transparency: give a grey image, white on the object")
     # Some tools write 0 and 1.
     return grey * np.uint8(255) if grey.max() == 1 else grey
 

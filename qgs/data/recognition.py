@@ -37,8 +37,6 @@ def _recognises(kind: str, source: type[Component], path: UPath) -> bool:
         return source.recognises(path)
     # One of a plugin must not hinder the others.
     except Exception as error:
-        if kind.startswith("qgs/"):
-            raise
         warn_once(f"{kind} is not asked whether it reads {path}: it raises {one_line(error)}")
         return False
 

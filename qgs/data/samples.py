@@ -108,8 +108,10 @@ def with_noise(
 ) -> Cameras:
     """Return cameras (1, F), the first `inputs` of them, but for the first, with noise.
 
-    They turn and move by `ViewsConfig.pose_noise`.
+    They turn and move by `ViewsConfig.pose_noise`; without it nothing is drawn.
     """
+    if not views.pose_noise:
+        return cameras
     c2w = cameras.c2w[0, :inputs]
     angle = math.radians(views.pose_noise)
     turns, moves = torch.from_numpy(rng.normal(0, angle, (2, inputs, 3))).to(c2w)
@@ -128,24 +130,17 @@ def views_in(
 ) -> Views:
     """Read views (1, F) of these frames in a world as of `own_world`, float32; times are 0 to 1."""
     refuse_too_many(len(frames), scene)
-    # A frame that is input and target, or target twice, is decoded once.
-    wanted = sorted(set(frames))
-    order = [wanted.index(frame) for frame in frames]
-
-    def in_order(maps: Tensor | None) -> Tensor | None:
-        return None if maps is None else torch.from_numpy(maps.numpy()[order])[None]
-
+    wanted = list(frames)
+    masks = scene.masks(wanted)
     surface = scene.depths(wanted) if depths else None
-    if surface is not None:
-        # The z of cameras scales with their translations.
-        surface = surface * world[1].float()
-    times = None if scene.times is None else from_0_to_1(scene.times[list(frames)])
+    times = None if scene.times is None else from_0_to_1(scene.times[wanted])
     return Views(
-        images=torch.from_numpy(scene.images(wanted).numpy()[order])[None],
+        images=scene.images(wanted)[None],
         cameras=cameras_in(world, scene, frames),
-        masks=in_order(scene.masks(wanted)),
+        masks=None if masks is None else masks[None],
         times=None if times is None else times[None].float(),
-        depths=in_order(surface),
+        # The z of cameras scales with their translations.
+        depths=None if surface is None else (surface * world[1].float())[None],
     )
 
 

@@ -45,14 +45,12 @@ class BoundedCache(Generic[Value]):
 
 
 class LazyScenes(Sequence[Scene]):
-    """Scenes of the first `limit` places (0: all), opened when indexed; 64 stay open."""
+    """Scenes of `places` by name, opened when indexed; 64 stay open."""
 
-    def __init__(
-        self, places: Mapping[str, Any], open: Callable[[str, Any], Scene], limit: int = 0
-    ) -> None:
-        self.names = list(places)[: limit or None]
+    def __init__(self, places: Mapping[str, Any], open: Callable[[str, Any], Scene]) -> None:
+        self.names = list(places)
+        self.places = places
         self._open = open
-        self.places = {name: places[name] for name in self.names}
         self._opened: BoundedCache[Scene] = BoundedCache(64)
 
     def __len__(self) -> int:

@@ -198,7 +198,7 @@ class SampleStream(Dataset[Batch | Exception]):
         _, inputs, targets = self._drawn(scene, rng, step)
         count = len(inputs)
         both = cameras_in(own_world(scene, inputs, self._views), scene, (*inputs, *targets))
-        both = with_noise(both, count, self._views, rng) if self._views.pose_noise else both
+        both = with_noise(both, count, self._views, rng)
         return both[:, :count], both[:, count:]
 
     def _drawn(

@@ -52,3 +52,18 @@ def test_files_that_are_read_whole_have_a_limit(tmp_path):
     member = UPath(f"zip:///::{tmp_path / 'a.zip'}") / "large"
     assert len(open_file(member).read()) == 10**6
     must_refuse(r"large.*a\.zip is larger than 1 kB", read_file, member, 1000, kind=OSError)
+
+
+def test_an_archive_that_another_thread_replaces_stays_open_while_it_is_read(tmp_path, monkeypatch):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr("inside", bytes(10**5))
+    member = UPath(f"zip:///::{tmp_path / 'a.zip'}") / "inside"
+    system = type(member.fs)
+    whole = system._open
+
+    def replaced(self, path, *given, **options):
+        del member._fs_cached
+        return whole(self, path, *given, **options)
+
+    monkeypatch.setattr(system, "_open", replaced)
+    assert len(read_file(member)) == 10**5

@@ -1,8 +1,9 @@
 """`datasets/chunks`: RealEstate10K-style chunks; their format is described in `chunk_files`."""
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
+from itertools import islice
 from typing import ClassVar
 
 import numpy as np
@@ -184,7 +185,7 @@ class ChunksSource(LazySource):
         splits: dict[Split, LazyScenes] = {"train": self._nothing}
         for split, folder in _folders(opened_path(config.path)).items():
             files = _long_enough(folder, config, opener)
-            splits[split] = LazyScenes(files, opener, config.max_scenes)
+            splits[split] = first_scenes(files, config.max_scenes, opener)
         self.splits = splits
 
     @classmethod
@@ -209,6 +210,13 @@ class ChunksSource(LazySource):
         for index, file in enumerate(self.scenes(split).places.values()):
             by_file.setdefault(str(file), []).append(index)
         return list(by_file.values())
+
+
+def first_scenes(
+    places: Mapping[str, UPath], limit: int, opener: Callable[[str, UPath], Scene]
+) -> LazyScenes:
+    """Return the first `limit` scenes; all for 0."""
+    return LazyScenes(dict(islice(places.items(), limit or None)), opener)
 
 
 def _folders(path: UPath) -> dict[Split, UPath]:

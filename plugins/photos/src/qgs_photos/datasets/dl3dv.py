@@ -12,9 +12,10 @@ from upath import UPath
 from qgs.contracts import SceneSource
 from qgs.data.photos import formats_of
 from qgs.data.photos.source import PhotoScene, PhotosConfig
-from qgs.data.scenes import BoundedCache, LazyScenes, LazySource
+from qgs.data.scenes import BoundedCache, LazySource
 from qgs.paths import opened_path, read_file, read_json
 from qgs.wording import listed, warn_once
+from qgs_photos.datasets.chunks import first_scenes
 
 LISTING = "transforms.json"
 # Folders of a scene that may hold the listing.
@@ -73,8 +74,8 @@ class Dl3dvSource(LazySource):
         photos = PhotosConfig(format="nerfstudio", **same)
         opener = partial(_opened, config=photos, cache=BoundedCache(0))
         self.splits = {
-            "train": LazyScenes(train, opener, config.max_scenes),
-            "test": LazyScenes(test, opener, config.max_scenes),
+            "train": first_scenes(train, config.max_scenes, opener),
+            "test": first_scenes(test, config.max_scenes, opener),
         }
 
     @classmethod
