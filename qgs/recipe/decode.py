@@ -77,9 +77,9 @@ def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen
     name = type_at(node, place.path)
     known = registry.components(place.slot)
     if not isinstance(name, str) or name not in known:
-        reason, fix = _why_no_component(name, place.slot, registry)
+        why = _why_no_component(name, place.slot, registry)
         origin = node.origins.get("type", place.origin)
-        return problems.add(origin, (*place.source, "type"), reason, fix)
+        return why and problems.add(origin, (*place.source, "type"), *why)
     component = known[name]
     installed = registry.plugins[name.partition("/")[0]]
     try:
@@ -130,8 +130,8 @@ def corners(schedules: Mapping[str, Schedule]) -> list[int]:
     return sorted({0, *(step for schedule in schedules.values() for step in schedule.corners)})
 
 
-def _why_no_component(name: object, slot: str, registry: Registry) -> tuple[str, str]:
-    """Reason and fix for a `type` that names no component of `slot`."""
+def _why_no_component(name: object, slot: str, registry: Registry) -> tuple[str, str] | None:
+    """Reason and fix for a `type` that names no component of `slot`; None where that is told."""
     known = registry.components(slot)
     choice = f"choose {', '.join(sorted(known))}"
     if not isinstance(name, str):
@@ -139,6 +139,9 @@ def _why_no_component(name: object, slot: str, registry: Registry) -> tuple[str,
         return f"`type` must name a component of the slot `{slot}`, got {brief(name)}", choice
     plugin, slash, _ = name.partition("/")
     if slash and plugin not in registry.plugins:
+        # It may be one of a plug-in that cannot be used, which is a problem by itself.
+        if not registry.complete:
+            return None
         reason = f"`{name}` is of the plugin `{plugin}`, which this recipe does not use"
         return reason, f"add `plugins: [{plugin}]`, which joins those of its base"
     # The same name may stand in several slots, such as `qgs/none`.

@@ -14,7 +14,7 @@ import qgs.tokengs
 from qgs import extensions
 from qgs.contracts import Component, ComponentConfig, OptionError
 from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
-from qgs.recipe.errors import Problems
+from qgs.recipe.errors import Problems, did_you_mean
 from qgs.recipe.slots import SLOTS
 from qgs.recipe.yaml_text import MapNode, items_of
 from qgs.version import __version__
@@ -63,9 +63,10 @@ class InstalledPlugin:
 
 @dataclass(frozen=True)
 class Registry:
-    """The plugins that one recipe uses."""
+    """The plugins that one recipe uses. complete: whether all that it names can be used."""
 
     plugins: Mapping[str, InstalledPlugin]
+    complete: bool = True
 
     def components(self, slot: str) -> dict[str, type[Component]]:
         """`PLUGIN/NAME` to component, of one slot."""
@@ -98,7 +99,7 @@ def load_registry(names: Iterable[str]) -> Registry:
 def load_plugins(
     names: Sequence[str], tree: MapNode, problems: Problems, given: Sequence[Plugin]
 ) -> Registry:
-    """The components of the plugins `names` of a recipe; raises RecipeError where one is unusable.
+    """The components of the plugins `names` of a recipe; each that is unusable is a problem.
 
     given: plugins that need not be installed.
     """
@@ -111,10 +112,7 @@ def load_plugins(
         except PluginError as error:
             origin = written[index][1]
             problems.add(origin, f"plugins.{index}", error.reason, error.fix, error)
-    if not plugins.keys() >= {*names}:
-        # Each of their components would be a problem more.
-        problems.raise_any()
-    return Registry(plugins)
+    return Registry(plugins, complete=plugins.keys() >= {*names})
 
 
 def load_usable_plugins() -> tuple[Registry, list[str]]:
@@ -136,8 +134,7 @@ def load_plugin(name: str) -> InstalledPlugin:
         return builtin()
     available = available_plugins()
     if not (entries := available.get(name)):
-        installed = ", ".join(sorted(available)) or "none"
-        fix = f"{extensions.INSTALL_ALL}; installed plugins: {installed}"
+        fix = f"{extensions.INSTALL_ALL}; {did_you_mean(name, available, 'installed plugins')}"
         raise PluginError(f"no installed distribution offers a plugin `{name}`", fix)
     if len(entries) > 1:
         releases = ", ".join(sorted(map(_release, entries)))
