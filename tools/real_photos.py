@@ -23,11 +23,11 @@ import torch.nn.functional as F
 from kornia.geometry.transform import warp_perspective
 from qgs_photos.datasets.overlapping import apart
 from qgs_photos.refine import refine
-from qgs_viewer.comparison import checkpoints, recipes_alike
+from qgs_viewer.comparison import checkpoints, recipes_alike, spread_windows
 from torch import Tensor
 
 from qgs.checkpoint.model_file import CheckpointFile, load
-from qgs.data.inputs import choose_windows, scene_depth
+from qgs.data.inputs import scene_depth
 from qgs.data.samples import Sample, make_sample, own_world
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
@@ -80,7 +80,7 @@ def scene_rows(
     with CheckpointFile(options.model[0]) as file:
         domain = apart(file.domain, distance)
     search = ScaleSearch(model, views.model_copy(update={"scale": "search"}))
-    for inputs, targets in choose_windows(scene, views, domain, options.windows):
+    for inputs, targets in spread_windows(scene, views.inputs, domain, options.windows):
         found = search(scene, inputs, targets).scale_factor
         auto = float(own_world(scene, inputs, views.model_copy(update={"scale": "auto"}))[1])
         sample = make_sample(scene, inputs, targets, constant_scale(views, 1.0), mirror=False)

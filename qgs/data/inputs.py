@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.containers import map_tensors
-from qgs.contracts import Frames, Scene, ViewsConfig
+from qgs.contracts import Frames, Scene
 from qgs.data.frames import evenly
 from qgs.domain import Domain
 from qgs.geometry.poses import largest_distance, look_at_depth
@@ -42,8 +42,6 @@ _NEAR = 48
 _POINTS = 6
 # Least share of a compared photo that the inputs see.
 _SEEN = 0.7
-# Cost above the best window's up to which a window is shown.
-_POOR = 1.0
 # Photos that are swept, and the ranks by distance of those that each is matched with.
 _PHOTOS = 4
 _OTHERS = (0, 1, 4)
@@ -59,22 +57,18 @@ _MOST_COST = 0.3
 _MARGIN = 0.03
 
 
-def choose_windows(
-    scene: Scene,
-    views: ViewsConfig,
-    trained_on: Domain,
-    count: int = 1,
-    held_out: Sequence[int] | None = None,
-) -> list[Window]:
-    """Return at most `count` windows of `scene`, the best first, the others spread over the scene.
+def ranked_windows(
+    frusta: "Frusta", inputs: int, held_out: Sequence[int] | None = None
+) -> list[tuple[float, Frames, int]]:
+    """Return cost, `inputs` input frames and compared frame of windows of a scene, the best first.
 
-    Each has `views.inputs` inputs, none of them held out. A window is made for each photo to
-    compare with, a held-out one where there are: of the photos near it those that together see most
-    of it, overlap, and stand as far apart as in training. Deterministic; the order of the frames
-    does not matter. held_out: by default the scene's. ValueError for fewer photos than inputs.
+    A window is made for each photo to compare with, a held-out one where there are: of the photos
+    near it those that together see most of it, overlap, and stand as far apart as in training. None
+    where all photos are inputs. Deterministic; the order of the frames does not matter. held_out:
+    by default the scene's. ValueError for fewer photos than inputs.
     """
+    scene = frusta.scene
     held = sorted(scene.held_out if held_out is None else held_out)
-    inputs = views.inputs
     usable = [frame for frame in range(len(scene)) if frame not in held]
     if inputs > len(usable):
         besides = f" beside {len(held)} held-out ones" if held else ""
@@ -83,18 +77,8 @@ def choose_windows(
             "photos, take fewer inputs, or hold no photos out"
         )
     targets = held or (usable if len(usable) > inputs else [])
-    if not targets:
-        return [(tuple(usable), ())]
-    frusta = Frusta(scene, trained_on)
     usable = evenly(usable, _MOST)
-    ranked = sorted((*frusta.window(t, usable, inputs), t) for t in evenly(targets, _MOST))
-    best, _, first = ranked[0]
-    good = {target: window for cost, window, target in ranked if cost <= best + _POOR}
-    chosen = [first]
-    while len(chosen) < min(count, len(good)):
-        # The farthest from all chosen ones; of equal ones the best.
-        chosen.append(max(good.keys() - {*chosen}, key=lambda t: frusta.far[t, chosen].min()))
-    return [(good[target], frusta.compared(good[target], target)) for target in chosen]
+    return sorted((*frusta.window(t, usable, inputs), t) for t in evenly(targets, _MOST))
 
 
 def trained_ratios(trained_on: Domain) -> tuple[tuple[float, float], float]:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.frames import evenly, moments, spread
-from qgs.data.inputs import NOVEL, Frusta, Window, choose_windows
+from qgs.data.inputs import NOVEL, Frusta, Window, ranked_windows
 from qgs.data.samples import Sample, make_sample, own_world
 from qgs.domain import Domain, verdict
 from qgs.evaluate.plan import ViewsOf
@@ -115,7 +115,7 @@ def choose_sample(
 ) -> tuple[Sample, tuple[Tensor, Tensor]]:
     """Return inputs and compared views of `scene`, and their world as of `own_world`.
 
-    frames, compare: by default the best of `choose_windows`; where times are known, inputs spread
+    frames, compare: by default the best of `ranked_windows`; where times are known, inputs spread
     over them, and views of one time between. trained_on: of the model. views_of: makes the settings
     of the chosen views, such as their scale; None takes `views`. Raises ValueError for frames that
     do not exist or come twice, and for too few.
@@ -129,7 +129,10 @@ def choose_sample(
     if scene.times is not None:
         frames, novel = _over_time(scene, scene.times, views, frames)
     elif frames is None:
-        frames, novel = choose_windows(scene, views, domain, held_out=compare)[0]
+        frusta = Frusta(scene, domain)
+        ranked = ranked_windows(frusta, views.inputs, compare)
+        _, frames, target = ranked[0] if ranked else (0, tuple(range(len(scene))), None)
+        novel = frusta.compared(frames, target)
     elif compare is None:
         novel = Frusta(scene, domain).compared(tuple(frames))
     # Named photos win over those that were chosen beside the inputs.

@@ -1,6 +1,7 @@
 """nerfstudio's masks, depth maps, splits and scaled copies."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -116,7 +117,7 @@ def test_doubtful_intrinsics_are_read_and_told(folder, caplog):
     change(folder, 2, cx=55.0)
     change(folder, 4, fl_x=2000.0, fl_y=2000.0)
     assert read(folder).cameras.intrinsics[[2, 4], [2, 0]].tolist() == [55, 2000]
-    assert "2 of 6 frames are doubtful: frame 2 (images/view_002.png)" in caplog.text
+    assert re.search(r"2 of 6 frames .*implausible.*: images/view_002\.png", caplog.text)
 
 
 def test_the_world_is_that_of_the_poses(folder):

@@ -11,8 +11,8 @@ from qgs.data.photos.reader import (
     PhotoReader,
     existing,
     installed_readers,
-    refuse_fatal_problems,
     refuse_outside,
+    refuse_problems,
 )
 from qgs.paths import is_local, listing
 from qgs.wording import listed, warn_once
@@ -112,7 +112,7 @@ def present_frames(
     present = [frame for frame in frames if frame.path in there]
     missing = [str(frame.path) for frame in frames if frame.path not in there]
     # Before the count: a wrong listing explains missing images.
-    refuse_fatal_problems(found.file, present if len(present) > 1 else frames)
+    refuse_problems(found.file, present if len(present) > 1 else frames)
     if len(present) < 2:
         raise FileNotFoundError(
             f"{found.file} names {count} images, but {len(present)} exist and 2 are needed: add "

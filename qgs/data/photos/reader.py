@@ -20,6 +20,10 @@ Intrinsics: TypeAlias = tuple[float, float, float, float]
 Size: TypeAlias = tuple[int, int]
 GROUP = "qgs.photo_readers"
 """Entry point group of further readers: format name = module:subclass of `PhotoReader`."""
+UNLESS = (
+    "correct them, unless the photo is cut from a larger one; fx and cx go with the width, fy and "
+    "cy with the height"
+)
 _COPY = re.compile(r"images(_\d+)?")
 # Pixels of a listed photo.
 LARGEST_SIDE = 10**6
@@ -41,11 +45,10 @@ _FOCAL = (0.1, 30.0)
 
 @dataclass(frozen=True)
 class FrameProblem:
-    """A fault of a `PhotoFrame`. fatal: see `refuse_fatal_problems`."""
+    """A fault of a `PhotoFrame`."""
 
     reason: str
     fix: str
-    fatal: bool = True
 
     def __str__(self) -> str:
         return f"{self.reason}: {self.fix}"
@@ -79,7 +82,7 @@ class Lens(ABC):
 
 @dataclass(frozen=True)
 class PhotoFrame:
-    """One photo as listed; nothing of it is judged yet (see `refuse_fatal_problems`).
+    """One photo as listed; nothing of it is judged yet (see `refuse_problems`).
 
     name: the image file relative to the scene's folder. path: that file. mask: its mask; the image
     itself for its alpha channel. depth: its depth map. c2w: (4, 4) float64 OpenCV camera-to-world.
@@ -262,7 +265,7 @@ def pose_problems(c2w: np.ndarray) -> Iterator[FrameProblem]:
 
 
 def intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> Iterator[FrameProblem]:
-    """Yield problems of fx, fy, cx, cy in pixels of `size` (H, W); not all are fatal."""
+    """Yield problems of fx, fy, cx, cy in pixels of `size` (H, W)."""
     fx, fy, cx, cy = intrinsics
     values = f"(fx {fx:.6g}, fy {fy:.6g}, cx {cx:.6g}, cy {cy:.6g})"
     if not all(map(math.isfinite, intrinsics)) or fx <= 0 or fy <= 0:
@@ -273,20 +276,16 @@ def intrinsics_problems(intrinsics: Intrinsics, size: Size | None) -> Iterator[F
     if max(fx, fy) < _NORMALISED and (in_pixels or max(abs(cx), abs(cy)) <= 1):
         fix = "they must be in pixels; multiply fx and cx by the width, fy and cy by the height"
         yield FrameProblem(f"the intrinsics look normalised {values}", fix)
-        return
-    if size is None:
-        return
+
+
+def are_plausible(intrinsics: Intrinsics, size: Size) -> bool:
+    """Return whether fx, fy, cx, cy are those of a usual whole photo of `size` (H, W)."""
+    fx, fy, cx, cy = intrinsics
     height, width = size
     nearest, farthest = (limit * max(size) for limit in _FOCAL)
     off_centre = max(abs(cx / width - 0.5), abs(cy / height - 0.5))
-    plausible = nearest <= min(fx, fy) and max(fx, fy) <= farthest and off_centre <= _OFF_CENTRE
-    if not plausible or not 1 / _SQUARE < fx / fy < _SQUARE:
-        yield FrameProblem(
-            f"the intrinsics {values} are implausible for {width} x {height} pixels",
-            "correct them, unless the photo is cut from a larger one; fx and cx go with the width, "
-            "fy and cy with the height",
-            fatal=False,
-        )
+    usual = nearest <= min(fx, fy) and max(fx, fy) <= farthest and off_centre <= _OFF_CENTRE
+    return usual and 1 / _SQUARE < fx / fy < _SQUARE
 
 
 def size_problems(size: Size, listed: Size | None) -> Iterator[FrameProblem]:
@@ -318,20 +317,16 @@ def listed_size(height: float, width: float) -> tuple[Size | None, tuple[FramePr
     return None, (FrameProblem(reason, "correct the width and height"),)
 
 
-def refuse_fatal_problems(listing: object, frames: Sequence[PhotoFrame]) -> None:
-    """Raise ValueError for the first fatal problem, with its frame; log the others."""
-    doubtful: list[str] = []
+def refuse_problems(listing: object, frames: Sequence[PhotoFrame]) -> None:
+    """Raise ValueError for the first problem, with its frame; log implausible intrinsics."""
     for index, frame in enumerate(frames):
-        problems = frame.problems or (
+        for problem in frame.problems or (
             *pose_problems(frame.c2w),
             *intrinsics_problems(frame.intrinsics, frame.size),
-        )
-        where = f"frame {numbered(index, frame.name)}"
-        for problem in problems:
-            if problem.fatal:
-                raise ValueError(f"{listing}: {where}: {problem}")
-        if problems:
-            doubtful.append(f"{where}: {problems[0]}")
+        ):
+            raise ValueError(f"{listing}: frame {numbered(index, frame.name)}: {problem}")
+    doubtful = [f.name for f in frames if f.size and not are_plausible(f.intrinsics, f.size)]
     if doubtful:
-        shown = listed(doubtful, 3, "; ")
-        warn_once(f"{listing}: {len(doubtful)} of {len(frames)} frames are doubtful: {shown}")
+        count = f"{len(doubtful)} of {len(frames)}"
+        what = f"{count} frames have intrinsics that are implausible for the size"
+        warn_once(f"{listing}: {what}: {listed(doubtful, 3)}; {UNLESS}")

@@ -13,7 +13,7 @@ from qgs.checkpoint.model_file import CheckpointFile
 from qgs.checkpoint.models import about, checkpoint_path
 from qgs.contracts import Scene, ViewsConfig
 from qgs.data.frames import Span
-from qgs.data.inputs import Window, choose_windows
+from qgs.data.inputs import Frusta, Window, ranked_windows
 from qgs.data.recognition import is_training_data, open_for
 from qgs.domain import Domain
 from qgs.evaluate.evaluation import evaluate
@@ -48,8 +48,27 @@ OF_THE_METHOD = (
 unit of a model's world, which no score depends on."""
 
 
+# Cost above the best window's up to which a window is shown.
+POOR = 1.0
+
+
+def spread_windows(scene: Scene, inputs: int, trained_on: Domain, count: int) -> list[Window]:
+    """Return at most `count` of `ranked_windows`, the best first, the others spread over the scene.
+
+    The compared frames of each are the photos near it. ValueError for fewer photos than inputs.
+    """
+    frusta = Frusta(scene, trained_on)
+    ranked = ranked_windows(frusta, inputs)
+    good = {target: window for cost, window, target in ranked if cost <= ranked[0][0] + POOR}
+    chosen = [target for *_, target in ranked[:1]]
+    while len(chosen) < min(count, len(good)):
+        # the farthest from all chosen ones; of equal ones the best
+        chosen.append(max(good.keys() - {*chosen}, key=lambda t: frusta.far[t, chosen].min()))
+    return [(good[target], frusta.compared(good[target], target)) for target in chosen]
+
+
 class PhotoWindows(Span):
-    """WINDOWS windows of each scene by `choose_windows`, chosen once."""
+    """WINDOWS windows of each scene by `spread_windows`, chosen once."""
 
     def __init__(self, trained_on: Domain) -> None:
         super().__init__(Span.Config())
@@ -62,7 +81,7 @@ class PhotoWindows(Span):
             # a moment of a moving scene has few views; the recipe's sampler knows which
             return []
         if scene.name not in self._known:
-            windows = choose_windows(scene, views, self._trained_on, WINDOWS)
+            windows = spread_windows(scene, views.inputs, self._trained_on, WINDOWS)
             if not any(compared for _, compared in windows):
                 raise ValueError(
                     f"all {len(scene)} photos are inputs, none is left to compare with: add one "

@@ -216,8 +216,7 @@ def require_usable(record: Record) -> None:
     # checking all frames at once first is ten times as fast as one by one
     for frame in () if usable else range(len(record)):
         for problem in camera_problems(record, frame):
-            if problem.fatal:
-                raise ValueError(f"{record.place(frame)}: {problem}")
+            raise ValueError(f"{record.place(frame)}: {problem}")
 
 
 def camera_problems(record: Record, frame: int) -> Iterator[FrameProblem]:

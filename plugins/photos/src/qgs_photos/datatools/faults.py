@@ -5,7 +5,14 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from scipy.spatial import KDTree
 
-from qgs.data.photos.reader import intrinsics_problems, pose_problems, size_problems
+from qgs.data.photos.reader import (
+    UNLESS,
+    FrameProblem,
+    are_plausible,
+    intrinsics_problems,
+    pose_problems,
+    size_problems,
+)
 from qgs_photos.datatools.findings import Finding
 from qgs_photos.datatools.photos import DecodedScene
 
@@ -28,7 +35,13 @@ def photo_findings(scene: DecodedScene) -> Iterator[Finding]:
         problems = list(listed.problems)
         # a wrong size makes intrinsics look wrong
         problems += size_problems(result.size, listed.size) if result.size else ()
-        problems = problems or intrinsics_problems(listed.intrinsics, listed.size or result.size)
+        size = listed.size or result.size
+        problems = problems or [*intrinsics_problems(listed.intrinsics, size)]
+        if size and not problems and not are_plausible(listed.intrinsics, size):
+            fx, fy, cx, cy = listed.intrinsics
+            values = f"(fx {fx:.6g}, fy {fy:.6g}, cx {cx:.6g}, cy {cy:.6g})"
+            reason = f"the intrinsics {values} are implausible for {size[1]} x {size[0]} pixels"
+            problems = [FrameProblem(reason, UNLESS)]
         for problem in problems:
             yield scene.finding([frame], problem.reason, problem.fix)
     empty = [frame for frame, result in enumerate(scene.decoded) if result.empty_mask]
