@@ -118,9 +118,16 @@ def raise_precision(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, 
     return gaussians.to(dtype), cameras.to(dtype)
 
 
-def colors_of(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Colours (B, G, 3), or (B, V, G, 3) where they depend on the direction."""
-    return gaussians.colors if gaussians.sh is None else seen_colors(gaussians, cameras)
+def channels_of(gaussians: Gaussians, cameras: Cameras) -> Tensor:
+    """What is blended: colours as cameras see them, then features.
+
+    (B, V, G, 3 + F); (B, 1, G, 3 + F) where all cameras see the same.
+    """
+    colors = seen_colors(gaussians, cameras)
+    if gaussians.features is None:
+        return colors
+    features = gaussians.features[:, None].expand(*colors.shape[:-1], -1)
+    return torch.cat([colors, features], -1)
 
 
 def background_of(

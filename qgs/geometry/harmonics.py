@@ -40,13 +40,13 @@ def harmonics(directions: Tensor, count: int) -> Tensor:
 
 @full_precision
 def seen_colors(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Colours (B, V, G, 3), at least 0, of Gaussians (B, G) with `sh` in cameras (B, V).
+    """Colours (B, V, G, 3) of Gaussians (B, G) in cameras (B, V), at least 0.
 
-    The direction is that from a camera's centre to a mean. Differentiable in colors, sh, means and
-    c2w.
+    Without `sh` they are `colors`, (B, 1, G, 3) for all cameras. The direction is that from a
+    camera's centre to a mean. Differentiable in colors, sh, means and c2w.
     """
     if gaussians.sh is None:
-        raise ValueError("these Gaussians have no spherical harmonics: `colors` are what is seen")
+        return gaussians.colors[:, None]
     directions = F.normalize(gaussians.means[:, None] - cameras.c2w[..., None, :3, 3], dim=-1)
     # Directions from the camera to the Gaussian, as the 3DGS release has them.
     values = harmonics(directions, gaussians.sh.shape[-2])

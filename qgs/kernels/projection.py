@@ -138,15 +138,15 @@ def _turn(pose, factor_columns):
 
 
 @kernel
-def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, size, limits, splats):
+def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, splats):
     """Fill splats (V, G, 9) for the Gaussians [first, last) of one scene.
 
     means (G, 3), scales (G, 3), quats (G, 4), opacities (G,), c2w (V, 4, 4), lenses (V, 4).
-    size: height and width. limits: near, far, dilation, alpha_min, margin of the clamped Jacobian.
+    limits: near, far, dilation, alpha_min, margin of the clamped Jacobian, height, width.
     A contribution reaches alpha_min where the Mahalanobis distance is sqrt(2 ln(opacity /
     alpha_min)); half a pixel, and a little in the power, are added against rounding.
     """
-    near, far, dilation, alpha_min, margin = limits
+    near, far, dilation, alpha_min, margin, height, width = limits
     for g in range(bounds[0], bounds[1]):
         rows, _, _ = _rotation(quats[g])
         factor = _scaled_columns(rows, _vector(scales[g]))
@@ -168,8 +168,8 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, size, lim
             x = seen[0] / z
             y = seen[1] / z
             turned = _turn(pose, factor)
-            held_x, _ = _clamp(x, fx, cx, size[1], margin)
-            held_y, _ = _clamp(y, fy, cy, size[0], margin)
+            held_x, _ = _clamp(x, fx, cx, width, margin)
+            held_y, _ = _clamp(y, fy, cy, height, margin)
             row_x = _image_factor(turned, 0, held_x, fx, z)
             row_y = _image_factor(turned, 1, held_y, fy, z)
             xx = _dot(row_x, row_x)
@@ -286,23 +286,22 @@ def _sum_parts(given, g, slopes):
 
 @kernel
 def project_backward_unit(
-    means, scales, quats, c2w, lenses, bounds, size, limits, splats, given, wants_cameras,
-    of_means, of_scales, of_quats, of_opacities, of_colors, of_cameras,
+    means, scales, quats, c2w, lenses, bounds, limits, splats, given, wants_cameras,
+    of_means, of_scales, of_quats, of_opacities, of_cameras,
 ):  # fmt: skip
     """Gradients of what `project_unit` projected, from those of the rasteriser, (V, P, G, 10).
 
     P partial gradients per view are added first. Writes of_means (G, 3), of_scales (G, 3),
-    of_quats (G, 4), of_opacities (G,) and of_colors (G, 3), and adds to of_cameras (V, 16) if
-    `wants_cameras`.
+    of_quats (G, 4) and of_opacities (G,), and adds to of_cameras (V, 16) if `wants_cameras`.
     """
-    _, _, dilation, _, margin = limits
+    _, _, dilation, _, margin, height, width = limits
     zeros = (_ZERO, _ZERO, _ZERO)
     slopes = np.empty(given.shape[3], np.float32)
     for g in range(bounds[0], bounds[1]):
         rows, quat, norm = _rotation(quats[g])
         scale = _vector(scales[g])
         factor = _scaled_columns(rows, scale)
-        of_mean = of_color = zeros
+        of_mean = zeros
         of_opacity = _ZERO
         of_factor = (zeros, zeros, zeros)
         for v in range(c2w.shape[0]):
@@ -311,14 +310,13 @@ def project_backward_unit(
                 continue
             _sum_parts(given[v], g, slopes)
             of_opacity += slopes[6]
-            of_color = _plus(of_color, _ONE, _vector(slopes[7:]))
             pose, offset, seen = _seen(c2w[v], means[g])
             fx, fy, cx, cy = _four(lenses[v])
             z = seen[2]
             x, y = seen[0] / z, seen[1] / z
             turned = _turn(pose, factor)
-            held_x, is_held_x = _clamp(x, fx, cx, size[1], margin)
-            held_y, is_held_y = _clamp(y, fy, cy, size[0], margin)
+            held_x, is_held_x = _clamp(x, fx, cx, width, margin)
+            held_y, is_held_y = _clamp(y, fy, cy, height, margin)
             row_x = _image_factor(turned, 0, held_x, fx, z)
             row_y = _image_factor(turned, 1, held_y, fy, z)
             of_row_x, of_row_y = _covariance_slopes(row_x, row_y, splat, slopes, dilation)
@@ -342,6 +340,5 @@ def project_backward_unit(
         of_columns, axes = _columns(of_factor), _columns(rows)
         for i in range(3):
             of_means[g, i] = of_mean[i]
-            of_colors[g, i] = of_color[i]
             of_scales[g, i] = _dot(of_columns[i], axes[i])
         _quat_slopes(quat, norm, _columns(_scaled_columns(of_factor, scale)), of_quats[g])

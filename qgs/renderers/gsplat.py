@@ -10,7 +10,7 @@ from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Problem, RecipeContext, Renderer, RendererConfig
 from qgs.contracts.component import MissingExtraError
-from qgs.contracts.renderer import background_of, check_inputs, colors_of
+from qgs.contracts.renderer import background_of, channels_of, check_inputs
 from qgs.renderers.reference import TorchRenderer
 from qgs.types import Cameras, Gaussians, Rendering
 
@@ -52,13 +52,9 @@ class GsplatRenderer(Renderer):
             gaussians = gaussians.to(torch.float32)
             cameras = cameras.to(torch.float32)
             backdrop = background_of(background, self.config.background, gaussians.means)
-            colors = colors_of(gaussians, cameras)
-            features = gaussians.features
-            # Further channels, over 0.
-            if features is not None:
-                backdrop = F.pad(backdrop, (0, features.shape[-1]))
-                features = features[:, None] if colors.ndim == 4 else features
-                colors = torch.cat([colors, features.expand(*colors.shape[:-1], -1)], -1)
+            channels = channels_of(gaussians, cameras)
+            # Features are over 0.
+            backdrop = F.pad(backdrop, (0, channels.shape[-1] - 3))
             height, width = cameras.size
             fx, fy, cx, cy = cameras.intrinsics.unbind(-1)
             o = torch.zeros_like(fx)
@@ -70,7 +66,7 @@ class GsplatRenderer(Renderer):
                 quats=gaussians.quats,
                 scales=gaussians.scales,
                 opacities=gaussians.opacities,
-                colors=colors,
+                colors=channels.expand(-1, cameras.shape[1], -1, -1),
                 viewmats=cameras.w2c,
                 Ks=calibration.unflatten(-1, (3, 3)),
                 width=width,
@@ -87,7 +83,7 @@ class GsplatRenderer(Renderer):
             rgb=images[..., :3, :, :],
             alpha=alpha.movedim(-1, -3),
             depth=images[..., -1:, :, :],
-            features=None if features is None else images[..., 3:-1, :, :],
+            features=None if gaussians.features is None else images[..., 3:-1, :, :],
         )
 
 

@@ -3,7 +3,6 @@
 EWA projection after Zwicker et al. 2001 and gsplat 1.5.3.
 """
 
-from dataclasses import dataclass
 from itertools import product
 
 import torch
@@ -11,58 +10,60 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.contracts import Renderer, RendererConfig
-from qgs.contracts.renderer import background_of, check_inputs, colors_of, raise_precision
-from qgs.geometry.transforms import quat_to_matrix
+from qgs.contracts.renderer import background_of, channels_of, check_inputs, raise_precision
+from qgs.geometry.constants import constant
+from qgs.geometry.transforms import quat_to_matrix, to_camera, to_pixels
 from qgs.types import Cameras, Gaussians, Rendering
 
 # Of the image's width or height: beyond it the Jacobian is held constant.
 CLAMP_MARGIN = 0.15
 
 
-@dataclass(frozen=True)
-class Splats:
-    """Gaussians as cameras see them, each field (B, V, G, ...).
-
-    means: (..., 2) pixels. conics: (..., 3) entries xx, xy, yy of the inverse covariance, pixel^-2.
-    depths: camera-frame z. visible: False for what near, far or an overflow drops; the other fields
-    are finite placeholders there, with zero gradients.
-    """
-
-    means: Tensor
-    conics: Tensor
-    depths: Tensor
-    visible: Tensor
-
-
 def project(
     gaussians: Gaussians, cameras: Cameras, near: float, far: float, dilation: float
-) -> Splats:
-    """Splats (B, V, G) of Gaussians (B, G) in cameras (B, V) of one dtype, autocast being off.
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Gaussians (B, G) as cameras (B, V) of their dtype see them, autocast being off.
 
-    Differentiable in means, scales, quats (normalised here), c2w and intrinsics. In the Jacobian,
-    x/z and y/z are clamped to 15 % of the image beyond its borders, as gsplat does.
+    Pixels (B, V, G, 2); entries xx, xy, yy (B, V, G, 3) of inverse covariances, pixel^-2; depths
+    (B, V, G), camera-frame z; and whether they are visible (B, V, G). Where near, far or an
+    overflow drops one, the others are finite placeholders with zero gradients. Differentiable in
+    means, scales, quats (normalised here), c2w and intrinsics.
     """
-    w2c = cameras.w2c
-    turns = quat_to_matrix(F.normalize(gaussians.quats, dim=-1))
-    factors = turns * gaussians.scales[..., None, :]  # (B, G, 3, 3)
-    position = w2c[..., :3, :3] @ gaussians.means.mT[:, None] + w2c[..., :3, 3:]
-    x, y, z = position.unbind(-2)  # (B, V, G) each
-    in_range = (z >= near) & (z <= far)
+    centres = to_camera(gaussians.means, cameras)  # (B, V, G, 3)
+    in_range = (centres[..., 2] >= near) & (centres[..., 2] <= far)
     # Placeholders where nothing is drawn: a NaN there would reach every gradient through 0 * NaN.
-    z = torch.where(in_range, z, 1.0)
-    x, y = (torch.where(in_range, value, 0.0) / z for value in (x, y))
+    centres = torch.where(in_range[..., None], centres, constant([0.0, 0.0, 1.0], centres))
+    rotations = quat_to_matrix(F.normalize(gaussians.quats, dim=-1))
+    factors = rotations * gaussians.scales[..., None, :]  # R S, (B, G, 3, 3)
+    factors = cameras.w2c[..., None, :3, :3] @ factors[:, None]  # W R S, (B, V, G, 3, 3)
+    with torch.no_grad():
+        _, usable = _conics(_image_factors(factors, centres, cameras), dilation)
+    # Before anything can overflow: where() after it would pass on gradients 0 * inf.
+    factors = torch.where(usable[..., None, None], factors, 0.0)
+    conics, _ = _conics(_image_factors(factors, centres, cameras), dilation)
+    means = to_pixels(centres, cameras.intrinsics)
+    return means, conics, centres[..., 2], in_range & usable
 
-    fx, fy, cx, cy = cameras.intrinsics[..., None, :].unbind(-1)  # (B, V, 1) each
-    height, width = cameras.size
-    means = torch.stack([torch.addcmul(cx, fx, x), torch.addcmul(cy, fy, y)], -1)
-    # Far off screen the linear Jacobian would blow a Gaussian up over the whole image.
-    x = _clamped(x, fx, cx, width)
-    y = _clamped(y, fy, cy, height)
 
-    turned = w2c[..., :3, :3] @ factors.permute(0, 2, 1, 3).flatten(2)[:, None]
-    rows = turned.unflatten(-1, (-1, 3))  # (B, V, 3, G, 3): rows of W R S
-    row_x = (fx / z)[..., None] * (rows[:, :, 0] - x[..., None] * rows[:, :, 2])
-    row_y = (fy / z)[..., None] * (rows[:, :, 1] - y[..., None] * rows[:, :, 2])
+def _image_factors(factors: Tensor, centres: Tensor, cameras: Cameras) -> Tensor:
+    """J W R S (B, V, G, 2, 3), from W R S (B, V, G, 3, 3) and camera-frame means (B, V, G, 3).
+
+    In the Jacobian J, x/z and y/z are clamped to 15 % of the image beyond its borders, as gsplat
+    does: farther off screen it would blow a Gaussian up over the whole image.
+    """
+    focal, principal = cameras.intrinsics[:, :, None].split(2, -1)
+    sides = cameras.size[::-1]
+    low = constant([-CLAMP_MARGIN * side for side in sides], centres)
+    high = constant([side + CLAMP_MARGIN * side for side in sides], centres)
+    z = centres[..., 2:]
+    slopes = torch.maximum(centres[..., :2] / z, (low - principal) / focal)
+    slopes = torch.minimum(slopes, (high - principal) / focal)[..., None]
+    return (focal / z)[..., None] * (factors[..., :2, :] - slopes * factors[..., 2:, :])
+
+
+def _conics(factors: Tensor, dilation: float) -> tuple[Tensor, Tensor]:
+    """Inverses (..., 3) of F F^T + dilation for F (..., 2, 3), and whether there is one."""
+    row_x, row_y = factors.unbind(-2)
     xx = (row_x * row_x).sum(-1)
     xy = (row_x * row_y).sum(-1)
     yy = (row_y * row_y).sum(-1)
@@ -70,17 +71,8 @@ def project(
     # Cauchy-Binet: unlike xx * yy - xy^2 this does not cancel for needles.
     determinant = (minors * minors).sum(-1) + dilation * (xx + yy) + dilation * dilation
     usable = torch.isfinite(determinant) & (determinant > 0)
-    determinant = torch.where(usable, determinant, 1.0)
-    conics = torch.stack([yy + dilation, -xy, xx + dilation], -1) / determinant[..., None]
-    conics = torch.where(usable[..., None], conics, 0.0)
-    return Splats(means, conics, z, in_range & usable)
-
-
-def _clamped(slope: Tensor, focal: Tensor, principal: Tensor, size: int) -> Tensor:
-    margin = CLAMP_MARGIN * size
-    low = (-margin - principal) / focal
-    high = (size + margin - principal) / focal
-    return torch.minimum(torch.maximum(slope, low), high)
+    divisor = torch.where(usable, determinant, 1.0)[..., None]
+    return torch.stack([yy + dilation, -xy, xx + dilation], -1) / divisor, usable
 
 
 class TorchRenderer(Renderer):
@@ -99,47 +91,51 @@ class TorchRenderer(Renderer):
         config = self.config
         with torch.autocast(gaussians.means.device.type, enabled=False):
             gaussians, cameras = raise_precision(gaussians, cameras)
+            means, conics, depths, visible = project(
+                gaussians, cameras, config.near, config.far, config.dilation
+            )
+            channels = channels_of(gaussians, cameras).expand(-1, cameras.shape[1], -1, -1)
+            sums = []
+            for image in product(range(cameras.shape[0]), range(cameras.shape[1])):
+                # Front to back; equal depths stay in order.
+                order = depths[image].argsort(stable=True)
+                order = order[visible[image][order]]
+                z = depths[image][order][:, None]
+                weights = _weights(
+                    means[image][order],
+                    conics[image][order],
+                    gaussians.opacities[image[0]][order],
+                    cameras.size,
+                    config,
+                )
+                summed = torch.cat([channels[image][order], z, torch.ones_like(z)], 1)
+                sums.append(torch.einsum("ghw,gc->chw", weights, summed))
             backdrop = background_of(background, config.background, gaussians.means)
-            splats = project(gaussians, cameras, config.near, config.far, config.dilation)
-            colors = colors_of(gaussians, cameras)
-            sums = [
-                _composite(splats, gaussians, colors, image, cameras.size, config)
-                for image in product(range(cameras.shape[0]), range(cameras.shape[1]))
-            ]
-            sums = torch.stack(sums).unflatten(0, cameras.shape)
-            features = None if gaussians.features is None else sums[:, :, 5:]
-            return resolve(sums[:, :, :5], backdrop, features)
+            return resolve(torch.stack(sums).unflatten(0, cameras.shape), backdrop)
 
 
-def resolve(sums: Tensor, background: Tensor, features: Tensor | None = None) -> Rendering:
-    """Sums (B, V, 5, H, W) of w r, w g, w b, w z, w, and those of features -> Rendering."""
-    rgb, depth, alpha = sums.split([3, 1, 1], dim=2)
+def resolve(sums: Tensor, background: Tensor) -> Rendering:
+    """Sums (B, V, C, H, W) of w r, w g, w b, those of features, w z, w -> Rendering."""
+    rgb, features, depth, alpha = sums.tensor_split([3, sums.shape[2] - 2, sums.shape[2] - 1], 2)
     # Depth is 0, not NaN, where nothing was hit.
     hit = torch.where(alpha > 0, alpha, 1.0)
-    rgb = rgb + (1 - alpha) * background[:, None, None]
-    return Rendering(rgb=rgb, alpha=alpha, depth=depth / hit, features=features)
+    return Rendering(
+        rgb=rgb + (1 - alpha) * background[:, None, None],
+        alpha=alpha,
+        depth=depth / hit,
+        features=features if features.shape[2] else None,
+    )
 
 
-def _composite(
-    splats: Splats,
-    gaussians: Gaussians,
-    colors: Tensor,
-    image: tuple[int, int],
+def _weights(
+    means: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
     size: tuple[int, int],
     config: RendererConfig,
 ) -> Tensor:
-    """Sums (5 + F, H, W) of one image (scene, view), front to back.
-
-    colors: (B, G, 3) or (B, V, G, 3).
-    """
+    """Weights (G, H, W) in the pixels of one image, of its splats (G, ...) from front to back."""
     height, width = size
-    # Front to back; equal depths stay in order.
-    order = splats.depths[image].argsort(stable=True)
-    order = order[splats.visible[image][order]]
-    means, conics, depths = (
-        field[image][order] for field in (splats.means, splats.conics, splats.depths)
-    )
-    opacities = gaussians.opacities[image[0]][order]
     # Pixel centres are at .5: (0, 0) is the corner of the image.
     u = torch.arange(width, dtype=means.dtype, device=means.device) + 0.5
     v = torch.arange(height, dtype=means.dtype, device=means.device) + 0.5
@@ -152,12 +148,6 @@ def _composite(
     # alpha_min: less changes no 8-bit image. The cap: gradients divide by 1 - alpha.
     alphas = torch.where(alphas >= config.alpha_min, alphas.clamp(max=config.alpha_cap), 0.0)
     after = torch.cumprod(1 - alphas, 0)
-    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])[: len(order)]
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])[: len(after)]
     # `after`, not `before`: a Gaussian that would close the pixel is left out, as in gsplat.
-    weights = torch.where(after > config.transmittance_min, alphas * before, 0.0)
-    colors = colors[image[: colors.ndim - 2]][order]
-    z = depths[:, None]
-    summed = [colors, z, torch.ones_like(z)]
-    if gaussians.features is not None:
-        summed.append(gaussians.features[image[0]][order])
-    return torch.einsum("ghw,gc->chw", weights, torch.cat(summed, 1))
+    return torch.where(after > config.transmittance_min, alphas * before, 0.0)

@@ -98,6 +98,7 @@ def extremes(gaussians):
         "coincident": at(means[:, :1].expand_as(means)),
         "huge": times("scales", 1e4),
         "overflowing": times("scales", 1e12),
+        "of overflowing minors": times("scales", 1e36),
         "needles": times("scales", 10.0, 1e-6, 1e-6),
         "on the near plane": at(flat + torch.tensor([0, 0, 0.025])),
     }
@@ -113,6 +114,15 @@ def test_extreme_gaussians_are_finite_and_exact_or_unseen(build):
     for part in (rendering.alpha, *gradients.values()):
         assert not part[:5].any()
     compared(build(), (together[5:11], fixed_cameras(6)), 1e-4, 1e-3)
+
+
+def test_gaussians_beyond_float64_have_no_gradient():
+    gaussians, cameras = make_scene(dtype=torch.float64)
+    for scale in (1e100, 1e160, 1e300):
+        huge = gaussians.replace(scales=scale * gaussians.scales)
+        _, gradients = differentiate(TorchRenderer(RendererConfig()), huge, cameras)
+        for name, gradient in gradients.items():
+            assert not gradient.any(), (scale, name)
 
 
 def test_near_and_far_are_inclusive(build):

@@ -58,7 +58,7 @@ def test_arguments_are_what_gsplat_expects(calls):
         "backgrounds": backdrop,
     }
     torch.testing.assert_close(found, expected)
-    assert torch.equal(of_bare["colors"], gaussians.colors)
+    assert torch.equal(of_bare["colors"], gaussians.colors[:, None].expand(2, 3, 7, 3))
     assert torch.equal(of_bare["backgrounds"], backdrop[..., :3])
     channels = torch.tensor([0, 1, 2, 3, 4, 5, 0.25, 3])[:, None, None].expand(2, 3, 8, 12, 20)
     images = [rendering.rgb, rendering.features, rendering.depth, rendering.alpha, bare.depth]
