@@ -173,22 +173,12 @@ class QueryGaussianModel(nn.Module):
     def decode(self, state: QueryState) -> Gaussians:
         """The Gaussians of a state, ordered query by query."""
         attributes = self.head(state)
-        means = self.centers(attributes.offsets, state)
-        # N, K -> G.
-        flat = map_tensors(lambda x: x.flatten(1, 2), attributes)
-        opacities = flat.opacities
+        parts = attributes.replace(offsets=self.centers(attributes.offsets, state))
         # Places without a query decode Gaussians that nobody sees.
         if state.mask is not None:
-            opacities = (attributes.opacities * state.mask[..., None]).flatten(1, 2)
-        return Gaussians(
-            means=means.flatten(1, 2),
-            scales=flat.scales,
-            quats=flat.quats,
-            opacities=opacities,
-            colors=flat.colors,
-            sh=flat.sh,
-            features=flat.features,
-        )
+            parts = parts.replace(opacities=parts.opacities * state.mask[..., None])
+        # N, K -> G; attributes and Gaussians have their fields in one order.
+        return Gaussians(*vars(map_tensors(lambda x: x.flatten(1, 2), parts)).values())
 
     def render(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None

@@ -37,7 +37,7 @@ from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
 from qgs.contracts.queries import LearnedQueries, Queries
 from qgs.contracts.renderer import Renderer, RendererConfig
 from qgs.contracts.settings import EvaluationConfig, TrainingConfig, ViewsConfig
-from qgs.contracts.weights import LayoutError, Rename, WeightLayout
+from qgs.contracts.weights import LayoutError, WeightLayout
 
 __all__ = [
     "CONTRACT_VERSION",
@@ -82,7 +82,6 @@ __all__ = [
     "Queries",
     "RecipeContext",
     "Refinement",
-    "Rename",
     "Renderer",
     "RendererConfig",
     "Scene",

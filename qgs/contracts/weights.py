@@ -14,24 +14,18 @@ class LayoutError(ValueError):
     """Published names and shapes that fit no recipe; the message says why."""
 
 
-@dataclass(frozen=True)
-class Rename:
-    """Our and their name of a module or parameter; `{}` stands for the number of a layer.
+def renamed(name: str, ours: str, theirs: str) -> str | None:
+    """`name` with `theirs` in place of `ours`; None if it has another one.
 
-    Names that end with a dot are modules; what follows is the same on both sides.
+    `{}` stands for the number of a layer. An `ours` that ends with a dot is a module; what follows
+    is the same on both sides.
     """
-
-    ours: str
-    theirs: str
-
-    def renamed(self, ours: str) -> str | None:
-        """The published name of `ours`; None if this rename does not apply."""
-        # Only `{}` stands for something: the dots of a name are dots.
-        pattern = re.escape(self.ours).replace(r"\{\}", r"(\d+)")
-        match = re.match(pattern if self.ours.endswith(".") else pattern + "$", ours)
-        if match is None:
-            return None
-        return self.theirs.format(*match.groups()) + ours[match.end() :]
+    # Only `{}` stands for something: the dots of a name are dots.
+    pattern = re.escape(ours).replace(r"\{\}", r"(\d+)")
+    match = re.match(pattern if ours.endswith(".") else pattern + "$", name)
+    if match is None:
+        return None
+    return theirs.format(*match.groups()) + name[match.end() :]
 
 
 @dataclass(frozen=True)
@@ -40,9 +34,11 @@ class WeightLayout:
 
     name: what the codebase calls its model. source: where it is published.
     components: slot to the component types that the codebase has; other slots may hold any.
-    renames: the first that applies to a name counts.
+    renames: our to their names of modules and parameters, see `renamed`; the first that applies to
+        a name counts.
     marks: published names by which this layout is recognised; a file of it has them all.
-    unused: from a published name to that of a parameter stored with it, which their code ignores.
+    unused: pairs of a published name and that of a parameter stored with it, which their code
+        ignores.
     read: names and shapes of a whole state dict to a recipe that fits, a mapping with `recipe: 1`;
         raises LayoutError.
     undecided: text: what names and shapes leave open, and that `read` chooses the published value.
@@ -51,15 +47,16 @@ class WeightLayout:
     name: str
     source: str
     components: Mapping[str, tuple[str, ...]]
-    renames: tuple[Rename, ...]
+    renames: Mapping[str, str]
     marks: tuple[str, ...]
     read: Callable[[Shapes], dict[str, Any]]
-    unused: tuple[Rename, ...] = ()
+    unused: tuple[tuple[str, str], ...] = ()
     undecided: tuple[str, ...] = ()
 
     def published_name(self, ours: str) -> str | None:
         """The published name of our parameter `ours`; None where the codebase has none."""
-        return next((name for r in self.renames if (name := r.renamed(ours)) is not None), None)
+        names = (renamed(ours, *rule) for rule in self.renames.items())
+        return next((name for name in names if name is not None), None)
 
 
 def layer_count(shapes: Shapes, prefix: str) -> int:

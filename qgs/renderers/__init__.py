@@ -1,7 +1,6 @@
 """The renderers, and the one that chooses between two by device; one contract, `Renderer`."""
 
 from collections.abc import Iterable
-from functools import cached_property
 
 from torch import Tensor
 
@@ -29,18 +28,9 @@ class AutoRenderer(Renderer):
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
         """See `Renderer`. Raises RuntimeError when the package it needs is not installed."""
-        renderer = self._on_cuda if gaussians.means.is_cuda else self._on_cpu
-        # Options may follow a schedule.
-        renderer.config = self.config
-        return renderer(gaussians, cameras, background)
-
-    @cached_property
-    def _on_cuda(self) -> GsplatRenderer:
-        return GsplatRenderer(self.config)
-
-    @cached_property
-    def _on_cpu(self) -> CpuRenderer:
-        return CpuRenderer(self.config)
+        kind = GsplatRenderer if gaussians.means.is_cuda else CpuRenderer
+        # Made anew, since options may follow a schedule.
+        return kind(self.config)(gaussians, cameras, background)
 
 
 COMPONENTS: tuple[type[Component], ...] = (AutoRenderer, CpuRenderer, GsplatRenderer, TorchRenderer)

@@ -34,13 +34,13 @@ def project(
     # Placeholders where nothing is drawn: a NaN there would reach every gradient through 0 * NaN.
     centres = torch.where(in_range[..., None], centres, constant([0.0, 0.0, 1.0], centres))
     rotations = quat_to_matrix(F.normalize(gaussians.quats, dim=-1))
-    factors = rotations * gaussians.scales[..., None, :]  # R S, (B, G, 3, 3)
-    factors = cameras.w2c[..., None, :3, :3] @ factors[:, None]  # W R S, (B, V, G, 3, 3)
+    in_world = rotations * gaussians.scales[..., None, :]  # R S, (B, G, 3, 3)
+    in_camera = cameras.w2c[..., None, :3, :3] @ in_world[:, None]  # W R S, (B, V, G, 3, 3)
     with torch.no_grad():
-        _, usable = _conics(_image_factors(factors, centres, cameras), dilation)
+        _, usable = _conics(_image_factors(in_camera, centres, cameras), dilation)
     # Before anything can overflow: where() after it would pass on gradients 0 * inf.
-    factors = torch.where(usable[..., None, None], factors, 0.0)
-    conics, _ = _conics(_image_factors(factors, centres, cameras), dilation)
+    drawn = torch.where(usable[..., None, None], in_camera, 0.0)
+    conics, _ = _conics(_image_factors(drawn, centres, cameras), dilation)
     means = to_pixels(centres, cameras.intrinsics)
     return means, conics, centres[..., 2], in_range & usable
 

@@ -1,7 +1,14 @@
 """The default components: TokenGS, one file per slot."""
 
 from qgs.contracts import Component
-from qgs.tokengs.blocks import NORM_EPS, CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
+from qgs.tokengs.blocks import (
+    NORM_EPS,
+    CrossAttentionCore,
+    LayerScale,
+    Mlp,
+    NormConfig,
+    SelfAttentionCore,
+)
 from qgs.tokengs.decoder import (
     ContentCrossAttention,
     ContentSelfAttention,
@@ -50,6 +57,7 @@ __all__ = [
     "MultiViewViT",
     "NoFeedback",
     "NoRefinement",
+    "NormConfig",
     "OffsetCenters",
     "OneCycleAdamW",
     "OnePass",

@@ -6,12 +6,20 @@ Axes: B scenes, T tokens, N queries, M image tokens, Q chosen queries, D width, 
 import torch
 import torch.nn.functional as F
 from einops import rearrange
+from pydantic import Field
 from torch import Tensor, nn
 
-from qgs.contracts import AttentionWeights
+from qgs.contracts import AttentionWeights, ComponentConfig
 
 NORM_EPS = 1e-5
 """Added to the variance by every LayerNorm of both releases (PyTorch's default)."""
+
+
+class NormConfig(ComponentConfig):
+    """Options of a component with LayerNorms."""
+
+    norm_eps: float = Field(default=NORM_EPS, gt=0)
+    """Added to the variance by every LayerNorm."""
 
 
 class LayerScale(nn.Module):

@@ -18,7 +18,7 @@ from qgs.contracts import (
     SelfAttention,
     memory_fields,
 )
-from qgs.tokengs.blocks import NORM_EPS, CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
+from qgs.tokengs.blocks import CrossAttentionCore, LayerScale, Mlp, NormConfig, SelfAttentionCore
 from qgs.types import ImageMemory, QueryState, Rendering, Views
 
 
@@ -75,9 +75,8 @@ class ContentCrossAttention(CrossAttention):
     name = "content"
     reads = memory_fields("keys", "values")
 
-    class Config(ComponentConfig):
-        norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Added to the variance by every LayerNorm."""
+    class Config(NormConfig):
+        """Those of its LayerNorms."""
 
     config: Config
 
@@ -98,9 +97,8 @@ class ContentSelfAttention(SelfAttention):
 
     name = "content"
 
-    class Config(ComponentConfig):
-        norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Added to the variance by every LayerNorm."""
+    class Config(NormConfig):
+        """Those of its LayerNorms."""
 
     config: Config
 
@@ -121,11 +119,9 @@ class MlpFeedForward(FeedForward):
 
     name = "mlp"
 
-    class Config(ComponentConfig):
+    class Config(NormConfig):
         ratio: float = Field(default=4.0, ge=1)
         """Hidden width (rounded down) over the model's width."""
-        norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Added to the variance by the LayerNorm."""
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)

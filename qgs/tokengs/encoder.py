@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from qgs.contracts import ModelDims, PatchEncoder
 from qgs.geometry.constants import constant
 from qgs.geometry.rays import patch_rays, plucker_rays
-from qgs.tokengs.blocks import NORM_EPS, LayerScale, Mlp, SelfAttentionCore, split_heads
+from qgs.tokengs.blocks import LayerScale, Mlp, NormConfig, SelfAttentionCore, split_heads
 from qgs.types import ImageMemory, Views
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -56,15 +56,13 @@ class PatchViT(PatchEncoder):
     Subclasses say what of the blocks' outputs the memory holds.
     """
 
-    class Config(PatchEncoder.Config):
+    class Config(NormConfig, PatchEncoder.Config):
         depth: int = Field(default=3, ge=0, le=256)
         """Number of ViT blocks."""
         mlp_ratio: float = Field(default=4.0, ge=1)
         """Hidden width of the MLPs (rounded down) over the model's width."""
         layer_scale: float = Field(default=0.01, gt=0)
         """Initial value of every LayerScale factor of the encoder."""
-        norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Added to the variance by every LayerNorm."""
 
     config: Config
 

@@ -20,7 +20,7 @@ from qgs.contracts import (
 )
 from qgs.geometry.constants import constant
 from qgs.geometry.precision import at_least_float32, full_precision
-from qgs.tokengs.blocks import NORM_EPS
+from qgs.tokengs.blocks import NormConfig
 from qgs.types import GaussianAttributes, QueryState
 
 CHANNELS = (3, 3, 3, 4, 1)
@@ -32,7 +32,7 @@ class GaussianHead(Head):
 
     name = "gaussian_head"
 
-    class Config(ComponentConfig):
+    class Config(NormConfig):
         """Defaults are the LocusGS release's."""
 
         gaussians_per_query: int = Field(default=64, ge=1)
@@ -45,8 +45,6 @@ class GaussianHead(Head):
         """What the biases of the z of positions start from, raw (TokenGS 2026.6: log 1.1)."""
         norm: bool = False
         """A LayerNorm before the linear layer (in neither release; steadier for small models)."""
-        norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Added to the variance by that LayerNorm."""
         scale_cap: float = Field(default=0.075, gt=0)
         """Largest scale, world units; a raw scale of 0 gives 1/e of it."""
         scale_input_limit: float | None = Field(default=10.0, gt=0)
@@ -65,13 +63,12 @@ class GaussianHead(Head):
         # Small weights: all Gaussians of a query start at one place, near one size and grey.
         nn.init.zeros_(self.linear.bias)
         nn.init.trunc_normal_(self.linear.weight, std=config.init_std)
-        # Spread initial positions divide the scene sooner.
-        if config.position_std is not None:
-            rows_K3D = torch.empty(config.gaussians_per_query, CHANNELS[0], dims.width)
-            nn.init.trunc_normal_(rows_K3D, std=config.position_std)
-            with torch.no_grad():
-                self.linear.weight.unflatten(0, (-1, sum(CHANNELS)))[:, : CHANNELS[0]] = rows_K3D
         with torch.no_grad():
+            # Spread initial positions divide the scene sooner.
+            if config.position_std is not None:
+                rows_K3D = torch.empty(config.gaussians_per_query, CHANNELS[0], dims.width)
+                nn.init.trunc_normal_(rows_K3D, std=config.position_std)
+                self.linear.weight.unflatten(0, (-1, sum(CHANNELS)))[:, : CHANNELS[0]] = rows_K3D
             self.linear.bias.unflatten(0, (-1, sum(CHANNELS)))[:, CHANNELS[0] - 1] = config.z_init
 
     @classmethod

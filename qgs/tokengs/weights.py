@@ -2,42 +2,42 @@
 
 from typing import Any
 
-from qgs.contracts.weights import Rename, Shapes, layer_count, real_ratio, size_at, whole_ratio
+from qgs.contracts.weights import Shapes, layer_count, real_ratio, size_at, whole_ratio
 from qgs.tokengs.head import CHANNELS
 
 ENCODER = "enc_dec_backbone.encoder."
 DECODER = "enc_dec_backbone.decoder_blocks."
 
-BACKBONE_RENAMES = (
-    Rename("encoder.rgb_embedding.", "patch_embed."),
-    Rename("encoder.ray_embedding.", "patch_plucker_embed."),
-    Rename("encoder.norm.", "enc_dec_backbone.encoder_norm."),
-    Rename("encoder.kv_proj.", "enc_dec_backbone.kv_proj."),
-    Rename("encoder.k_norm.", "enc_dec_backbone.k_proj_norm."),
-    Rename("encoder.blocks.{}.attention.", ENCODER + "{}.attn."),
-    Rename("encoder.blocks.{}.scale1.", ENCODER + "{}.ls1."),
-    Rename("encoder.blocks.{}.scale2.", ENCODER + "{}.ls2."),
-    Rename("encoder.blocks.{}.norm1.", ENCODER + "{}.norm1."),
-    Rename("encoder.blocks.{}.norm2.", ENCODER + "{}.norm2."),
-    Rename("encoder.blocks.{}.mlp.", ENCODER + "{}.mlp."),
-    Rename("queries.features", "gs_tokens"),
-    Rename("decoder.{}.cross_attention.core.norm.", DECODER + "{}.gs_cross_attn.gs_token_norm."),
-    Rename("decoder.{}.cross_attention.core.q_norm.", DECODER + "{}.gs_cross_attn.q_norm."),
-    Rename("decoder.{}.cross_attention.core.out_proj.", DECODER + "{}.gs_cross_attn.out_proj."),
-    Rename("decoder.{}.cross_scale.", DECODER + "{}.gs_cross_attn_scale."),
-    Rename("decoder.{}.self_attention.norm.", DECODER + "{}.gs_self_attn.norm."),
-    Rename("decoder.{}.self_attention.attention.", DECODER + "{}.gs_self_attn.gs_self_attn."),
-    Rename("decoder.{}.self_scale.", DECODER + "{}.gs_self_attn_scale."),
-    Rename("decoder.{}.feed_forward.norm.", DECODER + "{}.mlp.norm."),
-    Rename("decoder.{}.feed_forward.mlp.", DECODER + "{}.mlp.mlp."),
-    Rename("decoder.{}.feed_forward_scale.", DECODER + "{}.mlp_scale."),
-    Rename("head.linear.", "activation_head.deconv."),
-)
+BACKBONE_RENAMES = {
+    "encoder.rgb_embedding.": "patch_embed.",
+    "encoder.ray_embedding.": "patch_plucker_embed.",
+    "encoder.norm.": "enc_dec_backbone.encoder_norm.",
+    "encoder.kv_proj.": "enc_dec_backbone.kv_proj.",
+    "encoder.k_norm.": "enc_dec_backbone.k_proj_norm.",
+    "encoder.blocks.{}.attention.": ENCODER + "{}.attn.",
+    "encoder.blocks.{}.scale1.": ENCODER + "{}.ls1.",
+    "encoder.blocks.{}.scale2.": ENCODER + "{}.ls2.",
+    "encoder.blocks.{}.norm1.": ENCODER + "{}.norm1.",
+    "encoder.blocks.{}.norm2.": ENCODER + "{}.norm2.",
+    "encoder.blocks.{}.mlp.": ENCODER + "{}.mlp.",
+    "queries.features": "gs_tokens",
+    "decoder.{}.cross_attention.core.norm.": DECODER + "{}.gs_cross_attn.gs_token_norm.",
+    "decoder.{}.cross_attention.core.q_norm.": DECODER + "{}.gs_cross_attn.q_norm.",
+    "decoder.{}.cross_attention.core.out_proj.": DECODER + "{}.gs_cross_attn.out_proj.",
+    "decoder.{}.cross_scale.": DECODER + "{}.gs_cross_attn_scale.",
+    "decoder.{}.self_attention.norm.": DECODER + "{}.gs_self_attn.norm.",
+    "decoder.{}.self_attention.attention.": DECODER + "{}.gs_self_attn.gs_self_attn.",
+    "decoder.{}.self_scale.": DECODER + "{}.gs_self_attn_scale.",
+    "decoder.{}.feed_forward.norm.": DECODER + "{}.mlp.norm.",
+    "decoder.{}.feed_forward.mlp.": DECODER + "{}.mlp.mlp.",
+    "decoder.{}.feed_forward_scale.": DECODER + "{}.mlp_scale.",
+    "head.linear.": "activation_head.deconv.",
+}
 """Names that TokenGS and the models built on it share."""
 
-CROSS_QUERY = Rename(
-    "decoder.{}.cross_attention.core.q_proj.", DECODER + "{}.gs_cross_attn.q_proj."
-)
+CROSS_QUERY = {
+    "decoder.{}.cross_attention.core.q_proj.": DECODER + "{}.gs_cross_attn.q_proj.",
+}
 
 
 def backbone(shapes: Shapes, queries: str) -> dict[str, Any]:

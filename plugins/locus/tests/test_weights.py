@@ -6,6 +6,7 @@ from qgs_locus.weights import LOCUSGS
 
 import qgs
 from qgs.contracts import LayoutError
+from qgs.contracts.weights import renamed
 
 RECIPE = yaml.safe_load("""
 recipe: 1
@@ -61,7 +62,7 @@ def test_the_recipe_that_is_read_makes_the_same_model():
 def test_what_is_never_read_stands_beside_what_is():
     for overrides, each_layer in (((), 9), ((CONTENT,), 8)):
         names = published_shapes(composed(*overrides))
-        unused = {rule.renamed(name) for name in names for rule in LOCUSGS.unused} - {None}
+        unused = {renamed(name, *rule) for name in names for rule in LOCUSGS.unused} - {None}
         assert len(unused) == 3 * each_layer
         assert not unused & names.keys()
 

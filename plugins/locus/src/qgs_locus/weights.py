@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from qgs.contracts.weights import Rename, Shapes, WeightLayout
+from qgs.contracts.weights import Shapes, WeightLayout
 from qgs.tokengs.weights import BACKBONE_RENAMES, DECODER, backbone
 
 _CROSS = DECODER + "{}.gs_cross_attn."
@@ -48,22 +48,22 @@ LOCUSGS = WeightLayout(
         "head": ("qgs/gaussian_head",),
         "centers": ("locus/radius_scaled", "locus/anchor_offset", "qgs/free"),
     },
-    renames=(
-        *BACKBONE_RENAMES,
-        Rename("decoder.{}.cross_attention.core.q_proj.", _CROSS + "q_content_proj."),
-        Rename("decoder.{}.cross_attention.raw_gamma", _CROSS + "geo_scale"),
-        Rename("decoder.{}.self_attention.position_mlp.", DECODER + "{}.anchor_head_self_attn."),
-        Rename("queries.center", "gs_anchor_xyz_raw"),
-        Rename("queries.raw_radius", "gs_anchor_radius_raw"),
-        Rename("refinements.0.center_mlp.", "xyz_embed."),
-        Rename("refinements.0.radius_mlp.", "radius_embed."),
-    ),
+    renames={
+        **BACKBONE_RENAMES,
+        "decoder.{}.cross_attention.core.q_proj.": _CROSS + "q_content_proj.",
+        "decoder.{}.cross_attention.raw_gamma": _CROSS + "geo_scale",
+        "decoder.{}.self_attention.position_mlp.": DECODER + "{}.anchor_head_self_attn.",
+        "queries.center": "gs_anchor_xyz_raw",
+        "queries.raw_radius": "gs_anchor_radius_raw",
+        "refinements.0.center_mlp.": "xyz_embed.",
+        "refinements.0.radius_mlp.": "radius_embed.",
+    },
     marks=(DECODER + "0.gs_cross_attn.q_content_proj.weight",),
     read=_read,
     # Norms that the release builds and never calls, so that its files load whole.
     unused=(
-        *(Rename(_CROSS + "q_norm.", _CROSS + name) for name in _UNUSED_NORMS),
-        Rename(_CROSS + "geo_scale", _CROSS + "tau_sample"),
+        *((_CROSS + "q_norm.", _CROSS + name) for name in _UNUSED_NORMS),
+        (_CROSS + "geo_scale", _CROSS + "tau_sample"),
     ),
     undecided=(
         "bandwidth of the ray bias: the radius where there is one, else fixed",

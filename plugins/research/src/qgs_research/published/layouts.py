@@ -9,7 +9,7 @@ from torch import Tensor
 from qgs.checkpoint.model_file import unique_tensors
 from qgs.checkpoint.tensors import differing_tensors, shapes_of
 from qgs.contracts import LayoutError, WeightLayout
-from qgs.contracts.weights import Shapes
+from qgs.contracts.weights import Shapes, renamed
 from qgs.recipe import Recipe, RecipeError, resolve
 from qgs.recipe.registry import InstalledPlugin, load_registry, load_usable_plugins
 from qgs.wording import listed
@@ -104,7 +104,7 @@ def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
     assert len(set(published.values())) == len(published)
     unnamed = tuple(name for name in shapes if name not in published)
     # Stored beside the used ones, and never read by the published code.
-    beside = (rule.renamed(name) for name in published.values() for rule in layout.unused)
+    beside = (renamed(name, *rule) for name in published.values() for rule in layout.unused)
     unused = tuple(name for name in beside if name is not None)
     return Names(layout, shapes, published, unnamed, unused)
 

@@ -16,7 +16,7 @@ TOKENGS = WeightLayout(
         "head": ("qgs/gaussian_head",),
         "centers": ("qgs/free",),
     },
-    renames=(*BACKBONE_RENAMES, CROSS_QUERY),
+    renames=BACKBONE_RENAMES | CROSS_QUERY,
     marks=(DECODER + "0.gs_cross_attn.q_proj.weight",),
     read=read_tokengs,
     undecided=(

@@ -4,7 +4,6 @@ from typing import Any
 
 from qgs.contracts.weights import (
     LayoutError,
-    Rename,
     Shapes,
     WeightLayout,
     layer_count,
@@ -145,7 +144,7 @@ MVSPLAT = WeightLayout(
         "head": ("mvsplat/gaussians",),
         **_ENDS,
     },
-    renames=(Rename("encoder.", "encoder."),),
+    renames={"encoder.": "encoder."},
     marks=(_PREDICTOR + "corr_refine_net.0.weight", _PREDICTOR + "to_disparity.2.weight"),
     read=_read_mvsplat,
     undecided=(
@@ -165,7 +164,7 @@ DEPTHSPLAT = WeightLayout(
         "head": ("mvsplat/depthsplat_gaussians",),
         **_ENDS,
     },
-    renames=(Rename("encoder.network.", "encoder."),),
+    renames={"encoder.network.": "encoder."},
     marks=(_PREDICTOR + "pretrained.norm.weight", _UPSAMPLER + "projects.0.weight", _HEAD),
     read=_read_depthsplat,
     undecided=(

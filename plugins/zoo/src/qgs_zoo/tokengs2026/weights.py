@@ -4,7 +4,6 @@ from typing import Any
 
 from qgs.contracts.weights import (
     LayoutError,
-    Rename,
     Shapes,
     WeightLayout,
     layer_count,
@@ -24,17 +23,17 @@ TARGET_TIME = "patch_time_embed_tgt"
 LATENTS = "enc_dec_backbone.latents"
 LATENT_BLOCK = "enc_dec_backbone.latent_blocks."
 
-_RENAMES = (
-    Rename("encoder.time_embedding.", "patch_time_embed."),
-    Rename("queries.time_embedding.", "patch_time_embed_tgt."),
-    Rename("queries.dynamic", DYNAMIC),
-    Rename("encoder.norms.{}.", READOUT + "{}."),
-    Rename("encoder.latents", LATENTS),
-    Rename("encoder.feature_kv_proj.", "enc_dec_backbone.latent_feature_kv_proj."),
-    Rename("encoder.feature_k_norm.", "enc_dec_backbone.latent_feature_k_norm."),
-    Rename("encoder.latent_kv_proj.", "enc_dec_backbone.latent_kv_proj."),
-    *(
-        Rename(f"encoder.latent_blocks.{{}}.{ours}", LATENT_BLOCK + f"{{}}.{theirs}")
+_RENAMES = {
+    "encoder.time_embedding.": "patch_time_embed.",
+    "queries.time_embedding.": "patch_time_embed_tgt.",
+    "queries.dynamic": DYNAMIC,
+    "encoder.norms.{}.": READOUT + "{}.",
+    "encoder.latents": LATENTS,
+    "encoder.feature_kv_proj.": "enc_dec_backbone.latent_feature_kv_proj.",
+    "encoder.feature_k_norm.": "enc_dec_backbone.latent_feature_k_norm.",
+    "encoder.latent_kv_proj.": "enc_dec_backbone.latent_kv_proj.",
+    **{
+        f"encoder.latent_blocks.{{}}.{ours}": LATENT_BLOCK + f"{{}}.{theirs}"
         for ours, theirs in (
             ("cross_attention.norm.", "gs_cross_attn.gs_token_norm."),
             ("cross_attention.", "gs_cross_attn."),
@@ -46,8 +45,8 @@ _RENAMES = (
             ("mlp.", "mlp.mlp."),
             ("mlp_scale.", "mlp_scale."),
         )
-    ),
-)
+    },
+}
 
 
 def _read(shapes: Shapes) -> dict[str, Any]:
@@ -106,7 +105,7 @@ TOKENGS_2026_6 = WeightLayout(
         "head": ("qgs/gaussian_head",),
         "centers": ("qgs/free",),
     },
-    renames=(*BACKBONE_RENAMES, *_RENAMES, CROSS_QUERY),
+    renames=BACKBONE_RENAMES | _RENAMES | CROSS_QUERY,
     marks=(DECODER + "0.gs_cross_attn.q_proj.weight", READOUT + "0.weight"),
     read=_read,
     undecided=(
