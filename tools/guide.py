@@ -27,8 +27,9 @@ from qgs.cli.tables import option_rows
 from qgs.contracts import Component, ComponentConfig
 from qgs.recipe import slots
 from qgs.recipe.registry import default_config, load_usable_plugins
-from qgs.recipe.schema import settings_schema, summary_of
+from qgs.recipe.schema import settings_schema
 from qgs.recipe.sections import SETTINGS
+from qgs.recipe.slots import summary_of
 
 ROOT = Path(__file__).parents[1]
 PART = re.compile(r"^<!-- from the code: (.*) -->\n(.*?)^<!-- end -->$", re.MULTILINE | re.DOTALL)

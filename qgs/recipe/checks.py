@@ -46,7 +46,7 @@ def _context(draft: Draft) -> RecipeContext:
     source = data.config
     size = source.image_size if isinstance(source, SceneSourceConfig) else None
     timed = bool(getattr(data.component, "tells_times", False))
-    return RecipeContext(draft.dims, size, draft.settings["views",].inputs, timed)
+    return RecipeContext(draft.dims, size, draft.settings.views.inputs, timed)
 
 
 def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -> bool:
@@ -118,17 +118,17 @@ def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, 
     settings = draft.settings
     encoder: Any = parts["model", "encoder"]
     # Tuning fits what an encoder can make keys and values of anew.
-    if settings["evaluation",].tuning == "latents" and not encoder.component.tunable:
+    if settings.evaluation.tuning == "latents" and not encoder.component.tunable:
         known: dict[str, Any] = draft.registry.components("encoder")
         others = " or ".join(f"`{name}`" for name in sorted(known) if known[name].tunable)
         reason = f"`{encoder.type}` at model.encoder has no latents to tune"
         fix = f"write `queries`, or use {others} in the slot `encoder`"
         yield ("evaluation", "tuning"), reason, fix
-    if settings["training",].judge_inputs:
+    if settings.training.judge_inputs:
         path = ("training", "judge_inputs")
         fix = "set it to false; evaluations do not read it"
         # A loss would compare renderings from moved cameras with photos from true ones.
-        if settings["views",].pose_noise:
+        if settings.views.pose_noise:
             reason = "views.pose_noise moves the cameras of input views, which must be exact"
             yield path, reason, fix
         objective: Any = parts["objective",]
@@ -146,7 +146,7 @@ def _idle_layer_scale(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str
     default = DecoderSettings().layer_scale
     layers: list[Any] = [parts[place] for place in layer_places(draft.dims.depth, "layer")]
     read = any(layer.component.reads_layer_scale for layer in layers)
-    if not read and draft.settings[DECODER].layer_scale != default:
+    if not read and draft.settings.model.decoder.layer_scale != default:
         names = " and ".join(sorted({f"`{layer.type}`" for layer in layers}))
         reason = f"it has no effect: {names or 'a decoder of depth 0'} does not read it"
         fix = f"remove it; the default, `layer_scale: {inline(default)}`, drops an inherited one"

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticUndefinedType, to_jsonable_python
 
 from qgs.contracts import Component, ComponentConfig, OptionError
 from qgs.contracts.schedule import Schedule, at_step
-from qgs.recipe.errors import Problems, did_you_mean
+from qgs.recipe.errors import Problems, did_you_mean, nearest
 from qgs.recipe.places import Place
 from qgs.recipe.registry import InstalledPlugin, Registry, component_failure
 from qgs.recipe.slots import SLOTS, type_at
@@ -156,26 +157,60 @@ def decode_config(
     config: type[ConfigT], node: MapNode, path: KeyPath, problems: Problems
 ) -> ConfigT | None:
     """The options written as `node` at `path`; None, with problems, if `config` refuses them."""
+    options, faults = validated(config, node)
+    for fault in faults:
+        report(fault, config, node, path, problems)
+    return options
+
+
+def validated(
+    config: type[ConfigT], node: MapNode
+) -> tuple[ConfigT | None, Sequence[ErrorDetails]]:
+    """The options written as `node`, or what pydantic says against them."""
     try:
         # JSON is pydantic's only strict mode for text: a list may be read as a tuple and a string
         # as a path, but no string as a number.
-        return config.model_validate_json(json.dumps(node))
+        return config.model_validate_json(json.dumps(node)), ()
     except ValidationError as error:
-        details = error.errors()
-    for detail in details:
-        loc = detail["loc"]
-        steps, origin, given = find(node, loc)
-        reason, fix = _explain(detail, given, config)
-        if detail["type"] == "missing":
-            steps.append(loc[-1])
-        field = config.model_fields.get(str(loc[0])) if loc else None
-        if field and not isinstance(field.default, BaseModel | PydanticUndefinedType):
-            fix += f" (default: {inline(to_jsonable_python(field.get_default()))})"
-        problems.add(origin, [*path, *map(str, steps)], reason, fix)
-    return None
+        return None, error.errors()
 
 
-def _explain(error: ErrorDetails, given: Any, config: type[BaseModel]) -> tuple[str, str]:
+def report(
+    fault: ErrorDetails, config: type[BaseModel], node: MapNode, path: KeyPath, problems: Problems
+) -> None:
+    """Add the problem that `config` finds with the options written as `node` at `path`."""
+    steps, origin, given = find(node, fault["loc"])
+    options = dict(options_in(config))
+    shown = ".".join(step for step in steps if isinstance(step, str))
+    if fault["type"] == "extra_forbidden":
+        section, _, option = shown.rpartition(".")
+        reason = f"there is no option `{option}` here"
+        # A key that stands somewhere else is no typing error: name its section.
+        homes = {known.rpartition(".")[2]: known for known in reversed(options)}
+        near = nearest(option, homes)
+        beside = [known for known in options if known.rpartition(".")[0] == section]
+        fix = f"did you mean `{homes[near]}`?" if near else did_you_mean("", beside, "options")
+    else:
+        reason, fix = _explain(fault, given)
+    if fault["type"] == "missing":
+        steps.append(fault["loc"][-1])
+    field = options.get(shown)
+    if field and not isinstance(field.default, BaseModel | PydanticUndefinedType):
+        fix += f" (default: {inline(to_jsonable_python(field.get_default()))})"
+    problems.add(origin, [*path, *map(str, steps)], reason, fix)
+
+
+def options_in(annotation: Any, above: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """Dotted path and declaration of every option that a value of this type can hold."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        for name, field in annotation.model_fields.items():
+            yield above + name, field
+            yield from options_in(field.annotation, f"{above}{name}.")
+    for part in get_args(annotation):
+        yield from options_in(part, above)
+
+
+def _explain(error: ErrorDetails, given: Any) -> tuple[str, str]:
     """Reason and fix: pydantic's message, or a better one where we know more than pydantic."""
     kind = error["type"]
     context = error.get("ctx", {})
@@ -183,16 +218,12 @@ def _explain(error: ErrorDetails, given: Any, config: type[BaseModel]) -> tuple[
     written = str(given)
     if kind == "missing":
         return f"`{error['loc'][-1]}` is missing and has no default", "add it"
-    if kind == "extra_forbidden":
-        option = str(error["loc"][-1])
-        known = {name for model in configs_in(config) for name in model.model_fields}
-        return f"there is no option `{option}`", did_you_mean(option, known, "options")
     if isinstance(cause, OptionError):
         return cause.reason, cause.fix
     if kind == "value_error":
         return str(cause), "change the value so that this holds"
     reason = re.sub(r"^\w+ should ", "must ", error["msg"].split(", got")[0])
-    reason = reason.replace(" after validation", "")
+    reason = reason.replace(" after validation", "").replace("an object", "a mapping")
     if kind not in ("too_long", "too_short"):
         reason += f", got {brief(given)}"
     if kind == "literal_error":
@@ -200,11 +231,3 @@ def _explain(error: ErrorDetails, given: Any, config: type[BaseModel]) -> tuple[
     if kind == "bool_type":
         return reason, "write `true` or `false`: in YAML 1.2 other words are strings"
     return reason, "put it in quotes" if kind == "string_type" else "give a value that fits"
-
-
-def configs_in(annotation: Any) -> set[type[BaseModel]]:
-    """The configs that an option of this type can hold, with those in their own options."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        inside = [field.annotation for field in annotation.model_fields.values()]
-        return {annotation}.union(*map(configs_in, inside))
-    return {model for part in get_args(annotation) for model in configs_in(part)}

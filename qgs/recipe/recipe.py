@@ -1,11 +1,11 @@
 """Resolving a recipe: read, merge, check, and write out every default; no tensor is allocated."""
 
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from torch import nn
@@ -146,49 +146,85 @@ def resolve(
         found = at_their_causes(draft, written, error.problems, plugins)
         raise RecipeError(found) from error.__cause__
     settings = draft.settings
-    spelled = spell_out(draft, parts)
-    used = [draft.registry.plugins[name] for name in ("qgs", *spelled["plugins"])]
+    tree: dict[str, Any] = {}
+    provenance: dict[str, str] = {}
+    for path, value, origin in spell_out(draft, parts):
+        holder = tree
+        for key in path[:-1]:
+            holder = holder.setdefault(key, {})
+        holder[path[-1]] = value
+        provenance[".".join(path)] = str(origin)
+    used = [draft.registry.plugins[name] for name in ("qgs", *tree["plugins"])]
     return Recipe(
-        # A plain mapping: a checkpoint stores it, and nobody changes the draft through it.
-        tree=json.loads(json.dumps(spelled)),
-        provenance={path: str(at.origins[key]) for path, at, key in leaves(spelled)},
+        tree=tree,
+        provenance=provenance,
         parts=parts,
         dims=draft.dims,
-        layer_scale=settings["model", "decoder"].layer_scale,
-        seed=settings[()].seed,
-        init_from=settings[()].init_from,
-        views=settings["views",],
-        training=settings["training",],
-        evaluation=settings["evaluation",],
+        layer_scale=settings.model.decoder.layer_scale,
+        seed=settings.seed,
+        init_from=settings.init_from,
+        views=settings.views,
+        training=settings.training,
+        evaluation=settings.evaluation,
         releases={one.plugin.name: (one.distribution, one.version) for one in used},
     )
 
 
-_DEFAULT = Origin("default")
+_DEFAULT = "default"
+_Spelled: TypeAlias = Iterator[tuple[KeyPath, Any, Origin | str]]
+"""Path of each value, the value, and where it was written."""
 
 
-def spell_out(draft: Draft, parts: Mapping[KeyPath, Chosen]) -> MapNode:
-    """Return all that a draft describes, in the order of a recipe; only plugins in use."""
+def spell_out(draft: Draft, parts: Mapping[KeyPath, Chosen]) -> _Spelled:
+    """All that a draft describes, in the order of a recipe; only plugins in use."""
     shown = _shown_parts(parts)
-    whole = _section(draft, ())
-    _put_plugins(whole, draft, {part.installed.plugin.name for part in shown.values()})
-    for path, part in shown.items():
-        if path == ("model", "feedback"):
-            # The decoder stands before it, also one of depth 0, which has no component.
-            _holder(whole, ("model", "decoder", ""), draft)
-        _holder(whole, path, draft)[path[-1]] = _component(part)
+    top, model, decoder, *sections = SETTINGS
+    encoder, queries, *others = shown
+    for path in (top, model, encoder, queries, decoder, *others, *sections):
+        if path in shown:
+            part = shown[path]
+            yield (*path, "type"), part.type, part.chosen_at
+            yield from _spelled(path, part.options, part.node, f"default of {part.type}")
+        else:
+            settings = reduce(getattr, path, draft.settings)
+            values = settings.model_dump(mode="json", include={*SETTINGS[path].model_fields})
+            yield from _spelled(path, values, draft.tree.child(*path), _DEFAULT)
+    yield _plugins(draft, {part.installed.plugin.name for part in shown.values()})
     for name, section in SECTIONS.items():
-        written = draft.tree.child(name)
         # Without a `null` the default metric would come back when the recipe is read again.
-        dropped = [key for key in section.defaults if (name, key) not in parts]
-        for key in dropped if section.defaults_stay else ():
-            _holder(whole, (name, key), draft).put(key, None, written.origin_of(key))
+        staying = section.defaults if section.defaults_stay else ()
+        for key in staying:
+            if (name, key) not in parts:
+                yield (name, key), None, draft.tree.child(name).origin_of(key)
         # An empty section is not a missing one, which stands for the defaults.
-        if section.named and name not in whole:
-            whole.put(name, {}, draft.tree.origins.get(name, _DEFAULT))
-    for name in ("views", "training", "evaluation"):
-        whole[name] = _section(draft, (name,))
-    return whole
+        if section.named and not staying and not any(path[0] == name for path in parts):
+            yield (name,), {}, draft.tree.origins.get(name, _DEFAULT)
+
+
+def _spelled(
+    path: KeyPath, values: Mapping[str, Any], written: MapNode, default: Origin | str
+) -> _Spelled:
+    """`values` at `path`, with `default` as the origin of those that are not written."""
+    for name, value in values.items():
+        origin = written.origins.get(name, default)
+        if isinstance(value, dict) and value:
+            inner = default if isinstance(written.get(name), MapNode) else origin
+            yield from _spelled((*path, name), value, written.child(name), inner)
+        else:
+            yield (*path, name), value, origin
+
+
+def _plugins(draft: Draft, used: set[str]) -> tuple[KeyPath, Any, Origin | str]:
+    """The plugins of a draft that are `used`, and the lines that name them."""
+    kept = [
+        name
+        for name, installed in draft.registry.plugins.items()
+        # One with weight layouts alone has no component to use: `qgs import` reads it.
+        if name != "qgs" and (name in used or not installed.plugin.components)
+    ]
+    origin = draft.tree.origins.get("plugins", Origin(_DEFAULT))
+    lines = [str(at) for name, at in items_of(draft.tree.get("plugins"), origin) if name in kept]
+    return ("plugins",), kept, ", ".join(dict.fromkeys(lines)) or origin
 
 
 def _shown_parts(parts: Mapping[KeyPath, Chosen]) -> dict[KeyPath, Chosen]:
@@ -207,69 +243,15 @@ def _shown_parts(parts: Mapping[KeyPath, Chosen]) -> dict[KeyPath, Chosen]:
     return shown | own
 
 
-def _holder(whole: MapNode, path: KeyPath, draft: Draft) -> MapNode:
-    """The mapping that holds `path`; one that is new begins with the settings of its section."""
-    holder = whole
-    for end, key in enumerate(path[:-1], start=1):
-        if key not in holder:
-            holder[key] = _section(draft, path[:end])
-        holder = holder[key]
-    return holder
-
-
-def _section(draft: Draft, path: KeyPath) -> MapNode:
-    """The settings of a section, if it has any."""
-    values = draft.settings[path].model_dump(mode="json") if path in SETTINGS else {}
-    return _spelled(values, draft.tree.child(*path), _DEFAULT)
-
-
-def _component(chosen: Chosen) -> MapNode:
-    """`type` and options of a component."""
-    default = Origin(f"default of {chosen.type}")
-    spelled = _spelled({"type": chosen.type, **chosen.options}, chosen.node, default)
-    spelled.origins["type"] = chosen.node.origins.get("type", Origin("default of the slot"))
-    return spelled
-
-
-def _spelled(values: Mapping[str, Any], written: MapNode, default: Origin) -> MapNode:
-    """`values`, with `default` as the origin of those that are not written."""
-    spelled = MapNode(written.origin)
-    for name, value in values.items():
-        origin = written.origins.get(name, default)
-        if isinstance(value, dict):
-            known = isinstance(written.get(name), MapNode)
-            value = _spelled(value, written.child(name), default if known else origin)
-        spelled.put(name, value, origin)
-    return spelled
-
-
-def _put_plugins(whole: MapNode, draft: Draft, used: set[str]) -> None:
-    kept = [
-        name
-        for name, installed in draft.registry.plugins.items()
-        # One with weight layouts alone has no component to use: `qgs import` reads it.
-        if name != "qgs" and (name in used or not installed.plugin.components)
-    ]
-    origin = draft.tree.origins.get("plugins", _DEFAULT)
-    lines = [str(at) for name, at in items_of(draft.tree.get("plugins"), origin) if name in kept]
-    if lines:
-        origin = Origin(", ".join(dict.fromkeys(lines)))
-    whole.put("plugins", kept, origin)
-
-
-def leaves(tree: Mapping[str, Any], path: KeyPath = ()) -> Iterator[tuple[str, Any, str]]:
-    """Dotted path of each value, mappings opened; the mapping that holds it, and its key there."""
-    for key, value in tree.items():
-        below = (*path, key)
-        if isinstance(value, Mapping) and value:
-            yield from leaves(value, below)
-        else:
-            yield ".".join(below), tree, key
-
-
-def flat(tree: Mapping[str, Any]) -> dict[str, Any]:
+def flat(tree: Mapping[str, Any], above: str = "") -> dict[str, Any]:
     """Dotted path to value, mappings opened."""
-    return {path: holder[key] for path, holder, key in leaves(tree)}
+    found: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, Mapping) and value:
+            found |= flat(value, f"{above}{key}.")
+        else:
+            found[above + key] = value
+    return found
 
 
 def differing_options(

@@ -1,10 +1,11 @@
 """The sections of a recipe, and a draft: components chosen, not yet checked beside each other."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, WithJsonSchema, create_model, field_validator
 
 from qgs.contracts import (
     LAYER_SLOTS,
@@ -16,14 +17,13 @@ from qgs.contracts import (
     TrainingConfig,
     ViewsConfig,
 )
-from qgs.recipe.decode import Parts, decode_config, decode_place
-from qgs.recipe.errors import Origin, Problems, nearest
+from qgs.recipe.decode import Parts, decode_place, report, validated
+from qgs.recipe.errors import Origin, Problems
 from qgs.recipe.files import merge
 from qgs.recipe.places import apply_swaps, expand
 from qgs.recipe.registry import Registry, load_plugins
-from qgs.recipe.slots import MODEL_SLOTS, SECTIONS
-from qgs.recipe.yaml_text import KeyPath, MapNode, brief, from_plain
-from qgs.wording import listed
+from qgs.recipe.slots import AFTER_LAYERS, SECTIONS, SLOTS, summary_of
+from qgs.recipe.yaml_text import KeyPath, MapNode, find, from_plain
 
 
 class ModelSettings(ComponentConfig):
@@ -76,70 +76,93 @@ SETTINGS: dict[KeyPath, type[ComponentConfig]] = {
     ("training",): TrainingConfig,
     ("evaluation",): EvaluationConfig,
 }
-_BESIDE: dict[KeyPath, tuple[str, ...]] = {
-    (): ("swap", "model", *SECTIONS, "views", "training", "evaluation"),
-    ("model",): (*MODEL_SLOTS, "decoder"),
-    ("model", "decoder"): (*LAYER_SLOTS, "layers"),
-}
-"""Keys that stand beside the settings of a section."""
-_KEYS = {path: {*SETTINGS[path].model_fields, *keys} for path, keys in _BESIDE.items()}
-_HOMES = {key: ".".join((*path, key)) for path, keys in _KEYS.items() for key in keys}
-_LAYERS: KeyPath = ("model", "decoder", "layers")
-_NAMED = [(name,) for name, section in SECTIONS.items() if section.named]
-_MAPPINGS: set[KeyPath] = {("swap",), _LAYERS, *SETTINGS, *_NAMED}
 
 
-def check_keys(tree: MapNode, problems: Problems, path: KeyPath = ()) -> MapNode:
-    """Report unknown keys and sections that are no mappings; the tree without them."""
-    # Options of components are checked where their Config is known.
-    known = LAYER_SLOTS if path[:-1] == _LAYERS else _KEYS.get(path)
-    checked = MapNode(tree.origin)
-    for key, node, origin in tree.entries():
-        below = (*path, key)
-        if known is not None and key not in known:
-            # A key that stands somewhere else is no typing error: name its section.
-            near = nearest(key, _HOMES)
-            fix = f"did you mean `{_HOMES[near]}`?" if near else f"keys: {listed(sorted(known))}"
-            problems.add(origin, below, f"there is no key `{key}` here", fix)
-        elif below not in _MAPPINGS and path != _LAYERS:
-            checked.put(key, node, origin)
-        elif isinstance(node, MapNode):
-            checked.put(key, check_keys(node, problems, below), origin)
-        elif node is not None:
-            reason = f"`{key}` is a mapping, this is {brief(node)}"
-            fix = f"write `key: value` lines below `{key}:`"
-            problems.add(origin, below, reason, fix)
-    return checked
+def _parts(*slots: str) -> dict[str, Any]:
+    """Fields of components, of any form: `decode_place` knows which options they have."""
+    fields: dict[str, Any] = {}
+    for name in slots:
+        about = summary_of(SLOTS[name].contract)
+        part = Annotated[Any, WithJsonSchema({"slot": name})]
+        fields[name] = part, Field(default=None, description=about)
+        if SLOTS[name].named:
+            about = f"By name: {about}"
+            fields[name] = dict[str, part], Field(default_factory=dict, description=about)
+    return fields
 
 
-def decode_settings(tree: MapNode, problems: Problems) -> dict[KeyPath, Any]:
-    """Settings by section, defaults for one with problems."""
-    settings: dict[KeyPath, Any] = {}
-    for path, config in SETTINGS.items():
-        written = tree.child(*path).without(*_BESIDE.get(path, ()))
-        # Go on with defaults, so that problems of other sections are reported as well.
-        settings[path] = decode_config(config, written, path, problems) or config.model_construct()
-    return settings
+def _section(settings: type[ComponentConfig], **places: Any) -> Any:
+    """A field of a section that has settings, and maybe components."""
+    kind: Any = settings
+    if places:
+        named = settings.__name__
+        kind = create_model(named, __base__=settings, __doc__=settings.__doc__, **places)
+    return kind, Field(default_factory=kind)
+
+
+_LAYER = _parts(*LAYER_SLOTS)
+_LAYERS: Any = dict[str, create_model("Layer", __base__=ComponentConfig, **_LAYER)]
+_BY_INDEX: Any = Field(
+    default_factory=dict,
+    description="Overrides of single layers, by their index from 0.",
+    json_schema_extra={"propertyNames": {"pattern": "^[0-9]+$"}},
+)
+Layout: Any = create_model(
+    "Layout",
+    __base__=RecipeSettings,
+    # Components by pattern of the places that they take; null drops an inherited swap.
+    swap=(dict[str, Any], {}),
+    model=_section(
+        ModelSettings,
+        **_parts("encoder", "queries"),
+        decoder=_section(DecoderSettings, **_LAYER, layers=(_LAYERS, _BY_INDEX)),
+        **_parts(*AFTER_LAYERS),
+    ),
+    **_parts(*SECTIONS),
+    views=_section(ViewsConfig),
+    training=_section(TrainingConfig),
+    evaluation=_section(EvaluationConfig),
+)
+"""A whole recipe: its settings, and the places of components."""
+
+
+def decode_settings(tree: MapNode, problems: Problems) -> tuple[MapNode, Any]:
+    """The Layout of `tree`, and `tree` without what it refuses and sections that are null."""
+    settings, faults = validated(Layout, tree)
+    for fault in faults:
+        # A section that is null leaves the default one.
+        if fault["input"] is not None or fault["type"] not in ("model_type", "dict_type"):
+            report(fault, Layout, tree, (), problems)
+    sound = deepcopy(tree)
+    # Go on with defaults, so that problems of components are reported as well.
+    while faults:
+        for fault in faults:
+            keys = [step for step in find(sound, fault["loc"])[0] if isinstance(step, str)]
+            if keys:
+                del sound.child(*keys[:-1])[keys[-1]]
+        sound.put("recipe", 1, sound.origin_of("recipe"))
+        settings, faults = validated(Layout, sound)
+    return sound, settings
 
 
 @dataclass(frozen=True)
 class Draft:
     """A recipe that has been read.
 
-    tree: all files and overrides merged, with the default losses and metrics. settings: of each
-    section. parts: what stands at each place, decoder layers numbered.
+    tree: all files and overrides merged, with the default losses and metrics. settings: a Layout.
+    parts: what stands at each place, decoder layers numbered.
     """
 
     tree: MapNode
-    settings: Mapping[KeyPath, Any]
+    settings: Any
     registry: Registry
     parts: Parts
 
     @property
     def dims(self) -> ModelDims:
         """Width, heads and depth of the model."""
-        model = self.settings["model",]
-        return ModelDims(model.width, model.heads, self.settings["model", "decoder"].depth)
+        model = self.settings.model
+        return ModelDims(model.width, model.heads, model.decoder.depth)
 
 
 def draft_of(written: MapNode, problems: Problems, plugins: Sequence[Plugin]) -> Draft:
@@ -148,10 +171,10 @@ def draft_of(written: MapNode, problems: Problems, plugins: Sequence[Plugin]) ->
     plugins: those that it may name although they are not installed.
     """
     # Under what is written: `losses: {}` has none, a recipe without `losses` the default ones.
-    tree = _with_defaults(check_keys(written, problems))
-    settings = decode_settings(tree, problems)
-    registry = load_plugins(settings[()].plugins or (), tree, problems, plugins)
-    expanded = expand(tree, settings["model", "decoder"].depth, problems)
+    sound, settings = decode_settings(written, problems)
+    tree = _with_defaults(sound)
+    registry = load_plugins(settings.plugins or (), tree, problems, plugins)
+    expanded = expand(tree, settings.model.decoder.depth, problems)
     places = apply_swaps(tree.child("swap"), expanded, problems)
     found = [decode_place(place, registry, problems) for place in places.values()]
     # Components that are not known cannot be checked beside each other.

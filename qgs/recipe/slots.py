@@ -1,5 +1,6 @@
 """The places of a recipe that hold components, and what stands there by default."""
 
+import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -67,6 +68,11 @@ def slot_at(path: KeyPath) -> Slot | None:
     """The slot at a place of a recipe; None where no component belongs."""
     # That of a section stands first, that of a part of the model last.
     return next((SLOTS[key] for key in (*path[:1], *path[-1:]) if key in SLOTS), None)
+
+
+def summary_of(described: object) -> str:
+    """The first paragraph of a docstring, on one line."""
+    return " ".join((inspect.getdoc(described) or "").split("\n\n")[0].split())
 
 
 def type_at(node: Any, path: KeyPath) -> Any:

@@ -6,18 +6,19 @@ What `Component`, its `Config` and `nn.Module` give a class that does as usual i
 import random
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, get_args
 from unittest.mock import patch
 
 import numpy
 import torch
+from pydantic import BaseModel
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from qgs.containers import map_tensors
 from qgs.contracts import ComponentConfig
 from qgs.recipe.build import OnMeta
-from qgs.recipe.decode import configs_in, decode_config
+from qgs.recipe.decode import decode_config
 from qgs.recipe.errors import Problems, RecipeError
 from qgs.recipe.yaml_text import dump, load_mapping
 from qgs.types import GaussianAttributes, ImageMemory, QueryState, Rendering
@@ -243,9 +244,17 @@ def _expect_strict_options(case: Case) -> None:
     config, message = _decoded(case, {**options, wrong: 1})
     expect(config is None, f"the option `{wrong}` is accepted")
     expect(not names or f"did you mean `{names[0]}`" in message, f"the message is: {message}")
-    for model in configs_in(type(case.config)):
+    for model in _configs_in(type(case.config)):
         strict = model.model_config.get("extra") == "forbid"
         expect(strict, f"{model.__qualname__} accepts any option; derive it from ComponentConfig")
+
+
+def _configs_in(annotation: Any) -> set[type[BaseModel]]:
+    """The configs that an option of this type can hold, with those in their own options."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        inside = [field.annotation for field in annotation.model_fields.values()]
+        return {annotation}.union(*map(_configs_in, inside))
+    return {model for part in get_args(annotation) for model in _configs_in(part)}
 
 
 def _decoded(case: Case, options: dict[str, Any]) -> tuple[ComponentConfig | None, str]:
