@@ -156,8 +156,6 @@ class Component(metaclass=ABCMeta):
         super().__init_subclass__(**options)
         # `component_of` finds a component by its Config, so that no two may share one.
         inherited = cls.Config
-        if not (isinstance(inherited, type) and issubclass(inherited, ComponentConfig)):
-            return  # reported when the plugin is loaded
         if inherited.__qualname__ != f"{cls.__qualname__}.Config":
             own: dict[str, Any] = {"__qualname__": f"{cls.__qualname__}.Config"}
             own["__module__"] = cls.__module__

@@ -32,16 +32,6 @@ class AttentionWeights:
     geometry: Tensor | None
     weights: Tensor
 
-    def __post_init__(self) -> None:
-        shape = tuple(self.content.shape)
-        assert len(shape) == 4, f"content has the shape {shape}, not (B, h, Q, T)"
-        assert self.weights.shape == shape, f"weights {tuple(self.weights.shape)}, content {shape}"
-        if self.geometry is not None:
-            found = tuple(self.geometry.shape)
-            # Geometry is most often the same for all heads, and large.
-            shared = (shape[0], 1, *shape[2:])
-            assert found in (shared, shape), f"geometry {found}, content {shape}"
-
 
 @dataclass(frozen=True)
 class LayerParts:

@@ -141,7 +141,7 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
             isinstance(error, ValueError | OSError)
             and issubclass(component, SceneSource | Optimizer)
         )
-        if users_mistake or is_out_of_memory(error) or chosen.installed.plugin is BUILTIN:
+        if users_mistake or is_out_of_memory(error) or chosen.installed is BUILTIN:
             raise
         failure = component_failure(chosen.type, "__init__", error, chosen.installed)
         problems = Problems()

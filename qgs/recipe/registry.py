@@ -19,22 +19,6 @@ from qgs.recipe.slots import SLOTS
 from qgs.recipe.yaml_text import MapNode, items_of
 from qgs.version import __version__
 
-BUILTIN = Plugin(
-    name="qgs",
-    contract_version=CONTRACT_VERSION,
-    components=(
-        *qgs.tokengs.COMPONENTS,
-        *qgs.renderers.COMPONENTS,
-        *qgs.losses.COMPONENTS,
-        *qgs.metrics.COMPONENTS,
-        *qgs.data.COMPONENTS,
-    ),
-    examples=(
-        qgs.tokengs.LayerSupervision.Config(layers=(1, 2)),
-        qgs.data.PhotosSource.Config(path="photos"),  # type: ignore[call-arg]
-    ),
-)
-
 
 class PluginError(OptionError):
     """A plugin that cannot be used: `reason` names its distribution, `fix` the remedy."""
@@ -61,6 +45,28 @@ class InstalledPlugin:
         return {f"{self.plugin.name}/{name}": self.folder / file for name, file in models}
 
 
+BUILTIN = InstalledPlugin(
+    Plugin(
+        name="qgs",
+        contract_version=CONTRACT_VERSION,
+        components=(
+            *qgs.tokengs.COMPONENTS,
+            *qgs.renderers.COMPONENTS,
+            *qgs.losses.COMPONENTS,
+            *qgs.metrics.COMPONENTS,
+            *qgs.data.COMPONENTS,
+        ),
+        examples=(
+            qgs.tokengs.LayerSupervision.Config(layers=(1, 2)),
+            qgs.data.PhotosSource.Config(path="photos"),  # type: ignore[call-arg]
+        ),
+    ),
+    "query-gaussians",
+    __version__,
+)
+"""The plugin `qgs`."""
+
+
 @dataclass(frozen=True)
 class Registry:
     """The plugins that one recipe uses. complete: whether all that it names can be used."""
@@ -78,11 +84,6 @@ class Registry:
         }
 
 
-def builtin() -> InstalledPlugin:
-    """The plugin `qgs`."""
-    return InstalledPlugin(BUILTIN, "query-gaussians", __version__)
-
-
 def available_plugins() -> dict[str, list[EntryPoint]]:
     """Name to entry points of every installed plugin, by metadata alone."""
     found: dict[str, list[EntryPoint]] = {}
@@ -93,7 +94,7 @@ def available_plugins() -> dict[str, list[EntryPoint]]:
 
 def load_registry(names: Iterable[str]) -> Registry:
     """The built-in components and those of the plugins `names`; raises PluginError."""
-    return Registry({"qgs": builtin(), **{name: load_plugin(name) for name in names}})
+    return Registry({"qgs": BUILTIN, **{name: load_plugin(name) for name in names}})
 
 
 def load_plugins(
@@ -104,7 +105,7 @@ def load_plugins(
     given: plugins that need not be installed.
     """
     at_hand = {plugin.name: InstalledPlugin(plugin) for plugin in given}
-    plugins = {"qgs": builtin()}
+    plugins = {"qgs": BUILTIN}
     written = items_of(tree.get("plugins"), tree.origin_of("plugins"))
     for index, name in enumerate(names):
         try:
@@ -117,7 +118,7 @@ def load_plugins(
 
 def load_usable_plugins() -> tuple[Registry, list[str]]:
     """The components of every installed plugin that can be used, and why the others cannot."""
-    plugins = {"qgs": builtin()}
+    plugins = {"qgs": BUILTIN}
     broken = []
     # A plug-in of the framework's own name hides nothing.
     for name in sorted(available_plugins().keys() - {"qgs"}):
@@ -131,7 +132,7 @@ def load_usable_plugins() -> tuple[Registry, list[str]]:
 def load_plugin(name: str) -> InstalledPlugin:
     """Import and check the plugin `name`; raises PluginError."""
     if name == "qgs":
-        return builtin()
+        return BUILTIN
     available = available_plugins()
     if not (entries := available.get(name)):
         fix = f"{extensions.INSTALL_ALL}; {did_you_mean(name, available, 'installed plugins')}"

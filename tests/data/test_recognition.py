@@ -9,7 +9,7 @@ from upath import UPath
 from qgs.contracts import SceneSourceConfig
 from qgs.data import PhotosSource
 from qgs.data.recognition import open_for, recognised
-from qgs.recipe.registry import InstalledPlugin, Registry, builtin
+from qgs.recipe.registry import BUILTIN, InstalledPlugin, Registry
 
 HASH = "0a" * 32
 BLACK = (0.0, 0.0, 0.0)
@@ -33,7 +33,7 @@ readme.txt: qgs/photos
 """
 """A file in a folder, and the source that opens the folder."""
 PLUGINS = {"datasets": InstalledPlugin(datasets), "tapes": InstalledPlugin(plugin)}
-SOURCES = Registry({"qgs": builtin(), **PLUGINS}).components("data")
+SOURCES = Registry({"qgs": BUILTIN, **PLUGINS}).components("data")
 
 
 def test_by_content(tmp_path):

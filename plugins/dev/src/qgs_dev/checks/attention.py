@@ -72,6 +72,12 @@ def check_explanation_is_a_softmax(case: Case) -> None:
     right = shape == (batch, shape[1], queries, tokens)
     expect(right, f"content is {shape}, not (B, h, Q, T) = ({batch}, h, {queries}, {tokens})")
     expect(given.content.isfinite().all(), "content is not finite: a mask is geometry")
+    expect(given.weights.shape == shape, f"weights are {tuple(given.weights.shape)}, not {shape}")
+    if given.geometry is not None:
+        found = tuple(given.geometry.shape)
+        # Geometry is most often the same for all heads, and large.
+        shared = (batch, 1, queries, tokens)
+        expect(found in (shape, shared), f"geometry is {found}, neither {shape} nor {shared}")
     asked = [2, 0]
     some = explanation(trial.module, trial.inputs, asked)
     expect(some is not None, "asked for queries 2 and 0 alone, it gives nothing")
