@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from numpy.testing import assert_allclose
 from qgs_viewer import queries
 from qgs_viewer.look import CATEGORICAL
-from qgs_viewer.placement import Placement, Splats, hit, on_photo, splats
+from qgs_viewer.placement import Placement, hit, on_photo, splats
 from scipy.spatial.transform import Rotation
 from small import cloud
 from walk import arc, pinhole
@@ -132,11 +132,3 @@ def test_a_click_hits_what_the_renderer_shows_there():
             checked += 1
     assert checked > 20
     assert hit(found, np.array([9.0, 0, 0]), AHEAD) is None
-
-
-def test_small_gaussians_beside_large_ones_survive_half_precision():
-    sizes = np.array([2.0, 2e-4])
-    covariances = sizes[:, None, None] ** 2 * np.eye(3)
-    factor = Splats(None, covariances, None, None).magnification
-    sent = (covariances * factor**2).astype(np.float16).astype(np.float64)
-    assert_allclose(np.sqrt(sent[:, 0, 0]) / factor, sizes, rtol=1e-3)

@@ -74,10 +74,3 @@ def test_a_reconstruction_keeps_its_background(opened):
     assert opened("scene", "views").scene_of(()).background == NEUTRAL
     with pytest.raises(ValueError, match=r"cameras\.json is no record"):
         opened(background=[0.5])
-
-
-def test_a_ply_shows_gaussians_alone(finished):
-    file = finished / "gaussians.ply"
-    found = open_source(str(file)).scene_of(())
-    assert (found.queries, found.views) == (0, None)
-    assert found.gaussians.count == load_ply(file).count

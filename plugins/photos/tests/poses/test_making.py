@@ -143,15 +143,6 @@ def test_a_training_makes_none(folder, calls):
     assert not calls
 
 
-def test_a_folder_of_something_else_is_not_written_into(folder):
-    notes = folder.parent / "holiday_poses/mine.txt"
-    notes.parent.mkdir()
-    notes.touch()
-    with pytest.raises(FileExistsError):
-        photos_of(folder)
-    assert [*notes.parent.iterdir()] == [notes]
-
-
 def test_a_folder_whose_photos_are_elsewhere_is_none(tmp_path):
     (tmp_path / "a/b").mkdir(parents=True)
     with pytest.raises(FileNotFoundError, match="lists no cameras"):
