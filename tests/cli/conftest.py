@@ -1,12 +1,9 @@
-"""A run of `qgs train` made once, and pictures so small that a reconstruction takes no time."""
+"""A run of `qgs train` made once."""
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from commands import done, run_qgs, sets
-
-from qgs.reconstruction import saving
 
 RECIPE = Path(__file__).parents[2] / "recipes/tiny/locus.yaml"
 QUICK = sets(
@@ -30,15 +27,3 @@ def trained(tmp_path_factory):
     """What that printed and its folder, which no test changes."""
     out = tmp_path_factory.mktemp("trained") / "run"
     return done("train", RECIPE, "--out", out, *QUICK).output, out
-
-
-@pytest.fixture
-def short_orbit(monkeypatch):
-    monkeypatch.setattr(saving, "ORBIT_FRAMES", 2)
-    monkeypatch.setattr(saving, "ORBIT_SIDE", 16)
-
-
-@pytest.fixture
-def small_pictures(monkeypatch, short_orbit):
-    """Overview and orbit are most of the work of saving; one test looks at a real one."""
-    monkeypatch.setattr(saving, "overview", lambda result: np.zeros((4, 4, 3), np.uint8))

@@ -3,12 +3,9 @@
 import shutil
 
 import pytest
-from installing import install
 from planted import Planted, good_sets
 from qgs_photos.datatools import geometry
 from textured_room import walk
-
-__all__ = ["install"]
 
 
 def once(make, key):

@@ -3,13 +3,12 @@
 import json
 import shutil
 
-import numpy as np
 import pytest
 from commands import done, record_of, run_qgs, saved
 from photo_formats import noisy_photos
 from plyfile import PlyData
 
-from qgs.reconstruction import saving
+pytestmark = pytest.mark.usefixtures("small_pictures")
 
 
 @pytest.fixture(scope="module")
@@ -21,14 +20,6 @@ def photos(tmp_path_factory):
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
     return saved(tmp_path_factory.mktemp("rooms") / "rooms.safetensors", "rooms/procedural")
-
-
-@pytest.fixture(autouse=True)
-def small_pictures(monkeypatch):
-    """Pictures take most of the time, and are tested with `qgs reconstruct`."""
-    monkeypatch.setattr(saving, "ORBIT_FRAMES", 2)
-    monkeypatch.setattr(saving, "ORBIT_SIDE", 16)
-    monkeypatch.setattr(saving, "overview", lambda result: np.zeros((4, 4, 3), np.uint8))
 
 
 @pytest.fixture

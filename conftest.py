@@ -2,6 +2,7 @@
 
 import gc
 
+import numpy as np
 import pytest
 import suite_watch
 from installing import install
@@ -34,3 +35,16 @@ def _seeded_on_one_thread():
 def few_samples_measured(monkeypatch):
     """A training measures the ranges of its views in .1 s, not in a second."""
     monkeypatch.setattr("qgs.data.stream.MEASURED", 48)
+
+
+@pytest.fixture
+def short_orbit(monkeypatch):
+    monkeypatch.setattr("qgs.reconstruction.saving.ORBIT_FRAMES", 2)
+    monkeypatch.setattr("qgs.reconstruction.saving.ORBIT_SIDE", 16)
+
+
+@pytest.fixture
+def small_pictures(monkeypatch, short_orbit):
+    """Overview and orbit are most of the work of saving; one test looks at a real one."""
+    picture = np.zeros((4, 4, 3), np.uint8)
+    monkeypatch.setattr("qgs.reconstruction.saving.overview", lambda result: picture)
