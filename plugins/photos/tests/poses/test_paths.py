@@ -11,7 +11,6 @@ from commands import done, run_qgs
 from photo_formats import noisy_photos, row_of_frames
 from PIL import Image, ImageSequence
 from qgs_photos.poses.filming import (
-    FilmOptions,
     FilmScene,
     cameras_of,
     open_film_scene,
@@ -105,10 +104,10 @@ def test_size_length_and_angle_of_view():
     world = torch.eye(4).double(), 1.0
     scene = FilmScene(wall(3.0), cameras(), AutoRenderer(AutoRenderer.Config()), world)
     assert seen_depth(scene) == pytest.approx(3.0, rel=0.02)
-    path = cameras_of(scene, FilmOptions("orbit", seconds=0.5, rate=10))
+    path = cameras_of(scene, "orbit", None, 5, None)
     assert path.shape == (1, 5)
     assert path.size == (480, 720)
-    path = cameras_of(scene, FilmOptions("spiral", size=(100, 200), seconds=0.5, rate=10, fov=60))
+    path = cameras_of(scene, "spiral", (100, 200), 5, 60)
     focal = 50 / math.tan(math.radians(30))
     assert path.intrinsics[0, 0].tolist() == pytest.approx([focal, focal, 100, 50])
 

@@ -45,19 +45,15 @@ def video(
     from rich.console import Console
 
     from qgs.files import refuse_existing
-    from qgs_photos.poses.filming import FilmOptions, film, open_film_scene, refuse_suffix
+    from qgs_photos.poses.filming import cameras_of, film, open_film_scene, refuse_suffix
 
     # before the scene is opened, which takes seconds
     refuse_existing(out)
     refuse_suffix(out)
     use_threads(threads)
     console = Console()
-    options = FilmOptions(
-        path=path,
-        size=parse_size(size),
-        seconds=seconds,
-        rate=rate,
-        fov=fov,
-    )
-    film(open_film_scene(source, photos, scene), options, out, console)
+    pixels = parse_size(size)
+    opened = open_film_scene(source, photos, scene)
+    cameras = cameras_of(opened, path, pixels, round(seconds * rate), fov)
+    film(opened, cameras, out, rate, console)
     say(console, f"wrote {out}")

@@ -35,17 +35,6 @@ _HEIGHT = 480
 
 
 @dataclass(frozen=True)
-class FilmOptions:
-    """Options of a film. path: of KINDS, or a file. size: (H, W). fov: vertical, in degrees."""
-
-    path: str = "orbit"
-    size: tuple[int, int] | None = None
-    seconds: float = 8.0
-    rate: int = 24
-    fov: float | None = None
-
-
-@dataclass(frozen=True)
 class FilmScene:
     """Gaussians (1, G) and the cameras (1, V) of photos of them, in one world.
 
@@ -58,12 +47,12 @@ class FilmScene:
     world: tuple[Tensor, Tensor]
 
 
-def film(scene: FilmScene, options: FilmOptions, file: Path, console: Console) -> None:
-    """Render the path and write `file`. Raises ValueError for a path that is none."""
-    path = cameras_of(scene, options).to(scene.gaussians.means.device)
+def film(scene: FilmScene, path: Cameras, file: Path, rate: int, console: Console) -> None:
+    """Render from the cameras (1, T) of a path, `rate` a second, and write `file`."""
+    path = path.to(scene.gaussians.means.device)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         cameras = bar.track(range(path.shape[1]), description="rendering")
-        write_film((_picture(scene, path[:, [place]]) for place in cameras), file, options.rate)
+        write_film((_picture(scene, path[:, [place]]) for place in cameras), file, rate)
 
 
 @torch.no_grad()
@@ -110,14 +99,18 @@ def _write_webp(frames: Iterator[np.ndarray], path: Path, rate: int) -> None:
     first.save(path, "WEBP", save_all=True, append_images=rest, **options)
 
 
-def cameras_of(scene: FilmScene, options: FilmOptions) -> Cameras:
-    """Return the cameras (1, T) of the path, of the wanted size and angle of view."""
-    size = options.size or _film_size(scene.cameras.size)
-    if options.path in KINDS:
-        count = max(round(options.seconds * options.rate), 2)
-        path = path_of(options.path, scene.cameras, seen_depth(scene), count)
-        return Cameras(path.c2w, lenses(path, size, options.fov), size)
-    c2w, intrinsics = read_path(Path(options.path), size, options.fov)
+def cameras_of(
+    scene: FilmScene, path: str, size: tuple[int, int] | None, frames: int, fov: float | None
+) -> Cameras:
+    """Return the cameras (1, T) of a path: of KINDS, of so many frames, or of a file.
+
+    size: (H, W). fov: vertical, in degrees. Raises ValueError for a path that is none.
+    """
+    size = size or _film_size(scene.cameras.size)
+    if path in KINDS:
+        found = path_of(path, scene.cameras, seen_depth(scene), max(frames, 2))
+        return Cameras(found.c2w, lenses(found, size, fov), size)
+    c2w, intrinsics = read_path(Path(path), size, fov)
     reference, scale = scene.world
     inside = scaled(relative_to(reference, c2w), scale)
     return Cameras(inside.float()[None], intrinsics.float()[None], size)

@@ -75,10 +75,10 @@ class Things:
         faces = 6 if self.rng.random() < 0.3 else 1
         return self.rng.randrange(self._textures - 5), faces
 
-    def skinned(self, body: Primitive, scale: float = 1.0, cut: Primitive | None = None) -> Shape:
+    def skinned(self, body: Primitive, scale: float = 1.0) -> Shape:
         """Return a shape with textures of its own."""
         first, faces = self.texture()
-        return Shape(body, cut, first, faces, self.rng.randrange(self._textures), scale)
+        return Shape(body, None, first, faces, self.rng.randrange(self._textures), scale)
 
     def draw(self) -> Thing:
         """Draw a thing."""
