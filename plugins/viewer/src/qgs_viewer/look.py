@@ -38,9 +38,9 @@ def categorical(index: int) -> Color:
     return CATEGORICAL[index % len(CATEGORICAL)]
 
 
-def running_mean(values: Sequence[float], share: float = 0.05) -> np.ndarray:
-    """Return the mean over a centred window of `share` of the values, cut off at both ends."""
-    window = np.ones(2 * int(len(values) * share / 2) + 1)
+def running_mean(values: Sequence[float]) -> np.ndarray:
+    """Return the mean over a centred twentieth of the values, cut off at both ends."""
+    window = np.ones(2 * int(len(values) / 40) + 1)
     sums = np.convolve(values, window, "same")
     return sums / np.convolve(np.ones(len(values)), window, "same")
 
@@ -58,18 +58,12 @@ def page_environment(**filters: Callable[..., str]) -> Environment:
     return environment
 
 
-def data_uri(image: Picture | list[Picture], photo: bool = False) -> str:
-    """Encode a picture as PNG, a large `photo` as WebP, frames as an endless WebP animation."""
-    frames = image if isinstance(image, list) else [image]
-    if len(frames) == 1 and not (photo and max(frames[0].shape) > EXACT):
-        return "data:image/png;base64," + base64.b64encode(png_bytes(frames[0])).decode()
+def data_uri(image: Picture, photo: bool = False) -> str:
+    """Encode a picture as PNG, a large `photo` as WebP."""
+    if not (photo and max(image.shape) > EXACT):
+        return "data:image/png;base64," + base64.b64encode(png_bytes(image)).decode()
     buffer = BytesIO()
-    first, *rest = map(Image.fromarray, frames)
-    quality = 90 if photo else 80
-    first.save(
-        buffer, "WEBP", save_all=True, append_images=rest,
-        duration=90, loop=0, quality=quality, method=2,
-    )  # fmt: skip
+    Image.fromarray(image).save(buffer, "WEBP", quality=90, method=2)
     return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
