@@ -30,7 +30,7 @@ KERNELS = ("@jit", "@kernel", "numba", "triton.jit")
 def group_of(path: str) -> str:
     """Return qgs, plugins, tests, tools, docs or other; `path` is relative to the repository."""
     parts = path.split("/")
-    if "tests" in parts:
+    if "tests" in parts or path == "conftest.py":
         return "tests"
     return parts[0] if parts[0] in ("qgs", "plugins", "tools", "docs") else "other"
 
