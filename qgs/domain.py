@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from qgs.geometry.poses import look_at_depth
 from qgs.types import Cameras
@@ -44,12 +43,27 @@ class Domain:
     samples: int = 0
 
     def see(self, inputs: Cameras, targets: Cameras) -> None:
-        """Add samples: cameras (B, V_in) and (B, V_out) in the model's frame."""
-        for name, values in _measured(inputs, targets):
-            known = values[~values.isnan()].tolist()
+        """Add a sample: cameras (1, V_in) and (1, V_out) in the model's frame."""
+        # In float32 a cosine near 1 is off by angles of 0.02 degrees.
+        c2w = inputs.c2w[0].double()
+        measured = {"views": [float(len(c2w))]}
+        # Distances and axes only for several inputs.
+        if len(c2w) > 1:
+            places = c2w[:, :3, 3]
+            axes = c2w[:, :3, 2]
+            turn = (axes @ axes.mT).min().clamp(-1, 1).arccos().rad2deg()
+            measured["baseline"] = [float(torch.cdist(places, places).max())]
+            measured["turn"] = [float(turn)]
+        depth = float(look_at_depth(torch.cat([inputs.c2w[0], targets.c2w[0]])))
+        halves = inputs.size[1] / 2 / inputs.intrinsics[0, :, 0].double()
+        # Axes that meet behind the cameras diverge in front of them: no depth, as parallel ones.
+        measured["depth"] = [depth if depth > 0 else math.inf]
+        measured["fov"] = (2 * halves.arctan().rad2deg()).tolist()
+        for name, values in measured.items():
             # Four digits are enough for a comparison that allows 25 %.
-            self.values.setdefault(name, []).extend(float(f"{value:.4g}") for value in known)
-        self.samples += len(inputs.c2w)
+            known = [float(f"{value:.4g}") for value in values if not math.isnan(value)]
+            self.values.setdefault(name, []).extend(known)
+        self.samples += 1
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
@@ -111,24 +125,6 @@ def verdict(trained: Domain, found: Domain) -> str:
         "the cameras lie within what this model was trained on, in distance, direction, depth and "
         "field of view; what they show may still be new to it"
     )
-
-
-def _measured(inputs: Cameras, targets: Cameras) -> Iterator[tuple[str, Tensor]]:
-    """Yield names of WORDS and their values; distances and axes only for several inputs."""
-    count = inputs.c2w.shape[1]
-    yield "views", torch.tensor([float(count)])
-    if count > 1:
-        # In float32 a cosine near 1 is off by angles of 0.02 degrees.
-        c2w = inputs.c2w.double()
-        yield "baseline", torch.cdist(c2w[..., :3, 3], c2w[..., :3, 3]).amax((-2, -1))
-        axes = c2w[..., :3, 2]
-        cosines = (axes @ axes.mT).amin((-2, -1)).clamp(-1, 1)
-        yield "turn", cosines.arccos().rad2deg()
-    depths = torch.stack([look_at_depth(c2w) for c2w in torch.cat([inputs.c2w, targets.c2w], 1)])
-    # Axes that meet behind the cameras diverge in front of them: no depth, as of parallel ones.
-    yield "depth", torch.where(depths > 0, depths, math.inf)
-    halves = inputs.size[1] / 2 / inputs.intrinsics[..., 0].double()
-    yield "fov", 2 * halves.arctan().rad2deg()
 
 
 def _shown(values: tuple[float, float]) -> str:
