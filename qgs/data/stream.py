@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import InitVar, dataclass, replace
 from functools import cached_property, partial
 from itertools import count, islice
 from typing import Any
@@ -105,6 +105,7 @@ def scenes_fingerprint(source: SceneSource) -> str:
     return digest.hexdigest()[:16]
 
 
+@dataclass(eq=False)
 class SampleStream(Dataset[Batch | Exception]):
     """Samples by number, each a function of (seed, number) alone. Raises ValueError without scenes.
 
@@ -118,23 +119,17 @@ class SampleStream(Dataset[Batch | Exception]):
     of a sample. depths: whether views have them, see `make_sample`.
     """
 
-    def __init__(
-        self,
-        source: SceneSource,
-        views: ViewsConfig,
-        seed: int,
-        skips: bool = False,
-        sampler: ViewSampler | None = None,
-        per_step: int = 1,
-        depths: bool = False,
-    ) -> None:
+    source: InitVar[SceneSource]
+    views: ViewsConfig
+    seed: int
+    skips: bool = False
+    sampler: ViewSampler | None = None
+    per_step: int = 1
+    depths: bool = False
+
+    def __post_init__(self, source: SceneSource) -> None:
         self._open = partial(type(source), source.config)
-        self._views = views
-        self._seed = seed
-        self._skips = skips
-        self._sampler = sampler or Span(Span.Config())
-        self._per_step = per_step
-        self._depths = depths
+        self._sampler = self.sampler or Span(Span.Config())
         self._scenes = source.scenes("train")
         if not len(self._scenes):
             raise ValueError(f"the data source {type(source).name!r} has no training scenes")
@@ -155,7 +150,7 @@ class SampleStream(Dataset[Batch | Exception]):
         return self._scenes[int(order[place])]
 
     def _draw_epoch(self, epoch: int) -> np.ndarray:
-        rng = np.random.default_rng([self._seed, 0, epoch])
+        rng = np.random.default_rng([self.seed, 0, epoch])
         groups = [group for group in self._groups if len(group)]
         # Groups in turn, such as files of scenes: each is opened once an epoch.
         shuffled = rng.permutation(len(groups))
@@ -184,7 +179,7 @@ class SampleStream(Dataset[Batch | Exception]):
                 return self._sample_after(number, attempt)
             except Exception as error:
                 # Another scene would need the same memory.
-                if not self._skips or is_out_of_memory(error):
+                if not self.skips or is_out_of_memory(error):
                     raise
                 left_out.append(one_line(error))
         raise SampleError(
@@ -193,30 +188,30 @@ class SampleStream(Dataset[Batch | Exception]):
 
     def cameras(self, number: int, step: int) -> tuple[Cameras, Cameras]:
         """Draw the cameras (1, V) of inputs and targets as after `step` optimiser steps."""
-        rng = np.random.default_rng([self._seed, 1, number])
+        rng = np.random.default_rng([self.seed, 1, number])
         scene = self._scene(number)
         _, inputs, targets = self._drawn(scene, rng, step)
         count = len(inputs)
-        both = cameras_in(own_world(scene, inputs, self._views), scene, (*inputs, *targets))
-        both = with_noise(both, count, self._views, rng)
+        both = cameras_in(own_world(scene, inputs, self.views), scene, (*inputs, *targets))
+        both = with_noise(both, count, self.views, rng)
         return both[:, :count], both[:, count:]
 
     def _drawn(
         self, scene: Scene, rng: np.random.Generator, step: int
     ) -> tuple[bool, Frames, Frames]:
         """Draw whether a sample is mirrored, and its input and target frames."""
-        mirror = bool(rng.random() < self._views.mirror)
-        return mirror, *self._sampler.draw(scene, self._views, rng, step)
+        mirror = bool(rng.random() < self.views.mirror)
+        return mirror, *self._sampler.draw(scene, self.views, rng, step)
 
     def _sample_after(self, number: int, attempt: int) -> Sample:
         """Make sample `number`, or its replacement after `attempt` failures."""
         # The first attempt draws from (seed, 1, number), whether others were replaced or not.
-        key = [self._seed, 1, number]
+        key = [self.seed, 1, number]
         rng = np.random.default_rng([*key, attempt] if attempt else key)
         scene = self._scene(number + attempt)
-        mirror, inputs, targets = self._drawn(scene, rng, number // self._per_step)
+        mirror, inputs, targets = self._drawn(scene, rng, number // self.per_step)
         try:
-            return make_sample(scene, inputs, targets, self._views, mirror, rng, self._depths)
+            return make_sample(scene, inputs, targets, self.views, mirror, rng, self.depths)
         except Exception as error:
             if is_out_of_memory(error):
                 raise
@@ -283,22 +278,22 @@ def _prepare_worker(number: int) -> None:
     atexit.register(os._exit, 0)
 
 
+@dataclass
 class Feed:
     """The batches of the next optimiser step, or the error that fetching them raised.
 
-    Fetched during a step, so that processes can agree on failures at its end.
+    Fetched during a step, `count` at a time, so that processes can agree on failures at its end.
     """
 
-    def __init__(self, stream: Iterator[Batch], count: int) -> None:
-        self.batches: Sequence[Batch] = ()
-        self.error: Exception | None = None
-        self._stream = stream
-        self._count = count
+    stream: Iterator[Batch]
+    count: int
+    batches: Sequence[Batch] = ()
+    error: Exception | None = None
 
     def fetch(self) -> None:
         """Get the `count` batches of the next step; none, and `error`, when that fails."""
         try:
-            self.batches = list(islice(self._stream, self._count))
+            self.batches = list(islice(self.stream, self.count))
         # Whoever reads `error` raises it, once all processes know.
         except Exception as error:
             self.batches = ()

@@ -29,8 +29,10 @@ from qgs.paths import read_json
 
 PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 """Camera models that are a pinhole where no coefficient bends rays."""
-_BENDING = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
-_OTHER = ("tau_x", "tau_y", "sx1", "sy1", "b1", "b2")
+_COEFFICIENTS = (
+    "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4", "tau_x", "tau_y",
+    "sx1", "sy1", "b1", "b2",
+)  # fmt: skip
 _NO_POSE = np.full((4, 4), np.nan)
 _NO_INTRINSICS: Intrinsics = (math.nan, math.nan, math.nan, math.nan)
 # Of a pose's columns: the camera's y and z axes change sign.
@@ -183,7 +185,7 @@ def _lens(values: _Values) -> Lens | None:
     fisheye = values.get("is_fisheye")
     model = "OPENCV_FISHEYE" if fisheye else values.get("camera_model", "PINHOLE")
     # An ignored coefficient would shift pixels against the poses without an error.
-    found = {key: number for key in (*_BENDING, *_OTHER) if (number := values.number(key))}
+    found = {key: number for key in _COEFFICIENTS if (number := values.number(key))}
     if model in PINHOLE and not found:
         return None
     lenses = (reader.lens(str(model), found) for reader in installed_readers().values())

@@ -109,10 +109,10 @@ class PhotoScene(Scene):
         """
         sizes: dict[object, Size] = {}
         intrinsics: list[Tensor] = []
-        for frame in self.photos:
+        for number, frame in enumerate(self.photos):
             alike = (frame.path.parent, frame.size, frame.turns) if frame.size else frame.path
             if alike not in sizes:
-                sizes[alike] = _stored_size(frame)
+                sizes[alike] = self.stored_size(number)
             stored = torch.tensor(frame.at_size(sizes[alike]), dtype=torch.float64)
             intrinsics.append(self._crop(frame, sizes[alike]).intrinsics(stored))
         c2w = torch.from_numpy(np.stack([frame.c2w for frame in self.photos]))
@@ -141,7 +141,8 @@ class PhotoScene(Scene):
 
     def stored_size(self, frame: int) -> Size:
         """See `Scene`."""
-        return _stored_size(self.photos[frame])
+        photo = self.photos[frame]
+        return _checked(read_image(photo.path, image_size), photo, photo.path)
 
     def _stacked(
         self, read: Callable[[PhotoFrame], np.ndarray], frames: Sequence[int]
@@ -205,10 +206,6 @@ def whole_mask(frame: PhotoFrame) -> Image.Image:
     assert frame.mask is not None
     decode = decode_alpha if frame.mask == frame.path else decode_mask
     return Image.fromarray(read_image(frame.mask, decode))
-
-
-def _stored_size(frame: PhotoFrame) -> Size:
-    return _checked(read_image(frame.path, image_size), frame, frame.path)
 
 
 def _checked(size: Size, frame: PhotoFrame, file: UPath) -> Size:
