@@ -2,7 +2,7 @@
 
 from abc import ABCMeta
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, TypeAlias
 
@@ -98,7 +98,8 @@ class Problem:
 
     option: str
     reason: str
-    fix: str
+    # The same problem may have other fixes where other components are installed.
+    fix: str = field(compare=False)
 
 
 def without_effect(

@@ -2,8 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
-from types import UnionType
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
+from typing import TypeVar
 
 from qgs.contracts.component import Component, ComponentConfig
 
@@ -29,20 +28,11 @@ class Schedule(ComponentConfig):
         return ()
 
 
-def number_kinds(annotation: Any) -> set[type]:
-    """Kinds of int and float that an option of this type can hold; none where it is no number."""
-    if annotation in (int, float):
-        return {annotation}
-    # `float | None`, and numbers with limits; a list of numbers is no number.
-    parts = get_args(annotation) if get_origin(annotation) in (Union, UnionType, Annotated) else ()
-    return {kind for part in parts for kind in number_kinds(part)}
-
-
 def at_step(config: ConfigT, schedules: Mapping[str, Schedule], step: int) -> ConfigT:
     """`config` with the numbers after `step` steps, rounded for options that are whole numbers."""
     numbers = {name: schedule.number(step) for name, schedule in schedules.items()}
     for name in numbers:
-        if float not in number_kinds(type(config).model_fields[name].annotation):
+        if isinstance(getattr(config, name), int):
             numbers[name] = round(numbers[name])
     # Every value was within its limits at the corners, so that it is not checked again.
     return config.model_copy(update=numbers)

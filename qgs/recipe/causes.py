@@ -55,8 +55,8 @@ def _blames(
     left = list(found)
     for newer, older in pairwise(drafts):
         known = _told(older)
-        fresh = [problem for problem in left if _key(problem) not in known]
-        left = [problem for problem in left if _key(problem) in known]
+        fresh = [problem for problem in left if problem not in known]
+        left = [problem for problem in left if problem in known]
         # Changes are made one after the other until the problem is there: the last one brought it.
         parts = dict(older.parts)
         for changed in _changes(newer, older) if fresh else ():
@@ -64,7 +64,7 @@ def _blames(
             old = parts.get(path)
             parts |= changed
             now = _told(replace(older, parts=parts))
-            for problem in [problem for problem in fresh if _key(problem) in now]:
+            for problem in [problem for problem in fresh if problem in now]:
                 fresh.remove(problem)
                 if old:
                     blames[problem] = _replacing(new, old)
@@ -81,16 +81,11 @@ def _changes(newer: Draft, older: Draft) -> list[dict[KeyPath, Chosen]]:
     return [*changed.values()]
 
 
-def _told(draft: Draft) -> set[tuple[str, str]]:
+def _told(draft: Draft) -> set[RecipeProblem]:
     problems = Problems()
     with suppress(RecipeError):
         check(draft, problems)
-    return {_key(problem) for problem in problems.found}
-
-
-def _key(problem: RecipeProblem) -> tuple[str, str]:
-    # A fix may name more components than another layer's plug-ins offer.
-    return problem.place, problem.reason
+    return set(problems.found)
 
 
 def _replacing(new: Chosen, old: Chosen) -> RecipeProblem:

@@ -40,13 +40,12 @@ def check(draft: Draft, problems: Problems) -> Parts:
 
 
 def _context(draft: Draft) -> RecipeContext:
-    data = draft.parts.get(("data",))
+    data: Any = draft.parts.get(("data",))
     if data is None:
         return RecipeContext(draft.dims)
     source = data.config
     size = source.image_size if isinstance(source, SceneSourceConfig) else None
-    timed = bool(getattr(data.component, "tells_times", False))
-    return RecipeContext(draft.dims, size, draft.settings.views.inputs, timed)
+    return RecipeContext(draft.dims, size, draft.settings.views.inputs, data.component.tells_times)
 
 
 def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -> bool:

@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticUndefinedType, to_jsonable_python
 
 from qgs.contracts import Component, ComponentConfig, OptionError
-from qgs.contracts.schedule import Schedule, at_step
+from qgs.contracts.schedule import Schedule
 from qgs.recipe.errors import Problems, did_you_mean, nearest
 from qgs.recipe.places import Place
 from qgs.recipe.registry import InstalledPlugin, Registry, component_failure
@@ -28,15 +28,17 @@ ConfigT = TypeVar("ConfigT", bound=ComponentConfig)
 class Chosen(Place):
     """The component that stands at a place: its `type`, class, options, and where it came from.
 
-    schedules: of options that follow the progress of training; `config` has their first numbers.
+    schedules: of options that follow the progress of training; `config` has their first numbers,
+    `later` the others at which they have extremes.
     """
 
     node: MapNode
     type: str
     component: type[Component]
     config: ComponentConfig
-    installed: InstalledPlugin
+    later: Sequence[ComponentConfig]
     schedules: Mapping[str, Schedule]
+    installed: InstalledPlugin
 
     @property
     def options(self) -> dict[str, Any]:
@@ -47,11 +49,6 @@ class Chosen(Place):
     def equals(self, other: Chosen) -> bool:
         """Return whether `other` is the same component with the same options."""
         return self.component is other.component and self.options == other.options
-
-    @property
-    def later(self) -> list[ComponentConfig]:
-        """The options at the extremes of the schedules, but for the first."""
-        return [at_step(self.config, self.schedules, step) for step in corners(self.schedules)[1:]]
 
     @property
     def shown_path(self) -> str:
@@ -88,15 +85,17 @@ def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen
     except Exception as error:
         failure = component_failure(name, "Config", error, installed)
         return problems.add(place.origin, place.source, failure.reason, failure.fix, error)
-    return found and Chosen(
-        place.path, place.source, node, place.origin, name, component, found[0], installed, found[1]
-    )
+    if found is None:
+        return None
+    (config, *later), schedules = found
+    at = (place.path, place.source, node, place.origin)
+    return Chosen(*at, name, component, config, later, schedules, installed)
 
 
 def _decode_options(
     component: type[Component], node: MapNode, path: KeyPath, problems: Problems
-) -> tuple[ComponentConfig, dict[str, Schedule]] | None:
-    """The first options and the schedules of the rest, all of whose extremes are within limits."""
+) -> tuple[list[ComponentConfig], dict[str, Schedule]] | None:
+    """The options at each extreme of the schedules, the first ones first; and the schedules."""
     schedules: dict[str, Schedule] = {}
     for option, value, origin in node.entries():
         if option in component.scheduled and isinstance(value, MapNode):
@@ -113,7 +112,7 @@ def _decode_options(
             schedules[option] = schedule
     configs = list[ComponentConfig]()
     # Between two corners a schedule is monotonic, so that no other step is beyond its limits.
-    for step in corners(schedules):
+    for step in sorted({0, *(step for one in schedules.values() for step in one.corners)}):
         options = MapNode(node.origin, node.entries())
         for option, schedule in schedules.items():
             number = schedule.number(step)
@@ -123,12 +122,7 @@ def _decode_options(
         if config is None:
             return None
         configs.append(config)
-    return configs[0], schedules
-
-
-def corners(schedules: Mapping[str, Schedule]) -> list[int]:
-    """The steps at which any of them may have an extreme, with the first."""
-    return sorted({0, *(step for schedule in schedules.values() for step in schedule.corners)})
+    return configs, schedules
 
 
 def _why_no_component(name: object, slot: str, registry: Registry) -> tuple[str, str] | None:

@@ -264,11 +264,13 @@ def differing_options(
     ours = flat(a)
     theirs = flat(b)
     differing = [key for key in ours | theirs if ours.get(key, ...) != theirs.get(key, ...)]
-    return {key: (_shown(ours, key), _shown(theirs, key)) for key in differing}
-
-
-def _shown(options: Mapping[str, Any], key: str) -> str | None:
-    return inline(options[key]) if key in options else None
+    return {
+        key: (
+            inline(ours[key]) if key in ours else None,
+            inline(theirs[key]) if key in theirs else None,
+        )
+        for key in differing
+    }
 
 
 _NO_EFFECT_ONCE_TRAINED = re.compile(

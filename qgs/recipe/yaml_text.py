@@ -3,8 +3,9 @@
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
+from itertools import count
 from typing import Any, TypeAlias, cast
 
 import yaml
@@ -184,59 +185,52 @@ def load_text(
 
     line: given to every node in place of its own line. path: where the text belongs.
     """
+
+    def origin(mark: yaml.Mark | None) -> Origin:
+        found = mark.line + 1 if mark else 1
+        return Origin(file, found if line is None else line)
+
     try:
         root = _composed(text)
-        return None if root is None else _Reader(file, line).read(root)
-    # Python's stack ends while PyYAML composes, before `_Reader` counts levels.
+        return None if root is None else _read(root, origin, count(1))
+    # Python's stack ends while PyYAML composes, before `_read` counts levels.
     except (yaml.YAMLError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        found = mark.line + 1 if mark else 1
         reason = f"this is no YAML of a recipe: {getattr(error, 'problem', error)}"
         fix = "correct the line; check indentation (spaces, no tabs), brackets, quotes and `: `"
-        problems.stop(Origin(file, found if line is None else line), path, reason, fix)
+        problems.stop(origin(getattr(error, "problem_mark", None)), path, reason, fix)
 
 
 # The variants of a study extend the same files over and over.
 _composed = lru_cache(maxsize=128)(partial(yaml.compose, Loader=Yaml12Loader))
 
 
-class _Reader:
-    """Turns PyYAML's nodes into ours. line: see `load_text`."""
-
-    def __init__(self, file: str, line: int | None) -> None:
-        self.file = file
-        self.line = line
-        self.count = 0
-
-    def origin(self, node: yaml.Node) -> Origin:
-        return Origin(self.file, node.start_mark.line + 1 if self.line is None else self.line)
-
-    def read(self, node: yaml.Node, depth: int = 0) -> Node:
-        """Our node; raises YAMLError for what no recipe may hold."""
-        self.count += 1
-        if depth > MAX_DEPTH or self.count > MAX_NODES:
-            what = f"more than {MAX_DEPTH} levels or {MAX_NODES:,} values, aliases written out"
-            raise _fault(what, node)
-        if node.tag not in _TAGS:
-            raise _fault(f"the tag {node.tag!r} is not allowed in a recipe", node)
-        origin = self.origin(node)
-        if isinstance(node, yaml.MappingNode):
-            read = MapNode(origin)
-            for key_node, value_node in node.value:
-                key = key_node.value
-                # The last of two equal keys would win in silence.
-                if not isinstance(key_node, yaml.ScalarNode) or key in read:
-                    raise _fault(f"the key {key!r:.100} is no word, or comes twice", key_node)
-                read.put(key, self.read(value_node, depth + 1), self.origin(key_node))
-            return read
-        if isinstance(node, yaml.SequenceNode):
-            items = ((self.read(item, depth + 1), self.origin(item)) for item in node.value)
-            return ListNode(origin, items)
-        kind = node.tag.removeprefix(_STANDARD)
-        try:
-            return _scalar(kind, node.value)
-        except ValueError:
-            raise _fault(f"{node.value!r:.100} is no {kind} of 64 bits", node) from None
+def _read(
+    node: yaml.Node, origin: Callable[[yaml.Mark], Origin], counter: Iterator[int], depth: int = 0
+) -> Node:
+    """PyYAML's node as ours; raises YAMLError for what no recipe may hold."""
+    if depth > MAX_DEPTH or next(counter) > MAX_NODES:
+        what = f"more than {MAX_DEPTH} levels or {MAX_NODES:,} values, aliases written out"
+        raise _fault(what, node)
+    if node.tag not in _TAGS:
+        raise _fault(f"the tag {node.tag!r} is not allowed in a recipe", node)
+    below = partial(_read, origin=origin, counter=counter, depth=depth + 1)
+    if isinstance(node, yaml.MappingNode):
+        read = MapNode(origin(node.start_mark))
+        for key_node, value_node in node.value:
+            key = key_node.value
+            # The last of two equal keys would win in silence.
+            if not isinstance(key_node, yaml.ScalarNode) or key in read:
+                raise _fault(f"the key {key!r:.100} is no word, or comes twice", key_node)
+            read.put(key, below(value_node), origin(key_node.start_mark))
+        return read
+    if isinstance(node, yaml.SequenceNode):
+        items = ((below(item), origin(item.start_mark)) for item in node.value)
+        return ListNode(origin(node.start_mark), items)
+    kind = node.tag.removeprefix(_STANDARD)
+    try:
+        return _scalar(kind, node.value)
+    except ValueError:
+        raise _fault(f"{node.value!r:.100} is no {kind} of 64 bits", node) from None
 
 
 def _fault(reason: str, node: yaml.Node) -> yaml.YAMLError:

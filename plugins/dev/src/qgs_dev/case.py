@@ -4,7 +4,8 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
 
 import torch
 from pydantic_core import to_jsonable_python
@@ -23,7 +24,6 @@ from qgs.contracts import (
     Renderer,
     ViewSampler,
 )
-from qgs.contracts.schedule import number_kinds
 from qgs.recipe.build import load_pretrained
 from qgs.recipe.yaml_text import dump
 from qgs.tokengs import ContentCrossAttention, ContentSelfAttention, MlpFeedForward
@@ -217,10 +217,19 @@ def component_fault(component: type[Component]) -> str:
         return "whose Config has an option `type`, which names the component itself"
     fields: Mapping[str, Any] = config.model_fields
     scheduled: object = component.scheduled
-    known = {n for n, option in fields.items() if number_kinds(option.annotation)}
+    known = {n for n, option in fields.items() if _number_kinds(option.annotation)}
     if not (isinstance(scheduled, frozenset) and scheduled <= known):
         return f"whose `scheduled` is {scheduled!r}, not a frozenset of options that are numbers"
     # Others are built once, and have no step to follow.
     if scheduled and not issubclass(component, Module | Objective | Optimizer | ViewSampler):
         return f"which lists `scheduled` options; those of the slot `{component.slot}` stay"
     return ""
+
+
+def _number_kinds(annotation: Any) -> set[type]:
+    """Kinds of int and float that an option of this type can hold; none where it is no number."""
+    if annotation in (int, float):
+        return {annotation}
+    # `float | None`, and numbers with limits; a list of numbers is no number.
+    parts = get_args(annotation) if get_origin(annotation) in (Union, UnionType, Annotated) else ()
+    return {kind for part in parts for kind in _number_kinds(part)}
