@@ -32,7 +32,7 @@ from qgs.data.samples import Sample, make_sample, own_world
 from qgs.metrics.baselines import nearest_input
 from qgs.metrics.images import psnr, ssim
 from qgs.model import QueryGaussianModel
-from qgs.reconstruction.scale import ScaleSearch, at_factors, constant_scale
+from qgs.reconstruction.scale import at_factors, constant_scale, find_scale
 from qgs.types import Cameras, Views
 
 SYSTEMS = ("landmark", "locus", "tokengs")
@@ -79,9 +79,8 @@ def scene_rows(
     # Its weights are not read: only the cameras that it was trained on are asked for.
     with CheckpointFile(options.model[0]) as file:
         domain = apart(file.domain, distance)
-    search = ScaleSearch(model, views.model_copy(update={"scale": "search"}))
     for inputs, targets in spread_windows(scene, views.inputs, domain, options.windows):
-        found = search(scene, inputs, targets).scale_factor
+        found = find_scale(model, scene, inputs, targets, views).factor
         auto = float(own_world(scene, inputs, views.model_copy(update={"scale": "auto"}))[1])
         sample = make_sample(scene, inputs, targets, constant_scale(views, 1.0), mirror=False)
         shown = {

@@ -33,7 +33,8 @@ from qgs.wording import listed, numbered, warn_once
 class Sample:
     """Input and target Views (1, V) of one scene, in the frame of the inputs.
 
-    names: of frames that are known by more than their number, such as by a file.
+    world: of the frame, reference pose (4, 4) and scale, as of `own_world`. names: of frames that
+    are known by more than their number, such as by a file.
     """
 
     scene: str
@@ -41,6 +42,7 @@ class Sample:
     targets: Views
     input_frames: Frames
     target_frames: Frames
+    world: tuple[Tensor, Tensor]
     names: Mapping[int, str] = field(default_factory=dict)
 
     def label(self, frame: int) -> str:
@@ -93,6 +95,7 @@ def make_sample(
         targets=both.select(slice(count, None)),
         input_frames=input_frames,
         target_frames=target_frames,
+        world=world,
         names={frame: name for frame, name in names.items() if name != str(frame)},
     )
 

@@ -3,29 +3,22 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike, fspath
+from typing import Any
 
 from torch import Tensor
 
-from qgs.contracts import Scene, ViewsConfig
+from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.data.frames import evenly, moments, spread
 from qgs.data.inputs import NOVEL, Frusta, Window, ranked_windows
-from qgs.data.samples import Sample, make_sample, own_world
+from qgs.data.samples import Sample, make_sample
 from qgs.domain import Domain, verdict
-from qgs.evaluate.plan import ViewsOf
 from qgs.evaluate.tuning import tune as tuned_on
 from qgs.evaluate.tuning import tuning_loss, tuning_settings
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.result import Reconstruction, reconstruct_sample
-from qgs.reconstruction.scale import ScaleSearch, photo_settings
-from qgs.reconstruction.scenes import (
-    ChosenScene,
-    Frames,
-    GivenScene,
-    Size,
-    chosen_scene,
-    frame_list,
-)
+from qgs.reconstruction.scale import constant_scale, find_scale, photo_settings
+from qgs.reconstruction.scenes import FrameNames, GivenScene, Size, chosen_scene, frame_list
 from qgs.types import Views
 from qgs.wording import counted, listed
 
@@ -35,8 +28,8 @@ def reconstruct(
     photos: str | PathLike[str] | Views,
     *,
     inputs: int | None = None,
-    frames: Frames | None = None,
-    compare: Frames | None = None,
+    frames: FrameNames | None = None,
+    compare: FrameNames | None = None,
     size: Size | None = None,
     scene: str | None = None,
     overrides: Sequence[str] = (),
@@ -61,33 +54,36 @@ def reconstruct(
     Raises ValueError without a recipe, for several scenes, for images out of range, as the data do.
     """
     recipe = _recipe(model, overrides, tune)
+    seen: Sequence[int] | None = None
     if isinstance(photos, Views):
         if size is not None or scene is not None:
             raise ValueError("`size` and `scene` are for folders: Views have one scene and size")
-        chosen = ChosenScene(GivenScene(photos))
+        found: Scene = GivenScene(photos)
         if frames is None and inputs is None:
-            frames = range(len(chosen.scene))
+            frames = range(len(found))
     else:
-        chosen = chosen_scene(recipe, fspath(photos), size, scene, compare is None)
-    found = chosen.scene
+        found, seen = chosen_scene(recipe, fspath(photos), size, scene, compare is None)
     wanted = None if frames is None else frame_list(frames, "frames", found)
     against = [] if compare == "none" else compare
     against = None if against is None else frame_list(against, "compare", found)
+    window = choose_frames(found, recipe.views, inputs, wanted, against, model.trained_on)
     # A model's own data keep its scale; photos of a user have any unit.
-    search = ScaleSearch(model, photo_settings(recipe.views, chosen.is_training_data, overrides))
-    domain = model.trained_on
-    sample, world = choose_sample(found, recipe.views, inputs, wanted, against, domain, search)
+    views = photo_settings(recipe.views, seen is not None, overrides)
+    records: dict[str, Any] = {}
     training = model.training
     try:
         model.eval()
-        tuned = record = None
+        if views.scale == "search":
+            records["scale"] = scale = find_scale(model, found, *window, views)
+            views = constant_scale(views, scale.factor)
+        sample = make_sample(found, *window, views, mirror=False)
+        tuned = None
         if tune and recipe.evaluation.tuning_steps:
-            tuned, record = tuned_on(model, sample.inputs, tuning_loss(recipe), recipe.evaluation)
-        result = reconstruct_sample(model, sample, world, chosen.seen, tuned, record)
+            loss = tuning_loss(recipe)
+            tuned, records["tuning"] = tuned_on(model, sample.inputs, loss, recipe.evaluation)
+        result = reconstruct_sample(model, sample, seen or (), tuned, **records)
     finally:
         model.train(training)
-    # There was one window, so one scale.
-    result = replace(result, scale=next(iter(search.found.values()), None))
     return replace(result, remarks=_remarks(result, found))
 
 
@@ -104,26 +100,24 @@ def _recipe(model: QueryGaussianModel, overrides: Sequence[str], tune: str | Non
     return resolve(model.recipe, [*overrides, *tuning_settings(tune)])
 
 
-def choose_sample(
+def choose_frames(
     scene: Scene,
     views: ViewsConfig,
     inputs: int | None,
     frames: Sequence[int] | None,
     compare: Sequence[int] | None,
     trained_on: Domain | None = None,
-    views_of: ViewsOf | None = None,
-) -> tuple[Sample, tuple[Tensor, Tensor]]:
-    """Return inputs and compared views of `scene`, and their world as of `own_world`.
+) -> Window:
+    """Return input and compared frames of `scene`.
 
     frames, compare: by default the best of `ranked_windows`; where times are known, inputs spread
-    over them, and views of one time between. trained_on: of the model. views_of: makes the settings
-    of the chosen views, such as their scale; None takes `views`. Raises ValueError for frames that
-    do not exist or come twice, and for too few.
+    over them, and views of one time between. trained_on: of the model. Raises ValueError for frames
+    that do not exist or come twice, and for too few.
     """
     views = views.model_copy(update={"inputs": inputs or views.inputs})
     # A model whose checkpoint records no range takes any views.
     domain = trained_on or Domain()
-    novel = tuple(compare or ())
+    novel: Frames = ()
     if frames is not None:
         checked_window(len(scene), frames)
     if scene.times is not None:
@@ -136,11 +130,7 @@ def choose_sample(
     elif compare is None:
         novel = Frusta(scene, domain).compared(tuple(frames))
     # Named photos win over those that were chosen beside the inputs.
-    picked = checked_window(len(scene), frames, novel if compare is None else compare)
-    # Only now: the scale is searched on the chosen views.
-    views = views_of(scene, *picked) if views_of else views
-    sample = make_sample(scene, *picked, views, mirror=False)
-    return sample, own_world(scene, sample.input_frames, views)
+    return checked_window(len(scene), frames, novel if compare is None else compare)
 
 
 def checked_window(total: int, frames: Sequence[int], compare: Sequence[int] = ()) -> Window:
@@ -187,11 +177,9 @@ def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
     return [*filter(None, remarks)]
 
 
-def choice(sample: Sample, scene: Scene, compares: bool = True) -> str:
-    """Return a sentence on the photos of `sample` and, if it compares, on held-out ones."""
+def choice(sample: Sample, scene: Scene) -> str:
+    """Return a sentence on the photos of `sample` and on held-out ones."""
     text = f"inputs {listed(map(scene.frame_name, sample.input_frames))}"
-    if not compares:
-        return text
     if sample.target_frames:
         text += f", compared with {listed(map(scene.frame_name, sample.target_frames))}"
     if scene.held_out:

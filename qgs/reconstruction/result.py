@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from qgs.containers import concatenated
 from qgs.data.samples import Sample
@@ -18,7 +17,7 @@ from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.images import Psnr, psnr
 from qgs.model import QueryGaussianModel
 from qgs.reconstruction.scale import FoundScale
-from qgs.types import Cameras, Gaussians, Prediction, Rendering
+from qgs.types import Cameras, Gaussians, Rendering
 
 KINDS = ("input", "novel", "seen in training")
 """A compared view of a folder that the model was trained on is novel if it was held out."""
@@ -38,18 +37,15 @@ class ViewScore:
 class Reconstruction:
     """Gaussians (1, G) of a sample by `model`, in its world, rendered from all views of the sample.
 
-    prediction: None where the Gaussians were tuned or refined; `tuning`, `refinement` are the
-    records. world: reference pose (4, 4) and scale, as of `own_world`. remarks: for the user.
-    scale: how the scale was found, None where it was set.
+    tuning, refinement: records of how the Gaussians were changed. remarks: for the user. scale: how
+    the scale was found, None where it was set.
     """
 
     model: QueryGaussianModel
     sample: Sample
-    prediction: Prediction | None
     gaussians: Gaussians
     rendering: Rendering
     scores: list[ViewScore]
-    world: tuple[Tensor, Tensor]
     tuning: Mapping[str, Any] | None = None
     refinement: Mapping[str, Any] | None = None
     remarks: Sequence[str] = ()
@@ -69,12 +65,12 @@ class Reconstruction:
     @property
     def in_photos_world(self) -> Gaussians:
         """Gaussians (1, G) in the frame and unit of the photos' cameras, as for `save_ply`."""
-        reference, scale = self.world
+        reference, scale = self.sample.world
         return moved(self.gaussians, reference, 1 / float(scale))
 
     def render(self, cameras: Cameras) -> Rendering:
         """Render from cameras (1, V) in the photos' world; depth is in its unit."""
-        reference, scale = (part.to(cameras.c2w.device) for part in self.world)
+        reference, scale = (part.to(cameras.c2w.device) for part in self.sample.world)
         # In float64: coordinates of maps have seven digits before the point.
         c2w = scaled(relative_to(reference, cameras.c2w.double()), scale).float()
         own = Cameras(c2w, cameras.intrinsics.float(), cameras.size).to(self.gaussians.means.device)
@@ -109,35 +105,22 @@ class Reconstruction:
 def reconstruct_sample(
     model: QueryGaussianModel,
     sample: Sample,
-    world: tuple[Tensor, Tensor],
     seen: Collection[int] = (),
-    tuned: Gaussians | None = None,
-    tuning: Mapping[str, Any] | None = None,
-    refinement: Mapping[str, Any] | None = None,
+    changed: Gaussians | None = None,
+    **records: Any,
 ) -> Reconstruction:
     """Return the Gaussians of `sample`, rendered from its views, on the model's device.
 
-    seen: frames that the model was trained on. tuned: use these Gaussians instead of a forward
-    pass; `tuning` or `refinement` is the record of how they were made.
+    seen: frames that the model was trained on. changed: use these Gaussians instead of a forward
+    pass. records: `tuning`, `refinement` and others of `Reconstruction`.
     """
     device = next(model.parameters()).device
     # Views come from the data on the CPU.
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
-    prediction: Prediction | None = model(sample.inputs) if tuned is None else None
-    gaussians = prediction.gaussians if prediction else tuned
-    assert gaussians is not None
+    gaussians = model(sample.inputs).gaussians if changed is None else changed
     rendering = model.render(gaussians, sample_cameras(sample))
-    return Reconstruction(
-        model=model,
-        sample=sample,
-        prediction=prediction,
-        gaussians=gaussians,
-        rendering=rendering,
-        scores=_scores(sample, rendering, seen),
-        world=world,
-        tuning=tuning,
-        refinement=refinement,
-    )
+    scores = _scores(sample, rendering, seen)
+    return Reconstruction(model, sample, gaussians, rendering, scores, **records)
 
 
 def _scores(sample: Sample, rendering: Rendering, seen: Collection[int]) -> list[ViewScore]:

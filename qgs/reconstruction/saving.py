@@ -109,7 +109,7 @@ def overview(result: Reconstruction) -> Picture:
 
 
 def _camera_record(result: Reconstruction, path: Cameras) -> dict[str, Any]:
-    reference, scale = result.world
+    reference, scale = result.sample.world
     views = []
     for score, camera in zip(result.scores, _plain(sample_cameras(result.sample)), strict=True):
         photo = result.sample.names.get(score.frame)

@@ -88,26 +88,6 @@ class FoundScale:
         return {"result": self.text, "further_frames": list(self.further), "tried": tried}
 
 
-class ScaleSearch:
-    """The settings of views for windows of scenes, with the found factor in place of `search`.
-
-    found: by scene, inputs and compared frames; no window is searched twice.
-    """
-
-    def __init__(self, model: QueryGaussianModel, views: ViewsConfig) -> None:
-        self.model, self.views = model, views
-        self.found: dict[tuple[str, Frames, Frames], FoundScale] = {}
-
-    def __call__(self, scene: Scene, inputs: Frames, compared: Frames) -> ViewsConfig:
-        """See `find_scale`."""
-        if self.views.scale != "search":
-            return self.views
-        key = (scene.name, tuple(inputs), tuple(compared))
-        if key not in self.found:
-            self.found[key] = find_scale(self.model, scene, inputs, compared, self.views)
-        return constant_scale(self.views, self.found[key].factor)
-
-
 def photo_settings(views: ViewsConfig, own: bool, overrides: Sequence[str] = ()) -> ViewsConfig:
     """Return `views` for photos of a user: `search` for a constant scale not set for them.
 
@@ -132,10 +112,9 @@ def find_scale(
     Factors STEP apart cover what the trained ranges allow, and more past an end that is best;
     thirds of a step lie around the best, and the last one is the vertex of a parabola in log scale.
     Without further photos one of three or more inputs is judged and not given to the model; of two,
-    factors that bring what the cameras look at nearer than in training lose PENALTY. Where the
-    model is; restores its mode.
+    factors that bring what the cameras look at nearer than in training lose PENALTY. model: in
+    evaluation mode; the search runs where it is.
     """
-    training = model.training
     given = tuple(inputs)
     further = further_photos(scene, inputs, compared)
     if not further and len(given) > 2:
@@ -148,16 +127,13 @@ def find_scale(
     count = min(math.ceil(math.log(high / low) / math.log(STEP)) + 1, MOST)
     ratio = (high / low) ** (1 / max(count - 1, 1))
     # Places are thirds of a step, so that the finer search lies between those of the first.
-    trial = _Trial(model.eval(), sample, low, ratio ** (1 / 3), 0.0 if further else nearest)
-    try:
-        best = trial.best(range(0, 3 * count, 3))
-        if ratio > 1:
-            while (end := trial.past(best)) and len(trial.tried) < MOST:
-                best = trial.best(end)
-            best = trial.best([best + place for place in (-2, -1, 1, 2)])
-            best = trial.best([best + trial.vertex(best)])
-    finally:
-        model.train(training)
+    trial = _Trial(model, sample, low, ratio ** (1 / 3), 0.0 if further else nearest)
+    best = trial.best(range(0, 3 * count, 3))
+    if ratio > 1:
+        while (end := trial.past(best)) and len(trial.tried) < MOST:
+            best = trial.best(end)
+        best = trial.best([best + place for place in (-2, -1, 1, 2)])
+        best = trial.best([best + trial.vertex(best)])
     return FoundScale(
         factor=trial.factor(best),
         psnr=trial.psnr(best),

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from os import PathLike, fspath
 from typing import TypeAlias
 
@@ -20,24 +19,15 @@ from qgs.wording import listed, warn_once
 
 HOLDOUT = 8
 """Every n-th photo of a user's scene is held out, as papers on novel views do (Mip-NeRF 360)."""
-Frames: TypeAlias = str | Sequence[int | str]
+FrameNames: TypeAlias = str | Sequence[int | str]
 Size: TypeAlias = tuple[int, int]
-
-
-@dataclass(frozen=True)
-class ChosenScene:
-    """A scene for a model; `seen` are the frames that the model was trained on."""
-
-    scene: Scene
-    is_training_data: bool = False
-    seen: Sequence[int] = ()
 
 
 def read_photos(
     folder: str | PathLike[str],
     *,
     size: Size | None = None,
-    frames: Frames | None = None,
+    frames: FrameNames | None = None,
     scene: str | None = None,
 ) -> Views:
     """Photos and cameras of a folder, or its URL, as Views (1, V) in the photos' own world.
@@ -68,12 +58,12 @@ def photo_scene(path: str, size: Size | None, name: str | None) -> Scene:
 
 def chosen_scene(
     recipe: Recipe, path: str, size: Size | None, name: str | None, holdout: bool = True
-) -> ChosenScene:
+) -> tuple[Scene, Sequence[int] | None]:
     """Return the scene called `name` at `path`, or the only one, for a model of `recipe`.
 
-    size: (H, W) of its images; by default the recipe's, or for other photos than the training's
-    `whole_size`. holdout: hold out every HOLDOUT-th photo that nobody else splits. Raises
-    ValueError without a size.
+    And the frames that the model was trained on; None for other photos than the training's.
+    size: (H, W) of its images; by default the recipe's, or for other photos `whole_size`. holdout:
+    hold out every HOLDOUT-th photo that nobody else splits. Raises ValueError without a size.
     """
     if recipe.data_config is None and size is None:
         raise ValueError(
@@ -85,13 +75,11 @@ def chosen_scene(
     if is_training_data:
         # Scenes of the test split were never seen, though their folder was trained on.
         seen = training_frames(scene) if scene.name in source.names("train") else ()
-        return ChosenScene(scene, is_training_data, seen)
-    # Size and split depend on the photos, so the scene is opened once more where they differ.
+        return scene, seen
+    # Size and split depend on the photos, so the scene is opened once more.
     whole = size or whole_size(scene, size_multiple([recipe]))
     config = holding_out(source.config, scene) if holdout else source.config
-    if whole != scene.cameras.size or config is not source.config:
-        scene = named_scene(_resized(source, config, whole), path, name)
-    return ChosenScene(scene)
+    return named_scene(_resized(source, config, whole), path, name), None
 
 
 def _resized(source: SceneSource, config: SceneSourceConfig, size: Size) -> SceneSource:
@@ -162,7 +150,7 @@ def named_scene(source: SceneSource, path: str, name: str | None) -> Scene:
     return source.scenes(split)[place]
 
 
-def frame_list(frames: Frames, option: str, scene: Scene) -> list[int]:
+def frame_list(frames: FrameNames, option: str, scene: Scene) -> list[int]:
     """Return frame numbers of "0,8,x.jpg" or [0, 8, "x.jpg"]; folders of a photo may be left out.
 
     Raises ValueError for what is neither a number nor the name of one photo of `scene`.

@@ -28,8 +28,8 @@ NO_DATA = resolve({"recipe": 1, "model": MODEL})
 
 def chosen(trained, path, size=None, name=None):
     """Photos of the scene that are held out, those that were trained on, and their size."""
-    found = chosen_scene(trained, str(path), size, name)
-    return tuple(found.scene.held_out), tuple(found.seen), found.scene.cameras.size
+    scene, seen = chosen_scene(trained, str(path), size, name)
+    return tuple(scene.held_out), tuple(seen or ()), scene.cameras.size
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def test_photos_of_any_format_are_opened_for_a_model_of_other_data(folders):
     for trained in (elsewhere, ROOMS):
         assert chosen(trained, llff) == ((2,), (), WHOLE)
         assert chosen(trained, llff, SIZE) == ((2,), (), SIZE)
-    scene = chosen_scene(elsewhere, str(llff), None, None).scene
+    scene, _ = chosen_scene(elsewhere, str(llff), None, None)
     assert scene.frame_name(2) == "images/view_002.png"
     assert scene.images([2])[0, :, 3, 3].mul(255).round().tolist() == [20, 0, 0]
 

@@ -7,7 +7,7 @@ import torch
 from photo_formats import noisy_photos
 
 from qgs.contracts import ViewsConfig
-from qgs.reconstruction.reconstruct import checked_window, choose_sample
+from qgs.reconstruction.reconstruct import checked_window, choose_frames
 from qgs.reconstruction.scenes import GivenScene, read_photos
 
 
@@ -20,8 +20,7 @@ def chosen(photos, inputs, times=range(9), held_out=(), gap=(3, 20)):
     """Input and compared frames of photos taken at `times`."""
     scene = GivenScene(replace(photos, times=torch.tensor([[*times]])))
     scene.held_out = held_out
-    sample, _ = choose_sample(scene, ViewsConfig(gap=gap), inputs, None, None)
-    return sample.input_frames, sample.target_frames
+    return choose_frames(scene, ViewsConfig(gap=gap), inputs, None, None)
 
 
 def test_inputs_spread_over_times_and_novel_frames_are_of_one_time_between(photos):
@@ -39,8 +38,7 @@ def test_held_out_times_are_compared_with_and_never_inputs(photos):
 
 
 def test_frames_that_are_given_are_taken_as_they_are_or_refused(photos):
-    sample, _ = choose_sample(GivenScene(photos), ViewsConfig(), None, [1, 3], [2])
-    assert (sample.input_frames, sample.target_frames) == ((1, 3), (2,))
+    assert choose_frames(GivenScene(photos), ViewsConfig(), None, [1, 3], [2]) == ((1, 3), (2,))
     for compared, *frames in ((0, 1, 5), (0, -1, 2), (0, 1, 1), (3, 0, 3)):
         with pytest.raises(ValueError, match="frames"):
             checked_window(5, frames, [compared])

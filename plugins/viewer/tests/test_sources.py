@@ -10,7 +10,7 @@ from small import VIEWS, model_of
 from walk import Walk
 
 import qgs
-from qgs.reconstruction.reconstruct import choose_sample
+from qgs.data.samples import make_sample
 from qgs.reconstruction.result import reconstruct_sample
 from qgs.reconstruction.scene_formats import load_ply
 
@@ -21,8 +21,8 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished")
     qgs.save(model_of("locus"), folder / "model.safetensors")
     model = qgs.load(folder / "model.safetensors")
-    sample, world = choose_sample(Walk(), VIEWS, 2, (1, 4), (0, 2, 3, 5))
-    reconstruct_sample(model, sample, world).save(folder / "scene")
+    sample = make_sample(Walk(), (1, 4), (0, 2, 3, 5), VIEWS, mirror=False)
+    reconstruct_sample(model, sample).save(folder / "scene")
     return folder / "scene"
 
 

@@ -11,7 +11,7 @@ import yaml
 
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.checkpoint.models import about, checkpoint_path
-from qgs.contracts import Scene, ViewsConfig
+from qgs.contracts import Frames, Scene, ViewsConfig
 from qgs.data.frames import Span
 from qgs.data.inputs import Frusta, Window, ranked_windows
 from qgs.data.recognition import is_training_data, open_for
@@ -21,7 +21,7 @@ from qgs.evaluate.results import Evaluation
 from qgs.model import QueryGaussianModel
 from qgs.model_text import heading
 from qgs.recipe import Recipe, resolve
-from qgs.reconstruction.scale import ScaleSearch, photo_settings
+from qgs.reconstruction.scale import FoundScale, constant_scale, find_scale, photo_settings
 from qgs.reconstruction.scenes import (
     Size,
     holding_out,
@@ -89,6 +89,27 @@ class PhotoWindows(Span):
                 )
             self._known[scene.name] = windows
         return self._known[scene.name]
+
+
+class ScaleSearch:
+    """The settings of views for windows of scenes, with the found factor in place of `search`.
+
+    found: by scene, inputs and compared frames; no window is searched twice.
+    """
+
+    def __init__(self, model: QueryGaussianModel, views: ViewsConfig) -> None:
+        self.model = model
+        self.views = views
+        self.found: dict[tuple[str, Frames, Frames], FoundScale] = {}
+
+    def __call__(self, scene: Scene, inputs: Frames, compared: Frames) -> ViewsConfig:
+        """See `find_scale`."""
+        if self.views.scale != "search":
+            return self.views
+        key = (scene.name, tuple(inputs), tuple(compared))
+        if key not in self.found:
+            self.found[key] = find_scale(self.model.eval(), scene, inputs, compared, self.views)
+        return constant_scale(self.views, self.found[key].factor)
 
 
 @dataclass(frozen=True)

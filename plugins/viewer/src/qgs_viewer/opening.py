@@ -18,8 +18,8 @@ from qgs.data.samples import make_sample, own_world, views_in
 from qgs.domain import Domain, verdict
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
-from qgs.reconstruction.reconstruct import checked_window, choice, choose_sample
-from qgs.reconstruction.scale import ScaleSearch, constant_scale, photo_settings
+from qgs.reconstruction.reconstruct import checked_window, choose_frames
+from qgs.reconstruction.scale import FoundScale, constant_scale, find_scale, photo_settings
 from qgs.reconstruction.scene_formats import load_ply
 from qgs.reconstruction.scenes import Size, chosen_scene, frame_list, named_scene
 from qgs.types import Cameras
@@ -135,21 +135,24 @@ def open_model(
     chosen = None if frames is None else frame_list(frames, "--frames", shown)
     trained = model.trained_on or Domain()
     own = photos is None or is_training_data(photos, recipe.data_config)
+    window = choose_frames(shown, recipe.views, inputs, chosen, None, trained)
     # photos of a user have a unit of their own
-    search = ScaleSearch(model, photo_settings(recipe.views, own, overrides))
-    sample, _ = choose_sample(shown, recipe.views, inputs, chosen, None, trained, search)
-    scales = list(search.found.values())
+    views = photo_settings(recipe.views, own, overrides)
+    scales: list[FoundScale] = []
+    if views.scale == "search":
+        scales.append(find_scale(model, shown, *window, views))
+        # inputs that are chosen later keep the scale
+        views = constant_scale(views, scales[0].factor)
+    sample = make_sample(shown, *window, views, mirror=False)
     # users learn if their photos are like those of the training
     seen = Domain()
     seen.see(sample.inputs.cameras, sample.targets.cameras)
     notes = [
         summary(scales) if scales else "",
-        choice(sample, shown, compares=False) if photos else "",
+        f"inputs {listed(map(shown.frame_name, sample.input_frames))}" if photos else "",
         verdict(trained, seen),
         *(scale.poor for scale in scales),
     ]
-    # inputs that are chosen later keep the scale
-    views = search(shown, sample.input_frames, sample.target_frames)
     title = f"{name}: {shown.name}"
     given = [note for note in notes if note]
     return ModelSource(model, shown, views, sample.input_frames, title, given)
@@ -158,7 +161,7 @@ def open_model(
 def _scene(recipe: Recipe, photos: str | None, size: Size | None, name: str | None) -> Scene:
     """Return the scene of the photos, or the named or first test scene of the recipe's data."""
     if photos is not None:
-        return chosen_scene(recipe, photos, size, name).scene
+        return chosen_scene(recipe, photos, size, name)[0]
     if recipe.data_config is None:
         raise ValueError("the checkpoint's recipe has no data: name a folder of photos after it")
     data = recipe.build_data()

@@ -61,11 +61,11 @@ def refine(
     from qgs_photos.refine.reconstruction import opened_reconstruction, refine_reconstruction
 
     console = Console()
-    start, chosen = opened_reconstruction(
+    start, scene, seen = opened_reconstruction(
         reconstruction, photos, pixels, scene_name, choose_device(device)
     )
     show(start, console)
-    result = refine_reconstruction(start, chosen, seconds, gaussians, inputs_only, console)
+    result = refine_reconstruction(start, scene, seen, seconds, gaussians, inputs_only, console)
     show(result, console)
     for file in result.save(target):
         say(console, f"wrote {file}")

@@ -27,7 +27,7 @@ def _is_index(file: UPath) -> bool:
 def index_findings(file: UPath, held: Mapping[str, Sequence[SceneReport]]) -> Iterator[Finding]:
     """Yield what an index asks for and the data set does not hold. held: scenes by name."""
     try:
-        index = read_index(str(file))
+        index = read_index(str(file)) or {}
     except ValueError as error:
         yield Finding(file.name, str(error), "correct the file, or get it again")
         return

@@ -68,7 +68,7 @@ def chosen_initialisation(photos: ScenePhotos, options: Options) -> Initialisati
         overrides=scale_settings(options.scale),
     )
     inputs = ",".join(map(photos.small.frame_name, result.sample.input_frames))
-    return Initialisation(name, result.world, result.gaussians, inputs)
+    return Initialisation(name, result.sample.world, result.gaussians, inputs)
 
 
 def shipped_model() -> str:

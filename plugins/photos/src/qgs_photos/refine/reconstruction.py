@@ -1,5 +1,6 @@
 """A reconstruction in a folder, refined on the photos of its scene."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from qgs.data.frames import training_frames
 from qgs.data.samples import Sample, cameras_in, views_in
 from qgs.recipe import resolve
 from qgs.reconstruction.result import Reconstruction, reconstruct_sample
-from qgs.reconstruction.scenes import ChosenScene, Size, chosen_scene
+from qgs.reconstruction.scenes import Size, chosen_scene
 from qgs.types import Views
 from qgs.wording import listed
 from qgs_photos.record import Record, has_record, read_record
@@ -24,8 +25,10 @@ _SAME_POSE = 1e-3
 
 def opened_reconstruction(
     folder: Path, photos: str, size: Size | None, name: str | None, device: str
-) -> tuple[Reconstruction, ChosenScene]:
-    """Open what `qgs reconstruct` wrote into `folder`, and its photos at the size to refine at.
+) -> tuple[Reconstruction, Scene, Sequence[int]]:
+    """Open what `qgs reconstruct` wrote into `folder`, and its scene at the size to refine at.
+
+    And the frames that its model was trained on.
 
     size: (H, W) of these, by default the recorded one. name: of the scene, by
     default the recorded one. Raises FileNotFoundError for another folder, ValueError for a
@@ -46,24 +49,23 @@ def opened_reconstruction(
     recipe = resolve(model.recipe or {})
     wanted = name or record.scene
     # At the recorded size, so that the scores before are those of the reconstruction
-    chosen = chosen_scene(recipe, photos, record.cameras.size, wanted)
+    scene, seen = chosen_scene(recipe, photos, record.cameras.size, wanted)
     # Photos that were named to be compared with are the only ones that stay aside, and with none
     # compared all are refined on; the record does not say so, its frames do.
-    default = bool(record.compared) and {*record.compared} <= {*chosen.scene.held_out}
+    default = bool(record.compared) and {*record.compared} <= {*scene.held_out}
     if not default:
-        chosen = chosen_scene(recipe, photos, record.cameras.size, wanted, holdout=False)
-    refuse_other_photos(record, chosen.scene, photos)
+        scene, seen = chosen_scene(recipe, photos, record.cameras.size, wanted, holdout=False)
+    refuse_other_photos(record, scene, photos)
     start = reconstruct_sample(
         model,
-        _sample(record, chosen.scene),
-        record.world,
-        chosen.seen,
+        _sample(record, scene),
+        seen or (),
         record.gaussians.to(device),
-        record.tuning,
+        tuning=record.tuning,
     )
     if size is not None:
-        chosen = chosen_scene(recipe, photos, size, wanted, holdout=default)
-    return start, chosen
+        scene, seen = chosen_scene(recipe, photos, size, wanted, holdout=default)
+    return start, scene, seen or ()
 
 
 def refuse_other_photos(record: Record, scene: Scene, photos: str) -> None:
@@ -90,26 +92,30 @@ def _sample(record: Record, scene: Scene) -> Sample:
         targets=views.select(slice(count, None)),
         input_frames=record.inputs,
         target_frames=record.compared,
+        world=record.world,
         names=record.photos,
     )
 
 
 def refine_reconstruction(
     start: Reconstruction,
-    chosen: ChosenScene,
+    scene: Scene,
+    seen: Sequence[int],
     seconds: float,
     count: int | None,
     inputs_only: bool,
     console: Console,
 ) -> Reconstruction:
-    """Refine the Gaussians of `start` on photos of the chosen scene, at the size of these photos.
+    """Refine the Gaussians of `start` on photos of `scene`, at the size of these photos.
 
-    seconds, count: see `refine`. inputs_only: optimise on the input photos alone; otherwise on all
-    photos that are neither compared with nor held out of training.
+    seen: frames that its model was trained on. seconds, count: see `refine`. inputs_only: optimise
+    on the input photos alone; otherwise on all photos that are neither compared with nor held out
+    of training.
     """
-    scene = chosen.scene
     frames, targets = _chosen_frames(scene, start, inputs_only)
-    every = views_in(start.world, scene, (*frames, *targets)).to(start.gaussians.means.device)
+    every = views_in(start.sample.world, scene, (*frames, *targets)).to(
+        start.gaussians.means.device
+    )
     photos = every.select(slice(len(frames)))
     compared = every.select(slice(len(frames), None))
     refined = refine(
@@ -137,7 +143,7 @@ def refine_reconstruction(
         "stopped_by": refined.stopped_by,
     }
     found = reconstruct_sample(
-        start.model, sample, start.world, chosen.seen, refined.gaussians, start.tuning, record
+        start.model, sample, seen, refined.gaussians, tuning=start.tuning, refinement=record
     )
     return replace(found, remarks=list(filter(None, [found.worse_than_nearest])))
 
