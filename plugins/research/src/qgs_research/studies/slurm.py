@@ -24,14 +24,14 @@ def train(
 ) -> None:
     """Write RUN.slurm.sh, which trains on the GPUs of a node. RECIPE and options: `qgs train`."""
     from qgs.cli import app as qgs
-    from qgs.evaluate.protocol import index_of
+    from qgs.evaluate.plan import read_index
     from qgs.recipe import resolve
 
     group: Any = typer.main.get_command(qgs)
     # Parsed as `qgs train` does: what it would refuse is refused now, not when the job starts.
     given = group.commands["train"].make_context("qgs train", [*words]).params
     recipe = resolve(given["recipe"], given["overrides"] or ())
-    index_of(recipe)
+    read_index(recipe.evaluation.index)
     recipe.build_data()
     recipe.training.scenes_per_batch(gpus)
     run = given["out"].resolve()
