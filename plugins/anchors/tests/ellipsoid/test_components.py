@@ -115,17 +115,6 @@ def test_gaussians_turn_and_grow_with_their_anchor():
         assert torch.equal(getattr(placed, name), getattr(local, name))
 
 
-def test_quaternions_of_no_use_become_the_identity():
-    head = made(EllipsoidHead, gaussians_per_query=2)
-    state = _state()
-    with torch.no_grad():
-        head.linear.weight.zero_()
-        head.linear.bias.view(2, 14)[1, 9:13] = 1e-6
-    out = head(state)
-    assert_close(out.quats[..., 0, :], state[ROTATION])
-    assert_close(out.quats.norm(dim=-1), torch.ones(2, 6, 2))
-
-
 REFUSED = """
 model.decoder.refinement={type: ellipsoid/refine, center: false, rotation: false, radius: false}
     model.decoder.refinement: nothing is

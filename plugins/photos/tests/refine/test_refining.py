@@ -12,7 +12,7 @@ import pytest
 import torch
 from line_scenes import circle
 from qgs_photos.refine import refine
-from qgs_photos.refine.growth import DEAD, FreeGaussians
+from qgs_photos.refine.growth import FreeGaussians
 from qgs_photos.refine.refining import Extras, resized
 from qgs_photos.refine.result import plain
 from qgs_photos.refine.scene import masked
@@ -168,27 +168,6 @@ def test_unusable_input_is_refused():
         ("count=0", {"wanted": 0}),
     ):
         must_refuse(word, partial(refined, **wrong))
-
-
-def test_moments_follow_their_gaussians():
-    """After growth every Gaussian that was not touched learns on as before."""
-    opacities = torch.full((1, 40), 0.1)
-    opacities[0, :5] = DEAD / 5
-    opacities[0, 7] = 0.99  # drawn more often
-    given = free(replace(cloud(40), opacities=opacities))
-    learn(given, "means", "opacities")
-    before = given.values["means"].detach().clone()
-    given.grow(44, generator())
-    means = given.values["means"]
-    assert (means[:40] != before).any(1).nonzero()[:, 0].tolist() == [0, 1, 2, 3, 4]
-    assert (given.values["opacity_logits"].sigmoid() >= DEAD - 1e-6).all()
-    (group,) = (g for g in given.optimizer.param_groups if g["name"] == "means")
-    assert group["params"][0] is means
-    moments = given.optimizer.state[means]["exp_avg"]
-    assert moments.shape == (44, 3)
-    assert not moments[[0, 1, 2, 3, 4, 40, 41, 42, 43]].any()
-    assert moments[5:40].any()
-    learn(given, "means")
 
 
 def test_colors_beside_harmonics_may_have_any_value():
