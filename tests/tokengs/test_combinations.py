@@ -14,7 +14,7 @@ from qgs.recipe.registry import load_registry
 
 RECIPE = yaml.safe_load("""
 recipe: 1
-plugins: [locus, tokengs2026]
+plugins: [locus, tokengs2026, ellipsoid]
 model:
   width: 32
   heads: 2
@@ -27,7 +27,7 @@ losses: {photometric: {type: qgs/photometric}}
 """)
 PATHS = ("queries", "decoder.cross_attention", "decoder.self_attention", "decoder.refinement",
          "centers")  # fmt: skip
-PRIME = 7
+PRIME = 11
 """At least the choices of any slot."""
 
 
