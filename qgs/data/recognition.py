@@ -21,7 +21,16 @@ def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
         )
     # Plugins first: photos lie in many a layout that only a plugin reads in full.
     asked = sorted(sources, key=lambda kind: kind.startswith("qgs/"))
-    found = [kind for kind in asked if _recognises(kind, sources[kind], path)]
+    found: list[str] = []
+    for kind in asked:
+        source = sources[kind]
+        assert issubclass(source, SceneSource)
+        try:
+            if source.recognises(path):
+                found.append(kind)
+        # One of a plugin must not hinder the others.
+        except Exception as error:
+            warn_once(f"{kind} is not asked whether it reads {path}: it raises {one_line(error)}")
     if len(found) > 1:
         warn_once(
             f"{path} looks like data of {' and of '.join(found)}, and is read as {found[0]}; to "
@@ -29,16 +38,6 @@ def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
         )
     # The errors of photos say best what a folder lacks.
     return found[0] if found else "qgs/photos"
-
-
-def _recognises(kind: str, source: type[Component], path: UPath) -> bool:
-    assert issubclass(source, SceneSource)
-    try:
-        return source.recognises(path)
-    # One of a plugin must not hinder the others.
-    except Exception as error:
-        warn_once(f"{kind} is not asked whether it reads {path}: it raises {one_line(error)}")
-        return False
 
 
 def is_training_data(path: str, trained: SceneSourceConfig | None) -> bool:

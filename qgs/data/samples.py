@@ -166,52 +166,41 @@ def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[T
     """Return the world in which a model sees these inputs of `scene`: reference pose and scale.
 
     A point p of it is, in the scene's world, the reference (4, 4) applied to p / scale (0-d).
-    Raises ValueError for `scale: distance` when the input cameras stand on one point, for `search`,
-    which needs a model, and as `auto_scale`.
+    `scale: auto` brings what all cameras of the scene look at to depth 1; where that is nothing in
+    common (see `look_at_depth`), it warns, and the largest distance from the first one becomes 1.
+    Raises ValueError where a scale is asked of cameras that stand on one point, and for `search`,
+    which needs a model.
     """
     if views.scale == "search":
         raise ValueError(
             "views.scale: search finds the scale at which a trained model renders photos best, so "
             "it is for photos of a user alone; write auto, distance or constant"
         )
-    c2w = scene.cameras.c2w[list(input_frames)]
-    reference = reference_pose(views.frame, c2w)
     # Of all cameras: the scale of a scene does not depend on which inputs are drawn.
-    if views.scale == "auto":
-        return reference, auto_scale(scene.cameras.c2w, scene.name)
+    every = scene.cameras.c2w
+    c2w = every[list(input_frames)]
+    reference = reference_pose(views.frame, c2w)
     factor = torch.tensor(views.scale_factor, dtype=c2w.dtype)
-    if views.scale == "distance":
-        distance = largest_distance(relative_to(reference, c2w))
-        if not distance > 0:
-            raise ValueError(
-                f"views.scale is 'distance', but the input cameras of scene {scene.name!r} stand "
-                "on one point: use at least two inputs that moved, or `scale: constant`"
-            )
-        factor = factor / distance
-    return reference, factor
-
-
-def auto_scale(c2w: Tensor, scene: str) -> Tensor:
-    """Return the factor that brings what cameras c2w (F, 4, 4) of `scene` look at to depth 1.
-
-    Where they look at nothing in common (see `look_at_depth`), it warns, and the largest distance
-    from the first camera becomes 1. 0-d. Raises ValueError when all stand on one point.
-    """
-    depth = look_at_depth(c2w)
-    if depth > 0:
-        return 1 / depth
-    distance = largest_distance(c2w)
+    if views.scale == "constant":
+        return reference, factor
+    auto = views.scale == "auto"
+    if auto and (depth := look_at_depth(every)) > 0:
+        return reference, 1 / depth
+    distance = largest_distance(every if auto else relative_to(reference, c2w))
     if not distance > 0:
+        which = "all" if auto else "the input"
         raise ValueError(
-            f"views.scale is 'auto', but all cameras of scene {scene!r} stand on one point: "
-            "use `scale: constant`"
+            f"views.scale is {views.scale!r}, but {which} cameras of scene {scene.name!r} stand on "
+            "one point: use `scale: constant`, or photos that were taken from several places"
         )
+    if not auto:
+        return reference, factor / distance
     warn_once(
-        f"the cameras of scene {scene!r} look at no common point, so views.scale: auto makes the "
-        f"largest distance from the first one 1, a factor of {1 / float(distance):.4g}; if what "
-        "they see comes out too near or too far, give `scale: constant` and a scale_factor"
+        f"the cameras of scene {scene.name!r} look at no common point, so views.scale: auto makes "
+        f"the largest distance from the first one 1, a factor of {1 / float(distance):.4g}; if "
+        "what they see comes out too near or too far, give `scale: constant` and a scale_factor"
     )
-    return 1 / distance
+    return reference, 1 / distance
 
 
 def mirrored_views(views: Views) -> Views:
