@@ -21,7 +21,8 @@ class ExtensionError(ValueError):
 def installed(group: str) -> tuple[EntryPoint, ...]:
     """Entry points of `group`. Imports nothing; sees what was installed since the last call."""
     # Reading all metadata takes some 10 ms, so that it is repeated only after a change of sys.path.
-    return _read(group, tuple((path, _changed_at(path)) for path in sys.path))
+    searched = [path for path in sys.path if os.path.exists(path)]
+    return _read(group, *searched, *map(os.path.getmtime, searched))
 
 
 def load(entry: EntryPoint, base: type[T]) -> type[T]:
@@ -48,12 +49,5 @@ def _where(entry: EntryPoint) -> str:
 
 
 @lru_cache(maxsize=16)
-def _read(group: str, searched: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]:
+def _read(group: str, *searched: str | float) -> tuple[EntryPoint, ...]:
     return tuple(entry_points(group=group))
-
-
-def _changed_at(path: str) -> int:
-    try:
-        return os.stat(path or ".").st_mtime_ns
-    except OSError:
-        return 0

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 from rich.console import Console
-from rich.progress import Progress
 
 from qgs.cli import options
 from qgs.cli.options import Checkpoint, Device, Overrides, Threads, Tune
@@ -103,6 +102,8 @@ def evaluate_into(
     console: Console,
 ) -> Evaluation:
     """Evaluate `model` as `recipe` says, write the results into `folder` and show them."""
+    from rich.progress import Progress
+
     from qgs.evaluate.evaluation import evaluate as judge
 
     with Progress(console=console, transient=True) as progress:

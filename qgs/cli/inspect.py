@@ -91,8 +91,8 @@ def recipes(
     from qgs.recipe.files import files_of, recipe_folder
 
     home = recipe_folder().resolve()
-    found = {path.relative_to(home).as_posix(): path for path in sorted(home.rglob("*.yaml"))}
-    known = {label: path for label, path in found.items() if not label.startswith("studies/")}
+    files = {*home.rglob("*.yaml")} - {*home.glob("studies/**/*")}
+    known = {path.relative_to(home).as_posix(): path for path in sorted(files)}
     if name is None:
         if out:
             raise ValueError("give the name of a recipe before --out")

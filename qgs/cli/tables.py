@@ -1,10 +1,9 @@
 """Tables of `qgs list`."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
@@ -23,83 +22,78 @@ _WORDS = {"string": "text", "boolean": "true or false", "object": "mapping"}
 _BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
 
 
-def folded_table(title: str, *columns: str) -> Table:
-    """Return a table with folded cells."""
-    table = Table(title=title or None, title_justify="left")
-    for column in columns:
-        table.add_column(escape(column), overflow="fold")
-    return table
-
-
 def overview(registry: Registry) -> Iterator[Table]:
     """Yield a table per slot: installed components, what they are, where they come from."""
     for name, slot in SLOTS.items():
         default = f" (default {slot.default})" if slot.default else ""
-        table = folded_table(recipe_path(name) + default, "type", "meaning", "origin")
-        for kind, component in registry.components(name).items():
-            table.add_row(*map(escape, (kind, summary_of(component), _release(kind, registry))))
-        yield table
+        components = registry.components(name).items()
+        meanings = {kind: summary_of(component) for kind, component in components}
+        yield _origins(recipe_path(name) + default, "type", meanings, registry)
     if models := _models(registry):
-        table = folded_table("trained models", "name", "meaning", "origin")
-        for name, file in models.items():
-            table.add_row(*map(escape, (name, about(file), _release(name, registry))))
-        yield table
+        meanings = {name: about(file) for name, file in models.items()}
+        yield _origins("trained models", "name", meanings, registry)
 
 
-def details(name: str, registry: Registry) -> Iterator[Group]:
+def _origins(title: str, column: str, meanings: Mapping[str, str], registry: Registry) -> Table:
+    rows = [(name, meaning, _release(name, registry)) for name, meaning in meanings.items()]
+    return _table(title, (column, "meaning", "origin"), *rows)
+
+
+def _table(title: str, *rows: Sequence[str]) -> Table:
+    """Return a table with folded cells, headers first."""
+    table = Table(title=title or None, title_justify="left")
+    for column in rows[0]:
+        table.add_column(column, overflow="fold")
+    for row in rows[1:]:
+        table.add_row(*map(escape, row))
+    return table
+
+
+def details(name: str, registry: Registry) -> Iterator[Table | str]:
     """Explain a section of settings, a trained model, a component or the components of a slot.
 
     name: such as qgs/latent, queries, training, or rooms/locus_64; `recipe` stands for the
     settings at the top of a recipe. Raises ValueError for other names.
     """
-    settings = {".".join(path) or "recipe": path for path in SETTINGS}
+    settings = {".".join(path) or "recipe": config for path, config in SETTINGS.items()}
     models = _models(registry)
     slot = name.removeprefix("model.").removeprefix("decoder.")
     components = [(s, kind) for s in SLOTS for kind in registry.components(s)]
     shown = [(s, kind) for s, kind in components if name == kind or slot == s]
     if name in settings:
-        config = SETTINGS[settings[name]]
-        yield _explained(name, config, config)
+        yield from _explained(name, settings[name], settings[name])
     elif name in models:
         file = checkpoint_path(name)
-        heading = f"[bold]{escape(name)}[/bold], {escape(_release(name, registry))}"
-        size = f"{file}: {file.stat().st_size / 1e6:.1f} MB"
-        yield Group(heading, escape(size), "", escape(card_of(file)))
+        yield f"[bold]{escape(name)}[/bold], {escape(_release(name, registry))}"
+        yield escape(f"{file}: {file.stat().st_size / 1e6:.1f} MB\n\n{card_of(file)}")
     elif not shown:
         known = [*SLOTS, *settings, *models, *(kind for _, kind in components)]
         hint = did_you_mean(name, known, "names")
         raise ValueError(f"there is no slot, component or section `{name}`; {hint}")
     for place, kind in shown:
-        yield _component(place, kind, registry)
+        component = registry.components(place)[kind]
+        heading = f"{recipe_path(place)}: {kind}, {_release(kind, registry)}"
+        yield from _explained(heading, component, component.Config)
+        if config := default_config(component):
+            yield from _fields("requires", component.fields_read(config))
+            yield from _fields("provides", component.fields_written(config))
+        yield ""
 
 
-def _explained(heading: str, described: type, config: type[ComponentConfig], *more: str) -> Group:
-    """What `described` is, the options of `config`, and more lines."""
-    options = settings_schema(config)["properties"]
-    table = folded_table("", "option", "type", "default", "meaning")
-    for cells in option_rows(options):
-        table.add_row(*map(escape, cells))
-    summary = escape(summary_of(described))
-    shown = table if options else "  no options"
-    return Group(f"[bold]{escape(heading)}[/bold]", summary, shown, *more)
+def _explained(
+    heading: str, described: type, config: type[ComponentConfig]
+) -> Iterator[Table | str]:
+    """Yield what `described` is, and the options of `config`."""
+    yield f"[bold]{escape(heading)}[/bold]"
+    yield escape(summary_of(described))
+    rows = [*option_rows(settings_schema(config)["properties"])]
+    yield _table("", ("option", "type", "default", "meaning"), *rows) if rows else "  no options"
 
 
-def _component(slot: str, kind: str, registry: Registry) -> Group:
-    """Explain the options of a component, and the fields that it needs and makes by default."""
-    component = registry.components(slot)[kind]
-    heading = f"{recipe_path(slot)}: {kind}, {_release(kind, registry)}"
-    config = default_config(component)
-    fields = []
-    if config is not None:
-        declared = {
-            "requires": component.fields_read(config),
-            "provides": component.fields_written(config),
-        }
-        for word, specs in declared.items():
-            if specs:
-                text = "; ".join(f"{name} ({spec})" for name, spec in specs.items())
-                fields.append(escape(f"  {word}: {text}"))
-    return _explained(heading, component, component.Config, *fields, "")
+def _fields(word: str, specs: Mapping[str, object]) -> Iterator[str]:
+    if specs:
+        text = "; ".join(f"{name} ({spec})" for name, spec in specs.items())
+        yield escape(f"  {word}: {text}")
 
 
 def _models(registry: Registry) -> dict[str, Path]:
