@@ -4,7 +4,7 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -45,21 +45,13 @@ class SceneScore:
     scene: str
     views: Sequence[tuple[Frames, Frames]]
     values: Mapping[str, float]
-    names: Mapping[int, str] = field(default_factory=dict)
+    names: Mapping[int, str]
 
     @property
     def given(self) -> list[int]:
         """Frames that one of the samples has as input and as target."""
         both = [given_targets(*frames) for frames in self.views]
         return sorted(set().union(*both))
-
-    def cells(self) -> dict[str, str | float]:
-        """Return what scenes.csv says of it, by column; frames by name where they have any."""
-        cells: dict[str, str | float] = {}
-        for place, column in enumerate(("input_frames", "target_frames")):
-            sides = [[self.names.get(f, str(f)) for f in frames[place]] for frames in self.views]
-            cells[column] = "; ".join(map(" ".join, sides))
-        return {**cells, **self.values}
 
 
 @dataclass(frozen=True)
@@ -77,8 +69,8 @@ class Evaluation:
     scores: Sequence[SceneScore]
     gaussians: int
     missing: Mapping[str, str]
-    incomplete: Mapping[str, str] = field(default_factory=dict)
-    step: int | None = None
+    incomplete: Mapping[str, str]
+    step: int | None
     remarks: Sequence[str] = ()
 
     def mean(self, metric: str, method: str = "model") -> float | None:
@@ -179,7 +171,14 @@ class Evaluation:
         return rows
 
     def _csv(self) -> str:
-        rows = [{"scene": score.scene, **score.cells()} for score in self.scores]
+        rows: list[dict[str, Any]] = []
+        for score in self.scores:
+            row = {"scene": score.scene}
+            # Frames by name where they have any; samples apart.
+            for place, column in enumerate(("input_frames", "target_frames")):
+                named = [[score.names.get(f, str(f)) for f in one[place]] for one in score.views]
+                row[column] = "; ".join(map(" ".join, named))
+            rows.append({**row, **score.values})
         columns = dict.fromkeys(column for row in rows for column in row)
         # A scene that is missing has a row too, so that it shows in the file.
         rows += [{"scene": scene, "problem": reason} for scene, reason in self.missing.items()]

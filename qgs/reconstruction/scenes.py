@@ -1,7 +1,6 @@
 """Photos of a user as one scene: from a folder, its URL or Views."""
 
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from os import PathLike, fspath
 from typing import TypeAlias
 
@@ -77,7 +76,7 @@ def chosen_scene(
         seen = training_frames(scene) if scene.name in source.names("train") else ()
         return scene, seen
     # Size and split depend on the photos, so the scene is opened once more.
-    whole = size or whole_size(scene, size_multiple([recipe]))
+    whole = size or whole_size(scene, size_multiple(recipe))
     config = holding_out(source.config, scene) if holdout else source.config
     return named_scene(_resized(source, config, whole), path, name), None
 
@@ -110,18 +109,12 @@ def whole_size(scene: Scene, multiple: int | None) -> Size:
     return height, width
 
 
-def size_multiple(recipes: Iterable[Recipe]) -> int | None:
-    """Return the least common multiple of all models' size multiples; None if one size is fixed."""
-    known = list[int]()
-    for recipe in recipes:
-        # The parts are known without building a model.
-        part = recipe.parts["model", "encoder"]
-        assert issubclass(part.component, Encoder)
-        multiple = part.component.size_multiple(part.config)
-        if multiple is None:
-            return None
-        known.append(multiple)
-    return math.lcm(*known)
+def size_multiple(recipe: Recipe) -> int | None:
+    """Return what sides of the model's images are multiples of; None if their size is fixed."""
+    # The part is known without building a model.
+    part = recipe.parts["model", "encoder"]
+    assert issubclass(part.component, Encoder)
+    return part.component.size_multiple(part.config)
 
 
 def installed_sources() -> dict[str, type[Component]]:

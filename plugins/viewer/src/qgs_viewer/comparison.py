@@ -1,5 +1,6 @@
 """Trained models on the same scenes: opened, and judged under one protocol."""
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -255,7 +256,11 @@ def _data_of(photos: str, recipes: Collection[Recipe], size: Size | None) -> dic
     config = source.config
     if not own and scene is not None:
         # cropped photos would hide part of the user's scene
-        size = size or whole_size(scene, size_multiple(recipes))
+        multiples = [size_multiple(recipe) for recipe in recipes]
+        # a multiple of all models' sizes; none where one takes a single size
+        known = [multiple for multiple in multiples if multiple is not None]
+        common = math.lcm(*known) if len(known) == len(multiples) else None
+        size = size or whole_size(scene, common)
         config = holding_out(config, scene)
     # recipes know sources of data by PLUGIN/NAME
     kind = next(name for name, component in sources.items() if component is type(source))
