@@ -99,29 +99,6 @@ def _scaled_columns(rows, scale):
 
 
 @kernel
-def _seen(c2w, mean):
-    """Rows of a camera's rotation, a mean from its centre, and the mean in its frame."""
-    pose = (_vector(c2w[0]), _vector(c2w[1]), _vector(c2w[2]))
-    offset = _plus(_vector(mean), -_ONE, (c2w[0, 3], c2w[1, 3], c2w[2, 3]))
-    return pose, offset, _combine(offset, pose)
-
-
-@kernel
-def _clamp(slope, focal, principal, size, margin):
-    """`slope` held within `margin` of the image, and whether it was held."""
-    low = (-margin * size - principal) / focal
-    high = (size + margin * size - principal) / focal
-    held = min(max(slope, low), high)
-    return held, held != slope
-
-
-@kernel
-def _image_factor(turned, axis, slope, focal, z):
-    """Row `axis` of the 2 x 3 factor J W R S, from the rows of W R S."""
-    return _times(focal / z, _plus(turned[axis], -slope, turned[2]))
-
-
-@kernel
 def _dots(a, rows):
     return (_dot(rows[0], a), _dot(rows[1], a), _dot(rows[2], a))
 
@@ -135,6 +112,29 @@ def _turn(pose, factor_columns):
         _dots(axes[1], factor_columns),
         _dots(axes[2], factor_columns),
     )
+
+
+@kernel
+def _axis(axis, seen, turned, focal, principal, size, margin):
+    """Of an image axis: the slope, the one held within `margin` of the image, a row of J W R S."""
+    slope = seen[axis] / seen[2]
+    low = (-margin * size - principal) / focal
+    high = (size + margin * size - principal) / focal
+    held = min(max(slope, low), high)
+    return slope, held, _times(focal / seen[2], _plus(turned[axis], -held, turned[2]))
+
+
+@kernel
+def _view(c2w, lens, mean, factor, margin, height, width):
+    """A camera's rotation, the mean from its centre and in its frame, W R S, and both `_axis`."""
+    pose = (_vector(c2w[0]), _vector(c2w[1]), _vector(c2w[2]))
+    offset = _plus(_vector(mean), -_ONE, (c2w[0, 3], c2w[1, 3], c2w[2, 3]))
+    seen = _combine(offset, pose)
+    turned = _turn(pose, factor)
+    fx, fy, cx, cy = _four(lens)
+    x_axis = _axis(0, seen, turned, fx, cx, width, margin)
+    y_axis = _axis(1, seen, turned, fy, cy, height, margin)
+    return pose, offset, seen, turned, x_axis, y_axis
 
 
 @kernel
@@ -155,7 +155,9 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, s
         reach = np.sqrt(_TWO * fall)
         lowest = -_LOG2_E * fall - _SLACK
         for v in range(c2w.shape[0]):
-            pose, _, seen = _seen(c2w[v], means[g])
+            _, _, seen, _, (x, _, row_x), (y, _, row_y) = _view(
+                c2w[v], lenses[v], means[g], factor, margin, height, width
+            )
             fx, fy, cx, cy = _four(lenses[v])
             z = seen[2]
             out = splats[v, g]
@@ -165,13 +167,6 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, s
             if not (opacity >= alpha_min and z >= near and z <= far):
                 out[5] = _ONE
                 continue
-            x = seen[0] / z
-            y = seen[1] / z
-            turned = _turn(pose, factor)
-            held_x, _ = _clamp(x, fx, cx, width, margin)
-            held_y, _ = _clamp(y, fy, cy, height, margin)
-            row_x = _image_factor(turned, 0, held_x, fx, z)
-            row_y = _image_factor(turned, 1, held_y, fy, z)
             xx = _dot(row_x, row_x)
             xy = _dot(row_x, row_y)
             yy = _dot(row_y, row_y)
@@ -209,11 +204,12 @@ def _covariance_slopes(row_x, row_y, splat, given, dilation):
 
 
 @kernel
-def _axis_slopes(slope, held, is_held, focal, z, row, of_row, turned_z, of_pixel):
+def _axis_slopes(axis, focal, z, of_row, turned_z, of_pixel):
     """Slopes of (camera-frame coordinate, z, focal, principal, row of W R S, its row z).
 
     One image axis: pixel = principal + focal slope, row = focal / z (turned - held turned_z).
     """
+    slope, held, row = axis
     gain = focal / z
     of_turned = _times(gain, of_row)
     of_turned_z = _times(-held, of_turned)
@@ -223,7 +219,7 @@ def _axis_slopes(slope, held, is_held, focal, z, row, of_row, turned_z, of_pixel
     of_principal = of_pixel
     of_slope = focal * of_pixel
     # At (border - principal) / focal.
-    if is_held:
+    if held != slope:
         of_focal -= of_held * held / focal
         of_principal -= of_held / focal
     else:
@@ -310,21 +306,16 @@ def project_backward_unit(
                 continue
             _sum_parts(given[v], g, slopes)
             of_opacity += slopes[6]
-            pose, offset, seen = _seen(c2w[v], means[g])
-            fx, fy, cx, cy = _four(lenses[v])
-            z = seen[2]
-            x, y = seen[0] / z, seen[1] / z
-            turned = _turn(pose, factor)
-            held_x, is_held_x = _clamp(x, fx, cx, width, margin)
-            held_y, is_held_y = _clamp(y, fy, cy, height, margin)
-            row_x = _image_factor(turned, 0, held_x, fx, z)
-            row_y = _image_factor(turned, 1, held_y, fy, z)
-            of_row_x, of_row_y = _covariance_slopes(row_x, row_y, splat, slopes, dilation)
+            pose, offset, seen, turned, x_axis, y_axis = _view(
+                c2w[v], lenses[v], means[g], factor, margin, height, width
+            )
+            fx, fy, _, _ = _four(lenses[v])
+            of_row_x, of_row_y = _covariance_slopes(x_axis[2], y_axis[2], splat, slopes, dilation)
             of_x, z_x, of_fx, of_cx, of_turned_x, turned_z_x = _axis_slopes(
-                x, held_x, is_held_x, fx, z, row_x, of_row_x, turned[2], slopes[0]
+                x_axis, fx, seen[2], of_row_x, turned[2], slopes[0]
             )
             of_y, z_y, of_fy, of_cy, of_turned_y, turned_z_y = _axis_slopes(
-                y, held_y, is_held_y, fy, z, row_y, of_row_y, turned[2], slopes[1]
+                y_axis, fy, seen[2], of_row_y, turned[2], slopes[1]
             )
             of_seen = (of_x, of_y, z_x + z_y + slopes[5])
             of_turned = (of_turned_x, of_turned_y, _plus(turned_z_x, _ONE, turned_z_y))

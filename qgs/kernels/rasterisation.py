@@ -26,6 +26,8 @@ SUMS = 5
 GRADIENTS = 10
 
 _LANES = np.uint64(TILE)
+# Where blocks of lanes begin.
+_BLOCKS = tuple(np.uint64(TILE * block) for block in range(10))
 # Floats per row of a tile.
 _ROW = 9 * TILE
 _STATE = np.uint64(_ROW)
@@ -144,17 +146,17 @@ def _blend_row(state, base, dx0, power_of, look, options):
         power = max(min((quadratic * dx + linear) * dx + constant, _ZERO), _LOWEST)
         alpha = opacity * _exp2(power)
         before = state[i]
-        live = state[i + _LANES]
+        live = state[i + _BLOCKS[1]]
         alpha = min(alpha, alpha_cap) if alpha >= alpha_min else _ZERO
         live = live if before - before * alpha > transmittance_min else _ZERO
         weight = before * alpha * live
         state[i] = before - weight
-        state[i + _LANES] = live
-        state[i + np.uint64(2) * _LANES] += weight * r
-        state[i + np.uint64(3) * _LANES] += weight * g
-        state[i + np.uint64(4) * _LANES] += weight * b
-        state[i + np.uint64(5) * _LANES] += weight * z
-        state[i + np.uint64(6) * _LANES] += weight
+        state[i + _BLOCKS[1]] = live
+        state[i + _BLOCKS[2]] += weight * r
+        state[i + _BLOCKS[3]] += weight * g
+        state[i + _BLOCKS[4]] += weight * b
+        state[i + _BLOCKS[5]] += weight * z
+        state[i + _BLOCKS[6]] += weight
 
 
 @kernel
@@ -172,35 +174,35 @@ def _backward_row(state, base, totals, dx0, dy, power_of, look, options):
         power = max(min((quadratic * dx + linear) * dx + constant, _ZERO), _LOWEST)
         full = opacity * _exp2(power)
         before = state[i]
-        live = state[i + _LANES]
+        live = state[i + _BLOCKS[1]]
         alpha = min(full, alpha_cap) if full >= alpha_min else _ZERO
         live = live if before - before * alpha > transmittance_min else _ZERO
         alpha = alpha * live
         weight = before * alpha
         state[i] = before - weight
-        state[i + _LANES] = live
-        g_r = state[i + np.uint64(3) * _LANES]
-        g_g = state[i + np.uint64(4) * _LANES]
-        g_b = state[i + np.uint64(5) * _LANES]
-        g_z = state[i + np.uint64(6) * _LANES]
-        z_here = z - state[i + np.uint64(8) * _LANES]
-        value = g_r * r + g_g * g + g_b * b + g_z * z_here + state[i + np.uint64(7) * _LANES]
-        rest = state[i + np.uint64(2) * _LANES] - weight * value
-        state[i + np.uint64(2) * _LANES] = rest
+        state[i + _BLOCKS[1]] = live
+        g_r = state[i + _BLOCKS[3]]
+        g_g = state[i + _BLOCKS[4]]
+        g_b = state[i + _BLOCKS[5]]
+        g_z = state[i + _BLOCKS[6]]
+        z_here = z - state[i + _BLOCKS[8]]
+        value = g_r * r + g_g * g + g_b * b + g_z * z_here + state[i + _BLOCKS[7]]
+        rest = state[i + _BLOCKS[2]] - weight * value
+        state[i + _BLOCKS[2]] = rest
         slope = before * value - rest / (_ONE - alpha)
         h = slope * alpha if full <= alpha_cap else _ZERO
         hx = h * dx
         hy = h * dy
         totals[lane] += h
-        totals[lane + _LANES] += hx
-        totals[lane + np.uint64(2) * _LANES] += hy
-        totals[lane + np.uint64(3) * _LANES] += hx * dx
-        totals[lane + np.uint64(4) * _LANES] += hx * dy
-        totals[lane + np.uint64(5) * _LANES] += hy * dy
-        totals[lane + np.uint64(6) * _LANES] += weight * g_z
-        totals[lane + np.uint64(7) * _LANES] += weight * g_r
-        totals[lane + np.uint64(8) * _LANES] += weight * g_g
-        totals[lane + np.uint64(9) * _LANES] += weight * g_b
+        totals[lane + _BLOCKS[1]] += hx
+        totals[lane + _BLOCKS[2]] += hy
+        totals[lane + _BLOCKS[3]] += hx * dx
+        totals[lane + _BLOCKS[4]] += hx * dy
+        totals[lane + _BLOCKS[5]] += hy * dy
+        totals[lane + _BLOCKS[6]] += weight * g_z
+        totals[lane + _BLOCKS[7]] += weight * g_r
+        totals[lane + _BLOCKS[8]] += weight * g_g
+        totals[lane + _BLOCKS[9]] += weight * g_b
 
 
 @kernel
