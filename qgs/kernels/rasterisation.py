@@ -268,8 +268,12 @@ def _store_sums(state, sums, y0, x0, rows, columns):
 
 
 @kernel
-def _unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, backward):
-    """Walk the tile rows [first, last) of one image; `backward` is a constant of either caller."""
+def blend_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, backward):
+    """Walk the tile rows [first, last) of one image with its splats (G, 9).
+
+    Fills sums (5, H, W); or, if `backward`, adds to out (G, 10) the gradients of what it had
+    filled, from slopes (5, H, W), the gradient of the loss in `sums`.
+    """
     height, width = sums.shape[1:]
     top, bottom = tile_rows[0] * TILE, min(tile_rows[1] * TILE, height)
     order = _by_depth(splats, top, bottom, width)
@@ -328,18 +332,3 @@ def _unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, back
                         break
             if not backward:
                 _store_sums(state, sums, y0, x0, rows, columns)
-
-
-@kernel
-def forward_unit(splats, opacities, colors, tile_rows, options, sums):
-    """Fill the tile rows [first, last) of sums (5, H, W) from one image's splats (G, 9)."""
-    _unit(splats, opacities, colors, tile_rows, options, sums, sums, splats, False)
-
-
-@kernel
-def backward_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out):
-    """Add the gradients of the unit that `forward_unit` rendered to `out` (G, 10).
-
-    slopes: (5, H, W), the gradient of the loss in `sums`.
-    """
-    _unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, True)

@@ -106,7 +106,10 @@ class _Splat(torch.autograd.Function):
         def blend(scene: int, view: int, stripe: _Part) -> None:
             image = scene, view
             look = opacities[scene], colors[scene, view % colors.shape[1]]
-            kernels.forward_unit(rows[image], *look, stripe[1], blending, out[image])
+            seen = out[image]
+            kernels.blend_unit(
+                rows[image], *look, stripe[1], blending, seen, seen, rows[image], False
+            )
 
         # First all projections: every stripe of an image sorts all of its splats.
         in_threads(project, product(range(batch), chunks))
@@ -140,9 +143,9 @@ class _Splat(torch.autograd.Function):
             image = scene, view
             look = opacities[scene], colors[scene, view % colors.shape[1]]
             part, tile_rows = stripe
-            kernels.backward_unit(
+            kernels.blend_unit(
                 rows[image], *look, tile_rows, blending, sums[image], given[image],
-                grads[image][part],
+                grads[image][part], True,
             )  # fmt: skip
 
         def project(scene: int, chunk: _Part) -> None:
