@@ -25,10 +25,10 @@ from qgs.contracts import (
 from qgs.contracts.component import MissingExtraError
 from qgs.machine import is_out_of_memory
 from qgs.model import QueryGaussianModel
-from qgs.recipe.decode import Chosen
+from qgs.recipe.decode import Chosen, report_failure
 from qgs.recipe.errors import Problems, RecipeError, did_you_mean
 from qgs.recipe.places import matches
-from qgs.recipe.registry import BUILTIN, component_failure
+from qgs.recipe.registry import BUILTIN
 from qgs.recipe.slots import AFTER_LAYERS
 from qgs.recipe.yaml_text import KeyPath
 
@@ -143,9 +143,9 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
         )
         if users_mistake or is_out_of_memory(error) or chosen.installed is BUILTIN:
             raise
-        failure = component_failure(chosen.type, "__init__", error, chosen.installed)
+        called = f"`__init__` of `{chosen.type}`"
         problems = Problems()
-        problems.add(chosen.origin, chosen.source, failure.reason, failure.fix)
+        report_failure(chosen, called, error, chosen.installed, problems)
         raise RecipeError(problems.found) from error
     if chosen.schedules:
         built.schedules = chosen.schedules

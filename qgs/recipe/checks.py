@@ -16,10 +16,10 @@ from qgs.contracts import (
     Supervision,
 )
 from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpec
-from qgs.recipe.decode import Chosen, Parts
+from qgs.recipe.decode import Chosen, Parts, report_failure
 from qgs.recipe.errors import Problems
 from qgs.recipe.places import DECODER, layer_places
-from qgs.recipe.registry import Registry, component_failure, default_config
+from qgs.recipe.registry import Registry, default_config
 from qgs.recipe.sections import DecoderSettings, Draft
 from qgs.recipe.slots import AFTER_LAYERS
 from qgs.recipe.yaml_text import KeyPath, find, inline
@@ -70,8 +70,8 @@ def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -
         )
     # What code of a plugin raises.
     except Exception as error:
-        failure = component_failure(chosen.type, called, error, chosen.installed)
-        problems.add(chosen.origin, chosen.source, failure.reason, failure.fix, error)
+        called = f"`{called}` of `{chosen.type}`"
+        report_failure(chosen, called, error, chosen.installed, problems)
         return False
     for problem in found:
         steps, origin, _ = find(chosen.node, problem.option.split("."))

@@ -16,7 +16,7 @@ from qgs.contracts import Component, ComponentConfig, OptionError
 from qgs.contracts.schedule import Schedule
 from qgs.recipe.errors import Problems, did_you_mean, nearest
 from qgs.recipe.places import Place
-from qgs.recipe.registry import InstalledPlugin, Registry, component_failure
+from qgs.recipe.registry import InstalledPlugin, Registry
 from qgs.recipe.slots import SLOTS, type_at
 from qgs.recipe.yaml_text import KeyPath, MapNode, brief, find, inline
 from qgs.tokengs.schedules import SCHEDULES
@@ -83,13 +83,23 @@ def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen
     try:
         found = _decode_options(component, node.without("type"), place.source, problems)
     except Exception as error:
-        failure = component_failure(name, "Config", error, installed)
-        return problems.add(place.origin, place.source, failure.reason, failure.fix, error)
+        return report_failure(place, f"`Config` of `{name}`", error, installed, problems)
     if found is None:
         return None
     (config, *later), schedules = found
     at = (place.path, place.source, node, place.origin)
     return Chosen(*at, name, component, config, later, schedules, installed)
+
+
+def report_failure(
+    place: Place, called: str, error: Exception, installed: InstalledPlugin, problems: Problems
+) -> None:
+    """Report that `called`, of the component at `place`, raised `error`; names the distribution."""
+    release = installed.released_as
+    origin = f"the plugin `{installed.plugin.name}`{f' of {release}' if release else ''}"
+    reason = f"{origin} fails: {called} raises {type(error).__name__}: {error}"
+    fix = f"update or correct {release or 'it'}, or choose another component"
+    problems.add(place.origin, place.source, reason, fix, error)
 
 
 def _decode_options(

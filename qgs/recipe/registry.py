@@ -185,13 +185,3 @@ def default_config(component: type[Component]) -> ComponentConfig | None:
         return component.Config()
     except (Exception, SystemExit):
         return None
-
-
-def component_failure(
-    kind: str, called: str, error: Exception, installed: InstalledPlugin
-) -> PluginError:
-    """`called`, a function of the component `kind`, raised `error`; names the distribution."""
-    release = installed.released_as
-    origin = f"the plugin `{installed.plugin.name}`{f' of {release}' if release else ''}"
-    reason = f"{origin} fails: `{called}` of `{kind}` raises {type(error).__name__}: {error}"
-    return PluginError(reason, f"update or correct {release or 'it'}, or choose another component")
