@@ -5,27 +5,22 @@ A distribution adds a tracker by an entry point in the group `qgs.trackers` that
 
 import logging
 import time
-import uuid
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from datetime import timedelta
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar
 
 import numpy as np
-from accelerate.tracking import TensorBoardTracker, WandBTracker
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from qgs.contracts import MissingExtraError
-from qgs.extensions import installed, load
-from qgs.files import write_text
+from qgs.extensions import INSTALL_ALL, installed, load
 from qgs.metrics.images import Psnr
 from qgs.wording import listed
-
-Options: TypeAlias = Mapping[str, bool | int | float | str]
 
 _REFRESH_SECONDS = 0.25
 _LOG_SECONDS = 15.0
@@ -37,11 +32,14 @@ class Tracker(ABC):
     """A destination of the numbers and pictures of one run, in addition to its folder."""
 
     package: ClassVar[str] = ""
-    """The package that it needs, an extra of query-gaussians."""
+    """The package that it needs, as Python and pip call it; "" for none."""
 
     @abstractmethod
-    def __init__(self, run: Path, options: Options, step: int):
-        """Start, or go on after `step` steps. run: the run's folder; options: of its recipe."""
+    def __init__(self, run: Path, options: Mapping[str, Any], step: int):
+        """Start, or go on after `step` steps of the run in the folder `run`.
+
+        options: of its recipe, by dotted path.
+        """
 
     @abstractmethod
     def log(self, values: Mapping[str, float], step: int) -> None:
@@ -56,95 +54,34 @@ class Tracker(ABC):
         return
 
 
-class _OfAccelerate(Tracker):
-    """A tracker that accelerate has; subclasses make it in `_tracker`."""
-
-    _tracker: Any
-    _of_pictures: ClassVar[Mapping[str, str]] = {}
-
-    def _start(self, options: Options) -> None:
-        self._tracker.start()
-        self._tracker.store_init_configuration(dict(options))
-
-    def log(self, values: Mapping[str, float], step: int) -> None:
-        self._tracker.log(dict(values), step=step)
-
-    def picture(self, name: str, picture: np.ndarray, step: int) -> None:
-        self._tracker.log_images({name: picture[None]}, step=step, **self._of_pictures)
-
-    def close(self) -> None:
-        self._tracker.finish()
-
-
-class TensorBoard(_OfAccelerate):
-    """Writes into RUN/tensorboard."""
-
-    package = "tensorboard"
-    _of_pictures: ClassVar = {"dataformats": "NHWC"}
-
-    def __init__(self, run: Path, options: Options, step: int):
-        # A resumed run repeats steps after its last save: TensorBoard drops those it has.
-        self._tracker = TensorBoardTracker(self.package, run, purge_step=step + 1)
-        self._start(options)
-
-
-class WeightsAndBiases(_OfAccelerate):
-    """Writes into RUN/wandb; a resumed training goes on in the same wandb run."""
-
-    package = "wandb"
-
-    def __init__(self, run: Path, options: Options, step: int):
-        place = run / "wandb" / "id"
-        if not place.is_file():
-            write_text(place, uuid.uuid4().hex)
-        name = run.resolve().name
-        known = place.read_text()
-        self._tracker = WandBTracker("qgs", name=name, dir=str(run), id=known, resume="allow")
-        self._start(options)
-
-
-def tracker_kind(name: str) -> type[Tracker]:
-    """Return the tracker that `training.trackers` calls `name`.
-
-    Raises ValueError for one that is not installed, MissingExtraError if its package is missing.
-    """
-    built_in: dict[str, type[Tracker]] = {"tensorboard": TensorBoard, "wandb": WeightsAndBiases}
-    offered = {entry.name: entry for entry in installed("qgs.trackers")}
-    if name not in {*built_in, *offered}:
-        raise ValueError(
-            f"training.trackers names {name!r}, which no installed distribution offers; there are "
-            f"{listed(sorted({*built_in, *offered}))}"
-        )
-    kind = built_in.get(name) or load(offered[name], Tracker)
-    if kind.package and find_spec(kind.package) is None:
-        raise MissingExtraError(
-            f"training.trackers names {name}, which is not installed: run "
-            f'`pip install "query-gaussians[{name}]"`, or take it out of training.trackers'
-        )
-    return kind
-
-
 class Trackers:
     """The trackers of a recipe, opened when the run's folder exists; all on the main process.
 
     One that fails is logged, closed and left out from then on: training goes on without it.
-    Raises as `tracker_kind`.
+    Raises ValueError for one that is not installed, MissingExtraError if its package is missing.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
-        self._kinds = {name: tracker_kind(name) for name in names}
+        offered = {entry.name: entry for entry in installed("qgs.trackers")}
+        if unknown := sorted({*names} - offered.keys()):
+            raise ValueError(
+                f"training.trackers names {listed(unknown)}, and installed distributions offer "
+                f"{listed(sorted(offered)) or 'no tracker'}: take it out, or {INSTALL_ALL}"
+            )
+        self._kinds = {name: load(offered[name], Tracker) for name in names}
+        for name, kind in self._kinds.items():
+            if kind.package and find_spec(kind.package) is None:
+                raise MissingExtraError(
+                    f"training.trackers names {name}, which needs the package {kind.package}: run "
+                    f"`pip install {kind.package}`, or take {name} out of training.trackers"
+                )
         self._open: dict[str, Tracker] = {}
 
     def open(self, run: Path, options: Mapping[str, Any], step: int = 0) -> None:
         """Track into the folder `run` from step `step` + 1 on; log the recipe's `options`."""
-        # Trackers take plain values only; lists and nulls become text.
-        plain = {
-            name: value if isinstance(value, bool | int | float | str) else str(value)
-            for name, value in options.items()
-        }
         for name, kind in self._kinds.items():
             try:
-                self._open[name] = kind(run, plain, step)
+                self._open[name] = kind(run, options, step)
             except Exception as error:
                 _warn(name, error)
 
