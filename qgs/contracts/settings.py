@@ -5,6 +5,7 @@ from typing import Literal, TypeAlias
 from pydantic import Field, field_validator
 
 from qgs.contracts.component import ComponentConfig, OptionError
+from qgs.geometry.precision import Precision
 
 Tuned: TypeAlias = Literal["queries", "latents"]
 """Parts that can be tuned at test time."""
@@ -63,7 +64,7 @@ class TrainingConfig(ComponentConfig):
     """Batches that a process makes of its scenes of a step, one after the other: less memory."""
     clip: float = Field(default=1.0, gt=0)
     """Largest norm of the gradient; a larger one is scaled down to it."""
-    precision: Literal["float32", "bf16"] = "bf16"
+    precision: Precision = "bf16"
     """What the model computes in; bf16 is torch's autocast, weights stay float32."""
     save_every: int = Field(default=1000, ge=0)
     """Steps between checkpoints; 0 saves at the end and before evaluations only."""

@@ -1,9 +1,9 @@
-"""Float32 or better for geometry, also inside autocast."""
+"""What a model computes in, float32 or bf16; float32 or better for geometry in either."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import wraps
-from typing import Any, TypeVar, cast
+from typing import Any, Literal, TypeAlias, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -13,6 +13,18 @@ from qgs.containers import map_tensors, named_tensors
 F = TypeVar("F", bound=Callable[..., Any])
 
 HALF = (torch.float16, torch.bfloat16)
+
+
+Precision: TypeAlias = Literal["float32", "bf16"]
+"""Of `training.precision` and `qgs bench`. Weights stay float32."""
+
+
+def autocast(precision: Precision, device: str) -> torch.autocast:
+    """The context in which a model computes in `precision`; geometry leaves it by itself.
+
+    bfloat16 has float32's exponents, so that no gradients need scaling.
+    """
+    return torch.autocast(device, torch.bfloat16, enabled=precision == "bf16")
 
 
 def at_least_float32(x: Tensor) -> Tensor:

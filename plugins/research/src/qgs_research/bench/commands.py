@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated, TypeAlias, get_args
 
 import typer
 
@@ -48,12 +48,14 @@ def bench(
 
     from qgs.evaluate.results import as_json
     from qgs.files import refuse_existing, write_text
+    from qgs.geometry.precision import Precision
     from qgs.train.distributed import choose_device
     from qgs_research.bench.output import show
     from qgs_research.bench.run import measure_recipes
 
-    if precision not in ("float32", "bf16"):
-        raise ValueError(f"--precision must be float32 or bf16, got {precision!r}")
+    if precision not in get_args(Precision):
+        known = " or ".join(get_args(Precision))
+        raise ValueError(f"--precision must be {known}, got {precision!r}")
     if json is not None:
         refuse_existing(json)
     use_threads(threads)

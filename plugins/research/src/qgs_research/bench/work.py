@@ -13,6 +13,7 @@ from typing import Any, Literal, TypeAlias
 import torch
 from torch import nn
 
+from qgs.geometry.precision import Precision, autocast
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.train.parameters import make_optimizer
@@ -32,11 +33,7 @@ class Workload:
     size: tuple[int, int]
     batch: int = 1
     device: str = "cpu"
-    precision: Literal["float32", "bf16"] = "float32"
-
-    def autocast(self) -> torch.autocast:
-        """The context in which the model runs."""
-        return torch.autocast(self.device, torch.bfloat16, enabled=self.precision == "bf16")
+    precision: Precision = "float32"
 
 
 def workload_of(
@@ -103,7 +100,7 @@ def make_task(
 
         def step() -> None:
             optimizer.zero_grad(set_to_none=True)
-            with workload.autocast():
+            with autocast(workload.precision, workload.device):
                 outcome = objective(inputs, targets)
             outcome.total.backward()
             nn.utils.clip_grad_norm_(objective.parameters(), recipe.training.clip)
@@ -114,7 +111,7 @@ def make_task(
 
     @torch.inference_mode()
     def forward() -> Gaussians:
-        with workload.autocast():
+        with autocast(workload.precision, workload.device):
             return model(inputs).gaussians
 
     if operation == "forward":
