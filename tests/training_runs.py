@@ -77,7 +77,7 @@ def same(first, second):
 
 def parts_of(folder):
     """What the saved state of a run holds, by part."""
-    return read_state(RunFolder(folder).state).parts
+    return read_state(RunFolder(folder).state).states
 
 
 def saved_step(folder):

@@ -2,8 +2,7 @@
 
 import logging
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -61,14 +60,6 @@ class Counters:
         *numbers, seconds = mean(self.accelerator, values).tolist()
         self.seconds += seconds
         return dict(zip(measured, numbers, strict=True))
-
-    @contextmanager
-    def clock_stopped(self) -> Iterator[None]:
-        """Count no time in the block."""
-        started = time.perf_counter()
-        yield
-        # Shifted, not reset: the time since the last step still counts.
-        self.last_tick += time.perf_counter() - started
 
     def finish_step(self, batches: Iterable[Batch]) -> None:
         """Count a step with `batches`, and log each new reason why a sample is left out."""

@@ -20,12 +20,14 @@ from qgs.files import is_leftover, naming_full_disk, read_records, write_text
 from qgs.machine import is_out_of_memory
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
-from qgs.recipe.recipe import flat
+from qgs.recipe.recipe import differing_options
 
 State: TypeAlias = Mapping[str, Any]
 """Tensors and JSON values by name."""
 
-_PARTS = "qgs.state"
+HISTORY = "history.jsonl"
+EVALUATIONS = "evaluations.jsonl"
+_STATES = "qgs.state"
 _RECIPE = "qgs.recipe"
 _LOCK = ".lock"
 
@@ -71,7 +73,7 @@ class RunFolder:
         self.checkpoint_ema = self.path / "checkpoint_ema.safetensors"
         self.state = self.path / "state.safetensors"
         self.evaluation = self.path / "evaluation"
-        self._history = self.path / "history.jsonl"
+        self._history = self.path / HISTORY
         self._lock = FileLock(self.path / _LOCK, blocking=False)
 
     @property
@@ -116,10 +118,11 @@ class RunFolder:
         for leftover in filter(is_leftover, self.path.iterdir()):
             leftover.unlink()
 
-    def append(self, record: Mapping[str, float]) -> None:
-        """Add one line to the history."""
+    def append(self, record: Mapping[str, Any], name: str = HISTORY) -> None:
+        """Add one line to the history, or to another file of records."""
+        path = self.path / name
         # Opened for each line: readers see every step, and a kill leaves nothing in a buffer.
-        with naming_full_disk(self._history), self._history.open("a", encoding="utf-8") as file:
+        with naming_full_disk(path), path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record) + "\n")
 
     def synchronise(self) -> None:
@@ -131,11 +134,12 @@ class RunFolder:
         """Return all records so far, one per optimiser step; of one left out, finite numbers."""
         return read_records(self._history)
 
-    def cut_history(self, step: int) -> None:
+    def cut_records(self, step: int) -> None:
         """Drop the records of later steps than `step`, and lines that are damaged."""
-        if self._history.exists():
-            kept = [record for record in self.history() if record["step"] <= step]
-            write_text(self._history, "".join(json.dumps(record) + "\n" for record in kept))
+        for path in (self._history, self.path / EVALUATIONS):
+            if path.exists():
+                kept = [record for record in read_records(path) if record["step"] <= step]
+                write_text(path, "".join(json.dumps(record) + "\n" for record in kept))
 
     def close(self) -> None:
         """Leave the folder to others."""
@@ -149,30 +153,30 @@ class RunFolder:
 class Saver:
     """Writes the checkpoint and the state of a run; of several processes, the main one writes.
 
-    parts: everything that continues the run, beside the weights, by name. Each has `state()`, which
-    returns a State, and `load_state(state)`, which restores it. "ema" has a checkpoint too.
+    stateful: what continues the run, beside the weights, by name. Each has `state()`, which returns
+    a State, and `load_state(state)`, which restores it. "ema" has a checkpoint too.
     Each file appears whole or not at all. All processes must call each method together.
     """
 
     accelerator: Accelerator
     folder: RunFolder
     model: QueryGaussianModel
-    parts: dict[str, Any] = field(default_factory=dict)
+    stateful: dict[str, Any] = field(default_factory=dict)
 
     def save(self, step: int, state_only: bool = False) -> None:
         """Save the run after `step` optimiser steps; `state_only` leaves the checkpoints."""
-        parts: dict[str, State] = {"weights": unique_tensors(self.model)}
-        parts |= {name: part.state() for name, part in self.parts.items()}
+        states: dict[str, State] = {"weights": unique_tensors(self.model)}
+        states |= {name: one.state() for name, one in self.stateful.items()}
         if self.accelerator.is_main_process:
             if not state_only:
                 # A kill between the files must not leave a checkpoint that cannot go on.
                 if not self.folder.state.exists():
-                    self._write_state(parts)
-                self._write_checkpoint(self.folder.checkpoint, step, parts["weights"])
-                if "ema" in parts:
-                    self._write_checkpoint(self.folder.checkpoint_ema, step, parts["ema"])
+                    self._write_state(states)
+                self._write_checkpoint(self.folder.checkpoint, step, states["weights"])
+                if "ema" in states:
+                    self._write_checkpoint(self.folder.checkpoint_ema, step, states["ema"])
             # Last: complete by itself, and never ahead of the weights.
-            self._write_state(parts)
+            self._write_state(states)
         self.accelerator.wait_for_everyone()
 
     def save_checkpoint(self, step: int, weights: Mapping[str, Tensor]) -> None:
@@ -181,13 +185,13 @@ class Saver:
             self._write_checkpoint(self.folder.checkpoint, step, weights)
         self.accelerator.wait_for_everyone()
 
-    def restore(self, parts: Mapping[str, State]) -> None:
-        """Bring every part back to its state in `parts`; raises CheckpointError."""
-        load_weights(self.model, parts.get("weights", {}), str(self.folder.state))
-        for name, part in self.parts.items():
+    def restore(self, states: Mapping[str, State]) -> None:
+        """Bring the weights and all that is stateful back; raises CheckpointError."""
+        load_weights(self.model, states.get("weights", {}), str(self.folder.state))
+        for name, one in self.stateful.items():
             try:
-                part.load_state(parts[name])
-            except Exception as error:  # a part of a plugin may raise anything
+                one.load_state(states[name])
+            except Exception as error:  # a component of a plugin may raise anything
                 if isinstance(error, OtherRunError) or is_out_of_memory(error):
                     raise
                 raise CheckpointError(
@@ -199,43 +203,43 @@ class Saver:
         domain = self.model.trained_on or Domain()
         save(self.model, path, extra={"step": str(step), KEY: domain.text}, weights=weights)
 
-    def _write_state(self, parts: Mapping[str, State]) -> None:
+    def _write_state(self, states: Mapping[str, State]) -> None:
         # The history must reach the disk first: a state ahead of it would leave a gap.
         self.folder.synchronise()
-        write_state(self.folder.state, self.model.recipe or {}, parts)
+        write_state(self.folder.state, self.model.recipe or {}, states)
 
 
 class SavedState(NamedTuple):
-    """A state file: the recipe of its run, and the states of its parts."""
+    """A state file: the recipe of its run, and the states by name."""
 
     recipe: Recipe
-    parts: Mapping[str, State]
+    states: Mapping[str, State]
 
 
-def write_state(path: Path, recipe: Mapping[str, Any], parts: Mapping[str, State]) -> None:
-    """Write `parts` to `path`, whole or not at all; recipe: the resolved tree."""
+def write_state(path: Path, recipe: Mapping[str, Any], states: Mapping[str, State]) -> None:
+    """Write `states` to `path`, whole or not at all; recipe: the resolved tree."""
     tensors: dict[str, Tensor] = {}
     values: dict[str, dict[str, Any]] = {}
-    for part, state in parts.items():
-        values[part] = {}
+    for name, state in states.items():
+        values[name] = {}
         for key, value in state.items():
             if isinstance(value, Tensor):
                 # safetensors refuses views and tensors that share memory.
                 own = value.detach().cpu().clone(memory_format=torch.contiguous_format)
-                tensors[f"{part}/{key}"] = own
+                tensors[f"{name}/{key}"] = own
             else:
-                values[part][key] = value
-    write_tensors(path, tensors, {_PARTS: json.dumps(values), _RECIPE: json.dumps(recipe)})
+                values[name][key] = value
+    write_tensors(path, tensors, {_STATES: json.dumps(values), _RECIPE: json.dumps(recipe)})
 
 
 def read_state(path: Path) -> SavedState:
     """Read what `write_state` wrote; raises FileNotFoundError, CheckpointError, RecipeError."""
     with TensorFile(path) as file:
-        parts = file.mapping(_PARTS)
-        for name, tensor in file.read().items():
-            part, _, key = name.partition("/")
-            parts.setdefault(part, {})[key] = tensor
-        return SavedState(file.stored_recipe(_RECIPE), parts)
+        states = file.mapping(_STATES)
+        for place, tensor in file.read().items():
+            name, _, key = place.partition("/")
+            states.setdefault(name, {})[key] = tensor
+        return SavedState(file.stored_recipe(_RECIPE), states)
 
 
 def saved_state(folder: RunFolder, recipe: Recipe) -> SavedState | None:
@@ -249,14 +253,12 @@ def saved_state(folder: RunFolder, recipe: Recipe) -> SavedState | None:
     # A run that was killed before its first save has a recipe and no state: it starts again.
     saved = read_state(folder.state) if folder.state.is_file() else None
     run = saved.recipe if saved else resolve(folder.recipe)
-    ours = flat(recipe.tree)
-    theirs = flat(run.tree)
     # `Counters` compares the scenes of a step, which older runs counted by process.
     may_change = tuple(f"{k}." for k in (*FREE, "training.batch_size", "training.accumulate"))
     differing = [
-        f"\n  {key}: {ours.get(key, 'absent')} here, {theirs.get(key, 'absent')} in the run"
-        for key in dict.fromkeys([*ours, *theirs])
-        if ours.get(key) != theirs.get(key) and not f"{key}.".startswith(may_change)
+        f"\n  {key}: {ours or 'absent'} here, {theirs or 'absent'} in the run"
+        for key, (ours, theirs) in differing_options(recipe.tree, run.tree).items()
+        if not f"{key}.".startswith(may_change)
     ]
     if differing:
         raise OtherRunError(

@@ -38,29 +38,24 @@ MAX_SKIPPED = 10
 """Steps in a row that may be skipped; after them training stops."""
 
 _TOO_FAST = (
-    "a learning rate too high for this model (lower optimizer.learning_rate, lengthen "
+    "\n  - a learning rate too high for this model (lower optimizer.learning_rate, lengthen "
     "optimizer.warmup)"
 )
 
-LESS_MEMORY = (
-    "lower views.inputs, views.targets, training.batch_size, "
-    "data.image_size, model.queries.count or model.head.gaussians_per_query"
-)
-
 COLLAPSE_CAUSES = (
-    _TOO_FAST,
-    "a visibility loss too strong or absent (try losses.visibility.weight 0.1 with behind_camera: "
-    "invisible)",
-    "an initialisation that hides every Gaussian (raise model.head.opacity_bias)",
-    "a scale of the world that leaves none before the cameras (check views.scale and "
-    "views.scale_factor against the anchors' and the scenes' depth)",
+    f"{_TOO_FAST}"
+    "\n  - a visibility loss too strong or absent (try losses.visibility.weight 0.1 with "
+    "behind_camera: invisible)"
+    "\n  - an initialisation that hides every Gaussian (raise model.head.opacity_bias)"
+    "\n  - a scale of the world that leaves none before the cameras (check views.scale and "
+    "views.scale_factor against the anchors' and the scenes' depth)"
 )
 
 NONFINITE_CAUSES = (
-    _TOO_FAST,
-    "a range that bfloat16 does not hold (training.precision: float32)",
-    "data that is not finite: images, poses or intrinsics (look at it with `qgs data check`; with "
-    "views.scale distance, at input cameras that almost stand on one point)",
+    f"{_TOO_FAST}"
+    "\n  - a range that bfloat16 does not hold (training.precision: float32)"
+    "\n  - data that is not finite: images, poses or intrinsics (look at it with `qgs data check`; "
+    "with views.scale distance, at input cameras that almost stand on one point)"
 )
 
 
@@ -109,22 +104,16 @@ class Guard:
         self.skipped = state["skipped"]
         self.signs = SignsOfLife(**state["detector"])
 
-    def passed(self, numbers: Mapping[str, float]) -> None:
-        """Take note of a finite step."""
-        self.skipped = 0
-        self.signs.observe(numbers)
-        self.good.observe(numbers)
+    def refuse_nonfinite(self, step: int, batches: Sequence[Batch], symptom: str) -> None:
+        """Raise about the step after `step`, which is not finite, unless it is to be skipped.
 
-    def leave_out(self, step: int, batches: Sequence[Batch], symptom: str) -> None:
-        """Repeat the step after `step`, which is not finite, to say why; return to leave it out.
-
-        Raises NonFiniteError, the run saved as before that step, or CollapseError.
+        It is repeated to name the first bad tensor. Raises NonFiniteError, the run saved as before
+        that step, or CollapseError; logs a warning where the step is skipped.
         """
         self.skipped += 1
         # All processes repeat the step: its collective operations need everyone.
-        first = first_bad_tensor(self.training_pass, lambda: self.repeat(batches))
-        words = first.described(batches) if first else ""
-        told = list(filter(None, gather_object([words])))
+        first = first_bad_tensor(self.training_pass, batches, lambda: self.repeat(batches))
+        told = list(filter(None, gather_object([first])))
         found = "; ".join([symptom, *(told or ["repeating the step gave finite numbers"])])
         skips = self.config.on_nonfinite == "skip"
         if skips and self.skipped <= MAX_SKIPPED:
@@ -139,15 +128,18 @@ class Guard:
             remedy = f", after {MAX_SKIPPED} steps in a row were skipped; continue with --resume"
         raise NonFiniteError(
             f"step {step + 1} is not finite, and the run is saved as it was before this "
-            f"step{remedy}.\n{found}.\nLikely causes:{_as_list(NONFINITE_CAUSES)}"
+            f"step{remedy}.\n{found}.\nLikely causes:{NONFINITE_CAUSES}"
         )
 
-    def check(self, step: int) -> None:
-        """Copy the weights if they are good and a copy is due.
+    def watch(self, step: int, numbers: Mapping[str, float]) -> None:
+        """Take note of the numbers of `step`, a finite one; copy the weights if good and due.
 
         Raises CollapseError when the last steps, a whole window of them, were dead, and for weights
-        that are not finite.
+        to copy that are not finite.
         """
+        self.skipped = 0
+        self.signs.observe(numbers)
+        self.good.observe(numbers)
         window = self.config.collapse_window
         if self.signs.dead >= window:
             self._collapse(step, f"for {self._dead_steps}", COLLAPSE_CAUSES)
@@ -196,7 +188,8 @@ class Guard:
                 f"out of memory in step {step + 1}: {str(error).splitlines()[0][:300]}. "
                 "What was saved continues with --resume and a higher training.accumulate, more "
                 "processes, or fewer training.render_views. A new run also takes less when you "
-                f"{LESS_MEMORY}."
+                "lower views.inputs, views.targets, training.batch_size, data.image_size, "
+                "model.queries.count or model.head.gaussians_per_query."
             ) from error
 
     @property
@@ -215,17 +208,13 @@ class Guard:
         if problem := self._broken_weights():
             self._collapse(step, problem, NONFINITE_CAUSES)
 
-    def _collapse(self, step: int, problem: str, causes: Sequence[str]) -> NoReturn:
+    def _collapse(self, step: int, problem: str, causes: str) -> NoReturn:
         good, weights = self.good.last
         self.saver.save_checkpoint(good, weights)
         raise CollapseError(
             f"training collapsed at step {step}: {problem}. The weights of step {good} "
-            f"are kept in {self.saver.folder.checkpoint}. Likely causes:{_as_list(causes)}"
+            f"are kept in {self.saver.folder.checkpoint}. Likely causes:{causes}"
         )
-
-
-def _as_list(causes: Sequence[str]) -> str:
-    return "".join(f"\n  - {cause}" for cause in causes)
 
 
 @dataclass

@@ -55,10 +55,11 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     resized = model.queries.resized(_part(_QUERIES, learned), generator)
     weights |= {_QUERIES + name: values for name, values in resized.items()}
     load_weights(model, weights, str(path))
+    before = shapes_of(learned)
     changes = [
-        _change(name, learned.get(name), values)
-        for name, values in weights.items()
-        if name not in learned or values.shape != learned[name].shape
+        f"{name}: {before.get(name, 'none')} -> {shape}"
+        for name, shape in shapes_of(weights).items()
+        if shape != before.get(name)
     ]
     return [f"weights start from {path}", *changes, *(f"learned with {o}" for o in options)]
 
@@ -66,14 +67,6 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
 def _part(prefix: str, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the weights of one part of the model, by their names in it."""
     return {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
-
-
-def _change(name: str, old: Tensor | None, new: Tensor) -> str:
-    if old is None:
-        return f"{name}: none -> {tuple(new.shape)}"
-    if name.startswith(_QUERIES):
-        return f"{name}: {len(old)} -> {len(new)}, the first are kept, any more are noisy copies"
-    return f"{name}: {tuple(old.shape)} -> {tuple(new.shape)}"
 
 
 def _comparable(tensors: Mapping[str, Tensor], count: int | None) -> Shapes:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -22,32 +22,16 @@ def not_finite(numbers: Mapping[str, float]) -> str:
     return ", ".join(bad)
 
 
-class BadTensor(NamedTuple):
-    """A tensor with NaN or infinity. batch: which of the step's batches it came up in, from 0."""
+def first_bad_tensor(
+    training_pass: nn.Module, batches: Sequence[Batch], repeat: Callable[[], Any]
+) -> str:
+    """Name the first tensor that is not finite while `repeat` makes a step of `batches`, if any.
 
-    tensor: str
-    values: str
-    batch: int
-
-    def described(self, batches: Sequence[Batch]) -> str:
-        """Say in words which tensor it is, and with which samples of the step's `batches`."""
-        batch = batches[self.batch]
-        samples = ", ".join(
-            f"scene {scene!r} (inputs {list(inputs)}, targets {list(targets)})"
-            for scene, inputs, targets in zip(
-                batch.scenes, batch.input_frames, batch.target_frames, strict=True
-            )
-        )
-        return f"the first bad tensor is {self.tensor} ({self.values}), with {samples}"
-
-
-def first_bad_tensor(training_pass: nn.Module, repeat: Callable[[], Any]) -> BadTensor | None:
-    """Return the first tensor that is not finite while `repeat` makes a step.
-
+    In words, with the samples of its batch; "" for none.
     Torch's anomaly mode would name an operation, not a module; it misses infinities, and raises in
     the middle of a step for which other processes wait.
     """
-    watch = _Watch()
+    watch = _Watch(batches)
     for name, tensor in unique_tensors(training_pass).items():
         watch.see(f"weight {name}", tensor)
     handles = [training_pass.register_forward_pre_hook(watch.see_batch)]
@@ -62,24 +46,33 @@ def first_bad_tensor(training_pass: nn.Module, repeat: Callable[[], Any]) -> Bad
     finally:
         for handle in handles:
             handle.remove()
-    return watch.first
+    return watch.found
 
 
 class _Watch:
-    """Notes the first tensor that is not finite, in the order in which a step computes."""
+    """Describes the first tensor that is not finite, in the order in which a step computes."""
 
-    def __init__(self) -> None:
-        self.first: BadTensor | None = None
-        self._batch = -1
+    def __init__(self, batches: Sequence[Batch]) -> None:
+        self.found = ""
+        self._batch = batches[0]
+        self._coming = iter(batches)
 
     def see(self, name: str, value: Any) -> None:
         """Look at `value`: a tensor, or any nest of mappings, sequences and containers of them."""
         for path, tensor in named_tensors(value, name):
-            if not self.first and (bad := nonfinite_values(tensor)):
-                self.first = BadTensor(path, bad, max(self._batch, 0))
+            if not self.found and (bad := nonfinite_values(tensor)):
+                self.found = f"the first bad tensor is {path} ({bad}), with {self._samples()}"
+
+    def _samples(self) -> str:
+        batch = self._batch
+        drawn = zip(batch.scenes, batch.input_frames, batch.target_frames, strict=True)
+        return ", ".join(
+            f"scene {scene!r} (inputs {list(inputs)}, targets {list(targets)})"
+            for scene, inputs, targets in drawn
+        )
 
     def see_batch(self, module: nn.Module, arguments: Sequence[Any]) -> None:
-        self._batch += 1
+        self._batch = next(self._coming)
         inputs, targets = arguments
         self.see("inputs", inputs)
         self.see("targets", targets)

@@ -1,39 +1,32 @@
 """Parameter groups, the optimiser's state, and averaged weights."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from qgs.checkpoint.model_file import unique_tensors
+from qgs.checkpoint.model_file import load_weights, unique_tensors
 from qgs.contracts import ModelComponent, Optimizer, ParameterGroup
 
 
 def make_optimizer(
     module: nn.Module, optimizer: Optimizer, factors: Mapping[str, float]
 ) -> torch.optim.Optimizer:
-    """Build torch's optimiser; a `Recipe.rate_factors` of 0 freezes, ValueError if all are 0."""
-    for name, parameter in module.named_parameters():
-        # Frozen, not only a rate of 0: no gradient, no moments, no weight decay.
-        if factors[name] == 0:
-            parameter.requires_grad_(False)
-    groups = parameter_groups(module, factors)
-    if not groups:
-        raise ValueError("optimizer.parts freezes every parameter, so there is nothing to train")
-    return optimizer.build(groups)
-
-
-def parameter_groups(module: nn.Module, factors: Mapping[str, float]) -> list[ParameterGroup]:
-    """Group the parameters of `module` that train by decay and factor of the learning rate.
+    """Build torch's optimiser, with parameters grouped by decay and factor of the learning rate.
 
     The innermost component around a parameter decides whether it decays (`ModelComponent.decays`);
     outside of components all but 1-d parameters do. A shared parameter goes by its first name.
+    factors: as `Recipe.rate_factors`; one of 0 freezes, ValueError if all are 0.
     """
-    groups: dict[Any, ParameterGroup] = {}
+    groups: dict[tuple[bool, float], ParameterGroup] = {}
     components = {name: m for name, m in module.named_modules() if isinstance(m, ModelComponent)}
     for name, parameter in module.named_parameters():
+        factor = factors[name]
+        # Frozen, not only a rate of 0: no gradient, no moments, no weight decay.
+        if factor == 0:
+            parameter.requires_grad_(False)
         if not parameter.requires_grad:
             continue
         # Biases and gains of norms are 1-d; decay would pull them from where they work.
@@ -43,11 +36,12 @@ def parameter_groups(module: nn.Module, factors: Mapping[str, float]) -> list[Pa
             if not outer or name.startswith(f"{outer}."):
                 inner = name.removeprefix(outer).removeprefix(".")
                 decays = component.decays(inner, parameter)
-        factor = factors[name]
         empty = ParameterGroup(params=[], decays=decays, factor=factor)
         groups.setdefault((not decays, factor), empty)["params"].append(parameter)
+    if not groups:
+        raise ValueError("optimizer.parts freezes every parameter, so there is nothing to train")
     # Sorted: the same groups in every process and after a resume.
-    return [groups[key] for key in sorted(groups)]
+    return optimizer.build([groups[key] for key in sorted(groups)])
 
 
 class OptimizerState:
@@ -89,51 +83,23 @@ class OptimizerState:
         self._optimizer.load_state_dict({**present, "state": kept})
 
 
-class MovingAverage:
-    """float32 copies of the weights of `model`, which `update` moves towards the present ones.
+class MovingAverage(AveragedModel):
+    """A copy of a model, `module`, that `update_parameters` moves towards the present weights.
 
     average = decay * average + (1 - decay) * weights; buffers are taken as they are.
     """
 
+    module: Any
+
     def __init__(self, model: nn.Module, decay: float) -> None:
-        self._model = model
-        self._decay = decay
-        self._averages: dict[str, Tensor] = {}
-        for name, tensor in unique_tensors(model).items():
-            copy = tensor.detach().clone()
-            # float32, since a decay near 1 moves the average by less than bf16 resolves.
-            self._averages[name] = copy.float() if isinstance(tensor, nn.Parameter) else copy
-
-    @torch.no_grad()
-    def update(self) -> None:
-        """Take the present weights into the average."""
-        for name, tensor in unique_tensors(self._model).items():
-            if isinstance(tensor, nn.Parameter):
-                self._averages[name].lerp_(tensor.detach().float(), 1 - self._decay)
-            else:
-                self._averages[name].copy_(tensor)
-
-    @contextmanager
-    def applied(self) -> Iterator[None]:
-        """Give the model the averaged weights, for the `with` block only."""
-        tensors = unique_tensors(self._model)
-        present = {name: tensor.detach().clone() for name, tensor in tensors.items()}
-        try:
-            _copy(self._averages, tensors)
-            yield
-        finally:
-            _copy(present, tensors)
+        super().__init__(model, multi_avg_fn=get_ema_multi_avg_fn(decay))
+        # At 0 torch would drop the initial weights for those of the first step.
+        self.n_averaged += 1
 
     def state(self) -> dict[str, Tensor]:
         """Return the averages, named as `qgs.checkpoint.model_file.save` takes weights."""
-        return dict(self._averages)
+        return unique_tensors(self.module)
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Go on from the averages in `state`."""
-        _copy(state, self._averages)
-
-
-@torch.no_grad()
-def _copy(tensors: Mapping[str, Tensor], into: Mapping[str, Tensor]) -> None:
-    for name, tensor in into.items():
-        tensor.copy_(tensors[name])
+        """Go on from the averages in `state`; raises CheckpointError where they do not fit."""
+        load_weights(self.module, state, "the moving average")

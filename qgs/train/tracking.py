@@ -68,7 +68,9 @@ class Trackers:
                 f"training.trackers names {listed(unknown)}, and installed distributions offer "
                 f"{listed(sorted(offered)) or 'no tracker'}: take it out, or {INSTALL_ALL}"
             )
-        self._kinds = {name: load(offered[name], Tracker) for name in names}
+        self._kinds: dict[str, type[Tracker]] = {
+            name: load(offered[name], Tracker) for name in names
+        }
         for name, kind in self._kinds.items():
             if kind.package and find_spec(kind.package) is None:
                 raise MissingExtraError(

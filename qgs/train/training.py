@@ -1,20 +1,18 @@
 """The training loop."""
 
 import math
+import time
 from collections.abc import Generator, Mapping, Sequence
-from contextlib import ExitStack, closing, nullcontext
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
-from accelerate import Accelerator
 from accelerate.utils import set_seed
 from rich.console import Console
-from torch import Tensor, nn
 
-from qgs.contracts import Outcome, SceneSource, TrainingConfig
+from qgs.contracts import SceneSource
 from qgs.contracts.schedule import follow
 from qgs.data.samples import Batch
 from qgs.data.stream import (
@@ -45,7 +43,7 @@ from qgs.train.nonfinite import not_finite
 from qgs.train.parameters import MovingAverage, OptimizerState, make_optimizer
 from qgs.train.periodic import PeriodicEvaluation
 from qgs.train.tracking import Trackers, TrainingProgress
-from qgs.train.training_pass import TrainingPass
+from qgs.train.training_pass import TrainingPass, compute_gradients
 
 ELSEWHERE = "another process of this training has no next batch; see its own message"
 
@@ -107,7 +105,7 @@ def train(
 
 
 class Trainer:
-    """One run: its parts, and the loop.
+    """One run: what it is made of, and the loop.
 
     Making one opens the data and draws the first batch, but touches no file of a new run; its
     folder is made after the first step, when nothing is missing any more.
@@ -121,7 +119,6 @@ class Trainer:
         self.folder = RunFolder(run)
         self.trackers = Trackers(recipe.training.trackers)
         self._resumes = resume
-        self._folder_is_open = False
         with ExitStack() as resources:
             resources.callback(self.folder.close)
             resources.callback(self.trackers.close)
@@ -131,11 +128,12 @@ class Trainer:
             # draws its random numbers before anything else does, and the data comes last, since
             # its first batch depends on how many samples the restored run has seen.
             saved = self._saved()
-            self._build_model(initial=saved is None)
+            self._build_model(initial=not saved)
+            self._build_optimizer()
             source = recipe.build_data()
-            self._build_parts(source)
+            self._build_watchers(source)
             if saved:
-                self.saver.restore(saved.parts)
+                self.saver.restore(saved.states)
             self.resumed_at = self.counters.step if saved else None
             self._follow_schedules()
             batches = self._open_data(source)
@@ -143,8 +141,8 @@ class Trainer:
             self.feed = Feed(batches, self.config.accumulate)
             self.feed.fetch()
             # Where one process fails, all raise, and none waits for it.
-            if true_anywhere(self.accelerator, self.feed.error):
-                raise self.feed.error or SampleError(ELSEWHERE)
+            if error := self._feed_error():
+                raise error
             self._resources = resources.pop_all()
 
     def close(self) -> None:
@@ -162,10 +160,9 @@ class Trainer:
         return saved_state(self.folder, self.recipe)
 
     def _build_model(self, initial: bool) -> None:
-        """Build the model, what trains it, and torch's optimiser; initial: load `init_from`."""
+        """Build the model, and note what is odd about it. initial: load `init_from`."""
         recipe = self.recipe
-        device = self.accelerator.device
-        self.model = recipe.build_model(device, pretrained=initial).train()
+        self.model = recipe.build_model(self.accelerator.device, pretrained=initial).train()
         self.notes = [f"warning: {text}" for text in recipe.warnings]
         if initial:
             self.notes += initialise(self.model, recipe)
@@ -175,15 +172,18 @@ class Trainer:
                 f"stops after {self.config.seconds:g} s (training.seconds) or "
                 f"{self.config.steps:,} steps (training.steps), whichever comes first"
             )
-        self.training_pass = TrainingPass(recipe, self.model).to(device)
-        factors = recipe.rate_factors(self.training_pass)
+
+    def _build_optimizer(self) -> None:
+        """Make what computes gradients, torch's optimiser and the moving average."""
+        self.training_pass = TrainingPass(self.recipe, self.model).to(self.accelerator.device)
+        factors = self.recipe.rate_factors(self.training_pass)
         optimizer = make_optimizer(self.training_pass, self.optimizer, factors)
         prepared: Any = self.accelerator.prepare(self.training_pass, optimizer)
         wrapped, self.torch_optimizer = prepared
         self._gradients = partial(compute_gradients, self.accelerator, wrapped, self.config)
         self.average = MovingAverage(self.model, self.config.ema) if self.config.ema else None
 
-    def _build_parts(self, source: SceneSource) -> None:
+    def _build_watchers(self, source: SceneSource) -> None:
         """Make what counts, watches, saves and judges."""
         recipe = self.recipe
         # Only the main process writes checkpoints, which carry the range of the training views.
@@ -198,10 +198,10 @@ class Trainer:
             self.accelerator, self.training_pass, self.saver, self.config, self._gradients
         )
         self.evaluations = PeriodicEvaluation(
-            self.accelerator, recipe, self.model, self.average, self.folder.path, self.trackers
+            self.accelerator, recipe, self.model, self.average, self.folder, self.trackers
         )
         # Beside the weights, all that continues the run.
-        parts = {
+        stateful = {
             "guard": self.guard,
             "good": self.guard.good,
             "counters": self.counters,
@@ -209,10 +209,10 @@ class Trainer:
             "schedule": self.optimizer,
         }
         if self.average:
-            parts["ema"] = self.average
-        # Last: restoring a part may draw random numbers.
-        parts["random"] = RandomStates(self.accelerator)
-        self.saver.parts = parts
+            stateful["ema"] = self.average
+        # Last: restoring something may draw random numbers.
+        stateful["random"] = RandomStates(self.accelerator)
+        self.saver.stateful = stateful
 
     def _open_data(self, source: SceneSource) -> Generator[Batch, None, None]:
         """Return the batches from the first that the run has not seen yet."""
@@ -234,83 +234,93 @@ class Trainer:
         )
 
     def _follow_schedules(self) -> None:
-        self.training_pass.follow(self.counters.step)
-        follow([self.optimizer], self.counters.step)
+        scheduled = (*self.training_pass.modules(), self.training_pass.objective, self.optimizer)
+        follow(scheduled, self.counters.step)
 
     def run(self, progress: TrainingProgress, stop: StopRequest) -> TrainingResult:
         """Train until the budget is used, a stop is asked for, or the model dies."""
         counters = self.counters
         stopped_by = None
-        if counters.used >= 1:
-            # A kill may have come between the state and the checkpoint of the last step.
-            if not self.folder.checkpoint.exists():
-                self.guard.save(counters.step)
-            return self._result(stopped_by)
         while counters.used < 1 and not stopped_by:
             self._one_step(progress, stop)
             stopped_by = self._stopped_by(stop)
             if not stopped_by:
                 self._refuse_missing_batches()
-        # Saved before the last evaluation, which may take long or fail.
-        self.guard.finish(counters.step, stopped=bool(stopped_by))
-        if self.average and not stopped_by and self.evaluations.latest != counters.step:
-            self._evaluate(stop)
-            stopped_by = self._stopped_by(stop)
-        return self._result(stopped_by)
+        if counters.step == self.resumed_at:
+            # A kill may have come between the state and the checkpoint of the last step.
+            if not self.folder.checkpoint.exists():
+                self.guard.save(counters.step)
+        else:
+            # Saved before the last evaluation, which may take long or fail.
+            self.guard.finish(counters.step, stopped=bool(stopped_by))
+            judged = counters.every(self.config.evaluate_every)
+            if self.average and not stopped_by and not judged:
+                self._evaluate(stop)
+                stopped_by = self._stopped_by(stop)
+        return TrainingResult(
+            model=self.model.eval(),
+            folder=self.folder,
+            steps=counters.step,
+            seconds=counters.seconds,
+            stopped_by=stopped_by,
+            main=self.accelerator.is_main_process,
+            resumed_at=self.resumed_at,
+        )
 
     def _one_step(self, progress: TrainingProgress, stop: StopRequest) -> None:
-        """Make one optimiser step, and what is due after it."""
+        """Make one optimiser step: gradients, new weights, a record; then what is due after it."""
         counters = self.counters
-        rate = self.optimizer.learning_rate(counters.step, counters.seconds)
-        for group in self.torch_optimizer.param_groups:
-            # Torch's own schedulers know no time budget and no factors of parts.
-            group["lr"] = rate * group["factor"]
-        self.torch_optimizer.zero_grad(set_to_none=True)
         batches = self.feed.batches
-        with self.guard.memory_explained(counters.step, saves=True):
-            measured = self._gradients(batches)
-        # The next batches are fetched before the step's numbers are read, so that a GPU computes
-        # gradients meanwhile.
-        if not stop and counters.step + 1 < self.config.steps:
-            self.feed.fetch()
-        numbers = counters.read(measured)
-        if symptom := not_finite(numbers):
-            self._open_folder()  # the run may be saved in it
-            self.guard.leave_out(counters.step, batches, symptom)
-            numbers["skipped"] = True
-        else:
+        numbers = self._compute(batches, stop)
+        symptom = not_finite(numbers)
+        if not symptom:
             with self.guard.memory_explained(counters.step):
                 self.torch_optimizer.step()
             if self.average:
-                self.average.update()
-            self.guard.passed(numbers)
+                self.average.update_parameters(self.model)
+        # Only now, so that a start that fails in its first step leaves no folder.
+        if counters.step == (self.resumed_at or 0):
+            self._open_folder()
+        if symptom:
+            self.guard.refuse_nonfinite(counters.step, batches, symptom)
+            numbers["skipped"] = True
         counters.finish_step(batches)
         self._follow_schedules()
-        # Only now, so that a start that fails in its first step leaves no folder.
-        self._open_folder()
-        self._report({"lr": rate, **numbers}, progress)
-        # A dead model must not be saved as a good one, so this comes before saving.
-        self.guard.check(counters.step)
+        self._report(numbers, progress)
+        if not symptom:
+            self.guard.watch(counters.step, numbers)
         evaluates = counters.every(self.config.evaluate_every)
         saves = evaluates or counters.every(self.config.save_every)
+        # A model that may be dying must not be saved as a good one.
         if saves and not self.guard.signs.dead:
             self.guard.save(counters.step)
         if evaluates:
             self._evaluate(stop)
 
+    def _compute(self, batches: Sequence[Batch], stop: StopRequest) -> dict[str, float]:
+        """Leave the gradients of `batches`, and fetch the next ones; return the step's numbers."""
+        step = self.counters.step
+        rate = self.optimizer.learning_rate(step, self.counters.seconds)
+        for group in self.torch_optimizer.param_groups:
+            # Torch's own schedulers know no time budget and no factors of parts.
+            group["lr"] = rate * group["factor"]
+        self.torch_optimizer.zero_grad(set_to_none=True)
+        with self.guard.memory_explained(step, saves=True):
+            measured = self._gradients(batches)
+        # Before the numbers are read, so that a GPU computes gradients meanwhile.
+        if not stop and step + 1 < self.config.steps:
+            self.feed.fetch()
+        return {"lr": rate, **self.counters.read(measured)}
+
     def _open_folder(self) -> None:
-        """Make the folder, once, write the recipe, and drop records of steps that were lost."""
-        if self._folder_is_open:
-            return
-        self._folder_is_open = True
+        """Make the folder, write the recipe, and drop records of steps that were lost."""
         if self.accelerator.is_main_process:
             if not self._resumes:
                 self.folder.refuse_other(resume=False)
             self.folder.take()
             write_text(self.folder.recipe, annotated(self.recipe) + "\n")
-            begun = self.resumed_at or 0
-            self.folder.cut_history(begun)
-            self.trackers.open(self.folder.path, flat(self.recipe.tree), begun)
+            self.folder.cut_records(self.counters.step)
+            self.trackers.open(self.folder.path, flat(self.recipe.tree), self.counters.step)
         self.accelerator.wait_for_everyone()
 
     def _report(self, numbers: Mapping[str, float], progress: TrainingProgress) -> None:
@@ -324,8 +334,10 @@ class Trainer:
         progress.show(counters.step, record["loss"], record["psnr"], counters.used)
 
     def _evaluate(self, stop: StopRequest) -> None:
-        with self.counters.clock_stopped():
-            self.evaluations.run(self.counters.step, stop)
+        started = time.perf_counter()
+        self.evaluations.run(self.counters.step, stop)
+        # Not counted. Shifted, not reset: the time since the last step still counts.
+        self.counters.last_tick += time.perf_counter() - started
 
     def _stopped_by(self, stop: StopRequest) -> str | None:
         """Return the signal's name when any process was asked to stop."""
@@ -333,54 +345,16 @@ class Trainer:
             return None
         return stop.signal.name if stop.signal else "SIGTERM"
 
+    def _feed_error(self) -> Exception | None:
+        """Return why a process has no next batches, in all of them, whichever it is."""
+        found = true_anywhere(self.accelerator, self.feed.error)
+        return self.feed.error or SampleError(ELSEWHERE) if found else None
+
     def _refuse_missing_batches(self) -> None:
-        """Save the run and raise where a process has no next batches, in all of them together."""
+        """Save the run and raise where a process has no next batches."""
         step = self.counters.step
-        if true_anywhere(self.accelerator, self.feed.error) and self.counters.used < 1:
+        error = self._feed_error()
+        if error and self.counters.used < 1:
             self.guard.save_to_go_on(step)
-            error = self.feed.error or SampleError(ELSEWHERE)
             error.add_note(f"The run is saved at step {step}; continue with --resume")
             raise error
-
-    def _result(self, stopped_by: str | None) -> TrainingResult:
-        return TrainingResult(
-            model=self.model.eval(),
-            folder=self.folder,
-            steps=self.counters.step,
-            seconds=self.counters.seconds,
-            stopped_by=stopped_by,
-            main=self.accelerator.is_main_process,
-            resumed_at=self.resumed_at,
-        )
-
-
-def compute_gradients(
-    accelerator: Accelerator,
-    training_pass: nn.Module,
-    config: TrainingConfig,
-    batches: Sequence[Batch],
-) -> dict[str, Tensor]:
-    """Leave the gradients of the mean loss of `batches`, clipped; return what was measured, 0-d.
-
-    training_pass: as accelerate wraps it. "gradient" is the norm before clipping, over all
-    processes; the rest is of this one. Nothing waits for the device.
-    """
-    device = accelerator.device
-    sums: dict[str, Tensor] = {}
-    for number, batch in enumerate(batches, start=1):
-        # Only the last batch exchanges gradients between processes.
-        last = number == len(batches)
-        with nullcontext() if last else accelerator.no_sync(training_pass):
-            # Geometry leaves autocast by itself; bfloat16 has float32's exponents, so that no
-            # gradients need scaling.
-            in_half = config.precision == "bf16"
-            with torch.autocast(device.type, torch.bfloat16, enabled=in_half):
-                outcome: Outcome = training_pass(batch.inputs.to(device), batch.targets.to(device))
-            accelerator.backward(outcome.total / len(batches))
-        found = {"loss": outcome.total.detach(), **outcome.terms, **outcome.signs}
-        for name, value in found.items():
-            sums[name] = sums.get(name, 0) + value / len(batches)
-    # After the exchange, so that all processes clip by the same norm.
-    norm = accelerator.clip_grad_norm_(training_pass.parameters(), config.clip)
-    sums["gradient"] = torch.as_tensor(norm, device=device)
-    return sums

@@ -1,23 +1,23 @@
-"""The forward pass of a training step: the objective with the model and the losses it calls."""
+"""The forward pass of a training step, an objective with the model and losses; its gradients."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import torch
+from accelerate import Accelerator
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from qgs.containers import concatenated, map_tensors, named_tensors
-from qgs.contracts import Outcome
-from qgs.contracts.schedule import follow
+from qgs.contracts import Outcome, TrainingConfig
+from qgs.data.samples import Batch
 from qgs.geometry.constants import constant
+from qgs.geometry.precision import autocast
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
 from qgs.types import Cameras, Gaussians, LayerPrediction, Prediction, Rendering, Views
-
-RECORDED = {"step", "seconds", "lr", "loss", "psnr", "alpha", "deviation", "gradient", "skipped"}
-"""Names of a record of history.jsonl that no term may have."""
 
 
 class TrainingPass(nn.Module):
@@ -43,31 +43,16 @@ class TrainingPass(nn.Module):
         self.losses = nn.ModuleDict(losses)
         self._of_gaussians = [n for n, loss in losses.items() if loss.renderings == "none"]
         self._of_images = [name for name in losses if name not in self._of_gaussians]
+        self.reads_depths = any(loss.reads_depths for loss in losses.values())
         self._owners: dict[str, str] = {}  # names of terms to those of their losses
         self.render_views = recipe.training.render_views
         self.judge_inputs = recipe.training.judge_inputs
 
     def forward(self, inputs: Views, targets: Views) -> Outcome:
-        """Return what the objective makes of a batch.
-
-        Raises ValueError when two terms have one name, or one that a step's record has already.
-        """
+        """Return what the objective makes of a batch."""
         # Input views become targets too, the last ones.
         targets = targets.joined(inputs) if self.judge_inputs else targets
-        outcome = self.objective.forward(inputs, targets, self)
-        if taken := sorted(outcome.terms.keys() & RECORDED):
-            kinds = f"losses or the objective {self.objective.name}"
-            raise ValueError(f"terms of {kinds} are named {taken}, as other numbers of a step are")
-        return outcome
-
-    @property
-    def reads_depths(self) -> bool:
-        """True where a loss reads depth maps."""
-        return any(getattr(loss, "reads_depths", False) for loss in self.losses.values())
-
-    def follow(self, step: int) -> None:
-        """Set every scheduled option to its value after `step` optimiser steps."""
-        follow((*self.modules(), self.objective), step)
+        return self.objective.forward(inputs, targets, self)
 
     def predict(self, inputs: Views) -> Prediction:
         """See `Passes`."""
@@ -82,18 +67,22 @@ class TrainingPass(nn.Module):
         total = targets.images.new_zeros(())
         count = targets.images.shape[1]
         terms: dict[str, Tensor] = {}
-        signs: list[tuple[float, Mapping[str, Tensor]]] = []
+        signs: dict[str, Tensor] = {}
         rounds = [number for number in prediction.layers if number > len(self.model.decoder)]
         for number, weight in self.model.supervision.weights(rounds).items():
             layer = DetachedLayer(prediction.layers[number], parameters)
             # Of this layer: those of the last one remain.
-            signs = []
+            signs = {}
+            deviations: list[Tensor] = []
             for part in self._parts(targets):
-                views = part.images.shape[1]
+                share = part.images.shape[1] / count
                 rendering = self.render(layer.prediction.gaussians, part.cameras)
-                signs.append((views / count, self._signs(rendering, part)))
+                means, deviation = self._signs(rendering, part)
+                deviations.append(deviation)
+                _add({name: share * mean for name, mean in means.items()}, signs)
                 found = self._terms(self._of_images, layer.prediction, rendering, part, inputs)
-                layer.add(found, weight * views / count)
+                layer.add(found, weight * share)
+            signs["deviation"] = torch.stack(deviations).amax()
             # Losses of the Gaussians run once for all parts, with a rendering of no view.
             no_views = map_tensors(lambda x: x[:, :0].detach(), rendering)
             found = self._terms(self._of_gaussians, layer.prediction, no_views, targets, inputs)
@@ -101,12 +90,7 @@ class TrainingPass(nn.Module):
             # Layers meet here: one backward pass through the network serves them all.
             total = total + layer.total()
             _add(layer.terms, terms)
-        means = {
-            name: torch.stack([share * found[name] for share, found in signs]).sum()
-            for name in ("psnr", "alpha")
-        }
-        deviation = torch.stack([found["deviation"] for _, found in signs]).amax()
-        return Outcome(total, terms, {**means, "deviation": deviation})
+        return Outcome(total, terms, signs)
 
     def _parts(self, targets: Views) -> list[Views]:
         """Slice the target views by `render_views`; whole where a loss compares views."""
@@ -140,11 +124,40 @@ class TrainingPass(nn.Module):
         return terms
 
     @torch.no_grad()
-    def _signs(self, rendering: Rendering, target: Views) -> Mapping[str, Tensor]:
+    def _signs(self, rendering: Rendering, target: Views) -> tuple[dict[str, Tensor], Tensor]:
         background = constant(self.model.renderer.config.background, rendering.rgb)
         alpha, deviation = measure(rendering.rgb, rendering.alpha, background)
         likeness = psnr(rendering.rgb, target.images).mean()
-        return {"psnr": likeness, "alpha": alpha, "deviation": deviation}
+        return {"psnr": likeness, "alpha": alpha}, deviation
+
+
+def compute_gradients(
+    accelerator: Accelerator,
+    training_pass: nn.Module,
+    config: TrainingConfig,
+    batches: Sequence[Batch],
+) -> dict[str, Tensor]:
+    """Leave the gradients of the mean loss of `batches`, clipped; return what was measured, 0-d.
+
+    training_pass: as accelerate wraps it. "gradient" is the norm before clipping, over all
+    processes; the rest is of this one. Nothing waits for the device.
+    """
+    device = accelerator.device
+    sums: dict[str, Tensor] = {}
+    for number, batch in enumerate(batches, start=1):
+        # Only the last batch exchanges gradients between processes.
+        last = number == len(batches)
+        with nullcontext() if last else accelerator.no_sync(training_pass):
+            with autocast(config.precision, device.type):
+                outcome: Outcome = training_pass(batch.inputs.to(device), batch.targets.to(device))
+            accelerator.backward(outcome.total / len(batches))
+        found = {"loss": outcome.total.detach(), **outcome.terms, **outcome.signs}
+        for name, value in found.items():
+            sums[name] = sums.get(name, 0) + value / len(batches)
+    # After the exchange, so that all processes clip by the same norm.
+    norm = accelerator.clip_grad_norm_(training_pass.parameters(), config.clip)
+    sums["gradient"] = torch.as_tensor(norm, device=device)
+    return sums
 
 
 class DetachedLayer:

@@ -115,7 +115,8 @@ def test_weights_that_are_not_finite_end_a_run_and_are_never_saved(tmp_path):
 def test_one_dead_step_at_the_end_fails_no_run(tmp_path, caplog):
     def die_at_the_end(trainer, stop):
         if trainer.counters.step == 3:
-            trainer.guard.signs.observe(DEAD)
+            signs = trainer.guard.signs
+            signs.observe = lambda numbers: SignsOfLife.observe(signs, DEAD)
 
     result = run_calling(die_at_the_end, tiny("tokengs"), tmp_path)
     assert CheckpointFile(result.folder.checkpoint).step == 3

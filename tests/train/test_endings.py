@@ -25,7 +25,6 @@ from qgs.data.stream import MAX_REPLACED, SampleError, WorkerError
 from qgs.train import periodic, training
 from qgs.train.folder import RunFolder
 from qgs.train.guard import OutOfMemoryError
-from qgs.train.periodic import PeriodicEvaluation
 from qgs.train.tracking import TrainingProgress
 
 
@@ -116,14 +115,17 @@ def test_an_evaluation_that_fails_is_told_and_ends_nothing(tmp_path, monkeypatch
 
 
 def test_a_stop_is_heard_between_two_scenes(tmp_path, monkeypatch):
-    between = PeriodicEvaluation._between_scenes
+    judge = periodic.evaluate
 
-    def asked(periodic, done, wanted):
-        assert done == 1
-        signal.raise_signal(signal.SIGTERM)
-        between(periodic, done, wanted)
+    def asked(*given, observe):
+        def seen(done, wanted):
+            assert done == 1
+            signal.raise_signal(signal.SIGTERM)
+            observe(done, wanted)
 
-    monkeypatch.setattr(PeriodicEvaluation, "_between_scenes", asked)
+        return judge(*given, observe=seen)
+
+    monkeypatch.setattr(periodic, "evaluate", asked)
     result = run(tiny("tokengs", "training.evaluate_every=1"), tmp_path)
     assert (result.steps, result.stopped_by) == (1, "SIGTERM")
     assert not (tmp_path / "evaluations.jsonl").exists()

@@ -47,7 +47,7 @@ def test_old_queries_stay_and_new_ones_are_noisy_copies(learned):
                 continue
             assert len(now) == count
             assert torch.equal(now[:COUNT], before[:count])
-            assert sum(f"{parameter}: {COUNT} -> {count}, " in line for line in told) == 1
+            assert f"{parameter}: {tuple(before.shape)} -> {tuple(now.shape)}" in told
             if count > COUNT:
                 noise = (now[COUNT:] - before[torch.arange(COUNT, count) % COUNT]) / GROWTH_NOISE
                 assert noise.abs().max() < 6
@@ -95,4 +95,4 @@ def test_training_starts_from_a_run(trained_run, tmp_path):
     result = train(grown, tmp_path, device="cpu", console=console)
     before, after = (weights(r)["queries.center"] for r in (trained_run, result))
     torch.testing.assert_close(after[:COUNT], before, rtol=0, atol=1e-6)
-    assert "queries.center: 24 -> 32" in console.file.getvalue()
+    assert "queries.center: (24, 3) -> (32, 3)" in console.file.getvalue()

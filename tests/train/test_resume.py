@@ -47,7 +47,7 @@ def resumed(folder, *options):
 
 def change_counters(folder, **values):
     state = read_state(folder / "state.safetensors")
-    parts = {**state.parts, "counters": {**state.parts["counters"], **values}}
+    parts = {**state.states, "counters": {**state.states["counters"], **values}}
     write_state(folder / "state.safetensors", state.recipe.tree, parts)
 
 
