@@ -26,6 +26,11 @@ from qgs_dev.vocabulary import (
     scene,
 )
 
+SIGNS = {"psnr", "alpha", "deviation"}
+RECORDED = SIGNS | {"step", "seconds", "lr", "loss", "gradient", "skipped"}
+"""Names of a record of history.jsonl that no term may have."""
+TAKEN = "terms with names of other numbers of a step"
+
 
 def check_loss_is_a_mean_over_scenes(case: Case) -> None:
     """The terms of a batch are the mean of those of its scenes."""
@@ -54,9 +59,13 @@ def check_masked_queries_are_not_judged(case: Case) -> None:
 
 
 def check_renderings_as_declared(case: Case) -> None:
-    """A loss needs the renderings that `renderings` declares: of each view, of all, or none."""
+    """A loss needs the renderings that `renderings` declares: of each view, of all, or none.
+
+    Its terms are 0-d, and named unlike other numbers of a step.
+    """
     trial = Trial(case)
     terms = trial()
+    expect_none(terms.keys() & RECORDED, TAKEN)
     for name, term in terms.items():
         expect(term.ndim == 0, f"the term `{name}` is of shape {tuple(term.shape)}, not 0-d")
     if trial.module.renderings == "each":
@@ -134,9 +143,6 @@ def _values(module: Metric, given: MetricInput) -> dict[str, Tensor]:
     return {"": values} if isinstance(values, Tensor) else dict(values)
 
 
-SIGNS = {"psnr", "alpha", "deviation"}
-
-
 def check_objective_gives_an_outcome(case: Case) -> None:
     """An objective predicts and judges; its total is the sum of its terms, and trains the model.
 
@@ -156,6 +162,7 @@ def check_objective_gives_an_outcome(case: Case) -> None:
         odd = [n for n, x in numbers.items() if not isinstance(x, Tensor) or x.ndim]
         expect_none(odd, f"no 0-d tensor {where}")
         expect_finite(numbers, where)
+        expect_none(outcome.terms.keys() & RECORDED, TAKEN)
         kept = [name for name, x in parts.items() if x.requires_grad]
         expect_none(kept, f"not detached {where}")
         expect_none(outcome.signs.keys() ^ SIGNS, f"lost, or no sign that is watched, {where}")
