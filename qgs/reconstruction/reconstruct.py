@@ -37,8 +37,7 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct one scene as `qgs reconstruct` does, in the frame of the recipe.
 
-    The scale is the recipe's; where that is a constant and the model was not trained on these
-    photos, it is searched, see `qgs.reconstruction.scale`.
+    So is the scale, but a constant one is searched for photos of no training, see `find_scale`.
 
     photos: a folder of photos and cameras, or its URL; or Views (1, V) in any world, which all
         become inputs unless `frames` names some. OpenCV cameras, images in [0, 1].
@@ -46,8 +45,7 @@ def reconstruct(
     frames: which photos, by number or file name; by default see `qgs.data.inputs`.
     compare: photos to compare with, "none" or no frames for none; of a folder, by default those
         near the inputs of every eighth photo, which is held out.
-    size: (H, W) of the photos of a folder; by default see `chosen_scene`.
-    scene: name, where a folder holds several.
+    size, scene: of a folder: (H, W), by default see `chosen_scene`; name, where it holds several.
     overrides: of the recipe's `views`, such as "views.scale=auto".
     tune: fit queries or latents to the inputs first, see `qgs.evaluate.tuning.tuning_settings`.
 
