@@ -1,9 +1,13 @@
-"""What standard output and error show: no control characters, no passwords."""
+"""Safe standard output and error: no control characters, no passwords; tables and lines."""
 
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, TextIO
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 _RAW = "[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
 # A password may hold / ? #.
@@ -52,3 +56,21 @@ def show_safely() -> None:
         # None where the system gave none.
         if stream := getattr(sys, name):
             setattr(sys, name, _Shown(stream))
+
+
+def print_table(
+    console: Console, title: str, rows: Sequence[Sequence[str]], **options: Any
+) -> None:
+    """Print rows, headers first; numbers to the right. options: of rich's Table."""
+    table = Table(title=escape(title) or None, title_justify="left", **options)
+    for place, header in enumerate(rows[0]):
+        table.add_column(header, justify="right" if place else "left", overflow="fold")
+    for row in rows[1:]:
+        table.add_row(*row)
+    console.print(table)
+
+
+def print_lines(console: Console, lines: Iterable[str]) -> None:
+    """Print lines of plain text."""
+    for line in lines:
+        console.print(escape(line), highlight=False, soft_wrap=True)

@@ -42,10 +42,10 @@ def compose(recipe: RecipeFile, overrides: Overrides = None) -> None:
 
     The recipe goes to standard output and is valid YAML; the parameters go to standard error.
     """
-    from qgs.evaluate.results import print_table
     from qgs.model_text import parameter_counts, slot_rows
     from qgs.recipe import resolve
     from qgs.recipe.recipe import annotated
+    from qgs.terminal import print_table
 
     resolved = resolve(recipe, overrides or ())
     model = resolved.build_model("meta")

@@ -101,10 +101,10 @@ def _refuse_unusable(out: Path, overwrite: bool) -> None:
 
 def show(result: Reconstruction, console: Console) -> None:
     """Print PSNR of all views and of the baselines, means by kind, and the remarks."""
-    from qgs.evaluate.results import print_lines, print_table
     from qgs.metrics.baselines import BASELINES
     from qgs.metrics.images import Psnr
     from qgs.reconstruction.result import KINDS
+    from qgs.terminal import print_lines, print_table
 
     title = f"{result.sample.scene}: {result.gaussians.count:,} Gaussians"
     shown = Psnr.column.shown

@@ -3,7 +3,7 @@
 import csv
 import io
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,6 @@ from typing import Any
 import numpy as np
 from rich.box import MARKDOWN
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from qgs.contracts import Column
 from qgs.data.samples import Frames
@@ -21,6 +19,7 @@ from qgs.evaluate.protocol import Protocol
 from qgs.files import write_text
 from qgs.metrics.baselines import BASELINES
 from qgs.metrics.dispersion import OPACITY_USED
+from qgs.terminal import print_lines, print_table
 from qgs.wording import counted, listed
 
 METHODS = ("model", *BASELINES)
@@ -226,21 +225,3 @@ class Evaluation:
 def as_json(value: Mapping[str, Any]) -> str:
     """Return a file's text; raises ValueError for NaN and infinities."""
     return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def print_table(
-    console: Console, title: str, rows: Sequence[Sequence[str]], **options: Any
-) -> None:
-    """Print rows, headers first; numbers to the right. options: of rich's Table."""
-    table = Table(title=escape(title) or None, title_justify="left", **options)
-    for place, header in enumerate(rows[0]):
-        table.add_column(header, justify="right" if place else "left", overflow="fold")
-    for row in rows[1:]:
-        table.add_row(*row)
-    console.print(table)
-
-
-def print_lines(console: Console, lines: Iterable[str]) -> None:
-    """Print lines of plain text."""
-    for line in lines:
-        console.print(escape(line), highlight=False, soft_wrap=True)

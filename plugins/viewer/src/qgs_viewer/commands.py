@@ -144,8 +144,8 @@ def view(
     # a wrong word is refused before torch is loaded, which takes seconds
     pixels = parse_size(size)
 
-    from qgs.evaluate.results import print_lines
     from qgs.files import refuse_existing
+    from qgs.terminal import print_lines
     from qgs.train.distributed import choose_device
     from qgs_viewer.opening import open_source
 
@@ -189,7 +189,7 @@ def _write_page(source: Source, query: int | None, file: Path, console: Console)
 def _serve(
     source: Source, query: int | None, host: str, port: int, show: bool, console: Console
 ) -> None:
-    from qgs.evaluate.results import print_lines
+    from qgs.terminal import print_lines
     from qgs_viewer.page import quiet_server
     from qgs_viewer.panel import Panel
 
@@ -279,7 +279,7 @@ def figures(
 
     Models stand side by side; figures.md explains each figure.
     """
-    from qgs.evaluate.results import print_lines
+    from qgs.terminal import print_lines
     from qgs.train.distributed import choose_device
     from qgs_viewer.comparison import open_models
     from qgs_viewer.figures import write_figures

@@ -9,10 +9,10 @@ from rich import box
 from rich.console import Console
 from rich.markup import escape
 
-from qgs.evaluate.results import print_lines, print_table
 from qgs.files import write_text
 from qgs.metrics.baselines import BASELINES
 from qgs.recipe.schema import summary_of
+from qgs.terminal import print_lines, print_table
 from qgs.wording import listed
 from qgs_viewer import sections
 from qgs_viewer.comparison import Model

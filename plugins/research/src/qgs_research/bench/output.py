@@ -6,7 +6,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from qgs.evaluate.results import print_table
+from qgs.terminal import print_table
 from qgs.wording import short_names
 
 MEBIBYTE = 2**20

@@ -109,10 +109,10 @@ def diff(
     """
     from rich.markup import escape
 
-    from qgs.evaluate.results import print_table
     from qgs.model_text import parameter_counts
     from qgs.recipe import resolve
     from qgs.recipe.recipe import differing_options
+    from qgs.terminal import print_table
     from qgs.wording import short_names
 
     ours = resolve(first, set_a or ())

@@ -18,9 +18,9 @@ from filelock import FileLock, Timeout
 from rich.console import Console
 
 from qgs.evaluate.evaluation import evaluate
-from qgs.evaluate.results import print_lines
 from qgs.files import write_text
 from qgs.recipe import Recipe, resolve
+from qgs.terminal import print_lines
 from qgs.train.distributed import stop_requests
 from qgs.train.training import train
 from qgs.wording import counted

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 from rich import box
 from rich.console import Console
 
-from qgs.evaluate.results import print_lines, print_table
+from qgs.terminal import print_lines, print_table
 from qgs.wording import listed
 from qgs_research.studies.estimates import Estimate, interval_shown, shown
 from qgs_research.studies.hypotheses import MAIN
