@@ -3,7 +3,7 @@
 import torch
 
 from qgs.contracts import Scene, SceneSource, SceneSourceConfig
-from qgs.data.frames import Span
+from qgs.data.view_samplers import Span
 from qgs.evaluate.plan import EvaluationPlan
 from qgs.geometry.poses import look_at
 from qgs.types import Cameras

@@ -1,8 +1,8 @@
 """Where scenes come from, and how views are drawn from them."""
 
 from qgs.contracts import Component
-from qgs.data.frames import Span
 from qgs.data.photos.source import PhotosSource
+from qgs.data.view_samplers import Span
 
 COMPONENTS: tuple[type[Component], ...] = (PhotosSource, Span)
 

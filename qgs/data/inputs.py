@@ -16,7 +16,7 @@ from torch import Tensor
 
 from qgs.containers import map_tensors
 from qgs.contracts import Frames, Scene
-from qgs.data.frames import evenly
+from qgs.data.view_samplers import evenly
 from qgs.domain import Domain
 from qgs.geometry.poses import largest_distance, look_at_depth
 from qgs.geometry.rays import pixel_directions

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from qgs.containers import concatenated, map_tensors
 from qgs.contracts import Frames, Scene, ViewsConfig
-from qgs.data.frames import refuse_too_many
+from qgs.data.view_samplers import refuse_too_many
 from qgs.geometry.poses import (
     largest_distance,
     look_at_depth,

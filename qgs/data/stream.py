@@ -19,9 +19,9 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from qgs.contracts import Frames, Scene, SceneSource, ViewSampler, ViewsConfig
-from qgs.data.frames import Span
 from qgs.data.samples import Batch, Sample, cameras_in, collate, make_sample, own_world, with_noise
 from qgs.data.scenes import BoundedCache
+from qgs.data.view_samplers import Span
 from qgs.domain import Domain
 from qgs.machine import is_out_of_memory
 from qgs.terminal import show_safely

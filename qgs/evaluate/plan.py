@@ -9,8 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from qgs.contracts import EvaluationConfig, Scene, SceneSource, ViewSampler, ViewsConfig
 from qgs.contracts.schedule import END
-from qgs.data.frames import evenly, gap_range, moments, spread
 from qgs.data.samples import Frames, Sample, make_sample
+from qgs.data.view_samplers import evenly, gap_range, moments, spread
 from qgs.paths import opened_path, read_json
 from qgs.wording import listed
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from qgs.contracts import Metric, SceneSource, SceneSourceConfig
 from qgs.contracts.schedule import END, at_step
-from qgs.data.frames import Span
+from qgs.data.view_samplers import Span
 from qgs.evaluate.plan import EvaluationIndex
 from qgs.evaluate.tuning import tuning_loss
 from qgs.recipe import Recipe

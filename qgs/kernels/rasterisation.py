@@ -300,9 +300,7 @@ def blend_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out,
                 first, last = _rows_within(v - np.float32(y0) - _HALF, ey)
                 dx0 = np.float32(x0) + _HALF - u
                 quadratic = -_HALF * _LOG2_E * xx
-                # the peak of a row moves by lean dy
-                lean = -xy / xx
-                lowest = splats[g, 8]
+                lean = -xy / xx  # the peak of a row moves by lean dy
                 touched = False
                 for row in range(first, last + 1):
                     if not live[row]:
@@ -310,9 +308,9 @@ def blend_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out,
                     dy = np.float32(y0 + row) + _HALF - v
                     linear = -_LOG2_E * xy * dy
                     constant = -_HALF * _LOG2_E * yy * dy * dy
-                    # power is below `lowest` in all lanes if at its peak on their real interval
+                    # power is too low in all lanes if it is at its peak on their real interval
                     peak = min(max(lean * dy, dx0), dx0 + _LAST_LANE)
-                    if (quadratic * peak + linear) * peak + constant < lowest:
+                    if (quadratic * peak + linear) * peak + constant < splats[g, 8]:
                         continue
                     base = np.uint64(row) * _STATE
                     power = (linear, quadratic, constant)
@@ -326,9 +324,7 @@ def blend_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out,
                 if touched:
                     _add_gradients(totals, xx, xy, yy, opacities[g], out[g])
                 since_check += 1
-                if since_check == _CHECK_EVERY:
-                    since_check = 0
-                    if not _close_rows(state, live):
-                        break
+                if since_check % _CHECK_EVERY == 0 and not _close_rows(state, live):
+                    break
             if not backward:
                 _store_sums(state, sums, y0, x0, rows, columns)

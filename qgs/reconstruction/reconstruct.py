@@ -8,9 +8,9 @@ from typing import Any
 from torch import Tensor
 
 from qgs.contracts import Frames, Scene, ViewsConfig
-from qgs.data.frames import evenly, moments, spread
 from qgs.data.inputs import NOVEL, Frusta, Window, ranked_windows
 from qgs.data.samples import Sample, make_sample
+from qgs.data.view_samplers import evenly, moments, spread
 from qgs.domain import Domain, verdict
 from qgs.evaluate.tuning import tune as tuned_on
 from qgs.evaluate.tuning import tuning_loss, tuning_settings

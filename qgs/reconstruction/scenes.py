@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import Component, Encoder, Scene, SceneSource, SceneSourceConfig, Split
-from qgs.data.frames import training_frames
 from qgs.data.recognition import open_for
 from qgs.data.samples import views_in
+from qgs.data.view_samplers import training_frames
 from qgs.recipe import Recipe
 from qgs.recipe.registry import load_usable_plugins
 from qgs.types import Cameras, Views

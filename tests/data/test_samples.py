@@ -11,8 +11,8 @@ from training_runs import tiny
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.contracts.schedule import END
-from qgs.data.frames import Span
 from qgs.data.samples import collate, make_sample, mirrored_views, stack_views
+from qgs.data.view_samplers import Span
 from qgs.evaluate.plan import held_out_windows
 from qgs.evaluate.protocol import protocol_of
 from qgs.geometry.poses import look_at, look_at_depth

@@ -9,8 +9,8 @@ from torch.testing import assert_close
 from training_runs import run
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
-from qgs.data.frames import Span
 from qgs.data.samples import collate, make_sample
+from qgs.data.view_samplers import Span
 from qgs.evaluate.plan import held_out_windows
 from qgs.recipe import RecipeError, resolve
 

@@ -15,7 +15,6 @@ from torch import Tensor
 from upath import UPath
 
 from qgs.contracts import OptionError, Scene, SceneSource, SceneSourceConfig
-from qgs.data.frames import held_out_frames
 from qgs.data.images import (
     TURN,
     TURNED,
@@ -33,6 +32,7 @@ from qgs.data.images import (
 from qgs.data.photos import formats_of, present_frames, readers
 from qgs.data.photos.reader import PhotoFrame, Size, size_problems
 from qgs.data.scenes import BoundedCache, LazyScenes, LazySource
+from qgs.data.view_samplers import held_out_frames
 from qgs.paths import is_local, listing, opened_path
 from qgs.types import Cameras
 from qgs.wording import listed, warn_once

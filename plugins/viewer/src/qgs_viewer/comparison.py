@@ -13,9 +13,9 @@ import yaml
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.checkpoint.models import about, checkpoint_path
 from qgs.contracts import Frames, Scene, ViewsConfig
-from qgs.data.frames import Span
 from qgs.data.inputs import Frusta, Window, ranked_windows
 from qgs.data.recognition import is_training_data, open_for
+from qgs.data.view_samplers import Span
 from qgs.domain import Domain
 from qgs.evaluate.evaluation import evaluate
 from qgs.evaluate.results import Evaluation

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from qgs.containers import map_tensors
 from qgs.contracts import LearnedQueries
-from qgs.data.frames import evenly
+from qgs.data.view_samplers import evenly
 from qgs.drawing import images
 from qgs.drawing.figures import figure_picture
 from qgs.drawing.images import (

@@ -7,7 +7,7 @@ from pydantic import Field
 
 from qgs.contracts import Frames, Problem, RecipeContext, Scene, ViewSampler, ViewsConfig
 from qgs.contracts.component import ComponentConfig
-from qgs.data.frames import moments, one_of_each, refuse_too_many
+from qgs.data.view_samplers import moments, one_of_each, refuse_too_many
 
 
 class Bounded(ViewSampler):

@@ -14,10 +14,10 @@ from torch import Tensor
 from upath import UPath
 
 from qgs.contracts import Scene, SceneSource, Split
-from qgs.data.frames import held_out_frames
 from qgs.data.images import CropResize, decode_rgb, to_tensor
 from qgs.data.photos.reader import Size
 from qgs.data.scenes import BoundedCache, LazyScenes, LazySource
+from qgs.data.view_samplers import held_out_frames
 from qgs.paths import opened_path
 from qgs.types import Cameras
 from qgs.wording import listed, warn_once

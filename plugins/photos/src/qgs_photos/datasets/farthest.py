@@ -9,7 +9,7 @@ from torch import Tensor
 
 from qgs.contracts import Frames, Problem, RecipeContext, Scene, ViewsConfig
 from qgs.contracts.schedule import END
-from qgs.data.frames import one_of_each
+from qgs.data.view_samplers import one_of_each
 from qgs_photos.datasets.bounded import Bounded
 
 

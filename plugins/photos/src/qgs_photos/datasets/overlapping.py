@@ -5,8 +5,8 @@ from pydantic import field_validator
 
 from qgs.contracts import Frames, OptionError, Scene, ViewSampler, ViewsConfig
 from qgs.contracts.component import ComponentConfig
-from qgs.data.frames import evenly, refuse_too_many, training_frames
 from qgs.data.inputs import Frusta, scene_depth, trained_ratios
+from qgs.data.view_samplers import evenly, refuse_too_many, training_frames
 from qgs.domain import Domain
 
 _SHARE = 0.5

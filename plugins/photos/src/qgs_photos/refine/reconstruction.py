@@ -9,8 +9,8 @@ from rich.console import Console
 
 from qgs.checkpoint.model_file import load
 from qgs.contracts import Frames, Scene
-from qgs.data.frames import training_frames
 from qgs.data.samples import Sample, cameras_in, views_in
+from qgs.data.view_samplers import training_frames
 from qgs.recipe import resolve
 from qgs.reconstruction.result import Reconstruction, reconstruct_sample
 from qgs.reconstruction.scenes import Size, chosen_scene

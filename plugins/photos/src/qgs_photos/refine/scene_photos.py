@@ -3,8 +3,8 @@
 import math
 
 from qgs.contracts import Frames, Scene
-from qgs.data.frames import held_out_frames
 from qgs.data.recognition import open_for
+from qgs.data.view_samplers import held_out_frames
 from qgs.machine import available_bytes
 from qgs.reconstruction.scenes import Size, installed_sources, named_scene
 from qgs_photos.refine.options import NONE, Options

@@ -14,6 +14,9 @@ app = typer.Typer(help="How fast and how large models are.")
 InputViews: TypeAlias = Annotated[
     int | None, typer.Option(min=1, help="Input views; default: the recipe's.")
 ]
+Memory: TypeAlias = Annotated[
+    bool, typer.Option("--memory", help="Peak memory too, of a fresh process each.")
+]
 Report: TypeAlias = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Write a report with every sample, a new file.")
 ]
@@ -28,9 +31,7 @@ def bench(
     batch: Annotated[int, typer.Option(min=1, help="Scenes at once.")] = 1,
     precision: Annotated[str, typer.Option(help="float32 or bf16 (autocast).")] = "float32",
     step: Annotated[bool, typer.Option("--step", help="Training steps too.")] = False,
-    memory: Annotated[
-        bool, typer.Option("--memory", help="Peak memory too, of a fresh process each.")
-    ] = False,
+    memory: Memory = False,
     renderer: Annotated[bool, typer.Option("--renderer", help="The renderer too.")] = False,
     rounds: Annotated[int, typer.Option(min=1, help="Samples of each latency.")] = 10,
     warmup: Annotated[int, typer.Option(min=0, help="Calls before the first sample.")] = 2,
@@ -40,9 +41,9 @@ def bench(
 ) -> None:
     """Size, latency and memory of models: any number of recipes in turn.
 
-    Ratios are to the first. Models have their initial weights, photos and poses
-    are random: no data is needed. Latency and FLOPs are from photos to Gaussians.
-    Memory: on a CPU a process's peak, on a GPU what torch allocated at most.
+    Ratios are to the first. Weights, photos and poses are random: no data is needed.
+    Latency and FLOPs are from photos to Gaussians. Memory: on a CPU a process's peak,
+    on a GPU what torch allocated at most.
     """
     from rich.console import Console
 
@@ -53,12 +54,12 @@ def bench(
     from qgs_research.bench.output import show
     from qgs_research.bench.run import measure_recipes
 
-    if precision not in get_args(Precision):
-        known = " or ".join(get_args(Precision))
-        raise ValueError(f"--precision must be {known}, got {precision!r}")
+    known = get_args(Precision)
+    if precision not in known:
+        raise ValueError(f"--precision must be {' or '.join(known)}, got {precision!r}")
+    use_threads(threads)
     if json is not None:
         refuse_existing(json)
-    use_threads(threads)
     console = Console()
     work = {
         "views": views,
