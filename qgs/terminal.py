@@ -73,4 +73,4 @@ def print_table(
 def print_lines(console: Console, lines: Iterable[str]) -> None:
     """Print lines of plain text."""
     for line in lines:
-        console.print(escape(line), highlight=False, soft_wrap=True)
+        console.print(escape(line), highlight=False, soft_wrap=True, emoji=False)

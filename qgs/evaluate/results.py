@@ -123,7 +123,10 @@ class Evaluation:
         """
         table = io.StringIO()
         # As wide as the lines are; without the colours that the environment may ask for.
-        self.show(Console(file=table, width=10_000, color_system=None))
+        plain = Console(
+            file=table, width=10_000, color_system=None, force_terminal=False, emoji=False
+        )
+        self.show(plain)
         files = {
             "scenes.csv": self._csv(),
             "summary.json": as_json(self.summary()),

@@ -234,4 +234,6 @@ def _explain(error: ErrorDetails, given: Any) -> tuple[str, str]:
         return reason, did_you_mean(written, re.findall(r"'([^']*)'", context["expected"]), "words")
     if kind == "bool_type":
         return reason, "write `true` or `false`: in YAML 1.2 other words are strings"
+    if kind in ("model_type", "dict_type"):
+        return reason, "write `key: value` lines below it"
     return reason, "put it in quotes" if kind == "string_type" else "give a value that fits"

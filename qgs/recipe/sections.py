@@ -136,10 +136,15 @@ def decode_settings(tree: MapNode, problems: Problems) -> tuple[MapNode, Any]:
     sound = deepcopy(tree)
     # Go on with defaults, so that problems of components are reported as well.
     while faults:
-        for fault in faults:
-            keys = [step for step in find(sound, fault["loc"])[0] if isinstance(step, str)]
-            if keys:
-                del sound.child(*keys[:-1])[keys[-1]]
+        faulty = [
+            [step for step in find(sound, fault["loc"])[0] if isinstance(step, str)]
+            for fault in faults
+        ]
+        if not any(faulty):
+            # A fault of the whole, such as text that no JSON holds, leaves nothing to check.
+            problems.raise_any()
+        for keys in filter(None, faulty):
+            del sound.child(*keys[:-1])[keys[-1]]
         sound.put("recipe", 1, sound.origin_of("recipe"))
         settings, faults = validated(Layout, sound)
     return sound, settings

@@ -118,12 +118,12 @@ class RunFolder:
         for leftover in filter(is_leftover, self.path.iterdir()):
             leftover.unlink()
 
-    def append(self, record: Mapping[str, Any], name: str = HISTORY) -> None:
-        """Add one line to the history, or to another file of records."""
+    def append(self, *records: Mapping[str, Any], name: str = HISTORY) -> None:
+        """Add a line each to the history, or to another file of records: all of them or none."""
         path = self.path / name
         # Opened for each line: readers see every step, and a kill leaves nothing in a buffer.
         with naming_full_disk(path), path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(record) + "\n")
+            file.write("".join(json.dumps(record) + "\n" for record in records))
 
     def synchronise(self) -> None:
         """See that the history outlives the system."""

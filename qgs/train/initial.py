@@ -13,6 +13,7 @@ from qgs.recipe import Recipe
 from qgs.recipe.recipe import differing_predictions
 
 _QUERIES = "queries."
+_KEPT = ", the first are kept, any more are noisy copies"
 
 
 def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
@@ -58,6 +59,7 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     before = shapes_of(learned)
     changes = [
         f"{name}: {before.get(name, 'none')} -> {shape}"
+        + (_KEPT if name.startswith(_QUERIES) and name in before else "")
         for name, shape in shapes_of(weights).items()
         if shape != before.get(name)
     ]

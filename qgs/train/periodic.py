@@ -104,8 +104,7 @@ class PeriodicEvaluation:
                     "scores": scores,
                 }
             )
-        for record in records:
-            self.folder.append(record, EVALUATIONS)
+        self.folder.append(*records, name=EVALUATIONS)
         self.trackers.tell(lambda tracker: tracker.log(told, step))
         picture = self._picture()
         write_png(picture, self.folder.path / "pictures" / f"step-{step}.png")

@@ -19,6 +19,9 @@ from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
 from qgs.types import Cameras, Gaussians, LayerPrediction, Prediction, Rendering, Views
 
+RECORDED = {"step", "seconds", "lr", "loss", "psnr", "alpha", "deviation", "gradient", "skipped"}
+"""Names of a record of history.jsonl that no term may have."""
+
 
 class TrainingPass(nn.Module):
     """The model, its losses and its objective; `forward` hands itself to the objective as `Passes`.
@@ -52,7 +55,11 @@ class TrainingPass(nn.Module):
         """Return what the objective makes of a batch."""
         # Input views become targets too, the last ones.
         targets = targets.joined(inputs) if self.judge_inputs else targets
-        return self.objective.forward(inputs, targets, self)
+        outcome = self.objective.forward(inputs, targets, self)
+        if taken := sorted(outcome.terms.keys() & RECORDED):
+            kinds = f"losses or the objective {self.objective.name}"
+            raise ValueError(f"terms of {kinds} are named {taken}, as other numbers of a step are")
+        return outcome
 
     def predict(self, inputs: Views) -> Prediction:
         """See `Passes`."""

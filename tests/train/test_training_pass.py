@@ -203,6 +203,15 @@ def test_signs_are_those_of_all_views_of_the_last_layer():
         torch.testing.assert_close(tuple(objective(inputs, targets).signs.values()), wanted)
 
 
+def test_a_term_named_as_a_number_of_a_step_is_refused(monkeypatch):
+    step, inputs, targets = setting("qgs/cpu")
+    outcome = step(inputs, targets)
+    taken = replace(outcome, terms={"lr": outcome.total})
+    monkeypatch.setattr(step.objective, "forward", lambda *given: taken)
+    with pytest.raises(ValueError, match="lr"):
+        step(inputs, targets)
+
+
 def test_input_views_are_judged_too():
     recipe = tiny("tokengs", "training.judge_inputs=true", "losses.visibility=null")
     model = recipe.build_model().train()

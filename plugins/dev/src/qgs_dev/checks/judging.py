@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from qgs.containers import map_tensors
 from qgs.contracts import Metric, MetricInput, Outcome
-from qgs.train.training_pass import TrainingPass
+from qgs.train.training_pass import RECORDED, TrainingPass
 from qgs.types import LayerPrediction
 from qgs_dev.case import CannotCheck, Case
 from qgs_dev.checks.fields import resolved
@@ -27,7 +27,6 @@ from qgs_dev.vocabulary import (
 )
 
 SIGNS = {"psnr", "alpha", "deviation"}
-RECORDED = SIGNS | {"step", "seconds", "lr", "loss", "gradient", "skipped"}
 """Names of a record of history.jsonl that no term may have."""
 TAKEN = "terms with names of other numbers of a step"
 
