@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 from guide_pages import text_of
+from qgs_viewer.comparison import open_models
 
 from qgs.cli import COMMANDS, GROUP
 from qgs.recipe.slots import SECTIONS, SLOTS
@@ -44,9 +45,6 @@ def test_the_models_score_what_the_readme_says(side):
     of_photo = rf"^\| the nearest photo, {side} .*? \| (\S+) \| (\S+) \|"
     (nearest,) = re.findall(of_photo, README, re.MULTILINE)
     assert len(models) >= 2
-    # Loads what starts threads, which a process forked by another test would wait for.
-    from qgs_viewer.comparison import open_models
-
     results = open_models([model[0] for model in models], None, "cpu")
     for (_, *own, count, size), result in zip(models, results, strict=True):
         for method, (psnr, ssim) in (("model", own), ("nearest_input", nearest)):
