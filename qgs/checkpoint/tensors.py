@@ -7,18 +7,19 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeAlias
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from qgs.contracts.weights import Shapes
 from qgs.files import replacing
 from qgs.recipe import Recipe, RecipeError, resolve
 from qgs.wording import name_shown
 
+Shapes: TypeAlias = Mapping[str, tuple[int, ...]]
+"""Name of a tensor to its shape."""
 SEAL = "qgs.seal"
 """Metadata entry with the checksum of all others."""
 _PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}

@@ -37,7 +37,6 @@ from qgs.contracts.plugin import CONTRACT_VERSION, Plugin
 from qgs.contracts.queries import LearnedQueries, Queries
 from qgs.contracts.renderer import Renderer, RendererConfig
 from qgs.contracts.settings import EvaluationConfig, TrainingConfig, ViewsConfig
-from qgs.contracts.weights import LayoutError, WeightLayout
 
 __all__ = [
     "CONTRACT_VERSION",
@@ -61,7 +60,6 @@ __all__ = [
     "Frames",
     "Head",
     "LayerParts",
-    "LayoutError",
     "LearnedQueries",
     "Loss",
     "Metric",
@@ -93,7 +91,6 @@ __all__ = [
     "TrainingConfig",
     "ViewSampler",
     "ViewsConfig",
-    "WeightLayout",
     "component_of",
     "memory_fields",
     "without_effect",

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from qgs.contracts.component import Component, ComponentConfig
-from qgs.contracts.weights import WeightLayout
 
 CONTRACT_VERSION = 1
 """Goes up when components written for the old contracts no longer fit."""
@@ -20,7 +19,6 @@ class Plugin:
     name: the part of `type: NAME/component` before the slash.
     contract_version: the CONTRACT_VERSION that the components were written for.
     components: component classes; a `name` is unique within its slot.
-    layouts: weights that other codebases publish and these components can load.
     examples: options that `qgs check-plugin` tries in addition to the defaults of every component.
     models: files of trained models by name, relative to the folder of the module that the entry
         point names; PLUGIN/NAME stands for the path in every command. A card in the same
@@ -32,7 +30,6 @@ class Plugin:
     name: str
     contract_version: int
     components: Sequence[type[Component]]
-    layouts: Sequence[WeightLayout] = ()
     examples: Sequence[ComponentConfig] = ()
     models: Mapping[str, str] = field(default_factory=dict)
     exemptions: Mapping[type[Component] | ComponentConfig, Mapping[str, str]] = field(

@@ -216,12 +216,7 @@ def _spelled(
 
 def _plugins(draft: Draft, used: set[str]) -> tuple[KeyPath, Any, Origin | str]:
     """The plugins of a draft that are `used`, and the lines that name them."""
-    kept = [
-        name
-        for name, installed in draft.registry.plugins.items()
-        # One with weight layouts alone has no component to use: `qgs import` reads it.
-        if name != "qgs" and (name in used or not installed.plugin.components)
-    ]
+    kept = [name for name in draft.registry.plugins if name != "qgs" and name in used]
     origin = draft.tree.origins.get("plugins", Origin(_DEFAULT))
     lines = [str(at) for name, at in items_of(draft.tree.get("plugins"), origin) if name in kept]
     return ("plugins",), kept, ", ".join(dict.fromkeys(lines)) or origin

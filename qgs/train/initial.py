@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from qgs.checkpoint.model_file import CheckpointFile, load_weights, unique_tensors
-from qgs.checkpoint.tensors import CheckpointError, differing_tensors, shapes_of
-from qgs.contracts.weights import Shapes
+from qgs.checkpoint.tensors import CheckpointError, Shapes, differing_tensors, shapes_of
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
 from qgs.recipe.recipe import differing_predictions

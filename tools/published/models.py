@@ -12,6 +12,7 @@ from qgs_locus.cross_attention import RayBiasedCrossAttention
 from qgs_locus.fields import CENTER, RAW_RADIUS, support_radius
 from qgs_locus.self_attention import AnchorAwareSelfAttention
 from qgs_research.published.layouts import names_of
+from qgs_research.published.weight_layout import real_ratio
 from qgs_zoo.tokengs2026.multiscale import LatentBottleneck, time_features
 from torch import Tensor
 
@@ -21,7 +22,6 @@ from published.mvsplat import mvsplat_tensors
 from published.recipes import locusgs_recipe, tokengs_recipe
 from published.recording import Recorder
 from published.splats import cases_tensors
-from qgs.contracts.weights import real_ratio
 from qgs.geometry.rays import camera_rays, plucker_rays
 from qgs.model import QueryGaussianModel
 from qgs.recipe import resolve

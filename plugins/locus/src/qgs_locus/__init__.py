@@ -7,7 +7,6 @@ from qgs_locus.decoding import AnchorOffsetCenters, RadiusScaledCenters
 from qgs_locus.refinement import AnchorRefinement
 from qgs_locus.self_attention import AnchorAwareSelfAttention
 from qgs_locus.visibility import AnchorVisibility
-from qgs_locus.weights import LOCUSGS
 
 FRUSTUM = FrustumCenters(kind="frustum")
 
@@ -23,7 +22,6 @@ plugin = Plugin(
         RadiusScaledCenters,
         AnchorVisibility,
     ),
-    layouts=(LOCUSGS,),
     examples=(
         AnchoredQueries.Config(radius=False),
         AnchoredQueries.Config(count=8, radius_bound="offset", center_init=FRUSTUM),

@@ -1,6 +1,7 @@
 """Published weights become checkpoints: every tensor accounted for, or nothing is written."""
 
 import os
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
@@ -12,7 +13,7 @@ from published.files import read_golden
 from qgs_research.published.importing import import_weights
 from qgs_research.published.layouts import PublishedError, fitting_recipe, names_of
 from qgs_research.published.tokengs import TOKENGS
-from qgs_zoo.tokengs2026.weights import TOKENGS_2026_6
+from qgs_research.published.tokengs2026 import TOKENGS_2026_6
 from safetensors.torch import load_file, save_file
 from torch.testing import assert_close
 
@@ -110,6 +111,14 @@ def test_every_ablation_has_a_published_name_for_each_parameter():
         assert not known.unnamed
         assert known.published.keys() == known.shapes.keys()
         assert not {*known.unused} & {*known.published.values()}
+
+
+def test_other_distributions_add_layouts(monkeypatch):
+    mine = replace(TOKENGS, name="Mine", marks=(*TOKENGS.marks, "gs_tokens"))
+    installed = Mock(return_value=[Mock(load=lambda: mine)])
+    monkeypatch.setattr("qgs_research.published.layouts.installed", installed)
+    assert fitting_recipe(shapes_of(TOKENGS_A), "file")[0] is mine
+    installed.assert_called_with("qgs.layouts")
 
 
 def test_every_difference_is_listed_at_once():

@@ -6,11 +6,12 @@ import pytest
 import torch
 from qgs_dev import CHECKS, cases_of, run_check
 from qgs_dev.inputs import inputs_of
+from qgs_research.published.mvsplat import DEPTHSPLAT, MVSPLAT
+from qgs_research.published.weight_layout import LayoutError
 from qgs_zoo.mvsplat import DecayedSupervision, DepthError, DepthSplatEncoder, Exchange
-from qgs_zoo.mvsplat.weights import DEPTHSPLAT, MVSPLAT
 from small_parts import made
 
-from qgs.contracts import LayerParts, LayoutError, MetricInput, ModelDims
+from qgs.contracts import LayerParts, MetricInput, ModelDims
 from qgs.recipe import resolve
 from qgs.recipe.registry import load_plugin
 from qgs.types import QueryState

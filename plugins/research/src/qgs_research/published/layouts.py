@@ -1,19 +1,27 @@
 """Published codebases: their names for our parameters, and the recipe that their shapes give."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
 
 from qgs.checkpoint.model_file import unique_tensors
-from qgs.checkpoint.tensors import differing_tensors, shapes_of
-from qgs.contracts import LayoutError, WeightLayout
-from qgs.contracts.weights import Shapes, renamed
+from qgs.checkpoint.tensors import Shapes, differing_tensors, shapes_of
+from qgs.extensions import imported, installed
 from qgs.recipe import Recipe, RecipeError, resolve
-from qgs.recipe.registry import InstalledPlugin, load_registry, load_usable_plugins
 from qgs.wording import listed
+from qgs_research.published.locus import LOCUSGS
+from qgs_research.published.mvsplat import DEPTHSPLAT, MVSPLAT
 from qgs_research.published.tokengs import TOKENGS
+from qgs_research.published.tokengs2026 import TOKENGS_2026_6
+from qgs_research.published.weight_layout import LayoutError, WeightLayout, renamed
+
+# TokenGS comes first: it is the most general.
+LAYOUTS = (TOKENGS, LOCUSGS, MVSPLAT, DEPTHSPLAT, TOKENGS_2026_6)
+"""Published codebases that this distribution knows."""
+ENTRY_POINT_GROUP = "qgs.layouts"
+"""Entry points at which other distributions list a `WeightLayout`."""
 
 
 class PublishedError(ValueError):
@@ -59,10 +67,9 @@ def names_of(recipe: Recipe) -> Names:
 
     Raises PublishedError with the components that each layout does not know.
     """
-    # Only plugins of this recipe: others could claim its names.
-    registry = load_registry([name for name in recipe.releases if name != "qgs"])
     reasons = []
-    for layout in _layouts(registry.plugins.values()):
+    # Only plugins of this recipe: others could claim its names.
+    for layout in (one for one in _layouts() if one.plugin in recipe.releases):
         found = _unknown_components(recipe, layout)
         if not found:
             return _names_in(recipe, layout)
@@ -70,9 +77,8 @@ def names_of(recipe: Recipe) -> Names:
     raise PublishedError("no published layout can hold this model:" + "".join(reasons))
 
 
-def _layouts(plugins: Iterable[InstalledPlugin]) -> list[WeightLayout]:
-    # The framework's own comes first: it is the most general.
-    return [TOKENGS, *(layout for installed in plugins for layout in installed.plugin.layouts)]
+def _layouts() -> list[WeightLayout]:
+    return [*LAYOUTS, *map(imported, installed(ENTRY_POINT_GROUP))]
 
 
 def _unknown_components(recipe: Recipe, layout: WeightLayout) -> list[str]:
@@ -110,8 +116,8 @@ def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
 
 
 def recognise(shapes: Shapes) -> tuple[WeightLayout | None, list[WeightLayout]]:
-    """The layout that fits a state dict best, None without one, and the layouts of all plugins."""
-    layouts = _layouts(load_usable_plugins()[0].plugins.values())
+    """The layout that fits a state dict best, None without one, and all layouts."""
+    layouts = _layouts()
     found = [layout for layout in layouts if set(layout.marks) <= set(shapes)]
     # A codebase's later release has all names of the earlier one.
     return max(found, key=lambda layout: len(layout.marks), default=None), layouts

@@ -7,7 +7,6 @@ from qgs_zoo.mvsplat.head import RayHead, WorldHead
 from qgs_zoo.mvsplat.mvsplat import MVSplatEncoder
 from qgs_zoo.mvsplat.pixels import OnRays, PixelQueries
 from qgs_zoo.mvsplat.two_depths import DecayedSupervision, DepthError, Exchange
-from qgs_zoo.mvsplat.weights import DEPTHSPLAT, MVSPLAT
 
 _SMALL = DepthSplatEncoder.Config(
     near=0.2,
@@ -31,7 +30,6 @@ plugin = Plugin(
         *(MVSplatEncoder, PixelQueries, RayHead, OnRays),
         *(DepthSplatEncoder, WorldHead, Exchange, DecayedSupervision, DepthError),
     ),
-    layouts=(MVSPLAT, DEPTHSPLAT),
     examples=(
         MVSplatEncoder.Config(
             near=0.2,

@@ -3,7 +3,6 @@
 from qgs.contracts import Plugin
 from qgs_zoo.tokengs2026.dynamic import BlockCausalSelfAttention, DynamicObjective, DynamicQueries
 from qgs_zoo.tokengs2026.multiscale import LatentBottleneck, MultiscaleViT
-from qgs_zoo.tokengs2026.weights import TOKENGS_2026_6
 
 plugin = Plugin(
     name="tokengs2026",
@@ -15,7 +14,6 @@ plugin = Plugin(
         BlockCausalSelfAttention,
         DynamicObjective,
     ),
-    layouts=(TOKENGS_2026_6,),
     examples=(
         MultiscaleViT.Config(blocks=(2, 3), time_channels=2),
         LatentBottleneck.Config(depth=2, blocks=(1, 2), latents=6, latent_depth=2),

@@ -2,8 +2,9 @@
 
 from typing import Any
 
-from qgs.contracts.weights import Shapes, WeightLayout
-from qgs.tokengs.weights import BACKBONE_RENAMES, DECODER, backbone
+from qgs.checkpoint.tensors import Shapes
+from qgs_research.published.tokengs import BACKBONE_RENAMES, DECODER, backbone
+from qgs_research.published.weight_layout import WeightLayout
 
 _CROSS = DECODER + "{}.gs_cross_attn."
 _UNUSED_NORMS = ("anchor_norm.", "plucker_norm.", "q_pos_norm.", "k_pos_norm.")
@@ -37,6 +38,7 @@ def _read(shapes: Shapes) -> dict[str, Any]:
 
 LOCUSGS = WeightLayout(
     name="LocusGS",
+    plugin="locus",
     source="leo-frank/LocusGS",
     components={
         "encoder": ("qgs/multiview_vit",),

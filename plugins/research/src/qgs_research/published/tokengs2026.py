@@ -2,19 +2,9 @@
 
 from typing import Any
 
-from qgs.contracts.weights import (
-    LayoutError,
-    Shapes,
-    WeightLayout,
-    layer_count,
-    size_at,
-)
-from qgs.tokengs.weights import (
-    BACKBONE_RENAMES,
-    CROSS_QUERY,
-    DECODER,
-    read_tokengs,
-)
+from qgs.checkpoint.tensors import Shapes
+from qgs_research.published.tokengs import BACKBONE_RENAMES, CROSS_QUERY, DECODER, read_tokengs
+from qgs_research.published.weight_layout import LayoutError, WeightLayout, layer_count, size_at
 
 READOUT = "enc_dec_backbone.multiscale_norms."
 DYNAMIC = "gs_tokens_dynamic"
@@ -94,6 +84,7 @@ def _encoder(shapes: Shapes, depth: int) -> dict[str, Any]:
 
 TOKENGS_2026_6 = WeightLayout(
     name="TokenGS 2026.6",
+    plugin="tokengs2026",
     source="nv-tlabs/TokenGS",
     components={
         "encoder": ("tokengs2026/multiscale_vit", "tokengs2026/latent_bottleneck"),

@@ -2,26 +2,27 @@
 
 from typing import Any
 
-from qgs.contracts.weights import (
+from qgs.checkpoint.tensors import Shapes
+from qgs_research.published.weight_layout import (
     LayoutError,
-    Shapes,
     WeightLayout,
     layer_count,
     size_at,
     whole_ratio,
 )
-from qgs_zoo.mvsplat.cnn import WIDTHS as CNN_WIDTHS
-from qgs_zoo.mvsplat.depthsplat import GAUSSIAN_CHANNELS
-from qgs_zoo.mvsplat.pixels import WIDTHS
 
 _PREDICTOR = "encoder.depth_predictor."
 _VIT = _PREDICTOR + "pretrained."
 _UPSAMPLER = "encoder.feature_upsampler."
 _HEAD = "encoder.gaussian_head.2.weight"
-HEAD_WIDTH = 64
+_HEAD_WIDTH = 64
 """Channels of a head of every DINOv2."""
-BLOCKS = {12: [2, 5, 8, 11], 24: [4, 11, 17, 23]}
+_BLOCKS = {12: [2, 5, 8, 11], 24: [4, 11, 17, 23]}
 """Depth of the ViT to the blocks that are read."""
+_CNN_WIDTHS = [64, 96, 128]
+"""Stages of MVSplat's CNN as published."""
+_HARMONICS = (4, 9, 16, 25)
+"""Numbers of a colour's harmonics, of degrees 1 to 4."""
 _EMPTY = dict.fromkeys(("cross_attention", "self_attention", "feed_forward", "refinement"))
 _ENDS = {"queries": ("mvsplat/pixels",), "centers": ("mvsplat/on_rays",)}
 
@@ -43,7 +44,7 @@ def _stages(shapes: Shapes, cnn: str) -> list[int]:
     return [size_at(shapes, f"{cnn}layer{n}.0.conv1.weight", 0) for n in (1, 2, 3)]
 
 
-def unet_levels(shapes: Shapes, name: str) -> int:
+def _unet_levels(shapes: Shapes, name: str) -> int:
     """Levels of the U-Net stored as `name`: each has two blocks on the way up."""
     numbers = {key[len(name) :].split(".")[1] for key in shapes if key.startswith(name + "output")}
     if not numbers or len(numbers) % 2:
@@ -61,12 +62,12 @@ def _read_mvsplat(shapes: Shapes) -> dict[str, Any]:
         "features": size_at(shapes, backbone + "conv2.weight", 0),
         "candidates": size_at(shapes, _PREDICTOR + "regressor_residual.weight", 0),
         "cost_width": size_at(shapes, _PREDICTOR + "corr_refine_net.0.weight", 0),
-        "cost_levels": unet_levels(shapes, _PREDICTOR + "corr_refine_net.3."),
+        "cost_levels": _unet_levels(shapes, _PREDICTOR + "corr_refine_net.3."),
         "depth_width": size_at(shapes, _PREDICTOR + "refine_unet.0.weight", 0),
-        "depth_levels": unet_levels(shapes, _PREDICTOR + "refine_unet.3."),
+        "depth_levels": _unet_levels(shapes, _PREDICTOR + "refine_unet.3."),
     }
     stages = _stages(shapes, backbone)
-    if tuple(stages) != CNN_WIDTHS:
+    if stages != _CNN_WIDTHS:
         encoder["cnn_widths"] = stages
     return _recipe(
         {
@@ -85,7 +86,7 @@ def _encoder(shapes: Shapes) -> dict[str, Any]:
     scales = layer_count(shapes, _PREDICTOR + "regressor.")
     width = size_at(shapes, _VIT + "norm.weight", 0)
     depth = layer_count(shapes, _VIT + "blocks.")
-    if scales not in (1, 2) or depth not in BLOCKS:
+    if scales not in (1, 2) or depth not in _BLOCKS:
         raise LayoutError(f"{scales} scales and a ViT of {depth} blocks are not published")
     dpt = [size_at(shapes, f"{_UPSAMPLER}projects.{n}.weight", 0) for n in range(4)]
     joined = size_at(shapes, _UPSAMPLER + "concat_projects.2.weight", 1)
@@ -103,9 +104,9 @@ def _encoder(shapes: Shapes) -> dict[str, Any]:
         "vit": {
             "width": width,
             "depth": depth,
-            "heads": whole_ratio(width, HEAD_WIDTH, "width of the ViT over that of a head"),
+            "heads": whole_ratio(width, _HEAD_WIDTH, "width of the ViT over that of a head"),
         },
-        "blocks": BLOCKS[depth],
+        "blocks": _BLOCKS[depth],
         "dpt": dpt,
         "full_features": size_at(shapes, _UPSAMPLER + "scratch.layer1_rn.weight", 0),
         "regressor": size_at(shapes, "encoder.gaussian_regressor.0.weight", 0),
@@ -116,17 +117,16 @@ def _encoder(shapes: Shapes) -> dict[str, Any]:
 def _read_depthsplat(shapes: Shapes) -> dict[str, Any]:
     encoder = _encoder(shapes)
     raw = size_at(shapes, _HEAD, 0)
-    # the depth stands in front
     two = encoder["scales"] == 2
-    numbers = raw + 1
-    if numbers not in WIDTHS:
-        raise LayoutError(f"{_HEAD}: {raw} is not {GAUSSIAN_CHANNELS} and harmonics of a degree")
+    if raw not in [10 + 3 * harmonics for harmonics in _HARMONICS]:
+        raise LayoutError(f"{_HEAD}: {raw} is not 10 and harmonics of a degree")
     # A layer for each depth, so that both can be supervised.
     decoder = {"depth": 2, "layer": {"type": "mvsplat/exchange"}} if two else {"depth": 0}
     supervision = {"type": "mvsplat/decayed", "layers": [1, 2]}
     return _recipe(
         {
-            "width": numbers + two,
+            # The depths stand in front.
+            "width": raw + 1 + two,
             "encoder": encoder,
             "decoder": {**decoder, **_EMPTY},
             "head": {"type": "mvsplat/depthsplat_gaussians"},
@@ -138,6 +138,7 @@ def _read_depthsplat(shapes: Shapes) -> dict[str, Any]:
 
 MVSPLAT = WeightLayout(
     name="MVSplat",
+    plugin="mvsplat",
     source="donydchen/mvsplat",
     components={
         "encoder": ("mvsplat/mvsplat",),
@@ -158,6 +159,7 @@ MVSPLAT = WeightLayout(
 
 DEPTHSPLAT = WeightLayout(
     name="DepthSplat",
+    plugin="mvsplat",
     source="cvg/depthsplat",
     components={
         "encoder": ("mvsplat/depthsplat",),

@@ -4,10 +4,9 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
-Shapes: TypeAlias = Mapping[str, tuple[int, ...]]
-"""Published parameter name to shape."""
+from qgs.checkpoint.tensors import Shapes
 
 
 class LayoutError(ValueError):
@@ -32,7 +31,8 @@ def renamed(name: str, ours: str, theirs: str) -> str | None:
 class WeightLayout:
     """Names and shapes in the state dicts of one published codebase.
 
-    name: what the codebase calls its model. source: where it is published.
+    name: what the codebase calls its model. plugin: that whose components it has.
+    source: where it is published.
     components: slot to the component types that the codebase has; other slots may hold any.
     renames: our to their names of modules and parameters, see `renamed`; the first that applies to
         a name counts.
@@ -45,6 +45,7 @@ class WeightLayout:
     """
 
     name: str
+    plugin: str
     source: str
     components: Mapping[str, tuple[str, ...]]
     renames: Mapping[str, str]

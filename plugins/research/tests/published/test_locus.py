@@ -2,11 +2,10 @@
 
 import pytest
 import yaml
-from qgs_locus.weights import LOCUSGS
+from qgs_research.published.locus import LOCUSGS
+from qgs_research.published.weight_layout import LayoutError, renamed
 
 import qgs
-from qgs.contracts import LayoutError
-from qgs.contracts.weights import renamed
 
 RECIPE = yaml.safe_load("""
 recipe: 1
