@@ -10,7 +10,6 @@ from rich.console import Console
 
 from qgs.data.stream import SampleStream, training_batches
 from qgs.recipe import resolve
-from qgs.train.distributed import StopRequest
 from qgs.train.folder import RunFolder, read_state
 from qgs.train.tracking import TrainingProgress
 from qgs.train.training import Trainer, train
@@ -53,7 +52,7 @@ def trained_run(tmp_path_factory):
 
 def run_calling(after_step, recipe, folder, resume=False):
     """A run that calls `after_step(trainer, stop)` after each step."""
-    stop = StopRequest()
+    stop = []
 
     class Calling(TrainingProgress):
         def show(self, *_):

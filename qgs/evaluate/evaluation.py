@@ -11,7 +11,7 @@ from qgs.data.samples import Sample
 from qgs.domain import REMEDY, Domain, verdict
 from qgs.evaluate.plan import EvaluationPlan, ViewsOf
 from qgs.evaluate.protocol import protocol_of
-from qgs.evaluate.results import TUNED, Evaluation, SceneScore
+from qgs.evaluate.results import Evaluation, SceneScore
 from qgs.evaluate.tuning import tune, tuning_loss
 from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.dispersion import OPACITY_USED
@@ -95,8 +95,8 @@ def _remarks(
         own = recipe.tree["data"] == (model.recipe or {}).get("data")
         remedy = "train for longer" if own else REMEDY
         name, column = next(iter(evaluation.columns.items()))
-        nearest = evaluation.mean(name, "nearest_input")
-        if worse := worse_than_nearest(column, evaluation.mean(name), nearest, remedy):
+        nearest = evaluation.mean(f"nearest_input_{name}")
+        if worse := worse_than_nearest(column, evaluation.mean(f"model_{name}"), nearest, remedy):
             remarks.append(worse)
     return remarks
 
@@ -192,11 +192,9 @@ class _Scorer:
         self.seen.see(sample.inputs.cameras, sample.targets.cameras)
         inputs = sample.inputs.to(self.device)
         targets = sample.targets.to(self.device)
-        tuned: dict[str, float] = {}
         if self.tuning_loss:
             settings = self.recipe.evaluation
-            gaussians, record = tune(self.model, inputs, self.tuning_loss, settings)
-            tuned = {f"tuning_{key}": record[key] for key in TUNED}
+            gaussians, _ = tune(self.model, inputs, self.tuning_loss, settings)
         else:
             gaussians = self.model(inputs).gaussians
         self.gaussians = max(self.gaussians, gaussians.count)
@@ -213,7 +211,6 @@ class _Scorer:
         for name, baseline in BASELINES.items():
             values |= self.measures(name, MetricInput(baseline(inputs, targets.cameras), targets))
         values["gaussians_used"] = float((gaussians.opacities > OPACITY_USED).sum())
-        values |= tuned
         # One NaN would spoil every mean over scenes.
         if broken := [name for name, value in values.items() if not math.isfinite(value)]:
             raise ValueError(f"{', '.join(broken)} is not finite")

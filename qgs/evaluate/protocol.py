@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from qgs.contracts import Metric, SceneSource, SceneSourceConfig
+from qgs.contracts import Metric, SceneSource
 from qgs.contracts.schedule import END, at_step
 from qgs.data.view_samplers import Span
 from qgs.evaluate.plan import EvaluationIndex
@@ -53,9 +53,7 @@ def protocol_of(
     Scheduled options of the renderer are those after `step` steps.
     """
     evaluation = recipe.evaluation
-    source = recipe.parts["data",].config
-    assert isinstance(source, SceneSourceConfig)
-    data, views = _data_and_views(recipe, source, index, scenes)
+    data, views = _data_and_views(recipe, index, scenes)
     tuning = None
     if evaluation.tuning_steps:
         tuning = {
@@ -82,7 +80,7 @@ def protocol_of(
     renderer = recipe.parts["model", "renderer"]
     content = {
         "format": 1,
-        "image_size": list(source.image_size),
+        "image_size": list(recipe.tree["data"]["image_size"]),
         "crop": "centre crop to the aspect ratio of image_size, then Lanczos resize",
         "data": data,
         "poses": poses,
@@ -97,10 +95,7 @@ def protocol_of(
 
 
 def _data_and_views(
-    recipe: Recipe,
-    config: SceneSourceConfig,
-    index: EvaluationIndex | None,
-    scenes: Sequence[str],
+    recipe: Recipe, index: EvaluationIndex | None, scenes: Sequence[str]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return what decides the photos, and which of them are compared.
 
@@ -115,10 +110,10 @@ def _data_and_views(
     if index is not None:
         # An index names scenes and frames itself, whatever the split.
         left_out |= source.split_options
-        data = config.model_dump(mode="json", exclude=left_out, exclude_defaults=True)
+        data = part.config.model_dump(mode="json", exclude=left_out, exclude_defaults=True)
         entries = {name: entry.model_dump() if entry else None for name, entry in index.items()}
         return data, {"index": entries}
-    data = {"type": part.type, **config.model_dump(mode="json", exclude=left_out)}
+    data = {"type": part.type, **part.config.model_dump(mode="json", exclude=left_out)}
     drawn = recipe.views.model_dump(mode="json", include={"inputs", "targets", "gap"})
     drawn |= recipe.evaluation.model_dump(include={"scenes", "samples", "seed"})
     drawn["names"] = list(scenes)

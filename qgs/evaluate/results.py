@@ -6,9 +6,9 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import fmean, median, pvariance
 from typing import Any
 
-import numpy as np
 from rich.box import MARKDOWN
 from rich.console import Console
 
@@ -23,22 +23,14 @@ from qgs.terminal import print_lines, print_table
 from qgs.wording import counted, listed
 
 METHODS = ("model", *BASELINES)
-TUNED = ("loss_before", "loss_after")
-"""Of the record of a tuning, what is a value of its scene, with `tuning_` before it."""
-
-
-def spread(values: Sequence[float]) -> dict[str, float]:
-    """Return mean, variance (over the population) and median of a value over scenes."""
-    found = {"mean": np.mean(values), "variance": np.var(values), "median": np.median(values)}
-    return {name: float(value) for name, value in found.items()}
 
 
 @dataclass(frozen=True)
 class SceneScore:
     """One scene. views: input and target frames of each of its samples; names: as in `Sample`.
 
-    values: means over the samples of METHOD_METRIC, "gaussians_used", of tuned scenes TUNED; less
-    those whose metric needs what the method or the scene lacks.
+    values: means over the samples of METHOD_METRIC and "gaussians_used", less those whose metric
+    needs what the method or the scene lacks.
     """
 
     scene: str
@@ -72,35 +64,24 @@ class Evaluation:
     step: int | None
     remarks: Sequence[str] = ()
 
-    def mean(self, metric: str, method: str = "model") -> float | None:
-        """Return the mean over scenes of one of `columns`; None if none has this value."""
-        return self._mean(f"{method}_{metric}")
+    def mean(self, value: str) -> float | None:
+        """Return the mean over scenes of one of their values; None if none has it."""
+        found = self._values(value)
+        return sum(found) / len(found) if found else None
 
     def means(self, method: str = "model") -> dict[str, float | None]:
         """Return the `mean` of all `columns`."""
-        return {name: self.mean(name, method) for name in self.columns}
-
-    @property
-    def statement(self) -> str:
-        """The model's first value, usually PSNR, and over how many scenes, in one line."""
-        line = f"over {self._judged} scene{'s' * (self._wanted != 1)}"
-        for name, value in self.means().items():
-            if value is not None:
-                column = self.columns[name]
-                line = f"{column.heading} {column.shown(value)} {line}"
-                break
-        return f"{line}; missing: {listed(self.missing)}" if self.missing else line
+        return {name: self.mean(f"{method}_{name}") for name in self.columns}
 
     def summary(self) -> dict[str, Any]:
         """Return everything but the scores of single scenes, as plain values for JSON.
 
-        over_scenes: of each value of the model the mean, variance and median over scenes.
+        over_scenes: of each value of the model the mean, variance (of the population) and median.
         """
         values = {name: self._values(f"model_{name}") for name in self.columns}
         return {
             "protocol": {"name": self.protocol.name, "sha256": self.protocol.sha256},
             "step": self.step,
-            "statement": self.statement,
             "scenes": len(self.scores),
             "scenes_in_protocol": self._wanted,
             "samples": sum(len(score.views) for score in self.scores),
@@ -109,10 +90,10 @@ class Evaluation:
             "columns": {name: asdict(column) for name, column in self.columns.items()},
             **{method: self.means(method) for method in METHODS},
             "incomplete": self.incomplete,
-            "over_scenes": {n: {**spread(v), "scenes": len(v)} for n, v in values.items() if v},
+            "over_scenes": {name: _spread(found) for name, found in values.items() if found},
             "gaussians": self.gaussians,
-            "gaussians_used": {"opacity_above": OPACITY_USED, "mean": self._mean("gaussians_used")},
-            "tuning": self._tuning(),
+            "gaussians_used": {"opacity_above": OPACITY_USED, "mean": self.mean("gaussians_used")},
+            "tuning": self.protocol.content["tuning"],
             "remarks": self.remarks,
         }
 
@@ -145,31 +126,17 @@ class Evaluation:
     def _values(self, name: str) -> list[float]:
         return [score.values[name] for score in self.scores if name in score.values]
 
-    def _mean(self, name: str) -> float | None:
-        values = self._values(name)
-        return sum(values) / len(values) if values else None
-
     @property
     def _wanted(self) -> int:
         return len(self.scores) + len(self.missing)
 
-    @property
-    def _judged(self) -> str:
-        judged = len(self.scores)
-        return f"{judged} of {self._wanted}" if self.missing else str(judged)
-
-    def _tuning(self) -> dict[str, Any] | None:
-        settings = self.protocol.content["tuning"]
-        if settings is None:
-            return None
-        return {**settings, **{key: self._mean(f"tuning_{key}") for key in TUNED}}
-
     def _rows(self) -> list[list[str]]:
-        """Return the means of all methods."""
+        """Return the means of all methods, and over how many scenes."""
+        judged = f"{len(self.scores)} of {self._wanted}" if self.missing else str(self._wanted)
         rows = [["method", *(column.title for column in self.columns.values()), "scenes"]]
         for method in METHODS:
             cells = [self.columns[name].shown(v) for name, v in self.means(method).items()]
-            rows.append([method.replace("_", " "), *cells, self._judged])
+            rows.append([method.replace("_", " "), *cells, judged])
         return rows
 
     def _csv(self) -> str:
@@ -192,7 +159,6 @@ class Evaluation:
 
     def _notes(self) -> Iterator[str]:
         """Yield what table.md says below the table, a line each."""
-        yield self.statement
         content = self.protocol.content
         height, width = content["image_size"]
         counts = sorted({len(inputs) for score in self.scores for inputs, _ in score.views})
@@ -213,16 +179,25 @@ class Evaluation:
             count = len(self._values(f"model_{name}"))
             over = f"over {count} of {self._wanted} scenes" if count else "empty"
             yield f"{self.columns[name].heading} is {over}: {why}"
-        used = self._mean("gaussians_used")
+        used = self.mean("gaussians_used")
         yield (
             f"{self.gaussians:,} Gaussians a scene, {used:,.0f} of them used (opacity above "
             f"{OPACITY_USED:.4f}; mean over scenes)"
         )
-        if tuning := self._tuning():
-            yield "{what} tuned on the input views: {steps} steps of Adam at {rate}".format(
-                **tuning
+        if tuning := content["tuning"]:
+            yield "{what} tuned on the input views: {steps} steps of Adam at {rate}".format_map(
+                tuning
             )
         yield from self.remarks
+
+
+def _spread(values: Sequence[float]) -> dict[str, float]:
+    return {
+        "mean": fmean(values),
+        "variance": pvariance(values),
+        "median": median(values),
+        "scenes": len(values),
+    }
 
 
 def as_json(value: Mapping[str, Any]) -> str:

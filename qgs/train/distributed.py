@@ -1,17 +1,16 @@
-"""Devices, processes and random states of a run; requests to stop."""
+"""Devices and processes of a run; requests to stop."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import timedelta
 from importlib.util import find_spec
 from types import FrameType
-from typing import Any
+from typing import TypeAlias
 
 import torch
 from accelerate import Accelerator
@@ -19,9 +18,7 @@ from accelerate.utils import (
     DistributedDataParallelKwargs,
     DistributedType,
     InitProcessGroupKwargs,
-    gather_object,
 )
-from torch import Tensor
 
 TIMEOUT = timedelta(hours=24)
 """How long processes wait while one evaluates or saves. NCCL's default of 10 minutes would end such
@@ -46,44 +43,6 @@ def make_accelerator(device: str, unread: bool = False) -> Accelerator:
         kind = accelerator.distributed_type.value
         raise ValueError(f"training runs in one process or under DDP: launch it without {kind}")
     return accelerator
-
-
-def mean(accelerator: Accelerator, value: Tensor) -> Tensor:
-    """Return the mean of `value` over processes, which must all call this."""
-    reduced: Any = accelerator.reduce(value, "mean")
-    return reduced
-
-
-def true_anywhere(accelerator: Accelerator, flag: object) -> bool:
-    """Return whether `flag` is true in any process; all must call this, and all get one answer."""
-    own = torch.tensor(float(bool(flag)), device=accelerator.device)
-    return bool(mean(accelerator, own))
-
-
-@dataclass
-class RandomStates:
-    """Torch's generators, of every process by its rank; components draw from no others."""
-
-    accelerator: Accelerator
-
-    def state(self) -> dict[str, Any]:
-        """Return the states; all processes must call this."""
-        own = {"torch": torch.get_rng_state()}
-        if self.accelerator.device.type == "cuda":
-            own["cuda"] = torch.cuda.get_rng_state(self.accelerator.device)
-        ranks = enumerate(gather_object([own]))
-        return {f"{rank}/{key}": value for rank, found in ranks for key, value in found.items()}
-
-    def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore this process's generators; a rank that `state` lacks keeps its own."""
-        rank = self.accelerator.process_index
-        # A run may go on in more processes than it was saved by.
-        if rank and f"{rank}/torch" not in state:
-            return
-        torch.set_rng_state(state[f"{rank}/torch"])
-        on_device = state.get(f"{rank}/cuda")
-        if self.accelerator.device.type == "cuda" and on_device is not None:
-            torch.cuda.set_rng_state(on_device, self.accelerator.device)
 
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -116,14 +75,8 @@ def choose_device(wanted: str = "auto", say: Callable[[str], None] = print) -> s
     return "cuda" if available else "cpu"
 
 
-@dataclass
-class StopRequest:
-    """A request to stop training, true once there is one. signal: the first that asked."""
-
-    signal: signal.Signals | None = None
-
-    def __bool__(self) -> bool:
-        return self.signal is not None
+StopRequest: TypeAlias = list[signal.Signals]
+"""The signals that asked to stop; empty, thus false, until one does."""
 
 
 @contextmanager
@@ -132,20 +85,19 @@ def stop_requests(quiet: bool = False) -> Iterator[StopRequest]:
 
     Does nothing outside the main thread, where Python cannot handle signals.
     """
-    request = StopRequest()
+    request: StopRequest = []
     if threading.current_thread() is not threading.main_thread():
         yield request
         return
 
     def ask(number: int, frame: FrameType | None) -> None:
+        asked = signal.Signals(number)
+        message = f"\n{asked.name}: finishing the step, then saving (Ctrl-\\ ends at once)\n"
         # Launchers and terminals each send the signal: repeats mean nothing new.
-        if request:
-            return
-        request.signal = signal.Signals(number)
-        message = f"{request.signal.name}: finishing the step, then saving (Ctrl-\\ ends at once)"
-        # Not print, which is not reentrant: a handler may interrupt it.
-        if not quiet:
-            os.write(2, f"\n{message}\n".encode())
+        if not (quiet or request):
+            # Not print, which is not reentrant: a handler may interrupt it.
+            os.write(2, message.encode())
+        request.append(asked)
 
     # Restored afterwards: a notebook goes on with handlers of its own.
     before = {s: signal.signal(s, ask) for s in (signal.SIGINT, signal.SIGTERM)}

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import torch
-from accelerate import Accelerator
+from accelerate import PartialState
+from accelerate.utils import wait_for_everyone
 from filelock import FileLock, Timeout
 from torch import Tensor
 
@@ -158,32 +159,33 @@ class Saver:
     Each file appears whole or not at all. All processes must call each method together.
     """
 
-    accelerator: Accelerator
     folder: RunFolder
     model: QueryGaussianModel
     stateful: dict[str, Any] = field(default_factory=dict)
 
-    def save(self, step: int, state_only: bool = False) -> None:
-        """Save the run after `step` optimiser steps; `state_only` leaves the checkpoints."""
+    def save(self, step: int, good: tuple[int, Mapping[str, Tensor]] | None = None) -> None:
+        """Save the run after `step` optimiser steps.
+
+        good: steps and weights of the checkpoint, if not the present ones; averages then stay.
+        """
         states: dict[str, State] = {"weights": unique_tensors(self.model)}
         states |= {name: one.state() for name, one in self.stateful.items()}
-        if self.accelerator.is_main_process:
-            if not state_only:
-                # A kill between the files must not leave a checkpoint that cannot go on.
-                if not self.folder.state.exists():
-                    self._write_state(states)
-                self._write_checkpoint(self.folder.checkpoint, step, states["weights"])
-                if "ema" in states:
-                    self._write_checkpoint(self.folder.checkpoint_ema, step, states["ema"])
+        if PartialState().is_main_process:
+            # A kill between the files must not leave a checkpoint that cannot go on.
+            if not self.folder.state.exists():
+                self._write_state(states)
+            self._write_checkpoint(self.folder.checkpoint, *(good or (step, states["weights"])))
+            if "ema" in states and not good:
+                self._write_checkpoint(self.folder.checkpoint_ema, step, states["ema"])
             # Last: complete by itself, and never ahead of the weights.
             self._write_state(states)
-        self.accelerator.wait_for_everyone()
+        wait_for_everyone()
 
     def save_checkpoint(self, step: int, weights: Mapping[str, Tensor]) -> None:
         """Save a checkpoint of other weights than the present ones."""
-        if self.accelerator.is_main_process:
+        if PartialState().is_main_process:
             self._write_checkpoint(self.folder.checkpoint, step, weights)
-        self.accelerator.wait_for_everyone()
+        wait_for_everyone()
 
     def restore(self, states: Mapping[str, State]) -> None:
         """Bring the weights and all that is stateful back; raises CheckpointError."""
@@ -248,8 +250,6 @@ def saved_state(folder: RunFolder, recipe: Recipe) -> SavedState | None:
     Raises OtherRunError unless `recipe` equals the run's outside of FREE, CheckpointError when the
     state cannot be read.
     """
-    if folder.is_new:
-        return None
     # A run that was killed before its first save has a recipe and no state: it starts again.
     saved = read_state(folder.state) if folder.state.is_file() else None
     run = saved.recipe if saved else resolve(folder.recipe)

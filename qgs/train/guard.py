@@ -6,7 +6,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from typing import Any, NoReturn
 
-from accelerate import Accelerator
+from accelerate import PartialState
 from accelerate.utils import gather_object
 from torch import Tensor, nn
 
@@ -80,12 +80,12 @@ class Guard:
     """Stops a run that is dead or not finite, and sees that good weights are kept.
 
     All processes must call each of its methods together; `step` counts finished optimiser steps.
+    What saves raises CollapseError for weights that are not finite.
 
     training_pass: not wrapped by accelerate. repeat: computes the gradients of a step again.
     skipped: the latest steps in a row that were not finite.
     """
 
-    accelerator: Accelerator
     training_pass: TrainingPass
     saver: Saver
     config: TrainingConfig
@@ -94,7 +94,7 @@ class Guard:
 
     def __post_init__(self) -> None:
         self.signs = SignsOfLife()
-        keep = self.accelerator.is_main_process
+        keep = PartialState().is_main_process
         self.good = GoodWeights(self.training_pass.model, keep)
 
     def state(self) -> dict[str, Any]:
@@ -120,9 +120,9 @@ class Guard:
             _log.warning("step %d is skipped: %s", step + 1, found)
             return
         # A model that was dying gave this NaN: going on from here would not help.
-        if self.signs.dead or self._broken_weights():
-            self._collapse(step + 1, found, NONFINITE_CAUSES)
-        self.saver.save(step)
+        if self.signs.dead:
+            self._collapse(step + 1, found)
+        self.save(step)
         remedy = "; continue without it by `--resume --set training.on_nonfinite=skip`"
         if skips:
             remedy = f", after {MAX_SKIPPED} steps in a row were skipped; continue with --resume"
@@ -142,34 +142,25 @@ class Guard:
         self.good.observe(numbers)
         window = self.config.collapse_window
         if self.signs.dead >= window:
-            self._collapse(step, f"for {self._dead_steps}", COLLAPSE_CAUSES)
+            self._collapse(step)
         if not self.signs.dead and self.good.due(step, window):
             self._refuse_broken_weights(step)
             self.good.refresh(step)
 
-    def save(self, step: int) -> None:
-        """Save the run. Raises CollapseError for weights that are not finite."""
-        self._refuse_broken_weights(step)
-        self.saver.save(step)
+    def save(self, step: int, ends: bool = False) -> None:
+        """Save the run; a dead model's checkpoint is the last good one.
 
-    def save_to_go_on(self, step: int) -> None:
-        """Save the run as one that may go on; a dead model's checkpoint is the last good one."""
-        if not self._is_dead(step):
-            self.save(step)
-            return
-        self.saver.save_checkpoint(*self.good.last)
-        # The state keeps the dead weights: a resumed run must equal an uninterrupted one.
-        self.saver.save(step, state_only=True)
-
-    def finish(self, step: int, stopped: bool) -> None:
-        """Save a run whose budget is used or that was stopped. Raises CollapseError."""
-        symptom = f"for the last {self._dead_steps}"
-        if self._is_dead(step):
-            if not stopped:
-                self._collapse(step, symptom, COLLAPSE_CAUSES)
-        elif self.signs.dead:
-            _log.warning("training ended in doubt: %s; the weights are saved as they are", symptom)
-        self.save_to_go_on(step)
+        ends: the budget is used. Raises CollapseError for a dead model then.
+        """
+        # A run shorter than a window is dead when all of its steps were.
+        if self.signs.dead < min(self.config.collapse_window, step):
+            self._refuse_broken_weights(step)
+            self.saver.save(step)
+        elif ends:
+            self._collapse(step)
+        else:
+            # The state keeps the dead weights: a resumed run must equal an uninterrupted one.
+            self.saver.save(step, self.good.last)
 
     @contextmanager
     def memory_explained(self, step: int, saves: bool = False) -> Iterator[None]:
@@ -181,9 +172,9 @@ class Guard:
                 raise
             # Saving takes memory too; the files of the last save are whole in any case. With
             # several processes the others would wait for this one in vain.
-            if saves and step and self.accelerator.num_processes == 1:
+            if saves and step and PartialState().num_processes == 1:
                 with suppress(Exception):
-                    self.save_to_go_on(step)
+                    self.save(step)
             raise OutOfMemoryError(
                 f"out of memory in step {step + 1}: {str(error).splitlines()[0][:300]}. "
                 "What was saved continues with --resume and a higher training.accumulate, more "
@@ -192,23 +183,14 @@ class Guard:
                 "model.queries.count or model.head.gaussians_per_query."
             ) from error
 
-    @property
-    def _dead_steps(self) -> str:
-        return f"{self.signs.dead} steps {self.signs.symptom}"
-
-    def _is_dead(self, steps: int) -> bool:
-        # A run shorter than a window is dead when all of its steps were.
-        return self.signs.dead >= min(self.config.collapse_window, steps)
-
-    def _broken_weights(self) -> str:
-        names = nonfinite(unique_tensors(self.saver.model).items())
-        return f"weights are not finite: {listed(names)}" if names else ""
-
     def _refuse_broken_weights(self, step: int) -> None:
-        if problem := self._broken_weights():
-            self._collapse(step, problem, NONFINITE_CAUSES)
+        if names := nonfinite(unique_tensors(self.saver.model).items()):
+            self._collapse(step, f"weights are not finite: {listed(names)}")
 
-    def _collapse(self, step: int, problem: str, causes: str) -> NoReturn:
+    def _collapse(self, step: int, problem: str = "") -> NoReturn:
+        """Keep good weights and raise. problem: what is not finite; dead steps by default."""
+        causes = NONFINITE_CAUSES if problem else COLLAPSE_CAUSES
+        problem = problem or f"for the last {self.signs.dead} steps {self.signs.symptom}"
         good, weights = self.good.last
         self.saver.save_checkpoint(good, weights)
         raise CollapseError(

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from accelerate import Accelerator
+from accelerate import PartialState
+from accelerate.utils import wait_for_everyone
 
 from qgs.contracts.schedule import follow
 from qgs.data.samples import Sample
@@ -27,7 +28,7 @@ from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
 from qgs.train.distributed import StopRequest
 from qgs.train.folder import EVALUATIONS, RunFolder
-from qgs.train.parameters import MovingAverage
+from qgs.train.state import MovingAverage
 from qgs.train.tracking import Trackers
 
 SAMPLES = 4
@@ -48,7 +49,6 @@ class PeriodicEvaluation:
     the model's mode. One process evaluates and the others wait.
     """
 
-    accelerator: Accelerator
     recipe: Recipe
     model: QueryGaussianModel
     average: MovingAverage | None
@@ -65,11 +65,11 @@ class PeriodicEvaluation:
         stop: where it is requested, the evaluation ends between two scenes. A failing evaluation is
         logged as a warning and does not end the training.
         """
-        device = self.accelerator.device
+        used = [torch.cuda.current_device()] if torch.cuda.is_initialized() else []
         try:
             # An evaluation must not change what the training draws afterwards.
-            with torch.random.fork_rng([device] if device.type == "cuda" else []):
-                if self.accelerator.is_main_process:
+            with torch.random.fork_rng(used):
+                if PartialState().is_main_process:
                     self._evaluate(step, stop)
         except _StoppedError:
             _log.warning("the evaluation at step %d is given up: training was asked to stop", step)
@@ -78,7 +78,7 @@ class PeriodicEvaluation:
             _log.warning("the evaluation at step %d failed: %s: %s", step, kind, error)
             _log.debug("where it failed", exc_info=True)
         # The others wait here, see TIMEOUT in `distributed`.
-        self.accelerator.wait_for_everyone()
+        wait_for_everyone()
 
     def _evaluate(self, step: int, stop: StopRequest) -> None:
         def between_scenes(done: int, wanted: int) -> None:

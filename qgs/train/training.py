@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from accelerate.utils import set_seed
+from accelerate.utils import gather_object, set_seed
 from rich.console import Console
 
 from qgs.contracts import SceneSource
@@ -27,21 +27,19 @@ from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
 from qgs.recipe.checks import keys_are_read
 from qgs.recipe.recipe import annotated, flat
-from qgs.train.counters import Counters
-from qgs.train.distributed import (
-    RandomStates,
-    StopRequest,
-    choose_device,
-    make_accelerator,
-    stop_requests,
-    true_anywhere,
-)
+from qgs.train.distributed import StopRequest, choose_device, make_accelerator, stop_requests
 from qgs.train.folder import RunFolder, SavedState, Saver, saved_state
 from qgs.train.guard import Guard
 from qgs.train.initial import initialise
 from qgs.train.nonfinite import not_finite
-from qgs.train.parameters import MovingAverage, OptimizerState, make_optimizer
 from qgs.train.periodic import PeriodicEvaluation
+from qgs.train.state import (
+    Counters,
+    MovingAverage,
+    OptimizerState,
+    RandomStates,
+    make_optimizer,
+)
 from qgs.train.tracking import Trackers, TrainingProgress
 from qgs.train.training_pass import TrainingPass, compute_gradients
 
@@ -89,8 +87,7 @@ def train(
     holds the last good weights), NonFiniteError for a step that gave NaN, and what the data source
     raises; the run is then saved where it stood, and a note of the error says so.
     """
-    if not resume:
-        RunFolder(run).refuse_other(resume)  # before the data is opened, which may take minutes
+    RunFolder(run).refuse_other(resume)  # before the data is opened, which may take minutes
     terminal = console or Console(stderr=True)
     chosen = choose_device(device, terminal.print)
     # Before the model is built: its initial weights are part of the recipe.
@@ -140,9 +137,6 @@ class Trainer:
             resources.callback(batches.close)
             self.feed = Feed(batches, self.config.accumulate)
             self.feed.fetch()
-            # Where one process fails, all raise, and none waits for it.
-            if error := self._feed_error():
-                raise error
             self._resources = resources.pop_all()
 
     def close(self) -> None:
@@ -151,10 +145,9 @@ class Trainer:
 
     def _saved(self) -> SavedState | None:
         """Lock the folder of a run that is continued; its saved state, None to start at step 0."""
-        if not self._resumes:
+        if not self._resumes or self.folder.is_new:
             return None
-        self.folder.refuse_other(resume=True)
-        if self.accelerator.is_main_process and not self.folder.is_new:
+        if self.accelerator.is_main_process:
             self.folder.take()
         self.accelerator.wait_for_everyone()
         return saved_state(self.folder, self.recipe)
@@ -192,13 +185,11 @@ class Trainer:
             self.model.trained_on = trained_domain(
                 source, recipe.views, recipe.seed, sampler, self.config.steps
             )
-        self.counters = Counters(self.accelerator, self.config, scenes_fingerprint(source))
-        self.saver = Saver(self.accelerator, self.folder, self.model)
-        self.guard = Guard(
-            self.accelerator, self.training_pass, self.saver, self.config, self._gradients
-        )
+        self.counters = Counters(self.config, scenes_fingerprint(source))
+        self.saver = Saver(self.folder, self.model)
+        self.guard = Guard(self.training_pass, self.saver, self.config, self._gradients)
         self.evaluations = PeriodicEvaluation(
-            self.accelerator, recipe, self.model, self.average, self.folder, self.trackers
+            recipe, self.model, self.average, self.folder, self.trackers
         )
         # Beside the weights, all that continues the run.
         stateful = {
@@ -211,7 +202,7 @@ class Trainer:
         if self.average:
             stateful["ema"] = self.average
         # Last: restoring something may draw random numbers.
-        stateful["random"] = RandomStates(self.accelerator)
+        stateful["random"] = RandomStates()
         self.saver.stateful = stateful
 
     def _open_data(self, source: SceneSource) -> Generator[Batch, None, None]:
@@ -223,7 +214,7 @@ class Trainer:
             self.config.scenes_per_batch(processes),
             self.recipe.seed,
             # A step that accumulates takes several batches.
-            start=self.counters.samples * self.config.accumulate // self.config.batch_size,
+            start=self.counters.step * self.config.accumulate,
             rank=self.accelerator.process_index,
             processes=processes,
             workers=self.config.workers,
@@ -242,21 +233,13 @@ class Trainer:
         counters = self.counters
         stopped_by = None
         while counters.used < 1 and not stopped_by:
+            self._refuse_missing_batches()
             self._one_step(progress, stop)
-            stopped_by = self._stopped_by(stop)
-            if not stopped_by:
-                self._refuse_missing_batches()
-        if counters.step == self.resumed_at:
-            # A kill may have come between the state and the checkpoint of the last step.
-            if not self.folder.checkpoint.exists():
-                self.guard.save(counters.step)
-        else:
-            # Saved before the last evaluation, which may take long or fail.
-            self.guard.finish(counters.step, stopped=bool(stopped_by))
-            judged = counters.every(self.config.evaluate_every)
-            if self.average and not stopped_by and not judged:
-                self._evaluate(stop)
-                stopped_by = self._stopped_by(stop)
+            # A signal may have reached one process alone.
+            stopped_by = next((asked.name for asked in gather_object(stop)), None)
+        # A kill may have come between the state and the checkpoint of the last step.
+        if counters.step != self.resumed_at or not self.folder.checkpoint.exists():
+            self.guard.save(counters.step, ends=not stopped_by)
         return TrainingResult(
             model=self.model.eval(),
             folder=self.folder,
@@ -289,7 +272,10 @@ class Trainer:
         self._report(numbers, progress)
         if not symptom:
             self.guard.watch(counters.step, numbers)
-        evaluates = counters.every(self.config.evaluate_every)
+        # Averages are judged at the end in any case: they are what a recipe with them is for.
+        evaluates = counters.every(self.config.evaluate_every) or (
+            self.average is not None and counters.used >= 1
+        )
         saves = evaluates or counters.every(self.config.save_every)
         # A model that may be dying must not be saved as a good one.
         if saves and not self.guard.signs.dead:
@@ -315,8 +301,7 @@ class Trainer:
     def _open_folder(self) -> None:
         """Make the folder, write the recipe, and drop records of steps that were lost."""
         if self.accelerator.is_main_process:
-            if not self._resumes:
-                self.folder.refuse_other(resume=False)
+            self.folder.refuse_other(self._resumes)
             self.folder.take()
             write_text(self.folder.recipe, annotated(self.recipe) + "\n")
             self.folder.cut_records(self.counters.step)
@@ -339,22 +324,14 @@ class Trainer:
         # Not counted. Shifted, not reset: the time since the last step still counts.
         self.counters.last_tick += time.perf_counter() - started
 
-    def _stopped_by(self, stop: StopRequest) -> str | None:
-        """Return the signal's name when any process was asked to stop."""
-        if not true_anywhere(self.accelerator, stop):
-            return None
-        return stop.signal.name if stop.signal else "SIGTERM"
-
-    def _feed_error(self) -> Exception | None:
-        """Return why a process has no next batches, in all of them, whichever it is."""
-        found = true_anywhere(self.accelerator, self.feed.error)
-        return self.feed.error or SampleError(ELSEWHERE) if found else None
-
     def _refuse_missing_batches(self) -> None:
-        """Save the run and raise where a process has no next batches."""
+        """Save the run and raise, in all processes, where one has no next batches."""
+        own = self.feed.error
+        if not any(gather_object([own is not None])):
+            return
+        error = own or SampleError(ELSEWHERE)
         step = self.counters.step
-        error = self._feed_error()
-        if error and self.counters.used < 1:
-            self.guard.save_to_go_on(step)
+        if step > (self.resumed_at or 0):
+            self.guard.save(step)
             error.add_note(f"The run is saved at step {step}; continue with --resume")
-            raise error
+        raise error

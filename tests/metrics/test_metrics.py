@@ -12,7 +12,6 @@ from torch.testing import assert_close
 
 from qgs.contracts import Column, MetricInput
 from qgs.data.samples import stack_views
-from qgs.evaluate.results import spread
 from qgs.metrics.baselines import mean_colour, nearest_input, worse_than_nearest
 from qgs.metrics.dispersion import Dispersion, token_dispersion
 from qgs.metrics.images import psnr, ssim
@@ -114,7 +113,3 @@ def test_distances_to_the_centroid_of_each_token():
         found = Dispersion(Dispersion.Config())(given)
         assert float(found["mean"].mean()) == pytest.approx(distances.mean())
         assert float(found["median"]) == pytest.approx(np.median(distances))
-
-
-def test_the_spread_over_scenes():
-    assert spread([1.0, 2.0, 4.0, 9.0]) == {"mean": 4.0, "variance": 9.5, "median": 3.0}

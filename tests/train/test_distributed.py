@@ -30,7 +30,7 @@ def train_in_two_processes(*arguments):
 
 def test_two_processes_continue_what_one_began(tmp_path):
     def ask(trainer, stop):
-        stop.signal = signal.SIGINT
+        stop.append(signal.SIGINT)
 
     recipe = tiny("locus", "training.ema=0.9", PARTS)
     two = tmp_path / "two"

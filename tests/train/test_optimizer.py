@@ -11,7 +11,7 @@ from training_runs import assert_equal_runs, parts_of, run, tiny
 from qgs.contracts import TrainingConfig
 from qgs.recipe import resolve
 from qgs.tokengs import OneCycleAdamW
-from qgs.train.parameters import MovingAverage, make_optimizer
+from qgs.train.state import MovingAverage, make_optimizer
 
 
 def adamw(steps, warmup, seconds=None, **options):

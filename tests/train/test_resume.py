@@ -14,7 +14,6 @@ from training_runs import (
     TRAINED,
     TWO,
     assert_equal_runs,
-    parts_of,
     read_jsonl,
     run,
     run_calling,
@@ -62,7 +61,7 @@ def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):
         loss = trainer.training_pass.losses["photometric"]
         seen.append((trainer.model.renderer.config.dilation, loss.config.ssim_weight))
         if trainer.counters.step == 2:
-            stop.signal = signal.SIGTERM
+            stop.append(signal.SIGTERM)
 
     stopped = run_calling(note, recipe, parts)
     assert (stopped.steps, stopped.stopped_by) == (2, "SIGTERM")
@@ -121,8 +120,6 @@ def test_a_longer_budget_goes_on_without_damaged_and_lost_records(copied, caplog
     last = resumed(in_halves, *longer, "training.accumulate=2").folder.history()[-1]
     for name in ("lr", "loss", "gradient"):
         assert last[name] == pytest.approx(history[-1][name], rel=1e-4)
-    samples = [parts_of(folder)["counters"]["samples"] for folder in (copied, in_halves)]
-    assert samples == [8, 8]
 
 
 def test_the_clock_goes_on(copied):

@@ -76,7 +76,7 @@ def next_commands(
     commands write goes there, since it is new. options: those of the report for its photos.
     """
     first, column = next(iter(models[0].evaluation.columns.items()))
-    scores = [model.evaluation.mean(first) for model in models]
+    scores = [model.evaluation.mean(f"model_{first}") for model in models]
     # of equal ones the first
     best = names[scores.index(column.best(scores))]
     scenes = [*dict.fromkeys(score.scene for score in models[0].evaluation.scores)]

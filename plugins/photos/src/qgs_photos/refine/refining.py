@@ -124,7 +124,7 @@ def refine(
             steps=run.step,
             seconds=run.spent,
             cameras=run.adjustments.every_camera(views.cameras),
-            stopped_by=stop.signal.name if stop.signal else None,
+            stopped_by=stop[0].name if stop else None,
         )
 
 

@@ -16,7 +16,7 @@ from torch import nn
 from qgs.geometry.precision import Precision, autocast
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
-from qgs.train.parameters import make_optimizer
+from qgs.train.state import make_optimizer
 from qgs.train.training_pass import TrainingPass
 from qgs.types import Cameras, Gaussians, Views
 

@@ -115,7 +115,7 @@ def train_missing(
             process.terminate()
         for process in processes.values():
             process.wait()
-    return failed, stop.signal
+    return failed, next(iter(stop), None)
 
 
 def started(plan: Plan, run: Run, threads: int, device: str, gpu: str) -> Popen[bytes]:
@@ -193,7 +193,8 @@ def _train_and_evaluate(folder: Path, run: Run, device: str, evaluations: Sequen
         if not run.evaluated(name):
             evaluation = evaluate(result.model, recipe_of(name), result.steps)
             evaluation.write(run.evaluation(name))
-            print(f"{name or 'evaluation'}: {evaluation.statement}")
+            console.print(name or "evaluation")
+            evaluation.show(console)
 
 
 if __name__ == "__main__":
