@@ -17,6 +17,7 @@ from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.dispersion import OPACITY_USED
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
+from qgs.types import Rendering
 from qgs.wording import one_line
 
 SECTIONS = ("plugins", "data", "views", "evaluation", "metrics")
@@ -30,12 +31,14 @@ def evaluate(
     observe: Callable[[int, int], None] | None = None,
     views_of: ViewsOf | None = None,
     sampler: ViewSampler | None = None,
+    show: Callable[[Sample, Rendering], None] | None = None,
 ) -> Evaluation:
     """Evaluate `model` by the metrics of `recipe` on its test views, where the model is.
 
     A scene that fails is named in the result with the reason, and the others go on. Restores the
     model's mode. step: optimiser steps behind the weights. observe: called with (scenes done, all
-    scenes). views_of: see `EvaluationPlan`. sampler: of views, by default the recipe's.
+    scenes). views_of: see `EvaluationPlan`. sampler: of views, by default the recipe's. show:
+    called with each sample and the rendering of its targets.
 
     Raises what opening the data source or the index and `Measures` raise, and ValueError when no
     scene could be scored.
@@ -50,7 +53,7 @@ def evaluate(
         # Depth maps cost as much as photos to decode.
         depths="true_depth" in measures.needed,
     )
-    scorer = _Scorer(model, measures, recipe)
+    scorer = _Scorer(model, measures, recipe, show)
     scores: list[SceneScore] = []
     missing: dict[str, str] = {}
     training = model.training
@@ -162,6 +165,7 @@ class _Scorer:
     model: QueryGaussianModel
     measures: Measures
     recipe: Recipe
+    show: Callable[[Sample, Rendering], None] | None
     seen: Domain = field(default_factory=Domain)
     gaussians: int = 0
 
@@ -199,6 +203,8 @@ class _Scorer:
             gaussians = self.model(inputs).gaussians
         self.gaussians = max(self.gaussians, gaussians.count)
         rendering = self.model.render(gaussians, targets.cameras)
+        if self.show:
+            self.show(sample, rendering)
         shown = MetricInput(
             rendering.rgb,
             targets,

@@ -1,10 +1,7 @@
 """Evaluations and pictures while a model trains."""
 
 import logging
-from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -23,13 +20,13 @@ from qgs.drawing.images import (
     write_png,
 )
 from qgs.evaluate.evaluation import Measures, evaluate
-from qgs.evaluate.plan import EvaluationPlan
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
 from qgs.train.distributed import StopRequest
 from qgs.train.folder import EVALUATIONS, RunFolder
 from qgs.train.state import MovingAverage
 from qgs.train.tracking import Trackers
+from qgs.types import Rendering
 
 SAMPLES = 4
 """Samples that are drawn, the same ones each time."""
@@ -85,6 +82,12 @@ class PeriodicEvaluation:
             if stop:
                 raise _StoppedError
 
+        rows: list[Picture] = []
+
+        def draw(sample: Sample, rendering: Rendering) -> None:
+            if len(rows) < SAMPLES:
+                rows.append(_row(sample, rendering))
+
         judged = {"raw": self.model}
         if self.average:
             follow(self.average.modules(), step)
@@ -92,7 +95,8 @@ class PeriodicEvaluation:
         records: list[dict[str, Any]] = []
         told: dict[str, float] = {}
         for weights, model in judged.items():
-            evaluation = evaluate(model, self.recipe, step, observe=between_scenes)
+            show = draw if model is self.model else None
+            evaluation = evaluate(model, self.recipe, step, observe=between_scenes, show=show)
             scores = {n: score for n, score in evaluation.means().items() if score is not None}
             told |= {f"evaluation/{weights}/{name}": score for name, score in scores.items()}
             records.append(
@@ -106,36 +110,13 @@ class PeriodicEvaluation:
             )
         self.folder.append(*records, name=EVALUATIONS)
         self.trackers.tell(lambda tracker: tracker.log(told, step))
-        picture = self._picture()
+        picture = np.concatenate(rows)
         write_png(picture, self.folder.path / "pictures" / f"step-{step}.png")
         self.trackers.tell(lambda tracker: tracker.picture("evaluation", picture, step))
 
-    @torch.no_grad()
-    def _picture(self) -> Picture:
-        """Draw a row per sample: the first target view, its rendering and its depth."""
-        recipe = self.recipe
-        data = recipe.build_data()
-        sampler = recipe.build_view_sampler()
-        plan = EvaluationPlan(data, recipe.views, recipe.evaluation, sampler)
-        self.model.eval()
-        try:
-            rows = [_row(self.model, sample) for sample in islice(_usable(plan), SAMPLES)]
-        finally:
-            self.model.train()
-        return np.concatenate(rows)
 
-
-def _usable(plan: EvaluationPlan) -> Iterator[Sample]:
-    for name in plan.wanted:
-        # A broken test scene has been reported by the scores; pictures take the next one.
-        with suppress(Exception):
-            yield from plan.samples(name)
-
-
-def _row(model: QueryGaussianModel, sample: Sample) -> Picture:
-    device = next(model.parameters()).device
-    target = sample.targets.select(slice(0, 1)).to(device)
-    rendering = model.render(model(sample.inputs.to(device)).gaussians, target.cameras)
-    depth = depth_picture(rendering.depth[0, 0], *depth_range(rendering.depth))
-    images = (target.images[0, 0], rendering.rgb[0, 0])
-    return side_by_side([*map(rgb_picture, images), depth])
+def _row(sample: Sample, rendering: Rendering) -> Picture:
+    """Draw a sample: the first target view, its rendering and its depth."""
+    depth = rendering.depth[0, 0]
+    images = (sample.targets.images[0, 0], rendering.rgb[0, 0])
+    return side_by_side([*map(rgb_picture, images), depth_picture(depth, *depth_range(depth))])

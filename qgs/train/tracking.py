@@ -8,7 +8,6 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from datetime import timedelta
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
@@ -22,7 +21,6 @@ from qgs.extensions import INSTALL_ALL, installed, load
 from qgs.metrics.images import Psnr
 from qgs.wording import listed
 
-_REFRESH_SECONDS = 0.25
 _LOG_SECONDS = 15.0
 
 _log = logging.getLogger(__name__)
@@ -120,23 +118,17 @@ class TrainingProgress(Progress):
             TextColumn("{task.fields[line]}"),
             TimeRemainingColumn(),
             console=console,
-            auto_refresh=False,
             transient=True,
-            speed_estimate_period=300,
             disable=not console.is_terminal,
         )
         self._task = self.add_task("training", total=1.0, step=0, line="")
         self._next = 0.0
 
     def show(self, step: int, loss: float, psnr: float, used: float) -> None:
-        """Show a step, unless the last one was shown a moment ago. used: part of the budget."""
-        now = time.monotonic()
-        if now < self._next:
-            return
-        self._next = now + (_LOG_SECONDS if self.disable else _REFRESH_SECONDS)
+        """Show a step. used: part of the budget."""
         line = f"loss {loss:.4f}  {Psnr.column.heading} {Psnr.column.shown(psnr):>5}"
-        self.update(self._task, completed=used, step=step, line=line, refresh=not self.disable)
-        if self.disable:
-            if (left := self.tasks[0].time_remaining) is not None:
-                line += f"  {timedelta(seconds=round(left))} left"
-            self.console.print(f"step {step}  {line}", highlight=False)
+        self.update(self._task, completed=used, step=step, line=line)
+        now = time.monotonic()
+        if self.disable and now >= self._next:
+            self._next = now + _LOG_SECONDS
+            self.console.print(f"step {step}  {line}  budget {used:.1%}", highlight=False)

@@ -72,6 +72,7 @@ class TrainingPass(nn.Module):
         """
         parameters = dict(self.losses.named_parameters(prefix="losses"))
         total = targets.images.new_zeros(())
+        background = constant(self.model.renderer.config.background, targets.images)
         count = targets.images.shape[1]
         terms: dict[str, Tensor] = {}
         signs: dict[str, Tensor] = {}
@@ -84,9 +85,9 @@ class TrainingPass(nn.Module):
             for part in self._parts(targets):
                 share = part.images.shape[1] / count
                 rendering = self.render(layer.prediction.gaussians, part.cameras)
-                means, deviation = self._signs(rendering, part)
-                deviations.append(deviation)
-                _add({name: share * mean for name, mean in means.items()}, signs)
+                shown = signs_of(rendering, part, background)
+                deviations.append(shown.pop("deviation"))
+                _add({name: share * mean for name, mean in shown.items()}, signs)
                 found = self._terms(self._of_images, layer.prediction, rendering, part, inputs)
                 layer.add(found, weight * share)
             signs["deviation"] = torch.stack(deviations).amax()
@@ -129,13 +130,6 @@ class TrainingPass(nn.Module):
                     )
                 terms[term] = value
         return terms
-
-    @torch.no_grad()
-    def _signs(self, rendering: Rendering, target: Views) -> tuple[dict[str, Tensor], Tensor]:
-        background = constant(self.model.renderer.config.background, rendering.rgb)
-        alpha, deviation = measure(rendering.rgb, rendering.alpha, background)
-        likeness = psnr(rendering.rgb, target.images).mean()
-        return {"psnr": likeness, "alpha": alpha}, deviation
 
 
 def compute_gradients(
@@ -210,13 +204,18 @@ class DetachedLayer:
         return total
 
 
-def measure(rgb: Tensor, alpha: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
-    """Return mean alpha, and the largest of the views' mean |rgb - background|; both 0-d.
+@torch.no_grad()
+def signs_of(rendering: Rendering, target: Views, background: Tensor) -> dict[str, Tensor]:
+    """Return mean PSNR and alpha, and the largest of the views' mean |rgb - background|; all 0-d.
 
-    rgb: (B, V, 3, H, W). Means over a view's pixels: a stray splat must not count as life.
+    Means over a view's pixels: a stray splat must not count as life.
     """
-    deviation = (rgb - background[:, None, None]).abs().mean((-3, -2, -1))
-    return alpha.mean(), deviation.amax()
+    deviation = (rendering.rgb - background[:, None, None]).abs().mean((-3, -2, -1))
+    return {
+        "psnr": psnr(rendering.rgb, target.images).mean(),
+        "alpha": rendering.alpha.mean(),
+        "deviation": deviation.amax(),
+    }
 
 
 def _slices(cameras: Cameras, step: int) -> list[slice]:

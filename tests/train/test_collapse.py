@@ -1,6 +1,7 @@
 """Runs that die are noticed, said so, and leave good weights."""
 
 import signal
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ import qgs
 from qgs.checkpoint.model_file import CheckpointFile
 from qgs.train.folder import RunFolder
 from qgs.train.guard import EMPTY_ALPHA, CollapseError, GoodWeights, SignsOfLife
-from qgs.train.training_pass import measure
+from qgs.train.training_pass import signs_of
 
 ALIVE = {"alpha": 0.5, "deviation": 0.3, "gradient": 0.1}
 PLAIN = ALIVE | {"deviation": 1e-4}
@@ -43,10 +44,11 @@ def test_steps_without_signs_of_life_are_counted():
 def test_a_stray_splat_is_no_sign_of_life():
     rgb = torch.ones(2, 3, 3, 32, 32)
     rgb[0, 0, :, 4:6, 4:6] = 0
-    alpha, deviation = measure(rgb, 1 - rgb[:, :, :1], torch.ones(3))
-    assert alpha < EMPTY_ALPHA
-    assert deviation == pytest.approx(4 / 32**2)
-    symptom = observed(ALIVE, ALIVE | {"deviation": float(deviation)}).symptom
+    rendering = Mock(rgb=rgb, alpha=1 - rgb[:, :, :1])
+    signs = signs_of(rendering, Mock(images=rgb), torch.ones(3))
+    assert signs["alpha"] < EMPTY_ALPHA
+    assert signs["deviation"] == pytest.approx(4 / 32**2)
+    symptom = observed(ALIVE, ALIVE | {"deviation": float(signs["deviation"])}).symptom
     assert "equal the background" in symptom
 
 

@@ -117,13 +117,13 @@ def test_an_evaluation_that_fails_is_told_and_ends_nothing(tmp_path, monkeypatch
 def test_a_stop_is_heard_between_two_scenes(tmp_path, monkeypatch):
     judge = periodic.evaluate
 
-    def asked(*given, observe):
+    def asked(*given, observe, **options):
         def seen(done, wanted):
             assert done == 1
             signal.raise_signal(signal.SIGTERM)
             observe(done, wanted)
 
-        return judge(*given, observe=seen)
+        return judge(*given, observe=seen, **options)
 
     monkeypatch.setattr(periodic, "evaluate", asked)
     result = run(tiny("tokengs", "training.evaluate_every=1"), tmp_path)
