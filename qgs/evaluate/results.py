@@ -176,9 +176,7 @@ class Evaluation:
                 f"perfect: {listed(given)}"
             )
         for name, why in self.incomplete.items():
-            count = len(self._values(f"model_{name}"))
-            over = f"over {count} of {self._wanted} scenes" if count else "empty"
-            yield f"{self.columns[name].heading} is {over}: {why}"
+            yield f"{self.columns[name].heading} is not complete: {why}"
         used = self.mean("gaussians_used")
         yield (
             f"{self.gaussians:,} Gaussians a scene, {used:,.0f} of them used (opacity above "

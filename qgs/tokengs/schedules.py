@@ -3,7 +3,7 @@
 import math
 from bisect import bisect_right
 from collections.abc import Mapping
-from typing import Annotated, Literal, Self, TypeAlias
+from typing import Annotated, ClassVar, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
@@ -26,24 +26,42 @@ class Constant(Schedule):
         return self.value
 
 
-class Steps(Schedule):
+class _Listed(Schedule):
+    """A number by ascending steps `at`, and one of `values` for each of them, or `more`."""
+
+    more: ClassVar[int] = 0
+    values: tuple[float, ...]
+    at: tuple[int, ...]
+
+    @model_validator(mode="after")
+    def _values_fit(self) -> Self:
+        steps = list(self.at)
+        if steps != sorted(set(steps)):
+            raise OptionError(f"`at` must ascend, got {steps}", f"write {sorted(set(steps))}")
+        wanted = len(steps) + self.more
+        if len(self.values) != wanted:
+            raise OptionError(
+                f"{len(steps)} steps in `at` need {wanted} values, got {len(self.values)}",
+                "give `linear` and `cosine` as many values as steps, `steps` the first one besides",
+            )
+        return self
+
+    @property
+    def corners(self) -> tuple[int, ...]:
+        """See `Schedule`."""
+        return self.at
+
+
+class Steps(_Listed):
     """`values[0]` first, and each further value from its step on."""
 
+    more: ClassVar[int] = 1
     schedule: Literal["steps"]
     """A number for each of several ranges of steps."""
     values: tuple[float, ...]
     """The numbers, one more than there are steps in `at`."""
     at: tuple[Annotated[int, Field(ge=1)], ...] = Field(min_length=1)
     """Steps after which the next value holds, ascending."""
-
-    @model_validator(mode="after")
-    def _one_value_more(self) -> Self:
-        steps = _ascending(self.at)
-        count = len(self.values)
-        if count != len(steps) + 1:
-            reason = f"{len(steps)} steps in `at` part {len(steps) + 1} values, got {count}"
-            raise OptionError(reason, "give one value more than steps; the first holds from 0")
-        return self
 
     def number(self, step: int) -> float:
         """See `Schedule`."""
@@ -55,7 +73,7 @@ class Steps(Schedule):
         return tuple(step for at in self.at for step in (max(at - 1, 0), at))
 
 
-class Linear(Schedule):
+class Linear(_Listed):
     """From each number to the next one over a range of steps; constant before and after."""
 
     schedule: Literal["linear", "cosine"]
@@ -64,15 +82,6 @@ class Linear(Schedule):
     """The numbers at the steps in `at`: the first also before, the last also after them."""
     at: tuple[Step, ...]
     """Steps, ascending, one for each of `values`."""
-
-    @model_validator(mode="after")
-    def _one_step_each(self) -> Self:
-        steps = _ascending(self.at)
-        count = len(self.values)
-        if count != len(steps):
-            reason = f"{count} values need {count} steps in `at`, got {len(steps)}"
-            raise OptionError(reason, "give a step for each value; for jumps, `schedule: steps`")
-        return self
 
     def number(self, step: int) -> float:
         """See `Schedule`."""
@@ -84,18 +93,6 @@ class Linear(Schedule):
         if self.schedule == "cosine":
             share = (1 - math.cos(math.pi * share)) / 2
         return (1 - share) * start + share * end
-
-    @property
-    def corners(self) -> tuple[int, ...]:
-        """See `Schedule`."""
-        return self.at
-
-
-def _ascending(at: tuple[int, ...]) -> list[int]:
-    """The steps; raises OptionError where they do not ascend."""
-    if (steps := list(at)) != sorted(set(steps)):
-        raise OptionError(f"`at` must ascend, got {steps}", f"write {sorted(set(steps))}")
-    return steps
 
 
 SCHEDULES: Mapping[str, type[Schedule]] = {

@@ -94,8 +94,7 @@ class Guard:
 
     def __post_init__(self) -> None:
         self.signs = SignsOfLife()
-        keep = PartialState().is_main_process
-        self.good = GoodWeights(self.training_pass.model, keep)
+        self.good = GoodWeights(self.training_pass.model)
 
     def state(self) -> dict[str, Any]:
         return {"skipped": self.skipped, "detector": asdict(self.signs)}
@@ -113,22 +112,18 @@ class Guard:
         self.skipped += 1
         # All processes repeat the step: its collective operations need everyone.
         first = first_bad_tensor(self.training_pass, batches, lambda: self.repeat(batches))
-        told = list(filter(None, gather_object([first])))
-        found = "; ".join([symptom, *(told or ["repeating the step gave finite numbers"])])
-        skips = self.config.on_nonfinite == "skip"
-        if skips and self.skipped <= MAX_SKIPPED:
+        found = "; ".join(filter(None, [symptom, *gather_object([first])]))
+        if self.config.on_nonfinite == "skip" and self.skipped <= MAX_SKIPPED:
             _log.warning("step %d is skipped: %s", step + 1, found)
             return
         # A model that was dying gave this NaN: going on from here would not help.
         if self.signs.dead:
             self._collapse(step + 1, found)
         self.save(step)
-        remedy = "; continue without it by `--resume --set training.on_nonfinite=skip`"
-        if skips:
-            remedy = f", after {MAX_SKIPPED} steps in a row were skipped; continue with --resume"
         raise NonFiniteError(
-            f"step {step + 1} is not finite, and the run is saved as it was before this "
-            f"step{remedy}.\n{found}.\nLikely causes:{NONFINITE_CAUSES}"
+            f"step {step + 1} is not finite, and the run is saved as it was before this step; "
+            "continue without it by `--resume --set training.on_nonfinite=skip`, which skips at "
+            f"most {MAX_SKIPPED} steps in a row.\n{found}.\nLikely causes:{NONFINITE_CAUSES}"
         )
 
     def watch(self, step: int, numbers: Mapping[str, float]) -> None:
@@ -234,12 +229,11 @@ class GoodWeights:
     is the last that is surely good. Copies are made every fifth of a window at first and a window
     in long runs, and none is made while the images are worse than they were.
 
-    keep: this process holds the copies; one of several suffices. psnr, best: its running mean, in
-    dB, and the largest one at a copy.
+    Of several processes the main one holds them. psnr, best: its running mean, in dB, and the
+    largest one at a copy.
     """
 
     model: nn.Module
-    keep: bool = True
     psnr: float | None = None
     best: float | None = None
 
@@ -270,7 +264,7 @@ class GoodWeights:
 
     def refresh(self, step: int) -> None:
         """Copy the present weights, which `step` optimiser steps made."""
-        present = unique_tensors(self.model) if self.keep else {}
+        present = unique_tensors(self.model) if PartialState().is_main_process else {}
         # Host memory: the device's is needed for the training.
         copy = {name: tensor.detach().to("cpu", copy=True) for name, tensor in present.items()}
         self.copies = [*self.copies, (step, copy)][-2:]

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from torch import Tensor, nn
+from torch import nn
 
 from qgs.checkpoint.model_file import unique_tensors
 from qgs.containers import named_tensors
@@ -13,12 +13,9 @@ from qgs.data.samples import Batch
 
 
 def not_finite(numbers: Mapping[str, float]) -> str:
-    """Name what is NaN or infinite of a step: loss terms, else the gradient; "" if nothing is."""
-    # PSNR is infinite for a perfect image; the gradient follows the terms.
-    terms = {name: n for name, n in numbers.items() if name not in ("gradient", "psnr")}
-    bad = [f"loss term {name} is {n}" for name, n in terms.items() if not math.isfinite(n)]
-    if not bad and not math.isfinite(numbers["gradient"]):
-        bad = [f"the gradient norm is {numbers['gradient']}"]
+    """Name which numbers of a step are NaN or infinite; "" if none is."""
+    # PSNR is infinite for a perfect image.
+    bad = [f"{k} is {n}" for k, n in numbers.items() if k != "psnr" and not math.isfinite(n)]
     return ", ".join(bad)
 
 
@@ -60,8 +57,10 @@ class _Watch:
     def see(self, name: str, value: Any) -> None:
         """Look at `value`: a tensor, or any nest of mappings, sequences and containers of them."""
         for path, tensor in named_tensors(value, name):
-            if not self.found and (bad := nonfinite_values(tensor)):
-                self.found = f"the first bad tensor is {path} ({bad}), with {self._samples()}"
+            bad = tensor[~tensor.isfinite()]
+            if bad.numel() and not self.found:
+                values = f"{bad.numel()} of {tensor.numel()} values, the first {bad[0].item()}"
+                self.found = f"the first bad tensor is {path} ({values}), with {self._samples()}"
 
     def _samples(self) -> str:
         batch = self._batch
@@ -83,10 +82,3 @@ class _Watch:
             # Gradients arrive in reverse order: the first bad one is nearest to the loss.
             if tensor.requires_grad:
                 tensor.register_hook(partial(self.see, path))
-
-
-def nonfinite_values(tensor: Tensor) -> str:
-    """Say how many values of `tensor` are NaN and infinite; "" if none is."""
-    counts = {"NaN": int(tensor.isnan().sum()), "infinite": int(tensor.isinf().sum())}
-    found = [f"{count} {word}" for word, count in counts.items() if count]
-    return f"{' and '.join(found)} of {tensor.numel()} values" if found else ""

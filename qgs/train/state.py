@@ -1,9 +1,9 @@
 """What a run counts and keeps to go on: steps, random states, moments, averaged weights."""
 
-import logging
 import time
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -14,10 +14,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from qgs.checkpoint.model_file import load_weights, unique_tensors
 from qgs.contracts import ModelComponent, Optimizer, ParameterGroup, TrainingConfig
-from qgs.data.samples import Batch
 from qgs.train.folder import OtherRunError
-
-_log = logging.getLogger(__name__)
 
 
 def make_optimizer(
@@ -29,7 +26,7 @@ def make_optimizer(
     outside of components all but 1-d parameters do. A shared parameter goes by its first name.
     factors: as `Recipe.rate_factors`; one of 0 freezes, ValueError if all are 0.
     """
-    groups: dict[tuple[bool, float], ParameterGroup] = {}
+    groups: defaultdict[tuple[bool, float], list[nn.Parameter]] = defaultdict(list)
     components = {name: m for name, m in module.named_modules() if isinstance(m, ModelComponent)}
     for name, parameter in module.named_parameters():
         factor = factors[name]
@@ -45,12 +42,16 @@ def make_optimizer(
             if not outer or name.startswith(f"{outer}."):
                 inner = name.removeprefix(outer).removeprefix(".")
                 decays = component.decays(inner, parameter)
-        empty = ParameterGroup(params=[], decays=decays, factor=factor)
-        groups.setdefault((not decays, factor), empty)["params"].append(parameter)
+        groups[not decays, factor].append(parameter)
     if not groups:
         raise ValueError("optimizer.parts freezes every parameter, so there is nothing to train")
     # Sorted: the same groups in every process and after a resume.
-    return optimizer.build([groups[key] for key in sorted(groups)])
+    return optimizer.build(
+        [
+            ParameterGroup(params=groups[stays, factor], decays=not stays, factor=factor)
+            for stays, factor in sorted(groups)
+        ]
+    )
 
 
 @dataclass
@@ -58,8 +59,7 @@ class Counters:
     """Steps and time of a run so far, in all sessions.
 
     step, seconds: optimiser steps, and time spent; a session's clock starts after its first step,
-    in which kernels compile. left_out: why samples of this process could not be made in this
-    session.
+    in which kernels compile.
     """
 
     config: TrainingConfig
@@ -67,7 +67,6 @@ class Counters:
     """The `scenes_fingerprint` of the data."""
     step: int = 0
     seconds: float = 0.0
-    left_out: set[str] = field(default_factory=set)
     last_tick: float = 0.0
 
     @property
@@ -94,14 +93,6 @@ class Counters:
         *numbers, seconds = means.tolist()
         self.seconds += seconds
         return dict(zip(measured, numbers, strict=True))
-
-    def finish_step(self, batches: Iterable[Batch]) -> None:
-        """Count a step with `batches`, and log each new reason why a sample is left out."""
-        self.step += 1
-        for batch in batches:
-            for reason in {*batch.left_out} - self.left_out:
-                _log.warning("a sample is left out: %s", reason)
-                self.left_out.add(reason)
 
     def state(self) -> dict[str, Any]:
         """Return the counts, and what must not change for them to mean the same."""
@@ -183,14 +174,12 @@ class OptimizerState:
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore what `state()` gave; options of the groups stay.
 
-        Raises KeyError with what is missing, ValueError for what is not of these parameters.
+        Raises KeyError with what is missing.
         """
         kept: dict[int, dict[str, Any]] = {}
         for place, name in enumerate(self._names):
             if keys := state["keys"][name]:
                 kept[place] = {key: state[f"{name}/{key}"] for key in keys}
-        if len(state) > 1 + sum(map(len, kept.values())):
-            raise ValueError("it has values of unknown parameters")
         present = self._optimizer.state_dict()
         self._optimizer.load_state_dict({**present, "state": kept})
 

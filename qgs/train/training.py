@@ -1,14 +1,17 @@
 """The training loop."""
 
+import logging
 import math
 import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import torch
 from accelerate.utils import gather_object, set_seed
 from rich.console import Console
 
@@ -22,6 +25,7 @@ from qgs.data.stream import (
     trained_domain,
     training_batches,
 )
+from qgs.evaluate.evaluation import Measures
 from qgs.files import write_text
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe
@@ -32,7 +36,7 @@ from qgs.train.folder import RunFolder, SavedState, Saver, saved_state
 from qgs.train.guard import Guard
 from qgs.train.initial import initialise
 from qgs.train.nonfinite import not_finite
-from qgs.train.periodic import PeriodicEvaluation
+from qgs.train.periodic import judge
 from qgs.train.state import (
     Counters,
     MovingAverage,
@@ -42,6 +46,9 @@ from qgs.train.state import (
 )
 from qgs.train.tracking import Trackers, TrainingProgress
 from qgs.train.training_pass import TrainingPass, compute_gradients
+from qgs.wording import one_line, warn_once
+
+_log = logging.getLogger(__name__)
 
 ELSEWHERE = "another process of this training has no next batch; see its own message"
 
@@ -126,7 +133,6 @@ class Trainer:
             # its first batch depends on how many samples the restored run has seen.
             saved = self._saved()
             self._build_model(initial=not saved)
-            self._build_optimizer()
             source = recipe.build_data()
             self._build_watchers(source)
             if saved:
@@ -153,7 +159,10 @@ class Trainer:
         return saved_state(self.folder, self.recipe)
 
     def _build_model(self, initial: bool) -> None:
-        """Build the model, and note what is odd about it. initial: load `init_from`."""
+        """Build the model, what computes its gradients, and torch's optimiser.
+
+        Notes what is odd about them. initial: load `init_from`.
+        """
         recipe = self.recipe
         self.model = recipe.build_model(self.accelerator.device, pretrained=initial).train()
         self.notes = [f"warning: {text}" for text in recipe.warnings]
@@ -166,10 +175,8 @@ class Trainer:
                 f"{self.config.steps:,} steps (training.steps), whichever comes first"
             )
 
-    def _build_optimizer(self) -> None:
-        """Make what computes gradients, torch's optimiser and the moving average."""
-        self.training_pass = TrainingPass(self.recipe, self.model).to(self.accelerator.device)
-        factors = self.recipe.rate_factors(self.training_pass)
+        self.training_pass = TrainingPass(recipe, self.model).to(self.accelerator.device)
+        factors = recipe.rate_factors(self.training_pass)
         optimizer = make_optimizer(self.training_pass, self.optimizer, factors)
         prepared: Any = self.accelerator.prepare(self.training_pass, optimizer)
         wrapped, self.torch_optimizer = prepared
@@ -188,9 +195,8 @@ class Trainer:
         self.counters = Counters(self.config, scenes_fingerprint(source))
         self.saver = Saver(self.folder, self.model)
         self.guard = Guard(self.training_pass, self.saver, self.config, self._gradients)
-        self.evaluations = PeriodicEvaluation(
-            recipe, self.model, self.average, self.folder, self.trackers
-        )
+        # A metric that is wrong must fail now, not after the training.
+        Measures(recipe)
         # Beside the weights, all that continues the run.
         stateful = {
             "guard": self.guard,
@@ -267,7 +273,9 @@ class Trainer:
         if symptom:
             self.guard.refuse_nonfinite(counters.step, batches, symptom)
             numbers["skipped"] = True
-        counters.finish_step(batches)
+        counters.step += 1
+        for reason in chain.from_iterable(batch.left_out for batch in batches):
+            warn_once(f"a sample is left out: {reason}")
         self._follow_schedules()
         self._report(numbers, progress)
         if not symptom:
@@ -319,8 +327,20 @@ class Trainer:
         progress.show(counters.step, record["loss"], record["psnr"], counters.used)
 
     def _evaluate(self, stop: StopRequest) -> None:
+        """Judge the weights; a failure is logged, and ends no training."""
         started = time.perf_counter()
-        self.evaluations.run(self.counters.step, stop)
+        step = self.counters.step
+        used = [torch.cuda.current_device()] if torch.cuda.is_initialized() else []
+        try:
+            # An evaluation must not change what the training draws afterwards.
+            with torch.random.fork_rng(used):
+                if self.accelerator.is_main_process:
+                    shown = (self.folder, self.trackers, stop)
+                    judge(self.recipe, self.model, self.average, step, *shown)
+        except Exception as error:  # the run is saved, and worth more than an evaluation
+            _log.warning("the evaluation at step %d failed: %s", step, one_line(error))
+        # The others wait here, see TIMEOUT in `distributed`.
+        self.accelerator.wait_for_everyone()
         # Not counted. Shifted, not reset: the time since the last step still counts.
         self.counters.last_tick += time.perf_counter() - started
 

@@ -166,7 +166,7 @@ def test_evaluations_write_the_same_files(judged, tmp_path):
     assert protocol["name"] == "rooms-2view"
     assert hashlib.sha256(files["protocol.json"]).hexdigest() == protocol["sha256"]
     assert " MAE ↓ |" in files["table.md"].decode()
-    told = "masked is over 1 of 2 scenes: it needs masks, not known for 1 of 2 scenes"
+    told = "masked is not complete: it needs masks, not known for 1 of 2 scenes"
     for text in ("MAE ↓", f" {summary['model']['mae']:.5f} ", told):
         assert text in shown(evaluation)
 

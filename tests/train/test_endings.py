@@ -111,7 +111,7 @@ def test_an_evaluation_that_fails_is_told_and_ends_nothing(tmp_path, monkeypatch
     monkeypatch.setattr(periodic, "evaluate", failing)
     run(tiny("tokengs", "training.evaluate_every=1"), tmp_path)
     assert saved == [1, 2, 3]  # saved before it is judged
-    assert "the evaluation at step 2 failed: ValueError: no scene could be judged" in caplog.text
+    assert "the evaluation at step 2 failed: no scene could be judged" in caplog.text
 
 
 def test_a_stop_is_heard_between_two_scenes(tmp_path, monkeypatch):
@@ -160,7 +160,6 @@ def test_a_damaged_state_is_refused_and_nothing_is_replaced(copied):
         (f"weights/{weight}", one),
         (f"ema/{weight}", None),
         (f"moments/model.{weight}/exp_avg", None),
-        ("moments/foo/exp_avg", one),
         ("random/", None),
     ):
         kept = {n: tensor for n, tensor in tensors.items() if not n.startswith(name)}

@@ -66,10 +66,10 @@ def test_a_weight_comes_before_everything_and_data_is_named_with_its_batch(step)
         ("inputs.images", second.inputs.images),
     ):
         tensor.view(-1)[0] = NAN
-        assert told(step, f"{name} (1 NaN of {tensor.numel()} values)", 1)
+        assert told(step, f"{name} (1 of {tensor.numel()} values, the first nan)", 1)
     name, parameter = list(step.model.named_parameters())[5]
     parameter.data.view(-1)[:2] = torch.tensor([NAN, INF])
-    values = f"1 NaN and 1 infinite of {parameter.numel()} values"
+    values = f"2 of {parameter.numel()} values, the first nan"
     assert told(step, f"weight model.{name} ({values})", 0)
 
 
@@ -113,5 +113,5 @@ def test_a_module_is_named_by_its_output_and_the_gradient_of_it(step, monkeypatc
 
 def test_what_is_not_finite_is_named():
     assert not not_finite({"mse": 1.0, "gradient": 0.5, "psnr": INF})
-    assert not_finite({"mse": NAN, "gradient": 0.5}) == "loss term mse is nan"
-    assert not_finite({"mse": 1.0, "gradient": INF}) == "the gradient norm is inf"
+    assert not_finite({"mse": NAN, "gradient": 0.5}) == "mse is nan"
+    assert not_finite({"mse": 1.0, "gradient": INF}) == "gradient is inf"

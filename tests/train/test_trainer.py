@@ -131,7 +131,7 @@ def test_bad_steps_are_skipped_on_demand(tmp_path, monkeypatch, caplog):
     assert [record["step"] for record in curves] == [1, 3]
     assert parts_of(through)["guard"]["skipped"] == 1  # a good step lies between the two
     for resume in (False, True):
-        with pytest.raises(NonFiniteError, match=r"targets\.images \(1 NaN of") as error:
+        with pytest.raises(NonFiniteError, match=r"targets\.images \(1 of") as error:
             run(tiny("locus", *options), stopped, resume)
     for part in ("step 2 is not finite", "mse is nan"):
         assert part in str(error.value)
@@ -156,6 +156,6 @@ def test_a_bad_gradient_ends_the_run_too(tmp_path, monkeypatch):
 def test_skipping_comes_to_an_end(tmp_path, monkeypatch):
     spoil(monkeypatch, *range(2, 100))
     monkeypatch.setattr(guard, "MAX_SKIPPED", 2)
-    with pytest.raises(NonFiniteError, match="2 steps in a row were skipped"):
+    with pytest.raises(NonFiniteError, match="most 2 steps in a row"):
         run(tiny("tokengs", "training.on_nonfinite=skip", "training.steps=50"), tmp_path)
     assert len(read_jsonl(tmp_path / "history.jsonl")) == 3
