@@ -76,7 +76,7 @@ def same(first, second):
 
 def parts_of(folder):
     """What the saved state of a run holds, by part."""
-    return read_state(RunFolder(folder).state).states
+    return read_state(RunFolder(folder).state)[1]
 
 
 def saved_step(folder):

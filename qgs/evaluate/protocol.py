@@ -38,9 +38,6 @@ class Protocol:
         """Hash of `canonical` in UTF-8, hexadecimal."""
         return hashlib.sha256(self.canonical.encode()).hexdigest()
 
-    def __str__(self) -> str:
-        return f"{self.name} ({self.sha256[:12]})"
-
 
 def protocol_of(
     recipe: Recipe,

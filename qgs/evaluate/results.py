@@ -120,7 +120,7 @@ class Evaluation:
 
     def show(self, console: Console) -> None:
         """Print the table and the notes as Markdown."""
-        print_table(console, str(self.protocol), self._rows(), box=MARKDOWN)
+        print_table(console, self.protocol.name, self._rows(), box=MARKDOWN)
         print_lines(console, (f"- {note}" for note in self._notes()))
 
     def _values(self, name: str) -> list[float]:

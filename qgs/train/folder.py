@@ -5,7 +5,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from accelerate import PartialState
@@ -74,7 +74,7 @@ class RunFolder:
         self.checkpoint_ema = self.path / "checkpoint_ema.safetensors"
         self.state = self.path / "state.safetensors"
         self.evaluation = self.path / "evaluation"
-        self._history = self.path / HISTORY
+        self.history_file = self.path / HISTORY
         self._lock = FileLock(self.path / _LOCK, blocking=False)
 
     @property
@@ -126,18 +126,13 @@ class RunFolder:
         with naming_full_disk(path), path.open("a", encoding="utf-8") as file:
             file.write("".join(json.dumps(record) + "\n" for record in records))
 
-    def synchronise(self) -> None:
-        """See that the history outlives the system."""
-        with naming_full_disk(self._history), self._history.open("a") as file:
-            os.fsync(file.fileno())
-
     def history(self) -> list[dict[str, float]]:
         """Return all records so far, one per optimiser step; of one left out, finite numbers."""
-        return read_records(self._history)
+        return read_records(self.history_file)
 
     def cut_records(self, step: int) -> None:
         """Drop the records of later steps than `step`, and lines that are damaged."""
-        for path in (self._history, self.path / EVALUATIONS):
+        for path in (self.history_file, self.path / EVALUATIONS):
             if path.exists():
                 kept = [record for record in read_records(path) if record["step"] <= step]
                 write_text(path, "".join(json.dumps(record) + "\n" for record in kept))
@@ -207,15 +202,10 @@ class Saver:
 
     def _write_state(self, states: Mapping[str, State]) -> None:
         # The history must reach the disk first: a state ahead of it would leave a gap.
-        self.folder.synchronise()
+        history = self.folder.history_file
+        with naming_full_disk(history), history.open("a") as file:
+            os.fsync(file.fileno())
         write_state(self.folder.state, self.model.recipe or {}, states)
-
-
-class SavedState(NamedTuple):
-    """A state file: the recipe of its run, and the states by name."""
-
-    recipe: Recipe
-    states: Mapping[str, State]
 
 
 def write_state(path: Path, recipe: Mapping[str, Any], states: Mapping[str, State]) -> None:
@@ -234,25 +224,28 @@ def write_state(path: Path, recipe: Mapping[str, Any], states: Mapping[str, Stat
     write_tensors(path, tensors, {_STATES: json.dumps(values), _RECIPE: json.dumps(recipe)})
 
 
-def read_state(path: Path) -> SavedState:
+def read_state(path: Path) -> tuple[Recipe, Mapping[str, State]]:
     """Read what `write_state` wrote; raises FileNotFoundError, CheckpointError, RecipeError."""
     with TensorFile(path) as file:
         states = file.mapping(_STATES)
         for place, tensor in file.read().items():
             name, _, key = place.partition("/")
             states.setdefault(name, {})[key] = tensor
-        return SavedState(file.stored_recipe(_RECIPE), states)
+        return file.stored_recipe(_RECIPE), states
 
 
-def saved_state(folder: RunFolder, recipe: Recipe) -> SavedState | None:
-    """Return the state from which the run in `folder` continues; None to start it from step 0.
+def saved_state(folder: RunFolder, recipe: Recipe) -> Mapping[str, State]:
+    """Return the states from which the run in `folder` continues; none to start it from step 0.
 
     Raises OtherRunError unless `recipe` equals the run's outside of FREE, CheckpointError when the
     state cannot be read.
     """
-    # A run that was killed before its first save has a recipe and no state: it starts again.
-    saved = read_state(folder.state) if folder.state.is_file() else None
-    run = saved.recipe if saved else resolve(folder.recipe)
+    if folder.state.is_file():
+        run, states = read_state(folder.state)
+    else:
+        # A run that was killed before its first save has a recipe alone: it starts again.
+        run = resolve(folder.recipe)
+        states = {}
     # `Counters` compares the scenes of a step, which older runs counted by process.
     may_change = tuple(f"{k}." for k in (*FREE, "training.batch_size", "training.accumulate"))
     differing = [
@@ -267,4 +260,4 @@ def saved_state(folder: RunFolder, recipe: Recipe) -> SavedState | None:
             f"\nContinue it with its own recipe, {folder.recipe}, or choose another folder. "
             f"Only these may change: {', '.join(FREE)}."
         )
-    return saved
+    return states

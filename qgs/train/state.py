@@ -1,5 +1,6 @@
 """What a run counts and keeps to go on: steps, random states, moments, averaged weights."""
 
+import math
 import time
 from collections import defaultdict
 from collections.abc import Mapping
@@ -72,7 +73,7 @@ class Counters:
     @property
     def used(self) -> float:
         """Fraction of the budget that is used, the larger of steps and seconds."""
-        of_seconds = self.seconds / self.config.seconds if self.config.seconds else 0.0
+        of_seconds = self.seconds / (self.config.seconds or math.inf)
         return max(self.step / self.config.steps, of_seconds)
 
     def every(self, steps: int) -> bool:

@@ -88,7 +88,6 @@ class Trackers:
     def close(self) -> None:
         """End tracking."""
         self.tell(lambda tracker: tracker.close())
-        self._open.clear()
 
     def tell(self, act: Callable[[Tracker], None]) -> None:
         """Have each tracker take something."""

@@ -32,7 +32,7 @@ from qgs.recipe import Recipe
 from qgs.recipe.checks import keys_are_read
 from qgs.recipe.recipe import annotated, flat
 from qgs.train.distributed import StopRequest, choose_device, make_accelerator, stop_requests
-from qgs.train.folder import RunFolder, SavedState, Saver, saved_state
+from qgs.train.folder import RunFolder, Saver, State, saved_state
 from qgs.train.guard import Guard
 from qgs.train.initial import initialise
 from qgs.train.nonfinite import not_finite
@@ -131,12 +131,17 @@ class Trainer:
             # The order matters: the state is read before memory is taken for the model, the model
             # draws its random numbers before anything else does, and the data comes last, since
             # its first batch depends on how many samples the restored run has seen.
-            saved = self._saved()
+            saved: Mapping[str, State] = {}
+            if resume and not self.folder.is_new:
+                if self.accelerator.is_main_process:
+                    self.folder.take()
+                self.accelerator.wait_for_everyone()
+                saved = saved_state(self.folder, recipe)
             self._build_model(initial=not saved)
             source = recipe.build_data()
             self._build_watchers(source)
             if saved:
-                self.saver.restore(saved.states)
+                self.saver.restore(saved)
             self.resumed_at = self.counters.step if saved else None
             self._follow_schedules()
             batches = self._open_data(source)
@@ -148,15 +153,6 @@ class Trainer:
     def close(self) -> None:
         """Stop reading ahead, end tracking and leave the folder to others."""
         self._resources.close()
-
-    def _saved(self) -> SavedState | None:
-        """Lock the folder of a run that is continued; its saved state, None to start at step 0."""
-        if not self._resumes or self.folder.is_new:
-            return None
-        if self.accelerator.is_main_process:
-            self.folder.take()
-        self.accelerator.wait_for_everyone()
-        return saved_state(self.folder, self.recipe)
 
     def _build_model(self, initial: bool) -> None:
         """Build the model, what computes its gradients, and torch's optimiser.
@@ -174,12 +170,10 @@ class Trainer:
                 f"stops after {self.config.seconds:g} s (training.seconds) or "
                 f"{self.config.steps:,} steps (training.steps), whichever comes first"
             )
-
         self.training_pass = TrainingPass(recipe, self.model).to(self.accelerator.device)
         factors = recipe.rate_factors(self.training_pass)
-        optimizer = make_optimizer(self.training_pass, self.optimizer, factors)
-        prepared: Any = self.accelerator.prepare(self.training_pass, optimizer)
-        wrapped, self.torch_optimizer = prepared
+        self.torch_optimizer = make_optimizer(self.training_pass, self.optimizer, factors)
+        wrapped: Any = self.accelerator.prepare(self.training_pass)
         self._gradients = partial(compute_gradients, self.accelerator, wrapped, self.config)
         self.average = MovingAverage(self.model, self.config.ema) if self.config.ema else None
 

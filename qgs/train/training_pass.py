@@ -74,6 +74,10 @@ class TrainingPass(nn.Module):
         total = targets.images.new_zeros(())
         background = constant(self.model.renderer.config.background, targets.images)
         count = targets.images.shape[1]
+        parts = [targets]
+        # Whole where a loss compares views.
+        if self.render_views and not any(x.renderings == "all" for x in self.losses.values()):
+            parts = [targets.select(views) for views in _slices(targets.cameras, self.render_views)]
         terms: dict[str, Tensor] = {}
         signs: dict[str, Tensor] = {}
         rounds = [number for number in prediction.layers if number > len(self.model.decoder)]
@@ -82,7 +86,7 @@ class TrainingPass(nn.Module):
             # Of this layer: those of the last one remain.
             signs = {}
             deviations: list[Tensor] = []
-            for part in self._parts(targets):
+            for part in parts:
                 share = part.images.shape[1] / count
                 rendering = self.render(layer.prediction.gaussians, part.cameras)
                 shown = signs_of(rendering, part, background)
@@ -99,12 +103,6 @@ class TrainingPass(nn.Module):
             total = total + layer.total()
             _add(layer.terms, terms)
         return Outcome(total, terms, signs)
-
-    def _parts(self, targets: Views) -> list[Views]:
-        """Slice the target views by `render_views`; whole where a loss compares views."""
-        if not self.render_views or any(loss.renderings == "all" for loss in self.losses.values()):
-            return [targets]
-        return [targets.select(views) for views in _slices(targets.cameras, self.render_views)]
 
     def render(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """See `Passes`: the graphs of at most `render_views` views exist at a time."""

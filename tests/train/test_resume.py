@@ -45,9 +45,9 @@ def resumed(folder, *options):
 
 
 def change_counters(folder, **values):
-    state = read_state(folder / "state.safetensors")
-    parts = {**state.states, "counters": {**state.states["counters"], **values}}
-    write_state(folder / "state.safetensors", state.recipe.tree, parts)
+    recipe, states = read_state(folder / "state.safetensors")
+    parts = {**states, "counters": {**states["counters"], **values}}
+    write_state(folder / "state.safetensors", recipe.tree, parts)
 
 
 def test_a_stopped_run_goes_on_where_it_and_its_schedules_stopped(tmp_path):

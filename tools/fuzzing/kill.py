@@ -82,12 +82,12 @@ def saved_step(run: Path) -> int:
     folder = RunFolder(run)
     if folder.checkpoint.exists():
         qgs.load(folder.checkpoint)
-    return read_state(folder.state).states["counters"]["step"] if folder.state.exists() else 0
+    return read_state(folder.state)[1]["counters"]["step"] if folder.state.exists() else 0
 
 
 def values_of(run: Path) -> dict[str, Any]:
     """Return all values of the state of a run by name, times aside."""
-    parts = read_state(run / "state.safetensors").states
+    parts = read_state(run / "state.safetensors")[1]
     values = {f"{part}/{name}": parts[part][name] for part in parts for name in parts[part]}
     del values["counters/seconds"]
     return {name: x.tolist() if isinstance(x, Tensor) else x for name, x in values.items()}
