@@ -12,7 +12,7 @@ from qgs.domain import REMEDY, Domain, verdict
 from qgs.evaluate.plan import EvaluationPlan, ViewsOf
 from qgs.evaluate.protocol import protocol_of
 from qgs.evaluate.results import Evaluation, SceneScore
-from qgs.evaluate.tuning import tune, tuning_loss
+from qgs.evaluate.tuning import tune
 from qgs.metrics.baselines import BASELINES, worse_than_nearest
 from qgs.metrics.dispersion import OPACITY_USED
 from qgs.model import QueryGaussianModel
@@ -171,8 +171,6 @@ class _Scorer:
 
     def __post_init__(self) -> None:
         self.device = next(self.model.parameters()).device
-        tunes = self.recipe.evaluation.tuning_steps
-        self.tuning_loss = tuning_loss(self.recipe) if tunes else None
         for metric in self.measures.metrics.values():
             metric.to(self.device)
 
@@ -196,9 +194,8 @@ class _Scorer:
         self.seen.see(sample.inputs.cameras, sample.targets.cameras)
         inputs = sample.inputs.to(self.device)
         targets = sample.targets.to(self.device)
-        if self.tuning_loss:
-            settings = self.recipe.evaluation
-            gaussians, _ = tune(self.model, inputs, self.tuning_loss, settings)
+        if self.recipe.evaluation.tuning_steps:
+            gaussians, _ = tune(self.model, inputs, self.recipe)
         else:
             gaussians = self.model(inputs).gaussians
         self.gaussians = max(self.gaussians, gaussians.count)

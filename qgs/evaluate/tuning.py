@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from qgs.containers import map_tensors, named_tensors
-from qgs.contracts import EvaluationConfig
 from qgs.contracts.schedule import END, follow
 from qgs.losses import Photometric
 from qgs.model import QueryGaussianModel
@@ -44,17 +43,20 @@ def tuning_loss(recipe: Recipe) -> Photometric:
 
 
 def tune(
-    model: QueryGaussianModel, views: Views, loss: Photometric, settings: EvaluationConfig
+    model: QueryGaussianModel, views: Views, recipe: Recipe
 ) -> tuple[Gaussians, dict[str, Any]]:
     """Fit what the model holds of the scenes `views` (B, V) to these views; weights stay.
 
-    settings.tuning: "queries", all features and floating fields of the initial state, so LocusGS's
-    anchors too; or "latents", the features of the image memory; the encoder makes keys and values
-    of them anew in every step. `loss` compares the last layer with the photos; the optimiser is
-    Adam. TokenGS takes 50 steps, at a rate of 1e-4 of queries and 1e-2 of latents.
+    evaluation.tuning of the recipe: "queries", all features and floating fields of the initial
+    state, so LocusGS's anchors too; or "latents", the features of the image memory; the encoder
+    makes keys and values of them anew in every step. `tuning_loss` compares the last layer with the
+    photos; the optimiser is Adam. TokenGS takes 50 steps, at a rate of 1e-4 of queries and 1e-2 of
+    latents.
 
     Returns the Gaussians of what was tuned, and a record of the tuning.
     """
+    settings = recipe.evaluation
+    loss = tuning_loss(recipe)
     what = settings.tuning
     views = views.to(next(model.parameters()).device)
     # Encoded once: weights and photos stay, so the memory does too.
@@ -85,10 +87,9 @@ def tune(
     with torch.enable_grad():
         for _ in range(settings.tuning_steps):
             _, value = predicted()
-            # Not backward(): that would leave gradients in the model's weights.
-            gradients = torch.autograd.grad(value, leaves, allow_unused=True)
-            for leaf, gradient in zip(leaves, gradients, strict=True):
-                leaf.grad = gradient
+            optimizer.zero_grad()
+            # Of these alone: others would be left in the model's weights.
+            value.backward(inputs=leaves)
             optimizer.step()
     with torch.no_grad():
         prediction, _ = predicted()

@@ -13,7 +13,7 @@ from qgs.data.samples import Sample, make_sample
 from qgs.data.view_samplers import evenly, moments, spread
 from qgs.domain import Domain, verdict
 from qgs.evaluate.tuning import tune as tuned_on
-from qgs.evaluate.tuning import tuning_loss, tuning_settings
+from qgs.evaluate.tuning import tuning_settings
 from qgs.model import QueryGaussianModel
 from qgs.recipe import Recipe, resolve
 from qgs.reconstruction.result import Reconstruction, reconstruct_sample
@@ -77,8 +77,7 @@ def reconstruct(
         sample = make_sample(found, *window, views, mirror=False)
         tuned = None
         if tune and recipe.evaluation.tuning_steps:
-            loss = tuning_loss(recipe)
-            tuned, records["tuning"] = tuned_on(model, sample.inputs, loss, recipe.evaluation)
+            tuned, records["tuning"] = tuned_on(model, sample.inputs, recipe)
         result = reconstruct_sample(model, sample, seen or (), tuned, **records)
     finally:
         model.train(training)

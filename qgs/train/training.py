@@ -329,8 +329,15 @@ class Trainer:
             # An evaluation must not change what the training draws afterwards.
             with torch.random.fork_rng(used):
                 if self.accelerator.is_main_process:
-                    shown = (self.folder, self.trackers, stop)
-                    judge(self.recipe, self.model, self.average, step, *shown)
+                    judge(
+                        self.recipe,
+                        self.model,
+                        self.average,
+                        step,
+                        self.folder,
+                        self.trackers,
+                        stop,
+                    )
         except Exception as error:  # the run is saved, and worth more than an evaluation
             _log.warning("the evaluation at step %d failed: %s", step, one_line(error))
         # The others wait here, see TIMEOUT in `distributed`.

@@ -8,7 +8,7 @@ from line_scenes import samples_of
 from training_runs import tiny
 
 from qgs.containers import map_tensors
-from qgs.evaluate.tuning import tune, tuning_loss
+from qgs.evaluate.tuning import tune
 
 LATENTS = (
     "plugins=[tokengs2026]",
@@ -27,7 +27,7 @@ def opened(*words):
 
 
 def tuned(recipe, model, inputs):
-    return tune(model, inputs, tuning_loss(recipe), recipe.evaluation)
+    return tune(model, inputs, recipe)
 
 
 @pytest.mark.parametrize(
