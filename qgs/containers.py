@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 _C = TypeVar("_C")
+_DIGITS = {str(size): size for size in range(10)}
 
 
 class TensorContainer:
@@ -18,9 +19,9 @@ class TensorContainer:
         cls.__repr__ = TensorContainer.__repr__
 
     def __repr__(self) -> str:
-        """Shapes, and types and devices that are not float32 on the CPU; no numbers."""
+        """Shapes, types and devices; no numbers."""
         # Numbers of a million Gaussians help nobody.
-        parts = [f"{name}: {_described(tensor)}" for name, tensor in named_tensors(self)]
+        parts = [f"{n}: {tuple(x.shape)} {x.dtype} {x.device}" for n, x in named_tensors(self)]
         lines = "\n  ".join(["", *parts])
         return f"{type(self).__name__}({lines}\n)"
 
@@ -75,12 +76,6 @@ def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
             yield from named_tensors(item, f"{name}.{key}" if name else str(key))
 
 
-def _described(tensor: Tensor) -> str:
-    unusual = [str(tensor.dtype).removeprefix("torch.")] * (tensor.dtype != torch.float32)
-    unusual += [str(tensor.device)] * (tensor.device.type != "cpu")
-    return " ".join([str(tuple(tensor.shape)), *unusual])
-
-
 def _items(value: Any) -> Iterator[tuple[Any, Any]]:
     if isinstance(value, TensorContainer):
         yield from ((f.name, getattr(value, f.name)) for f in fields(cast(Any, value)) if f.init)
@@ -96,7 +91,7 @@ def check_shapes(
     A letter is one size wherever it occurs, "..." the same leading axes; `known` gives the sizes of
     some letters. Fields that are None pass.
     """
-    sizes: dict[str, Any] = dict(known or {})
+    sizes: dict[str, Any] = {**_DIGITS, **(known or {})}
     for name, spec in shapes.items():
         tensor = getattr(container, name)
         axes = spec.split()
@@ -107,14 +102,12 @@ def check_shapes(
         if axes[0] == "...":
             leading = max(len(shape) - len(axes) + 1, 0)
             given = (shape[:leading], *shape[leading:])
-        wanted = [int(axis) if axis.isdigit() else sizes.get(axis, axis) for axis in axes]
-        if len(given) != len(wanted) or any(
-            not isinstance(want, str) and want != size
-            for want, size in zip(wanted, given, strict=True)
+        if len(given) != len(axes) or any(
+            sizes.setdefault(axis, size) != size for axis, size in zip(axes, given, strict=True)
         ):
+            wanted = [sizes.get(axis, axis) for axis in axes]
             flat = [n for want in wanted for n in (want if isinstance(want, tuple) else [want])]
             message = f"must have shape ({', '.join(map(str, flat))}), got {shape}"
             if axes[0] == "B" and len(shape) == len(axes) - 1:
                 message += "; add a leading dimension for a single scene"
             raise ValueError(f"{type(container).__name__}.{name} {message}")
-        sizes.update(zip(axes, given, strict=True))

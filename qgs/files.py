@@ -12,16 +12,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from qgs.machine import with_unit
+from rich.filesize import decimal
+
 from qgs.wording import listed
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 _log = logging.getLogger(__name__)
-
-
-class DiskFullError(OSError):
-    """There is no space for a file; the message names it, and what to do."""
 
 
 @contextmanager
@@ -53,15 +50,15 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def naming_full_disk(path: Path) -> Iterator[None]:
-    """Raise DiskFullError about `path` where the block fails for want of space."""
+    """Raise an OSError about `path` where the block fails for want of space, and what to do."""
     try:
         yield
     except OSError as error:
         if error.errno not in _FULL:
             raise
         free = shutil.disk_usage(path.parent).free
-        raise DiskFullError(
-            f"{path} could not be written ({error.strerror}); {with_unit(free)} are free. Earlier "
+        raise OSError(
+            f"{path} could not be written ({error.strerror}); {decimal(free)} are free. Earlier "
             "files are whole: free space and repeat the command, a training with --resume"
         ) from error
 

@@ -2,33 +2,28 @@
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
 from functools import lru_cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
+from rich.filesize import decimal
 
 
 class TooLargeError(ValueError):
     """A request that does not fit into memory; the message has the numbers."""
 
 
-def refuse_more_than_memory(what: str, needed: Mapping[str, int], advice: str) -> None:
-    """Raise TooLargeError when the sum of `needed` is more than the available memory.
-
-    needed: name to bytes, a lower bound.
-    """
-    total = sum(needed.values())
+def refuse_more_than_memory(what: str, needed: int, advice: str) -> None:
+    """Raise TooLargeError when `needed` bytes, a lower bound, are more than the available ones."""
     limit = available_bytes()
-    if total > limit:
-        parts = sorted(needed.items(), key=lambda part: -part[1])[:3]
+    if needed > limit:
         raise TooLargeError(
-            f"{what} takes {with_unit(total)} of memory at least, and {with_unit(limit)} are "
-            f"available: {', '.join(f'{name} {with_unit(size)}' for name, size in parts)}. {advice}"
+            f"{what} takes {decimal(needed)} of memory at least, and {decimal(limit)} are "
+            f"available. {advice}"
         )
 
 
@@ -57,18 +52,6 @@ def is_out_of_memory(error: BaseException) -> bool:
     words = str(error).lower()
     from_torch = "can't allocate memory" in words or "out of memory" in words
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and from_torch)
-
-
-def with_unit(size: int) -> str:
-    """Bytes with a unit: 1.5 GB."""
-    units = ("bytes", "kB", "MB", "GB", "TB", "PB")
-    power = min((len(str(abs(size))) - 1) // 3, len(units) - 1)
-    return f"{size / 1000**power:.3g} {units[power]}"
-
-
-def can_compile() -> bool:
-    """Whether numba is installed, which `qgs.kernels` needs."""
-    return find_spec("numba") is not None
 
 
 def in_threads(unit: Callable[..., None], work: Iterable[tuple[Any, ...]]) -> None:

@@ -9,9 +9,9 @@ import zlib
 from pathlib import Path
 from typing import IO, Any
 
+from rich.filesize import decimal
 from upath import UPath
 
-from qgs.machine import with_unit
 from qgs.terminal import without_secrets
 
 LARGEST = 500_000_000
@@ -72,7 +72,7 @@ def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
     except _DAMAGED as error:
         raise OSError(f"{path} is damaged: {error}") from error
     if len(content) > most:
-        raise OSError(f"{path} is larger than {with_unit(most)}")
+        raise OSError(f"{path} is larger than {decimal(most)}")
     return content
 
 

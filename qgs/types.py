@@ -99,15 +99,11 @@ class Views(TensorContainer):
     depths: Tensor | None = None
 
     def __post_init__(self) -> None:
-        size = dict(zip("HW", self.cameras.size, strict=True))
+        check_shapes(self.cameras, c2w="B V 4 4")
+        sizes = dict(zip("BVHW", (*self.cameras.shape, *self.cameras.size), strict=True))
         shapes = {"images": "B V 3 H W", "masks": "B V 1 H W", "depths": "B V 1 H W"}
-        check_shapes(self, size, **shapes, times="B V", target_time="B 1")
+        check_shapes(self, sizes, **shapes, times="B V", target_time="B 1")
         _check_unit_images(self)
-        if self.images.shape[:2] != self.cameras.shape:
-            raise ValueError(
-                f"Views.images has {tuple(self.images.shape[:2])} scenes and views, "
-                f"Views.cameras {tuple(self.cameras.shape)}"
-            )
 
     def select(self, index: Any) -> Self:
         """The views at `index` of every scene (a slice or a list of ints), of the same time."""
@@ -117,9 +113,6 @@ class Views(TensorContainer):
 
     def joined(self, other: Self) -> Self:
         """These views, then `other` ones of the same scenes, of one size, with the same parts."""
-        if self.cameras.size != other.cameras.size:
-            sizes = (self.cameras.size, other.cameras.size)
-            raise ValueError(f"views of different sizes cannot be joined: {sizes}")
         both = concatenated([x.replace(target_time=None) for x in (self, other)], 1)
         return both.replace(target_time=self.target_time)
 
@@ -194,9 +187,9 @@ class QueryState(TensorContainer):
         check_shapes(self, features="B N D", mask="B N")
         if self.mask is not None and self.mask.dtype != torch.bool:
             raise ValueError(f"QueryState.mask must be bool, got {self.mask.dtype}")
-        count = tuple(self.features.shape[:2])
+        count = self.features.shape[:2]
         for name, tensor in self.fields.items():
-            if tuple(tensor.shape[:2]) != count:
+            if tensor.shape[:2] != count:
                 raise ValueError(
                     f"the field {name} must have shape {(*count, '...')} as the features have, "
                     f"got {tuple(tensor.shape)}"
@@ -291,9 +284,8 @@ class Gaussians(TensorContainer):
         chosen = self.opacities.topk(min(count, self.count), -1).indices.sort(-1).values
 
         def kept(x: Tensor) -> Tensor:
-            rest = x.shape[chosen.ndim :]
-            index = chosen.reshape(*chosen.shape, *(1 for _ in rest)).expand(*chosen.shape, *rest)
-            return x.gather(chosen.ndim - 1, index)
+            index = chosen[(..., *[None] * (x.ndim - chosen.ndim))]
+            return x.take_along_dim(index, chosen.ndim - 1)
 
         return map_tensors(kept, self)
 

@@ -39,8 +39,6 @@ def test_what_does_not_fit_together_is_refused():
     both = [Gaussians(*BALLS), Gaussians(*BALLS, zeros(1, 5, 3, 3))]
     must_refuse("sh", concatenated, both, 1)
     must_refuse(r"Rendering\.depth", Rendering, RGB, ALPHA, ALPHA[..., :4])
-    odd = Views(zeros(1, 1, 3, 8, 9), CAMERA.replace(size=(8, 9)))
-    must_refuse("different sizes", Views(zeros(1, 1, 3, 8, 8), CAMERA).joined, odd)
     must_refuse(r"SpatialSupport\.axes", SpatialSupport, zeros(1, 2, 3), zeros(1, 2, 3))
 
 

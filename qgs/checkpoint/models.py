@@ -15,10 +15,10 @@ from urllib.error import HTTPError
 from urllib.parse import quote, unquote, urlsplit
 from urllib.request import Request, urlopen
 
+from rich.filesize import decimal
 from safetensors import SafetensorError, safe_open
 
 from qgs.files import replacing
-from qgs.machine import with_unit
 from qgs.paths import opened_path
 from qgs.recipe.errors import did_you_mean
 from qgs.recipe.registry import available_plugins, load_plugin
@@ -51,7 +51,7 @@ def checkpoint_path(name: str | os.PathLike[str]) -> Path:
         # Only a plug-in that is installed makes a name of what may be a path.
         is_name = bool(model) and "/" not in model and path.suffix != ".safetensors"
         if is_name and plugin in available_plugins():
-            return _shipped(plugin, text)
+            path = _shipped(plugin, text)
     if not path.is_file():
         raise FileNotFoundError(
             f"no checkpoint at {path}; give a run folder of `qgs train`, a .safetensors file, its "
@@ -65,13 +65,7 @@ def _shipped(plugin: str, name: str) -> Path:
     if name not in installed.models:
         hint = did_you_mean(name, installed.models, "models")
         raise FileNotFoundError(f"{installed.released_as} ships no model {name}; {hint}")
-    file = installed.models[name]
-    if not file.is_file():
-        raise FileNotFoundError(
-            f"{installed.released_as} should ship the model {name}, but {file} is not there; "
-            f"install {installed.released_as} again"
-        )
-    return file
+    return installed.models[name]
 
 
 def card_of(file: Path) -> str:
@@ -102,16 +96,14 @@ def downloaded(url: str) -> Path:
     key = hashlib.sha256(url.encode()).hexdigest()[:16]
     # A file name may have 255 bytes.
     file = cache / key / (last.strip(".")[-50:] or "checkpoint")
-    kept = "not downloaded again (delete the file to do so); it was kept as"
     if file.is_file() and not _is_whole(file):
         print(f"{file} is damaged and is downloaded again", file=sys.stderr)
         file.unlink()
     if not file.is_file():
         _download(url, file)
-        kept = "kept as"
     with file.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    print(f"{name}: sha256 {digest}, {kept} {file}", file=sys.stderr)
+    print(f"{name}: sha256 {digest}, kept as {file} (delete it to download again)", file=sys.stderr)
     return file
 
 
@@ -151,7 +143,7 @@ def _copy(stream: Any, local: IO[bytes], folder: Path) -> None:
         local.write(part)
         left -= len(part)
     if announced > limit or left <= 0:
-        raise OSError(f"it is larger than {with_unit(limit)}")
+        raise OSError(f"it is larger than {decimal(limit)}")
 
 
 def _opened(url: str) -> Any:

@@ -93,8 +93,7 @@ class TensorFile:
             raise
         # Forged JSON makes later code raise anything.
         except Exception as error:
-            kind = "nested too deep" if isinstance(error, RecursionError) else str(error)[:200]
-            what = f"`{key}` in its metadata cannot be read ({type(error).__name__}: {kind})"
+            what = f"`{key}` in its metadata cannot be read ({type(error).__name__}: {error})"
             raise self.damaged(what) from error
 
     def mapping(self, key: str) -> dict[str, Any]:

@@ -10,10 +10,11 @@ from typing import IO, TypeVar
 import numpy as np
 import torch
 from PIL import Image, UnidentifiedImageError
+from rich.filesize import decimal
 from torch import Tensor
 from upath import UPath
 
-from qgs.machine import is_out_of_memory, with_unit
+from qgs.machine import is_out_of_memory
 from qgs.paths import LARGEST, open_file
 from qgs.wording import name_shown
 
@@ -133,7 +134,7 @@ def load_array(file: IO[bytes]) -> np.ndarray:
         shape, _, dtype = np.lib.format.read_array_header_2_0(file)
     size = math.prod(shape) * dtype.itemsize
     if size > LARGEST:
-        raise ValueError(f"it has {with_unit(size)}: scale it down")
+        raise ValueError(f"it has {decimal(size)}: scale it down")
     file.seek(0)
     return np.load(file, allow_pickle=False)
 

@@ -73,7 +73,7 @@ def refuse_too_many(frames: int, scene: Scene) -> None:
     height, width = scene.cameras.size
     refuse_more_than_memory(
         f"a sample of {frames} images of {height} x {width}",
-        {"images": frames * 3 * height * width * torch.float32.itemsize},
+        frames * 3 * height * width * torch.float32.itemsize,
         "Ask for fewer views (views.inputs, views.targets) or smaller images (data.image_size).",
     )
 

@@ -1,4 +1,4 @@
-"""Compiled loops of the renderer `qgs/cpu`, by numba (the extra `cpu`).
+"""Compiled loops of the renderer `qgs/cpu`, by numba.
 
 Nothing here is needed to understand a model. Each kernel computes what a few lines of torch say
 elsewhere, which are its oracle in the tests, without tensors of all pairs.

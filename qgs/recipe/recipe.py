@@ -70,8 +70,9 @@ class Recipe:
             # A width of 65,536 is valid, and would end in the kernel's out-of-memory killer.
             state = build_model(self, "meta").state_dict()
             sizes = {name: x.numel() * x.element_size() for name, x in state.items()}
-            fix = "Lower the option of the model that makes the largest of them."
-            refuse_more_than_memory("the model with its weights", sizes, fix)
+            largest = max(sizes, key=lambda name: sizes[name])
+            fix = f"Lower the option of the model that makes {largest}."
+            refuse_more_than_memory("the model with its weights", sum(sizes.values()), fix)
         model = build_model(self, device)
         model.releases = self.releases
         if pretrained:

@@ -9,9 +9,9 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from qgs.contracts import MissingExtraError, Renderer, RendererConfig
+from qgs.contracts import Renderer, RendererConfig
 from qgs.contracts.renderer import background_of, channels_of, check_inputs, raise_precision
-from qgs.machine import can_compile, in_threads
+from qgs.machine import in_threads
 from qgs.renderers.reference import CLAMP_MARGIN, resolve
 from qgs.types import Cameras, Gaussians, Rendering
 
@@ -33,15 +33,6 @@ class CpuRenderer(Renderer):
 
     name = "cpu"
     devices = ("cpu",)
-
-    def __init__(self, config: RendererConfig) -> None:
-        super().__init__(config)
-        if not can_compile():
-            raise MissingExtraError(
-                "the renderer qgs/cpu needs numba, which is not installed: run "
-                "`pip install numba`, or choose `renderer: {type: qgs/torch}` "
-                "(much slower)"
-            )
 
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None

@@ -9,7 +9,7 @@ import torch
 from safetensors import SafetensorError
 
 from qgs.checkpoint.tensors import write_tensors
-from qgs.files import DiskFullError, is_leftover, replacing, replacing_entries, write_text
+from qgs.files import is_leftover, replacing, replacing_entries, write_text
 
 
 def put(folder, text, *names):
@@ -64,7 +64,7 @@ def test_a_disk_is_called_full_only_where_it_is(tmp_path, monkeypatch):
         with pytest.raises(OSError, match=r"a\.safetensors") as caught:
             write_tensors(tmp_path / "a.safetensors", {"a": torch.ones(1)}, {})
         full = number is None
-        assert isinstance(caught.value, DiskFullError) == full
+        assert ("free space" in str(caught.value)) == full
         assert full or caught.value.errno == number
         assert words in str(caught.value)
         assert not list(tmp_path.iterdir())

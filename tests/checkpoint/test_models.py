@@ -61,7 +61,7 @@ def test_models_are_listed_and_checked(shipped):
     told = run_qgs("list", "box/small").output
     assert f"{shipped}: 0.3 MB" in told.replace("\n", "")
     assert "- Seed: 0" in told
-    assert "should ship the model box/gone" in str(run_qgs("list", "box/gone").exception)
+    assert "no checkpoint at" in str(run_qgs("list", "box/gone").exception)
     checked = run_qgs("check-plugin", "box", "--core")
     assert checked.exit_code == 1
     assert "ok     model box/small" in checked.output

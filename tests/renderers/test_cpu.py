@@ -10,7 +10,6 @@ from renderers.scenes import differentiate, make_scene
 from tables import must_refuse
 from torch.testing import assert_close
 
-import qgs.renderers.cpu
 from qgs.containers import concatenated, named_tensors
 from qgs.contracts import RendererConfig
 from qgs.kernels import kernel
@@ -44,11 +43,6 @@ def test_more_gaussians_than_a_unit_of_work_takes(more):
         assert not of_fillers.any(), name
         assert torch.equal(found[name], gradients[name]), name
     assert_close(found, gradients)
-
-
-def test_missing_numba_says_what_to_do(monkeypatch):
-    monkeypatch.setattr(qgs.renderers.cpu, "can_compile", lambda: False)
-    must_refuse(r"pip install numba.*qgs/torch", CpuRenderer, RendererConfig(), kind=RuntimeError)
 
 
 def test_tensors_elsewhere_are_refused():

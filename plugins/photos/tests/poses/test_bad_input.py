@@ -15,8 +15,6 @@ from qgs_photos.poses import making
 from qgs_photos.poses.photos import PosesError
 from walked import cut, write_photos, write_video
 
-from qgs.files import DiskFullError
-
 
 def state(folder):
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
@@ -70,7 +68,7 @@ def test_what_cannot_be_written_is_named(walk, tmp_path, monkeypatch):
 
     monkeypatch.setattr(making, "prepare", full)
     result = run_qgs("poses", walk, "--out", tmp_path / "out")
-    assert isinstance(result.exception, DiskFullError)
+    assert "free space" in str(result.exception)
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from qgs.geometry.precision import full_precision
-from qgs.machine import can_compile, in_threads
+from qgs.machine import in_threads
 from qgs_locus.kernels.attention_choice import AttentionKernel, chosen_kernel
 
 T = TypeVar("T")
@@ -109,7 +109,7 @@ class AttentionBias(ABC):
 
     def _kernels(self, queries: Tensor) -> tuple[Kernel, Kernel] | None:
         usable = queries.device.type == "cpu" and queries.dtype == torch.float32
-        return self.compiled() if usable and can_compile() else None
+        return self.compiled() if usable else None
 
     def dense(self, chosen: Tensor | None = None) -> Tensor:
         """The bias of all pairs, (B, N, M), or of the queries with indices `chosen`, (B, Q, M)."""
