@@ -11,7 +11,6 @@ from qgs.contracts.component import (
     OptionError,
     Problem,
     RecipeContext,
-    component_of,
     without_effect,
 )
 from qgs.contracts.data import Frames, Scene, SceneSource, SceneSourceConfig, Split, ViewSampler
@@ -91,7 +90,6 @@ __all__ = [
     "TrainingConfig",
     "ViewSampler",
     "ViewsConfig",
-    "component_of",
     "memory_fields",
     "without_effect",
 ]

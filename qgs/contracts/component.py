@@ -153,9 +153,9 @@ class Component(metaclass=ABCMeta):
         self.config = config
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Give every class a Config of its own, for `component_of`."""
+        """Give every class a Config of its own, which knows it."""
         super().__init_subclass__(**options)
-        # `component_of` finds a component by its Config, so that no two may share one.
+        # Options tell their component, so that no two may share a Config.
         inherited = cls.Config
         if inherited.__qualname__ != f"{cls.__qualname__}.Config":
             own: dict[str, Any] = {"__qualname__": f"{cls.__qualname__}.Config"}
@@ -188,15 +188,6 @@ class Component(metaclass=ABCMeta):
         brings all weights. Raises MissingExtraError where a file or a package is not there: the
         message says what to do.
         """
-
-
-def component_of(config: ComponentConfig) -> type[Component]:
-    """The component that has the options `config`; raises TypeError where there is none."""
-    # Options tell their component, so that a call needs no registry.
-    component = type(config).__component__ if isinstance(config, ComponentConfig) else None
-    if component is None:
-        raise TypeError(f"{type(config).__name__} is not the Config of a component class")
-    return component
 
 
 class ModelComponent(Component, torch.nn.Module):

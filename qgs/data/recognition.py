@@ -1,10 +1,11 @@
 """Which source opens a path, and opening it for a trained model."""
 
 from collections.abc import Mapping
+from typing import Any
 
 from upath import UPath
 
-from qgs.contracts import Component, SceneSource, SceneSourceConfig, component_of
+from qgs.contracts import Component, SceneSource, SceneSourceConfig
 from qgs.data.photos import with_cameras
 from qgs.paths import opened_path
 from qgs.wording import one_line, warn_once
@@ -23,8 +24,7 @@ def recognised(path: UPath, sources: Mapping[str, type[Component]]) -> str:
     asked = sorted(sources, key=lambda kind: kind.startswith("qgs/"))
     found: list[str] = []
     for kind in asked:
-        source = sources[kind]
-        assert issubclass(source, SceneSource)
+        source: Any = sources[kind]
         try:
             if source.recognises(path):
                 found.append(kind)
@@ -45,8 +45,7 @@ def is_training_data(path: str, trained: SceneSourceConfig | None) -> bool:
     root = getattr(trained, "path", None)
     if trained is None or not isinstance(root, str):
         return False
-    source = component_of(trained)
-    assert issubclass(source, SceneSource)
+    source: Any = trained.__component__
     return source.trains_on(opened_path(root).resolve(), opened_path(path).resolve())
 
 
@@ -63,14 +62,13 @@ def open_for(
     image_size: (H, W), by default that of `trained`. Raises as `recognised` and the source do.
     """
     size = image_size or (trained or SceneSourceConfig()).image_size
+    source: Any
     if trained is not None and is_training_data(path, trained):
-        source = component_of(trained)
-        assert issubclass(source, SceneSource)
+        source = trained.__component__
         return source(trained.model_copy(update={"path": path, "image_size": size})), True
     opened = opened_path(path)
     kind = recognised(opened, sources)
     if kind == "qgs/photos":
         path = str(with_cameras(opened))
     source = sources[kind]
-    assert issubclass(source, SceneSource)
     return source(source.config_for(path, size, trained)), False

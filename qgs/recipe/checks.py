@@ -32,7 +32,7 @@ def check(draft: Draft, problems: Problems) -> Parts:
     sound = [_check_options(part, context, problems) for part in parts.values()]
     if all(sound):
         check_flow(parts, draft.dims.depth, draft.registry, problems)
-    for path, reason, fix in [*_contradictions(draft, parts), *_idle_layer_scale(draft, parts)]:
+    for path, reason, fix in _contradictions(draft, parts):
         section = draft.tree.child(*path[:-1])
         problems.add(section.origin_of(path[-1]), path, reason, fix)
     problems.raise_any()
@@ -137,15 +137,11 @@ def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, 
     if ("data",) in parts and not any(path[0] == "losses" for path in parts):
         reason = "a recipe with data needs at least one loss to train"
         yield ("losses",), reason, "add one under `losses`, or drop the data with `data: null`"
-
-
-def _idle_layer_scale(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, str]]:
-    """Path, reason and fix where `layer_scale` was changed and no layer reads it."""
     # A resolved recipe writes the default out, which must stay valid.
     default = DecoderSettings().layer_scale
     layers: list[Any] = [parts[place] for place in layer_places(draft.dims.depth, "layer")]
     read = any(layer.component.reads_layer_scale for layer in layers)
-    if not read and draft.settings.model.decoder.layer_scale != default:
+    if not read and settings.model.decoder.layer_scale != default:
         names = " and ".join(sorted({f"`{layer.type}`" for layer in layers}))
         reason = f"it has no effect: {names or 'a decoder of depth 0'} does not read it"
         fix = f"remove it; the default, `layer_scale: {inline(default)}`, drops an inherited one"
@@ -204,7 +200,7 @@ def _unmet(missing: Fields, reader: Chosen, parts: Parts, registry: Registry) ->
     named = " and ".join(f"{name} ({spec})" for name, spec in missing.items())
     reason = f"`{reader.type}` needs {named}, which nothing before it provides"
     for name in missing:
-        late = [part for part in parts.values() if name in _offers(part)]
+        late = [part for part in parts.values() if name in _offered(part.component, part.config)]
         if late:
             reason += f"; `{late[0].type}` at {late[0].shown_path} provides {name} too late"
     # Whoever replaced a component that provided them finds the line here.
@@ -218,10 +214,6 @@ def _unmet(missing: Fields, reader: Chosen, parts: Parts, registry: Registry) ->
     if known:
         return reason, f"use {' or '.join(known)} with default options"
     return reason, f"use or install a component that provides {' and '.join(missing)}"
-
-
-def _offers(part: Chosen) -> Fields:
-    return _offered(part.component, part.config)
 
 
 def _offered(component: type[Component], config: ComponentConfig | None) -> Fields:
@@ -246,7 +238,7 @@ def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
     readers = [part for part in used if not issubclass(part.component, Refinement)]
     read = {name for part in readers for name in part.component.fields_read(part.config)}
     queries = parts["model", "queries"]
-    for name, spec in _offers(queries).items():
+    for name, spec in _offered(queries.component, queries.config).items():
         if name not in read and spec.dtype.is_floating_point:
             yield (
                 f"nothing reads {name}, which `{queries.type}` at model.queries provides: what is "

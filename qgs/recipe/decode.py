@@ -185,14 +185,16 @@ def report(
     """Add the problem that `config` finds with the options written as `node` at `path`."""
     steps, origin, given = find(node, fault["loc"])
     options = dict(options_in(config))
-    shown = ".".join(step for step in steps if isinstance(step, str))
+    # Layers have numbers, and one option of each name for all of them.
+    shown = ".".join(step for step in map(str, steps) if not step.isdigit())
     if fault["type"] == "extra_forbidden":
         section, _, option = shown.rpartition(".")
         reason = f"there is no option `{option}` here"
         # A key that stands somewhere else is no typing error: name its section.
         homes = {known.rpartition(".")[2]: known for known in reversed(options)}
         near = nearest(option, homes)
-        beside = [known for known in options if known.rpartition(".")[0] == section]
+        split = [known.rpartition(".") for known in options]
+        beside = [name for above, _, name in split if above == section]
         fix = f"did you mean `{homes[near]}`?" if near else did_you_mean("", beside, "options")
     else:
         reason, fix = _explain(fault, given)

@@ -93,9 +93,7 @@ class Problems:
 
 def nearest(word: str, choices: Iterable[str]) -> str | None:
     """The choice that `word` is probably a misspelling of."""
-    # Below .6 difflib takes words for similar that share a few letters.
-    found = get_close_matches(word, sorted(choices), n=1, cutoff=0.6)
-    return found[0] if found else None
+    return next(iter(get_close_matches(word, sorted(choices))), None)
 
 
 def did_you_mean(word: str, choices: Collection[str], noun: str) -> str:

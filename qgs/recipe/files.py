@@ -46,7 +46,7 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
         if below == ("plugins",) and isinstance(old, list) and isinstance(value, list):
             # A file names the plug-ins that it needs and leaves those of its base.
             added = [item for item in items_of(value, origin) if item[0] not in old]
-            value = ListNode(origin, [*items_of(old, base.origins[key]), *added])
+            value = ListNode([*items_of(old, base.origins[key]), *added])
         elif isinstance(old, MapNode) and isinstance(value, MapNode):
             value = merge(old, value, below)
         merged.put(key, value, origin)

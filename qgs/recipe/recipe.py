@@ -257,16 +257,10 @@ def differing_options(
 
     None stands for an option that a recipe does not have.
     """
-    ours = flat(a)
-    theirs = flat(b)
-    differing = [key for key in ours | theirs if ours.get(key, ...) != theirs.get(key, ...)]
-    return {
-        key: (
-            inline(ours[key]) if key in ours else None,
-            inline(theirs[key]) if key in theirs else None,
-        )
-        for key in differing
-    }
+    ours = {key: inline(value) for key, value in flat(a).items()}
+    theirs = {key: inline(value) for key, value in flat(b).items()}
+    pairs = {key: (ours.get(key), theirs.get(key)) for key in ours | theirs}
+    return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
 
 
 _NO_EFFECT_ONCE_TRAINED = re.compile(

@@ -77,29 +77,25 @@ class MapNode(dict[str, Any]):
 
 
 class ListNode(list[Any]):
-    """A list. origin: where it begins. origins: where each item was written."""
+    """A list. origins: where each item was written, by index."""
 
-    def __init__(self, origin: Origin, items: Iterable[tuple[Any, Origin]] = ()) -> None:
-        super().__init__()
-        self.origin = origin
-        self.origins: list[Origin] = []
-        for value, written in items:
-            self.append(value)
-            self.origins.append(written)
+    def __init__(self, items: Iterable[tuple[Any, Origin]]) -> None:
+        entries = [*items]
+        super().__init__(value for value, _ in entries)
+        self.origins = {index: origin for index, (_, origin) in enumerate(entries)}
 
 
-Node: TypeAlias = MapNode | list[Any] | str | int | float | None
+Node: TypeAlias = MapNode | ListNode | str | int | float | None
 
 
 def items_of(value: Any, origin: Origin) -> list[tuple[Any, Origin]]:
-    """Items of a list, and where each was written: at `origin` for one that does not know.
+    """Items of a list, and where each was written.
 
-    One value stands for a list of it, null for none.
+    One value, written at `origin`, stands for a list of it, null for none.
     """
     if isinstance(value, ListNode):
-        return [*zip(value, value.origins, strict=True)]
-    items = value if isinstance(value, list) else [] if value is None else [value]
-    return [(item, origin) for item in items]
+        return [*zip(value, value.origins.values(), strict=True)]
+    return [] if value is None else [(value, origin)]
 
 
 def from_plain(value: Mapping[str, Any], origin: Origin) -> MapNode:
@@ -108,11 +104,15 @@ def from_plain(value: Mapping[str, Any], origin: Origin) -> MapNode:
     Raises ValueError or TypeError for what YAML could not hold.
     """
 
-    def mapping(pairs: list[tuple[str, Any]]) -> MapNode:
-        return MapNode(origin, ((key, item, origin) for key, item in pairs))
+    def read(plain: Any) -> Any:
+        if isinstance(plain, dict):
+            return MapNode(origin, ((key, read(item), origin) for key, item in plain.items()))
+        if isinstance(plain, list):
+            return ListNode((read(item), origin) for item in plain)
+        return plain
 
     # JSON refuses what contains itself, and what is no plain value.
-    return json.loads(json.dumps(value, default=os.fspath), object_pairs_hook=mapping)
+    return read(json.loads(json.dumps(value, default=os.fspath)))
 
 
 def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Origin, Node]:
@@ -126,10 +126,9 @@ def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Ori
     for step in path:
         # Pydantic names the tag of a union as a step, which nobody writes.
         key: Any = str(step) if isinstance(node, MapNode) else step
-        keys = range(len(node)) if isinstance(node, list) else ()
-        if key in (node if isinstance(node, MapNode) else keys):
-            # Lists of Python mappings know no lines.
-            origin = node.origins[key] if isinstance(node, MapNode | ListNode) else origin
+        origins = getattr(node, "origins", {})
+        if key in origins:
+            origin = origins[key]
             node = node[key]
             taken.append(step)
     return taken, origin, node
@@ -224,8 +223,7 @@ def _read(
             read.put(key, below(value_node), origin(key_node.start_mark))
         return read
     if isinstance(node, yaml.SequenceNode):
-        items = ((below(item), origin(item.start_mark)) for item in node.value)
-        return ListNode(origin(node.start_mark), items)
+        return ListNode((below(item), origin(item.start_mark)) for item in node.value)
     kind = node.tag.removeprefix(_STANDARD)
     try:
         return _scalar(kind, node.value)

@@ -81,7 +81,9 @@ class Case:
     @property
     def component(self) -> type[contracts.Component]:
         """The class under test."""
-        return contracts.component_of(self.config)
+        component = self.config.__component__
+        assert component is not None
+        return component
 
     @property
     def slot(self) -> str:

@@ -237,7 +237,7 @@ def _variant(tree: MapNode, name: str, problems: Problems) -> MapNode:
     overlay = tree.child("overlay")
     _locate_index(overlay)
     whole = merge(node.without("extends"), overlay)
-    extends = ("extends", ListNode(at, files), at)
+    extends = ("extends", ListNode(files), at)
     return MapNode(origin, [extends, ("recipe", 1, origin), *whole.entries()])
 
 
