@@ -22,12 +22,12 @@ from typing import Any
 
 from jinja2 import Template
 from qgs_dev import CHECKS
+from qgs_dev.schema import settings_schema
+from qgs_dev.tables import option_rows
 
-from qgs.cli.tables import option_rows
 from qgs.contracts import Component, ComponentConfig
 from qgs.recipe import slots
 from qgs.recipe.registry import default_config, load_usable_plugins
-from qgs.recipe.schema import settings_schema
 from qgs.recipe.sections import SETTINGS
 from qgs.recipe.slots import summary_of
 

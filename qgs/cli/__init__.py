@@ -75,9 +75,7 @@ app = typer.Typer(
 )
 
 COMMANDS = {
-    "list": inspect.list_components,
     "compose": inspect.compose,
-    "schema": inspect.schema,
     "recipes": inspect.recipes,
     "train": train.train,
     "eval": evaluate.evaluate,

@@ -1,4 +1,4 @@
-"""`qgs list`, `compose`, `recipes`, names of recipes, options of all commands, mistakes."""
+"""`qgs compose`, `recipes`, names of recipes, options of all commands, mistakes."""
 
 import sys
 from pathlib import Path
@@ -28,25 +28,6 @@ def _in_a_folder_with_a_recipe(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
     (tmp_path / "a.yaml").write_text(SMALL)
-
-
-LISTED = """
-queries; model.queries: qgs/latent, query-gaussians 0; locus/anchored
-qgs/latent; count | integer >= 1 | 4096 | N, the number of queries.
-locus/anchored; center_init.std; provides: anchor.center (3 float32, world frame)
-qgs/photos; path | text | required |
-model.decoder; layer_scale | number > 0 | 5.0e-05
-recipe; seed; init_from
-"""
-
-
-def test_list_explains_options():
-    for line in LISTED.strip().splitlines():
-        name, *parts = line.split("; ")
-        shown = done("list", name).output.replace("\N{BOX DRAWINGS LIGHT VERTICAL}", "|")
-        output = " ".join(shown.split())
-        assert all(part in output for part in parts), output
-        assert "qgs/mlp" not in output
 
 
 def test_compose_prints_a_recipe_that_composes_again(tmp_path):

@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from qgs.files import write_text
 from qgs.metrics.baselines import BASELINES
-from qgs.recipe.schema import summary_of
+from qgs.recipe.slots import summary_of
 from qgs.terminal import print_lines, print_table
 from qgs.wording import listed
 from qgs_viewer import sections

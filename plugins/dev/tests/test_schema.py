@@ -1,4 +1,4 @@
-"""The JSON Schema agrees with the composer, and the committed copy with the code."""
+"""`qgs list`; the JSON Schema agrees with the composer, and the committed copy with the code."""
 
 import json
 from pathlib import Path
@@ -6,11 +6,12 @@ from pathlib import Path
 import jsonschema
 import pytest
 import yaml
+from commands import done
+from qgs_dev.schema import recipe_schema
 
 from qgs.recipe.registry import load_registry
-from qgs.recipe.schema import recipe_schema
 
-COMMITTED = Path(__file__).parents[2] / "recipes/recipe.schema.json"
+COMMITTED = Path(__file__).parents[3] / "recipes/recipe.schema.json"
 SHIPPED = "c3g datasets dinov2 ellipsoid globalsplat gslrm landmark locus lpips mvsplat rooms"
 SHIPPED += " tokengs2026 worlds"
 SOUND = """
@@ -58,3 +59,23 @@ def test_nulls_and_schedules_are_valid_and_mistakes_are_not(schema):
     is_valid = jsonschema.Draft202012Validator(schema).is_valid
     recipes = yaml.safe_load_all(f"{SOUND}---{MISTAKEN}")
     assert [is_valid(json.loads(json.dumps(x))) for x in recipes] == [True] * 2 + [False] * 9
+
+
+LISTED = """
+queries; model.queries: qgs/latent, query-gaussians 0; locus/anchored
+qgs/latent; count | integer >= 1 | 4096 | N, the number of queries.
+locus/anchored; center_init.std; provides: anchor.center (3 float32, world frame)
+qgs/photos; path | text | required |
+model.decoder; layer_scale | number > 0 | 5.0e-05
+recipe; seed; init_from
+"""
+
+
+def test_list_explains_options(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    for line in LISTED.strip().splitlines():
+        name, *parts = line.split("; ")
+        shown = done("list", name).output.replace("\N{BOX DRAWINGS LIGHT VERTICAL}", "|")
+        output = " ".join(shown.split())
+        assert all(part in output for part in parts), output
+        assert "qgs/mlp" not in output

@@ -1,0 +1,51 @@
+"""`qgs list`, `qgs schema`: the installed components and their options."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+list_app = typer.Typer()
+schema_app = typer.Typer()
+
+
+@list_app.command()
+def list_components(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            help="A slot, a component such as qgs/latent, a trained model, a section of settings."
+        ),
+    ] = None,
+) -> None:
+    """Installed components by slot, and trained models; with NAME all options and meanings.
+
+    Imports every installed plugin; for a NAME such as rooms/locus-64 that of the name alone.
+    """
+    from qgs.recipe.registry import load_registry, load_usable_plugins
+    from qgs_dev.tables import details, overview
+
+    plugin, slash, _ = (name or "").partition("/")
+    # One plug-in is enough for a name that begins with it: all would take seconds.
+    registry, broken = (load_registry([plugin]), []) if slash else load_usable_plugins()
+    for part in details(name, registry) if name else overview(registry):
+        Console().print(part, highlight=False)
+    for message in broken:
+        Console(stderr=True).print(f"plugin left out: {message}", markup=False)
+
+
+@schema_app.command()
+def schema(
+    out: Annotated[
+        Path | None, typer.Option(help="File to write; standard output if none.")
+    ] = None,
+) -> None:
+    """JSON Schema of a recipe with everything that is installed; imports every plugin."""
+    from qgs.files import write_text
+    from qgs.recipe.registry import load_usable_plugins
+    from qgs_dev.schema import recipe_schema
+
+    text = json.dumps(recipe_schema(load_usable_plugins()[0]), indent=1) + "\n"
+    typer.echo(text, nl=False) if out is None else write_text(out, text)
