@@ -1,11 +1,10 @@
 """Slot `objective`: which passes of the model a training step makes, and what it minimises."""
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
-import torch
 from torch import Tensor
 
 from qgs.contracts.component import Component
@@ -24,31 +23,6 @@ class Outcome:
     total: Tensor
     terms: Mapping[str, Tensor]
     signs: Mapping[str, Tensor]
-
-    @classmethod
-    def mean(cls, outcomes: Sequence["Outcome"], **terms: Tensor) -> "Outcome":
-        """The mean of `outcomes` of equally many losses, plus `terms`: 0-d, weighted, named.
-
-        Raises ValueError for a term that is named as one of the outcomes'.
-        """
-        first = outcomes[0]
-        share = 1 / len(outcomes)
-        # One of two equal names would be lost from the log.
-        if taken := sorted(first.terms.keys() & terms.keys()):
-            raise ValueError(f"the recipe's losses have terms {taken} already; rename the others")
-        judged = {n: share * _sum(o.terms[n] for o in outcomes) for n in first.terms}
-        signs = {n: share * _sum(o.signs[n] for o in outcomes) for n in first.signs}
-        # One collapsed pass is a sign that a mean would hide.
-        signs["deviation"] = torch.stack([o.signs["deviation"] for o in outcomes]).amax()
-        total = share * _sum(o.total for o in outcomes) + _sum(terms.values())
-        # Numbers for the log; their graph would hold the memory of the step.
-        detached = {n: term.detach() for n, term in terms.items()}
-        return cls(total, judged | detached, signs)
-
-
-def _sum(terms: Iterable[Tensor]) -> Tensor:
-    summands = [*terms]
-    return torch.stack(summands).sum() if summands else torch.zeros(())
 
 
 class Passes(Protocol):

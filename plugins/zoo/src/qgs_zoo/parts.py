@@ -1,6 +1,6 @@
 """Parts that several systems share: attention, rays of pixels, rotations, files of weights."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -9,7 +9,7 @@ from einops import repeat
 from safetensors.torch import load_file
 from torch import Tensor
 
-from qgs.contracts import MissingExtraError
+from qgs.contracts import MissingExtraError, Outcome
 from qgs.geometry.precision import full_precision
 from qgs.tokengs.blocks import merge_heads, split_heads
 from qgs.types import Cameras
@@ -83,3 +83,28 @@ def load_weights(file: str, fill: Callable[[Mapping[str, Tensor]], object], reme
         # Whatever torch and safetensors raise about an absent, a damaged or another file.
         what = f"cannot read weights of {path.name} ({type(error).__name__}: {error})"
         raise MissingExtraError(f"{what}; {remedy}") from error
+
+
+def mean_outcome(outcomes: Sequence[Outcome], **terms: Tensor) -> Outcome:
+    """The mean of `outcomes` of equally many losses, plus `terms`: 0-d, weighted, named.
+
+    Raises ValueError for a term that is named as one of the outcomes'.
+    """
+    first = outcomes[0]
+    share = 1 / len(outcomes)
+    # One of two equal names would be lost from the log.
+    if taken := sorted(first.terms.keys() & terms.keys()):
+        raise ValueError(f"the recipe's losses have terms {taken} already; rename the others")
+    judged = {n: share * _sum(o.terms[n] for o in outcomes) for n in first.terms}
+    signs = {n: share * _sum(o.signs[n] for o in outcomes) for n in first.signs}
+    # One collapsed pass is a sign that a mean would hide.
+    signs["deviation"] = torch.stack([o.signs["deviation"] for o in outcomes]).amax()
+    total = share * _sum(o.total for o in outcomes) + _sum(terms.values())
+    # Numbers for the log; their graph would hold the memory of the step.
+    detached = {n: term.detach() for n, term in terms.items()}
+    return Outcome(total, judged | detached, signs)
+
+
+def _sum(terms: Iterable[Tensor]) -> Tensor:
+    summands = [*terms]
+    return torch.stack(summands).sum() if summands else torch.zeros(())

@@ -24,6 +24,7 @@ from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import to_camera
 from qgs.losses import mean_of_gaussians
 from qgs.types import Cameras, LayerPrediction, Rendering, Views
+from qgs_zoo.parts import mean_outcome
 
 
 class Frustum(Loss):
@@ -145,7 +146,7 @@ class TwoPasses(Objective):
             # Both are drawn from the target cameras, which neither pass has seen.
             renderings.append(passes.render(prediction.gaussians, targets.cameras))
         one, other = renderings
-        return Outcome.mean(
+        return mean_outcome(
             outcomes,
             alpha_consistency=self.config.alpha_weight * disagreement(one.alpha, other.alpha),
             depth_consistency=self.config.depth_weight * disagreement(one.depth, other.depth),

@@ -22,6 +22,7 @@ from qgs.contracts import (
 )
 from qgs.tokengs.decoder import ContentSelfAttention
 from qgs.types import ImageMemory, LayerPrediction, Prediction, QueryState, Views
+from qgs_zoo.parts import mean_outcome
 from qgs_zoo.tokengs2026.multiscale import TimeEmbedding, without_times
 
 MOVES = "dynamic.moves"
@@ -135,7 +136,7 @@ class DynamicObjective(Objective):
             last = layers[max(layers)]
             alone = Prediction(last.gaussians, last.state, layers)
             added = self.config.weight * passes.judge(alone, targets, inputs).total
-        return Outcome.mean([whole], dynamic=added)
+        return mean_outcome([whole], dynamic=added)
 
 
 def _alone(layer: LayerPrediction) -> LayerPrediction:
