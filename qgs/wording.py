@@ -1,9 +1,7 @@
 """Words that messages and tables share."""
 
 import logging
-import os
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import lru_cache
 
 _log = logging.getLogger(__name__)
@@ -27,20 +25,6 @@ def numbered(frame: int, name: str) -> str:
 def counted(number: int, what: str) -> str:
     """Such as "1 thread", "12 threads"."""
     return f"{number:,} {what}{'' if number == 1 else 's'}"
-
-
-def short_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
-    """Names of models or recipes, each another: what their folders share and suffixes left out.
-
-    One that comes again is numbered: `a/x.yaml`, `b/x.yaml` and that again are a/x, b/x, b/x (2).
-    """
-    files = [os.path.abspath(path) for path in paths]
-    # Runs of one study share most of their path.
-    shared = os.path.commonpath([os.path.dirname(file) for file in files])
-    suffix = r"\.(ya?ml|safetensors)$"
-    names = [re.sub(suffix, "", os.path.relpath(file, shared)) for file in files]
-    before = [names[:index].count(name) for index, name in enumerate(names)]
-    return [f"{n} ({b + 1})" if b else n for n, b in zip(names, before, strict=True)]
 
 
 def name_shown(name: str, most: int = 500) -> str:

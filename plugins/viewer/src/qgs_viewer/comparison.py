@@ -1,6 +1,8 @@
 """Trained models on the same scenes: opened, and judged under one protocol."""
 
 import math
+import os
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,7 +32,6 @@ from qgs.reconstruction.scenes import (
     size_multiple,
     whole_size,
 )
-from qgs.wording import short_names
 
 # Scenes, and windows of a scene, that are judged of a user's photos.
 WINDOWS = 6
@@ -157,6 +158,20 @@ class Model:
     def recipe_text(self) -> str:
         """The recipe as YAML."""
         return yaml.safe_dump(dict(self.recipe.tree), sort_keys=False, allow_unicode=True)
+
+
+def short_names(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
+    """Names of models or recipes, each another: what their folders share and suffixes left out.
+
+    One that comes again is numbered: `a/x.yaml`, `b/x.yaml` and that again are a/x, b/x, b/x (2).
+    """
+    files = [os.path.abspath(path) for path in paths]
+    # Runs of one study share most of their path.
+    shared = os.path.commonpath([os.path.dirname(file) for file in files])
+    suffix = r"\.(ya?ml|safetensors)$"
+    names = [re.sub(suffix, "", os.path.relpath(file, shared)) for file in files]
+    before = [names[:index].count(name) for index, name in enumerate(names)]
+    return [f"{n} ({b + 1})" if b else n for n, b in zip(names, before, strict=True)]
 
 
 def checkpoints(names: Sequence[str]) -> dict[str, Path]:

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from qgs.cli.inspect import RecipeFile
 from qgs.cli.options import Device
+from qgs_research import short_names
 
 app = typer.Typer(help="Train variants of a model by seeds, and compare them.")
 compare_app = typer.Typer(help="Compare results of evaluations.")
@@ -113,7 +114,6 @@ def diff(
     from qgs.recipe import resolve
     from qgs.recipe.recipe import differing_options
     from qgs.terminal import print_table
-    from qgs.wording import short_names
 
     ours = resolve(first, set_a or ())
     theirs = resolve(second, set_b or ())
