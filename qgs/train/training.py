@@ -33,9 +33,8 @@ from qgs.recipe.checks import keys_are_read
 from qgs.recipe.recipe import annotated, flat
 from qgs.train.distributed import StopRequest, choose_device, make_accelerator, stop_requests
 from qgs.train.folder import RunFolder, Saver, State, saved_state
-from qgs.train.guard import Guard
+from qgs.train.guard import Guard, not_finite
 from qgs.train.initial import initialise
-from qgs.train.nonfinite import not_finite
 from qgs.train.periodic import judge
 from qgs.train.state import (
     Counters,

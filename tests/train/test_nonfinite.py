@@ -10,7 +10,7 @@ from training_runs import tiny
 
 from qgs.data.stream import training_batches
 from qgs.train.distributed import make_accelerator
-from qgs.train.nonfinite import first_bad_tensor, not_finite
+from qgs.train.guard import first_bad_tensor, not_finite
 from qgs.train.training_pass import TrainingPass, compute_gradients
 
 NAN = float("nan")
