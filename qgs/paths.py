@@ -79,11 +79,11 @@ def read_file(path: Path | UPath, most: int = LARGEST) -> bytes:
 def read_json(path: UPath, fix: str) -> Any:
     """Return the content of a JSON file.
 
-    fix: the remedy, for messages. Raises ValueError for a file that is no JSON, FileNotFoundError.
+    fix: the remedy, for messages. Raises ValueError for a file that is no JSON, OSError as
+    `read_file`.
     """
+    content = read_file(path, _LARGEST_JSON)
     try:
-        return json.loads(read_file(path, _LARGEST_JSON))
-    except FileNotFoundError:
-        raise
-    except (ValueError, OSError, RecursionError) as error:
+        return json.loads(content)
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not valid JSON ({error}): {fix}") from error

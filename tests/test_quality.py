@@ -12,11 +12,11 @@ TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
 LIMITS = {
-    "all": {"tokens": 495_000},
-    "qgs": {"tokens": 105_400, "parallel": 1, "why": 3},
-    "plugins": {"tokens": 205_000, "parallel": 1, "why": 3.5},
-    "tests": {"tokens": 168_100, "parallel": 1},
-    "tools": {"tokens": 19_600, "parallel": 1},
+    "all": {"tokens": 492_400},
+    "qgs": {"tokens": 100_000, "parallel": 1, "why": 3},
+    "plugins": {"tokens": 204_300, "parallel": 1, "why": 3.5},
+    "tests": {"tokens": 164_300, "parallel": 1},
+    "tools": {"tokens": 19_500, "parallel": 1},
 }
 """Limits of each group, as `python tools/size.py` counts: tokens and parallel assignments at most,
 comments that say why at least. They only get stricter: a change that adds removes as much."""
