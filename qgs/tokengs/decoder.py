@@ -76,7 +76,7 @@ class ContentCrossAttention(CrossAttention):
     reads = memory_fields("keys", "values")
 
     class Config(NormConfig):
-        """Those of its LayerNorms."""
+        """Options of its LayerNorms."""
 
     config: Config
 
@@ -98,7 +98,7 @@ class ContentSelfAttention(SelfAttention):
     name = "content"
 
     class Config(NormConfig):
-        """Those of its LayerNorms."""
+        """Options of its LayerNorms."""
 
     config: Config
 

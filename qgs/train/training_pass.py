@@ -195,8 +195,9 @@ class DetachedLayer:
         """Return the sum of the terms, 0-d, with `gradients` with respect to what was cut off."""
         total = _sum(self.terms)
         for name, gradient in self.gradients.items():
-            # A linear function with this gradient, less its own value: the sum stays as it is. The
-            # graph of the losses is gone by now.
+            # The graph of the losses is freed, so their gradient g with respect to a source x
+            # reaches the rest of the model by <x, g>, whose gradient is g. Less its own value, so
+            # that the total stays as it is.
             linear = (self._sources[name] * gradient).sum()
             total = total + (linear - linear.detach())
         return total

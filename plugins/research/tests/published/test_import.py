@@ -1,7 +1,6 @@
 """Published weights become checkpoints: every tensor accounted for, or nothing is written."""
 
 import os
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
@@ -111,14 +110,6 @@ def test_every_ablation_has_a_published_name_for_each_parameter():
         assert not known.unnamed
         assert known.published.keys() == known.shapes.keys()
         assert not {*known.unused} & {*known.published.values()}
-
-
-def test_other_distributions_add_layouts(monkeypatch):
-    mine = replace(TOKENGS, name="Mine", marks=(*TOKENGS.marks, "gs_tokens"))
-    installed = Mock(return_value=[Mock(load=lambda: mine)])
-    monkeypatch.setattr("qgs_research.published.layouts.installed", installed)
-    assert fitting_recipe(shapes_of(TOKENGS_A), "file")[0] is mine
-    installed.assert_called_with("qgs.layouts")
 
 
 def test_every_difference_is_listed_at_once():

@@ -109,10 +109,7 @@ def _without_prefix(file: WeightFile) -> WeightFile:
     for depth in range(1, len(modules) + 1):
         prefix = ".".join(modules[:depth]) + "."
         tensors = {name.removeprefix(prefix): tensor for name, tensor in file.tensors.items()}
-        if (
-            all(name.startswith(prefix) for name in file.tensors)
-            and recognise(shapes_of(tensors))[0]
-        ):
+        if all(name.startswith(prefix) for name in file.tensors) and recognise(shapes_of(tensors)):
             note = f"took {prefix!r} off all {len(tensors)} names"
             return WeightFile(file.path, tensors, (*file.notes, note))
     return file

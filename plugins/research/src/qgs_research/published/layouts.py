@@ -8,7 +8,6 @@ from torch import Tensor
 
 from qgs.checkpoint.model_file import unique_tensors
 from qgs.checkpoint.tensors import Shapes, differing_tensors, shapes_of
-from qgs.extensions import imported, installed
 from qgs.recipe import Recipe, RecipeError, resolve
 from qgs.wording import listed
 from qgs_research.published.locus import LOCUSGS
@@ -19,9 +18,7 @@ from qgs_research.published.weight_layout import LayoutError, WeightLayout, rena
 
 # TokenGS comes first: it is the most general.
 LAYOUTS = (TOKENGS, LOCUSGS, MVSPLAT, DEPTHSPLAT, TOKENGS_2026_6)
-"""Published codebases that this distribution knows."""
-ENTRY_POINT_GROUP = "qgs.layouts"
-"""Entry points at which other distributions list a `WeightLayout`."""
+"""The published codebases."""
 
 
 class PublishedError(ValueError):
@@ -69,16 +66,12 @@ def names_of(recipe: Recipe) -> Names:
     """
     reasons = []
     # Only plugins of this recipe: others could claim its names.
-    for layout in (one for one in _layouts() if one.plugin in recipe.releases):
+    for layout in (one for one in LAYOUTS if one.plugin in recipe.releases):
         found = _unknown_components(recipe, layout)
         if not found:
             return _names_in(recipe, layout)
         reasons += [f"\n  {layout.name}: {line}" for line in found]
     raise PublishedError("no published layout can hold this model:" + "".join(reasons))
-
-
-def _layouts() -> list[WeightLayout]:
-    return [*LAYOUTS, *map(imported, installed(ENTRY_POINT_GROUP))]
 
 
 def _unknown_components(recipe: Recipe, layout: WeightLayout) -> list[str]:
@@ -115,23 +108,22 @@ def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
     return Names(layout, shapes, published, unnamed, unused)
 
 
-def recognise(shapes: Shapes) -> tuple[WeightLayout | None, list[WeightLayout]]:
-    """The layout that fits a state dict best, None without one, and all layouts."""
-    layouts = _layouts()
-    found = [layout for layout in layouts if set(layout.marks) <= set(shapes)]
+def recognise(shapes: Shapes) -> WeightLayout | None:
+    """The layout that fits a state dict best, None without one."""
+    found = [layout for layout in LAYOUTS if set(layout.marks) <= set(shapes)]
     # A codebase's later release has all names of the earlier one.
-    return max(found, key=lambda layout: len(layout.marks), default=None), layouts
+    return max(found, key=lambda layout: len(layout.marks), default=None)
 
 
 def fitting_recipe(shapes: Shapes, origin: str) -> tuple[WeightLayout, dict[str, Any]]:
     """The layout of a state dict and the recipe that its sizes give, a plain mapping.
 
-    Raises PublishedError, about `origin`, when no installed layout knows the names or when names
+    Raises PublishedError, about `origin`, when no layout knows the names or when names
     and shapes make no recipe.
     """
-    layout, known = recognise(shapes)
+    layout = recognise(shapes)
     if layout is None:
-        names = "; ".join(f"{one.name} has {', '.join(one.marks)}" for one in known)
+        names = "; ".join(f"{one.name} has {', '.join(one.marks)}" for one in LAYOUTS)
         raise PublishedError(
             f"{origin} has the names of no published model that is known here ({names}); its "
             f"names are {listed(shapes, 3)}"
