@@ -1,7 +1,15 @@
-"""The picture of the rooms shows the imports of today."""
+"""Pictures of the code, and the page that begins with them, show the code of today."""
 
-from rooms import PICTURE, drawn
+import re
+
+from rooms import PICTURE, ROOT, drawn
 
 
 def test_the_picture_is_fresh():
     assert PICTURE.read_text(encoding="utf-8") == drawn(), "run python tools/rooms.py"
+
+
+def test_files_that_are_named_exist():
+    for page in (*PICTURE.parent.glob("*.svg"), ROOT / "docs/design.md"):
+        for name in re.findall(r"(?<![/\w])(?<!python )(?:qgs/)?([\w/]+\.py)", page.read_text()):
+            assert (ROOT / "qgs" / name).exists(), page
