@@ -155,7 +155,7 @@ def posact(t: Tensor) -> Tensor:
     return torch.where(t >= 0, torch.expm1(t), -torch.expm1(-t))
 
 
-# ---- Head, centres: qgs/tokengs/{head,centers}.py, qgs_locus/decoding.py; qgs/model.py ----
+# ---- Head, centres: qgs/tokengs/head.py, qgs_locus/decoding.py; qgs/model.py ----
 def decode(p: Weights, x: Tensor, mu: Tensor, rho: Tensor) -> Gaussians:
     """N*K Gaussians: means at offsets from the anchor that are multiples of its radius."""
     sizes = (3, 3, 3, 4, 1)

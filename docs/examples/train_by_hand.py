@@ -1,4 +1,4 @@
-"""Train a model without the framework's engine, and save a scene that it reconstructs.
+"""Train a model by a loop of your own, and save a scene that it reconstructs.
 
     python docs/examples/train_by_hand.py recipes/tiny/locus.yaml 200 scene.ply
 

@@ -1,4 +1,4 @@
-"""`model.reconstruct` and `qgs.read_photos`; a model given views in another world warns."""
+"""`qgs.reconstruct` and `qgs.read_photos`; a model given views in another world warns."""
 
 from dataclasses import replace
 

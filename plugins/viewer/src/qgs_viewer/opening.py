@@ -32,7 +32,7 @@ PLY = "gaussians.ply"
 CAMERAS = "cameras.json"
 """Files in the folder of a finished reconstruction, as `qgs reconstruct --out` writes it."""
 REFINED = "refined"
-"""The folder in it with the result of `--refine`."""
+"""The folder in it with the result of `qgs refine`."""
 # Median distance of means, per spread of the scene, up to which a model made a PLY's Gaussians.
 #
 # A finished reconstruction keeps its photos in 8 bits, which moves means by some thousandths.
