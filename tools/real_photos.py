@@ -21,7 +21,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from kornia.geometry.transform import warp_perspective
-from qgs_photos.datasets.overlapping import apart
+from qgs_photos.datasets.view_samplers import apart
 from qgs_photos.refine import refine
 from qgs_viewer.comparison import checkpoints, recipes_alike, spread_windows
 from torch import Tensor

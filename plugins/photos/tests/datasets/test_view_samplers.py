@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import torch
 from line_scenes import Line, Lines, circle, samples_of
-from qgs_photos.datasets.bounded import Bounded
-from qgs_photos.datasets.farthest import Farthest
-from qgs_photos.datasets.overlapping import Overlapping
+from qgs_photos.datasets.view_samplers import Bounded, Farthest, Overlapping
 
 from qgs.contracts import EvaluationConfig, ViewsConfig
 from qgs.contracts.schedule import END

@@ -1,11 +1,9 @@
 """Published data sets as `qgs` reads them: chunks in pixelSplat's format, and DL3DV's archives."""
 
 from qgs.contracts import Plugin
-from qgs_photos.datasets.bounded import Bounded
 from qgs_photos.datasets.chunks import ChunksSource
 from qgs_photos.datasets.dl3dv import Dl3dvSource
-from qgs_photos.datasets.farthest import Farthest
-from qgs_photos.datasets.overlapping import Overlapping
+from qgs_photos.datasets.view_samplers import Bounded, Farthest, Overlapping
 
 plugin = Plugin(
     name="datasets",

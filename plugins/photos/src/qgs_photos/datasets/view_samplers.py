@@ -1,0 +1,283 @@
+"""Samplers of views: pixelSplat's, DepthSplat's, and one for photos in any order."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import torch
+from pydantic import Field, field_validator
+from torch import Tensor
+
+from qgs.contracts import (
+    Frames,
+    OptionError,
+    Problem,
+    RecipeContext,
+    Scene,
+    ViewSampler,
+    ViewsConfig,
+)
+from qgs.contracts.component import ComponentConfig
+from qgs.contracts.schedule import END
+from qgs.data.inputs import Frusta, scene_depth, trained_ratios
+from qgs.data.view_samplers import (
+    evenly,
+    moments,
+    one_of_each,
+    refuse_too_many,
+    training_frames,
+)
+from qgs.domain import Domain
+
+_SHARE = 0.5
+"""Share of the photos among which a sample looks for its inputs, so that a photo does not always
+have the same."""
+_JUDGED = 4
+"""Photos on which a scene without held-out ones is judged."""
+
+
+class Bounded(ViewSampler):
+    """Inputs at both ends of a gap that widens over `warm_up_steps`, targets between them.
+
+    pixelSplat's sampler of this name for two inputs; further inputs are drawn between the ends.
+    The published code limits the largest gap by the least one on paths that do not close; here the
+    number of frames limits it. Targets may repeat. `views.gap` is read for windows around held-out
+    frames alone.
+    """
+
+    name = "bounded"
+    scheduled = frozenset({"min_gap", "max_gap", "margin"})
+
+    class Config(ComponentConfig):
+        min_gap: int = Field(default=45, ge=1)
+        """Least number of frames from the first input to the last, after the warm-up."""
+        max_gap: int = Field(default=192, ge=1)
+        """Largest number, after the warm-up; a scene may allow less."""
+        margin: int = Field(default=0, ge=0)
+        """Frames from a target to the first and the last input, at least."""
+        warm_up_steps: int = Field(default=150_000, ge=0)
+        """Optimiser steps in which the gap goes from its initial bounds to the final ones."""
+        initial_min_gap: int = Field(default=25, ge=1)
+        """Least gap in the first step."""
+        initial_max_gap: int = Field(default=45, ge=1)
+        """Largest gap in the first step."""
+
+    config: Config
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """See `Component`."""
+        if context.inputs == 1:
+            yield Problem("", "it needs two inputs, and `views.inputs` is 1", "take qgs/span")
+        for low, high in (("min_gap", "max_gap"), ("initial_min_gap", "initial_max_gap")):
+            if getattr(config, low) > getattr(config, high):
+                yield Problem(low, f"it is larger than `{high}`", f"raise `{high}`")
+
+    def draw(
+        self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
+    ) -> tuple[Frames, Frames]:
+        """See `ViewSampler`."""
+        span = self.span(scene, views, rng, step)
+        between = rng.choice(range(1, len(span) - 1), views.inputs - 2, replace=False)
+        places = [0, *sorted(map(int, between)), len(span) - 1]
+        inputs = one_of_each([span[place] for place in places], range(len(places)))
+        pool = self.seen(scene, span, rng, step)
+        return inputs, tuple(map(int, rng.choice(pool, views.targets)))
+
+    def span(
+        self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int, parts: int = 1
+    ) -> list[Frames]:
+        """Return the moments that are drawn from, first to last; gaps are divided by `parts`."""
+        refuse_too_many(views.inputs + views.targets, scene)
+        options = self.options(step)
+        usable = moments(scene)
+        low, high = (gap // parts for gap in self.gaps(step))
+        high = min(high, len(usable) - 1)
+        # a target needs a place at the margin from both ends, and each input one of its own
+        low = max(min(low, high), 2 * options.margin, views.inputs - 1)
+        if high < low:
+            raise ValueError(
+                f"scene {scene.name!r} has {len(usable)} frames for inputs, and {low + 1} are "
+                "needed for this gap: lower min_gap or margin, or drop the scene"
+            )
+        gap = int(rng.integers(low, high + 1))
+        first = int(rng.integers(0, len(usable) - gap))
+        return usable[first : first + gap + 1]
+
+    def seen(
+        self, scene: Scene, span: Sequence[Frames], rng: np.random.Generator, step: int
+    ) -> list[int]:
+        """Return the frames of a span that targets are drawn from."""
+        margin = self.options(step).margin
+        inside = span[margin : len(span) - margin]
+        # all targets of a sample are of one moment
+        if scene.times is not None:
+            inside = [inside[int(rng.integers(len(inside)))]]
+        return [frame for moment in inside for frame in moment]
+
+    def gaps(self, step: int) -> tuple[int, int]:
+        """Return the least and largest gap after `step` steps: linear between the bounds."""
+        options = self.options(step)
+        share = min(step / options.warm_up_steps, 1.0) if options.warm_up_steps else 1.0
+        bounds = (
+            (options.initial_min_gap, options.min_gap),
+            (options.initial_max_gap, options.max_gap),
+        )
+        low, high = (start + int((end - start) * share) for start, end in bounds)
+        return low, high
+
+
+class Farthest(Bounded):
+    """Inputs far from each other in a gap that widens over `warm_up_steps`, targets between them.
+
+    DepthSplat's sampler `boundedv2` with `farthest_point`: two inputs are the ends of the gap, more
+    are chosen one after the other, each farthest from those chosen. Of few inputs the gap is
+    shorter: its bounds are divided by `views.inputs` // their number. Targets differ, and may be
+    inputs; where the gap has too few frames some repeat (there: fewer targets).
+
+    The number of inputs goes from `fewest` to `views.inputs` and again with the steps of training,
+    where the release draws it: each is as frequent, and samples of a step make one batch.
+    """
+
+    name = "farthest"
+
+    class Config(Bounded.Config):
+        fewest: int = Field(default=2, ge=2)
+        """Least number of inputs in training, where `views.inputs` is the largest. Evaluation has
+        that one always."""
+
+    config: Config
+
+    @classmethod
+    def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
+        """See `Component`."""
+        yield from super().problems(config, context)
+        if context.inputs and config.fewest > context.inputs:
+            reason = f"it is larger than `views.inputs`, {context.inputs}"
+            yield Problem("fewest", reason, "lower it, or raise `views.inputs`")
+
+    def draw(
+        self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
+    ) -> tuple[Frames, Frames]:
+        """See `ViewSampler`."""
+        most = views.inputs
+        fewest = self.config.fewest
+        count = most if step == END else fewest + step % (most - fewest + 1)
+        views = views.model_copy(update={"inputs": count})
+        span = self.span(scene, views, rng, step, parts=most // count)
+        places = [0, len(span) - 1]
+        if count > 2:
+            centres = scene.cameras.c2w[[moment[0] for moment in span], :3, 3]
+            places = sorted(farthest_points(centres, count))
+        inputs = one_of_each([span[place] for place in places], range(count))
+        pool = self.seen(scene, span, rng, step)
+        targets = [*rng.permutation(pool), *rng.choice(pool, max(views.targets - len(pool), 0))]
+        return inputs, tuple(map(int, targets[: views.targets]))
+
+
+def farthest_points(points: Tensor, count: int) -> list[int]:
+    """Choose `count` of `points` (N, 3): the one farthest from their mean, then from all chosen.
+
+    Points that coincide with a chosen one come last, each once.
+    """
+    chosen = [int((points - points.mean(0)).norm(dim=-1).argmax())]
+    while len(chosen) < count:
+        distance = torch.cdist(points, points[chosen]).amin(-1)
+        # the release can choose a point twice where all coincide
+        distance[chosen] = -1
+        chosen.append(int(distance.argmax()))
+    return chosen
+
+
+class Overlapping(ViewSampler):
+    """Inputs that see most of a random photo, and overlap; it and those nearest to it are targets.
+
+    Of photos drawn at random, inputs are those that `qgs demo` takes for the photo, .06 to .25
+    depths of the scene apart, times a factor drawn log-uniformly between the bounds of `apart`. In
+    evaluation the factor is 1: each held-out photo is a target, of inputs among all training
+    photos; of a scene without held-out photos, four of them are. `views.gap` is not read, except
+    where scenes move: those are judged in the order of time, and training refuses them.
+    """
+
+    name = "overlapping"
+
+    class Config(ComponentConfig):
+        apart: tuple[float, float] = (0.5, 2.0)
+        """Bounds of the factor in training."""
+
+        @field_validator("apart")
+        @classmethod
+        def _apart_is_ordered(cls, apart: tuple[float, float]) -> tuple[float, float]:
+            low, high = apart
+            if not 0 < low <= high:
+                raise OptionError(
+                    f"must be [least, largest] with 0 < least <= largest, got [{low}, {high}]",
+                    "write [0.5, 2.0], half to twice the usual distance",
+                )
+            return apart
+
+    config: Config
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        # by the names of scenes; a sweep takes a third second
+        self._depths: dict[str, float] = {}
+
+    def draw(
+        self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
+    ) -> tuple[Frames, Frames]:
+        """See `ViewSampler`. Raises ValueError for a scene that moves."""
+        if scene.times is not None:
+            raise ValueError(f"scene {scene.name!r} moves: set view_sampler.type to qgs/span")
+        refuse_too_many(views.inputs + views.targets, scene)
+        usable = _enough(scene, views.inputs + 1)
+        factor = float(np.exp(rng.uniform(*np.log(self.config.apart))))
+        frusta = self._frusta(scene, factor)
+        target = int(rng.choice(usable))
+        others = [frame for frame in usable if frame != target]
+        count = max(views.inputs, round(_SHARE * len(others)))
+        some = sorted(map(int, rng.choice(others, count, replace=False)))
+        _, inputs = frusta.window(target, some, views.inputs)
+        near = sorted({*usable} - {*inputs}, key=lambda frame: frusta.far[frame, target])
+        return _ascending(inputs), tuple(near[i % len(near)] for i in range(views.targets))
+
+    def windows(self, scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
+        """See `ViewSampler`; none where a scene moves."""
+        if scene.times is not None:
+            return []
+        # without held-out photos the target is one of those that inputs are chosen from
+        usable = _enough(scene, views.inputs if scene.held_out else views.inputs + 1)
+        frusta = self._frusta(scene)
+        found = list[tuple[Frames, Frames]]()
+        for target in sorted(scene.held_out) or evenly(usable, _JUDGED):
+            _, inputs = frusta.window(target, usable, views.inputs)
+            found.append((_ascending(inputs), (target,)))
+        return found
+
+    def _frusta(self, scene: Scene, factor: float = 1.0) -> Frusta:
+        """Return frusta of cameras that may stand and turn `factor` times as far apart."""
+        if scene.name not in self._depths:
+            self._depths[scene.name] = scene_depth(scene)
+        return Frusta(scene, apart(Domain(), factor), self._depths[scene.name])
+
+
+def apart(domain: Domain, factor: float) -> Domain:
+    """Return `domain` with the best inputs `factor` times as far apart and turned."""
+    (low, high), turn = trained_ratios(domain)
+    ends = {"baseline": [factor * low, factor * high], "turn": [0.0, factor * turn]}
+    return Domain({**ends, "depth": [1.0, 1.0]}, domain.samples)
+
+
+def _enough(scene: Scene, least: int) -> list[int]:
+    """Return the frames of training; raises ValueError for fewer than `least`."""
+    usable = training_frames(scene)
+    if len(usable) < least:
+        besides = f" beside {len(scene.held_out)} held-out ones" if scene.held_out else ""
+        raise ValueError(
+            f"scene {scene.name!r} has {len(usable)} photos{besides}, and needs {least}: lower "
+            "views.inputs, hold fewer out or add photos"
+        )
+    return usable
+
+
+def _ascending(frames: Frames) -> Frames:
+    return tuple(sorted(frames))
