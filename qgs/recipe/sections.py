@@ -144,7 +144,8 @@ def decode_settings(tree: MapNode, problems: Problems) -> tuple[MapNode, Any]:
             # A fault of the whole, such as text that no JSON holds, leaves nothing to check.
             problems.raise_any()
         for keys in filter(None, faulty):
-            del sound.child(*keys[:-1])[keys[-1]]
+            # Two faults may lie in one list.
+            sound.child(*keys[:-1]).pop(keys[-1], None)
         sound.put("recipe", 1, sound.origin_of("recipe"))
         settings, faults = validated(Layout, sound)
     return sound, settings
