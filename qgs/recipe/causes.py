@@ -1,33 +1,37 @@
 """Problems of a recipe at the line that caused them.
 
-A file or an override laid over others may replace a component that theirs rely on. Then its line is
-to blame, and not those that were right before.
+A file or an override laid over others may replace a component or a setting that theirs rely on.
+Then its line is to blame, and not those that were right before.
 """
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import pairwise
+from typing import Any
 
 from qgs.contracts import Plugin
 from qgs.recipe.checks import check
-from qgs.recipe.decode import Chosen
-from qgs.recipe.errors import Problems, RecipeError, RecipeProblem
+from qgs.recipe.errors import Origin, Problems, RecipeError, RecipeProblem
+from qgs.recipe.files import KINDS, merge
 from qgs.recipe.sections import Draft, draft_of
-from qgs.recipe.yaml_text import KeyPath, MapNode
+from qgs.recipe.yaml_text import KeyPath, MapNode, brief, find
 
 
 def at_their_causes(
-    draft: Draft, written: MapNode, found: Sequence[RecipeProblem], plugins: Sequence[Plugin]
+    written: MapNode, found: Sequence[RecipeProblem], plugins: Sequence[Plugin]
 ) -> Iterator[RecipeProblem]:
-    """`found`, what is wrong with the draft of `written`; those of one cause become one problem."""
-    drafts = [draft]
+    """Return `found`, what is wrong with `written`; problems of one cause become one."""
+    blames: dict[RecipeProblem, RecipeProblem] = {}
+    left = [*found]
     # Only a recipe that is refused is read once more for each layer.
     with suppress(RecipeError):
-        while written.under is not None:
+        while left and written.under is not None:
+            known = _told(draft_of(written.under, Problems(), plugins))
+            fresh = [problem for problem in left if problem not in known]
+            left = [problem for problem in left if problem in known]
+            if fresh:
+                blames |= _blames(fresh, written.under, written.over, plugins)
             written = written.under
-            drafts.append(draft_of(written, Problems(), plugins))
-    blames = _blames(found, drafts)
     caused: dict[RecipeProblem, list[RecipeProblem]] = {}
     for problem in found:
         blame = blames.get(problem, problem)
@@ -45,40 +49,38 @@ def at_their_causes(
 
 
 def _blames(
-    found: Sequence[RecipeProblem], drafts: Sequence[Draft]
+    found: Sequence[RecipeProblem], base: MapNode, over: MapNode, plugins: Sequence[Plugin]
 ) -> dict[RecipeProblem, RecipeProblem]:
-    """The problem of the line with which each of `found` came, where a component was replaced.
+    """Return the problem of the line of `over` with which each of `found` came to `base`.
 
-    drafts: the whole recipe, and before each file or override that was laid over it, newest first.
+    Its options are laid over one after the other until the problem is there: the last brought it.
     """
     blames: dict[RecipeProblem, RecipeProblem] = {}
-    left = list(found)
-    for newer, older in pairwise(drafts):
-        known = _told(older)
-        fresh = [problem for problem in left if problem not in known]
-        left = [problem for problem in left if problem in known]
-        # Changes are made one after the other until the problem is there: the last one brought it.
-        parts = dict(older.parts)
-        for changed in _changes(newer, older) if fresh else ():
-            path, new = next(iter(changed.items()))
-            old = parts.get(path)
-            parts |= changed
-            now = _told(replace(older, parts=parts))
-            for problem in [problem for problem in fresh if problem in now]:
-                fresh.remove(problem)
-                if old:
-                    blames[problem] = _replacing(new, old)
+    before = draft_of(base, Problems(), plugins)
+    # Plug-ins first: the components are theirs.
+    for path, value, origin in sorted(_options(over), key=lambda option: option[0] != ("plugins",)):
+        piece = value
+        for key in reversed(path):
+            piece = MapNode(origin, [(key, piece, origin)])
+        base = merge(base, piece)
+        # Options that only make sense together are refused one by one.
+        with suppress(RecipeError):
+            after = draft_of(base, Problems(), plugins)
+            for problem in _told(after).intersection(found):
+                blame = _replacing(after, before) or _setting(path, value, origin, before)
+                blames.setdefault(problem, blame or problem)
+            before = after
     return blames
 
 
-def _changes(newer: Draft, older: Draft) -> list[dict[KeyPath, Chosen]]:
-    """Components that a layer changed, those of one line together, in the order of a recipe."""
-    changed: dict[KeyPath, dict[KeyPath, Chosen]] = {}
-    for path, part in newer.parts.items():
-        old = older.parts.get(path)
-        if old is None or not part.equals(old):
-            changed.setdefault(part.source, {})[path] = part
-    return [*changed.values()]
+def _options(over: MapNode, above: KeyPath = ()) -> Iterator[tuple[KeyPath, Any, Origin]]:
+    """Yield path, value and origin of each option of `over`; what has a type or kind is one."""
+    for key, value, origin in over.entries():
+        path = (*above, key)
+        if isinstance(value, MapNode) and value and not {"type", *KINDS} & value.keys():
+            yield from _options(value, path)
+        else:
+            yield path, value, origin
 
 
 def _told(draft: Draft) -> set[RecipeProblem]:
@@ -88,14 +90,32 @@ def _told(draft: Draft) -> set[RecipeProblem]:
     return set(problems.found)
 
 
-def _replacing(new: Chosen, old: Chosen) -> RecipeProblem:
-    """The problem of the line that put `new`, or options of it, in place of `old`."""
-    changed = [key for key in new.node if new.options.get(key) != old.options.get(key)]
-    option = new.shown_path
-    origin = new.node.origins.get("type", new.origin)
-    reason = f"`{new.type}` in place of `{old.type}` ({old.chosen_at})"
-    if new.type == old.type and changed:
-        option = f"{new.shown_path}.{changed[0]}"
-        origin = new.node.origins[changed[0]]
-        reason = f"another {' and '.join(changed)} of `{new.type}` than at {old.origin}"
-    return RecipeProblem(option, reason, f"keep `{old.type}` as it was", origin.file, origin.line)
+def _replacing(after: Draft, before: Draft) -> RecipeProblem | None:
+    """Return the problem of the line that put another component, or options, in place of one."""
+    for path, new in after.parts.items():
+        old = before.parts.get(path, new)
+        if new.equals(old):
+            continue
+        option = new.shown_path
+        origin = new.node.origins.get("type", new.origin)
+        reason = f"`{new.type}` in place of `{old.type}`"
+        fix = f"keep `{old.type}`"
+        if new.type == old.type:
+            was = old.options
+            key = next(key for key, value in new.options.items() if value != was[key])
+            option = f"{option}.{key}"
+            origin = new.node.origins.get(key, origin)
+            reason = f"another {key} of `{new.type}`"
+            fix = f"keep {key} {brief(was[key])}"
+        return RecipeProblem(option, f"{reason} ({old.chosen_at})", fix, origin.file, origin.line)
+    return None
+
+
+def _setting(path: KeyPath, value: Any, origin: Origin, before: Draft) -> RecipeProblem | None:
+    """Return the problem of an option of no component, such as a size of the model."""
+    if isinstance(value, MapNode):
+        return None
+    taken, place, old = find(before.tree, path)
+    was = f"{brief(old)} ({place})" if len(taken) == len(path) else "the default"
+    reason = f"{brief(value)} in place of {was}"
+    return RecipeProblem(".".join(path), reason, f"keep {was}", origin.file, origin.line)

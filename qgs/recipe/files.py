@@ -20,6 +20,8 @@ from qgs.recipe.yaml_text import (
     load_text,
 )
 
+KINDS = ("kind", "schedule")
+"""Options that decide which others a mapping without a type has."""
 _Trees: TypeAlias = dict[Path, MapNode | None]
 """Merged trees by resolved path; None for one that is being read."""
 
@@ -37,6 +39,7 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
         return over
     merged = MapNode(over.origin, base.entries())
     merged.under = base
+    merged.over = over
     for key, value, origin in over.entries():
         below = (*path, key)
         old = base.get(key)
@@ -59,7 +62,7 @@ def _replaces(base: MapNode, over: MapNode, path: KeyPath) -> bool:
         return True
     if "type" in over and type_at(base, path) not in (None, type_at(over, path)):
         return True
-    kinds = [key for key in ("kind", "schedule") if key in over]
+    kinds = [key for key in KINDS if key in over]
     return any(base.get(key) not in (None, over[key]) for key in kinds)
 
 

@@ -144,7 +144,7 @@ def resolve(
     try:
         parts = check(draft, problems)
     except RecipeError as error:
-        found = at_their_causes(draft, written, error.problems, plugins)
+        found = at_their_causes(written, error.problems, plugins)
         raise RecipeError(found) from error.__cause__
     settings = draft.settings
     tree: dict[str, Any] = {}

@@ -37,10 +37,11 @@ _TAGS = {_STANDARD + kind for kind in (*_SCALARS, "str", "map", "seq")}
 class MapNode(dict[str, Any]):
     """A mapping. origin: where it begins. origins: where each key was written.
 
-    under: what it was laid over, if anything.
+    under, over: what was merged into it, if anything; `over` is laid over `under`.
     """
 
     under: "MapNode | None" = None
+    over: "MapNode"
 
     def __init__(self, origin: Origin, items: Iterable[tuple[str, Any, Origin]] = ()) -> None:
         super().__init__()
