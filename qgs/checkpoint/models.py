@@ -7,7 +7,6 @@ import hashlib
 import os
 import shutil
 import string
-import sys
 from base64 import b64encode
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
@@ -23,6 +22,7 @@ from qgs.paths import opened_path
 from qgs.recipe.errors import did_you_mean
 from qgs.recipe.registry import available_plugins, load_plugin
 from qgs.terminal import without_secrets
+from qgs.wording import warn_once
 
 CHECKPOINT = "checkpoint.safetensors"
 """In a run folder: the latest good weights."""
@@ -81,7 +81,7 @@ def about(file: Path) -> str:
 
 
 def downloaded(url: str) -> Path:
-    """Return the file of `url`, as downloaded before or now; print its SHA-256 to standard error.
+    """Return the file of `url`, as downloaded before or now.
 
     Only whole safetensors files are kept, in the environment's QGS_CACHE or ~/.cache/qgs; one that
     is damaged there is downloaded again. Raises OSError with the cause of a failure.
@@ -97,13 +97,11 @@ def downloaded(url: str) -> Path:
     # A file name may have 255 bytes.
     file = cache / key / (last.strip(".")[-50:] or "checkpoint")
     if file.is_file() and not _is_whole(file):
-        print(f"{file} is damaged and is downloaded again", file=sys.stderr)
+        warn_once(f"{file} is damaged and is downloaded again")
         file.unlink()
     if not file.is_file():
         _download(url, file)
-    with file.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    print(f"{name}: sha256 {digest}, kept as {file} (delete it to download again)", file=sys.stderr)
+    warn_once(f"{name} is kept as {file} (delete it to download again)")
     return file
 
 

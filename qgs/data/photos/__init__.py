@@ -69,10 +69,10 @@ def read_listing(folder: UPath, format: str = "auto", images: str | None = None)
         )
     if not held:
         inside = listed(sorted(item.name for item in folder.iterdir()))
+        more = "" if "colmap" in known else " (query-gaussians-photos reads more)"
         raise FileNotFoundError(
             f"{folder} lists no cameras; it holds {inside or 'nothing'}. Make some by `qgs poses`, "
-            f"or give a folder that holds one of {listings}; query-gaussians-photos "
-            f"reads more, such as COLMAP's. A minimal transforms.json: {_SMALLEST}"
+            f"or give a folder that holds {listings}{more}. A minimal transforms.json: {_SMALLEST}"
         )
     if format == "auto" and len(held) > 1:
         warn_once(

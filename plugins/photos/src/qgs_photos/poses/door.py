@@ -8,7 +8,7 @@ from filelock import FileLock
 from rich.console import Console
 from upath import UPath
 
-from qgs.data.photos.reader import Listing, PhotoReader
+from qgs_photos.datasets.colmap import Colmap
 from qgs_photos.image_files import image_files
 from qgs_photos.poses.making import RECORD, Options, fingerprint, make_poses
 from qgs_photos.poses.photos import PosesError
@@ -17,21 +17,8 @@ from qgs_photos.printing import say
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
 
-class Unposed(PhotoReader):
-    """Photos without cameras, and videos: they hold no listing, `posed` makes one."""
-
-    name = "unposed"
-    listing = "photos or a video for `qgs poses`"
-
-    @classmethod
-    def recognises(cls, folder: UPath) -> bool:
-        """Return False: there is no listing to read."""
-        return False
-
-    @classmethod
-    def read(cls, folder: UPath, images: str | None) -> Listing:
-        """Raise ValueError: there is no listing to read."""
-        raise ValueError(f"{folder} has no camera poses: run `qgs poses {folder}`")
+class ColmapOrPhotos(Colmap):
+    """COLMAP's models, which it makes of photos without cameras and of videos."""
 
     @classmethod
     def posed(cls, path: UPath) -> UPath | None:
