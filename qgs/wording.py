@@ -1,7 +1,8 @@
 """Words that messages and tables share."""
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
+from difflib import get_close_matches
 from functools import lru_cache
 
 _log = logging.getLogger(__name__)
@@ -45,3 +46,14 @@ def one_line(error: Exception) -> str:
 def warn_once(message: str) -> None:
     """Log `message`, unless this process has logged it before."""
     _log.warning("%s", message)
+
+
+def nearest(word: str, choices: Iterable[str]) -> str | None:
+    """The choice that `word` is probably a misspelling of."""
+    return next(iter(get_close_matches(word, sorted(choices))), None)
+
+
+def did_you_mean(word: str, choices: Collection[str], noun: str) -> str:
+    """A fix: the nearest choice, or the choices."""
+    near = nearest(word, choices)
+    return f"did you mean `{near}`?" if near else f"{noun}: {listed(sorted(choices), 30) or 'none'}"

@@ -19,10 +19,9 @@ from safetensors import SafetensorError, safe_open
 
 from qgs.files import replacing
 from qgs.paths import opened_path
-from qgs.recipe.errors import did_you_mean
 from qgs.recipe.registry import available_plugins, load_plugin
 from qgs.terminal import without_secrets
-from qgs.wording import warn_once
+from qgs.wording import did_you_mean, warn_once
 
 CHECKPOINT = "checkpoint.safetensors"
 """In a run folder: the latest good weights."""
@@ -49,13 +48,12 @@ def checkpoint_path(name: str | os.PathLike[str]) -> Path:
         if "://" in text:
             return downloaded(text)
         # Only a plug-in that is installed makes a name of what may be a path.
-        is_name = bool(model) and "/" not in model and path.suffix != ".safetensors"
-        if is_name and plugin in available_plugins():
+        if model and plugin in available_plugins():
             path = _shipped(plugin, text)
     if not path.is_file():
         raise FileNotFoundError(
             f"no checkpoint at {path}; give a run folder of `qgs train`, a .safetensors file, its "
-            "URL, or PLUGIN/NAME of a model that `qgs list` shows"
+            "URL, or the name of a model that a plug-in ships, such as rooms/locus-64"
         )
     return path
 

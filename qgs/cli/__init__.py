@@ -11,7 +11,7 @@ from typer.core import TyperCommand, TyperGroup
 from qgs.cli import convert, evaluate, inspect, reconstruct, train
 from qgs.extensions import INSTALL_ALL, installed
 from qgs.terminal import show_safely
-from qgs.wording import listed
+from qgs.wording import did_you_mean, listed
 
 GROUP = "qgs.commands"
 """Group of entry points NAME = "module:app", where `app` is a `typer.Typer`."""
@@ -33,8 +33,10 @@ class CommandGroup(TyperGroup):
             return own
         offers = [entry for entry in installed(GROUP) if entry.name == cmd_name]
         if not offers:
+            hint = did_you_mean(cmd_name, self.list_commands(ctx), "commands")
             raise ValueError(
-                f"there is no command `qgs {cmd_name}` here; if a plug-in has it, {INSTALL_ALL}"
+                f"there is no command `qgs {cmd_name}` here. If a plug-in has it, {INSTALL_ALL}; "
+                f"{hint}"
             )
         return offered_command(cmd_name, offers)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -18,14 +18,6 @@ if TYPE_CHECKING:
     from qgs.model import QueryGaussianModel
     from qgs.recipe import Recipe
 
-Out: TypeAlias = Annotated[
-    Path | None,
-    typer.Option(
-        help="Folder; default: RUN/evaluation; RUN/evaluation-N for other settings; "
-        "evaluation_NAME here for a shipped model or a URL."
-    ),
-]
-
 
 def evaluate(
     run: Checkpoint,
@@ -34,7 +26,13 @@ def evaluate(
         str | None, typer.Option(help="JSON file of scenes and frames; sets evaluation.index.")
     ] = None,
     tune: Tune = None,
-    out: Out = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder; default: RUN/evaluation; RUN/evaluation-N for other settings; "
+            "evaluation_NAME here for a shipped model or a URL."
+        ),
+    ] = None,
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit with 1 when a scene has no score.")
     ] = False,

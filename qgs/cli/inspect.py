@@ -48,8 +48,8 @@ def recipes(
     A file of that name in the working directory comes first.
     """
     from qgs.files import refuse_existing, write_text
-    from qgs.recipe.errors import did_you_mean
     from qgs.recipe.files import files_of, recipe_folder
+    from qgs.wording import did_you_mean
 
     home = recipe_folder().resolve()
     files = {*home.rglob("*.yaml")} - {*home.glob("studies/**/*")}

@@ -26,11 +26,12 @@ from qgs.contracts.component import MissingExtraError
 from qgs.machine import is_out_of_memory
 from qgs.model import QueryGaussianModel
 from qgs.recipe.decode import Chosen, report_failure
-from qgs.recipe.errors import Problems, RecipeError, did_you_mean
+from qgs.recipe.errors import Problems, RecipeError
 from qgs.recipe.places import matches
 from qgs.recipe.registry import BUILTIN
 from qgs.recipe.slots import AFTER_LAYERS
 from qgs.recipe.yaml_text import KeyPath
+from qgs.wording import did_you_mean
 
 if TYPE_CHECKING:
     from qgs.recipe.recipe import Recipe

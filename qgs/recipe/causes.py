@@ -22,15 +22,16 @@ def at_their_causes(
 ) -> Iterator[RecipeProblem]:
     """Return `found`, what is wrong with `written`; problems of one cause become one."""
     blames: dict[RecipeProblem, RecipeProblem] = {}
-    left = [*found]
+    left = found
     # Only a recipe that is refused is read once more for each layer.
     with suppress(RecipeError):
         while left and written.under is not None:
-            known = _told(draft_of(written.under, Problems(), plugins))
+            older = draft_of(written.under, Problems(), plugins)
+            known = _told(older)
             fresh = [problem for problem in left if problem not in known]
             left = [problem for problem in left if problem in known]
             if fresh:
-                blames |= _blames(fresh, written.under, written.over, plugins)
+                blames |= _blames(fresh, older, written, plugins)
             written = written.under
     caused: dict[RecipeProblem, list[RecipeProblem]] = {}
     for problem in found:
@@ -49,16 +50,16 @@ def at_their_causes(
 
 
 def _blames(
-    found: Sequence[RecipeProblem], base: MapNode, over: MapNode, plugins: Sequence[Plugin]
+    found: Sequence[RecipeProblem], before: Draft, written: MapNode, plugins: Sequence[Plugin]
 ) -> dict[RecipeProblem, RecipeProblem]:
-    """Return the problem of the line of `over` with which each of `found` came to `base`.
+    """Return the problem of the line with which each of `found` came, in the last layer.
 
     Its options are laid over one after the other until the problem is there: the last brought it.
+    before: the draft of `written` without that layer.
     """
     blames: dict[RecipeProblem, RecipeProblem] = {}
-    before = draft_of(base, Problems(), plugins)
-    # Plug-ins first: the components are theirs.
-    for path, value, origin in sorted(_options(over), key=lambda option: option[0] != ("plugins",)):
+    base: Any = written.under
+    for path, value, origin in _options(written.over):
         piece = value
         for key in reversed(path):
             piece = MapNode(origin, [(key, piece, origin)])
@@ -67,17 +68,19 @@ def _blames(
         with suppress(RecipeError):
             after = draft_of(base, Problems(), plugins)
             for problem in _told(after).intersection(found):
-                blame = _replacing(after, before) or _setting(path, value, origin, before)
+                blame = _replacing(after, before) or _changing(path, value, origin, before)
                 blames.setdefault(problem, blame or problem)
             before = after
     return blames
 
 
 def _options(over: MapNode, above: KeyPath = ()) -> Iterator[tuple[KeyPath, Any, Origin]]:
-    """Yield path, value and origin of each option of `over`; what has a type or kind is one."""
-    for key, value, origin in over.entries():
+    """Yield path, value and origin of each option of `over`; those that decide others first."""
+    first = ("plugins", "type", *KINDS)
+    for key, value, origin in sorted(over.entries(), key=lambda entry: entry[0] not in first):
         path = (*above, key)
-        if isinstance(value, MapNode) and value and not {"type", *KINDS} & value.keys():
+        # A swap replaces another as a whole.
+        if isinstance(value, MapNode) and value and above != ("swap",):
             yield from _options(value, path)
         else:
             yield path, value, origin
@@ -91,29 +94,20 @@ def _told(draft: Draft) -> set[RecipeProblem]:
 
 
 def _replacing(after: Draft, before: Draft) -> RecipeProblem | None:
-    """Return the problem of the line that put another component, or options, in place of one."""
+    """Return the problem of the line that put another component in place of one."""
     for path, new in after.parts.items():
         old = before.parts.get(path, new)
-        if new.equals(old):
-            continue
-        option = new.shown_path
-        origin = new.node.origins.get("type", new.origin)
-        reason = f"`{new.type}` in place of `{old.type}`"
-        fix = f"keep `{old.type}`"
-        if new.type == old.type:
-            was = old.options
-            key = next(key for key, value in new.options.items() if value != was[key])
-            option = f"{option}.{key}"
-            origin = new.node.origins.get(key, origin)
-            reason = f"another {key} of `{new.type}`"
-            fix = f"keep {key} {brief(was[key])}"
-        return RecipeProblem(option, f"{reason} ({old.chosen_at})", fix, origin.file, origin.line)
+        if new.type != old.type:
+            origin = new.node.origins.get("type", new.origin)
+            reason = f"`{new.type}` in place of `{old.type}` ({old.chosen_at})"
+            keep = f"keep `{old.type}`"
+            return RecipeProblem(new.shown_path, reason, keep, origin.file, origin.line)
     return None
 
 
-def _setting(path: KeyPath, value: Any, origin: Origin, before: Draft) -> RecipeProblem | None:
-    """Return the problem of an option of no component, such as a size of the model."""
-    if isinstance(value, MapNode):
+def _changing(path: KeyPath, value: Any, origin: Origin, before: Draft) -> RecipeProblem | None:
+    """Return the problem of an option; None of a component that is in nobody's place."""
+    if path[-1] == "type":
         return None
     taken, place, old = find(before.tree, path)
     was = f"{brief(old)} ({place})" if len(taken) == len(path) else "the default"

@@ -14,12 +14,13 @@ from pydantic_core import ErrorDetails, PydanticUndefinedType, to_jsonable_pytho
 
 from qgs.contracts import Component, ComponentConfig, OptionError
 from qgs.contracts.schedule import Schedule
-from qgs.recipe.errors import Problems, did_you_mean, nearest
+from qgs.recipe.errors import Problems
 from qgs.recipe.places import Place
 from qgs.recipe.registry import InstalledPlugin, Registry
 from qgs.recipe.slots import SLOTS, type_at
 from qgs.recipe.yaml_text import KeyPath, MapNode, brief, find, inline
 from qgs.tokengs.schedules import SCHEDULES
+from qgs.wording import did_you_mean, nearest
 
 ConfigT = TypeVar("ConfigT", bound=ComponentConfig)
 

@@ -1,12 +1,10 @@
 """Problems of a recipe, each with its place, its reason and a fix."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from typing import NoReturn
 
 from qgs.contracts import Problem
-from qgs.wording import listed
 
 
 @dataclass(frozen=True)
@@ -89,14 +87,3 @@ class Problems:
             error = RecipeError(self.found, self.what)
             causes = [problem.cause for problem in error.problems if problem.cause]
             raise error from (ExceptionGroup("of plugins", causes) if causes else None)
-
-
-def nearest(word: str, choices: Iterable[str]) -> str | None:
-    """The choice that `word` is probably a misspelling of."""
-    return next(iter(get_close_matches(word, sorted(choices))), None)
-
-
-def did_you_mean(word: str, choices: Collection[str], noun: str) -> str:
-    """A fix: the nearest choice, or the choices."""
-    near = nearest(word, choices)
-    return f"did you mean `{near}`?" if near else f"{noun}: {listed(sorted(choices), 30) or 'none'}"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from qgs.paths import open_file
-from qgs.recipe.errors import Origin, Problems, nearest
+from qgs.recipe.errors import Origin, Problems
 from qgs.recipe.slots import type_at
 from qgs.recipe.yaml_text import (
     MAX_DEPTH,
@@ -19,6 +19,7 @@ from qgs.recipe.yaml_text import (
     load_mapping,
     load_text,
 )
+from qgs.wording import nearest
 
 KINDS = ("kind", "schedule")
 """Options that decide which others a mapping without a type has."""

@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
 from qgs.contracts import LAYER_SLOTS
-from qgs.recipe.errors import Origin, Problems, did_you_mean
+from qgs.recipe.errors import Origin, Problems
 from qgs.recipe.files import merge
 from qgs.recipe.slots import AFTER_LAYERS, SECTIONS, slot_at
 from qgs.recipe.yaml_text import KeyPath, MapNode, Node, brief
+from qgs.wording import did_you_mean
 
 DECODER: KeyPath = ("model", "decoder")
 

@@ -14,10 +14,11 @@ import qgs.tokengs
 from qgs import extensions
 from qgs.contracts import Component, ComponentConfig, OptionError
 from qgs.contracts.plugin import CONTRACT_VERSION, ENTRY_POINT_GROUP, Plugin
-from qgs.recipe.errors import Problems, did_you_mean
+from qgs.recipe.errors import Problems
 from qgs.recipe.slots import SLOTS
 from qgs.recipe.yaml_text import MapNode, items_of
 from qgs.version import __version__
+from qgs.wording import did_you_mean
 
 
 class PluginError(OptionError):

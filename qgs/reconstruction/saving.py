@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -127,7 +128,7 @@ def _camera_record(result: Reconstruction, path: Cameras) -> dict[str, Any]:
             "rule": "a point p of this world is reference_c2w applied to p / scale in the photos'",
             "reference_c2w": reference.tolist(),
             "scale": float(scale),
-            "search": result.scale.record if result.scale else None,
+            "search": asdict(result.scale) if result.scale else None,
         },
         "views": views,
         "orbit": _plain(path),

@@ -8,7 +8,6 @@ too small, surfaces close to the cameras render them well, so further photos are
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -80,12 +79,6 @@ class FoundScale:
         """Factor, photos and quality."""
         judged = " and ".join(["the inputs", *filter(None, [listed(self.names)])])
         return f"scale {self.factor:.3g}, found on {judged}: {self.psnr:.1f} dB"
-
-    @property
-    def record(self) -> dict[str, Any]:
-        """For JSON; the same in each run."""
-        tried = [[round(factor, 5), round(quality, 3)] for factor, quality in self.tried]
-        return {"result": self.text, "further_frames": list(self.further), "tried": tried}
 
 
 def photo_settings(views: ViewsConfig, own: bool, overrides: Sequence[str] = ()) -> ViewsConfig:

@@ -28,8 +28,8 @@ def readers() -> dict[str, type[PhotoReader]]:
 
     Where a folder holds several listings, the first of this order is read.
     """
-    own = {Nerfstudio.name: Nerfstudio}
-    return {**own, **installed_readers(), **own}
+    own = {"nerfstudio": Nerfstudio}
+    return own | installed_readers() | own
 
 
 def formats_of(folder: UPath) -> list[str]:

@@ -42,7 +42,6 @@ _OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0, 1.0])
 class Nerfstudio(PhotoReader):
     """`transforms.json` with masks, depth, splits; reduced copies if all photos are missing."""
 
-    name = "nerfstudio"
     listing = "transforms.json"
 
     @classmethod

@@ -124,10 +124,7 @@ class Listing:
 
 
 class PhotoReader(ABC):
-    """A format that lists posed photos; subclasses are entry points of `GROUP`."""
-
-    name: ClassVar[str]
-    """What the option `format` calls it."""
+    """A format that lists posed photos; subclasses are entry points of `GROUP`, which name it."""
 
     listing: ClassVar[str]
     """The file that lists the photos, below the folder, for messages."""

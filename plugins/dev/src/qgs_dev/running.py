@@ -11,9 +11,9 @@ from typing import Literal, TypeAlias, get_args
 
 from qgs.contracts import Component, ComponentConfig, ModelComponent, ModelDims
 from qgs.contracts.component import MissingExtraError
-from qgs.recipe.errors import did_you_mean
 from qgs.recipe.registry import InstalledPlugin, PluginError, default_config, load_plugin
 from qgs.recipe.slots import SLOTS
+from qgs.wording import did_you_mean
 from qgs_dev.case import SMALL, CannotCheck, Case, ContractError
 from qgs_dev.inputs import FACTS, data_file
 

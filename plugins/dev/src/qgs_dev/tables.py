@@ -9,11 +9,11 @@ from rich.table import Table
 
 from qgs.checkpoint.models import about, card_of, checkpoint_path
 from qgs.contracts import LAYER_SLOTS, ComponentConfig
-from qgs.recipe.errors import did_you_mean
 from qgs.recipe.registry import Registry, default_config
 from qgs.recipe.sections import SETTINGS
 from qgs.recipe.slots import MODEL_SLOTS, SLOTS, summary_of
 from qgs.recipe.yaml_text import inline
+from qgs.wording import did_you_mean
 from qgs_dev.schema import settings_schema
 
 Schema = Mapping[str, Any]

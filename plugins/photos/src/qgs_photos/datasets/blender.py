@@ -13,7 +13,6 @@ _SPLITS = {"train": "train", "val": "test", "test": "test"}
 class Blender(PhotoReader):
     """NeRF's synthetic scenes: a transforms file for each split; the alpha channel is the mask."""
 
-    name = "blender"
     listing = "transforms_train.json"
 
     @classmethod

@@ -54,7 +54,6 @@ class CamerasJson(PhotoReader):
     name.
     """
 
-    name = "cameras"
     listing = "cameras.json"
 
     @classmethod

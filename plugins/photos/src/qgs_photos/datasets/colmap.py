@@ -50,7 +50,6 @@ _BYTES_OF_A_POINT = 24  # x, y and the point's number
 class Colmap(PhotoReader):
     """The posed images by name, of a binary model before a text one, as `_PLACES` are ordered."""
 
-    name = "colmap"
     listing = "sparse/0/{cameras,images}.{bin,txt}"
 
     @classmethod

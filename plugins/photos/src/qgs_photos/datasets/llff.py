@@ -22,7 +22,6 @@ class Llff(PhotoReader):
     length; the principal point is the middle. Near and far are checked, not used.
     """
 
-    name = "llff"
     listing = "poses_bounds.npy"
 
     @classmethod

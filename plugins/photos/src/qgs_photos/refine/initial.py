@@ -118,7 +118,7 @@ def sparse_points(folder: UPath) -> tuple[Tensor, Tensor] | None:
     Raises ValueError for points that cannot be read.
     """
     # other formats go first, and have a world of their own
-    if formats_of(folder)[:1] != [Colmap.name]:
+    if formats_of(folder)[:1] != ["colmap"]:
         return None
     model = Colmap.read(folder, None).file
     readers = {model / "points3D.bin": _binary, model / "points3D.txt": _text}

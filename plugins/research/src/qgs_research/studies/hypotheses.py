@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from qgs.contracts import OptionError
-from qgs.recipe.errors import did_you_mean
+from qgs.wording import did_you_mean
 
 NAME = r"[A-Za-z0-9_][A-Za-z0-9_.]*"
 """Of variants and evaluations: folders on any system, and words of a hypothesis."""

@@ -13,9 +13,10 @@ from qgs.contracts import ComponentConfig, OptionError
 from qgs.evaluate.evaluation import SECTIONS
 from qgs.paths import open_file
 from qgs.recipe.decode import decode_config
-from qgs.recipe.errors import Origin, Problems, did_you_mean
+from qgs.recipe.errors import Origin, Problems
 from qgs.recipe.files import found_recipe, merge
 from qgs.recipe.yaml_text import ListNode, MapNode, load_mapping
+from qgs.wording import did_you_mean
 from qgs_research.studies.hypotheses import NAME, Contrast, parsed
 
 _BY_NAME = ("variants", "evaluations", "published")
