@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from guide_pages import BLOCK, text_of
+from photo_formats import synthetic, write_nerfstudio
 
 pytestmark = pytest.mark.slow
 
@@ -35,17 +36,21 @@ def run(environment, command, cwd):
 
 @pytest.fixture(scope="module")
 def fresh(tmp_path_factory):
-    """An environment with qgs, LocusGS, worlds and tools for authors from their wheels.
+    """An environment with qgs, LocusGS, worlds and tools for authors."""
+    return environment_with(tmp_path_factory.mktemp("fresh"), "locus", "worlds", "dev")
+
+
+def environment_with(folder, *plugins):
+    """An environment in `folder` with qgs and plug-ins from their wheels.
 
     Installing torch again would take minutes. All packages of the present environment but qgs and
     its plugins are lent through a folder of links, so that qgs can only come from its wheel.
     Whether the wheels require what they import cannot be seen there: tools/lint.
     """
-    folder = tmp_path_factory.mktemp("fresh")
     wheels = folder / "wheels"
     build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--wheel-dir", str(wheels)]
-    plugins = (str(ROOT / "plugins" / name) for name in ("locus", "worlds", "dev"))
-    subprocess.run([*build, str(ROOT), *plugins], check=True)
+    sources = (str(ROOT / "plugins" / name) for name in plugins)
+    subprocess.run([*build, str(ROOT), *sources], check=True)
     environment = folder / "venv"
     venv.create(environment, with_pip=True)
     run(environment, "pip uninstall -q -y setuptools", folder)  # torch wants a newer one: the lent
@@ -107,3 +112,16 @@ def test_every_command_of_the_tutorial(fresh, tmp_path):
     assert list((folder / "dist").glob("qgs_sightline-*.whl"))
     assert "sightline/frustum" in output
     run(fresh, "pip uninstall -q -y qgs-sightline", tmp_path)
+
+
+LOCUS_ALONE = f"""
+qgs train tiny/locus_alone.yaml --out run --set data.path=photos {SHORTER}
+qgs eval run --set evaluation.scenes=1
+qgs reconstruct run photos --out scene
+"""
+
+
+def test_locus_alone_trains_evaluates_and_reconstructs(tmp_path):
+    write_nerfstudio(tmp_path / "photos", synthetic(tmp_path / "noise", 12, (64, 64)))
+    run(environment_with(tmp_path / "alone", "locus"), LOCUS_ALONE, tmp_path)
+    assert list((tmp_path / "scene").glob("*.ply"))
