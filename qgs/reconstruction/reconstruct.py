@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike, fspath
-from typing import Any
 
 from torch import Tensor
 
@@ -67,20 +66,21 @@ def reconstruct(
     window = choose_frames(found, recipe.views, inputs, wanted, against, model.trained_on)
     # A model's own data keep its scale; photos of a user have any unit.
     views = photo_settings(recipe.views, seen is not None, overrides)
-    records: dict[str, Any] = {}
+    tuned = None
+    tuning = None
     training = model.training
     try:
         model.eval()
-        if views.scale == "search":
-            records["scale"] = scale = find_scale(model, found, *window, views)
+        scale = find_scale(model, found, *window, views) if views.scale == "search" else None
+        if scale:
             views = constant_scale(views, scale.factor)
         sample = make_sample(found, *window, views, mirror=False)
-        tuned = None
         if tune and recipe.evaluation.tuning_steps:
-            tuned, records["tuning"] = tuned_on(model, sample.inputs, recipe)
-        result = reconstruct_sample(model, sample, seen or (), tuned, **records)
+            tuned, tuning = tuned_on(model, sample.inputs, recipe)
+        result = reconstruct_sample(model, sample, seen or (), tuned)
     finally:
         model.train(training)
+    result = replace(result, scale=scale, tuning=tuning)
     return replace(result, remarks=_remarks(result, found))
 
 

@@ -107,20 +107,24 @@ def reconstruct_sample(
     sample: Sample,
     seen: Collection[int] = (),
     changed: Gaussians | None = None,
-    **records: Any,
 ) -> Reconstruction:
     """Return the Gaussians of `sample`, rendered from its views, on the model's device.
 
     seen: frames that the model was trained on. changed: use these Gaussians instead of a forward
-    pass. records: `tuning`, `refinement` and others of `Reconstruction`.
+    pass.
     """
     device = next(model.parameters()).device
     # Views come from the data on the CPU.
     sample = replace(sample, inputs=sample.inputs.to(device), targets=sample.targets.to(device))
     gaussians = model(sample.inputs).gaussians if changed is None else changed
     rendering = model.render(gaussians, sample_cameras(sample))
-    scores = _scores(sample, rendering, seen)
-    return Reconstruction(model, sample, gaussians, rendering, scores, **records)
+    return Reconstruction(
+        model=model,
+        sample=sample,
+        gaussians=gaussians,
+        rendering=rendering,
+        scores=_scores(sample, rendering, seen),
+    )
 
 
 def _scores(sample: Sample, rendering: Rendering, seen: Collection[int]) -> list[ViewScore]:

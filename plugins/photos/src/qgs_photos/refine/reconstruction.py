@@ -56,13 +56,9 @@ def opened_reconstruction(
     if not default:
         scene, seen = chosen_scene(recipe, photos, record.cameras.size, wanted, holdout=False)
     refuse_other_photos(record, scene, photos)
-    start = reconstruct_sample(
-        model,
-        _sample(record, scene),
-        seen or (),
-        record.gaussians.to(device),
-        tuning=record.tuning,
-    )
+    sample = _sample(record, scene)
+    start = reconstruct_sample(model, sample, seen or (), record.gaussians.to(device))
+    start = replace(start, tuning=record.tuning)
     if size is not None:
         scene, seen = chosen_scene(recipe, photos, size, wanted, holdout=default)
     return start, scene, seen or ()
@@ -142,10 +138,10 @@ def refine_reconstruction(
         "photos": [scene.frame_name(frame) for frame in frames],
         "stopped_by": refined.stopped_by,
     }
-    found = reconstruct_sample(
-        start.model, sample, seen, refined.gaussians, tuning=start.tuning, refinement=record
-    )
-    return replace(found, remarks=list(filter(None, [found.worse_than_nearest])))
+    found = reconstruct_sample(start.model, sample, seen, refined.gaussians)
+    worse = found.worse_than_nearest
+    remarks = [worse] if worse else []
+    return replace(found, tuning=start.tuning, refinement=record, remarks=remarks)
 
 
 def _chosen_frames(
