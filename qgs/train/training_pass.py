@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from typing import Any
 
 import torch
 from accelerate import Accelerator
@@ -106,7 +105,7 @@ class TrainingPass(nn.Module):
 
     def render(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """See `Passes`: the graphs of at most `render_views` views exist at a time."""
-        if cameras.shape[1] <= (self.render_views or cameras.shape[1]):
+        if not self.render_views or cameras.shape[1] <= self.render_views:
             return self.model.render(gaussians, cameras)
         # Rendered again in the backward pass: memory for one part instead of all.
         parts = [
@@ -115,11 +114,19 @@ class TrainingPass(nn.Module):
         ]
         return concatenated(parts, 1)
 
-    def _terms(self, names: Sequence[str], *shown: Any) -> dict[str, Tensor]:
-        """Return the terms of the losses `names`. shown: what a `Loss` is called with."""
+    def _terms(
+        self,
+        names: Sequence[str],
+        prediction: LayerPrediction,
+        rendering: Rendering,
+        target: Views,
+        inputs: Views,
+    ) -> dict[str, Tensor]:
+        """Return the terms of the losses `names`; for the rest see `Loss`."""
         terms: dict[str, Tensor] = {}
         for name in names:
-            for term, value in self.losses[name](*shown).items():
+            found = self.losses[name](prediction, rendering, target, inputs)
+            for term, value in found.items():
                 owner = self._owners.setdefault(term, name)
                 if owner != name:
                     raise ValueError(
