@@ -81,16 +81,16 @@ def ranked_windows(
     return sorted((*frusta.window(t, usable, inputs), t) for t in evenly(targets, _MOST))
 
 
-def trained_ratios(trained_on: Domain) -> tuple[tuple[float, float], float]:
-    """Return the range of baseline per depth, and the largest turn in degrees, of training."""
+def trained_ratios(trained_on: Domain) -> tuple[float, float, float]:
+    """Return least and most baseline per depth, and the largest turn in degrees, of training."""
     ranges = trained_on.ranges
     least, most = ranges.get("baseline", (0.0, math.inf))
     if most > VARIED * least:
-        return BASELINE, TURN
+        return *BASELINE, TURN
     near, far = ranges.get("depth", (1.0, 1.0))
     # Parallel axes meet at infinity; what they show has a depth of the order of the nearest.
     depth = math.sqrt(near * min(far, 3 * near)) if math.isfinite(near) else 1.0
-    return (least / depth, most / depth), ranges.get("turn", (0.0, TURN))[1]
+    return least / depth, most / depth, ranges.get("turn", (0.0, TURN))[1]
 
 
 class Frusta:
@@ -104,7 +104,7 @@ class Frusta:
         self.cameras = Cameras(c2w, given.intrinsics.double(), given.size)
         self.centres = c2w[:, :3, 3].numpy()
         axes = c2w[:, :3, 2].numpy()
-        (self.low, self.high), self.most_turn = trained_ratios(trained_on)
+        self.low, self.high, self.most_turn = trained_ratios(trained_on)
         self.apart = np.linalg.norm(self.centres[:, None] - self.centres, axis=-1)
         self.turns = np.degrees(np.arccos((axes @ axes.T).clip(-1, 1)))
         # A turn by the trained largest one counts as the largest distance does.
@@ -135,7 +135,10 @@ class Frusta:
         seen = self.seen(target, near)
         frames = np.array(near)
         # Pairs of inputs, the ends of the window; one input is both.
-        first, second = np.triu_indices(len(near), 1) if inputs > 1 else (np.arange(len(near)),) * 2
+        first = np.arange(len(near))
+        second = first
+        if inputs > 1:
+            first, second = np.triu_indices(len(near), 1)
         a = frames[first]
         b = frames[second]
         # A photo that is almost one of the inputs compares little.

@@ -61,7 +61,7 @@ def test_inputs_of_an_orbit_stand_beside_a_held_out_photo_in_any_order():
 
 
 def test_inputs_are_as_far_apart_as_in_training_whatever_the_unit():
-    (low, high), turn = trained_ratios(TRAINED)
+    low, high, turn = trained_ratios(TRAINED)
     for unit in (1.0, 100.0):
         c2w = orbit(30, 2.0, 4.0 * unit)
         (((first, last), _),) = windows_of(scene_of(c2w, (15,)))

@@ -262,7 +262,7 @@ class Overlapping(ViewSampler):
 
 def apart(domain: Domain, factor: float) -> Domain:
     """Return `domain` with the best inputs `factor` times as far apart and turned."""
-    (low, high), turn = trained_ratios(domain)
+    low, high, turn = trained_ratios(domain)
     ends = {"baseline": [factor * low, factor * high], "turn": [0.0, factor * turn]}
     return Domain({**ends, "depth": [1.0, 1.0]}, domain.samples)
 
