@@ -133,9 +133,9 @@ class CheckpointFile(TensorFile):
         Raises CheckpointError, and ValueError for weights that are NaN or infinite.
         """
         # On the meta device first: sizes are compared before the recipe's model takes memory.
-        refuse_misfit(self.untrained("meta"), self.tensors, str(self.path))
+        refuse_misfit(self.untrained("meta"), self.tensors, self.path)
         model = self.untrained()
-        load_weights(model, self.tensors, str(self.path))
+        load_weights(model, self.tensors, self.path)
         follow(model.modules(), END if self.step is None else self.step)
         model.trained_on = self.domain
         local = Path(self.name).expanduser().exists()
@@ -209,7 +209,7 @@ def unique_tensors(model: nn.Module) -> dict[str, Tensor]:
     return dict(first.values())
 
 
-def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -> None:
+def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: object) -> None:
     """Copy `tensors`, read from `origin`, into `model`; nothing is copied where one does not fit.
 
     Raises CheckpointError that lists differences in names, shapes and types, and ValueError for NaN
@@ -225,12 +225,12 @@ def load_weights(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -
 
 def refuse_nonfinite(tensors: Mapping[str, Tensor], origin: object) -> None:
     """Raise ValueError for NaN and infinity in weights read from `origin`."""
-    if broken := nonfinite(tensors.items()):
+    if broken := nonfinite(tensors):
         fix = "its training had diverged, or the file is damaged: take another"
         raise ValueError(f"{origin}: weights are not finite: {listed(broken)}; {fix}")
 
 
-def refuse_misfit(model: nn.Module, tensors: Mapping[str, Tensor], origin: str) -> None:
+def refuse_misfit(model: nn.Module, tensors: Mapping[str, Tensor], origin: object) -> None:
     """Raise CheckpointError that lists in what `tensors` differ from those of `model`."""
     own = unique_tensors(model)
     differences = differing_tensors(shapes_of(tensors), shapes_of(own))

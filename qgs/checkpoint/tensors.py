@@ -3,7 +3,7 @@
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from hashlib import blake2b
 from pathlib import Path
@@ -151,9 +151,9 @@ def shapes_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
     return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
 
 
-def nonfinite(tensors: Iterable[tuple[str, Tensor]]) -> list[str]:
+def nonfinite(tensors: Mapping[str, Tensor]) -> list[str]:
     """Return the names of the tensors, all on one device, that hold NaN or infinity."""
-    finite = {name: tensor.isfinite().all() for name, tensor in tensors}
+    finite = {name: tensor.isfinite().all() for name, tensor in tensors.items()}
     # One read for all: each read would make the host wait for the device.
     flags = torch.stack([*finite.values()]).tolist() if finite else []
     return [name for name, is_finite in zip(finite, flags, strict=True) if not is_finite]

@@ -181,7 +181,7 @@ class Guard:
             ) from error
 
     def _refuse_broken_weights(self, step: int) -> None:
-        if names := nonfinite(unique_tensors(self.saver.model).items()):
+        if names := nonfinite(unique_tensors(self.saver.model)):
             self._collapse(step, f"weights are not finite: {listed(names)}")
 
     def _collapse(self, step: int, problem: str = "") -> NoReturn:

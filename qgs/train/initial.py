@@ -54,7 +54,7 @@ def initialise(model: QueryGaussianModel, recipe: Recipe) -> list[str]:
     generator = torch.Generator().manual_seed(recipe.seed)
     resized = model.queries.resized(_part(_QUERIES, learned), generator)
     weights |= {_QUERIES + name: values for name, values in resized.items()}
-    load_weights(model, weights, str(path))
+    load_weights(model, weights, path)
     before = shapes_of(learned)
     changes = [
         f"{name}: {before.get(name, 'none')} -> {shape}"

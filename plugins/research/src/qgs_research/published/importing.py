@@ -154,7 +154,7 @@ def export_checkpoint(name: str | os.PathLike[str], out: str | Path, half: bool 
             real = {name: t.half() for name, t in tensors.items() if t.is_floating_point()}
             tensors = {**tensors, **real}
         # Finite in float32, they may be infinite now.
-        if broken := nonfinite(tensors.items()):
+        if broken := nonfinite(tensors):
             raise CheckpointError(
                 f"{file.path} has weights that float16 cannot hold (larger than 65504): "
                 f"{listed(broken)}; ship it as it is"
