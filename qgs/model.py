@@ -133,9 +133,11 @@ class QueryGaussianModel(nn.Module):
         if layers is None:
             layers = self.supervision.weights().keys() if self.training else ()
         last = len(self.decoder)
-        again = len(self.decoder) - self.feedback.layers
+        again = last - self.feedback.layers
         rounds = self.feedback.drawn() if self.training else self.feedback.rounds
-        order = [*range(last), *(rounds * [*range(again, last)])]
+        order = [*range(last)]
+        # Every round of feedback repeats the last layers.
+        order += rounds * [*range(again, last)]
         known = range(min(1, last), len(order) + 1)
         unknown = sorted(n for n in layers if n not in known)
         if unknown:

@@ -32,7 +32,7 @@ def similarity_map(x: Tensor, y: Tensor, padding: Padding, correction: float = 1
         raise ValueError(f"SSIM of whole windows needs images of {size}: raise data.image_size")
     moments = torch.stack([x, y, x * x + y * y, x * y])
     planes = moments.reshape(1, -1, height, width)
-    edge = WINDOW // 2 * (padding == "same")
+    edge = WINDOW // 2 if padding == "same" else 0
     # One group a plane: on a CPU a tenth of the time of planes as a batch.
     kernel = _WEIGHTS.to(planes).expand(planes.shape[1], 1, 1, -1)
     groups = planes.shape[1]

@@ -284,7 +284,10 @@ class Gaussians(TensorContainer):
         chosen = self.opacities.topk(min(count, self.count), -1).indices.sort(-1).values
 
         def kept(x: Tensor) -> Tensor:
-            index = chosen[(..., *[None] * (x.ndim - chosen.ndim))]
+            index = chosen
+            # `take_along_dim` wants as many axes as x has.
+            while index.ndim < x.ndim:
+                index = index[..., None]
             return x.take_along_dim(index, chosen.ndim - 1)
 
         return map_tensors(kept, self)

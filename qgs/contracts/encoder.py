@@ -87,7 +87,8 @@ class PatchEncoder(Encoder):
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
         """A patch that does not divide the data's images."""
-        size, patch = context.image_size, config.patch_size
+        size = context.image_size
+        patch = config.patch_size
         if size and any(side % patch for side in size):
             # The multiple that crops or enlarges least.
             nearest = [max(round(side / patch), 1) * patch for side in size]

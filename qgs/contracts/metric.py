@@ -40,7 +40,7 @@ class Column:
     def beats(self, value: float | None, other: float | None) -> bool:
         """Return whether `value` is better than `other` in the digits that tables show."""
         # 14.463 and 14.457 both read 14.46: a sentence that ranks them would puzzle its reader
-        if value is None or other is None or self.shown(value) == self.shown(other):
+        if other is None or self.shown(value) == self.shown(other):
             return False
         return self.best((value, other)) == value
 

@@ -95,7 +95,8 @@ class TrainingConfig(ComponentConfig):
         scenes, left = divmod(self.batch_size, parts)
         if left:
             # The multiples below and above; 0 scenes are no batch.
-            near = f"{scenes * parts or parts} or {(scenes or 1) * parts + parts}"
+            below = max(scenes, 1)
+            near = f"{below * parts} or {(below + 1) * parts}"
             raise ValueError(
                 f"training.batch_size: {self.batch_size} scenes do not split evenly over "
                 f"{processes} x {self.accumulate} (processes x training.accumulate): choose a "

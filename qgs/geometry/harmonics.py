@@ -31,7 +31,8 @@ def harmonics(directions: Tensor, count: int) -> Tensor:
         a, b, c = _C2
         values += [a * x * y, -a * y * z, b * (2 * zz - xx - yy), -a * x * z, c * (xx - yy)]
     if count > SH_COUNTS[1]:
-        (a, b, c), (d, e) = _C3, _C3_INNER
+        a, b, c = _C3
+        d, e = _C3_INNER
         values += [-a * y * (3 * xx - yy), b * x * y * z, -c * y * (4 * zz - xx - yy)]
         values += [d * z * (2 * zz - 3 * xx - 3 * yy), -c * x * (4 * zz - xx - yy)]
         values += [e * z * (xx - yy), -a * x * (xx - 3 * yy)]

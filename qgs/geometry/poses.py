@@ -93,5 +93,5 @@ def look_at_depth(c2w: Tensor) -> Tensor:
 def mirrored(c2w: Tensor) -> Tensor:
     """Poses of the scene mirrored in x: R' = F R F, t' = F t with F = diag(-1, 1, 1)."""
     # Both sides: a mirrored rotation alone would be no rotation.
-    flip = torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0], dtype=c2w.dtype, device=c2w.device))
+    flip = torch.diag(constant([-1.0, 1.0, 1.0, 1.0], c2w))
     return flip @ c2w @ flip

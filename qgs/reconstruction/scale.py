@@ -77,7 +77,7 @@ class FoundScale:
     @property
     def text(self) -> str:
         """Factor, photos and quality."""
-        judged = " and ".join(["the inputs", *filter(None, [listed(self.names)])])
+        judged = f"the inputs and {listed(self.names)}" if self.names else "the inputs"
         return f"scale {self.factor:.3g}, found on {judged}: {self.psnr:.1f} dB"
 
 
@@ -164,9 +164,10 @@ def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, 
         found += [max(low, high / 10) / baseline / BELOW, high / baseline * ABOVE]
     near = trained.ranges.get("depth", (NEAREST, math.inf))[0]
     near = near if 0 < near < math.inf else NEAREST
+    nearest = 0.0
     if depth > 0:
         found += [near / TOLERANCE / depth, near * REACH / depth]
-    nearest = near * TOLERANCE / depth if depth > 0 else 0.0
+        nearest = near * TOLERANCE / depth
     # Cameras on one point leave nothing to search: no factor changes what they see.
     return min(found, default=1.0), max(found, default=1.0), nearest
 

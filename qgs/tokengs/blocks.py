@@ -91,7 +91,8 @@ class SelfAttentionCore(nn.Module):
     def forward(self, x_BTD: Tensor, mask: Tensor | None = None) -> Tensor:
         """(B, T, D). mask: (B, T), False for tokens that nobody reads; or (B, T, T), for each."""
         q_BhTd, k_BhTd, v_BhTd = self.project(x_BTD)
-        mask = None if mask is None else _by_head(mask if mask.ndim == 3 else mask[:, None])
+        if mask is not None:
+            mask = _by_head(mask if mask.ndim == 3 else mask[:, None])
         read_BhTd = F.scaled_dot_product_attention(q_BhTd, k_BhTd, v_BhTd, attn_mask=mask)
         return self.proj(merge_heads(read_BhTd))
 

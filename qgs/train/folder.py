@@ -169,7 +169,8 @@ class Saver:
             # A kill between the files must not leave a checkpoint that cannot go on.
             if not self.folder.state.exists():
                 self._write_state(states)
-            self._write_checkpoint(self.folder.checkpoint, *(good or (step, states["weights"])))
+            saved, weights = good or (step, states["weights"])
+            self._write_checkpoint(self.folder.checkpoint, saved, weights)
             if "ema" in states and not good:
                 self._write_checkpoint(self.folder.checkpoint_ema, step, states["ema"])
             # Last: complete by itself, and never ahead of the weights.
@@ -184,7 +185,7 @@ class Saver:
 
     def restore(self, states: Mapping[str, State]) -> None:
         """Bring the weights and all that is stateful back; raises CheckpointError."""
-        load_weights(self.model, states.get("weights", {}), str(self.folder.state))
+        load_weights(self.model, states.get("weights", {}), self.folder.state)
         for name, one in self.stateful.items():
             try:
                 one.load_state(states[name])

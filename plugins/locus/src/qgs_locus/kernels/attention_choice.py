@@ -47,8 +47,12 @@ def chosen_kernel(
 
 def plain_bytes(q_BhNd: Tensor, bias: "AttentionBias") -> int:
     """Memory of the plain way without q, k and v: the bias, and its gradient for each head."""
-    (scenes, heads, queries, _), read = q_BhNd.shape, q_BhNd.element_size()
-    each = bias.queries.element_size() + (read if q_BhNd.dtype != bias.queries.dtype else 0)
+    scenes, heads, queries, _ = q_BhNd.shape
+    read = q_BhNd.element_size()
+    each = bias.queries.element_size()
+    # Attention reads a copy in the dtype of the queries.
+    if q_BhNd.dtype != bias.queries.dtype:
+        each += read
     # Torch makes the gradient of the mask for each head.
     if torch.is_grad_enabled() and (bias.queries.requires_grad or bias.tokens.requires_grad):
         each += heads * read

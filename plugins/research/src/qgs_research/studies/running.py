@@ -102,7 +102,8 @@ def train_missing(
                     if plan.done(run) or run.failed or process.returncode:
                         print_lines(console, [_ended(plan, run, process.returncode)])
                     # One try a call: what failed would most likely fail again at once.
-                    failed += [run] * bool(run.failed or process.returncode)
+                    if run.failed or process.returncode:
+                        failed.append(run)
             left = [run for run in runs if run not in failed and not plan.done(run)]
             for run in left:
                 # A process that finds its run taken has imported torch for nothing.
