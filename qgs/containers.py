@@ -61,10 +61,17 @@ def concatenated(parts: Sequence[_C], dim: int) -> _C:
     Raises ValueError where one has a tensor that another one lacks.
     """
     found = [dict(named_tensors(part)) for part in parts]
-    if some := sorted({name for other in found for name in other.keys() ^ found[0].keys()}):
-        raise ValueError(f"all or none must have {', '.join(some)}")
-    joined = iter([torch.cat([x[name] for x in found], dim) for name in found[0]])
-    return map_tensors(lambda _: next(joined), parts[0])
+    for other in found:
+        if some := sorted(other.keys() ^ found[0].keys()):
+            raise ValueError(f"all or none must have {', '.join(some)}")
+    # `map_tensors` comes to the tensors in the order of their names.
+    names = iter(found[0])
+
+    def joined(_: Tensor) -> Tensor:
+        name = next(names)
+        return torch.cat([tensors[name] for tensors in found], dim)
+
+    return map_tensors(joined, parts[0])
 
 
 def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
@@ -105,9 +112,11 @@ def check_shapes(
         if len(given) != len(axes) or any(
             sizes.setdefault(axis, size) != size for axis, size in zip(axes, given, strict=True)
         ):
-            wanted = [sizes.get(axis, axis) for axis in axes]
-            flat = [n for want in wanted for n in (want if isinstance(want, tuple) else [want])]
-            message = f"must have shape ({', '.join(map(str, flat))}), got {shape}"
+            wanted = []
+            for axis in axes:
+                size = sizes.get(axis, axis)
+                wanted += size if isinstance(size, tuple) else [size]
+            message = f"must have shape ({', '.join(map(str, wanted))}), got {shape}"
             if axes[0] == "B" and len(shape) == len(axes) - 1:
                 message += "; add a leading dimension for a single scene"
             raise ValueError(f"{type(container).__name__}.{name} {message}")

@@ -79,10 +79,9 @@ class Domain:
     def text(self) -> str:
         """Its ranges as JSON; null stands for infinity."""
         # JSON has no infinity, which is the depth of parallel axes.
-        ranges = {
-            name: [end if math.isfinite(end) else None for end in ends]
-            for name, ends in self.ranges.items()
-        }
+        ranges = {}
+        for name, ends in self.ranges.items():
+            ranges[name] = [end if math.isfinite(end) else None for end in ends]
         return json.dumps({"samples": self.samples, "ranges": ranges})
 
     @classmethod

@@ -12,11 +12,11 @@ def parameter_counts(model: Any) -> dict[str, int]:
 
     `decoder.layer` has what is not of its sublayers.
     """
-    sublayers = {
-        f"decoder.{slot}": sum(map(_count, modules))
-        for slot in SUBLAYER_SLOTS
-        if (modules := [getattr(layer, slot) for layer in model.decoder if hasattr(layer, slot)])
-    }
+    sublayers: dict[str, int] = {}
+    for slot in SUBLAYER_SLOTS:
+        modules = [getattr(layer, slot) for layer in model.decoder if hasattr(layer, slot)]
+        if modules:
+            sublayers[f"decoder.{slot}"] = sum(map(_count, modules))
     return {
         "encoder": _count(model.encoder),
         "queries": _count(model.queries),
@@ -36,7 +36,7 @@ def _count(module: nn.Module) -> int:
 def model_text(model: Any) -> str:
     """Sizes, then a line for each slot: its component and number of parameters."""
     rows = slot_rows(model)
-    wide = [max(len(row[column]) for row in rows) for column in range(3)]
+    wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [f"  {slot:<{wide[0]}}  {kind:<{wide[1]}}  {n:>{wide[2]}}" for slot, kind, n in rows]
     return "\n".join([heading(model), *(line.rstrip() for line in lines)])
 

@@ -114,10 +114,11 @@ class Measures:
     def __init__(self, recipe: Recipe) -> None:
         # eval(): layers of a learned metric may differ in training.
         self.metrics = {name: metric.eval() for name, metric in recipe.build_metrics().items()}
-        self.needed = {need for metric in self.metrics.values() for need in metric.needs}
+        self.needed = set[str]()
         self.columns: dict[str, Column] = {}
         self._owners: dict[str, Metric] = {}
         for label, metric in self.metrics.items():
+            self.needed.update(metric.needs)
             for key, column in metric.columns().items():
                 name = _name(label, key)
                 if name in self.columns:
@@ -184,9 +185,12 @@ class _Scorer:
             found.append(self._values(sample))
             views.append((sample.input_frames, sample.target_frames))
             names |= sample.names
-        # A value that one sample lacks would be a mean over other samples.
-        common = [key for key in found[0] if all(key in values for values in found)]
-        means = {key: sum(values[key] for values in found) / len(found) for key in common}
+        means: dict[str, float] = {}
+        for key in found[0]:
+            each = [values[key] for values in found if key in values]
+            # A value that one sample lacks would be a mean over other samples.
+            if len(each) == len(found):
+                means[key] = sum(each) / len(each)
         return SceneScore(scene, views, means, names)
 
     def _values(self, sample: Sample) -> dict[str, float]:

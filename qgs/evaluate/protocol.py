@@ -77,7 +77,7 @@ def protocol_of(
     renderer = recipe.parts["model", "renderer"]
     content = {
         "format": 1,
-        "image_size": list(recipe.tree["data"]["image_size"]),
+        "image_size": recipe.tree["data"]["image_size"],
         "crop": "centre crop to the aspect ratio of image_size, then Lanczos resize",
         "data": data,
         "poses": poses,
@@ -113,7 +113,7 @@ def _data_and_views(
     data = {"type": part.type, **part.config.model_dump(mode="json", exclude=left_out)}
     drawn = recipe.views.model_dump(mode="json", include={"inputs", "targets", "gap"})
     drawn |= recipe.evaluation.model_dump(include={"scenes", "samples", "seed"})
-    drawn["names"] = list(scenes)
+    drawn["names"] = scenes
     # The default sampler is what `gap` says; any other one draws other views.
     sampler = recipe.parts["view_sampler",]
     if sampler.options != Span.Config().model_dump() or sampler.type != "qgs/span":

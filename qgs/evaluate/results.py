@@ -141,14 +141,20 @@ class Evaluation:
 
     def _csv(self) -> str:
         rows: list[dict[str, Any]] = []
+        columns: dict[str, Any] = {}
         for score in self.scores:
-            row = {"scene": score.scene}
-            # Frames by name where they have any; samples apart.
+            row: dict[str, Any] = {"scene": score.scene}
             for place, column in enumerate(("input_frames", "target_frames")):
-                named = [[score.names.get(f, str(f)) for f in one[place]] for one in score.views]
-                row[column] = "; ".join(map(" ".join, named))
-            rows.append({**row, **score.values})
-        columns = dict.fromkeys(column for row in rows for column in row)
+                samples = []
+                for views in score.views:
+                    # By name where they have any.
+                    names = [score.names.get(frame, str(frame)) for frame in views[place]]
+                    samples.append(" ".join(names))
+                row[column] = "; ".join(samples)
+            row |= score.values
+            rows.append(row)
+            # A column stays where the first scene that has it puts it.
+            columns |= row
         # A scene that is missing has a row too, so that it shows in the file.
         rows += [{"scene": scene, "problem": reason} for scene, reason in self.missing.items()]
         text = io.StringIO()
@@ -161,12 +167,15 @@ class Evaluation:
         """Yield what table.md says below the table, a line each."""
         content = self.protocol.content
         height, width = content["image_size"]
-        counts = sorted({len(inputs) for score in self.scores for inputs, _ in score.views})
+        counts = set[int]()
+        for score in self.scores:
+            counts.update(len(inputs) for inputs, _ in score.views)
         poses = content["poses"]
+        scale = f"{poses['scale']} {poses.get('scale_factor', '')}".rstrip()
         yield (
             f"protocol {self.protocol.name}, sha256 {self.protocol.sha256}: "
-            f"{' or '.join(map(str, counts))} input views of {width} x {height} pixels, poses "
-            f"{poses['frame']}, scale {poses['scale']} {poses.get('scale_factor', '')}".rstrip()
+            f"{' or '.join(map(str, sorted(counts)))} input views of {width} x {height} pixels, "
+            f"poses {poses['frame']}, scale {scale}"
         )
         # A broken data set would bury the table; scenes.csv has every reason.
         yield from (f"missing {scene}: {why}" for scene, why in [*self.missing.items()][:10])

@@ -155,7 +155,7 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
 
 def load_pretrained(*parts: nn.Module) -> None:
     """Call `load_pretrained` of every component; its MissingExtraError then names the component."""
-    for component in (module for part in parts for module in part.modules()):
+    for component in nn.ModuleList(parts).modules():
         if isinstance(component, Component) and not any(x.is_meta for x in component.parameters()):
             try:
                 component.load_pretrained()
@@ -182,7 +182,9 @@ def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
         # What is trained holds the model as `model`, a recipe its parts in the section `model`.
         wanted = pattern.removeprefix("model.").split(".")
         if not named and (module is not model or wanted[0] != "losses"):
-            known = {".".join(path[: len(wanted)]) for below in paths.values() for path in below}
+            known = set[str]()
+            for below in paths.values():
+                known.update(".".join(path[: len(wanted)]) for path in below)
             reason = f"the pattern `{pattern}` matches no parameter of the model"
             origin = optimizer.node.child("parts").origin_of(pattern)
             fix = did_you_mean(pattern.removeprefix("model."), known, "parts")

@@ -10,6 +10,7 @@ from typing import Any
 from qgs.contracts import (
     LAYER_SLOTS,
     SUBLAYER_SLOTS,
+    Problem,
     RecipeContext,
     Refinement,
     SceneSourceConfig,
@@ -18,7 +19,7 @@ from qgs.contracts import (
 from qgs.contracts.component import Component, ComponentConfig, Fields, FieldSpec
 from qgs.recipe.decode import Chosen, Parts, report_failure
 from qgs.recipe.errors import Problems
-from qgs.recipe.places import DECODER, layer_places
+from qgs.recipe.places import DECODER, layer_place
 from qgs.recipe.registry import Registry, default_config
 from qgs.recipe.sections import DecoderSettings, Draft
 from qgs.recipe.slots import AFTER_LAYERS
@@ -63,11 +64,9 @@ def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -
             component(config).weights()
         called = "problems"
         # A scheduled option must be valid at every extreme of its schedule.
-        found = dict.fromkeys(
-            problem
-            for options in (config, *chosen.later)
-            for problem in component.problems(options, context)
-        )
+        found: dict[Problem, None] = {}
+        for options in (config, *chosen.later):
+            found |= dict.fromkeys(component.problems(options, context))
     # What code of a plugin raises.
     except Exception as error:
         called = f"`{called}` of `{chosen.type}`"
@@ -86,10 +85,11 @@ def _without_idle_sublayers(draft: Draft, problems: Problems) -> Parts:
     A template used by any layer is not reported.
     """
     kept = dict(draft.parts)
-    layers: dict[KeyPath, Any] = {
-        path[:-1]: kept[path] for path in layer_places(draft.dims.depth, "layer")
-    }
-    read = {name for layer in layers.values() for name in layer.component.sublayers}
+    layers: dict[KeyPath, Any] = {}
+    for index in range(draft.dims.depth):
+        path = layer_place(index, "layer")
+        layers[path[:-1]] = kept[path]
+    read = set().union(*(layer.component.sublayers for layer in layers.values()))
     for place, layer in layers.items():
         for name in {*SUBLAYER_SLOTS} - {*layer.component.sublayers}:
             idle = kept.pop((*place, name))
@@ -139,7 +139,8 @@ def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, 
         yield ("losses",), reason, "add one under `losses`, or drop the data with `data: null`"
     # A resolved recipe writes the default out, which must stay valid.
     default = DecoderSettings().layer_scale
-    layers: list[Any] = [parts[place] for place in layer_places(draft.dims.depth, "layer")]
+    places = [layer_place(index, "layer") for index in range(draft.dims.depth)]
+    layers: list[Any] = [parts[place] for place in places]
     read = any(layer.component.reads_layer_scale for layer in layers)
     if not read and settings.model.decoder.layer_scale != default:
         names = " and ".join(sorted({f"`{layer.type}`" for layer in layers}))
@@ -188,7 +189,7 @@ def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[list[Chosen], b
     decode += [part for path, part in parts.items() if path[0] in ("losses", "objective")]
     yield [parts["model", "encoder"], parts["model", "queries"]], False
     for layer in range(depth + 1):
-        places = [(*DECODER, "layers", str(layer - 1), name) for name in LAYER_SLOTS]
+        places = [layer_place(layer - 1, name) for name in LAYER_SLOTS]
         yield [parts[place] for place in places if place in parts], False
         if layer in decoded:
             yield decode, True
@@ -205,12 +206,11 @@ def _unmet(missing: Fields, reader: Chosen, parts: Parts, registry: Registry) ->
             reason += f"; `{late[0].type}` at {late[0].shown_path} provides {name} too late"
     # Whoever replaced a component that provided them finds the line here.
     now = {part.slot: f"`{part.type}`, {part.chosen_at}" for part in parts.values()}
-    known = [
-        f"`{kind}` in the slot `{slot}` (now {now.get(slot, 'empty')})"
-        for slot in _FLOW[: _FLOW.index(reader.slot)]
-        for kind, component in registry.components(slot).items()
-        if missing.keys() <= _offered(component, default_config(component)).keys()
-    ]
+    known: list[str] = []
+    for slot in _FLOW[: _FLOW.index(reader.slot)]:
+        for kind, component in registry.components(slot).items():
+            if missing.keys() <= _offered(component, default_config(component)).keys():
+                known.append(f"`{kind}` in the slot `{slot}` (now {now.get(slot, 'empty')})")
     if known:
         return reason, f"use {' or '.join(known)} with default options"
     return reason, f"use or install a component that provides {' and '.join(missing)}"
@@ -227,16 +227,17 @@ def _offered(component: type[Component], config: ComponentConfig | None) -> Fiel
 
 def keys_are_read(parts: Mapping[KeyPath, Chosen]) -> bool:
     """Return whether a component requires keys or values of the image memory."""
-    read = {name for part in parts.values() for name in part.component.fields_read(part.config)}
-    return not read.isdisjoint({"memory.keys", "memory.values"})
+    wanted = {"memory.keys", "memory.values"}
+    return any(wanted & part.component.fields_read(part.config).keys() for part in parts.values())
 
 
 def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
     """A sentence for each learnable field of the queries that only refinements read."""
-    used = [part for path, part in parts.items() if path[:-1] != DECODER]
-    # A refinement reads what it updates, which alone makes no use of it.
-    readers = [part for part in used if not issubclass(part.component, Refinement)]
-    read = {name for part in readers for name in part.component.fields_read(part.config)}
+    read = set[str]()
+    for path, part in parts.items():
+        # A refinement reads what it updates, which alone makes no use of it.
+        if path[:-1] != DECODER and not issubclass(part.component, Refinement):
+            read.update(part.component.fields_read(part.config))
     queries = parts["model", "queries"]
     for name, spec in _offered(queries.component, queries.config).items():
         if name not in read and spec.dtype.is_floating_point:

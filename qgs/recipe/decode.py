@@ -87,7 +87,8 @@ def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen
         return report_failure(place, f"`Config` of `{name}`", error, installed, problems)
     if found is None:
         return None
-    (config, *later), schedules = found
+    configs, schedules = found
+    config, *later = configs
     at = (place.path, place.source, node, place.origin)
     return Chosen(*at, name, component, config, later, schedules, installed)
 
@@ -108,6 +109,7 @@ def _decode_options(
 ) -> tuple[list[ComponentConfig], dict[str, Schedule]] | None:
     """The options at each extreme of the schedules, the first ones first; and the schedules."""
     schedules: dict[str, Schedule] = {}
+    steps = {0}
     for option, value, origin in node.entries():
         if option in component.scheduled and isinstance(value, MapNode):
             kind = str(value.get("schedule", ""))
@@ -121,9 +123,10 @@ def _decode_options(
             if schedule is None:
                 return None
             schedules[option] = schedule
+            steps.update(schedule.corners)
     configs = list[ComponentConfig]()
     # Between two corners a schedule is monotonic, so that no other step is beyond its limits.
-    for step in sorted({0, *(step for one in schedules.values() for step in one.corners)}):
+    for step in sorted(steps):
         options = MapNode(node.origin, node.entries())
         for option, schedule in schedules.items():
             number = schedule.number(step)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import NoReturn
 
 from qgs.contracts import Problem
+from qgs.wording import counted
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,8 @@ class RecipeError(ValueError):
         # A template of the decoder may be refused once for each of its layers.
         ordered = sorted(set(problems), key=lambda p: (p.file, p.line, p.option, p.reason, p.fix))
         self.problems = tuple(ordered)
-        title = "1 problem" if len(ordered) == 1 else f"{len(ordered)} problems"
-        super().__init__("\n".join([f"{title} in the {what}", *map(str, ordered)]))
+        title = f"{counted(len(ordered), 'problem')} in the {what}"
+        super().__init__("\n".join([title, *map(str, ordered)]))
 
 
 class Problems:

@@ -35,9 +35,9 @@ class Place:
         return slot.name
 
 
-def layer_places(depth: int, *slots: str) -> list[KeyPath]:
-    """Paths of `slots` in all decoder layers, layer by layer."""
-    return [(*DECODER, "layers", str(index), name) for index in range(depth) for name in slots]
+def layer_place(index: int, slot: str) -> KeyPath:
+    """Path of a slot of a decoder layer."""
+    return (*DECODER, "layers", str(index), slot)
 
 
 def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place]:
@@ -50,7 +50,8 @@ def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place
         problems.add(origin, (*DECODER, "layers", key), reason, fix)
     paths: list[KeyPath] = [("model", "encoder"), ("model", "queries")]
     paths += [(*DECODER, name) for name in LAYER_SLOTS]
-    paths += layer_places(depth, *LAYER_SLOTS)
+    for index in range(depth):
+        paths += [layer_place(index, name) for name in LAYER_SLOTS]
     paths += [("model", name) for name in AFTER_LAYERS]
     for name, section in SECTIONS.items():
         if section.named:

@@ -77,12 +77,12 @@ class Registry:
 
     def components(self, slot: str) -> dict[str, type[Component]]:
         """`PLUGIN/NAME` to component, of one slot."""
-        return {
-            f"{name}/{component.name}": component
-            for name, installed in self.plugins.items()
-            for component in installed.plugin.components
-            if component.slot == slot
-        }
+        found: dict[str, type[Component]] = {}
+        for name, installed in self.plugins.items():
+            for component in installed.plugin.components:
+                if component.slot == slot:
+                    found[f"{name}/{component.name}"] = component
+        return found
 
 
 def available_plugins() -> dict[str, list[EntryPoint]]:

@@ -35,7 +35,6 @@ def orbit(inputs: Cameras, depth: float, frames: int) -> Cameras:
     times_T = (1 - angles.cos()) / 2 * (count - 1)
     distances_TV = times_T[:, None] - torch.arange(count, device=times_T.device)
     # A smooth mean of neighbouring inputs, so that the path has no corner at any of them.
-    # Between inputs the camera moves on a smooth mean of their poses.
     weights_TV = torch.softmax(-0.5 * (distances_TV / 0.6) ** 2, -1)
     mean = torch.einsum("tv,vij->tij", weights_TV, inputs.c2w[0])
     _, down, forward, centre = mean[:, :3].unbind(-1)
@@ -104,7 +103,9 @@ def overview(result: Reconstruction) -> Picture:
         file = Path(result.sample.names.get(score.frame, "")).name
         quality = f"{Psnr.column.shown(score.psnr)} {Psnr.column.unit}"
         titles.append(f"frame {numbered(score.frame, file)}\n{score.kind.split()[0]}, {quality}")
-    rows = {kind: [pictures[i] for i in shown] for kind, pictures in _pictures(result).items()}
+    rows = {}
+    for kind, pictures in _pictures(result).items():
+        rows[kind] = [pictures[index] for index in shown]
     figure = grid_figure(rows, titles, depth_range(result.rendering.depth))
     return figure_picture(figure)
 
@@ -113,9 +114,13 @@ def _camera_record(result: Reconstruction, path: Cameras) -> dict[str, Any]:
     reference, scale = result.sample.world
     views = []
     for score, camera in zip(result.scores, _plain(sample_cameras(result.sample)), strict=True):
-        photo = result.sample.names.get(score.frame)
-        view = {"frame": score.frame, "photo": photo, "kind": score.kind}
-        views.append({**view, "psnr": round(score.psnr, 3), **camera})
+        view = {
+            "frame": score.frame,
+            "photo": result.sample.names.get(score.frame),
+            "kind": score.kind,
+            "psnr": round(score.psnr, 3),
+        }
+        views.append({**view, **camera})
     return {
         "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
         "scene": result.sample.scene,
@@ -137,5 +142,5 @@ def _camera_record(result: Reconstruction, path: Cameras) -> dict[str, Any]:
 
 def _plain(cameras: Cameras) -> list[dict[str, Any]]:
     pairs = zip(cameras.c2w[0].tolist(), cameras.intrinsics[0].tolist(), strict=True)
-    size = list(cameras.size)
+    size = cameras.size
     return [{"c2w": c2w, "intrinsics": intrinsics, "size": size} for c2w, intrinsics in pairs]

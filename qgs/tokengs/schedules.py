@@ -70,7 +70,8 @@ class Steps(_Listed):
     @property
     def corners(self) -> tuple[int, ...]:
         """See `Schedule`; others go on until the last step before a jump."""
-        return tuple(step for at in self.at for step in (max(at - 1, 0), at))
+        before = [max(at - 1, 0) for at in self.at]
+        return (*before, *self.at)
 
 
 class Linear(_Listed):
@@ -88,7 +89,8 @@ class Linear(_Listed):
         after = bisect_right(self.at, step)
         if after in (0, len(self.at)):
             return self.values[min(after, len(self.at) - 1)]
-        (first, last), (start, end) = self.at[after - 1 : after + 1], self.values[after - 1 :][:2]
+        first, last = self.at[after - 1 : after + 1]
+        start, end = self.values[after - 1 : after + 1]
         share = (step - first) / (last - first)
         if self.schedule == "cosine":
             share = (1 - math.cos(math.pi * share)) / 2

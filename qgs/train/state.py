@@ -133,8 +133,10 @@ class RandomStates:
         own = {"torch": torch.get_rng_state()}
         if torch.cuda.is_initialized():
             own["cuda"] = torch.cuda.get_rng_state()
-        ranks = enumerate(gather_object([own]))
-        return {f"{rank}/{key}": value for rank, found in ranks for key, value in found.items()}
+        found: dict[str, Any] = {}
+        for rank, states in enumerate(gather_object([own])):
+            found |= {f"{rank}/{key}": value for key, value in states.items()}
+        return found
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore this process's generators; a rank that `state` lacks keeps its own."""
@@ -157,7 +159,9 @@ class OptimizerState:
 
     def __init__(self, module: nn.Module, optimizer: torch.optim.Optimizer) -> None:
         names = {id(parameter): name for name, parameter in module.named_parameters()}
-        self._names = [names[id(p)] for group in optimizer.param_groups for p in group["params"]]
+        self._names: list[str] = []
+        for group in optimizer.param_groups:
+            self._names += [names[id(parameter)] for parameter in group["params"]]
         self._optimizer = optimizer
 
     def state(self) -> dict[str, Any]:
