@@ -180,7 +180,7 @@ def own_world(scene: Scene, input_frames: Frames, views: ViewsConfig) -> tuple[T
     every = scene.cameras.c2w
     c2w = every[list(input_frames)]
     reference = reference_pose(views.frame, c2w)
-    factor = torch.tensor(views.scale_factor, dtype=c2w.dtype)
+    factor = c2w.new_tensor(views.scale_factor)
     if views.scale == "constant":
         return reference, factor
     auto = views.scale == "auto"

@@ -66,10 +66,8 @@ def training_batches(
     optimiser step.
     Raises ValueError without training scenes or with too few frames, SampleError and WorkerError.
     """
-    stream = SampleStream(
-        source, views, seed, skips, sampler, batch_size * processes * accumulate, depths
-    )
     every = batch_size * processes
+    stream = SampleStream(source, views, seed, skips, sampler, every * accumulate, depths)
     firsts = count(start * every + rank * batch_size, every)
     numbers = (range(first, first + batch_size) for first in firsts)
     return _from_workers(stream, numbers, workers) if workers else _from_thread(stream, numbers)
@@ -79,8 +77,8 @@ def trained_domain(
     source: SceneSource,
     views: ViewsConfig,
     seed: int,
-    sampler: ViewSampler | None = None,
-    steps: int = 0,
+    sampler: ViewSampler,
+    steps: int,
 ) -> Domain:
     """Measure the cameras of MEASURED training samples; no image is decoded.
 

@@ -44,8 +44,9 @@ def shaded(values: Tensor, low: float, high: float, colors: str) -> Picture:
 
 def depth_range(depths: Tensor) -> tuple[float, float]:
     """Return the 2nd and 98th percentile of values above 0, for a scale that pictures share."""
-    seen = depths.detach()[depths.detach() > 0].float()
-    if seen.numel() == 0:
+    depths = depths.detach()
+    seen = depths[depths > 0].float()
+    if not seen.numel():
         return 0.0, 1.0
     # A few far pixels would make everything else one colour.
     near, far = torch.quantile(seen.cpu(), torch.tensor([0.02, 0.98])).tolist()

@@ -27,7 +27,7 @@ runs; a process that died is noticed by the launcher, which ends the others."""
 _PARALLEL = (DistributedType.NO, DistributedType.MULTI_CPU, DistributedType.MULTI_GPU)
 
 
-def make_accelerator(device: str, unread: bool = False) -> Accelerator:
+def make_accelerator(device: str, unread: bool) -> Accelerator:
     """Return the processes that a launcher started (DDP), or this one alone.
 
     unread: some parameters never get a gradient, which DDP must then search for.
@@ -48,7 +48,7 @@ def make_accelerator(device: str, unread: bool = False) -> Accelerator:
 DEVICES = ("auto", "cpu", "cuda")
 
 
-def choose_device(wanted: str = "auto", say: Callable[[str], None] = print) -> str:
+def choose_device(wanted: str, say: Callable[[str], None] = print) -> str:
     """Return "cpu" or "cuda" for one of DEVICES.
 
     "auto" takes CUDA if there is one and gsplat is installed; `say` gets a note if it is missing.
@@ -80,7 +80,7 @@ StopRequest: TypeAlias = list[signal.Signals]
 
 
 @contextmanager
-def stop_requests(quiet: bool = False) -> Iterator[StopRequest]:
+def stop_requests(quiet: bool) -> Iterator[StopRequest]:
     """Turn SIGINT and SIGTERM inside the block into a request; print so once unless `quiet`.
 
     Does nothing outside the main thread, where Python cannot handle signals.

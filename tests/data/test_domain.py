@@ -14,6 +14,7 @@ from qgs.checkpoint.model_file import CheckpointFile, save
 from qgs.checkpoint.tensors import CheckpointError
 from qgs.data import stream
 from qgs.data.stream import trained_domain
+from qgs.data.view_samplers import Span
 from qgs.domain import KEY, Domain, verdict
 from qgs.geometry.poses import look_at
 from qgs.recipe import resolve
@@ -121,12 +122,13 @@ def test_the_own_test_data_of_a_recipe_lie_inside(name, options, monkeypatch):
 def test_a_scene_that_fails_is_left_out_of_the_ranges(monkeypatch):
     source = recipe().build_data()
     monkeypatch.setattr(type(source.scenes("train")[0]), "cameras", None)
-    assert trained_domain(source, recipe().views, 0).samples == 0
+    assert trained_domain(source, recipe().views, 0, Span(Span.Config()), 0).samples == 0
 
 
 def test_checkpoints_tell_what_they_were_trained_on_also_where_one_was_cut(tmp_path):
     two = recipe("training.steps=2")
-    expected = trained_domain(two.build_data(), two.views, two.seed).ranges
+    sampler = two.build_view_sampler()
+    expected = trained_domain(two.build_data(), two.views, two.seed, sampler, 2).ranges
     file = run(recipe("training.steps=1"), tmp_path).folder.checkpoint
     assert CheckpointFile(file).domain.ranges == expected
     file.write_bytes(file.read_bytes()[:1000])

@@ -24,7 +24,7 @@ class Step:
         recipe = tiny("tokengs", "training.render_views=1")
         self.model = recipe.build_model().train()
         self.objective = TrainingPass(recipe, self.model)
-        accelerator = make_accelerator("cpu")
+        accelerator = make_accelerator("cpu", unread=False)
         self.gradients = partial(compute_gradients, accelerator, self.objective, recipe.training)
         stream = training_batches(recipe.build_data(), recipe.views, 2, seed=0)
         self.batches = [next(stream), next(stream)]
