@@ -114,13 +114,15 @@ def _camera_record(result: Reconstruction, path: Cameras) -> dict[str, Any]:
     reference, scale = result.sample.world
     views = []
     for score, camera in zip(result.scores, _plain(sample_cameras(result.sample)), strict=True):
-        view = {
-            "frame": score.frame,
-            "photo": result.sample.names.get(score.frame),
-            "kind": score.kind,
-            "psnr": round(score.psnr, 3),
-        }
-        views.append({**view, **camera})
+        views.append(
+            {
+                "frame": score.frame,
+                "photo": result.sample.names.get(score.frame),
+                "kind": score.kind,
+                "psnr": round(score.psnr, 3),
+                **camera,
+            }
+        )
     return {
         "convention": "OpenCV camera-to-world; intrinsics fx, fy, cx, cy in pixels; size H, W",
         "scene": result.sample.scene,
@@ -142,5 +144,6 @@ def _camera_record(result: Reconstruction, path: Cameras) -> dict[str, Any]:
 
 def _plain(cameras: Cameras) -> list[dict[str, Any]]:
     pairs = zip(cameras.c2w[0].tolist(), cameras.intrinsics[0].tolist(), strict=True)
-    size = cameras.size
-    return [{"c2w": c2w, "intrinsics": intrinsics, "size": size} for c2w, intrinsics in pairs]
+    return [
+        {"c2w": c2w, "intrinsics": intrinsics, "size": cameras.size} for c2w, intrinsics in pairs
+    ]
