@@ -30,7 +30,8 @@ def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
 
     See PIXEL_ENCODING.
     """
-    (height, width), c2w = cameras.size, cameras.c2w
+    height, width = cameras.size
+    c2w = cameras.c2w
     left = torch.arange(columns, device=c2w.device).to(c2w) * (width / columns)
     upper = torch.arange(rows, device=c2w.device).to(c2w) * (height / rows)
     fx, fy, cx, cy = (x_BV[..., None] for x_BV in cameras.intrinsics.unbind(-1))
@@ -49,7 +50,7 @@ def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
 @full_precision
 def quaternions(rotations: Tensor) -> Tensor:
     """Unit quaternions w x y z (..., 4), up to sign, of rotation matrices (..., 3, 3)."""
-    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotations.unbind(-2))
+    a, b, c, d, e, f, g, h, i = rotations.flatten(-2).unbind(-1)
     # 4 q q^T: every row is the quaternion times four of its numbers; the longest loses no digits.
     outer = [
         1 + a + e + i, h - f, c - g, d - b,

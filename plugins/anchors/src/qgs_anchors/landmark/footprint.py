@@ -57,7 +57,8 @@ class FootprintCenters(RadiusScaledCenters):
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
         """(B, N, K, 3) -> (B, N, K, 3)."""
-        count, (size_BN2, rows_BN1) = offsets.shape[2], state[FOOTPRINT].tensor_split([2], -1)
+        count = offsets.shape[2]
+        size_BN2, rows_BN1 = state[FOOTPRINT].tensor_split([2], -1)
         rows = rows_BN1[0, 0, 0].round().long().clamp_max(count)
         rows = torch.where(rows > 0, rows, rows_in_square(count))
         cell_BNK2 = size_BN2[:, :, None] * cells(count, rows, offsets)

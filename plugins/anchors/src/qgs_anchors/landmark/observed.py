@@ -224,8 +224,8 @@ class ObservedQueries(Queries):
         z_BN1 = self._depth(nearness_BN1)
         place_BN2 = place_N2.expand(len(z_BN1), -1, -1)
         origin_BN3, direction_BN3 = rays_at(cameras, view_N, place_BN2)
-        (height, width), (_, photos) = cameras.size, cameras.shape
-        side = side_of(len(view_N), photos, cameras.size)
+        height, width = cameras.size
+        side = side_of(len(view_N), cameras.shape[1], cameras.size)
         # A footprint of s pixels is s z / f wide at depth z.
         focal_BN1 = cameras.intrinsics[:, view_N, :2].mean(-1, keepdim=True)
         radii_BN1 = config.radius * side * z_BN1 / focal_BN1

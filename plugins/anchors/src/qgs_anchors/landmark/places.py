@@ -130,7 +130,7 @@ def sampled(
 
 def bilinear(maps_BVCHW: Tensor, view_N: Tensor, place_BNX2: Tensor) -> Tensor:
     """Values (B, C, N, X) at places of the maps `view_N`; outside of one those of its edge."""
-    photos, height, width = maps_BVCHW.shape[1], *maps_BVCHW.shape[-2:]
+    _, photos, _, height, width = maps_BVCHW.shape
     # All maps as one, one below another: places keep half a pixel from the edges of theirs.
     edge_2 = constant([0.5 / width, 0.5 / height], place_BNX2)
     x_BNX, y_BNX = place_BNX2.maximum(edge_2).minimum(1 - edge_2).unbind(-1)

@@ -184,7 +184,8 @@ def _camera(model: str, width: int, height: int, parameters: Sequence[float]) ->
     values = dict(zip(_parameters(model), parameters, strict=True))
     size, problems = listed_size(height, width)
     focal = values.pop("f", math.nan)  # simple models have one for both axes
-    fx, fy = values.pop("fx", focal), values.pop("fy", focal)
+    fx = values.pop("fx", focal)
+    fy = values.pop("fy", focal)
     intrinsics = fx, fy, values.pop("cx"), values.pop("cy")
     kind = _MODELS[model][2]
     lens = bending(kind(**values)) if kind else None
@@ -198,5 +199,6 @@ def _c2w(*cam_from_world: float) -> np.ndarray:
         raise ValueError(f"the quaternion {[*cam_from_world[:4]]} of an image has not length 1")
     rotation = quat_to_matrix(quaternion / quaternion.norm()).T
     c2w = torch.eye(4, dtype=torch.float64)
-    c2w[:3, :3], c2w[:3, 3] = rotation, -rotation @ translation
+    c2w[:3, :3] = rotation
+    c2w[:3, 3] = -rotation @ translation
     return c2w.numpy()

@@ -61,7 +61,9 @@ def _rows(file: UPath) -> np.ndarray:
 
 
 def _frame(path: UPath, row: np.ndarray) -> PhotoFrame:
-    down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
+    # Columns of a 3 x 5 matrix: axes and centre of the camera, then its size and focal length.
+    down, right, back, centre, lens = row[:15].reshape(3, 5).T
+    height, width, focal = lens
     c2w = np.eye(4)
     # OpenCV's axes
     c2w[:3] = np.stack([right, down, -back, centre], 1)

@@ -22,8 +22,10 @@ from qgs_photos.datatools.indices import found_indices, index_findings
 from qgs_photos.datatools.photos import Candidate, DecodedScene, Photo, decode, error_text
 from qgs_photos.datatools.sources import OF_FILES, kind_of, left_out, source_scenes, sources
 
-PHOTOS, FEWEST = 400, 20
-"""Photos that are matched in all, half a second each, and in a scene at least."""
+PHOTOS = 400
+"""Photos that are matched in all, half a second each."""
+FEWEST = 20
+"""Photos that are matched in a scene, at least."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ semi-transparent fog, whose single Gaussians are all faint."""
 _BESIDE = 0.2
 # Copies of one Gaussian at a time, as in the paper's code.
 _MOST_COPIES = 51
-_COLOR_MARGIN, _OPACITY_MARGIN = 0.02, 1e-4
+_COLOR_MARGIN = 0.02
+_OPACITY_MARGIN = 1e-4
 
 
 class FreeGaussians:

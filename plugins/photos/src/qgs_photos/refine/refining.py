@@ -40,14 +40,18 @@ _RATES = {
     "features": 0.0,
 }
 # Final learning rates over the first.
-_LAST, _LAST_OF_MEANS = 0.1, 0.01
+_LAST = 0.1
+_LAST_OF_MEANS = 0.01
 # Weight of SSIM beside the mean squared error.
 _SSIM = 0.25
 # Weight of mean opacity and mean scale: at least the first, else the second over the number of
 # photos, because few photos leave more freedom to fill space with fog.
-_SMALL, _SMALL_OF_FEW = 0.06, 0.4
-# Parts of the budget at which growth is complete, and at which relocation ends.
-_GROWN, _SETTLED = 0.6, 0.8
+_SMALL = 0.06
+_SMALL_OF_FEW = 0.4
+# Part of the budget at which growth is complete.
+_GROWN = 0.6
+# Part of the budget at which relocation ends.
+_SETTLED = 0.8
 _STEPS_BETWEEN_GROWTHS = 40
 # Part of the resolution, up to this part of the budget: coarse levels move Gaussians farther.
 _LEVELS = ((4, 0.2), (2, 0.5), (1, 1.0))

@@ -20,8 +20,10 @@ from qgs_photos.refine.result import Result, page_writer, write_scene
 from qgs_photos.refine.scene_photos import TIMED, ScenePhotos, affordable
 from qgs_photos.refine.sweeping import swept
 
-END, PART_OF_END = 4.0, 0.03
-"""Seconds, and part of the time, kept for scores and files."""
+END = 4.0
+"""Seconds kept for scores and files."""
+PART_OF_END = 0.03
+"""Part of the time kept for them besides."""
 # Of the time for the optimisation, however long all else took.
 _LEAST_PART = 0.1
 SWEEP = 0.12

@@ -26,7 +26,8 @@ MOST_GAUSSIANS = 262_144
 # Of memory for each value of a photo, at all its sizes: half of it is kept free.
 _BYTES = 16
 # Exponents of the time of a step, measured on CPUs.
-_OF_PIXELS, _OF_GAUSSIANS = 0.77, 0.3
+_OF_PIXELS = 0.77
+_OF_GAUSSIANS = 0.3
 # Time of a step in the mean over coarse levels, over that of a start at full size.
 _COARSE = 0.9
 # Shorter side with which a step is timed.

@@ -11,12 +11,17 @@ from torch import Tensor
 
 from qgs.types import Cameras, Gaussians, Views
 
-# Number of hypotheses for a depth, and their range over the size of the scene.
-_DEPTHS, _NEAREST, _FARTHEST = 56, 0.1, 4.0
+# Hypotheses for a depth.
+_DEPTHS = 56
+# Their range over the size of the scene.
+_NEAREST = 0.1
+_FARTHEST = 4.0
 # Photos that a pixel is compared with; the better half counts, because others may see it hidden.
 _OTHERS = 6
-# Best baseline over the size of the scene; weight of 1 - cosine of the axes.
-_BASELINE, _TURNED = 0.06, 10.0
+# Best baseline over the size of the scene.
+_BASELINE = 0.06
+# Weight of 1 - cosine of the axes.
+_TURNED = 10.0
 # Radius of the compared patch, in pixels.
 _PATCH = 1
 # Truncation of a difference of colours; half of it outside a photo.
@@ -25,8 +30,10 @@ _MAX_COST = 0.3
 _NO_EVIDENCE = 1e-4
 # Pixels at once, so that memory stays within 0.3 GB.
 _AT_ONCE = 1024
-# Opacity of the Gaussians, and their standard deviation in pixels.
-_OPACITY, _PIXELS = 0.1, 2.0
+# Opacity of the Gaussians.
+_OPACITY = 0.1
+# Their standard deviation in pixels.
+_PIXELS = 2.0
 
 
 @torch.no_grad()

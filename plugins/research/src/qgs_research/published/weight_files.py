@@ -33,7 +33,8 @@ def read_weight_file(path: str | Path) -> WeightFile:
 
     Raises FileNotFoundError, and CheckpointError for anything but a state dict of tensors.
     """
-    path, notes = Path(path), list[str]()
+    path = Path(path)
+    notes = list[str]()
     if not path.is_file():
         raise FileNotFoundError(f"no file of weights at {path}")
     if path.suffix.lower() == ".safetensors":

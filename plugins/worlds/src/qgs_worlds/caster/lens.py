@@ -24,7 +24,9 @@ def look_along(eyes: np.ndarray, forward: np.ndarray, roll: np.ndarray | None = 
     if roll is not None:
         cos = np.cos(roll)[:, None]
         sin = np.sin(roll)[:, None]
-        right, down = cos * right + sin * down, cos * down - sin * right
+        turned = cos * right + sin * down
+        down = cos * down - sin * right
+        right = turned
     c2w = np.tile(np.eye(4), (len(eyes), 1, 1))
     c2w[:, :3] = np.stack([right, down, forward, eyes], -1)
     return c2w

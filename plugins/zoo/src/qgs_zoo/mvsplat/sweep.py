@@ -226,7 +226,8 @@ class SweepEncoder(Encoder):
 
     def forward(self, views: Views) -> ImageMemory:
         """Raises ValueError for images that the U-Nets and windows do not divide."""
-        (height, width), multiple = views.cameras.size, self.multiple(self.config)
+        height, width = views.cameras.size
+        multiple = self.multiple(self.config)
         if height % multiple or width % multiple:
             raise ValueError(
                 f"images of {height} x {width} (H x W) are no multiples of {multiple} pixels; "
