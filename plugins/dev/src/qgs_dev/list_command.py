@@ -48,4 +48,7 @@ def schema(
     from qgs_dev.schema import recipe_schema
 
     text = json.dumps(recipe_schema(load_usable_plugins()[0]), indent=1) + "\n"
-    typer.echo(text, nl=False) if out is None else write_text(out, text)
+    if out is None:
+        typer.echo(text, nl=False)
+    else:
+        write_text(out, text)

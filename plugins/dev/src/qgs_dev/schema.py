@@ -33,10 +33,10 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
     written = yaml.safe_load(_WRITTEN)
     written["swap"]["additionalProperties"] = {"anyOf": [*map(_ref, SLOTS), _NULL]}
     schema["properties"] |= written
-    definitions: dict[str, dict[str, Any]] = {
-        slot: {"anyOf": [_type(name, c) for name, c in registry.components(slot).items()]}
-        for slot in SLOTS
-    }
+    definitions: dict[str, dict[str, Any]] = {}
+    for slot in SLOTS:
+        types = [_type(name, kind) for name, kind in registry.components(slot).items()]
+        definitions[slot] = {"anyOf": types}
     kinds = [settings_schema(kind) for kind in dict.fromkeys(SCHEDULES.values())]
     definitions["schedule"] = {"anyOf": kinds, "description": summary_of(Schedule)}
     dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "qgs recipe"}

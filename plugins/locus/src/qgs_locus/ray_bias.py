@@ -30,11 +30,10 @@ def dense_bias(
     sigma_sq: Tensor | float,  # (B, N, 1) sigma^2, world units squared, or one number
     rays: Tensor,  # (B, M, 6) Plücker rays of patches, world
     bias_min: float,
-    direction_eps: float = 1e-6,
 ) -> Tensor:
     """b (B, N, M), without its weight gamma."""
     # A patch's ray is the mean of its pixels', shorter than 1, and D needs |d| = 1.
-    moment, direction = (x[:, None] for x in normalised_rays(rays, direction_eps))
+    moment, direction = (x[:, None] for x in normalised_rays(rays))
     # (2). In float32: where rays pass near, D is a small difference of numbers as large as |mu|.
     D = (torch.linalg.cross(center[:, :, None], direction, dim=-1) - moment).norm(dim=-1)
     sigma = sigma_sq**0.5

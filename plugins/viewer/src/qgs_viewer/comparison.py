@@ -237,7 +237,7 @@ def refuse_unequal(recipes: Mapping[str, Recipe], sections: Sequence[str]) -> No
 def recipes_alike(
     files: Mapping[str, Path],
     photos: str | None,
-    size: Size | None = None,
+    size: Size | None,
     overrides: Sequence[str] = (),
 ) -> dict[str, Recipe]:
     """Read the recipes of `files`, with the data at `photos` in place of their own.

@@ -153,7 +153,7 @@ class QueryScene:
 def explained(
     model: QueryGaussianModel,
     views: Views,
-    frames: Sequence[int] = (),
+    frames: Sequence[int],
     placement: Placement | None = None,
 ) -> QueryScene:
     """Reconstruct views (1, V) by `model`, and keep what can be asked of its queries."""

@@ -117,10 +117,9 @@ class DrawnSource(LazySource):
         super().__init__(config)
         cache: ImageCache = {}
         counts: dict[Split, int] = {"train": config.scenes, "test": config.test_scenes}
-        self.splits = {
-            split: LazyScenes(
-                {f"{split}/{index:06d}": index for index in range(count)},
-                partial(self.scene, config=config, split=split, cache=cache),
-            )
-            for split, count in counts.items()
-        }
+        splits = {}
+        for split, count in counts.items():
+            places = {f"{split}/{index:06d}": index for index in range(count)}
+            scene = partial(self.scene, config=config, split=split, cache=cache)
+            splits[split] = LazyScenes(places, scene)
+        self.splits = splits

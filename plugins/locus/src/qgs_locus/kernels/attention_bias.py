@@ -142,12 +142,16 @@ def _parts(queries_nF: Tensor, of_pairs_nM: Tensor) -> tuple[tuple[Tensor, ...],
 
 def _in_rows(kernel: Kernel, tokens_GM: Tensor, *of_rows: Tensor) -> None:
     """Call a kernel for some rows at a time of all but the tokens, on several threads."""
-    tokens, (queries, *others) = tokens_GM.numpy(), [x.numpy() for x in of_rows]
+    tokens = tokens_GM.numpy()
+    queries, *others = (x.numpy() for x in of_rows)
     pairs = len(queries) * tokens.shape[1]
     threads = min(torch.get_num_threads(), -(-pairs // _UNIT)) or 1
     step = -(-len(queries) // threads)
-    parts = [slice(n, n + step) for n in range(0, len(queries), step)]
-    in_threads(kernel, ((queries[n], tokens, *(x[n] for x in others)) for n in parts))
+    work = []
+    for first in range(0, len(queries), step):
+        part = slice(first, first + step)
+        work.append((queries[part], tokens, *(x[part] for x in others)))
+    in_threads(kernel, work)
 
 
 def _scratch(size: int, device: torch.device, dtype: torch.dtype) -> Tensor:
@@ -338,7 +342,10 @@ def _attention_gradients(
                 dk[scene, head].addmm_(ds.mT, q_nd)
             if of_bias.wanted:
                 # All heads share the bias, so its gradient is their sum.
-                total.copy_(ds) if head == 0 else total.add_(ds)
+                if head == 0:
+                    total.copy_(ds)
+                else:
+                    total.add_(ds)
         if of_bias.wanted:
             of_bias.add(scene, rows, total)
     return None if dq is None else dq.mul_(scale), dk, dv, of_bias.queries, of_bias.tokens

@@ -75,7 +75,10 @@ class CamerasJson(PhotoReader):
         """See `PhotoReader`. Raises ValueError for unnamed images of another number."""
         file = folder / cls.listing
         cameras = _cameras(file, read_json(file, f"write {_FORM}"))
-        names = [next((n for k in _NAMES if isinstance(n := c.get(k), str)), "") for c in cameras]
+        names: list[str] = []
+        for camera in cameras:
+            given = (camera[key] for key in _NAMES if isinstance(camera.get(key), str))
+            names.append(next(given, ""))
         if not cameras:
             raise ValueError(f"{file} lists no cameras: expected {_FORM}")
         folders = [folder / images] if images else [folder, folder / "images"]

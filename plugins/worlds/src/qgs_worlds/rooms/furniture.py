@@ -48,7 +48,9 @@ class Shape(NamedTuple):
         if self.turn:
             cos = abs(math.cos(self.turn))
             sin = abs(math.sin(self.turn))
-            a, b = cos * a + sin * b, sin * a + cos * b
+            turned = cos * a + sin * b
+            b = sin * a + cos * b
+            a = turned
         return x - a, y - b, z - c, x + a, y + b, z + c
 
 
@@ -110,12 +112,12 @@ def _terms(value: float | str) -> float | list[tuple[float, str]]:
 
 
 def _lengths(values: list[Any], sizes: Sizes) -> list[float]:
-    return [
-        sum([factor * sizes.get(name, 1.0) for factor, name in value])
-        if isinstance(value, list)
-        else value
-        for value in values
-    ]
+    lengths = []
+    for value in values:
+        if isinstance(value, list):
+            value = sum([factor * sizes.get(name, 1.0) for factor, name in value])
+        lengths.append(value)
+    return lengths
 
 
 # The file says what its keys mean; sums are read once, as rooms are drawn often.

@@ -95,10 +95,12 @@ class PerceptualDistance(nn.Module):
         self.requires_grad_(False)
 
     def _fill_blocks(self, vgg: Mapping[str, Tensor]) -> None:
-        self.blocks = nn.ModuleList(
-            nn.Sequential(*(layer for number in block for layer in _layers(vgg, number)))
-            for block in _BLOCKS
-        )
+        self.blocks = nn.ModuleList()
+        for numbers in _BLOCKS:
+            block = nn.Sequential()
+            for number in numbers:
+                block.extend(_layers(vgg, number))
+            self.blocks.append(block)
 
     def _fill_linear(self, factors: Mapping[str, Tensor]) -> None:
         names = (f"lin{index}.model.1.weight" for index in range(len(_BLOCKS)))
