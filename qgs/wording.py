@@ -50,7 +50,8 @@ def warn_once(message: str) -> None:
 
 def nearest(word: str, choices: Iterable[str]) -> str | None:
     """The choice that `word` is probably a misspelling of."""
-    return next(iter(get_close_matches(word, sorted(choices))), None)
+    # Names of one plug-in share their first part: at 0.6 any is like any other.
+    return next(iter(get_close_matches(word, sorted(choices), cutoff=0.65)), None)
 
 
 def did_you_mean(word: str, choices: Collection[str], noun: str) -> str:
