@@ -7,8 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from qgs.geometry.precision import full_precision
 from qgs.machine import in_threads
+from qgs.precision import full_precision
 
 WINDOW = 11
 _BELL = np.exp(-0.5 * (np.arange(-(WINDOW // 2), WINDOW // 2 + 1) / 1.5) ** 2)

@@ -5,7 +5,7 @@ from typing import Literal, TypeAlias
 from pydantic import Field, field_validator
 
 from qgs.contracts.component import ComponentConfig, OptionError
-from qgs.geometry.precision import Precision
+from qgs.precision import Precision
 
 Tuned: TypeAlias = Literal["queries", "latents"]
 """Parts that can be tuned at test time."""

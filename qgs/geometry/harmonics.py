@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.types import SH_COUNTS, Cameras, Gaussians
 
 SH_C0 = 0.28209479177387814

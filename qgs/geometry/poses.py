@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.geometry.constants import constant
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 
 # Mean squared sine of the axes' angles to their mean; 1 degree.
 _PARALLEL = 3e-4

@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.types import Cameras
 
 

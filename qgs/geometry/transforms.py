@@ -8,7 +8,7 @@ from torch import Tensor
 
 from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import rotated
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.types import Cameras, Gaussians
 
 

@@ -6,8 +6,8 @@ from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import Loss
-from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import to_camera
+from qgs.precision import full_precision
 from qgs.types import LayerPrediction, Rendering, Views
 from qgs.wording import warn_once
 

@@ -7,7 +7,7 @@ from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import Loss, Problem, RecipeContext
-from qgs.geometry.precision import at_least_float32, full_precision
+from qgs.precision import at_least_float32, full_precision
 from qgs.similarity import WINDOW, Padding, mean_ssim
 from qgs.types import LayerPrediction, Rendering, Views
 

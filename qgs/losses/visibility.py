@@ -9,8 +9,8 @@ from torch import Tensor
 
 from qgs.contracts import Loss, Problem, RecipeContext, without_effect
 from qgs.geometry.constants import constant
-from qgs.geometry.precision import full_precision
 from qgs.losses.photometric import mean_of_gaussians
+from qgs.precision import full_precision
 from qgs.types import Cameras, LayerPrediction, Rendering, Views
 
 _TINY_Z = 1e-8

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import Column
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.types import Cameras, Views
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from qgs.contracts import Column, Metric, MetricInput
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 
 OPACITY_USED = 1 / 255
 """A Gaussian of lower opacity is never drawn: renderers skip alpha below 1/255."""

@@ -6,7 +6,7 @@ from typing import Literal, TypeAlias
 from torch import Tensor
 
 from qgs.contracts import Column, ComponentConfig, Metric, MetricInput
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.similarity import WINDOW, similarity_map
 
 SsimCovariance: TypeAlias = Literal["population", "sample"]

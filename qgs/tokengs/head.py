@@ -19,7 +19,7 @@ from qgs.contracts import (
     without_effect,
 )
 from qgs.geometry.constants import constant
-from qgs.geometry.precision import at_least_float32, full_precision
+from qgs.precision import at_least_float32, full_precision
 from qgs.tokengs.blocks import NormConfig
 from qgs.types import GaussianAttributes, QueryState
 

@@ -12,9 +12,9 @@ from qgs.containers import concatenated, map_tensors, named_tensors
 from qgs.contracts import Outcome, TrainingConfig
 from qgs.data.samples import Batch
 from qgs.geometry.constants import constant
-from qgs.geometry.precision import autocast
 from qgs.metrics.images import psnr
 from qgs.model import QueryGaussianModel
+from qgs.precision import autocast
 from qgs.recipe import Recipe
 from qgs.types import Cameras, Gaussians, LayerPrediction, Prediction, Rendering, Views
 

@@ -7,7 +7,7 @@ from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import Centers, ComponentConfig, Fields, Problem, RecipeContext, without_effect
-from qgs.geometry.precision import at_least_float32
+from qgs.precision import at_least_float32
 from qgs.tokengs import posact
 from qgs.types import QueryState
 from qgs_locus.fields import (

@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from qgs.contracts import ComponentConfig, Fields, FieldSpec
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.types import SpatialSupport
 
 CENTER = "anchor.center"

@@ -9,7 +9,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs_locus.kernels.attention_bias import AttentionBias, Kernel
 
 

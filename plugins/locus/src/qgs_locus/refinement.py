@@ -7,7 +7,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.contracts import Fields, ModelDims, Problem, RecipeContext, Refinement, without_effect
-from qgs.geometry.precision import at_least_float32
+from qgs.precision import at_least_float32
 from qgs.tokengs import Mlp, posact
 from qgs.types import QueryState
 from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, radius_field

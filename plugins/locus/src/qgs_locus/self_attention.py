@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.contracts import AttentionWeights, ComponentConfig, ModelDims, SelfAttention
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.tokengs import NORM_EPS, Mlp, SelfAttentionCore
 from qgs.types import QueryState
 from qgs_locus.fields import CENTER, CENTER_FIELD

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import quat_to_matrix
+from qgs.precision import full_precision
 from qgs.types import Cameras, Gaussians
 from qgs.wording import warn_once
 

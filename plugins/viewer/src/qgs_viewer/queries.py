@@ -9,10 +9,10 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from qgs.drawing.images import NOTHING, Picture, rgb_picture, side_by_side
-from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.metrics.dispersion import token_dispersion
 from qgs.model import QueryGaussianModel
+from qgs.precision import full_precision
 from qgs.types import Cameras, Gaussians, SpatialSupport
 from qgs_viewer.look import INK, Color, categorical, enlarged
 from qgs_viewer.query_scene import QueryScene

@@ -10,7 +10,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from qgs.contracts import MissingExtraError, Outcome
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.tokengs.blocks import merge_heads, split_heads
 from qgs.types import Cameras
 

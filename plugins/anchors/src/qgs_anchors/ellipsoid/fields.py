@@ -9,8 +9,8 @@ from qgs_locus.fields import RadiusOptions, radius_field, support_radius
 from torch import Tensor
 
 from qgs.contracts import Fields, FieldSpec
-from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import quat_product, quat_to_matrix, unit
+from qgs.precision import full_precision
 from qgs.types import QueryState
 
 ROTATION = "ellipsoid.rotation"

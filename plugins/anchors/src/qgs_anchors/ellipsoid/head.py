@@ -5,8 +5,8 @@ from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, support_radius
 from torch import Tensor
 
 from qgs.contracts import Fields
-from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import quat_product, quat_to_matrix, unit
+from qgs.precision import full_precision
 from qgs.tokengs import GaussianHead
 from qgs.types import GaussianAttributes, QueryState
 from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_axes, shape_fields

@@ -14,8 +14,8 @@ from qgs_locus.kernels.attention_bias import AttentionBias, Kernel
 from qgs_locus.ray_bias import clamped, normalised_rays
 from torch import Tensor
 
-from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import unit
+from qgs.precision import full_precision
 
 UPWARD = (0.0, 0.0, 1.0)
 """The direction of a ray that has none."""

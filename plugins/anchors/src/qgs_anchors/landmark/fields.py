@@ -3,7 +3,7 @@
 from torch import Tensor
 
 from qgs.contracts import Fields, FieldSpec
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 
 COLORS = "landmark.colors"
 FOOTPRINT = "landmark.footprint"

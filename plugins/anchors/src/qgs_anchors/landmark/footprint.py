@@ -14,7 +14,7 @@ from qgs_locus.refinement import AnchorRefinement
 from torch import Tensor
 
 from qgs.contracts import Fields
-from qgs.geometry.precision import at_least_float32
+from qgs.precision import at_least_float32
 from qgs.tokengs import GaussianHead
 from qgs.tokengs.head import CHANNELS
 from qgs.types import GaussianAttributes, QueryState

@@ -6,7 +6,7 @@ from qgs_locus.fields import CENTER, CENTER_FIELD
 from torch import Tensor, nn
 
 from qgs.contracts import AttentionWeights, ComponentConfig, ModelDims, SelfAttention
-from qgs.geometry.precision import at_least_float32, full_precision
+from qgs.precision import at_least_float32, full_precision
 from qgs.tokengs import NORM_EPS, Mlp, SelfAttentionCore
 from qgs.tokengs.blocks import attention_weights, merge_heads
 from qgs.types import QueryState

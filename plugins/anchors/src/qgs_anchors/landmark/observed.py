@@ -29,7 +29,7 @@ from qgs.contracts import (
     without_effect,
 )
 from qgs.geometry.constants import constant
-from qgs.geometry.precision import at_least_float32, full_precision
+from qgs.precision import at_least_float32, full_precision
 from qgs.tokengs import Mlp
 from qgs.types import ImageMemory, QueryState, SpatialSupport, Views
 from qgs_anchors.landmark.fields import (

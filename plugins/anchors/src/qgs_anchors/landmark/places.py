@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from qgs.geometry.constants import constant
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.types import Cameras
 
 EPS = 1e-4

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from qgs.geometry.constants import constant
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.types import Cameras, Views
 from qgs_anchors.landmark.places import bilinear, cells, rays_at
 

@@ -13,7 +13,7 @@ from torch.overrides import TorchFunctionMode
 
 from qgs.containers import map_tensors, named_tensors
 from qgs.contracts import GAUSSIAN_FIELDS
-from qgs.geometry.precision import at_least_float32
+from qgs.precision import at_least_float32
 from qgs_dev.case import CannotCheck, Case
 from qgs_dev.checks.attention import explanation
 from qgs_dev.inputs import (

@@ -49,7 +49,7 @@ def bench(
 
     from qgs.evaluate.results import as_json
     from qgs.files import refuse_existing, write_text
-    from qgs.geometry.precision import Precision
+    from qgs.precision import Precision
     from qgs.train.distributed import choose_device
     from qgs_research.bench.output import show
     from qgs_research.bench.run import measure_recipes

@@ -13,8 +13,8 @@ from typing import Any, Literal, TypeAlias
 import torch
 from torch import nn
 
-from qgs.geometry.precision import Precision, autocast
 from qgs.model import QueryGaussianModel
+from qgs.precision import Precision, autocast
 from qgs.recipe import Recipe, resolve
 from qgs.train.state import make_optimizer
 from qgs.train.training_pass import TrainingPass

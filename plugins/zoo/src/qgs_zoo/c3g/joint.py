@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from qgs.contracts import ComponentConfig, DecoderLayer, Head, LayerParts, ModelDims, memory_fields
 from qgs.geometry.harmonics import SH_C0
-from qgs.geometry.precision import at_least_float32
+from qgs.precision import at_least_float32
 from qgs.tokengs import NORM_EPS, Mlp
 from qgs.types import GaussianAttributes, ImageMemory, QueryState
 from qgs_zoo.parts import self_attention

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from qgs.contracts import Fields, FieldSpec, ModelDims, PatchEncoder, memory_fields
 from qgs.geometry.constants import constant
-from qgs.geometry.precision import full_precision
 from qgs.geometry.rays import plucker_rays
+from qgs.precision import full_precision
 from qgs.tokengs import Mlp
 from qgs.types import Cameras, ImageMemory, Views
 

@@ -22,7 +22,7 @@ from qgs.contracts import (
 )
 from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import SH_C0
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.types import GaussianAttributes, QueryState
 from qgs_zoo.globalsplat.streams import TEXTURE, TEXTURE_FIELD
 from qgs_zoo.parts import quaternions

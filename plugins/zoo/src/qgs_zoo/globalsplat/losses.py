@@ -20,9 +20,9 @@ from qgs.contracts import (
     Problem,
     RecipeContext,
 )
-from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import to_camera
 from qgs.losses import mean_of_gaussians
+from qgs.precision import full_precision
 from qgs.types import Cameras, LayerPrediction, Rendering, Views
 from qgs_zoo.parts import mean_outcome
 

@@ -18,7 +18,7 @@ from qgs.contracts import (
     Problem,
     RecipeContext,
 )
-from qgs.geometry.precision import at_least_float32
+from qgs.precision import at_least_float32
 from qgs.tokengs import NORM_EPS, CrossAttentionCore, LayerScale, Mlp
 from qgs.tokengs.encoder import EncoderBlock, keys_and_values
 from qgs.types import ImageMemory, QueryState

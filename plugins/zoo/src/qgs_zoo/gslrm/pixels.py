@@ -27,9 +27,9 @@ from qgs.contracts import (
     memory_fields,
 )
 from qgs.geometry.harmonics import SH_C0
-from qgs.geometry.precision import at_least_float32, full_precision
 from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.geometry.transforms import unit
+from qgs.precision import at_least_float32, full_precision
 from qgs.tokengs import NORM_EPS
 from qgs.types import GaussianAttributes, ImageMemory, QueryState, Views
 from qgs_zoo.parts import PIXEL_ENCODING, pixel_rays, self_attention

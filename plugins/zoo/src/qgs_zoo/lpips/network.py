@@ -25,8 +25,8 @@ from qgs.contracts import (
     Problem,
     RecipeContext,
 )
-from qgs.geometry.precision import full_precision
 from qgs.losses.photometric import too_small
+from qgs.precision import full_precision
 from qgs.types import LayerPrediction, Rendering, Views
 from qgs_zoo.parts import load_weights
 

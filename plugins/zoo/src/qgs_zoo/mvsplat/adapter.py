@@ -9,8 +9,8 @@ from torch import Tensor
 
 from qgs.geometry.constants import constant
 from qgs.geometry.harmonics import rotated
-from qgs.geometry.precision import full_precision
 from qgs.geometry.transforms import quat_product, unit
+from qgs.precision import full_precision
 
 SH_DEGREE = 3
 """Largest degree that the rasteriser of the released code and ours read."""

@@ -12,7 +12,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from torch import Tensor, nn
 
 from qgs.contracts import ComponentConfig, OptionError
-from qgs.geometry.precision import at_least_float32, full_precision
+from qgs.precision import at_least_float32, full_precision
 from qgs.tokengs.encoder import imagenet_normalised
 from qgs.types import Cameras
 from qgs_zoo.dinov2.vit import PATCH, DinoV2, VitConfig

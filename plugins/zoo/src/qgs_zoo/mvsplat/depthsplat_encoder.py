@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from qgs.contracts import ModelDims, Problem, RecipeContext
 from qgs.geometry.harmonics import SH_C0
-from qgs.geometry.precision import at_least_float32
+from qgs.precision import at_least_float32
 from qgs.types import Views
 from qgs_zoo.mvsplat.adapter import coefficients
 from qgs_zoo.mvsplat.depthsplat import GAUSSIAN_CHANNELS, DepthSplat, DepthSplatConfig

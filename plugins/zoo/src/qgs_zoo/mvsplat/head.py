@@ -13,7 +13,7 @@ from torch import Tensor
 from qgs.contracts import ComponentConfig, Fields, Head, Problem, RecipeContext
 from qgs.contracts.head import GAUSSIAN_FIELDS
 from qgs.geometry.harmonics import SH_C0
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.types import GaussianAttributes, QueryState
 from qgs_zoo.mvsplat.adapter import SH_DEGREE, camera_quaternions, coefficients, world_quaternions
 from qgs_zoo.mvsplat.pixels import (

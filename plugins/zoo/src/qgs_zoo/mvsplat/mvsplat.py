@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from qgs.contracts import ModelDims
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.tokengs.encoder import imagenet_normalised
 from qgs.types import Cameras, Views
 from qgs_zoo.mvsplat.cnn import CNN, WIDTHS

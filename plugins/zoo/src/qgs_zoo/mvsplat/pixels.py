@@ -17,7 +17,7 @@ from qgs.contracts import (
     RecipeContext,
     memory_fields,
 )
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.types import Cameras, ImageMemory, QueryState, Views
 from qgs_zoo.mvsplat.adapter import coefficients, world_harmonics
 from qgs_zoo.parts import PIXEL_ENCODING, pixel_rays, quaternions

@@ -23,7 +23,7 @@ from qgs.contracts import (
     memory_fields,
 )
 from qgs.geometry.constants import constant
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.types import Cameras, ImageMemory, Views
 from qgs_zoo.mvsplat.pixels import width_problems
 

@@ -23,8 +23,8 @@ from qgs.contracts import (
     RecipeContext,
     memory_fields,
 )
-from qgs.geometry.precision import full_precision
 from qgs.geometry.rays import patch_rays, plucker_rays
+from qgs.precision import full_precision
 from qgs.tokengs.blocks import CrossAttentionCore, LayerScale, Mlp, SelfAttentionCore
 from qgs.tokengs.encoder import PatchViT, keys_and_values
 from qgs.types import ImageMemory, Views

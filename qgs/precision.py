@@ -1,4 +1,4 @@
-"""What a model computes in, float32 or bf16; float32 or better for geometry in either."""
+"""The precision that a model computes in: autocast, and float32 or better for geometry."""
 
 from collections.abc import Callable
 from contextlib import nullcontext

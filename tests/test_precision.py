@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 from qgs.containers import named_tensors
-from qgs.geometry.precision import full_precision
+from qgs.precision import full_precision
 from qgs.types import QueryState
 
 
