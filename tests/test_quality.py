@@ -12,9 +12,9 @@ TEXTS = (*SOURCES, "docs", "recipes", ".ci")
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
 LIMITS = {
-    "all": {"tokens": 492_200},
+    "all": {"tokens": 492_100},
     "qgs": {"tokens": 100_000, "parallel": 1, "why": 3},
-    "plugins": {"tokens": 204_100, "parallel": 1, "why": 3.5},
+    "plugins": {"tokens": 204_000, "parallel": 1, "why": 3.5},
     "tests": {"tokens": 164_300, "parallel": 1},
     "tools": {"tokens": 19_500, "parallel": 1},
 }
