@@ -48,7 +48,8 @@ def checkpoint_path(name: str | os.PathLike[str]) -> Path:
         if "://" in text:
             return downloaded(text)
         # Only a plug-in that is installed makes a name of what may be a path.
-        if model and plugin in available_plugins():
+        is_name = bool(model) and "/" not in model and path.suffix != ".safetensors"
+        if is_name and plugin in available_plugins():
             path = _shipped(plugin, text)
     if not path.is_file():
         raise FileNotFoundError(

@@ -117,10 +117,10 @@ def test_any_name_is_kept_in_a_folder_of_the_cache(server, cache):
         assert file.parent.parent == cache
 
 
-def test_passwords_are_sent_and_never_printed(server, caplog):
+def test_passwords_are_sent_and_never_printed(server, capsys, caplog):
     url = f"http://me:p%40ss@{server}/login/a.safetensors"
     assert checkpoint_path(url).read_bytes() == CONTENT
-    assert "p%40ss" not in caplog.text
+    assert "p%40ss" not in capsys.readouterr().err + caplog.text
     with pytest.raises(OSError, match="401"):  # not sent on to where a server leads
         checkpoint_path(url.replace("login", "302"))
 
