@@ -67,8 +67,8 @@ def _blames(
         # Options that only make sense together are refused one by one.
         with suppress(RecipeError):
             after = draft_of(base, Problems(), plugins)
+            blame = _replacing(after, before) or _changing(path, value, origin, before)
             for problem in _told(after).intersection(found):
-                blame = _replacing(after, before) or _changing(path, value, origin, before)
                 blames.setdefault(problem, blame or problem)
             before = after
     return blames

@@ -238,7 +238,7 @@ class Overlapping(ViewSampler):
         some = sorted(map(int, rng.choice(others, count, replace=False)))
         _, inputs = frusta.window(target, some, views.inputs)
         near = sorted({*usable} - {*inputs}, key=lambda frame: frusta.far[frame, target])
-        return _ascending(inputs), tuple(near[i % len(near)] for i in range(views.targets))
+        return tuple(sorted(inputs)), tuple(near[i % len(near)] for i in range(views.targets))
 
     def windows(self, scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
         """See `ViewSampler`; none where a scene moves."""
@@ -250,7 +250,7 @@ class Overlapping(ViewSampler):
         found = list[tuple[Frames, Frames]]()
         for target in sorted(scene.held_out) or evenly(usable, _JUDGED):
             _, inputs = frusta.window(target, usable, views.inputs)
-            found.append((_ascending(inputs), (target,)))
+            found.append((tuple(sorted(inputs)), (target,)))
         return found
 
     def _frusta(self, scene: Scene, factor: float = 1.0) -> Frusta:
@@ -277,7 +277,3 @@ def _enough(scene: Scene, least: int) -> list[int]:
             "views.inputs, hold fewer out or add photos"
         )
     return usable
-
-
-def _ascending(frames: Frames) -> Frames:
-    return tuple(sorted(frames))
