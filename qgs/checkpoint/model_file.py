@@ -49,7 +49,7 @@ class CheckpointFile(TensorFile):
     name: a path, of a run folder too, PLUGIN/NAME of a shipped model, or a URL; see
     `checkpoint_path`. Parts are read when they are used.
     extra: the metadata that `save` was given.
-    Raises FileNotFoundError, and CheckpointError for another kind of file or a later format.
+    Raises FileNotFoundError, and CheckpointError for another kind of file or another format.
     """
 
     def __init__(self, name: str | os.PathLike[str]) -> None:
@@ -63,12 +63,12 @@ class CheckpointFile(TensorFile):
             )
         with self.entry(_FORMAT) as text:
             written = int(text[:20])
-        if written > FORMAT_VERSION:
+        if written != FORMAT_VERSION:
             raise CheckpointError(
-                f"{self.path} has {_FORMAT} {written}, and qgs {__version__} reads "
-                f"{FORMAT_VERSION}: install the newer qgs that wrote it"
+                f"{self.path} has {_FORMAT} {written}, and qgs {__version__} reads only "
+                f"{FORMAT_VERSION}: install the qgs that wrote it"
             )
-        if written > 2 and SEAL not in self.metadata:
+        if SEAL not in self.metadata:
             raise self.damaged(f"its metadata lack {SEAL}")
         self.extra = {
             key.removeprefix(_EXTRA): value
