@@ -10,7 +10,8 @@ from qgs_dev.new_command import rendered
 
 TEMPLATE = {path.name: text for path, text in rendered("sightline")}
 README = TEMPLATE["README.md"]
-TEXTS = {path.name: text_of(path.name) for path in sorted(DOCS.glob("*.md"))} | {"README": README}
+TEXTS = {path.name: text_of(path.name) for path in sorted(DOCS.glob("*.md"))}
+TEXTS |= {"README": README, "README of qgs": text_of("../README.md")}
 PROJECT = tomllib.loads((DOCS.parent / "pyproject.toml").read_text())["project"]
 PLUGIN = tomllib.loads(TEMPLATE["pyproject.toml"])["project"]
 
