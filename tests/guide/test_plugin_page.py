@@ -55,7 +55,7 @@ def test_the_recipes_work_and_what_the_page_says_is_refused(package):
     assert isinstance(recipe.build_model("meta").centers, package.FrustumCenters)
     for name in ("depth.yaml", "cnn.yaml"):
         assert resolve(name, plugins=plugins)
-    assert {*resolve("nearby.yaml", plugins=plugins).tree["plugins"]} >= {"locus", "sightline"}
+    assert {*resolve("widening.yaml", plugins=plugins).tree["plugins"]} >= {"locus", "sightline"}
     with pytest.raises(RecipeError, match="far must be more than near, 9\n  fix: set it farther"):
         resolve("frustum.yaml", ["model.centers.near=9"], plugins=plugins)
     needed = r"`sightline/deepen` needs sightline\.log_depth [\s\S]*use `sightline/deep`"
