@@ -11,6 +11,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
+from qgs.containers import TensorContainer
 from qgs.contracts.component import ComponentConfig, ModelComponent, ModelDims
 from qgs.types import ImageMemory, QueryState, Rendering, Views
 
@@ -20,7 +21,7 @@ LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
 
 
 @dataclass(frozen=True)
-class AttentionWeights:
+class AttentionWeights(TensorContainer):
     """Attention of Q chosen queries to T tokens, for pictures.
 
     content: (B, h, Q, T) logits of content alone, finite. geometry: what is added to them, (B, 1,

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from qgs.containers import map_tensors
+from qgs.containers import TensorContainer, map_tensors
 from qgs.contracts import AttentionWeights
 from qgs.model import QueryGaussianModel
 from qgs.types import ImageMemory, QueryState
@@ -23,7 +23,7 @@ ATTENTIONS = ("cross_attention", "self_attention")
 
 
 @dataclass
-class LayerTrace:
+class LayerTrace(TensorContainer):
     """A layer's Q queries: states (B, Q, ...) and attention."""
 
     before: QueryState

@@ -61,10 +61,16 @@ class Steps(AtPlaces, Refinement):
         return state.replace(fields=self.moved(state["place.center"], self.step(state.features)))
 
 
-@mutant(CHECK, "reads some of memory.features, memory.patch_rays")
+@mutant(CHECK, "reads some of memory.features, memory.grid, memory.patch_rays")
 class ReadsMemoryUndeclared(ContentCrossAttention):
     def forward(self, state, memory):
         return super().forward(state, memory) + memory.features.mean(1, keepdim=True)
+
+
+@mutant(CHECK, "which it declares not to: add it to `reads`")
+class ReadsTheGridUndeclared(ContentCrossAttention):
+    def forward(self, state, memory):
+        return super().forward(state, memory) * memory.grid[0]
 
 
 @mutant(CHECK, "anchor.center: read in")
