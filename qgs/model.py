@@ -95,6 +95,8 @@ class QueryGaussianModel(nn.Module):
         layers: see `predict`. state: the initial state; None for that of the queries.
         Raises ValueError for photos without cameras where the encoder or the queries read them.
         """
+        # NumPy's cameras are float64, the weights hardly ever.
+        views = views.to(torch.promote_types(next(self.parameters()).dtype, torch.float32))
         if isinstance(views, Photos):
             views = self._without_cameras(views)
         memory = self.encoder(views)
