@@ -9,22 +9,20 @@ from guide_pages import DOCS, text_of
 from qgs_dev.new_command import rendered
 
 TEMPLATE = {path.name: text for path, text in rendered("sightline")}
-README = TEMPLATE["README.md"]
 TEXTS = {path.name: text_of(path.name) for path in sorted(DOCS.glob("*.md"))}
-TEXTS |= {"README": README, "README of qgs": text_of("../README.md")}
+TEXTS |= {"README": TEMPLATE["README.md"] + text_of("../README.md")}
 PROJECT = tomllib.loads((DOCS.parent / "pyproject.toml").read_text())["project"]
 PLUGIN = tomllib.loads(TEMPLATE["pyproject.toml"])["project"]
 
 
 COMMAND = re.compile(r"`qgs ([^`\n]+)`|^(?: {4}|! )?qgs (.+)$", re.MULTILINE)
-PLACEHOLDER = re.compile(r"^(COMMAND|[A-Z]+=.*)$")
 
 
 def commands():
     for page, text in TEXTS.items():
         for found in COMMAND.finditer(text):
             shown = (found[1] or found[2]).partition("  #")[0].strip()
-            if not PLACEHOLDER.match(shown.split()[0]) and re.match(r"[a-z]", shown):
+            if shown[0].islower():
                 yield page, shown
 
 
