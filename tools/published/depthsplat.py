@@ -1,9 +1,11 @@
 """Every tensor of a golden file of DepthSplat, computed by the components."""
 
+import json
 from typing import Any
 
 import torch
-from qgs_zoo.dinov2.vit import PATCH, VitConfig
+from qgs_research.published.mvsplat import depthsplat_encoder
+from qgs_zoo.dinov2.vit import PATCH
 from qgs_zoo.mvsplat.depthsplat import DepthPredictor, finer_candidates, nearest_neighbours
 from qgs_zoo.mvsplat.depthsplat_encoder import DepthSplatEncoder
 from qgs_zoo.mvsplat.head import WorldHead
@@ -34,7 +36,6 @@ from qgs.types import ImageMemory, Views
 
 DIMS = {1: ModelDims(38, 1, 0), 2: ModelDims(39, 1, 2)}
 """Of models of one scale, and of two with both depths."""
-VITS = {"vits": VitConfig(), "vitb": VitConfig(width=768, depth=12, heads=12)}
 
 OUTPUTS = """
 features_cnn.0                        depth_predictor.backbone.conv2
@@ -65,16 +66,12 @@ features_mono.1   mono_pyramid.stages.1
 
 def encoder_of(golden: GoldenFile) -> DepthSplatEncoder:
     """The encoder with the options and the weights of a file."""
-    options = golden.config["options"]
-    config = DepthSplatEncoder.Config(
-        near=0.5,
-        far=100.0,
-        scales=options["num_scales"],
-        stride=options["lowest_feature_resolution"],
-        neighbours=options["local_mv_match"],
-        vit=VITS[options["monodepth_vit_type"]],
-        coarse_depth=options["num_scales"] > 1,
-    )
+    shapes = {f"encoder.{name}": shape for name, shape in golden.config["state_dict"]}
+    options = depthsplat_encoder(shapes)
+    del options["type"]
+    options["neighbours"] = golden.config["options"]["local_mv_match"]
+    # In Python a Config takes tuples alone, of JSON lists too.
+    config = DepthSplatEncoder.Config.model_validate_json(json.dumps(options))
     encoder = DepthSplatEncoder(config, DIMS[config.scales]).eval()
     encoder.network.load_state_dict(weights_of(golden))
     return encoder

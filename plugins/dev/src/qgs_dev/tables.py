@@ -69,7 +69,7 @@ def details(name: str, registry: Registry) -> Iterator[Table | str]:
     elif not shown:
         known = [*SLOTS, *settings, *models, *(kind for _, kind in components)]
         hint = did_you_mean(name, known, "names")
-        raise ValueError(f"there is no slot, component or section `{name}`; {hint}")
+        raise ValueError(f"there is no slot, component or section `{name}` in `qgs list`; {hint}")
     for place, kind in shown:
         component = registry.components(place)[kind]
         heading = f"{recipe_path(place)}: {kind}, {_release(kind, registry)}"

@@ -82,7 +82,11 @@ def _read_mvsplat(shapes: Shapes) -> dict[str, Any]:
     )
 
 
-def _encoder(shapes: Shapes) -> dict[str, Any]:
+def depthsplat_encoder(shapes: Shapes) -> dict[str, Any]:
+    """Return the options of the encoder, read off the shapes of published weights.
+
+    Raises LayoutError for shapes that no release has.
+    """
     scales = layer_count(shapes, _PREDICTOR + "regressor.")
     width = size_at(shapes, _VIT + "norm.weight", 0)
     depth = layer_count(shapes, _VIT + "blocks.")
@@ -115,7 +119,7 @@ def _encoder(shapes: Shapes) -> dict[str, Any]:
 
 
 def _read_depthsplat(shapes: Shapes) -> dict[str, Any]:
-    encoder = _encoder(shapes)
+    encoder = depthsplat_encoder(shapes)
     raw = size_at(shapes, _HEAD, 0)
     two = encoder["scales"] == 2
     if raw not in [10 + 3 * harmonics for harmonics in _HARMONICS]:
