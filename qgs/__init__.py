@@ -37,8 +37,8 @@ for _other in Path(__file__).resolve().parents[1].glob("qgs-[0-9]*-info"):
     )
 
 os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
-"""PyTorch's CPU allocator then asks for huge pages for large tensors, if qgs is imported before it
-has allocated any; with 4 KiB pages a forward pass takes some 5 % longer. Set it to 0 to refuse."""
+"""Setting of PyTorch's CPU allocator: use huge pages for large tensors. It works if qgs is imported
+before any allocation. With 4 KiB pages a forward pass takes about 5 % longer. 0 switches it off."""
 
 _ELSEWHERE = {
     "CONTRACT_VERSION": "qgs.contracts.plugin",
@@ -54,7 +54,7 @@ _ELSEWHERE = {
     "save_ply": "qgs.reconstruction.scene_formats",
     "trace": "qgs.reconstruction.trace",
 }
-"""Where public names come from that are not of `qgs.types`."""
+"""Modules of the public names outside of `qgs.types`."""
 
 __all__ = [
     "CONTRACT_VERSION",

@@ -1,4 +1,4 @@
-"""What containers of tensors share: shapes that are checked, tensors found and mapped."""
+"""Base of all containers of tensors: checks of shapes, iteration and mapping over tensors."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
@@ -15,29 +15,29 @@ class TensorContainer:
     """A frozen dataclass of tensors, containers and mappings of them."""
 
     def __init_subclass__(cls) -> None:
-        """Give every class this `__repr__`, which `dataclass` then leaves as it is."""
+        """Give every class this `__repr__`; `dataclass` then keeps it."""
         cls.__repr__ = TensorContainer.__repr__
 
     def __repr__(self) -> str:
-        """Shapes, types and devices; no numbers."""
+        """Return shapes, types and devices, without values."""
         # Numbers of a million Gaussians help nobody.
         parts = [f"{n}: {tuple(x.shape)} {x.dtype} {x.device}" for n, x in named_tensors(self)]
         lines = "\n  ".join(["", *parts])
         return f"{type(self).__name__}({lines}\n)"
 
     def replace(self, **changes: Any) -> Self:
-        """A new container with other values in some fields."""
+        """Return a new container with other values in some fields."""
         return replace(cast(Any, self), **changes)
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
-        """The container with every tensor moved as by `Tensor.to`; a dtype moves geometry too."""
+        """Apply `Tensor.to` to every tensor; a dtype also converts geometry."""
         return map_tensors(lambda x: x.to(*args, **kwargs), self)
 
 
 def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
-    """`value` with `function(tensor)` for each tensor in containers, mappings, lists and tuples.
+    """Apply `function` to each tensor in containers, mappings, lists and tuples.
 
-    A part in which no tensor changes is returned itself, not copied.
+    A part in which no tensor changes is returned as it is, without a copy.
     """
     if isinstance(value, Tensor):
         return function(value)
@@ -56,9 +56,9 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
 
 
 def concatenated(parts: Sequence[_C], dim: int) -> _C:
-    """One container, or tuple of them, with the tensors of all `parts` along `dim`.
+    """Concatenate the tensors of all `parts`, containers or tuples of containers, along `dim`.
 
-    Raises ValueError where one has a tensor that another one lacks.
+    Raises ValueError if one part has a tensor that another one lacks.
     """
     found = [dict(named_tensors(part)) for part in parts]
     for other in found:
@@ -75,7 +75,7 @@ def concatenated(parts: Sequence[_C], dim: int) -> _C:
 
 
 def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
-    """Every tensor that `map_tensors` finds, with its dotted name; `name` is that of `value`."""
+    """Yield all tensors that `map_tensors` finds, with dotted names. name: the name of `value`."""
     if isinstance(value, Tensor):
         yield name, value
     elif isinstance(value, TensorContainer | Mapping | list | tuple):
@@ -95,8 +95,8 @@ def check_shapes(
 ) -> None:
     """Raise ValueError unless the fields of `container` have `shapes`, such as "B N 3".
 
-    A letter is one size wherever it occurs, "..." the same leading axes; `known` gives the sizes of
-    some letters. Fields that are None pass.
+    A letter stands for the same size wherever it occurs, "..." for the same leading axes. `known`
+    has the sizes of some letters. Fields that are None pass.
     """
     sizes: dict[str, Any] = {**_DIGITS, **(known or {})}
     for name, spec in shapes.items():

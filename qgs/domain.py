@@ -1,6 +1,6 @@
-"""The range of views that a model was trained on, and how other views leave it.
+"""Range of the views that a model was trained on, and checks of other views against it.
 
-Only cameras in the model's frame are compared, so it works for any data.
+It compares only cameras in the model's frame, so it works for any data.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from qgs.geometry.poses import look_at_depth
 from qgs.types import Cameras
 
 OUTLIERS = 0.05
-"""Share of the values at either end of a range that does not count, such as parallel axes."""
+"""Fraction of values ignored at each end of a range, such as depths of parallel axes."""
 TOLERANCE = 1.25
-"""Views are outside where they leave the trained range by more than this factor."""
+"""Factor by which views may leave the trained range without counting as outside."""
 KEY = "trained_on"
 """Key of `Domain.text` in the extra metadata of a checkpoint."""
 
@@ -27,17 +27,17 @@ WORDS = {
     "views": "there are {} input views",
     "baseline": "the largest distance between input cameras is {}",
     "turn": "their axes differ by {} degrees",
-    "depth": "what they look at is {} away",
+    "depth": "the point they look at is {} away",
     "fov": "their field of view is {} degrees wide",
 }
-"""What is measured of a sample, lengths in the model's units."""
+"""Measurements of a sample, as phrases; lengths are in the model's units."""
 REMEDY = "try another scale of the world, other input views, or train on views like these"
-"""What may bring views into the trained range."""
+"""Advice for bringing views into the trained range."""
 
 
 @dataclass
 class Domain:
-    """Measurements by name of WORDS, over `samples` samples; after loading only the two ends."""
+    """Measurements over `samples` samples, by the names in WORDS; only two ends after loading."""
 
     values: dict[str, list[float]] = field(default_factory=dict)
     samples: int = 0
@@ -67,7 +67,7 @@ class Domain:
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """(least, largest) of each name, without OUTLIERS of its values at either end."""
+        """Range (least, largest) by name, without the OUTLIERS at each end."""
         found = {}
         for name, values in self.values.items():
             left_out = int(OUTLIERS * len(values))
@@ -77,7 +77,7 @@ class Domain:
 
     @property
     def text(self) -> str:
-        """Its ranges as JSON; null stands for infinity."""
+        """Ranges as JSON; null stands for infinity."""
         # JSON has no infinity, which is the depth of parallel axes.
         ranges = {}
         for name, ends in self.ranges.items():
@@ -86,18 +86,18 @@ class Domain:
 
     @classmethod
     def read(cls, plain: Mapping[str, Any]) -> Domain:
-        """Return the domain of a parsed `text`. Raises ValueError, TypeError or KeyError."""
+        """Return the domain of a parsed `text`; raise ValueError, TypeError or KeyError."""
         domain = cls(samples=int(plain["samples"]))
         for name, (low, high) in plain["ranges"].items():
             ends = [math.inf if end is None else float(end) for end in (low, high)]
             # NaN is not above 0 either.
             if name not in WORDS or not all(end >= 0 for end in (domain.samples, *ends)):
-                raise ValueError(f"these are no ranges of views: {str(plain)[:100]}")
+                raise ValueError(f"these are not valid ranges of views: {str(plain)[:100]}")
             domain.values[name] = ends
         return domain
 
     def differences(self, found: Domain) -> dict[str, str]:
-        """Describe by name each range of the training that the range of `found` exceeds."""
+        """Describe, by name, each range in which `found` leaves the trained range."""
         phrases: dict[str, str] = {}
         seen = found.ranges
         for name, trained in self.ranges.items():
@@ -109,9 +109,9 @@ class Domain:
 
 
 def verdict(trained: Domain, found: Domain) -> str:
-    """Return a sentence that compares views with the training's, and what may help.
+    """Compare views with the training views in a sentence, with advice if they differ.
 
-    trained: empty if unknown.
+    trained: the domain of the training; empty if unknown.
     """
     if not trained.values:
         return "the checkpoint does not record the views on which this model was trained"

@@ -1,4 +1,4 @@
-"""Objects that installed distributions offer under an entry point group, found by metadata."""
+"""Entry points of installed distributions, found by metadata."""
 
 from __future__ import annotations
 
@@ -11,30 +11,33 @@ from typing import Any, TypeVar
 T = TypeVar("T")
 
 INSTALL_ALL = 'run `pip install "query-gaussians[all]"`, which has all plug-ins of this project'
-"""What to do where something of another distribution is missing."""
+"""Advice for a missing part of another distribution."""
 
 
 class ExtensionError(ValueError):
-    """An entry point that cannot be loaded; the message names its distribution."""
+    """Error for an entry point that cannot be loaded; the message names its distribution."""
 
 
 def installed(group: str) -> tuple[EntryPoint, ...]:
-    """Entry points of `group`. Imports nothing; sees what was installed since the last call."""
+    """Return the entry points of `group`, with those installed since the last call.
+
+    It imports nothing.
+    """
     # Reading all metadata takes some 10 ms, so that it is repeated only after a change of sys.path.
     searched = [path for path in sys.path if os.path.exists(path)]
     return _read(group, *searched, *map(os.path.getmtime, searched))
 
 
 def load(entry: EntryPoint, base: type[T]) -> type[T]:
-    """The class that `entry` names, a subclass of `base`. Raises ExtensionError."""
+    """Load the class that `entry` names; raise ExtensionError unless it is a subclass of `base`."""
     offered = imported(entry)
     if not (isinstance(offered, type) and issubclass(offered, base)):
-        raise ExtensionError(f"{_where(entry)} is no subclass of {base.__name__}: update it")
+        raise ExtensionError(f"{_where(entry)} is not a subclass of {base.__name__}: update it")
     return offered
 
 
 def imported(entry: EntryPoint) -> Any:
-    """What `entry` names. Raises ExtensionError with its distribution."""
+    """Import the object that `entry` names; raise ExtensionError with its distribution."""
     try:
         return entry.load()
     except Exception as error:

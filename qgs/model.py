@@ -1,4 +1,4 @@
-"""The model: views to image memory, queries through the decoder layers, states to Gaussians."""
+"""The model: an encoder of views, queries in decoder layers, and a head for Gaussians."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, cast
@@ -34,14 +34,14 @@ from qgs.types import (
 
 
 class QueryGaussianModel(nn.Module):
-    """From photos to the Gaussians of its queries, in one forward pass.
+    """A model that turns photos into the Gaussians of its queries, in one forward pass.
 
-    refinements: one per decoder layer, at `refinement_of`; layers may share a module.
-    recipe: the resolved recipe this model was composed from, None for one built by hand.
-    releases: plugins of that recipe, as `Recipe.releases`; those that were imported, whatever is
-        installed when the model is saved.
-    trained_on: statistics of the training views, as its checkpoint records them, or None.
-    loaded_from: its checkpoint as `qgs.load` takes it, an absolute path; "" if it was not loaded.
+    refinements: the different refinements; layers may share one. `refinement_of` has the index for
+        each decoder layer.
+    recipe: the resolved recipe of this model; None for a model built by hand.
+    releases: plugins of that recipe, like `Recipe.releases`, as imported when it was built.
+    trained_on: statistics of the training views from its checkpoint, or None.
+    loaded_from: the absolute path of its checkpoint, for `qgs.load`; "" if it was not loaded.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class QueryGaussianModel(nn.Module):
 
     @property
     def depth(self) -> int:
-        """Number of decoder layers that an evaluation runs, those of rounds of feedback too."""
+        """Number of decoder layers that an evaluation runs, including rounds of feedback."""
         return len(self.decoder) + self.feedback.rounds * self.feedback.layers
 
     def forward(
@@ -92,8 +92,8 @@ class QueryGaussianModel(nn.Module):
     ) -> Prediction:
         """Reconstruct every scene of `views`, whose cameras are in the model's world.
 
-        layers: see `predict`. state: the initial state; None for that of the queries.
-        Raises ValueError for photos without cameras where the encoder or the queries read them.
+        layers: see `predict`. state: the initial state; None uses the state of the queries.
+        Raises ValueError for photos without cameras if encoder, queries or feedback read cameras.
         """
         # NumPy's cameras are float64, the weights hardly ever.
         views = views.to(torch.promote_types(next(self.parameters()).dtype, torch.float32))
@@ -105,13 +105,13 @@ class QueryGaussianModel(nn.Module):
         return self.predict(views, memory, initial, layers)
 
     def _without_cameras(self, photos: Photos) -> Views:
-        """`photos` for parts that read no cameras; ValueError if one does."""
+        """Return `photos` if no part of the model reads cameras, else raise ValueError."""
         parts = (self.encoder, self.queries, self.feedback)
         readers = [type(part).__name__ for part in parts if part.reads_cameras]
         if readers:
             raise ValueError(
-                f"{' and '.join(readers)} of this model read cameras, and these photos have none; "
-                "give Views with cameras, or take an encoder that does without (reads_cameras)"
+                f"{' and '.join(readers)} of this model need cameras, but these photos have none; "
+                "give Views with cameras, or use an encoder that does not read them (reads_cameras)"
             )
         # It has the same images and masks.
         return cast(Views, photos)
@@ -125,11 +125,12 @@ class QueryGaussianModel(nn.Module):
     ) -> Prediction:
         """Run all decoder layers and decode Gaussians after the chosen ones.
 
-        views, memory: the encoder's input and output. state: the queries before the first layer, of
-            as many scenes.
-        layers: numbers of the layers to decode, beside the last and that of each round (1 is the
-            first, rounds count on; 0 is the start, of a decoder of depth 0); None for the
-            supervised ones in training, and for no others in evaluation.
+        views, memory: the encoder's input and output.
+        state: the queries before the first layer, for the same scenes.
+        layers: numbers of further layers to decode, besides the last layer of the decoder and of
+            each round. 1 is the first layer; layers of rounds get the following numbers. 0 is the
+            initial state, only in a decoder of depth 0. None: the supervised layers in training, no
+            further ones in evaluation.
         Raises ValueError for a layer that does not exist and for another number of scenes.
         """
         if layers is None:
@@ -149,7 +150,7 @@ class QueryGaussianModel(nn.Module):
         scenes = memory.features.shape[0]
         given = state.features.shape[0]
         if scenes != given:
-            raise ValueError(f"the memory is of {scenes} scenes, the initial state of {given}")
+            raise ValueError(f"the memory has {scenes} scenes, but the initial state has {given}")
         decoded = {} if last else {0: LayerPrediction(self.decode(state), state)}
         first = memory
         for number, index in enumerate(order, start=1):
@@ -167,15 +168,15 @@ class QueryGaussianModel(nn.Module):
     def _corrected(
         self, before: LayerPrediction, memory: ImageMemory, views: Views
     ) -> tuple[QueryState, ImageMemory]:
-        """What a round starts with."""
+        """Return the state and memory at the start of a round of feedback."""
         photos = self.feedback.compared(views)
-        # What looks wrong is an input of the round, no loss.
+        # The rendering is an input of the round, not a loss.
         with torch.no_grad():
             rendering = self.render(before.gaussians, photos.cameras)
         return self.feedback(before.state, memory, rendering, photos)
 
     def decode(self, state: QueryState) -> Gaussians:
-        """The Gaussians of a state, ordered query by query."""
+        """Decode the Gaussians of a state, ordered query by query."""
         attributes = self.head(state)
         parts = attributes.replace(offsets=self.centers(attributes.offsets, state))
         # Places without a query decode Gaussians that nobody sees.

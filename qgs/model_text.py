@@ -1,4 +1,4 @@
-"""Models as text: sizes, and a line for each slot."""
+"""Text descriptions of models: sizes, and a line for each slot."""
 
 from typing import Any
 
@@ -8,9 +8,9 @@ from qgs.contracts import LAYER_SLOTS, SUBLAYER_SLOTS
 
 
 def parameter_counts(model: Any) -> dict[str, int]:
-    """Component to its number of parameters, decoder layers summed by slot.
+    """Count the parameters of each component, summed over decoder layers by slot.
 
-    `decoder.layer` has what is not of its sublayers.
+    `decoder.layer` counts the parameters outside of its sublayers.
     """
     sublayers: dict[str, int] = {}
     for slot in SUBLAYER_SLOTS:
@@ -34,7 +34,7 @@ def _count(module: nn.Module) -> int:
 
 
 def model_text(model: Any) -> str:
-    """Sizes, then a line for each slot: its component and number of parameters."""
+    """Describe a model: sizes, then component and number of parameters for each slot."""
     rows = slot_rows(model)
     wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [f"  {slot:<{wide[0]}}  {kind:<{wide[1]}}  {n:>{wide[2]}}" for slot, kind, n in rows]
@@ -42,7 +42,7 @@ def model_text(model: Any) -> str:
 
 
 def heading(model: Any) -> str:
-    """Class, parameters, decoder layers, queries and device."""
+    """Return a line with class, parameters, decoder layers, queries and device."""
     tree = (model.recipe or {}).get("model", {})
     options = {**tree.get("queries", {}), **tree.get("head", {})}
     parts = [f"{_count(model):,} parameters", f"{len(model.decoder)} decoder layers"]
@@ -53,7 +53,10 @@ def heading(model: Any) -> str:
 
 
 def slot_rows(model: Any) -> list[tuple[str, str, str]]:
-    """Slot, types of its components (without a recipe classes, outside the decoder), parameters."""
+    """Return slot, types of its components and number of parameters for each slot.
+
+    Without a recipe the types are class names, and empty for slots of decoder layers.
+    """
     counts = {name: f"{count:,}" for name, count in parameter_counts(model).items()}
     counts |= {"supervision": "", "renderer": ""}
     kinds = {name: _types(model, name.removeprefix("decoder.")) for name in counts}
@@ -61,7 +64,7 @@ def slot_rows(model: Any) -> list[tuple[str, str, str]]:
 
 
 def _types(model: Any, slot: str) -> list[str]:
-    """What stands in a slot, in one of the decoder by layer."""
+    """Return the types of the components in a slot; for a slot of the decoder, of each layer."""
     if model.recipe is None:
         return [type(getattr(model, slot)).__name__] if hasattr(model, slot) else []
     tree = model.recipe["model"]

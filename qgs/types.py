@@ -1,14 +1,14 @@
-"""The containers that travel between components.
+"""Containers of tensors that components exchange.
 
 Axes: B scenes, V views, H x W pixels, N queries, K Gaussians per query, G = N*K Gaussians,
 M image tokens, D width, h heads, d = D/h. Model code ends the names of tensors with their axes,
-such as `x_BND`, a digit for a fixed size; fields of containers and arguments that a contract names
-go without.
+such as `x_BND`; a digit is a fixed size. Fields of containers and arguments that a contract names
+have no such ending.
 
-Frames: "world" is the frame of the first input camera once poses are normalised; cameras are OpenCV
-(x right, y down, z forward).
+Frames: "world" is the frame of the first input camera after poses are normalised; cameras are
+OpenCV (x right, y down, z forward).
 
-Containers are frozen. A component returns a new one and never writes into the one it was given.
+Containers are frozen. A component returns a new container and never changes its inputs.
 """
 
 import math
@@ -23,7 +23,7 @@ from qgs.containers import TensorContainer, check_shapes, concatenated, map_tens
 
 
 def _check_unit_images(views: Any) -> None:
-    """Raise ValueError for images that are no floating-point numbers."""
+    """Raise ValueError for images that are not floating-point numbers."""
     if not views.images.is_floating_point():
         raise ValueError(
             f"{type(views).__name__}.images must be floating-point numbers in [0, 1], got "
@@ -54,7 +54,7 @@ class Cameras(TensorContainer):
 
     @property
     def w2c(self) -> Tensor:
-        """(..., 4, 4) world-to-camera: the rigid inverse of `c2w`, differentiable."""
+        """World-to-camera poses (..., 4, 4): the rigid inverse of `c2w`, differentiable."""
         # Rigid, so the inverse needs no solver, and its gradient stays exact.
         rotation = self.c2w[..., :3, :3].mT
         translation = -rotation @ self.c2w[..., :3, 3:]
@@ -66,9 +66,9 @@ class Cameras(TensorContainer):
 
 @dataclass(frozen=True)
 class Photos(TensorContainer):
-    """Photos of unknown cameras, for models whose encoder and queries do without.
+    """Photos without cameras, for models whose encoder and queries do not need them.
 
-    images: (B, V, 3, H, W) in [0, 1]. times, target_time: as of `Views`.
+    images: (B, V, 3, H, W) in [0, 1]. times, target_time: see `Views`.
     """
 
     images: Tensor
@@ -84,11 +84,11 @@ class Photos(TensorContainer):
 class Views(TensorContainer):
     """Posed photos: images (B, V, 3, H, W) in [0, 1] and their cameras (B, V).
 
-    masks: (B, V, 1, H, W) in [0, 1], 1 where the photo shows what is to be modelled; None for
-    photos without masks. times: (B, V), when each photo was taken; None where nothing moves.
-    target_time: (B, 1), of the scene that is to be reconstructed from them.
-    depths: (B, V, 1, H, W), camera-frame z in world units, 0 where unknown; None without maps, and
-        where no loss reads them.
+    masks: (B, V, 1, H, W) in [0, 1], 1 on the object to reconstruct; None without masks.
+    times: (B, V), time of each photo; None for static scenes.
+    target_time: (B, 1), time at which to reconstruct the scene.
+    depths: (B, V, 1, H, W), camera-frame z in world units, 0 where unknown; None without maps, or
+        if no loss reads them.
     """
 
     images: Tensor
@@ -106,30 +106,30 @@ class Views(TensorContainer):
         _check_unit_images(self)
 
     def select(self, index: Any) -> Self:
-        """The views at `index` of every scene (a slice or a list of ints), of the same time."""
+        """Select the views at `index` (a slice or a list of ints) of every scene; keep the time."""
         # All parts but the time have the views as their second axis.
         chosen = map_tensors(lambda x: x[:, index], self.replace(target_time=None))
         return chosen.replace(target_time=self.target_time)
 
     def joined(self, other: Self) -> Self:
-        """These views, then `other` ones of the same scenes, of one size, with the same parts."""
+        """Append `other` views of the same scenes, with the same image size and the same parts."""
         both = concatenated([x.replace(target_time=None) for x in (self, other)], 1)
         return both.replace(target_time=self.target_time)
 
 
 @dataclass(frozen=True)
 class ImageMemory(TensorContainer):
-    """What the encoder leaves for the decoder: M tokens, with what it knows of them.
+    """Output of the encoder for the decoder: M tokens and their properties.
 
     features: (B, M, C), for components that project their own keys and values; C is the model's
-        width D, or a width of the encoder's own.
-    keys, values: (B, h, M, D/h), made once for all decoder layers.
+        width D, or another width of the encoder.
+    keys, values: (B, h, M, D/h), computed once for all decoder layers.
     patch_rays: (B, M, 6) float32 world-frame Plücker rays (moment, direction), averaged over each
-        patch and not renormalised. None where tokens are not of one patch, or cameras unknown.
-    grid: (V, H/P, W/P), M is its product; tokens are ordered view, row, column. None for tokens
-        that are no patches, such as learned latents.
+        patch and not renormalised. None if tokens are not single patches, or cameras are unknown.
+    grid: (V, H/P, W/P), M is its product; tokens are ordered by view, row, column. None for tokens
+        that are not patches, such as learned latents.
 
-    The encoder's `writes` say which of these are not None.
+    The encoder's `writes` lists the parts that are not None.
     """
 
     features: Tensor
@@ -144,24 +144,24 @@ class ImageMemory(TensorContainer):
     def __post_init__(self) -> None:
         shape = tuple(self.features.shape)
         if self.grid is not None and shape[1:2] != (patches := math.prod(self.grid),):
-            raise ValueError(f"ImageMemory.grid {self.grid}: {patches} tokens, features {shape}")
+            raise ValueError(f"ImageMemory.grid {self.grid} has {patches} tokens, features {shape}")
         check_shapes(
             self, features="B M C", keys="B h M D/h", values="B h M D/h", patch_rays="B M 6"
         )
 
     def __getitem__(self, name: str) -> Tensor:
-        """A tensor that a component `reads`, such as "keys"; KeyError where there is none."""
+        """Return a tensor by name, such as "keys"; raise KeyError if it is None."""
         part = getattr(self, name, None)
         if not isinstance(part, Tensor):
             raise KeyError(f"the image memory has no {name}; its encoder does not provide it")
         return part
 
     def once(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
-        """`compute()` of the first layer that asks for `name`, kept for the other layers.
+        """Return `compute()`, computed for the first layer and cached for the other layers.
 
-        `compute` reads this memory alone. Start `name` with your plugin's name. Copies of the
-        memory start with nothing kept. What was computed without gradients, or in inference mode,
-        is computed again where gradients are wanted.
+        `compute` must read only this memory. Start `name` with your plugin's name. Copies of the
+        memory start with an empty cache. A result from a call without gradients, or in inference
+        mode, is computed again for a call with gradients.
         """
         # What was made without gradients is of no use to a pass that needs them.
         key = (name, torch.is_grad_enabled(), torch.is_inference_mode_enabled())
@@ -174,9 +174,9 @@ class ImageMemory(TensorContainer):
 class QueryState(TensorContainer):
     """The state of every query: features (B, N, D) and named fields (B, N, ...).
 
-    mask: (B, N) bool, False for places that hold no query where scenes of a batch have different
-        numbers of them; None where every place holds one. What stands there is finite, no other
-        query reads it, and its Gaussians have opacity 0.
+    mask: (B, N) bool, False for empty places, if scenes of a batch have different numbers of
+        queries; None if all places hold queries. Values at empty places are finite, no query reads
+        them, and their Gaussians have opacity 0.
     """
 
     features: Tensor
@@ -202,7 +202,7 @@ class QueryState(TensorContainer):
         return name in self.fields
 
     def replace(self, **changes: Any) -> Self:
-        """A new state; `fields` are added to the present ones, or take the place of some."""
+        """Return a new state; `fields` are added to the present ones or replace them."""
         fields = {**self.fields, **changes.pop("fields", {})}
         return super().replace(fields=fields, **changes)
 
@@ -211,11 +211,11 @@ _OF_GAUSSIANS = {"scales": "... 3", "quats": "... 4", "opacities": "...", "color
 _OF_GAUSSIANS |= {"sh": "... C 3", "features": "... F"}
 
 SH_COUNTS = (3, 8, 15)
-"""Coefficients of spherical harmonics of degrees 1 to 1, 2 and 3; `colors` is degree 0."""
+"""Counts of spherical-harmonic coefficients for degrees 1 to 1, 2 or 3; `colors` is degree 0."""
 
 
 def _check_gaussians(container: TensorContainer, **shapes: str) -> None:
-    """Raise ValueError for a wrong shape of what both kinds of Gaussians have, or of `shapes`."""
+    """Raise ValueError for wrong shapes of the common fields of Gaussians, or of `shapes`."""
     check_shapes(container, **shapes, **_OF_GAUSSIANS)
     sh = getattr(container, "sh", None)
     if sh is not None and sh.shape[-2] not in SH_COUNTS:
@@ -227,9 +227,9 @@ def _check_gaussians(container: TensorContainer, **shapes: str) -> None:
 
 @dataclass(frozen=True)
 class GaussianAttributes(TensorContainer):
-    """What a head reads off each query; everything of a Gaussian but its mean.
+    """Output of a head for each query: all attributes of its Gaussians except the means.
 
-    offsets: (B, N, K, 3) raw, before any activation: a `centers` component turns them into means.
+    offsets: (B, N, K, 3) raw, before any activation; a `centers` component turns them into means.
     scales: (B, N, K, 3) positive, world units. quats: (B, N, K, 4) unit, w x y z.
     opacities: (B, N, K) in (0, 1). colors: (B, N, K, 3) RGB in [0, 1], beside `sh` of any value.
     sh: (B, N, K, C, 3), features: (B, N, K, F), see `Gaussians`; None for none.
@@ -249,14 +249,14 @@ class GaussianAttributes(TensorContainer):
 
 @dataclass(frozen=True)
 class Gaussians(TensorContainer):
-    """G Gaussians per scene, ordered query by query.
+    """Gaussians, G per scene, ordered query by query.
 
     means: (B, G, 3) world. scales: (B, G, 3) standard deviations, world units.
     quats: (B, G, 4) unit, w x y z. opacities: (B, G). colors: (B, G, 3) RGB.
     sh: (B, G, C, 3) coefficients of real spherical harmonics in the world frame, RGB, of degrees 1
         to 1, 2 or 3 (C = 3, 8, 15) in the order of `qgs.geometry.harmonics`. Seen along the
-        direction d, the colour is max(colors + sum_i Y_i(d) sh_i, 0). None: `colors` from anywhere.
-    features: (B, G, F) whatever else is rendered, over 0; None for nothing.
+        direction d, the colour is max(colors + sum_i Y_i(d) sh_i, 0). None: `colors` everywhere.
+    features: (B, G, F) other values to render, over 0; None for none.
     """
 
     means: Tensor
@@ -272,14 +272,14 @@ class Gaussians(TensorContainer):
 
     @property
     def count(self) -> int:
-        """Gaussians per scene."""
+        """Number of Gaussians per scene."""
         return self.means.shape[-2]
 
     def __getitem__(self, index: Any) -> Self:
         return map_tensors(lambda x: x[index], self)
 
     def most_opaque(self, count: int) -> Self:
-        """The `count` most opaque of each scene, all where there are fewer, in their order."""
+        """Return the `count` most opaque Gaussians of each scene, or all, in their order."""
         # Sorted again, so that files keep the order of the queries.
         chosen = self.opacities.topk(min(count, self.count), -1).indices.sort(-1).values
 
@@ -295,11 +295,11 @@ class Gaussians(TensorContainer):
 
 @dataclass(frozen=True)
 class Rendering(TensorContainer):
-    """What cameras see: rgb (B, V, 3, H, W), alpha and depth (B, V, 1, H, W).
+    """Rendered images: rgb (B, V, 3, H, W), alpha and depth (B, V, 1, H, W).
 
-    `rgb` is over the background, `alpha` in [0, 1], `depth` the expected camera-frame z of what
-    was hit, sum(w z) / sum(w), 0 where nothing was. `features` (B, V, F, H, W) are sum(w f), over
-    0; None where the Gaussians have none.
+    `rgb` is over the background. `alpha` is in [0, 1]. `depth` is the expected camera-frame z,
+    sum(w z) / sum(w), or 0 where no Gaussian was hit. `features` (B, V, F, H, W) are sum(w f), over
+    0; None for Gaussians without features.
     """
 
     rgb: Tensor
@@ -314,7 +314,7 @@ class Rendering(TensorContainer):
 
 @dataclass(frozen=True)
 class SpatialSupport(TensorContainer):
-    """Where queries look, for pictures: an ellipsoid per query.
+    """Spatial support of queries, for pictures: an ellipsoid per query.
 
     centers: (B, N, 3) world. axes: (B, N, 3, 3), its semi-axes as columns, world units.
     """
@@ -328,7 +328,7 @@ class SpatialSupport(TensorContainer):
 
 @dataclass(frozen=True)
 class LayerPrediction(TensorContainer):
-    """What one decoder layer predicts: its Gaussians and the state they were decoded from."""
+    """Prediction of one decoder layer: its Gaussians and the state that they were decoded from."""
 
     gaussians: Gaussians
     state: QueryState
@@ -336,10 +336,10 @@ class LayerPrediction(TensorContainer):
 
 @dataclass(frozen=True)
 class Prediction(TensorContainer):
-    """A forward pass: the last layer's Gaussians and state, and those of every decoded layer.
+    """Output of a forward pass: Gaussians and state of the last layer, and of all decoded layers.
 
-    layers: layer number (1 is the first; 0 the start, of a decoder of depth 0) to LayerPrediction,
-        ascending.
+    layers: LayerPrediction by ascending layer number. 1 is the first layer; 0 is the initial state,
+        only in a decoder of depth 0.
     """
 
     gaussians: Gaussians

@@ -1,4 +1,4 @@
-"""Words that messages and tables share."""
+"""Helpers for the text of messages and tables."""
 
 import logging
 from collections.abc import Collection, Iterable
@@ -9,9 +9,9 @@ _log = logging.getLogger(__name__)
 
 
 def listed(names: Iterable[object], most: int = 8, between: str = ", ") -> str:
-    """The first `most` of `names`, and how many more there are; "" for none.
+    """List the first `most` of `names`, and the number of further ones; "" for none.
 
-    Long ones are cut, those that no terminal prints as they are escaped.
+    Long names are cut, names with unprintable characters are escaped.
     """
     shown = [*map(str, names)]
     more = f" and {len(shown) - most} more" if len(shown) > most else ""
@@ -19,23 +19,23 @@ def listed(names: Iterable[object], most: int = 8, between: str = ", ") -> str:
 
 
 def numbered(frame: int, name: str) -> str:
-    """A frame's number and its photo's name, such as "3 (images/0004.png)"; "3" without a name."""
+    """Return a frame's number and photo, such as "3 (images/0004.png)"; "3" without a name."""
     return f"{frame} ({name})" if name not in ("", str(frame)) else str(frame)
 
 
 def counted(number: int, what: str) -> str:
-    """Such as "1 thread", "12 threads"."""
+    """Return a number with its noun, such as "1 thread" or "12 threads"."""
     return f"{number:,} {what}{'' if number == 1 else 's'}"
 
 
 def name_shown(name: str, most: int = 500) -> str:
-    """`name` as a message shows it, of at most some characters."""
+    """Return `name` for a message: escaped if unprintable, cut after `most` characters."""
     name = name if name.replace("\n", "").isprintable() else repr(name)
     return name if len(name) <= most else f"{name[:most]} ... ({len(name):,} characters)"
 
 
 def one_line(error: Exception) -> str:
-    """An exception in one line; its kind is left out where the message is for users."""
+    """Return an exception on one line, without its type if the message is for users."""
     message = " ".join(str(error).split())
     if isinstance(error, ValueError | FileNotFoundError) and message:
         return message
@@ -44,17 +44,17 @@ def one_line(error: Exception) -> str:
 
 @lru_cache(maxsize=4096)
 def warn_once(message: str) -> None:
-    """Log `message`, unless this process has logged it before."""
+    """Log the warning `message`, unless this process has logged it before."""
     _log.warning("%s", message)
 
 
 def nearest(word: str, choices: Iterable[str]) -> str | None:
-    """The choice that `word` is probably a misspelling of."""
+    """Return the choice that `word` probably misspells; None if there is none."""
     # Names of one plug-in share their first part: at 0.6 any is like any other.
     return next(iter(get_close_matches(word, sorted(choices), cutoff=0.65)), None)
 
 
 def did_you_mean(word: str, choices: Collection[str], noun: str) -> str:
-    """A fix: the nearest choice, or the choices."""
+    """Return a fix for a message: the nearest choice, or the list of choices."""
     near = nearest(word, choices)
     return f"did you mean `{near}`?" if near else f"{noun}: {listed(sorted(choices), 12) or 'none'}"

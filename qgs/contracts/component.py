@@ -1,4 +1,4 @@
-"""The base of all components: a name, a Config, the fields they read and write, problems."""
+"""Base classes of all components: options, fields that they read and write, problems."""
 
 from abc import ABCMeta
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,7 +12,10 @@ from pydantic import BaseModel, ConfigDict
 
 # A ValueError, since pydantic turns these into problems of the option.
 class OptionError(ValueError):
-    """For validators of a Config: `reason` says what is wrong, `fix` what to write instead."""
+    """Error for validators of a Config.
+
+    `reason` says what is wrong, `fix` what to write instead.
+    """
 
     def __init__(self, reason: str, fix: str) -> None:
         super().__init__(f"{reason}; {fix}")
@@ -27,7 +30,7 @@ class ComponentConfig(BaseModel):
     """
 
     __component__: ClassVar["type[Component] | None"] = None
-    """The component that has these options; None for settings of a section of a recipe."""
+    """Component that has these options. None for the settings of a section of a recipe."""
 
     model_config = ConfigDict(
         # Checkpoints and hashes hold the options: nothing may change them behind their back.
@@ -46,9 +49,10 @@ class ComponentConfig(BaseModel):
 class FieldSpec:
     """A named tensor that one component writes and later ones read.
 
-    shape: after the leading (batch, item) axes; a str is a symbolic size such as "D".
+    shape: the axes after the leading (batch, item) ones; a str is a symbolic size such as "D".
     frame: the coordinate frame of its numbers.
-    encoding: how to read raw numbers where there are several ways; writer and reader must agree.
+    encoding: a name for the meaning of raw numbers that could be read in several ways. Writer and
+        reader must use the same one.
     """
 
     shape: tuple[int | str, ...]
@@ -77,10 +81,11 @@ class ModelDims:
 
 @dataclass(frozen=True)
 class RecipeContext:
-    """The rest of a recipe, as far as `Component.problems` sees it.
+    """Facts about the rest of a recipe, for `Component.problems`.
 
-    image_size: (H, W) of the data's images; None for a recipe without data. inputs: how many input
-    views a training sample has; None likewise. times: whether photos of the data may have times.
+    image_size: (H, W) of the data's images; None for a recipe without data.
+    inputs: number of input views in a training sample; None for a recipe without data.
+    times: True if photos of the data may have times.
     """
 
     dims: ModelDims
@@ -91,7 +96,7 @@ class RecipeContext:
 
 @dataclass(frozen=True)
 class Problem:
-    """A fault of an option, and what to do about it.
+    """A fault of an option, and how to fix it.
 
     option: dotted path below the component, "" for the component itself.
     """
@@ -105,9 +110,10 @@ class Problem:
 def without_effect(
     config: ComponentConfig, options: Iterable[str], because: str
 ) -> Iterator[Problem]:
-    """A problem for each of `options` that was changed although nothing reads it.
+    """Yield a problem for each of `options` that was changed although nothing reads it.
 
-    because: what in `config` makes it idle. Defaults pass, since resolved recipes write them out.
+    because: the setting in `config` that makes the option idle. Options with their default value
+    pass, because resolved recipes write them out.
     """
     for option in options:
         default = type(config).model_fields[option].get_default()
@@ -124,36 +130,36 @@ class Component(metaclass=ABCMeta):
     A slot's contract sets `slot`; a component sets `name` and nests its `Config`. Classmethods are
     called with a valid config before anything is built.
 
-    `forward`: the scenes of a batch are independent, neither inputs nor parameters and buffers are
-    changed, random numbers are drawn (from torch's global generator) in training only, and every
-    tensor that is read gets a gradient.
+    Rules for `forward`: The scenes of a batch are independent. It changes no inputs, parameters or
+    buffers. It draws random numbers only in training, from torch's global generator. Every tensor
+    that it reads gets a gradient.
     """
 
     slot: ClassVar[str]
     name: ClassVar[str]
     reads: ClassVar[Fields] = {}
-    """Fields that must exist before this component runs; see `fields_read` for those that depend on
-    options."""
+    """Fields that must exist before this component runs. If they depend on options, override
+    `fields_read`."""
     writes: ClassVar[Fields] = {}
-    """Fields that exist after it has run; see `fields_written`."""
+    """Fields that exist after it has run. If they depend on options, override `fields_written`."""
     scheduled: ClassVar[frozenset[str]] = frozenset()
-    """Options, numbers, that are read from `self.config` in every call and nowhere else: training
-    may change them from step to step, as a schedule in the recipe says."""
+    """Numeric options that a schedule in the recipe may change from step to step. The component
+    must read them from `self.config` in every call, and nowhere else."""
 
     schedules: Mapping[str, Any] = MappingProxyType({})
-    """Option to its `qgs.contracts.schedule.Schedule`; `config` has the numbers after `followed`
-    steps."""
+    """The `qgs.contracts.schedule.Schedule` of each scheduled option, by name. `config` holds their
+    values after `followed` steps."""
     followed: int = 0
 
     class Config(ComponentConfig):
-        """No options."""
+        """Options of the component; there are none by default."""
 
     def __init__(self, config: ComponentConfig) -> None:
         super().__init__()
         self.config = config
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Give every class a Config of its own, which knows it."""
+        """Give every class a Config of its own, with a reference to the class."""
         super().__init_subclass__(**options)
         # Options tell their component, so that no two may share a Config.
         inherited = cls.Config
@@ -168,30 +174,30 @@ class Component(metaclass=ABCMeta):
 
     @classmethod
     def fields_read(cls, config: ComponentConfig) -> Fields:
-        """Fields that must exist before this component runs: `reads`, unless options decide."""
+        """Return the fields that must exist before this component runs (default: `reads`)."""
         return cls.reads
 
     @classmethod
     def fields_written(cls, config: ComponentConfig) -> Fields:
-        """Fields that exist after this component has run: `writes`, unless options decide."""
+        """Return the fields that exist after this component has run (default: `writes`)."""
         return cls.writes
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """Options that do not fit each other or the rest of the recipe."""
+        """Return problems: options that do not fit each other or the rest of the recipe."""
         return ()
 
     def load_pretrained(self) -> None:  # noqa: B027 (most have no such files)
         """Read weights from files that options name.
 
-        Called once after a component is built, never on the meta device, and not where a checkpoint
-        brings all weights. Raises MissingExtraError where a file or a package is not there: the
-        message says what to do.
+        Called once after the component is built. Not called on the meta device, or if a checkpoint
+        brings all weights. Raises MissingExtraError for a missing file or package; its message says
+        what to do.
         """
 
 
 class ModelComponent(Component, torch.nn.Module):
-    """A component with parameters, built with the sizes that all parts of the model share."""
+    """A component with parameters. It is built with the sizes that all parts of the model share."""
 
     def __init__(self, config: ComponentConfig, dims: ModelDims) -> None:
         super().__init__(config)
@@ -200,18 +206,20 @@ class ModelComponent(Component, torch.nn.Module):
     def decays(self, name: str, parameter: torch.nn.Parameter) -> bool:
         """Return whether weight decay applies to `parameter`, called `name` inside this component.
 
-        By default, to all but 1-d parameters: biases, norms, LayerScale (LocusGS release).
+        By default it applies to all but 1-d parameters: biases, norms, LayerScale (LocusGS
+        release).
         """
         # Pulled towards 0, a norm or a LayerScale would silence its layer.
         return parameter.ndim != 1
 
     def adapted(self, learned: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """A state dict made of another, or of none: `init_from` asks encoder, feedback and head.
+        """Return a state dict for this component, made from `learned`, which may be empty.
 
-        Weights that cannot be brought to this component's shapes stay, and are then refused.
+        `init_from` calls this for encoder, feedback and head. Weights that cannot be brought to
+        this component's shapes are returned as they are; loading then refuses them.
         """
         return dict(learned)
 
 
 class MissingExtraError(RuntimeError):
-    """An optional package is missing; the message names the command that installs it."""
+    """Error for a missing optional package; the message names the command that installs it."""

@@ -1,4 +1,4 @@
-"""Slots `data` and `view_sampler`: where scenes come from, and which of their frames to use."""
+"""Contracts of the slots `data` (the source of scenes) and `view_sampler` (the frames to use)."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -21,59 +21,62 @@ Side: TypeAlias = Annotated[int, Field(ge=1)]
 
 
 class Scene(ABC):
-    """Frames of one scene, decoded only when asked for.
+    """The frames of one scene; images are decoded on demand.
 
-    A frame's number is its place, from 0, among those that are there: indices, held-out lists,
-    options, tables and messages all mean this number.
+    Frames are numbered from 0, and missing images are not counted. Indices, held-out lists,
+    options, tables and messages all use this number.
     """
 
     name: str
     held_out: Sequence[int] = ()
-    """Frames that training never sees, so that evaluation can target them."""
+    """Frames that training never sees. Evaluation can use them as targets."""
     missing: Sequence[str] = ()
-    """Images that are listed and do not exist; they are no frames, so later ones move up."""
+    """Listed images that do not exist. They are no frames, so later frames move up."""
     times: Tensor | None = None
-    """Times (F,) at which frames were taken, float64, in any unit; None where nothing moves."""
+    """Times (F,) of the frames, float64, in any unit. None for a static scene."""
 
     @property
     @abstractmethod
     def cameras(self) -> Cameras:
-        """Cameras (F,) of all frames at the delivered image size, in the scene's own frame.
+        """Cameras (F,) of all frames, for the delivered image size, in the scene's own frame.
 
-        Poses are float64 where the data has that precision: normalising them loses digits.
+        Poses are float64 where the data has that precision, because normalising loses digits.
         """
 
     @abstractmethod
     def images(self, frames: Sequence[int]) -> Tensor:
-        """Images (len(frames), 3, H, W) float32 in [0, 1]."""
+        """Return images (len(frames), 3, H, W), float32 in [0, 1]."""
 
     def masks(self, frames: Sequence[int]) -> Tensor | None:
-        """Masks (len(frames), 1, H, W) in [0, 1], 1 on what is to be modelled; None without."""
+        """Return masks (len(frames), 1, H, W) in [0, 1], 1 on the object; None without masks."""
         return None
 
     def frame_name(self, frame: int) -> str:
-        """The name by which a person knows a frame: a file name or a time stamp."""
+        """Return the name under which a user knows a frame: a file name or a time stamp."""
         return str(frame)
 
     def label(self, frame: int) -> str:
-        """Number and name of a frame, for messages."""
+        """Return number and name of a frame, for messages."""
         return numbered(frame, self.frame_name(frame))
 
     def stored_size(self, frame: int) -> tuple[int, int] | None:
-        """(H, W) of the photo before it is delivered; None where images are made to measure."""
+        """Return (H, W) of the photo as stored; None if images are made at the delivered size."""
         return None
 
     def depths(self, frames: Sequence[int]) -> Tensor | None:
-        """Camera-frame z (len(frames), 1, H, W), world units, 0 where unknown; None without."""
+        """Return depth maps (len(frames), 1, H, W); None if the scene has none.
+
+        Values are camera-frame z in world units, 0 where unknown.
+        """
         return None
 
     def __len__(self) -> int:
-        """F, the number of frames."""
+        """Return F, the number of frames."""
         return self.cameras.shape[0]
 
 
 class SceneSourceConfig(ComponentConfig):
-    """Options of all sources. Where a source's data lies is its option `path`."""
+    """Options of all sources. A source adds the option `path`, the location of its data."""
 
     image_size: tuple[Side, Side] = (64, 64)
     """(H, W) of every delivered image, in pixels."""
@@ -82,36 +85,37 @@ class SceneSourceConfig(ComponentConfig):
 class SceneSource(Component):
     """A collection of scenes with a training and a test split.
 
-    Opening a source reads what it needs to list its scenes and raises FileNotFoundError or
-    ValueError with the path and the remedy; images are decoded by `Scene.images`.
+    Opening a source reads only what it needs to list its scenes. It raises FileNotFoundError or
+    ValueError, whose message names the path and a fix. `Scene.images` decodes images.
     """
 
     slot: ClassVar[str] = "data"
     not_in_protocol: ClassVar[frozenset[str]] = frozenset({"path"})
-    """Options that change no scene, image or camera: where files lie, how they are kept in memory.
-    Hashes of evaluation protocols leave them out."""
+    """Options that change no scene, image or camera, such as paths and caching. Hashes of
+    evaluation protocols leave them out."""
     split_options: ClassVar[frozenset[str]] = frozenset()
-    """Options that only choose which scenes and frames are trained on, and which are judged. Where
-    an evaluation index names these, hashes of protocols leave them out too."""
+    """Options that only split scenes and frames into training and test. If an evaluation index
+    names scenes and frames, hashes of protocols leave these options out too."""
     tells_times: ClassVar[bool] = False
-    """Whether scenes may have `Scene.times`; models that read times are refused beside others."""
+    """True if scenes may have `Scene.times`. A model that reads times needs such a source; a recipe
+    with another one is refused."""
 
     class Config(SceneSourceConfig):
-        """The common settings."""
+        """Options of this source; by default only the common ones."""
 
     config: SceneSourceConfig
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
-        """Return whether the existing `path` looks like data of this source, by its names of files.
+        """Return whether the existing `path` looks like data of this source, judged by file names.
 
-        So that `qgs reconstruct` and `qgs data` open it without a recipe. By default no path does.
+        `qgs reconstruct` and `qgs data` use this to open data without a recipe. Default: False.
         """
         return False
 
     @classmethod
     def trains_on(cls, root: UPath, path: UPath) -> bool:
-        """Return whether training data at `root` is `path` or has it as a scene, both absolute."""
+        """Return whether training data at `root` is or contains `path`, a scene; both absolute."""
         # Sources whose scenes are files below the root say more.
         return path == root
 
@@ -119,9 +123,10 @@ class SceneSource(Component):
     def config_for(
         cls, path: str, image_size: tuple[int, int], trained: SceneSourceConfig | None
     ) -> SceneSourceConfig:
-        """Options that open all frames of `path` for a model that was trained on other data.
+        """Return options that open all frames of `path` for a model trained on other data.
 
-        trained: options of that data, of any source; what goes for `path` too is taken over.
+        trained: the options of the training data, of any source. Options that also hold for `path`
+        are copied from it.
         """
         # Of the trained data, only how photos look goes for others as well.
         options: dict[str, object] = {"path": path, "image_size": image_size}
@@ -132,27 +137,27 @@ class SceneSource(Component):
 
     @abstractmethod
     def scenes(self, split: Split) -> Sequence[Scene]:
-        """The scenes of a split; indexing is cheap and deterministic."""
+        """Return the scenes of a split; indexing must be cheap and deterministic."""
 
     def names(self, split: Split) -> Sequence[str]:
-        """The name of every scene of `scenes(split)`; sources that know them open no scene."""
+        """Return the names of `scenes(split)`; override it to avoid opening the scenes."""
         # Correct for any source, and slow where opening a scene reads files.
         return [scene.name for scene in self.scenes(split)]
 
     def groups(self, split: Split) -> Sequence[Sequence[int]]:
-        """Indices of `scenes(split)` by where they are stored, such as one group per file.
+        """Return the indices of `scenes(split)`, grouped by storage, such as one group per file.
 
-        Training visits groups in random order, and the scenes of a group one after another in
-        random order, so that a file is read once an epoch. One group shuffles everything.
+        Training visits groups in random order, and then the scenes of each group in random order,
+        so that it reads a file once per epoch. A single group shuffles all scenes together.
         """
         return [range(len(self.scenes(split)))]
 
 
 class ViewSampler(Component):
-    """Which frames of a scene are the inputs and the targets of a sample.
+    """Sampler of the input and target frames of a scene.
 
-    Sample k of a training is a function of (seed, k): `draw` reads nothing but its arguments and
-    `config`, and all chance comes from `rng`.
+    Sample k of a training run is a function of (seed, k). So `draw` may read only its arguments
+    and `config`, and all randomness must come from `rng`.
     """
 
     slot: ClassVar[str] = "view_sampler"
@@ -161,19 +166,20 @@ class ViewSampler(Component):
     def draw(
         self, scene: Scene, views: ViewsConfig, rng: np.random.Generator, step: int
     ) -> tuple[Frames, Frames]:
-        """Up to `views.inputs` frames, ascending, as many in each sample of a step, and targets.
+        """Draw input frames, ascending, and target frames; raise ValueError for too few frames.
 
-        Held-out frames are never drawn. step: optimiser steps before the one that the sample is
-        for; `qgs.contracts.schedule.END` in evaluation. Raises ValueError for too few frames.
+        There are at most `views.inputs` inputs, equally many in all samples of a step. Held-out
+        frames are never drawn. step: number of optimiser steps before the sample is used;
+        `qgs.contracts.schedule.END` in evaluation.
         """
 
     def windows(self, scene: Scene, views: ViewsConfig) -> list[tuple[Frames, Frames]]:
-        """Input and target frames of each window that a scene is judged on.
+        """Return the input and target frames of each window that evaluation scores in a scene.
 
-        Empty by default: then `EvaluationPlan` has windows in the order of frames.
+        The default is empty: `EvaluationPlan` then chooses windows in the order of frames.
         """
         return []
 
     def options(self, step: int) -> Any:
-        """`config` with the numbers of scheduled options after `step` steps."""
+        """Return `config` with the values of scheduled options after `step` steps."""
         return at_step(self.config, self.schedules, step)

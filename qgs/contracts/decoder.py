@@ -1,7 +1,7 @@
-"""Slots of the decoder: `layer`, what stands inside one, `refinement` after each, `feedback`.
+"""Contracts of the decoder's slots: `layer` and its sublayers, `refinement`, `feedback`.
 
 An attention or feed-forward component holds its norms and its output projection; the decoder layer
-adds LayerScale and the residual sum.
+adds LayerScale and the residual sum. A refinement runs after each layer.
 """
 
 from abc import abstractmethod
@@ -17,16 +17,17 @@ from qgs.types import ImageMemory, QueryState, Rendering, Views
 
 SUBLAYER_SLOTS = ("cross_attention", "self_attention", "feed_forward")
 LAYER_SLOTS = ("layer", *SUBLAYER_SLOTS, "refinement")
-"""Slots of the decoder that one of its layers may fill otherwise than the others."""
+"""Slots of the decoder that each layer may fill differently."""
 
 
 @dataclass(frozen=True)
 class AttentionWeights(TensorContainer):
     """Attention of Q chosen queries to T tokens, for pictures.
 
-    content: (B, h, Q, T) logits of content alone, finite. geometry: what is added to them, (B, 1,
-    Q, T) or one for each head (B, h, Q, T), -inf for tokens that a mask hides; None where nothing
-    is. weights: (B, h, Q, T) softmax of the sum.
+    content: (B, h, Q, T) logits from content alone, finite.
+    geometry: the bias added to `content`, (B, 1, Q, T), or (B, h, Q, T) for one per head; -inf for
+        masked tokens. None without a bias.
+    weights: (B, h, Q, T) softmax of the sum.
     """
 
     content: Tensor
@@ -36,9 +37,10 @@ class AttentionWeights(TensorContainer):
 
 @dataclass(frozen=True)
 class LayerParts:
-    """Parts of which a decoder layer is built.
+    """Parts for building a decoder layer.
 
-    sublayers: components by slot, those that the class names. layer_scale: `decoder.layer_scale`.
+    sublayers: the components, by slot, for the slots that the layer's class names.
+    layer_scale: the option `decoder.layer_scale`.
     """
 
     dims: ModelDims
@@ -47,16 +49,16 @@ class LayerParts:
 
 
 class DecoderLayer(ModelComponent):
-    """(QueryState, ImageMemory) -> both, as the next layer reads them.
+    """Decoder layer: (QueryState, ImageMemory) -> both, as the next layer reads them.
 
-    A layer may update features, write fields that it declares, and return a memory with other
-    features where image tokens change from layer to layer. Of a memory it keeps what it does not
-    change, and the fields of a state.
+    A layer may update features and write fields that it declares. It may return a memory with other
+    features, if image tokens change from layer to layer. It keeps the fields of the state and all
+    parts of the memory that it does not change.
 
-    sublayers: the slots inside this layer, of `cross_attention`, `self_attention` and
-        `feed_forward`; a recipe that fills another one is refused.
-    reads_layer_scale: whether `decoder.layer_scale` has an effect; a recipe that sets it is refused
-        where no layer reads it.
+    sublayers: the slots inside this layer, some of `cross_attention`, `self_attention` and
+        `feed_forward`. A recipe that fills another one is refused.
+    reads_layer_scale: True if the layer uses `decoder.layer_scale`. A recipe that sets it is
+        refused if no layer uses it.
     """
 
     slot: ClassVar[str] = "layer"
@@ -68,17 +70,17 @@ class DecoderLayer(ModelComponent):
 
     @abstractmethod
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
-        """One layer, without the refinement."""
+        """Run the layer, without the refinement."""
 
 
 class CrossAttention(ModelComponent):
-    """(QueryState, ImageMemory) -> update (B, N, D).
+    """Cross-attention: (QueryState, ImageMemory) -> update (B, N, D).
 
-    Raises KeyError for a field that the state lacks (the composer rules this out through
+    Raises KeyError for a field that the state lacks (the composer prevents this by checking
     `reads`), and RuntimeError (torch's) for a memory of another width or number of heads.
 
-    ordered_views: whether the order of the views matters. Otherwise, permuting the views of the
-    memory leaves the update as it is.
+    ordered_views: True if the order of the views matters. If False, permuting the views of the
+        memory must not change the update.
     """
 
     slot: ClassVar[str] = "cross_attention"
@@ -86,7 +88,7 @@ class CrossAttention(ModelComponent):
 
     @abstractmethod
     def forward(self, state: QueryState, memory: ImageMemory) -> Tensor:
-        """The update of the query features, before LayerScale."""
+        """Return the update of the query features, before LayerScale."""
 
     def explain(
         self,
@@ -94,26 +96,29 @@ class CrossAttention(ModelComponent):
         memory: ImageMemory,
         queries: Tensor,  # (Q,) indices
     ) -> AttentionWeights | None:
-        """Attention of some queries; None if it has none to show."""
+        """Return the attention weights of `queries`, for pictures; None if none."""
         return None
 
 
 class SelfAttention(ModelComponent):
-    """QueryState -> update (B, N, D). Permuting queries and fields permutes the update."""
+    """Self-attention: QueryState -> update (B, N, D).
+
+    Permuting the queries, with their fields, permutes the update.
+    """
 
     slot: ClassVar[str] = "self_attention"
 
     @abstractmethod
     def forward(self, state: QueryState) -> Tensor:
-        """The update of the query features, before LayerScale."""
+        """Return the update of the query features, before LayerScale."""
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights | None:
-        """Attention of the queries with indices `queries` (Q,); None if it has none to show."""
+        """Return the attention weights of `queries` (Q,), indices, for pictures; None if none."""
         return None
 
 
 class FeedForward(ModelComponent):
-    """Features (B, N, D) -> update (B, N, D), each query by itself.
+    """Feed-forward network: features (B, N, D) -> update (B, N, D), for each query separately.
 
     Raises RuntimeError (torch's) for features of another width.
     """
@@ -122,13 +127,13 @@ class FeedForward(ModelComponent):
 
     @abstractmethod
     def forward(self, features: Tensor) -> Tensor:  # (B, N, D)
-        """The update of the query features, before LayerScale."""
+        """Return the update of the query features, before LayerScale."""
 
 
 class Refinement(ModelComponent):
-    """QueryState -> QueryState with refined fields and the same features, after each layer.
+    """Refinement after each layer: QueryState -> QueryState with refined fields, same features.
 
-    shared_by_layers: whether layers with equal options share one module (as in LocusGS).
+    shared_by_layers: True if layers with equal options share one module (as in LocusGS).
     """
 
     slot: ClassVar[str] = "refinement"
@@ -136,17 +141,17 @@ class Refinement(ModelComponent):
 
     @abstractmethod
     def forward(self, state: QueryState) -> QueryState:
-        """The refined state."""
+        """Return the refined state."""
 
 
 class Feedback(ModelComponent):
-    """(QueryState, ImageMemory, Rendering, Views) -> state and memory of the next round.
+    """Feedback: (QueryState, ImageMemory, Rendering, Views) -> state and memory of the next round.
 
-    A round begins with what the last layer's Gaussians look like from the cameras of the photos,
-    rendered without gradients; then the last `layers` decoder layers run again, and update the
-    state once more. The memory is the one that the first of them read in the first pass.
+    A round renders the last layer's Gaussians from the cameras of the photos, without gradients.
+    Then the last `layers` decoder layers run again and update the state once more. The memory is
+    the one that the first of these layers read in the first pass.
 
-    rounds: how many an evaluation makes; it may be changed on a built model.
+    rounds: number of rounds in an evaluation; it may be changed on a built model.
     """
 
     slot: ClassVar[str] = "feedback"
@@ -155,15 +160,18 @@ class Feedback(ModelComponent):
     rounds: int = 0
 
     def drawn(self) -> int:
-        """Number of rounds that a forward pass in training makes; it may be random."""
+        """Return the number of rounds of a forward pass in training; it may be random."""
         return self.rounds
 
     def compared(self, views: Views) -> Views:
-        """The input photos as they are rendered and compared; smaller ones take less time."""
+        """Return the input photos at the size to render and compare; smaller ones are faster."""
         return views
 
     @abstractmethod
     def forward(
         self, state: QueryState, memory: ImageMemory, rendering: Rendering, photos: Views
     ) -> tuple[QueryState, ImageMemory]:
-        """Input of the first repeated layer. photos: `compared` views, (B, V) as `rendering`."""
+        """Return the input of the first repeated layer.
+
+        photos: views (B, V) from `compared`, of the same shape as `rendering`.
+        """

@@ -1,4 +1,4 @@
-"""Slot `encoder`: posed photos to image memory."""
+"""Contract of the slot `encoder`, from posed photos to image memory."""
 
 from abc import abstractmethod
 from collections.abc import Iterable
@@ -28,21 +28,21 @@ MEMORY_FIELDS: Fields = {
 
 
 def memory_fields(*names: str) -> Fields:
-    """Some of MEMORY_FIELDS: `memory_fields("keys", "values")`."""
+    """Return some of MEMORY_FIELDS, such as `memory_fields("keys", "values")`."""
     return {f"memory.{name}": MEMORY_FIELDS[f"memory.{name}"] for name in names}
 
 
 class Encoder(ModelComponent):
-    """Views (B, V, 3, H, W) in [0, 1] with world-frame cameras -> ImageMemory of M tokens.
+    """Encoder: Views (B, V, 3, H, W) in [0, 1] with world-frame cameras -> ImageMemory, M tokens.
 
-    Runs once per forward pass. A token may see all views; where the memory has a grid, it depends
-    most on its own patch, that of its view, row and column. Raises ValueError for images that it
+    It runs once per forward pass. A token may see all views. If the memory has a grid, a token
+    depends most on the patch at its view, row and column. Raises ValueError for images that it
     cannot divide into patches.
 
-    ordered_views: whether the order of the views matters. Otherwise, permuting the views permutes
-    the tokens.
-    reads_cameras: whether it reads `views.cameras`. One that does not may be given `Photos`.
-    tunable: whether `project` makes a memory of other features, which tuning at test time needs.
+    ordered_views: True if the order of the views matters. If False, permuting the views permutes
+        the tokens.
+    reads_cameras: True if it reads `views.cameras`. If False, it also accepts `Photos`.
+    tunable: True if it has `project`, which test-time tuning needs.
     """
 
     slot: ClassVar[str] = "encoder"
@@ -50,14 +50,14 @@ class Encoder(ModelComponent):
     reads_cameras: ClassVar[bool] = True
     tunable: ClassVar[bool] = False
     writes = MEMORY_FIELDS
-    """The parts of the ImageMemory that it fills, all by default; its features may have a width of
-    their own."""
+    """Parts of the ImageMemory that it fills (default: all). The features may have a width of their
+    own."""
 
     @classmethod
     def size_multiple(cls, config: ComponentConfig) -> int | None:
-        """Divisor of both sides of an image; None where it takes the trained size alone.
+        """Return a number that must divide both image sides; None for the trained size only.
 
-        Photos of a user are then seen whole, in their own aspect, and are not cropped.
+        With a number, photos of a user keep their aspect ratio and are not cropped.
         """
         return None
 
@@ -66,27 +66,27 @@ class Encoder(ModelComponent):
         """Encode all views of each scene together."""
 
     def project(self, features: Tensor, memory: ImageMemory) -> ImageMemory:
-        """`memory` made anew from other `features` of its shape: what tuning at test time reads.
+        """Return `memory` recomputed from other `features` of its shape, for test-time tuning.
 
-        `project(memory.features, memory)` is that memory again. Raises NotImplementedError unless
-        the encoder is `tunable`.
+        `project(memory.features, memory)` must give an equal memory. Raises NotImplementedError
+        unless the encoder is `tunable`.
         """
         # Recipes that would come here are refused: see `tunable`.
         raise NotImplementedError(f"{type(self).__name__} makes no memory of other features")
 
 
 class PatchEncoder(Encoder):
-    """An encoder that cuts every photo into squares, a token each."""
+    """An encoder that cuts every photo into square patches, one token each."""
 
     class Config(ComponentConfig):
         patch_size: int = Field(default=8, ge=1)
-        """Side of a patch, pixels; must divide both sides of the image."""
+        """Side of a patch in pixels. It must divide both sides of the image."""
 
     config: Config
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """A patch that does not divide the data's images."""
+        """Return a problem if patches do not divide the data's images."""
         size = context.image_size
         patch = config.patch_size
         if size and any(side % patch for side in size):
@@ -94,18 +94,18 @@ class PatchEncoder(Encoder):
             nearest = [max(round(side / patch), 1) * patch for side in size]
             yield Problem(
                 "patch_size",
-                f"patches of {patch} do not divide images of {size[0]} x {size[1]} (H x W)",
+                f"patches of {patch} pixels do not divide images of {size[0]} x {size[1]} (H x W)",
                 f"set data.image_size to {nearest}, or choose a patch_size that divides both sides",
             )
 
     @classmethod
     def size_multiple(cls, config: ComponentConfig) -> int:
-        """The side of a patch."""
+        """Return the side of a patch."""
         assert isinstance(config, PatchEncoder.Config)
         return config.patch_size
 
     def grid(self, views: Views) -> tuple[int, int, int]:
-        """(V, H/P, W/P); raises ValueError where patches do not divide the images."""
+        """Return (V, H/P, W/P); raise ValueError if patches do not divide the images."""
         patch = self.config.patch_size
         count, _, height, width = views.images.shape[1:]
         if height % patch or width % patch:

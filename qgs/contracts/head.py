@@ -1,4 +1,4 @@
-"""Slots `head` and `centers`: from query features to Gaussians."""
+"""Contracts of the slots `head` and `centers`, from query features to Gaussians."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -13,37 +13,37 @@ GAUSSIAN_FIELDS: Fields = {
     "gaussians.sh": FieldSpec(("C", 3)),
     "gaussians.features": FieldSpec(("F",)),
 }
-"""Optional outputs of a head; the other attributes are those of every Gaussian."""
+"""Optional outputs of a head. Every Gaussian has the other attributes."""
 
 
 class Head(ModelComponent):
-    """QueryState -> GaussianAttributes of K Gaussians per query, in the ranges given there.
+    """Head: QueryState -> GaussianAttributes of K Gaussians per query, in their valid ranges.
 
-    They hold with initial parameters too, for features other than zero. A head that gives `sh` or
-    `features` provides those of GAUSSIAN_FIELDS, so that losses which read them can require them.
+    The ranges also hold with initial parameters, for nonzero features. A head that outputs `sh` or
+    `features` declares them in `writes`, see GAUSSIAN_FIELDS, so that losses can require them.
     """
 
     slot: ClassVar[str] = "head"
 
     @property
     def gaussians_per_query(self) -> int:
-        """K, the Gaussians decoded from each query: the option of this name, if there is one."""
+        """Number K of Gaussians per query: the option of this name, if there is one."""
         return getattr(self.config, "gaussians_per_query")  # noqa: B009 (an option of subclasses)
 
     @abstractmethod
     def forward(self, state: QueryState) -> GaussianAttributes:
-        """The attributes of all Gaussians, without their means."""
+        """Return the attributes of all Gaussians, without their means."""
 
     def decays(self, name: str, parameter: torch.nn.Parameter) -> bool:
-        """No weight decay on a head (TokenGS release)."""
+        """Return False: a head has no weight decay (TokenGS release)."""
         return False
 
 
 class Centers(ModelComponent):
-    """(raw offsets (B, N, K, 3), QueryState) -> means (B, N, K, 3), world frame, float32.
+    """Centers: (raw offsets (B, N, K, 3), QueryState) -> means (B, N, K, 3), world frame, float32.
 
-    The state is that after the refinement of the decoded layer. Means are finite for finite
-    offsets. Raises KeyError for a field that the state lacks (the composer rules this out).
+    The state comes from after the refinement of the decoded layer. Finite offsets give finite
+    means. Raises KeyError for a field that the state lacks (the composer prevents this).
     """
 
     slot: ClassVar[str] = "centers"
@@ -54,4 +54,4 @@ class Centers(ModelComponent):
         offsets: Tensor,  # (B, N, K, 3) raw
         state: QueryState,
     ) -> Tensor:
-        """World-frame means."""
+        """Return world-frame means."""

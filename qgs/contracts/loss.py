@@ -1,4 +1,4 @@
-"""Slots `losses` and `supervision`: what training minimises, and after which layers."""
+"""Contracts of the slots `losses` and `supervision` (the layers that losses apply to)."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -13,15 +13,14 @@ from qgs.types import LayerPrediction, Rendering, Views
 
 
 class Loss(Component, torch.nn.Module):
-    """(LayerPrediction, Rendering, target Views, input Views) -> a number to minimise, or several.
+    """Loss: (LayerPrediction, Rendering, target Views, input Views) -> one term or several.
 
-    A loss defines `term`; its `weight`, and the schedule of that, are applied here. Called for each
-    supervised layer with a rendering from the target's cameras, and with all views that the
-    prediction was made from; what is minimised is the sum of all terms, weighted by layer. Term
-    names are unique within a recipe. Every term has a gradient in the prediction or in the
-    rendering.
+    A loss defines `term`; this class applies `weight` and its schedule. Training calls the loss for
+    each supervised layer, with a rendering from the target cameras and all input views of the
+    prediction. It minimises the sum of all terms, weighted by layer. Term names are unique within a
+    recipe. Every term has a gradient in the prediction or in the rendering.
 
-    renderings: which views a call needs, since training may render few at a time
+    renderings: the views that a call needs, since training may render few at a time
         (`training.render_views`). "each": a term is a mean over views, so the loss is called with
         some views at a time and averaged. "all": all target views at once. "none": the loss reads
         no rendering; it gets all target views and a rendering of no views, (B, 0, ...).
@@ -31,11 +30,11 @@ class Loss(Component, torch.nn.Module):
     renderings: ClassVar[Literal["each", "all", "none"]] = "all"
     scheduled: ClassVar[frozenset[str]] = frozenset({"weight"})
     reads_depths: ClassVar[bool] = False
-    """Whether it reads `Views.depths`, which training then decodes where the data has them."""
+    """True if it reads `Views.depths`. Training then decodes them, if the data has depth maps."""
 
     class Config(ComponentConfig):
         weight: float = Field(default=1.0, ge=0)
-        """Factor of this loss in the objective; 0 leaves it out and takes no time."""
+        """Factor of this loss in the objective. 0 skips the loss and saves its time."""
 
     config: Config
 
@@ -47,12 +46,12 @@ class Loss(Component, torch.nn.Module):
         target: Views,  # (B, V)
         inputs: Views,
     ) -> Tensor | Mapping[str, Tensor]:
-        """The loss without its weight, averaged over scenes: 0-d, or several by name."""
+        """Return the unweighted loss, averaged over scenes: a 0-d term, or several by name."""
 
     def forward(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
-        """The terms, weighted, by name: that of the component where there is one; none for 0."""
+        """Return the weighted terms by name, none for weight 0. A single term has `name`."""
         weight = self.config.weight
         # A weight of 0 takes no time: the term is not even computed.
         if not weight:
@@ -70,8 +69,8 @@ class Supervision(Component):
 
     @abstractmethod
     def weights(self, rounds: Sequence[int] = ()) -> Mapping[int, float]:
-        """Layer number to weight, ascending; the weights sum to 1.
+        """Return the weight of each supervised layer, by ascending number; the weights sum to 1.
 
-        1 is the first layer; 0, the start, is the only one of a decoder of depth 0. rounds: numbers
-        of the last layers of rounds of feedback, which are supervised too.
+        1 is the first layer. 0 is the initial state, the only one in a decoder of depth 0.
+        rounds: numbers of the last layers of feedback rounds, which are supervised too.
         """

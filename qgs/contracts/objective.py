@@ -1,4 +1,4 @@
-"""Slot `objective`: which passes of the model a training step makes, and what it minimises."""
+"""Contract of the slot `objective`: the model passes of a training step, and its loss."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -15,9 +15,10 @@ from qgs.types import Cameras, Gaussians, Prediction, Rendering, Views
 class Outcome:
     """The loss that is minimised, and numbers about it; all 0-d.
 
-    total: the sum of the terms, with gradients. terms: by name, weighted, detached.
-    signs: of life, as training watches them: means "psnr" and "alpha", and "deviation", the largest
-        of the views' mean distances to the background.
+    total: the sum of the terms, with gradients.
+    terms: the terms by name, weighted and detached.
+    signs: numbers with which training detects collapse: the means "psnr" and "alpha", and
+        "deviation", the largest of the views' mean distances to the background.
     """
 
     total: Tensor
@@ -26,33 +27,33 @@ class Outcome:
 
 
 class Passes(Protocol):
-    """Functions that training lends to an objective for one step."""
+    """Functions that training gives to an objective for one step."""
 
     def predict(self, inputs: Views) -> Prediction:
-        """A forward pass of the model."""
+        """Run a forward pass of the model."""
         ...
 
     def judge(self, prediction: Prediction, targets: Views, inputs: Views) -> Outcome:
-        """The recipe's losses of every supervised layer, rendered from the cameras of `targets`.
+        """Compute the recipe's losses of every supervised layer, rendered from `targets`' cameras.
 
-        inputs: the views that `prediction` was made from. The losses' gradients are taken here,
-        layer by layer and `training.render_views` views at a time, so that memory grows with
-        neither; `total` passes them on.
+        inputs: the views that `prediction` was made from. This computes the losses' gradients layer
+        by layer, `training.render_views` views at a time, so that memory grows with neither.
+        `total` passes the gradients on.
         """
         ...
 
     def render(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """A rendering with gradients, as `judge` makes it: few views' graphs exist at a time."""
+        """Render with gradients, like `judge`: few views' graphs exist at a time."""
         ...
 
 
 class Objective(Component):
-    """What a training step computes: (input Views, target Views) -> Outcome.
+    """Computation of a training step: (input Views, target Views) -> Outcome.
 
-    It has no parameters and keeps no state. Each pass of the model that it asks for costs as much
-    as another step. Names of its own terms differ from those of the recipe's losses.
+    It has no parameters and keeps no state. Each extra pass of the model costs as much as another
+    step. Names of its own terms must differ from those of the recipe's losses.
 
-    judges_inputs: whether input views may be targets too, see `training.judge_inputs`.
+    judges_inputs: True if input views may be targets too, see `training.judge_inputs`.
     """
 
     slot: ClassVar[str] = "objective"
@@ -60,4 +61,4 @@ class Objective(Component):
 
     @abstractmethod
     def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
-        """Predict from `inputs` or from some of them, judge, and add terms of its own."""
+        """Predict from `inputs` or some of them, compute losses, and add terms of its own."""

@@ -1,4 +1,4 @@
-"""Slot `optimizer`: how gradients change the weights, and how fast."""
+"""Contract of the slot `optimizer`: the update rule of the weights and its learning rate."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -19,17 +19,17 @@ class OptimizerConfig(ComponentConfig):
     """The learning rate: a number, or a schedule such as `{schedule: linear, values: [0, 4.0e-4],
     at: [0, 500]}`."""
     parts: dict[str, Annotated[float, Field(ge=0)]] = Field(default={}, max_length=1000)
-    """Parts of the model to factors of the learning rate: `{encoder: 0.1}`; 0 freezes a part. A
-    part is a path of the recipe, as in `swap`, or a module or parameter of the model; `*`, `?` and
-    `[...]` stand for parts of one segment. It holds for everything below it:
-    `decoder.layers.*.cross_attention` is all cross-attention. Of several that match, the last
-    counts; one that matches nothing is an error."""
+    """Factors of the learning rate for parts of the model, such as `{encoder: 0.1}`. 0 freezes a
+    part. A part is a path in the recipe, as in `swap`, or a module or parameter of the model. `*`,
+    `?` and `[...]` match within one segment of the path. A part includes everything below it:
+    `decoder.layers.*.cross_attention` is all cross-attention. If several match, the last one
+    counts. A part that matches nothing is an error."""
 
 
 class ParameterGroup(TypedDict):
     """Parameters with the same decay and factor; a group of torch's optimisers.
 
-    decays: whether weight decay applies. factor: of the learning rate, from `parts`.
+    decays: True if weight decay applies. factor: factor of the learning rate, from `parts`.
     """
 
     params: list[nn.Parameter]
@@ -40,8 +40,8 @@ class ParameterGroup(TypedDict):
 class Optimizer(Component):
     """An optimiser of torch with its learning rate.
 
-    Training makes one, calls `build` once, and sets the learning rate of every group of torch's
-    optimiser to `learning_rate(...)` times the group's factor before each step. Training saves and
+    Training calls `build` once. Before each step it sets the learning rate of every group of
+    torch's optimiser to `learning_rate(...)` times the group's factor. Training also saves and
     restores the state of torch's optimiser.
 
     The kinds of schedules that a recipe can write are in `qgs.tokengs.schedules`.
@@ -51,38 +51,38 @@ class Optimizer(Component):
     scheduled: ClassVar[frozenset[str]] = frozenset({"learning_rate"})
 
     class Config(OptimizerConfig):
-        """No options but those of every optimiser."""
+        """Options of this optimiser; by default only the common ones."""
 
     def __init__(self, config: OptimizerConfig, training: TrainingConfig | None = None) -> None:
-        """training: its budget of steps and seconds."""
+        """Store the options and `training`, which has the budget of steps and seconds."""
         self.config = config
         # Without a recipe, such as in a test of a component.
         self.training = training or TrainingConfig()
 
     def check(self) -> None:
-        """Raise ValueError where the options do not fit the budget; called once it is built."""
+        """Raise ValueError if the options do not fit the budget. Called after the constructor."""
         return
 
     @abstractmethod
     def build(self, groups: Sequence[ParameterGroup]) -> torch.optim.Optimizer:
-        """Torch's optimiser of `groups`; groups of its own keep the `factor` of what they hold."""
+        """Return torch's optimiser of `groups`. Groups of its own must keep each `factor`."""
 
     def learning_rate(self, step: int, seconds: float) -> float:
-        """Rate of the `step`-th optimiser step (0 is the first), `seconds` into training.
+        """Return the rate of optimiser step `step` (0 is the first), `seconds` into training.
 
-        Called with ascending steps, `config` at this step's values. By default the option
-        `learning_rate`; another rule should leave it so where `follows_schedule`.
+        Called with ascending steps; `config` has the values of this step. The default returns the
+        option `learning_rate`. Another rule should do the same if `follows_schedule`.
         """
         return self.config.learning_rate
 
     @property
     def follows_schedule(self) -> bool:
-        """Return whether the recipe writes a schedule for `learning_rate`."""
+        """True if the recipe has a schedule for `learning_rate`."""
         return "learning_rate" in self.schedules
 
     def state(self) -> Mapping[str, Any]:
-        """JSON values that `learning_rate` needs to continue in another process."""
+        """Return the JSON values that `learning_rate` needs to continue in another process."""
         return {}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state`."""
+        """Continue from `state`."""

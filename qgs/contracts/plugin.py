@@ -1,4 +1,4 @@
-"""The plugin, which a distribution offers to recipes."""
+"""The plugin: a distribution's components for recipes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -6,25 +6,25 @@ from dataclasses import dataclass, field
 from qgs.contracts.component import Component, ComponentConfig
 
 CONTRACT_VERSION = 1
-"""Goes up when components written for the old contracts no longer fit."""
+"""Version of the contracts. A new version breaks components written for the old one."""
 
 ENTRY_POINT_GROUP = "qgs.plugins"
-"""Entry points at which a distribution lists its `Plugin` object, under the plugin's name."""
+"""Entry point group in which a distribution lists its `Plugin`, under the plugin's name."""
 
 
 @dataclass(frozen=True)
 class Plugin:
-    """Components under one name. Importing it has no side effect.
+    """Components under one name. Importing a plugin must have no side effects.
 
     name: the part of `type: NAME/component` before the slash.
     contract_version: the CONTRACT_VERSION that the components were written for.
     components: component classes; a `name` is unique within its slot.
     examples: options that `qgs check-plugin` tries in addition to the defaults of every component.
     models: files of trained models by name, relative to the folder of the module that the entry
-        point names; PLUGIN/NAME stands for the path in every command. A card in the same
+        point names. Every command accepts PLUGIN/NAME in place of the path. A card in the same
         folder describes the model: models/mine.md for models/mine.safetensors.
-    exemptions: checks of the contract suite that a component is known to fail, and why; by class,
-        or by options where it passes with others.
+    exemptions: checks of the contract suite that a component is known to fail, with the reason.
+        The key is the class, or options if the component passes with other options.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Slot `queries`: the state that a scene starts from."""
+"""Contract of the slot `queries`, the initial state of a scene."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -15,13 +15,14 @@ GROWTH_NOISE = 0.01
 
 
 class Queries(ModelComponent):
-    """(ImageMemory, Views) -> QueryState of N queries: features (B, N, D), fields in `writes`.
+    """Queries: (ImageMemory, Views) -> QueryState of N queries.
 
-    Spatial fields are float32 in the world frame, (B, N, ...). Queries that read the memory say
-    which parts of it they need in `reads`, as `memory.features`. Scenes are independent; a
-    state whose scenes have different numbers of queries has a mask.
+    The state has features (B, N, D) and the fields in `writes`. Spatial fields are (B, N, ...)
+    float32 in the world frame. Queries that read the memory list the parts in `reads`, such as
+    `memory.features`. Scenes are independent. A state whose scenes have different numbers of
+    queries has a mask.
 
-    reads_cameras: whether they read `views.cameras`. Those that do not may be given `Photos`.
+    reads_cameras: True if they read `views.cameras`. If False, they also accept `Photos`.
     """
 
     slot: ClassVar[str] = "queries"
@@ -29,21 +30,21 @@ class Queries(ModelComponent):
 
     @property
     def count(self) -> int | None:
-        """N, the number of queries: the option `count`; None where it depends on the views."""
+        """Number N of queries: the option `count`; None if it depends on the views."""
         return getattr(self.config, "count", None)
 
     @abstractmethod
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
-        """The initial state of every scene."""
+        """Return the initial state of every scene."""
 
     def resized(
         self, learned: Mapping[str, Tensor], generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """A state dict for these queries, made of one `learned` with another number of queries.
+        """Return a state dict for these queries, made from one with another number of queries.
 
-        learned: on the CPU; shapes differ from ours in the first axis alone, the queries.
-        Shrinking keeps the first N. Growing keeps all; each new query i copies query i modulo
-        their number, plus noise of N(0, 0.01) on all parameters (LocusGS release, finetuning).
+        learned: the old state dict, on the CPU. Shapes differ from ours only in the first axis, the
+        queries. Shrinking keeps the first N queries. Growing keeps all; new query i copies query i
+        modulo their number, plus noise N(0, 0.01) on all parameters (LocusGS release, finetuning).
         """
         own = {name: values.shape for name, values in self.state_dict().items()}
         return {
@@ -52,31 +53,31 @@ class Queries(ModelComponent):
         }
 
     def support(self, state: QueryState) -> SpatialSupport | None:
-        """Space in which each query of `state` looks; None for queries without a position."""
+        """Return the spatial support of each query; None for queries without a position."""
         return None
 
 
 class LearnedQueries(Queries):
-    """Queries that start from parameters alone: the same in all scenes, whatever the photos."""
+    """Queries whose initial state depends only on parameters, so it is the same in all scenes."""
 
     reads_cameras = False
 
     @property
     def count(self) -> int:
-        """N, the number of queries: the option `count`."""
+        """Number N of queries: the option `count`."""
         return getattr(self.config, "count")  # noqa: B009 (an option of subclasses)
 
     @abstractmethod
     def start(self, batch_size: int) -> QueryState:
-        """The initial state, expanded to `batch_size` scenes."""
+        """Return the initial state, expanded to `batch_size` scenes."""
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
-        """The initial state of as many scenes as the memory has."""
+        """Return the initial state of every scene in the memory."""
         return self.start(memory.features.shape[0])
 
 
 def _resized(values: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """The first `count` items of `values`, or all of them and then noisy copies in turn."""
+    """Return the first `count` items of `values`, or all of them and then noisy copies in turn."""
     if count <= len(values):
         return values[:count]
     # In turn, so that every learned query has as many descendants as the others.

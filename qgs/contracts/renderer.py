@@ -1,4 +1,4 @@
-"""Slot `renderer`: Gaussians to images, and how a renderer checks and prepares what it is given."""
+"""Contract of the slot `renderer`, and helpers that check and prepare a renderer's inputs."""
 
 from abc import abstractmethod
 from typing import Annotated, ClassVar, TypeAlias
@@ -16,22 +16,22 @@ Channel: TypeAlias = Annotated[float, Field(ge=0, le=1)]
 
 
 class RendererConfig(ComponentConfig):
-    """Splatting settings that every renderer obeys (defaults: both releases, gsplat 1.5.3)."""
+    """Splatting options of every renderer (defaults: both releases, gsplat 1.5.3)."""
 
     near: float = Field(default=0.025, gt=0)
-    """Gaussians nearer than this camera-frame z are dropped, world units."""
+    """Drop Gaussians nearer than this camera-frame z, in world units."""
     far: float = Field(default=125.0, gt=0, validate_default=True)
-    """Gaussians beyond this camera-frame z are dropped, world units."""
+    """Drop Gaussians beyond this camera-frame z, in world units."""
     dilation: float = Field(default=0.3, ge=0)
-    """Added to the diagonal of the projected covariance, pixel^2."""
+    """Number added to the diagonal of the projected covariance, in pixel^2. 0 adds nothing."""
     alpha_min: float = Field(default=1 / 255, gt=0, lt=1)
-    """Contributions to a pixel below this are skipped."""
+    """Skip contributions to a pixel below this alpha."""
     alpha_cap: float = Field(default=0.999, gt=0, lt=1)
-    """Upper bound of one Gaussian's contribution to a pixel."""
+    """Largest alpha of one Gaussian at a pixel."""
     transmittance_min: float = Field(default=1e-4, ge=0, lt=1)
-    """A pixel takes no more Gaussians once its transmittance would fall to this."""
+    """Stop adding Gaussians to a pixel before its transmittance falls to this."""
     background: tuple[Channel, Channel, Channel] = (0.5, 0.5, 0.5)
-    """RGB in [0, 1] behind everything."""
+    """Background colour, RGB in [0, 1]."""
 
     @field_validator("far")
     @classmethod
@@ -49,14 +49,14 @@ class RendererConfig(ComponentConfig):
 class Renderer(Component, torch.nn.Module):
     """EWA splatting: (Gaussians (B, G), Cameras (B, V), background) -> Rendering (B, V).
 
-    Colours are those that `Gaussians.sh` gives along the direction from the camera's centre to the
-    mean. `Gaussians.features` are blended with the weights of the colours, over 0.
-    Differentiable in all Gaussian parameters. Images and gradients are finite, also for no
+    Colours come from `Gaussians.sh`, along the direction from the camera's centre to the mean.
+    `Gaussians.features` are blended with the same weights as colours, over 0. The rendering is
+    differentiable in all Gaussian parameters. Images and gradients are finite, even without
     Gaussians and for Gaussians behind the camera, off screen or huge.
 
     devices: types of torch devices that it renders on, such as "cpu", "cuda", "mps".
-    camera_gradients: those of "c2w" and "intrinsics" that have a gradient on all these devices (of
-        c2w, along rotations and translations). A ValueError refuses others that require one.
+    camera_gradients: "c2w" and "intrinsics", if they get gradients on all these devices (c2w along
+        rotations and translations). If another one requires a gradient, a ValueError is raised.
     """
 
     slot: ClassVar[str] = "renderer"
@@ -65,7 +65,7 @@ class Renderer(Component, torch.nn.Module):
     camera_gradients: ClassVar[tuple[str, ...]] = ("c2w", "intrinsics")
 
     class Config(RendererConfig):
-        """The settings of every renderer; add your own below."""
+        """Options of this renderer; by default only the common ones."""
 
     config: RendererConfig
     writes: ClassVar[Fields] = {
@@ -83,20 +83,20 @@ class Renderer(Component, torch.nn.Module):
     ) -> Rendering:
         """Render every scene from each of its cameras.
 
-        background: None for the configured one.
+        background: RGB; None for the option `background`.
         Raises ValueError for Gaussians and cameras of different batch sizes or devices, and for
-        cameras that require a gradient which there is not.
+        cameras that require a gradient outside of `camera_gradients`.
         """
 
 
 def check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
-    """Raise ValueError unless Gaussians (B, G) and cameras (B, V) belong together."""
+    """Raise ValueError unless Gaussians (B, G) and cameras (B, V) match in shape and device."""
     means = gaussians.means
     if means.ndim != 3 or len(cameras.shape) != 2:
         raise ValueError(
-            f"a renderer takes Gaussians of B scenes, means (B, G, 3), and cameras of shape "
-            f"(B, V), got {tuple(means.shape)} and {tuple(cameras.shape)}; add leading dimensions "
-            "for a single scene or view"
+            f"a renderer needs Gaussians with means (B, G, 3) and cameras of shape (B, V), got "
+            f"{tuple(means.shape)} and {tuple(cameras.shape)}; add leading dimensions for a single "
+            "scene or view"
         )
     if len(means) != cameras.shape[0]:
         raise ValueError(
@@ -112,16 +112,16 @@ def check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
 
 
 def raise_precision(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
-    """Both as float64 if the means are, as float32 otherwise."""
+    """Convert both to float64 if the means are float64, else to float32."""
     # Half precision would move the projection of a Gaussian by pixels.
     dtype = torch.promote_types(gaussians.means.dtype, torch.float32)
     return gaussians.to(dtype), cameras.to(dtype)
 
 
 def channels_of(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """What is blended: colours as cameras see them, then features.
+    """Return the channels to blend: colours as each camera sees them, then features.
 
-    (B, V, G, 3 + F); (B, 1, G, 3 + F) where all cameras see the same.
+    Shape (B, V, G, 3 + F), or (B, 1, G, 3 + F) if all cameras see the same colours.
     """
     colors = seen_colors(gaussians, cameras)
     if gaussians.features is None:
@@ -133,7 +133,7 @@ def channels_of(gaussians: Gaussians, cameras: Cameras) -> Tensor:
 def background_of(
     background: Tensor | None, configured: tuple[float, float, float], like: Tensor
 ) -> Tensor:
-    """The background RGB (3,) in the dtype and on the device of `like`."""
+    """Return the background RGB (3,) in the dtype and on the device of `like`."""
     if background is None:
         # A tensor of Python numbers would make the GPU wait for a copy.
         return constant(configured, like)

@@ -8,34 +8,39 @@ from qgs.contracts.component import ComponentConfig, OptionError
 from qgs.precision import Precision
 
 Tuned: TypeAlias = Literal["queries", "latents"]
-"""Parts that can be tuned at test time."""
+"""The parts of a model that test-time tuning can fit."""
 
 
 class ViewsConfig(ComponentConfig):
-    """How views are drawn from a scene and brought into the model's frame (TokenGS release)."""
+    """Settings for drawing views from a scene and moving them into the model's frame.
+
+    The defaults are those of the TokenGS release.
+    """
 
     inputs: int = Field(default=4, ge=1)
     """Input views per sample."""
     targets: int = Field(default=4, ge=1)
-    """Target views per sample, drawn from the span of the inputs."""
+    """Target views per sample, drawn between the first and the last input."""
     gap: tuple[int, int] = (10, 40)
-    """[min, max] frames, or times where they are known, from the first input to the last, which
-    count too; it shrinks to what a scene has, with a warning where that is below min."""
+    """Distance from the first to the last input, [min, max] in frames. Neighbours have distance 1.
+    Scenes with times count distinct times instead of frames. Shorter scenes use the distance that
+    they have, with a warning below min."""
     frame: Literal["first_cam", "mean_cam", "given"] = "first_cam"
-    """The camera that becomes the identity: the first input, the mean of inputs; "given": none."""
+    """Camera that becomes the identity: "first_cam" is the first input, "mean_cam" the mean of the
+    inputs. "given" keeps the poses of the data."""
     scale: Literal["constant", "distance", "auto", "search"] = "constant"
-    """Translations are multiplied by `scale_factor`; with "distance", they are divided by the
-    largest distance from the first input camera to another one before. "auto" takes one factor per
-    scene, which brings the point nearest to the optical axes of all its cameras to a depth of 1.
-    "search", for reconstructions alone, takes the one at which the model renders photos best."""
+    """Rule for scaling camera positions. "constant" multiplies them by `scale_factor`. "distance"
+    first divides them by the largest distance from the first input camera to another one. "auto"
+    computes one factor per scene: it brings the point nearest to all optical axes to depth 1.
+    "search" takes the factor at which the model renders photos best, in reconstructions only."""
     scale_factor: float = Field(default=0.15, gt=0)
-    """Factor of all translations, see `scale`; no effect with "auto" and "search"."""
+    """Factor for all camera positions, see `scale`. It has no effect with "auto" and "search"."""
     mirror: float = Field(default=0.5, ge=0, le=1)
     """Probability of mirroring a training sample in x."""
     pose_noise: float = Field(default=0.0, ge=0, le=45)
-    """Degrees by which the poses of the inputs are off, in training and evaluation: the standard
-    deviation, about each axis, of their rotation and of their direction from the first input,
-    which sets the world and is exact, as targets are. What is reconstructed keeps its poses."""
+    """Noise on the input poses in training and evaluation: standard deviation in degrees, about
+    each axis, of the rotation and of the direction from the first input. The first input and the
+    targets stay exact. Reconstructions ignore this option. Default 0: no noise."""
 
     @field_validator("gap")
     @classmethod
@@ -51,46 +56,48 @@ class ViewsConfig(ComponentConfig):
 
 
 class TrainingConfig(ComponentConfig):
-    """How a model is trained, the optimiser aside (defaults: LocusGS release, base stage)."""
+    """Training settings, except for the optimiser (defaults: LocusGS release, base stage)."""
 
     steps: int = Field(default=150_000, ge=1)
-    """Optimiser steps."""
+    """Number of optimiser steps."""
     seconds: float | None = Field(default=None, gt=0)
-    """Time budget; training ends when this or `steps` is used up. null: `steps` alone."""
+    """Time budget. Training ends when this or `steps` is used up. null: no time limit."""
     batch_size: int = Field(default=16, ge=1)
-    """Scenes per optimiser step, over all processes; they split evenly over processes and
-    `accumulate`."""
+    """Scenes per optimiser step, over all processes. It must be a multiple of the number of
+    processes times `accumulate`."""
     accumulate: int = Field(default=1, ge=1)
-    """Batches that a process makes of its scenes of a step, one after the other: less memory."""
+    """Batches into which each process splits its scenes of a step. It computes them one after the
+    other, so a larger number needs less memory."""
     clip: float = Field(default=1.0, gt=0)
-    """Largest norm of the gradient; a larger one is scaled down to it."""
+    """Largest norm of the gradient. A larger gradient is scaled down to it."""
     precision: Precision = "bf16"
-    """What the model computes in; bf16 is torch's autocast, weights stay float32."""
+    """Precision of the model's computations. bf16 uses torch's autocast; weights stay float32."""
     save_every: int = Field(default=1000, ge=0)
-    """Steps between checkpoints; 0 saves at the end and before evaluations only."""
+    """Steps between checkpoints. 0 saves only at the end and before evaluations."""
     collapse_window: int = Field(default=50, ge=10, le=100)
-    """Steps in a row without signs of life (empty renderings, no gradient) that end training."""
+    """Stop training after this many steps in a row with empty renderings or without a gradient."""
     workers: int = Field(default=0, ge=0)
-    """Processes that decode data; 0 for a thread of the training process."""
+    """Number of processes that load data. 0 uses a thread of the training process."""
     render_views: int = Field(default=0, ge=0)
-    """Target views rendered at a time, which bounds memory and changes no gradient; 0 for all."""
+    """Target views rendered at a time. Fewer need less memory; gradients stay the same. 0: all."""
     judge_inputs: bool = False
-    """Whether the input views are rendered and judged as target views are, after them."""
+    """Render the input views too, after the target views, and compute the losses on both."""
     ema: float | None = Field(default=None, gt=0, lt=1)
-    """Decay of a moving average of the weights, saved and evaluated beside them; null for none."""
+    """Decay of a moving average of the weights, which is saved and evaluated too. null: none."""
     on_nonfinite: Literal["stop", "skip"] = "stop"
-    """What a step with a NaN or infinite loss or gradient does; its first bad tensor is named."""
+    """Stop, or skip the step, when the loss or a gradient is NaN or infinite. The message names the
+    first bad tensor."""
     on_bad_sample: Literal["stop", "skip"] = "stop"
-    """What a sample that cannot be made does, of a damaged image for example; "skip" takes one of
-    the next scenes instead, with a warning."""
+    """Stop, or skip the sample, when one fails to load (a damaged image, for example). "skip" takes
+    one of the next scenes instead, with a warning."""
     evaluate_every: int = Field(default=0, ge=0)
-    """Steps between evaluations with pictures; 0 for none."""
+    """Steps between evaluations with pictures. 0: none."""
     trackers: tuple[str, ...] = ()
-    """Further destinations of numbers and pictures: tensorboard, wandb, or a plugin's; the folder
-    of the run always has them."""
+    """Trackers that also get all numbers and pictures: tensorboard, wandb, or one of a plugin. The
+    folder of the run always gets them."""
 
     def scenes_per_batch(self, processes: int) -> int:
-        """Scenes in a batch of one of `processes`; ValueError where they do not split evenly."""
+        """Return the number of scenes in a batch of a process; ValueError for an uneven split."""
         parts = processes * self.accumulate
         scenes, left = divmod(self.batch_size, parts)
         if left:
@@ -106,30 +113,32 @@ class TrainingConfig(ComponentConfig):
 
 
 class EvaluationConfig(ComponentConfig):
-    """What `qgs eval` runs: which views are judged, after how much tuning; see also `metrics`."""
+    """Settings of `qgs eval`: the views to score, and test-time tuning. See also `metrics`."""
 
     scenes: int = Field(default=32, ge=1)
-    """Test scenes, and windows of one with held-out frames, at most; no effect beside `index`."""
+    """Largest number of test scenes, and of windows of a scene with held-out frames. It has no
+    effect if `index` is set."""
     samples: int = Field(default=1, ge=1)
-    """Samples drawn from a scene; no effect beside `index` and for scenes with held-out frames."""
+    """Samples drawn from each scene. It has no effect if `index` is set, or for scenes with
+    held-out frames."""
     seed: int = Field(default=0, ge=0)
-    """Of the samples that are drawn; no effect where `samples` has none."""
+    """Seed for drawing the samples (default 0). It has no effect where `samples` has none."""
     index: str | None = None
-    """JSON file {scene: null | {"context": [frames], "target": [frames]}} of the views to judge
-    (pixelSplat's format), relative to the working directory; null draws them."""
+    """JSON file with the views to score, relative to the working directory, in pixelSplat's format:
+    {scene: null | {"context": [frames], "target": [frames]}}. null draws the views."""
     protocol: str | None = None
-    """Name of these settings in tables; null takes the name of the index file."""
+    """Name of these settings in tables. null uses the name of the index file."""
     tuning: Tuned = "queries"
-    """What tuning fits to a scene's input views: its queries, or the features of its image memory,
-    with an encoder that makes keys and values of them anew."""
+    """Part that tuning fits to a scene's input views: its queries, or the features of its image
+    memory ("latents"). "latents" needs an encoder that recomputes keys and values from features."""
     tuning_steps: int = Field(default=0, ge=0)
-    """Steps of tuning on the input views of each scene before it is judged, with the recipe's
-    photometric loss (TokenGS: 50); 0 for none."""
+    """Tuning steps on the input views of each scene before it is scored, with the recipe's
+    photometric loss (TokenGS: 50). 0: no tuning."""
     tuning_rate: float | None = Field(default=None, gt=0)
-    """Learning rate of tuning, by Adam; null for TokenGS's, 1e-4 of queries and 1e-2 of latents."""
+    """Learning rate of tuning (Adam). null: as in TokenGS, 1e-4 for queries, 1e-2 for latents."""
 
     @property
     def rate(self) -> float:
-        """`tuning_rate`, or the default of what is tuned."""
+        """Learning rate of tuning: `tuning_rate`, or the default of the tuned part."""
         # TokenGS tunes features with a hundred times the rate of queries.
         return self.tuning_rate or {"queries": 1e-4, "latents": 1e-2}[self.tuning]

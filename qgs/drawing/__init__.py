@@ -1,1 +1,1 @@
-"""Tensors to pictures and figures."""
+"""Drawing of tensors as pictures and figures."""

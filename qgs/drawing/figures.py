@@ -1,4 +1,4 @@
-"""The look of all figures: type, grids of pictures with a depth scale."""
+"""Style of all figures, and grids of pictures with a depth scale."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -35,7 +35,10 @@ def grid_figure(
     columns: Sequence[str],
     depths: tuple[float, float] | None = None,
 ) -> Figure:
-    """Draw rows of pictures under column titles; depths: range of a scale beside the last row."""
+    """Draw rows of pictures under column titles.
+
+    depths: range of a depth scale beside the last row; None for no scale.
+    """
     height, width, _ = next(iter(rows.values()))[0].shape
     row_inches = COLUMN_INCHES * height / width
     # Labels, titles and the scale take the rest.

@@ -1,4 +1,4 @@
-"""Tensors to pictures (H, W, 3) uint8, of RGB, depth and other sizes; PNG and GIF files."""
+"""Pictures (H, W, 3) uint8 of RGB, depth and other values; PNG and GIF files."""
 
 from collections.abc import Sequence
 from io import BytesIO
@@ -14,7 +14,7 @@ from qgs.types import Cameras
 
 # uint8 (H, W, 3)
 Picture = np.ndarray
-# Where there is nothing to show: no depth, no attention.
+# Colour of pixels without depth or attention.
 NOTHING = (232, 233, 235)
 DEPTH_MAP = "viridis_r"
 # Pixels between pictures in a row.
@@ -43,7 +43,7 @@ def shaded(values: Tensor, low: float, high: float, colors: str) -> Picture:
 
 
 def depth_range(depths: Tensor) -> tuple[float, float]:
-    """Return the 2nd and 98th percentile of values above 0, for a scale that pictures share."""
+    """Return the 2nd and 98th percentile of values above 0, for a common scale of pictures."""
     depths = depths.detach()
     seen = depths[depths > 0].float()
     if not seen.numel():
@@ -54,7 +54,7 @@ def depth_range(depths: Tensor) -> tuple[float, float]:
 
 
 def side_by_side(pictures: list[Picture]) -> Picture:
-    """Join pictures of one height in a row, white between them."""
+    """Join pictures of equal height in a row, with white gaps."""
     left = ((0, 0), (GAP, 0), (0, 0))
     padded = [np.pad(picture, left, constant_values=255) for picture in pictures]
     return np.concatenate(padded, 1)[:, GAP:]

@@ -1,4 +1,4 @@
-"""Fixed numbers as tensors, made on their device."""
+"""Constant tensors, created on their device."""
 
 from collections.abc import Sequence
 
@@ -7,5 +7,5 @@ from torch import Tensor
 
 
 def constant(values: Sequence[float], like: Tensor) -> Tensor:
-    """`values` (N,) in the dtype and on the device of `like`; the host waits for no copy."""
+    """Return `values` (N,) in the dtype and on the device of `like`, without waiting for a copy."""
     return torch.stack([like.new_full((), value) for value in values])

@@ -1,8 +1,8 @@
-"""Real spherical harmonics of degrees 1 to 3: colours that depend on the direction of sight.
+"""Real spherical harmonics of degrees 1 to 3, for colours that depend on the view direction.
 
 Order, signs and factors are those of the 3DGS release (Kerbl et al. 2023, utils/sh_utils.py) and of
-gsplat: the order m rises from -l to l in each degree l, with the Condon-Shortley phase. Sloan,
-Efficient Spherical Harmonic Evaluation (2013), has the formulas.
+gsplat: m rises from -l to l in each degree l, with the Condon-Shortley phase. The formulas are in
+Sloan, Efficient Spherical Harmonic Evaluation (2013).
 """
 
 import torch
@@ -13,7 +13,7 @@ from qgs.precision import full_precision
 from qgs.types import SH_COUNTS, Cameras, Gaussians
 
 SH_C0 = 0.28209479177387814
-"""The harmonic of degree 0: colour = 0.5 + SH_C0 * f_dc (3DGS release)."""
+"""Harmonic of degree 0: colour = 0.5 + SH_C0 * f_dc (3DGS release)."""
 _C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 _C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658)
@@ -21,7 +21,7 @@ _C3_INNER = (0.3731763325901154, 1.445305721320277)
 
 
 def harmonics(directions: Tensor, count: int) -> Tensor:
-    """The first `count` (3, 8 or 15) functions (..., count) at unit `directions` (..., 3)."""
+    """Evaluate the first `count` (3, 8 or 15) functions at unit `directions` (..., 3)."""
     x, y, z = directions.unbind(-1)
     xx = x * x
     yy = y * y
@@ -41,10 +41,10 @@ def harmonics(directions: Tensor, count: int) -> Tensor:
 
 @full_precision
 def seen_colors(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Colours (B, V, G, 3) of Gaussians (B, G) in cameras (B, V), at least 0.
+    """Return the colours (B, V, G, 3) of Gaussians (B, G) seen by cameras (B, V), at least 0.
 
-    Without `sh` they are `colors`, (B, 1, G, 3) for all cameras. The direction is that from a
-    camera's centre to a mean. Differentiable in colors, sh, means and c2w.
+    Without `sh` they are `colors`, (B, 1, G, 3) for all cameras. The direction points from the
+    camera's centre to the mean. Differentiable in colors, sh, means and c2w.
     """
     if gaussians.sh is None:
         return gaussians.colors[:, None]
@@ -57,10 +57,10 @@ def seen_colors(gaussians: Gaussians, cameras: Cameras) -> Tensor:
 
 @full_precision
 def rotated(sh: Tensor, rotation: Tensor) -> Tensor:
-    """Coefficients (..., C, 3) in a world turned by `rotation` (3, 3), which turns what they paint.
+    """Rotate coefficients (..., C, 3), and thus the colours they describe, by `rotation` (3, 3).
 
-    Turned functions are sums of the others of their degree, whose factors are found in float64
-    from values at directions all around.
+    A rotated function is a sum of the functions of its degree. The factors are fitted in float64 to
+    values at random directions.
     """
     directions = torch.randn(64, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     directions = F.normalize(directions, dim=-1)

@@ -10,7 +10,7 @@ from qgs.types import Cameras
 
 @full_precision
 def pixel_directions(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
-    """Camera-frame directions with z = 1 through the pixel centres.
+    """Return camera-frame directions with z = 1 through the pixel centres.
 
     intrinsics (..., 4) -> (..., H, W, 3). Pixel centres lie at +0.5.
     """
@@ -28,7 +28,7 @@ def pixel_directions(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
 
 @full_precision
 def camera_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """World-frame origins and unit directions through the pixel centres, both (..., H, W, 3)."""
+    """Return world-frame origins and unit directions of pixel rays, both (..., H, W, 3)."""
     c2w = cameras.c2w
     directions = F.normalize(pixel_directions(cameras.intrinsics, cameras.size), dim=-1)
     directions = torch.einsum("...ij,...hwj->...hwi", c2w[..., :3, :3], directions)
@@ -36,7 +36,7 @@ def camera_rays(cameras: Cameras) -> tuple[Tensor, Tensor]:
 
 
 def plucker_rays(cameras: Cameras) -> Tensor:
-    """Plücker map (..., 6, H, W): moment o x d, then the unit direction d (TokenGS release)."""
+    """Return Plücker maps (..., 6, H, W): moment o x d, then direction d (TokenGS release)."""
     origins, directions = camera_rays(cameras)
     moments = torch.linalg.cross(origins, directions, dim=-1)
     return torch.cat([moments, directions], -1).movedim(-1, -3)
@@ -44,7 +44,7 @@ def plucker_rays(cameras: Cameras) -> Tensor:
 
 @full_precision
 def patch_rays(plucker: Tensor, patch_size: int) -> Tensor:
-    """Mean Plücker ray of each patch, not renormalised.
+    """Return the mean Plücker ray of each patch, not renormalised.
 
     plucker (B, V, 6, H, W) -> (B, V*H/P*W/P, 6), ordered view, row, column.
     """

@@ -1,4 +1,4 @@
-"""Points into cameras and pixels, quaternions and their matrices, worlds to worlds."""
+"""Transforms of points to cameras and pixels, of quaternions, and of Gaussians."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,7 +27,7 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 
 @full_precision
 def unit(vectors: Tensor, otherwise: Sequence[float] = (1.0, 0.0, 0.0, 0.0)) -> Tensor:
-    """Vectors (..., C) of length 1; `otherwise`, the identity as a quaternion, for zeros."""
+    """Normalise vectors (..., C); zeros become `otherwise` (default: the identity quaternion)."""
     length = vectors.norm(dim=-1, keepdim=True)
     divisor = torch.where(length > 0, length, 1)
     return torch.where(length > 0, vectors / divisor, constant(otherwise, vectors))
@@ -35,7 +35,7 @@ def unit(vectors: Tensor, otherwise: Sequence[float] = (1.0, 0.0, 0.0, 0.0)) -> 
 
 @full_precision
 def quat_product(left: Tensor, right: Tensor) -> Tensor:
-    """Hamilton products (..., 4), w x y z: the rotation `right`, then the rotation `left`."""
+    """Return Hamilton products (..., 4), w x y z: the rotation `right`, then `left`."""
     w, v = left.split((1, 3), -1)
     w2, v2 = right.split((1, 3), -1)
     real = w * w2 - (v * v2).sum(-1, keepdim=True)
@@ -44,16 +44,16 @@ def quat_product(left: Tensor, right: Tensor) -> Tensor:
 
 @full_precision
 def to_camera(points: Tensor, cameras: Cameras) -> Tensor:
-    """Camera-frame points (B, V, P, 3) of world points (B, P, 3) in cameras (B, V)."""
+    """Transform world points (B, P, 3) to the frames of cameras (B, V) -> (B, V, P, 3)."""
     w2c = cameras.w2c
     return points[:, None] @ w2c[..., :3, :3].mT + w2c[..., None, :3, 3]
 
 
 @full_precision
 def to_pixels(camera_points: Tensor, intrinsics: Tensor) -> Tensor:
-    """Pixels (..., P, 2) of camera-frame points (..., P, 3) under intrinsics (..., 4).
+    """Project camera-frame points (..., P, 3) with intrinsics (..., 4) to pixels (..., P, 2).
 
-    The division by z is unguarded: a point at z = 0 gives inf or NaN.
+    A point at z = 0 gives inf or NaN.
     """
     focal = intrinsics[..., None, :2]
     principal = intrinsics[..., None, 2:]
@@ -62,7 +62,7 @@ def to_pixels(camera_points: Tensor, intrinsics: Tensor) -> Tensor:
 
 @full_precision
 def moved(gaussians: Gaussians, pose: Tensor, factor: float) -> Gaussians:
-    """The Gaussians enlarged by `factor` about the origin, then placed by the rigid pose (4, 4)."""
+    """Scale Gaussians by `factor` about the origin, then move them by the rigid pose (4, 4)."""
     from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
     pose = pose.to(gaussians.means)

@@ -1,7 +1,7 @@
-"""Compiled loops of the renderer `qgs/cpu`, by numba.
+"""Loops of the renderer `qgs/cpu` and of SSIM, compiled by numba.
 
-Nothing here is needed to understand a model. Each kernel computes what a few lines of torch say
-elsewhere, which are its oracle in the tests, without tensors of all pairs.
+You can understand a model without reading them. Each kernel computes the same as a few lines of
+torch elsewhere, without tensors of all pairs. Tests compare it with those lines.
 """
 
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile `function` with numba on first use, kept on disk where a place can be written."""
+    """Compile `function` with numba on first use; cache it on disk if a folder is writable."""
     from numba import njit
 
     options = {

@@ -1,8 +1,8 @@
-"""Numba kernels of `qgs/cpu`: Gaussians to splats, and their gradients.
+"""Numba kernels of `qgs/cpu` that project Gaussians to splats, and their gradients.
 
-The formulas are those of `reference.project`, whose autograd these kernels are tested against.
-A unit of work is a range of one scene's Gaussians in all of its views, so that gradients add up
-over the views in a fixed order. Vectors are tuples; a matrix is the tuple of its rows.
+The formulas are those of `reference.project`; tests compare the kernels with its autograd. A unit
+of work is a range of one scene's Gaussians in all views of the scene, so that gradients are summed
+over views in a fixed order. Vectors are tuples; a matrix is a tuple of its rows.
 
 With C the rotation and p the position of c2w, F = R S the factor of the covariance and m the mean,
 the camera sees C^T (m - p) and the factor C^T F.
@@ -12,7 +12,7 @@ import numpy as np
 
 from qgs.kernels import kernel
 
-# Of C by rows, p, fx, fy, cx, cy.
+# Number of gradients: C by rows, p, fx, fy, cx, cy.
 CAMERA_GRADIENTS = 16
 
 _ZERO = np.float32(0)
@@ -22,7 +22,7 @@ _TWO = np.float32(2)
 # A quaternion's norm is at least this, as in F.normalize.
 _SHORTEST = np.float32(1e-12)
 _LOG2_E = np.float32(1.4426950408889634)
-# Of a power of 2.
+# Added to a power of 2 against rounding.
 _SLACK = np.float32(0.05)
 # Half extent in pixels that still converts to an integer.
 _LARGEST = np.float32(1e9)
@@ -40,7 +40,7 @@ def _cross(a, b):
 
 @kernel
 def _plus(a, s, b):
-    """a + s b."""
+    """Return a + s b."""
     return (a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2])
 
 
@@ -51,7 +51,7 @@ def _times(s, a):
 
 @kernel
 def _combine(a, rows):
-    """sum_i a_i rows_i."""
+    """Return sum_i a_i rows_i."""
     return _plus(_plus(_times(a[0], rows[0]), a[1], rows[1]), a[2], rows[2])
 
 
@@ -74,7 +74,7 @@ def _four(row):
 
 @kernel
 def _rotation(quat):
-    """Rows of the rotation matrix, the unit quaternion and the norm it was divided by."""
+    """Return the rows of the rotation matrix, the unit quaternion and the original norm."""
     w, x, y, z = _four(quat)
     norm = max(np.sqrt(w * w + x * x + y * y + z * z), _SHORTEST)
     w = w / norm
@@ -91,7 +91,7 @@ def _rotation(quat):
 
 @kernel
 def _scaled_columns(rows, scale):
-    """The columns of R S."""
+    """Return the columns of R S."""
     columns = _columns(rows)
     return (
         _times(scale[0], columns[0]), _times(scale[1], columns[1]), _times(scale[2], columns[2]),
@@ -105,7 +105,7 @@ def _dots(a, rows):
 
 @kernel
 def _turn(pose, factor_columns):
-    """Rows of C^T F."""
+    """Return the rows of C^T F."""
     axes = _columns(pose)
     return (
         _dots(axes[0], factor_columns),
@@ -116,7 +116,7 @@ def _turn(pose, factor_columns):
 
 @kernel
 def _axis(axis, seen, turned, focal, principal, size, margin):
-    """Of an image axis: the slope, the one held within `margin` of the image, a row of J W R S."""
+    """Return, for an image axis, the slope, the slope clamped to `margin`, and a row of J W R S."""
     slope = seen[axis] / seen[2]
     low = (-margin * size - principal) / focal
     high = (size + margin * size - principal) / focal
@@ -126,7 +126,7 @@ def _axis(axis, seen, turned, focal, principal, size, margin):
 
 @kernel
 def _view(c2w, lens, mean, factor, margin, height, width):
-    """A camera's rotation, the mean from its centre and in its frame, W R S, and both `_axis`."""
+    """Return a camera's rotation, mean minus centre, camera-frame mean, W R S, both `_axis`."""
     pose = (_vector(c2w[0]), _vector(c2w[1]), _vector(c2w[2]))
     offset = _plus(_vector(mean), -_ONE, (c2w[0, 3], c2w[1, 3], c2w[2, 3]))
     seen = _combine(offset, pose)
@@ -143,8 +143,8 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, s
 
     means (G, 3), scales (G, 3), quats (G, 4), opacities (G,), c2w (V, 4, 4), lenses (V, 4).
     limits: near, far, dilation, alpha_min, margin of the clamped Jacobian, height, width.
-    A contribution reaches alpha_min where the Mahalanobis distance is sqrt(2 ln(opacity /
-    alpha_min)); half a pixel, and a little in the power, are added against rounding.
+    A contribution falls to alpha_min at the Mahalanobis distance sqrt(2 ln(opacity / alpha_min)).
+    Half a pixel, and a little in the power, are added against rounding.
     """
     near, far, dilation, alpha_min, margin, height, width = limits
     for g in range(bounds[0], bounds[1]):
@@ -188,7 +188,7 @@ def project_unit(means, scales, quats, opacities, c2w, lenses, bounds, limits, s
 
 @kernel
 def _covariance_slopes(row_x, row_y, splat, given, dilation):
-    """dL/drow_x and dL/drow_y from dL/dconic = given[2:5]."""
+    """Return dL/drow_x and dL/drow_y, from dL/dconic = given[2:5]."""
     xx = _dot(row_x, row_x)
     yy = _dot(row_y, row_y)
     minors = _cross(row_x, row_y)
@@ -205,9 +205,9 @@ def _covariance_slopes(row_x, row_y, splat, given, dilation):
 
 @kernel
 def _axis_slopes(axis, focal, z, of_row, turned_z, of_pixel):
-    """Slopes of (camera-frame coordinate, z, focal, principal, row of W R S, its row z).
+    """Return slopes of (camera-frame coordinate, z, focal, principal, row of W R S, its row z).
 
-    One image axis: pixel = principal + focal slope, row = focal / z (turned - held turned_z).
+    For one image axis: pixel = principal + focal slope, row = focal / z (turned - held turned_z).
     """
     slope, held, row = axis
     gain = focal / z
@@ -263,7 +263,7 @@ def _add_camera(out, offset, factor_rows, of_seen, of_turned, of_mean, of_lens):
 
 @kernel
 def _added(of_factor, pose, of_turned):
-    """Slopes of the rows of R S with those of one view added."""
+    """Add the slopes of one view to the slopes of the rows of R S."""
     return (
         _plus(of_factor[0], _ONE, _combine(pose[0], of_turned)),
         _plus(of_factor[1], _ONE, _combine(pose[1], of_turned)),
@@ -273,7 +273,7 @@ def _added(of_factor, pose, of_turned):
 
 @kernel
 def _sum_parts(given, g, slopes):
-    """Write the sum over parts of a splat's slopes, given as (P, G, 10)."""
+    """Write the sum over parts of a splat's slopes. given: (P, G, 10)."""
     slopes[:] = given[0, g]
     for part in range(1, given.shape[0]):
         for i in range(slopes.shape[0]):
@@ -285,9 +285,9 @@ def project_backward_unit(
     means, scales, quats, c2w, lenses, bounds, limits, splats, given, wants_cameras,
     of_means, of_scales, of_quats, of_opacities, of_cameras,
 ):  # fmt: skip
-    """Gradients of what `project_unit` projected, from those of the rasteriser, (V, P, G, 10).
+    """Compute the gradients of `project_unit` from those of the rasteriser, (V, P, G, 10).
 
-    P partial gradients per view are added first. Writes of_means (G, 3), of_scales (G, 3),
+    It first adds the P partial gradients per view. Writes of_means (G, 3), of_scales (G, 3),
     of_quats (G, 4) and of_opacities (G,), and adds to of_cameras (V, 16) if `wants_cameras`.
     """
     _, _, dilation, _, margin, height, width = limits

@@ -1,18 +1,19 @@
-"""Numba kernels of `qgs/cpu`: splats to sums of weighted features, and their gradients.
+"""Numba kernels of `qgs/cpu` that blend splats into sums of features, and their gradients.
 
-A unit of work is a stripe of tile rows of one image. It sorts the splats that touch it by depth,
-then walks its tiles of 16 x 16 pixels, front to back. A row of a tile is 16 lanes without branches
-in one flat float32 buffer at constant offsets, which is what lets LLVM vectorise the lanes.
+A unit of work is a stripe of tile rows of one image. It sorts the splats that touch the stripe by
+depth, then processes tiles of 16 x 16 pixels, front to back. A row of a tile is 16 lanes without
+branches, in one flat float32 buffer at constant offsets, so that LLVM can vectorise the lanes.
 
 Splats are rows of 9 float32: u, v, conic xx, xy, yy, depth, half extents in x and y (pixels; not
-positive for what is not visible), and the power of 2 below which alpha cannot reach alpha_min.
+positive for invisible splats), and the power of 2 below which alpha cannot reach alpha_min.
 Sums are 5 planes: w r, w g, w b, w z, w.
 
-For each row of a tile, the buffer holds blocks of 16 lanes: the transmittance; 1 until the pixel
-stops, then 0; the sums (forward) or what `_load_gradients` puts there (backward).
+For each row of a tile, the buffer has blocks of 16 lanes: the transmittance; 1 until the pixel
+stops, then 0; the sums (forward) or the values from `_load_gradients` (backward).
 
-The backward pass repeats the forward one, with the same skips and the same end. With v_i = dL/dw_i,
-transmittance T_i and the rest S_i = sum_{j>i} w_j v_j, dL/dalpha_i = T_i v_i - S_i / (1 - alpha_i).
+The backward pass repeats the forward pass, with the same skips and the same end. With
+v_i = dL/dw_i, transmittance T_i and the rest S_i = sum_{j>i} w_j v_j,
+dL/dalpha_i = T_i v_i - S_i / (1 - alpha_i).
 """
 
 import numpy as np
@@ -22,17 +23,17 @@ from qgs.kernels import kernel
 TILE = 16
 SPLAT_FIELDS = 9
 SUMS = 5
-# Of u, v, xx, xy, yy, depth, opacity, r, g, b.
+# Number of gradients: u, v, xx, xy, yy, depth, opacity, r, g, b.
 GRADIENTS = 10
 
 _LANES = np.uint64(TILE)
-# Where blocks of lanes begin.
+# Offsets of the blocks of lanes.
 _BLOCKS = tuple(np.uint64(TILE * block) for block in range(10))
 # Floats per row of a tile.
 _ROW = 9 * TILE
 _STATE = np.uint64(_ROW)
 _LAST_LANE = np.float32(TILE - 1)
-# Splats between two looks at which rows are still open.
+# Splats between two checks for open rows.
 _CHECK_EVERY = 16
 
 _ZERO = np.float32(0)
@@ -48,7 +49,7 @@ _C0, _C1, _C2, _C3, _C4, _C5 = (
 
 @kernel
 def _exp2(x):
-    """2^x for float32 x in [-126, 0]."""
+    """Compute 2^x for float32 x in [-126, 0]."""
     whole = np.floor(x)
     f = x - whole
     mantissa = _C0 + f * (_C1 + f * (_C2 + f * (_C3 + f * (_C4 + f * _C5))))
@@ -58,7 +59,7 @@ def _exp2(x):
 
 @kernel
 def _by_depth(splats, top, bottom, width):
-    """Indices of the splats that touch rows [top, bottom) of the image, by ascending depth.
+    """Return the indices of splats that touch image rows [top, bottom), by ascending depth.
 
     A stable radix sort: positive floats sort like their bits.
     """
@@ -97,21 +98,21 @@ def _by_depth(splats, top, bottom, width):
 
 @kernel
 def _touching_rows(order, splats, top, bottom, out):
-    """Copy to `out` the splats of `order` that touch rows [top, bottom); return how many."""
+    """Copy to `out` the splats of `order` that touch rows [top, bottom); return their number."""
     n = 0
     for i in range(order.shape[0]):
         g = order[i]
         v = splats[g, 1]
         ey = splats[g, 7]
         out[n] = g
-        # no branch: where splats are cut off follows no pattern that a processor could guess
+        # No branch: a processor could not predict which splats touch the rows.
         n += 1 if v + ey > top and v - ey < bottom else 0
     return n
 
 
 @kernel
 def _open(state, live, rows, columns):
-    """Start a tile: transmittance 1 in lane block 0, 1 in block 1 for pixels inside the image."""
+    """Initialise a tile: transmittance 1 in block 0; 1 in block 1 for pixels in the image."""
     state[:] = _ZERO
     for row in range(TILE):
         live[row] = row < rows
@@ -229,8 +230,8 @@ def _add_gradients(totals, xx, xy, yy, opacity, out):
 def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
     """Put sum_j w_j v_j of a tile in block 2, dL/dsums in blocks 3 to 7, depth in block 8.
 
-    v holds (z - depth) dL/dsums_z + (dL/dsums_w + depth dL/dsums_z): taken about the pixel's
-    depth, the large gradients of nearly transparent pixels do not cancel in float32.
+    v contains (z - depth) dL/dsums_z + (dL/dsums_w + depth dL/dsums_z). Relative to the pixel's
+    depth, large gradients of nearly transparent pixels do not cancel in float32.
     """
     for row in range(rows):
         for lane in range(columns):
@@ -252,7 +253,7 @@ def _load_gradients(state, sums, slopes, y0, x0, rows, columns):
 
 @kernel
 def _rows_within(above, reach):
-    """First and last row of a tile whose pixel centres lie within `reach` of a splat's centre."""
+    """Return the first and last row of a tile with pixel centres within `reach` of a splat."""
     first = max(0, int(np.ceil(above - reach)))
     last = min(TILE - 1, int(np.floor(above + reach)))
     return first, last
@@ -269,10 +270,10 @@ def _store_sums(state, sums, y0, x0, rows, columns):
 
 @kernel
 def blend_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out, backward):
-    """Walk the tile rows [first, last) of one image with its splats (G, 9).
+    """Process the tile rows [first, last) of one image with its splats (G, 9).
 
-    Fills sums (5, H, W); or, if `backward`, adds to out (G, 10) the gradients of what it had
-    filled, from slopes (5, H, W), the gradient of the loss in `sums`.
+    Fills sums (5, H, W). If `backward`, it instead adds the gradients of the forward pass to out
+    (G, 10). slopes: (5, H, W), gradient of the loss with respect to `sums`.
     """
     height, width = sums.shape[1:]
     top, bottom = tile_rows[0] * TILE, min(tile_rows[1] * TILE, height)
@@ -308,7 +309,7 @@ def blend_unit(splats, opacities, colors, tile_rows, options, sums, slopes, out,
                     dy = np.float32(y0 + row) + _HALF - v
                     linear = -_LOG2_E * xy * dy
                     constant = -_HALF * _LOG2_E * yy * dy * dy
-                    # power is too low in all lanes if it is at its peak on their real interval
+                    # If the largest power over all lanes is too low, skip the row.
                     peak = min(max(lean * dy, dx0), dx0 + _LAST_LANE)
                     if (quadratic * peak + linear) * peak + constant < splats[g, 8]:
                         continue

@@ -1,6 +1,6 @@
-"""Numba kernel of `qgs.similarity`: the sum of SSIM over a plane, and its gradient.
+"""Numba kernel of `qgs.similarity` for the sum of SSIM over a plane, and its gradient.
 
-The formula is that of `similarity_map`, whose autograd this is tested against.
+The formula is that of `similarity_map`; tests compare the kernel with its autograd.
 """
 
 import numpy as np
@@ -15,9 +15,10 @@ _TWO = np.float32(2)
 
 @kernel
 def _windowed(planes, row, weights, framed, out):
-    """Means (N, W) over the windows around a row of planes (N, H, W), which are zero outside.
+    """Write means (N, W) over windows around a row of planes (N, H, W), zero-padded, to `out`.
 
-    weights: of pixels 0 to _REACH from the centre. framed: (N, W + 2 _REACH), overwritten.
+    weights: weights of pixels at distances 0 to _REACH from the centre.
+    framed: (N, W + 2 _REACH), overwritten.
     """
     parts, height, width = planes.shape
     framed[:] = _ZERO
@@ -36,14 +37,14 @@ def _windowed(planes, row, weights, framed, out):
 
 @kernel
 def similarity_sum(moments, weights, stabilisers, slope):
-    """The sum of SSIM of x and y over all pixels; `slope` (H, W) gets its gradient by x.
+    """Return the sum of SSIM of x and y over all pixels; write its gradient in x to `slope`.
 
-    moments: (4, H, W), x, y, x^2 + y^2 and x y.
+    moments: (4, H, W), x, y, x^2 + y^2 and x y. slope: (H, W).
     """
     (_, height, width), (c1, c2), total = moments.shape, stabilisers, 0.0
     framed = np.empty((4, width + 2 * _REACH), np.float32)
     means = np.empty((4, width), np.float32)
-    # By the means of x, of squares, of x y.
+    # Slopes with respect to the means of x, of squares, of x y.
     slopes = np.empty((3, height, width), np.float32)
     for row in range(height):
         _windowed(moments, row, weights, framed, means)

@@ -1,4 +1,4 @@
-"""What training minimises."""
+"""The built-in losses."""
 
 from qgs.losses.depth import DepthSurface
 from qgs.losses.photometric import Mask, Opacity, Photometric, mean_of_gaussians

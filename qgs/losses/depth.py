@@ -1,4 +1,4 @@
-"""`qgs/depth_surface`: Gaussians on the surface that depth maps show."""
+"""`qgs/depth_surface`, a loss that moves Gaussians to the surface of depth maps."""
 
 import torch
 import torch.nn.functional as F
@@ -13,13 +13,13 @@ from qgs.wording import warn_once
 
 
 class DepthSurface(Loss):
-    """Smooth L1 between the camera-frame z of each Gaussian's centre and the depth map behind it.
+    """Smooth L1 between the camera-frame z of each Gaussian's centre and the depth map.
 
-    Of all target views, and input views if asked for, that have depth maps (`Views.depths`), the
-    view with the smallest error counts for a centre: a surface hidden in one view is not drawn to
-    what hides it there, and centres on surfaces that any view shows have the loss 0. A view that
-    is both target and input (`training.judge_inputs`) thus counts once. A batch without depth maps
-    has the loss 0; the first one is logged as a warning.
+    It uses all target views with depth maps (`Views.depths`), and input views if `inputs` is set.
+    Each centre counts with its smallest error over the views. So a centre on a surface that any
+    view shows has the loss 0, even if another view does not see the surface. A view that is both
+    target and input (`training.judge_inputs`) does not count twice. A batch without depth maps has
+    the loss 0; the first such batch logs a warning.
     """
 
     name = "depth_surface"
@@ -28,11 +28,11 @@ class DepthSurface(Loss):
 
     class Config(Loss.Config):
         beta: float = Field(default=0.05, gt=0)
-        """Error at which the loss turns from a parabola into a line, world units."""
+        """Error at which the loss changes from quadratic to linear, in world units."""
         near: float = Field(default=0.025, gt=0)
-        """Camera-frame z at or below which a centre is behind a view and not compared there."""
+        """Camera-frame z, in world units, at or below which a view ignores a centre."""
         inputs: bool = True
-        """Whether input views count beside target views."""
+        """Use input views besides target views."""
 
     config: Config
 
@@ -46,8 +46,8 @@ class DepthSurface(Loss):
         mask = prediction.state.mask
         if not measured:
             warn_once(
-                "a batch has no depth maps, so the loss qgs/depth_surface is 0 for it: where no "
-                "scene has any, give `depth_file_path` in transforms.json, or take the loss out"
+                "a batch has no depth maps, so the loss qgs/depth_surface is 0 for it: if no "
+                "scene has any, give `depth_file_path` in transforms.json, or remove the loss"
             )
             return 0 * means.sum()
         found = [
@@ -70,10 +70,10 @@ def surface_errors(
     beta: float,
     near: float,
 ) -> tuple[Tensor, Tensor]:
-    """Smooth L1 error in z of each point in each view, and where it counts; (B, V, G) both.
+    """Return the smooth L1 error in z of each point in each view, and its validity, (B, V, G).
 
-    It counts in front of `near`, inside the image, and where the depth of the pixel is known. The
-    pixel is constant for the gradient, which moves a point along the view's axis.
+    An error is valid beyond `near`, inside the image, and where the depth of the pixel is known.
+    The pixel counts as constant in the gradient, so it moves a point along the view's axis.
     """
     assert views.depths is not None
     local = to_camera(points, views.cameras)  # (B, V, G, 3)

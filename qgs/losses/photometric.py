@@ -1,4 +1,4 @@
-"""Losses of images and opacities: `photometric` (TokenGS, LocusGS), `mask`, `opacity` (TokenGS)."""
+"""Losses on images and opacities: `photometric` (TokenGS, LocusGS), `mask`, `opacity` (TokenGS)."""
 
 from collections.abc import Iterable, Iterator
 
@@ -13,7 +13,7 @@ from qgs.types import LayerPrediction, Rendering, Views
 
 
 class Photometric(Loss):
-    """mse_weight * MSE + l1_weight * L1 + ssim_weight * (1 - SSIM) / 2, three terms."""
+    """Photometric loss: mse_weight * MSE + l1_weight * L1 + ssim_weight * (1 - SSIM) / 2."""
 
     name = "photometric"
     scheduled = frozenset({"weight", "mse_weight", "l1_weight", "ssim_weight"})
@@ -21,11 +21,11 @@ class Photometric(Loss):
 
     class Config(Loss.Config):
         mse_weight: float = Field(default=1.0, ge=0)
-        """Factor of the mean squared error; 0 leaves the term out."""
+        """Factor of the mean squared error. 0 drops the term."""
         l1_weight: float = Field(default=0.0, ge=0)
-        """Factor of the mean absolute error (TokenGS 2026.6: 0.8, without MSE); 0 leaves it out."""
+        """Factor of the mean absolute error (TokenGS 2026.6: 0.8, without MSE). 0 drops it."""
         ssim_weight: float = Field(default=0.2, ge=0)
-        """Factor of (1 - SSIM) / 2; 0 leaves the term out."""
+        """Factor of (1 - SSIM) / 2. 0 drops the term."""
         padding: Padding = "same"
         """Borders of SSIM: "same" pads with zeros (releases), "valid" uses whole windows only."""
 
@@ -37,14 +37,14 @@ class Photometric(Loss):
             yield from too_small(context, WINDOW, "padding", "SSIM of whole windows")
 
     def weights(self) -> tuple[float, float, float]:
-        """Of MSE, L1 and SSIM in the objective."""
+        """Return the weights of MSE, L1 and SSIM in the objective."""
         c = self.config
         return c.weight * c.mse_weight, c.weight * c.l1_weight, c.weight * c.ssim_weight
 
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
-        """Terms `mse`, `l1`, `ssim`; raises ValueError for images that are too small for SSIM."""
+        """Return the terms `mse`, `l1`, `ssim`; raise ValueError for images too small for SSIM."""
         terms = {}
         if self.config.mse_weight:
             terms["mse"] = self.config.mse_weight * mean_squared_error(rendering.rgb, target.images)
@@ -58,16 +58,16 @@ class Photometric(Loss):
 
 
 class Opacity(Loss):
-    """Mean over Gaussians of -ln(opacity + eps) (TokenGS release, weight 0 in its recipes)."""
+    """Opacity loss: mean of -ln(opacity + eps) (TokenGS release, weight 0 in its recipes)."""
 
     name = "opacity"
     renderings = "none"
 
     class Config(Loss.Config):
         weight: float = Field(default=0.1, ge=0)
-        """Factor of the term in the objective."""
+        """Factor of this loss in the objective. 0 skips the loss."""
         eps: float = Field(default=1e-6, gt=0)
-        """Added to the opacity, so that the logarithm is finite (TokenGS release)."""
+        """Number added to the opacity, so that the logarithm is finite (TokenGS release)."""
 
     config: Config
 
@@ -80,45 +80,45 @@ class Opacity(Loss):
 
 
 class Mask(Loss):
-    """Mean of (alpha - mask)^2 over all pixels (TokenGS, LocusGS releases; no published recipe)."""
+    """Mask loss: mean of (alpha - mask)^2 (TokenGS, LocusGS releases; in no published recipe)."""
 
     name = "mask"
     renderings = "each"
 
     class Config(Loss.Config):
         weight: float = Field(default=0.5, ge=0)
-        """Factor of the term in the objective."""
+        """Factor of this loss in the objective. 0 skips the loss."""
 
     config: Config
 
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> Tensor:
-        """Raises ValueError for views without masks."""
+        """Return the loss; raise ValueError for views without masks."""
         if target.masks is None:
             raise ValueError(
-                "the loss qgs/mask needs views with masks and these have none; "
-                "choose data with masks, or take the loss out of the recipe"
+                "the loss qgs/mask needs views with masks, but these have none; "
+                "choose data with masks, or remove the loss from the recipe"
             )
         return mean_squared_error(rendering.alpha, target.masks)
 
 
 def too_small(context: RecipeContext, side: int, option: str, measure: str) -> Iterator[Problem]:
-    """A problem of `option` where the data's images have a side below `side` pixels."""
+    """Yield a problem of `option` if the data's images have a side below `side` pixels."""
     if context.image_size and min(context.image_size) < side:
         given = "{} x {} (H x W)".format(*context.image_size)
-        reason = f"{measure} needs images of at least {side} pixels a side, the data's are {given}"
-        yield Problem(option, reason, "raise data.image_size, or do without it")
+        reason = f"{measure} needs images of at least {side} pixels a side, but they are {given}"
+        yield Problem(option, reason, "raise data.image_size, or remove this option")
 
 
 @full_precision
 def mean_squared_error(images: Tensor, truth: Tensor) -> Tensor:
-    """Mean over everything of (images - truth)^2."""
+    """Return the mean of (images - truth)^2 over all elements."""
     return F.mse_loss(images, truth)
 
 
 def mean_of_gaussians(values: Tensor, prediction: LayerPrediction) -> Tensor:
-    """Values (B, G), averaged over the Gaussians of queries that exist, then over scenes; 0-d."""
+    """Average values (B, G) over the Gaussians of existing queries, then over scenes (0-d)."""
     values = at_least_float32(values)
     mask = prediction.state.mask
     if mask is None:

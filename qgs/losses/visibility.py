@@ -1,4 +1,4 @@
-"""`qgs/visibility`: moves points that no target view sees towards the nearest one (TokenGS)."""
+"""`qgs/visibility`, a loss that moves unseen points towards the nearest target view (TokenGS)."""
 
 from collections.abc import Iterable, Iterator
 from typing import Literal
@@ -14,54 +14,54 @@ from qgs.precision import full_precision
 from qgs.types import Cameras, LayerPrediction, Rendering, Views
 
 _TINY_Z = 1e-8
-"""Below this |z| counts as 0, so that gradients of x / z stay finite."""
+"""Value of |z| below which z counts as 0, so that gradients of x / z stay finite."""
 
 INFINITE_PIXEL = 1e6
-"""Stands for x / 0 with x != 0 (TokenGS release)."""
+"""Value for x / 0 with x != 0 (TokenGS release)."""
 
 
 class VisibilityOptions(Loss.Config):
     """Options of a visibility loss.
 
-    A point behind the camera, like every clamped point, gets no gradient from that view; it still
-    moves under views that it stands in front of.
+    A point behind the camera, like every clamped point, gets no gradient from that view. Views that
+    have the point in front of them still move it.
     """
 
     clamp: float | None = Field(default=1.0, gt=0)
-    """Upper bound per point, in halves of an image side (release: 1); null for no bound."""
+    """Upper bound per point, in halves of an image side (release: 1). null: no bound."""
     near: float = Field(default=0.025, gt=0)
-    """Camera-frame z at or below which a point is behind the camera, world units."""
+    """Camera-frame z at or below which a point is behind the camera, in world units."""
     behind_camera: Literal["published", "invisible"] = "published"
-    """A point behind the camera is seen mirrored, so it may count as visible ("published", as in
-    both releases), or it costs the full `clamp` in that view ("invisible")."""
+    """Rule for points behind the camera. "published" projects them mirrored, so they may count as
+    visible, as in both releases. "invisible" gives them the full `clamp` in that view."""
 
     @property
     def behind(self) -> float | None:
-        """z at or below which a point counts as invisible; None ignores the sign of z."""
+        """Camera-frame z at or below which points are invisible; None ignores the sign of z."""
         return self.near if self.behind_camera == "invisible" else None
 
     def conflicts(self) -> Iterator[Problem]:
-        """Options that contradict each other or have no effect."""
+        """Yield problems of options that contradict each other or have no effect."""
         if self.behind_camera == "published":
             yield from without_effect(self, ("near",), "`behind_camera` is published")
         elif self.clamp is None:
             yield Problem(
                 "clamp",
-                "a point behind every camera would cost infinitely much: `behind_camera` is "
-                "invisible and nothing bounds it",
-                "give `clamp` a number, such as 1.0",
+                "`behind_camera` is invisible and `clamp` is null, so the loss of a point behind "
+                "every camera is infinite",
+                "set `clamp` to a number, such as 1.0",
             )
 
 
 class Visibility(Loss):
-    """Mean over Gaussians of `view_visibility` of their means."""
+    """Visibility loss: mean of `view_visibility` over the means of all Gaussians."""
 
     name = "visibility"
     renderings = "none"
 
     class Config(VisibilityOptions):
         infinite_pixel: float = Field(default=INFINITE_PIXEL, gt=0)
-        """Stands for x / 0 with x != 0, pixels; no effect when `clamp` is set."""
+        """Value for x / 0 with x != 0, in pixels. It has no effect if `clamp` is set."""
 
     config: Config
 
@@ -94,17 +94,20 @@ def view_visibility(
     z_guard: float | None = None,
     infinite_pixel: float = INFINITE_PIXEL,
 ) -> Tensor:
-    """Distance (B, P) of each point to the nearest view's image, 0 if a view sees it.
+    """Return the distance (B, P) of each point to the nearest view's image; 0 if a view sees it.
 
-    Per view, with u and v scaled to [-1, 1] over the image: relu(|u| - 1) + relu(|v| - 1); then the
-    minimum over views, at most `clamp` (TokenGS, LocusGS releases).
+    The distance to a view is relu(|u| - 1) + relu(|v| - 1), with u and v scaled to [-1, 1] over the
+    image. The result is the minimum over views, at most `clamp` (TokenGS, LocusGS releases).
 
-    points: (B, P, 3) world. cameras: (B, V). behind: z at or below which a point is infinitely far
-    from a view's image; None ignores the sign of z. z_guard: |z| below it is replaced by +z_guard
-    (LocusGS anchors); None leaves z, where x / 0 is `infinite_pixel` and 0 / 0 visible (TokenGS).
+    points: (B, P, 3) world. cameras: (B, V).
+    behind: z at or below which a point is infinitely far from a view's image; None ignores the sign
+        of z.
+    z_guard: replaces z with |z| below it by +z_guard (LocusGS anchors). None keeps z; then x / 0 is
+        `infinite_pixel` and 0 / 0 is visible (TokenGS).
 
-    The gradient goes to the nearest view alone (the first of several), so that memory does not grow
-    with the views. Values and gradients are finite if `clamp` is set whenever `behind` is.
+    The gradient uses only the nearest view (the first of several), so that memory does not grow
+    with the number of views. Values and gradients are finite, unless `behind` is set without
+    `clamp`.
     """
     options = (behind, z_guard, infinite_pixel)
     # Find the nearest view first, so that only its graph is kept.
@@ -125,9 +128,9 @@ def _image_excess(
     z_guard: float | None,
     infinite_pixel: float,
 ) -> Tensor:
-    """relu(|u| - 1) + relu(|v| - 1) of world points (B, P, 3) -> (B, P).
+    """Compute relu(|u| - 1) + relu(|v| - 1) of world points (B, P, 3) -> (B, P).
 
-    cameras: (B, P), one for each point, or (B, 1); both give the same bits.
+    cameras: (B, P), one for each point, or (B, 1); both give bitwise equal results.
     """
     # By sums, not a matrix product: one point and many must give the same bits.
     from_camera = points - cameras.c2w[..., :3, 3]

@@ -1,4 +1,4 @@
-"""How good a reconstruction is, and what needs no model to reach."""
+"""Metrics of reconstructions, and baselines that need no model."""
 
 from qgs.metrics.dispersion import Dispersion
 from qgs.metrics.images import Psnr, Ssim

@@ -1,4 +1,4 @@
-"""Scores that a model must beat: copying an input view, painting the mean colour."""
+"""Baselines that a model must beat: a copied input view, and the mean colour."""
 
 import torch
 from torch import Tensor
@@ -9,9 +9,9 @@ from qgs.types import Cameras, Views
 
 
 def nearest_input(inputs: Views, targets: Cameras) -> Tensor:
-    """For every target camera (B, T) the image of the nearest input view -> (B, T, 3, H, W).
+    """Return the nearest input image for every target camera (B, T) -> (B, T, 3, H, W).
 
-    Nearest by `pose_distance`.
+    The nearest one has the least `pose_distance`.
     """
     index = pose_distance(inputs.cameras.c2w, targets.c2w).argmin(-1)
     scene = torch.arange(index.shape[0], device=index.device)[:, None]
@@ -19,32 +19,33 @@ def nearest_input(inputs: Views, targets: Cameras) -> Tensor:
 
 
 def mean_colour(inputs: Views, targets: Cameras) -> Tensor:
-    """The mean RGB of a scene's input views everywhere -> (B, T, 3, H, W)."""
+    """Fill images with the mean RGB of a scene's input views -> (B, T, 3, H, W)."""
     colour = inputs.images.mean((1, 3, 4))
     return colour[:, None, :, None, None].expand(-1, targets.shape[1], -1, *targets.size)
 
 
 BASELINES = {"nearest_input": nearest_input, "mean_colour": mean_colour}
-"""By their names in results; tables write blanks for underscores."""
+"""Baselines by their names in results; tables replace underscores by blanks."""
 
 
 def worse_than_nearest(
     column: Column, model: float | None, nearest: float | None, remedy: str
 ) -> str:
-    """A remark with `remedy` where `nearest_input` scores better than the model, else ""."""
+    """Return a remark with `remedy` if `nearest_input` scores better than the model, else ""."""
     if not column.beats(nearest, model):
         return ""
     return (
-        f"the result is worse than the nearest photo, copied: {column.heading} "
+        f"the result is worse than a copy of the nearest photo: {column.heading} "
         f"{column.shown(model)} against {column.shown(nearest)}; {remedy}"
     )
 
 
 @full_precision
 def pose_distance(inputs: Tensor, targets: Tensor) -> Tensor:
-    """Distances (B, T, V) of poses inputs (B, V, 4, 4) and targets (B, T, 4, 4).
+    """Return distances (B, T, V) between input poses (B, V, 4, 4) and targets (B, T, 4, 4).
 
-    Of camera centres, over the spread of the inputs, plus the angle of the axes in radians.
+    A distance is that of the camera centres, divided by the spread of the inputs, plus the angle
+    between the axes in radians.
     """
     centres = inputs[..., :3, 3]
     seen_from = targets[..., :3, 3]

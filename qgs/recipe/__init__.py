@@ -1,15 +1,15 @@
 """The composer: from a recipe to a checked, reproducible model.
 
-`compose` makes the model; `resolve` merges and checks a recipe without allocating a tensor. The way
-of a recipe, each step in a file of its own:
+`compose` makes the model. `resolve` merges and checks a recipe without allocating a tensor. A
+recipe passes through these steps, each in a file of its own:
 
 | step | file |
 |---|---|
-| read it with what it extends, lay overrides over it | `files.py`, `yaml_text.py` |
-| decode its sections and settings, draft the whole | `sections.py` |
-| find what stands at each place: defaults, layers, swaps | `places.py`, `slots.py` |
+| read it and the recipes that it extends, apply overrides | `files.py`, `yaml_text.py` |
+| decode its sections and settings, make a draft | `sections.py` |
+| find the component at each place: defaults, layers, swaps | `places.py`, `slots.py` |
 | choose components and decode their options | `registry.py`, `decode.py` |
-| check them beside each other, follow fields from writer to reader | `checks.py` |
+| check them together, follow fields from writer to reader | `checks.py` |
 | find the line that caused a problem | `causes.py` |
 | write out every default | `recipe.py` |
 | build the model | `build.py` |
@@ -35,10 +35,10 @@ def compose(
     *,
     device: torch.device | str | None = None,
 ) -> QueryGaussianModel:
-    """The model that a recipe describes, with its initial parameters.
+    """Build the model that a recipe describes, with its initial parameters.
 
-    recipe, overrides: as `resolve` takes them. device: where to put it; "meta" allocates nothing.
-    The same recipe gives the same parameters, and the global random state stays as it was.
+    recipe, overrides: see `resolve`. device: device of the model; "meta" allocates nothing.
+    The same recipe gives the same parameters. The global random state does not change.
     Raises RecipeError, a ValueError, with every problem of the recipe.
     """
     return resolve(recipe, overrides).build_model(device)

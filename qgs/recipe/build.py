@@ -1,4 +1,4 @@
-"""From chosen components to a model, and the learning-rate factors of its parameters."""
+"""Construction of a model from chosen components, and learning-rate factors."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 
 
 def build_model(recipe: Recipe, device: torch.device | str | None) -> QueryGaussianModel:
-    """The model of a checked recipe; on "meta" nothing is allocated.
+    """Build the model of a checked recipe; on "meta" nothing is allocated.
 
-    Parameters are drawn on the CPU from the recipe's seed, whatever the device; the global random
-    state stays.
+    Parameters are drawn on the CPU from the recipe's seed, for every device. The global random
+    state does not change.
     """
     on_meta = device is not None and torch.device(device).type == "meta"
     with (
@@ -94,10 +94,11 @@ def _assemble(recipe: Recipe) -> QueryGaussianModel:
 
 
 class OnMeta(TorchFunctionMode):
-    """The meta device as constructors need it.
+    """The meta device, changed for constructors of components.
 
-    `linspace` has numbers, which DINO's constructor reads. Weights are not drawn, and `randn` and
-    arithmetic give float32 tensors by shape alone: for these torch imports its compiler, 1 to 3 s.
+    `linspace` returns numbers, because DINO's constructor reads them. Weights are not drawn.
+    `randn` and arithmetic on float32 tensors compute shapes only; otherwise torch would import its
+    compiler, which takes 1 to 3 s.
     """
 
     arithmetic = frozenset({Tensor.add, Tensor.sub, Tensor.mul, Tensor.__rpow__})
@@ -129,10 +130,11 @@ class OnMeta(TorchFunctionMode):
 
 
 def build(chosen: Chosen, *arguments: Any) -> Any:
-    """The component itself. arguments: those of its constructor after its Config.
+    """Build the component. arguments: the constructor's arguments after the Config.
 
-    Raises RecipeError, with the plugin's distribution, where a plugin's constructor fails; a user's
-    mistakes pass: missing packages or data, training too short for its optimiser.
+    Raises RecipeError, with the plugin's distribution, if a plugin's constructor fails. Errors for
+    mistakes of the user pass unchanged: missing packages or data, training too short for the
+    optimiser.
     """
     component: Any = chosen.component
     try:
@@ -154,7 +156,7 @@ def build(chosen: Chosen, *arguments: Any) -> Any:
 
 
 def load_pretrained(*parts: nn.Module) -> None:
-    """Call `load_pretrained` of every component; its MissingExtraError then names the component."""
+    """Call `load_pretrained` of every component; a MissingExtraError gets the component's name."""
     for component in nn.ModuleList(parts).modules():
         if isinstance(component, Component) and not any(x.is_meta for x in component.parameters()):
             try:
@@ -165,10 +167,10 @@ def load_pretrained(*parts: nn.Module) -> None:
 
 
 def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
-    """Factor of the learning rate for every parameter of `module`, by name; 1 where none is given.
+    """Return the learning-rate factor of every parameter of `module`, by name (default 1).
 
-    module: a model, which leaves patterns of `losses` unchecked, or what holds both. A shared
-    parameter goes by its first name. Raises RecipeError.
+    module: a model, or a module that holds the model and the losses. For a model alone, patterns
+    for `losses` are not checked. A shared parameter has its first name. Raises RecipeError.
     """
     config = optimizer.config
     model = next(m for m in module.modules() if isinstance(m, QueryGaussianModel))
@@ -194,7 +196,7 @@ def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
 
 
 def _paths(name: str, model: QueryGaussianModel) -> list[KeyPath]:
-    """Paths of a parameter: its own, and those under which a recipe has its component."""
+    """Return the paths of a parameter: its own, and those of its component in a recipe."""
     path = tuple(name.split("."))
     if path[0] == "decoder":
         return [path, ("decoder", "layers", *path[1:]), ("decoder", *path[2:])]

@@ -1,7 +1,7 @@
-"""Problems of a recipe at the line that caused them.
+"""Search for the line that caused a problem of a recipe.
 
-A file or an override laid over others may replace a component or a setting that theirs rely on.
-Then its line is to blame, and not those that were right before.
+A file or an override may replace a component or a setting that lower layers rely on. Then the
+problem is reported at the replacing line, not at the lines that were correct before.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,7 +20,7 @@ from qgs.recipe.yaml_text import KeyPath, MapNode, brief, find
 def at_their_causes(
     written: MapNode, found: Sequence[RecipeProblem], plugins: Sequence[Plugin]
 ) -> Iterator[RecipeProblem]:
-    """Return `found`, what is wrong with `written`; problems of one cause become one."""
+    """Yield the problems `found` in `written` at their causes; merge those with the same cause."""
     blames: dict[RecipeProblem, RecipeProblem] = {}
     left = found
     # Only a recipe that is refused is read once more for each layer.
@@ -52,10 +52,10 @@ def at_their_causes(
 def _blames(
     found: Sequence[RecipeProblem], before: Draft, written: MapNode, plugins: Sequence[Plugin]
 ) -> dict[RecipeProblem, RecipeProblem]:
-    """Return the problem of the line with which each of `found` came, in the last layer.
+    """Map each of `found` to a problem at the line of the last layer that caused it.
 
-    Its options are laid over one after the other until the problem is there: the last brought it.
-    before: the draft of `written` without that layer.
+    The options of that layer are applied one by one. The one after which a problem appears caused
+    it. before: the draft of `written` without the last layer.
     """
     blames: dict[RecipeProblem, RecipeProblem] = {}
     base: Any = written.under
@@ -75,7 +75,7 @@ def _blames(
 
 
 def _options(over: MapNode, above: KeyPath = ()) -> Iterator[tuple[KeyPath, Any, Origin]]:
-    """Yield path, value and origin of each option of `over`; those that decide others first."""
+    """Yield path, value and origin of each option of `over`; options that decide others first."""
     first = ("plugins", "type", *KINDS)
     for key, value, origin in sorted(over.entries(), key=lambda entry: entry[0] not in first):
         path = (*above, key)
@@ -94,7 +94,7 @@ def _told(draft: Draft) -> set[RecipeProblem]:
 
 
 def _replacing(after: Draft, before: Draft) -> RecipeProblem | None:
-    """Return the problem of the line that put another component in place of one."""
+    """Return a problem at the line that replaced a component; None if none was replaced."""
     for path, new in after.parts.items():
         old = before.parts.get(path, new)
         if new.type != old.type:
@@ -106,7 +106,7 @@ def _replacing(after: Draft, before: Draft) -> RecipeProblem | None:
 
 
 def _changing(path: KeyPath, value: Any, origin: Origin, before: Draft) -> RecipeProblem | None:
-    """Return the problem of an option; None of a component that is in nobody's place."""
+    """Return a problem at the line that changed an option; None for a `type`."""
     if path[-1] == "type":
         return None
     taken, place, old = find(before.tree, path)

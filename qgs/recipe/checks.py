@@ -1,6 +1,6 @@
-"""Checks of a recipe as a whole: each component beside the others and beside the settings.
+"""Checks of a whole recipe: components against each other and against the settings.
 
-Fields that components require and provide are followed in the order of a forward pass.
+Fields are followed from writer to reader in the order of a forward pass.
 """
 
 from collections.abc import Iterator, Mapping
@@ -27,7 +27,7 @@ from qgs.recipe.yaml_text import KeyPath, find, inline
 
 
 def check(draft: Draft, problems: Problems) -> Parts:
-    """The parts that a layer has a slot for; raises RecipeError for all that does not fit."""
+    """Check a draft and return its parts without idle sublayers; raise RecipeError for problems."""
     parts = _without_idle_sublayers(draft, problems)
     context = _context(draft)
     sound = [_check_options(part, context, problems) for part in parts.values()]
@@ -50,7 +50,7 @@ def _context(draft: Draft) -> RecipeContext:
 
 
 def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -> bool:
-    """Report what is wrong with a component's options; whether its declarations can be read."""
+    """Report problems of a component's options; return False if its declarations fail."""
     component = chosen.component
     config = chosen.config
     called = "fields_read"
@@ -80,9 +80,9 @@ def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -
 
 
 def _without_idle_sublayers(draft: Draft, problems: Problems) -> Parts:
-    """The parts without components in slots that no layer has; reports those that are written.
+    """Return the parts without components for slots that no layer has; report written ones.
 
-    A template used by any layer is not reported.
+    A template that any layer uses is not reported.
     """
     kept = dict(draft.parts)
     layers: dict[KeyPath, Any] = {}
@@ -108,12 +108,12 @@ def _without_idle_sublayers(draft: Draft, problems: Problems) -> Parts:
 def _report_idle(idle: Chosen, reason: str, problems: Problems) -> None:
     # What is a default is nobody's mistake.
     if idle.node:
-        fix = f"remove it; `{idle.slot}: null` drops one that is inherited"
+        fix = f"remove it, or write `{idle.slot}: null` to drop an inherited one"
         problems.add(idle.origin, idle.source, reason, fix)
 
 
 def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, str]]:
-    """Path, reason and fix of settings that contradict the components."""
+    """Yield path, reason and fix of settings that contradict the components."""
     settings = draft.settings
     encoder: Any = parts["model", "encoder"]
     # Tuning fits what an encoder can make keys and values of anew.
@@ -128,11 +128,11 @@ def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, 
         fix = "set it to false; evaluations do not read it"
         # A loss would compare renderings from moved cameras with photos from true ones.
         if settings.views.pose_noise:
-            reason = "views.pose_noise moves the cameras of input views, which must be exact"
+            reason = "input views must have exact cameras, but views.pose_noise moves them"
             yield path, reason, fix
         objective: Any = parts["objective",]
         if not objective.component.judges_inputs:
-            reason = f"`{objective.type}` reconstructs one moment, input views show others"
+            reason = f"`{objective.type}` reconstructs one moment, but input views show others"
             yield path, reason, fix
     if ("data",) in parts and not any(path[0] == "losses" for path in parts):
         reason = "a recipe with data needs at least one loss to train"
@@ -145,7 +145,7 @@ def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, 
     if not read and settings.model.decoder.layer_scale != default:
         names = " and ".join(sorted({f"`{layer.type}`" for layer in layers}))
         reason = f"it has no effect: {names or 'a decoder of depth 0'} does not read it"
-        fix = f"remove it; the default, `layer_scale: {inline(default)}`, drops an inherited one"
+        fix = f"remove it, or write the default, `{inline(default)}`, to drop an inherited one"
         yield (*DECODER, "layer_scale"), reason, fix
 
 
@@ -154,7 +154,7 @@ _FLOW = ("encoder", "queries", *LAYER_SLOTS, *AFTER_LAYERS, "losses", "objective
 
 
 def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems) -> None:
-    """Report fields that are read before they are written, or not as they are written."""
+    """Report fields that are read before they are written, or with another specification."""
     state: dict[str, tuple[FieldSpec, Chosen]] = {}
     for turns, decodes in _execution_order(parts, depth):
         # What is decoded of a layer is not there for the next one.
@@ -169,7 +169,7 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
                 written, writer = fields[name]
                 if written != needed[name]:
                     reason = (
-                        f"`{chosen.type}` reads {name} as {needed[name]}, `{writer.type}` at "
+                        f"`{chosen.type}` reads {name} as {needed[name]}, but `{writer.type}` at "
                         f"{writer.shown_path} ({writer.chosen_at}) writes it as {written}"
                     )
                     both = f"`{chosen.type}` or `{writer.type}`"
@@ -181,7 +181,7 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
 
 
 def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[list[Chosen], bool]]:
-    """Components in the order of a training step; whether they decode and judge a layer."""
+    """Yield components in the order of a training step; True if they decode and judge a layer."""
     supervision: Any = parts["model", "supervision"]
     # A supervised layer is decoded and judged right after it.
     decoded = {depth, *supervision.component(supervision.config).weights()}
@@ -197,9 +197,9 @@ def _execution_order(parts: Parts, depth: int) -> Iterator[tuple[list[Chosen], b
 
 
 def _unmet(missing: Fields, reader: Chosen, parts: Parts, registry: Registry) -> tuple[str, str]:
-    """Reason and fix where no component before `reader` provides the fields that it requires."""
+    """Return reason and fix for fields that `reader` needs and no component before it provides."""
     named = " and ".join(f"{name} ({spec})" for name, spec in missing.items())
-    reason = f"`{reader.type}` needs {named}, which nothing before it provides"
+    reason = f"`{reader.type}` needs {named}, which no component before it provides"
     for name in missing:
         late = [part for part in parts.values() if name in _offered(part.component, part.config)]
         if late:
@@ -217,7 +217,7 @@ def _unmet(missing: Fields, reader: Chosen, parts: Parts, registry: Registry) ->
 
 
 def _offered(component: type[Component], config: ComponentConfig | None) -> Fields:
-    """Fields that `component` provides without requiring them; none where a plugin's code fails."""
+    """Return the fields that `component` writes and does not read; none if its code fails."""
     with suppress(Exception):
         assert config is not None
         given = component.fields_read(config)
@@ -226,13 +226,13 @@ def _offered(component: type[Component], config: ComponentConfig | None) -> Fiel
 
 
 def keys_are_read(parts: Mapping[KeyPath, Chosen]) -> bool:
-    """Return whether a component requires keys or values of the image memory."""
+    """Return whether any component reads keys or values of the image memory."""
     wanted = {"memory.keys", "memory.values"}
     return any(wanted & part.component.fields_read(part.config).keys() for part in parts.values())
 
 
 def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
-    """A sentence for each learnable field of the queries that only refinements read."""
+    """Yield a sentence for each learnable field of the queries that only refinements read."""
     read = set[str]()
     for path, part in parts.items():
         # A refinement reads what it updates, which alone makes no use of it.
@@ -242,17 +242,17 @@ def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
     for name, spec in _offered(queries.component, queries.config).items():
         if name not in read and spec.dtype.is_floating_point:
             yield (
-                f"nothing reads {name}, which `{queries.type}` at model.queries provides: what is "
-                "learned of it has no effect"
+                f"nothing reads {name} of `{queries.type}` at model.queries, so learning it "
+                "has no effect"
             )
 
 
 def unfinished(parts: Mapping[KeyPath, Chosen], steps: int) -> Iterator[str]:
-    """A sentence for each schedule that goes on after `steps` steps."""
+    """Yield a sentence for each schedule that goes on after `steps` steps."""
     # Once for the template of a decoder, not for each layer.
     for part in {part.source: part for part in parts.values()}.values():
         for option, schedule in part.schedules.items():
             last = max(schedule.corners, default=0)
             if last > steps:
                 changes = f"{part.shown_path}.{option} changes until step {last}"
-                yield f"{changes}, training ends at {steps}"
+                yield f"{changes}, but training ends at step {steps}"

@@ -1,4 +1,4 @@
-"""From what is written at a place to a component class and its Config."""
+"""Decoding of the node at a place into a component class and its Config."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ ConfigT = TypeVar("ConfigT", bound=ComponentConfig)
 
 @dataclass(frozen=True)
 class Chosen(Place):
-    """The component that stands at a place: its `type`, class, options, and where it came from.
+    """The component at a place: its `type`, class, options, and origin.
 
-    schedules: of options that follow the progress of training; `config` has their first numbers,
-    `later` the others at which they have extremes.
+    schedules: the schedules of options that change during training. `config` has their first
+        values, `later` the values at their other extremes.
     """
 
     node: MapNode
@@ -43,7 +43,7 @@ class Chosen(Place):
 
     @property
     def options(self) -> dict[str, Any]:
-        """The options as a recipe writes them."""
+        """Options in the form of a recipe."""
         written = {name: s.model_dump(mode="json") for name, s in self.schedules.items()}
         return self.config.model_dump(mode="json") | written
 
@@ -53,7 +53,7 @@ class Chosen(Place):
 
     @property
     def shown_path(self) -> str:
-        """The dotted path under which a user finds it."""
+        """Dotted path at which a user finds it."""
         return ".".join(self.source)
 
     @property
@@ -67,10 +67,10 @@ Parts: TypeAlias = Mapping[KeyPath, Chosen]
 
 
 def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen | None:
-    """The component of a place; None, with a problem, where there is none to be had."""
+    """Return the component of a place; None, with a problem, if there is none."""
     node = place.node
     if not isinstance(node, MapNode):
-        reason = f"a component is a mapping, this is {brief(node)}"
+        reason = f"a component must be a mapping, got {brief(node)}"
         fix = "write `{type: PLUGIN/NAME, option: value}`"
         return problems.add(place.origin, place.source, reason, fix)
     name = type_at(node, place.path)
@@ -96,18 +96,18 @@ def decode_place(place: Place, registry: Registry, problems: Problems) -> Chosen
 def report_failure(
     place: Place, called: str, error: Exception, installed: InstalledPlugin, problems: Problems
 ) -> None:
-    """Report that `called`, of the component at `place`, raised `error`; names the distribution."""
+    """Report that `called` of the component at `place` raised `error`; name the distribution."""
     release = installed.released_as
     origin = f"the plugin `{installed.plugin.name}`{f' of {release}' if release else ''}"
     reason = f"{origin} fails: {called} raises {type(error).__name__}: {error}"
-    fix = f"update or correct {release or 'it'}, or choose another component"
+    fix = f"update or fix {release or 'it'}, or choose another component"
     problems.add(place.origin, place.source, reason, fix, error)
 
 
 def _decode_options(
     component: type[Component], node: MapNode, path: KeyPath, problems: Problems
 ) -> tuple[list[ComponentConfig], dict[str, Schedule]] | None:
-    """The options at each extreme of the schedules, the first ones first; and the schedules."""
+    """Return the options at each extreme of the schedules, by ascending step, and the schedules."""
     schedules: dict[str, Schedule] = {}
     steps = {0}
     for option, value, origin in node.entries():
@@ -115,7 +115,7 @@ def _decode_options(
             kind = str(value.get("schedule", ""))
             below = (*path, option)
             if kind not in SCHEDULES:
-                reason = "a mapping in place of a number is a schedule, and names its kind"
+                reason = "a mapping here is a schedule, so `schedule` must name a known kind"
                 fix = did_you_mean(kind, SCHEDULES, "schedules")
                 at = value.origins.get("schedule", origin)
                 return problems.add(at, (*below, "schedule"), reason, fix)
@@ -140,7 +140,7 @@ def _decode_options(
 
 
 def _why_no_component(name: object, slot: str, registry: Registry) -> tuple[str, str] | None:
-    """Reason and fix for a `type` that names no component of `slot`; None where that is told."""
+    """Return reason and fix for an unknown `type` in `slot`; None if already reported."""
     known = registry.components(slot)
     choice = f"choose {', '.join(sorted(known))}"
     if not isinstance(name, str):
@@ -151,8 +151,8 @@ def _why_no_component(name: object, slot: str, registry: Registry) -> tuple[str,
         # It may be one of a plug-in that cannot be used, which is a problem by itself.
         if not registry.complete:
             return None
-        reason = f"`{name}` is of the plugin `{plugin}`, which this recipe does not use"
-        return reason, f"add `plugins: [{plugin}]`, which joins those of its base"
+        reason = f"`{name}` belongs to the plugin `{plugin}`, which this recipe does not use"
+        return reason, f"add `plugins: [{plugin}]`; plugins of a base recipe stay"
     # The same name may stand in several slots, such as `qgs/none`.
     for other in SLOTS:
         if name in registry.components(other):
@@ -164,7 +164,7 @@ def _why_no_component(name: object, slot: str, registry: Registry) -> tuple[str,
 def decode_config(
     config: type[ConfigT], node: MapNode, path: KeyPath, problems: Problems
 ) -> ConfigT | None:
-    """The options written as `node` at `path`; None, with problems, if `config` refuses them."""
+    """Decode the options in `node` at `path`; return None, with problems, if they are invalid."""
     options, faults = validated(config, node)
     for fault in faults:
         report(fault, config, node, path, problems)
@@ -174,7 +174,7 @@ def decode_config(
 def validated(
     config: type[ConfigT], node: MapNode
 ) -> tuple[ConfigT | None, Sequence[ErrorDetails]]:
-    """The options written as `node`, or what pydantic says against them."""
+    """Return the options in `node`, or pydantic's errors."""
     try:
         # JSON is pydantic's only strict mode for text: a list may be read as a tuple and a string
         # as a path, but no string as a number.
@@ -186,7 +186,7 @@ def validated(
 def report(
     fault: ErrorDetails, config: type[BaseModel], node: MapNode, path: KeyPath, problems: Problems
 ) -> None:
-    """Add the problem that `config` finds with the options written as `node` at `path`."""
+    """Add the problem for pydantic's `fault` in the options in `node` at `path`."""
     steps, origin, given = find(node, fault["loc"])
     options = dict(options_in(config))
     # Layers have numbers, and one option of each name for all of them.
@@ -211,7 +211,7 @@ def report(
 
 
 def options_in(annotation: Any, above: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Dotted path and declaration of every option that a value of this type can hold."""
+    """Yield dotted path and declaration of every option that a value of this type can hold."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         for name, field in annotation.model_fields.items():
             yield above + name, field
@@ -221,7 +221,7 @@ def options_in(annotation: Any, above: str = "") -> Iterator[tuple[str, FieldInf
 
 
 def _explain(error: ErrorDetails, given: Any) -> tuple[str, str]:
-    """Reason and fix: pydantic's message, or a better one where we know more than pydantic."""
+    """Return reason and fix: pydantic's message, or a clearer one where we have one."""
     kind = error["type"]
     context = error.get("ctx", {})
     cause = context.get("error")
@@ -231,7 +231,7 @@ def _explain(error: ErrorDetails, given: Any) -> tuple[str, str]:
     if isinstance(cause, OptionError):
         return cause.reason, cause.fix
     if kind == "value_error":
-        return str(cause), "change the value so that this holds"
+        return str(cause), "change the value to meet this condition"
     reason = re.sub(r"^\w+ should ", "must ", error["msg"].split(", got")[0])
     reason = reason.replace(" after validation", "").replace("an object", "a mapping")
     if kind not in ("too_long", "too_short"):
@@ -242,4 +242,4 @@ def _explain(error: ErrorDetails, given: Any) -> tuple[str, str]:
         return reason, "write `true` or `false`: in YAML 1.2 other words are strings"
     if kind in ("model_type", "dict_type"):
         return reason, "write `key: value` lines below it"
-    return reason, "put it in quotes" if kind == "string_type" else "give a value that fits"
+    return reason, "put it in quotes" if kind == "string_type" else "write a valid value"

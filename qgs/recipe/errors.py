@@ -1,4 +1,4 @@
-"""Problems of a recipe, each with its place, its reason and a fix."""
+"""Problems of a recipe, each with a place, a reason and a fix."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from qgs.wording import counted
 
 @dataclass(frozen=True)
 class Origin:
-    """File and line where something was written; line 0 where lines mean nothing."""
+    """File and line of a value; line 0 if there is no line."""
 
     file: str
     line: int = 0
@@ -21,10 +21,13 @@ class Origin:
 
 @dataclass(frozen=True)
 class RecipeProblem(Problem):
-    """A mistake in a recipe. option: its dotted path, "" for the whole recipe.
+    """A mistake in a recipe.
 
-    file: as the user named it, "--set #n" for the n-th override, "<mapping>" for a Python mapping.
-    line: 1-based, 0 where there is none. cause: what a plugin's code raised, if that is the reason.
+    option: dotted path of the option, "" for the whole recipe.
+    file: the file as the user named it, "--set #n" for the n-th override, "<mapping>" for a Python
+        mapping.
+    line: 1-based, 0 if there is none.
+    cause: the exception of a plugin's code, if that is the reason.
     """
 
     file: str
@@ -41,9 +44,9 @@ class RecipeProblem(Problem):
 
 
 class RecipeError(ValueError):
-    """A recipe that cannot work. `problems` holds all of them, by file and line.
+    """Error for an invalid recipe. `problems` holds all problems, sorted by file and line.
 
-    what: the kind of file that was read.
+    what: the kind of file, for the message.
     """
 
     def __init__(self, problems: Iterable[RecipeProblem], what: str = "recipe") -> None:
@@ -55,9 +58,9 @@ class RecipeError(ValueError):
 
 
 class Problems:
-    """Collects problems while a recipe is read, so that all are reported at once.
+    """Collection of problems while a recipe is read, to report all of them at once.
 
-    what: the kind of file that is read. found: the problems, in the order in which they were met.
+    what: the kind of file, for the message. found: the problems, in the order of discovery.
     """
 
     def __init__(self, what: str = "recipe") -> None:
@@ -65,7 +68,7 @@ class Problems:
         self.found: list[RecipeProblem] = []
 
     def stop(self, origin: Origin, path: str | Iterable[str], reason: str, fix: str) -> NoReturn:
-        """Raise RecipeError for a mistake that hides part of the recipe, and for those before."""
+        """Raise RecipeError for a mistake after which checks cannot go on, and all earlier ones."""
         # Checks of the rest would mislead.
         self.add(origin, path, reason, fix)
         raise RecipeError(self.found, self.what)
@@ -78,13 +81,13 @@ class Problems:
         fix: str,
         cause: Exception | None = None,
     ) -> None:
-        """Note a mistake and go on. path: of the option, with dots or in parts."""
+        """Note a mistake and go on. path: path of the option, dotted or in parts."""
         option = path if isinstance(path, str) else ".".join(path)
         self.found.append(RecipeProblem(option, reason, fix, origin.file, origin.line, cause))
 
     def raise_any(self) -> None:
-        """Raise RecipeError if anything was found, chained to what plugins raised."""
+        """Raise RecipeError if there are problems, chained to the exceptions of plugins."""
         if self.found:
             error = RecipeError(self.found, self.what)
             causes = [problem.cause for problem in error.problems if problem.cause]
-            raise error from (ExceptionGroup("of plugins", causes) if causes else None)
+            raise error from (ExceptionGroup("failures of plugins", causes) if causes else None)

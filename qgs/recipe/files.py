@@ -1,4 +1,4 @@
-"""A recipe file with everything it extends, and `--set` overrides laid over it."""
+"""Reading of a recipe file, the files that it extends, and `--set` overrides."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -22,18 +22,18 @@ from qgs.recipe.yaml_text import (
 from qgs.wording import nearest
 
 KINDS = ("kind", "schedule")
-"""Options that decide which others a mapping without a type has."""
+"""Options that decide which other options a mapping without a type has."""
 _Trees: TypeAlias = dict[Path, MapNode | None]
-"""Merged trees by resolved path; None for one that is being read."""
+"""Merged trees by resolved path; None while a file is being read."""
 
 
 def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
-    """`over` laid over `base`, both at `path`.
+    """Merge `over` into `base`, both at `path`; `over` wins.
 
-    A component of another `type`, or a mapping of another `kind` or `schedule`, keeps nothing of
-    the old one. `plugins` are united, other lists replaced. `null` replaces what it lies over: in
-    place of an option it is a value, in place of a component or a section it leaves the default, in
-    place of a swap it drops the swap.
+    A component of another `type`, or a mapping of another `kind` or `schedule`, replaces the old
+    one completely. `plugins` are united, other lists replaced. `null` replaces the value below it:
+    for an option it is a value, for a component or a section it restores the default, for a swap
+    it removes the swap.
     """
     # Options of another component would be refused, or worse, mean something else.
     if _replaces(base, over, path):
@@ -58,7 +58,7 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
 
 
 def _replaces(base: MapNode, over: MapNode, path: KeyPath) -> bool:
-    """Return whether nothing of `base` stays under `over`."""
+    """Return whether `over` replaces `base` completely."""
     if path[:1] == ("swap",) and len(path) == 2:
         return True
     if "type" in over and type_at(base, path) not in (None, type_at(over, path)):
@@ -68,14 +68,14 @@ def _replaces(base: MapNode, over: MapNode, path: KeyPath) -> bool:
 
 
 def recipe_folder() -> Path:
-    """The recipes that come with qgs: in its wheel, else in the repository that it runs from."""
+    """Return the folder of the recipes that come with qgs, in its wheel or its repository."""
     package = Path(__file__).parents[1]
     inside = package / "recipes"
     return inside if inside.is_dir() else package.parent / "recipes"
 
 
 def found_recipe(file: Path, name: str | Path) -> Path:
-    """`file` where it exists, else the recipe called `name`, if there is one, of `recipe_folder`.
+    """Return `file` if it exists, else the recipe `name` in `recipe_folder`, else `file`.
 
     name: such as tiny/locus.yaml, or recipes/tiny/locus.yaml.
     """
@@ -89,7 +89,7 @@ def found_recipe(file: Path, name: str | Path) -> Path:
 
 
 def read_recipe(recipe: str | Path | Mapping[str, Any], problems: Problems) -> MapNode:
-    """The merged tree of `recipe`, without its `extends`."""
+    """Return the merged tree of `recipe`, without `extends`."""
     if not isinstance(recipe, Mapping):
         return _read(found_recipe(Path(recipe), recipe), {}, problems)
     origin = Origin("<mapping>")
@@ -97,26 +97,28 @@ def read_recipe(recipe: str | Path | Mapping[str, Any], problems: Problems) -> M
         # A study's variant is a mapping that knows where it was written.
         node = recipe if isinstance(recipe, MapNode) else from_plain(recipe, origin)
     except (ValueError, TypeError, RecursionError) as error:
-        problems.stop(origin, "", str(error), "give mappings, lists, strings, numbers, bools, None")
+        problems.stop(
+            origin, "", str(error), "use only mappings, lists, strings, numbers, bools, None"
+        )
     return _with_bases(node, Path(), {}, problems)
 
 
 def files_of(recipe: Path) -> list[Path]:
-    """A recipe file and all that it extends, each once, links resolved; raises RecipeError."""
+    """Return a recipe file and all files that it extends, links resolved; raise RecipeError."""
     trees: _Trees = {}
     _read(recipe, trees, Problems())
     return [*trees]
 
 
 def _read(file: Path, trees: _Trees, problems: Problems, at: Origin | None = None) -> MapNode:
-    """The merged tree of `file`. at: where it is extended."""
+    """Return the merged tree of `file`. at: the line that extends it."""
     # Two files may extend the same third one, by links as well.
     place = Path(os.path.realpath(file))
     if known := trees.get(place):
         return known
     option = "extends" if at else ""
     at = at or Origin(str(file))
-    fix = "check the path, or take one of `qgs recipes`"
+    fix = "check the path, or choose a recipe from `qgs recipes`"
     try:
         with open_file(file) as opened:
             text = opened.read().decode("utf-8")
@@ -138,11 +140,11 @@ def _read(file: Path, trees: _Trees, problems: Problems, at: Origin | None = Non
 
 
 def _with_bases(node: MapNode, folder: Path, trees: _Trees, problems: Problems) -> MapNode:
-    """`node` laid over the files that it extends, the later ones over the earlier ones."""
+    """Merge `node` over the files that it extends; later files win over earlier ones."""
     layers: list[MapNode] = []
     for name, origin in items_of(node.get("extends"), node.origin_of("extends")):
         if not isinstance(name, str):
-            reason = "`extends` names one recipe file or a list of them"
+            reason = "`extends` must be a recipe file or a list of recipe files"
             fix = "write `extends: base.yaml`, relative to this file"
             problems.stop(origin, "extends", reason, fix)
         # `..` must not follow links: a recipe names its base as it is written.
@@ -157,7 +159,7 @@ def _with_bases(node: MapNode, folder: Path, trees: _Trees, problems: Problems) 
 
 
 def apply_overrides(tree: MapNode, overrides: Sequence[str], problems: Problems) -> MapNode:
-    """`tree` with every override laid over it in order; the n-th has the origin `--set #n`."""
+    """Apply all overrides to `tree` in order; the n-th has the origin `--set #n`."""
     for number, text in enumerate(overrides, start=1):
         # One by one: an override may set an option of a component that the one before chose.
         tree = merge(tree, _read_override(text, Origin(f"--set #{number}"), problems))
@@ -169,7 +171,7 @@ def _read_override(text: str, origin: Origin, problems: Problems) -> MapNode:
     path = tuple(name.strip().split("."))
     if not equals or not all(path) or len(path) > MAX_DEPTH:
         fix = "write `path.to.option=value`, such as `model.queries.count=128`"
-        problems.add(origin, path, f"{text!r:.100} is no override", fix)
+        problems.add(origin, path, f"{text!r:.100} is not an override", fix)
         return MapNode(origin)
     node: Any = load_text(value, origin.file, problems, 0, path)
     for key in reversed(path):

@@ -1,4 +1,4 @@
-"""The places of a recipe that hold components: defaults, decoder layers, swaps."""
+"""Places for components in a recipe: defaults, decoder layers, swaps."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -16,10 +16,11 @@ DECODER: KeyPath = ("model", "decoder")
 
 @dataclass(frozen=True)
 class Place:
-    """A place and what is written there.
+    """A place and the node written there.
 
-    path: the place, decoder layers numbered. source: where a user finds it: the template, a layer's
-    override, or a swap. node: an empty mapping where nothing is written.
+    path: the place, with decoder layers numbered.
+    source: the path at which a user finds it: the template, a layer's override, or a swap.
+    node: the value; an empty mapping if nothing is written.
     """
 
     path: KeyPath
@@ -29,19 +30,19 @@ class Place:
 
     @property
     def slot(self) -> str:
-        """The slot's name."""
+        """Name of the slot."""
         slot = slot_at(self.path)
         assert slot is not None
         return slot.name
 
 
 def layer_place(index: int, slot: str) -> KeyPath:
-    """Path of a slot of a decoder layer."""
+    """Return the path of a slot of a decoder layer."""
     return (*DECODER, "layers", str(index), slot)
 
 
 def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place]:
-    """All places of `tree`, in the order in which a recipe is read."""
+    """Return all places of `tree`, in the order of a recipe."""
     # A layer with an index beyond the depth is often one of a base that was deeper.
     layers = tree.child(*DECODER, "layers").without(*map(str, range(depth)))
     for key, _, origin in layers.entries():
@@ -62,7 +63,7 @@ def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place
 
 
 def _place(tree: MapNode, path: KeyPath) -> Place:
-    """What is written at `path`; in a layer, laid over the decoder's template."""
+    """Return the place at `path`; in a layer, its node is merged over the decoder's template."""
     *above, name = path
     parent = tree.child(*above)
     node = parent.get(name)
@@ -80,11 +81,11 @@ def _place(tree: MapNode, path: KeyPath) -> Place:
 def apply_swaps(
     swaps: MapNode, places: Mapping[KeyPath, Place], problems: Problems
 ) -> dict[KeyPath, Place]:
-    """`places` with every swap made; `swaps` maps patterns to components.
+    """Return `places` after all swaps. swaps: maps patterns to components.
 
-    A pattern is a place's path in which `*`, `?` and `[...]` stand for parts of one segment, with
-    or without the leading `model.`; decoder layers are addressed as `decoder.layers.INDEX.SLOT`.
-    `null` in place of a component drops a swap that was inherited.
+    A pattern is the path of a place, with or without the leading `model.`. `*`, `?` and `[...]`
+    match within one segment. Decoder layers have the paths `decoder.layers.INDEX.SLOT`. `null` in
+    place of a component drops an inherited swap.
     """
     result = dict(places)
     # Swaps of the decoder's template would be lost under the layers made from it.
@@ -94,8 +95,8 @@ def apply_swaps(
         hits = {path: result[path] for path in swappable if matches(pattern, path)}
         set_before = [x for x in hits.values() if x.source[0] == "swap" or "layers" in x.source]
         if not isinstance(node, MapNode) or node.get("type") is None:
-            reason = f"a swap puts a component, this is {brief(node)} without a `type`"
-            fix = "write `PATTERN: {type: PLUGIN/NAME, ...}`; null drops an inherited swap"
+            reason = f"a swap must be a component with a `type`, got {brief(node)}"
+            fix = "write `PATTERN: {type: PLUGIN/NAME, ...}`, or null to drop an inherited swap"
         elif not hits:
             reason = f"the pattern `{pattern}` matches no place"
             known = [".".join(path).removeprefix("model.") for path in swappable]
@@ -103,7 +104,7 @@ def apply_swaps(
         elif set_before:
             place = set_before[0]
             reason = f"`{'.'.join(place.path)}` is already set at {place.origin}"
-            fix = "narrow one of the two, or remove one (null removes an inherited one)"
+            fix = "narrow one of the two, or remove one (null removes an inherited swap)"
         else:
             for path, place in hits.items():
                 result[path] = replace(place, source=source, node=node, origin=origin)
@@ -113,7 +114,7 @@ def apply_swaps(
 
 
 def matches(pattern: str, path: KeyPath, *, below: bool = False) -> bool:
-    """Return whether `pattern` names `path`, or where `below` what this lies below."""
+    """Return whether `pattern` matches `path` or, if `below`, a path above it."""
     # `model.` may be left out, so `*.renderer` is no place of the model.
     wanted = pattern.removeprefix("model.").split(".")
     shown = path[1:] if path[0] == "model" else path

@@ -1,4 +1,4 @@
-"""Resolving a recipe: read, merge, check, and write out every default; no tensor is allocated."""
+"""Resolution of a recipe: read, merge, check, write out defaults. It allocates no tensor."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,11 +28,11 @@ from qgs.recipe.yaml_text import KeyPath, MapNode, inline, items_of
 class Recipe:
     """A recipe that has passed every check.
 
-    tree: plain mapping, every default spelled out; resolving it again gives the same.
-    provenance: dotted path of each value of `tree` to `FILE:LINE`, `--set #n`, or the default that
-        set it.
-    parts: path of each place, decoder layers numbered, to the component that stands there.
-    releases: name to (distribution, version) of every plugin in use, `qgs` included.
+    tree: plain mapping with all defaults written out; resolving it again gives the same tree.
+    provenance: the origin of each value of `tree` by dotted path: `FILE:LINE`, `--set #n`, or a
+        default.
+    parts: the component at each place, by path, with decoder layers numbered.
+    releases: (distribution, version) of every plugin in use, by name, including `qgs`.
     """
 
     tree: Mapping[str, Any]
@@ -49,29 +49,29 @@ class Recipe:
 
     @property
     def data_config(self) -> contracts.SceneSourceConfig | None:
-        """The options of its data source; None without one, or where that has other options."""
+        """Options of its data source; None without data, or if the source has other options."""
         config = self.parts["data",].config if ("data",) in self.parts else None
         return config if isinstance(config, contracts.SceneSourceConfig) else None
 
     @property
     def warnings(self) -> list[str]:
-        """A sentence for each thing that works and is probably not what was meant."""
+        """Warnings, one sentence each, about valid settings that are probably mistakes."""
         return [*idle_fields(self.parts), *unfinished(self.parts, self.training.steps)]
 
     def build_model(
         self, device: torch.device | str | None = None, pretrained: bool = True
     ) -> QueryGaussianModel:
-        """The model with its initial parameters; on "meta" it takes no memory.
+        """Build the model with its initial parameters; on "meta" it takes no memory.
 
-        pretrained: components read the weights that options name; False where a checkpoint follows.
-        Raises TooLargeError for weights that do not fit into memory, before any is made.
+        pretrained: read the weights that options name. Use False if a checkpoint follows.
+        Raises TooLargeError, before it allocates weights, if they do not fit into memory.
         """
         if device is None or torch.device(device).type != "meta":
             # A width of 65,536 is valid, and would end in the kernel's out-of-memory killer.
             state = build_model(self, "meta").state_dict()
             sizes = {name: x.numel() * x.element_size() for name, x in state.items()}
             largest = max(sizes, key=lambda name: sizes[name])
-            fix = f"Lower the option of the model that makes {largest}."
+            fix = f"Lower the model option that sets the size of {largest}."
             refuse_more_than_memory("the model with its weights", sum(sizes.values()), fix)
         model = build_model(self, device)
         model.releases = self.releases
@@ -80,14 +80,14 @@ class Recipe:
         return model
 
     def build_losses(self, pretrained: bool = True) -> dict[str, contracts.Loss]:
-        """Losses by the names that the recipe gives; only one without data may have none."""
+        """Build the losses, by their names in the recipe; none only for a recipe without data."""
         losses = self._named("losses")
         if pretrained:
             load_pretrained(*losses.values())
         return losses
 
     def build_metrics(self) -> dict[str, contracts.Metric]:
-        """Metrics by the names that the recipe gives."""
+        """Build the metrics, by their names in the recipe."""
         metrics = self._named("metrics")
         for metric in metrics.values():
             try:
@@ -101,25 +101,25 @@ class Recipe:
         return {at[1]: build(part) for at, part in self.parts.items() if at[0] == section}
 
     def build_objective(self) -> contracts.Objective:
-        """The objective, which a training step computes."""
+        """Build the objective of a training step."""
         return build(self.parts["objective",])
 
     def build_optimizer(self) -> contracts.Optimizer:
-        """The optimiser; raises ValueError where `training` is too short for it."""
+        """Build the optimiser; raise ValueError if `training` is too short for it."""
         optimizer = build(self.parts["optimizer",], self.training)
         optimizer.check()
         return optimizer
 
     def rate_factors(self, module: nn.Module) -> dict[str, float]:
-        """Factor of the learning rate for every parameter of a model or objective, by name."""
+        """Return the learning-rate factor of every parameter of a model or objective, by name."""
         return rate_factors(module, self.parts["optimizer",])
 
     def build_view_sampler(self) -> contracts.ViewSampler:
-        """The sampler that draws the frames of samples."""
+        """Build the sampler of input and target frames."""
         return build(self.parts["view_sampler",])
 
     def build_data(self) -> contracts.SceneSource:
-        """The source of scenes; raises ValueError for a recipe without data."""
+        """Build the data source; raise ValueError for a recipe without data."""
         if ("data",) not in self.parts:
             raise ValueError("this recipe has no data; add `data: {type: PLUGIN/NAME}`")
         return build(self.parts["data",])
@@ -132,11 +132,11 @@ def resolve(
 ) -> Recipe:
     """Read, merge and check a recipe.
 
-    recipe: path of a YAML file, else the name of one that comes with qgs (tiny/locus.yaml); or a
-        mapping of the same form, whose `extends` is relative to the working directory.
-    overrides: such as "model.queries.count=128", laid over it in order.
-    plugins: plugins that it may name although they are not installed, such as one under test.
-    Raises RecipeError with every problem that was found.
+    recipe: path of a YAML file, or the name of a recipe that comes with qgs (tiny/locus.yaml), or a
+        mapping of the same form. `extends` in a mapping is relative to the working directory.
+    overrides: changes such as "model.queries.count=128", applied in order.
+    plugins: plugins that the recipe may name without being installed, such as one under test.
+    Raises RecipeError with all problems found.
     """
     problems = Problems()
     written = apply_overrides(read_recipe(recipe, problems), overrides, problems)
@@ -173,11 +173,11 @@ def resolve(
 
 _DEFAULT = "default"
 _Spelled: TypeAlias = Iterator[tuple[KeyPath, Any, Origin | str]]
-"""Path of each value, the value, and where it was written."""
+"""Path, value and origin of each value."""
 
 
 def spell_out(draft: Draft, parts: Mapping[KeyPath, Chosen]) -> _Spelled:
-    """All that a draft describes, in the order of a recipe; only plugins in use."""
+    """Yield all values of a draft, in the order of a recipe, with only the plugins in use."""
     shown = _shown_parts(parts)
     top, model, decoder, *sections = SETTINGS
     encoder, queries, *others = shown
@@ -205,7 +205,7 @@ def spell_out(draft: Draft, parts: Mapping[KeyPath, Chosen]) -> _Spelled:
 def _spelled(
     path: KeyPath, values: Mapping[str, Any], written: MapNode, default: Origin | str
 ) -> _Spelled:
-    """`values` at `path`, with `default` as the origin of those that are not written."""
+    """Yield `values` at `path`; values that are not written have `default` as their origin."""
     for name, value in values.items():
         origin = written.origins.get(name, default)
         if isinstance(value, dict) and value:
@@ -216,7 +216,7 @@ def _spelled(
 
 
 def _plugins(draft: Draft, used: set[str]) -> tuple[KeyPath, Any, Origin | str]:
-    """The plugins of a draft that are `used`, and the lines that name them."""
+    """Return the path `plugins`, those of a draft that are `used`, and the lines naming them."""
     kept = [name for name in draft.registry.plugins if name != "qgs" and name in used]
     origin = draft.tree.origins.get("plugins", Origin(_DEFAULT))
     lines = [str(at) for name, at in items_of(draft.tree.get("plugins"), origin) if name in kept]
@@ -224,9 +224,9 @@ def _plugins(draft: Draft, used: set[str]) -> tuple[KeyPath, Any, Origin | str]:
 
 
 def _shown_parts(parts: Mapping[KeyPath, Chosen]) -> dict[KeyPath, Chosen]:
-    """Parts as a recipe writes them: the decoder's template, and what differs from it in layers.
+    """Return parts in the form of a recipe: the decoder's template, and layers that differ.
 
-    A template that no layer uses gives way to what all layers have.
+    If all layers have the same component, it becomes the template.
     """
     shown = {path: part for path, part in parts.items() if "layers" not in path}
     layers = {path: part for path, part in parts.items() if "layers" in path}
@@ -240,7 +240,7 @@ def _shown_parts(parts: Mapping[KeyPath, Chosen]) -> dict[KeyPath, Chosen]:
 
 
 def flat(tree: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """Dotted path to value, mappings opened."""
+    """Flatten nested mappings to one from dotted path to value."""
     found: dict[str, Any] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping) and value:
@@ -253,7 +253,7 @@ def flat(tree: Mapping[str, Any], above: str = "") -> dict[str, Any]:
 def differing_options(
     a: Mapping[str, Any], b: Mapping[str, Any]
 ) -> dict[str, tuple[str | None, str | None]]:
-    """Dotted paths of the options that differ between two recipes, to both values as YAML.
+    """Return the options that differ between two recipes: dotted path to both values as YAML.
 
     None stands for an option that a recipe does not have.
     """
@@ -269,9 +269,9 @@ _NO_EFFECT_ONCE_TRAINED = re.compile(
 
 
 def differing_predictions(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
-    """`differing_options` that change what a model with given weights predicts, "none" for None.
+    """Return the `differing_options` that change the predictions of a trained model.
 
-    Initial values, supervision and the renderer do not.
+    Initial values, supervision and the renderer do not change them. "none" replaces None.
     """
     return {
         path: (ours or "none", theirs or "none")
@@ -281,7 +281,7 @@ def differing_predictions(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[st
 
 
 def annotated(recipe: Recipe) -> str:
-    """The resolved recipe in YAML; aligned comments name the file and line that set each value."""
+    """Write the resolved recipe as YAML; aligned comments name the file and line of each value."""
 
     def lines_of(tree: Mapping[str, Any], path: KeyPath) -> Iterator[tuple[str, str]]:
         for key, value in tree.items():

@@ -1,4 +1,4 @@
-"""Installed components: found by metadata, imported when a recipe or a command asks for them."""
+"""Installed components, found by metadata and imported when a recipe or command needs them."""
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,12 +22,15 @@ from qgs.wording import did_you_mean
 
 
 class PluginError(OptionError):
-    """A plugin that cannot be used: `reason` names its distribution, `fix` the remedy."""
+    """Error for an unusable plugin: `reason` names its distribution, `fix` says what to do."""
 
 
 @dataclass(frozen=True)
 class InstalledPlugin:
-    """A plugin and its distribution, "" for none. folder: of the module that holds the Plugin."""
+    """A plugin and its distribution ("" for none).
+
+    folder: folder of the module that holds the Plugin.
+    """
 
     plugin: Plugin
     distribution: str = ""
@@ -36,12 +39,12 @@ class InstalledPlugin:
 
     @property
     def released_as(self) -> str:
-        """Name and version of the distribution, as messages give them; "" for none."""
+        """Name and version of the distribution, for messages; "" for none."""
         return f"{self.distribution} {self.version}" if self.distribution else ""
 
     @property
     def models(self) -> dict[str, Path]:
-        """`PLUGIN/NAME` of every model that it ships to its file, which may be missing."""
+        """Files of the models that it ships, by `PLUGIN/NAME`; a file may be missing."""
         models = self.plugin.models.items()
         return {f"{self.plugin.name}/{name}": self.folder / file for name, file in models}
 
@@ -70,13 +73,16 @@ BUILTIN = InstalledPlugin(
 
 @dataclass(frozen=True)
 class Registry:
-    """The plugins that one recipe uses. complete: whether all that it names can be used."""
+    """The plugins that one recipe uses.
+
+    complete: True if all plugins that the recipe names can be used.
+    """
 
     plugins: Mapping[str, InstalledPlugin]
     complete: bool = True
 
     def components(self, slot: str) -> dict[str, type[Component]]:
-        """`PLUGIN/NAME` to component, of one slot."""
+        """Return the components of a slot, by `PLUGIN/NAME`."""
         found: dict[str, type[Component]] = {}
         for name, installed in self.plugins.items():
             for component in installed.plugin.components:
@@ -86,7 +92,7 @@ class Registry:
 
 
 def available_plugins() -> dict[str, list[EntryPoint]]:
-    """Name to entry points of every installed plugin, by metadata alone."""
+    """Return the entry points of all installed plugins, by name, from metadata alone."""
     found: dict[str, list[EntryPoint]] = {}
     for entry in extensions.installed(ENTRY_POINT_GROUP):
         found.setdefault(entry.name, []).append(entry)
@@ -94,14 +100,14 @@ def available_plugins() -> dict[str, list[EntryPoint]]:
 
 
 def load_registry(names: Iterable[str]) -> Registry:
-    """The built-in components and those of the plugins `names`; raises PluginError."""
+    """Load the built-in components and those of the plugins `names`; raise PluginError."""
     return Registry({"qgs": BUILTIN, **{name: load_plugin(name) for name in names}})
 
 
 def load_plugins(
     names: Sequence[str], tree: MapNode, problems: Problems, given: Sequence[Plugin]
 ) -> Registry:
-    """The components of the plugins `names` of a recipe; each that is unusable is a problem.
+    """Load the plugins `names` of a recipe; add a problem for each unusable one.
 
     given: plugins that need not be installed.
     """
@@ -118,7 +124,7 @@ def load_plugins(
 
 
 def load_usable_plugins() -> tuple[Registry, list[str]]:
-    """The components of every installed plugin that can be used, and why the others cannot."""
+    """Load all installed plugins; return the usable ones, and the faults of the others."""
     plugins = {"qgs": BUILTIN}
     broken = []
     # A plug-in of the framework's own name hides nothing.
@@ -131,7 +137,7 @@ def load_usable_plugins() -> tuple[Registry, list[str]]:
 
 
 def load_plugin(name: str) -> InstalledPlugin:
-    """Import and check the plugin `name`; raises PluginError."""
+    """Import and check the plugin `name`; raise PluginError."""
     if name == "qgs":
         return BUILTIN
     available = available_plugins()
@@ -141,7 +147,7 @@ def load_plugin(name: str) -> InstalledPlugin:
     if len(entries) > 1:
         releases = ", ".join(sorted(map(_release, entries)))
         reason = f"several distributions offer a plugin `{name}`: {releases}"
-        raise PluginError(reason, "uninstall all of them but one")
+        raise PluginError(reason, "uninstall all but one of them")
     entry = entries[0]
     release = _release(entry)
     assert entry.dist is not None
@@ -151,10 +157,10 @@ def load_plugin(name: str) -> InstalledPlugin:
     # A plug-in's module may do anything, `sys.exit` included.
     except (Exception, SystemExit) as error:
         message = f"cannot be imported from `{entry.value}`: {type(error).__name__}: {error}"
-        fix = f"install what it needs, update or correct {release}, or do without the plugin"
+        fix = f"install what it needs, update or fix {release}, or do without the plugin"
         raise PluginError(f"{named} {message}", fix) from error
     if fault := _plugin_fault(plugin, name):
-        raise PluginError(f"{named} {fault}", f"update or correct {release}, or do without it")
+        raise PluginError(f"{named} {fault}", f"update or fix {release}, or do without it")
     folder = Path(sys.modules[entry.module].__file__ or "").parent
     return InstalledPlugin(plugin, entry.dist.name, entry.dist.version, folder)
 
@@ -165,15 +171,15 @@ def _release(entry: EntryPoint) -> str:
 
 
 def _plugin_fault(plugin: object, name: str) -> str:
-    """The end of a sentence on why the plugin at the entry point `name` cannot be used; or ""."""
+    """Return the fault of the plugin at entry point `name`, as an end of a sentence; "" if none."""
     if not isinstance(plugin, Plugin):
-        return f"is no qgs.Plugin: its entry point leads to an object of type {type(plugin)}"
+        return f"is not a qgs.Plugin: its entry point leads to an object of type {type(plugin)}"
     if plugin.contract_version != CONTRACT_VERSION:
         versions = f"version {plugin.contract_version}; this qgs has version {CONTRACT_VERSION}"
         return f"was written for contract {versions}"
     # Recipes name the entry point, messages the plug-in.
     if plugin.name != name:
-        return f"calls itself `{plugin.name}`; the two names must be one"
+        return f"calls itself `{plugin.name}`; the two names must be equal"
     for component in plugin.components:
         if not (isinstance(component, type) and getattr(component, "slot", None) in SLOTS):
             return f"lists {component!r}, which implements no slot's contract"
@@ -181,7 +187,7 @@ def _plugin_fault(plugin: object, name: str) -> str:
 
 
 def default_config(component: type[Component]) -> ComponentConfig | None:
-    """Its default options; None if one must be given, or if a plugin's own validator fails."""
+    """Return default options; None if one has no default, or if a plugin's validator fails."""
     try:
         return component.Config()
     except (Exception, SystemExit):

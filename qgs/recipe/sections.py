@@ -1,4 +1,4 @@
-"""The sections of a recipe, and a draft: components chosen, not yet checked beside each other."""
+"""Sections of a recipe, and drafts: components are chosen, but not yet checked together."""
 
 from collections.abc import Sequence
 from copy import deepcopy
@@ -27,12 +27,12 @@ from qgs.recipe.yaml_text import KeyPath, MapNode, find, from_plain
 
 
 class ModelSettings(ComponentConfig):
-    """The model: sizes that all of its components share."""
+    """Sizes that all components of the model share."""
 
     width: int = Field(default=1024, ge=1, le=65_536)
-    """Features of a token and of a query (D in the papers)."""
+    """Number of features of a token and of a query (D in the papers)."""
     heads: int = Field(default=16, ge=1, validate_default=True)
-    """Attention heads (h in the papers), a divisor of the width."""
+    """Number of attention heads (h in the papers). It must divide the width."""
 
     @field_validator("heads")
     @classmethod
@@ -46,10 +46,10 @@ class ModelSettings(ComponentConfig):
 
 
 class DecoderSettings(ComponentConfig):
-    """The decoder, but for the components of its layers."""
+    """Settings of the decoder, except for the components of its layers."""
 
     depth: int = Field(default=12, ge=0, le=256)
-    """Number of layers (L in the papers); 0 decodes the queries as they start."""
+    """Number of layers (L in the papers). 0 decodes the initial queries."""
     layer_scale: float = Field(default=5e-5, gt=0)
     """Initial LayerScale of every sublayer (TokenGS release)."""
 
@@ -60,12 +60,12 @@ class RecipeSettings(ComponentConfig):
     recipe: int = Field(ge=1, le=1)
     """Version of the recipe format."""
     seed: int = Field(default=0, ge=0, lt=2**63)
-    """Of the model's initial parameters and of training."""
+    """Seed of the model's initial parameters and of training (default 0)."""
     init_from: str | None = None
-    """Checkpoint whose weights training starts from, its queries made as many as this recipe has
-    (LocusGS release: finetuning); null to start from the initial parameters."""
+    """Checkpoint with the weights from which training starts. Its queries are resized to the number
+    in this recipe (LocusGS release, finetuning). null starts from initial parameters."""
     plugins: tuple[str, ...] | None = ()
-    """Plugins whose components the recipe may name."""
+    """Plugins whose components the recipe may use. Default and null: only the built-in ones."""
 
 
 SETTINGS: dict[KeyPath, type[ComponentConfig]] = {
@@ -79,20 +79,20 @@ SETTINGS: dict[KeyPath, type[ComponentConfig]] = {
 
 
 def _parts(*slots: str) -> dict[str, Any]:
-    """Fields of components, of any form: `decode_place` knows which options they have."""
+    """Return fields for the components of `slots`, of any form; `decode_place` checks options."""
     fields: dict[str, Any] = {}
     for name in slots:
         about = summary_of(SLOTS[name].contract)
         part = Annotated[Any, WithJsonSchema({"slot": name})]
         fields[name] = part, Field(default=None, description=about)
         if SLOTS[name].named:
-            about = f"By name: {about}"
+            about = f"Components by name. {about}"
             fields[name] = dict[str, part], Field(default_factory=dict, description=about)
     return fields
 
 
 def _section(settings: type[ComponentConfig], **places: Any) -> Any:
-    """A field of a section that has settings, and maybe components."""
+    """Return a field of a section that has settings, and maybe components."""
     kind: Any = settings
     if places:
         named = settings.__name__
@@ -123,11 +123,11 @@ Layout: Any = create_model(
     training=_section(TrainingConfig),
     evaluation=_section(EvaluationConfig),
 )
-"""A whole recipe: its settings, and the places of components."""
+"""Model of a whole recipe: its settings, and the places of components."""
 
 
 def decode_settings(tree: MapNode, problems: Problems) -> tuple[MapNode, Any]:
-    """The Layout of `tree`, and `tree` without what it refuses and sections that are null."""
+    """Return `tree` without invalid values and null sections, and its Layout; add problems."""
     settings, faults = validated(Layout, tree)
     for fault in faults:
         # A section that is null leaves the default one.
@@ -153,10 +153,11 @@ def decode_settings(tree: MapNode, problems: Problems) -> tuple[MapNode, Any]:
 
 @dataclass(frozen=True)
 class Draft:
-    """A recipe that has been read.
+    """A recipe that was read but not yet checked as a whole.
 
-    tree: all files and overrides merged, with the default losses and metrics. settings: a Layout.
-    parts: what stands at each place, decoder layers numbered.
+    tree: all files and overrides merged, with the default losses and metrics.
+    settings: a Layout.
+    parts: the component at each place, with decoder layers numbered.
     """
 
     tree: MapNode
@@ -172,9 +173,9 @@ class Draft:
 
 
 def draft_of(written: MapNode, problems: Problems, plugins: Sequence[Plugin]) -> Draft:
-    """Choose the components of a merged recipe; raises RecipeError with all that it finds.
+    """Choose the components of a merged recipe; raise RecipeError with all problems.
 
-    plugins: those that it may name although they are not installed.
+    plugins: plugins that the recipe may name without being installed.
     """
     # Under what is written: `losses: {}` has none, a recipe without `losses` the default ones.
     sound, settings = decode_settings(written, problems)
@@ -189,7 +190,7 @@ def draft_of(written: MapNode, problems: Problems, plugins: Sequence[Plugin]) ->
 
 
 def _with_defaults(tree: MapNode) -> MapNode:
-    """`tree` with the default components of sections such as `losses` under what is written."""
+    """Merge `tree` over the default components of sections such as `losses`."""
     missing = {
         name: {key: {"type": kind} for key, kind in section.defaults.items()}
         for name, section in SECTIONS.items()

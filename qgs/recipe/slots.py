@@ -1,4 +1,4 @@
-"""The places of a recipe that hold components, and what stands there by default."""
+"""Slots of a recipe and their default components."""
 
 import inspect
 from collections.abc import Mapping
@@ -11,12 +11,14 @@ from qgs.recipe.yaml_text import KeyPath, MapNode
 
 @dataclass(frozen=True)
 class Slot:
-    """One kind of place. default: the `type` of a place that names none; None if it must.
+    """One kind of place for components.
 
-    The rest is for slots that are top-level sections. named: whether the section maps names to
-    components; else it is one component, and there is always one if there is a `default`.
-    defaults: name to type of the components of a recipe that lacks the section. defaults_stay:
-    whether they also stand beside those that are written; `NAME: null` drops one.
+    default: the `type` of a place that names none; None if a place must name one.
+    The other fields are for slots that are top-level sections.
+    named: True if the section maps names to components. Otherwise the section is one component; it
+        always exists if there is a `default`.
+    defaults: types of the components, by name, in a recipe without the section.
+    defaults_stay: True if the defaults are added to the written components; `NAME: null` drops one.
     """
 
     contract: type[contracts.Component]
@@ -27,7 +29,7 @@ class Slot:
 
     @property
     def name(self) -> str:
-        """The slot's name, as components know it."""
+        """Name of the slot, as in `Component.slot`."""
         return self.contract.slot
 
 
@@ -65,20 +67,20 @@ SECTIONS = {name: SLOTS[name] for name in _SECTIONS}
 
 
 def slot_at(path: KeyPath) -> Slot | None:
-    """The slot at a place of a recipe; None where no component belongs."""
+    """Return the slot at a place of a recipe; None for a place without a component."""
     # That of a section stands first, that of a part of the model last.
     return next((SLOTS[key] for key in (*path[:1], *path[-1:]) if key in SLOTS), None)
 
 
 def summary_of(described: object) -> str:
-    """The first paragraph of a docstring, on one line."""
+    """Return the first paragraph of a docstring, on one line."""
     return " ".join((inspect.getdoc(described) or "").split("\n\n")[0].split())
 
 
 def type_at(node: Any, path: KeyPath) -> Any:
-    """The `type` of the component written as `node` at `path`: its own, or the slot's default.
+    """Return the `type` of the component in `node` at `path`: its own, or the slot's default.
 
-    `type: null` leaves the default, as `null` does in place of a component.
+    `type: null` means the default, like `null` in place of a component.
     """
     if isinstance(node, MapNode) and node.get("type") is not None:
         return node["type"]

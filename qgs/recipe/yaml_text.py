@@ -1,4 +1,4 @@
-"""Recipes as YAML 1.2 text, and as nodes that know the line where each key was written."""
+"""Recipes as YAML 1.2 text, and as nodes that store the line of each key."""
 
 import json
 import os
@@ -27,7 +27,7 @@ _SCALARS = {
     "float": r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"
     r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
 }
-"""Scalars of YAML 1.2 that are no strings when they stand without quotes, by kind."""
+"""Patterns of unquoted YAML 1.2 scalars that are not strings, by kind."""
 _RESOLVERS: dict[str | None, list[tuple[str, re.Pattern[str]]]] = {
     None: [(_STANDARD + kind, re.compile(rf"({text})\Z")) for kind, text in _SCALARS.items()]
 }
@@ -35,9 +35,10 @@ _TAGS = {_STANDARD + kind for kind in (*_SCALARS, "str", "map", "seq")}
 
 
 class MapNode(dict[str, Any]):
-    """A mapping. origin: where it begins. origins: where each key was written.
+    """A mapping with origins.
 
-    under, over: what was merged into it, if anything; `over` is laid over `under`.
+    origin: start of the mapping. origins: origin of each key.
+    under, over: the two mappings that were merged into it, if any; `over` wins.
     """
 
     under: "MapNode | None" = None
@@ -51,20 +52,20 @@ class MapNode(dict[str, Any]):
             self.put(key, value, written)
 
     def put(self, key: str, value: Any, origin: Origin) -> None:
-        """Set `key`, which is written at `origin`."""
+        """Set `key`, with its origin."""
         self[key] = value
         self.origins[key] = origin
 
     def entries(self) -> list[tuple[str, Any, Origin]]:
-        """Keys and values, and where each key was written."""
+        """Return the key, value and origin of each entry."""
         return [(key, value, self.origins[key]) for key, value in self.items()]
 
     def without(self, *names: str) -> "MapNode":
-        """A copy that lacks `names`."""
+        """Return a copy without `names`."""
         return MapNode(self.origin, (entry for entry in self.entries() if entry[0] not in names))
 
     def child(self, *path: str) -> "MapNode":
-        """The mapping at `path`, an empty one where there is none."""
+        """Return the mapping at `path`, or an empty one."""
         found = self
         for key in path:
             empty = MapNode(found.origin_of(key))
@@ -73,12 +74,12 @@ class MapNode(dict[str, Any]):
         return found
 
     def origin_of(self, *keys: str) -> Origin:
-        """The origin of the first of `keys` that is there, else of the mapping."""
+        """Return the origin of the first of `keys` that exists, else of the mapping."""
         return next((self.origins[key] for key in keys if key in self.origins), self.origin)
 
 
 class ListNode(list[Any]):
-    """A list. origins: where each item was written, by index."""
+    """A list. origins: origin of each item, by index."""
 
     def __init__(self, items: Iterable[tuple[Any, Origin]]) -> None:
         entries = [*items]
@@ -90,9 +91,9 @@ Node: TypeAlias = MapNode | ListNode | str | int | float | None
 
 
 def items_of(value: Any, origin: Origin) -> list[tuple[Any, Origin]]:
-    """Items of a list, and where each was written.
+    """Return the items of a list, with their origins.
 
-    One value, written at `origin`, stands for a list of it, null for none.
+    A single value, written at `origin`, counts as a list of one item, null as an empty list.
     """
     if isinstance(value, ListNode):
         return [*zip(value, value.origins.values(), strict=True)]
@@ -100,9 +101,9 @@ def items_of(value: Any, origin: Origin) -> list[tuple[Any, Origin]]:
 
 
 def from_plain(value: Mapping[str, Any], origin: Origin) -> MapNode:
-    """A tree of plain Python values.
+    """Return a tree of nodes for plain Python values.
 
-    Raises ValueError or TypeError for what YAML could not hold.
+    Raises ValueError or TypeError for values that YAML cannot hold.
     """
 
     def read(plain: Any) -> Any:
@@ -136,54 +137,54 @@ def find(tree: MapNode, path: Sequence[str | int]) -> tuple[list[str | int], Ori
 
 
 def brief(value: Any) -> str:
-    """A node's value for messages, as JSON, of at most 200 characters."""
+    """Return a node's value for messages: JSON of at most 200 characters."""
     return f"`{json.dumps(value):.200}`"
 
 
 class Yaml12Loader(yaml.SafeLoader):
-    """Composes nodes with YAML 1.2 tags; `_scalar` reads their values."""
+    """Loader that composes nodes with YAML 1.2 tags; `_scalar` reads their values."""
 
     yaml_implicit_resolvers = _RESOLVERS
 
 
 class Yaml12Dumper(yaml.SafeDumper):
-    """Quotes exactly the strings that Yaml12Loader would not read as strings."""
+    """Dumper that quotes exactly the strings that Yaml12Loader would not read as strings."""
 
     yaml_implicit_resolvers = _RESOLVERS
 
     # Anchors would be hard to read in a resolved recipe.
     def ignore_aliases(self, data: Any) -> bool:
-        """Write repeated values out."""
+        """Return True: write repeated values in full."""
         return True
 
 
 def dump(value: Any, *, flow: bool | None = False) -> str:
-    """`value` as YAML 1.2, keys in their order."""
+    """Write `value` as YAML 1.2, with keys in their order."""
     # A width that long breaks no line: each option of a recipe stays on its own.
     style: Any = {"default_flow_style": flow, "sort_keys": False, "width": 10_000}
     return yaml.dump(value, Dumper=Yaml12Dumper, **style)
 
 
 def inline(value: Any) -> str:
-    """`value` as YAML 1.2 on one line."""
+    """Write `value` as YAML 1.2 on one line."""
     return dump(value, flow=True).removesuffix("\n").removesuffix("\n...")
 
 
 def load_mapping(text: str, file: str, problems: Problems) -> MapNode:
-    """The mapping in `text`; raises RecipeError where there is something else."""
+    """Read the mapping in `text`; raise RecipeError for anything else."""
     node = load_text(text, file, problems)
     if isinstance(node, MapNode):
         return node
-    fix = "write `key: value` lines, the first of them `recipe: 1`"
-    problems.stop(Origin(file, 1), "", f"a recipe is a mapping, this is {brief(node)}", fix)
+    fix = "write `key: value` lines, starting with `recipe: 1`"
+    problems.stop(Origin(file, 1), "", f"a recipe must be a mapping, got {brief(node)}", fix)
 
 
 def load_text(
     text: str, file: str, problems: Problems, line: int | None = None, path: KeyPath = ()
 ) -> Node:
-    """The value of `text`; raises RecipeError where it is no YAML.
+    """Read the value in `text`; raise RecipeError for invalid YAML.
 
-    line: given to every node in place of its own line. path: where the text belongs.
+    line: line for all nodes, in place of their own. path: place of the text in the recipe.
     """
 
     def origin(mark: yaml.Mark | None) -> Origin:
@@ -195,7 +196,7 @@ def load_text(
         return None if root is None else _read(root, origin, count(1))
     # Python's stack ends while PyYAML composes, before `_read` counts levels.
     except (yaml.YAMLError, RecursionError) as error:
-        reason = f"this is no YAML of a recipe: {getattr(error, 'problem', error)}"
+        reason = f"this is not valid YAML of a recipe: {getattr(error, 'problem', error)}"
         fix = "correct the line; check indentation (spaces, no tabs), brackets, quotes and `: `"
         problems.stop(origin(getattr(error, "problem_mark", None)), path, reason, fix)
 
@@ -207,9 +208,9 @@ _composed = lru_cache(maxsize=128)(partial(yaml.compose, Loader=Yaml12Loader))
 def _read(
     node: yaml.Node, origin: Callable[[yaml.Mark], Origin], counter: Iterator[int], depth: int = 0
 ) -> Node:
-    """PyYAML's node as ours; raises YAMLError for what no recipe may hold."""
+    """Convert PyYAML's node to ours; raise YAMLError for values that a recipe must not hold."""
     if depth > MAX_DEPTH or next(counter) > MAX_NODES:
-        what = f"more than {MAX_DEPTH} levels or {MAX_NODES:,} values, aliases written out"
+        what = f"more than {MAX_DEPTH} levels or {MAX_NODES:,} values after expanding aliases"
         raise _fault(what, node)
     if node.tag not in _TAGS:
         raise _fault(f"the tag {node.tag!r} is not allowed in a recipe", node)
@@ -220,7 +221,7 @@ def _read(
             key = key_node.value
             # The last of two equal keys would win in silence.
             if not isinstance(key_node, yaml.ScalarNode) or key in read:
-                raise _fault(f"the key {key!r:.100} is no word, or comes twice", key_node)
+                raise _fault(f"the key {key!r:.100} is not a word, or appears twice", key_node)
             read.put(key, below(value_node), origin(key_node.start_mark))
         return read
     if isinstance(node, yaml.SequenceNode):
@@ -229,7 +230,7 @@ def _read(
     try:
         return _scalar(kind, node.value)
     except ValueError:
-        raise _fault(f"{node.value!r:.100} is no {kind} of 64 bits", node) from None
+        raise _fault(f"{node.value!r:.100} is not a valid {kind} of 64 bits", node) from None
 
 
 def _fault(reason: str, node: yaml.Node) -> yaml.YAMLError:
@@ -237,7 +238,7 @@ def _fault(reason: str, node: yaml.Node) -> yaml.YAMLError:
 
 
 def _scalar(kind: str, text: str) -> Any:
-    """The value of a scalar; raises ValueError for a text that is none of this kind."""
+    """Return the value of a scalar; raise ValueError for text of another kind."""
     if kind == "null":
         return None
     if kind == "bool":

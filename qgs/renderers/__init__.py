@@ -1,4 +1,4 @@
-"""The renderers, and the one that chooses between two by device; one contract, `Renderer`."""
+"""The built-in renderers, and `auto`, which chooses one by device."""
 
 from collections.abc import Iterable
 
@@ -14,22 +14,22 @@ __all__ = ["COMPONENTS", "AutoRenderer", "CpuRenderer", "GsplatRenderer", "Torch
 
 
 class AutoRenderer(Renderer):
-    """gsplat for Gaussians on CUDA, `qgs/cpu` for others, whatever is installed."""
+    """Renderer that uses gsplat for Gaussians on CUDA, and `qgs/cpu` for all others."""
 
     name = "auto"
     camera_gradients = GsplatRenderer.camera_gradients
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """Options that gsplat lacks: refused on the CPU too, so that a recipe means one thing."""
+        """Return problems of options that gsplat lacks, also on the CPU, for equal results."""
         return GsplatRenderer.problems(config, context)
 
     def forward(
         self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None
     ) -> Rendering:
-        """See `Renderer`. Raises RuntimeError when the package it needs is not installed."""
+        """See `Renderer`. Raises RuntimeError if the package that it needs is not installed."""
         kind = GsplatRenderer if gaussians.means.is_cuda else CpuRenderer
-        # Made anew, since options may follow a schedule.
+        # Created in each call, because options may follow a schedule.
         return kind(self.config)(gaussians, cameras, background)
 
 

@@ -1,4 +1,4 @@
-"""`qgs/cpu`: projection and blending by tiles of 16 x 16 pixels, in numba."""
+"""`qgs/cpu`, a renderer in numba that blends tiles of 16 x 16 pixels."""
 
 from itertools import pairwise, product
 from typing import Any, TypeAlias
@@ -25,10 +25,10 @@ _Part: TypeAlias = tuple[int, tuple[int, int]]
 
 
 class CpuRenderer(Renderer):
-    """Fast on a CPU; the same bits on every run, whatever the number of threads.
+    """Fast renderer for CPUs. Results are bitwise equal for every run and number of threads.
 
-    Computes in float32 on `torch.get_num_threads()` threads; float64 inputs come back in float64,
-    at float32 accuracy. Gradients cannot be differentiated again.
+    It computes in float32 on `torch.get_num_threads()` threads. float64 inputs give float64 results
+    with float32 accuracy. Gradients cannot be differentiated again.
     """
 
     name = "cpu"
@@ -67,7 +67,7 @@ class CpuRenderer(Renderer):
 
 
 class _Splat(torch.autograd.Function):
-    """Sums (B, V, 5, H, W) of w r, w g, w b, w z, w.
+    """Function that computes sums (B, V, 5, H, W) of w r, w g, w b, w z, w.
 
     Inputs: colors (B, V, G, 3) or (B, 1, G, 3), means, scales, quats, opacities, c2w, intrinsics;
     size and options.
@@ -162,7 +162,7 @@ class _Splat(torch.autograd.Function):
 
 
 def _limits(config: RendererConfig, size: tuple[int, int]) -> list[tuple[Any, ...]]:
-    """The kernels' options: those of the projection and those of the blending."""
+    """Return the kernels' options for the projection and for the blending."""
     projection = (config.near, config.far, config.dilation, config.alpha_min, CLAMP_MARGIN, *size)
     blending = (config.alpha_min, config.alpha_cap, config.transmittance_min)
     return [tuple(map(np.float32, options)) for options in (projection, blending)]
@@ -173,7 +173,7 @@ def _arrays(*tensors: Tensor) -> tuple[Any, ...]:
 
 
 def _parts(splats: Any, size: tuple[int, int]) -> tuple[list[_Part], list[_Part]]:
-    """Ranges of Gaussians, and of tile rows (several if images are few), with their numbers."""
+    """Return numbered ranges of Gaussians, and of tile rows (several if images are few)."""
     batch, views, count, _ = splats.shape
     chunks = pairwise([*range(0, count, _CHUNK), count])
     rows = -(-size[0] // _TILE)

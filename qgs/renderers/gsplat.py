@@ -1,4 +1,4 @@
-"""`qgs/gsplat`: the CUDA kernels of gsplat 1.5.3."""
+"""`qgs/gsplat`, a renderer with the CUDA kernels of gsplat 1.5.3."""
 
 from collections.abc import Iterable
 from importlib import import_module
@@ -16,10 +16,10 @@ from qgs.types import Cameras, Gaussians, Rendering
 
 
 class GsplatRenderer(Renderer):
-    """For tensors on CUDA, in float32.
+    """Renderer for float32 tensors on CUDA.
 
     gsplat has no gradient for intrinsics, so intrinsics that require one are refused. Its kernels
-    fix alpha_min, alpha_cap and transmittance_min at the defaults.
+    use fixed alpha_min, alpha_cap and transmittance_min, equal to the defaults.
     """
 
     name = "gsplat"
@@ -33,7 +33,7 @@ class GsplatRenderer(Renderer):
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """The options that gsplat's kernels fix."""
+        """Return problems of options that differ from the fixed values of gsplat's kernels."""
         return _unsupported(config)
 
     def forward(

@@ -1,6 +1,6 @@
-"""`qgs/torch`: the dense reference in autograd, every Gaussian at every pixel.
+"""`qgs/torch`, a dense reference renderer in autograd: every Gaussian at every pixel.
 
-EWA projection after Zwicker et al. 2001 and gsplat 1.5.3.
+The EWA projection follows Zwicker et al. 2001 and gsplat 1.5.3.
 """
 
 from itertools import product
@@ -15,19 +15,19 @@ from qgs.geometry.constants import constant
 from qgs.geometry.transforms import quat_to_matrix, to_camera, to_pixels
 from qgs.types import Cameras, Gaussians, Rendering
 
-# Of the image's width or height: beyond it the Jacobian is held constant.
+# Fraction of the image's width or height; farther outside, the Jacobian is constant.
 CLAMP_MARGIN = 0.15
 
 
 def project(
     gaussians: Gaussians, cameras: Cameras, near: float, far: float, dilation: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Gaussians (B, G) as cameras (B, V) of their dtype see them, autocast being off.
+    """Project Gaussians (B, G) to cameras (B, V) of the same dtype, with autocast off.
 
-    Pixels (B, V, G, 2); entries xx, xy, yy (B, V, G, 3) of inverse covariances, pixel^-2; depths
-    (B, V, G), camera-frame z; and whether they are visible (B, V, G). Where near, far or an
-    overflow drops one, the others are finite placeholders with zero gradients. Differentiable in
-    means, scales, quats (normalised here), c2w and intrinsics.
+    Returns pixels (B, V, G, 2); entries xx, xy, yy (B, V, G, 3) of inverse covariances, pixel^-2;
+    depths (B, V, G), camera-frame z; and visibility (B, V, G), bool. For Gaussians dropped by near,
+    far or an overflow, the other values are finite placeholders with zero gradients. Differentiable
+    in means, scales, quats (normalised here), c2w and intrinsics.
     """
     centres = to_camera(gaussians.means, cameras)  # (B, V, G, 3)
     in_range = (centres[..., 2] >= near) & (centres[..., 2] <= far)
@@ -46,10 +46,10 @@ def project(
 
 
 def _image_factors(factors: Tensor, centres: Tensor, cameras: Cameras) -> Tensor:
-    """J W R S (B, V, G, 2, 3), from W R S (B, V, G, 3, 3) and camera-frame means (B, V, G, 3).
+    """Return J W R S (B, V, G, 2, 3) from W R S (B, V, G, 3, 3) and camera-frame means.
 
-    In the Jacobian J, x/z and y/z are clamped to 15 % of the image beyond its borders, as gsplat
-    does: farther off screen it would blow a Gaussian up over the whole image.
+    In the Jacobian J, x/z and y/z are clamped to 15 % of the image beyond its borders, as in
+    gsplat. Without it, a Gaussian farther off screen could spread over the whole image.
     """
     focal, principal = cameras.intrinsics[:, :, None].split(2, -1)
     sides = cameras.size[::-1]
@@ -62,7 +62,7 @@ def _image_factors(factors: Tensor, centres: Tensor, cameras: Cameras) -> Tensor
 
 
 def _conics(factors: Tensor, dilation: float) -> tuple[Tensor, Tensor]:
-    """Inverses (..., 3) of F F^T + dilation for F (..., 2, 3), and whether there is one."""
+    """Return the inverse (..., 3) of F F^T + dilation for F (..., 2, 3), and if it exists."""
     row_x, row_y = factors.unbind(-2)
     xx = (row_x * row_x).sum(-1)
     xy = (row_x * row_y).sum(-1)
@@ -76,9 +76,9 @@ def _conics(factors: Tensor, dilation: float) -> tuple[Tensor, Tensor]:
 
 
 class TorchRenderer(Renderer):
-    """The reference for tests: any device, float32 or float64, time and memory G x H x W.
+    """Reference renderer for tests: any device, float32 or float64.
 
-    Gaussians at the same depth are drawn in their given order.
+    Time and memory grow with G x H x W. Gaussians at the same depth are drawn in their given order.
     """
 
     name = "torch"
@@ -115,7 +115,7 @@ class TorchRenderer(Renderer):
 
 
 def resolve(sums: Tensor, background: Tensor) -> Rendering:
-    """Sums (B, V, C, H, W) of w r, w g, w b, those of features, w z, w -> Rendering."""
+    """Convert sums (B, V, C, H, W) of w r, w g, w b, w features, w z, w to a Rendering."""
     rgb, features, depth, alpha = sums.tensor_split([3, sums.shape[2] - 2, sums.shape[2] - 1], 2)
     # Depth is 0, not NaN, where nothing was hit.
     hit = torch.where(alpha > 0, alpha, 1.0)
@@ -134,7 +134,7 @@ def _weights(
     size: tuple[int, int],
     config: RendererConfig,
 ) -> Tensor:
-    """Weights (G, H, W) in the pixels of one image, of its splats (G, ...) from front to back."""
+    """Return the weights (G, H, W) of an image's splats (G, ...), sorted front to back."""
     height, width = size
     # Pixel centres are at .5: (0, 0) is the corner of the image.
     u = torch.arange(width, dtype=means.dtype, device=means.device) + 0.5
@@ -145,7 +145,7 @@ def _weights(
     xx, xy, yy = conics[..., None, None].unbind(1)
     power = -0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy
     alphas = opacities[:, None, None] * power.clamp(max=0).exp()
-    # alpha_min: less changes no 8-bit image. The cap: gradients divide by 1 - alpha.
+    # Alpha below alpha_min changes no 8-bit image. The cap: gradients divide by 1 - alpha.
     alphas = torch.where(alphas >= config.alpha_min, alphas.clamp(max=config.alpha_cap), 0.0)
     after = torch.cumprod(1 - alphas, 0)
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])[: len(after)]

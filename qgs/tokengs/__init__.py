@@ -1,4 +1,4 @@
-"""The default components: TokenGS, one file per slot."""
+"""The default components, from TokenGS; one file per slot."""
 
 from qgs.contracts import Component
 from qgs.tokengs.blocks import (

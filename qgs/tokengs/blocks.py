@@ -12,14 +12,14 @@ from torch import Tensor, nn
 from qgs.contracts import AttentionWeights, ComponentConfig
 
 NORM_EPS = 1e-5
-"""Added to the variance by every LayerNorm of both releases (PyTorch's default)."""
+"""Epsilon of every LayerNorm in both releases (PyTorch's default)."""
 
 
 class NormConfig(ComponentConfig):
     """Options of a component with LayerNorms."""
 
     norm_eps: float = Field(default=NORM_EPS, gt=0)
-    """Added to the variance by every LayerNorm."""
+    """Number that every LayerNorm adds to the variance."""
 
 
 class LayerScale(nn.Module):
@@ -35,7 +35,7 @@ class LayerScale(nn.Module):
 
 
 class Mlp(nn.Module):
-    """Linear, GELU, linear: (..., inputs) -> (..., outputs)."""
+    """MLP of linear, GELU, linear: (..., inputs) -> (..., outputs)."""
 
     def __init__(self, inputs: int, hidden: int, outputs: int) -> None:
         super().__init__()
@@ -47,17 +47,17 @@ class Mlp(nn.Module):
 
 
 def split_heads(x_BTD: Tensor, heads: int) -> Tensor:
-    """(B, T, D) -> (B, h, T, d)."""
+    """Split the heads: (B, T, D) -> (B, h, T, d)."""
     return rearrange(x_BTD, "b t (h d) -> b h t d", h=heads)
 
 
 def merge_heads(x_BhTd: Tensor) -> Tensor:
-    """(B, h, T, d) -> (B, T, D)."""
+    """Merge the heads: (B, h, T, d) -> (B, T, D)."""
     return rearrange(x_BhTd, "b h t d -> b t (h d)")
 
 
 def attention_weights(q_BhQd: Tensor, k_BhTd: Tensor, bias_BhQT: Tensor | None) -> AttentionWeights:
-    """The parts of scaled dot-product attention, computed in float32. bias: for one head or all."""
+    """Compute scaled dot-product attention weights in float32. bias: one for all heads, or each."""
     # So that logits keep their spread for any width of a head.
     scale = q_BhQd.shape[-1] ** -0.5
     content_BhQT = torch.einsum("bhqd,bhtd->bhqt", q_BhQd.float(), k_BhTd.float()) * scale
@@ -69,7 +69,7 @@ def attention_weights(q_BhQd: Tensor, k_BhTd: Tensor, bias_BhQT: Tensor | None) 
 class SelfAttentionCore(nn.Module):
     """Multi-head self-attention with fused qkv and per-head LayerNorm on queries and keys."""
 
-    # The same for all logits of a query; TokenGS has it.
+    # It adds the same number to all logits of a query, so it has no effect; TokenGS has it.
     unlearned = ("k_norm.bias",)
 
     def __init__(self, width: int, heads: int, norm_eps: float = NORM_EPS) -> None:
@@ -81,7 +81,7 @@ class SelfAttentionCore(nn.Module):
         self.proj = nn.Linear(width, width)
 
     def project(self, x_BTD: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Queries, keys and values (B, h, T, d), norms applied."""
+        """Return queries, keys and values (B, h, T, d), after their norms."""
         q_BhTd, k_BhTd, v_BhTd = (
             split_heads(part_BTD, self.heads) for part_BTD in self.qkv(x_BTD).chunk(3, -1)
         )
@@ -89,7 +89,7 @@ class SelfAttentionCore(nn.Module):
         return self.q_norm(q_BhTd).to(v_BhTd.dtype), self.k_norm(k_BhTd).to(v_BhTd.dtype), v_BhTd
 
     def forward(self, x_BTD: Tensor, mask: Tensor | None = None) -> Tensor:
-        """(B, T, D). mask: (B, T), False for tokens that nobody reads; or (B, T, T), for each."""
+        """Return (B, T, D). mask: (B, T), False for hidden tokens, or (B, T, T) for each reader."""
         q_BhTd, k_BhTd, v_BhTd = self.project(x_BTD)
         if mask is not None:
             mask = _by_head(mask if mask.ndim == 3 else mask[:, None])
@@ -99,7 +99,7 @@ class SelfAttentionCore(nn.Module):
     def explain(
         self, x_BTD: Tensor, queries: Tensor, mask: Tensor | None = None
     ) -> AttentionWeights:
-        """Attention of the tokens with indices `queries` (Q,), with the mask as in `forward`."""
+        """Return the attention of the tokens `queries` (Q,), indices; `mask` as in `forward`."""
         q_BhTd, k_BhTd, _ = self.project(x_BTD)
         bias_B1QT = None
         if mask is not None:
@@ -121,13 +121,13 @@ class CrossAttentionCore(nn.Module):
         self.out_proj = nn.Linear(width, width)
 
     def project(self, x_BND: Tensor) -> Tensor:
-        """Queries (B, h, N, d), norm applied."""
+        """Return queries (B, h, N, d), after their norm."""
         return self.q_norm(split_heads(self.q_proj(self.norm(x_BND)), self.heads))
 
     def forward(
         self, x_BND: Tensor, k_BhMd: Tensor, v_BhMd: Tensor, bias: Tensor | None = None
     ) -> Tensor:
-        """(B, N, D). bias: (B, N, M) for all heads, or (B, h, N, M), -inf hides a token."""
+        """Return (B, N, D). bias: (B, N, M) for all heads, or (B, h, N, M); -inf hides a token."""
         # Keys are normalised by their encoder, in float32 under autocast, as these queries are.
         q_BhNd = self.project(x_BND).to(v_BhMd.dtype)
         k_BhMd = k_BhMd.to(v_BhMd.dtype)
@@ -138,7 +138,7 @@ class CrossAttentionCore(nn.Module):
     def explain(
         self, x_BND: Tensor, k_BhMd: Tensor, queries: Tensor, bias: Tensor | None = None
     ) -> AttentionWeights:
-        """Attention of the queries with indices `queries` (Q,), with the bias as in `forward`."""
+        """Return the attention weights of `queries` (Q,), indices; `bias` as in `forward`."""
         q_BhQd = self.project(x_BND)[:, :, queries]
         full = (len(x_BND), -1, x_BND.shape[1], k_BhMd.shape[2])
         bias_BhQM = None if bias is None else _by_head(bias).expand(full)[:, :, queries]
@@ -146,5 +146,5 @@ class CrossAttentionCore(nn.Module):
 
 
 def _by_head(bias: Tensor) -> Tensor:
-    """(B, N, M) -> (B, 1, N, M); one that has heads stays."""
+    """Add a head axis: (B, N, M) -> (B, 1, N, M); (B, h, N, M) stays."""
     return bias if bias.ndim == 4 else bias[:, None]

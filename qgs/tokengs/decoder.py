@@ -1,4 +1,4 @@
-"""The default queries and decoder layer: attention by content alone, an MLP (TokenGS)."""
+"""The default queries and decoder layer (TokenGS), with content-only attention and an MLP."""
 
 import torch
 from pydantic import Field
@@ -23,15 +23,15 @@ from qgs.types import ImageMemory, QueryState, Rendering, Views
 
 
 class LatentQueries(LearnedQueries):
-    """N learned vectors, shared by all scenes, without a position."""
+    """Queries that are N learned vectors without a position, the same in all scenes."""
 
     name = "latent"
 
     class Config(ComponentConfig):
         count: int = Field(default=4096, ge=1)
-        """N, the number of queries."""
+        """Number N of queries."""
         std: float = Field(default=0.01, ge=0)
-        """Standard deviation of the normal distribution that the features start from."""
+        """Standard deviation of the initial features. 0 makes all queries equal."""
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
@@ -43,7 +43,7 @@ class LatentQueries(LearnedQueries):
 
 
 class CrossSelfMlp(DecoderLayer):
-    """Cross-attention, self-attention, MLP; each update is scaled and added (TokenGS release)."""
+    """Layer of cross-attention, self-attention, MLP; adds each scaled update (TokenGS release)."""
 
     name = "cross_self_mlp"
     sublayers = ("cross_attention", "self_attention", "feed_forward")
@@ -70,13 +70,13 @@ class CrossSelfMlp(DecoderLayer):
 
 
 class ContentCrossAttention(CrossAttention):
-    """By content alone: softmax(q k / sqrt(d)) v over all image tokens."""
+    """Content-only cross-attention: softmax(q k / sqrt(d)) v over all image tokens."""
 
     name = "content"
     reads = memory_fields("keys", "values")
 
     class Config(NormConfig):
-        """Options of its LayerNorms."""
+        """Options of the LayerNorms."""
 
     config: Config
 
@@ -98,7 +98,7 @@ class ContentSelfAttention(SelfAttention):
     name = "content"
 
     class Config(NormConfig):
-        """Options of its LayerNorms."""
+        """Options of the LayerNorms."""
 
     config: Config
 
@@ -115,13 +115,13 @@ class ContentSelfAttention(SelfAttention):
 
 
 class MlpFeedForward(FeedForward):
-    """LayerNorm, D -> ratio*D -> D with GELU."""
+    """MLP with pre-norm: LayerNorm, then D -> ratio*D -> D with GELU."""
 
     name = "mlp"
 
     class Config(NormConfig):
         ratio: float = Field(default=4.0, ge=1)
-        """Hidden width (rounded down) over the model's width."""
+        """Hidden width divided by the model's width; the result is rounded down."""
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
@@ -134,7 +134,7 @@ class MlpFeedForward(FeedForward):
 
 
 class NoRefinement(Refinement):
-    """Returns the state unchanged."""
+    """No refinement: the state stays unchanged."""
 
     name = "none"
 
@@ -143,7 +143,7 @@ class NoRefinement(Refinement):
 
 
 class NoFeedback(Feedback):
-    """Every layer runs once."""
+    """No feedback: every layer runs once."""
 
     name = "none"
     reads_cameras = False

@@ -1,4 +1,4 @@
-"""ViTs over the patches of all views together; `qgs/multiview_vit` (TokenGS release)."""
+"""ViT encoders over the patches of all views, such as `qgs/multiview_vit` (TokenGS release)."""
 
 from collections.abc import Mapping
 
@@ -17,7 +17,7 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class PatchEmbedding(nn.Module):
-    """P x P convolution with stride P, then LayerNorm: (X, C, H, W) -> (X, H/P*W/P, D).
+    """Patch embedding: P x P convolution of stride P, LayerNorm; (X, C, H, W) -> (X, H/P*W/P, D).
 
     X is B*V, the views of all scenes.
     """
@@ -51,18 +51,18 @@ class EncoderBlock(nn.Module):
 
 
 class PatchViT(PatchEncoder):
-    """RGB and Plücker embeddings added, then ViT blocks over the tokens of all views together.
+    """ViT over the tokens of all views; its input is the sum of RGB and Plücker embeddings.
 
-    Subclasses say what of the blocks' outputs the memory holds.
+    Subclasses decide which outputs of the blocks go into the memory.
     """
 
     class Config(NormConfig, PatchEncoder.Config):
         depth: int = Field(default=3, ge=0, le=256)
-        """Number of ViT blocks."""
+        """Number of ViT blocks. 0 leaves the embeddings unchanged."""
         mlp_ratio: float = Field(default=4.0, ge=1)
-        """Hidden width of the MLPs (rounded down) over the model's width."""
+        """Hidden width of the MLPs divided by the model's width; the result is rounded down."""
         layer_scale: float = Field(default=0.01, gt=0)
-        """Initial value of every LayerScale factor of the encoder."""
+        """Initial value of all LayerScale factors in the encoder."""
 
     config: Config
 
@@ -79,9 +79,10 @@ class PatchViT(PatchEncoder):
         )
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Weights of smaller patches serve larger ones, if their side is a multiple.
+        """Return weights for larger patches, if the new side is a multiple of the old one.
 
-        A patch of f x f times the pixels then gives the token of the small one on means of f x f.
+        A patch with a side f times as long then gives the token of the old patch, computed on means
+        over f x f pixels.
         """
         # Its shapes give the size of our patches.
         own = self.state_dict()
@@ -91,14 +92,14 @@ class PatchViT(PatchEncoder):
         }
 
     def embed(self, views: Views, plucker: Tensor) -> Tensor:
-        """Views (B, V) and their Plücker maps (B, V, 6, H, W) -> (B, M, D)."""
+        """Embed views (B, V) and their Plücker maps (B, V, 6, H, W) as tokens (B, M, D)."""
         x_XPD = self.rgb_embedding(imagenet_normalised(views.images).flatten(0, 1))
         x_XPD = x_XPD + self.ray_embedding(plucker.flatten(0, 1))
         return rearrange(x_XPD, "(b v) p d -> b (v p) d", b=len(views.images))
 
 
 class MultiViewViT(PatchViT):
-    """RGB and Plücker embeddings added, ViT blocks over all views, one key-value layer."""
+    """ViT over all views, from RGB and Plücker embeddings, with one key-value layer."""
 
     name = "multiview_vit"
 
@@ -124,7 +125,7 @@ class MultiViewViT(PatchViT):
 def keys_and_values(
     features: Tensor, kv_proj: nn.Linear, k_norm: nn.LayerNorm
 ) -> tuple[Tensor, Tensor]:
-    """Keys, normalised by head, and values (B, h, M, d) of features (B, M, C), C -> 2 D."""
+    """Return keys, normalised per head, and values (B, h, M, d) of features (B, M, C)."""
     heads = kv_proj.out_features // 2 // k_norm.normalized_shape[0]
     k_BMD, v_BMD = kv_proj(features).chunk(2, -1)
     v_BhMd = split_heads(v_BMD, heads)
@@ -132,11 +133,11 @@ def keys_and_values(
 
 
 _KERNEL = "_embedding.proj.weight"
-"""How names of patch embeddings' kernels end."""
+"""Ending of the names of patch embeddings' kernels."""
 
 
 def _larger(kernel: Tensor, side: int) -> Tensor:
-    """A kernel (D, C, p, p) for patches of `side`, a multiple of p; of others, as it is."""
+    """Enlarge a kernel (D, C, p, p) to patches of `side`, a multiple of p; others stay."""
     if kernel.ndim != 4 or not kernel.numel() or side % kernel.shape[-1]:
         return kernel
     factor = side // kernel.shape[-1]
@@ -145,7 +146,7 @@ def _larger(kernel: Tensor, side: int) -> Tensor:
 
 
 def imagenet_normalised(images: Tensor) -> Tensor:
-    """(RGB - mean) / std of ImageNet, for images (..., 3, H, W) in [0, 1]."""
+    """Normalise images (..., 3, H, W) in [0, 1] by the mean and std of ImageNet."""
     # ImageNet's statistics, as in the release: for other photos they centre well enough.
     mean, std = (constant(x, images)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
     return (images - mean) / std

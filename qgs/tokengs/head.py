@@ -1,4 +1,4 @@
-"""From queries to Gaussians: `qgs/gaussian_head` (TokenGS, LocusGS), `qgs/free`, `qgs/offset`."""
+"""Heads and centers: `qgs/gaussian_head` (TokenGS, LocusGS), `qgs/free`, `qgs/offset`."""
 
 import math
 from collections.abc import Iterable
@@ -24,35 +24,35 @@ from qgs.tokengs.blocks import NormConfig
 from qgs.types import GaussianAttributes, QueryState
 
 CHANNELS = (3, 3, 3, 4, 1)
-"""Per Gaussian: position, RGB, scale, rotation, opacity (both releases)."""
+"""Channels per Gaussian: position, RGB, scale, rotation, opacity (both releases)."""
 
 
 class GaussianHead(Head):
-    """D -> K * 14 linear, then the published activations in float32."""
+    """Linear head, D -> K * 14, followed by the published activations in float32."""
 
     name = "gaussian_head"
 
     class Config(NormConfig):
-        """Defaults are the LocusGS release's."""
+        """Options; the defaults are those of the LocusGS release."""
 
         gaussians_per_query: int = Field(default=64, ge=1)
-        """K, the Gaussians decoded from each query."""
+        """Number K of Gaussians per query."""
         init_std: float = Field(default=0.002, gt=0)
-        """Standard deviation of the truncated normal that the weights start from."""
+        """Standard deviation of the initial weights (truncated normal)."""
         position_std: float | None = Field(default=None, gt=0)
-        """The same for the weights that make positions; null for `init_std`."""
+        """Standard deviation of the initial weights for positions. null uses `init_std`."""
         z_init: float = 0.0
-        """What the biases of the z of positions start from, raw (TokenGS 2026.6: log 1.1)."""
+        """Initial bias of the raw z of positions (default 0; TokenGS 2026.6: log 1.1)."""
         norm: bool = False
-        """A LayerNorm before the linear layer (in neither release; steadier for small models)."""
+        """Use a LayerNorm before the linear layer (in neither release; helps small models)."""
         scale_cap: float = Field(default=0.075, gt=0)
-        """Largest scale, world units; a raw scale of 0 gives 1/e of it."""
+        """Largest scale in world units. A raw scale of 0 gives 1/e of it."""
         scale_input_limit: float | None = Field(default=10.0, gt=0)
-        """Raw scales are clamped to +- this before the exponential; null for no clamp (TokenGS)."""
+        """Clamp raw scales to +- this before the exponential. null: no clamp (TokenGS)."""
         opacity_bias: float = -2.0
-        """Added to the opacity logit."""
+        """Number added to the opacity logit."""
         quat_eps: float = Field(default=1e-4, gt=0)
-        """Least length that a raw quaternion is divided by (TokenGS: 1e-12)."""
+        """Smallest divisor when raw quaternions are normalised (TokenGS: 1e-12)."""
 
     config: Config
 
@@ -81,7 +81,7 @@ class GaussianHead(Head):
         return self.activate(rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(CHANNELS)))
 
     def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
-        """Raw channels (B, N, K, 14) to attributes, in float32 or better."""
+        """Convert raw channels (B, N, K, 14) to attributes, in float32 or better."""
         offsets, rgb, scale, rotation, opacity = at_least_float32(raw_BNKC).split(CHANNELS, -1)
         cap = self.config.scale_cap
         limit = self.config.scale_input_limit
@@ -103,11 +103,11 @@ class GaussianHead(Head):
 def posact(
     t: Tensor, input_limit: float | None = None, output_limit: float | None = None
 ) -> Tensor:
-    """sign(t) (exp|t| - 1): linear near 0, exponential far out (TokenGS release).
+    """Compute sign(t) (exp|t| - 1), linear near 0 and exponential far out (TokenGS release).
 
-    input_limit: |t| is clamped to it. output_limit: the size of the result is (LocusGS release: 100
-    and 1000; TokenGS: none). The slope is 1 at 0, so that a head which starts at zero can learn,
-    and 0 outside a limit.
+    input_limit: clamps |t|. output_limit: clamps the size of the result. The LocusGS release uses
+    100 and 1000, TokenGS neither. The slope is 1 at 0, so that a head that starts at zero can
+    learn. It is 0 outside a limit.
     """
     # Exp of a stray output would be infinite.
     if input_limit is not None:
@@ -122,17 +122,17 @@ def posact(
 
 
 class FreeCenters(Centers):
-    """mean = posact(offset) + (0, 0, z_offset)."""
+    """Free centers: mean = posact(offset) + (0, 0, z_offset)."""
 
     name = "free"
 
     class Config(ComponentConfig):
         z_offset: float = 1.0
-        """Added to z, world units (1 in TokenGS, 0 in LocusGS's free-centre ablation)."""
+        """Number added to z, in world units (1 in TokenGS, 0 in LocusGS's free-centre ablation)."""
         input_limit: float | None = Field(default=100.0, gt=0)
-        """Raw offsets are clamped to +- this; null for no clamp (LocusGS 100, TokenGS null)."""
+        """Clamp raw offsets to +- this. null: no clamp (LocusGS 100, TokenGS null)."""
         output_limit: float | None = Field(default=1000.0, gt=0)
-        """Offsets are clamped to +- this, world units; null for no clamp (LocusGS 1000)."""
+        """Clamp offsets to +- this, in world units. null: no clamp (LocusGS 1000)."""
 
     config: Config
 
@@ -143,13 +143,13 @@ class FreeCenters(Centers):
 
 
 class OffsetCenters(Centers):
-    """mean = offset + (0, 0, z_offset)."""
+    """Offset centers: mean = offset + (0, 0, z_offset)."""
 
     name = "offset"
 
     class Config(ComponentConfig):
         z_offset: float = 1.0
-        """Added to z, world units (1 in C3G, 1.5 in GlobalSplat)."""
+        """Number added to z, in world units (1 in C3G, 1.5 in GlobalSplat)."""
 
     config: Config
 

@@ -10,40 +10,41 @@ from torch.optim import AdamW
 from qgs.contracts import Optimizer, OptimizerConfig, ParameterGroup, TrainingConfig
 
 WARMUP_TIME = 0.1
-"""Largest part of a time budget that warm-up may take."""
+"""Largest fraction of a time budget for warm-up."""
 
 Decay: TypeAlias = Annotated[float, Field(ge=0, lt=1)]
 
 
 class OneCycleAdamW(Optimizer):
-    """AdamW; the learning rate rises and falls along cosines (LocusGS release), or rises on a line.
+    """AdamW with a learning rate that rises and falls along cosines (LocusGS release).
 
     The rise ends after `warmup` optimiser steps, or after WARMUP_TIME of a time budget if that
-    comes first. The fall follows the fraction of the budget that is used, the larger of steps and
-    seconds; with steps alone this is torch's `OneCycleLR` with pct_start = warmup / steps.
+    comes first. It may also be linear. The fall follows the used fraction of the budget, the larger
+    one of steps and seconds. With steps alone this is torch's `OneCycleLR` with
+    pct_start = warmup / steps.
 
-    A schedule for `learning_rate` replaces this cycle; warmup and divisors then have no effect.
+    A schedule for `learning_rate` replaces this cycle. Then warmup and divisors have no effect.
     """
 
     name = "adamw"
 
     class Config(OptimizerConfig):
-        """The learning rate, and AdamW's own options."""
+        """Options of the learning rate and of AdamW."""
 
         learning_rate: float = Field(default=4e-4, ge=0)
-        """The peak, at the end of the warm-up; or a schedule, which replaces the cycle."""
+        """Peak learning rate, at the end of the warm-up. A schedule replaces the cycle."""
         warmup: int = Field(default=2000, ge=0)
-        """Optimiser steps up to the peak."""
+        """Optimiser steps up to the peak. 0: start at the peak."""
         warmup_shape: Literal["cosine", "linear"] = "cosine"
-        """How the rate rises to the peak."""
+        """Shape of the rise to the peak."""
         initial_divisor: float = Field(default=25.0, ge=1)
-        """Peak over first rate."""
+        """Peak rate divided by first rate."""
         final_divisor: float = Field(default=1000.0, gt=0)
-        """First rate over last rate, as in torch's OneCycleLR; below 1 the last one is larger."""
+        """First rate divided by last rate, as in torch's OneCycleLR. Below 1 the last is larger."""
         betas: tuple[Decay, Decay] = (0.9, 0.95)
-        """AdamW's decay rates of the averages of gradients and of their squares."""
+        """AdamW's decay rates for the averages of gradients and of their squares."""
         weight_decay: float = Field(default=0.05, ge=0)
-        """AdamW's weight decay, on the parameters that decay; 0 for none."""
+        """AdamW's weight decay, for the parameters that decay. 0: none."""
 
     def __init__(self, config: Config, training: TrainingConfig | None = None) -> None:
         super().__init__(config, training)
@@ -55,23 +56,23 @@ class OneCycleAdamW(Optimizer):
         self._descent_starts: float | None = None
 
     def check(self) -> None:
-        """Raise ValueError when the warm-up fills all steps and no time budget shortens it."""
+        """Raise ValueError if the warm-up fills all steps and no time budget shortens it."""
         warmup = self.options.warmup
         steps = self.training.steps
         if not self.follows_schedule and self.training.seconds is None and warmup >= steps:
             raise ValueError(
                 f"optimizer.warmup is {warmup}, but training.steps is {steps}: the learning rate "
-                "would never come down; lower warmup or train for longer"
+                "would never fall; lower warmup or train for longer"
             )
 
     def build(self, groups: Sequence[ParameterGroup]) -> AdamW:
-        """Fused AdamW; `weight_decay` where parameters decay, else none."""
+        """Build a fused AdamW; groups that do not decay get no `weight_decay`."""
         decay = self.options.weight_decay
         own = [{**group, "weight_decay": decay if group["decays"] else 0.0} for group in groups]
         return AdamW(own, lr=self.peak, betas=self.options.betas, fused=True)
 
     def learning_rate(self, step: int, seconds: float) -> float:
-        """The schedule's rate, else the one-cycle rate."""
+        """Return the schedule's rate, or else the one-cycle rate."""
         if self.follows_schedule:
             return super().learning_rate(step, seconds)
         # steps - 1: the last step has the last rate, as in torch's OneCycleLR.
@@ -92,7 +93,7 @@ class OneCycleAdamW(Optimizer):
         return _cosine(self.peak, self.last, min(part, 1.0))
 
     def state(self) -> Mapping[str, float | None]:
-        """Where the fall started, as a fraction of the budget."""
+        """Return the start of the fall, as a fraction of the budget."""
         return {"descent_starts": self._descent_starts}
 
     def load_state(self, state: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Kinds of schedules: what a recipe writes for a number that follows the steps of training."""
+"""Kinds of schedules, which a recipe can use for numbers that change during training."""
 
 import math
 from bisect import bisect_right
@@ -14,12 +14,12 @@ Step: TypeAlias = Annotated[int, Field(ge=0)]
 
 
 class Constant(Schedule):
-    """One number, as if it were written alone."""
+    """A constant number, the same as a plain number."""
 
     schedule: Literal["constant"]
-    """One number, as if it were written alone."""
+    """A constant number, the same as a plain number."""
     value: float
-    """The number."""
+    """The constant number."""
 
     def number(self, step: int) -> float:
         """See `Schedule`."""
@@ -27,7 +27,7 @@ class Constant(Schedule):
 
 
 class _Listed(Schedule):
-    """A number by ascending steps `at`, and one of `values` for each of them, or `more`."""
+    """Schedule with ascending steps `at`, one of `values` for each step, and `more` values."""
 
     more: ClassVar[int] = 0
     values: tuple[float, ...]
@@ -42,7 +42,7 @@ class _Listed(Schedule):
         if len(self.values) != wanted:
             raise OptionError(
                 f"{len(steps)} steps in `at` need {wanted} values, got {len(self.values)}",
-                "give `linear` and `cosine` as many values as steps, `steps` the first one besides",
+                "`linear` and `cosine` need one value per step in `at`, `steps` one more",
             )
         return self
 
@@ -53,15 +53,15 @@ class _Listed(Schedule):
 
 
 class Steps(_Listed):
-    """`values[0]` first, and each further value from its step on."""
+    """Steps: `values[0]` first, then each further value from its step on."""
 
     more: ClassVar[int] = 1
     schedule: Literal["steps"]
-    """A number for each of several ranges of steps."""
+    """One number for each range of steps."""
     values: tuple[float, ...]
-    """The numbers, one more than there are steps in `at`."""
+    """The numbers, one more than the steps in `at`."""
     at: tuple[Annotated[int, Field(ge=1)], ...] = Field(min_length=1)
-    """Steps after which the next value holds, ascending."""
+    """Ascending steps; each starts the next value."""
 
     def number(self, step: int) -> float:
         """See `Schedule`."""
@@ -69,20 +69,20 @@ class Steps(_Listed):
 
     @property
     def corners(self) -> tuple[int, ...]:
-        """See `Schedule`; others go on until the last step before a jump."""
+        """See `Schedule`. The last step before each jump is a corner too."""
         before = [max(at - 1, 0) for at in self.at]
         return (*before, *self.at)
 
 
 class Linear(_Listed):
-    """From each number to the next one over a range of steps; constant before and after."""
+    """Interpolation between numbers over ranges of steps; constant before and after."""
 
     schedule: Literal["linear", "cosine"]
-    """From number to number on lines, or on halves of a cosine, which are slow at both ends."""
+    """Interpolation on lines, or on half cosines, which are slow at both ends."""
     values: tuple[float, ...] = Field(min_length=2)
-    """The numbers at the steps in `at`: the first also before, the last also after them."""
+    """The numbers at the steps in `at`. The first also holds before, the last after them."""
     at: tuple[Step, ...]
-    """Steps, ascending, one for each of `values`."""
+    """Ascending steps, one for each of `values`."""
 
     def number(self, step: int) -> float:
         """See `Schedule`."""
@@ -100,4 +100,4 @@ class Linear(_Listed):
 SCHEDULES: Mapping[str, type[Schedule]] = {
     "constant": Constant, "steps": Steps, "linear": Linear, "cosine": Linear
 }  # fmt: skip
-"""By the word under `schedule` in a recipe."""
+"""Kinds of schedules, by their name in a recipe."""

@@ -1,4 +1,4 @@
-"""`qgs/layers`: a set of supervised layers, later ones weighing more (LocusGS)."""
+"""`qgs/layers`, supervision of chosen layers with larger weights for later ones (LocusGS)."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -18,14 +18,14 @@ from qgs.types import Views
 
 
 class LayerSupervision(Supervision):
-    """The m-th of S supervised layers, ends of rounds among them, weighs m / (1 + ... + S)."""
+    """Supervision of S layers, with ends of rounds; the m-th has weight m / (1 + ... + S)."""
 
     name = "layers"
 
     class Config(ComponentConfig):
         layers: tuple[int, ...] = Field(default=(12,), min_length=1)
-        """Numbers of the supervised decoder layers, ascending; 1 is the first, 0 the state before
-        any layer, in a decoder of depth 0."""
+        """Numbers of the supervised decoder layers, ascending. 1 is the first layer. 0 is the
+        initial state, only in a decoder of depth 0."""
 
         @field_validator("layers")
         @classmethod
@@ -49,9 +49,7 @@ class LayerSupervision(Supervision):
         if missing:
             reason = f"layers {missing} do not exist in a decoder of depth {depth}"
             fix = f"choose layers from 1 to {depth}, or raise model.decoder.depth"
-            yield Problem(
-                "layers", reason, fix if depth else "write [0], the queries as they start"
-            )
+            yield Problem("layers", reason, fix if depth else "write [0], the initial queries")
 
     def weights(self, rounds: Sequence[int] = ()) -> Mapping[int, float]:
         layers = (*self.config.layers, *rounds)
@@ -61,7 +59,7 @@ class LayerSupervision(Supervision):
 
 
 class OnePass(Objective):
-    """The recipe's losses of one prediction from all input views."""
+    """Objective of one pass: the recipe's losses of a prediction from all input views."""
 
     name = "one_pass"
 

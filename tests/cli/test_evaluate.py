@@ -115,7 +115,7 @@ def test_an_evaluation_names_its_photos_and_says_where_a_copy_is_better(tmp_path
     done("eval", tmp_path)
     folder = tmp_path / "evaluation"
     remarks = summary(folder)["remarks"]
-    for word in ("worse than the nearest", "within"):
+    for word in ("worse than a copy of the nearest", "within"):
         assert sum(word in remark for remark in remarks) == 1, word
     (row,) = csv.DictReader((folder / "scenes.csv").open())
     firsts = [row[name].split("; ")[0] for name in ("input_frames", "target_frames")]

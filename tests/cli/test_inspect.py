@@ -94,7 +94,7 @@ def test_a_name_stands_for_a_recipe_that_no_file_hides(name):
 
 def test_other_names_are_refused():
     for name in ("tiny/lotus.yaml", "../README.md", "../recipes/../README.md"):
-        with pytest.raises(RecipeError, match=r"does not exist[^?]*or take one of `qgs recipes`"):
+        with pytest.raises(RecipeError, match=r"does not exist[^?]*a recipe from `qgs recipes`"):
             resolve(name)
 
 

@@ -93,5 +93,5 @@ def test_a_forward_pass_starts_from_the_given_state():
         )
     assert torch.equal(plain, same)
     assert not torch.allclose(plain, moved)
-    with pytest.raises(ValueError, match="the memory is of 1 scenes, the initial state of 2"):
+    with pytest.raises(ValueError, match="the memory has 1 scenes, but the initial state has 2"):
         model(inputs, state=model.queries.start(2))
