@@ -1,4 +1,4 @@
-"""Base of all containers of tensors: checks of shapes, iteration and mapping over tensors."""
+"""Base of tensor containers, with checks of shapes, iteration and mapping over tensors."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace

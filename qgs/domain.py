@@ -1,4 +1,4 @@
-"""Range of the views that a model was trained on, and checks of other views against it.
+"""Trained range of views, and checks of other views against it.
 
 It compares only cameras in the model's frame, so it works for any data.
 """

@@ -1,4 +1,4 @@
-"""Entry points of installed distributions, found by metadata."""
+"""Entry points, found in the metadata of installed distributions."""
 
 from __future__ import annotations
 

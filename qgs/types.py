@@ -1,4 +1,4 @@
-"""Containers of tensors that components exchange.
+"""Containers of tensors, which components exchange.
 
 Axes: B scenes, V views, H x W pixels, N queries, K Gaussians per query, G = N*K Gaussians,
 M image tokens, D width, h heads, d = D/h. Model code ends the names of tensors with their axes,

@@ -1,4 +1,4 @@
-"""Helpers for the text of messages and tables."""
+"""Wording of messages and tables."""
 
 import logging
 from collections.abc import Collection, Iterable

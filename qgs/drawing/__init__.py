@@ -1,1 +1,1 @@
-"""Drawing of tensors as pictures and figures."""
+"""Pictures and figures."""

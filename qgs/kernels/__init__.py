@@ -1,4 +1,4 @@
-"""Loops of the renderer `qgs/cpu` and of SSIM, compiled by numba.
+"""Loops compiled by numba, for the renderer `qgs/cpu` and SSIM.
 
 You can understand a model without reading them. Each kernel computes the same as a few lines of
 torch elsewhere, without tensors of all pairs. Tests compare it with those lines.

@@ -1,4 +1,4 @@
-"""The built-in losses."""
+"""Losses that training minimises."""
 
 from qgs.losses.depth import DepthSurface
 from qgs.losses.photometric import Mask, Opacity, Photometric, mean_of_gaussians
