@@ -14,7 +14,11 @@ from qgs.recipe.sections import RecipeSettings
 from qgs.recipe.slots import SLOTS
 from qgs.recipe.yaml_text import load_text
 
-EQUATIONS, _, REST = all_pages()["equations.md"].partition("## Where paper and release differ")
+PAGES = all_pages()
+EQUATIONS, _, REST = PAGES["equations.md"].partition("## Where paper and release differ")
+EQUATIONS += "".join(
+    PAGES[f"api/{name}.md"] for name in ("c3g", "ellipsoid", "globalsplat", "gslrm")
+)
 CONSTANTS = r"""
 support radius | radius_min | softplus(ρ), {:g})
 bias | bias_min | clamped to [{:g}, 0]
