@@ -126,7 +126,7 @@ def test_what_has_no_default_options_is_named(monkeypatch, component) -> None:
     ("component", "why"),
     [
         (NeedsMore, 'needs_more needs numba: run `pip install "query-gaussians[cpu]"`'),
-        (OnOtherDevices, "runs on cuda alone, which is not here"),
+        (OnOtherDevices, "runs only on cuda, which this machine does not have"),
     ],
 )
 def test_what_cannot_be_built_here_is_not_checked(monkeypatch, component, why) -> None:
@@ -172,7 +172,7 @@ def test_a_test_of_a_case_names_all_that_fails_and_skips_what_cannot_run(monkeyp
     assert titles[0] == f"{CACHES.label}: {STATE}"
     assert titles[1].startswith(f"{CACHES.label}: {FROZEN} passes, although")
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    with pytest.raises(pytest.skip.Exception, match="runs on cuda alone"):
+    with pytest.raises(pytest.skip.Exception, match="runs only on cuda"):
         CaseRun(Case(GsplatRenderer.Config())).check(["core"])
 
 

@@ -42,8 +42,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import public names on first use: help of the commands needs neither torch nor pydantic."""
+    """Import public names on first use, so that `--help` needs neither torch nor pydantic."""
     if name not in __all__:
         raise AttributeError(f"module 'qgs_dev' has no attribute {name!r}")
-    # It imports the names of the other modules, too.
+    # `running` also imports the public names of the other modules.
     return getattr(import_module("qgs_dev.running"), name)

@@ -1,4 +1,4 @@
-"""A component with options and sizes, as the checks see it, and the errors that checks raise."""
+"""Cases of the contract suite, a component with options and sizes, and the errors of checks."""
 
 import re
 from collections.abc import Mapping
@@ -29,10 +29,10 @@ from qgs.recipe.yaml_text import dump
 from qgs.tokengs import ContentCrossAttention, ContentSelfAttention, MlpFeedForward
 from qgs_dev.modules import seeded
 
-# The least that has two heads and a layer after the first: checks take seconds for a plugin.
+# The smallest model with two heads and two layers, so that the checks of a plugin take seconds.
 SMALL = ModelDims(width=32, heads=2, depth=2)
 
-# Sizes that are tried in turn until the component's `problems` accepts one.
+# Image sizes to try in turn until the component's `problems` accepts one.
 IMAGE_SIZES = ((16, 24), (24, 16), (28, 42), (32, 48), (64, 96))
 
 # Components in the slots of a decoder layer.
@@ -42,30 +42,30 @@ SUBLAYERS: Mapping[str, Any] = {
     "feed_forward": MlpFeedForward,
 }
 
-# Large enough for what stands in the slots to show in the output of a layer.
+# Large enough that the sublayers change the output of a layer.
 LAYER_SCALE = 0.3
 
-# Added to parameters where initial zeros would hide what a component does.
+# Added to parameters, because initial zeros would hide what a component does.
 NOISE = 0.1
 
 
 class ContractError(AssertionError):
-    """A component does not keep its contract; the message says what it did instead."""
+    """Error for a component that breaks its contract; the message says what it did instead."""
 
 
 class CannotCheck(Exception):  # noqa: N818 (not an error: the reason of a skip)
-    """A check cannot be run here; the message is the reason."""
+    """Signal that a check cannot run here; the message is the reason."""
 
 
 @dataclass(frozen=True)
 class Case:
     """A component to check: `Case(MyAttention.Config(bandwidth="fixed"))`.
 
-    config: options of a component; the class that nests it is the one checked.
+    config: options of the component. The class in which `Config` is nested is the one checked.
     dims: sizes to build it with. image_size: (H, W) of the views; None tries a few small ones.
-    state_dict: name -> shape of every entry, pinned, so that saved weights stay loadable; None
-        pins nothing.
-    Raises TypeError for anything but the options of a complete component.
+    state_dict: expected name -> shape of every entry, so that saved weights stay loadable; None
+        expects nothing.
+    Raises TypeError unless `config` holds the options of a complete component.
     """
 
     config: ComponentConfig
@@ -76,28 +76,28 @@ class Case:
     def __post_init__(self) -> None:
         fault = component_fault(self.component)
         if fault:
-            raise TypeError(f"{self.component.__qualname__} cannot be checked: {fault}")
+            raise TypeError(f"{self.component.__qualname__} cannot be checked: it {fault}")
 
     @property
     def component(self) -> type[contracts.Component]:
-        """The class under test."""
+        """Class under test."""
         component = self.config.__component__
         assert component is not None
         return component
 
     @property
     def slot(self) -> str:
-        """The slot that it fills."""
+        """Slot that the component fills."""
         return self.component.slot
 
     @property
     def reads(self) -> Fields:
-        """The fields that it requires."""
+        """Fields that the component requires."""
         return self.component.fields_read(self.config)
 
     @property
     def writes(self) -> Fields:
-        """The fields that it provides."""
+        """Fields that the component provides."""
         return self.component.fields_written(self.config)
 
     @property
@@ -105,7 +105,7 @@ class Case:
         """True for a component that is built with the sizes of the model."""
         return issubclass(self.component, contracts.ModelComponent)
 
-    # Every check of the case is named by it.
+    # Reports name every check of the case by it.
     @cached_property
     def label(self) -> str:
         """Slot and name, and the options that differ from their defaults, in YAML."""
@@ -128,35 +128,35 @@ class Case:
 
     @property
     def device(self) -> str:
-        """The CPU if it can run there, else its GPU; raises CannotCheck if that is missing."""
+        """CPU if the component supports it, otherwise its GPU; CannotCheck if there is none."""
         devices = getattr(self.component, "devices", ("cpu",))
         if "cpu" in devices:
             return "cpu"
         if "cuda" in devices and torch.cuda.is_available():
             return "cuda"
-        raise CannotCheck(f"runs on {' or '.join(devices)} alone, which is not here")
+        raise CannotCheck(f"runs only on {' or '.join(devices)}, which this machine does not have")
 
     def problems(self, size: tuple[int, int] | None = None) -> list[contracts.Problem]:
-        """Return what the component says of its options, with images of `size`."""
+        """Return the problems that the component finds in its options, for images of `size`."""
         context = contracts.RecipeContext(self.dims, size)
         return list(self.component.problems(self.config, context))
 
     def build(self, seed: int = 0) -> Any:
-        """A new instance, parameters drawn under `seed`. CannotCheck where its data is missing."""
+        """Return a new instance with parameters drawn from `seed`; CannotCheck without its data."""
         try:
             with seeded(seed):
                 built = self.construct()
         except FileNotFoundError as error:
             if self.slot != "data":
                 raise
-            # Data sets are gigabytes, and here or not; any other file belongs to the component.
-            raise CannotCheck(f"the data of this case is not here: {error}") from error
+            # A data set of gigabytes may be missing; any other file belongs to the component.
+            raise CannotCheck(f"the data set of this case is missing: {error}") from error
         return built.to(self.device) if isinstance(built, nn.Module) else built
 
     def construct(self) -> Any:
-        """A new instance, drawn from the global random state."""
-        # The three kinds of constructors: of a layer, with the sizes of the model, with options
-        # alone.
+        """Return a new instance with parameters drawn from the global random state."""
+        # There are three kinds of constructors: of a layer, of a component that takes the sizes of
+        # the model, and of one that takes only options.
         make: Any = self.component
         if issubclass(make, contracts.DecoderLayer):
             parts = {}
@@ -170,7 +170,7 @@ class Case:
         return built
 
     def lively(self, seed: int = 0) -> Any:
-        """An instance in evaluation mode in which no parameter is zero by initialisation."""
+        """Return an instance in evaluation mode, with noise added to all parameters."""
         module = self.build(seed).eval()
         generator = torch.Generator().manual_seed(seed + 1)
         with torch.no_grad():
@@ -179,59 +179,59 @@ class Case:
         return module
 
     def with_at_most(self, **sizes: int) -> "Case":
-        """Return a case whose larger options are lowered to these, or itself if it refuses that."""
+        """Return a case with options lowered to at most `sizes`, or itself if that is invalid."""
         given = dict(self.config)
         lower = {name: size for name, size in sizes.items() if (given.get(name) or 0) > size}
         smaller = self.with_config(self.config.model_copy(update=lower))
         return self if smaller.problems(smaller.size) else smaller
 
     def with_config(self, config: ComponentConfig) -> "Case":
-        """Return the same case with other options."""
+        """Return this case with other options."""
         return replace(self, config=config)
 
     def with_dims(self, **sizes: int) -> "Case":
-        """Return the same component in a model of other sizes."""
+        """Return this case in a model of other sizes."""
         return replace(self, dims=replace(self.dims, **sizes))
 
 
-# Types of the devices that a renderer can render on.
+# Device types that a renderer can support.
 DEVICES = ("cpu", "cuda", "mps")
 
 
 def component_fault(component: type[Component]) -> str:
-    """Why a recipe cannot use the class `component`, as a relative clause; "" if it can."""
+    """Explain why recipes cannot use `component`; "" if they can. Phrases begin with a verb."""
     name = getattr(component, "name", None)
     if not isinstance(name, str):
-        return "which has no `name`"
-    # Else `type: PLUGIN/NAME` would be ambiguous.
+        return "has no `name`"
+    # Otherwise `type: PLUGIN/NAME` would be ambiguous.
     if not re.fullmatch(r"[^\s/]+", name):
-        return f"whose name {name!r} is empty or has a slash or a blank"
+        return f"has the `name` {name!r}; use at least one character, and no slash or space"
     if issubclass(component, Renderer):
         given: object = component.devices
         if not (isinstance(given, tuple) and given and set(given) <= set(DEVICES)):
-            return f"whose `devices` is {given!r}; give some of {DEVICES} as a tuple"
+            return f"has `devices` {given!r}; give some of {DEVICES} as a tuple"
     if issubclass(component, Metric) and not getattr(component, "definition", ""):
-        return "which gives no `definition`; describe what it measures, since protocols hash it"
+        return "has no `definition`; describe what it measures (protocols hash this text)"
     config = component.Config
     if not config.model_config.get("frozen"):
-        return "whose Config is not frozen; leave `frozen` of its `model_config` at True"
+        return "has a Config that is not frozen; leave `frozen` of its `model_config` at True"
     if "type" in config.model_fields:
-        return "whose Config has an option `type`, which names the component itself"
+        return "has an option `type`; rename it, because `type` names the component in a recipe"
     fields: Mapping[str, Any] = config.model_fields
     scheduled: object = component.scheduled
     known = {n for n, option in fields.items() if _number_kinds(option.annotation)}
     if not (isinstance(scheduled, frozenset) and scheduled <= known):
-        return f"whose `scheduled` is {scheduled!r}, not a frozenset of options that are numbers"
-    # Others are built once, and have no step to follow.
+        return f"has `scheduled` {scheduled!r}; give a frozenset of names of number options"
+    # Other components are built once and do not follow the training steps.
     if scheduled and not issubclass(component, Module | Objective | Optimizer | ViewSampler):
-        return f"which lists `scheduled` options; those of the slot `{component.slot}` stay"
+        return f"lists `scheduled` options, but those of the slot `{component.slot}` cannot change"
     return ""
 
 
 def _number_kinds(annotation: Any) -> set[type]:
-    """Kinds of int and float that an option of this type can hold; none where it is no number."""
+    """Return which of int and float an option of this type can hold, possibly neither."""
     if annotation in (int, float):
         return {annotation}
-    # `float | None`, and numbers with limits; a list of numbers is no number.
+    # `float | None` and numbers with limits count; a list of numbers does not.
     parts = get_args(annotation) if get_origin(annotation) in (Union, UnionType, Annotated) else ()
     return {kind for part in parts for kind in _number_kinds(part)}

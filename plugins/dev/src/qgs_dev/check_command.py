@@ -22,15 +22,15 @@ def check_plugin(
 ) -> None:
     """Test every component of a plugin against its contract.
 
-    Exit code 1 if one does not keep it, or cannot be built or called here. Components are checked
-    with their default options and with the plugin's `examples`.
+    Components are checked with their default options and with the plugin's `examples`. The exit
+    code is 1 if one breaks its contract, or cannot be built or called on this machine.
     """
     import torch
 
     from qgs.recipe.registry import load_plugin
     from qgs_dev import running
 
-    # The tensors are small: more threads would wait for each other.
+    # The tensors are small, so more threads would only wait for each other.
     torch.set_num_threads(1)
     installed = load_plugin(name)
     version = installed.plugin.contract_version
@@ -45,7 +45,7 @@ def check_plugin(
         results += of_case
     unchecked = running.without_case(installed)
     for component in unchecked:
-        fix = "it has no usable default options; list a Config of it in `examples` of the Plugin"
+        fix = "its default options are unusable; list a Config of it in `examples` of the Plugin"
         typer.echo(f"not checked: {component.slot}/{component.name}: {fix}")
     typer.echo(_total(results))
     good = all(result.ok and not result.leaves_unchecked for result in results)
@@ -54,7 +54,7 @@ def check_plugin(
 
 
 def _models_load(installed: InstalledPlugin) -> bool:
-    """Print a line for each model that the plugin ships; return whether all can be loaded."""
+    """Print a line for each model of the plugin; return True if all can be loaded."""
     from qgs.checkpoint.model_file import load
 
     good = True
@@ -69,7 +69,7 @@ def _models_load(installed: InstalledPlugin) -> bool:
 
 
 def _print_case(results: list[CheckResult]) -> None:
-    """Print a line for a case, and a line for each check that did not simply pass."""
+    """Print a line for a case, and one for each failed, skipped or unexpected result."""
     verdict = "ok    "
     if any(result.leaves_unchecked for result in results):
         verdict = "not checked"

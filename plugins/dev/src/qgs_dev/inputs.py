@@ -1,4 +1,4 @@
-"""Inputs for a component of each slot: small, deterministic, in front of the cameras."""
+"""Small, deterministic inputs for a component of each slot."""
 
 import math
 import tomllib
@@ -16,10 +16,10 @@ from qgs.geometry.rays import patch_rays, plucker_rays
 from qgs.types import Cameras, Gaussians, ImageMemory, LayerPrediction, QueryState, Rendering, Views
 from qgs_dev.case import Case
 
-# Arguments of a component's forward pass, by name, in their order.
+# Arguments of a component's forward pass by name, in order.
 Inputs: TypeAlias = dict[str, Any]
 
-# Pixels along a patch of the image memory that decoder components are given.
+# Side in pixels of a patch in the image memory for decoder components.
 PATCH = 8
 
 
@@ -28,10 +28,10 @@ def data_file(name: str) -> dict[str, Any]:
     return tomllib.loads(Path(__file__).with_name(name).read_text(encoding="utf-8"))
 
 
-# Slot of modules to what the suite knows of it; slots.toml says what.
+# Facts about each slot; slots.toml explains them.
 FACTS: dict[str, dict[str, Any]] = data_file("slots.toml")
 
-# Slots whose components give a state and an image memory.
+# Slots whose components return a state and an image memory.
 WITH_MEMORY = ("layer", "feedback")
 
 # Arguments whose second dimension counts queries.
@@ -40,7 +40,7 @@ QUERY_INPUTS = ("state", "features", "offsets")
 
 @dataclass(frozen=True)
 class Sizes:
-    """B, N, V, K, and (H, W), None for that of the case."""
+    """Sizes B, N, V, K and (H, W) of inputs; `image` None stands for the size of the case."""
 
     batch: int = 2
     queries: int = 6
@@ -53,36 +53,36 @@ USUAL = Sizes()
 
 
 def many(case: Case) -> Sizes:
-    """More queries, Gaussians and tokens than what works on windows or chunks of 128 covers."""
+    """Return sizes with more queries, Gaussians and tokens than a window or chunk of 128 holds."""
     image = (64, 96) if case.slot == "cross_attention" else None
     return Sizes(queries=200, views=3, gaussians=1, image=image)
 
 
 def inputs_of(case: Case, sizes: Sizes = USUAL, seed: int = 0) -> Inputs:
-    """Arguments for a component of the slot of `case`, drawn from `seed`."""
+    """Return arguments for the component of `case`, drawn from `seed`."""
     maker = Maker(case, sizes, seed)
     return {name: getattr(maker, name)() for name in FACTS[case.slot]["arguments"]}
 
 
 def required_fields(case: Case) -> Fields:
-    """The fields of the state of the queries that the case requires."""
+    """Return the fields of the query state that the case requires."""
     elsewhere = ("memory.", "rendering.", "gaussians.")
     return {name: spec for name, spec in case.reads.items() if not name.startswith(elsewhere)}
 
 
 def required_places(case: Case) -> set[str]:
-    """The required fields of the state that hold points of the world."""
+    """Return the names of required state fields that hold points in the world frame."""
     return {name for name, spec in required_fields(case).items() if is_place(spec)}
 
 
 def memory_width(case: Case) -> int:
-    """Width of the memory's features: what the case requires, else that of its model."""
+    """Return the width of memory features that the case requires, by default the model's."""
     features = "memory.features"
     return sizes_of(case.reads.get(features, MEMORY_FIELDS[features]), case.dims)[0]
 
 
 class Maker:
-    """Draws inputs of the given sizes from `seed`. axes: letters of shapes to sizes."""
+    """Generator of random inputs with the given sizes. axes: size of each letter of a shape."""
 
     def __init__(self, case: Case, sizes: Sizes = USUAL, seed: int = 0) -> None:
         height, width = sizes.image or case.size
@@ -101,50 +101,50 @@ class Maker:
         }
 
     def shape(self, axes: str) -> list[int]:
-        """Sizes of axes such as "BN3": letters of slots.toml, and numbers of one digit."""
+        """Return the sizes of axes such as "BN3": letters as in slots.toml, and single digits."""
         return [self.axes[axis] if axis in self.axes else int(axis) for axis in axes]
 
     def normal(self, axes: str, *more: int) -> Tensor:
-        """Numbers from N(0, 1). more: sizes behind those of `axes`."""
+        """Draw numbers from N(0, 1). more: further sizes after those of `axes`."""
         shape = [*self.shape(axes), *more]
         return torch.randn(shape, generator=self.generator).to(self.case.device)
 
     def uniform(self, low: float, high: float, axes: str) -> Tensor:
-        """Numbers between `low` and `high`."""
+        """Draw numbers between `low` and `high`."""
         numbers = torch.rand(self.shape(axes), generator=self.generator)
         return (low + (high - low) * numbers).to(self.case.device)
 
     def in_front(self, points: Tensor) -> Tensor:
-        """Normally distributed points (..., 3), brought in front of the cameras."""
+        """Move normally distributed points (..., 3) in front of the cameras."""
         return 0.4 * points + torch.tensor([0.0, 0.0, 1.5]).to(points)
 
     def field(self, spec: FieldSpec) -> Tensor:
-        """A state field; points of the world frame stand in front of the cameras."""
+        """Draw a state field; points in the world frame are in front of the cameras."""
         values = self.normal("BN", *sizes_of(spec, self.case.dims))
-        # Points behind the cameras are the subject of one check alone.
+        # One check alone is about points behind the cameras.
         if is_place(spec):
             values = self.in_front(values)
         return (values if spec.dtype.is_floating_point else values > 0).to(spec.dtype)
 
     def state(self) -> QueryState:
-        """Features, and the fields that the case requires."""
+        """Draw a state: features and the fields that the case requires."""
         required = required_fields(self.case)
         return QueryState(self.features(), {n: self.field(spec) for n, spec in required.items()})
 
     def features(self) -> Tensor:
-        """(B, N, D)."""
+        """Draw features (B, N, D)."""
         return self.normal("BND")
 
     def offsets(self) -> Tensor:
-        """(B, N, K, 3)."""
+        """Draw offsets (B, N, K, 3)."""
         return self.normal("BNK3")
 
     def cameras(self) -> Cameras:
-        """Cameras side by side that look along z, a little inwards."""
+        """Return cameras side by side that look along z and slightly inwards."""
         height, width = self.shape("HW")
         scene = torch.arange(self.axes["B"])[:, None]
         view = torch.arange(self.axes["V"])
-        # Overlapping, and no two alike: equal cameras would hide a mix-up.
+        # The views overlap. No two cameras are equal, because that would hide a mix-up.
         angle = -0.06 * view - 0.02 * scene
         c2w = torch.eye(4).repeat(*angle.shape, 1, 1)
         c2w[..., 0, 0] = c2w[..., 2, 2] = angle.cos()
@@ -157,7 +157,7 @@ class Maker:
         return Cameras(c2w, lens, (height, width)).to(self.case.device)
 
     def views(self) -> Views:
-        """Noise pictures; they have times where the component embeds these."""
+        """Draw noise images, with times if the component embeds them."""
         views = Views(self.uniform(0, 1, "BV3HW"), self.cameras())
         if not getattr(self.case.config, "time_channels", 0):
             return views
@@ -167,12 +167,12 @@ class Maker:
     photos = views
 
     def memory(self) -> ImageMemory:
-        """An image memory with the rays of the cameras, in patches of PATCH pixels."""
+        """Draw an image memory with the camera rays of patches of PATCH pixels."""
         height, width = self.shape("HW")
         grid = (self.axes["V"], -(-height // PATCH), -(-width // PATCH))
         dims = self.case.dims
         per_head = (math.prod(grid), dims.width // dims.heads)
-        # Images may be no multiple of PATCH; the rays are those of whole patches.
+        # The image size need not be a multiple of PATCH; rays exist for whole patches only.
         whole = Maker(self.case)
         whole.axes = {**self.axes, "H": grid[1] * PATCH, "W": grid[2] * PATCH}
         return ImageMemory(
@@ -184,7 +184,7 @@ class Maker:
         )
 
     def gaussians(self) -> Gaussians:
-        """Gaussians of all shapes in front of the cameras; a renderer's have all that they can."""
+        """Draw Gaussians in front of the cameras; for a renderer, with `sh` and `features`."""
         return Gaussians(
             means=self.in_front(self.normal("BG3")),
             scales=self.uniform(0.05, 0.3, "BG3"),
@@ -196,21 +196,21 @@ class Maker:
         )
 
     def gives(self, name: str) -> bool:
-        """Return whether Gaussians have `sh` or `features`: for renderers, or where required."""
+        """Return True if Gaussians have the part `name`: for renderers, or where required."""
         return self.case.slot == "renderer" or f"gaussians.{name}" in self.case.reads
 
     def prediction(self) -> LayerPrediction:
-        """Gaussians, and the state that stands for their origin."""
+        """Draw Gaussians and a state that they could come from."""
         return LayerPrediction(self.gaussians(), self.state())
 
     def rendering(self) -> Rendering:
-        """Noise pictures; of no views for a loss that needs none."""
+        """Draw noise images; of no views for a loss that needs none."""
         rendering = self.all_views()
         unseen = getattr(self.case.component, "renderings", "") == "none"
         return map_tensors(lambda x: x[:, :0], rendering) if unseen else rendering
 
     def all_views(self) -> Rendering:
-        """Noise pictures of all views."""
+        """Draw noise images of all views."""
         return Rendering(
             rgb=self.uniform(0, 1, "BV3HW"),
             alpha=self.uniform(0, 1, "BV1HW"),
@@ -219,20 +219,20 @@ class Maker:
         )
 
     def target(self) -> Views:
-        """Noise pictures with masks, and with depth maps for a loss that reads them."""
+        """Draw noise images with masks, and with depth maps for a loss that reads them."""
         views = replace(self.views(), masks=self.uniform(0, 1, "BV1HW").round())
         if not getattr(self.case.component, "reads_depths", False):
             return views
         return replace(views, depths=self.uniform(1, 2, "BV1HW"))
 
-    # Each call draws other pictures: those a prediction was made from are not its target.
+    # Each call draws other images: the inputs of a prediction are not its target.
     inputs = target
 
 
 def sizes_of(spec: FieldSpec, dims: ModelDims) -> list[int]:
-    """The trailing shape of a field in a model of `dims`; 4 for a size of another name.
+    """Return the trailing shape of a field in a model of `dims`.
 
-    "4*D" is four times the width.
+    "4*D" is four times the width. A size whose name `dims` does not have is 4.
     """
     named = {"D": dims.width, "h": dims.heads, "D/h": dims.width // dims.heads}
     sizes = []
@@ -244,5 +244,5 @@ def sizes_of(spec: FieldSpec, dims: ModelDims) -> list[int]:
 
 
 def is_place(spec: FieldSpec) -> bool:
-    """Return whether a field holds points of the world."""
+    """Return True if a field holds points in the world frame."""
     return spec.shape == (3,) and spec.frame == "world" and spec.dtype.is_floating_point

@@ -1,4 +1,4 @@
-"""`qgs list`, `qgs schema`: the installed components and their options."""
+"""The commands `qgs list` and `qgs schema`, which show installed components and options."""
 
 import json
 from pathlib import Path
@@ -20,15 +20,15 @@ def list_components(
         ),
     ] = None,
 ) -> None:
-    """Installed components by slot, and trained models; with NAME all options and meanings.
+    """List installed components by slot and trained models; with NAME, explain all its options.
 
-    Imports every installed plugin; for a NAME such as rooms/locus-64 that of the name alone.
+    This imports every installed plugin. For a NAME such as rooms/locus-64 it imports only `rooms`.
     """
     from qgs.recipe.registry import load_registry, load_usable_plugins
     from qgs_dev.tables import details, overview
 
     plugin, slash, _ = (name or "").partition("/")
-    # One plug-in is enough for a name that begins with it: all would take seconds.
+    # A name such as rooms/locus-64 needs one plugin only; importing all takes seconds.
     registry, broken = (load_registry([plugin]), []) if slash else load_usable_plugins()
     for part in details(name, registry) if name else overview(registry):
         Console().print(part, highlight=False)
@@ -39,10 +39,10 @@ def list_components(
 @schema_app.command()
 def schema(
     out: Annotated[
-        Path | None, typer.Option(help="File to write; standard output if none.")
+        Path | None, typer.Option(help="File to write. Default: standard output.")
     ] = None,
 ) -> None:
-    """JSON Schema of a recipe with everything that is installed; imports every plugin."""
+    """Write the JSON Schema of recipes with all installed components; imports every plugin."""
     from qgs.files import write_text
     from qgs.recipe.registry import load_usable_plugins
     from qgs_dev.schema import recipe_schema

@@ -1,4 +1,4 @@
-"""Modules under check: seeds, modes, and everything that a module keeps."""
+"""Seeds, modes and stored values of modules under check."""
 
 import inspect
 from collections import deque
@@ -11,35 +11,35 @@ import numpy
 import torch
 from torch import Tensor, nn
 
-# Attributes in which torch keeps parameters, buffers, submodules, hooks and the mode.
+# Attributes in which torch stores parameters, buffers, submodules, hooks and the mode.
 TORCH_OWN = frozenset(vars(nn.Module()))
 
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Run under a fixed torch seed; the global random state is restored afterwards."""
+    """Run with a fixed torch seed, and restore the global random state afterwards."""
     with torch.random.fork_rng(devices=()):
         torch.default_generator.manual_seed(seed)
         yield
 
 
 def each_mode(module: Any) -> Iterator[str]:
-    """Yield the names of the two modes, each while `module` is in it."""
+    """Put `module` into each of the two modes in turn, and yield the mode's name."""
     for mode in ("evaluation", "training"):
         module.train(mode == "training")
         yield mode
 
 
 def tensors_of(module: nn.Module) -> dict[str, Tensor]:
-    """Parameters and buffers, including buffers that are not saved."""
+    """Return parameters and buffers, including buffers that are not saved."""
     return dict(module.named_parameters()) | dict(module.named_buffers())
 
 
 def attributes(module: nn.Module) -> dict[str, Any]:
-    """Comparable values of what a module keeps besides parameters, buffers and submodules.
+    """Return comparable values of a module's attributes besides parameters, buffers, submodules.
 
-    Attributes of its submodules, and of the classes of all of them, are included; what a
-    `cached_property` keeps is not: it depends on the module alone.
+    Attributes of its submodules and of all their classes are included. Values of a
+    `cached_property` are not, since they depend on the module alone.
     """
     found = {}
     for name, part in module.named_modules():
@@ -49,7 +49,7 @@ def attributes(module: nn.Module) -> dict[str, Any]:
             if key not in TORCH_OWN and not kept:
                 found[f"{name}.{key}".lstrip(".")] = _comparable(value)
         for owner in type(part).__mro__:
-            # Classes keep state too, such as a cache that all instances share.
+            # Classes can have state too, such as a cache that all instances share.
             if owner.__module__.partition(".")[0] in ("torch", "builtins", "abc", "typing"):
                 continue
             for key, value in vars(owner).items():
@@ -59,18 +59,18 @@ def attributes(module: nn.Module) -> dict[str, Any]:
 
 
 def _is_code(value: Any) -> bool:
-    """Return whether it is a function, a class or a descriptor such as a property."""
+    """Return True for a function, a class or a descriptor such as a property."""
     return inspect.isroutine(value) or inspect.isclass(value) or hasattr(value, "__get__")
 
 
 def _comparable(value: Any, inside: tuple[int, ...] = ()) -> Any:
-    """A value that equals a later one if nothing changed. inside: ids of what contains it."""
-    # A module may hold what holds it.
+    """Return a copy of `value` to compare with a later one. inside: ids of its containers."""
+    # A module may hold an object that holds the module.
     if id(value) in inside:
         return None
     inside = (*inside, id(value))
     if isinstance(value, Tensor):
-        # Bytes, since a NaN equals no NaN.
+        # Bytes, since a NaN does not equal itself.
         data = value.detach().cpu().contiguous().flatten().view(torch.uint8)
         return str(value.dtype), tuple(value.shape), data.numpy().tobytes()
     if isinstance(value, numpy.ndarray):

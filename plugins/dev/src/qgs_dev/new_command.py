@@ -1,4 +1,4 @@
-"""`qgs new-plugin`: a distribution with one component, its test and a recipe, ready to change."""
+"""The command `qgs new-plugin`, which writes a component, its test and a recipe to change."""
 
 import keyword
 import re
@@ -18,7 +18,7 @@ app = typer.Typer(add_completion=False)
 def new_plugin(
     name: Annotated[str, typer.Argument(help="Name of the plugin, as in `type: NAME/component`.")],
     out: Annotated[
-        Path | None, typer.Option(help="New folder, never overwritten; default: ./qgs-NAME.")
+        Path | None, typer.Option(help="Folder to create; it must not exist. Default: ./qgs-NAME.")
     ] = None,
 ) -> None:
     """Write a plugin to start from: one component, its contract tests, a recipe."""
@@ -30,7 +30,7 @@ def new_plugin(
     for path, text in rendered(name):
         write_text(folder / path, text)
     typer.echo(
-        f"wrote {folder}; next, with query-gaussians-worlds installed for the recipe:\n"
+        f"wrote {folder}; next steps (the recipe needs query-gaussians-worlds):\n"
         f"  cd {shlex.quote(str(folder))}\n"
         "  pip install -e '.[test]'\n"
         "  python -m pytest\n"
@@ -39,19 +39,19 @@ def new_plugin(
 
 
 def distribution_of(name: str) -> str:
-    """Return the name of the distribution of the plugin `name`, as pip knows it."""
+    """Return the name under which pip installs the plugin `name`."""
     return f"qgs-{name.replace('_', '-')}"
 
 
 def check_name(name: str) -> None:
-    """Raise ValueError for a name that no plugin can have, or that an installed one has."""
+    """Raise ValueError for an invalid name of a plugin, or one that is already taken."""
     module = name.replace("-", "_")
     if not re.fullmatch("[a-z][a-z0-9]*([-_][a-z0-9]+)*", name) or keyword.iskeyword(module):
         raise ValueError(
-            f"`{name}` is no name of a plugin: lower-case letters and digits, a letter first, "
-            "words joined by single hyphens or _, and no word of Python's own"
+            f"`{name}` cannot name a plugin: use lower-case letters and digits, a letter first, "
+            "words joined by single hyphens or _, and no keyword of Python"
         )
-    # The package must not hide, or be hidden by, an installed one.
+    # The new package must neither hide an installed one nor be hidden by it.
     other = f"choose another, such as `{name}-things`"
     if module in sys.stdlib_module_names or module in packages_distributions():
         raise ValueError(f"`{name}` is the name of an installed package; {other}")
@@ -59,11 +59,11 @@ def check_name(name: str) -> None:
         owner = entry.dist.name if entry.dist else "a plugin"
         raise ValueError(f"`{name}` is taken by {owner}; {other}")
     if name in ("null", "true", "false"):
-        raise ValueError(f"`{name}` is a value in YAML, no text; {other}")
+        raise ValueError(f"YAML does not read `{name}` as text; {other}")
 
 
 def rendered(name: str) -> Iterator[tuple[PurePosixPath, str]]:
-    """Every file of the distribution of the plugin `name`: path inside it, content."""
+    """Yield the path and the content of every file of a new plugin `name`."""
     from jinja2 import Environment, StrictUndefined
 
     import qgs

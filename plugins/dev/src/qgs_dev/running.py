@@ -1,4 +1,4 @@
-"""The contract suite: its checks, as checks.toml lists them, made of the components of a plugin."""
+"""The contract suite: runs the checks that checks.toml lists on the components of a plugin."""
 
 import inspect
 import traceback
@@ -20,19 +20,18 @@ from qgs_dev.inputs import FACTS, data_file
 Tier: TypeAlias = Literal["core", "construction", "extended"]
 TIERS: tuple[Tier, ...] = get_args(Tier)
 
-# Checks that cannot be expected to fail: without them the others say nothing.
+# Checks that no plugin may expect to fail: without them the other checks mean nothing.
 BASICS = ("builds", "runs")
 
-# Checks that come first: when they fail, others do too, which compare two forward passes.
+# Checks that run first: when they fail, checks that compare two forward passes fail too.
 FIRST = (*BASICS, "forward_keeps_no_state", "eval_repeats_bitwise")
 
 
 @dataclass(frozen=True)
 class Check:
-    """One promise of the contract.
+    """One check of the contract.
 
-    variants: whether it is checked of every case of a class; the others are checked of the first
-    case alone.
+    variants: True if it runs on every case of a class; other checks run on the first case only.
     """
 
     name: str
@@ -43,12 +42,12 @@ class Check:
 
     @property
     def contract(self) -> str:
-        """The promise in one sentence: the first paragraph of the function's docstring."""
+        """Requirement in one sentence: the first paragraph of the function's docstring."""
         return " ".join(cleandoc(self.function.__doc__ or "").split("\n\n")[0].split())
 
 
 def _listed() -> Iterator[Check]:
-    """The checks of checks.toml: `check_NAME(case)` of the module of its subject is NAME."""
+    """Yield the checks of checks.toml; NAME is `check_NAME(case)` in the module of its subject."""
     subjects = data_file("checks.toml")
     groups = subjects.pop("groups")
     groups["all"] = [*SLOTS]
@@ -71,12 +70,12 @@ CHECKS = {check.name: check for check in _listed()}
 
 
 def checks_for(case: Case, tiers: Iterable[Tier] = TIERS, variant: bool = False) -> list[Check]:
-    """The checks that apply to the slot of `case`, causes before what they cause.
+    """Return the checks for the slot of `case`; those that make others fail come first.
 
-    variant: whether another case of its class comes before it; then only those of `variants`.
+    variant: True if the class had an earlier case; then only the checks of `variants` run.
     """
     wanted = {*tiers}
-    # No check at all would pass.
+    # Otherwise a run without checks would pass.
     assert wanted, "no tiers"
     assert wanted <= {*TIERS}, f"tiers are {wanted}, not some of {TIERS}"
     found = [
@@ -93,7 +92,7 @@ Verdict: TypeAlias = Literal["passed", "failed", "skipped", "expected failure", 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """How a check of a case went. message: why it did not simply pass."""
+    """Result of a check of a case. message: why the verdict is not "passed"."""
 
     case: Case
     check: Check
@@ -102,12 +101,12 @@ class CheckResult:
 
     @property
     def ok(self) -> bool:
-        """True if nothing is to be mended."""
+        """True if nothing needs to be fixed."""
         return self.verdict not in ("failed", "unexpected pass")
 
     @property
     def leaves_unchecked(self) -> bool:
-        """True if the component could not be built or called here."""
+        """True if the component could not be built or called on this machine."""
         return self.verdict == "skipped" and self.check.name in BASICS
 
 
@@ -115,8 +114,8 @@ class CheckResult:
 class CaseRun:
     """All checks of one case. After `builds` or `runs` fails, the rest is skipped.
 
-    expected: check -> why it fails; such a check that passes is a failure.
-    variant: whether another case of its class comes before it; see `Check.variants`.
+    expected: check -> why it is expected to fail; it is a failure if such a check passes.
+    variant: True if the class had an earlier case; see `Check.variants`.
     """
 
     case: Case
@@ -127,7 +126,7 @@ class CaseRun:
         return self.case.label
 
     def results(self, tiers: Iterable[Tier] = TIERS) -> Iterator[CheckResult]:
-        """How each check went, in their order."""
+        """Run the checks in order and yield their results."""
         cause = ""
         for check in checks_for(self.case, tiers, self.variant):
             if cause:
@@ -141,9 +140,9 @@ class CaseRun:
             yield result
 
     def check(self, tiers: Iterable[Tier] = TIERS) -> None:
-        """Make all checks inside of a pytest test, which fails with the messages of all that fail.
+        """Run all checks inside a pytest test, which fails with the messages of failed checks.
 
-        It is skipped where the component cannot be built or called. tiers: some of TIERS.
+        The test is skipped if the component cannot be built or called here. tiers: some of TIERS.
         """
         import pytest
 
@@ -157,7 +156,7 @@ class CaseRun:
 
 
 def run_check(check: Check, case: Case, expected: str = "") -> CheckResult:
-    """Run `check` on `case`. expected: why it is known to fail; then passing is a fault."""
+    """Run `check` on `case`. expected: why it should fail; if given, passing is a failure."""
     assert case.slot in check.slots, f"`{check.name}` is not for {case.label}"
     title = f"{case.label}: {check.name}"
     try:
@@ -173,13 +172,13 @@ def run_check(check: Check, case: Case, expected: str = "") -> CheckResult:
         return CheckResult(case, check, "failed", message)
     if not expected:
         return CheckResult(case, check, "passed")
-    fix = "drop the expected failure, or restrict it to the options with which it fails"
+    fix = "remove the expected failure, or restrict it to the options with which it fails"
     why = f"{title} passes, although it is expected to fail: {expected}\n  fix: {fix}"
     return CheckResult(case, check, "unexpected pass", why)
 
 
 def refuse_unexpectable(expected: Mapping[str, str], runs: Iterable[CaseRun]) -> None:
-    """Raise ValueError for an expected failure of no check, of no run, or without a reason.
+    """Raise ValueError for an expected failure without a reason or of a check that does not run.
 
     expected: name of a check -> why it fails.
     """
@@ -189,15 +188,15 @@ def refuse_unexpectable(expected: Mapping[str, str], runs: Iterable[CaseRun]) ->
             fix = did_you_mean(str(name), made, "checks made of it")
             raise ValueError(f"`{name}` cannot be expected to fail here; {fix}")
         if not (isinstance(why, str) and why.strip()):
-            raise ValueError(f"the expected failure of `{name}` needs a reason, as a text")
+            raise ValueError(f"the expected failure of `{name}` needs a text that gives the reason")
 
 
 def with_place(error: BaseException, component: type) -> str:
-    """Type and message of `error`, and FILE:LINE of the component's package that raised it.
+    """Return type and message of `error`, and the FILE:LINE of the component that raised it.
 
-    A broken contract has no place, nor does what was raised elsewhere.
+    There is no FILE:LINE for a broken contract, nor for an error from outside the package.
     """
-    # Notes say where in a check it happened.
+    # Notes say at which point of a check the error happened.
     noted = "".join(f"{note}, " for note in getattr(error, "__notes__", ()))
     if isinstance(error, ContractError):
         return f"{noted}{error}"
@@ -211,19 +210,19 @@ def with_place(error: BaseException, component: type) -> str:
     return what
 
 
-# Decoder depths that are tried in turn until the component's `problems` accepts one.
+# Decoder depths to try in turn until the component's `problems` accepts one.
 DEPTHS = (2, 12)
 
 
 def cases_of(installed: InstalledPlugin) -> list[Case]:
-    """Every component of the plugin with its default options, and the plugin's examples.
+    """Return a case for each component with default options and for each of the `examples`.
 
-    Raises PluginError for `examples` that are not options of its components.
+    Raises PluginError for an example that is not a Config of one of the plugin's components.
     """
     plugin = installed.plugin
     for example in plugin.examples:
         if getattr(type(example), "__component__", None) not in plugin.components:
-            fault = f"{example!r} is not options of its components, such as MyComponent.Config()"
+            fault = f"{example!r} is not a Config of its components; give MyComponent.Config()"
             raise _unsound(installed, "examples", fault)
     defaults = [default_config(component) for component in plugin.components]
     configs = [config for config in defaults if config is not None]
@@ -232,31 +231,31 @@ def cases_of(installed: InstalledPlugin) -> list[Case]:
 
 
 def without_case(installed: InstalledPlugin) -> list[type[Component]]:
-    """Components that have no example and no usable default options."""
+    """Return the components that have neither an example nor usable default options."""
     checked = {case.component for case in cases_of(installed)}
     return [component for component in installed.plugin.components if component not in checked]
 
 
 def runs_of(plugin: str | InstalledPlugin) -> list[CaseRun]:
-    """Return a run for each case of a plugin, for pytest to make a test of each.
+    """Return a run for each case of a plugin, to parametrise a pytest test.
 
         @pytest.mark.parametrize("run", runs_of("sightline"), ids=str)
         def test_contract(run):
             run.check()
 
-    The first case of a class has all checks, the others those of `variants`. Raises PluginError for
-    a plugin that is unusable, and for examples or exemptions that no check can have.
+    The first case of a class has all checks, later cases only those of `variants`. Raises
+    PluginError for a plugin that is unusable or has invalid examples or exemptions.
     """
     installed = load_plugin(plugin) if isinstance(plugin, str) else plugin
     runs: list[CaseRun] = []
     for case in cases_of(installed):
-        # The first case of a class has all checks, so the others need only those that see options.
+        # Later cases of a class need only the checks that depend on options.
         variant = any(run.case.component is case.component for run in runs)
         runs.append(CaseRun(case, variant=variant))
     for owner, exempted in installed.plugin.exemptions.items():
         concerned = [run for run in runs if owner in (run.case.component, run.case.config)]
         if not concerned:
-            fault = f"{owner!r} is neither a component of the plugin nor the options of a case"
+            fault = f"{owner!r} is neither a component of the plugin nor the Config of a case"
             raise _unsound(installed, "exemptions", fault)
         try:
             refuse_unexpectable(exempted, concerned)
@@ -268,7 +267,7 @@ def runs_of(plugin: str | InstalledPlugin) -> list[CaseRun]:
 
 
 def check_plugin(name: str, tiers: Iterable[Tier] = TIERS) -> Iterator[CheckResult]:
-    """Run every check on every case of the plugin `name`, case by case.
+    """Run all checks on each case of the plugin `name`, and yield the results case by case.
 
     Raises PluginError for a plugin that is unusable or has invalid examples or exemptions.
     """
@@ -277,13 +276,13 @@ def check_plugin(name: str, tiers: Iterable[Tier] = TIERS) -> Iterator[CheckResu
 
 
 def _case(config: ComponentConfig) -> Case:
-    """A case with as few decoder layers as the options allow."""
+    """Return a case with as few decoder layers as the options allow."""
     cases = [Case(config, ModelDims(SMALL.width, SMALL.heads, depth)) for depth in DEPTHS]
     return next((case for case in cases if _accepts(case)), cases[0])
 
 
 def _accepts(case: Case) -> bool:
-    """Return whether `problems` finds none; if it raises, the checks of the case report that."""
+    """Return True if `problems` is empty or raises, which the checks of the case report."""
     try:
         return not case.problems(case.size)
     except (Exception, SystemExit):

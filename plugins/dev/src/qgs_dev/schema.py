@@ -1,4 +1,4 @@
-"""The JSON Schema of a recipe, so that editors complete it, check it and show what options mean."""
+"""The JSON Schema of recipes, with which editors complete, check and explain options."""
 
 from typing import Any
 
@@ -14,20 +14,21 @@ from qgs.tokengs.schedules import SCHEDULES
 _NULL = {"type": "null"}
 _WRITTEN = """
 extends:
-  description: Recipe file or files that this one is laid over, relative to it.
+  description: Base recipe file or files that this one changes, relative to this file.
   anyOf: [{type: string}, {type: array, items: {type: string}}]
 swap:
-  description: Components by pattern of the places that they take, such as
-    `decoder.layers.*.feed_forward`; null drops an inherited swap.
+  description: Replacement components by pattern of places, such as
+    `decoder.layers.*.feed_forward`; null removes an inherited swap.
   type: object
 """
-"""Schemas of keys that are neither settings nor components."""
+"""Schemas of recipe keys that are neither settings nor components."""
 
 
 def recipe_schema(registry: Registry) -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of recipes that use the plugins of `registry`.
+    """Return the JSON Schema (draft 2020-12) of recipes that use the plugins of `registry`.
 
-    Nothing is required, as in overlays; without a `type` the options of all its slot may stand.
+    No key is required, since overlays leave out keys. Without a `type`, the options of every
+    component of the slot are allowed.
     """
     schema = settings_schema(Layout)
     written = yaml.safe_load(_WRITTEN)
@@ -44,7 +45,7 @@ def recipe_schema(registry: Registry) -> dict[str, Any]:
 
 
 def _type(name: str, component: type[Component]) -> dict[str, Any]:
-    """The options of `component`, and the `type` that chooses it."""
+    """Return the schema of `component`: its options and the `type` that selects it."""
     description = summary_of(component)
     schema = settings_schema(component.Config)
     properties = {"type": {"const": name, "description": description}, **schema["properties"]}
@@ -52,7 +53,7 @@ def _type(name: str, component: type[Component]) -> dict[str, Any]:
 
 
 def settings_schema(config: type[ComponentConfig]) -> dict[str, Any]:
-    """Options of a section or a component, without references."""
+    """Return the schema of options of a section or component, without references."""
     schema = {"properties": {}} | config.model_json_schema()
     definitions = schema.pop("$defs", {})
     # An overlay sets an option and leaves the rest to its base.
@@ -70,7 +71,7 @@ def settings_schema(config: type[ComponentConfig]) -> dict[str, Any]:
 
 
 def _inlined(schema: Any, definitions: dict[str, Any]) -> Any:
-    """`schema` with references to `definitions` replaced by what they stand for."""
+    """Return `schema` with references replaced by the `definitions` that they name."""
     if isinstance(schema, list):
         return [_inlined(item, definitions) for item in schema]
     if not isinstance(schema, dict):

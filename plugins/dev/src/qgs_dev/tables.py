@@ -1,4 +1,4 @@
-"""Tables of `qgs list`."""
+"""Tables that `qgs list` prints."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -23,7 +23,7 @@ _BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusive
 
 
 def overview(registry: Registry) -> Iterator[Table]:
-    """Yield a table per slot: installed components, what they are, where they come from."""
+    """Yield a table per slot with the names, meanings and origins of installed components."""
     for name, slot in SLOTS.items():
         default = f" (default {slot.default})" if slot.default else ""
         components = registry.components(name).items()
@@ -50,10 +50,10 @@ def _table(title: str, *rows: Sequence[str]) -> Table:
 
 
 def details(name: str, registry: Registry) -> Iterator[Table | str]:
-    """Explain a section of settings, a trained model, a component or the components of a slot.
+    """Explain a section of settings, a trained model, a component or all components of a slot.
 
-    name: such as qgs/latent, queries, training, or rooms/locus_64; `recipe` stands for the
-    settings at the top of a recipe. Raises ValueError for other names.
+    name: for example qgs/latent, queries, training or rooms/locus-64. `recipe` stands for the
+    settings at the top level of a recipe. Raises ValueError for an unknown name.
     """
     settings = {".".join(path) or "recipe": config for path, config in SETTINGS.items()}
     models = _models(registry)
@@ -83,7 +83,7 @@ def details(name: str, registry: Registry) -> Iterator[Table | str]:
 def _explained(
     heading: str, described: type, config: type[ComponentConfig]
 ) -> Iterator[Table | str]:
-    """Yield what `described` is, and the options of `config`."""
+    """Yield the summary of `described` and a table of the options of `config`."""
     yield f"[bold]{escape(heading)}[/bold]"
     yield escape(summary_of(described))
     rows = [*option_rows(settings_schema(config)["properties"])]
@@ -109,7 +109,7 @@ def _release(kind: str, registry: Registry) -> str:
 
 
 def recipe_path(slot: str) -> str:
-    """Return where in a recipe the components of `slot` are written."""
+    """Return the path in a recipe at which components of `slot` are written."""
     if slot in MODEL_SLOTS:
         return f"model.{slot}"
     return f"model.decoder.{slot}" if slot in LAYER_SLOTS else slot
@@ -118,7 +118,7 @@ def recipe_path(slot: str) -> str:
 def option_rows(properties: Mapping[str, Schema], above: str = "") -> Iterator[tuple[str, ...]]:
     """Yield name, values, default and meaning of each option.
 
-    Those inside a mapping follow it, `option.inner`.
+    Options inside a mapping follow it, written as `option.inner`.
     """
     for name, option in properties.items():
         default = inline(option["default"]) if "default" in option else "required"
@@ -129,7 +129,7 @@ def option_rows(properties: Mapping[str, Schema], above: str = "") -> Iterator[t
 
 
 def _type(option: Schema) -> str:
-    """Return which values a JSON Schema allows."""
+    """Describe the values that a JSON Schema allows."""
     match option:
         case {"$ref": name}:
             return name.rpartition("/")[2]

@@ -1,4 +1,4 @@
-"""The vocabulary of the checks: trees of tensors, runs of a component, and what to expect of them.
+"""Helpers of the checks: trees of tensors, trial runs of a component, and expectations.
 
 Inputs and outputs of components are trees of tensors with dotted names.
 """
@@ -18,7 +18,7 @@ from qgs_dev.modules import each_mode, seeded
 
 
 def leaves(tree: Any) -> dict[str, Tensor]:
-    """Every tensor of `tree` by its dotted name; a single tensor is called `output`."""
+    """Return every tensor of `tree` by dotted name; a single tensor is called `output`."""
     return {name or "output": tensor for name, tensor in named_tensors(tree)}
 
 
@@ -29,34 +29,34 @@ def mapped(tree: Any, function: Callable[[str, Tensor], Tensor]) -> Any:
 
 
 def floating(tree: Any) -> dict[str, Tensor]:
-    """Every floating-point tensor by its dotted name."""
+    """Return every floating-point tensor of `tree` by dotted name."""
     return {name: tensor for name, tensor in leaves(tree).items() if tensor.is_floating_point()}
 
 
 def cloned(tree: Any) -> Any:
-    """A copy that shares no memory and belongs to no autograd graph."""
+    """Return a copy that shares no memory and belongs to no autograd graph."""
     return map_tensors(lambda x: x.detach().clone(), tree)
 
 
 def tracked(tree: Any) -> Any:
-    """A copy whose floating-point tensors require gradients."""
+    """Return a copy whose floating-point tensors require gradients."""
     return map_tensors(lambda x: x.requires_grad_(x.is_floating_point()), cloned(tree))
 
 
 def cast(tree: Any, dtype: torch.dtype) -> Any:
-    """Return `tree` with its floating-point tensors in `dtype`."""
+    """Return `tree` with floating-point tensors converted to `dtype`."""
     return map_tensors(lambda x: x.to(dtype) if x.is_floating_point() else x, tree)
 
 
 def scene(tree: Any, index: int) -> Any:
-    """Return a batch of the scene at `index` alone."""
+    """Return a batch with only the scene at `index`."""
     return map_tensors(lambda x: x[index : index + 1], tree)
 
 
 def masked(tree: Any, mask_BN: Tensor, other: Any) -> Any:
-    """Return `tree` with the numbers of `other` for the queries that the mask leaves out.
+    """Return `tree` with the numbers of `other` wherever the mask of queries is False.
 
-    Tensors are of queries (B, N, ...) or of their Gaussians (B, N K, ...).
+    Tensors belong to queries (B, N, ...) or to their Gaussians (B, N K, ...).
     """
     theirs = leaves(other)
 
@@ -68,7 +68,7 @@ def masked(tree: Any, mask_BN: Tensor, other: Any) -> Any:
 
 
 def scalar(tree: Any) -> Tensor:
-    """A float64 sum of all floating-point numbers in `tree`, with random weights."""
+    """Return a float64 sum of all floating-point numbers in `tree` with random weights."""
     total = torch.zeros((), dtype=torch.float64)
     for index, tensor in enumerate(floating(tree).values()):
         # Equal weights would let errors of opposite signs cancel.
@@ -79,7 +79,7 @@ def scalar(tree: Any) -> Tensor:
 
 
 def gradients(total: Tensor, tree: Any) -> dict[str, Tensor]:
-    """The gradient of `total` in every tensor of `tree` that it depends on."""
+    """Return the gradient of `total` for every tensor of `tree` that it depends on."""
     if not total.requires_grad:
         return {}
     given = {name: tensor for name, tensor in floating(tree).items() if tensor.requires_grad}
@@ -88,9 +88,9 @@ def gradients(total: Tensor, tree: Any) -> dict[str, Tensor]:
 
 
 def difference(one: Any, other: Any, rtol: float = 0.0, atol: float = 0.0) -> str:
-    """Describe the first tensor in which two trees differ beyond the tolerances; "" if none does.
+    """Describe the first tensor that differs by more than the tolerances; "" if none does.
 
-    Without tolerances the dtypes must agree too.
+    Without tolerances, dtypes must agree too.
     """
     ours = leaves(one)
     theirs = leaves(other)
@@ -100,7 +100,7 @@ def difference(one: Any, other: Any, rtol: float = 0.0, atol: float = 0.0) -> st
         seen = theirs[name]
         if tensor.shape != seen.shape or (not atol and tensor.dtype != seen.dtype):
             return f"{name}: {described(tensor)} against {described(seen)}"
-        # Trees may be of two devices or, with a tolerance, of two precisions.
+        # Trees may be on two devices or, with a tolerance, in two precisions.
         seen = seen.to(tensor)
         if not torch.allclose(tensor, seen, rtol=rtol, atol=atol, equal_nan=True):
             off = (tensor.double() - seen.double()).abs().max().item()
@@ -109,13 +109,13 @@ def difference(one: Any, other: Any, rtol: float = 0.0, atol: float = 0.0) -> st
 
 
 def described(tensor: Tensor) -> str:
-    """Shape and dtype, such as `2x6x3 float32`."""
+    """Return shape and dtype, for example `2x6x3 float32`."""
     shape = "x".join(map(str, tensor.shape)) or "scalar"
     return f"{shape} {str(tensor.dtype).removeprefix('torch.')}"
 
 
 class Trial:
-    """A component of a case in which no parameter is zero, and inputs to call it with."""
+    """Component of a case with noise added to all parameters, and inputs to call it with."""
 
     def __init__(self, case: Case, sizes: Sizes = USUAL, seed: int = 0) -> None:
         self.case = case
@@ -123,26 +123,26 @@ class Trial:
         self.inputs = inputs_of(case, sizes, seed)
 
     def __call__(self, inputs: Inputs | None = None, **replaced: Any) -> Any:
-        """Return the outputs for `inputs`, by default its own, with some of them replaced."""
+        """Return the outputs for `inputs`, by default `self.inputs`, with some replaced."""
         given = {**(inputs or self.inputs), **replaced}
         return self.module(*given.values())
 
     def with_changed(self, change: Callable[[str, Tensor], Tensor]) -> Any:
-        """Return the outputs for its inputs with `change(name, tensor)` in place of each tensor."""
+        """Return the outputs when `change(name, tensor)` replaces each input tensor."""
         return self(mapped(self.inputs, change))
 
     def in_each_mode(self, inputs: Inputs | None = None) -> Iterator[tuple[str, Any]]:
-        """Yield the name of each mode, and the outputs in it under one seed."""
+        """Yield the name of each mode and its outputs, with the same seed in both modes."""
         for mode in each_mode(self.module):
-            # Seeded for each pass, so that the caller draws on from its own state.
+            # The seed holds for this pass only: the caller keeps its own random state.
             with seeded(0):
                 outputs = self(inputs)
             yield mode, outputs
 
     def tracked(self, inputs: Inputs | None = None) -> Inputs:
-        """Return copies of `inputs`, by default its own, that require gradients.
+        """Return copies of `inputs`, by default `self.inputs`, that require gradients.
 
-        Of cameras only in the tensors that a renderer declares.
+        For a renderer, only the camera tensors in `camera_gradients` require them.
         """
         component = self.case.component
         fixed: set[str] = set()
@@ -154,18 +154,18 @@ class Trial:
         )
 
     def state_of(self, outputs: Any) -> Any:
-        """Return the state among the outputs of a layer or a feedback, all outputs of others."""
+        """Return the state that a layer or a feedback returns, or all outputs of other slots."""
         return outputs[0] if self.case.slot in WITH_MEMORY else outputs
 
 
 def expect(holds: Any, seen: str) -> None:
-    """Raise ContractError with what was `seen` unless the contract `holds`."""
+    """Raise ContractError with the text `seen` unless `holds` is true."""
     if not holds:
         raise ContractError(seen)
 
 
 def expect_none(names: Iterable[Any], fault: str) -> None:
-    """Raise ContractError with all `names`, and the `fault` that they have, if there are any."""
+    """Raise ContractError with the `names` and their common `fault` if there are any names."""
     found = sorted(map(str, names))
     expect(not found, f"{', '.join(found)}: {fault}")
 
@@ -177,7 +177,7 @@ def expect_same(one: Any, other: Any, where: str, rtol: float = 0.0, atol: float
 
 
 def expect_finite(tree: Any, where: str) -> None:
-    """Raise ContractError if a tensor of `tree` holds a NaN or an infinity."""
+    """Raise ContractError if a tensor of `tree` contains NaN or infinity."""
     broken = [name for name, tensor in floating(tree).items() if not tensor.isfinite().all()]
     expect_none(broken, f"not finite {where}")
 
@@ -191,7 +191,7 @@ def expect_inside(x: Tensor, low: float, high: float, what: str) -> None:
 def expect_right_gradient(
     value: Callable[..., Tensor], points: Any, where: str, **tolerances: Any
 ) -> None:
-    """Raise ContractError unless `value` at `points` has the gradient of finite differences."""
+    """Raise ContractError unless the gradient of `value` at `points` matches finite differences."""
     try:
         gradcheck(value, points, **tolerances)
     except GradcheckError as error:

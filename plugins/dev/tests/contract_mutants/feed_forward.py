@@ -22,7 +22,7 @@ def register(
     mutant(check, seen)(type(name, (MlpFeedForward,), {"forward": forward_of}))
 
 
-register("ForgetsToReturn", "runs", "it gives a NoneType, not a Tensor", lambda self, mlp, x: None)
+register("ForgetsToReturn", "runs", "it returns NoneType instead of Tensor", lambda self, mlp, x: None)
 register(
     "DetachesASummand", "gradients_match_differences", "in evaluation: Jacobian",
     lambda self, mlp, x: mlp(x) + x.square().detach(),
@@ -44,11 +44,11 @@ register(
     lambda self, mlp, x: mlp(x - x.mean(0, keepdim=True)),
 )  # fmt: skip
 register(
-    "ReturnsItsInput", "outputs_share_no_memory", "in the memory of `features`",
+    "ReturnsItsInput", "outputs_share_no_memory", "shares memory with `features`",
     lambda self, mlp, x: x.view_as(x),
 )  # fmt: skip
 register(
-    "AddsNoise", "eval_repeats_bitwise", "the second time, output",
+    "AddsNoise", "eval_repeats_bitwise", "a second pass on the same inputs differs, output",
     lambda self, mlp, x: mlp(x) + 0.01 * torch.randn_like(x),
 )  # fmt: skip
 register(
@@ -68,10 +68,10 @@ register(
     lambda self, mlp, x: mlp(x).float(),
 )  # fmt: skip
 register(
-    "LoopsOverQueries", "compiles", "3 more graphs are compiled",
+    "LoopsOverQueries", "compiles", "3 new graphs are compiled",
     lambda self, mlp, x: torch.stack([self.mlp(self.norm(each)) for each in x.unbind(1)], 1),
 )  # fmt: skip
 register(
-    "DetachesWhenCompiled", "compiles", "features: a gradient only",
+    "DetachesWhenCompiled", "compiles", "features: has a gradient only",
     lambda self, mlp, x: mlp(x.detach() if torch.compiler.is_compiling() else x),
 )  # fmt: skip

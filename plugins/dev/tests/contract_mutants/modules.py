@@ -37,7 +37,7 @@ class RaisesWhenBuilt(ExtendedMlp):
         raise RuntimeError(f"no kernel for width {dims.width}")
 
 
-@mutant("sizes_vary", "`output` is of shape")
+@mutant("sizes_vary", "`output` has shape")
 class FixedNumberOfQueries(ExtendedMlp):
     def add(self, dims):
         self.place = nn.Parameter(torch.zeros(6, dims.width))
@@ -64,7 +64,7 @@ class ViewsAField(PlacesByALayer):
         return self.attention(self.norm(state.features + place), state.mask)
 
 
-@mutant("construction", "is read again as", options={"z_offset": 0.3})
+@mutant("construction", "is read back as", options={"z_offset": 0.3})
 class RoundsAnOption(FreeCenters):
     class Config(FreeCenters.Config):
         @field_serializer("z_offset")
@@ -72,7 +72,7 @@ class RoundsAnOption(FreeCenters):
             return float(round(z_offset))
 
 
-@mutant("construction", "`z_offset_x` is accepted")
+@mutant("construction", "the unknown option `z_offset_x` is accepted")
 class IgnoresUnknownOptions(FreeCenters):
     class Config(FreeCenters.Config):
         model_config = ConfigDict(extra="ignore")
@@ -92,7 +92,7 @@ class IgnoresUnknownInnerOptions(MlpFeedForward):
         outer: Outer | None = None
 
 
-@mutant("construction", "when it is built, ")
+@mutant("construction", "building it changes its options from")
 class AppendsToAnOption(ExtendedMlp):
     class Config(MlpFeedForward.Config):
         sizes: list[int] = Field(default=[1])
@@ -101,7 +101,7 @@ class AppendsToAnOption(ExtendedMlp):
         self.config.sizes.append(2)
 
 
-@mutant("scheduled_options_are_read_anew", "with `weight: 0.05` set after it was built")
+@mutant("scheduled_options_are_read_anew", "`weight: 0.05` set later gives other results")
 class ReadsItsWeightOnce(Opacity):
     def __init__(self, config):
         super().__init__(config)
@@ -140,7 +140,7 @@ class KeepsLayersInAList(ExtendedMlp):
         self.layers = [nn.Linear(dims.width, dims.width)]
 
 
-@mutant("construction", "torch is in one state")
+@mutant("construction", "building it sets the seed of torch's generator")
 class SeedsWhenBuilt(MlpFeedForward):
     def __init__(self, config, dims):
         torch.manual_seed(0)
@@ -156,7 +156,7 @@ class DrawsFromItsOwnGenerator(ExtendedMlp):
             self.mlp.fc1.weight.normal_(generator=generator)
 
 
-@mutant("construction", "with the same state dict, output")
+@mutant("construction", "with the same state dict differ, output")
 class KeepsARandomBufferUnsaved(ExtendedMlp):
     def add(self, dims):
         self.register_buffer("noise", torch.randn(dims.width), persistent=False)
@@ -194,7 +194,7 @@ class ShiftsAllLogits(ContentCrossAttention):
         return self.core(state.features, memory.keys, memory.values, shift)
 
 
-@mutant("inputs_are_not_changed", "the inputs differ, offsets")
+@mutant("inputs_are_not_changed", "changes inputs, offsets")
 class ClampsItsInputInPlace(FreeCenters):
     def forward(self, offsets, state):
         return super().forward(offsets.data.clamp_(-0.1, 0.1), state)
@@ -210,7 +210,7 @@ class CachesByShape(ExtendedMlp):
         return super().forward(features) + zeros
 
 
-@mutant("forward_keeps_no_state", "another one differs")
+@mutant("forward_keeps_no_state", "differs from a first one")
 class ScalesByItsFirstInput(ExtendedMlp):
     """Keeps a number in a closure, which no attribute shows."""
 
@@ -228,7 +228,7 @@ class ScalesByItsFirstInput(ExtendedMlp):
         return super().forward(features) + self.first(features)
 
 
-@mutant("training_draws_from_torch", "torch is in one state")
+@mutant("training_draws_from_torch", "sets the seed of torch's generator")
 class SeedsInTraining(MlpFeedForward):
     def forward(self, features):
         if self.training:

@@ -32,13 +32,13 @@ class HasItsOwnBackground(TorchRenderer):
         return super().forward(gaussians, cameras)
 
 
-@mutant("rendering_is_over_the_background", "the background shows")
+@mutant("rendering_is_over_the_background", "the weight of the background is not")
 class SquaresAlpha(ChangedRenderer):
     def result(self, out):
         return replace(out, alpha=out.alpha.square())
 
 
-@mutant("depth_is_expected", "depth is off")
+@mutant("depth_is_expected", "depth is not the expected z")
 class WeighsDepthByAlpha(ChangedRenderer):
     """Gives sum(w z), as if every pixel were opaque."""
 
@@ -46,7 +46,7 @@ class WeighsDepthByAlpha(ChangedRenderer):
         return replace(out, depth=out.alpha * out.depth)
 
 
-@mutant(HARMONICS, "with 15 coefficients, view 0 is off")
+@mutant(HARMONICS, "with 15 coefficients, view 0 has other colours")
 class IgnoresTheThirdDegree(ChangedRenderer):
     def given(self, gaussians, cameras):
         sh = gaussians.sh
@@ -63,7 +63,7 @@ class DarkensWithHarmonics(ChangedRenderer):
         return replace(gaussians, colors=gaussians.colors / 2), cameras
 
 
-@mutant(FEATURES, "Gaussians with features have none")
+@mutant(FEATURES, "the rendering has no features")
 class DropsFeatures(ChangedRenderer):
     def result(self, out):
         return replace(out, features=None)
@@ -100,7 +100,7 @@ class DetachesIntrinsicsSilently(ChangedRenderer):
         return gaussians, replace(cameras, intrinsics=cameras.intrinsics.detach())
 
 
-@mutant(CAMERAS, "is refused")
+@mutant(CAMERAS, "gradient is refused")
 class RefusesWhatItDeclares(ChangedRenderer):
     def given(self, gaussians, cameras):
         if cameras.intrinsics.requires_grad:

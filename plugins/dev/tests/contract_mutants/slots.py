@@ -78,13 +78,13 @@ class WeighsTwice(LayerSupervision):
         return {layer: factor * weight for layer, weight in super().weights(rounds).items()}
 
 
-@mutant("supervision_weights", "with rounds that end at [3, 4]", options={"layers": (1, 2)})
+@mutant("supervision_weights", "and rounds that end at [3, 4]", options={"layers": (1, 2)})
 class IgnoresRounds(LayerSupervision):
     def weights(self, rounds=()):
         return super().weights()
 
 
-@mutant("feedback_compares_the_photos", "rays through the corners")
+@mutant("feedback_compares_the_photos", "other rays through their corners")
 class HalvesTheLensAlone(NoFeedback):
     def compared(self, views):
         cameras = replace(views.cameras, intrinsics=views.cameras.intrinsics / 2)
@@ -105,7 +105,7 @@ class NoiseScene(Scene):
         return torch.rand(len(frames), 3, 16, 24)
 
 
-@mutant("scenes_repeat", "opened again, 1: values differ")
+@mutant("scenes_repeat", "opened a second time, scene 0 differs, 1: values differ")
 class DrawsItsImages(SceneSource):
     def scenes(self, split):
         return [NoiseScene()]
@@ -119,7 +119,7 @@ class HoldsOutTooMuch(DrawsItsImages):
         return [scene]
 
 
-@mutant("loss_is_a_mean_over_scenes", "against the mean over scenes")
+@mutant("loss_is_a_mean_over_scenes", "compared with the mean over scenes")
 class SumsOverScenes(Loss):
     renderings = "each"
 
@@ -127,7 +127,7 @@ class SumsOverScenes(Loss):
         return (rendering.rgb - target.images).square().mean((1, 2, 3, 4)).sum()
 
 
-@mutant("renderings_as_declared", "against the mean over views")
+@mutant("renderings_as_declared", "compared with the mean over views")
 class TakesTheWorstView(Loss):
     renderings = "each"
 
@@ -135,7 +135,7 @@ class TakesTheWorstView(Loss):
         return (rendering.rgb - target.images).square().mean((2, 3, 4)).amax(1).mean()
 
 
-@mutant("metric_gives_its_columns", "it has values for ['', 'lost'], columns for ['']")
+@mutant("metric_gives_its_columns", "its values are ['', 'lost'], its columns are ['']")
 class GivesAValueWithoutColumn(Psnr):
     def forward(self, given):
         return {"": super().forward(given), "lost": given.images.mean()}
@@ -146,13 +146,13 @@ class ReversesItsDirection(Psnr):
     column = Column("PSNR", "lower")
 
 
-@mutant("optimizer_steps", "it leaves out parameters")
+@mutant("optimizer_steps", "its groups lack given parameters")
 class OptimizesDecayingGroups(OneCycleAdamW):
     def build(self, groups):
         return super().build([group for group in groups if group["decays"]])
 
 
-@mutant("optimizer_continues", "three and three from a checkpoint")
+@mutant("optimizer_continues", "a checkpoint and three more")
 class CountsItsOwnSteps(OneCycleAdamW):
     calls = 0
 
@@ -167,7 +167,7 @@ class RoundsItsRays(ChangedEncoder):
         return replace(memory, patch_rays=memory.patch_rays.bfloat16().to(memory.patch_rays))
 
 
-@mutant("tokens_are_those_of_the_grid", "of `keys`, 8% of what changes a token comes from its own")
+@mutant("tokens_are_those_of_the_grid", "for `keys`: 8% of what changes a token comes from its own")
 class OrdersTokensByColumn(ChangedEncoder):
     def result(self, memory):
         def turned(x: Tensor, tokens: int) -> Tensor:
@@ -193,7 +193,7 @@ class PoolsEachView(StridedConvolutions):
         return x_BVDHW.mean((-1, -2), keepdim=True).expand_as(x_BVDHW)
 
 
-@mutant("tokens_are_those_of_the_grid", "`values` stays as it is")
+@mutant("tokens_are_those_of_the_grid", "`values` does not change")
 class IgnoresImages(ChangedEncoder):
     def given(self, views):
         return replace(views, images=0 * views.images)
@@ -202,7 +202,7 @@ class IgnoresImages(ChangedEncoder):
 LATENTS = {"depth": 1, "blocks": (1,), "latents": 5, "latent_depth": 1}
 
 
-@mutant("project_makes_the_memory_again", "made anew from its own", options=LATENTS)
+@mutant("project_makes_the_memory_again", "`project` of the memory's own features", options=LATENTS)
 class ProjectsDoubles(LatentBottleneck):
     def project(self, features, memory):
         return super().project(2 * features, memory)
@@ -239,14 +239,14 @@ class ExplainsBySigmoid(ContentSelfAttention):
         return AttentionWeights(content, None, torch.sigmoid(content))
 
 
-@mutant("updates_are_explained", "of them is left")
+@mutant("updates_are_explained", "of them is unexplained")
 class ExplainsTooSharply(ContentCrossAttention):
     def explain(self, state, memory, queries):
         content = 2 * super().explain(state, memory, queries).content
         return AttentionWeights(content, None, content.softmax(-1))
 
 
-@mutant("explanation_is_a_softmax", "content is not finite: a mask is geometry")
+@mutant("explanation_is_a_softmax", "content is not finite; put masks into geometry")
 class MasksItsContent(ContentSelfAttention):
     def explain(self, state, queries):
         content = super().explain(state, queries).content
@@ -254,7 +254,7 @@ class MasksItsContent(ContentSelfAttention):
         return AttentionWeights(content, None, content.softmax(-1))
 
 
-@mutant("masked_queries_are_not_read", "of the others")
+@mutant("masked_queries_are_not_read", "other queries change")
 class IgnoresTheMask(ContentSelfAttention):
     def forward(self, state):
         return self.attention(self.norm(state.features))
@@ -268,7 +268,7 @@ class JudgesWhatIsMasked(Loss):
         return prediction.gaussians.scales.mean()
 
 
-@mutant("head_gives_gaussians", "gives {'features'}, and provides None")
+@mutant("head_gives_gaussians", "returns {'features'}, not None")
 class GivesFeaturesUntold(GaussianHead):
     def activate(self, raw):
         return replace(super().activate(raw), features=1 * raw[..., :2])
@@ -295,13 +295,13 @@ class DetachesTheTotal(Changed):
         return replace(outcome, total=outcome.total.detach())
 
 
-@mutant("objective_gives_an_outcome", "against the sum of the terms")
+@mutant("objective_gives_an_outcome", "compared with the sum of terms")
 class HidesATerm(Changed):
     def result(self, outcome):
         return replace(outcome, total=2 * outcome.total)
 
 
-@mutant("objective_repeats", "the second time")
+@mutant("objective_repeats", "a second call differs")
 class CountsItsJudgements(Changed):
     calls = 0
 

@@ -67,7 +67,7 @@ class ReadsMemoryUndeclared(ContentCrossAttention):
         return super().forward(state, memory) + memory.features.mean(1, keepdim=True)
 
 
-@mutant(CHECK, "which it declares not to: add it to `reads`")
+@mutant(CHECK, "which it does not declare: add it to `reads`")
 class ReadsTheGridUndeclared(ContentCrossAttention):
     def forward(self, state, memory):
         return super().forward(state, memory) * memory.grid[0]
@@ -89,7 +89,7 @@ class ReadsAnUndeclaredRendering(Loss):
         return {"small": prediction.gaussians.scales.mean() + rendering.rgb.sum()}
 
 
-@mutant("requires_are_read", "requires memory.features, which")
+@mutant("requires_are_read", "requires memory.features, but")
 class RequiresTooMuch(ContentCrossAttention):
     @classmethod
     def fields_read(cls, config):
@@ -168,7 +168,7 @@ class BiasesInHalf(ContentCrossAttention):
         return self.core.explain(state.features, memory.keys, queries, bias)
 
 
-@mutant("updates_are_explained", "of them is left")
+@mutant("updates_are_explained", "of them is unexplained")
 class ExplainsNoBias(BiasesInHalf):
     """What it says of itself leaves out what geometry adds."""
 
@@ -180,7 +180,7 @@ class ExplainsNoBias(BiasesInHalf):
         return self.core.explain(state.features, memory.keys, queries)
 
 
-@mutant("forward_keeps_no_state", "in training changes the state")
+@mutant("forward_keeps_no_state", "in training changes a parameter or buffer")
 @mutant("batch_independence", "in training, scene 0 has a gradient")
 class BatchNormed(MlpFeedForward):
     def __init__(self, config, dims):
@@ -213,7 +213,7 @@ class NumbersTokens(ContentCrossAttention):
         return self.core(state.features, memory.keys + number[:, None], memory.values)
 
 
-@mutant("view_permutation", "`ordered_views` is declared")
+@mutant("view_permutation", "it declares `ordered_views`")
 class DeclaresAnOrder(ContentCrossAttention):
     ordered_views = True
 

@@ -1,1 +1,1 @@
-"""The checks, by subject, as checks.toml lists them."""
+"""The checks of the contract suite by subject; checks.toml lists them."""

@@ -1,4 +1,4 @@
-"""Promises of encoders, and of attention: its memos, masks and explanations."""
+"""Checks of encoders and of attention: memos, masks and explanations."""
 
 import math
 from collections.abc import Iterator
@@ -16,34 +16,34 @@ from qgs_dev.case import CannotCheck, Case
 from qgs_dev.inputs import Inputs, Sizes, inputs_of
 from qgs_dev.vocabulary import Trial, cast, difference, expect, expect_same, floating, masked, scene
 
-# Queries of a state in which each is masked in turn.
+# Queries of the state in which each query is masked in turn.
 QUERIES = 6
 
 
 def check_memo_is_of_the_memory_alone(case: Case) -> None:
-    """`ImageMemory.once` keeps what is made of the memory: not of the state, nor of a weight.
+    """Require that values in `ImageMemory.once` depend on the memory only, not on state or weights.
 
-    A layer gives on a memory that others have read what it gives on a fresh one. What a layer's own
-    weights make of the memory belongs to that layer alone, and into no memo.
+    A layer must give the same results on a memory that another layer has read as on a fresh one.
+    Do not store results of a layer's own weights there: they belong to that layer alone.
     """
     first = Trial(case)
-    # The first layer fills the memo that the readers below find.
+    # The first layer fills the memo that the layers below read.
     first()
     memory = first.inputs["memory"]
     state = inputs_of(case, seed=1)["state"]
     for seed, what in enumerate(("the state", "a weight")):
         reader = case.lively(seed)
         fresh = reader(state, replace(memory))
-        where = f"what it keeps in the memory depends on {what}: read after another layer"
+        where = f"a value in `ImageMemory.once` depends on {what}: after another layer read it"
         expect_same(fresh, reader(state, memory), where)
 
 
 def check_masked_queries_are_not_read(case: Case) -> None:
-    """Numbers where the state's mask is False change nothing of the other queries."""
+    """Require that queries whose mask is False do not change the results of other queries."""
     sizes = Sizes(queries=5)
     trial = Trial(case, sizes)
     state = trial.inputs["state"]
-    # The scenes have different masks: a component may take one for all.
+    # The scenes have different masks, since a component may wrongly use one mask for all.
     mask = torch.tensor([[True, False, True, True, False], [True, True, False, True, True]])
     mask = mask.to(case.device)
 
@@ -52,15 +52,15 @@ def check_masked_queries_are_not_read(case: Case) -> None:
         return {name: x[mask] for name, x in floating(output).items()}
 
     moved = masked(state, mask, inputs_of(case, sizes, seed=1)["state"])
-    where = "when masked queries change, of the others"
+    where = "other queries change when masked queries change"
     expect_same(seen(state), seen(moved), where, 1e-4, 1e-5)
 
 
 def check_explanation_is_a_softmax(case: Case) -> None:
-    """The weights that `explain` gives are the softmax of content and geometry, of all tokens.
+    """Require that the weights from `explain` are the softmax of content plus geometry over tokens.
 
-    Content is (B, h, Q, T), for the queries that are asked for in their order; what hides a token
-    is -inf in geometry, (B, 1, Q, T) or (B, h, Q, T).
+    Content is (B, h, Q, T) for the requested queries, in their order. Geometry is (B, 1, Q, T) or
+    (B, h, Q, T); it is -inf where a token is hidden.
     """
     trial = Trial(case)
     given = explanation(trial.module, trial.inputs)
@@ -71,7 +71,7 @@ def check_explanation_is_a_softmax(case: Case) -> None:
     tokens = trial.inputs["memory"].keys.shape[2] if "memory" in trial.inputs else shape[2]
     right = shape == (batch, shape[1], queries, tokens)
     expect(right, f"content is {shape}, not (B, h, Q, T) = ({batch}, h, {queries}, {tokens})")
-    expect(given.content.isfinite().all(), "content is not finite: a mask is geometry")
+    expect(given.content.isfinite().all(), "content is not finite; put masks into geometry")
     expect(given.weights.shape == shape, f"weights are {tuple(given.weights.shape)}, not {shape}")
     if given.geometry is not None:
         found = tuple(given.geometry.shape)
@@ -80,8 +80,8 @@ def check_explanation_is_a_softmax(case: Case) -> None:
         expect(found in (shape, shared), f"geometry is {found}, neither {shape} nor {shared}")
     asked = [2, 0]
     some = explanation(trial.module, trial.inputs, asked)
-    expect(some is not None, "asked for queries 2 and 0 alone, it gives nothing")
-    where = "asked for queries 2 and 0 alone, it gives other weights"
+    expect(some is not None, "`explain` returns None for queries 2 and 0, but not for all queries")
+    where = "`explain` of queries 2 and 0 alone gives other weights"
     expect_same(some.weights, given.weights[:, :, asked], where, 1e-4, 1e-5)
     logits = given.content if given.geometry is None else given.content + given.geometry
     off = (given.weights - logits.softmax(-1)).abs().max().item()
@@ -89,17 +89,17 @@ def check_explanation_is_a_softmax(case: Case) -> None:
 
 
 def check_updates_are_explained(case: Case) -> None:
-    """Updates are what the weights that `explain` gives make of one value for each head and token.
+    """Require that updates are sums of one value per head and token, weighted as `explain` says.
 
-    So the updates of many queries, or under several masks, are linear in unknown values, of which
-    there are fewer: they are solved for, and must leave no rest.
+    Updates of many queries, or under several masks, are then linear in the unknown values. There
+    are fewer values than updates, so a least-squares solution must leave no residual.
     """
     count = QUERIES if case.slot == "self_attention" else 60
     module = case.lively().double()
     inputs = cast(inputs_of(case, Sizes(batch=1, queries=count)), torch.float64)
     masks = torch.ones(1, count, dtype=torch.bool)
     if case.slot == "self_attention":
-        # Whichever queries are masked, the values of the others stay.
+        # Masking some queries does not change the values of the others.
         masks = torch.cat([masks, ~torch.eye(count, dtype=torch.bool)])
     factors = []
     updates = []
@@ -109,35 +109,36 @@ def check_updates_are_explained(case: Case) -> None:
         if found is None:
             return
         weights = found.weights[0, :, mask].double()  # (h, Q, N)
-        # The output layer of an attention has a bias, one more unknown.
+        # The bias of the output layer is one more unknown.
         bias = torch.ones(weights.shape[1], 1, dtype=torch.float64)
         factors.append(torch.cat([*weights, bias], 1))
         with torch.no_grad():
             updates.append(module(*given.values())[0, mask])
     factor = torch.cat(factors)
     update = torch.cat(updates)
-    # What no values explain is the rest of the least squares.
+    # The residual of the least squares is the part that no values explain.
     rest = update - factor @ torch.linalg.pinv(factor) @ update
     share = (rest.norm() / update.norm().clamp_min(1e-30)).item()
-    seen = "no values, read by the weights that `explain` gives, make the updates"
-    expect(share < 1e-3, f"{seen}: {share:.1%} of them is left")
+    seen = "the updates are no weighted sums of values with the weights from `explain`"
+    expect(share < 1e-3, f"{seen}: {share:.1%} of them is unexplained")
 
 
 def explanation(module: Any, inputs: Inputs, queries: list[int] | None = None) -> Any:
-    """AttentionWeights of `queries`, by default all; None of a component that explains nothing."""
+    """Return AttentionWeights of `queries`, by default all; None if the component gives none."""
     chosen = queries or range(inputs["state"].features.shape[1])
     return module.explain(*inputs.values(), torch.tensor([*chosen]))
 
 
-# Rows and columns of patches that are changed, a scene each; 4 where a token is a pixel.
+# Rows and columns of patches to change, each in a scene of its own; 4 if a token is a pixel.
 _SIDE = 6
 
-# Of the largest mean share at one displacement. Strided 3 x 3 convolutions, whose centres are
-# nearly half a patch off, have 0.75 to 1.5; tokens shifted by one at most 0.5.
+# Least share of a token's own patch, relative to the largest mean share at one displacement.
+# Strided 3 x 3 convolutions, whose centres are nearly half a patch off, have 0.75 to 1.5. Tokens
+# shifted by one have at most 0.5.
 _LEAST_SHARE = 0.6
 
-# Share of a token's own patch over the mean of a view's. Strided convolutions have at least 6, a
-# random ViT of 8 blocks 11.
+# Least share of a token's own patch over the mean share of a view's patches. Strided convolutions
+# have at least 6, a random ViT of 8 blocks has 11.
 _LEAST_GAIN = 1.5
 
 _ORDER = (
@@ -146,33 +147,33 @@ _ORDER = (
 
 
 def check_patch_rays_are_those_of_the_grid(case: Case) -> None:
-    """`grid` counts the patches of each view, `patch_rays` are their mean rays, in its order.
+    """Require that `grid` counts the patches of each view, and `patch_rays` are their mean rays.
 
-    A memory without rays may have no grid.
+    Rays have the order of the grid. A memory without rays may have no grid.
     """
     module = case.lively()
     for where, views in _wide_and_tall(case, case.size):
         memory = module(views)
         if memory.patch_rays is None:
-            raise CannotCheck("it gives no patch rays")
+            raise CannotCheck("its memory has no patch rays")
         patch = _patch_size(where, views, memory)
         rays = patch_rays(plucker_rays(views.cameras), patch)
-        where = f"{where}, against the mean rays of patches of {patch} pixels"
+        where = f"{where}, compared with the mean rays of patches of {patch} pixels"
         expect_same({"patch_rays": memory.patch_rays}, {"patch_rays": rays}, where, 1e-4, 1e-5)
 
 
 def check_tokens_are_those_of_the_grid(case: Case) -> None:
-    """A change of what one patch shows is largest in its own token: that of its place in `grid`.
+    """Require that a change of one patch changes the token at its place in `grid` most.
 
-    In the mean over the patches, and half a patch off is allowed: the centres of strided
-    convolutions stand there. Keys may be those of the rays alone. A memory may have no grid.
+    This holds in the mean over patches. Half a patch off is allowed, since centres of strided
+    convolutions are there. Keys may depend on rays alone. A memory may have no grid.
     """
-    # Initial parameters, not noise: in a random network a token shows what all patches show.
+    # Initial parameters without noise: in a random network every token depends on all patches.
     module = case.build().eval()
     size = case.size
     grid = module(inputs_of(case)["views"]).grid
     large = (2 * size[0], 2 * size[1])
-    # In a small grid most tokens are at a border.
+    # Most tokens of a small grid are at a border.
     if grid and min(grid[1:]) <= 3 and not case.image_size and not case.problems(large):
         size = large
     for where, views in _wide_and_tall(case, size):
@@ -180,7 +181,7 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
         memory = module(views)
         if memory.grid is None:
             declared = "memory.grid" in case.writes
-            expect(not declared, "`writes` has memory.grid, but `grid` of the ImageMemory is None")
+            expect(not declared, "`writes` lists memory.grid, but the memory's `grid` is None")
             continue
         patch = _patch_size(where, views, memory)
         side = _SIDE if patch > 1 else 4
@@ -195,16 +196,16 @@ def check_tokens_are_those_of_the_grid(case: Case) -> None:
             # Keys and values have heads.
             change = change.sum(1) if change.ndim == 3 else change
             if not change.any():
-                expect(name == "keys", f"{where}, `{name}` stays as it is when the images change")
+                expect(name == "keys", f"{where}, `{name}` does not change when the images change")
                 continue
             found = _misplaced(change, tokens, places, memory.grid)
-            expect(not found, f"{where}, of `{name}`, {found}")
+            expect(not found, f"{where}, for `{name}`: {found}")
 
 
 def check_project_makes_the_memory_again(case: Case) -> None:
-    """From its own features, a `tunable` encoder makes the memory that they came with.
+    """Require that `project` of a `tunable` encoder rebuilds a memory from the memory's features.
 
-    From others it makes another one. An encoder that is not tunable refuses.
+    Other features must give another memory. An encoder that is not tunable must refuse.
     """
     trial = Trial(case)
     module = trial.module
@@ -213,15 +214,15 @@ def check_project_makes_the_memory_again(case: Case) -> None:
         again = module.project(memory.features, memory)
         other = module.project(memory.features.roll(1, 1), memory)
     except NotImplementedError:
-        expect(not module.tunable, "it is declared `tunable`, but `project` is not implemented")
+        expect(not module.tunable, "it declares `tunable`, but does not implement `project`")
         return
-    expect(module.tunable, "it has `project`, but does not declare `tunable`")
-    expect_same(memory, again, "made anew from its own features")
-    expect(difference(memory, other), "other features make the same memory")
+    expect(module.tunable, "it implements `project`, but does not declare `tunable`")
+    expect_same(memory, again, "`project` of the memory's own features gives another memory")
+    expect(difference(memory, other), "`project` of other features gives the same memory")
 
 
 def _wide_and_tall(case: Case, size: tuple[int, int]) -> Iterator[tuple[str, Views]]:
-    """Views of `size` (H, W), and turned by 90 degrees if the component accepts that."""
+    """Yield views of `size` (H, W), and of (W, H) if the component accepts that."""
     for image in dict.fromkeys([size, (size[1], size[0])]):
         if image == size or not case.problems(image):
             where = f"with images of {image[0]} x {image[1]}"
@@ -229,10 +230,10 @@ def _wide_and_tall(case: Case, size: tuple[int, int]) -> Iterator[tuple[str, Vie
 
 
 def _patch_size(where: str, views: Views, memory: ImageMemory) -> int:
-    """Pixels along a patch, as the grid of `memory` says."""
+    """Return the patch size in pixels that the grid of `memory` implies."""
     grid = memory.grid
     if grid is None:
-        raise CannotCheck("its tokens are no patches: the memory has no grid")
+        raise CannotCheck("its tokens are not patches: the memory has no grid")
     count = views.images.shape[1]
     height, width = views.cameras.size
     patch = max(height // max(grid[1], 1), 1)
@@ -242,11 +243,12 @@ def _patch_size(where: str, views: Views, memory: ImageMemory) -> int:
 
 
 def _misplaced(change: Tensor, changed: Tensor, places: Tensor, grid: tuple[int, int, int]) -> str:
-    """How tokens of the `grid` stand off their patches, with the remedy; "" if they do not.
+    """Describe how tokens are misplaced in `grid`, and how to fix it; "" if they are not.
 
-    change: (T, M), of each token by each of the patches that were `changed` (T,), at `places`.
+    change: (T, M), the change of every token M by each changed patch T. changed: (T,), the tokens
+    of the changed patches, which are at `places`.
     """
-    # Shares of what changes a token: near borders, and after norms, some tokens change more.
+    # Use shares of a token's total change: near borders and after norms, some tokens change more.
     share = change / change.sum(0).clamp_min(1e-30)
     # From the patch to the token.
     steps = (places - places[:, None]).flatten(0, 1)
@@ -258,29 +260,29 @@ def _misplaced(change: Tensor, changed: Tensor, places: Tensor, grid: tuple[int,
     seen = f"{own:.0%} of what changes a token comes from its own patch"
     of_view = len(changed) / grid[0]
     if of_view > 4 and max(own, most / 2) * of_view < _LEAST_GAIN:
-        return f"{seen}, hardly more than from others: a token must show its patch; {_ORDER}"
+        return f"{seen}, hardly more than from others; {_ORDER}"
     if own < _LEAST_SHARE * most:
         step = ", ".join(f"{-x:+d}" for x in known[at].tolist())
         return (
             f"{seen}, {most:.0%} from the patch at view, row, column ({step}) of it; "
-            f"{_ORDER}, and pad so that the pixels which a token sees are centred on its patch"
+            f"{_ORDER}, and pad so that the receptive field of a token is centred on its patch"
         )
     return ""
 
 
 def _one_patch_each(views: Views, places: Tensor, patch: int) -> Views:
-    """A scene for each of `places`: the one given, with other noise in this one patch."""
+    """Return a copy of the scene for each of `places`, with other noise in that one patch."""
     scenes = map_tensors(lambda x: x.repeat(len(places), *[1] * (x.ndim - 1)), views)
     generator = torch.Generator().manual_seed(1)
     for images, (view, row, column) in zip(scenes.images, (places * patch).tolist(), strict=True):
-        # In place: these scenes are copies, and another patch of each is changed.
+        # Writing in place is safe, because these scenes are copies.
         seen = images[view // patch, :, row : row + patch, column : column + patch]
         seen.copy_(torch.rand(seen.shape, generator=generator))
     return scenes
 
 
 def check_unread_cameras_make_no_difference(case: Case) -> None:
-    """A component that declares `reads_cameras = False` gives the same without any cameras."""
+    """Require the same results without cameras if `reads_cameras` is False."""
     component = case.component
     if not issubclass(component, Encoder | Queries) or component.reads_cameras:
         raise CannotCheck("it reads cameras")

@@ -1,6 +1,6 @@
-"""A component can be built and called: with any sizes and strides, and compiled.
+"""Checks that a component can be built, called with any sizes and strides, and compiled.
 
-What `Component`, its `Config` and `nn.Module` give a class that does as usual is checked, too.
+They also cover what `Component`, `Config` and `nn.Module` provide unless a class overrides it.
 """
 
 import random
@@ -37,7 +37,7 @@ from qgs_dev.vocabulary import (
     tracked,
 )
 
-# Types that a forward pass gives; a tensor in all other slots.
+# Types that a forward pass returns; in all other slots it returns a tensor.
 OUTPUTS: Mapping[str, type] = {
     "encoder": ImageMemory,
     "queries": QueryState,
@@ -57,41 +57,43 @@ VARIED = (
 )
 
 WARM_UP = (Sizes(batch=2, queries=6), Sizes(batch=3, queries=8, views=3, gaussians=3))
-# Sizes for a compiled component; none of the later ones was seen before, in no number.
+# Later sizes for a compiled component; none of their numbers occurs in WARM_UP.
 LATER = (
     Sizes(batch=4, queries=9, views=4, gaussians=4),
     Sizes(batch=5, queries=11, views=5, gaussians=5),
     Sizes(batch=7, queries=13, views=7, gaussians=7),
 )
-# More graphs that the later sizes may take together, where one of them is special.
+# Number of further graphs that the later sizes may need, because one of them may be special.
 SLACK = 2
 
 
 def check_builds(case: Case) -> None:
-    """A component can be built from its options, in which its `problems` finds none."""
+    """Require that `problems` accepts the options and that the component can be built from them."""
     found = [f"`{p.option}`: {p.reason}" for p in case.problems(case.size)]
-    # A case that its component refuses says nothing about the component.
-    expect(not found, f"the options of this case are refused: {', '.join(found)}")
+    # A case with invalid options says nothing about the component.
+    expect(not found, f"`problems` refuses the options of this case: {', '.join(found)}")
     case.build()
 
 
 def check_runs(case: Case) -> None:
-    """A forward pass on ordinary inputs gives what the contract of the slot says that it gives."""
+    """Require that a forward pass on ordinary inputs returns the type that the slot prescribes."""
     output = Trial(case)()
     kind = OUTPUTS.get(case.slot, Tensor)
-    expect(isinstance(output, kind), f"it gives a {type(output).__name__}, not a {kind.__name__}")
+    returned = type(output).__name__
+    expect(isinstance(output, kind), f"it returns {returned} instead of {kind.__name__}")
     if case.slot in WITH_MEMORY:
         kinds = [type(part).__name__ for part in output]
-        expect(kinds == ["QueryState", "ImageMemory"], f"it gives {kinds}, not state and memory")
+        right = kinds == ["QueryState", "ImageMemory"]
+        expect(right, f"it returns {kinds} instead of QueryState and ImageMemory")
     if isinstance(output, Mapping):
         odd = [name for name, term in output.items() if not isinstance(term, Tensor)]
-        expect_none(odd, "no tensor")
+        expect_none(odd, "not a tensor")
 
 
 def check_sizes_vary(case: Case) -> None:
-    """One instance takes any number of scenes, queries and views, and gives the shapes it must.
+    """Require correct output shapes for any number of scenes, queries and views.
 
-    So does one of a model of another width and number of heads.
+    One instance must accept all of these. The same holds for another width and number of heads.
     """
     _expect_shapes(case, [*VARIED, Sizes(image=(case.size[1], case.size[0]))])
     other = case.with_dims(width=48, heads=3)
@@ -107,27 +109,27 @@ def _expect_shapes(case: Case, varied: Iterable[Sizes]) -> None:
     trial = Trial(case)
     for sizes in varied:
         if sizes.image and case.slot == "encoder" and case.problems(sizes.image):
-            # The component refuses these images, and says so.
+            # The component declares that it does not accept this image size.
             continue
         shapes = _expected_shapes(trial, sizes)
         for mode, output in trial.in_each_mode(inputs_of(case, sizes)):
             outputs = leaves(output)
             for name, shape in shapes.items():
-                expect(name in outputs, f"in {mode}, with {sizes}, it gives no `{name}`")
+                expect(name in outputs, f"in {mode}, with {sizes}, there is no output `{name}`")
                 seen = list(outputs[name].shape)
                 # None: the component chooses.
                 right = len(seen) == len(shape) and all(
                     size in (None, given) for size, given in zip(shape, seen, strict=True)
                 )
-                expect(right, f"in {mode}, with {sizes}, `{name}` is of shape {seen}, not {shape}")
+                expect(right, f"in {mode}, with {sizes}, `{name}` has shape {seen}, not {shape}")
 
 
 def _expected_shapes(trial: Trial, sizes: Sizes) -> dict[str, list[int | None]]:
-    """Shape of every output that the contract fixes; None for a size that it leaves open."""
+    """Return the required shape of every output; None stands for a size that is free."""
     case = trial.case
     maker = Maker(case, sizes)
     maker.axes["M"] = None
-    # Queries bring their own number, whatever the sizes of the inputs.
+    # Queries have their own number, whatever the sizes of the inputs.
     if case.slot == "queries":
         maker.axes["N"] = trial.module.count
     if case.slot == "head":
@@ -138,7 +140,7 @@ def _expected_shapes(trial: Trial, sizes: Sizes) -> dict[str, list[int | None]]:
         axes = "BN"
         place = f"0.fields.{name}" if case.slot in WITH_MEMORY else f"fields.{name}"
         if name == "memory.grid" or case.slot in ("head", "renderer"):
-            # No tensor, or the subject of another check.
+            # Such an output is not a tensor, or another check covers it.
             continue
         if case.slot == "encoder":
             axes = "BhM" if name in ("memory.keys", "memory.values") else "BM"
@@ -148,30 +150,30 @@ def _expected_shapes(trial: Trial, sizes: Sizes) -> dict[str, list[int | None]]:
 
 
 def check_strides_make_no_difference(case: Case) -> None:
-    """Inputs that are not contiguous, such as expanded or sliced ones, give the same results."""
+    """Require the same results for inputs that are not contiguous, such as slices."""
     trial = Trial(case)
     strided = map_tensors(_with_gaps, trial.inputs)
-    # Other strides are summed up in another order.
+    # With other strides, sums run in another order.
     expect_same(trial(), trial(strided), "with inputs that are not contiguous", 1e-3, 1e-4)
 
 
 def _with_gaps(tensor: Tensor) -> Tensor:
-    """The same numbers, with gaps in memory along every dimension."""
+    """Return the same numbers with gaps in memory along every dimension."""
     room = tensor.new_zeros([size + 1 for size in tensor.shape])
     return room[tuple(slice(size) for size in tensor.shape)].copy_(tensor)
 
 
 def check_compiles(case: Case) -> None:
-    """Traced by torch.compile, a component is close to eager, and new sizes need no new graphs.
+    """Require that torch.compile keeps results and gradients, and new sizes need no new graphs.
 
-    So are its gradients. The graphs run eagerly: what a compiler makes of them is torch's business.
+    The traced graphs run eagerly: the check does not test the compiler's code generation.
     """
     from torch._dynamo.testing import CompileCounterWithBackend
 
     trial = Trial(case)
     module = trial.module
     counter = CompileCounterWithBackend("aot_eager")
-    # Graphs of another case would count as its own.
+    # Otherwise graphs of an earlier case would count too.
     torch._dynamo.reset()
     try:
         compiled: Any = torch.compile(module, backend=counter)
@@ -189,7 +191,7 @@ def check_compiles(case: Case) -> None:
     found = _gradients(module, ours, eager)
     of_compiled = _gradients(module, theirs, outputs)
     odd = found.keys() ^ of_compiled.keys()
-    expect_none(odd, "a gradient only if compiled, or only if not")
+    expect_none(odd, "has a gradient only if compiled, or only if not compiled")
     largest = max((gradient.abs().max().item() for gradient in found.values()), default=0.0)
     for name, gradient in found.items():
         # Gradients of different inputs differ by orders of magnitude; a small one may be the rest
@@ -198,36 +200,37 @@ def check_compiles(case: Case) -> None:
         where = f"compiled, the gradient of {name} differs"
         expect_same(gradient, of_compiled[name], where, atol=atol)
     more = counter.frame_count
-    seen = f"{more} more graphs are compiled for {len(LATER)} new sizes after {len(WARM_UP)}"
+    seen = f"{more} new graphs are compiled for {len(LATER)} sizes after the first {len(WARM_UP)}"
     expect(more <= SLACK, seen)
 
 
 def _gradients(module: Any, inputs: Inputs, outputs: Any) -> dict[str, Tensor]:
-    """Gradients in the inputs and in the parameters, without those that are all zeros."""
+    """Return the gradients of inputs and parameters, without those that are all zeros."""
     given = {**inputs, "parameter": dict(module.named_parameters())}
     return {name: x for name, x in gradients(scalar(outputs), given).items() if bool(x.any())}
 
 
 def check_construction(case: Case) -> None:
-    """Options are those that were written, and modules are drawn, saved, loaded and moved whole.
+    """Require that options survive writing and reading, and modules survive saving and moving.
 
-    Options written as YAML and read again are the same, also after building; a misspelt one is
-    refused with the nearest one. A component with parameters allocates nothing under the meta
-    device, keeps every tensor as a parameter or a buffer, draws from torch's global generator
-    alone, gives the same bits from saved weights, and computes on the device that it is moved to.
+    Options must be the same after being written as YAML and read again, and after building. A
+    misspelt option is refused with the nearest name. A component with parameters allocates nothing
+    under the meta device. It keeps every tensor as a parameter or a buffer, and draws only from
+    torch's global generator. It gives the same bits from saved weights, and computes on the device
+    that it is moved to.
     """
     _expect_strict_options(case)
     if case.slot != "data":
-        # A shallow copy would share lists, and their change would go unseen.
+        # A shallow copy would share lists and hide changes of them.
         own = case.with_config(case.config.model_copy(deep=True))
         own.build()
         same = own.config == case.config
-        expect(same, f"when it is built, {case.config!r} becomes {own.config!r}")
+        expect(same, f"building it changes its options from {case.config!r} to {own.config!r}")
     if case.has_parameters:
         with torch.device("meta"), OnMeta():
             tensors = tensors_of(case.construct())
         real = [name for name, tensor in tensors.items() if not tensor.is_meta]
-        expect_none(real, "allocated; leave the device to the caller")
+        expect_none(real, "allocated under the meta device; leave the device to the caller")
         _expect_drawn_from_torch(case)
         _expect_registered(case.build())
         _expect_loadable(case)
@@ -237,22 +240,23 @@ def check_construction(case: Case) -> None:
 def _expect_strict_options(case: Case) -> None:
     options = case.config.model_dump(mode="json")
     names = list(type(case.config).model_fields)
-    expect_none(set(names) - options.keys(), "not written")
+    expect_none(set(names) - options.keys(), "missing when the options are written")
     again, message = _decoded(case, options)
-    expect(again is not None, f"{options} is refused: {message}")
-    expect(again == case.config, f"{case.config!r} is read again as {again!r}")
-    # One letter too many: near enough for a suggestion.
+    expect(again is not None, f"its own options {options} are refused: {message}")
+    expect(again == case.config, f"{case.config!r} is read back as {again!r}")
+    # This name is close enough for a suggestion.
     wrong = f"{names[0]}_x" if names else "no_such_option"
     config, message = _decoded(case, {**options, wrong: 1})
-    expect(config is None, f"the option `{wrong}` is accepted")
-    expect(not names or f"did you mean `{names[0]}`" in message, f"the message is: {message}")
+    expect(config is None, f"the unknown option `{wrong}` is accepted")
+    suggested = not names or f"did you mean `{names[0]}`" in message
+    expect(suggested, f"the message for `{wrong}` does not suggest `{names[0]}`: {message}")
     for model in _configs_in(type(case.config)):
         strict = model.model_config.get("extra") == "forbid"
         expect(strict, f"{model.__qualname__} accepts any option; derive it from ComponentConfig")
 
 
 def _configs_in(annotation: Any) -> set[type[BaseModel]]:
-    """The configs that an option of this type can hold, with those in their own options."""
+    """Return the configs that an option of this type can hold, nested ones included."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         inside = [field.annotation for field in annotation.model_fields.values()]
         return {annotation}.union(*map(_configs_in, inside))
@@ -260,7 +264,7 @@ def _configs_in(annotation: Any) -> set[type[BaseModel]]:
 
 
 def _decoded(case: Case, options: dict[str, Any]) -> tuple[ComponentConfig | None, str]:
-    """The options that the composer reads from YAML, and the message if it refuses them."""
+    """Return the options that the composer reads from YAML, and its message if it refuses them."""
     problems = Problems()
     node = load_mapping(dump(options), "case", problems)
     config = decode_config(case.component.Config, node, (), problems)
@@ -272,27 +276,27 @@ def _decoded(case: Case, options: dict[str, Any]) -> tuple[ComponentConfig | Non
 
 
 def _expect_drawn_from_torch(case: Case) -> None:
-    # Training resumes torch's generator alone.
+    # A resumed training restores torch's generator alone.
     others = other_generators()
     after = []
     for seed in (1, 2):
         with seeded(seed):
             case.construct()
             after.append(torch.get_rng_state())
-    expect(not torch.equal(*after), "after being built from two seeds, torch is in one state")
-    expect(others == other_generators(), "building draws from numpy's or random's generator")
+    expect(not torch.equal(*after), "building it sets the seed of torch's generator")
+    expect(others == other_generators(), "building it draws from numpy's or random's generator")
     first, second = (dict(case.build(seed=3).state_dict()) for _ in range(2))
     expect_same(first, second, "two instances built from one seed differ")
 
 
 def other_generators() -> tuple[Any, str]:
-    """The states of the random generators that components must not use."""
+    """Return the states of the random generators that components must not use."""
     return random.getstate(), str(numpy.random.get_state())
 
 
 def _expect_registered(module: nn.Module) -> None:
     for name, part in module.named_modules():
-        # Torch's own layers may list their parameters a second time, as its recurrent ones do.
+        # Torch's own layers may list their parameters twice, as its recurrent layers do.
         of_torch = type(part).__module__.startswith("torch.")
         for key, value in vars(part).items():
             listed = value if isinstance(value, list | tuple) and not of_torch else ()
@@ -308,7 +312,7 @@ def _expect_loadable(case: Case) -> None:
     other = case.build(seed=2).eval()
     other.load_state_dict(load(save(weights)))
     inputs = inputs_of(case).values()
-    expect_same(module(*inputs), other(*inputs), "with the same state dict")
+    expect_same(module(*inputs), other(*inputs), "two instances with the same state dict differ")
 
 
 def _expect_movable(case: Case) -> None:
@@ -318,8 +322,8 @@ def _expect_movable(case: Case) -> None:
         outputs = floating(case.lively().to(device)(*inputs.values()))
     for name, tensor in outputs.items():
         moved = tensor.device.type == device
-        expect(moved, f"`{name}` is on {tensor.device}, the component on {device}")
-    # The backward pass has devices of its own.
+        expect(moved, f"`{name}` is on {tensor.device}, but the component is on {device}")
+    # The backward pass may use other devices.
     totals = [x.sum() for x in outputs.values() if x.requires_grad]
     if totals:
         torch.autograd.backward(totals)
@@ -327,7 +331,7 @@ def _expect_movable(case: Case) -> None:
 
 @contextmanager
 def _autocast_accepts_meta() -> Iterator[None]:
-    """`torch.autocast(x.device.type, enabled=False)` is valid code, which torch refuses on meta."""
+    """Let `torch.autocast(x.device.type, enabled=False)` pass on meta, where torch refuses it."""
     start = torch.autocast.__init__
 
     def begin(self: Any, device_type: str, *args: Any, **kwargs: Any) -> None:

@@ -1,4 +1,4 @@
-"""Fields of the state: what a component reads and writes is what it declares, and recipes obey."""
+"""Checks that a component reads and writes the state fields that it declares."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -23,11 +23,10 @@ from qgs.recipe.slots import MODEL_SLOTS, SECTIONS
 from qgs.recipe.yaml_text import inline
 from qgs.tokengs import GaussianHead, LatentQueries, MultiViewViT
 from qgs.types import QueryState
-from qgs_dev.case import Case
+from qgs_dev.case import Case, ContractError
 from qgs_dev.inputs import FACTS, Inputs, Maker, Sizes, inputs_of, memory_width, required_fields
 from qgs_dev.modules import seeded
 from qgs_dev.vocabulary import (
-    ContractError,
     Trial,
     described,
     difference,
@@ -42,26 +41,26 @@ from qgs_dev.vocabulary import (
 )
 
 PLUGIN = "under_test"
-# Names of the plugin that offers the component, and of those that give it its fields.
+# Names of the plugin with the component, and of components that provide its fields.
 GIVEN = "given_fields"
 
 
 def check_reads_within_requires(case: Case) -> None:
-    """Only fields in `requires` are asked for, of the state and of the image memory.
+    """Require that a component reads only fields in `requires`, from the state and the memory.
 
-    Looking whether a field is there is asking for it. The other fields are passed on with
-    `QueryState.replace`. A loss looks at no rendering if it declares that it needs none.
+    Testing whether a field exists counts as reading. Pass other fields on with
+    `QueryState.replace`. A loss that declares no renderings must not read one.
     """
     trial = Trial(case)
     inputs = trial.inputs
     unread = {name for name in leaves(inputs) if name.startswith("memory.")} - {*case.reads}
     if getattr(case.component, "sublayers", ()):
-        # What stands in its slots may read them.
+        # The sublayers in its slots may read them.
         unread = set()
     if getattr(case.component, "renderings", "") == "none":
         inputs["rendering"] = Maker(case).all_views()
         unread = {name for name in leaves(inputs) if name.startswith("rendering.")}
-    # What reads a NaN gives one.
+    # A component that reads a NaN returns one.
     poisoned = mapped(inputs, lambda name, x: x + torch.nan if name in unread else x)
     if "memory" in inputs and "memory.grid" not in case.reads:
         poisoned = {**poisoned, "memory": replace(poisoned["memory"], grid=None)}
@@ -71,19 +70,19 @@ def check_reads_within_requires(case: Case) -> None:
         expect_none(asked - {*case.reads}, f"read in {mode}, but not required")
         if poisoned is not inputs:
             names = ", ".join(sorted(unread))
-            where = f"in {mode} it reads some of {names}, which it declares not to"
+            where = f"in {mode} it reads some of {names}, which it does not declare"
             with seeded(0):
                 try:
                     other = trial(poisoned)
-                # With the declared parts alone it fails, and with all it does not.
+                # It fails with the declared parts alone, and works with all parts.
                 except Exception as error:
                     raise ContractError(f"{where}: add it to `reads`") from error
-            # A layer passes on a memory that it does not read.
+            # A layer may pass on a memory that it does not read.
             expect_same(trial.state_of(output), trial.state_of(other), where)
 
 
 class AskedFields(dict[str, Tensor]):
-    """Fields of a state that add the names they are asked for to `asked`."""
+    """Fields of a state that record in `asked` which names are read."""
 
     def __init__(self, fields: Mapping[str, Tensor], asked: set[str]) -> None:
         super().__init__(fields)
@@ -98,7 +97,7 @@ class AskedFields(dict[str, Tensor]):
         return super().__contains__(name)
 
     def get(self, name: str, default: Any = None) -> Any:
-        """As of any dict."""
+        """Return the field `name`, or `default`, and record the name."""
         self.asked.add(name)
         return super().get(name, default)
 
@@ -116,21 +115,21 @@ def _with_asked_fields(inputs: Inputs, asked: set[str]) -> Inputs:
 
 
 def check_requires_are_read(case: Case) -> None:
-    """Every field in `requires` is read: else recipes that lack it are refused for nothing.
+    """Require that every field in `requires` is read, so that no recipe is refused needlessly.
 
-    Features of Gaussians may be read off their rendering.
+    Features of Gaussians may be read from their rendering.
     """
     trial = Trial(case)
-    # One of several draws must differ: a ReLU may be closed for some.
+    # At least one of several draws must differ, since a ReLU may be closed for some.
     outputs = trial()
     for field in case.reads:
         others = _with_others(trial, field)
         read = any(difference(outputs, trial(inputs)) for inputs in others)
-        expect(read, f"it requires {field}, which changes nothing")
+        expect(read, f"it requires {field}, but other values of it change nothing")
 
 
 def _with_others(trial: Trial, field: str) -> Iterator[Inputs]:
-    """Inputs of a trial with something else for a required field."""
+    """Yield inputs of a trial with other values for a required field."""
     inputs = trial.inputs
     if field == "memory.grid":
         views, rows, columns = inputs["memory"].grid
@@ -139,16 +138,17 @@ def _with_others(trial: Trial, field: str) -> Iterator[Inputs]:
         return
     ends = (field, f"rendering.{field.removeprefix('gaussians.')}")
     others = [inputs_of(trial.case, seed=seed) for seed in (1, 2, 3)]
-    # Rays have no seed.
+    # Rays do not depend on the seed.
     others.append(map_tensors(lambda x: x.roll(1, 1), inputs))
     for other in map(leaves, others):
         yield mapped(inputs, lambda n, x, other=other: other[n] if n.endswith(ends) else x)
 
 
 def check_writes_equal_provides(case: Case) -> None:
-    """The fields that are written are those in `provides`, in the shape and dtype given there.
+    """Require that written fields are those in `provides`, with the shape and dtype given there.
 
-    The others pass on all other fields as they are, a refinement the features too.
+    Components other than queries pass on all other fields unchanged; a refinement also passes on
+    the features.
     """
     trial = Trial(case)
     before: dict[str, Tensor] = {}
@@ -166,33 +166,34 @@ def check_writes_equal_provides(case: Case) -> None:
         expect_none(before.keys() - output.fields.keys(), f"lost in {mode}")
         if case.slot == "refinement":
             passed = _same(output.features, state.features)
-            expect(passed, f"in {mode} it changes the features, which a refinement passes on")
+            expect(passed, f"in {mode} it changes the features; a refinement must pass them on")
         for name, spec in case.writes.items():
             right = output[name].dtype == spec.dtype
-            expect(right, f"in {mode} `{name}` is {described(output[name])}, declared as {spec}")
+            found = described(output[name])
+            expect(right, f"in {mode} `{name}` is {found}, but declared as {spec}")
 
 
 def _same(one: Tensor, other: Tensor) -> bool:
-    # A view of the same memory is handed on, not written.
+    # A view of the same memory is passed on, not written.
     return one is other or (one.data_ptr() == other.data_ptr() and one.shape == other.shape)
 
 
 def check_unmet_requirement_fails_at_compose(case: Case) -> None:
-    """A recipe that lacks one thing a component needs is refused by name; one with all runs."""
+    """Require that a recipe without a required field is refused by name, and one with all runs."""
     needed = required_fields(case)
     for missing in needed:
         refusal = _refusal(case, {name: spec for name, spec in needed.items() if name != missing})
-        expect(refusal, f"a recipe without {missing} is composed")
-        expect(missing in refusal, f"the refusal does not name the missing {missing}: {refusal}")
+        expect(refusal, f"a recipe without the required {missing} is accepted")
+        expect(missing in refusal, f"the message does not name the missing {missing}: {refusal}")
     refusal = _refusal(case, needed)
-    expect(not refusal, f"a recipe that gives it all it requires is refused: {refusal}")
+    expect(not refusal, f"a recipe with all that it requires is refused: {refusal}")
     if case.slot in FACTS and case.slot != "renderer":
         # A recipe that is accepted must run.
         run_training_step(resolved(case, needed), case)
 
 
 def _refusal(case: Case, given: Fields) -> str:
-    """The message about a recipe in which the queries provide `given` alone; "" if accepted."""
+    """Return why a recipe is refused whose queries provide only `given`; "" if it is accepted."""
     try:
         resolved(case, given)
     except RecipeError as error:
@@ -201,13 +202,13 @@ def _refusal(case: Case, given: Fields) -> str:
 
 
 def resolved(case: Case, given: Fields) -> Recipe:
-    """The small recipe with the component of `case`, whose queries provide `given`."""
+    """Return a small recipe with the component of `case` and queries that provide `given`."""
     slot = case.slot
-    # Thousands of queries take seconds to render and show nothing more.
+    # Thousands of queries would take seconds to render and test nothing more.
     config = (case.with_at_most(count=6) if slot == "queries" else case).config
     options = {"type": f"{PLUGIN}/{case.component.name}", **config.model_dump(mode="json")}
     of_encoder = case.writes if slot == "encoder" else MEMORY_FIELDS
-    # The default layers read both.
+    # The default layers read keys and values.
     depth = case.dims.depth if {"memory.keys", "memory.values"} <= of_encoder.keys() else 0
     place = f"{slot}.case" if slot in SECTIONS and SECTIONS[slot].named else slot
     place = f"model.{slot}" if slot in MODEL_SLOTS else place
@@ -236,8 +237,8 @@ def resolved(case: Case, given: Fields) -> Recipe:
 
 
 def _given(base: type, provides: Fields, **methods: Any) -> Any:
-    """A component that provides the fields `provides`, derived from a built-in one."""
-    # A new class each time: two cases would share one registry entry otherwise.
+    """Return a subclass of a built-in component that provides the fields `provides`."""
+    # Make a new class each time; otherwise two cases would share one registry entry.
     written = classmethod(lambda cls, config: provides)
     return type(
         f"Given{base.__name__}", (base,), {"name": GIVEN, "fields_written": written, **methods}
@@ -245,7 +246,7 @@ def _given(base: type, provides: Fields, **methods: Any) -> Any:
 
 
 def _head_with(look: Fields) -> Any:
-    """A head whose Gaussians have harmonics or features, read off those of the queries."""
+    """Return a head whose Gaussians have harmonics or features, taken from the queries."""
 
     def forward(self: GaussianHead, state: QueryState) -> Any:
         x_BNKD = state.features[:, :, None].expand(-1, -1, self.gaussians_per_query, -1)
@@ -257,7 +258,7 @@ def _head_with(look: Fields) -> Any:
 
 
 def _encoder_with(case: Case) -> Any:
-    """An encoder whose features have a width of their own."""
+    """Return an encoder whose features have the width that the case requires."""
     wide = torch.arange(memory_width(case))
 
     def forward(self: MultiViewViT, views: Any) -> Any:
@@ -270,7 +271,7 @@ def _encoder_with(case: Case) -> Any:
 
 
 def _queries_with(case: Case, given: Fields) -> Any:
-    """Queries that provide the fields `given`, of one scene, expanded to all of them."""
+    """Return queries that provide the fields `given`, expanded from one scene to all."""
 
     def start(self: LatentQueries, batch_size: int) -> QueryState:
         maker = Maker(case, Sizes(batch=1, queries=self.count))
@@ -283,9 +284,9 @@ def _queries_with(case: Case, given: Fields) -> Any:
 
 @seeded(0)
 def run_training_step(recipe: Recipe, case: Case) -> None:
-    """A forward pass, one view rendered and compared with the target, and the backward pass.
+    """Run a forward pass, render one view, compare it with the target, and run the backward pass.
 
-    Raises ContractError for predictions, images, losses or gradients that are not finite.
+    Raises ContractError if predictions, images, losses or gradients are not finite.
     """
     model = recipe.build_model().train()
     losses = recipe.build_losses().values()
@@ -293,15 +294,15 @@ def run_training_step(recipe: Recipe, case: Case) -> None:
     target = views.select([0])
     total = torch.zeros((), dtype=torch.float64)
     for prediction in model(views).layers.values():
-        expect_finite(prediction, "in a prediction of a model that has it")
+        expect_finite(prediction, "in a prediction of a model with this component")
         rendering = model.render(prediction.gaussians, target.cameras)
-        expect_finite(rendering, "in a rendering of a model that has it")
+        expect_finite(rendering, "in a rendering of a model with this component")
         for loss in losses:
             unseen = loss.renderings == "none"
             seen = map_tensors(lambda x: x[:, :0], rendering) if unseen else rendering
             terms = loss(prediction, seen, target, views)
-            expect_finite(terms, "as a loss of a model that has it")
+            expect_finite(terms, "as a loss of a model with this component")
             total = total + scalar(terms)
     found = gradients(total, dict(model.named_parameters()))
-    expect(found, "in the model that it is composed into nothing gets a gradient")
-    expect_finite(found, "in its gradient in a model that has it")
+    expect(found, "no parameter of a model with this component gets a gradient")
+    expect_finite(found, "in its gradient in a model with this component")

@@ -1,6 +1,6 @@
-"""Gradients reach what is read and are right; numbers stay finite, and as precise as they must.
+"""Checks of gradients, of finite numbers and of precision.
 
-Geometry keeps float32 under autocast, learned layers stay close, float64 stays float64.
+Under autocast, geometry keeps float32 and learned layers stay close. float64 stays float64.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -44,16 +44,16 @@ from qgs_dev.vocabulary import (
     tracked,
 )
 
-# Parameters whose gradients are compared one by one; of modules with more, all together.
+# Largest number of parameters whose gradients are compared one by one; above it, all together.
 SEPARATE = 200
 
 
 def check_gradients_reach_inputs(case: Case) -> None:
-    """A gradient reaches all that is read: the inputs of the slot and the fields it requires.
-    One stopped on purpose, as of reference points, is an expected failure of this check and
-    of `gradients_match_differences`.
+    """Require a gradient for every floating-point input of the slot and every required field.
 
-    A component that requires nothing and gives zeros alone is an ablation, and passes.
+    If a component stops a gradient on purpose, for example that of reference points, list this
+    check and `gradients_match_differences` as expected failures. A component that requires nothing
+    and returns only zeros is an ablation and passes.
     """
     trial = Trial(case)
     missing = {*_read(case)}
@@ -72,17 +72,17 @@ def check_gradients_reach_inputs(case: Case) -> None:
 
 
 def _read(case: Case) -> Iterator[str]:
-    """Dotted names of the floating-point inputs that a component reads."""
+    """Yield the dotted names of floating-point inputs that the component of `case` reads."""
     yield from FACTS[case.slot]["reads"]
     state = "prediction.state" if case.slot == "losses" else "state"
     for name, spec in case.reads.items():
-        # Features of Gaussians may be read rendered.
+        # Features of Gaussians may be read from their rendering.
         if spec.dtype.is_floating_point and name not in GAUSSIAN_FIELDS:
             yield f"{state}.fields.{name}" if name in required_fields(case) else name
 
 
 def _draws(trial: Trial) -> Iterator[Inputs]:
-    # A ReLU of the component may be closed for some of them.
+    # A ReLU of the component may be closed for some draws.
     return (trial.tracked(inputs_of(trial.case, seed=seed)) for seed in range(8))
 
 
@@ -91,9 +91,9 @@ def _are_zero(outputs: Any) -> bool:
 
 
 def check_terms_have_gradients(case: Case) -> None:
-    """Every term has a gradient in the prediction or in the rendering: else it trains nothing.
+    """Require that every loss term has a gradient in the prediction or in the rendering.
 
-    A loss that requires nothing and is zero for all that it is given, as one of weight 0, passes.
+    A loss passes if it requires nothing and is zero for all inputs, such as one of weight 0.
     """
     trial = Trial(case)
     terms = trial()
@@ -103,20 +103,21 @@ def check_terms_have_gradients(case: Case) -> None:
         terms = trial(inputs)
         zeros = zeros and _are_zero(terms)
         learned = [inputs["prediction"], inputs["rendering"]]
-        # A term that one draw clips to zero may learn from another.
+        # A term that is clipped to zero for one draw may have a gradient for another.
         idle = {name for name in idle if _are_zero(gradients(terms[name], learned))}
     if not zeros:
         expect_none(idle, "no gradient comes from this term")
 
 
 def check_gradients_match_differences(case: Case) -> None:
-    """In float64, gradients agree with finite differences (torch.autograd.gradcheck).
+    """Require that float64 gradients agree with finite differences (torch.autograd.gradcheck).
 
-    In evaluation and in training. Gradients that are stopped on purpose: `gradients_reach_inputs`.
+    The check runs in evaluation and in training. For gradients that are stopped on purpose, see
+    `gradients_reach_inputs`.
     """
     small = case.with_dims(width=8, heads=2) if case.has_parameters else case
     small = case if small.problems(small.size) else small
-    # Further blocks repeat these.
+    # Further blocks would repeat the first two.
     small = small.with_at_most(depth=2)
     module = small.lively().double()
     inputs = cast(inputs_of(small, Sizes(batch=1, queries=3)), torch.float64)
@@ -124,7 +125,7 @@ def check_gradients_match_differences(case: Case) -> None:
     fixed = {"cameras", "masks", "depths"}
     points = {name: x for name, x in floating(inputs).items() if fixed.isdisjoint(name.split("."))}
     parameters = dict(module.named_parameters())
-    # Two passes for each of many parameters take minutes: these move together.
+    # Two passes for each of many parameters would take minutes, so they move together.
     together = len(parameters) > SEPARATE
     if together:
         points["parameters"] = nn.utils.parameters_to_vector(parameters.values())
@@ -148,22 +149,22 @@ def check_gradients_match_differences(case: Case) -> None:
     for mode in each_mode(module):
         total = value(*points.values())
         if not total.requires_grad:
-            # What it should have gradients in is the subject of other checks.
+            # Other checks test which inputs must have gradients.
             continue
         found = {"value": total, **gradients(total, points)}
-        # Dropout aside, both modes compute the same, and one pass of differences is enough.
+        # Without dropout both modes compute the same, so one pass of differences is enough.
         if not checked or difference(found, checked):
             checked = found
             expect_right_gradient(value, [*points.values()], f"in {mode}", **tolerances)
 
 
 def check_zeros_stay_finite(case: Case) -> None:
-    """Inputs of zeros give finite outputs and finite gradients."""
+    """Require finite outputs and gradients for inputs of zeros."""
     _expect_all_finite(case, "zeros", lambda _, x: torch.zeros_like(x))
 
 
 def check_large_numbers_stay_finite(case: Case) -> None:
-    """Inputs of some 1e4 give finite outputs and finite gradients."""
+    """Require finite outputs and gradients for inputs of about 1e4."""
     bounded = ("images", "rgb", "alpha", "opacities")
     _expect_all_finite(
         case, "inputs times 1e4", lambda name, x: x if name.endswith(bounded) else 1e4 * x
@@ -171,7 +172,7 @@ def check_large_numbers_stay_finite(case: Case) -> None:
 
 
 def check_coincident_queries_stay_finite(case: Case) -> None:
-    """Queries, anchors or Gaussians in one place give finite outputs and finite gradients."""
+    """Require finite outputs and gradients if all queries, anchors or Gaussians coincide."""
     of_queries = (*QUERY_INPUTS, "gaussians", "prediction")
     _expect_all_finite(
         case,
@@ -181,9 +182,9 @@ def check_coincident_queries_stay_finite(case: Case) -> None:
 
 
 def check_points_behind_cameras_stay_finite(case: Case) -> None:
-    """Points behind every camera, or in a camera's centre, give finite outputs and gradients.
+    """Require finite outputs and gradients for points behind cameras or in a camera centre.
 
-    Of components that are given points: Gaussians, or fields of points that they require.
+    The check applies to components that receive points: Gaussians or required fields of points.
     """
     places = required_places(case)
     if not places and case.slot not in ("renderer", "losses"):
@@ -199,12 +200,12 @@ def check_points_behind_cameras_stay_finite(case: Case) -> None:
 
 
 def check_duplicated_view_stays_finite(case: Case) -> None:
-    """A view that is given twice gives finite outputs and finite gradients."""
+    """Require finite outputs and gradients if all views are the same."""
 
     def twice(name: str, x: Tensor) -> Tensor:
         if name.startswith("memory."):
             axis = 2 if name in ("memory.keys", "memory.values") else 1
-            # Tokens are ordered by view: the first half are those of the first view.
+            # Tokens are ordered by view, so the first half belongs to the first view.
             first = x.narrow(axis, 0, x.shape[axis] // 2)
             return torch.cat([first, first], axis)
         of_no_view = name.startswith(("state", "gaussians", "prediction")) or not x.shape[1]
@@ -223,7 +224,7 @@ def _expect_all_finite(
     change: Callable[[str, Tensor], Tensor],
     fixed: Collection[str] = ("cameras", "patch_rays"),
 ) -> None:
-    """Expect finite outputs and gradients for inputs with changed numbers, but for `fixed` ones."""
+    """Expect finite outputs and gradients after a change of all inputs but the `fixed` ones."""
 
     def changed(name: str, x: Tensor) -> Tensor:
         stays = not {*fixed}.isdisjoint(name.split(".")) or not x.is_floating_point()
@@ -243,37 +244,37 @@ def _expect_all_finite(
 
 ATTENTION = ("cross_attention", "self_attention")
 
-# What geometry adds to attention logits; -inf where it keeps a query from looking.
+# Name of the geometry term of attention logits; it is -inf where a token is hidden from a query.
 EXPLAINED = "explain.geometry"
 
-# How far geometry under autocast may be from float32: bfloat16 rounds by 4e-3.
+# Tolerances of geometry under autocast against float32; bfloat16 rounding is 4e-3.
 RTOL = 1e-5
 ATOL = 1e-6
 
-# Inputs that are halved under autocast, and functions of torch that are layers or products.
+# Names of inputs that are bfloat16 under autocast, and of torch functions of layers and products.
 NAMES: dict[str, list[str]] = data_file("precision.toml")
 
 
 def check_geometry_is_float32_under_autocast(case: Case) -> None:
-    """Under bfloat16 autocast what is computed is finite, and geometry is computed in float32.
+    """Require finite outputs under bfloat16 autocast, and geometry that is computed in float32.
 
-    Learned layers run in bfloat16. What is made of their outputs and of the geometry that goes in
-    (means, world-frame fields, fields that are read and written again, what a head decodes, what
-    geometry adds to attention logits, images, losses) has the values that float32 gives it for the
-    same outputs of the layers. In training as in evaluation.
+    Learned layers run in bfloat16. For the same outputs of the layers, geometry must have the
+    values that float32 gives. Geometry means: means, world-frame fields, fields that are read and
+    written again, outputs of a head, the geometry term of attention logits, images and losses.
+    The check runs in training and in evaluation.
     """
     trial = Trial(case)
     module = trial.module
     inputs = _halved(trial.inputs)
     if case.slot == "queries":
-        # Its parameters are no layers: they are the geometry.
+        # The parameters of queries are not layers but geometry.
         module.requires_grad_(False)
     for mode in each_mode(module):
         where = f"in {mode} under autocast"
         with seeded(0), _autocast(case), LearnedLayers() as layers:
             outputs = _with_explanation(trial, inputs)
         expect_finite({n: x for n, x in outputs.items() if n != EXPLAINED}, where)
-        # Replayed, learned layers give the same in both, and what differs is geometry alone.
+        # Replayed layers give the same outputs in both precisions, so only geometry can differ.
         with seeded(0), LearnedLayers(layers.outputs) as replayed:
             exact = _with_explanation(trial, cast(inputs, torch.float32))
         geometry = tuple(FACTS[case.slot].get("geometry", ()))
@@ -281,16 +282,16 @@ def check_geometry_is_float32_under_autocast(case: Case) -> None:
         for name, tensor in seen.items():
             kept = tensor.dtype == torch.float32
             expect(kept, f"{where} `{name}` is {described(tensor)}, not float32")
-        # Fields that stand in no frame and carry on none that was read are learned.
+        # A field without a frame that is not an update of a field read before is learned.
         for name, spec in case.writes.items():
             if spec.frame == "none" and name not in case.reads:
                 seen.pop(f"fields.{name}", None)
         found = difference({name: exact[name] for name in seen}, seen, RTOL, ATOL)
         if found and replayed.differs:
-            raise CannotCheck("in float32 it calls other layers than under autocast")
-        expect(not found, f"{where}, against float32, {found}")
+            raise CannotCheck("it calls other layers in float32 than under autocast")
+        expect(not found, f"{where}, compared with float32, {found}")
         if case.slot in ATTENTION:
-            expect_none(layers.halved, f"takes float32 geometry to bfloat16 {where}")
+            expect_none(layers.halved, f"converts float32 geometry to bfloat16 {where}")
 
 
 def _autocast(case: Case) -> torch.autocast:
@@ -298,14 +299,14 @@ def _autocast(case: Case) -> torch.autocast:
 
 
 def _halved(inputs: Inputs) -> Inputs:
-    """Features in bfloat16, which require gradients; geometry requires none."""
+    """Convert features to bfloat16 and let them, but not geometry, require gradients."""
     return mapped(
         inputs, lambda name, x: x.bfloat16().requires_grad_() if name in NAMES["halved"] else x
     )
 
 
 def _with_explanation(trial: Trial, inputs: Inputs) -> dict[str, Any]:
-    """The outputs, and what geometry adds to the logits of an attention that explains itself."""
+    """Return the outputs, with the geometry term of the logits if an attention has `explain`."""
     outputs = leaves(trial(inputs))
     if trial.case.slot in ATTENTION:
         weights = explanation(trial.module, inputs)
@@ -315,9 +316,9 @@ def _with_explanation(trial: Trial, inputs: Inputs) -> dict[str, Any]:
 
 
 def check_autocast_is_close(case: Case) -> None:
-    """Under bfloat16 autocast a component gives what it gives in float32, but for rounding.
+    """Require that outputs under bfloat16 autocast agree with float32 up to rounding.
 
-    That is to within a tenth of the spread of each output.
+    The mean difference may be a tenth of the spread of each output.
     """
     trial = Trial(case)
     inputs = _halved(trial.inputs)
@@ -326,14 +327,14 @@ def check_autocast_is_close(case: Case) -> None:
         rounded = floating(trial(inputs))
     for name, tensor in exact.items():
         off = (rounded[name].float() - tensor).abs().mean()
-        # A constant output has no spread: then its size counts.
+        # A constant output has no spread; its size counts instead.
         spread = (tensor - tensor.mean()).abs().mean().clamp_min(0.1 * tensor.abs().mean() + 1e-6)
         seen = f"under autocast `{name}` is off by {off / spread:.2g} times its spread"
         expect(off <= 0.1 * spread, seen)
 
 
 def check_float64_stays_float64(case: Case) -> None:
-    """A float64 component with float64 inputs gives float64 outputs, in training too."""
+    """Require float64 outputs of a float64 component for float64 inputs, in training too."""
     trial = Trial(case)
     trial.module.double()
     for mode, outputs in trial.in_each_mode(cast(trial.inputs, torch.float64)):
@@ -343,12 +344,12 @@ def check_float64_stays_float64(case: Case) -> None:
 
 
 class LearnedLayers(TorchFunctionMode):
-    """Keeps what learned layers give, in their order, in `outputs`; or gives `replayed` instead.
+    """Recorder of the outputs of learned layers in call order, or replayer of recorded ones.
 
-    A product counts as a learned layer if all its factors require gradients: parameters, features,
-    and what is made of them. halved: names of the products of float32 tensors, none of them
-    learned, that autocast took to bfloat16. differs: whether other layers were called than those
-    that gave `replayed`; from the first such one on, layers give what they compute.
+    A product counts as a learned layer if all its factors require gradients: parameters, features
+    and values computed from them. halved: names of products of float32 tensors, none of them
+    learned, that autocast converted to bfloat16. differs: True if the called layers are not those
+    that were recorded in `replayed`; from the first such layer on, layers return what they compute.
     """
 
     def __init__(self, replayed: Iterable[tuple[str, Any]] | None = None) -> None:
@@ -359,7 +360,7 @@ class LearnedLayers(TorchFunctionMode):
         self._replayed = None if replayed is None else iter(replayed)
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Call `func`; keep what it gives if it is a learned layer, or give what is replayed."""
+        """Call `func`; if it is a learned layer, record its output or return the replayed one."""
         given = func(*args, **(kwargs or {}))
         name = getattr(func, "__name__", "")
         factors = [x for _, x in named_tensors([args, kwargs or {}])]

@@ -1,4 +1,4 @@
-"""Promises of losses, metrics and objectives alone."""
+"""Checks of losses, metrics and objectives."""
 
 from dataclasses import replace
 from typing import Any
@@ -27,19 +27,19 @@ from qgs_dev.vocabulary import (
 )
 
 SIGNS = {"psnr", "alpha", "deviation"}
-"""Names of a record of history.jsonl that no term may have."""
-TAKEN = "terms with names of other numbers of a step"
+"""Required names of signs that training watches."""
+TAKEN = "name of another number in history.jsonl; rename the term"
 
 
 def check_loss_is_a_mean_over_scenes(case: Case) -> None:
-    """The terms of a batch are the mean of those of its scenes."""
+    """Require that the terms of a batch are the means of the terms of its scenes."""
     trial = Trial(case)
     alone = [trial(scene(trial.inputs, index)) for index in range(2)]
-    expect_same(_mean(*alone), trial(), "against the mean over scenes", 1e-4, 1e-6)
+    expect_same(_mean(*alone), trial(), "compared with the mean over scenes", 1e-4, 1e-6)
 
 
 def check_masked_queries_are_not_judged(case: Case) -> None:
-    """Numbers where the state's mask is False, with opacity 0, change no term."""
+    """Require that queries whose mask is False, with opacity 0, change no term."""
     trial = Trial(case)
     prediction = trial.inputs["prediction"]
     batch, queries = prediction.state.features.shape[:2]
@@ -51,22 +51,22 @@ def check_masked_queries_are_not_judged(case: Case) -> None:
         gaussians = replace(given.gaussians, opacities=opacities)
         return trial(prediction=LayerPrediction(gaussians, replace(given.state, mask=mask_BN)))
 
-    # Masked Gaussians have opacity 0 in both, so only their other numbers change.
+    # Masked Gaussians have opacity 0 both times, so only their other numbers change.
     moved = masked(prediction, mask_BN, inputs_of(case, seed=1)["prediction"])
     where = "when masked queries and their Gaussians change"
     expect_same(seen(prediction), seen(moved), where, 1e-4, 1e-6)
 
 
 def check_renderings_as_declared(case: Case) -> None:
-    """A loss needs the renderings that `renderings` declares: of each view, of all, or none.
+    """Require that a loss uses renderings as `renderings` declares: each view, all views or none.
 
-    Its terms are 0-d, and named unlike other numbers of a step.
+    Terms must be 0-d and must not have the name of another number of a step.
     """
     trial = Trial(case)
     terms = trial()
     expect_none(terms.keys() & RECORDED, TAKEN)
     for name, term in terms.items():
-        expect(term.ndim == 0, f"the term `{name}` is of shape {tuple(term.shape)}, not 0-d")
+        expect(term.ndim == 0, f"the term `{name}` has shape {tuple(term.shape)}, not 0-d")
     if trial.module.renderings == "each":
         rendering = trial.inputs["rendering"]
         target = trial.inputs["target"]
@@ -74,7 +74,7 @@ def check_renderings_as_declared(case: Case) -> None:
         for view in ([0], [1]):
             seen = map_tensors(lambda x, view=view: x[:, view], rendering)
             alone.append(trial(rendering=seen, target=target.select(view)))
-        where = "`each` is declared; against the mean over views"
+        where = "it declares `each`, but compared with the mean over views"
         expect_same(_mean(*alone), terms, where, 1e-4, 1e-6)
 
 
@@ -83,25 +83,25 @@ def _mean(one: dict[str, Tensor], other: dict[str, Tensor]) -> dict[str, Tensor]
 
 
 def check_metric_gives_its_columns(case: Case) -> None:
-    """Given what it `needs` and no more, a metric has a finite value for each of its columns.
+    """Require a finite value for each column of a metric that receives only what it `needs`.
 
-    The same each time; it changes nothing that it is given.
+    The values must be the same each time, and the inputs must not change.
     """
     module = _metric(case)
-    # A perfect image is where metrics divide by zero.
+    # Metrics may divide by zero for a perfect image.
     for noise in (0.0, 0.2):
         given = _metric_input(case, module, noise)
         before = cloned(given)
         values = _values(module, given)
         keys = sorted(module.columns())
-        expect(sorted(values) == keys, f"it has values for {sorted(values)}, columns for {keys}")
+        expect(sorted(values) == keys, f"its values are {sorted(values)}, its columns are {keys}")
         expect_finite(values, "as the value of a column")
-        expect_same(values, _values(module, given), "the second time")
-        expect_same(before, given, "it changes what it is given")
+        expect_same(values, _values(module, given), "a second call gives other values")
+        expect_same(before, given, "it changes its inputs")
 
 
 def check_truth_scores_best(case: Case) -> None:
-    """Images that equal the true ones score no worse than others, as `better` says."""
+    """Require that the true images score no worse than others, in the sense of `better`."""
     module = _metric(case)
     true, false = (_values(module, _metric_input(case, module, noise)) for noise in (0.0, 0.2))
     for key, column in module.columns().items():
@@ -118,7 +118,7 @@ def _metric(case: Case) -> Metric:
 
 
 def _metric_input(case: Case, module: Metric, noise: float) -> MetricInput:
-    """True views, and images and depth that are off by `noise`; only what the metric needs."""
+    """Return views with images and depth that are off by `noise`, limited to what is needed."""
     maker = Maker(case, Sizes(batch=1))
     target = maker.target()
     depth = maker.uniform(1, 2, "BV1HW")
@@ -143,50 +143,52 @@ def _values(module: Metric, given: MetricInput) -> dict[str, Tensor]:
 
 
 def check_objective_gives_an_outcome(case: Case) -> None:
-    """An objective predicts and judges; its total is the sum of its terms, and trains the model.
+    """Require an Outcome whose total is the sum of its terms and has a gradient in the model.
 
-    It has no parameters. Terms and signs are 0-d and detached; the signs are those that training
-    watches.
+    An objective has no parameters. Terms and signs are 0-d and detached. The signs are exactly
+    those that training watches.
     """
     module = case.build()
     expect(not isinstance(module, nn.Module), "it is an nn.Module; objectives have no parameters")
-    # Objectives may split the views in halves; 2 is the least, 3 and 5 are odd.
+    # Objectives may split the views in halves: 2 is the least number, 3 and 5 are odd.
     for views in (2, 3, 5):
         where = f"with {views} input views"
         outcome, model = _outcome(case, module, views)
         kind = type(outcome).__name__
-        expect(isinstance(outcome, Outcome), f"{where} it gives {kind}, not an Outcome")
+        expect(isinstance(outcome, Outcome), f"{where} it returns {kind}, not an Outcome")
         parts = {**outcome.terms, **outcome.signs}
         numbers = {"total": outcome.total, **parts}
         odd = [n for n, x in numbers.items() if not isinstance(x, Tensor) or x.ndim]
-        expect_none(odd, f"no 0-d tensor {where}")
+        expect_none(odd, f"not a 0-d tensor {where}")
         expect_finite(numbers, where)
         expect_none(outcome.terms.keys() & RECORDED, TAKEN)
         kept = [name for name, x in parts.items() if x.requires_grad]
         expect_none(kept, f"not detached {where}")
-        expect_none(outcome.signs.keys() ^ SIGNS, f"lost, or no sign that is watched, {where}")
+        expect_none(outcome.signs.keys() ^ SIGNS, f"missing or unknown sign {where}")
         total = outcome.total
         of_terms = sum(outcome.terms.values())
-        expect_same(of_terms, total.detach(), f"{where}, against the sum of the terms", 1e-4, 1e-6)
+        expect_same(
+            of_terms, total.detach(), f"{where}, compared with the sum of terms", 1e-4, 1e-6
+        )
         found = gradients(total, dict(model.named_parameters()))
         reached = any(x.any() for x in found.values())
         expect(reached, f"{where} its total has no gradient in the model's parameters")
 
 
 def check_objective_repeats(case: Case) -> None:
-    """Under one seed an objective gives the same each time: it counts and keeps nothing."""
+    """Require the same results of an objective each time under one seed: it keeps no state."""
     module = case.build()
-    expect_same(rehearsed(case, module), rehearsed(case, module), "the second time")
+    expect_same(rehearsed(case, module), rehearsed(case, module), "a second call differs")
 
 
 def rehearsed(case: Case, module: Any) -> dict[str, Tensor]:
-    """Numbers that an objective gives with a small model."""
+    """Return the numbers that an objective gives with a small model."""
     outcome, _ = _outcome(case, module, 3)
     return cloned({"total": outcome.total, **outcome.terms, **outcome.signs})
 
 
 def _outcome(case: Case, module: Any, views: int) -> tuple[Outcome, nn.Module]:
-    """What an objective gives, and the model that it was given."""
+    """Return the outcome of an objective and the model that it used."""
     recipe = resolved(case, required_fields(case))
     maker = Maker(case, Sizes(views=views))
     with seeded(0):

@@ -1,8 +1,7 @@
-"""Renderers: the background, depth, directions, features, and gradients in all that they read.
+"""Checks of renderers: background, depth, directions, features and gradients.
 
-Finite differences are taken in a scene without jumps: every Gaussian contributes to every pixel,
-far above `alpha_min`, none blocks what is behind it, and none changes its place in the order of
-depths.
+Finite differences use a scene without jumps. Every Gaussian contributes to every pixel, far above
+`alpha_min`. No Gaussian blocks those behind it or changes its place in the order of depths.
 """
 
 from dataclasses import replace
@@ -36,10 +35,10 @@ CAMERA_TENSORS = ("c2w", "intrinsics")
 
 
 def check_no_gaussians_give_the_background(case: Case) -> None:
-    """Without Gaussians the image is the background, finite, with finite gradients."""
+    """Require the background as image, with finite gradients, if there are no Gaussians."""
     trial = Trial(case)
     inputs = trial.tracked()
-    # Scenes of no Gaussians occur: an opacity limit may take them all.
+    # Scenes without Gaussians occur: an opacity limit may remove all.
     inputs["gaussians"] = tracked(map_tensors(lambda x: x[:, :0], inputs["gaussians"]))
     colour = torch.tensor([0.1, 0.6, 0.9]).to(case.device)
     out = trial(inputs, background=colour)
@@ -51,36 +50,36 @@ def check_no_gaussians_give_the_background(case: Case) -> None:
 
 
 def check_rendering_is_over_the_background(case: Case) -> None:
-    """alpha is in [0, 1], and where it is below 1 the background shows by what is missing."""
+    """Require that alpha is in [0, 1] and that the background has the weight 1 - alpha."""
     trial = Trial(case)
-    # Between black and white, the background counts by what is missing of alpha.
+    # The images before white and before black differ by 1 - alpha.
     dark, light = (trial(background=torch.full((3,), v).to(case.device)) for v in (0.0, 1.0))
-    expect_inside(dark.alpha, 0, 1 + 1e-5, "numbers of alpha")
+    expect_inside(dark.alpha, 0, 1 + 1e-5, "values of alpha")
     missing = (1 - dark.alpha).expand_as(dark.rgb)
-    where = "the background shows by more or less than 1 - alpha"
+    where = "the weight of the background is not 1 - alpha"
     expect_same(missing, light.rgb - dark.rgb, where, atol=1e-4)
 
 
 def check_depth_is_expected(case: Case) -> None:
-    """Depth is the camera-frame z of what is hit, weighted by how much each hit contributes."""
+    """Require that depth is the mean camera-frame z of Gaussians, weighted as in blending."""
     trial = _broad(case, views=2)
     cameras = trial.inputs["cameras"]
     pair, near, far = (trial.inputs["gaussians"][:, at] for at in ([0, -1], [0], [-1]))
     seen = trial(gaussians=pair).depth
     front = trial(gaussians=near).alpha
-    # Two Gaussians are enough to tell blending from a sum or a mean.
+    # Two Gaussians are enough to distinguish blending from a sum or a mean.
     behind = (1 - front) * trial(gaussians=far).alpha
     z = to_camera(pair.means, cameras)[..., 2:, None]
     hit = front + behind
     expected = (front * z[:, :, :1] + behind * z[:, :, 1:]) / hit.clamp_min(1e-6)
     visible = hit > 0.05
-    expect_same(expected[visible], seen[visible], "depth is off", atol=1e-3)
+    expect_same(expected[visible], seen[visible], "depth is not the expected z", atol=1e-3)
 
 
 def check_colours_depend_on_the_direction(case: Case) -> None:
-    """With `sh`, every view is what Gaussians of the colours seen from there look like.
+    """Require that `sh` renders each view like Gaussians with the colours seen from that view.
 
-    Coefficients of zero change nothing.
+    Coefficients of zero must change nothing.
     """
     trial = Trial(case, Sizes(views=3))
     cameras = trial.inputs["cameras"]
@@ -91,10 +90,10 @@ def check_colours_depend_on_the_direction(case: Case) -> None:
         rgb = trial(gaussians=varying).rgb
         colors = seen_colors(varying, cameras)
         for view in range(cameras.shape[1]):
-            # A renderer without directions, given the colours of this one view.
+            # The colours of this one view, without dependence on the direction.
             fixed = replace(gaussians, sh=None, colors=colors[:, view])
             expected = trial(gaussians=fixed, cameras=cameras[:, [view]]).rgb
-            where = f"with {count} coefficients, view {view} is off"
+            where = f"with {count} coefficients, view {view} has other colours than `sh` gives"
             expect_same(expected, rgb[:, [view]], where, atol=1e-4)
     without, zeros = (
         trial(gaussians=replace(gaussians, sh=sh)).rgb for sh in (None, 0 * gaussians.sh)
@@ -103,9 +102,9 @@ def check_colours_depend_on_the_direction(case: Case) -> None:
 
 
 def check_features_are_blended_as_colours(case: Case) -> None:
-    """Features, of any number, are what colours of the same numbers give before black.
+    """Require that features are blended as colours before a black background, for any number.
 
-    They change nothing else, and Gaussians without features have none in their rendering.
+    Features must change nothing else. Without features of Gaussians, the rendering has none.
     """
     trial = Trial(case)
     black = torch.zeros(3).to(case.device)
@@ -113,18 +112,20 @@ def check_features_are_blended_as_colours(case: Case) -> None:
     bare = replace(gaussians, features=None)
     plain = trial(gaussians=bare)
     out = trial(gaussians=gaussians)
-    expect(plain.features is None, "Gaussians without features have some in their rendering")
-    expect(out.features is not None, "Gaussians with features have none in their rendering")
+    expect(plain.features is None, "the rendering has features, but the Gaussians have none")
+    expect(out.features is not None, "the rendering has no features, but the Gaussians have some")
     expect_same(plain.rgb, out.rgb, "features change the colours", atol=1e-4)
     for first in (0, gaussians.features.shape[-1] - 3):
         shown = slice(first, first + 3)
         painted = replace(bare, colors=gaussians.features[..., shown])
         expected = trial(gaussians=painted, background=black).rgb
-        expect_same(expected, out.features[:, :, shown], "features are off", atol=1e-4)
+        expect_same(
+            expected, out.features[:, :, shown], "features are not blended as colours", atol=1e-4
+        )
 
 
 def check_render_gradients_match_differences(case: Case) -> None:
-    """The gradient of an image in the Gaussians agrees with finite differences."""
+    """Require that gradients in the Gaussians agree with finite differences."""
     trial = _broad(case)
     given = {"gaussians": tracked(trial.inputs["gaussians"])}
     for name, gradient in gradients(_brightness(trial(**given)), given).items():
@@ -132,15 +133,15 @@ def check_render_gradients_match_differences(case: Case) -> None:
 
 
 def check_camera_gradients_match_differences(case: Case) -> None:
-    """The gradient in poses and intrinsics agrees with finite differences, or is refused.
+    """Require that gradients in poses and intrinsics agree with finite differences or are refused.
 
-    A tensor of the cameras that `camera_gradients` does not name may raise ValueError when it
-    requires a gradient.
+    A renderer may raise ValueError if a camera tensor requires a gradient that `camera_gradients`
+    does not list.
     """
     component: Any = case.component
     declared = component.camera_gradients
     unknown = {*declared} - {*CAMERA_TENSORS}
-    expect_none(unknown, "named by `camera_gradients`, but no tensor of the cameras")
+    expect_none(unknown, "listed in `camera_gradients`, but not a tensor of the cameras")
     trial = _broad(case, seed=1)
     for name in CAMERA_TENSORS:
         full = f"cameras.{name}"
@@ -148,37 +149,37 @@ def check_camera_gradients_match_differences(case: Case) -> None:
         try:
             found = gradients(_brightness(trial(given)), given)
         except ValueError as error:
-            seen = f"`camera_gradients` names {name}, but what requires one is refused: {error}"
+            seen = f"`camera_gradients` lists {name}, but its gradient is refused: {error}"
             expect(name not in declared, seen)
             continue
-        expect(full in found, f"`{name}` requires a gradient, is not refused, and gets none")
+        expect(full in found, f"`{name}` requires a gradient and gets none; raise ValueError")
         _expect_changes(trial, full, found[full])
 
 
 def _broad(case: Case, seed: int = 0, views: int = 1) -> Trial:
-    """Cameras (1, V) before broad Gaussians (1, G), one behind the other."""
+    """Return a trial with cameras (1, V) in front of broad Gaussians (1, G) in a row."""
     sizes = Sizes(batch=1, queries=3, views=views)
     trial = Trial(case, sizes, seed)
     maker = Maker(case, sizes, seed)
     means = maker.uniform(-0.25, 0.25, "BG3")
-    # Apart in depth, so that no step changes their order.
+    # Depths are far enough apart that no step changes their order.
     means[..., 2] = 1.6 + 0.13 * torch.arange(means.shape[1]).to(means)
     trial.inputs["gaussians"] = replace(
         trial.inputs["gaussians"],
         means=means,
         scales=maker.uniform(0.85, 1.7, "BG3"),
         opacities=maker.uniform(0.3, 0.5, "BG"),
-        # Above 0 with `sh` too.
+        # These colours stay above 0 with `sh` too.
         colors=maker.uniform(0.5, 1, "BG3"),
     )
     return trial
 
 
 def _expect_changes(trial: Trial, name: str, gradient: Tensor) -> None:
-    """Expect that one input, moved there and back, changes the image as its gradient says.
+    """Expect that small steps of one input change the image as its gradient predicts.
 
-    Gaussians move along the gradient and channel by channel, cameras along and about each of their
-    axes, focal lengths and principal points one by one.
+    Gaussians move along the gradient and channel by channel. Cameras move along and about each of
+    their axes. Focal lengths and principal points change one by one.
     """
     x = leaves(trial.inputs)[name]
     # Pixels.
@@ -201,18 +202,18 @@ def _expect_changes(trial: Trial, name: str, gradient: Tensor) -> None:
         return _brightness(trial.with_changed(lambda n, x: moved if n == name else x))
 
     steps = torch.zeros(len(moves), dtype=torch.float64, requires_grad=True)
-    # A GPU adds in no fixed order.
+    # A GPU adds numbers in no fixed order.
     tolerances = {"eps": 1.0, "atol": 1e-6, "rtol": 0.03, "nondet_tol": 1e-3}
     expect_right_gradient(value, steps, f"steps of `{name}`", **tolerances)
 
 
 def _brightness(rendering: Any) -> Tensor:
-    """A smooth number of a rendering: of its colours, of alpha, of depth and of features."""
+    """Return a smooth scalar function of the colours, alpha, depth and features."""
     total = torch.zeros((), dtype=torch.float64)
     for number, (_, image) in enumerate(named_tensors(rendering), 1):
         y, x = (torch.linspace(-1, 1, size, dtype=torch.float64) for size in image.shape[-2:])
         y = y[:, None]
-        # Smooth, and different for each picture and along each axis: nothing cancels.
+        # Weights are smooth and differ for each image and axis, so that nothing cancels.
         waves = torch.cos(number * x + y) + torch.sin(x - number * y)
         total = total + (image.double().cpu() * waves).mean()
     return total

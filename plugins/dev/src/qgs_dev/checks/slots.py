@@ -1,4 +1,4 @@
-"""Promises of heads, queries, supervisions, data and optimisers alone."""
+"""Checks of heads, queries, supervisions, feedback, data and optimisers."""
 
 import copy
 import json
@@ -27,10 +27,10 @@ from qgs_dev.vocabulary import (
 
 
 def check_head_gives_gaussians(case: Case) -> None:
-    """Quaternions are unit, scales positive, opacities inside (0, 1), colours inside [0, 1].
+    """Require unit quaternions, positive scales, opacities in (0, 1) and colours in [0, 1].
 
-    With initial parameters too, for ordinary features. `sh` and `features` are there if the head
-    provides them.
+    This also holds with initial parameters for ordinary features. `sh` and `features` must exist
+    exactly if the head provides them.
     """
     trial = Trial(case)
     for factor in (0.0, 1.0, 100.0):
@@ -46,43 +46,43 @@ def _expect_gaussians(trial: Trial, factor: float, where: str) -> None:
     for mode, out in trial.in_each_mode({"state": state}):
         here = f"in {mode}, {where},"
         given = {name for name in ("sh", "features") if getattr(out, name) is not None}
-        expect(given == named, f"in {mode} it gives {given or None}, and provides {named or None}")
+        expect(given == named, f"in {mode} it returns {given or None}, not {named or None}")
         expect_inside(out.quats.norm(dim=-1), 1 - 1e-4, 1 + 1e-4, f"{here} lengths of quaternions")
         expect((out.scales > 0).all(), f"{here} a scale is {out.scales.min():.4g}")
         expect_inside(out.opacities, 0, 1, f"{here} opacities")
-        # Opacities of large features may have been rounded to 0 or 1.
+        # Opacities of large features may round to 0 or 1.
         ends = (out.opacities == 0) | (out.opacities == 1)
         expect(factor > 1 or not ends.any(), f"{here} an opacity is 0 or 1")
-        # With `sh` they are degree 0 of what is clamped later.
+        # With `sh`, colours are the degree 0 of a sum that is clamped later.
         if out.sh is None:
             expect_inside(out.colors, 0, 1, f"{here} colours")
 
 
 def check_queries_are_shared_by_scenes(case: Case) -> None:
-    """Learned queries start from the same state in every scene, for any number of scenes.
+    """Require that learned queries start from the same state in any number of scenes.
 
-    `start` gives the state that a forward pass gives.
+    `start` must return the state that a forward pass returns.
     """
     if not issubclass(case.component, LearnedQueries):
-        raise CannotCheck("these queries may read the photos: they are no LearnedQueries")
+        raise CannotCheck("these queries are not LearnedQueries, so they may read the photos")
     trial = Trial(case, Sizes(batch=3))
     one = trial.module.start(1)
     several = trial()
     for index in range(3):
-        where = f"scene {index} of 3 starts otherwise than a scene alone"
+        where = f"scene {index} of 3 starts from another state than a scene alone"
         expect_same(one, scene(several, index), where)
 
 
 def check_queries_resize(case: Case) -> None:
-    """`resized` gives what this component loads, whatever number of queries was learned.
+    """Require that `resized` adapts a state dict with any number of queries to this component.
 
-    Checked of components whose option `count` says how many there are.
+    The check applies to components whose option `count` is the number of queries.
     """
     module = case.build()
     options = case.config.model_dump(mode="json")
     if "count" not in options or module.count is None:
-        raise CannotCheck("no option `count` says how many queries there are")
-    # Fewer and more queries than there are: cut and filled up.
+        raise CannotCheck("it has no option `count` for the number of queries")
+    # Fewer queries must be filled up, more queries must be cut.
     for count in (max(module.count // 2, 1), module.count + 3):
         options["count"] = count
         config = type(case.config).model_validate_json(json.dumps(options))
@@ -91,22 +91,22 @@ def check_queries_resize(case: Case) -> None:
         try:
             case.build(seed=2).load_state_dict(resized)
         except RuntimeError as error:
-            expect(False, f"of {count} queries, `resized` gives what cannot be loaded: {error}")
+            expect(False, f"`resized` of {count} queries cannot be loaded: {error}")
         for name, values in learned.items():
             first = slice(min(len(values), len(resized[name]))) if values.ndim else ...
             kept = torch.equal(resized[name][first], values[first])
-            expect(kept, f"of {count} queries, `resized` changes `{name}` of the first")
+            expect(kept, f"`resized` of {count} queries changes `{name}` of the first ones")
 
 
 def check_supervision_weights(case: Case) -> None:
-    """Weights are of existing layers, ascending, none negative, and sum to 1.
+    """Require non-negative weights of existing layers, in ascending order, that sum to 1.
 
-    So they do with ends of rounds of feedback, all of which are supervised.
+    This also holds with rounds of feedback. The end of every round must have a weight.
     """
     depth = case.dims.depth
     for rounds in ([], [depth + 1, depth + 2]):
         weights = dict(case.build().weights(rounds))
-        where = f"of {depth} layers, with rounds that end at {rounds},"
+        where = f"with {depth} layers and rounds that end at {rounds},"
         chosen = [layer for layer in [*range(1, depth + 1), *rounds] if layer in weights]
         right = weights and [*weights] == chosen and weights.keys() >= {*rounds}
         expect(right, f"{where} it supervises {[*weights]}")
@@ -116,9 +116,9 @@ def check_supervision_weights(case: Case) -> None:
 
 
 def check_feedback_compares_the_photos(case: Case) -> None:
-    """`compared` views have the poses and rays of the photos, and their mean colours.
+    """Require that `compared` views have the poses, rays and mean colours of the photos.
 
-    `rounds` and what `drawn` gives are not negative, and a round repeats an existing layer.
+    `rounds` and the results of `drawn` must not be negative. A round must repeat existing layers.
     """
     trial = Trial(case)
     module = trial.module
@@ -127,7 +127,7 @@ def check_feedback_compares_the_photos(case: Case) -> None:
     expect_same(photos.cameras.c2w, seen.cameras.c2w, "`compared` views have other poses")
     corners, of_seen = (_corners(views.cameras) for views in (photos, seen))
     expect_same(
-        corners, of_seen, "rays through the corners of `compared` views are others", 1e-5, 1e-6
+        corners, of_seen, "`compared` views have other rays through their corners", 1e-5, 1e-6
     )
     colours, of_seen = (views.images.mean((-1, -2)) for views in (photos, seen))
     expect_same(colours, of_seen, "`compared` views have other mean colours", 1e-4, 1e-5)
@@ -135,11 +135,11 @@ def check_feedback_compares_the_photos(case: Case) -> None:
     counts = [module.rounds, *(module.drawn() for _ in range(4))]
     expect(min(counts) >= 0, f"it makes {min(counts)} rounds")
     layers = range(bool(max(counts)), case.dims.depth + 1)
-    expect(module.layers in layers, f"of {case.dims.depth} layers a round repeats {module.layers}")
+    expect(module.layers in layers, f"a round repeats {module.layers} of {case.dims.depth} layers")
 
 
 def _corners(cameras: Cameras) -> Tensor:
-    """Rays through the first and last pixel's corner, (..., 4): x / z and y / z of both."""
+    """Return x / z and y / z of the rays through two opposite image corners, (..., 4)."""
     focal = cameras.intrinsics[..., :2]
     principal = cameras.intrinsics[..., 2:]
     size = torch.tensor(cameras.size[::-1]).to(focal)
@@ -147,9 +147,12 @@ def _corners(cameras: Cameras) -> Tensor:
 
 
 def check_scenes_repeat(case: Case) -> None:
-    """A scene is the same each time: names, cameras, and images of the delivered size in [0, 1]."""
+    """Require the same name, cameras and images of a scene each time.
+
+    Images have the size of the cameras and values in [0, 1].
+    """
     first, second = (case.build().scenes("train")[0] for _ in range(2))
-    expect(first.name == second.name, f"scene 0 is `{first.name}`, then `{second.name}`")
+    expect(first.name == second.name, f"scene 0 is first `{first.name}`, then `{second.name}`")
     frames = list(range(min(2, len(first))))
     images = first.images(frames)
     wanted = (len(frames), 3, *first.cameras.size)
@@ -157,22 +160,22 @@ def check_scenes_repeat(case: Case) -> None:
     expect(right, f"images are {described(images)}, not float32 of shape {wanted}")
     expect_inside(images, 0, 1, "images")
     again = [second.cameras, second.images(frames)]
-    expect_same([first.cameras, images], again, "opened again")
+    expect_same([first.cameras, images], again, "opened a second time, scene 0 differs")
 
 
 def check_scenes_are_as_listed(case: Case) -> None:
-    """`names` are those of the scenes, `groups` hold each scene once, held-out frames exist."""
+    """Require correct `names`, each scene once in `groups`, and held-out frames that exist."""
     source = case.build()
     for split in get_args(Split):
-        where = f"of the {split} split"
+        where = f"in the {split} split"
         scenes = source.scenes(split)
         count = len(scenes)
         names = list(source.names(split))
-        expect(len(names) == count, f"{where}, there are {count} scenes, {len(names)} names")
+        expect(len(names) == count, f"{where} there are {count} scenes, but {len(names)} names")
         grouped = sorted(int(index) for group in source.groups(split) for index in group)
         once = grouped == list(range(count))
-        expect(once, f"{where}, groups hold not each of {count} scenes once: {listed(grouped)}")
-        # The ends and the middle: a data set may have millions of scenes.
+        expect(once, f"{where} groups do not hold each of {count} scenes once: {listed(grouped)}")
+        # Only the ends and the middle, since a data set may have millions of scenes.
         for place in {0, count // 2, count - 1} if count else ():
             found = scenes[place]
             name = f"scene {place} {where}"
@@ -182,29 +185,32 @@ def check_scenes_are_as_listed(case: Case) -> None:
 
 
 def check_optimizer_steps(case: Case) -> None:
-    """Steps move all parameters that have gradients and no others, at finite learning rates.
+    """Require that steps change exactly the parameters that have gradients.
 
-    Its groups hold all parameters that it was given, with the `factor` of their learning rate.
+    Learning rates must be finite. Groups must hold all given parameters, with the `factor` of their
+    learning rate.
     """
     run = _Optimization(case)
     groups = run.torch_optimizer.param_groups
     given = {id(parameter) for group in groups for parameter in group["params"]}
-    expect(given == {*map(id, run.weights)}, "it leaves out parameters, or adds some")
+    expect(given == {*map(id, run.weights)}, "its groups lack given parameters or have others")
     factors = all("factor" in group for group in groups)
-    expect(factors, "a group of its own has no `factor`, by which its learning rate is scaled")
+    expect(factors, "a group has no `factor`; training scales its learning rate by it")
     before = cloned(run.weights)
     run.step(range(3))
     expect_finite(run.weights, "after three steps")
     decaying, other, without_gradient = (
         torch.equal(old, new) for old, new in zip(before, run.weights, strict=True)
     )
-    expect(not (decaying or other), "three steps leave a parameter with a gradient as it was")
-    expect(without_gradient, "it moves a parameter that has no gradient")
+    expect(not (decaying or other), "three steps do not change a parameter that has a gradient")
+    expect(without_gradient, "three steps change a parameter that has no gradient")
 
 
 def check_optimizer_continues(case: Case) -> None:
-    """Restored from its `state`, and from what torch's optimiser keeps of each parameter, an
-    optimiser goes on as if it had not stopped, to the bit."""
+    """Require that an optimiser continues to the bit after its state is restored.
+
+    The state is its own `state` and the values that torch's optimiser keeps per parameter.
+    """
     straight, first, second = (_Optimization(case) for _ in range(3))
     straight.step(range(6))
     first.step(range(3))
@@ -212,15 +218,15 @@ def check_optimizer_continues(case: Case) -> None:
         ours.data.copy_(theirs)
         kept = first.torch_optimizer.state.get(theirs, {})
         second.torch_optimizer.state[ours] = copy.deepcopy(kept)
-    # As in a checkpoint, whose numbers are JSON.
+    # A checkpoint stores these numbers as JSON.
     second.optimizer.load_state(json.loads(json.dumps(dict(first.optimizer.state()))))
     second.step(range(3, 6))
-    where = "after six steps, or three and three from a checkpoint"
+    where = "six steps differ from three steps, a checkpoint and three more"
     expect_same(straight.weights, second.weights, where)
 
 
 class _Optimization:
-    """Three parameters and their optimiser: one decays, one does not, one gets no gradient."""
+    """Optimiser of three parameters: one decays, one does not, one gets no gradient."""
 
     def __init__(self, case: Case) -> None:
         generator = torch.Generator().manual_seed(0)
@@ -235,7 +241,7 @@ class _Optimization:
         )
 
     def step(self, steps: Iterable[int]) -> None:
-        """Step as training does, with other gradients in every step."""
+        """Run steps as training does, with other gradients in every step."""
         for step in steps:
             rate = self.optimizer.learning_rate(step, float(step))
             expect(0 <= rate < math.inf, f"the learning rate of step {step} is {rate}")

@@ -1,4 +1,4 @@
-"""Parameters and state: parameters learn, and a forward pass changes nothing that is kept."""
+"""Checks that parameters learn and that a forward pass changes no state."""
 
 from typing import Any
 
@@ -23,17 +23,17 @@ from qgs_dev.vocabulary import (
     scalar,
 )
 
-# Share of the largest gradient that float32 inside of a float64 component leaves of none.
+# Share of the largest gradient below which a gradient is a rounding error of float32.
 ROUNDING = 1e-8
 
 
 @seeded(0)
 def check_parameters_learn(case: Case) -> None:
-    """Every trainable parameter gets a finite, non-zero gradient within two optimiser steps.
+    """Require a finite, non-zero gradient of every trainable parameter within two optimiser steps.
 
-    A gradient below ROUNDING times the largest of another parameter is a rounding error.
-    A component that draws numbers in training, as to leave a layer out, has twelve steps. Weights
-    of a release that change nothing are named by the module that has them, in `unlearned`.
+    A gradient below ROUNDING times the largest gradient is a rounding error. A component that draws
+    random numbers in training, for example to skip a layer, has twelve steps. If weights of a
+    release have no effect, the module that has them lists their names in `unlearned`.
     """
     module = case.build().double().train()
     unlearned = {
@@ -64,46 +64,46 @@ def check_parameters_learn(case: Case) -> None:
         # A long step would close every ReLU.
         torch.nn.utils.clip_grad_norm_(parameters.values(), 1.0)
         optimizer.step()
-        # Two steps are enough where nothing is drawn: zero-initialised layers learn in the second.
+        # Two steps are enough without random draws: zero-initialised layers learn in the second.
         draws_nothing = torch.equal(before, torch.get_rng_state())
         if step and (draws_nothing or not idle):
             break
-    expect_none(idle, "no gradient reaches it; use it or name it in `unlearned`")
+    expect_none(idle, "no gradient reaches it; use it or list it in `unlearned`")
 
 
 def check_state_dict_keys(case: Case) -> None:
-    """Names and shapes in the state dict are as pinned in the case, if it pins any."""
+    """Require the names and shapes in the state dict that the case expects, if it does."""
     if case.state_dict is None:
         return
     shapes = {name: tuple(x.shape) for name, x in case.build().state_dict().items()}
     pinned = {name: tuple(shape) for name, shape in case.state_dict.items()}
     moved = pinned.items() ^ shapes.items()
-    expect_none(moved, "pinned or present, not both; saved weights would not load")
+    expect_none(moved, "either expected or present, but not both; saved weights would not load")
 
 
 def check_inputs_are_not_changed(case: Case) -> None:
-    """Neither the forward nor the backward pass changes an input, in numbers or in names."""
+    """Require that forward and backward passes change neither values nor names of inputs."""
     trial = Trial(case)
     for mode in each_mode(trial.module):
         inputs = trial.tracked()
         before = cloned(inputs)
         total = scalar(trial(inputs))
-        expect_same(before, inputs, f"after the forward pass in {mode} the inputs differ")
+        expect_same(before, inputs, f"the forward pass in {mode} changes inputs")
         if total.requires_grad:
             total.backward()
-        expect_same(before, inputs, f"after the backward pass in {mode} the inputs differ")
+        expect_same(before, inputs, f"the backward pass in {mode} changes inputs")
 
 
 def check_outputs_share_no_memory(case: Case) -> None:
-    """Outputs that a component computes share no memory with its inputs or weights.
+    """Require that computed outputs share no memory with inputs, parameters or buffers.
 
-    Buffers are weights here. A refinement, a layer and a feedback may hand on the fields that they
-    do not provide, the latter two the memory too, and a feedback the features.
+    A refinement, a layer and a feedback may pass on fields that they do not provide. A layer and a
+    feedback may also pass on the memory, and a feedback the features.
     """
     trial = Trial(case)
     outputs = leaves(trial())
     tensors = leaves(trial.inputs) | tensors_of(trial.module)
-    # Views of one memory have one storage.
+    # Views of the same memory share one storage.
     owners = {x.untyped_storage().data_ptr(): name for name, x in tensors.items() if x.numel()}
     provided = [f"fields.{name}" for name in case.writes]
     of_state = [f"0.{name}" for name in provided]
@@ -111,15 +111,15 @@ def check_outputs_share_no_memory(case: Case) -> None:
     for name in own.get(case.slot, outputs):
         tensor = outputs[name]
         owner = owners.get(tensor.untyped_storage().data_ptr()) if tensor.numel() else None
-        expect(owner is None, f"`{name}` lies in the memory of `{owner}`")
+        expect(owner is None, f"output `{name}` shares memory with `{owner}`")
 
 
 def check_forward_keeps_no_state(case: Case) -> None:
-    """A forward pass leaves no trace: in no parameter, buffer or attribute, private or not.
+    """Require that a forward pass changes no parameter, buffer or attribute, private ones included.
 
-    In training as in evaluation; the next pass gives what it gives as the first one. What is to be
-    computed once for all layers belongs into `ImageMemory.once`, what depends on sizes alone into a
-    function of them.
+    This holds in training and in evaluation; the next pass must give the same as a first one. Use
+    `ImageMemory.once` to compute a value once for all layers. Use a function of the sizes for
+    values that depend on sizes alone.
     """
     trial = Trial(case)
     module = trial.module
@@ -127,54 +127,57 @@ def check_forward_keeps_no_state(case: Case) -> None:
         before = cloned(tensors_of(module))
         kept = attributes(module)
         trial()
-        expect_same(before, tensors_of(module), f"a forward pass in {mode} changes the state")
+        expect_same(
+            before, tensors_of(module), f"a forward pass in {mode} changes a parameter or buffer"
+        )
         now = attributes(module)
         changed = [name for name in kept.keys() | now.keys() if kept.get(name) != now.get(name)]
         expect_none(changed, f"changed by a forward pass in {mode}")
-        # What a pass leaves in a closure no attribute shows: the next pass does.
+        # A pass may store values in a closure. Only the next pass shows these.
         fresh = case.lively().train(mode == "training")
         inputs = inputs_of(case, seed=1)
         first, later = (_outputs(one, inputs, 0)[0] for one in (fresh, module))
-        expect_same(first, later, f"after a forward pass in {mode} another one differs")
+        expect_same(first, later, f"a second forward pass in {mode} differs from a first one")
 
 
 def check_eval_repeats_bitwise(case: Case) -> None:
-    """In evaluation the same inputs give the same outputs, to the bit, and nothing is drawn.
+    """Require bitwise equal outputs for equal inputs in evaluation, without random numbers.
 
-    Every global random state stays as it was.
+    Every global random state must stay the same.
     """
     trial = Trial(case)
     others = other_generators()
     torchs = torch.get_rng_state()
     first = trial()
     trial(inputs_of(case, seed=1))
-    expect_same(first, trial(inputs_of(case)), "the second time")
+    expect_same(first, trial(inputs_of(case)), "a second pass on the same inputs differs")
     expect(torch.equal(torchs, torch.get_rng_state()), "it draws from torch's generator")
     expect(others == other_generators(), "it draws from numpy's or random's generator")
 
 
 def check_training_draws_from_torch(case: Case) -> None:
-    """In training, random numbers come from torch's global generator alone, which nothing seeds."""
+    """Require that training draws only from torch's global generator and never seeds it."""
     module = case.lively().train()
     before = other_generators()
     first, other, again = (_outputs(module, inputs_of(case), seed) for seed in (1, 2, 1))
-    expect(before == other_generators(), "in training it uses numpy's or random's generator")
+    expect(before == other_generators(), "it draws from numpy's or random's generator in training")
     reseeded = torch.equal(first[1], other[1])
-    expect(not reseeded, "after training passes from two seeds, torch is in one state")
-    expect_same(first[0], again[0], "two training passes from one seed differ")
+    expect(not reseeded, "a training pass sets the seed of torch's generator")
+    expect_same(first[0], again[0], "two training passes from the same seed differ")
 
 
 def _outputs(module: Any, inputs: Inputs, seed: int) -> tuple[Any, torch.Tensor]:
-    """Outputs of a forward pass under `seed`, and torch's random state after it."""
+    """Return the outputs of a forward pass under `seed`, and torch's random state after it."""
     with seeded(seed), torch.no_grad():
         outputs = cloned(module(*inputs.values()))
         return outputs, torch.get_rng_state()
 
 
 def check_scheduled_options_are_read_anew(case: Case) -> None:
-    """An option in `scheduled` counts in the next call once it is changed, as if built with it.
+    """Require that a changed option in `scheduled` takes effect in the next call.
 
-    What a component requires and provides does not depend on it.
+    The result must be that of a component built with the new value. The fields that a component
+    requires and provides must not depend on the option.
     """
     for option in sorted(case.component.scheduled):
         other = case.with_config(_with_another(case.config, option))
@@ -184,10 +187,10 @@ def check_scheduled_options_are_read_anew(case: Case) -> None:
         same = dict(other.reads) == dict(case.reads) and dict(other.writes) == dict(case.writes)
         expect(same, f"{what} changes what it requires or provides")
         module = _ready(case)
-        # A first call may keep what the second must read anew.
+        # A first call may store a value that the second call must read again.
         _called(case, module)
         module.config = other.config
-        where = f"with {what} set after it was built"
+        where = f"{what} set later gives other results than when built with it"
         expect_same(_called(case, _ready(other)), _called(case, module), where)
 
 

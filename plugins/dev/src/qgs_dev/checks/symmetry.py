@@ -1,4 +1,4 @@
-"""Scenes are independent, queries and views have no order, the world frame is arbitrary."""
+"""Checks of symmetry: independent scenes, no order of queries or views, any world frame."""
 
 from collections.abc import Callable, Collection
 from typing import Any
@@ -29,10 +29,10 @@ from qgs_dev.vocabulary import (
 RTOL = 1e-4
 ATOL = 1e-5
 
-# Arguments that hold something of every view.
+# Arguments with one entry for every view.
 VIEW_INPUTS = ("views", "memory", "cameras", "rendering", "photos", "target", "inputs")
 
-# A rigid motion of the world about and along none of its axes.
+# Rigid motion of the world that is not about or along any of its axes.
 POSE = (
     (0.60, -0.80, 0.00, 0.4),
     (0.48, 0.36, -0.80, -0.3),
@@ -42,9 +42,10 @@ POSE = (
 
 
 def check_batch_independence(case: Case) -> None:
-    """Results for a scene do not depend on any other scene, in training neither.
+    """Require that results for a scene do not depend on other scenes, in training too.
 
-    Its gradient there is exactly zero; beside other scenes, or alone, it has the same numbers.
+    The gradient in other scenes must be exactly zero. Results must be the same beside other scenes
+    and alone.
     """
     sizes = many(case)
     trial = Trial(case, sizes)
@@ -59,26 +60,26 @@ def check_batch_independence(case: Case) -> None:
         given = trial.tracked()
         total = scalar(scene(floating(trial(given)), 0))
         for name, gradient in gradients(total, given).items():
-            # Exact zeros: any dependence at all mixes scenes.
+            # Zeros must be exact, because any dependence mixes scenes.
             leak = gradient[1:].abs().max().item()
-            seen = f"in {mode}, scene 0 has a gradient of {leak:.3g} in `{name}` of others"
+            seen = f"in {mode}, scene 0 has a gradient of {leak:.3g} in `{name}` of other scenes"
             expect(leak == 0, seen)
         first = first_scene(trial.inputs)
         expect_same(first, first_scene(beside), f"in {mode}, beside another scene", RTOL, ATOL)
-        # In training, one scene may draw other numbers than two.
+        # In training, one scene may draw other random numbers than two.
         if mode == "evaluation":
             expect_same(first, first_scene(scene(trial.inputs, 0)), "alone", RTOL, ATOL)
 
 
 def check_query_permutation(case: Case) -> None:
-    """Permuting the queries, with all their fields, permutes what is computed for them.
+    """Require that permuting the queries and their fields permutes the results for them.
 
-    Renderings and losses stay as they are.
+    Renderings and losses must not change.
     """
     order = _shuffled(many(case).queries)
 
     def permuted(tree: Any) -> Any:
-        # A dimension of queries, or of all their Gaussians, stands behind that of scenes.
+        # The dimension of queries, or of all their Gaussians, follows that of scenes.
         return map_tensors(lambda x: x.unflatten(1, (len(order), -1))[:, order].flatten(1, 2), tree)
 
     names = (*QUERY_INPUTS, "gaussians", "prediction")
@@ -89,9 +90,10 @@ def check_query_permutation(case: Case) -> None:
 
 
 def check_view_permutation(case: Case) -> None:
-    """Views have no order, unless an encoder or a cross-attention declares `ordered_views`.
+    """Require that the order of views does not matter, unless `ordered_views` is declared.
 
-    Then they have one. Tokens of no grid, such as learned latents, keep their places.
+    An encoder or a cross-attention may declare it; then the order must matter. Tokens without a
+    grid, such as learned latents, keep their places.
     """
     order = _shuffled(many(case).views)
 
@@ -113,15 +115,15 @@ def check_view_permutation(case: Case) -> None:
         case, VIEW_INPUTS, permuted, case.slot in ("encoder", "renderer"), part=1
     )
     if may_declare and component.ordered_views:
-        expect(found, "`ordered_views` is declared, but the order is ignored")
+        expect(found, "it declares `ordered_views`, but ignores the order")
     else:
         expect(not found, f"with {len(order)} permuted views, {found}{hint}")
 
 
 def _shuffled(count: int) -> list[int]:
-    """A permutation that leaves no item in its place."""
+    """Return a permutation that moves every item."""
     order = torch.randperm(count, generator=torch.Generator().manual_seed(0)).tolist()
-    # One cycle through all places: a permutation with a fixed item would hide it.
+    # One cycle through all places moves every item; a fixed item would hide errors.
     return [order[(order.index(place) + 1) % count] for place in range(count)]
 
 
@@ -132,9 +134,10 @@ def _difference_after(
     outputs_too: bool,
     part: int,
 ) -> str:
-    """How outputs for inputs `names` permuted differ from permuted outputs; "" if they agree.
+    """Describe how outputs after a permutation of the inputs `names` are wrong; "" if they agree.
 
-    outputs_too: whether they are permuted. part: of state and memory, the one that is.
+    outputs_too: permute the expected outputs. part: index of the part to permute, 0 for the state
+    and 1 for the memory.
     """
     trial = Trial(case, many(case))
     moved = {name: permute(x) if name in names else x for name, x in trial.inputs.items()}
@@ -148,7 +151,7 @@ def _difference_after(
 
 
 def check_world_frame_makes_no_difference(case: Case) -> None:
-    """Moving the world (Gaussians, fields and cameras alike) changes no image and no loss."""
+    """Require that moving Gaussians, fields and cameras together changes no image or loss."""
     trial = Trial(case)
     pose = torch.tensor(POSE).to(case.device)
     places = required_places(case)
@@ -163,6 +166,6 @@ def check_world_frame_makes_no_difference(case: Case) -> None:
             return x @ pose[:3, :3].T + pose[:3, 3]
         return pose @ x if name.endswith("c2w") else x
 
-    # A renderer sorts by depth and cuts at limits, where rounding shows.
+    # A renderer sorts by depth and cuts at limits, so rounding has larger effects.
     rtol, atol = (1e-2, 2e-3) if case.slot == "renderer" else (1e-3, 1e-5)
     expect_same(trial(), trial.with_changed(moved), "in a moved world", rtol, atol)
