@@ -79,9 +79,10 @@ class Domain:
     def text(self) -> str:
         """Ranges as JSON; null stands for infinity."""
         # JSON has no infinity, which is the depth of parallel axes.
-        ranges = {}
-        for name, ends in self.ranges.items():
-            ranges[name] = [end if math.isfinite(end) else None for end in ends]
+        ranges = {
+            name: [end if math.isfinite(end) else None for end in ends]
+            for name, ends in self.ranges.items()
+        }
         return json.dumps({"samples": self.samples, "ranges": ranges})
 
     @classmethod

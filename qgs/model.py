@@ -98,23 +98,20 @@ class QueryGaussianModel(nn.Module):
         # NumPy's cameras are float64, the weights hardly ever.
         views = views.to(torch.promote_types(next(self.parameters()).dtype, torch.float32))
         if isinstance(views, Photos):
-            views = self._without_cameras(views)
+            parts = (self.encoder, self.queries, self.feedback)
+            readers = [type(part).__name__ for part in parts if part.reads_cameras]
+            if readers:
+                raise ValueError(
+                    f"{' and '.join(readers)} of this model need cameras, but these photos have "
+                    "none; give Views with cameras, or use an encoder that does not read them "
+                    "(reads_cameras)"
+                )
+            # The other parts read only what photos have too.
+            views = cast(Views, views)
         memory = self.encoder(views)
         # Tuning at test time brings its own state.
         initial = self.queries(memory, views) if state is None else state
         return self.predict(views, memory, initial, layers)
-
-    def _without_cameras(self, photos: Photos) -> Views:
-        """Return `photos` if no part of the model reads cameras, else raise ValueError."""
-        parts = (self.encoder, self.queries, self.feedback)
-        readers = [type(part).__name__ for part in parts if part.reads_cameras]
-        if readers:
-            raise ValueError(
-                f"{' and '.join(readers)} of this model need cameras, but these photos have none; "
-                "give Views with cameras, or use an encoder that does not read them (reads_cameras)"
-            )
-        # It has the same images and masks.
-        return cast(Views, photos)
 
     def predict(
         self,
@@ -138,9 +135,8 @@ class QueryGaussianModel(nn.Module):
         last = len(self.decoder)
         again = last - self.feedback.layers
         rounds = self.feedback.drawn() if self.training else self.feedback.rounds
-        order = [*range(last)]
         # Every round of feedback repeats the last layers.
-        order += rounds * [*range(again, last)]
+        order = [*range(last), *rounds * [*range(again, last)]]
         known = range(min(1, last), len(order) + 1)
         unknown = sorted(n for n in layers if n not in known)
         if unknown:
@@ -155,25 +151,19 @@ class QueryGaussianModel(nn.Module):
         first = memory
         for number, index in enumerate(order, start=1):
             if index == again and number > last:
-                state, memory = self._corrected(decoded[number - 1], first, views)
+                before = decoded[number - 1]
+                photos = self.feedback.compared(views)
+                # The rendering is an input of the round, not a loss.
+                with torch.no_grad():
+                    rendering = self.render(before.gaussians, photos.cameras)
+                state, memory = self.feedback(before.state, first, rendering, photos)
             elif index == again:
                 first = memory
-            refine = self.refinements[self.refinement_of[index]]
             state, memory = self.decoder[index](state, memory)
-            state = refine(state)
+            state = self.refinements[self.refinement_of[index]](state)
             if number in layers or index == last - 1:
                 decoded[number] = LayerPrediction(self.decode(state), state)
         return Prediction(decoded[len(order)].gaussians, state, decoded)
-
-    def _corrected(
-        self, before: LayerPrediction, memory: ImageMemory, views: Views
-    ) -> tuple[QueryState, ImageMemory]:
-        """Return the state and memory at the start of a round of feedback."""
-        photos = self.feedback.compared(views)
-        # The rendering is an input of the round, not a loss.
-        with torch.no_grad():
-            rendering = self.render(before.gaussians, photos.cameras)
-        return self.feedback(before.state, memory, rendering, photos)
 
     def decode(self, state: QueryState) -> Gaussians:
         """Decode the Gaussians of a state, ordered query by query."""

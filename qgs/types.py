@@ -207,17 +207,23 @@ class QueryState(TensorContainer):
         return super().replace(fields=fields, **changes)
 
 
-_OF_GAUSSIANS = {"scales": "... 3", "quats": "... 4", "opacities": "...", "colors": "... 3"}
-_OF_GAUSSIANS |= {"sh": "... C 3", "features": "... F"}
+_OF_GAUSSIANS = {
+    "scales": "... 3",
+    "quats": "... 4",
+    "opacities": "...",
+    "colors": "... 3",
+    "sh": "... C 3",
+    "features": "... F",
+}
 
 SH_COUNTS = (3, 8, 15)
 """Counts of spherical-harmonic coefficients for degrees 1 to 1, 2 or 3; `colors` is degree 0."""
 
 
-def _check_gaussians(container: TensorContainer, **shapes: str) -> None:
+def _check_gaussians(container: Any, **shapes: str) -> None:
     """Raise ValueError for wrong shapes of the common fields of Gaussians, or of `shapes`."""
     check_shapes(container, **shapes, **_OF_GAUSSIANS)
-    sh = getattr(container, "sh", None)
+    sh = container.sh
     if sh is not None and sh.shape[-2] not in SH_COUNTS:
         raise ValueError(
             f"{type(container).__name__}.sh has {sh.shape[-2]} coefficients per Gaussian; give 3, "

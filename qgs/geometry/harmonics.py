@@ -16,8 +16,10 @@ SH_C0 = 0.28209479177387814
 """Harmonic of degree 0: colour = 0.5 + SH_C0 * f_dc (3DGS release)."""
 _C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
-_C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658)
-_C3_INNER = (0.3731763325901154, 1.445305721320277)
+_C3 = (
+    0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154,
+    1.445305721320277,
+)  # fmt: skip
 
 
 def harmonics(directions: Tensor, count: int) -> Tensor:
@@ -31,8 +33,7 @@ def harmonics(directions: Tensor, count: int) -> Tensor:
         a, b, c = _C2
         values += [a * x * y, -a * y * z, b * (2 * zz - xx - yy), -a * x * z, c * (xx - yy)]
     if count > SH_COUNTS[1]:
-        a, b, c = _C3
-        d, e = _C3_INNER
+        a, b, c, d, e = _C3
         values += [-a * y * (3 * xx - yy), b * x * y * z, -c * y * (4 * zz - xx - yy)]
         values += [d * z * (2 * zz - 3 * xx - 3 * yy), -c * x * (4 * zz - xx - yy)]
         values += [e * z * (xx - yy), -a * x * (xx - 3 * yy)]

@@ -55,7 +55,7 @@ def patch_rays(plucker: Tensor, patch_size: int) -> Tensor:
 
 @full_precision
 def camera_centers(rays: Tensor, grid: tuple[int, int, int]) -> Tensor:
-    """Camera centres (B, V, 3), world frame, of the `patch_rays` and `grid` of an image memory.
+    """Return world-frame camera centres (B, V, 3) from `patch_rays` and `grid` of a memory.
 
     rays (B, M, 6). Each centre is the point where the rays of its view meet, by least squares.
     """

@@ -104,17 +104,6 @@ def _dots(a, rows):
 
 
 @kernel
-def _turn(pose, factor_columns):
-    """Return the rows of C^T F."""
-    axes = _columns(pose)
-    return (
-        _dots(axes[0], factor_columns),
-        _dots(axes[1], factor_columns),
-        _dots(axes[2], factor_columns),
-    )
-
-
-@kernel
 def _axis(axis, seen, turned, focal, principal, size, margin):
     """Return, for an image axis, the slope, the slope clamped to `margin`, and a row of J W R S."""
     slope = seen[axis] / seen[2]
@@ -130,7 +119,9 @@ def _view(c2w, lens, mean, factor, margin, height, width):
     pose = (_vector(c2w[0]), _vector(c2w[1]), _vector(c2w[2]))
     offset = _plus(_vector(mean), -_ONE, (c2w[0, 3], c2w[1, 3], c2w[2, 3]))
     seen = _combine(offset, pose)
-    turned = _turn(pose, factor)
+    axes = _columns(pose)
+    # Rows of C^T F.
+    turned = (_dots(axes[0], factor), _dots(axes[1], factor), _dots(axes[2], factor))
     fx, fy, cx, cy = _four(lens)
     x_axis = _axis(0, seen, turned, fx, cx, width, margin)
     y_axis = _axis(1, seen, turned, fy, cy, height, margin)
@@ -262,16 +253,6 @@ def _add_camera(out, offset, factor_rows, of_seen, of_turned, of_mean, of_lens):
 
 
 @kernel
-def _added(of_factor, pose, of_turned):
-    """Add the slopes of one view to the slopes of the rows of R S."""
-    return (
-        _plus(of_factor[0], _ONE, _combine(pose[0], of_turned)),
-        _plus(of_factor[1], _ONE, _combine(pose[1], of_turned)),
-        _plus(of_factor[2], _ONE, _combine(pose[2], of_turned)),
-    )
-
-
-@kernel
 def _sum_parts(given, g, slopes):
     """Write the sum over parts of a splat's slopes. given: (P, G, 10)."""
     slopes[:] = given[0, g]
@@ -321,7 +302,11 @@ def project_backward_unit(
             of_turned = (of_turned_x, of_turned_y, _plus(turned_z_x, _ONE, turned_z_y))
             of_offset = _dots(of_seen, pose)
             of_mean = _plus(of_mean, _ONE, of_offset)
-            of_factor = _added(of_factor, pose, of_turned)
+            of_factor = (
+                _plus(of_factor[0], _ONE, _combine(pose[0], of_turned)),
+                _plus(of_factor[1], _ONE, _combine(pose[1], of_turned)),
+                _plus(of_factor[2], _ONE, _combine(pose[2], of_turned)),
+            )
             if wants_cameras:
                 _add_camera(
                     of_cameras[v], offset, _columns(factor), of_seen, of_turned, of_offset,

@@ -125,15 +125,13 @@ def _open(state, live, rows, columns):
 @kernel
 def _close_rows(state, live):
     """Mark rows in which every pixel has stopped; return whether any row is still open."""
-    any_live = False
     for row in range(TILE):
         total = _ZERO
         base = row * _ROW + TILE
         for lane in range(TILE):
             total += state[base + lane]
         live[row] = total > _ZERO
-        any_live = any_live or live[row]
-    return any_live
+    return live.any()
 
 
 @kernel

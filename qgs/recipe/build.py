@@ -78,8 +78,11 @@ def _assemble(recipe: Recipe) -> QueryGaussianModel:
     refinements = []
     for index in range(recipe.dims.depth):
         path = ("decoder", "layers", str(index))
-        slots = [slot for slot in SUBLAYER_SLOTS if ("model", *path, slot) in recipe.parts]
-        sublayers = {slot: at(*path, slot) for slot in slots}
+        sublayers = {
+            slot: at(*path, slot)
+            for slot in SUBLAYER_SLOTS
+            if ("model", *path, slot) in recipe.parts
+        }
         layer_parts = LayerParts(recipe.dims, sublayers, recipe.layer_scale)
         decoder.append(build(recipe.parts["model", *path, "layer"], layer_parts))
         refinements.append(at(*path, "refinement"))
@@ -184,9 +187,7 @@ def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
         # What is trained holds the model as `model`, a recipe its parts in the section `model`.
         wanted = pattern.removeprefix("model.").split(".")
         if not named and (module is not model or wanted[0] != "losses"):
-            known = set[str]()
-            for below in paths.values():
-                known.update(".".join(path[: len(wanted)]) for path in below)
+            known = {".".join(path[: len(wanted)]) for below in paths.values() for path in below}
             reason = f"the pattern `{pattern}` matches no parameter of the model"
             origin = optimizer.node.child("parts").origin_of(pattern)
             fix = did_you_mean(pattern.removeprefix("model."), known, "parts")

@@ -100,8 +100,8 @@ def _replacing(after: Draft, before: Draft) -> RecipeProblem | None:
         if new.type != old.type:
             origin = new.node.origins.get("type", new.origin)
             reason = f"`{new.type}` in place of `{old.type}` ({old.chosen_at})"
-            keep = f"keep `{old.type}`"
-            return RecipeProblem(new.shown_path, reason, keep, origin.file, origin.line)
+            fix = f"keep `{old.type}`"
+            return RecipeProblem(new.shown_path, reason, fix, origin.file, origin.line)
     return None
 
 

@@ -139,8 +139,7 @@ def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, 
         yield ("losses",), reason, "add one under `losses`, or drop the data with `data: null`"
     # A resolved recipe writes the default out, which must stay valid.
     default = DecoderSettings().layer_scale
-    places = [layer_place(index, "layer") for index in range(draft.dims.depth)]
-    layers: list[Any] = [parts[place] for place in places]
+    layers: list[Any] = [parts[layer_place(index, "layer")] for index in range(draft.dims.depth)]
     read = any(layer.component.reads_layer_scale for layer in layers)
     if not read and settings.model.decoder.layer_scale != default:
         names = " and ".join(sorted({f"`{layer.type}`" for layer in layers}))
@@ -172,8 +171,7 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
                         f"`{chosen.type}` reads {name} as {needed[name]}, but `{writer.type}` at "
                         f"{writer.shown_path} ({writer.chosen_at}) writes it as {written}"
                     )
-                    both = f"`{chosen.type}` or `{writer.type}`"
-                    fix = f"change the options of {both} until they agree"
+                    fix = f"change options of `{chosen.type}` or `{writer.type}` until both agree"
                     problems.add(chosen.origin, chosen.source, reason, fix)
             provided = chosen.component.fields_written(chosen.config)
             # Who changes a field that was never written has not provided it.
@@ -206,11 +204,12 @@ def _unmet(missing: Fields, reader: Chosen, parts: Parts, registry: Registry) ->
             reason += f"; `{late[0].type}` at {late[0].shown_path} provides {name} too late"
     # Whoever replaced a component that provided them finds the line here.
     now = {part.slot: f"`{part.type}`, {part.chosen_at}" for part in parts.values()}
-    known: list[str] = []
-    for slot in _FLOW[: _FLOW.index(reader.slot)]:
-        for kind, component in registry.components(slot).items():
-            if missing.keys() <= _offered(component, default_config(component)).keys():
-                known.append(f"`{kind}` in the slot `{slot}` (now {now.get(slot, 'empty')})")
+    known = [
+        f"`{kind}` in the slot `{slot}` (now {now.get(slot, 'empty')})"
+        for slot in _FLOW[: _FLOW.index(reader.slot)]
+        for kind, component in registry.components(slot).items()
+        if missing.keys() <= _offered(component, default_config(component)).keys()
+    ]
     if known:
         return reason, f"use {' or '.join(known)} with default options"
     return reason, f"use or install a component that provides {' and '.join(missing)}"

@@ -45,8 +45,8 @@ class InstalledPlugin:
     @property
     def models(self) -> dict[str, Path]:
         """Files of the models that it ships, by `PLUGIN/NAME`; a file may be missing."""
-        models = self.plugin.models.items()
-        return {f"{self.plugin.name}/{name}": self.folder / file for name, file in models}
+        plugin = self.plugin
+        return {f"{plugin.name}/{name}": self.folder / at for name, at in plugin.models.items()}
 
 
 BUILTIN = InstalledPlugin(
@@ -83,12 +83,12 @@ class Registry:
 
     def components(self, slot: str) -> dict[str, type[Component]]:
         """Return the components of a slot, by `PLUGIN/NAME`."""
-        found: dict[str, type[Component]] = {}
-        for name, installed in self.plugins.items():
-            for component in installed.plugin.components:
-                if component.slot == slot:
-                    found[f"{name}/{component.name}"] = component
-        return found
+        return {
+            f"{name}/{component.name}": component
+            for name, installed in self.plugins.items()
+            for component in installed.plugin.components
+            if component.slot == slot
+        }
 
 
 def available_plugins() -> dict[str, list[EntryPoint]]:

@@ -33,8 +33,6 @@ class Slot:
         return self.contract.slot
 
 
-DEFAULT_LOSSES = {"photometric": "qgs/photometric", "visibility": "qgs/visibility"}
-DEFAULT_METRICS = {"psnr": "qgs/psnr", "ssim": "qgs/ssim", "dispersion": "qgs/dispersion"}
 SLOTS = {
     slot.name: slot
     for slot in (
@@ -50,9 +48,18 @@ SLOTS = {
         Slot(contracts.Centers, "qgs/free"),
         Slot(contracts.Supervision, "qgs/layers"),
         Slot(contracts.Renderer, "qgs/auto"),
-        Slot(contracts.Loss, named=True, defaults=DEFAULT_LOSSES),
+        Slot(
+            contracts.Loss,
+            named=True,
+            defaults={"photometric": "qgs/photometric", "visibility": "qgs/visibility"},
+        ),
         Slot(contracts.Objective, "qgs/one_pass"),
-        Slot(contracts.Metric, named=True, defaults=DEFAULT_METRICS, defaults_stay=True),
+        Slot(
+            contracts.Metric,
+            named=True,
+            defaults={"psnr": "qgs/psnr", "ssim": "qgs/ssim", "dispersion": "qgs/dispersion"},
+            defaults_stay=True,
+        ),
         Slot(contracts.Optimizer, "qgs/adamw"),
         Slot(contracts.SceneSource),
         Slot(contracts.ViewSampler, "qgs/span"),
@@ -61,8 +68,10 @@ SLOTS = {
 # In the order in which their parameters are drawn: another one makes other models of a seed.
 AFTER_LAYERS = ("feedback", "head", "centers", "supervision", "renderer")
 MODEL_SLOTS = ("encoder", "queries", *AFTER_LAYERS)
-_SECTIONS = ("losses", "objective", "data", "view_sampler", "metrics", "optimizer")
-SECTIONS = {name: SLOTS[name] for name in _SECTIONS}
+SECTIONS = {
+    name: SLOTS[name]
+    for name in ("losses", "objective", "data", "view_sampler", "metrics", "optimizer")
+}
 """Slots that are top-level sections of a recipe."""
 
 
