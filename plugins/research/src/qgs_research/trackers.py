@@ -1,4 +1,4 @@
-"""`training.trackers`: TensorBoard and Weights & Biases, by way of accelerate."""
+"""Trackers for `training.trackers`: TensorBoard and Weights & Biases, through accelerate."""
 
 import uuid
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from qgs.train.tracking import Tracker
 
 
 class _OfAccelerate(Tracker):
-    """A tracker that accelerate has; subclasses make it in `_tracker`."""
+    """Tracker of accelerate; subclasses create it in `_tracker`."""
 
     _tracker: Any
     _of_pictures: ClassVar[Mapping[str, str]] = {}
@@ -36,24 +36,24 @@ class _OfAccelerate(Tracker):
         self._tracker.log_images({name: picture[None]}, step=step, **self._of_pictures)
 
     def close(self) -> None:
-        """Write or send what is left."""
+        """Write or send the remaining data."""
         self._tracker.finish()
 
 
 class TensorBoard(_OfAccelerate):
-    """Writes into RUN/tensorboard."""
+    """TensorBoard tracker that writes into RUN/tensorboard."""
 
     package = "tensorboard"
     _of_pictures: ClassVar = {"dataformats": "NHWC"}
 
     def __init__(self, run: Path, options: Mapping[str, Any], step: int):
-        # A resumed run repeats steps after its last save: TensorBoard drops those it has.
+        # A resumed run repeats the steps after its last save; TensorBoard drops the old ones.
         self._tracker = TensorBoardTracker(self.package, run, purge_step=step + 1)
         self._start(options)
 
 
 class WeightsAndBiases(_OfAccelerate):
-    """Writes into RUN/wandb; a resumed training goes on in the same wandb run."""
+    """Weights & Biases tracker in RUN/wandb; a resumed training continues the same wandb run."""
 
     package = "wandb"
 

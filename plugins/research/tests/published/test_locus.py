@@ -77,7 +77,7 @@ def test_shapes_without_a_recipe_are_refused():
     for changes, why in (
         ({"gs_tokens": None}, "gs_tokens is missing"),
         ({"activation_head.deconv.weight": (71, 48)}, "head: 71 is no multiple of 14"),
-        ({"gs_tokens": (10,)}, "no size can be read"),
+        ({"gs_tokens": (10,)}, "without axis"),
     ):
         given = {name: shape for name, shape in (shapes | changes).items() if shape}
         with pytest.raises(LayoutError, match=why):

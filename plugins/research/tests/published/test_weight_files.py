@@ -41,7 +41,7 @@ def test_weights_are_read_and_where_they_lay_is_told(tmp_path):
         ("w.pt", torch_bytes({"module": WEIGHTS, "lr": {"a": 0.1}}), ["'module'; left out: lr"]),
     ):
         file = read(tmp_path / name, content)
-        assert file.notes == tuple(f"the weights lie below {what}" for what in told)
+        assert file.notes == tuple(f"the weights are below the key {what}" for what in told)
         assert_close(file.tensors, WEIGHTS, rtol=0, atol=0)
 
 

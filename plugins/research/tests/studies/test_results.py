@@ -135,9 +135,9 @@ def test_one_seed_leaves_it_open_however_sure_the_scenes_are(tmp_path):
     found = results(tmp_path, [1])
     judged = found.judgements()[1]
     assert judged.estimate.interval[0] > 0
-    assert (judged.verdict, judged.reason) == ("undecided", "one training a side")
+    assert (judged.verdict, judged.reason) == ("undecided", "one training per side")
     assert answer(found).startswith("Not known: other, +1.0")
-    assert answer(found).endswith("one training a side. Missing: 6 of 9 runs.")
+    assert answer(found).endswith("one training per side. Missing: 6 of 9 runs.")
     assert "missing runs: full seed 1" in "\n".join(notes(found))
     write_files(found)
 
@@ -166,7 +166,7 @@ def test_numbers_of_unlike_protocols_are_not_compared(tmp_path):
     assert cells["less"][0].startswith("-0.9")
     assert any("protocols differ" in note for note in notes(found))
     reasons = [j.reason for j in found.judgements()]
-    assert reasons == ["", "the interval holds 0, judged by unlike protocols", ""]
+    assert reasons == ["", "the interval contains 0, evaluated by different protocols", ""]
     row = record(found)["table"][2]
     assert (row["variant"], row["difference"]) == ("other", {})
 

@@ -1,1 +1,1 @@
-"""Procedural scenes for qgs with true depth: rooms and worlds, drawn by one ray caster."""
+"""Procedural scenes for qgs with true depth: rooms and worlds, rendered by one ray caster."""

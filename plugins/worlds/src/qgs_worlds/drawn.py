@@ -1,4 +1,4 @@
-"""Scenes that are drawn from a seed, and whose images are cast on demand and kept."""
+"""Random scenes from a seed, with images that are rendered on demand and cached."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -18,31 +18,31 @@ if TYPE_CHECKING:
     from qgs_worlds.caster.tables import Room, World
 
 ImageCache = dict[tuple[str, int], np.ndarray]
-"""Images (H, W, 3) uint8 by scene and frame; once it is full, what it holds stays."""
+"""Images (H, W, 3) uint8 by scene and frame. A full cache keeps its content."""
 
 
 class DrawnConfig(SceneSource.Config):
-    """Options of all sources of drawn scenes."""
+    """Options of all sources of procedural scenes."""
 
     scenes: int = Field(default=2000, ge=1)
-    """Scenes of the training split."""
+    """Number of scenes in the training split."""
     test_scenes: int = Field(default=32, ge=1)
-    """Scenes of the test split; none of them is in the training split."""
+    """Number of scenes in the test split, which shares none with the training split."""
     views_per_scene: int = Field(default=8, ge=2)
-    """Cameras in each scene."""
+    """Number of cameras in each scene."""
     samples: int = Field(default=2, ge=1, le=8)
-    """Rays per pixel along each axis."""
+    """Number of rays per pixel along each axis."""
     seed: int = Field(default=0, ge=0)
-    """All scenes follow from it."""
+    """Random seed of all scenes, 0 or more."""
     cache_mb: int = Field(default=512, ge=0)
-    """Megabytes of images kept in memory; 0 keeps none."""
+    """Megabytes of images to keep in memory. 0: keep none."""
 
 
 class DrawnScene(Scene):
-    """Scene `index` of a split. config: of its source; `views_per_scene` cameras see it.
+    """Scene `index` of a split, with `views_per_scene` cameras. config: options of its source.
 
-    key: seed, split and index, of which all that is drawn is a function. c2w: OpenCV (F, 4, 4), in
-    metres of `tables`. lens: fx, fy, cx, cy in pixels. scale: factor of all lengths.
+    key: seed, split and index, which determine the scene. c2w: OpenCV (F, 4, 4), in the metres of
+    `tables`. lens: fx, fy, cx, cy in pixels. scale: factor of all lengths.
     """
 
     c2w: np.ndarray
@@ -55,7 +55,7 @@ class DrawnScene(Scene):
         self.name = name
         self._config = config
         self._cache = cache
-        # a list, as numpy's generators are seeded by one
+        # a list, because numpy's generators take a list as seed
         self.key = [config.seed, 0 if split == "train" else 1, index]
 
     def __len__(self) -> int:
@@ -64,7 +64,7 @@ class DrawnScene(Scene):
     @property
     @abstractmethod
     def tables(self) -> "World | Room":
-        """What is there, for the ray caster."""
+        """Content of the scene for the ray caster."""
 
     @cached_property
     def cameras(self) -> Cameras:
@@ -75,7 +75,7 @@ class DrawnScene(Scene):
         return Cameras(c2w, intrinsics, self._config.image_size)
 
     def depths(self, frames: Sequence[int]) -> Tensor:
-        """See `Scene`: z along the ray through the pixel's centre; the sky is unknown."""
+        """Return z along the ray through each pixel centre; depth of the sky is unknown."""
         from qgs_worlds.caster.casting import cast
 
         depths = cast(self.tables, self.c2w[list(frames)], self.lens, self._config.image_size)
@@ -83,7 +83,7 @@ class DrawnScene(Scene):
 
     @abstractmethod
     def cast(self, frames: list[int]) -> Sequence[np.ndarray]:
-        """Images (H, W, 3) uint8, one for each frame."""
+        """Return an image (H, W, 3) uint8 for each frame."""
 
     def images(self, frames: Sequence[int]) -> Tensor:
         """See `Scene`."""
@@ -93,7 +93,7 @@ class DrawnScene(Scene):
         if missing := [frame for frame in dict.fromkeys(frames) if frame not in images]:
             cast = self.cast(missing)
             images.update(zip(missing, cast, strict=True))
-            # the first scenes stay: dropping the oldest would keep none over an epoch
+            # keep the first scenes: dropping the oldest would keep none over an epoch
             fitting = config.cache_mb * 2**20 // cast[0].nbytes - len(cache)
             cache.update(
                 {(self.name, frame): images[frame] for frame in missing[: max(fitting, 0)]}
@@ -105,11 +105,11 @@ class DrawnScene(Scene):
 
 
 class DrawnSource(LazySource):
-    """Endless scenes; scene i of a split is a function of (seed, split, i) alone."""
+    """Source of endless scenes; scene i of a split depends only on (seed, split, i)."""
 
     Config = DrawnConfig
     scene: ClassVar[Callable[..., DrawnScene]]
-    """Called with name and index of the scene, its config, split and cache."""
+    """Constructor of a scene from its name, index, config, split and cache."""
     not_in_protocol: ClassVar[frozenset[str]] = SceneSource.not_in_protocol | {"cache_mb"}
     split_options: ClassVar[frozenset[str]] = frozenset({"scenes", "test_scenes"})
 

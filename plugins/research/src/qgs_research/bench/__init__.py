@@ -1,1 +1,1 @@
-"""How fast and how large models are: any number of recipes, measured in turn in one run."""
+"""Benchmark of speed, memory and size of models, with any number of recipes in one run."""

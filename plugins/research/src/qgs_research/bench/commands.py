@@ -1,4 +1,4 @@
-"""`qgs bench`: size, latency and memory of models, as tables and as a JSON report."""
+"""The command `qgs bench`: size, latency and memory of models as tables and a JSON report."""
 
 from __future__ import annotations
 
@@ -9,41 +9,43 @@ import typer
 
 from qgs.cli.options import Device, Overrides, Size, Threads, parse_size, use_threads
 
-app = typer.Typer(help="How fast and how large models are.")
+app = typer.Typer(help="Measure speed, memory and size of models.")
 
 InputViews: TypeAlias = Annotated[
-    int | None, typer.Option(min=1, help="Input views; default: the recipe's.")
+    int | None, typer.Option(min=1, help="Input views. Default: the recipe's.")
 ]
 Memory: TypeAlias = Annotated[
-    bool, typer.Option("--memory", help="Peak memory too, of a fresh process each.")
+    bool, typer.Option("--memory", help="Also measure peak memory, each in a fresh process.")
 ]
 Report: TypeAlias = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Write a report with every sample, a new file.")
+    Path | None, typer.Option(metavar="FILE", help="New file for a JSON report with all samples.")
 ]
 
 
 @app.command()
 def bench(
-    recipes: Annotated[list[Path], typer.Argument(help="Recipe files; the first is the measure.")],
+    recipes: Annotated[list[Path], typer.Argument(help="Recipe files; ratios are to the first.")],
     overrides: Overrides = None,
     views: InputViews = None,
     size: Size = None,
-    batch: Annotated[int, typer.Option(min=1, help="Scenes at once.")] = 1,
+    batch: Annotated[int, typer.Option(min=1, help="Scenes per batch.")] = 1,
     precision: Annotated[str, typer.Option(help="float32 or bf16 (autocast).")] = "float32",
-    step: Annotated[bool, typer.Option("--step", help="Training steps too.")] = False,
+    step: Annotated[bool, typer.Option("--step", help="Also measure training steps.")] = False,
     memory: Memory = False,
-    renderer: Annotated[bool, typer.Option("--renderer", help="The renderer too.")] = False,
+    renderer: Annotated[
+        bool, typer.Option("--renderer", help="Also measure the renderer.")
+    ] = False,
     rounds: Annotated[int, typer.Option(min=1, help="Samples of each latency.")] = 10,
     warmup: Annotated[int, typer.Option(min=0, help="Calls before the first sample.")] = 2,
     json: Report = None,
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Size, latency and memory of models: any number of recipes in turn.
+    """Measure size, latency and memory of models, for any number of recipes.
 
-    Ratios are to the first. Weights, photos and poses are random: no data is needed.
-    Latency and FLOPs are from photos to Gaussians. Memory: on a CPU a process's peak,
-    on a GPU what torch allocated at most.
+    Ratios are to the first recipe. Weights, photos and poses are random, so no data is
+    needed. Latency and FLOPs are from photos to Gaussians. Memory is the peak of a
+    process on a CPU, and the most that torch allocated on a GPU.
     """
     from rich.console import Console
 

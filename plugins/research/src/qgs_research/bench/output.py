@@ -1,4 +1,4 @@
-"""Tables of what was measured."""
+"""Tables of measurements."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -18,7 +18,7 @@ TITLES = {
 
 
 def show(report: Mapping[str, Any], console: Console) -> None:
-    """Print the models, then one table for each thing that was measured of them."""
+    """Print a table of the models, then one table per measured quantity."""
     entries = report["recipes"]
     base = entries[0]
     of = "{device} ({processor}, {threads} threads), torch {torch}".format(**report["machine"])
@@ -69,7 +69,7 @@ def _memory_cells(peak: Mapping[str, float]) -> tuple[str, ...]:
 
 
 def _cells(found: Mapping[str, float], scale: float) -> tuple[str, str]:
-    """Median and quartiles, four digits each."""
+    """Return median and quartiles as texts with four digits."""
     shown = []
     for quartile in ("lower_quartile", "median", "upper_quartile"):
         value = found[quartile] * scale

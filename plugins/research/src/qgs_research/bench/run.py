@@ -1,4 +1,4 @@
-"""Measuring recipes: memory first, in processes of their own, then seconds, all in turn."""
+"""Measurement of recipes: first memory, each in its own process, then seconds, in turns."""
 
 import platform
 from collections.abc import Callable, Mapping, Sequence
@@ -40,18 +40,19 @@ def measure_recipes(
 ) -> dict[str, Any]:
     """Measure size and forward latency of all recipes, with initial weights.
 
-    All models are in memory while latencies are measured, so that each round has all of them.
+    All models stay in memory while latencies are measured, because each round runs all of them.
 
     Args:
-        names: recipes, as `resolve` takes them.
-        work: fields of the workload, as `workload_of` takes them.
-        step, memory, renderer: what is measured too.
+        names: recipes, as for `resolve`.
+        work: fields of the workload, as for `workload_of`.
+        step, memory, renderer: also measure training steps, peak memory or the renderer.
         rounds: samples of each latency, after `warmup` calls.
-        overrides: of all recipes.
-        say: called with what is measured next.
+        overrides: changes to all recipes.
+        say: called with a description of the next measurement.
 
-    Returns the report, plain values for JSON: seconds with every sample, bytes, and ratios to the
-    first, those of latencies round by round. Raises as the models and `peak_memory` do.
+    Returns the report as plain values for JSON: seconds with every sample, bytes, and ratios to the
+    first recipe. Ratios of latencies are taken round by round. Raises the errors of the models and
+    of `peak_memory`.
     """
     recipes = [resolve(name, overrides) for name in names]
     works = [workload_of(recipe, **work) for recipe in recipes]
@@ -81,7 +82,7 @@ def measure_recipes(
         say(f"seconds of the {operation}")
         columns = in_turn(tasks, rounds, warmup)
         for entry, samples in zip(entries, columns, strict=True):
-            # Round by round, so that the machine's load cancels.
+            # Ratios within a round cancel the load of the machine.
             ratio = quartiles([*map(truediv, samples, columns[0])])
             entry["seconds"][operation] = {**quartiles(samples), "samples": samples, "ratio": ratio}
     settings = {"overrides": [*overrides], "rounds": rounds, "warmup": warmup}
@@ -89,7 +90,7 @@ def measure_recipes(
 
 
 def _sizes(model: QueryGaussianModel) -> dict[str, Any]:
-    """Queries, Gaussians (None where the views decide), parameters and bytes of weights."""
+    """Return numbers of queries, Gaussians (None if views decide), parameters and weight bytes."""
     queries = model.queries.count
     return {
         "queries": queries,
@@ -102,9 +103,9 @@ def _sizes(model: QueryGaussianModel) -> dict[str, Any]:
 
 
 def forward_flops(recipe: Recipe, workload: Workload) -> int:
-    """Return the floating-point operations of a forward pass: matrix products and convolutions.
+    """Return the floating-point operations of matrix products and convolutions in a forward pass.
 
-    Counted from shapes, a multiplication and an addition as two.
+    They are counted from shapes. A multiplication and an addition count as two.
     """
     # On the meta device nothing is computed, and attention is matrix products, which are counted;
     # kernels of our own would not be. The counter hooks into modules, which needs gradients to be
@@ -117,7 +118,7 @@ def forward_flops(recipe: Recipe, workload: Workload) -> int:
 
 
 def machine(device: str) -> dict[str, Any]:
-    """Processor, threads and versions, for the report."""
+    """Return processor, threads and versions for the report."""
     return {
         "device": device,
         "processor": torch.cuda.get_device_name() if device == "cuda" else _processor(),
@@ -128,7 +129,7 @@ def machine(device: str) -> dict[str, Any]:
 
 
 def quartiles(samples: Sequence[float]) -> dict[str, float]:
-    """Quartiles by name (linear interpolation)."""
+    """Return quartiles by name (linear interpolation)."""
     names = ("lower_quartile", "median", "upper_quartile")
     return dict(zip(names, np.quantile(samples, (0.25, 0.5, 0.75)).tolist(), strict=True))
 
@@ -138,13 +139,13 @@ def in_turn(
     rounds: int,
     warmup: int,
 ) -> list[list[float]]:
-    """Seconds of each task: `warmup` calls of each unmeasured, then all of them in every round.
+    """Return the seconds of each task in every round, after `warmup` unmeasured calls.
 
-    torch.utils.benchmark's clock waits for a GPU.
+    The clock of torch.utils.benchmark waits for a GPU.
     """
     columns: list[list[float]] = [[] for _ in tasks]
     for _ in range(warmup + rounds):
-        # All tasks in each round: a slow moment of the machine meets every recipe.
+        # Every round runs all tasks, so that a slow moment affects every recipe.
         for task, column in zip(tasks, columns, strict=True):
             start = timer()
             task()

@@ -1,4 +1,4 @@
-"""Inputs of a size, and operations that are ready to be called again and again."""
+"""Inputs of a given size, and operations to call repeatedly."""
 
 import math
 import sys
@@ -23,9 +23,10 @@ from qgs.types import Cameras, Gaussians, Views
 
 @dataclass(frozen=True)
 class Workload:
-    """views, targets: photos read and photos rendered per scene. size: (H, W) of both, in pixels.
+    """Size of the inputs of a measurement.
 
-    batch: scenes at once. precision: float32, or bf16 for autocast.
+    views, targets: number of photos read and rendered per scene. size: (H, W) of both in pixels.
+    batch: scenes per call. precision: float32, or bf16 for autocast.
     """
 
     views: int
@@ -39,31 +40,32 @@ class Workload:
 def workload_of(
     recipe: Recipe, views: int | None = None, size: tuple[int, int] | None = None, **more: Any
 ) -> Workload:
-    """The workload of `recipe`: its `views` and `data.image_size`, unless given here.
+    """Return the workload of `recipe`, by default with its `views` and `data.image_size`.
 
-    more: further fields. Raises ValueError when nothing says how large the images are.
+    more: further fields. Raises ValueError if neither the recipe nor `size` gives the image size.
     """
     if size is None and recipe.data_config:
         size = recipe.data_config.image_size
     if size is None:
         raise ValueError(
-            "the recipe has no data.image_size, so the size of the photos is not known; "
-            "give one with --size HxW, such as --size 256x256"
+            "the recipe has no data.image_size, so the size of the photos is unknown; "
+            "give it with --size HxW, for example --size 256x256"
         )
     return Workload(views or recipe.views.inputs, recipe.views.targets, size, **more)
 
 
 def posed_photos(batch: int, count: int, size: tuple[int, int], seed: int) -> Views:
-    """Random pixels from cameras on an arc around (0, 0, 1), all looking at that point, in time.
+    """Return random photos with times, from cameras on an arc that look at its centre (0, 0, 1).
 
-    The first is the identity; the field of view is some 53 degrees across the longer side.
+    The pose of the first camera is the identity. The field of view is about 53 degrees across the
+    longer side.
     """
-    # Equal photos in all recipes and processes.
+    # All recipes and processes get equal photos.
     generator = torch.Generator().manual_seed(seed)
     images = torch.rand(batch, count, 3, *size, generator=generator)
     c2w = torch.eye(4).repeat(batch, count, 1, 1)
     for index in range(count):
-        # Ten degrees apart, as neighbouring photos of a walk are.
+        # Cameras are ten degrees apart, like neighbouring photos of a walk.
         angle = math.radians(10 * index)
         sine = math.sin(angle)
         cosine = math.cos(angle)
@@ -83,17 +85,17 @@ Operation: TypeAlias = Literal["forward", "render", "step"]
 def make_task(
     operation: Operation, recipe: Recipe, model: QueryGaussianModel, workload: Workload
 ) -> Task:
-    """`operation` as a call without arguments that leaves nothing behind but changed weights.
+    """Return `operation` as a function without arguments that changes at most the weights.
 
-    forward: photos to the last layer's Gaussians, no gradients. render: those Gaussians at the
-    targets' cameras, no gradients. step: a whole training step.
+    forward: photos to the last layer's Gaussians, without gradients. render: those Gaussians at the
+    target cameras, without gradients. step: a whole training step.
     """
     inputs, targets = (
         posed_photos(workload.batch, count, workload.size, seed).to(workload.device)
         for seed, count in enumerate((workload.views, workload.targets))
     )
     if operation == "step":
-        # A whole step as `qgs train` makes it, so that losses and renderer are in its time.
+        # A whole step as in `qgs train`, so that its time includes losses and renderer.
         objective = TrainingPass(recipe, model.train()).to(workload.device)
         factors = recipe.rate_factors(objective)
         optimizer = make_optimizer(objective, recipe.build_optimizer(), factors)
@@ -116,15 +118,18 @@ def make_task(
 
     if operation == "forward":
         return forward
-    # Made once, outside of what is timed.
+    # Made once, outside the measured time.
     gaussians = forward()
     return torch.inference_mode()(lambda: model.render(gaussians, targets.cameras))
 
 
 @dataclass(frozen=True)
 class Peak:
-    """peak_bytes: on the CPU the largest resident set of the whole process; on a GPU the most that
-    torch had allocated. idle_bytes: before the model was built."""
+    """Peak memory of an operation.
+
+    peak_bytes: on a CPU the largest resident set of the process, on a GPU the most that torch
+    allocated. idle_bytes: memory before the model was built.
+    """
 
     peak_bytes: int
     idle_bytes: int
@@ -133,17 +138,16 @@ class Peak:
 def peak_memory(recipe: Recipe, operation: Operation, workload: Workload, threads: int) -> Peak:
     """Build the model in a fresh process, run `operation` there, and return the peak.
 
-    Raises ChildProcessError when the process was killed, and what the model raises in it.
+    Raises ChildProcessError if the process was killed, and the errors of the model.
     """
-    # Spawned: a forked process would begin with the memory of this one.
+    # Spawned, because a forked process would start with the memory of this one.
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         try:
             return pool.submit(measure, dict(recipe.tree), operation, workload, threads).result()
         except BrokenProcessPool:
             raise ChildProcessError(
-                f"the process that measured the memory of the {operation} was killed, most likely "
-                "because the machine has too little: choose fewer or smaller views, or a smaller "
-                "batch or model"
+                f"the process that measured the memory of the {operation} was killed, probably "
+                "because memory ran out; choose fewer or smaller views, or a smaller batch or model"
             ) from None
 
 
@@ -155,7 +159,7 @@ def measure(tree: dict[str, Any], operation: Operation, workload: Workload, thre
     idle = 0 if on_gpu else resident_bytes("VmRSS")
     task = make_task(operation, recipe, recipe.build_model(workload.device), workload)
     if operation == "step":
-        # The first step makes the optimiser's moments and compiles kernels: count from the second.
+        # The first step creates the optimiser's moments and compiles kernels: measure the second.
         task()
         restart = Path("/proc/self/clear_refs")
         if on_gpu:
@@ -168,7 +172,7 @@ def measure(tree: dict[str, Any], operation: Operation, workload: Workload, thre
 
 
 def resident_bytes(field: str) -> int:
-    """Bytes resident now (VmRSS) or at most so far (VmHWM); the latter for both outside Linux."""
+    """Return resident bytes now (VmRSS) or their peak (VmHWM); outside Linux always the peak."""
     status = Path("/proc/self/status")
     if status.exists():
         lines = status.read_text().splitlines()

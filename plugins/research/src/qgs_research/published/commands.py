@@ -1,4 +1,4 @@
-"""`qgs import` and `qgs export`."""
+"""The commands `qgs import` and `qgs export`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,8 +7,8 @@ import typer
 
 from qgs.cli.options import Checkpoint, Overrides
 
-app = typer.Typer(help="Published weights in, checkpoints out.")
-export_app = typer.Typer(help="Checkpoints, written anew.")
+app = typer.Typer(help="Turn published weights into checkpoints.")
+export_app = typer.Typer(help="Write checkpoints again.")
 
 
 @app.command()
@@ -17,16 +17,16 @@ def import_(
         Path, typer.Argument(help="Published weights: .safetensors, or .pt .pth .bin .ckpt.")
     ],
     recipe: Annotated[
-        str, typer.Option(help="Recipe file whose model they are; auto for the one that fits.")
+        str, typer.Option(help="Recipe of the model. auto: derive it from the weights.")
     ],
     out: Annotated[Path, typer.Option(help="New checkpoint; never overwritten.")],
     overrides: Overrides = None,
 ) -> None:
-    """Turn published weights into a checkpoint; every tensor is accounted for.
+    """Turn published weights into a checkpoint. An unknown tensor is an error.
 
-    With `--recipe auto` the recipe that fits, after every --set, is written beside the checkpoint,
-    as .yaml. A recipe without data knows no image size: give `--set data.type=qgs/photos --set
-    data.path=PHOTOS --set data.image_size=[256,256]`, or `qgs reconstruct --size`.
+    `--recipe auto` also writes the recipe that fits, changed by every --set, beside the checkpoint
+    as .yaml. A recipe without data has no image size: give `--set data.type=qgs/photos --set
+    data.path=PHOTOS --set data.image_size=[256,256]`, or later `qgs reconstruct --size`.
     """
     from qgs.recipe import resolve
     from qgs_research.published.importing import import_weights
@@ -41,10 +41,10 @@ def export(
     checkpoint: Checkpoint,
     out: Annotated[Path, typer.Option(help="New .safetensors file; never overwritten.")],
     half: Annotated[
-        bool, typer.Option("--half", help="Store half precision; loading gives float32.")
+        bool, typer.Option("--half", help="Store float16; loading converts to float32.")
     ] = False,
 ) -> None:
-    """Write a checkpoint as one new file, with --half at half the size."""
+    """Copy a checkpoint into one new file; --half halves its size."""
     from qgs_research.published.importing import export_checkpoint
 
     export_checkpoint(checkpoint, out, half)

@@ -1,4 +1,4 @@
-"""Published codebases: their names for our parameters, and the recipe that their shapes give."""
+"""Published codebases: names of their parameters, and recipes derived from shapes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,22 +16,22 @@ from qgs_research.published.tokengs import TOKENGS
 from qgs_research.published.tokengs2026 import TOKENGS_2026_6
 from qgs_research.published.weight_layout import LayoutError, WeightLayout, renamed
 
-# TokenGS comes first: it is the most general.
+# TokenGS comes first, because it is the most general.
 LAYOUTS = (TOKENGS, LOCUSGS, MVSPLAT, DEPTHSPLAT, TOKENGS_2026_6)
 """The published codebases."""
 
 
 class PublishedError(ValueError):
-    """Weights that do not fit a recipe, or a model that a published layout cannot hold."""
+    """Error for weights that do not fit a recipe, or a model that fits no published layout."""
 
 
 @dataclass(frozen=True)
 class Names:
-    """The parameters of one recipe's model under both names.
+    """Names of the parameters of a recipe's model, ours and the published ones.
 
-    shapes: of our parameters. published: our name to the published one, both unique.
-    unnamed: our names without a published one. unused: published names that a file may also hold,
-    whose parameters the published code ignores.
+    shapes: shape of each of our parameters. published: our name -> published name, both unique.
+    unnamed: our names without a published name. unused: further names that a published file may
+    hold; the published code ignores them.
     """
 
     layout: WeightLayout
@@ -43,39 +43,39 @@ class Names:
     def from_published(
         self, weights: Mapping[str, Tensor], origin: object = "the file"
     ) -> dict[str, Tensor]:
-        """A published state dict under our names, `unused` left out.
+        """Return a published state dict under our names and without the `unused` tensors.
 
-        Raises PublishedError with every difference in names and shapes.
+        Raises PublishedError with all differences in names and shapes.
         """
         wanted = {theirs: self.shapes[ours] for ours, theirs in self.published.items()}
         found = [f"no published name: {name}" for name in self.unnamed]
         given = {name: w for name, w in weights.items() if name not in self.unused}
         if found := found + differing_tensors(shapes_of(given), wanted):
             raise PublishedError(
-                f"{origin} does not fit the recipe, whose model is a {self.layout.name} "
-                f"(`--recipe auto` writes one that fits), {len(found)} differences:\n  "
+                f"{origin} does not fit the recipe of a {self.layout.name}; "
+                f"`--recipe auto` writes one that fits. {len(found)} differences:\n  "
                 + listed(found, 20, "\n  ")
             )
         return {ours: weights[theirs] for ours, theirs in self.published.items()}
 
 
 def names_of(recipe: Recipe) -> Names:
-    """Both names of the parameters of the model of `recipe`, by the first layout that can hold it.
+    """Return both names of all parameters of `recipe`, by the first layout that fits it.
 
     Raises PublishedError with the components that each layout does not know.
     """
     reasons = []
-    # Only plugins of this recipe: others could claim its names.
+    # Use only plugins of this recipe, because others could claim its names.
     for layout in (one for one in LAYOUTS if one.plugin in recipe.releases):
         found = _unknown_components(recipe, layout)
         if not found:
             return _names_in(recipe, layout)
         reasons += [f"\n  {layout.name}: {line}" for line in found]
-    raise PublishedError("no published layout can hold this model:" + "".join(reasons))
+    raise PublishedError("this model fits no published layout:" + "".join(reasons))
 
 
 def _unknown_components(recipe: Recipe, layout: WeightLayout) -> list[str]:
-    """Components of `recipe` that a codebase does not know, one line each."""
+    """Describe the components of `recipe` that a codebase does not know, one line each."""
     found: dict[str, None] = {}
     types: dict[str, set[str]] = {}
     for path, chosen in recipe.parts.items():
@@ -99,38 +99,38 @@ def _names_in(recipe: Recipe, layout: WeightLayout) -> Names:
     shapes = shapes_of(unique_tensors(model))
     named = {name: layout.published_name(name) for name in shapes}
     published = {ours: theirs for ours, theirs in named.items() if theirs is not None}
-    # Two of our parameters under one published name would be an error in the layout's renames.
+    # Two of our parameters with the same published name would be an error in `renames`.
     assert len(set(published.values())) == len(published)
     unnamed = tuple(name for name in shapes if name not in published)
-    # Stored beside the used ones, and never read by the published code.
+    # These are stored beside the used ones, but the published code never reads them.
     beside = (renamed(name, *rule) for name in published.values() for rule in layout.unused)
     unused = tuple(name for name in beside if name is not None)
     return Names(layout, shapes, published, unnamed, unused)
 
 
 def recognise(shapes: Shapes) -> WeightLayout | None:
-    """The layout that fits a state dict best, None without one."""
+    """Return the layout that fits a state dict best, or None."""
     found = [layout for layout in LAYOUTS if set(layout.marks) <= set(shapes)]
-    # A codebase's later release has all names of the earlier one.
+    # A later release of a codebase has all names of the earlier one.
     return max(found, key=lambda layout: len(layout.marks), default=None)
 
 
 def fitting_recipe(shapes: Shapes, origin: str) -> tuple[WeightLayout, dict[str, Any]]:
-    """The layout of a state dict and the recipe that its sizes give, a plain mapping.
+    """Return the layout of a state dict and the recipe that fits its sizes, as a plain mapping.
 
-    Raises PublishedError, about `origin`, when no layout knows the names or when names
-    and shapes make no recipe.
+    Raises PublishedError about `origin` if no layout knows the names, or if no recipe fits the
+    names and shapes.
     """
     layout = recognise(shapes)
     if layout is None:
         names = "; ".join(f"{one.name} has {', '.join(one.marks)}" for one in LAYOUTS)
         raise PublishedError(
-            f"{origin} has the names of no published model that is known here ({names}); its "
-            f"names are {listed(shapes, 3)}"
+            f"{origin} is not from a known published model ({names}); its tensors are named "
+            f"{listed(shapes, 3)}"
         )
     try:
         tree = layout.read(shapes)
-        # Shapes may contradict each other, which only the whole recipe shows.
+        # Contradictions between shapes show only in the whole recipe.
         resolve(tree)
     except (LayoutError, RecipeError) as error:
         raise PublishedError(

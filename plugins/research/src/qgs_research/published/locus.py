@@ -1,4 +1,4 @@
-"""The weights of LocusGS: published names, and the recipe that fits a state dict."""
+"""Layout of LocusGS: published names of weights, and the recipe that fits a state dict."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ _UNUSED_NORMS = ("anchor_norm.", "plucker_norm.", "q_pos_norm.", "k_pos_norm.")
 
 
 def _read(shapes: Shapes) -> dict[str, Any]:
-    # The ablations of the paper leave parts out, so the names that are there tell the variant.
+    # The ablations of the paper omit parts, so the names that exist determine the variant.
     radius = "gs_anchor_radius_raw" in shapes
     ray_biased = DECODER + "0.gs_cross_attn.geo_scale" in shapes
     anchor_aware = DECODER + "0.anchor_head_self_attn.fc1.weight" in shapes
@@ -25,7 +25,7 @@ def _read(shapes: Shapes) -> dict[str, Any]:
         "refinement": {"type": "locus/refine", "radius": "radius_embed.fc1.weight" in shapes},
     }
     model["centers"] = {"type": "locus/radius_scaled" if radius else "locus/anchor_offset"}
-    # No tensor tells which layers were supervised: the paper takes the middle one and the last.
+    # No tensor shows which layers were supervised; the paper uses the middle and the last layer.
     depth = model["decoder"]["depth"]
     model["supervision"] = {"type": "qgs/layers", "layers": sorted({(depth + 1) // 2, depth})}
     losses = {
@@ -62,18 +62,18 @@ LOCUSGS = WeightLayout(
     },
     marks=(DECODER + "0.gs_cross_attn.q_content_proj.weight",),
     read=_read,
-    # Norms that the release builds and never calls, so that its files load whole.
+    # The release builds these norms and never calls them. They are here to load its files whole.
     unused=(
         *((_CROSS + "q_norm.", _CROSS + name) for name in _UNUSED_NORMS),
         (_CROSS + "geo_scale", _CROSS + "tau_sample"),
     ),
     undecided=(
-        "bandwidth of the ray bias: the radius where there is one, else fixed",
-        "Gaussian centres: scaled by the radius where there is one, else anchor + offset",
-        "clamps, epsilons, sigma0, lower bound of the radius: the LocusGS release's",
+        "bandwidth of the ray bias: the radius if there is one, otherwise fixed",
+        "Gaussian centres: scaled by the radius if there is one, otherwise anchor + offset",
+        "clamps, epsilons, sigma0, lower bound of the radius: as in the LocusGS release",
         "supervised layers: the middle one and the last",
         "losses: photometric, visibility, and anchor visibility with weight 0.1",
         "scale and frame of the world, renderer, training: the framework's defaults",
     ),
 )
-"""The released LocusGS, and its ablations that change parameters."""
+"""Layout of the released LocusGS and of its ablations that change parameters."""

@@ -1,4 +1,4 @@
-"""The weights of MVSplat and DepthSplat: published names, and the recipes that fit state dicts."""
+"""Layouts of MVSplat and DepthSplat: published names of weights, and recipes that fit."""
 
 from typing import Any
 
@@ -16,13 +16,13 @@ _VIT = _PREDICTOR + "pretrained."
 _UPSAMPLER = "encoder.feature_upsampler."
 _HEAD = "encoder.gaussian_head.2.weight"
 _HEAD_WIDTH = 64
-"""Channels of a head of every DINOv2."""
+"""Channels per head of every DINOv2."""
 _BLOCKS = {12: [2, 5, 8, 11], 24: [4, 11, 17, 23]}
-"""Depth of the ViT to the blocks that are read."""
+"""Blocks that are read, by depth of the ViT."""
 _CNN_WIDTHS = [64, 96, 128]
-"""Stages of MVSplat's CNN as published."""
+"""Published channels of the stages of MVSplat's CNN."""
 _HARMONICS = (4, 9, 16, 25)
-"""Numbers of a colour's harmonics, of degrees 1 to 4."""
+"""Number of harmonics per colour channel for degrees 1 to 4."""
 _EMPTY = dict.fromkeys(("cross_attention", "self_attention", "feed_forward", "refinement"))
 _ENDS = {"queries": ("mvsplat/pixels",), "centers": ("mvsplat/on_rays",)}
 
@@ -40,15 +40,15 @@ def _recipe(model: dict[str, Any]) -> dict[str, Any]:
 
 
 def _stages(shapes: Shapes, cnn: str) -> list[int]:
-    """Channels of the three stages of the CNN stored as `cnn`."""
+    """Return the channels of the three stages of the CNN stored as `cnn`."""
     return [size_at(shapes, f"{cnn}layer{n}.0.conv1.weight", 0) for n in (1, 2, 3)]
 
 
 def _unet_levels(shapes: Shapes, name: str) -> int:
-    """Levels of the U-Net stored as `name`: each has two blocks on the way up."""
+    """Return the number of levels of the U-Net `name`; each has two blocks on the way up."""
     numbers = {key[len(name) :].split(".")[1] for key in shapes if key.startswith(name + "output")}
     if not numbers or len(numbers) % 2:
-        raise LayoutError(f"{name}output_blocks are {len(numbers)}, not two for each level")
+        raise LayoutError(f"there are {len(numbers)} {name}output_blocks, not two for each level")
     return len(numbers) // 2
 
 
@@ -71,7 +71,7 @@ def _read_mvsplat(shapes: Shapes) -> dict[str, Any]:
         encoder["cnn_widths"] = stages
     return _recipe(
         {
-            # The memory has depth and opacity in front of what the release calls a raw Gaussian.
+            # The memory has depth and opacity before the channels of a raw Gaussian.
             "width": raw + 2,
             "encoder": encoder,
             "decoder": {"depth": 0, **_EMPTY},
@@ -91,10 +91,10 @@ def depthsplat_encoder(shapes: Shapes) -> dict[str, Any]:
     width = size_at(shapes, _VIT + "norm.weight", 0)
     depth = layer_count(shapes, _VIT + "blocks.")
     if scales not in (1, 2) or depth not in _BLOCKS:
-        raise LayoutError(f"{scales} scales and a ViT of {depth} blocks are not published")
+        raise LayoutError(f"no published model has {scales} scales and a ViT of {depth} blocks")
     dpt = [size_at(shapes, f"{_UPSAMPLER}projects.{n}.weight", 0) for n in range(4)]
     joined = size_at(shapes, _UPSAMPLER + "concat_projects.2.weight", 1)
-    # Sizes are read off the weights: the releases differ in them alone.
+    # Sizes come from the weights, because releases differ only in sizes.
     return {
         "type": "mvsplat/depthsplat",
         "near": 0.5,
@@ -103,12 +103,12 @@ def depthsplat_encoder(shapes: Shapes) -> dict[str, Any]:
         "cnn": _stages(shapes, _PREDICTOR + "backbone."),
         "candidates": size_at(shapes, _PREDICTOR + "depth_head.0.2.weight", 0),
         "scales": scales,
-        # At 1/8 other features join only where the CNN goes down to it.
+        # Other features join at 1/8 only if the CNN reaches that resolution.
         "stride": 4 if joined == dpt[2] else 8,
         "vit": {
             "width": width,
             "depth": depth,
-            "heads": whole_ratio(width, _HEAD_WIDTH, "width of the ViT over that of a head"),
+            "heads": whole_ratio(width, _HEAD_WIDTH, "width of the ViT over width of a head"),
         },
         "blocks": _BLOCKS[depth],
         "dpt": dpt,
@@ -123,13 +123,13 @@ def _read_depthsplat(shapes: Shapes) -> dict[str, Any]:
     raw = size_at(shapes, _HEAD, 0)
     two = encoder["scales"] == 2
     if raw not in [10 + 3 * harmonics for harmonics in _HARMONICS]:
-        raise LayoutError(f"{_HEAD}: {raw} is not 10 and harmonics of a degree")
-    # A layer for each depth, so that both can be supervised.
+        raise LayoutError(f"{_HEAD}: {raw} channels are not 10 plus the harmonics of a degree")
+    # One layer for each depth, so that both depths can be supervised.
     decoder = {"depth": 2, "layer": {"type": "mvsplat/exchange"}} if two else {"depth": 0}
     supervision = {"type": "mvsplat/decayed", "layers": [1, 2]}
     return _recipe(
         {
-            # The depths stand in front.
+            # The depths come first.
             "width": raw + 1 + two,
             "encoder": encoder,
             "decoder": {**decoder, **_EMPTY},
@@ -154,12 +154,12 @@ MVSPLAT = WeightLayout(
     read=_read_mvsplat,
     undecided=(
         "near and far: 1 and 100, of RealEstate10K and ACID (DTU: 2.125 and 4.525)",
-        "bounds of the scales, opacity map: the release's",
-        "losses: mean squared error, to which the release adds 0.05 LPIPS (plugin `lpips`)",
+        "bounds of the scales, opacity map: as in the release",
+        "losses: mean squared error; the release adds 0.05 LPIPS (plugin `lpips`)",
         "frame and scale of the world: as given; renderer, training: the framework's defaults",
     ),
 )
-"""The released MVSplat, in files of Lightning or of a bare state dict."""
+"""Layout of the released MVSplat, in Lightning files or as a bare state dict."""
 
 DEPTHSPLAT = WeightLayout(
     name="DepthSplat",
@@ -175,11 +175,11 @@ DEPTHSPLAT = WeightLayout(
     read=_read_depthsplat,
     undecided=(
         "near and far: 0.5 and 100, of RealEstate10K (DL3DV: 0.5 and 200)",
-        "views that each is matched with: the nearest 2",
-        "bounds of the scales: the release's",
-        "losses: mean squared error of both depths where there are two, to which the release adds "
-        "0.05 LPIPS (plugin `lpips`)",
+        "views matched with each view: the nearest 2",
+        "bounds of the scales: as in the release",
+        "losses: mean squared error, of both depths if there are two; the release adds 0.05 LPIPS "
+        "(plugin `lpips`)",
         "frame and scale of the world: as given; renderer, training: the framework's defaults",
     ),
 )
-"""The released DepthSplat, in files of Lightning or of a bare state dict."""
+"""Layout of the released DepthSplat, in Lightning files or as a bare state dict."""

@@ -1,4 +1,4 @@
-"""Published names of TokenGS's weights, and the recipe that fits a state dict."""
+"""Layout of TokenGS: published names of weights, and the recipe that fits a state dict."""
 
 from typing import Any
 
@@ -40,7 +40,7 @@ BACKBONE_RENAMES = {
     "decoder.{}.feed_forward_scale.": DECODER + "{}.mlp_scale.",
     "head.linear.": "activation_head.deconv.",
 }
-"""Names that TokenGS and the models built on it share."""
+"""Names that TokenGS and models built on it have in common."""
 
 CROSS_QUERY = {
     "decoder.{}.cross_attention.core.q_proj.": DECODER + "{}.gs_cross_attn.q_proj.",
@@ -48,9 +48,9 @@ CROSS_QUERY = {
 
 
 def backbone(shapes: Shapes, queries: str) -> dict[str, Any]:
-    """The part of `model` that TokenGS and the models built on it share; raises LayoutError.
+    """Return the part of `model` that TokenGS and models built on it share; raises LayoutError.
 
-    queries: the `type` of its queries.
+    queries: the `type` of the queries.
     """
     count = size_at(shapes, "gs_tokens", 0)
     width = size_at(shapes, "gs_tokens", 1)
@@ -81,7 +81,7 @@ def backbone(shapes: Shapes, queries: str) -> dict[str, Any]:
 
 
 def read_tokengs(shapes: Shapes) -> dict[str, Any]:
-    """The recipe of a TokenGS by its names and shapes; raises LayoutError."""
+    """Return the recipe of a TokenGS from its names and shapes; raises LayoutError."""
     model = backbone(shapes, "qgs/latent")
     model["decoder"] |= {
         "cross_attention": {"type": "qgs/content"},
@@ -113,9 +113,9 @@ TOKENGS = WeightLayout(
     marks=(DECODER + "0.gs_cross_attn.q_proj.weight",),
     read=read_tokengs,
     undecided=(
-        "activations of the head and of the positions, their clamps and epsilons: TokenGS's",
+        "activations of the head and of the positions, their clamps and epsilons: as in TokenGS",
         "supervised layers: the last",
         "scale and frame of the world, losses, renderer, training: the framework's defaults",
     ),
 )
-"""The released TokenGS, before its version of June 2026."""
+"""Layout of the released TokenGS before its version of June 2026."""

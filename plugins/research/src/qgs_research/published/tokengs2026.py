@@ -1,4 +1,4 @@
-"""The weights of TokenGS 2026.6: published names, and the recipe that fits a state dict."""
+"""Layout of TokenGS 2026.6: published names of weights, and the recipe that fits."""
 
 from typing import Any
 
@@ -63,16 +63,18 @@ def _read(shapes: Shapes) -> dict[str, Any]:
 
 
 def _channels(shapes: Shapes, module: str) -> int:
-    """Channels of a time embedding; 0 without one."""
+    """Return the channels of a time embedding, or 0 without one."""
     name = f"{module}.proj.weight"
     return size_at(shapes, name, 1) if name in shapes else 0
 
 
 def _encoder(shapes: Shapes, depth: int) -> dict[str, Any]:
-    """Options of the encoder, of `depth` blocks, that TokenGS does not have."""
+    """Return options of the encoder of `depth` blocks that TokenGS does not have."""
     scales = layer_count(shapes, READOUT)
     if scales > depth:
-        raise LayoutError(f"{READOUT}: {scales} norms, one for each block read, of {depth} blocks")
+        raise LayoutError(
+            f"{READOUT}: {scales} norms (one per block read) do not fit {depth} blocks"
+        )
     step = 2 if 2 * scales <= depth + 1 else 1
     found: dict[str, Any] = {"blocks": list(range(depth - step * (scales - 1), depth + 1, step))}
     if LATENTS not in shapes:
@@ -100,12 +102,15 @@ TOKENGS_2026_6 = WeightLayout(
     marks=(DECODER + "0.gs_cross_attn.q_proj.weight", READOUT + "0.weight"),
     read=_read,
     undecided=(
-        "activations of the head and of the positions, their clamps and epsilons: TokenGS's",
+        "activations of the head and of the positions, their clamps and epsilons: as in TokenGS",
         "blocks that the encoder reads: every second one up to the last",
         "supervised layers: the last",
         "frame of the world: the mean camera",
         "scale of the world, losses, renderer, training: the framework's defaults",
     ),
 )
-"""The release of June 2026. Runs with `use_multiscale_encoder: False` are not recognised: they name
-the norm of the block that they read as TokenGS does."""
+"""Layout of the release of June 2026.
+
+Runs with `use_multiscale_encoder: False` are not recognised, because their norm of the block that
+they read has the same name as in TokenGS.
+"""

@@ -1,4 +1,4 @@
-"""Files of published weights: a flat state dict, in safetensors or as torch saves it."""
+"""Files of published weights: flat state dicts in safetensors or in torch's formats."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from qgs.wording import listed
 
 TORCH = (".pt", ".pth", ".bin", ".ckpt")
 NESTING = ("model", "state_dict", "module")
-"""Keys under which training scripts store the state dict, next to an optimiser's state and such."""
+"""Keys under which training scripts store the state dict, beside other values."""
 
 
 @dataclass(frozen=True)
 class WeightFile:
-    """A flat state dict. tensors: by name, memory-mapped where the format allows it.
+    """Flat state dict. tensors: by name, memory-mapped if the format allows it.
 
-    notes: how it was found in the file, a sentence each.
+    notes: sentences that say how it was found in the file.
     """
 
     path: Path
@@ -29,9 +29,9 @@ class WeightFile:
 
 
 def read_weight_file(path: str | Path) -> WeightFile:
-    """The state dict in a file; memory-mapped pages are read when they are used.
+    """Return the state dict in a file; memory-mapped pages are read when they are used.
 
-    Raises FileNotFoundError, and CheckpointError for anything but a state dict of tensors.
+    Raises FileNotFoundError, and CheckpointError unless the file holds a state dict of tensors.
     """
     path = Path(path)
     notes = list[str]()
@@ -39,15 +39,17 @@ def read_weight_file(path: str | Path) -> WeightFile:
         raise FileNotFoundError(f"no file of weights at {path}")
     if path.suffix.lower() == ".safetensors":
         with TensorFile(path) as file:
-            # Its recipe would be lost on the way.
+            # An import would lose its recipe.
             if "qgs.recipe" in file.metadata:
-                raise CheckpointError(f"{path} is a qgs checkpoint, no published weights")
+                raise CheckpointError(
+                    f"{path} is already a qgs checkpoint; import files of published weights only"
+                )
             tensors = file.read()
     elif path.suffix.lower() in TORCH:
         tensors = _read_torch(path, notes)
     else:
         known = ", ".join((".safetensors", *TORCH))
-        raise CheckpointError(f"{path}: weights are read from files named {known}")
+        raise CheckpointError(f"{path}: the name of a file of weights must end in {known}")
     if not tensors:
         raise CheckpointError(f"{path} holds no tensors")
     return WeightFile(path, tensors, tuple(notes))
@@ -59,34 +61,35 @@ def _read_torch(path: Path, notes: list[str]) -> dict[str, Tensor]:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
     except Exception as error:  # whatever torch raises about a file that it cannot read
         raise CheckpointError(
-            f"{path} is not a whole torch file of plain tensors ({type(error).__name__}); it is "
-            "cut off, or holds Python objects, which could run code: copy it again, or save "
-            "`model.state_dict()` alone"
+            f"{path} is not a complete torch file of plain tensors ({type(error).__name__}); it is "
+            "cut off, or holds Python objects, which could run code. Copy it again, or save only "
+            "`model.state_dict()`"
         ) from error
     try:
         return _state_dict(content, path, notes)
     except RecursionError:  # a dict may hold itself
         raise CheckpointError(
-            f"{path}: the weights lie too deep; save `model.state_dict()` alone"
+            f"{path}: the weights are nested too deeply; save only `model.state_dict()`"
         ) from None
 
 
 def _state_dict(content: Any, path: Path, notes: list[str]) -> dict[str, Tensor]:
-    """The tensors of a state dict, flat or below the keys in NESTING."""
+    """Return the tensors of a state dict, flat or below the keys in NESTING."""
     if not isinstance(content, Mapping):
-        raise CheckpointError(f"{path} holds {type(content).__name__}, no state dict")
-    # A training script stores more than weights, as a rule one level above them.
+        raise CheckpointError(f"{path} holds {type(content).__name__}, not a state dict")
+    # A training script stores other values too, usually one level above the weights.
     others = [str(key) for key, value in content.items() if not isinstance(value, Tensor)]
     if not others:
         return {str(name): tensor.detach() for name, tensor in content.items()}
     inner = [key for key in NESTING if isinstance(content.get(key), Mapping)]
-    # Of two state dicts (a moving average, say) the user must choose.
+    # The user must choose between two state dicts, for example one of a moving average.
     if len(inner) != 1:
         raise CheckpointError(
-            f"{path} holds entries that are no tensors ({listed(others)}); one state dict may lie "
-            f"below {', '.join(NESTING)}, found {', '.join(inner) or 'none'}: save it alone"
+            f"{path} holds entries that are not tensors ({listed(others)}); exactly one of "
+            f"{', '.join(NESTING)} may hold a state dict, found {', '.join(inner) or 'none'}. "
+            "Save only the state dict"
         )
     left = [str(key) for key in content if key != inner[0]]
     beside = f"; left out: {listed(left)}" if left else ""
-    notes.append(f"the weights lie below {inner[0]!r}{beside}")
+    notes.append(f"the weights are below the key {inner[0]!r}{beside}")
     return _state_dict(content[inner[0]], path, notes)

@@ -1,4 +1,4 @@
-"""Weights that other codebases publish: their names for our parameters, and recipes that fit."""
+"""Description of the weights that another codebase publishes: names, and recipes that fit."""
 
 import math
 import re
@@ -10,16 +10,16 @@ from qgs.checkpoint.tensors import Shapes
 
 
 class LayoutError(ValueError):
-    """Published names and shapes that fit no recipe; the message says why."""
+    """Error for published names and shapes that fit no recipe; the message says why."""
 
 
 def renamed(name: str, ours: str, theirs: str) -> str | None:
-    """`name` with `theirs` in place of `ours`; None if it has another one.
+    """Return `name` with `ours` replaced by `theirs`; None if `ours` does not match.
 
-    `{}` stands for the number of a layer. An `ours` that ends with a dot is a module; what follows
-    is the same on both sides.
+    `{}` stands for the number of a layer. If `ours` ends with a dot it is a module, and the rest of
+    the name stays the same.
     """
-    # Only `{}` stands for something: the dots of a name are dots.
+    # Only `{}` is a placeholder: dots in a name are plain dots.
     pattern = re.escape(ours).replace(r"\{\}", r"(\d+)")
     match = re.match(pattern if ours.endswith(".") else pattern + "$", name)
     if match is None:
@@ -31,17 +31,18 @@ def renamed(name: str, ours: str, theirs: str) -> str | None:
 class WeightLayout:
     """Names and shapes in the state dicts of one published codebase.
 
-    name: what the codebase calls its model. plugin: that whose components it has.
+    name: name of the published model. plugin: plugin with its components.
     source: where it is published.
-    components: slot to the component types that the codebase has; other slots may hold any.
-    renames: our to their names of modules and parameters, see `renamed`; the first that applies to
-        a name counts.
-    marks: published names by which this layout is recognised; a file of it has them all.
-    unused: pairs of a published name and that of a parameter stored with it, which their code
+    components: slot -> component types of the codebase; other slots may hold any component.
+    renames: our name -> published name of modules and parameters, see `renamed`; the first that
+        matches counts.
+    marks: published names that identify this layout; its files have all of them.
+    unused: pairs of a published name and a parameter stored with it that the published code
         ignores.
-    read: names and shapes of a whole state dict to a recipe that fits, a mapping with `recipe: 1`;
-        raises LayoutError.
-    undecided: text: what names and shapes leave open, and that `read` chooses the published value.
+    read: function from names and shapes of a state dict to a recipe that fits, a mapping with
+        `recipe: 1`; raises LayoutError.
+    undecided: texts about options that names and shapes leave open, with the published value that
+        `read` chooses.
     """
 
     name: str
@@ -55,36 +56,36 @@ class WeightLayout:
     undecided: tuple[str, ...] = ()
 
     def published_name(self, ours: str) -> str | None:
-        """The published name of our parameter `ours`; None where the codebase has none."""
+        """Return the published name of our parameter `ours`, or None."""
         names = (renamed(ours, *rule) for rule in self.renames.items())
         return next((name for name in names if name is not None), None)
 
 
 def layer_count(shapes: Shapes, prefix: str) -> int:
-    """Number of layers stored as `prefix`N.: the largest N plus one."""
+    """Return the number of layers stored as `prefix`N., which is the largest N plus one."""
     pattern = re.compile(re.escape(prefix) + r"(\d+)\.")
-    # Layers may be missing from a file: it is then refused for what is missing.
+    # If a layer is missing from the file, a later step refuses the file.
     return max((int(match[1]) + 1 for name in shapes if (match := pattern.match(name))), default=0)
 
 
 def size_at(shapes: Shapes, name: str, axis: int) -> int:
-    """Size of an axis of a published parameter; raises LayoutError if there is none."""
+    """Return the size of an axis of a published parameter; raises LayoutError without it."""
     if name not in shapes:
-        raise LayoutError(f"{name} is missing, from which a size would be read off")
+        raise LayoutError(f"{name} is missing; its shape gives a size of the model")
     if not -len(shapes[name]) <= axis < len(shapes[name]):
-        raise LayoutError(f"{name} has the shape {shapes[name]}, from which no size can be read")
+        raise LayoutError(f"{name} has the shape {shapes[name]}, without axis {axis}")
     return shapes[name][axis]
 
 
 def whole_ratio(size: int, unit: int, what: str) -> int:
-    """size / unit; raises LayoutError about `what` if that is no whole number."""
+    """Return size / unit; raises LayoutError about `what` if that is not a whole number."""
     if unit < 1 or size % unit or not size:
         raise LayoutError(f"{what}: {size} is no multiple of {unit}")
     return size // unit
 
 
 def real_ratio(size: int, unit: int, what: str) -> float:
-    """A ratio such that int(ratio * unit) is `size`; raises LayoutError if there is none."""
+    """Return a ratio such that int(ratio * unit) is `size`; raises LayoutError without one."""
     if unit < 1 or not size:
         raise LayoutError(f"{what}: {size} is no multiple of {unit}")
     # A published width need not be a multiple; rounding down must give it back.

@@ -1,1 +1,1 @@
-"""Studies for qgs: variants of a model, each trained with several seeds, in one table."""
+"""Studies for qgs: comparison of variants of a model, each trained with several seeds."""

@@ -1,4 +1,4 @@
-"""`qgs study`, `qgs compare` and `qgs diff`."""
+"""The commands `qgs study`, `qgs compare` and `qgs diff`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from qgs.cli.inspect import RecipeFile
 from qgs.cli.options import Device
 from qgs_research import short_names
 
-app = typer.Typer(help="Train variants of a model by seeds, and compare them.")
+app = typer.Typer(help="Train variants of a model with several seeds, and compare them.")
 compare_app = typer.Typer(help="Compare results of evaluations.")
 diff_app = typer.Typer(help="Compare recipes.")
 
@@ -23,15 +23,16 @@ def compare(
         list[str], typer.Argument(metavar="RUN...", help="Run folders, or folders of `qgs eval`.")
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Folder for comparison.json and comparison.md.")
+        Path | None, typer.Option(help="Write comparison.json and comparison.md there.")
     ] = None,
     across_protocols: Annotated[
-        bool, typer.Option("--across-protocols", help="Compare results of different protocols.")
+        bool, typer.Option("--across-protocols", help="Allow results of different protocols.")
     ] = False,
 ) -> None:
-    """Compare the results of the first RUN with those of each other, scene by scene.
+    """Compare the results of the first RUN with each other RUN, scene by scene.
 
-    Nothing is evaluated. Runs of one recipe with several seeds count as one side.
+    The command reads results and evaluates nothing. Runs of one recipe with several seeds are
+    compared as one model.
     """
     from qgs.evaluate.results import as_json
     from qgs.files import write_text
@@ -52,24 +53,22 @@ def study(
     file: Annotated[
         str, typer.Argument(metavar="STUDY", help="Study file, or one that comes with qgs.")
     ],
-    out: Annotated[
-        Path, typer.Option(help="Folder of the study; what is there already is not run again.")
-    ],
+    out: Annotated[Path, typer.Option(help="Folder of the study; finished runs there are kept.")],
     workers: Annotated[
-        int, typer.Option(min=0, help="Runs at a time here; 0 trains nothing, and only reports.")
+        int, typer.Option(min=0, help="Runs in parallel. 0: train nothing, only report.")
     ] = 1,
     threads: Annotated[
-        int | None, typer.Option(min=1, help="CPU threads of a run; default: cores / workers.")
+        int | None, typer.Option(min=1, help="CPU threads per run. Default: cores / workers.")
     ] = None,
     only: Annotated[
-        int | None, typer.Option(min=0, help="Train the run of this number, from 0, alone.")
+        int | None, typer.Option(min=0, help="Train only the missing run of this number, from 0.")
     ] = None,
     device: Device = "auto",
 ) -> None:
     """Train every variant with every seed, evaluate all by one protocol, and compare the scores.
 
-    It is checked as a whole before anything trains. The same command goes on
-    at any time. OUT/table.md has the answer, OUT/results.json the numbers.
+    The whole study is checked before training. To continue after a stop, repeat
+    the command. OUT/table.md has the answer, OUT/results.json the numbers.
 
     \b
         study: 1
@@ -86,7 +85,7 @@ def study(
     \b
         qgs study mine_study.yaml --out studies/mine --workers 2
 
-    A variant changes `base`, or names a recipe file; docs/studies.md has all keys.
+    A variant changes `base` or names a recipe file. docs/studies.md explains all keys.
     """
     from qgs_research.studies.running import run_study
 
@@ -98,15 +97,16 @@ def diff(
     first: RecipeFile,
     second: RecipeFile,
     set_a: Annotated[
-        list[str] | None, typer.Option("--set-a", help="Override of the first; repeatable.")
+        list[str] | None, typer.Option("--set-a", help="Override for the first recipe; repeatable.")
     ] = None,
     set_b: Annotated[
-        list[str] | None, typer.Option("--set-b", help="Override of the second; repeatable.")
+        list[str] | None,
+        typer.Option("--set-b", help="Override for the second recipe; repeatable."),
     ] = None,
 ) -> None:
-    """Show which slots and options of two recipes differ, and what that costs in parameters.
+    """Show which slots and options of two recipes differ, and their numbers of parameters.
 
-    "-" stands for an option that a recipe's component does not have.
+    "-" stands for an option that the component of a recipe does not have.
     """
     from rich.markup import escape
 
@@ -121,7 +121,7 @@ def diff(
     slots = [["slot", *names]]
     options = [["option", *names]]
     for path, values in differing_options(ours.tree, theirs.tree).items():
-        # Another component has other options: first which one it is.
+        # Another component has other options, so name the components first.
         rows = slots if path.endswith(".type") else options
         rows.append([path.removesuffix(".type"), *(escape(value or "-") for value in values)])
     before = parameter_counts(ours.build_model("meta"))

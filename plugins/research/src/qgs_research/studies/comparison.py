@@ -1,6 +1,6 @@
-"""`qgs compare`: results of evaluations, the first held against each of the others.
+"""Comparison for `qgs compare`: the first result against each of the others.
 
-Several trainings of one recipe count as one side, whose interval then covers trainings too.
+Several trainings of one recipe count as one side; its interval then covers trainings too.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -21,10 +21,10 @@ from qgs_research.studies.tables import (
 
 
 def compare(results: Sequence[StoredResults], across_protocols: bool = False) -> Scores:
-    """Return the scores of `results`, with the first of them, or its side, as the reference.
+    """Return the scores of `results`; the side of the first result is the reference.
 
-    Raises ValueError for fewer than two, one folder twice and no scene in common, and unless
-    `across_protocols` for different protocols and scenes judged on different frames.
+    Raises ValueError for fewer than two results, for a folder given twice, and without a common
+    scene. Different protocols or frames raise ValueError unless `across_protocols` is True.
     """
     names = [result.name for result in results]
     if len(names) < 2 or len(set(names)) < len(names):
@@ -32,30 +32,30 @@ def compare(results: Sequence[StoredResults], across_protocols: bool = False) ->
     reference, *others = sides = _sides(results)
     for name in others:
         if not common_scenes([*sides[reference].values(), *sides[name].values()]):
-            raise ValueError(f"{reference} and {name} have no scene in common")
+            raise ValueError(f"{reference} and {name} have no common scene")
         if not across_protocols:
             _refuse_unlike(reference, sides[reference], name, sides[name])
         sides[name] = _paired(sides[reference], sides[name])
     return Scores(
         stored={(name, MAIN): runs for name, runs in sides.items()},
         reference=reference,
-        # The first metric of a recipe decides, usually PSNR.
+        # The first metric of a recipe decides; it is usually PSNR.
         metric=next(iter(results[0].columns)),
         across_protocols=across_protocols,
     )
 
 
 def _sides(results: Sequence[StoredResults]) -> dict[str, Runs]:
-    """Return trainings by name and seed: those of one recipe as one, where there are others."""
+    """Return results by side and seed; trainings of one recipe are one side if there are others."""
     groups: dict[Any, list[StoredResults]] = {}
     for number, result in enumerate(results):
-        # Results without a run folder have no recipe: each is a side of its own.
+        # Results without a run folder have no recipe, so each is a side of its own.
         key = (result.recipe, result.protocol.sha256) if result.recipe else number
         groups.setdefault(key, []).append(result)
     sides: dict[str, Runs] = {}
     for group in groups.values():
         by_seed = {run.seed or 0: run for run in group}
-        # Alone, the seeds of one recipe are compared; a seed twice is no second training.
+        # If there is only one recipe, compare its seeds. The same seed twice is no second training.
         if len(groups) == 1 or len(by_seed) < len(group) or len(group) == 1:
             sides |= {run.name: {run.seed or 0: run} for run in group}
             continue
@@ -64,17 +64,17 @@ def _sides(results: Sequence[StoredResults]) -> dict[str, Runs]:
 
 
 def _paired(reference: Runs, runs: Runs) -> Runs:
-    """Return `runs` as they are where seeds are shared, else with those of the reference."""
-    # Equal seeds saw the same data in the same order.
+    """Return `runs` unchanged if seeds are shared, otherwise under seeds of the reference."""
+    # Trainings with equal seeds saw the same data in the same order.
     if len(reference.keys() & runs.keys()) >= min(2, len(reference), len(runs)):
         return runs
-    # Those without a partner have keys that no seed has.
+    # Runs without a partner get keys that no seed has.
     keys = [*reference, *range(-len(runs), 0)]
     return dict(zip(keys, runs.values(), strict=False))
 
 
 def _refuse_unlike(reference: str, first: Runs, name: str, second: Runs) -> None:
-    """Raise ValueError where results of two sides do not measure the same."""
+    """Raise ValueError if the results of two sides do not measure the same."""
     results = [*first.values(), *second.values()]
     ours = results[0].protocol
     theirs = results[-1].protocol
@@ -82,26 +82,26 @@ def _refuse_unlike(reference: str, first: Runs, name: str, second: Runs) -> None
         keys = sorted({*ours.content, *theirs.content})
         unequal = [key for key in keys if ours.content.get(key) != theirs.content.get(key)]
         raise ValueError(
-            f"{reference} was judged by {ours}, {name} by {theirs}, which differ in "
-            f"{listed(unequal)}: evaluate both by one protocol, or add --across-protocols to "
-            "compare them all the same"
+            f"{reference} was evaluated by {ours}, {name} by {theirs}, which differ in "
+            f"{listed(unequal)}. Evaluate both by one protocol, or compare anyway with "
+            "--across-protocols"
         )
     if moved := moved_scenes(results):
         raise ValueError(
-            f"{reference} and {name} judged {len(moved)} scenes on different frames, "
-            f"although their protocols agree: {listed(moved)}. The data, or how views are "
-            "drawn, changed between them: evaluate both again, or add --across-protocols"
+            f"{reference} and {name} were evaluated on different frames of {len(moved)} scenes, "
+            f"although their protocols agree: {listed(moved)}. The data or the choice of views "
+            "changed in between: evaluate both again, or add --across-protocols"
         )
 
 
 def summary(scores: Scores) -> Summary:
-    """Return a table for each metric, with notes."""
+    """Return a table for each metric, and notes."""
     tables = [("", table_rows(scores, MAIN, metric)) for metric in scores.columns]
     return Summary(answer="", tables=tables, notes=[*_notes(scores)])
 
 
 def record(scores: Scores) -> dict[str, Any]:
-    """Return plain values for JSON."""
+    """Return the scores as plain values for JSON."""
     return {
         "reference": scores.reference,
         "table": [*table_records(scores)],
@@ -110,8 +110,8 @@ def record(scores: Scores) -> dict[str, Any]:
 
 
 def _notes(scores: Scores) -> Iterator[str]:
-    """Yield what is to be known beside the tables."""
-    yield f"difference: minus {scores.reference}, over the scenes that both have"
+    """Yield notes below the tables."""
+    yield f"difference: minus {scores.reference}, over scenes that both have"
     yield from interval_notes([*scores.differences().values()])
     yield from training_notes(scores)
     for sha256 in sorted(scores.protocols(MAIN)):
@@ -121,11 +121,11 @@ def _notes(scores: Scores) -> Iterator[str]:
             if names:
                 yield f"{name}: {words} ({len(names)}): {listed(sorted(names))}"
     if len(scores.protocols(MAIN)) > 1:
-        yield "the protocols differ: the scores do not measure the same"
+        yield "the protocols differ, so the scores do not measure the same"
 
 
 def _left_out(scores: Scores, name: str) -> dict[str, Collection[str]]:
-    """Return what no difference of a side is made of, by what is wrong with it."""
+    """Return the results that the differences of a side leave out, by reason."""
     runs = scores.stored[name, MAIN]
     reference = scores.stored[scores.reference, MAIN]
     results = [*reference.values(), *runs.values()]

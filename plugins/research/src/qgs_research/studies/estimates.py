@@ -1,8 +1,8 @@
-"""Means over seeds and scenes, their intervals, and how tables show both.
+"""Means over seeds and scenes, their intervals, and their format in tables.
 
-An interval takes trainings and scenes as random, both: it holds for other seeds and other scenes
-of the kind (`interval`). Differences are paired: a seed with the same seed of the
-reference, which saw the same data in the same order, and a scene with the same scene.
+Intervals treat both trainings and scenes as random, so they hold for other seeds and other scenes
+of the same kind (`interval`). Differences are paired by seed and by scene: trainings with the same
+seed saw the same data in the same order.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,10 +27,10 @@ Runs: TypeAlias = Mapping[int, StoredResults]
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean, or a sum of means, over the seeds and scenes that all of its parts have.
+    """Mean, or weighted sum of means, over the seeds and scenes that all parts have.
 
-    values: (S, C) of the seeds and scenes. interval: see the module; None of one scene. Of one seed
-    it covers scenes alone.
+    values: (S, C), by seed and scene. interval: see the module; None for one scene. For one seed it
+    covers scenes alone.
     """
 
     seeds: Sequence[int]
@@ -39,13 +39,13 @@ class Estimate:
 
     @property
     def mean(self) -> float:
-        """The mean over seeds, each once."""
+        """Mean over seeds with equal weights."""
         return float(self.values.mean(1).mean())
 
     @property
     def deviation(self) -> float | None:
-        """Standard deviation over seeds; None of one."""
-        # Of a sample: the seeds stand for all that could be drawn.
+        """Standard deviation over seeds; None for one seed."""
+        # This is the deviation of a sample, because seeds stand for all possible seeds.
         return float(self.values.mean(1).std(ddof=1)) if len(self.seeds) > 1 else None
 
     @property
@@ -55,18 +55,18 @@ class Estimate:
 
     @property
     def sample(self) -> str:
-        """Size of the sample, such as "3 seeds x 32 scenes"."""
+        """Size of the sample, for example "3 seeds x 32 scenes"."""
         return f"{counted(len(self.seeds), 'seed')} x {counted(self.scenes, 'scene')}"
 
     @property
     def too_small(self) -> str:
-        """Reason why the interval says nothing of other trainings and scenes; "" where it does."""
-        reasons = {"one training a side": len(self.seeds), "one scene": self.scenes}
+        """Reason why the interval does not hold for other trainings and scenes; "" if it does."""
+        reasons = {"one training per side": len(self.seeds), "one scene": self.scenes}
         return " and ".join(reason for reason, count in reasons.items() if count < 2)
 
     def clear(self, sign: int) -> bool:
-        """Return True if the interval is over trainings and scenes, and all on a side of 0."""
-        # An interval over scenes alone says nothing of other trainings.
+        """Return True if the interval covers trainings and scenes and lies on the side `sign`."""
+        # An interval over scenes alone does not hold for other trainings.
         ends = () if self.too_small else self.interval or ()
         return min((sign * end for end in ends), default=0.0) > 0
 
@@ -84,31 +84,31 @@ class Estimate:
 def estimate(
     parts: Sequence[tuple[Runs, int]], metric: str, confidence: float = CONFIDENCE
 ) -> Estimate | None:
-    """Return the sum of means that `parts` weigh; None where they share no seed or no scene."""
+    """Return the sum of means with weights `parts`; None without a common seed and scene."""
     seeds = [seed for seed in parts[0][0] if all(seed in runs for runs, _ in parts)]
     scenes = scenes_with(metric, [runs[seed] for runs, _ in parts for seed in seeds])
     if not scenes:
         return None
     values = np.zeros((len(seeds), len(scenes)))
     for runs, weight in parts:
-        # Paired before any mean is taken: what a seed or a scene adds to all models cancels.
+        # Pairing precedes the means, so that common effects of a seed or scene cancel.
         values += weight * np.array([runs[seed].scores(metric, scenes) for seed in seeds])
     return Estimate(seeds=seeds, values=values, interval=interval(values, confidence))
 
 
 def sign_of(column: Column) -> int:
-    """Return 1 where more of a metric is better, else -1."""
+    """Return 1 if more of a metric is better, otherwise -1."""
     return 1 if column.better == "higher" else -1
 
 
 def shown(column: Column, value: float | None, sign: str = "") -> str:
-    """Return a value one digit finer than evaluations show it. sign: "+" for differences."""
-    # Differences are small against the means that an evaluation prints.
+    """Return a value with one digit more than evaluations show. sign: "+" for differences."""
+    # Differences are small compared with the means that an evaluation prints.
     return "–" if value is None else f"{value:{sign}.{column.digits + 1}f}"
 
 
 def interval_shown(column: Column, estimate: Estimate | None) -> str:
-    """Return "[low, high]", a dash without an interval."""
+    """Return "[low, high]", or a dash without an interval."""
     if estimate is None or estimate.interval is None:
         return "–"
     return f"[{', '.join(shown(column, end, '+') for end in estimate.interval)}]"
@@ -117,9 +117,9 @@ def interval_shown(column: Column, estimate: Estimate | None) -> str:
 def interval(values: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float, float] | None:
     """Return the interval of the mean of differences (S, C) of S trainings on the same C scenes.
 
-    Both are random: it holds for other trainings and for other scenes; see `crossed_error`. Of one
-    training it covers scenes alone, at 95 %: the percentile bootstrap, whose resamples are seeded,
-    so that equal numbers give equal intervals. None for one scene.
+    Both are random, so the interval holds for other trainings and other scenes; see
+    `crossed_error`. For one training it covers scenes alone, at 95 %, by the percentile bootstrap.
+    Resamples are seeded, so that equal numbers give equal intervals. None for one scene.
     """
     trainings, scenes = values.shape
     if scenes < 2:
@@ -132,7 +132,7 @@ def interval(values: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float,
         values,
         np.mean,
         n_resamples=RESAMPLES,
-        # In parts, because 10,000 resamples of many scenes would fill memory.
+        # Resample in parts, because 10,000 resamples of many scenes would fill the memory.
         batch=100,
         confidence_level=CONFIDENCE,
         method="percentile",
@@ -145,20 +145,20 @@ def interval(values: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float,
 def crossed_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the standard error of the means of `values` (..., S, C), and its degrees of freedom.
 
-    Both have the shape (...). The variance is that of two-way analysis of variance, a sum of mean
-    squares; its degrees of freedom are those of Satterthwaite 1946 (doi.org/10.2307/3002019), at
-    least those of the smaller side. Without the scenes' own (Hillis 2007, doi.org/10.1002/sim.2532)
-    it is too narrow for few.
+    Both have the shape (...). The variance is a sum of mean squares, as in two-way analysis of
+    variance. Its degrees of freedom follow Satterthwaite 1946 (doi.org/10.2307/3002019), but are at
+    least those of the smaller side. Without the scenes' own variance (Hillis 2007,
+    doi.org/10.1002/sim.2532) the interval is too narrow for few trainings.
     """
     *_, trainings, scenes = values.shape
     of_training = values.mean(-1, keepdims=True)
     of_scene = values.mean(-2, keepdims=True)
-    # The interaction, which is also the noise of a single score.
+    # This is the interaction, and also the noise of a single score.
     rest = values - of_training - of_scene + values.mean((-2, -1), keepdims=True)
     noise = (rest**2).sum((-2, -1)) / ((trainings - 1) * (scenes - 1))
     first = scenes * of_training.var((-2, -1), ddof=1)
     second = trainings * of_scene.var((-2, -1), ddof=1)
-    # Otherwise the scenes add no variance of their own, and the difference would be negative.
+    # Otherwise the scenes add no variance, and the difference would be negative.
     own = second > noise
     whole = first + own * (second - noise)
     spread = first**2 + own * (second**2 * (trainings - 1) + noise**2) / (scenes - 1)

@@ -1,4 +1,4 @@
-"""Hypotheses: from `A@noisy - A < B@noisy - B` to coefficients of means."""
+"""Parser of hypotheses such as `A@noisy - A < B@noisy - B` into coefficients of means."""
 
 import re
 from collections.abc import Collection, Mapping
@@ -8,10 +8,10 @@ from qgs.contracts import OptionError
 from qgs.wording import did_you_mean
 
 NAME = r"[A-Za-z0-9_][A-Za-z0-9_.]*"
-"""Of variants and evaluations: folders on any system, and words of a hypothesis."""
+"""Pattern of names of variants and evaluations, valid as folders and in hypotheses."""
 
 MAIN = ""
-"""The evaluation that recipes have themselves."""
+"""Name of the evaluation in the recipes themselves."""
 
 _FORM = "write `A < B` or `A > B`, each side a variant or a sum such as `A@noisy - A`"
 _TERM = re.compile(rf"\s*([+-]?)\s*({NAME})(?:@({NAME}))?\s*")
@@ -19,9 +19,9 @@ _TERM = re.compile(rf"\s*([+-]?)\s*({NAME})(?:@({NAME}))?\s*")
 
 @dataclass(frozen=True)
 class Contrast:
-    """Left side minus right side. terms: (variant, evaluation) to coefficient.
+    """Left side minus right side of a hypothesis. terms: (variant, evaluation) -> coefficient.
 
-    sign: of what is claimed, -1 for `<`.
+    sign: claimed sign, -1 for `<`.
     """
 
     text: str
@@ -30,21 +30,21 @@ class Contrast:
 
 
 def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -> Contrast:
-    """Return the contrast that `text` writes.
+    """Return the contrast that `text` describes.
 
-    Raises OptionError for another form and unknown names.
+    Raises OptionError for another form or unknown names.
     """
     sides = re.split(r"\s*([<>])\s*", text.strip())
     if len(sides) != 3:
-        raise OptionError(f"`{text}` has not one `<` or `>`", _FORM)
+        raise OptionError(f"`{text}` needs exactly one `<` or `>`", _FORM)
     left, comparison, right = sides
     terms: dict[tuple[str, str], int] = {}
     for side, factor in ((left, 1), (right, -1)):
         matches = [*_TERM.finditer(side)]
-        # Nothing but terms, and a sign before each but the first.
+        # A side has only terms, with a sign before each except the first.
         whole = "".join(match[0] for match in matches) == side and side
         if not whole or any(not match[1] for match in matches[1:]):
-            raise OptionError(f"`{side}` in `{text}` is no sum of variants", _FORM)
+            raise OptionError(f"`{side}` in `{text}` is not a sum of variants", _FORM)
         for sign, variant, evaluation in (match.groups() for match in matches):
             _check_known("variant", variant, variants, text)
             if evaluation:
@@ -54,7 +54,7 @@ def parsed(text: str, variants: Collection[str], evaluations: Collection[str]) -
     # A sum that does not cancel would depend on the data set, not on the variants.
     if sum(terms.values()):
         raise OptionError(
-            f"the two sides of `{text}` weigh unlike: it compares no like with like",
+            f"the two sides of `{text}` have different weights, so they cannot be compared",
             "write differences on both sides, such as `A@noisy - A < B@noisy - B`",
         )
     terms = {term: coefficient for term, coefficient in terms.items() if coefficient}

@@ -1,4 +1,4 @@
-"""A study as it runs: every variant composed, and all of them checked before anything trains."""
+"""Plan of a study: all variants are composed and checked before training."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -24,10 +24,10 @@ from qgs_research.studies.study import Study
 
 
 def planned(study: Study, folder: Path) -> Plan:
-    """Compose all variants and check the study as a whole; nothing is written or trained.
+    """Compose all variants and check the whole study, without writing or training.
 
-    Raises as `composed`, what data sources raise, and ValueError where `folder` has runs of a
-    variant, or results of an evaluation, that were another then.
+    Raises the errors of `composed` and of data sources. Raises ValueError if a variant or an
+    evaluation with runs or results in `folder` has changed.
     """
     plan = Plan(study, folder, composed(study))
     check_data(plan)
@@ -38,17 +38,17 @@ def planned(study: Study, folder: Path) -> Plan:
 def composed(study: Study) -> dict[str, Recipe]:
     """Return the recipes of all variants, with the study's budget.
 
-    Raises RecipeError with all that is wrong with them and with what differs between them, and
-    what building them raises.
+    Raises RecipeError with all their faults and forbidden differences, and the errors of building
+    them.
     """
     problems = Problems("study")
     recipes: dict[str, Recipe] = {}
     for name, node in study.variants.items():
         with _collected(problems, f"variants.{name}", study.variants[name].origin):
-            # A recipe has one seed; the runs set theirs over it.
+            # A recipe has one seed, which each run replaces by its own.
             recipe = resolve(node, [f"seed={study.settings.seeds[0]}"])
             recipes[name] = _with_budget(study, with_absolute_path(recipe))
-    # What differs from a variant that cannot be composed is not known.
+    # Differences to a variant that cannot be composed are unknown.
     if len(recipes) == len(study.variants):
         check_equal(study, recipes, problems)
         check_distinct(study, recipes, problems)
@@ -61,7 +61,7 @@ def composed(study: Study) -> dict[str, Recipe]:
         try:
             _build(recipe)
         except (ValueError, OSError) as error:
-            # What a component raises does not know in which variant it stands.
+            # The error of a component does not name the variant.
             error.add_note(f"in the variant `{name}`, {study.variants[name].origin}")
             raise
     return recipes
@@ -69,7 +69,7 @@ def composed(study: Study) -> dict[str, Recipe]:
 
 @contextmanager
 def _collected(problems: Problems, place: str, origin: Origin) -> Iterator[None]:
-    """Add what is wrong with a recipe to `problems`, instead of raising it."""
+    """Add the faults of a recipe to `problems` instead of raising them."""
     try:
         yield
     except RecipeError as error:
@@ -82,16 +82,16 @@ def _with_budget(study: Study, recipe: Recipe) -> Recipe:
     changes = study.settings.budget.model_dump()
     if changes["steps"] is None:
         del changes["steps"]
-    # Not an override: `qgs compose` shows who set the budget.
+    # With an origin, because `qgs compose` shows who set the budget.
     tree = {**recipe.tree, "training": {**recipe.tree["training"], **changes}}
     origins = {f"training.{name}": "the study's budget" for name in changes}
     return replace(resolve(tree), provenance={**recipe.provenance, **origins})
 
 
 def _build(recipe: Recipe) -> None:
-    """Make every part of a variant, the model without memory, to see that they fit."""
+    """Build every part of a variant, the model without memory, to check that they fit."""
     recipe.build_optimizer()
-    # On the meta device: published models would not fit a laptop's memory.
+    # Use the meta device, because published models would not fit into a laptop's memory.
     recipe.rate_factors(recipe.build_model("meta"))
     recipe.build_losses()
     recipe.build_objective()
@@ -103,17 +103,17 @@ EQUAL = (
     *("data", "views", "training", "evaluation", "metrics"),
     *("losses", "objective", "init_from"),
 )
-"""Sections of recipes that are equal in all variants unless `differs` names them.
+"""Sections of recipes that must be equal in all variants unless `differs` names them.
 
-All but the model and its optimiser.
+The model and its optimiser may always differ.
 """
 
 INDEX = "evaluation.index"
-"""Compared by what the file holds, because it may have moved."""
+"""Option that is compared by the content of its file, because the file may have moved."""
 
 
 def check_equal(study: Study, recipes: Mapping[str, Recipe], problems: Problems) -> None:
-    """Report what differs between variants although the study does not name it."""
+    """Report differences between variants that `differs` does not allow."""
     settings = study.settings
     first = recipes[settings.reference]
     used = set[str]()
@@ -124,7 +124,7 @@ def check_equal(study: Study, recipes: Mapping[str, Recipe], problems: Problems)
             allowed = [a for a in settings.differs if f"{path}.".startswith(f"{a}.")]
             used.update(allowed)
             section, *names = path.split(".")
-            # Another loss or metric is one difference, whatever options it has.
+            # Another loss or metric counts as one difference, whatever its options.
             option = f"{section}.{names[0]}" if section in ("losses", "metrics") else path
             if section not in EQUAL or allowed or option in reported:
                 continue
@@ -142,37 +142,37 @@ def check_equal(study: Study, recipes: Mapping[str, Recipe], problems: Problems)
     for path in settings.differs:
         if path not in used:
             at = Origin(str(study.file))
-            reason = f"`{path}` differs in no variant"
+            reason = f"`{path}` is the same in all variants"
             problems.add(at, "differs", reason, f"remove it; sections are {', '.join(EQUAL)}")
 
 
 def check_distinct(study: Study, recipes: Mapping[str, Recipe], problems: Problems) -> None:
-    """Report variants that are one model."""
+    """Report variants that are the same model."""
     names: dict[str, str] = {}
     for name, recipe in recipes.items():
         tree = {key: part for key, part in recipe.tree.items() if key not in BESIDE}
-        # The whole recipe is the key: two names of one model would count as two tries.
+        # The key is the whole recipe: two names of one model would count as two tries.
         other = names.setdefault(json.dumps(tree, sort_keys=True), name)
         if other != name:
             reason = f"`{name}` is the same model as `{other}`"
-            fix = "change an option of it, or leave one of them out"
+            fix = "change an option, or remove one of the two"
             problems.add(study.variants[name].origin, f"variants.{name}", reason, fix)
 
 
 def check_data(plan: Plan) -> None:
-    """Open every data source and index once. Raises as they do, OptionError for metrics."""
+    """Open every data source and index once; raises their errors, and OptionError for metrics."""
     settings = plan.study.settings
     metrics = [settings.metric, *(h.metric for h in settings.hypotheses if h.metric)]
     opened = set[str]()
     for variant, name in product(plan.recipes, plan.evaluations):
         recipe = plan.evaluation_recipe(variant, name)
-        # Most variants share their data: opening it takes seconds.
+        # Most variants share their data, and opening it takes seconds.
         key = dump([recipe.tree[section] for section in ("data", "evaluation", "metrics")])
         if key in opened:
             continue
         opened.add(key)
         measures = Measures(recipe)
-        # LPIPS without its weights, for example: after the training would be too late.
+        # For example, the weights of LPIPS may be missing; after training it would be too late.
         unavailable = dict(measures.incomplete([]))
         available = [metric for metric in measures.columns if metric not in unavailable]
         for metric in metrics:
@@ -187,17 +187,17 @@ def check_data(plan: Plan) -> None:
 
 
 def refuse_changed(plan: Plan) -> None:
-    """Raise ValueError where runs or results in the folder were made of something else."""
+    """Raise ValueError if runs or results in the folder come from other recipes."""
     for variant, name in product(plan.recipes, plan.evaluations):
         recipe = plan.evaluation_recipe(variant, name)
         file = recipe_file(plan.folder, variant, name)
-        # Runs of seeds that the study no longer names count too: it may name them again.
+        # Runs of seeds that the study no longer names count too, since it may name them again.
         folders = (plan.folder / "runs" / variant).glob("seed-*/")
         runs = [Run(variant, 0, folder) for folder in folders]
         evaluated = [run for run in runs if run.evaluated(name)]
         made = evaluated if name else [run for run in runs if not RunFolder(run.folder).is_new]
         changed = differences(resolve(file), recipe) if made and file.is_file() else {}
-        # Where the index lies is no matter, but which scenes and frames it names.
+        # The place of the index does not matter, but its scenes and frames do.
         changed.pop(INDEX, None)
         index = read_index(recipe.evaluation.index)
         protocols = [run.evaluation(name) / "protocol.json" for run in evaluated]
@@ -208,7 +208,7 @@ def refuse_changed(plan: Plan) -> None:
             what = f"the evaluation `{name}`" if name else f"the variant `{variant}`"
             shown = [f"{path}: {old} then, {new} now" for path, (old, new) in changed.items()]
             raise ValueError(
-                f"{plan.study.file}: {what} is not what {len(made)} runs in {plan.folder} were "
-                f"made with ({listed(shown, between='; ')}); give {what} another name, or another "
-                "--out"
+                f"{plan.study.file}: {what} has changed since {len(made)} runs in {plan.folder} "
+                f"were made ({listed(shown, between='; ')}); give {what} another name, or give "
+                "another --out"
             )

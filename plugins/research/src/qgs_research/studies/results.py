@@ -1,4 +1,4 @@
-"""The results of a study: verdicts, what they say in a line, and the files with all numbers."""
+"""The results of a study: verdicts, a one-line answer, and files with all numbers."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -31,15 +31,15 @@ CONTRADICTED = "contradicted"
 UNDECIDED = "undecided"
 
 _RANKED = 5
-"""Fewest variants for a rank correlation.
+"""Least number of variants for a rank correlation.
 
-Of three, one order in six is the published one by chance; of five, one in 120.
+A random order of three variants is the published one in 1 of 6 cases, of five in 1 of 120.
 """
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """A hypothesis and its verdict. estimate: left minus right; None without runs."""
+    """Verdict on a hypothesis. estimate: left minus right; None without runs."""
 
     hypothesis: Hypothesis
     metric: str
@@ -51,14 +51,14 @@ class Judgement:
 class Results(Scores):
     """All results in the folder of `plan`.
 
-    missing: runs that lack some of theirs. failed: those of them that failed.
+    missing: runs that lack some results. failed: the missing runs that failed.
     """
 
     def __init__(self, plan: Plan) -> None:
         settings = plan.study.settings
         stored = {place: {} for place in product(plan.recipes, plan.evaluations)}
         for run, evaluation in product(plan.runs, plan.evaluations):
-            # Whole evaluations alone: one that is being written would change the means.
+            # Only complete evaluations count: one that is being written would change the means.
             if run.evaluated(evaluation):
                 found = read_results(run.evaluation(evaluation))
                 stored[run.variant, evaluation][run.seed] = found
@@ -70,12 +70,12 @@ class Results(Scores):
 
     @property
     def shared(self) -> str | None:
-        """The first evaluation that judged all of its runs by one protocol; None without one."""
-        # In the order of the study, so that the recipes' own comes first.
+        """First evaluation that used one protocol for all its runs, or None."""
+        # The order is that of the study, so the recipes' own evaluation comes first.
         return next((n for n in self.plan.evaluations if len(self.protocols(n)) == 1), None)
 
     def judgements(self) -> list[Judgement]:
-        """Return the hypotheses, judged, in their order."""
+        """Return the verdicts on all hypotheses, in their order."""
         pairs = zip(self.settings.hypotheses, self.plan.study.contrasts, strict=True)
         return [self._judgement(hypothesis, contrast) for hypothesis, contrast in pairs]
 
@@ -85,13 +85,13 @@ class Results(Scores):
         verdict = UNDECIDED
         reasons = [f"no seed and scene with `{metric}` in all its runs"]
         if found:
-            reasons = [found.too_small or "the interval holds 0"]
+            reasons = [found.too_small or "the interval contains 0"]
             for sign, word in ((contrast.sign, SEEN), (-contrast.sign, CONTRADICTED)):
                 if found.clear(sign):
                     verdict = word
                     reasons = []
             if self.unlike(contrast.terms):
-                reasons.append("judged by unlike protocols")
+                reasons.append("evaluated by different protocols")
         return Judgement(
             hypothesis=hypothesis,
             metric=metric,
@@ -101,9 +101,10 @@ class Results(Scores):
         )
 
     def rank_correlation(self) -> float | None:
-        """Return Spearman's, of our means by the recipes' own evaluation with the published ones.
+        """Return Spearman's rank correlation of our means with the published values.
 
-        None for fewer than five variants, or those of unlike protocols.
+        Our means are from the recipes' own evaluation. None for fewer than five variants or for
+        different protocols.
         """
         published = self.settings.published
         scores = {variant: self.score(variant, self.metric) for variant in published}
@@ -115,7 +116,7 @@ class Results(Scores):
 
 
 def write_files(results: Results) -> Path:
-    """Write results.json and table.md, and return the latter; equal runs differ by `times`."""
+    """Write results.json and table.md; return the path of the latter. Only `times` can vary."""
     study = results.plan.study
     head = "\n\n".join(filter(None, [f"# {study.title}", study.settings.question]))
     table = results.plan.folder / "table.md"
@@ -125,7 +126,7 @@ def write_files(results: Results) -> Path:
 
 
 def answer(results: Results) -> str:
-    """Return in one line if a variant is better than the reference, and how sure that is."""
+    """Return one line that says if a variant is better than the reference, with its interval."""
     text = _verdict(results)
     if results.failed:
         text += f" Failed: {listed(results.failed)}."
@@ -135,10 +136,11 @@ def answer(results: Results) -> str:
 
 
 def _verdict(results: Results) -> str:
-    """Return the verdict by scores alone, of the first evaluation by one protocol.
+    """Return the verdict from scores alone, of the first evaluation by one protocol.
 
-    The best of n is better where the interval at 1 - 0.05 / n says so (Bonferroni): chance has n
-    tries. That all are worse needs no correction, as each must be (an intersection-union test).
+    The best of n variants is better if its interval at 1 - 0.05 / n says so (Bonferroni), because
+    chance has n tries. The claim that all are worse needs no correction: it requires each to be
+    worse (an intersection-union test).
     """
     if results.metric not in results.columns:
         return "Not known yet: no run is finished."
@@ -148,7 +150,7 @@ def _verdict(results: Results) -> str:
     found = results.differences(evaluation)
     if not found:
         return f"Not known yet: {results.reference} and another variant share no finished seed."
-    # One training a side cannot tell a better model from a better seed.
+    # One training per side cannot distinguish a better model from a better seed.
     tested = [name for name, estimate in found.items() if not estimate.too_small]
     sign = sign_of(results.column)
     worse = all(found[name].clear(-sign) for name in tested)
@@ -163,7 +165,7 @@ def _verdict(results: Results) -> str:
     if small:
         word = "Not known"
     where = f" (evaluation `{evaluation}`)" if evaluation else ""
-    # Metrics without a unit are named.
+    # A metric without a unit is shown with its name.
     unit = results.column.unit or results.column.heading
     value = f"{shown(results.column, found[best].mean, '+')} {unit}"
     interval = interval_shown(results.column, judged[best])
@@ -172,21 +174,21 @@ def _verdict(results: Results) -> str:
 
 
 def notes(results: Results) -> list[str]:
-    """Return what is to be known beside the table."""
-    # The table of the recipes' own evaluation is what readers see first.
+    """Return the notes below the tables."""
+    # Readers see the table of the recipes' own evaluation first.
     found = [*interval_notes([*results.differences().values()]), *training_notes(results)]
     if (count := len(results.settings.hypotheses)) > 1:
-        found.append(f"each of {count} verdicts is at 95 % on its own")
+        found.append(f"each of {count} verdicts alone has 95 % confidence")
     if results.missing:
         found.append(f"missing runs: {listed(results.missing)}")
     found += [f"{run} failed: {run.failed}" for run in results.failed]
-    # The order of variants can be as published where sizes cannot.
+    # Our order of variants can match the published one even if the values cannot.
     if (rank := results.rank_correlation()) is not None:
         found.append(f"rank correlation with the published order: {rank:+.2f}")
     for evaluation in results.plan.evaluations:
         where = evaluation or "the recipes' own evaluation"
         if len(results.protocols(evaluation)) > 1:
-            found.append(f"{where}: protocols differ, and no difference is shown between them")
+            found.append(f"{where}: protocols differ, so differences between them are not shown")
         unscored = {s for result in results.results_of(evaluation) for s in result.missing}
         if unscored:
             found.append(f"{where}: no score in some run of {listed(sorted(unscored))}")
@@ -194,7 +196,7 @@ def notes(results: Results) -> list[str]:
 
 
 def study_summary(results: Results) -> Summary:
-    """Return the answer, the verdicts, the table of every evaluation that has results, notes."""
+    """Return the answer, the verdicts, a table for each evaluation with results, and notes."""
     head = ["hypothesis", "metric", "left - right", "95 % interval", "verdict", "of", "note"]
     judged = [_hypothesis_row(results, judgement) for judgement in results.judgements()]
     tables: list[tuple[str, Rows]] = [("", [head, *judged])] if judged else []
@@ -223,7 +225,7 @@ def _hypothesis_row(results: Results, judgement: Judgement) -> list[str]:
 
 
 def record(results: Results) -> dict[str, Any]:
-    """Return everything that the tables say, as plain values, and the times of every run."""
+    """Return the content of all tables as plain values, and the times of every run."""
     table = [row for name in results.plan.evaluations for row in table_records(results, name)]
     return {
         "answer": answer(results),
@@ -246,9 +248,9 @@ def record(results: Results) -> dict[str, Any]:
 
 
 def _times(results: Results) -> Iterator[dict[str, Any]]:
-    """Yield how long every run has trained, which no other machine or day repeats."""
+    """Yield the training time of every run, which differs between machines and days."""
     for run in results.plan.runs:
-        # Of the clock of training, which pauses between sessions do not move.
+        # The clock of training stands still between sessions.
         for last in read_records(run.folder / "history.jsonl")[-1:]:
             times = {name: last[name] for name in ("step", "seconds")}
             yield {"variant": run.variant, "seed": run.seed, **times}

@@ -1,6 +1,6 @@
-"""Runs of a study, a process each: as many at a time as there are workers.
+"""Execution of a study: one process per run, and one run at a time per worker.
 
-A killed process takes nothing with it but its own run's last steps since they were saved.
+A killed process loses only the steps of its run since the last save.
 """
 
 import os
@@ -31,16 +31,16 @@ from qgs_research.studies.runs import Plan, Run, recipe_file, run_of, write_plan
 from qgs_research.studies.study import read_study
 
 WORK = (sys.executable, "-m", "qgs_research.studies.running")
-"""The command of a run's process, before the arguments that `main` takes."""
+"""Command of the process of a run, before the arguments of `main`."""
 
 _SECONDS = 0.3
-"""Between two looks at the processes."""
+"""Seconds between two checks of the processes."""
 
 
 def run_study(
     file: str, out: Path, workers: int, threads: int | None, only: int | None, device: str
 ) -> int:
-    """Do what `qgs study` says; return its exit code."""
+    """Run `qgs study` and return its exit code."""
     console = Console()
     with console.status("composing and checking all variants"):
         plan = planned(read_study(file), out)
@@ -62,7 +62,7 @@ def run_study(
         study_summary(results).show(console)
         print_lines(console, [f"written to {table}"])
     if stopped:
-        print_lines(console, [f"stopped by {stopped.name}; the same command goes on"])
+        print_lines(console, [f"stopped by {stopped.name}; repeat the command to continue"])
         return 128 + stopped
     return int(bool(failed))
 
@@ -76,19 +76,19 @@ def train_missing(
     device: str,
     console: Console,
 ) -> tuple[list[Run], signal.Signals | None]:
-    """Train what is missing of `runs`; return those that failed, and the signal that ended it.
+    """Train the missing `runs`; return those that failed, and the signal that stopped training.
 
-    Waits for runs that another call on this machine has, and continues them if it dies. threads: of
-    each run; None for its share. The workers share the GPUs.
+    It waits for runs of another call on this machine, and continues them if that call dies.
+    threads: CPU threads per run; None for an equal share. The workers share the GPUs.
     """
     threads = threads or max(torch.get_num_threads() // workers, 1)
-    # Set by Slurm, for example: other GPUs belong to others.
+    # Slurm, for example, sets this variable: the other GPUs belong to other jobs.
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     every = map(str, range(torch.cuda.device_count()))
     gpus = [*every] if visible is None else visible.split(",")
     failed = [run for run in runs if run.failed]
     for run in failed:
-        again = f"to train it again, delete {run.failure}, and {run.folder} to begin anew"
+        again = f"to retry, delete {run.failure}; to start from step 0, delete {run.folder} too"
         print_lines(console, [f"{run} failed before: {run.failed}; {again}"])
     processes: dict[Run, Popen[bytes]] = {}
     gpu_of: dict[Run, str] = {}
@@ -98,15 +98,15 @@ def train_missing(
             for run, process in [*processes.items()]:
                 if process.poll() is not None:
                     del processes[run]
-                    # Without either it was stopped, and has saved, or another process has it.
+                    # Otherwise it was stopped and has saved, or another process has it.
                     if plan.done(run) or run.failed or process.returncode:
                         print_lines(console, [_ended(plan, run, process.returncode)])
-                    # One try a call: what failed would most likely fail again at once.
+                    # One try per call: a failed run would probably fail again at once.
                     if run.failed or process.returncode:
                         failed.append(run)
             left = [run for run in runs if run not in failed and not plan.done(run)]
             for run in left:
-                # A process that finds its run taken has imported torch for nothing.
+                # Otherwise a process would import torch before it finds that its run is taken.
                 if len(processes) < workers and run not in processes and is_free(run):
                     used = [gpu_of[other] for other in processes]
                     gpu_of[run] = min(gpus, key=used.count, default="")
@@ -120,8 +120,8 @@ def train_missing(
 
 
 def started(plan: Plan, run: Run, threads: int, device: str, gpu: str) -> Popen[bytes]:
-    """Train `run` in a process of its own, which prints into its log. gpu: "" for any."""
-    # Before the process imports what reads them. A log has no width of its own.
+    """Start a process that trains `run` and prints into its log. gpu: "" for any."""
+    # Libraries read these variables at import. A log has no width of its own.
     names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")
     environment = {**os.environ, **dict.fromkeys(names, str(threads)), "COLUMNS": "100"}
     if gpu:
@@ -136,13 +136,15 @@ def _ended(plan: Plan, run: Run, code: int) -> str:
         return f"{run} is done, {sum(map(plan.done, plan.runs))} of {len(plan.runs)} runs"
     if run.failed:
         return f"{run} failed: {run.failed} (see {run.log})"
-    return f"{run}: its process ended with {code} (see {run.log}); the same command continues it"
+    return (
+        f"{run}: its process ended with {code} (see {run.log}); repeat the command to continue it"
+    )
 
 
 def lock_of(run: Run) -> FileLock:
     """Return the lock of a run; entering it raises Timeout if another process has the run."""
     run.folder.parent.mkdir(parents=True, exist_ok=True)
-    # The kernel releases the lock of a process that dies, so a killed run is free at once.
+    # The kernel releases the lock when a process dies, so a killed run is free at once.
     return FileLock(run.beside("lock"), blocking=False)
 
 
@@ -156,9 +158,9 @@ def is_free(run: Run) -> bool:
 
 
 def main(folder: str, variant: str, seed: str, device: str, *evaluations: str) -> None:
-    """Train a run of the study in `folder`, and evaluate it; what is there already is kept.
+    """Train and evaluate a run of the study in `folder`; existing results are kept.
 
-    Does nothing where another process has the run. An error is written beside the run.
+    It does nothing if another process has the run. An error is written beside the run.
     """
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     run = run_of(Path(folder), variant, int(seed))
@@ -173,21 +175,21 @@ def main(folder: str, variant: str, seed: str, device: str, *evaluations: str) -
 
 
 def _end_with(parent: int) -> None:
-    """Stop, as SIGTERM does, when the process that started this one is gone."""
+    """Stop as after SIGTERM when the parent process has ended."""
     while os.getppid() == parent:
         time.sleep(1.0)
     os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _train_and_evaluate(folder: Path, run: Run, device: str, evaluations: Sequence[str]) -> None:
-    """Do what `run` lacks. Raises whatever training and evaluating raise."""
+    """Do the missing work of `run`; raises the errors of training and evaluation."""
 
     def recipe_of(evaluation: str) -> Recipe:
         return resolve(recipe_file(folder, run.variant, evaluation), [f"seed={run.seed}"])
 
     console = Console()
     result = train(recipe_of(MAIN), run.folder, console=console, device=device, resume=True)
-    # It has saved, and the next call goes on from there.
+    # The training has saved, and the next call continues from there.
     if result.stopped_by:
         return
     for name in evaluations:

@@ -1,4 +1,4 @@
-"""The runs of a study, and the files of its folder."""
+"""The runs of a study and the files in its folder."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from qgs_research.studies.hypotheses import MAIN
 from qgs_research.studies.study import Study
 
 BESIDE = ("seed", "plugins")
-"""What does not make a recipe another model."""
+"""Parts of a recipe that do not change the model."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One training of a variant. folder: where it is, as `qgs train` leaves it."""
+    """Training of a variant with one seed. folder: run folder of `qgs train`."""
 
     variant: str
     seed: int
@@ -31,41 +31,41 @@ class Run:
         return f"{self.variant} seed {self.seed}"
 
     def beside(self, suffix: str) -> Path:
-        """A file beside the folder, such as the lock."""
+        """Return a file beside the folder, such as the lock."""
         return self.folder.with_name(f"{self.folder.name}.{suffix}")
 
     @property
     def log(self) -> Path:
-        """The output of its processes."""
+        """File with the output of its processes."""
         return self.beside("log")
 
     @property
     def failure(self) -> Path:
-        """The reason why it failed, where it did."""
+        """File with the reason of a failure."""
         return self.beside("failed")
 
     @property
     def failed(self) -> str:
-        """Why it failed, the first sentence, until that file is deleted; "" where it did not."""
+        """First sentence of the reason of a failure; "" without that file."""
         if not self.failure.is_file():
             return ""
-        # The rest of the file is advice, and tables have no room for it.
+        # The rest of the file is advice, which has no room in tables.
         first_line = self.failure.read_text(encoding="utf-8").strip().split("\n")[0]
         return first_line.partition(". ")[0]
 
     def evaluation(self, name: str) -> Path:
-        """The folder of its results by one evaluation."""
+        """Return the folder of its results of one evaluation."""
         return self.folder / (f"evaluation-{name}" if name else "evaluation")
 
     def evaluated(self, name: str) -> bool:
-        """True if that evaluation is there, as a whole."""
-        # The last file that an evaluation writes.
+        """Return True if that evaluation is complete."""
+        # An evaluation writes this file last.
         return (self.evaluation(name) / "protocol.json").is_file()
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be trained and evaluated in `folder`. recipes: by variant, with the first seed."""
+    """Runs and evaluations of a study in `folder`. recipes: by variant, with the first seed."""
 
     study: Study
     folder: Path
@@ -73,30 +73,30 @@ class Plan:
 
     @property
     def evaluations(self) -> list[str]:
-        """Names of all evaluations, the recipes' own first."""
+        """Names of all evaluations; the recipes' own comes first."""
         return [MAIN, *self.study.evaluations]
 
     @property
     def runs(self) -> list[Run]:
-        """All runs, every variant with the first seed, then with the next."""
+        """All runs, ordered by seed, then by variant."""
         seeds = self.study.settings.seeds
-        # By seed first: an unfinished study then has whole comparisons.
+        # Seeds come first, so that an unfinished study has complete comparisons.
         return [run_of(self.folder, name, seed) for seed in seeds for name in self.recipes]
 
     @property
     def size(self) -> str:
-        """Such as "4 variants x 3 seeds"."""
+        """Size of the study, for example "4 variants x 3 seeds"."""
         variants = counted(len(self.recipes), "variant")
         return f"{variants} x {counted(len(self.study.settings.seeds), 'seed')}"
 
     def evaluation_recipe(self, variant: str, evaluation: str) -> Recipe:
-        """The recipe of a variant as an evaluation changes it."""
+        """Return the recipe of a variant as changed by an evaluation."""
         recipe = self.recipes[variant]
         changes = self.study.evaluations.get(evaluation)
         return changed_recipe(recipe, changes) if changes else recipe
 
     def done(self, run: Run) -> bool:
-        """True if nothing of `run` is missing."""
+        """Return True if no result of `run` is missing."""
         return all(map(run.evaluated, self.evaluations))
 
 
@@ -106,28 +106,28 @@ def run_of(folder: Path, variant: str, seed: int) -> Run:
 
 
 def recipe_file(folder: Path, variant: str, evaluation: str = MAIN) -> Path:
-    """The resolved recipe of the runs of a variant, in training or as an evaluation changes it."""
-    # No name has an @: hypotheses write it between a variant and an evaluation, too.
+    """Return the file of a variant's resolved recipe, for training or for an evaluation."""
+    # Names have no @, which separates variant and evaluation in hypotheses too.
     name = f"{variant}@{evaluation}" if evaluation else variant
     return folder / "variants" / f"{name}.yaml"
 
 
 def changed_recipe(recipe: Recipe, changes: MapNode) -> Recipe:
-    """Return `recipe` as an evaluation changes it; raises RecipeError."""
+    """Return `recipe` with the changes of an evaluation; raises RecipeError."""
     tree = from_plain(recipe.tree, Origin("the variant"))
     assert isinstance(tree, MapNode)
     return resolve(merge(tree, changes))
 
 
 def write_plan(plan: Plan) -> None:
-    """Write the recipes that the runs' processes read."""
+    """Write the recipes that the processes of the runs read."""
     for variant, evaluation in product(plan.recipes, plan.evaluations):
-        # With the file and line that set each value, for those who read the folder.
+        # Include the file and line that set each value, for readers of the folder.
         text = annotated(plan.evaluation_recipe(variant, evaluation))
         write_text(recipe_file(plan.folder, variant, evaluation), f"{text}\n")
 
 
 def differences(ours: Recipe, theirs: Recipe) -> dict[str, tuple[str | None, str | None]]:
-    """Return options in which two recipes differ, seeds and names of plugins aside."""
+    """Return the options in which two recipes differ, except seeds and names of plugins."""
     found = differing_options(ours.tree, theirs.tree)
     return {path: values for path, values in found.items() if path not in BESIDE}

@@ -1,4 +1,4 @@
-"""Scores of models by evaluation and seed: means, differences to a reference, baselines."""
+"""Scores of models: means, differences to a reference, and baselines."""
 
 from collections import defaultdict
 from collections.abc import Mapping
@@ -21,9 +21,9 @@ Terms: TypeAlias = Mapping[tuple[str, str], int]
 
 @dataclass
 class Scores:
-    """Results by model and evaluation, then by seed. reference: the model that others are held to.
+    """Results by model and evaluation, then by seed. reference: the model to compare others with.
 
-    metric: the one that decides. across_protocols: whether numbers of two protocols are compared.
+    metric: the metric that decides. across_protocols: True to compare results of two protocols.
     """
 
     stored: Mapping[tuple[str, str], Runs]
@@ -33,7 +33,7 @@ class Scores:
 
     @cached_property
     def columns(self) -> dict[str, Column]:
-        """How values are shown, of all metrics: models may have some that others lack."""
+        """Format of the values of all metrics, also of those that only some models have."""
         columns: dict[str, Column] = {}
         for runs in self.stored.values():
             for result in runs.values():
@@ -42,15 +42,15 @@ class Scores:
 
     @property
     def column(self) -> Column:
-        """How the metric that decides is shown; raises KeyError without results."""
+        """Format of the metric that decides; raises KeyError without results."""
         return self.columns[self.metric]
 
     def models(self, evaluation: str = MAIN) -> list[str]:
-        """Return models that have results by `evaluation`."""
+        """Return the models that have results of `evaluation`."""
         return [name for (name, of), runs in self.stored.items() if of == evaluation and runs]
 
     def score(self, model: str, metric: str, evaluation: str = MAIN) -> Estimate | None:
-        """Return the mean of a model; None where it has no values of the metric."""
+        """Return the mean of a model; None if it has no values of the metric."""
         return self.estimate({(model, evaluation): 1}, metric)
 
     def difference(
@@ -60,12 +60,12 @@ class Scores:
         evaluation: str = MAIN,
         confidence: float = CONFIDENCE,
     ) -> Estimate | None:
-        """Return a model minus the reference.
+        """Return the difference of a model minus the reference.
 
-        None of the reference itself, and where the two were not judged by one protocol.
+        None for the reference itself, and if the two were evaluated by different protocols.
         """
         terms = {(model, evaluation): 1, (self.reference, evaluation): -1}
-        # Numbers of two protocols do not measure the same.
+        # Values of two protocols do not measure the same.
         if model == self.reference or (self.unlike(terms) and not self.across_protocols):
             return None
         return self.estimate(terms, metric, confidence)
@@ -73,7 +73,7 @@ class Scores:
     def differences(
         self, evaluation: str = MAIN, confidence: float = CONFIDENCE
     ) -> dict[str, Estimate]:
-        """Return the differences in the metric that decides, by model, where there are any."""
+        """Return the differences in the metric that decides, for models that have one."""
         found: dict[str, Estimate] = {}
         for model in self.models(evaluation):
             if apart := self.difference(model, self.metric, evaluation, confidence):
@@ -83,18 +83,18 @@ class Scores:
     def estimate(
         self, terms: Terms, metric: str, confidence: float = CONFIDENCE
     ) -> Estimate | None:
-        """Return the sum of means that `terms` weigh; None where they share no seed or scene."""
+        """Return the sum of means with weights `terms`; None without a common seed and scene."""
         parts = [(self.stored.get(term, {}), weight) for term, weight in terms.items()]
         return estimate(parts, metric, confidence)
 
     def baselines(self, evaluation: str = MAIN) -> dict[str, dict[str, float]]:
-        """Return means over scenes of what needs no model, by name and metric.
+        """Return means over scenes of the baselines, by name and metric.
 
-        None where an evaluation has several protocols, which have baselines each.
+        The result is empty if an evaluation has several protocols, each with its own baselines.
         """
         if len(self.protocols(evaluation)) != 1:
             return {}
-        # Any run will do: baselines see the photos, not the model.
+        # Any run is enough, because baselines do not depend on the model.
         scenes = self.results_of(evaluation)[0].scenes.values()
         found: dict[str, dict[str, float]] = defaultdict(dict)
         for name, metric in product(BASELINES, self.columns):
@@ -104,17 +104,17 @@ class Scores:
         return found
 
     def protocols(self, evaluation: str) -> set[str]:
-        """Return hashes of all protocols by which `evaluation` judged."""
+        """Return the hashes of all protocols that `evaluation` used."""
         return {result.protocol.sha256 for result in self.results_of(evaluation)}
 
     def results_of(self, evaluation: str) -> list[StoredResults]:
-        """Return the results of all runs by `evaluation`."""
+        """Return the results of `evaluation` for all runs."""
         parts = (runs for (_, of), runs in self.stored.items() if of == evaluation)
         return [result for runs in parts for result in runs.values()]
 
     def unlike(self, terms: Terms) -> bool:
-        """Return True if terms of one evaluation weigh numbers of unlike protocols."""
-        # Terms of one protocol may cancel: `A@two - B@two < C - D` compares like with like twice.
+        """Return True if the terms combine values of different protocols in one evaluation."""
+        # Each evaluation may have its own protocol: `A@two - B@two < C - D` is a valid comparison.
         sums: dict[tuple[str, str], int] = defaultdict(int)
         for (model, evaluation), weight in terms.items():
             runs = self.stored.get((model, evaluation), {}).values()

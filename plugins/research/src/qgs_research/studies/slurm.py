@@ -1,4 +1,4 @@
-"""`qgs slurm`: jobs that save before their time is over; started again, they go on."""
+"""The command `qgs slurm`: jobs that save before their time ends and continue later."""
 
 import shlex
 import sys
@@ -11,24 +11,27 @@ import typer
 
 from qgs.cli.options import Device
 
-app = typer.Typer(help="Write jobs for Slurm that save before their time ends, and go on.")
+app = typer.Typer(help="Write Slurm jobs that save before their time ends and continue later.")
 
 
-# Options that this command does not have are those of `qgs train`.
+# Unknown options are passed on to `qgs train`.
 @app.command(context_settings={"ignore_unknown_options": True})
 def train(
     words: Annotated[
-        list[str], typer.Argument(metavar="RECIPE --out RUN ...", help="As `qgs train` takes them.")
+        list[str],
+        typer.Argument(
+            metavar="RECIPE --out RUN ...", help="Arguments and options of `qgs train`."
+        ),
     ],
-    gpus: Annotated[int, typer.Option(min=1, help="GPUs of one node, a process each.")] = 1,
+    gpus: Annotated[int, typer.Option(min=1, help="GPUs on one node, one process each.")] = 1,
 ) -> None:
-    """Write RUN.slurm.sh, which trains on the GPUs of a node. RECIPE and options: `qgs train`."""
+    """Write RUN.slurm.sh, which runs `qgs train` with these arguments on the GPUs of a node."""
     from qgs.cli import app as qgs
     from qgs.evaluate.plan import read_index
     from qgs.recipe import resolve
 
     group: Any = typer.main.get_command(qgs)
-    # Parsed as `qgs train` does: what it would refuse is refused now, not when the job starts.
+    # Parse as `qgs train` does, so that errors appear now and not when the job starts.
     given = group.commands["train"].make_context("qgs train", [*words]).params
     recipe = resolve(given["recipe"], given["overrides"] or ())
     read_index(recipe.evaluation.index)
@@ -53,10 +56,10 @@ def study(
         str, typer.Argument(metavar="STUDY", help="Study file, or one that comes with qgs.")
     ],
     out: Annotated[Path, typer.Option(help="Folder of the study.")],
-    threads: Annotated[int, typer.Option(min=1, help="CPU threads of a run.")] = 1,
+    threads: Annotated[int, typer.Option(min=1, help="CPU threads per run.")] = 1,
     device: Device = "auto",
 ) -> None:
-    """Write OUT/slurm.sh, an array with a task for each missing run of a study."""
+    """Write OUT/slurm.sh, a job array with a task for each missing run of a study."""
     from qgs_research.studies.plan import planned
     from qgs_research.studies.study import read_study
 
@@ -65,7 +68,9 @@ def study(
         str(number) for number, run in enumerate(plan.runs) if not plan.done(run) and not run.failed
     ]
     if not missing:
-        raise ValueError(f"{out} lacks no run: `qgs study` with --workers 0 writes its tables")
+        raise ValueError(
+            f"no run is missing in {out}; write its tables by `qgs study` with --workers 0"
+        )
     words = ["study", file, "--out", str(plan.folder), "--threads", str(threads)]
     workers = max(recipe.training.workers for recipe in plan.recipes.values())
     _write_job(
@@ -83,7 +88,7 @@ def study(
 def _write_job(
     script: Path, words: Sequence[str], *, template: str, name: str, log: Path, **values: Any
 ) -> None:
-    """Write `script` for sbatch, which runs Python with `words` in this folder."""
+    """Write the sbatch file `script`, which runs Python with `words` in this folder."""
     from qgs.files import write_text
 
     text = files("qgs_research.studies").joinpath("template", template).read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Results that `qgs eval` wrote, read back."""
+"""Reader of the results that `qgs eval` writes."""
 
 import csv
 import json
@@ -16,12 +16,12 @@ from qgs.recipe.yaml_text import load_mapping
 
 @dataclass(frozen=True)
 class StoredResults:
-    """Results of one evaluation. name: the folder, as it was given.
+    """Results of one evaluation. name: path of the folder as given.
 
-    scenes: `SceneScore.values` of the evaluated scenes. frames: their input and target frames, as
-    scenes.csv writes them. columns, missing and step as in
-    `Evaluation`. recipe, seed: of a run folder; its resolved recipe as JSON without seed and
-    evaluation. trained: what decides how much a training learns, by name.
+    scenes: `SceneScore.values` of the evaluated scenes. frames: their input and target frames as in
+    scenes.csv. columns, missing, step: as in `Evaluation`. recipe, seed: those of the run folder,
+    the resolved recipe as JSON without seed and evaluation. trained: data, duration and other
+    facts about the training, by name.
     """
 
     name: str
@@ -36,12 +36,12 @@ class StoredResults:
     trained: Mapping[str, str] = field(default_factory=dict)
 
     def scores(self, metric: str, scenes: Iterable[str]) -> list[float]:
-        """Return values of the model in these scenes; raises KeyError where one has none."""
+        """Return the values of the model in these scenes; raises KeyError if one is missing."""
         return [self.scenes[scene][f"model_{metric}"] for scene in scenes]
 
 
 def scenes_with(metric: str, results: Sequence[StoredResults]) -> list[str]:
-    """Return the scenes in which all of `results` have the metric, in the order of the first."""
+    """Return the scenes with the metric in all `results`, in the order of the first."""
     # scenes.csv has the baselines' values too.
     value = f"model_{metric}"
     scenes = common_scenes(results)
@@ -49,14 +49,14 @@ def scenes_with(metric: str, results: Sequence[StoredResults]) -> list[str]:
 
 
 def common_scenes(results: Sequence[StoredResults]) -> list[str]:
-    """Return the scenes that all of `results` have, in the order of the first."""
+    """Return the scenes in all `results`, in the order of the first."""
     first = results[0].scenes if results else {}
     return [scene for scene in first if all(scene in one.scenes for one in results)]
 
 
 def moved_scenes(results: Sequence[StoredResults]) -> list[str]:
-    """Return scenes that all of `results` judged, but not on the same frames."""
-    # Protocols that draw views name no frames: the data decides.
+    """Return the scenes in all `results` that were not evaluated on the same frames."""
+    # A protocol that draws views names no frames; they depend on the data.
     scenes = common_scenes(results)
     return [scene for scene in scenes if len({one.frames[scene] for one in results}) > 1]
 
@@ -64,15 +64,15 @@ def moved_scenes(results: Sequence[StoredResults]) -> list[str]:
 def read_results(path: str | Path) -> StoredResults:
     """Return the results in `path`: a folder that `qgs eval` wrote, or a run folder with one.
 
-    Raises FileNotFoundError when there are none, ValueError when they cannot be read.
+    Raises FileNotFoundError if there are none, ValueError if they cannot be read.
     """
-    # A folder of `qgs eval` itself, or the one that a training leaves.
+    # `path` is a folder of `qgs eval`, or the run folder of a training.
     folders = (Path(path), Path(path) / "evaluation")
     folder = next((folder for folder in folders if (folder / "summary.json").is_file()), None)
     if folder is None:
         raise FileNotFoundError(
-            f"no results in {path}; give a folder that `qgs eval` wrote, or a run folder with an "
-            "evaluation/ in it"
+            f"no results in {path}; give a folder that `qgs eval` wrote, or a run folder that "
+            "has evaluation/"
         )
     try:
         return _read(folder, str(path))
@@ -90,7 +90,7 @@ def _read(folder: Path, name: str) -> StoredResults:
     frames: dict[str, tuple[str, str]] = {}
     with (folder / "scenes.csv").open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
-            # A scene without a score has a row too.
+            # A scene without a score also has a row.
             if row.pop("problem"):
                 continue
             scene = row["scene"]
@@ -109,11 +109,11 @@ def _read(folder: Path, name: str) -> StoredResults:
 
 
 def _training(recipe: Path) -> dict[str, Any]:
-    """Return recipe, seed and `trained` of the run of a resolved recipe; {} without the file."""
+    """Return recipe, seed and `trained` of the run with this resolved recipe; {} without it."""
     if not recipe.is_file():
         return {}
     tree = load_mapping(recipe.read_text(encoding="utf-8"), str(recipe), Problems())
-    # Trainings that differ in nothing but these are one side of a comparison.
+    # Trainings that differ only in these values are one side of a comparison.
     seed = tree.pop("seed")
     del tree["evaluation"]
     names = ("steps", "seconds", "batch_size")

@@ -1,4 +1,4 @@
-"""A study as it is written: variants, seeds, a budget, evaluations, hypotheses."""
+"""Study files: variants, seeds, a budget, evaluations and hypotheses."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -20,18 +20,18 @@ from qgs.wording import did_you_mean
 from qgs_research.studies.hypotheses import NAME, Contrast, parsed
 
 _BY_NAME = ("variants", "evaluations", "published")
-"""Keys whose entries a study that extends another replaces one by one."""
+"""Keys whose entries are replaced one by one by a study that extends another."""
 
 
 def _folder_name(name: str) -> str:
     if not re.fullmatch(NAME, name):
-        fix = "use letters, digits, `_` and `.`, the first one no `.`"
-        raise OptionError(f"{name!r} cannot be a folder or stand in hypotheses", fix)
+        fix = "use letters, digits, `_` and `.`, but no `.` at the start"
+        raise OptionError(f"{name!r} cannot name a folder or a term of a hypothesis", fix)
     return name
 
 
 def _variant_name(name: str, info: ValidationInfo) -> str:
-    # Without variants, which were refused, no name is known.
+    # If the variants were refused, no name is known.
     variants = info.data.get("variants", {name: None})
     if name not in variants:
         fix = did_you_mean(name, variants, "variants")
@@ -52,30 +52,32 @@ Section: TypeAlias = Annotated[str, AfterValidator(_evaluation_section)]
 
 
 class Budget(ComponentConfig):
-    """What each run may use: one of the two."""
+    """Budget of each run, either steps or seconds."""
 
     steps: int | None = Field(default=None, ge=1)
-    """Optimiser steps: the only budget that a busy machine does not change."""
+    """Number of optimiser steps, which does not depend on the machine. Default: use seconds."""
     seconds: float | None = Field(default=None, gt=0)
-    """Seconds on the clock of training; how many steps that were is shown."""
+    """Seconds of training time. Default: use steps. Tables show the number of steps."""
 
     @model_validator(mode="after")
     def _is_one(self) -> "Budget":
         if (self.steps is None) == (self.seconds is None):
-            raise OptionError("a budget is steps or seconds", "write `budget: {steps: 2000}`")
+            raise OptionError(
+                "a budget is either steps or seconds", "write `budget: {steps: 2000}`"
+            )
         return self
 
 
 class Hypothesis(ComponentConfig):
-    """A claim about means, checked when the runs are done."""
+    """Claim about means, checked when the runs are done."""
 
     claim: str
-    """`A < B` or `A > B` of variants; each side may be a sum such as `A@noisy - A`, with the name
-    of an evaluation behind the @."""
+    """Claim `A < B` or `A > B` about variants. Each side may be a sum such as `A@noisy - A`, with
+    the name of an evaluation after the @."""
     metric: str | None = None
-    """What is compared; null for the study's metric."""
+    """Metric to compare. Null: the study's metric."""
     note: str = ""
-    """What else is to be known, such as what a paper says; shown beside the verdict."""
+    """Remark to show beside the verdict, for example the value in a paper."""
 
     @model_validator(mode="before")
     @classmethod
@@ -90,39 +92,39 @@ def _known_terms(hypothesis: Hypothesis, info: ValidationInfo) -> Hypothesis:
 
 
 class StudySettings(ComponentConfig):
-    """A study as its file has it, with the files that it extends.
+    """Content of a study file and the files that it extends.
 
-    A field is checked against those before it: variants and evaluations come first.
+    Each field is checked against earlier fields, so variants and evaluations come first.
     """
 
     study: int = Field(ge=1, le=1)
     """Version of the format."""
     title: str = ""
-    """Heading of the page; empty takes the file's name."""
+    """Heading of the page. Empty: the file's name."""
     question: str = ""
-    """What the study is to answer, in a sentence or more."""
+    """Question that the study answers, in one or more sentences."""
     base: Any = None
-    """Recipe, or several laid over each other, that variants are laid over."""
+    """Recipe that variants change, or a list of recipes, where later ones change earlier ones."""
     overlay: dict[str, Any] = Field(default_factory=dict)
-    """Part of a recipe that is laid over every variant."""
+    """Part of a recipe that changes every variant. Default: no change."""
     variants: dict[Name, dict[str, Any] | None] = Field(min_length=1, max_length=200)
-    """A recipe file, or the part of a recipe, by name. Each takes a tenth of a second to check."""
+    """Recipe file or part of a recipe, by name. Null: the base. Each takes 0.1 s to check."""
     evaluations: dict[Name, dict[Section, Any]] = Field(default_factory=dict)
-    """What is changed before every trained model is judged once more, by name."""
+    """Further evaluations by name: changes of the recipe before every model is evaluated again."""
     seeds: tuple[int, ...] = Field(default=(0, 1, 2), min_length=1)
-    """One run of each variant for each: the model's start, and which data it sees in what order."""
+    """Seeds of the runs of each variant. A seed sets initial weights, data and its order."""
     reference: VariantName
-    """The variant that the others are held against."""
+    """Variant to compare the others with."""
     budget: Budget
-    """The same for all variants."""
+    """Budget of each run, the same for all variants."""
     metric: str = "psnr"
-    """The value that decides, as evaluations call it."""
+    """Metric that decides, by its name in evaluations."""
     differs: tuple[str, ...] = ()
-    """Options of data, views, training, evaluation and metrics in which variants may differ."""
+    """Options outside model and optimiser in which variants may differ."""
     hypotheses: tuple[Annotated[Hypothesis, AfterValidator(_known_terms)], ...] = ()
-    """What is expected; a text stands for its claim."""
+    """Claims to check. A plain text is read as the claim."""
     published: dict[VariantName, float] = Field(default_factory=dict)
-    """The metric as published, by variant: shown beside ours, with the rank correlation."""
+    """Published values of the metric by variant, to show beside ours with the rank correlation."""
 
     @field_validator("seeds")
     @classmethod
@@ -136,10 +138,10 @@ class StudySettings(ComponentConfig):
 
 @dataclass(frozen=True)
 class Study:
-    """A study that was read. file: where it is written.
+    """Study that was read from `file`.
 
-    variants: by name what `qgs.recipe.resolve` takes. evaluations: by name what is laid over a
-    trained recipe before its model is judged once more. Both know where they are written.
+    variants: recipes by name, as input of `qgs.recipe.resolve`. evaluations: changes of the trained
+    recipe by name of the evaluation. Both keep the file and line of each value.
     """
 
     file: Path
@@ -149,26 +151,26 @@ class Study:
 
     @property
     def title(self) -> str:
-        """The heading."""
+        """Heading of the study."""
         return self.settings.title or self.file.stem.replace("_", " ")
 
     @cached_property
     def contrasts(self) -> Sequence[Contrast]:
-        """The hypotheses as sums of means."""
+        """Hypotheses as sums of means."""
         claims = [hypothesis.claim for hypothesis in self.settings.hypotheses]
         return [parsed(claim, self.variants, self.evaluations) for claim in claims]
 
 
 def read_study(file: str | Path) -> Study:
-    """Return the study in `file`, or the one of that name that comes with qgs.
+    """Return the study in `file`, or the study of that name that comes with qgs.
 
-    Nothing is composed yet. Raises RecipeError with all that is wrong with it, by file and line.
+    Variants are not composed yet. Raises RecipeError with all faults by file and line.
     """
     problems = Problems("study")
     found = found_recipe(Path(file), str(file))
     tree = _read(found, problems, ())
     for name, written, origin in tree.child("variants").entries():
-        # A file name is a recipe that changes nothing of that file.
+        # A file name stands for a recipe that changes nothing in that file.
         if isinstance(written, str):
             tree["variants"][name] = MapNode(origin, [("extends", written, origin)])
     settings = decode_config(StudySettings, tree, (), problems)
@@ -183,7 +185,7 @@ def read_study(file: str | Path) -> Study:
 
 
 def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
-    """Return the tree of `file` over that of the study that it extends."""
+    """Return the tree of `file`, merged over that of the study that it extends."""
     try:
         with open_file(file) as opened:
             text = opened.read().decode("utf-8")
@@ -195,7 +197,7 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
     if extended is None:
         return tree
     if not isinstance(extended, str) or file in chain:
-        reason = "`extends` names one other study, and no circle of them"
+        reason = "`extends` must name one other study, without a cycle"
         fix = "write `extends: other.yaml`, relative to this file"
         problems.stop(tree.origins["extends"], "extends", reason, fix)
     base = _read(found_recipe(file.parent / extended, extended), problems, (*chain, file))
@@ -205,7 +207,7 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
             if key == "overlay":
                 value = merge(old, value)
             elif key in _BY_NAME:
-                # Null drops an entry; a variant that is new and null is the base itself.
+                # Null removes an entry, but a new variant that is null is the base itself.
                 dropped = [name for name in value if value[name] is None and name in old]
                 kept = old.without(*value).entries()
                 value = MapNode(origin, [*kept, *value.without(*dropped).entries()])
@@ -215,13 +217,13 @@ def _read(file: Path, problems: Problems, chain: tuple[Path, ...]) -> MapNode:
 
 
 def _variant(tree: MapNode, name: str, problems: Problems) -> MapNode:
-    """Return the recipe of a variant: the base or what it extends, the variant, the overlay."""
+    """Return the recipe of a variant: its base, changed by the variant, then by the overlay."""
     variants = tree.child("variants")
     origin = variants.origins[name]
     node = variants.child(name)
     holder, key = (node, "extends") if "extends" in node else (tree, "base")
     if holder.get(key) is None:
-        reason = f"`{name}` has neither a recipe of its own nor a `base` to be laid over"
+        reason = f"`{name}` has no recipe of its own, and the study has no `base`"
         fix = "add `base: RECIPE.yaml`, or `extends` here"
         problems.add(origin, f"variants.{name}", reason, fix)
         return node
@@ -243,11 +245,11 @@ def _variant(tree: MapNode, name: str, problems: Problems) -> MapNode:
 
 
 def _locate_index(node: MapNode) -> None:
-    """Make the name of an index hold anywhere: it may be relative to the study that has it."""
+    """Make the path of an index absolute if it is relative to the study file."""
     section = node.child("evaluation")
     index = section.get("index")
     if isinstance(index, str):
         file = Path(section.origins["index"].file).parent / index
-        # Otherwise it is relative to the working directory, as in a recipe.
+        # Otherwise the path is relative to the working directory, as in a recipe.
         if file.is_file():
             section["index"] = str(file.resolve())

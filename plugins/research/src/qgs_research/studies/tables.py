@@ -1,4 +1,4 @@
-"""Tables of scores with what is said above and below: on the terminal, as Markdown and JSON."""
+"""Tables of scores with text above and below, for the terminal, Markdown and JSON."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ Rows: TypeAlias = Sequence[Sequence[str]]
 
 @dataclass(frozen=True)
 class Summary:
-    """Results in words and tables. answer: one line, or "". tables: titles and rows."""
+    """Results as text and tables. answer: one line, or "". tables: titles and rows."""
 
     answer: str
     tables: Sequence[tuple[str, Rows]]
@@ -36,7 +36,7 @@ class Summary:
 
     @property
     def markdown(self) -> str:
-        """Text of a Markdown file."""
+        """Content of a Markdown file."""
         parts = [self.answer]
         for title, rows in self.tables:
             parts += [f"**{title}**" if title else "", markdown_table(rows)]
@@ -45,7 +45,7 @@ class Summary:
 
 
 def markdown_table(rows: Rows) -> str:
-    """Return rows of equal length as a Markdown table; numbers to the right."""
+    """Return rows of equal length as a Markdown table with numbers aligned to the right."""
     rule = [":---", *["---:"] * (len(rows[0]) - 1)]
     lines = [[cell.replace("|", "\\|") for cell in row] for row in (rows[0], rule, *rows[1:])]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
@@ -58,7 +58,7 @@ def table_rows(
     others: Sequence[str] = (),
     published: Mapping[str, float] | None = None,
 ) -> Rows:
-    """Return a row for each model and baseline: a metric in full, means of `others`."""
+    """Return a row per model and baseline: all values of a metric, and means of `others`."""
     column = scores.columns[metric]
     head = [column.title, "sd", "difference", "95 % interval"]
     head += ["published"] if published else []
@@ -82,7 +82,7 @@ def table_rows(
             row.append(shown(scores.columns[name], other.mean if other else None))
         runs = scores.stored[model, evaluation].values()
         rows.append([*row, str(len(runs)), steps_shown(runs)])
-    # Baselines stand below the models: they were not trained.
+    # Baselines come after the models, because they were not trained.
     for name, values in scores.baselines(evaluation).items():
         first, *rest = [shown(scores.columns[m], values.get(m)) for m in (metric, *others)]
         dashes = ["–"] * (len(head) - 1 - len(rest))
@@ -91,14 +91,14 @@ def table_rows(
 
 
 def steps_shown(runs: Iterable[StoredResults]) -> str:
-    """Return steps of runs: 2,100, or from the fewest to the most where they differ."""
+    """Return the number of steps of runs, for example 2,100, or a range if they differ."""
     # Budgets in seconds end at different steps.
     steps = sorted({stored.step for stored in runs if stored.step is not None})
     return " to ".join(f"{step:,}" for step in (*steps[:1], *steps[1:][-1:])) or "–"
 
 
 def table_records(scores: Scores, evaluation: str = MAIN) -> Iterator[dict[str, Any]]:
-    """Yield mean and difference to the reference, by model and metric, as plain values."""
+    """Yield mean and difference to the reference for each model and metric as plain values."""
     for model in scores.models(evaluation):
         for metric in scores.columns:
             if score := scores.score(model, metric, evaluation):
@@ -114,7 +114,7 @@ def table_records(scores: Scores, evaluation: str = MAIN) -> Iterator[dict[str, 
 
 
 def training_notes(scores: Scores) -> Iterator[str]:
-    """Yield which models were trained on other data than the reference, or longer."""
+    """Yield a note for each model that was trained on other data than the reference, or longer."""
 
     def facts(model: str) -> set[tuple[str, str]]:
         return {fact for run in scores.stored[model, MAIN].values() for fact in run.trained.items()}
@@ -122,16 +122,16 @@ def training_notes(scores: Scores) -> Iterator[str]:
     theirs = facts(scores.reference)
     for model in scores.models():
         ours = facts(model)
-        # Results without a run folder do not say how they were trained.
+        # Results without a run folder do not include how the model was trained.
         known = dict(ours).keys() & dict(theirs).keys()
         if unequal := sorted(known & dict(ours ^ theirs).keys()):
-            yield f"{model} was not trained as {scores.reference}: {listed(unequal)} differ"
+            yield f"{model} was trained otherwise than {scores.reference}: {listed(unequal)} differ"
 
 
 def interval_notes(differences: Iterable[Estimate]) -> Iterator[str]:
-    """Yield what intervals cover."""
+    """Yield notes about the scope of the intervals."""
     seeds = {len(estimate.seeds) for estimate in differences}
     if max(seeds, default=0) > 1:
         yield "intervals: 95 %, over trainings and scenes; sd: over seeds"
     if 1 in seeds:
-        yield "one training a side: its interval covers scenes alone"
+        yield "an interval from one training per side covers scenes alone"

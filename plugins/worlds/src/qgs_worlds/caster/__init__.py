@@ -1,1 +1,1 @@
-"""The ray caster that draws rooms and worlds, and the tables that describe scenes to it."""
+"""The ray caster for rooms and worlds, and the tables that describe scenes to it."""

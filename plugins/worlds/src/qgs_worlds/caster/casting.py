@@ -1,4 +1,4 @@
-"""Images and depth maps of scenes, in bands of rows, which threads share."""
+"""Images and depth maps of scenes, computed by threads in bands of rows."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -26,10 +26,10 @@ def cast(
     paint: Callable[..., None] | None = None,
     images: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return depths (F, samples H, samples W) float32: z of the rays, inf in the sky.
+    """Return depths (F, samples H, samples W) float32, the z of each ray, inf in the sky.
 
     c2w: OpenCV. intrinsics: in pixels. paint: kernel that colours a band of `images` (F, H, W, 3)
-    by the means of samples^2 rays.
+    with the means of samples^2 rays.
     """
     height, width = size
     depths = np.empty((len(c2w), samples * height, samples * width), np.float32)
@@ -50,6 +50,6 @@ def cast(
             band(place)
         return depths
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        # the list raises what a thread raised
+        # reading the results raises the errors of the threads
         list(pool.map(band, bands))
     return depths

@@ -1,4 +1,4 @@
-"""What a camera makes of light: exposure, white balance, tone curve, vignette, noise, JPEG."""
+"""Effects of a camera: exposure, white balance, tone curve, vignette, noise and JPEG."""
 
 import io
 import math
@@ -10,9 +10,9 @@ from PIL import Image
 
 from qgs_worlds.caster.vectors import INNER, OPTIONS
 
-# Of full brightness, from where on highlights are compressed.
+# Share of full brightness above which highlights are compressed.
 _SHOULDER = 0.6
-# Of the table of the tone curve, over the square root of light, which spends it on dark tones.
+# Step of the tone curve's table over the square root of light, which is finer for dark tones.
 _STEP = 1 / 512
 _ENTRIES = 2048
 
@@ -28,7 +28,7 @@ def _scrambled(i, j, seed):
 
 @njit(**OPTIONS)
 def _curve(gamma):
-    """Return what becomes of the square root of light, from 0 on in steps of `_STEP`."""
+    """Return the tone curve for the square root of light, from 0 in steps of `_STEP`."""
     table = np.empty(_ENTRIES)
     for i in range(_ENTRIES):
         value = (i * _STEP) ** (2.0 / gamma)
@@ -49,22 +49,22 @@ def _develop(image, light, gains, gamma, vignette, grain, seed, frame):
             y = 2 * i + 1 - height
             x = 2 * j + 1 - width
             edge = 1.0 - vignette * (x * x + y * y) * reach
-            # a hash in place of a generator, so that threads and frames need no order
+            # a hash instead of a generator, so that threads and frames need no order
             h = _scrambled(i * width + j, frame, seed)
             for c in range(3):
                 value = math.sqrt(max(light[i, j, c] * gains[c] * edge, 0.0))
                 value = 255 * curve[min(int(value * (1 / _STEP) + 0.5), _ENTRIES - 1)]
-                # two uniform numbers for each colour: near enough to a normal one
+                # two uniform numbers for each colour are close enough to a normal one
                 value += grain * (((h >> 10 * c) & 31) + ((h >> (10 * c + 5)) & 31) - 31)
                 image[i, j, c] = int(min(max(value, 0.0), 255.0) + 0.5)
 
 
 @dataclass(frozen=True)
 class Effects:
-    """A camera: how it makes a photo of light.
+    """Effects of a camera that turn light into a photo.
 
-    gains: (3,) of R, G and B. gamma: exponent of the tone curve. vignette: darkening towards the
-    corners. noise: standard deviation. seed: of the noise. quality: of a JPEG file, 0 for none.
+    gains: (3,) for R, G and B. gamma: exponent of the tone curve. vignette: darkening towards the
+    corners. noise: standard deviation. seed: seed of the noise. quality: JPEG quality, 0 for none.
     """
 
     gains: np.ndarray
@@ -75,14 +75,14 @@ class Effects:
     quality: int = 0
 
     def photo(self, light: np.ndarray, frame: int) -> np.ndarray:
-        """Return the image (H, W, 3) uint8 of linear light (H, W, 3). frame: draws the noise."""
+        """Return the photo (H, W, 3) uint8 of linear light (H, W, 3). frame: seeds the noise."""
         image = np.empty(light.shape, np.uint8)
         # the sum of two numbers of 0 to 31 has a standard deviation of 13.06
         grain = 255 / 13.06 * self.noise
         _develop(image, light, self.gains, self.gamma, self.vignette, grain, self.seed, frame)
         if not self.quality:
             return image
-        # as a JPEG file of that quality keeps it
+        # compress and decompress as a JPEG file of that quality
         file = io.BytesIO()
         Image.fromarray(image).save(file, "JPEG", quality=self.quality)
         return np.asarray(Image.open(file))

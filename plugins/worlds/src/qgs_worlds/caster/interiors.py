@@ -1,4 +1,4 @@
-"""Colours of what rays meet in furnished rooms: even light, a lamp, a window, soft shadows."""
+"""Colours of surfaces in furnished rooms: even light, a lamp, a window and soft shadows."""
 
 import math
 
@@ -11,20 +11,20 @@ from qgs_worlds.caster.patterns import mixture, smooth
 from qgs_worlds.caster.shading import TAKEN, on_axis, to_world
 from qgs_worlds.caster.vectors import INNER, OPTIONS, along, dot, minus, mix, narrow, times, triple
 
-# How much of the light the lamp's shadow takes.
+# Share of the light that the lamp's shadow removes.
 _SHADOW = 0.36
 _SHADOW_CELLS = 80
-# Where rays that look for what is above a point of the floor begin, and their direction.
+# Start and direction of rays that search for shapes above a point of the floor.
 _UNDER = np.float32(-1)
 _UP = (np.float32(0), np.float32(0), np.float32(10))
 _FLOOR = 4
-# What lies on the floor and is lower than this shows the floor's shadows.
+# Flat things on the floor below this height show the floor's shadows.
 _FLAT = 0.03
 
 
 @njit(**INNER)
 def _range(low, high, lamp, reach, extent, cells):
-    """Return the cells of the floor's map, along an axis, that a shape or its shadow may cover."""
+    """Return the range of the floor map's cells, on one axis, that a shape or its shadow covers."""
     start = min(low, lamp + (low - lamp) * reach)
     end = max(high, lamp + (high - lamp) * reach)
     first = math.floor((start / extent + 0.5) * (cells - 1))
@@ -34,17 +34,17 @@ def _range(low, high, lamp, reach, extent, cells):
 
 @njit(**INNER)
 def _darken(darkness, body, size, lamp):
-    """Add the shadow that a shape throws from the lamp, and the dimness right below it."""
+    """Add a shape's shadow from the lamp and the dimness directly below it."""
     cells = darkness.shape[0]
     x, y, z = triple(body.center)
     bottom = z - body.extent[2]
     top = z + body.extent[2]
-    # what hangs high and what lies flat throws no shadow that is seen
+    # high or flat things cast no visible shadow
     if bottom > 1.2 or top < 0.03 or top > lamp[2] - 0.2:
         return
     ex = abs(body.axes[0, 0]) * body.extent[0] + abs(body.axes[0, 1]) * body.extent[1]
     ey = abs(body.axes[0, 1]) * body.extent[0] + abs(body.axes[0, 0]) * body.extent[1]
-    # how far the shape's top edge is thrown on to the floor
+    # how far the shadow of the shape's top edge reaches on the floor
     reach = lamp[2] / (lamp[2] - top)
     i0, i1 = _range(x - ex, x + ex, lamp[0], reach, size[0], cells)
     j0, j1 = _range(y - ey, y + ey, lamp[1], reach, size[1], cells)
@@ -80,18 +80,18 @@ def _blurred(values):
 
 @njit(**OPTIONS)
 def floor_shadows(shapes, size, lamp):
-    """Return the factor (C, C) of the light that reaches the floor, indexed by x, then y."""
+    """Return the factor (C, C) of the light on the floor, indexed by x, then y."""
     darkness = np.zeros((_SHADOW_CELLS, _SHADOW_CELLS))
     # the first shape is the room
     for i in range(1, shapes.shape[0]):
         _darken(darkness, shapes[i].body, size, lamp)
-    # twice, which is nearly a Gaussian: lamps are wide
+    # blurring twice is nearly a Gaussian; lamps are wide
     return 1 - _blurred(_blurred(darkness))
 
 
 @njit(**INNER)
 def _on_round(body, part, p):
-    """Return what `_surface` does of a ball or a cylinder, in its own frame; part 1 is a cap."""
+    """Return `_surface` of a ball or a cylinder, in its own frame; part 1 is a cap."""
     x, y, z = p
     radius = float(body.extent[0])
     if part == 1:
@@ -103,13 +103,13 @@ def _on_round(body, part, p):
 
 @njit(**INNER)
 def _surface(shape, part, place):
-    """Return the index of the texture, world normal and texture coordinates of a point.
+    """Return the texture index, world normal and texture coordinates of a point.
 
-    The coordinates are in metres, then in [-1, 1] across the surface.
+    Coordinates are given in metres, then in [-1, 1] across the surface.
     """
     body = shape.body
     inside = body.kind == s.INTERIOR
-    # the frame of the room is the world's
+    # the frame of the room is the world frame
     p = place if inside else upright(body, minus(place, body.center))
     if body.kind == s.BALL or body.kind == s.CYLINDER:
         normal, u, v, across, up = _on_round(body, part, p)
@@ -119,7 +119,7 @@ def _surface(shape, part, place):
     across = u / body.extent[1 if axis == 0 else 0]
     up = v / body.extent[1 if axis == 2 else 2]
     if inside:
-        # the sign of z says nothing on the floor, which is at 0
+        # the sign of z is meaningless on the floor, which is at 0
         inward = 1.0 - 2.0 * (part & 1)
         normal = (inward * abs(normal[0]), inward * abs(normal[1]), inward * abs(normal[2]))
         return shape.texture + part, normal, u, v, across, up
@@ -133,7 +133,7 @@ def _edge(distance):
 
 @njit(**INNER)
 def _wall_shadow(place, size, face):
-    """Return the darkening of walls towards the room's edges."""
+    """Return how much darker walls are towards the edges of the room."""
     x, y, z = place
     a = 1.0 if face < 2 else _edge(0.5 * size[0] - abs(x))
     b = 1.0 if face == 2 or face == 3 else _edge(0.5 * size[1] - abs(y))
@@ -143,7 +143,7 @@ def _wall_shadow(place, size, face):
 
 @njit(**INNER)
 def _floor_shadow(floor, place, size):
-    """Look up the floor's map of shadows, between its cells."""
+    """Interpolate the floor's map of shadows."""
     last = floor.shape[0] - 1
     a = min(max((place[0] / size[0] + 0.5) * last, 0.0), last - 1e-6)
     b = min(max((place[1] / size[1] + 0.5) * last, 0.0), last - 1e-6)
@@ -168,8 +168,8 @@ def _shadow(room, code, place, normal):
 
 @njit(**INNER)
 def _light(room, code, place, normal):
-    """Return RGB of the light at a point: a bright ceiling above, and what lamps add by Lambert."""
-    # more on what faces down, or ceilings would be dark
+    """Return the RGB light at a point: a bright ceiling above, and Lambert light of the lamps."""
+    # more light on surfaces that face down; otherwise ceilings would be dark
     even = 0.56 - 0.12 * normal[2]
     total = (even, even, even)
     for k in range(room.lights.shape[0]):
@@ -177,14 +177,14 @@ def _light(room, code, place, normal):
         toward = minus(light.place, place)
         square = dot(toward, toward)
         cosine = max(dot(normal, toward) / math.sqrt(square), 0.0)
-        # gentler than the square, as walls throw light back
+        # falls off less than the square, because walls reflect light
         total = along(total, cosine / (1 + 0.12 * square), light.color)
     return times(_shadow(room, code, place, normal), total)
 
 
 @njit(**INNER)
 def _gather(t, code, i, j, own, samples, top, o, rays, points):
-    """Write where rays of the pixel at (i, j) hit surface `own`, the mean in row 0; count them."""
+    """Write where rays of pixel (i, j) hit surface `own`, the mean in row 0; return the count."""
     n = 0
     step = 1.0 / samples
     total = (0.0, 0.0, 0.0)
@@ -205,7 +205,7 @@ def _gather(t, code, i, j, own, samples, top, o, rays, points):
 
 @njit(**INNER)
 def _albedo(texture, shape, part, points, n, footprint):
-    """Return the mean RGB of a texture at rows 1 to n of `points`; at row 0 of a smooth one."""
+    """Return the mean RGB of a texture at rows 1 to n of `points`, or at row 0 if it is smooth."""
     first = 0 if smooth(texture.pattern) else 1
     last = 1 if smooth(texture.pattern) else n + 1
     # edges need all samples of a pixel, gradients do not
@@ -235,9 +235,9 @@ def _shade(room, code, points, n, footprint):
 
 @njit(**OPTIONS)
 def paint_room(image, t, code, top, samples, room, c2w, rays):
-    """Write image (rows, W, 3) uint8, a band that begins at row `top`, and use `code` up.
+    """Write a band of the image (rows, W, 3) uint8 from row `top`; this overwrites `code`.
 
-    Rays of a pixel that meet one surface share their light, and their texture if it is smooth.
+    Rays of a pixel on the same surface share their light, and their texture if it is smooth.
     """
     eye = triple(c2w[:, 3])
     points = np.empty((samples * samples + 1, 3))

@@ -1,7 +1,8 @@
-"""Where a ray o + t d is inside a primitive: entry, exit, and by which face of each.
+"""Intervals of a ray o + t d inside a primitive: entry and exit, and the faces of both.
 
-Numbers are float32, constants too, as a wider one would widen the loops that LLVM vectorises. They
-are in the primitive's own frame. A ray that misses enters at inf and leaves at -inf.
+All numbers, constants too, are float32, because a wider one would widen the loops that LLVM
+vectorises. They are in the primitive's own frame. A ray that misses enters at inf and leaves at
+-inf.
 """
 
 import math
@@ -12,7 +13,7 @@ from numba import njit
 from qgs_worlds.caster import tables as s
 from qgs_worlds.caster.vectors import INNER, OPTIONS, along, dot, minus
 
-# Metres before which nothing is met: a camera never stands so near to a surface.
+# Least distance of a hit in metres; cameras are never that near to a surface.
 NEAR = np.float32(0.01)
 NONE = np.float32(np.inf)
 TINY = np.float32(1e-9)
@@ -33,13 +34,13 @@ _NUDGE = np.float32(1e-3)
 
 @njit(**INNER)
 def reciprocal(x):
-    """Return 1 / x, large where x is 0."""
+    """Return 1 / x, or a large number where x is 0."""
     return ONE / (x if abs(x) > TINY else TINY)
 
 
 @njit(**INNER)
 def slab(o, inverse, h):
-    """Return where a ray is between -h and h along one axis; inverse is 1 / d."""
+    """Return the interval of a ray between -h and h on one axis; inverse is 1 / d."""
     a = (-h - o) * inverse
     b = (h - o) * inverse
     return min(a, b), max(a, b)
@@ -47,14 +48,14 @@ def slab(o, inverse, h):
 
 @njit(**INNER)
 def nearest(o, d):
-    """Return the point of a ray that is nearest to the origin, and its t."""
+    """Return the point of a ray nearest to the origin, and its t."""
     t = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
     return along(o, t, d), t
 
 
 @njit(**INNER)
 def ellipsoid(o, d):
-    """Cross the unit sphere. o: see `nearest`."""
+    """Return the interval in the unit sphere. o: see `nearest`."""
     inside = ONE - (o[0] * o[0] + o[1] * o[1] + o[2] * o[2])
     root = math.sqrt(max(inside, ZERO) / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
     met = inside > ZERO
@@ -63,7 +64,7 @@ def ellipsoid(o, d):
 
 @njit(**INNER)
 def ball(o, d, radius):
-    """Enter a sphere around the origin; the exit is not needed, as balls have no cuts."""
+    """Return the entry into a sphere around the origin; balls have no cuts and need no exit."""
     inverse = ONE / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
     middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) * inverse
     x, y, z = along(o, middle, d)
@@ -75,7 +76,7 @@ def ball(o, d, radius):
 
 @njit(**INNER)
 def _last_and_first(x, y, z):
-    """Return where all three intervals overlap, and whose ends those are."""
+    """Return the overlap of three intervals, and which of them it starts and ends with."""
     near = max(x[0], y[0], z[0])
     far = min(x[1], y[1], z[1])
     entry = ZERO if near == x[0] else (ONE if near == y[0] else _TWO)
@@ -85,7 +86,7 @@ def _last_and_first(x, y, z):
 
 @njit(**INNER)
 def box(o, d):
-    """Cross the cube; faces are numbered by axis."""
+    """Return the interval in the cube; faces are numbered by axis."""
     x = slab(o[0], reciprocal(d[0]), ONE)
     y = slab(o[1], reciprocal(d[1]), ONE)
     z = slab(o[2], reciprocal(d[2]), ONE)
@@ -94,7 +95,7 @@ def box(o, d):
 
 @njit(**INNER)
 def block(o, d, h):
-    """Cross a box of half sizes h, as `box`."""
+    """Return the interval in a box of half sizes h, like `box`."""
     x = slab(o[0], reciprocal(d[0]), h[0])
     y = slab(o[1], reciprocal(d[1]), h[1])
     z = slab(o[2], reciprocal(d[2]), h[2])
@@ -103,9 +104,10 @@ def block(o, d, h):
 
 @njit(**INNER)
 def interior(o, d, h):
-    """Leave a room from within, which stands on z = 0: its far side hides what is behind.
+    """Return where a ray from inside leaves a room that stands on z = 0.
 
-    Faces -x, +x, -y, +y, floor and ceiling are 0 to 5. h: half of x and y, all of z.
+    The far side of the room hides everything behind it. Faces -x, +x, -y, +y, floor and ceiling are
+    0 to 5. h: half size in x and y, full size in z.
     """
     tx = (math.copysign(h[0], d[0]) - o[0]) / d[0]
     ty = (math.copysign(h[1], d[1]) - o[1]) / d[1]
@@ -120,7 +122,7 @@ def interior(o, d, h):
 
 @njit(**INNER)
 def _shaft(o, d, radius, half):
-    """Cross an upright cylinder; also where it would be entered and left by its caps."""
+    """Return the interval in an upright cylinder, and the interval between its caps."""
     low, high = slab(o[2], reciprocal(d[2]), half)
     inverse = reciprocal(d[0] * d[0] + d[1] * d[1])
     middle = -(o[0] * d[0] + o[1] * d[1]) * inverse
@@ -136,16 +138,16 @@ def _shaft(o, d, radius, half):
 
 @njit(**INNER)
 def cylinder(o, d, h):
-    """Cross an upright cylinder of radius h[0] and half height h[2]. Face 1 is a cap."""
+    """Return the interval in a cylinder of radius h[0] and half height h[2]. Face 1 is a cap."""
     near, far, low, high = _shaft(o, d, h[0], h[2])
     return near, far, (ONE if near == low else ZERO), (ONE if far == high else ZERO)
 
 
 @njit(**INNER)
 def capsule(o, d, half):
-    """Cross what is up to 1 from the segment between z = -half and half."""
+    """Return the interval within 1 of the segment from z = -half to half."""
     near, far, _, _ = _shaft(o, d, ONE, half)
-    # the ends are whole spheres, as their inner halves are inside of the shaft
+    # the ends are whole spheres, because their inner halves are inside the shaft
     for end in (-half, half):
         p, shift = nearest((o[0], o[1], o[2] - end), d)
         first, last, _, _ = ellipsoid(p, d)
@@ -156,8 +158,8 @@ def capsule(o, d, half):
 
 @njit(**INNER)
 def frustum(o, d, top):
-    """Cross a cone of radius 1 at z = -1, `top` <= 1 at z = 1. Face 0 is the side, 1 a cap."""
-    # caps first, as the side is cut off by them
+    """Return the interval in a cone of radius 1 at z = -1, `top` <= 1 at z = 1. Face 1 is a cap."""
+    # caps come first, because they cut off the side
     low, high = slab(o[2], reciprocal(d[2]), ONE)
     slope = _HALF * (top - ONE)
     radius = _HALF * (top + ONE) + slope * o[2]
@@ -168,7 +170,7 @@ def frustum(o, d, top):
     a = a if abs(a) > TINY else TINY
     square = b * b - a * c
     root = math.sqrt(max(square, ZERO))
-    # roots without a difference of like numbers
+    # roots without a difference of similar numbers
     q = -(b + math.copysign(root, b))
     one = q / a
     other = c / (q if abs(q) > TINY else TINY)
@@ -188,9 +190,9 @@ def frustum(o, d, top):
 
 @njit(**INNER)
 def torus(o, d, thickness, start):
-    """Enter a ring of outer radius 1 about z, from t `start` on; the exit is the entry.
+    """Return the entry into a ring of outer radius 1 about z, from t `start` on, as exit too.
 
-    By sphere tracing, as roots of its quartic lose thin rings in float32.
+    It uses sphere tracing, because roots of the quartic lose thin rings in float32.
     """
     step = ONE / math.sqrt(dot(d, d))
     t, end, _, _ = ellipsoid(o, d)
@@ -233,7 +235,7 @@ def _above(heights, o, d, t):
 
 @njit(**INNER)
 def _next_line(o, d, t, cells):
-    """Return the t at which a ray crosses the next line between cells along one axis."""
+    """Return the t at which a ray crosses the next cell border on one axis."""
     if abs(d) < TINY:
         return NONE
     place = (o + t * d + ONE) * _HALF * cells
@@ -243,8 +245,8 @@ def _next_line(o, d, t, cells):
 
 @njit(**INNER)
 def _surface_between(heights, o, d, t, above, line, below):
-    """Return where a ray meets the map between `above` it at t and `below` it at `line`."""
-    # regula falsi: heights along a ray in one cell are a parabola
+    """Return the t of a hit on the map: the ray is `above` it at t and `below` it at `line`."""
+    # regula falsi, because heights along a ray in one cell are a parabola
     for _ in range(3):
         middle = t + (line - t) * above / (above - below)
         height = _above(heights, o, d, middle)
@@ -259,7 +261,7 @@ def _surface_between(heights, o, d, t, above, line, below):
 
 @njit(**INNER)
 def relief(o, d, heights, start):
-    """Enter what is below the height map, in the cube, as `torus`. Face 0 is its top, 1 a side."""
+    """Return the entry into the cube below a height map, like `torus`. Face 0 is top, 1 a side."""
     t, end, _, _ = box(o, d)
     t = max(t, start)
     if t > end:
@@ -282,9 +284,9 @@ def relief(o, d, heights, start):
 
 @njit(**INNER)
 def less(near, far, entry, cut_near, cut_far, cut_leave):
-    """Return the entry into the first interval without the second, and its face, 3 more there."""
+    """Return the entry into an interval minus a cut, and its face, plus 3 on the cut's wall."""
     outer = (near > NEAR) & (near <= far) & ((near < cut_near) | (near > cut_far))
-    # a ray that begins in the cut, or enters by it, meets the wall of the cut
+    # a ray that starts in the cut, or enters through it, hits the wall of the cut
     inner = (cut_far > NEAR) & (cut_far > near) & (cut_far < far) & (cut_near <= cut_far)
     t = near if outer else (cut_far if inner else NONE)
     return t, (entry if outer else cut_leave + np.float32(3))
@@ -305,13 +307,13 @@ def local_point(primitive, p):
 
 @njit(**INNER)
 def hollow(shape):
-    """Return whether a shape is bent or cut: it may shade itself, and fills little of its box."""
+    """Return True for a bent or cut shape, which may shade itself and fills little of its box."""
     return shape.body.kind >= s.TORUS or shape.cut.kind != s.NOTHING
 
 
 @njit(**INNER)
 def upright(body, v):
-    """Return a direction as `local` does, sooner: of a shape in metres, which is turned about z."""
+    """Return `local` faster, for a shape in metres that is turned about z."""
     cos = body.axes[0, 0]
     sin = body.axes[0, 1]
     return cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2]
@@ -333,13 +335,13 @@ def hit(body, o, d):
 
 @njit(**OPTIONS)
 def height_of(heights, x, y):
-    """Return `height_at`, to be called from Python."""
+    """Return `height_at` for calls from Python."""
     return height_at(heights, x, y)
 
 
 @njit(**OPTIONS)
 def clearances(shapes, points):
-    """Return metres (F, S) from points (F, 3) to the boxes around shapes, 0 inside."""
+    """Return distances (F, S) in metres from points (F, 3) to the boxes of shapes, 0 inside."""
     distances = np.empty((points.shape[0], shapes.shape[0]))
     for f in range(points.shape[0]):
         for i in range(shapes.shape[0]):

@@ -6,7 +6,7 @@ import numpy as np
 
 
 def lens(fov: float, size: tuple[int, int]) -> np.ndarray:
-    """Return fx, fy, cx, cy in pixels of a horizontal field of view in degrees, for (H, W)."""
+    """Return fx, fy, cx, cy in pixels for a horizontal field of view in degrees and (H, W)."""
     height, width = size
     focal = width / 2 / math.tan(math.radians(fov) / 2)
     return np.array([focal, focal, width / 2, height / 2])
@@ -15,7 +15,7 @@ def lens(fov: float, size: tuple[int, int]) -> np.ndarray:
 def look_along(eyes: np.ndarray, forward: np.ndarray, roll: np.ndarray | None = None) -> np.ndarray:
     """Return OpenCV c2w (F, 4, 4) of cameras at `eyes` that look `forward`, both (F, 3).
 
-    roll: (F,) radians about the axis; level without it.
+    roll: (F,) radians about the viewing axis; None keeps cameras level.
     """
     forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
     right = np.cross(forward, (0.0, 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""Patterns of textures of furnished rooms, looked up at a point of a surface."""
+"""Texture patterns of furnished rooms, evaluated at a point of a surface."""
 
 import math
 
@@ -34,7 +34,7 @@ def _noise(x, y, seed):
 
 @njit(**INNER)
 def _part(x):
-    """Return what is left of x above an integer."""
+    """Return the fractional part of x."""
     return x - math.floor(x)
 
 
@@ -47,7 +47,7 @@ def _seam(x, width):
 
 @njit(**INNER)
 def _grid(x, y, shift, seed, softness):
-    """Draw tiles of unit size: a tone for each, and the joints between them."""
+    """Draw tiles of unit size with a tone for each, and the joints between them."""
     row = math.floor(y)
     x = x + shift * (row & 1)
     # no two tiles are quite alike
@@ -58,7 +58,7 @@ def _grid(x, y, shift, seed, softness):
 @njit(**INNER)
 def _planks(x, y, seed, fade):
     board = math.floor(x)
-    # boards begin at heights of their own
+    # boards start at different heights
     along = y * 0.16 + 7.0 * _hash(board, 3, seed)
     tone = 0.6 * _hash(board, math.floor(along), seed)
     tone += 0.4 * _noise(x * 9, y * 0.7, seed) * fade + 0.2 * (1 - fade)
@@ -119,16 +119,16 @@ def _spines(x, seed):
 
 @njit(**INNER)
 def smooth(kind):
-    """Return whether a texture has no edges inside."""
+    """Return True if a texture has no edges inside."""
     return kind in (PLAIN, CLOUDS, GRADIENT)
 
 
 @njit(**INNER)
 def mixture(texture, u, v, p, q, footprint):
-    """Return weights (m, n): the colour is lerp(lerp(a, b, m), c, n).
+    """Return weights (m, n) for the colour lerp(lerp(a, b, m), c, n).
 
     u, v: position on the surface in metres. p, q: the same in [-1, 1] across the surface.
-    footprint: distance between neighbouring samples in metres; what is finer than it fades away.
+    footprint: distance between neighbouring samples in metres; finer details fade away.
     """
     kind = texture.pattern
     seed = texture.seed

@@ -1,7 +1,7 @@
-"""Which surface each ray of an image meets first: shapes by the rows and columns they cover.
+"""First hits of the rays of an image, shape by shape over the rows and columns that each covers.
 
-A ray is o + t d with d = B (1, u, v) of a pixel (u, v) and z = 1 in the camera's frame, so that t
-is the depth.
+A ray is o + t d with d = B (1, u, v) for a pixel (u, v). It has z = 1 in the camera frame, so t is
+the depth.
 """
 
 import numpy as np
@@ -30,9 +30,9 @@ from qgs_worlds.caster.intervals import (
 )
 from qgs_worlds.caster.vectors import INNER, OPTIONS, along, dot, minus, narrow, over, triple
 
-# Part p of shape i has code 8 i + p; codes are float32, so that they lie beside t in loops.
+# Part p of shape i has code 8 i + p; codes are float32, so that loops vectorise them with t.
 SKY = -1
-# Shapes are clipped where they come nearer to the camera's plane than this, metres.
+# Shapes are clipped nearer than this to the camera plane, in metres.
 _PLANE = 0.02
 
 
@@ -43,7 +43,7 @@ def _corners(body, c2w, corners):
     for a in range(3):
         toward = c2w[:, a]
         center = dot(toward, middle)
-        # axes are a rotation divided by the units: times their squares they are half sizes
+        # axes are a rotation divided by the units; times their squares they are half sizes
         x = dot(toward, body.axes[0]) * body.unit[0] * body.unit[0] * body.extent[0]
         y = dot(toward, body.axes[1]) * body.unit[1] * body.unit[1] * body.extent[1]
         z = dot(toward, body.axes[2]) * body.unit[2] * body.unit[2] * body.extent[2]
@@ -54,7 +54,7 @@ def _corners(body, c2w, corners):
 
 @njit(**INNER)
 def _clipped(corners, points):
-    """Write the corners in front of the camera, and where edges cross its plane; their number."""
+    """Write the corners before the camera and where edges cross its plane; return the number."""
     n = 0
     for k in range(8):
         z = corners[k, 2]
@@ -74,13 +74,13 @@ def _clipped(corners, points):
 
 @njit(**INNER)
 def _covered(corners, points, intrinsics):
-    """Return u0, u1, v0, v1 in pixels of a box by its corners; u0 > u1 behind the camera.
+    """Return the pixel range u0, u1, v0, v1 of a box from its corners; u0 > u1 behind the camera.
 
-    points: (20, 3), memory to work in.
+    points: (20, 3), working memory.
     """
     u0 = v0 = np.inf
     u1 = v1 = -np.inf
-    # a box's outline is that of its corners, where none is behind the camera
+    # the corners bound the box in the image if none is behind the camera
     for k in range(_clipped(corners, points)):
         u = intrinsics[0] * points[k, 0] / points[k, 2] + intrinsics[2]
         v = intrinsics[1] * points[k, 1] / points[k, 2] + intrinsics[3]
@@ -93,8 +93,8 @@ def _covered(corners, points, intrinsics):
 
 @njit(**INNER)
 def _span(low, high, samples, first, count):
-    """Return indices of samples between two coordinates, among `count` from pixel `first` on."""
-    # half a sample more on both sides, as bounds and rays are rounded differently
+    """Return the range of samples between two coordinates, among `count` from pixel `first` on."""
+    # half a sample more on both sides, because bounds and rays round differently
     low = (low - first) * samples - 0.5
     high = (high - first) * samples + 0.5
     return int(min(max(low, 0.0), count)), int(min(max(high + 1, 0.0), count))
@@ -102,7 +102,7 @@ def _span(low, high, samples, first, count):
 
 @njit(**INNER)
 def ray_basis(c2w, intrinsics):
-    """Return (3, 3) B, by columns, with d = B (1, u, v) in the world frame."""
+    """Return the columns of B (3, 3), with d = B (1, u, v) in the world frame."""
     right = over(c2w[:, 0], intrinsics[0])
     down = over(c2w[:, 1], intrinsics[1])
     corner = along(along(c2w[:, 2], -intrinsics[2], right), -intrinsics[3], down)
@@ -117,9 +117,9 @@ def _row_base(rays, v):
 
 @njit(**INNER)
 def _ray(o, base, step, u):
-    """Return the ray at column u of a row: its point nearest to the origin, direction, t there.
+    """Return a ray of a row: its point nearest to the origin, its direction, and t at that point.
 
-    Small differences of large numbers would lose thin things far away.
+    Without this point, differences of large numbers would lose thin things far away.
     """
     d = along(base, u, step)
     p, t = nearest(o, d)
@@ -139,7 +139,7 @@ def _store(spans, k, found, t):
 def _inside_row(kind, extra, heights, steps, o, base, step, spans):
     """Write `spans` (4, R): entries, exits and their faces, for the rays of a row.
 
-    A loop for each kind, as LLVM vectorises loops without branches.
+    Each kind has its own loop, because LLVM vectorises loops without branches.
     """
     count = steps.shape[0]
     if kind == s.ELLIPSOID:
@@ -169,7 +169,7 @@ def _inside_row(kind, extra, heights, steps, o, base, step, spans):
 
 @njit(**INNER)
 def _closest(t, code, own, first, second):
-    """Keep what is nearer: a shape by the intervals of its primitives (4, R), or what was there."""
+    """Keep the nearer hit: that of a shape with intervals (4, R), or the earlier one."""
     for k in range(t.shape[0]):
         near, face = less(
             first[0, k], first[1, k], first[2, k], second[0, k], second[1, k], second[3, k]
@@ -189,9 +189,9 @@ def _keep(t, code, k, own, found):
 
 @njit(**INNER)
 def _cover_row(t, code, own, kind, extent, steps, o, base, step):
-    """Keep what is nearer along a row, as `_closest`: a shape in metres, which has no cut.
+    """Keep the nearer hits along a row, like `_closest`, for a shape in metres without a cut.
 
-    Without intervals in memory this takes a third of the time.
+    It stores no intervals and takes a third of the time.
     """
     if kind == s.BLOCK:
         for k in range(t.shape[0]):
@@ -218,7 +218,7 @@ def _trace_primitive(primitive, heights, o, base, step, steps, spans):
 
 @njit(**INNER)
 def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
-    """Do as `_trace_shape` for a shape in metres."""
+    """Do the same as `_trace_shape` for a shape in metres."""
     above, below, first, last = area
     kind = body.kind
     extent = triple(body.extent)
@@ -234,12 +234,12 @@ def _trace_metric(t, code, top, samples, body, own, o, rays, steps, area):
 
 @njit(**INNER)
 def _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, area, scratch):
-    """Let a shape cover what lies behind it in an area of the samples."""
+    """Let a shape cover everything behind it in an area of the samples."""
     above, below, first, last = area
     step = narrow(rays[1])
     along_row = steps[first:last]
     spans = scratch[:, :, : last - first]
-    # without a second primitive nothing is taken away
+    # without a second primitive there is no cut
     spans[1, 0] = NONE
     spans[1, 1] = -NONE
     spans[1, 3] = ZERO
@@ -253,9 +253,9 @@ def _trace_shape(t, code, top, samples, shape, own, heights, o, rays, steps, are
 
 @njit(**OPTIONS)
 def trace(rows, columns, top, samples, shapes, heights, c2w, intrinsics):
-    """Return t and code (R, C) float32 of rays from pixel row `top` on, at pixel sub-centres.
+    """Return t and code (R, C) float32 of rays from pixel row `top` on, and the basis of the rays.
 
-    Also the basis of the rays. t is inf and the code is SKY where a ray meets nothing.
+    Rays go through sub-centres of pixels. Without a hit, t is inf and the code is SKY.
     """
     t = np.full((rows * samples, columns * samples), NONE, np.float32)
     code = np.full((rows * samples, columns * samples), np.float32(SKY), np.float32)
@@ -266,9 +266,9 @@ def trace(rows, columns, top, samples, shapes, heights, c2w, intrinsics):
     o = narrow(c2w[:, 3])
     corners = np.empty((8, 3))
     points = np.empty((20, 3))
-    # one for all shapes, as allocating takes longer than small shapes do
+    # one for all shapes, because allocating takes longer than small shapes do
     scratch = np.empty((2, 4, columns * samples), np.float32)
-    # shape by shape, not ray by ray: a loop over a row is vectorised
+    # shape by shape, not ray by ray, because a loop over a row is vectorised
     for i in range(shapes.shape[0]):
         shape = shapes[i]
         _corners(shape.body, c2w, corners)

@@ -1,4 +1,4 @@
-"""Colours of what rays meet in worlds: light with shadows and occlusion, highlights, sky, fog."""
+"""Colours of surfaces in worlds: light with shadows and occlusion, highlights, sky and fog."""
 
 import math
 
@@ -27,13 +27,13 @@ from qgs_worlds.caster.vectors import (
 )
 
 TAKEN = np.float32(-2)
-# Metres above a surface where its light is looked up, so that it does not shade itself.
+# Height in metres above a surface at which its light is evaluated, to avoid self-shadowing.
 _LIFT = 2e-3
 
 
 @njit(**INNER)
 def on_axis(axis, p, unit):
-    """Return the normal of a box's face across an axis, the position on it, and its number."""
+    """Return the normal of a box face across an axis, the position on it and its number."""
     x, y, z = p
     if axis == 0:
         return (math.copysign(1.0, x), 0.0, 0.0), y * unit[1], z * unit[2], (1 if x > 0 else 0)
@@ -54,7 +54,7 @@ def _on_relief(field, p, unit):
 
 @njit(**INNER)
 def _on_primitive(primitive, heights, face, p):
-    """Return what `on_axis` does for a primitive of any kind, at a point and a face of it."""
+    """Return the result of `on_axis` for any primitive, at a point of one of its faces."""
     kind = primitive.kind
     extra = primitive.extra
     unit = triple(primitive.unit)
@@ -86,14 +86,14 @@ def _on_primitive(primitive, heights, face, p):
 
 @njit(**INNER)
 def to_world(primitive, n):
-    """Return a normal in the frame of a primitive in that of the world, of any length."""
+    """Return a normal of a primitive's frame in the world frame, with any length."""
     axes = primitive.axes
     return dot(axes[:, 0], n), dot(axes[:, 1], n), dot(axes[:, 2], n)
 
 
 @njit(**INNER)
 def surface(shape, heights, part, place):
-    """Return the index of the texture, world normal and texture coordinates of a point."""
+    """Return the texture index, world normal and texture coordinates of a point."""
     cut = part >= 3
     primitive = shape.cut if cut else shape.body
     face = part - 3 if cut else part
@@ -107,10 +107,10 @@ def surface(shape, heights, part, place):
 
 @njit(**INNER)
 def _clouds(air, x, y, z):
-    """Return how white the sky is in a direction: noise on a plane above."""
+    """Return how white the sky is in a direction, from noise on a plane above."""
     if air.clouds <= 0 or z <= 0.02:
         return 0.0
-    # the summand bounds how fine the clouds are at the horizon
+    # the summand limits how fine the clouds are at the horizon
     a = 1.2 * x / (z + 0.15)
     b = 1.2 * y / (z + 0.15)
     cloud = 0.0
@@ -125,7 +125,7 @@ def _clouds(air, x, y, z):
 
 @njit(**INNER)
 def _glow(lights, view):
-    """Return the glow about the sun: the eighth power of a cosine, by squares as `**` is slow."""
+    """Return the glow around the sun: a cosine to the eighth, by squares because `**` is slow."""
     if lights.shape[0] == 0 or lights[0].lamp > 0:
         return 0.0
     near = max(dot(view, lights[0].place), 0.0) ** 2
@@ -136,27 +136,27 @@ def _glow(lights, view):
 
 @njit(**INNER)
 def _sky(air, lights, view):
-    """Return RGB of the sky in a direction: a gradient, clouds and a glow about the sun."""
+    """Return RGB of the sky in a direction: a gradient, clouds and a glow around the sun."""
     x, y, z = view
     cloud = _clouds(air, x, y, z)
     glow = _glow(lights, view)
     white = 1.3 * max(air.horizon[0], air.horizon[1], air.horizon[2])
     clear = mix(air.horizon, air.zenith, math.sqrt(max(z, 0.0)))
-    # the sun is a little yellow
+    # the sun is slightly yellow
     glow = (glow * white, 0.9 * glow * white, 0.7 * glow * white)
     return along(glow, 1.0, mix(clear, (white, white, white), cloud))
 
 
 @njit(**INNER)
 def _light(light, shadows, own, place, normal, view, open_, shine):
-    """Return how much of a light comes from a point: reflected evenly, and as a highlight."""
+    """Return how much of a light a point reflects: diffusely, and as a highlight."""
     toward = minus(light.place, times(light.lamp, place))
     square = dot(toward, toward)
     near = 1.0 / math.sqrt(square)
     cosine = dot(normal, toward) * near
     if cosine <= 0:
         return 0.0, 0.0
-    # lamps are not points: less than the square near to them
+    # lamps are not points, so near them light falls off less than the square
     strength = 1.0 / (1.0 + light.lamp * 0.25 * square)
     if light.shadows > 0:
         strength *= lit(shadows, light, own, along(place, _LIFT, normal))
@@ -179,7 +179,7 @@ def _shade(world, around, code, place, view, footprint, distance):
     texture = world.textures[row]
     # bent and cut shapes shade themselves
     own = -1 if hollow(shape) else i
-    # a pixel covers more of a slanting surface, but not without bound at its outline
+    # a pixel covers more of a slanted surface, with a limit at its outline
     slant = footprint / math.sqrt(max(-dot(normal, view), 0.06))
     albedo = color(texture, u, v, slant / shape.scale)
     open_ = visible(world.shapes, around, i, place, normal, air.occlusion, air.reach, footprint)
@@ -193,16 +193,16 @@ def _shade(world, around, code, place, view, footprint, distance):
         high *= gloss
         reflected = along((high, high, high), even, albedo)
         seen = along(seen, 1.0, product(reflected, light.color))
-    # as an exponential near to the camera, and cheaper
+    # like an exponential near the camera, and cheaper
     mist = 1.0 - 1.0 / (1.0 + air.fog * distance)
     return mix(seen, air.horizon, mist)
 
 
 @njit(**INNER)
 def _gather(t, code, i, j, own, samples):
-    """Take the rays of the pixel at (i, j) that hit surface `own`: their number and means.
+    """Return number and means of the rays of pixel (i, j) that hit `own`, and mark them as used.
 
-    Of their t, and of their columns and rows within the pixel, which t weighs.
+    The means are of t, and of columns and rows within the pixel with weights t.
     """
     n = 0
     t_sum = u_sum = v_sum = ZERO
@@ -211,7 +211,7 @@ def _gather(t, code, i, j, own, samples):
             if code[i + a, j + b] == own:
                 code[i + a, j + b] = TAKEN
                 n += 1
-                # the sky is at no distance: its rays weigh alike
+                # the sky has no distance, so its rays have equal weights
                 distance = t[i + a, j + b] if own != SKY else ONE
                 t_sum += distance
                 u_sum += distance * b
@@ -221,11 +221,11 @@ def _gather(t, code, i, j, own, samples):
 
 @njit(**OPTIONS)
 def paint(image, t, code, top, samples, world, c2w, rays):
-    """Write image (rows, W, 3) float32, a band that begins at row `top`, and use `code` up.
+    """Write a band of the image (rows, W, 3) float32 from row `top`; this overwrites `code`.
 
-    Values are linear in light. Rays of a pixel that meet one surface are shaded at their mean.
+    Values are linear light. Rays of a pixel on the same surface are shaded at their mean.
     """
-    # kept over the band, as neighbouring points have the same boxes near
+    # kept over the band, because neighbouring points have the same boxes nearby
     around = surroundings(world.shapes)
     step = 1.0 / samples
     eye = triple(c2w[:, 3])

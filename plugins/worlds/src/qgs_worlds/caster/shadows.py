@@ -1,6 +1,6 @@
-"""Shadow maps, cast once for a scene by the kernels that cast its photos; ambient occlusion.
+"""Shadow maps, cast once per scene by the kernels that cast its photos, and ambient occlusion.
 
-The latter is how much of the sky or the walls a point sees, by boxes around shapes.
+Ambient occlusion estimates how much of the sky or walls a point sees, from boxes around shapes.
 """
 
 import math
@@ -13,12 +13,12 @@ from qgs_worlds.caster.intervals import ZERO, hollow, local
 from qgs_worlds.caster.raycast import trace
 from qgs_worlds.caster.vectors import INNER, OPTIONS, REDUCING, dot, longest, minus, narrow
 
-# Of a box: matrix, centre in its frame, extents, units and the number of its shape.
+# Fields of a box: matrix, centre in its frame, extents, units and the number of its shape.
 _FIELDS = 19
-# Pixels of the side of the sun's map, and of each of a lamp's six.
+# Side in pixels of the sun's map, and of each of the six maps of a lamp.
 _SUN_SIDE = 224
 _LAMP_SIDE = 72
-# Metres to the sun: far enough for rays that are nearly parallel, near enough for float32.
+# Distance of the sun in metres: far enough for nearly parallel rays, near enough for float32.
 _SUN = 300.0
 
 # Rotations of a lamp's cameras, which look along +x, -x, +y, -y, +z, -z.
@@ -34,11 +34,11 @@ def shadow_maps(
 ) -> tuple[np.ndarray, s.Shadows]:
     """Return the lights, with the number of their first map plus 1, and the maps.
 
-    middle, radius: where the sun's shadows are seen; lamps throw theirs everywhere.
+    middle, radius: ball with the sun's shadows; lamps cast shadows everywhere.
     """
     lights = lights.copy()
     maps = []
-    # an array of each, as a scene may have no shadows
+    # at least one array of each, because a scene may have no shadows
     depths = [np.zeros(0, np.float32)]
     codes = [np.zeros(0, np.float32)]
     begin = 0
@@ -73,7 +73,7 @@ def _views(
 
 @njit(**INNER)
 def _seen(shadows, k, own, p):
-    """Return the share of a light that a point gets by map k; all of it outside of the map."""
+    """Return the share of a light that reaches a point, from map k; 1 outside the map."""
     view = shadows.maps[k]
     side = view.side
     place = minus(p, view.c2w[:, 3])
@@ -90,7 +90,7 @@ def _seen(shadows, k, own, p):
     j = int(a)
     a = a - j
     b = b - i
-    # within a pixel of the map the depth of what shades itself varies
+    # within a pixel of the map, the depth of a shape that shades itself varies
     bias = np.float32(depth - 0.01 - (1.5 / scale if own < 0 else 0.0))
     # percentage closer filtering over 2 x 2 pixels softens the edge
     light = 0.0
@@ -104,7 +104,7 @@ def _seen(shadows, k, own, p):
 
 @njit(**INNER)
 def lit(shadows, light, own, p):
-    """Return the share of a light that reaches a point. own: its shape, if it shades itself not."""
+    """Return the share of a light that reaches a point. own: its shape if that cannot shade it."""
     k = light.shadows - 1
     if light.lamp > 0:
         away = minus(p, light.place)
@@ -115,10 +115,10 @@ def lit(shadows, light, own, p):
 
 @njit(**OPTIONS)
 def surroundings(shapes):
-    """Return what `visible` keeps for points that follow each other: all boxes; those near.
+    """Return the memory that `visible` keeps for successive points: all boxes, and the near ones.
 
-    Boxes (19, S), a field a row, so that loops over them are vectorised. Then the place, the number
-    of boxes near it, and the square of the distance up to which they are enough.
+    Boxes are (19, S), one field per row, so that loops over them are vectorised. Then come the
+    place, the number of boxes near it, and the square of the distance up to which they are enough.
     """
     boxes = np.empty((_FIELDS, shapes.shape[0]), np.float32)
     for i in range(shapes.shape[0]):
@@ -136,7 +136,7 @@ def surroundings(shapes):
 
 @njit(**INNER)
 def _find(shapes, around, p, reach, slack):
-    """Keep the boxes near to a place, without those of hollow shapes, which do not fill them."""
+    """Keep the boxes near a place, except those of hollow shapes, which do not fill their boxes."""
     boxes, near, place = around
     for k in range(3):
         place[k] = p[k]
@@ -155,10 +155,10 @@ def _find(shapes, around, p, reach, slack):
 
 @njit(**REDUCING)
 def visible(shapes, around, own, point, normal, strength, reach, footprint):
-    """Return how much ambient light reaches a point: a distance field at two heights above it.
+    """Return the ambient light at a point, from a distance field at two heights above it.
 
-    As Evans 2006, "Fast approximations for global illumination on dynamic scenes". own: the shape
-    that the point is on. footprint: metres between pixels there.
+    The method is that of Evans 2006, "Fast approximations for global illumination on dynamic
+    scenes". own: shape of the point. footprint: distance between pixels there, in metres.
     """
     x, y, z = narrow(point)
     nx, ny, nz = narrow(normal)
@@ -168,7 +168,7 @@ def visible(shapes, around, own, point, normal, strength, reach, footprint):
     moved = minus(place, point)
     if place[4] == np.inf or dot(moved, moved) > place[4]:
         _find(shapes, around, (x, y, z), reach, 0.3 * reach + 4 * footprint)
-    # float32 as the boxes are, so that the loop stays narrow
+    # float32 like the boxes, so that the loop stays narrow
     me = np.float32(own)
     first = low * low
     second = high * high
@@ -186,6 +186,6 @@ def visible(shapes, around, own, point, normal, strength, reach, footprint):
         other = near[18, i] != me
         first = min(first, under if other else first)
         second = min(second, over if other else second)
-    # hidden by as much as the nearest shape is nearer than the height itself
+    # light is lost by as much as the nearest shape is nearer than the height itself
     hidden = max(1 - math.sqrt(first) / low, ZERO) + max(1 - math.sqrt(second) / high, ZERO)
     return 1.0 - 0.5 * strength * hidden

@@ -1,4 +1,4 @@
-"""Primitives, shapes made of one or two of them, and the rows that they fill."""
+"""Primitives, shapes of one or two primitives, and their rows in tables."""
 
 import math
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ ROUND = (s.ELLIPSOID, s.CAPSULE, s.TORUS)
 
 
 class Primitive(NamedTuple):
-    """A primitive: `rows` says what `extra` is; `turn` is a rotation to the world, row by row."""
+    """Primitive. extra: see `rows`. turn: rotation to the world, row by row."""
 
     kind: int
     center: Point
@@ -27,7 +27,7 @@ class Primitive(NamedTuple):
     extra: float = 0.0
 
     def moved(self, to: Point, turn: Turn, size: float) -> "Primitive":
-        """Return it scaled about the origin, turned, then moved."""
+        """Return the primitive scaled about the origin, turned, then moved."""
         x, y, z = rotated(turn, self.center)
         center = (to[0] + size * x, to[1] + size * y, to[2] + size * z)
         a, b, c = self.half
@@ -35,7 +35,7 @@ class Primitive(NamedTuple):
         return Primitive(self.kind, center, half, product(turn, self.turn), self.extra)
 
     def reach(self) -> float:
-        """Return how far it extends up and down from its centre, metres, at most."""
+        """Return the largest extent up or down from its centre, in metres."""
         size = self.half[2]
         up = abs(self.turn[8])
         if self.kind == s.CAPSULE:
@@ -49,7 +49,7 @@ class Primitive(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """A primitive less another one. faces: textures from `texture` on, one a face."""
+    """Primitive minus an optional second one. faces: number of textures, from `texture` on."""
 
     body: Primitive
     cut: Primitive | None = None
@@ -86,8 +86,8 @@ def about_z(angle: float) -> Turn:
 
 
 def any_turn(rng: Random) -> Turn:
-    """Draw a rotation evenly from all (a random unit quaternion)."""
-    # Gaussians have no direction that they prefer
+    """Draw a uniform random rotation (a random unit quaternion)."""
+    # normal distributions prefer no direction
     w, x, y, z = (rng.gauss(0, 1) for _ in range(4))
     f = 2 / (w * w + x * x + y * y + z * z)
     return (
@@ -115,7 +115,7 @@ def rod(start: Point, end: Point, radius: float, square: bool = False) -> Primit
 
 
 def packed(shapes: Sequence[Shape]) -> np.ndarray:
-    """Return the table of SHAPE of the ray caster."""
+    """Return the ray caster's table of SHAPE."""
     table = np.zeros(len(shapes), s.SHAPE)
     body = _primitives([shape.body for shape in shapes])
     table["body"] = body

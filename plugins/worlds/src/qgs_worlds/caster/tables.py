@@ -1,16 +1,16 @@
 """Tables of numbers that describe shapes, textures, lights and air to the ray caster.
 
-World frame: metres, z up. A shape is a primitive in a frame of its own, less a second convex
-primitive, if it has one.
+The world frame is in metres, z up. A shape is a primitive in its own frame, minus an optional
+second convex primitive.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-# What fits the cube [-1, 1]^3 of a frame of its own; a capsule is longer.
+# Kinds that fit the cube [-1, 1]^3 of their own frame; a capsule is longer.
 ELLIPSOID, BOX, FRUSTUM, CAPSULE, TORUS, HEIGHT = range(6)
-# What is measured in metres and stands upright: shapes of furnished rooms, and a room from within.
+# Upright kinds in metres: shapes of furnished rooms, and a room from inside.
 BLOCK, BALL, CYLINDER, INTERIOR = range(6, 10)
 # kind of the second primitive of a shape that has none
 NOTHING = -1
@@ -92,7 +92,7 @@ def primitives(
 
 
 class Shadows(NamedTuple):
-    """Shadow maps: a table of MAP, and depths and codes of all their pixels one after the other."""
+    """Shadow maps: a table of MAP, and concatenated depths and codes of all their pixels."""
 
     maps: np.ndarray
     depths: np.ndarray
@@ -100,7 +100,7 @@ class Shadows(NamedTuple):
 
 
 class World(NamedTuple):
-    """A scene, ready to be cast: tables of SHAPE, TEXTURE, LIGHT and one row of AIR.
+    """Scene for the ray caster: tables of SHAPE, TEXTURE, LIGHT and one row of AIR.
 
     heights: (K, G, G) float32 in [-1, 1].
     """
@@ -114,10 +114,10 @@ class World(NamedTuple):
 
 
 class Room(NamedTuple):
-    """A furnished room, ready to be cast: tables of SHAPE, the room itself first, and of TEXTURE.
+    """Furnished room for the ray caster: tables of SHAPE, with the room first, and of TEXTURE.
 
     heights: see `World`. size: x, y, z extent in metres. lights: a table of LIGHT. floor: (C, C)
-    factor of the light that reaches the floor, indexed by x, then y.
+    factor of the light on the floor, indexed by x, then y.
     """
 
     shapes: np.ndarray

@@ -1,4 +1,4 @@
-"""Noise and patterns of textures, looked up at a point of a surface."""
+"""Noise and patterns of textures, evaluated at a point of a surface."""
 
 import math
 
@@ -23,7 +23,7 @@ def chance(i, j, seed):
 
 @njit(**INNER)
 def _corner(basis, i, j, seed, x, y):
-    """Return the height at (x, y) of a plane through the lattice point: level, or of any slope."""
+    """Return the height at (x, y) of a plane through the lattice point, level or sloped."""
     if basis == s.VALUE:
         return chance(i, j, seed) - 0.5
     return (2 * chance(i, j, seed) - 1.0) * x + (2 * chance(j, i, seed + 1371) - 1.0) * y
@@ -31,7 +31,7 @@ def _corner(basis, i, j, seed, x, y):
 
 @njit(**INNER)
 def _cells(x, y, i, j, seed):
-    """Return the distance to the nearest of points scattered one to a cell, less its mean."""
+    """Return the distance to the nearest of random points, one per cell, minus its mean."""
     least = 4.0
     for a in range(-1, 2):
         for b in range(-1, 2):
@@ -43,7 +43,7 @@ def _cells(x, y, i, j, seed):
 
 @njit(**INNER)
 def eased(x):
-    """Return x in [0, 1] so that it starts and ends without a slope."""
+    """Return x in [0, 1], eased to zero slope at both ends."""
     return x * x * (3 - 2 * x)
 
 
@@ -68,13 +68,13 @@ def noise(basis, x, y, seed):
 
 @njit(**INNER)
 def _seen(footprint, period):
-    """Return how much is seen of what has a period: 0 where it is finer than two footprints."""
+    """Return the visibility of details with a period, 0 if it is below two footprints."""
     return min(max(2.0 - 4.0 * footprint / period, 0.0), 1.0)
 
 
 @njit(**INNER)
 def _octaves(texture, x, y, footprint):
-    """Return noise in octaves, about 0.5; x, y: in periods, as is the footprint."""
+    """Return noise in octaves around 0.5; x, y and footprint are in periods."""
     total = 0.0
     weight = texture.contrast
     for octave in range(texture.octaves):
@@ -82,7 +82,7 @@ def _octaves(texture, x, y, footprint):
         if seen <= 0:
             break
         total += seen * weight * noise(texture.basis, x, y, texture.seed + 389 * octave)
-        # octaves of nearly twice the frequency, so that their lattices do not lie on each other
+        # octaves of nearly twice the frequency, so that their lattices do not coincide
         x = 1.97 * x + 7.3
         y = 1.97 * y
         footprint = 1.97 * footprint
@@ -92,7 +92,7 @@ def _octaves(texture, x, y, footprint):
 
 @njit(**INNER)
 def _step(x, blur):
-    """Return a step at 0, blurred."""
+    """Return a blurred step at 0."""
     return min(max(0.5 + x / blur, 0.0), 1.0)
 
 
@@ -104,7 +104,7 @@ def _bar(x, width, blur):
 
 @njit(**INNER)
 def _glyphs(x, y, seed):
-    """Draw lines of marks: random dots of 4 x 6 in a cell, words apart, lines of any length."""
+    """Draw lines of letters from 4 x 6 random dots, with spaces and lines of random length."""
     line = math.floor(y)
     place = math.floor(x)
     if chance(place // 3, line, seed + 5) < 0.25 or chance(place, line, seed) < 0.15:
@@ -118,7 +118,7 @@ def _glyphs(x, y, seed):
 
 @njit(**INNER)
 def _mean(kind, width):
-    """Return how much of the fourth colour a pattern has."""
+    """Return the mean share of the fourth colour in a pattern."""
     if kind == s.CHECKER:
         return 0.5
     if kind == s.TILES:
@@ -130,7 +130,7 @@ def _mean(kind, width):
 
 @njit(**INNER)
 def _pattern(kind, x, y, width, seed, blur):
-    """Return how much of the fourth colour is seen, and the tone of the cell in [0, 1]."""
+    """Return the share of the fourth colour, and the tone of the cell in [0, 1]."""
     if kind == s.STRIPES or kind == s.RINGS:
         place = x if kind == s.STRIPES else math.sqrt(x * x + y * y)
         return _bar(place, width, blur), chance(math.floor(place + 0.5), 0, seed)
@@ -141,7 +141,7 @@ def _pattern(kind, x, y, width, seed, blur):
         b = 2 * _bar(0.5 * y, 0.5, blur) - 1
         return 0.5 + 0.5 * a * b, chance(i, j, seed)
     if kind == s.TILES:
-        # every other row is shifted by half a tile, in one of two textures
+        # half of the textures shift every second row by half a tile
         x += 0.5 * (j & 1) * (seed & 1)
         joint = max(_bar(x, 0.25 * width, blur), _bar(y, 0.25 * width, blur))
         return joint, chance(math.floor(x), j, seed)
@@ -154,13 +154,13 @@ def _pattern(kind, x, y, width, seed, blur):
 
 @njit(**INNER)
 def _marked(texture, rgb, u, v, warped, footprint):
-    """Lay the pattern of a texture over a colour. warped: u, moved as the noise is."""
+    """Put the pattern of a texture over a colour. warped: u after the warp of the noise."""
     period = texture.pattern_period
     blur = footprint / period * max(texture.aspect, 1.0)
     x = u / period * texture.aspect + 0.2 * (warped - u / texture.period)
     kind = texture.pattern
     w, tone = _pattern(kind, x, v / period, texture.width, texture.seed, blur + 1e-6)
-    # from afar a pattern fades to its mean
+    # far away, a pattern fades to its mean
     seen = _seen(blur, 1.6)
     mean = _mean(kind, texture.width)
     w = texture.strength * (mean + seen * (w - mean))
@@ -170,7 +170,7 @@ def _marked(texture, rgb, u, v, warped, footprint):
 
 @njit(**INNER)
 def color(texture, u, v, footprint):
-    """Return RGB at u, v; footprint: distance of neighbouring pixels there, in the same unit."""
+    """Return RGB at u, v. footprint: distance between neighbouring pixels, in the same unit."""
     x = u / texture.period
     y = v / texture.period
     if texture.warp > 0:

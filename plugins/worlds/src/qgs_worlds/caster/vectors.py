@@ -1,6 +1,6 @@
-"""How kernels are compiled; points, directions and colours in them: tuples of three numbers.
+"""Options for compiling kernels, and operations on points, directions and colours.
 
-Anything indexed alike will do.
+These are tuples of three numbers, or anything that is indexed in the same way.
 """
 
 import math
@@ -14,23 +14,23 @@ OPTIONS: dict[str, Any] = {
     "nogil": True,
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "arcp", "nsz"},
-    # Cached kernels share the functions that they call by name, so that one loaded from the cache
+    # Cached kernels share the functions that they call by name, so one loaded from the cache
     # may run another kernel's build of them, with other roundings; what is inlined is its own.
     "forceinline": True,
 }
-"""For functions that Python calls, and for those that allocate arrays."""
+"""Options for functions that Python calls or that allocate arrays."""
 
 INNER: dict[str, Any] = {
     **OPTIONS,
     "no_cpython_wrapper": True,
     "no_cfunc_wrapper": True,
-    # Counting references to the arrays that are passed takes longer than what is done with them.
+    # Counting references to the passed arrays takes longer than the work on them.
     "_nrt": False,
 }
-"""For functions that kernels alone call and that allocate no arrays."""
+"""Options for functions that only kernels call and that allocate no arrays."""
 
 REDUCING: dict[str, Any] = {**INNER, "fastmath": {"contract", "reassoc", "arcp", "nsz", "nnan"}}
-"""For least values over a loop, which LLVM vectorises if no number is NaN."""
+"""Options for minima over a loop, which LLVM vectorises if no number is NaN."""
 
 
 @njit(**INNER)
@@ -77,7 +77,7 @@ def over(a, s):
 
 @njit(**INNER)
 def product(a, b):
-    """Return the product of each pair of numbers, as of a colour and the light on it."""
+    """Return the product of each pair of numbers, for example of a colour and the light on it."""
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 

@@ -1,7 +1,7 @@
-"""Pieces of furniture, each a list of shapes about the origin whose back is towards +y.
+"""Pieces of furniture, each a list of shapes around the origin with its back towards +y.
 
-World frame of rooms: metres, x and y along the walls, z up, the floor at z = 0, the room centred on
-the z axis. A shape is upright; it may be turned about z.
+The world frame of rooms is in metres: x and y along the walls, z up, the floor at z = 0, and the
+room centred on the z axis. Shapes are upright and may be turned about z.
 """
 
 import math
@@ -24,7 +24,7 @@ WALLS = 6
 
 
 class Shape(NamedTuple):
-    """One shape; `half` is the half size along each axis, radii for round ones."""
+    """Shape of furniture. half: half size along each axis, or radii of round shapes."""
 
     kind: int
     center: Point
@@ -41,7 +41,7 @@ class Shape(NamedTuple):
         return Shape(self.kind, center, self.half, self.turn + turn, self.texture)
 
     def bounds(self) -> tuple[float, ...]:
-        """Return the lowest x, y, z and the highest of the box around it."""
+        """Return the lowest and highest x, y, z of the box around the shape."""
         x, y, z = self.center
         a, b, c = self.half
         # most shapes are not turned, and bounds are asked for often
@@ -55,25 +55,25 @@ class Shape(NamedTuple):
 
 
 def box(x: float, y: float, z: float, w: float, d: float, h: float, texture: int) -> Shape:
-    """Return a box whose bottom centre is (x, y, z), w wide along x, d along y and h high."""
+    """Return a box with bottom centre (x, y, z), width w along x, depth d along y and height h."""
     return Shape(s.BLOCK, (x, y, z + h / 2), (w / 2, d / 2, h / 2), 0.0, texture)
 
 
 def cylinder(x: float, y: float, z: float, radius: float, height: float, texture: int) -> Shape:
-    """Return an upright cylinder whose bottom centre is (x, y, z)."""
+    """Return an upright cylinder with bottom centre (x, y, z)."""
     half = (radius, radius, height / 2)
     return Shape(s.CYLINDER, (x, y, z + height / 2), half, 0.0, texture)
 
 
 def sphere(x: float, y: float, z: float, radius: float, texture: int) -> Shape:
-    """Return a sphere whose lowest point is (x, y, z)."""
+    """Return a sphere with lowest point (x, y, z)."""
     return Shape(s.BALL, (x, y, z + radius), (radius, radius, radius), 0.0, texture)
 
 
 def packed(size: Point, inside: Sequence[Shape]) -> np.ndarray:
-    """Return the table of SHAPE of the ray caster for a room of a size and what is in it.
+    """Return the ray caster's table of SHAPE for a room of this size and the shapes inside it.
 
-    Textures of its walls, floor and ceiling come first, those of the shapes after them.
+    Textures of walls, floor and ceiling come first, then the textures of the shapes.
     """
     walls = Shape(s.INTERIOR, (0.0, 0.0, 0.0), (size[0] / 2, size[1] / 2, size[2]), 0.0, -WALLS)
     return shapes.packed(
@@ -89,10 +89,10 @@ def packed(size: Point, inside: Sequence[Shape]) -> np.ndarray:
 
 Piece = list[Shape]
 Sizes = dict[str, Any]
-"""Lengths in metres and indices of materials, by the names that `furniture.toml` gives them."""
+"""Lengths in metres and indices of materials, by their names in `furniture.toml`."""
 
 _ORNAMENTS = ("vase", "globe", "table_lamp", "pile", "cube")
-# what is named twice is drawn more often
+# a name that is listed twice is drawn more often
 AGAINST_WALLS = (
     "shelf", "sofa", "sideboard", "wardrobe", "shelf", "sideboard", "plant", "floor_lamp", "crates",
 )  # fmt: skip
@@ -104,7 +104,7 @@ _LEVEL = 0.38
 
 
 def _terms(value: float | str) -> float | list[tuple[float, str]]:
-    """Return factors and names of a sum such as "h-0.3r"; a number alone has no name."""
+    """Return factors and names of a sum such as "h-0.3r", or a plain number unchanged."""
     if not isinstance(value, str):
         return value
     found = re.findall(r"([+-]?)(?=[\d.a-z])([\d.]*)([a-z]*)", value)
@@ -120,7 +120,7 @@ def _lengths(values: list[Any], sizes: Sizes) -> list[float]:
     return lengths
 
 
-# The file says what its keys mean; sums are read once, as rooms are drawn often.
+# The file explains its keys. Sums are parsed once, because rooms are drawn often.
 _KINDS: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
 _MAKERS: dict[str, Any] = {"box": box, "cylinder": cylinder, "sphere": sphere}
 for _kind in _KINDS.values():
@@ -131,21 +131,21 @@ for _kind in _KINDS.values():
 
 
 def _part(row: list[Any], sizes: Sizes) -> Shape:
-    """Return a part of a piece by its row in the file."""
+    """Return the part of a piece that a row of the file describes."""
     make, lengths, material, *turn = row
     part = make(*_lengths(lengths, sizes), sizes[material])
     return part._replace(turn=sizes[turn[0]]) if turn else part
 
 
 class Furniture:
-    """Draws pieces of `furniture.toml` for one room."""
+    """Generator of random pieces of `furniture.toml` for one room."""
 
     def __init__(self, rng: Random, material: Materials) -> None:
         self.rng = rng
         self.material = material
 
     def piece(self, name: str, **sizes: Any) -> Piece:
-        """Draw a piece by its name. sizes: what is given and not drawn."""
+        """Draw a piece by name. sizes: given values, which are not drawn."""
         kind = _KINDS[name]
         for size, how in kind.get("draws", {}).items():
             if size not in sizes:
@@ -162,7 +162,7 @@ class Furniture:
         return piece
 
     def ornament(self, x: float, y: float, z: float) -> Piece:
-        """Draw something small that stands at (x, y, z)."""
+        """Draw a small ornament that stands at (x, y, z)."""
         return self.piece(self.rng.choice(_ORNAMENTS), x=x, y=y, z=z)
 
     def _drawn(self, how: Any) -> float:
@@ -176,7 +176,7 @@ class Furniture:
         return self.material(next(name for name, below in how.items() if pick < below))
 
     def spots(self, most: float) -> list[float]:
-        """Draw one to three places, as shares of a width."""
+        """Draw one to three places as shares of a width."""
         return [self.rng.uniform(-most, most) for _ in range(self.rng.randrange(1, 4))]
 
 
@@ -240,5 +240,5 @@ def _doors(make: Furniture, sizes: Sizes) -> Piece:
     return piece
 
 
-# What pieces have besides their parts in the file.
+# Functions that add to the parts of a piece in the file.
 _MORE = {"table": _around_table, "sofa": _cushions, "shelf": _books, "sideboard": _doors}

@@ -1,4 +1,4 @@
-"""Materials of a room: textures whose colours go together, drawn from a table of kinds."""
+"""Materials of a room: textures with matching colours, drawn from a table of kinds."""
 
 import colorsys
 import tomllib
@@ -14,29 +14,29 @@ from qgs_worlds.caster.tables import TEXTURE
 
 Color = Sequence[float]
 
-# The file says what its keys mean.
+# The file explains its keys.
 _KINDS: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
 _FIXED: dict[str, Color] = {"white": (0.95, 0.94, 0.91), "dark": (0.10, 0.09, 0.09)}
 _WOODS: list[Color] = _KINDS["floor"]["kinds"][0]["paints"]["board"]["any"]
 
 
 def toned(color: Color, factor: float) -> Color:
-    """Return `color` made darker (factor < 1) or lighter, within [0, 1]."""
+    """Return a darker (factor < 1) or lighter `color`, within [0, 1]."""
     return [min(part * factor, 1.0) for part in color]
 
 
 def between(rng: Random, value: float | Sequence[float]) -> float:
-    """Return a number as it is, or one drawn evenly from a range [low, high]."""
+    """Return a given number, or draw one uniformly from a range [low, high]."""
     return value if isinstance(value, int | float) else rng.uniform(*value)
 
 
 class Materials:
-    """The growing list of a room's textures, drawn from a few hues that go together."""
+    """Growing list of a room's textures, drawn from a few matching hues."""
 
     def __init__(self, rng: Random) -> None:
         self.rng = rng
         self._rows: list[dict[str, Any]] = []
-        # neighbours, an opposite and a third hue, which go together
+        # neighbouring hues, an opposite one and a third one match
         base = rng.random()
         self._hues = [(base + step + 0.04 * rng.gauss(0, 1)) % 1 for step in (0.0, 0.08, 0.5, 0.35)]
         self._wood = rng.choice(_WOODS)
@@ -64,7 +64,7 @@ class Materials:
         return len(self._rows) - 1
 
     def table(self, first: Sequence[int]) -> np.ndarray:
-        """Return the table of TEXTURE of the ray caster: `first` of them, then all."""
+        """Return the ray caster's table of TEXTURE: the materials `first`, then all."""
         rows = [self._rows[i] for i in first] + self._rows
         table = np.zeros(len(rows), TEXTURE)
         for field in rows[0].keys() - {"colors"}:
@@ -73,9 +73,9 @@ class Materials:
         return table
 
     def _pattern(self, kind: dict[str, Any], paints: dict[str, Color]) -> dict[str, int]:
-        """Draw the pattern of a kind, and its paints into `paints`."""
+        """Draw the pattern of a kind, and add its paints to `paints`."""
         names = kind.get("patterns", [])
-        # a choice among one would use a random number up
+        # a choice among one would consume a random number
         name = self.rng.choice(names) if len(names) > 1 else "".join(names)
         for paint, how in kind.get("paints", {}).items():
             paints[paint] = self._paint(how, paints)

@@ -1,4 +1,4 @@
-"""The plan of a room: walls, openings, furniture and lights, drawn from a seed."""
+"""Plan of a room: walls, openings, furniture and lights, drawn from a seed."""
 
 import math
 from random import Random
@@ -30,20 +30,20 @@ NO_HEIGHTS = np.zeros((1, 2, 2), np.float32)
 
 Size = tuple[float, float, float]
 Point = tuple[float, float, float]
-# Corners of a piece that fits wherever any does.
+# Corners of a piece that fits at every place where another piece fits.
 _SMALLEST: tuple[Point, Point] = ((-0.15, -0.15, 0.0), (0.15, 0.15, 0.3))
 
 
 def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
-    """Return a room of `size` whose furniture leaves the camera centres `eyes` (F, 3) free."""
+    """Return a room of `size` with furniture away from the camera centres `eyes` (F, 3)."""
     material = Materials(rng)
-    # most rooms have four walls of one kind
+    # in most rooms all four walls are of one kind
     wall = material("wall")
     walls = [wall] + [material("wall") if rng.random() < 0.4 else wall for _ in range(3)]
     surfaces = [*walls, material("floor"), material("pale")]
     make = Furniture(rng, material)
     furnisher = Furnisher(size, eyes)
-    # the table first, as it needs the most room
+    # the table comes first, because it needs the most room
     _centre(make, furnisher)
     for side in range(4):
         _against_wall(make, furnisher, side)
@@ -61,7 +61,7 @@ def furnish(rng: Random, size: Size, eyes: np.ndarray) -> Room:
 
 
 class Furnisher:
-    """Places pieces one by one where they hit neither each other nor the cameras."""
+    """Placer of pieces, one by one, without collisions with pieces or cameras."""
 
     def __init__(self, size: Size, eyes: np.ndarray) -> None:
         self.size = size
@@ -70,7 +70,7 @@ class Furnisher:
         self._taken: list[tuple[float, float, float, float]] = []
 
     def place(self, piece: Piece, x: float, y: float, turn: float) -> bool:
-        """Put `piece` at (x, y), turned; False, and nothing is placed, where it does not fit."""
+        """Place `piece` at (x, y), turned; return False, without placing it, if it does not fit."""
         low, high = turned(*bounds(piece), x, y, turn)
         if not self.free(low, high):
             return False
@@ -79,7 +79,7 @@ class Furnisher:
         return True
 
     def free(self, low: Point, high: Point) -> bool:
-        """Return whether the box between two corners is in the room and off pieces and cameras."""
+        """Return True if the box between two corners is inside and clear of pieces and cameras."""
         half_x = self.size[0] / 2
         half_y = self.size[1] / 2
         if low[0] < -half_x or high[0] > half_x or low[1] < -half_y or high[1] > half_y:
@@ -97,13 +97,13 @@ class Furnisher:
 
 
 def bounds(shapes: list[Shape]) -> tuple[Point, Point]:
-    """Return lowest and highest corner of the box around `shapes`."""
+    """Return the lowest and the highest corner of the box around `shapes`."""
     x0, y0, z0, x1, y1, z1 = zip(*[shape.bounds() for shape in shapes], strict=True)
     return (min(x0), min(y0), min(z0)), (max(x1), max(y1), max(z1))
 
 
 def turned(low: Point, high: Point, x: float, y: float, turn: float) -> tuple[Point, Point]:
-    """Return corners of a box that holds the given one after it was turned about z and moved."""
+    """Return the corners of a box around the given one after a turn about z and a move."""
     cos = math.cos(turn)
     sin = math.sin(turn)
     xs = [x + cos * a - sin * b for a in (low[0], high[0]) for b in (low[1], high[1])]
@@ -116,7 +116,7 @@ def _centre(make: Furniture, furnisher: Furnisher) -> None:
     name = rng.choice(CENTRAL)
     turn = float(rng.randrange(4)) * math.pi / 2 + rng.gauss(0, 0.12)
     piece = make.piece(name)
-    # a few tries, after which the room stays without
+    # after a few failed tries the room stays without it
     for _ in range(4):
         x, y = (rng.uniform(-0.18, 0.18) * extent for extent in furnisher.size[:2])
         if furnisher.place(piece, x, y, turn):
@@ -124,14 +124,14 @@ def _centre(make: Furniture, furnisher: Furnisher) -> None:
 
 
 def _against_wall(make: Furniture, furnisher: Furnisher, side: int) -> None:
-    """Place pieces in a row along a wall, backs to it. Sides are -x, -y, +x and +y."""
+    """Place pieces in a row with their backs to a wall. Sides 0 to 3 are -x, -y, +x and +y."""
     rng = make.rng
     across = furnisher.size[side % 2]
     along = furnisher.size[1 - side % 2]
     turn = math.pi / 2 + side * math.pi / 2
     position = -along / 2 + rng.uniform(0.1, 0.6)
     while position < along / 2 - 0.4:
-        # drawing a piece takes long: first see whether any would fit
+        # drawing a piece takes long, so first test if any piece would fit
         spot = turned(*_SMALLEST, *_from_wall(side, across / 2 - 0.2, position + 0.2), turn)
         if furnisher.free(*spot):
             piece = make.piece(rng.choice(AGAINST_WALLS))
@@ -162,7 +162,7 @@ def _on_walls(make: Furniture, size: Size, window_side: int) -> list[Shape]:
             window = make.piece("window")
             # a window is not in a corner
             hung = {rng.uniform(-0.15, 0.15) * along: window}
-            # the size of a picture that is not there, or the rooms of all seeds would change
+            # drawn even without a picture; otherwise the rooms of all seeds would change
             rng.random()
             rng.random()
         else:
@@ -193,7 +193,7 @@ def _fixed(make: Furniture, size: Size) -> list[Shape]:
 
 
 def _lights(rng: Random, size: Size, window_side: int) -> np.ndarray:
-    """Return the table of a warm lamp below the ceiling and a cool window."""
+    """Return the light table of a warm lamp below the ceiling and a cool window."""
     x, y = _from_wall(window_side, size[window_side % 2] / 2 - 0.1, 0.0)
     lights = np.zeros(2, LIGHT)
     lights["place"] = (0.0, 0.0, size[2] - 0.2), (x, y, 1.6)

@@ -1,6 +1,6 @@
-"""`rooms/procedural`: endless furnished rooms, ray-cast on demand.
+"""Data source `rooms/procedural`: endless furnished rooms, ray-cast on demand.
 
-Kernels are imported when the first room is drawn: numba takes longer to load than a recipe does.
+Kernels are imported when the first room is drawn, because numba takes longer to load than a recipe.
 """
 
 import math
@@ -31,7 +31,7 @@ class RoomsConfig(DrawnConfig):
     """Options of `rooms/procedural`."""
 
     fov: tuple[float, float] = (60.0, 75.0)
-    """Least and largest horizontal field of view, degrees."""
+    """Smallest and largest horizontal field of view, in degrees."""
 
     @model_validator(mode="after")
     def _fov_is_a_range(self) -> "RoomsConfig":
@@ -44,14 +44,14 @@ class RoomsConfig(DrawnConfig):
 
 
 class RoomScene(DrawnScene):
-    """One room and the cameras on its path. World: metres, z up, the floor at 0."""
+    """Room with cameras on a path. World: metres, z up, the floor at 0."""
 
     def __init__(
         self, name: str, index: int, config: RoomsConfig, split: Split, cache: ImageCache
     ) -> None:
         super().__init__(name, index, config, split, cache)
         rng = np.random.default_rng(self.key)
-        # drawn first, so that it does not depend on how many numbers the path takes
+        # drawn first, so that it does not depend on the number of draws for the path
         self._plan_seed = int(rng.integers(1 << 62))
         sizes = rng.uniform((4.2, 4.2, 2.45), (5.8, 5.8, 2.9))
         self.size: tuple[float, float, float] = tuple(map(float, sizes))  # type: ignore[assignment]
@@ -60,7 +60,7 @@ class RoomScene(DrawnScene):
 
     @cached_property
     def tables(self) -> "Room":
-        """The furnished room."""
+        """Furnished room."""
         from qgs_worlds.rooms.plan import furnish
 
         return furnish(Random(self._plan_seed), self.size, self.c2w[:, :3, 3])
@@ -78,7 +78,7 @@ class RoomScene(DrawnScene):
 
 
 class RoomsSource(DrawnSource):
-    """Endless procedural rooms; room i of a split is a function of (seed, split, i) alone."""
+    """Source of endless procedural rooms; room i of a split depends only on (seed, split, i)."""
 
     name = "procedural"
     Config = RoomsConfig
@@ -89,7 +89,7 @@ def camera_path(
     rng: np.random.Generator, size: tuple[float, float, float], count: int
 ) -> np.ndarray:
     """Return OpenCV c2w (count, 4, 4) of cameras that look across the room."""
-    # drawn along one wall, then turned, so that all four are alike
+    # drawn along one wall, then turned, so that all four walls are equally likely
     side = int(rng.integers(4))
     across = size[0] if side % 2 == 0 else size[1]
     along = size[1] if side % 2 == 0 else size[0]

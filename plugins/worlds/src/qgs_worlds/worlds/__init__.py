@@ -1,4 +1,4 @@
-"""Procedural worlds for qgs: scenes without meaning, textures, light, cameras."""
+"""Procedural worlds for qgs: abstract scenes with textures, light and cameras."""
 
 from qgs.contracts import Plugin
 from qgs_worlds.worlds.source import WorldsSource

@@ -1,4 +1,4 @@
-"""Cameras of a scene: walks, orbits, looks round and sets that look at one point."""
+"""Cameras of a scene: walks, orbits, looks around, and sets that look at one point."""
 
 import math
 from dataclasses import dataclass
@@ -11,25 +11,28 @@ from qgs_worlds.caster.lens import lens, look_along
 from qgs_worlds.caster.raycast import trace
 from qgs_worlds.worlds.places import Place
 
-# metres from a camera to the box around any shape, at least, before scaling
+# least distance in metres from a camera to the box around any shape, before scaling
 CLEARANCE = 0.2
 # across the longer side of an image, degrees: from a long lens to a wide one
 FOV = (18.0, 90.0)
-# degrees from which on cameras of a walk may look ahead alone
+# least field of view in degrees at which cameras of a walk may only look ahead
 AHEAD_FOV = 60.0
-# length of a path by the distance to what is looked at
+# length of a path relative to the distance of its target
 BASELINE = (0.04, 1.3)
 PLAIN_FOV = (60.0, 75.0)
 PLAIN_TRAVEL = (0.65, 1.2)
 _TRIES = 12
-# pixels of the depth maps by which views are judged
+# size in pixels of the depth maps that rate views
 _PROBE = (6, 6)
 
 
 @dataclass(frozen=True)
 class Rig:
-    """c2w: OpenCV (F, 4, 4). fov: across the longer side of an image, degrees. distance: to what
-    they look at."""
+    """Cameras of a scene.
+
+    c2w: OpenCV (F, 4, 4). fov: across the longer side of an image, in degrees. distance: from the
+    cameras to their target.
+    """
 
     c2w: np.ndarray
     fov: float
@@ -42,7 +45,7 @@ class Rig:
         return np.array([focal, focal, size[1] / 2, size[0] / 2])
 
     def sight(self, place: Place) -> tuple[np.ndarray, float]:
-        """Return centre and radius of a ball around most of what they see; indoors, the room."""
+        """Return centre and radius of a ball around most of the view; indoors, of the room."""
         if place.kind == "indoors":
             half = 0.5 * place.top
             return np.array([0.0, 0.0, half]), math.hypot(*place.high[:2], half) + 0.5
@@ -51,9 +54,9 @@ class Rig:
 
 
 class Path(NamedTuple):
-    """Where cameras may go: from `base`, for `length` metres, towards or around `target`.
+    """Path of cameras from `base`, `length` metres long, towards or around `target`.
 
-    s: from -.5 to .5, one number for each camera. fov: see `Rig`.
+    s: position of each camera on the path, from -.5 to .5. fov: see `Rig`.
     """
 
     base: np.ndarray
@@ -64,7 +67,7 @@ class Path(NamedTuple):
 
 
 Motion: TypeAlias = tuple[np.ndarray, np.ndarray]
-"""Eyes and what they look at, both (F, 3)."""
+"""Camera centres and the points that they look at, both (F, 3)."""
 
 
 def draw_cameras(
@@ -74,14 +77,14 @@ def draw_cameras(
     count: int,
     varied: bool,
 ) -> Rig:
-    """Return cameras in `place` that see something. world: shapes and heights.
+    """Return cameras in `place` with a useful view. world: shapes and heights.
 
-    They are the best of a few draws, and keep `CLEARANCE` from fixed shapes; others that are nearer
-    are to be taken out.
+    They are the best of a few draws and keep `CLEARANCE` from fixed shapes. The caller must remove
+    other shapes that are nearer.
     """
     best = None
     least = math.inf
-    # paths shrink from try to try, as short ones fit anywhere
+    # paths shrink from try to try, because short ones fit anywhere
     for attempt in range(_TRIES):
         rig = _draw(rng, place, count, varied, 0.7**attempt)
         fault = _outside(rig.c2w[:, :3, 3], place, world[0])
@@ -98,13 +101,13 @@ def draw_cameras(
 
 
 def _outside(eyes: np.ndarray, place: Place, shapes: np.ndarray) -> float:
-    """Return 0 if all eyes are where they may be, 100 if not."""
+    """Return 0 if all camera centres are at allowed places, otherwise 100."""
     inside = (eyes >= place.low).all() and (eyes <= place.high).all()
     return 0.0 if inside and clearances(shapes[: place.fixed], eyes).min() > CLEARANCE else 100.0
 
 
 def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
-    """Return the worst view's share of sky and of things right before the camera."""
+    """Return the share of sky and of things close to the camera in the worst view."""
     intrinsics = rig.lens(_PROBE)
     near = clearances(world[0], rig.c2w[:, :3, 3]).min()
     views = [trace(*_PROBE, 0, 1, *world, c2w, intrinsics)[0].ravel() for c2w in rig.c2w]
@@ -115,8 +118,8 @@ def _view_fault(rig: Rig, world: tuple[np.ndarray, np.ndarray]) -> float:
 
 
 def _still(rng: np.random.Generator, place: Place, shapes: np.ndarray, count: int, rig: Rig) -> Rig:
-    """Return cameras a few millimetres apart at the freest of some points, if all else fails."""
-    # any point is better than a camera inside of a wall
+    """Return cameras a few millimetres apart at the freest of some points, as a last resort."""
+    # any point is better than one inside a wall
     points = rng.uniform(place.low, place.high, (64, 3))
     base = points[clearances(shapes[: place.fixed], points).min(1).argmax()]
     eyes = base + 0.01 * rng.uniform(-1, 1, (count, 3))
@@ -156,7 +159,7 @@ def _draw(rng: np.random.Generator, place: Place, count: int, varied: bool, shri
 def _stand(
     rng: np.random.Generator, place: Place, target: np.ndarray, varied: bool
 ) -> tuple[np.ndarray, float]:
-    """Draw a point to look at the target from; return it and its distance."""
+    """Draw a point from which to look at the target; return it and its distance."""
     low, high = np.log(place.distance)
     for _ in range(20):
         distance = math.exp(rng.uniform(low, high))
@@ -178,9 +181,9 @@ def _stand(
 
 
 def _walk(rng: np.random.Generator, path: Path) -> Motion:
-    """Move along a bent line; looking ahead or at what is passed, the longer the lens the more."""
+    """Move along a bent line and look ahead or sideways; longer lenses look more sideways."""
     base, target, length, s, fov = path
-    # people walk more along than up
+    # people move more along the ground than up
     way = rng.normal(size=3) * (1, 1, 0.3)
     way /= np.linalg.norm(way)
     bend = rng.normal(size=3) * (0.3, 0.3, 0.1)
@@ -190,11 +193,11 @@ def _walk(rng: np.random.Generator, path: Path) -> Motion:
 
 
 def _orbit(rng: np.random.Generator, path: Path) -> Motion:
-    """Move around the target, rising and coming nearer a little."""
+    """Move around the target, and slightly up and nearer."""
     base, target, length, s, _ = path
     offset = base - target
     flat = max(math.hypot(offset[0], offset[1]), 0.2)
-    # less than half of a circle, or views share too little
+    # less than half of a circle; otherwise views share too little
     angles = s * min(length / flat, 2.4)
     nearer = 1 + 0.2 * rng.normal() * s
     rise = 0.2 * length * rng.normal() * s
@@ -204,7 +207,7 @@ def _orbit(rng: np.random.Generator, path: Path) -> Motion:
 
 
 def _round(rng: np.random.Generator, path: Path) -> Motion:
-    """Look from one place in directions that overlap."""
+    """Look from one place in several directions with overlapping views."""
     base, target, length, s, fov = path
     angles = s * math.radians(fov) * rng.uniform(0.3, 1.2)
     way = np.stack([*_turned(target - base, angles), np.full(len(s), (target - base)[2])], 1)
@@ -213,7 +216,7 @@ def _round(rng: np.random.Generator, path: Path) -> Motion:
 
 
 def _gather(rng: np.random.Generator, path: Path) -> Motion:
-    """Look from places scattered around one point, all at the target."""
+    """Look at the target from places scattered around one point."""
     base, target, length, s, _ = path
     offsets = rng.normal(size=(len(s), 3)) * (1, 1, 0.5)
     # the square root spreads them nearly evenly over the disc
@@ -225,7 +228,7 @@ _MOTIONS = {"walk": _walk, "orbit": _orbit, "round": _round, "gather": _gather}
 
 
 def _turned(way: np.ndarray, angles: np.ndarray) -> Motion:
-    """Return x and y (F,) of a vector turned about z by some angles."""
+    """Return x and y (F,) of a vector turned about z by each angle."""
     cos = np.cos(angles)
     sin = np.sin(angles)
     return cos * way[0] - sin * way[1], sin * way[0] + cos * way[1]
@@ -234,7 +237,7 @@ def _turned(way: np.ndarray, angles: np.ndarray) -> Motion:
 def _look_at(eyes: np.ndarray, targets: np.ndarray, roll: np.ndarray) -> np.ndarray:
     forward = targets - eyes
     flat = np.linalg.norm(forward[:, :2], axis=1)
-    # never straight up or down, where nothing says which way is right
+    # never straight up or down, where the right direction is undefined
     forward[:, 2] = np.clip(forward[:, 2], -4 * flat, 4 * flat)
     forward[flat < 1e-6] = (1.0, 0.0, 0.0)
     return look_along(eyes, forward, roll)

@@ -1,4 +1,4 @@
-"""Scenes drawn from a seed: place, light and camera; photos of them."""
+"""Random scenes from a seed (place, light and camera), and their photos."""
 
 import math
 from collections.abc import Sequence
@@ -32,15 +32,15 @@ Light = tuple[float, Sequence[float], np.ndarray, int]
 """A row of LIGHT."""
 # Height maps of a world.
 _MAPS = 4
-# Pixels of the pictures by which a scene is exposed, and its depth known.
+# Size in pixels of the images that determine exposure and depth of a scene.
 _THUMB = (10, 10)
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A scene: its place, world and cameras; how its photos are developed.
+    """Scene with place, world, cameras and effects of the camera.
 
-    scale: factor of all lengths, which brings the median depth of what is seen into its range.
+    scale: factor of all lengths that brings the median visible depth into its range.
     """
 
     place: Place
@@ -50,16 +50,16 @@ class Drawn:
     scale: float
 
     def photos(self, frames: list[int], size: Size, samples: int) -> list[np.ndarray]:
-        """Return images (H, W, 3) uint8."""
+        """Return an image (H, W, 3) uint8 for each frame."""
         light = np.empty((len(frames), *size, 3), np.float32)
         cast(self.world, self.rig.c2w[frames], self.rig.lens(size), size, samples, paint, light)
         return [self.effects.photo(seen, frame) for seen, frame in zip(light, frames, strict=True)]
 
 
 def draw(key: list[int], config: "WorldsConfig") -> Drawn:
-    """Return the scene of a key (seed, split, index); each option has random numbers of its own."""
+    """Return the scene of a key (seed, split, index)."""
     numbers = np.random.default_rng(key)
-    # four generators, so that an option changes its own part alone
+    # four generators, so that each option changes only its own part
     plan, skin, shine, camera = (Random(int(numbers.integers(1 << 62))) for _ in range(4))
     maps = materials.height_maps(int(numbers.integers(1 << 31)), _MAPS)
     varied = config.shapes == "varied"
@@ -70,7 +70,7 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
     shapes = packed(place.shapes)
     moving = config.cameras == "varied"
     rig = draw_cameras(numbers, place, (shapes, maps), config.views_per_scene, moving)
-    # things that stand where cameras are go
+    # remove things at the places of cameras
     kept = clearances(shapes, rig.c2w[:, :3, 3]).min(0) > CLEARANCE
     kept[: place.fixed] = True
     shapes = shapes[kept]
@@ -85,14 +85,14 @@ def draw(key: list[int], config: "WorldsConfig") -> Drawn:
     scale = 1.0
     if config.depth is not None:
         seen = depths[np.isfinite(depths)]
-        # a view of the sky alone has no depth
+        # a view that shows only sky has no depth
         median = float(np.median(seen)) if len(seen) else rig.distance
         scale = spread(Random(str(key)), *config.depth) / median
     return Drawn(place, world, rig, effects, scale)
 
 
 def _tinted(rng: Random, by: float) -> np.ndarray:
-    """Return a colour of mean 1, from warm to cool, a little green or magenta."""
+    """Return a colour with mean 1, from warm to cool and slightly green or magenta."""
     warm = rng.gauss(0, by)
     green = rng.gauss(0, 0.3 * by)
     color = np.array([2**warm, 2**green, 2**-warm])
@@ -100,9 +100,9 @@ def _tinted(rng: Random, by: float) -> np.ndarray:
 
 
 def draw_lights(rng: Random, place: Place, varied: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return tables of LIGHT and, with one row, of AIR. Lamps may be inside of things.
+    """Return a table of LIGHT and one of AIR with one row. Lamps may be inside things.
 
-    Not varied: one white lamp above the middle, which throws no shadows, as in a studio.
+    If not `varied`, there is one white lamp above the middle without shadows, as in a studio.
     """
     if not varied:
         lamp = (1.0, (0.3, 0.2, place.top - 0.3), np.full(3, 1.2), 0)
@@ -112,10 +112,10 @@ def draw_lights(rng: Random, place: Place, varied: bool) -> tuple[np.ndarray, np
     tint = _tinted(rng, 0.25)
     lights = [_sun(rng)] if sunny else []
     low, high = _LAMPS[place.kind]
-    # a scene that is not outdoors has one light at least
+    # a scene that is not outdoors has at least one light
     low = low if sunny or outdoors else 1
     for number in range(rng.randint(low, high)):
-        # shadow maps are slow to cast: only the first lamp has them
+        # shadow maps are slow to cast, so only the first lamp has them
         lights.append(_lamp(rng, place, number == 0 and not outdoors))
     above = spread(rng, 0.07, 0.5) * (1 if place.kind == "indoors" else 1.5) * tint
     below = rng.uniform(0.3, 0.9) * above * _tinted(rng, 0.15)
@@ -152,11 +152,11 @@ def _air(rng: Random, above: np.ndarray, below: np.ndarray, occlusion: float) ->
 
 
 def draw_effects(rng: Random, light: np.ndarray, varied: bool) -> Effects:
-    """Return the camera of a scene. light: of small pictures of all its views, which expose it."""
+    """Return the camera effects of a scene. light: small images of all views, to set exposure."""
     luminance = light.reshape(-1, 3) @ (0.3, 0.6, 0.1)
     # the mean of logarithms, so that a bright sky leaves the rest visible
     grey = math.exp(float(np.log(luminance + 0.02).mean()))
-    # the exponent of middle tones, which cameras' curves make steeper than that of displays
+    # the exponent of middle tones, which is steeper in cameras than in displays
     gamma = rng.uniform(1.15, 2.0) if varied else 1.6
     gains = np.full(3, 0.43**gamma / grey)
     if not varied:

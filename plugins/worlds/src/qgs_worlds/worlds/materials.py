@@ -1,4 +1,4 @@
-"""Textures of a world: noise through ramps of colours that go together, and patterns over it."""
+"""Textures of a world: noise in ramps of matching colours, with patterns on top."""
 
 import colorsys
 import math
@@ -19,7 +19,7 @@ COUNT = 14
 # points of a height map along each axis
 _SIDE = 33
 _PLAIN_PATTERNS = (s.STRIPES, s.CHECKER, s.TILES, s.DOTS)
-# what is named twice is drawn more often
+# a name that is listed twice is drawn more often
 _PATTERNS = (*_PLAIN_PATTERNS, s.TILES, s.GLYPHS, s.GLYPHS, s.RINGS)
 
 Color = tuple[float, float, float]
@@ -28,7 +28,7 @@ Texture = Mapping[str, ArrayLike]
 
 
 class Palette:
-    """A few hues and a liking for colour or grey, for one world. Colours are linear."""
+    """Hues of one world and its preference for colour or grey. Colours are linear."""
 
     def __init__(self, rng: Random) -> None:
         self.rng = rng
@@ -38,7 +38,7 @@ class Palette:
         self._grey = rng.uniform(1.5, 7)
 
     def color(self) -> Color:
-        """Return a colour: most are dull, few are bright or dark."""
+        """Draw a colour; most are dull, few are bright or dark."""
         rng = self.rng
         hue = rng.choice(self._hues) if rng.random() < 0.8 else rng.random()
         saturation = rng.random() ** self._grey
@@ -47,14 +47,14 @@ class Palette:
         return red**2.2, green**2.2, blue**2.2
 
     def near(self, color: Color, by: float) -> Color:
-        """Return a colour that differs from another by about `by` stops, and a little in hue."""
+        """Draw a colour that differs from `color` by about `by` stops and slightly in hue."""
         tone = 2 ** self.rng.gauss(0, by)
         red, green, blue = (min(tone * c * 2 ** self.rng.gauss(0, 0.25 * by), 0.9) for c in color)
         return red, green, blue
 
 
 def textures(rng: Random, varied: bool, highlights: bool) -> np.ndarray:
-    """Return a table of TEXTURE, COUNT long. Without highlights all else is drawn alike."""
+    """Return a table of COUNT TEXTUREs. `highlights` changes nothing else in them."""
     palette = Palette(rng)
     table = np.zeros(COUNT, s.TEXTURE)
     for field in ("period", "stretch", "pattern_period", "aspect"):
@@ -68,7 +68,7 @@ def textures(rng: Random, varied: bool, highlights: bool) -> np.ndarray:
 
 
 def _plain(rng: Random, palette: Palette) -> Texture:
-    """Draw an even surface, or two colours in a simple pattern."""
+    """Draw a uniform surface, or two colours in a simple pattern."""
     base = palette.color()
     ramp = [palette.near(base, 0.1), base, palette.near(base, 0.1)]
     fields = {"octaves": 1, "period": rng.uniform(0.3, 1), "contrast": 0.6}
@@ -95,18 +95,18 @@ def _pattern(rng: Random, kinds: tuple[int, ...]) -> dict[str, float]:
 
 
 def _varied(rng: Random, palette: Palette, highlights: bool) -> Texture:
-    """Draw noise with a spectrum near 1/f, half of it with a pattern; some surfaces are even."""
+    """Draw noise with a spectrum near 1/f, half of it with a pattern; some surfaces are uniform."""
     base = palette.color()
     flat = rng.random() < 0.2
     by = 0.15 if flat else rng.uniform(0.5, 1.6)
     ramp = [palette.near(base, by), base, palette.near(base, by)]
     if not flat and rng.random() < 0.3:
         ramp[rng.randrange(3)] = palette.color()
-    # cells are conspicuous, so rare
+    # cells are conspicuous, so they are rare
     basis = rng.choice((s.VALUE, s.VALUE, s.GRADIENT, s.GRADIENT, s.CELLS))
     octaves = 2 if basis == s.CELLS else rng.randint(3, 5)
     gain = rng.uniform(0.5, 0.85)
-    # octaves add up to a like contrast, however many there are
+    # octaves add up to a similar contrast for any number of octaves
     norm = math.sqrt(sum(gain ** (2 * k) for k in range(octaves)))
     fields = {
         "basis": basis,
@@ -129,7 +129,7 @@ def _varied(rng: Random, palette: Palette, highlights: bool) -> Texture:
 
 @njit(**OPTIONS)
 def height_maps(seed, count):
-    """Return (count, 33, 33) float32 in [-1, 1]: smooth octaves, each map of its own grain."""
+    """Return (count, 33, 33) float32 in [-1, 1] of smooth octaves, each map with its own grain."""
     maps = np.empty((count, _SIDE, _SIDE), np.float32)
     for k in range(count):
         cells = 2.0 + 5.0 * chance(k, 0, seed)
@@ -148,6 +148,6 @@ def height_maps(seed, count):
                     weight = gain * weight
                 maps[k, i, j] = height
                 largest = max(largest, abs(height))
-        # all maps use the whole range, for which terrains are scaled
+        # all maps use the whole range, as the scale of terrains assumes
         maps[k] /= max(largest, 1e-6)
     return maps

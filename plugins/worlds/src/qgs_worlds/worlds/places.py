@@ -1,4 +1,4 @@
-"""Kinds of scenes: a room with openings, the open with far things, objects on plain ground."""
+"""Kinds of scenes: rooms with openings, outdoor scenes with far things, objects on plain ground."""
 
 import math
 from collections.abc import Callable
@@ -22,11 +22,11 @@ _TERRAIN = 24.0
 
 @dataclass
 class Place:
-    """Shapes, and where cameras may stand and what they look at.
+    """Shapes of a scene, and possible positions and targets of cameras.
 
-    fixed: the number of shapes, from the first, that stay where cameras come near. low, high:
-    corners of the box for eyes. eyes: usual heights of eyes. targets: points to look at.
-    distance: least and largest one from an eye to its target. top: where lamps hang.
+    fixed: number of first shapes that stay even if cameras come near. low, high: corners of the
+    box for camera centres. eyes: usual heights of camera centres. targets: points to look at.
+    distance: smallest and largest distance from a camera to its target. top: height of lamps.
     """
 
     kind: str
@@ -45,7 +45,7 @@ def _level(x: float, y: float) -> float:
 
 
 def _toward(angle: float, away: float) -> tuple[float, float]:
-    """Return x and y of the point at a distance from the middle in a direction."""
+    """Return x and y of the point at distance `away` from the middle in direction `angle`."""
     return away * math.cos(angle), away * math.sin(angle)
 
 
@@ -66,7 +66,7 @@ def _indoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place
     size = (rng.uniform(2.6, 7.5), rng.uniform(2.6, 7.5), rng.uniform(2.2, 3.8))
     plain = things.style.tilted == 0
     shapes = [_ground(things, spread(rng, 0.4, 1.5)), *_walls(rng, things, size, 0 if plain else 3)]
-    # what is seen through the openings
+    # things that are visible through the openings
     for wall in [shape for shape in shapes if shape.cut]:
         toward = math.atan2(wall.body.center[1], wall.body.center[0])
         for _ in range(2):
@@ -76,7 +76,7 @@ def _indoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place
     y = size[1] / 2
     z = size[2]
     for _ in range(count):
-        # things leave way for cameras
+        # things leave space for cameras
         extent = min(spread(rng, 0.15, 1.0), 0.3 * min(size))
         at = (rng.uniform(-x, x) * 0.85, rng.uniform(-y, y) * 0.85, 0.0)
         shapes += _put(rng, things, at, extent, z)
@@ -94,7 +94,7 @@ def _indoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place
 
 
 def _put(rng: Random, things: Things, at: Point, size: float, ceiling: float) -> Thing:
-    """Draw a thing on the floor, at some height, or under the ceiling."""
+    """Draw a thing on the floor, at a random height, or under the ceiling."""
     thing = things.draw()
     pick = rng.random()
     lift = 0.0
@@ -112,7 +112,7 @@ def _beam(rng: Random, things: Things, x: float, y: float, z: float) -> Shape:
 
 
 def _walls(rng: Random, things: Things, size: Point, most: int) -> list[Shape]:
-    """Draw four walls and a ceiling, and windows or doors in up to `most` of them."""
+    """Draw four walls and a ceiling, with windows or doors in up to `most` walls."""
     half_x = size[0] / 2
     half_y = size[1] / 2
     height = size[2]
@@ -171,7 +171,7 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
         middle = len(maps[index]) // 4
         level = amplitude * float(maps[index][middle:-middle, middle:-middle].max())
     fixed = len(shapes)
-    # far things give the horizon an outline
+    # far things shape the horizon
     for _ in range(2 + count // 4):
         shapes += _far(rng, things, any_angle(rng))
     near: list[Shape] = []
@@ -189,14 +189,14 @@ def _outdoors(rng: Random, things: Things, count: int, maps: np.ndarray) -> Plac
 
 
 def _on(field: np.ndarray, amplitude: float) -> Callable[[float, float], float]:
-    """Return a function for the height of a terrain at x, y."""
+    """Return a function that gives the height of a terrain at x, y."""
     return lambda x, y: (
         amplitude * height_of(field, np.float32(x / _TERRAIN), np.float32(y / _TERRAIN))
     )
 
 
 def _far(rng: Random, things: Things, angle: float) -> Thing:
-    """Draw a hill, a building or a tree in a direction; it begins below any ground."""
+    """Draw a hill, a building or a tree in a direction; its base is below all ground."""
     pick = rng.random()
     if pick < 0.3:
         away = rng.uniform(60, 220)
@@ -242,7 +242,7 @@ def _objects(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place
     fixed = len(shapes)
     spot = (rng.gauss(0, 0.2), rng.gauss(0, 0.2))
     for number in range(count):
-        # every other thing stands in a heap, where things hide each other
+        # every second thing stands in a heap, where things occlude each other
         if number % 2:
             x = rng.gauss(0, 0.7)
             y = rng.gauss(0, 0.7)
@@ -262,5 +262,5 @@ def _objects(rng: Random, things: Things, count: int, maps: np.ndarray) -> Place
 
 
 PLACES = {"indoors": _indoors, "outdoors": _outdoors, "objects": _objects}
-"""By kind, what draws it with a number of things; terrains take one of the height maps."""
+"""Function that draws each kind with a number of things; terrains use one of the height maps."""
 SHARES = (0.45, 0.3, 0.25)

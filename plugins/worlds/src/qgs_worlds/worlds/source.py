@@ -1,6 +1,6 @@
-"""`worlds/procedural`: endless scenes without meaning, ray-cast on demand.
+"""Data source `worlds/procedural`: endless abstract scenes, ray-cast on demand.
 
-Kernels are imported when the first scene is drawn: numba takes longer to load than a recipe does.
+Kernels are imported when the first scene is drawn, since numba takes longer to load than a recipe.
 """
 
 import math
@@ -27,28 +27,32 @@ class WorldsConfig(DrawnConfig):
     """Options of `worlds/procedural`."""
 
     scenes: int = Field(default=100_000, ge=1)
-    """Scenes of the training split."""
+    """Number of scenes in the training split."""
     complexity: int = Field(default=32, ge=4)
-    """The most things near the cameras, of a few shapes each; how many is drawn log-uniformly."""
+    """Largest number of things near the cameras, each of a few shapes. The number is drawn
+    log-uniformly."""
     cameras: Variety = "varied"
-    """Plain: a walk along a line, level, with a field of view of 60 to 75 degrees. Varied: walks,
-    orbits, looks round and sets that look at one point, over baselines from tiny to wide, with
-    pitch and roll and 18 to 90 degrees. Fields of view are across an image's longer side."""
+    """Camera paths. Plain: level walks along a line, with fields of view of 60 to 75 degrees.
+    Varied: walks, orbits, looks around and sets that look at one point, with tiny to wide
+    baselines, pitch, roll and 18 to 90 degrees. Fields of view are across the longer side of an
+    image."""
     shapes: Variety = "varied"
-    """Plain: upright boxes, balls and cylinders in closed rooms. Varied: composites of all
-    primitives turned freely, with cuts, bars, wires and height fields, in rooms with openings, in
-    the open, and on plain ground."""
+    """Shapes of things. Plain: upright boxes, balls and cylinders in closed rooms. Varied: freely
+    turned composites of all primitives, with cuts, bars, wires and height fields, in rooms with
+    openings, outdoors and on plain ground."""
     textures: Variety = "varied"
-    """Plain: even surfaces and simple patterns. Varied: noise near 1/f, warped, and patterns."""
+    """Textures. Plain: uniform surfaces and simple patterns. Varied: warped noise near 1/f, and
+    patterns."""
     light: Variety = "varied"
-    """Plain: one lamp and soft shading. Varied: sun and lamps with shadows, highlights, fog."""
+    """Light. Plain: one lamp and soft shading. Varied: sun and lamps with shadows, highlights and
+    fog."""
     depth: tuple[float, float] | None = (1.2, 4.0)
-    """Least and largest median depth of what cameras see, metres; each scene is scaled to a depth
-    drawn from it log-uniformly. null: scenes are as large as they are drawn."""
+    """Smallest and largest median depth in the views, in metres. Each scene is scaled to a depth
+    drawn log-uniformly from this range. Null: scenes are not scaled."""
     rooms: float = Field(default=0.0, ge=0, le=1)
-    """Share of scenes that are those of `rooms/procedural` instead, with the same numbers."""
+    """Share of scenes, from 0 to 1, to take from `rooms/procedural` at the same index."""
     effects: bool = True
-    """Whether cameras differ in exposure, white balance, tone, vignette, noise and JPEG quality."""
+    """Vary exposure, white balance, tone, vignette, noise and JPEG quality between cameras."""
 
     @field_validator("depth")
     @classmethod
@@ -61,19 +65,19 @@ class WorldsConfig(DrawnConfig):
 
     @cached_property
     def of_rooms(self) -> RoomsConfig:
-        """Options of the rooms among the scenes."""
+        """Options of the scenes that are rooms."""
         alike = self.model_dump(include={"image_size", *DrawnConfig.model_fields})
         return RoomsConfig(**alike)
 
 
 class WorldScene(DrawnScene):
-    """One scene and its cameras. World: metres, scaled by `drawn.scale`; z up."""
+    """Scene with its cameras. World: metres, scaled by `drawn.scale`; z up."""
 
     _config: WorldsConfig
 
     @cached_property
     def drawn(self) -> "Drawn":
-        """What is there, and how it is seen."""
+        """Content, light and cameras of the scene."""
         from qgs_worlds.worlds.drawing import draw
 
         return draw(self.key, self._config)
@@ -106,15 +110,15 @@ class WorldScene(DrawnScene):
 def world_or_room(
     name: str, index: int, config: WorldsConfig, split: Split, cache: ImageCache
 ) -> DrawnScene:
-    """Scene `index` of a split: a world, or a room by the share of `rooms`."""
-    # a generator of its own, so that the share changes no scene
+    """Return scene `index` of a split: a world, or a room for a share `rooms` of the scenes."""
+    # a separate generator, so that the share changes no scene
     if Random(f"{config.seed} {split} {index}").random() >= config.rooms:
         return WorldScene(name, index, config, split, cache)
     return RoomScene(name, index, config.of_rooms, split, cache)
 
 
 class WorldsSource(DrawnSource):
-    """Endless procedural scenes; scene i of a split is a function of (seed, split, i) alone."""
+    """Source of endless procedural scenes; scene i of a split depends only on (seed, split, i)."""
 
     name = "procedural"
     Config = WorldsConfig

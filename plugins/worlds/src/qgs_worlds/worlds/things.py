@@ -1,4 +1,4 @@
-"""Things without meaning: composites of primitives, with cuts, bars and wires, repeated in rows."""
+"""Abstract things: composites of primitives, with cuts, bars and wires, repeated in rows."""
 
 import math
 from collections.abc import Callable
@@ -27,17 +27,17 @@ def spread(rng: Random, low: float, high: float) -> float:
 
 
 def any_angle(rng: Random) -> float:
-    """Draw a direction, radians."""
+    """Draw a direction in radians."""
     return rng.uniform(0, math.tau)
 
 
 @dataclass(frozen=True)
 class Style:
-    """What things are made of.
+    """Distribution of the shapes of things.
 
-    kinds: of primitives. tilted: share of primitives turned freely. cut, wired, repeated: shares of
-    things from which something is taken away, which are bars or wires, which stand in rows.
-    even: whether primitives are as wide as deep.
+    kinds: kinds of primitives. tilted: share of freely turned primitives. cut, wired, repeated:
+    shares of things with a cut, of bars or wires, and of things repeated in rows. even: True if
+    primitives are as wide as deep.
     """
 
     kinds: tuple[int, ...]
@@ -58,9 +58,9 @@ VARIED = Style(
 
 
 class Things:
-    """Draws things about 2 units large around the origin.
+    """Generator of random things of about 2 units around the origin.
 
-    textures: there are this many, of which a shape takes one, or six in a row for its faces.
+    textures: number of textures; a shape uses one, or six consecutive ones for its faces.
     maps: number of height maps.
     """
 
@@ -71,12 +71,12 @@ class Things:
         self._textures = textures
 
     def texture(self) -> tuple[int, int]:
-        """Draw the first texture of a shape and the number of them."""
+        """Draw the first texture of a shape and the number of its textures."""
         faces = 6 if self.rng.random() < 0.3 else 1
         return self.rng.randrange(self._textures - 5), faces
 
     def skinned(self, body: Primitive, scale: float = 1.0) -> Shape:
-        """Return a shape with textures of its own."""
+        """Return a shape with its own random textures."""
         first, faces = self.texture()
         return Shape(body, None, first, faces, self.rng.randrange(self._textures), scale)
 
@@ -115,8 +115,8 @@ class Things:
         return Primitive(kind, center, (a, b, c), self._turn(), extra)
 
     def _cut(self, body: Primitive) -> Primitive | None:
-        """Draw what is taken away from a primitive, at its surface or through it."""
-        # their exits are not known, which cuts need
+        """Draw a primitive to cut from another one, at its surface or through it."""
+        # cuts need exits, which these kinds do not have
         if body.kind in (s.TORUS, s.HEIGHT):
             return None
         rng = self.rng
@@ -137,7 +137,7 @@ class Things:
             reach = 0.6 if count > 1 else 0.0
             x, y, z = (rng.uniform(-reach, reach) for _ in range(3))
             body = self._primitive((x, y, z), 1.0 if count == 1 else rng.uniform(0.4, 0.9))
-            # parts of a thing often share a texture
+            # parts of a thing often have the same texture
             skin = skin if rng.random() < 0.4 else self.texture()
             hole = self._cut(body) if cut else None
             inner = skin[0] if rng.random() < 0.5 else rng.randrange(self._textures)
@@ -201,14 +201,14 @@ class Things:
 
 
 def lowest(thing: Thing) -> float:
-    """Return the least height of a thing, or a little below."""
+    """Return a lower bound, close to the least height of a thing."""
     return min(shape.body.center[2] - shape.body.reach() for shape in thing)
 
 
 def placed(
     thing: Thing, to: Point, turn: float, size: float, on: Callable[[float, float], float]
 ) -> Thing:
-    """Return the thing scaled and turned, to[2] metres above the ground `on` (x, y)."""
+    """Return the thing scaled, turned and placed to[2] metres above the ground `on` (x, y)."""
     low = lowest(thing) * size
     place = (to[0], to[1], to[2] + on(to[0], to[1]) - low)
     return [shape.moved(place, about_z(turn), size) for shape in thing]

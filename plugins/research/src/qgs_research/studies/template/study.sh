@@ -1,7 +1,7 @@
 #!/bin/bash
-# A study as an array, with a task for each run that is missing; the same with --workers 0 in place of --only writes the table.
-# Change time, memory and partition to those of your cluster. Five minutes before its time is over,
-# or when it is preempted, a task saves; Slurm then starts it again, and it goes on.
+# A study as a job array with a task for each missing run. To write the table, run the command with --workers 0 in place of --only.
+# Set time, memory and partition for your cluster. A task saves when it is preempted and five minutes
+# before its time ends. Slurm then starts it again, and it continues.
 #SBATCH --array={array}
 #SBATCH --job-name={name}
 #SBATCH --output={log}

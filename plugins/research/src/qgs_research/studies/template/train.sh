@@ -1,6 +1,6 @@
 #!/bin/bash
-# A training on GPUs of one node. Change time, memory, partition and GPUs to those of your cluster.
-# Five minutes before its time is over, or when it is preempted, the job saves; Slurm then starts it again, and it goes on.
+# A training on the GPUs of one node. Set time, memory, partition and GPUs for your cluster.
+# The job saves when it is preempted and five minutes before its time ends. Slurm then starts it again, and it continues.
 #SBATCH --job-name={name}
 #SBATCH --output={log}
 #SBATCH --ntasks=1
@@ -11,8 +11,8 @@
 #SBATCH --requeue
 #SBATCH --open-mode=append
 cd {folder} || exit
-# The trainings, not torchrun, which would kill them after 30 s, perhaps while they save.
+# Signal the trainings, not torchrun: it would kill them after 30 s, perhaps while they save.
 trap 'pkill -TERM -P "$job"; wait "$job"; scontrol requeue "$SLURM_JOB_ID"' TERM
-# In the background: bash runs a trap only after a command in the foreground has ended.
+# Run in the background, because bash runs a trap only after a foreground command has ended.
 {command} & job=$!
 wait "$job"
