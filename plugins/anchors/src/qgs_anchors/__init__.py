@@ -1,1 +1,1 @@
-"""Beyond LocusGS: anchors with an ellipsoid for a support, and Landmark."""
+"""Extensions of LocusGS: anchors with an ellipsoidal support, and Landmark."""

@@ -1,4 +1,4 @@
-"""LocusGS for qgs: queries with a 3D anchor that steers attention and places Gaussians."""
+"""LocusGS for qgs: each query has a 3D anchor that steers attention and places Gaussians."""
 
 from qgs.contracts import Plugin
 from qgs_locus.anchors import AnchoredQueries, FrustumCenters

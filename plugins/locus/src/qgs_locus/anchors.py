@@ -1,4 +1,4 @@
-"""`locus/anchored`: every query has a 3D anchor, a centre with a support radius."""
+"""`locus/anchored`: queries with a 3D anchor, which is a centre with a support radius."""
 
 from collections.abc import Iterable
 from typing import Annotated, Literal
@@ -31,25 +31,25 @@ from qgs_locus.fields import (
 
 
 class NormalCenters(ComponentConfig):
-    """Centres start normally distributed (release: N(0, 1), z + 1)."""
+    """Normal distribution of the first centres (release: N(0, 1), z + 1)."""
 
     kind: Literal["normal"] = "normal"
-    """Centres start normally distributed around `mean`."""
+    """Draw the centres from a normal distribution around `mean`."""
     mean: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Mean of the centres, world units."""
     std: float = Field(default=1.0, ge=0)
     """Standard deviation of each coordinate, world units."""
 
     def sample(self, count: int) -> Tensor:
-        """Centres (count, 3)."""
+        """Draw centres (count, 3)."""
         return torch.randn(count, 3) * self.std + torch.tensor(self.mean)
 
 
 class FrustumCenters(ComponentConfig):
-    """Centres start inside the first camera's frustum, uniform in log depth and in the image."""
+    """First centres in the first camera's frustum, uniform in log depth and in the image."""
 
     kind: Literal["frustum"]
-    """Centres start inside the first camera's frustum, uniform in log depth and in the image."""
+    """Draw centres in the first camera's frustum, uniformly in log depth and in the image."""
     depth: tuple[float, float] = (0.3, 3.0)
     """[nearest, farthest] z, world units."""
     slope: float = Field(default=0.6, gt=0)
@@ -67,7 +67,7 @@ class FrustumCenters(ComponentConfig):
         return depth
 
     def sample(self, count: int) -> Tensor:
-        """Centres (count, 3)."""
+        """Draw centres (count, 3)."""
         near, far = self.depth
         # Equal steps of parallax, not of depth.
         z = near * (far / near) ** torch.rand(count, 1)
@@ -75,7 +75,7 @@ class FrustumCenters(ComponentConfig):
 
 
 class AnchoredQueries(LearnedQueries):
-    """N learned vectors, centres mu and raw radii rho, shared by all scenes (LocusGS)."""
+    """N queries with learned features, centres mu and raw radii rho, shared by all scenes."""
 
     name = "anchored"
 
@@ -83,42 +83,42 @@ class AnchoredQueries(LearnedQueries):
         count: int = Field(default=4096, ge=1)
         """N, the number of queries."""
         std: float = Field(default=0.01, ge=0)
-        """Standard deviation of the normal distribution that the features start from."""
+        """Standard deviation of the initial features, which are normally distributed."""
         radius: bool = True
-        """Whether anchors have a support radius; false for centres alone."""
+        """Give anchors a support radius. With false, they have a centre only."""
         init_radius: float = Field(default=1.0, gt=0)
-        """softplus of the raw radius that every anchor starts with, world units."""
+        """Initial softplus of each raw radius, world units."""
         center_init: Annotated[NormalCenters | FrustumCenters, Field(discriminator="kind")] = (
             NormalCenters()
         )
-        """Distribution that the anchor centres start from."""
+        """Distribution of the initial anchor centres."""
 
     config: Config
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         self.features = nn.Parameter(torch.randn(config.count, dims.width) * config.std)
-        # Places are learned as features are: the same anchors start every scene.
+        # Centres are learned, as features are: every scene starts with the same anchors.
         self.center = nn.Parameter(config.center_init.sample(config.count))
         if config.radius:
-            # Stored before softplus, so that no step of the optimiser makes a radius negative.
+            # Stored before softplus, so that no optimiser step can make a radius negative.
             raw = raw_radius_of(config.init_radius)
             self.raw_radius = nn.Parameter(torch.full((config.count, 1), raw))
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """The centre, and the raw radius if there is one."""
+        """Return the centre, and the raw radius if there is one."""
         return {**CENTER_FIELD, **(radius_field(config) if config.radius else {})}
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Options of a radius that there is not."""
+        """Report radius options that have no effect because `radius` is false."""
         if not config.radius:
             idle = ("init_radius", "radius_bound", "radius_min")
             yield from without_effect(config, idle, "`radius` is false")
 
     def start(self, batch_size: int) -> QueryState:
-        """Features (B, N, D), `anchor.center` (B, N, 3) and `anchor.raw_radius` (B, N, 1)."""
+        """Return features (B, N, D), `anchor.center` (B, N, 3), `anchor.raw_radius` (B, N, 1)."""
         fields = {CENTER: self.center.expand(batch_size, -1, -1)}
         if self.config.radius:
             fields[RAW_RADIUS] = self.raw_radius.expand(batch_size, -1, -1)
@@ -126,9 +126,9 @@ class AnchoredQueries(LearnedQueries):
         return QueryState(features=features, fields=fields)
 
     def support(self, state: QueryState) -> SpatialSupport:
-        """Balls of the support radius, points for anchors without one."""
+        """Return balls of the support radius; anchors without a radius are points."""
         center_BN3 = state[CENTER]
-        # Anchors without a radius are shown as points.
+        # A radius of 0 shows an anchor as a point.
         r_BN1 = torch.zeros_like(center_BN3[..., :1])
         if self.config.radius:
             r_BN1 = support_radius(state[RAW_RADIUS], self.config)

@@ -34,10 +34,11 @@ from qgs_locus.ray_bias import RayBias, ray_tokens
 
 
 class RayBiasedCrossAttention(CrossAttention):
-    """By content, and by the distance D of a patch's ray to the anchor (LocusGS), equation (4).
+    """Cross-attention that prefers patches whose rays pass near the anchor: equation (4).
 
-    softmax(q k / sqrt(d) + gamma b) v, b = -1/2 (D / sigma)^2. sigma = sigma0 r ("radius"), or
-    sigma0 ("fixed"). The bias is the same for all heads.
+    It computes softmax(q k / sqrt(d) + gamma b) v with b = -1/2 (D / sigma)^2. D is the distance
+    from the patch's ray to the anchor's centre. sigma is sigma0 r ("radius") or sigma0 ("fixed").
+    All heads share the bias.
     """
 
     name = "ray_biased"
@@ -46,60 +47,60 @@ class RayBiasedCrossAttention(CrossAttention):
 
     class Config(RadiusOptions):
         bandwidth: Literal["radius", "fixed"] = "radius"
-        """sigma is `sigma0` times the anchor's radius, or `sigma0` for every anchor ("fixed")."""
+        """Set sigma to `sigma0` times the anchor's radius, or to `sigma0` for all ("fixed")."""
         sigma0: float = Field(default=0.1, gt=0)
-        """Bandwidth per radius, or the bandwidth in world units if it is fixed."""
+        """Bandwidth sigma in radii of the anchor, or in world units if it is fixed."""
         sigma_sq_min: float = Field(default=1e-3, gt=0)
-        """Least (sigma0 r)^2, world units squared."""
+        """Lower bound of (sigma0 r)^2, world units squared."""
         bias_min: float = Field(default=-20.0, lt=0)
-        """Lower clamp of the bias b, before gamma."""
+        """Lower bound of the bias b, before it is multiplied by gamma."""
         direction_eps: float = Field(default=1e-6, gt=0)
-        """Least length that the mean direction of a patch is divided by."""
+        """Lower bound of the length by which the mean direction of a patch is divided."""
         gamma_init: float = -2.25
-        """Initial g of each layer; the weight of the bias is gamma = softplus(g)."""
+        """Initial g of each layer. The bias is multiplied by gamma = softplus(g)."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Added to the variance by every LayerNorm."""
+        """Number that every LayerNorm adds to the variance."""
 
     config: Config
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
         self.core = CrossAttentionCore(dims.width, dims.heads, config.norm_eps)
-        # Before softplus, as the radius: the bias may be turned down, never into a repulsion.
+        # Stored before softplus: training can weaken the bias, but never turn it into a repulsion.
         self.raw_gamma = nn.Parameter(torch.tensor(config.gamma_init))
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Radii too if the bandwidth follows them."""
+        """Return the fields of the class, and the radii if the bandwidth follows them."""
         return {**cls.reads, **cls.bandwidth_fields(config)}
 
     @classmethod
     def bandwidth_fields(cls, config: Config) -> Fields:
-        """What a bandwidth that follows the anchor's size reads of it."""
+        """Return the fields that the bandwidth depends on; none if it is fixed."""
         return radius_field(config) if config.bandwidth == "radius" else {}
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Options of a radius that a fixed bandwidth does not read."""
+        """Report radius options that a fixed bandwidth does not read."""
         if config.bandwidth == "fixed":
             idle = ("sigma_sq_min", "radius_bound", "radius_min")
             yield from without_effect(config, idle, "`bandwidth` is fixed")
 
     @property
     def gamma(self) -> Tensor:
-        """Weight of the bias, 0-d, positive."""
+        """Positive weight of the bias, 0-d."""
         return F.softplus(self.raw_gamma)
 
     def sigma_sq(self, state: QueryState) -> Tensor | float:
-        """Squared bandwidth: (B, N, 1), or one number when fixed."""
+        """Return the squared bandwidth: (B, N, 1), or one number if it is fixed."""
         if self.config.bandwidth == "fixed":
             return self.config.sigma0**2
         r_BN1 = support_radius(state[self.raw_radius], self.config)
-        # The floor keeps an anchor that shrinks in sight of some ray, and 1 / sigma^2 finite.
+        # The floor lets a shrinking anchor still reach some ray, and keeps 1 / sigma^2 finite.
         return (self.config.sigma0 * r_BN1).square().clamp_min(self.config.sigma_sq_min)
 
     def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias:
-        """gamma b, of the state before this layer."""
+        """Return gamma b for the state before this layer."""
         config = self.config
         eps = config.direction_eps
         # The rays of a scene are the same in all layers.
@@ -119,7 +120,7 @@ class RayBiasedCrossAttention(CrossAttention):
         return self.core.out_proj(merge_heads(read_BhNd))
 
     def explain(self, state: QueryState, memory: ImageMemory, queries: Tensor) -> AttentionWeights:
-        # Norms are over channels, so choosing queries after the projection is exact.
+        # Norms run over channels, so selecting queries after the projection is exact.
         q_BhQd = self.core.project(state.features)[:, :, queries]
         bias_BQM = self.bias(state, memory).dense(queries)
         return attention_weights(q_BhQd, memory["keys"], bias_BQM[:, None])

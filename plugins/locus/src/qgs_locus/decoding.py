@@ -1,4 +1,4 @@
-"""`locus/anchor_offset`, `locus/radius_scaled`: means around the query's anchor."""
+"""`locus/anchor_offset`, `locus/radius_scaled`: Gaussian means around the query's anchor."""
 
 from collections.abc import Iterable
 from typing import Literal
@@ -21,62 +21,62 @@ from qgs_locus.fields import (
 
 
 class OffsetOptions(ComponentConfig):
-    """How raw offsets become displacements from the anchor."""
+    """Options that turn raw offsets into displacements from the anchor."""
 
     offset: Literal["posact", "linear"] = "posact"
-    """Displacement of a raw offset t: posact(t) (release) or t itself (paper)."""
+    """Displacement for a raw offset t: posact(t) (release), or t itself (paper)."""
     input_limit: float | None = Field(default=100.0, gt=0)
-    """Raw offsets are clamped to +- this before posact; null for no clamp."""
+    """Clamp raw offsets to +- this before posact. Null means no clamp."""
     output_limit: float | None = Field(default=1000.0, gt=0)
-    """Displacements are clamped to +- this after posact; null for no clamp."""
+    """Clamp displacements to +- this after posact. Null means no clamp."""
 
     def displacement(self, raw: Tensor) -> Tensor:
-        """Displacements of raw offsets, float32 or better, any shape."""
+        """Return the displacements for raw offsets of any shape, in float32 or better."""
         if self.offset == "linear":
             return at_least_float32(raw)
-        # The limits keep stray offsets of an untrained head finite, and their gradients.
+        # An untrained head may give huge offsets; the limits keep them and their gradients finite.
         return posact(raw, self.input_limit, self.output_limit)
 
 
 class AnchorOffsetCenters(Centers):
-    """mean = mu + posact(offset)."""
+    """Means at mu + posact(offset), with mu the anchor's centre."""
 
     name = "anchor_offset"
     reads = CENTER_FIELD
 
     class Config(OffsetOptions):
-        """See `OffsetOptions`."""
+        """Options of `OffsetOptions`."""
 
     config: Config
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Limits of a posact that is not used."""
+        """Report limits that have no effect because posact is not used."""
         if config.offset == "linear":
             yield from without_effect(config, ("input_limit", "output_limit"), "`offset` is linear")
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """(B, N, K, 3) -> (B, N, K, 3)."""
+        """Return means (B, N, K, 3) for raw offsets (B, N, K, 3)."""
         return state[CENTER][:, :, None] + self.config.displacement(offsets)
 
 
 class RadiusScaledCenters(AnchorOffsetCenters):
-    """mean = mu + r posact(offset), equation (7)."""
+    """Means at mu + r posact(offset), with r the support radius: equation (7)."""
 
     name = "radius_scaled"
 
     class Config(OffsetOptions, RadiusOptions):
-        """See `OffsetOptions` and `RadiusOptions`."""
+        """Options of `OffsetOptions` and `RadiusOptions`."""
 
     config: Config
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Centres and radii."""
+        """Return centres and radii."""
         return {**CENTER_FIELD, **radius_field(config)}
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """(B, N, K, 3) -> (B, N, K, 3)."""
-        # Offsets count in radii: a query of a large support spreads its Gaussians as far.
+        """Return means (B, N, K, 3) for raw offsets (B, N, K, 3)."""
+        # Offsets are in radii: a query with a large support spreads its Gaussians widely.
         r_BN1 = support_radius(state[RAW_RADIUS], self.config)
         return state[CENTER][:, :, None] + r_BN1[:, :, None] * self.config.displacement(offsets)

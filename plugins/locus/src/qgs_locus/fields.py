@@ -1,4 +1,4 @@
-"""The state fields of an anchor, and how its radius follows from the raw radius."""
+"""State fields of an anchor, and the map from its raw radius to its radius."""
 
 import math
 from typing import Literal
@@ -16,24 +16,27 @@ CENTER = "anchor.center"
 RAW_RADIUS = "anchor.raw_radius"
 
 CENTER_FIELD: Fields = {CENTER: FieldSpec((3,), frame="world")}
-"""Unbounded anchor centre mu (B, N, 3)."""
+"""Anchor centre mu (B, N, 3), unbounded."""
 
 RAW_LEAST = 1e-6
-"""Least softplus of a raw radius that is made from a radius, so that the raw one is finite."""
+"""Lower bound of softplus(rho) where rho is computed from a radius, so that rho is finite."""
 
 
 class RadiusOptions(ComponentConfig):
-    """How the support radius r follows from the raw radius rho; all components must agree."""
+    """Options that map the raw radius rho to the support radius r; all components must agree."""
 
     radius_bound: Literal["floor", "offset"] = "floor"
-    """r = max(softplus(rho), radius_min) ("floor", release) or softplus(rho) + radius_min (paper);
-    the same in all components."""
+    """Use r = max(softplus(rho), radius_min) ("floor", release) or r = softplus(rho) + radius_min
+    ("offset", paper). It must be the same in all components."""
     radius_min: float = Field(default=1e-3, ge=0)
-    """Least support radius, world units; the same in all components."""
+    """Least support radius, world units. It must be the same in all components."""
 
 
 def radius_field(options: RadiusOptions) -> Fields:
-    """Raw radius rho (B, N, 1); the encoding lets the composer refuse components that disagree."""
+    """Return the field of raw radii rho (B, N, 1).
+
+    Its encoding lets the composer refuse components that disagree about the options.
+    """
     reading = {
         "floor": f"radius = max(softplus(x), {options.radius_min:g})",
         "offset": f"radius = softplus(x) + {options.radius_min:g}",
@@ -43,22 +46,25 @@ def radius_field(options: RadiusOptions) -> Fields:
 
 @full_precision
 def support_radius(raw_radius: Tensor, options: RadiusOptions) -> Tensor:
-    """Support radii r > 0, world units, of raw radii of any shape: equation (1)."""
+    """Return support radii r > 0, world units, for raw radii of any shape: equation (1)."""
     radius = F.softplus(raw_radius)
-    # Softplus comes near 0, and r divides in equation (3)
+    # Softplus can be almost 0, and equation (3) divides by r.
     if options.radius_bound == "floor":
         return radius.clamp_min(options.radius_min)
     return radius + options.radius_min
 
 
 def raw_radius_of(radius: float) -> float:
-    """softplus^-1: the rho whose softplus is `radius` > 0."""
+    """Return rho with softplus(rho) = `radius` > 0."""
     return radius + math.log(-math.expm1(-radius))
 
 
 @full_precision
 def raw_radii(radii: Tensor, options: RadiusOptions) -> Tensor:
-    """The raw radii of which `support_radius` makes `radii`, which are raised to the least one."""
+    """Return the raw radii for which `support_radius` gives `radii`.
+
+    Radii below the least possible one are raised to it.
+    """
     least = options.radius_min if options.radius_bound == "offset" else 0.0
     # softplus^-1(y) = y + log(1 - exp(-y)), which stays exact for large y.
     softplus = (radii - least).clamp_min(RAW_LEAST)
@@ -66,5 +72,5 @@ def raw_radii(radii: Tensor, options: RadiusOptions) -> Tensor:
 
 
 def ball_support(centers: Tensor, radii: Tensor) -> SpatialSupport:
-    """Balls around centres (B, N, 3), of radii (B, N, 1)."""
+    """Return balls with centres (B, N, 3) and radii (B, N, 1)."""
     return SpatialSupport(centers=centers, axes=radii[..., None] * torch.eye(3).to(centers))

@@ -1,4 +1,4 @@
-"""`locus/refine`: updates the centres and radii of anchors after each decoder layer."""
+"""`locus/refine`: update of the centres and radii of anchors after each decoder layer."""
 
 from collections.abc import Iterable
 from typing import Literal
@@ -14,24 +14,27 @@ from qgs_locus.fields import CENTER, CENTER_FIELD, RadiusOptions, radius_field
 
 
 class AnchorRefinement(Refinement):
-    """mu += posact(MLP_mu(x)), rho += MLP_rho(x), heads shared by all layers: equation (6)."""
+    """Refinement mu += posact(MLP_mu(x)), rho += MLP_rho(x): equation (6).
+
+    All layers share the two MLPs.
+    """
 
     name = "refine"
     parts = ("`center`", "`radius`")
 
     class Config(RadiusOptions):
         center: bool = True
-        """Whether centres are refined."""
+        """Refine the centres."""
         radius: bool = True
-        """Whether radii are refined."""
+        """Refine the radii."""
         center_step: Literal["posact", "linear"] = "posact"
-        """The step of a centre for an MLP output t: posact(t) (release) or t itself (paper)."""
+        """Step of a centre for an MLP output t: posact(t) (release), or t itself (paper)."""
         input_limit: float | None = Field(default=100.0, gt=0)
-        """MLP outputs are clamped to +- this before posact; null for no clamp."""
+        """Clamp MLP outputs to +- this before posact. Null means no clamp."""
         output_limit: float | None = Field(default=1000.0, gt=0)
-        """Steps are clamped to +- this after posact, world units; null for no clamp."""
+        """Clamp steps to +- this after posact, world units. Null means no clamp."""
         zero_init: bool = False
-        """The last layer of each MLP starts at zero (in neither release; steadier at first)."""
+        """Start the last layer of each MLP at zero, for a steadier start (in neither release)."""
 
     config: Config
 
@@ -47,7 +50,7 @@ class AnchorRefinement(Refinement):
 
     def _head(self, channels: int) -> Mlp:
         mlp = Mlp(self.dims.width, self.dims.width, channels)
-        # The first layer stays random: with both at zero neither would get a gradient.
+        # The first layer stays random: if both were zero, neither would get a gradient.
         if self.config.zero_init:
             nn.init.zeros_(mlp.fc2.weight)
             nn.init.zeros_(mlp.fc2.bias)
@@ -55,23 +58,23 @@ class AnchorRefinement(Refinement):
 
     @classmethod
     def radius_field(cls, config: Config) -> Fields:
-        """The raw radius; a subclass may have another one, with any number of channels."""
+        """Return the field of raw radii; a subclass may use one with more channels."""
         return radius_field(config)
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Whatever is refined."""
+        """Return the fields that are refined."""
         center = CENTER_FIELD if config.center else {}
         return {**center, **(cls.radius_field(config) if config.radius else {})}
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Whatever is refined."""
+        """Return the fields that are refined."""
         return cls.fields_read(config)
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Nothing to refine, and options without effect."""
+        """Report options that refine nothing, and options without effect."""
         if not cls.fields_read(config):
             yield Problem(
                 "",
@@ -87,20 +90,20 @@ class AnchorRefinement(Refinement):
             yield from without_effect(config, ("radius_bound", "radius_min"), "`radius` is false")
 
     def forward(self, state: QueryState) -> QueryState:
-        """A state with moved centres and changed raw radii."""
+        """Return the state with updated centres and raw radii."""
         refined: dict[str, Tensor] = {}
         if self.config.center:
             refined[CENTER] = state[CENTER] + self.center_step(state)
         if self.config.radius:
-            # The raw radius takes the step as it is: softplus keeps the radius positive.
+            # The raw radius needs no bound: softplus keeps the radius positive.
             step = at_least_float32(self.radius_mlp(state.features))
             refined[self.raw_radius] = state[self.raw_radius] + step
         return state.replace(fields=refined)
 
     def center_step(self, state: QueryState) -> Tensor:
-        """What is added to the centres (B, N, 3), float32, world frame."""
+        """Return the step of the centres (B, N, 3), in float32 or better, world frame."""
         step_BN3 = self.center_mlp(state.features)
         if self.config.center_step == "posact":
             step_BN3 = posact(step_BN3, self.config.input_limit, self.config.output_limit)
-        # Autocast gives the step in half precision, which has no digits for a place.
+        # Under autocast the step has half precision, which is too coarse for positions.
         return at_least_float32(step_BN3)

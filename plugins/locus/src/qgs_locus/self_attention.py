@@ -1,4 +1,4 @@
-"""`locus/anchor_aware`: self-attention with an embedding of the anchors' centres."""
+"""`locus/anchor_aware`: self-attention with an embedding of the anchor centres."""
 
 import math
 from typing import Literal
@@ -18,12 +18,12 @@ from qgs_locus.fields import CENTER, CENTER_FIELD
 def sine_embedding(
     position: Tensor, features: int = 128, temperature: float = 10_000.0, divisor_eps: float = 1e-6
 ) -> Tensor:
-    """Sine features of positions in [-1, 1]: (..., 3) -> (..., 3 * features), axis by axis.
+    """Return sine features of positions in [-1, 1]: (..., 3) -> (..., 3 * features).
 
-    Each axis is mapped to [0, 2 pi] and divided by temperature^(2i / features) + divisor_eps; sine
-    and cosine interleave (LocusGS release).
+    Each axis is mapped to [0, 2 pi] and divided by temperature^(2i / features) + divisor_eps. Sines
+    and cosines alternate, axis by axis (LocusGS release).
     """
-    # A sine and a cosine share a frequency.
+    # Each sine shares its frequency with a cosine.
     half = torch.arange(features // 2, dtype=position.dtype, device=position.device)
     divisor = temperature ** (2 * half / features) + divisor_eps
     angle = ((position + 1) * math.pi)[..., None] / divisor
@@ -31,9 +31,9 @@ def sine_embedding(
 
 
 class AnchorAwareSelfAttention(SelfAttention):
-    """Self-attention over x + p with p = MLP(PE(mu)), for queries, keys and values: equation (5).
+    """Self-attention over x + p with p = MLP(PE(mu)): equation (5).
 
-    The residual stream does not keep p.
+    Queries, keys and values all contain p. The residual stream does not keep it.
     """
 
     name = "anchor_aware"
@@ -41,15 +41,15 @@ class AnchorAwareSelfAttention(SelfAttention):
 
     class Config(ComponentConfig):
         position: Literal["tanh", "raw"] = "tanh"
-        """What is embedded: tanh of the centre (release) or the centre itself ("raw", paper)."""
+        """Embed tanh of the centre ("tanh", release) or the centre itself ("raw", paper)."""
         features: int = Field(default=128, ge=2, multiple_of=2)
-        """Sines and cosines per axis."""
+        """Number of sines and cosines per axis, together."""
         temperature: float = Field(default=10_000.0, gt=0)
-        """About the ratio of the longest to the shortest wavelength of the sines."""
+        """Approximate ratio of the longest to the shortest wavelength of the sines."""
         divisor_eps: float = Field(default=1e-6, ge=0)
-        """Added to the divisor of each frequency (LocusGS release)."""
+        """Number that is added to the divisor of each frequency (LocusGS release)."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Added to the variance by every LayerNorm."""
+        """Number that every LayerNorm adds to the variance."""
 
     config: Config
 
@@ -60,10 +60,10 @@ class AnchorAwareSelfAttention(SelfAttention):
         self.position_mlp = Mlp(3 * config.features, dims.width, dims.width)
 
     def position_embedding(self, state: QueryState) -> Tensor:
-        """p (B, N, D)."""
+        """Return the embedding p (B, N, D)."""
         position_BN3 = state[CENTER]
         c = self.config
-        # The sines are made for [-1, 1], and centres are unbounded.
+        # The sines expect [-1, 1], but centres are unbounded.
         if c.position == "tanh":
             position_BN3 = torch.tanh(position_BN3)
         return self.position_mlp(
@@ -71,11 +71,11 @@ class AnchorAwareSelfAttention(SelfAttention):
         )
 
     def forward(self, state: QueryState) -> Tensor:
-        """The update (B, N, D)."""
+        """Return the update (B, N, D)."""
         x_BND = self.norm(state.features + self.position_embedding(state))
         return self.attention(x_BND, state.mask)
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
-        """Attention over queries."""
+        """Return the attention of the chosen queries to all queries."""
         x_BND = self.norm(state.features + self.position_embedding(state))
         return self.attention.explain(x_BND, queries, state.mask)

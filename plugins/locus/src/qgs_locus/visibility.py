@@ -1,4 +1,4 @@
-"""`locus/anchor_visibility`: moves anchors that no target view sees towards the nearest one."""
+"""`locus/anchor_visibility`: loss that moves unseen anchors towards the nearest target view."""
 
 from collections.abc import Iterable
 
@@ -12,7 +12,7 @@ from qgs_locus.fields import CENTER, CENTER_FIELD
 
 
 class AnchorVisibility(Loss):
-    """Mean over queries of `qgs.losses.view_visibility` of their anchors: equation (8)."""
+    """Mean of `qgs.losses.view_visibility` over the anchors of all queries: equation (8)."""
 
     name = "anchor_visibility"
     reads = CENTER_FIELD
@@ -22,19 +22,19 @@ class AnchorVisibility(Loss):
         weight: float = Field(default=0.1, ge=0)
         """Factor of the term in the objective."""
         z_guard: float = Field(default=1e-3, gt=0)
-        """|z| below this is replaced by it before the division, world units (LocusGS release)."""
+        """Least |z| in the perspective division; smaller ones are raised to it, world units."""
 
     config: Config
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """Options that contradict each other or have no effect."""
+        """Report options that contradict each other or have no effect."""
         return config.conflicts()
 
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> Tensor:
-        # The centres alone: an anchor outside of all targets gets no gradient from any image.
+        # Centres only: an anchor outside of all targets gets no gradient from any image.
         per_anchor = view_visibility(
             prediction.state[CENTER],
             target.cameras,

@@ -1,1 +1,1 @@
-"""Other published systems, one package each."""
+"""Published systems for qgs, one package each."""

@@ -1,4 +1,4 @@
-"""Ellipsoidal anchors for qgs: LocusGS with three radii and a rotation for its support."""
+"""Ellipsoidal anchors for qgs: LocusGS whose support has three radii and a rotation."""
 
 from qgs.contracts import Plugin
 from qgs_anchors.ellipsoid.anchors import EllipsoidQueries

@@ -1,6 +1,6 @@
-"""`ellipsoid/anchored`: every query has a 3D anchor, a centre with an ellipsoid around it.
+"""`ellipsoid/anchored`: queries with a 3D anchor, a centre with an ellipsoid around it.
 
-LocusGS is a special case: its weights become an ellipsoid of three equal radii.
+LocusGS is a special case: its weights become ellipsoids with three equal radii.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ Radius = Annotated[float, Field(gt=0)]
 
 
 class EllipsoidQueries(LearnedQueries):
-    """N learned vectors, centres mu, rotations and raw radii, shared by all scenes."""
+    """N queries with learned features, centres mu, rotations, raw radii, shared by all scenes."""
 
     name = "anchored"
 
@@ -29,13 +29,13 @@ class EllipsoidQueries(LearnedQueries):
         count: int = Field(default=4096, ge=1)
         """N, the number of queries."""
         std: float = Field(default=0.01, ge=0)
-        """Standard deviation of the normal distribution that the features start from."""
+        """Standard deviation of the initial features, which are normally distributed."""
         init_radii: tuple[Radius, Radius, Radius] = (1.0, 1.0, 1.0)
-        """softplus of the raw radii that every anchor starts with, along the world's axes."""
+        """Initial softplus of the raw radii of each anchor, along the world's axes, world units."""
         center_init: Annotated[NormalCenters | FrustumCenters, Field(discriminator="kind")] = (
             NormalCenters()
         )
-        """Distribution that the anchor centres start from."""
+        """Distribution of the initial anchor centres."""
 
     config: Config
 
@@ -43,7 +43,7 @@ class EllipsoidQueries(LearnedQueries):
         super().__init__(config, dims)
         self.features = nn.Parameter(torch.randn(config.count, dims.width) * config.std)
         self.center = nn.Parameter(config.center_init.sample(config.count))
-        # Unturned at first, so that equal radii start as LocusGS does.
+        # No rotation at first: with equal radii the model starts as LocusGS does.
         identity = [torch.ones(config.count, 1), torch.zeros(config.count, 3)]
         self.rotation = nn.Parameter(torch.cat(identity, -1))
         raw = [torch.full((config.count, 1), raw_radius_of(r)) for r in config.init_radii]
@@ -51,16 +51,16 @@ class EllipsoidQueries(LearnedQueries):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Centre, rotation and raw radii."""
+        """Return centre, rotation and raw radii."""
         return {**CENTER_FIELD, **shape_fields(config)}
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """No weight decay on rotations, whose length has no effect."""
+        """Leave rotations out of weight decay, because their length has no effect."""
         return name != "rotation" and super().decays(name, parameter)
 
     def start(self, batch_size: int) -> QueryState:
-        """Features (B, N, D); fields centre (B, N, 3), rotation (B, N, 4), raw radii (B, N, 3)."""
-        # The optimiser changes lengths, which mean nothing; components get unit ones.
+        """Return features (B, N, D), centres (B, N, 3), rotations (B, N, 4), radii (B, N, 3)."""
+        # The optimiser changes the meaningless lengths; components get unit quaternions.
         quats = F.normalize(self.rotation, dim=-1)
         fields = {CENTER: self.center, ROTATION: quats, RAW_RADII: self.raw_radii}
         fields = {name: x.expand(batch_size, -1, -1) for name, x in fields.items()}
@@ -68,21 +68,21 @@ class EllipsoidQueries(LearnedQueries):
         return QueryState(features=features, fields=fields)
 
     def support(self, state: QueryState) -> SpatialSupport:
-        """The ellipsoids."""
+        """Return the ellipsoids."""
         return SpatialSupport(centers=state[CENTER], axes=anchor_axes(state, self.config))
 
 
 def from_locus(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The state dict of a LocusGS for the same recipe with ellipsoidal anchors and LocusGS's head.
+    """Convert a LocusGS state dict for the same recipe with ellipsoidal anchors.
 
-    A radius becomes three equal ones, with equal steps in the refinement; rotations are the
-    identity. A model with `rotation: false` computes what LocusGS does. The result has no weights
-    of a refinement of rotations (load with `strict=False`). Raises KeyError for weights without
-    radii.
+    The head must stay that of LocusGS. Each radius becomes three equal ones, which get equal steps
+    in the refinement. Rotations are the identity. With `rotation: false` the model computes the
+    same as LocusGS. Weights that refine rotations are missing (load with `strict=False`). Raises
+    KeyError for weights without radii.
     """
     converted = {name: _tripled(name, values) for name, values in weights.items()}
     converted["queries.raw_radii"] = converted.pop("queries.raw_radius")
-    # A ball has no orientation, so any rotation would do.
+    # A ball has no orientation, so any rotation is right.
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0]).to(weights["queries.raw_radius"])
     converted["queries.rotation"] = identity.repeat(len(weights["queries.raw_radius"]), 1)
     return converted
@@ -91,7 +91,7 @@ def from_locus(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def _tripled(name: str, values: Tensor) -> Tensor:
     if name == "queries.raw_radius":
         return values.repeat(1, 3)
-    # Rows of the last layer are the radii: three equal ones step together.
+    # Rows of the last layer are the radii: with equal rows they get equal steps.
     if name.startswith("refinements.0.radius_mlp.fc2."):
         return values.repeat(3, *(1 for _ in values.shape[1:]))
     return values.clone()

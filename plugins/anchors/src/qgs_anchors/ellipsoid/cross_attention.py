@@ -1,4 +1,4 @@
-"""`ellipsoid/ray_biased`: queries attend more to rays that pass through their ellipsoid."""
+"""`ellipsoid/ray_biased`: attention that prefers rays through the query's ellipsoid."""
 
 from qgs_locus.cross_attention import RayBiasedCrossAttention
 from qgs_locus.fields import CENTER
@@ -12,10 +12,10 @@ from qgs_anchors.ellipsoid.ray_bias import EllipsoidBias, ray_tokens
 
 
 class EllipsoidCrossAttention(RayBiasedCrossAttention):
-    """`locus/ray_biased` whose bias measures a ray's distance in the metric of the anchor.
+    """Attention `locus/ray_biased` with distances to rays in the metric of the ellipsoid.
 
-    Options, floors, clamp and gamma are LocusGS's. The floor of (sigma0 r)^2 holds along each axis;
-    a fixed bandwidth ignores the shape.
+    Options, floors, clamp and gamma are those of LocusGS. The floor of (sigma0 r)^2 applies to each
+    axis. A fixed bandwidth ignores the shape.
     """
 
     name = "ray_biased"
@@ -26,13 +26,13 @@ class EllipsoidCrossAttention(RayBiasedCrossAttention):
         return shape_fields(config) if config.bandwidth == "radius" else {}
 
     def bias(self, state: QueryState, memory: ImageMemory) -> AttentionBias:
-        """gamma b, of the state before this layer."""
+        """Return gamma b for the state before this layer."""
         config = self.config
         sigma_sq_BN3 = self.sigma_sq(state)
-        # One bandwidth for all anchors is that of a ball: LocusGS's kernels are shorter.
+        # With one bandwidth for all anchors, the bias is that of LocusGS, whose kernels are faster.
         if not isinstance(sigma_sq_BN3, Tensor):
             return super().bias(state, memory)
-        # Made once a pass: all layers read the same rays.
+        # Computed once a pass: all layers read the same rays.
         tokens_B9M = memory.once(
             f"ellipsoid.ray_tokens.{config.direction_eps:g}",
             lambda: ray_tokens(memory["patch_rays"], config.direction_eps),

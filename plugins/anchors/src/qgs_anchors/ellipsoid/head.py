@@ -13,26 +13,26 @@ from qgs_anchors.ellipsoid.fields import RAW_RADII, ROTATION, anchor_axes, shape
 
 
 class EllipsoidHead(GaussianHead):
-    """`qgs/gaussian_head` whose rotations and scales are relative to the anchor.
+    """Head `qgs/gaussian_head` with rotations and scales relative to the anchor.
 
-    A Gaussian is turned with its anchor. Its scale s along an axis is multiplied by the radius that
-    the ellipsoid has in that direction: s / |u / r|, with u the axis in the anchor's frame.
+    A Gaussian is turned with its anchor. Its scale s along an axis is multiplied by the radius of
+    the ellipsoid in that direction: s / |u / r|, with u the axis in the anchor's frame.
     """
 
     name = "gaussian_head"
 
     class Config(GaussianHead.Config, RadiusOptions):
-        """As `qgs/gaussian_head`; `scale_cap` is a multiple of the anchor's radius."""
+        """Options of `qgs/gaussian_head`; `scale_cap` is a multiple of the anchor's radius."""
 
     config: Config
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """The shape of the anchors."""
+        """Return the fields of the anchors' shapes."""
         return shape_fields(config)
 
     def forward(self, state: QueryState) -> GaussianAttributes:
-        """(B, N, D) and the anchors' shapes -> attributes of (B, N, K) Gaussians."""
+        """Return attributes of (B, N, K) Gaussians from features (B, N, D) and anchor shapes."""
         local = super().forward(state)
         quats = unit(local.quats)
         # The anchor's rotation comes after the Gaussian's own.
@@ -43,7 +43,7 @@ class EllipsoidHead(GaussianHead):
 
 @full_precision
 def radii_along(radii_BN3: Tensor, quats_BNK4: Tensor) -> Tensor:
-    """Radii (B, N, K, 3) of ellipsoids along the axes of their Gaussians.
+    """Return radii (B, N, K, 3) of ellipsoids along the axes of their Gaussians.
 
     quats: Gaussian to anchor. In direction u of the anchor's frame the radius is 1 / |u / r|.
     """
@@ -51,18 +51,18 @@ def radii_along(radii_BN3: Tensor, quats_BNK4: Tensor) -> Tensor:
 
 
 class AxisScaledCenters(RadiusScaledCenters):
-    """mean = mu + R diag(r) posact(offset), with the options of `locus/radius_scaled`."""
+    """Means at mu + R diag(r) posact(offset), with the options of `locus/radius_scaled`."""
 
     name = "axis_scaled"
 
     @classmethod
     def fields_read(cls, config: RadiusScaledCenters.Config) -> Fields:
-        """Centres and shapes."""
+        """Return centres and shapes."""
         return {**CENTER_FIELD, **shape_fields(config)}
 
     @full_precision
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """(B, N, K, 3) -> (B, N, K, 3)."""
-        # Offsets are along the axes of the ellipsoid, in its radii.
+        """Return means (B, N, K, 3) for raw offsets (B, N, K, 3)."""
+        # Offsets are along the axes of the ellipsoid, in units of its radii.
         displaced = self.config.displacement(offsets)
         return state[CENTER][:, :, None] + displaced @ anchor_axes(state, self.config).mT

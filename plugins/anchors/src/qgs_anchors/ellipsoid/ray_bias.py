@@ -1,9 +1,9 @@
-"""The attention bias between ellipsoidal anchors and image rays: b = -1/2 min (x-mu)' A (x-mu).
+"""Attention bias between ellipsoidal anchors and image rays: b = -1/2 min (x-mu)' A (x-mu).
 
-The minimum is over the points x of a ray; A = R diag(1 / sigma^2) R' is the anchor's own metric
-with bandwidths sigma_i = sigma0 r_i. In coordinates where the ellipsoid is a unit ball,
-W = diag(1 / sigma) R', the direction d of a Plücker ray (m, d) is W d, and its moment around the
-centre cof(W) (m - mu x d), as W a x W b = cof(W) (a x b). The minimum is
+The minimum is over the points x of a ray. A = R diag(1 / sigma^2) R' is the metric of the anchor,
+with bandwidths sigma_i = sigma0 r_i. W = diag(1 / sigma) R' maps the ellipsoid to a unit ball. It
+maps the direction d of a Plücker ray (m, d) to W d. It maps the ray's moment around the centre to
+cof(W) (m - mu x d), because W a x W b = cof(W) (a x b). So the minimum is
 |cof(W) (m - mu x d)|^2 / |W d|^2.
 """
 
@@ -18,25 +18,24 @@ from qgs.geometry.transforms import unit
 from qgs.precision import full_precision
 
 UPWARD = (0.0, 0.0, 1.0)
-"""The direction of a ray that has none."""
+"""Direction of a ray whose own direction is 0."""
 
 
 @full_precision
 def ray_tokens(rays_BM6: Tensor, direction_eps: float = 1e-6) -> Tensor:
-    """Moments, directions and unit directions as rows: (B, M, 6) -> (B, 9, M).
+    """Return moments, directions and unit directions as rows: (B, M, 6) -> (B, 9, M).
 
-    direction_eps: least |d| that a ray is divided by; a shorter direction counts as in LocusGS's
-    bias.
+    direction_eps: lower bound of the |d| by which a ray is divided, as in LocusGS's bias.
     """
     m_BM3, d_BM3 = normalised_rays(rays_BM6, direction_eps)
     return torch.cat([m_BM3, d_BM3, unit(d_BM3, UPWARD)], -1).mT.contiguous()
 
 
 class EllipsoidBias(AttentionBias):
-    """gamma * clamp(b, bias_min, 0).
+    """Bias gamma * clamp(b, bias_min, 0).
 
-    Reads of a query mu, the rows of cof(W) and of W, gamma / 2 and gamma * bias_min; of a token m,
-    d and d / |d|.
+    Each query has mu, the rows of cof(W) and of W, gamma / 2 and gamma * bias_min. Each token has
+    m, d and d / |d|.
     """
 
     @classmethod
@@ -50,13 +49,15 @@ class EllipsoidBias(AttentionBias):
         bias_min: float,
         gamma: Tensor,
     ) -> Self:
-        """rotation: anchor to world. sigma_sq: along the axes of the anchor. tokens: `ray_tokens`,
-        the same for all layers. gamma: 0-d, positive.
+        """Make the bias of a layer.
+
+        rotation: anchor to world. sigma_sq: along the axes of the anchor. tokens: from
+        `ray_tokens`, the same for all layers. gamma: 0-d, positive.
         """
         sigma_BN3 = sigma_sq_BN3.sqrt()
         ball_BN9 = (rotation_BN33 / sigma_BN3[..., None, :]).mT.flatten(2)
         weights_BN3 = sigma_BN3 / sigma_BN3.prod(-1, keepdim=True)
-        # A rotation is its own cofactor matrix but for rounding, which this keeps out of the ratio.
+        # A rotation equals its cofactor matrix up to rounding; the ratio must not see the rounding.
         cofactors_BN9 = (_cofactors(rotation_BN33) * weights_BN3[..., None, :]).mT.flatten(2)
         # Kernels read all numbers of a query from one row.
         rest_BN2 = torch.stack([gamma / 2, gamma * bias_min]).expand(*center_BN3.shape[:2], 2)
@@ -64,11 +65,11 @@ class EllipsoidBias(AttentionBias):
         return cls(torch.cat(parts, -1), tokens_B9M)
 
     def value(self, queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
-        """(n, M), through (n, M, 3) moments and directions."""
+        """Return the bias (n, M), through moments and directions (n, M, 3)."""
         center_n3, *matrices, factor_n1, lower_n1 = queries_nF.split([3, 9, 9, 1, 1], -1)
         cofactors_n33, ball_n33 = (matrix.unflatten(-1, (3, 3)) for matrix in matrices)
         m_M3, d_M3, unit_M3 = (tokens_GM[rows : rows + 3].mT for rows in (0, 3, 6))
-        # Not expanded into products: far from the cameras m and mu x d nearly cancel.
+        # Not expanded into products: far from the cameras, m and mu x d nearly cancel.
         e_nM3 = m_M3 - torch.linalg.cross(center_n3[:, None], d_M3[None], dim=-1)
         moment_nM = _times(cofactors_n33, e_nM3).square().sum(-1)
         along_nM = _times(ball_n33, unit_M3[None]).square().sum(-1)
@@ -81,10 +82,10 @@ class EllipsoidBias(AttentionBias):
 
 
 def _times(matrix_n33: Tensor, vectors: Tensor) -> Tensor:
-    """(n, 3, 3) and (n or 1, M, 3) -> (n, M, 3), without the rounding of a GPU's matrix units."""
+    """Multiply (n, 3, 3) by (n or 1, M, 3) to (n, M, 3), without a GPU's inexact matrix units."""
     return (matrix_n33[:, None] * vectors[..., None, :]).sum(-1)
 
 
 def _cofactors(matrix: Tensor) -> Tensor:
-    """Cofactor matrices of (..., 3, 3)."""
+    """Return the cofactor matrices of (..., 3, 3)."""
     return torch.linalg.cross(matrix.roll(-1, -1), matrix.roll(-2, -1), dim=-2)

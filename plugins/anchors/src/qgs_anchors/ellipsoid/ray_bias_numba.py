@@ -1,7 +1,7 @@
 """Numba kernels of `EllipsoidBias`: one pass over the rays of each query, in registers.
 
-Queries are rows: mu, cof(W) and W by rows, gamma / 2, gamma * bias_min. Tokens have nine rows: m,
-d, d / |d|. A matrix is the tuple of its nine entries.
+Each query is a row: mu, cof(W) and W by rows, gamma / 2, gamma * bias_min. Tokens have nine rows:
+m, d, d / |d|. A matrix is a tuple of its nine entries.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ _TWO = np.float32(2)
 
 @kernel
 def _times(a, x, y, z):
-    """a (x, y, z)."""
+    """Return a (x, y, z), with a 3 x 3."""
     return (
         a[0] * x + a[1] * y + a[2] * z,
         a[3] * x + a[4] * y + a[5] * z,
@@ -32,7 +32,7 @@ def _nine(row, first):
 
 @kernel
 def _moment(mu, t, j):
-    """m - mu x d of token j."""
+    """Return m - mu x d of token j."""
     return (
         t[0, j] - mu[1] * t[5, j] + mu[2] * t[4, j],
         t[1, j] - mu[2] * t[3, j] + mu[0] * t[5, j],
@@ -42,7 +42,10 @@ def _moment(mu, t, j):
 
 @kernel
 def write(queries, tokens, out):
-    """max(-factor |cof(W) (m - mu x d)|^2 / |W d|^2, lower), with d of unit length below."""
+    """Write max(-factor |cof(W) (m - mu x d)|^2 / |W d|^2, lower) to `out`.
+
+    The d in the denominator has unit length.
+    """
     for n in range(queries.shape[0]):
         q = queries[n]
         row = out[n]
@@ -70,7 +73,7 @@ def _store(out, values):
 
 @kernel
 def gradients(queries, tokens, gradient, out):
-    """Gradients of the queries. A gradient g of e = m - mu x d is g x d of mu."""
+    """Write gradients of the queries to `out`: a gradient g of e = m - mu x d is g x d of mu."""
     for n in range(queries.shape[0]):
         q = queries[n]
         row = gradient[n]
@@ -80,7 +83,7 @@ def gradients(queries, tokens, gradient, out):
         w = _nine(q, 12)
         factor, lower = q[21], q[22]
         of_x = of_y = of_z = of_factor = of_lower = _ZERO
-        # Eighteen sums as scalars, which the compiler keeps in registers; an array it would not.
+        # Eighteen scalars, which the compiler keeps in registers, unlike an array.
         c0 = c1 = c2 = c3 = c4 = c5 = c6 = c7 = c8 = _ZERO
         w0 = w1 = w2 = w3 = w4 = w5 = w6 = w7 = w8 = _ZERO
         for j in range(row.shape[0]):
@@ -106,7 +109,7 @@ def gradients(queries, tokens, gradient, out):
             c6 += a2 * e[0]
             c7 += a2 * e[1]
             c8 += a2 * e[2]
-            # cof(W)' takes a gradient of a to one of e.
+            # cof(W)' maps a gradient of a to one of e.
             e0 = a0 * c[0] + a1 * c[3] + a2 * c[6]
             e1 = a0 * c[1] + a1 * c[4] + a2 * c[7]
             e2 = a0 * c[2] + a1 * c[5] + a2 * c[8]

@@ -1,4 +1,4 @@
-"""`ellipsoid/refine`: updates centres, rotations and radii of anchors after each decoder layer."""
+"""`ellipsoid/refine`: update of anchor centres, rotations and radii after each decoder layer."""
 
 from qgs_locus.refinement import AnchorRefinement
 
@@ -8,14 +8,14 @@ from qgs_anchors.ellipsoid.fields import ROTATION, ROTATION_FIELD, radii_field, 
 
 
 class EllipsoidRefinement(AnchorRefinement):
-    """`locus/refine` with three radii (rho += MLP(x)), and R = turn(MLP(x)) R."""
+    """Refinement `locus/refine` with three radii (rho += MLP(x)) and R = turn(MLP(x)) R."""
 
     name = "refine"
     parts = ("`center`", "`rotation`", "`radius`")
 
     class Config(AnchorRefinement.Config):
         rotation: bool = True
-        """Whether rotations are refined."""
+        """Refine the rotations."""
 
     config: Config
 
@@ -26,19 +26,19 @@ class EllipsoidRefinement(AnchorRefinement):
 
     @classmethod
     def radius_field(cls, config: Config) -> Fields:
-        """The three raw radii."""
+        """Return the field of the three raw radii."""
         return radii_field(config)
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Whatever is refined."""
+        """Return the fields that are refined."""
         return {**super().fields_read(config), **(ROTATION_FIELD if config.rotation else {})}
 
     def forward(self, state: QueryState) -> QueryState:
-        """A state with moved centres, turned rotations and changed raw radii."""
+        """Return the state with updated centres, rotations and raw radii."""
         refined = super().forward(state)
         if self.config.rotation:
-            # A small turn multiplied to the left: its axes are those of the world.
+            # The turn is multiplied from the left, so it is about world axes.
             rotation_BN4 = turned(state[ROTATION], self.rotation_mlp(state.features))
             refined = refined.replace(fields={ROTATION: rotation_BN4})
         return refined

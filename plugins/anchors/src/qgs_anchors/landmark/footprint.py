@@ -1,4 +1,4 @@
-"""`landmark/footprint`, `landmark/colored`: Gaussians that start as the photo that they see.
+"""`landmark/footprint`, `landmark/colored`: Gaussians that start as pixels of a photo.
 
 `landmark/refine`: LocusGS's refinement, with steps in radii along the axes of the photo.
 """
@@ -30,33 +30,33 @@ from qgs_anchors.landmark.fields import (
 from qgs_anchors.landmark.places import cells, rows_in_square
 
 COLOR_MARGIN = 0.02
-"""Colours of photos keep this far from 0 and 1, where no step would change them."""
+"""Least distance of initial colours from 0 and 1, where they would get no gradient."""
 
 _OF_CHANNELS = ("linear.weight", "linear.bias")
 
 
 class FootprintCenters(RadiusScaledCenters):
-    """mean = mu + r (u, v, 0) + r posact(offset), in the frame of the anchor's photo.
+    """Means at mu + r (u, v, 0) + r posact(offset), in the frame of the anchor's photo.
 
-    (u, v) is the middle of the Gaussian's cell relative to that of the footprint, in sides of a
-    square of its area. Where the radius is the side, offsets of 0 put each Gaussian onto the ray of
-    its cell.
+    (u, v) is the centre of the Gaussian's cell relative to the centre of the footprint. Its unit is
+    the side of a square with the area of the footprint. If the radius equals that side, offsets of
+    0 put each Gaussian on the ray of its cell.
     """
 
     name = "footprint"
 
     class Config(RadiusScaledCenters.Config):
-        """See `locus/radius_scaled`."""
+        """Options of `locus/radius_scaled`."""
 
     config: Config
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Anchors, the axes of their photos, and their footprints."""
+        """Return anchors, the axes of their photos, and their footprints."""
         return {**super().fields_read(config), **FRAME_FIELD, **FOOTPRINT_FIELD}
 
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """(B, N, K, 3) -> (B, N, K, 3)."""
+        """Return means (B, N, K, 3) for raw offsets (B, N, K, 3)."""
         count = offsets.shape[2]
         size_BN2, rows_BN1 = state[FOOTPRINT].tensor_split([2], -1)
         rows = rows_BN1[0, 0, 0].round().long().clamp_max(count)
@@ -69,30 +69,32 @@ class FootprintCenters(RadiusScaledCenters):
 
 
 class ColoredHead(GaussianHead):
-    """`qgs/gaussian_head` whose raw colours of 0 are those of the photo, whose scales are in radii.
+    """Head `qgs/gaussian_head` with colours relative to the photo and scales in radii.
 
-    The colour of a Gaussian is (tanh(raw + atanh(2 c - 1)) + 1) / 2, c that of its cell.
+    A Gaussian has the colour (tanh(raw + atanh(2 c - 1)) + 1) / 2, with c the colour of its cell.
+    So raw colours of 0 give those of the photo.
     """
 
     name = "colored"
 
     class Config(GaussianHead.Config, RadiusOptions):
         gaussians_per_query: int = Field(default=4, ge=1)
-        """K, the Gaussians of each query; `cells` of the queries is the same."""
+        """K, the number of Gaussians of each query. It must equal `cells` of the queries."""
         scale_cap: float = Field(default=0.8, gt=0)
-        """Largest scale, in radii of the anchor; a raw scale of 0 gives 1/e of it."""
+        """Largest scale, in radii of the anchor. A raw scale of 0 gives 1/e of it."""
 
     config: Config
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Colours and radii."""
+        """Return colours and radii."""
         return {**color_field(config.gaussians_per_query), **radius_field(config)}
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """A Gaussian takes the weights of the nearest of more or fewer cells.
+        """Adapt the weights of a head with another number of cells.
 
-        Both are those of a square, as with `count: null`; a grid of a tile may have other places.
+        Each Gaussian takes the weights of the nearest cell. Both sets of cells are taken to fill a
+        square, as with `count: null`; the cells of a tile may have other places.
         """
         return {
             name: self._of_cells(values) if name in _OF_CHANNELS else values
@@ -100,9 +102,9 @@ class ColoredHead(GaussianHead):
         }
 
     def _of_cells(self, rows: Tensor) -> Tensor:
-        """Rows (K' * 14, ...) of other cells as those (K * 14, ...) of this head's.
+        """Turn rows (K' * 14, ...) of other cells into rows (K * 14, ...) of this head's cells.
 
-        Rows that do not divide into channels are of another kind of head, and stay.
+        Rows that do not divide into channels belong to another kind of head, and stay unchanged.
         """
         if len(rows) % sum(CHANNELS):
             return rows
@@ -122,32 +124,32 @@ class ColoredHead(GaussianHead):
 
 
 class FramedRefinement(AnchorRefinement):
-    """mu += r step(MLP_mu(x)) in the frame of the anchor's photo, rho += MLP_rho(x).
+    """Refinement mu += r step(MLP_mu(x)) in the frame of the photo, and rho += MLP_rho(x).
 
-    An anchor that starts at what a photo sees is off by some radii, mostly in depth, which is the
-    same direction for all anchors in their photo's frame.
+    An anchor that starts on a ray of a photo is off by some radii, mostly in depth. In the frame of
+    its photo, depth is the same direction for all anchors.
     """
 
     name = "refine"
 
     class Config(AnchorRefinement.Config):
-        """See `locus/refine`."""
+        """Options of `locus/refine`."""
 
     config: Config
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Frames and radii too where centres are refined."""
+        """Return the refined fields, and frames and radii if centres are refined."""
         framed = {**FRAME_FIELD, **radius_field(config)} if config.center else {}
         return {**super().fields_read(config), **framed}
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Whatever is refined."""
+        """Return the fields that are refined."""
         return super().fields_read(config)
 
     def center_step(self, state: QueryState) -> Tensor:
-        """(B, N, 3), world frame."""
-        # Steps in radii: what is far away may move further.
+        """Return the step of the centres (B, N, 3), world frame."""
+        # Steps are in radii: distant anchors, with larger radii, may move further.
         r_BN1 = support_radius(state[RAW_RADIUS], self.config)
         return in_world(r_BN1 * super().center_step(state), state[FRAME])

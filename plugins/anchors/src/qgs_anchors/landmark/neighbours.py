@@ -1,4 +1,4 @@
-"""`landmark/neighbours`: self-attention of each anchor to the nearest ones, by relative place."""
+"""`landmark/neighbours`: self-attention of each anchor to its nearest anchors."""
 
 import torch
 from pydantic import Field
@@ -12,31 +12,32 @@ from qgs.tokengs.blocks import attention_weights, merge_heads
 from qgs.types import QueryState
 
 MAX_PAIRS = 1 << 22
-"""Distances at once (16 MiB in float32)."""
+"""Distances that are computed at once (16 MiB in float32)."""
 PLACE = 5
-"""Numbers of a relative place: difference over reach, its length, logarithm of the reach."""
+"""Numbers of a relative place: difference over reach, its length, log of the reach."""
 EPS = 1e-6
 
 
 class NeighbourAttention(SelfAttention):
-    """softmax_j(q_i k_j / sqrt(d) + MLP(p_ij)) over the k anchors j nearest to i, itself too.
+    """Self-attention softmax_j(q_i k_j / sqrt(d) + MLP(p_ij)) over the k nearest anchors j.
 
-    It reads values v_j and relative places p_ij. With s_i the distance of the farthest of the k,
-    p_ij is (mu_j - mu_i) / s_i, its length, and log s_i: close anchors differ as distant ones do.
+    The nearest anchors of i include i. Attention reads their values v_j and their relative places
+    p_ij: (mu_j - mu_i) / s_i, its length, and log s_i. The reach s_i is the distance of the
+    farthest of the k, so relative places do not depend on how dense the anchors are.
     """
 
     name = "neighbours"
     reads = CENTER_FIELD
-    # Adds the same to all logits of an anchor.
+    # This bias adds the same number to all logits of an anchor.
     unlearned = ("place_mlp.fc2.bias",)
 
     class Config(ComponentConfig):
         count: int = Field(default=16, ge=1)
-        """k, the anchors that each one reads; all where there are fewer."""
+        """k, the number of anchors that each one reads. It reads all if there are fewer."""
         hidden: int = Field(default=32, ge=1)
-        """Hidden width of the MLP that turns relative places into logits, one for each head."""
+        """Hidden width of the MLP that turns a relative place into one logit per head."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Added to the variance by every LayerNorm."""
+        """Number that every LayerNorm adds to the variance."""
 
     config: Config
 
@@ -48,7 +49,7 @@ class NeighbourAttention(SelfAttention):
         self.place_proj = nn.Linear(PLACE * dims.heads, dims.width, bias=False)
 
     def forward(self, state: QueryState) -> Tensor:
-        """The update (B, N, D)."""
+        """Return the update (B, N, D)."""
         index_BNk, place_BNkP, bias_BhNk = self._near(state)
         q_BhNd, k_BhNd, v_BhNd = self.attention.project(self.norm(state.features))
         near_k, near_v = (_taken(x, index_BNk) for x in (k_BhNd, v_BhNd))
@@ -61,7 +62,7 @@ class NeighbourAttention(SelfAttention):
         )
 
     def explain(self, state: QueryState, queries: Tensor) -> AttentionWeights:
-        """Attention over all queries, of which those that are no neighbours are hidden."""
+        """Return attention over all queries; queries that are not neighbours are hidden."""
         index_BNk, _, bias_BhNk = self._near(state)
         q_BhNd, k_BhNd, _ = self.attention.project(self.norm(state.features))
         chosen = bias_BhNk[:, :, queries]
@@ -70,7 +71,7 @@ class NeighbourAttention(SelfAttention):
         return attention_weights(q_BhNd[:, :, queries], k_BhNd, hidden.scatter(-1, index, chosen))
 
     def _near(self, state: QueryState) -> tuple[Tensor, Tensor, Tensor]:
-        """Neighbours (B, N, k), their relative places, and the logits (B, h, N, k) of these."""
+        """Return neighbours (B, N, k), their relative places, and logits (B, h, N, k) of these."""
         index_BNk, seen_BNk = nearest(state[CENTER], self.config.count, state.mask)
         place_BNkP = relative_places(state[CENTER], index_BNk, seen_BNk)
         bias_BNkh = at_least_float32(self.place_mlp(place_BNkP))
@@ -83,17 +84,19 @@ class NeighbourAttention(SelfAttention):
 @torch.no_grad()
 @full_precision
 def nearest(center_BN3: Tensor, count: int, mask_BN: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Indices (B, N, k) of the `count` nearest anchors of each, and which of them hold a query.
+    """Return indices (B, N, k) of the nearest anchors of each, and which of them are queries.
 
-    Exact, some rows of distances at a time. An anchor is its own first neighbour.
+    k is `count`, or the number of all anchors if that is less. The search is exact and computes
+    some rows of distances at a time. Each anchor is its own first neighbour. The second result is
+    None without a mask.
     """
     scenes, anchors, _ = center_BN3.shape
-    # One part where all distances fit: torch.compile makes a graph for each number of parts.
+    # One part if all distances fit: torch.compile makes a graph for each number of parts.
     rows = anchors if scenes * anchors**2 <= MAX_PAIRS else max(1, MAX_PAIRS // (scenes * anchors))
     found = []
     own_N = torch.arange(anchors, device=center_BN3.device)
     for part_BR3, own_R in zip(center_BN3.split(rows, 1), own_N.split(rows), strict=True):
-        # Not as |a|^2 + |b|^2 - 2 ab, which has no digits left between close anchors far away.
+        # Not |a|^2 + |b|^2 - 2 ab, which loses all digits for close anchors far from the origin.
         distance = torch.cdist(part_BR3, center_BN3, compute_mode="donot_use_mm_for_euclid_dist")
         if mask_BN is not None:
             distance = distance.masked_fill(~mask_BN[:, None], torch.inf)
@@ -103,13 +106,13 @@ def nearest(center_BN3: Tensor, count: int, mask_BN: Tensor | None) -> tuple[Ten
     if mask_BN is None:
         return index_BNk, None
     seen_BNk = mask_BN[:, None].expand(-1, anchors, -1).gather(2, index_BNk)
-    # itself, or all is NaN.
+    # An anchor always sees itself; with no neighbour at all the softmax would be NaN.
     return index_BNk, seen_BNk | (index_BNk == index_BNk[..., :1])
 
 
 @full_precision
 def relative_places(center_BN3: Tensor, index_BNk: Tensor, seen_BNk: Tensor | None) -> Tensor:
-    """p (B, N, k, 5) of neighbours; those that are not `seen` are no queries, and have no place."""
+    """Return relative places p (B, N, k, 5); neighbours that are not `seen` count as at 0."""
     around_BNk3 = _taken(center_BN3[:, None], index_BNk)[:, 0]
     step_BNk3 = around_BNk3 - center_BN3[:, :, None]
     if seen_BNk is not None:
@@ -121,8 +124,8 @@ def relative_places(center_BN3: Tensor, index_BNk: Tensor, seen_BNk: Tensor | No
 
 
 def _taken(x_BhNd: Tensor, index_BNk: Tensor) -> Tensor:
-    """(B, h, N, k, d)."""
-    # Whole rows: `gather` takes number by number (10 ms instead of 3 for 512 anchors on a CPU).
+    """Return the rows of neighbours (B, h, N, k, d)."""
+    # Whole rows: `gather` copies single numbers (10 ms, not 3, for 512 anchors on a CPU).
     scenes, heads, anchors, _ = x_BhNd.shape
     first = torch.arange(scenes * heads, device=index_BNk.device).view(scenes, heads, 1, 1)
     rows = (first * anchors + index_BNk[:, None]).flatten()

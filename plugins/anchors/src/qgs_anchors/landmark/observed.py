@@ -1,4 +1,4 @@
-"""`landmark/observed`: queries whose anchors start on rays of the photos, at a predicted depth."""
+"""`landmark/observed`: queries whose anchors start on rays of photos, at a predicted depth."""
 
 import math
 from collections.abc import Iterable
@@ -55,23 +55,27 @@ from qgs_anchors.landmark.places import (
 from qgs_anchors.landmark.sweep import mismatch
 
 SHARPNESS = 300.0
-"""1 / t at first: a difference of .01 in RGB makes a depth e times less likely."""
+"""Initial 1 / t. With 300, a difference of 1/300 in RGB makes a depth e times less likely."""
 UNSEEN = 0.2
-"""Difference in RGB at first that a depth which no other photo sees is taken to have."""
+"""Initial difference in RGB that is assumed for a depth that no other photo sees."""
 SAMPLES = 4
-"""Samples along each side of a window."""
+"""Number of samples along each side of a window."""
 
 
 class ObservedQueries(Queries):
-    """A query at a place of a photo: the token there, and an anchor on the ray through it.
+    """Queries at places of photos, each with the token there and an anchor on the ray through it.
 
-    The anchor's depth z, along the camera's axis, is near^w far^(1 - w), with w the sigmoid of an
-    MLP of the token. With a sweep w is the mean of D values from 0 to 1, with weights softmax(
-    MLP(token) - c / t): c is how much the photo differs from the others where it shows that depth.
-    The radius is `radius` sides of the anchor's footprint at its depth: the part of the photo that
-    is its share of all photos, a tile or a square; its side is the root of its area. A query of S
-    tokens starts with the mean of theirs + a matrix times how all but the first differ from it; w
-    is the mean of theirs.
+    The anchor's depth along the camera's axis is z = near^w far^(1 - w), with w the sigmoid of an
+    MLP of the token. With a sweep, w is the mean of D values from 0 to 1 with weights
+    softmax(MLP(token) - c / t). The cost c is the difference between the photo and the other photos
+    at that depth.
+
+    A query's footprint is its share of the photos' area: a tile or a square of its photo. The side
+    of a footprint is the root of its area. The initial radius is `radius` times the side at the
+    anchor's depth.
+
+    A query of S tokens starts with their mean, plus a matrix times the differences of all tokens
+    but the first from this mean. Its w is the mean of the S values.
     """
 
     name = "observed"
@@ -79,29 +83,32 @@ class ObservedQueries(Queries):
 
     class Config(RadiusOptions):
         count: int | None = Field(default=256, ge=1)
-        """N, the number of queries, spread evenly over all input photos, whatever their number and
-        size: in equal tiles if tiles with nearly square cells fit every photo, else in rows; null
-        for `per_token` at the centre of each token's patch."""
+        """N, the number of queries, spread evenly over all input photos of any number and size.
+        They fill equal tiles if tiles with nearly square cells fit every photo, else rows. Null
+        puts `per_token` queries at the centre of each token's patch."""
         tokens: int = Field(default=1, ge=1)
-        """S, places of its footprint whose tokens and depths make a query of `count`."""
+        """S, the number of places in its footprint from which a query takes tokens and depths. It
+        has an effect only if `count` is a number."""
         per_token: int = Field(default=1, ge=1)
-        """Queries of each token where `count` is null; each has a learned vector of its own."""
+        """Number of queries of each token if `count` is null. Each has its own learned vector."""
         near: float = Field(default=0.2, gt=0)
         """Least depth, world units."""
         far: float = Field(default=3.0, gt=0, validate_default=True)
         """Largest depth, world units."""
         sweep: int | None = Field(default=None, ge=2)
-        """D, the depths at which photos are compared; null for a depth by the token alone."""
+        """D, the number of depths at which photos are compared. Null predicts the depth from the
+        token alone."""
         window: float = Field(default=1.5, gt=0)
-        """Side of the squares that are compared, in sides of a square of 1/S of the footprint."""
+        """Side of the squares that are compared, in sides of a square with 1/S of the footprint's
+        area."""
         radius: float = Field(default=1.0, gt=0)
-        """Radius that an anchor starts with, in sides of its footprint at its depth."""
+        """Initial radius of an anchor, in sides of its footprint at its depth."""
         std: float = Field(default=0.3, ge=0)
-        """Standard deviation that the learned vectors start from, which are added to tokens."""
+        """Initial standard deviation of the learned vectors, which are added to tokens."""
         cells: int | None = Field(default=None, ge=1)
-        """K, parts of its footprint whose colours a query knows, for the Gaussians of
-        `landmark/colored`; null where nothing reads them. 8 are rows of 2, 3 and 3 where `count` is
-        null, and 2 rows of 4 where it is a number, whatever the number of photos."""
+        """K, the number of cells of its footprint whose colours a query knows, for the Gaussians of
+        `landmark/colored`. Null writes no colours. 8 cells are rows of 2, 3 and 3 if `count` is
+        null, and 2 rows of 4 if it is a number."""
 
         @field_validator("far")
         @classmethod
@@ -118,52 +125,52 @@ class ObservedQueries(Queries):
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
-        # Queries at one place differ by these alone.
+        # Only these make queries at one place different.
         self.slots = nn.Parameter(torch.randn(config.per_token, dims.width) * config.std)
         self.depth_mlp = Mlp(dims.width, dims.width, config.sweep or 1)
-        # Zero logits: every depth starts in the middle, or where the photos agree best.
+        # With zero logits, every depth starts in the middle, or where the photos agree best.
         nn.init.zeros_(self.depth_mlp.fc2.weight)
         nn.init.zeros_(self.depth_mlp.fc2.bias)
         if config.sweep is not None:
             # As a logarithm, so that it stays positive.
             self.sharpness = nn.Parameter(torch.tensor(math.log(SHARPNESS)))
             self.unseen = nn.Parameter(torch.tensor(UNSEEN))
-            # The curve of agreement says how sure a depth is, which later layers can use.
+            # The curve of agreement shows how certain a depth is; later layers can use it.
             self.match_proj = nn.Linear(config.sweep, dims.width)
         if config.tokens > 1:
             self.apart_proj = nn.Linear((config.tokens - 1) * dims.width, dims.width, bias=False)
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Centre, raw radius, the axes of the photo, footprint, and colours."""
+        """Return centre, raw radius, axes of the photo, footprint, and colours of cells."""
         colors = color_field(config.cells) if config.cells else {}
         anchor = {**CENTER_FIELD, **radius_field(config), **FRAME_FIELD}
         return {**anchor, **FOOTPRINT_FIELD, **colors}
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """`per_token` where points are chosen without regard to tokens, `tokens` where by them."""
+        """Report `per_token` without effect if `count` is a number, `tokens` if it is null."""
         if config.count is None:
             yield from without_effect(config, ("tokens",), "`count` is null")
         else:
             yield from without_effect(config, ("per_token",), "`count` is a number")
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
-        """Features (B, N, D), fields of anchors (B, N, ...), those of footprints with `cells`."""
+        """Return features (B, N, D) and fields (B, N, ...), with colours if there are `cells`."""
         assert memory.grid is not None
         config = self.config
         device = memory.features.device
         size = views.cameras.size
         if config.count is None:
             view_N, place_N2, share_2 = patches(memory.grid, config.per_token, size, device)
-            # A token and its place are one: nothing has to be interpolated.
+            # Each query is at its token: nothing has to be interpolated.
             x_BND = (memory.features[:, :, None] + self.slots).flatten(1, 2)
             x_BND, nearness_BN1 = self._swept(x_BND, views, view_N, place_N2)
         else:
             photos = memory.grid[0]
             aspect = aspect_of(config.cells or 1)
             view_N, place_N2, share_2 = spread(config.count, photos, size, aspect, device)
-            # Several tokens of a tile start one query, so it knows more than its middle.
+            # Several tokens of a tile start one query, so that it knows more than the centre.
             middle_S2 = cells(config.tokens, rows_in_tile(config.tokens), place_N2)
             view_X, place_X2 = _divided(view_N, place_N2, share_2 * middle_S2)
             place_BX2 = place_X2.expand(len(memory.features), -1, -1)
@@ -174,30 +181,30 @@ class ObservedQueries(Queries):
     def _swept(
         self, x_BND: Tensor, views: Views, view_N: Tensor, place_N2: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Features, with what a sweep shows in them, and w, how near places are (B, N, 1)."""
+        """Return features, with the result of the sweep added, and nearness w (B, N, 1)."""
         if self.config.sweep is None:
             return x_BND, at_least_float32(self.depth_mlp(x_BND)).sigmoid()
         match_BND = self._match(views, view_N, place_N2.expand(len(x_BND), -1, -1))
         x_BND = x_BND + self.match_proj(match_BND.softmax(-1))
-        # Logits add up: the network corrects what the photos say, and need not repeat it.
+        # Logits add up: the network only has to correct the result of the comparison.
         share_BND = (at_least_float32(self.depth_mlp(x_BND)) + match_BND).softmax(-1)
-        # Not as a matrix product, which autocast makes in half precision.
+        # Not a matrix product, which autocast would compute in half precision.
         nearness_D = _nearness(self.config.sweep, x_BND.device)
         return x_BND, (share_BND * nearness_D).sum(-1, keepdim=True)
 
     def _joined(self, x_BXD: Tensor, nearness_BX1: Tensor) -> tuple[Tensor, Tensor]:
-        """Features and nearness of queries, from those of their tokens."""
+        """Return features and nearness of queries from those of their tokens."""
         tokens = self.config.tokens
         if tokens == 1:
             return x_BXD, nearness_BX1
         x_BNSD, nearness_BNS1 = (x.unflatten(1, (-1, tokens)) for x in (x_BXD, nearness_BX1))
         mean_BND = x_BNSD.mean(2)
-        # The first is minus the others.
+        # The first difference is minus the sum of the others.
         apart_BNSD = x_BNSD[:, :, 1:] - mean_BND[:, :, None]
         return mean_BND + self.apart_proj(apart_BNSD.flatten(2)), nearness_BNS1.mean(2)
 
     def _match(self, views: Views, view_N: Tensor, place_BN2: Tensor) -> Tensor:
-        """Logits (B, N, D) of depths, by how well photos agree there."""
+        """Return logits (B, N, D) of depths from the agreement of the photos there."""
         assert self.config.sweep is not None
         depth_D = self._depth(_nearness(self.config.sweep, place_BN2.device))
         side = self.config.window * side_of(len(view_N), views.cameras.shape[1], views.cameras.size)
@@ -205,7 +212,7 @@ class ObservedQueries(Queries):
         return -self.sharpness.exp() * torch.where(seen_BND, error_BND, self.unseen)
 
     def _depth(self, nearness: Tensor) -> Tensor:
-        """World units."""
+        """Return depths for nearness w, world units."""
         # Even steps of w are even steps of log depth.
         return self.config.far * (self.config.near / self.config.far) ** nearness
 
@@ -218,7 +225,10 @@ class ObservedQueries(Queries):
         place_N2: Tensor,
         share_2: Tensor,
     ) -> dict[str, Tensor]:
-        """share_2: width and height of footprints, as shares of the photo's."""
+        """Return the fields of queries at places of photos.
+
+        share_2: width and height of footprints, as shares of the photo's.
+        """
         config = self.config
         cameras = views.cameras
         z_BN1 = self._depth(nearness_BN1)
@@ -234,7 +244,7 @@ class ObservedQueries(Queries):
             share_2.to(z_BN1) * constant([width, height], z_BN1) / side, (0, 1), value=rows
         )
         anchors = {
-            # The direction has z = 1 in the camera, so that z is a depth and no distance.
+            # The direction has z = 1 in the camera, so z is a depth, not a distance.
             CENTER: origin_BN3 + z_BN1 * direction_BN3,
             RAW_RADIUS: raw_radii(radii_BN1, config),
             FRAME: cameras.c2w[:, view_N, :3, :3].mT,
@@ -245,7 +255,7 @@ class ObservedQueries(Queries):
         cell_K2 = share_2 * cells(config.cells, rows, share_2)
         view_X, place_X2 = _divided(view_N, place_N2, cell_K2)
         place_BX2 = place_X2.expand(len(z_BN1), -1, -1)
-        # Each cell is averaged over its own area, as its Gaussian covers it.
+        # The colour of a cell is the mean over its area, which its Gaussian covers.
         colors = colors_at(views.images, side / math.sqrt(config.cells), view_X, place_BX2)
         return anchors | {COLORS: colors.unflatten(1, (-1, config.cells))}
 
@@ -253,16 +263,16 @@ class ObservedQueries(Queries):
         return rows_in_square(count) if self.config.count is None else rows_in_tile(count)
 
     def support(self, state: QueryState) -> SpatialSupport:
-        """Balls of the support radius."""
+        """Return balls of the support radius."""
         return ball_support(state[CENTER], support_radius(state[RAW_RADIUS], self.config))
 
 
 def _divided(view_N: Tensor, place_N2: Tensor, step_K2: Tensor) -> tuple[Tensor, Tensor]:
-    """Views (N * K,) of, and places (N * K, 2) at, K steps from each place."""
+    """Return views (N * K,) and places (N * K, 2) at K steps from each place."""
     place_X2 = (place_N2[:, None] + step_K2).flatten(0, 1)
     return view_N.repeat_interleave(len(step_K2)), place_X2
 
 
 def _nearness(count: int, device: torch.device) -> Tensor:
-    """From 0, which is `far`, to 1, which is `near`: (count,)."""
+    """Return evenly spaced values (count,) from 0, which is `far`, to 1, which is `near`."""
     return torch.linspace(0, 1, count, device=device)

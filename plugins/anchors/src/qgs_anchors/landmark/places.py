@@ -1,6 +1,6 @@
-"""Places in photos: where they are, what is seen there, and the rays through them.
+"""Places in photos: their coordinates, the colours there, and the rays through them.
 
-A place is x and y as shares of a photo's width and height; `view_N` says of which photo it is.
+A place is x and y as shares of a photo's width and height. `view_N` is the index of its photo.
 """
 
 import math
@@ -14,14 +14,16 @@ from qgs.precision import full_precision
 from qgs.types import Cameras
 
 EPS = 1e-4
-"""Less than any difference that counts, of pixels or of logarithms of shapes."""
+"""Tolerance in pixels, and in logarithms of aspect ratios."""
 MOST_OFF = 0.35
-"""Logarithm of the factor, 1.4, by which tiles may be higher or lower than asked for. Off by 2 they
-were worse than rows: untrained, 20.1 and 20.3 dB in 32 validation rooms, 512 points, 4 photos."""
+"""Logarithm of the largest factor, 1.4, by which tiles may miss the aspect that was asked for.
+
+Tiles that were off by 2 were worse than rows: 20.1 against 20.3 dB, for untrained models with 512
+points and 4 photos in 32 validation rooms."""
 
 
 def patch_centres(rows: int, columns: int, device: torch.device) -> Tensor:
-    """Places (rows * columns, 2) in one photo, row by row."""
+    """Return the centres (rows * columns, 2) of the patches of a photo, row by row."""
     y, x = ((torch.arange(n, device=device) + 0.5) / n for n in (rows, columns))
     return torch.cartesian_prod(y, x).flip(-1)
 
@@ -29,7 +31,10 @@ def patch_centres(rows: int, columns: int, device: torch.device) -> Tensor:
 def patches(
     grid: tuple[int, int, int], each: int, size: tuple[int, int], device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """As `spread`, `each` points in the middle of every patch of a grid (V, rows, columns)."""
+    """Return `each` points at the centre of every patch of a grid (V, rows, columns).
+
+    The results are those of `spread`.
+    """
     photos, rows, columns = grid
     place_N2 = patch_centres(rows, columns, device).repeat(photos, 1).repeat_interleave(each, 0)
     view_N = torch.arange(photos, device=device).repeat_interleave(rows * columns * each)
@@ -39,25 +44,27 @@ def patches(
 def spread(
     count: int, views: int, size: tuple[int, int], aspect: float, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Views (N,) of N = `count` points, in turn, their places (N, 2) in photos (H, W), and the
-    width and height (2,) of the part of its photo that is each one's own, as shares of the photo.
+    """Spread N = `count` points evenly over photos of size (H, W).
 
-    The parts are equal tiles if tiles of about `aspect`, height over width in pixels, fit every
-    photo, and the points their middles. Otherwise the points are in rows, some with one more, and
-    their parts count as squares. Both are as even as a low-discrepancy sequence. Where points are
-    fewer than photos, some photos have none.
+    Returns the view (N,) of each point, in turn; the places (N, 2); and the width and height (2,)
+    of the part of a photo that belongs to each point, as shares of the photo.
+
+    The parts are equal tiles if tiles of about `aspect` (height over width in pixels) fit every
+    photo. The points are then the centres of the tiles. Otherwise the points are in rows, some of
+    which have one point more, and their parts count as squares. Both ways are as even as a
+    low-discrepancy sequence. With fewer points than photos, some photos have no point.
     """
     index_N = torch.arange(count, device=device)
     of_photo = size[0] / size[1]
     view_N = index_N % views
     held_N = (count - 1 - view_N) // views + 1
-    # Tensors, since torch.compile would make a graph for each number that Python compares.
+    # Tensors: torch.compile would make a graph for each number that Python compares.
     each = held_N.amin()
     rows_R = index_N + 1
     off_R = (each * of_photo / rows_R**2 / aspect).log().abs()
-    # Tiles must be full rows of as many columns, the same in every photo.
+    # Tiles must form full rows with equally many columns, the same in every photo.
     fit_R = (each % rows_R == 0) & (off_R < MOST_OFF) & (each * views == count)
-    # Of two that are as far off, the wider one.
+    # If two are equally far off, take the wider one.
     wider_R = off_R - EPS * rows_R.log()
     rows = torch.where(fit_R, wider_R, torch.inf).argmin() + 1
     tiled = fit_R.any()
@@ -70,44 +77,48 @@ def spread(
 
 
 def _square(count: int, views: int, size: tuple[int, int], like: Tensor) -> Tensor:
-    """Width and height (2,) of a square of `side_of`, as shares of a photo's."""
+    """Return width and height (2,) of a square of `side_of`, as shares of a photo's."""
     return side_of(count, views, size) / constant([size[1], size[0]], like)
 
 
 def side_of(count: int, views: int, size: tuple[int, int]) -> float:
-    """Side in pixels of squares of which `count` have the area of all photos (H, W)."""
+    """Return the side in pixels of `count` squares with the total area of all photos (H, W)."""
     return math.sqrt(views * math.prod(size) / count)
 
 
 def rows_in_square(count: int) -> int:
-    """Rows of `count` cells that divide a square into about squares."""
+    """Return the number of rows in which `count` nearly square cells fill a square."""
     return round(math.sqrt(count))
 
 
 def rows_in_tile(count: int) -> int:
-    """Rows of a grid of `count` cells, with up to twice as many columns; else of a square."""
+    """Return the rows of a grid of `count` cells with at most twice as many columns.
+
+    If there is no such grid, return the rows of `rows_in_square`.
+    """
     few = range(math.isqrt(count), 0, -1)
     grids = (rows for rows in few if count % rows == 0 and count <= 2 * rows**2)
     return next(grids, rows_in_square(count))
 
 
 def aspect_of(count: int) -> float:
-    """Height over width of a tile whose `count` cells are squares."""
+    """Return height over width of a tile whose `count` cells are squares."""
     rows = rows_in_tile(count)
     return rows**2 / count if count % rows == 0 else 1.0
 
 
 def cells(count: int, rows: int | Tensor, like: Tensor) -> Tensor:
-    """Middles (K, 2), x and y, of K = `count` cells, in rows, of a unit square about 0."""
+    """Return the centres (K, 2), x and y, of K = `count` cells in rows of a unit square about 0."""
     index_K = torch.arange(count, device=like.device)
-    # A tensor, since torch.compile would make a graph for each number that Python divides.
+    # A tensor: torch.compile would make a graph for each number that Python divides.
     return parts(index_K, (index_K + 1).amax(), rows).to(like) - 0.5
 
 
 def parts(index_N: Tensor, count: Tensor, rows: Tensor | int) -> Tensor:
-    """Middles (N, 2), x and y, of the parts `index_N` of `count` of a unit square, row by row.
+    """Return the centres (N, 2), x and y, of the parts `index_N` of a unit square, row by row.
 
-    Rows are of equal height and have as many parts each, or one more.
+    The square has `count` parts. Rows have equal heights; their numbers of parts differ by at most
+    one.
     """
     row_N = ((index_N + 1) * rows - 1) // count
     first_N = row_N * count // rows
@@ -120,24 +131,25 @@ def parts(index_N: Tensor, count: Tensor, rows: Tensor | int) -> Tensor:
 def sampled(
     maps_BMC: Tensor, grid: tuple[int, int, int], view_N: Tensor, place_BN2: Tensor
 ) -> Tensor:
-    """Values (B, N, C), bilinear between the middles of patches; beyond them those of the edge.
+    """Sample values (B, N, C), bilinear between the centres of patches.
 
-    maps_BMC: values of the patches of a grid (V, rows, columns), by view, row and column.
+    Beyond the outer centres, values are those of the edge. maps_BMC: values of the patches of a
+    grid (V, rows, columns), by view, row and column.
     """
     maps_BVChw = maps_BMC.unflatten(1, grid).movedim(-1, 2)
     return bilinear(maps_BVChw, view_N, place_BN2[:, :, None])[..., 0].mT
 
 
 def bilinear(maps_BVCHW: Tensor, view_N: Tensor, place_BNX2: Tensor) -> Tensor:
-    """Values (B, C, N, X) at places of the maps `view_N`; outside of one those of its edge."""
+    """Sample values (B, C, N, X) at places of the maps `view_N`; outside, those of the edge."""
     _, photos, _, height, width = maps_BVCHW.shape
-    # All maps as one, one below another: places keep half a pixel from the edges of theirs.
+    # All maps are stacked below each other: places stay half a pixel inside their own map.
     edge_2 = constant([0.5 / width, 0.5 / height], place_BNX2)
     x_BNX, y_BNX = place_BNX2.maximum(edge_2).minimum(1 - edge_2).unbind(-1)
     y_BNX = (y_BNX + view_N[:, None]) / photos
     column = maps_BVCHW.transpose(1, 2).flatten(2, 3)
     grid = torch.stack([x_BNX, y_BNX], -1)
-    # Places have no digits in half precision, and features of float64 keep theirs.
+    # Half precision is too coarse for places, and float64 features keep their precision.
     kind = torch.promote_types(column.dtype, grid.dtype)
     found = F.grid_sample(column.to(kind), 2 * grid.to(kind) - 1, align_corners=False)
     return found.to(column.dtype)
@@ -145,9 +157,10 @@ def bilinear(maps_BVCHW: Tensor, view_N: Tensor, place_BNX2: Tensor) -> Tensor:
 
 @full_precision
 def colors_at(images_BV3HW: Tensor, side: float, view_N: Tensor, place_BN2: Tensor) -> Tensor:
-    """RGB (B, N, 3): means over squares of `side` pixels around places, by a sample a pixel.
+    """Return mean RGB (B, N, 3) over squares of `side` pixels around places.
 
-    Those of whole sides are exact. Beyond an edge, its pixels repeat.
+    There is one sample per pixel. For whole sides the mean is exact. Beyond an edge, its pixels
+    repeat.
     """
     height, width = images_BV3HW.shape[-2:]
     place_BN2 = place_BN2.to(images_BV3HW)
@@ -157,9 +170,9 @@ def colors_at(images_BV3HW: Tensor, side: float, view_N: Tensor, place_BN2: Tens
 
 
 def rays_at(cameras: Cameras, view_N: Tensor, place_BN2: Tensor) -> tuple[Tensor, Tensor]:
-    """World-frame origins and directions (B, N, 3) through places of photos.
+    """Return world-frame origins and directions (B, N, 3) of rays through places of photos.
 
-    Directions have length 1 along the axis of their camera.
+    Directions have z = 1 in the frame of their camera.
     """
     height, width = cameras.size
     c2w_BN44 = cameras.c2w[:, view_N]

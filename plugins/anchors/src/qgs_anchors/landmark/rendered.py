@@ -1,4 +1,4 @@
-"""`landmark/rendered`: rounds in which tokens know how the rendering of their photo is wrong."""
+"""`landmark/rendered`: rounds in which image tokens know the error of their photo's rendering."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -20,18 +20,18 @@ from qgs.tokengs.blocks import split_heads
 from qgs.types import Cameras, ImageMemory, QueryState, Rendering, Views
 
 CHANNELS = 7
-"""Photo minus rendering and rendered RGB, alpha."""
+"""Channels of an error map: photo minus rendering (RGB), rendering (RGB), alpha."""
 ERROR_GAIN = 4.0
-"""Errors are some tenths; the other channels reach 1."""
+"""Factor of errors: they are some tenths, while the other channels reach 1."""
 
 
 class RenderedFeedback(Feedback):
-    """Keys and values + MLP(patch of the error), features + a learned vector of the query.
+    """Feedback that adds rendering errors to keys and values, and a learned vector to queries.
 
-    The error maps of a photo are averaged into `cells` x `cells` for each token; a 3 x 3
-    convolution over tokens, GELU and a linear layer make keys and values of them, which are added
-    to those of the encoder. Rays of the tokens stay, so that attention with a bias by rays finds
-    the errors where the Gaussians of an anchor fall.
+    The error maps of a photo are averaged into `cells` x `cells` for each token. A 3 x 3
+    convolution over tokens, GELU and a linear layer turn them into keys and values, which are added
+    to those of the encoder. The rays of the tokens stay. So attention with a bias by rays finds the
+    errors where the Gaussians of an anchor are rendered.
     """
 
     name = "rendered"
@@ -39,15 +39,15 @@ class RenderedFeedback(Feedback):
 
     class Config(ComponentConfig):
         rounds: int = Field(default=2, ge=1, le=16)
-        """Rounds of an evaluation, and the most of a training step."""
+        """Number of rounds in evaluation, and the largest number in a training step."""
         least: int = Field(default=1, ge=1)
-        """Fewest rounds of a training step, which draws their number up to `rounds`."""
+        """Smallest number of rounds in a training step, which draws it from `least` to `rounds`."""
         layers: int = Field(default=2, ge=1)
-        """How many of the last decoder layers a round repeats."""
+        """Number of last decoder layers that a round repeats."""
         shrink: int = Field(default=2, ge=1)
-        """The input photos are rendered at 1/`shrink` of their size."""
+        """Render the input photos at 1/`shrink` of their size."""
         cells: int = Field(default=2, ge=1)
-        """Means of the error that a token gets along each side of its patch."""
+        """Number of error cells along each side of a token's patch."""
 
     config: Config
 
@@ -55,14 +55,14 @@ class RenderedFeedback(Feedback):
         super().__init__(config, dims)
         self.rounds = config.rounds
         self.layers = config.layers
-        # It tells a layer whether it runs in a round, with the weights of the first pass.
+        # It tells a layer that it runs in a round: the weights are those of the first pass.
         self.marker = nn.Parameter(torch.zeros(dims.width))
         self.embedding = nn.Conv2d(CHANNELS * config.cells**2, dims.width, 3, padding=1)
         self.kv_proj = nn.Linear(dims.width, 2 * dims.width)
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """More layers than there are, fewer rounds than the fewest, a size that does not divide."""
+        """Report too many layers, too few rounds, and a size that `shrink` does not divide."""
         depth = context.dims.depth
         size = context.image_size
         if config.layers > depth:
@@ -72,11 +72,11 @@ class RenderedFeedback(Feedback):
             reason = f"training draws from {config.least} to {config.rounds} rounds"
             yield Problem("least", reason, f"write at most {config.rounds}, or raise `rounds`")
         if size and any(side % config.shrink for side in size):
-            reason = f"images of {size[0]} x {size[1]} (H x W) cannot be {config.shrink} times less"
+            reason = f"images of {size[0]} x {size[1]} (H x W) cannot shrink by {config.shrink}"
             yield Problem("shrink", reason, "choose a number that divides both sides")
 
     def adapted(self, learned: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """As learned; without any, from a model without rounds, errors change nothing at first."""
+        """Return `learned`; for a model without rounds, weights that ignore errors at first."""
         # Only a checkpoint of a model with rounds has these names.
         if learned:
             return dict(learned)
@@ -84,11 +84,11 @@ class RenderedFeedback(Feedback):
         return own | {k: torch.zeros_like(own[k]) for k in own if k.startswith("kv_proj.")}
 
     def drawn(self) -> int:
-        """Uniformly from `least` to `rounds`."""
+        """Draw a number of rounds, uniformly from `least` to `rounds`."""
         return int(torch.randint(self.config.least, self.config.rounds + 1, ()))
 
     def compared(self, views: Views) -> Views:
-        """Photos of 1/`shrink` of the size, each pixel the mean of those that it covers."""
+        """Return photos at 1/`shrink` of their size, by averaging pixels."""
         by = self.config.shrink
         cameras = views.cameras
         size = (cameras.size[0] // by, cameras.size[1] // by)
@@ -101,7 +101,7 @@ class RenderedFeedback(Feedback):
     ) -> tuple[QueryState, ImageMemory]:
         assert memory.grid is not None
         _, rows, columns = memory.grid
-        # The rendering goes along: an error means another thing where nothing was drawn.
+        # The rendering is an input too: an error means something else where nothing was drawn.
         error = ERROR_GAIN * (photos.images - rendering.rgb)
         maps_BVCHW = torch.cat([error, rendering.rgb, rendering.alpha], 2)
         cells = self.config.cells

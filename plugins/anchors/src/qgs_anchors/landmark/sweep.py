@@ -1,4 +1,4 @@
-"""A sweep over depths: how well the photos agree about what a place of one of them shows."""
+"""Sweep over depths: comparison of the photos around a place of one of them."""
 
 import torch
 from torch import Tensor
@@ -9,24 +9,25 @@ from qgs.types import Cameras, Views
 from qgs_anchors.landmark.places import bilinear, cells, rays_at
 
 LEAST_SEEN = 0.5
-"""Share of a window that another photo must see for its colours to count."""
+"""Least share of a window that another photo must see, or else it does not count."""
 LEAST_DEPTH = 1e-3
-"""World units in front of a camera, of what it sees."""
+"""Least depth at which a camera sees a point, world units."""
 
 
 @full_precision
 def mismatch(
     views: Views, view_N: Tensor, place_BN2: Tensor, depth_D: Tensor, side: float, points: int
 ) -> tuple[Tensor, Tensor]:
-    """How much windows around places differ from other photos, at depths: (B, N, D), and where.
+    """Return differences (B, N, D) of windows from other photos at depths, and where they exist.
 
-    It is the mean difference of RGB over a square of `side` pixels, of points x points samples,
-    and over the photos that see at least half of it at that depth. The second tensor says whether
-    any does; where none does, the difference is 0. Cameras get gradients, as photos do.
+    A window is a square of `side` pixels around a place, with points x points samples. The
+    difference is the mean of |RGB - RGB| over these and over the photos that see at least half of
+    the window at that depth. If no photo does, the difference is 0 and the second tensor (B, N, D)
+    is False. Cameras and photos get gradients.
     """
     height, width = views.cameras.size
     place_BN2 = place_BN2.to(views.images)
-    # A window, not a pixel: one colour agrees with too many places.
+    # A window, not a pixel: a single colour matches too many places.
     step_P2 = side * cells(points**2, points, place_BN2) / constant([width, height], place_BN2)
     place_BNP2 = place_BN2[:, :, None] + step_P2
     color_B3NP = bilinear(views.images, view_N, place_BNP2)
@@ -39,12 +40,12 @@ def mismatch(
     at_BXDP2, seen_BXDP = reprojected(views.cameras, view_X, other_X, place_BXP2, depth_D)
     found_B3XDP = bilinear(views.images, other_X, at_BXDP2.flatten(2, 3))
     found_B3ANDP = found_B3XDP.unflatten(3, (-1, points**2)).unflatten(2, (photos - 1, count))
-    # Samples that fall outside of the other photo say nothing.
+    # Samples outside of the other photo do not count.
     seen_BANDP = seen_BXDP.unflatten(1, (photos - 1, count))
     error_BANDP = (found_B3ANDP - color_B3NP[:, :, None, :, None]).abs().mean(1)
     error_BAND = (error_BANDP * seen_BANDP).sum(-1) / seen_BANDP.sum(-1).clamp_min(1)
     counts_BAND = seen_BANDP.to(error_BAND).mean(-1) >= LEAST_SEEN
-    # A photo of which most of the window is outside does not count either.
+    # A photo that sees less than half of the window does not count either.
     count_BND = counts_BAND.sum(1)
     return (error_BAND * counts_BAND).sum(1) / count_BND.clamp_min(1), count_BND > 0
 
@@ -52,7 +53,10 @@ def mismatch(
 def reprojected(
     cameras: Cameras, view_N: Tensor, other_N: Tensor, place_BNP2: Tensor, depth_D: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Places (B, N, D, P, 2) in other photos of places at depths, and which lie in these photos."""
+    """Project places at depths into other photos.
+
+    Returns places (B, N, D, P, 2) there, and whether each is inside that photo.
+    """
     height, width = cameras.size
     points = place_BNP2.shape[2]
     view_X = view_N.repeat_interleave(points)
@@ -62,7 +66,7 @@ def reprojected(
     c2w_BN44 = cameras.c2w[:, other_N]
     lens_BN4 = cameras.intrinsics[:, other_N]
     turn_BN33 = c2w_BN44[..., :3, :3]
-    # Of a point at depth z, divided by z: the ray's direction + the step between cameras / z.
+    # A point at depth z, divided by z, is the ray's direction + the step between cameras / z.
     ray_BNP3 = direction_BNP3 @ turn_BN33
     step_BN13 = (origin_BN3 - c2w_BN44[..., :3, 3])[:, :, None] @ turn_BN33
     local = ray_BNP3[:, :, None] + step_BN13[:, :, None] / depth_D[:, None, None]
@@ -70,6 +74,6 @@ def reprojected(
     slope = local[..., :2] / local[..., 2:].clamp_min(LEAST_DEPTH / depth_D.max())
     focal_BN2, middle_BN2 = lens_BN4[:, :, None, None].split(2, -1)
     place_BNDP2 = (slope * focal_BN2 + middle_BN2) / constant([width, height], slope)
-    # Beyond the edges, colours would be those of the edge.
+    # Outside of a photo, sampling would return colours of its edge.
     inside_BNDP = ((place_BNDP2 > 0) & (place_BNDP2 < 1)).all(-1)
     return place_BNDP2, ahead_BNDP & inside_BNDP

@@ -1,4 +1,4 @@
-"""Attention with a bias that is a function; `RayBias` in numba for CPUs, Triton for GPUs.
+"""Attention with a computed bias: `RayBias` in numba for CPUs, in Triton for GPUs.
 
-The formula of the bias is in `qgs_locus.ray_bias`, that of attention in `attention_bias` here.
+`qgs_locus.ray_bias` has the formula of the bias; `attention_bias` has that of attention.
 """

@@ -1,9 +1,9 @@
-"""Attention with a bias that is a function of query and token, computed block by block.
+"""Attention with a bias that depends on query and token, computed block by block.
 
-The logits are q k / sqrt(d) + b. Neither they, nor b, nor their gradients ever exist for all N x M
-pairs, only for some queries and all tokens at a time: a block. The backward pass makes b and the
-weights p = exp(logits - lse) again from the log-sum-exp of each query (FlashAttention, arXiv
-2205.14135, section 3.1, whose blocks are of tokens too).
+The logits are q k / sqrt(d) + b. The logits, b and their gradients never exist for all N x M pairs.
+They exist for one block at a time: some queries and all tokens. The backward pass computes b again,
+and the weights p = exp(logits - lse) from the log-sum-exp of each query. This is FlashAttention
+(arXiv 2205.14135, section 3.1), which also splits the tokens into blocks.
 
 Axes: F numbers of a query, G numbers of a token, n queries of a block.
 """
@@ -27,29 +27,31 @@ from qgs_locus.kernels.attention_choice import AttentionKernel, chosen_kernel
 T = TypeVar("T")
 Kernel: TypeAlias = Callable[..., None]
 Block: TypeAlias = tuple[int, slice, tuple[Tensor, ...]]
-"""A scene, some of its queries, and buffers (n, M) for them."""
+"""Block of queries: the scene, a slice of its queries, and buffers (n, M) for them."""
 
 BLOCK = {"cpu": 2**22, "cuda": 2**25}
-"""Numbers that all blocks of a pass may hold at a time, each (n, M): what caches hold on a CPU, and
-enough to fill a GPU."""
+"""Numbers that all buffers (n, M) of a block may hold together.
+
+On a CPU they fit into its caches; on a GPU they are enough to keep it busy.
+"""
 
 _kept = threading.local()
 
-# Pairs that are worth a thread: some 0.1 ms.
+# Pairs that are worth a thread: about 0.1 ms of work.
 _UNIT = 2**20
-# Pairs whose `value` is computed at a time, as it may take ten times the memory.
+# Pairs whose `value` is computed at a time: it may need ten times the memory.
 _PART = 2**21
 
 
 class AttentionBias(ABC):
-    """A bias of attention logits, the same for all heads: a function of query and token.
+    """Bias of attention logits that depends on query and token and is the same for all heads.
 
-    queries: (B, N, F), what it reads of queries. tokens: (B, G, M), what it reads of tokens.
-    Gradients flow into both, and into nothing else that `value` reads. Float32 or float64.
+    queries: (B, N, F), numbers of each query. tokens: (B, G, M), numbers of each token. Gradients
+    flow into these two only. Both are float32 or float64.
     """
 
     in_triton = False
-    """Whether `attention_triton` computes it."""
+    """True if `attention_triton` can compute it."""
 
     def __init__(self, queries: Tensor, tokens: Tensor) -> None:
         self.queries = queries
@@ -57,14 +59,14 @@ class AttentionBias(ABC):
 
     @abstractmethod
     def value(self, queries_nF: Tensor, tokens_GM: Tensor) -> Tensor:
-        """The bias (n, M) of some queries of a scene and all its tokens, differentiable."""
+        """Return the bias (n, M) of some queries of a scene and all its tokens, differentiable."""
 
     def compiled(self) -> tuple[Kernel, Kernel] | None:
-        """Two kernels (`qgs.kernels.kernel`) that are faster on a CPU in float32; None for none.
+        """Return two kernels (`qgs.kernels.kernel`) for float32 on a CPU, or None.
 
-        The first one is called with arrays (queries, tokens, out) and does as `value`; the second
-        with (queries, tokens, gradient, out) and writes the gradient (n, F) of the queries, given
-        that of the bias. They may share rows among threads.
+        The first takes arrays (queries, tokens, out) and writes `value` to `out`. The second takes
+        (queries, tokens, gradient, out): from the gradient of the bias it computes that of the
+        queries (n, F). Several threads may run a kernel, each on its own rows.
         """
         return None
 
@@ -72,7 +74,7 @@ class AttentionBias(ABC):
     def write(self, queries_nF: Tensor, tokens_GM: Tensor, out_nM: Tensor) -> None:
         """Write `value` into `out_nM`."""
         kernels = self._kernels(queries_nF)
-        # One pass in registers, without (n, M, 3) tensors.
+        # Kernels need no (n, M, 3) tensors: they work in registers.
         if kernels is not None:
             return _in_rows(kernels[0], tokens_GM, queries_nF, out_nM)
         for part_nF, out in zip(*_parts(queries_nF, out_nM), strict=True):
@@ -82,13 +84,13 @@ class AttentionBias(ABC):
     def gradients(
         self, queries_nF: Tensor, tokens_GM: Tensor, gradient_nM: Tensor
     ) -> tuple[Tensor | None, Tensor | None]:
-        """Gradients (n, F) of the queries and (G, M) of the tokens, given that of the bias.
+        """Return gradients (n, F) of the queries and (G, M) of the tokens from that of the bias.
 
-        None for `self.queries` or `self.tokens` that require none; one of the two does.
+        A gradient is None if `self.queries` or `self.tokens` needs none. At least one needs it.
         """
         of_queries = self.queries.requires_grad
         of_tokens = self.tokens.requires_grad
-        # Kernels give no gradient of tokens: rays are data, unless poses are optimised.
+        # Kernels compute no gradient of tokens: rays are data, unless poses are optimised.
         kernels = None if of_tokens else self._kernels(queries_nF)
         if kernels is not None:
             out_nF = torch.empty_like(queries_nF)
@@ -96,7 +98,7 @@ class AttentionBias(ABC):
             return out_nF, None
         found: list[tuple[Tensor, ...]] = []
         for part_nF, part_nM in zip(*_parts(queries_nF, gradient_nM), strict=True):
-            # A backward pass runs without.
+            # A backward pass runs with gradients off.
             with torch.enable_grad():
                 leaves = part_nF.detach(), tokens_GM.detach()
                 leaves = leaves[0].requires_grad_(of_queries), leaves[1].requires_grad_(of_tokens)
@@ -112,7 +114,7 @@ class AttentionBias(ABC):
         return self.compiled() if usable else None
 
     def dense(self, chosen: Tensor | None = None) -> Tensor:
-        """The bias of all pairs, (B, N, M), or of the queries with indices `chosen`, (B, Q, M)."""
+        """Return the bias of all queries (B, N, M), or of those with indices `chosen` (B, Q, M)."""
         bias = self
         if chosen is not None:
             bias = copy(self)
@@ -120,11 +122,11 @@ class AttentionBias(ABC):
         return _outside_graphs(_Dense.apply)(bias.queries, bias.tokens, bias)
 
     def blocks(self, buffers: int, dtype: torch.dtype) -> Iterator[Block]:
-        """All queries, block by block, with memory for `buffers` tensors of a block's shape."""
+        """Yield all queries block by block, with memory for `buffers` tensors of its shape."""
         scenes, count, _ = self.queries.shape
         tokens = self.tokens.shape[2]
         device = self.queries.device
-        # At least one query a block, however many tokens there are.
+        # At least one query per block, for any number of tokens.
         numbers = BLOCK.get(device.type, BLOCK["cuda"])
         rows = min(max(numbers // max(buffers * tokens, tokens, 1), 1), max(count, 1))
         memory = _scratch(buffers * rows * tokens, device, dtype).view(buffers, rows, tokens)
@@ -135,13 +137,13 @@ class AttentionBias(ABC):
 
 
 def _parts(queries_nF: Tensor, of_pairs_nM: Tensor) -> tuple[tuple[Tensor, ...], ...]:
-    """Both in parts of some `_PART` pairs."""
+    """Split both tensors into parts of about `_PART` pairs."""
     rows = max(_PART // max(of_pairs_nM.shape[1], 1), 1)
     return queries_nF.split(rows), of_pairs_nM.split(rows)
 
 
 def _in_rows(kernel: Kernel, tokens_GM: Tensor, *of_rows: Tensor) -> None:
-    """Call a kernel for some rows at a time of all but the tokens, on several threads."""
+    """Call a kernel on several threads, each with some rows of all arrays except the tokens."""
     tokens = tokens_GM.numpy()
     queries, *others = (x.numpy() for x in of_rows)
     pairs = len(queries) * tokens.shape[1]
@@ -155,10 +157,10 @@ def _in_rows(kernel: Kernel, tokens_GM: Tensor, *of_rows: Tensor) -> None:
 
 
 def _scratch(size: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """Memory for `size` numbers."""
+    """Return memory for `size` numbers."""
     if device.type != "cpu":
         return torch.empty(size, device=device, dtype=dtype)
-    # It is kept: the first touch of new memory takes as long as computing the bias.
+    # Memory is kept: touching new memory takes as long as computing the bias.
     memory = getattr(_kept, "memory", None)
     if memory is None or memory.dtype != dtype or len(memory) < size:
         # A later pass may need gradients.
@@ -174,7 +176,10 @@ def biased_attention(
     bias: AttentionBias,
     kernel: AttentionKernel = "auto",
 ) -> Tensor:
-    """softmax(q k / sqrt(d) + b) v, (B, h, N, d). ValueError where `kernel` cannot compute it."""
+    """Return softmax(q k / sqrt(d) + b) v, (B, h, N, d).
+
+    Raises ValueError if `kernel` cannot compute it.
+    """
     qkv = (q_BhNd, k_BhMd, v_BhMd)
     of_bias = (bias.queries, bias.tokens)
     chosen = _outside_graphs(chosen_kernel)(q_BhNd, bias, kernel)
@@ -189,23 +194,24 @@ def biased_attention(
 
 
 def _outside_graphs(function: Callable[..., T]) -> Callable[..., T]:
-    """`function`, left out of compiled graphs, where its loop would be unrolled for every size.
+    """Keep `function` out of compiled graphs, which would unroll its loop for every size.
 
-    Outside them `torch.compiler.disable` would import the compiler (0.8 s).
+    If nothing is being compiled, return it unchanged: `torch.compiler.disable` would import the
+    compiler, which takes 0.8 s.
     """
     outside: Any = torch.compiler.disable if torch.compiler.is_compiling() else lambda f: f
     return outside(function)
 
 
 class _Dense(torch.autograd.Function):
-    """The bias of all pairs; keeps nothing of it for the backward pass."""
+    """Bias of all pairs, which is computed again in the backward pass."""
 
     @staticmethod
     def forward(ctx: Any, queries: Tensor, tokens: Tensor, bias: AttentionBias) -> Tensor:
         out_BNM = queries.new_empty(*queries.shape[:2], tokens.shape[2])
         for scene, rows, _ in bias.blocks(0, out_BNM.dtype):
             bias.write(queries[scene, rows], tokens[scene], out_BNM[scene, rows])
-        # Not the bias, which is made again.
+        # The bias itself is not saved: it is computed again.
         ctx.save_for_backward(queries, tokens)
         ctx.bias = bias
         return out_BNM
@@ -214,7 +220,7 @@ class _Dense(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         queries, tokens = ctx.saved_tensors
-        # The bias is made again block by block: its values never wait for the backward pass.
+        # Block by block, so that the values of all pairs need no memory.
         sums = _BiasGradients(queries, tokens, ctx.bias)
         for scene, rows, _ in ctx.bias.blocks(0, gradients[0].dtype):
             sums.add(scene, rows, gradients[0][scene, rows])
@@ -222,7 +228,7 @@ class _Dense(torch.autograd.Function):
 
 
 class _BiasGradients:
-    """Gradients of what a bias reads, summed over blocks. queries, tokens: as `AttentionBias`'s."""
+    """Gradients of the queries and tokens of an `AttentionBias`, summed over blocks."""
 
     def __init__(self, queries: Tensor, tokens: Tensor, bias: AttentionBias) -> None:
         self._read = (queries, tokens)
@@ -232,7 +238,7 @@ class _BiasGradients:
         self.wanted = bias.queries.requires_grad or bias.tokens.requires_grad
 
     def add(self, scene: int, rows: slice, gradient_nM: Tensor) -> None:
-        """Add those of a block, given the gradient of its values."""
+        """Add the gradients of a block, given the gradient of its values."""
         read = self._read[0][scene, rows], self._read[1][scene]
         of_queries, of_tokens = self._bias.gradients(*read, gradient_nM)
         if self.queries is not None and of_queries is not None:
@@ -242,17 +248,17 @@ class _BiasGradients:
 
 
 class _BiasedAttention(torch.autograd.Function):
-    """See `biased_attention`."""
+    """Autograd function of `biased_attention`, block by block."""
 
     @staticmethod
     def forward(
         ctx: Any, q: Tensor, k: Tensor, v: Tensor, queries: Tensor, tokens: Tensor, bias: Any
     ) -> Tensor:
-        # A log-sum-exp in bfloat16 is no sum.
+        # bfloat16 is too coarse for a log-sum-exp.
         exact = torch.promote_types(q.dtype, torch.float32)
         out = torch.empty_like(q)
         lse = q.new_empty(q.shape[:3], dtype=exact)
-        # `_attend` makes the logits of all heads at once, but for the fused kernel of a CPU.
+        # `_attend` needs the logits of all heads at once, except in the fused CPU kernel.
         heads = 0 if q.device.type == "cpu" else q.shape[1]
         for scene, rows, (bias_nM, *_) in bias.blocks(1 + heads, lse.dtype):
             bias.write(queries[scene, rows], tokens[scene], bias_nM)
@@ -272,7 +278,7 @@ class _BiasedAttention(torch.autograd.Function):
 
 
 def _attend(q_hnd: Tensor, k_hMd: Tensor, v_hMd: Tensor, bias_nM: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted values (h, n, d) and log-sum-exp (h, n) of some queries of a scene."""
+    """Return weighted values (h, n, d) and log-sum-exp (h, n) of some queries of a scene."""
     if q_hnd.device.type != "cpu" or (flash := _flash_for_cpu()) is None:
         return _attend_anywhere(q_hnd, k_hMd, v_hMd, bias_nM)
     out, lse = flash(q_hnd[None], k_hMd[None], v_hMd[None], attn_mask=bias_nM[None, None])
@@ -281,9 +287,9 @@ def _attend(q_hnd: Tensor, k_hMd: Tensor, v_hMd: Tensor, bias_nM: Tensor) -> tup
 
 @cache
 def _flash_for_cpu() -> Callable[..., tuple[Tensor, Tensor]] | None:
-    """What torch's attention calls on a CPU; None in a torch that has it no more, or otherwise.
+    """Return torch's private operator for attention on a CPU, or None if it is not as expected.
 
-    Only this private operator returns the log-sum-exp, which spares the backward pass a softmax.
+    Only this operator returns the log-sum-exp, which saves a softmax in the backward pass.
     """
     x = torch.ones(1, 1, 1, 8, device="cpu")
     try:
@@ -298,7 +304,7 @@ def _flash_for_cpu() -> Callable[..., tuple[Tensor, Tensor]] | None:
 def _attend_anywhere(
     q_hnd: Tensor, k_hMd: Tensor, v_hMd: Tensor, bias_nM: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """As `_attend`, in float32, on any device."""
+    """Return the same as `_attend`, in float32 or better, on any device."""
     logits_hnM = torch.baddbmm(bias_nM, q_hnd, k_hMd.mT, alpha=q_hnd.shape[-1] ** -0.5)
     lse_hn = logits_hnM.logsumexp(-1)
     return logits_hnM.sub_(lse_hn[..., None]).exp_() @ v_hMd, lse_hn
@@ -308,11 +314,11 @@ def _attend_anywhere(
 def _attention_gradients(
     saved: tuple[Tensor, ...], gradient: Tensor, bias: AttentionBias, needs: tuple[bool, ...]
 ) -> tuple[Tensor | None, ...]:
-    """Gradients of q, k, v (all (B, h, ., d)) that are needed, and of what the bias reads.
+    """Return gradients of q, k, v (each (B, h, ., d)) and of the bias's queries and tokens.
 
-    With P the weights of a head and dO the gradient of its output: dV = P' dO,
-    dS = P * (dO V' - rowsum(dO * O)), dQ = dS K / sqrt(d), dK = dS' Q / sqrt(d), and the gradient
-    of the bias is dS, summed over heads.
+    Gradients that are not needed are None. P are the weights of a head, dO is the gradient of its
+    output O: dV = P' dO, dS = P * (dO V' - rowsum(dO * O)), dQ = dS K / sqrt(d),
+    dK = dS' Q / sqrt(d). The gradient of the bias is dS, summed over heads.
     """
     q, k, v, queries, tokens, out, lse = saved
     scale = q.shape[-1] ** -0.5
@@ -320,7 +326,7 @@ def _attention_gradients(
     of_bias = _BiasGradients(queries, tokens, bias)
     # Scaled once here instead of for every pair.
     q = q * scale
-    # That of P * dP, without either.
+    # The row sum of P * dP, which needs neither P nor dP.
     rowsum = (gradient * out).sum(-1, keepdim=True)
     for scene, rows, (b, total, p, ds) in bias.blocks(4, lse.dtype):
         bias.write(queries[scene, rows], tokens[scene], b)
@@ -328,7 +334,7 @@ def _attention_gradients(
         of_tokens = k[scene], v[scene]
         each_head = enumerate(zip(*of_queries, *of_tokens, strict=True))
         for head, (q_nd, do_nd, lse_n1, rowsum_n1, k_Md, v_Md) in each_head:
-            # p = exp(q k + b - lse), each step into memory that is there already
+            # p = exp(q k + b - lse); each step writes into memory that exists already.
             torch.sub(b, lse_n1, out=p)
             p.addmm_(q_nd, k_Md.mT).exp_()
             # Frozen parts of a model need no gradient.

@@ -1,9 +1,9 @@
-"""What computes attention with a bias that is a function of query and token.
+"""Choice of the code that computes attention with a bias that depends on query and token.
 
-On a CPU: blocks. On CUDA: the plain way, with the bias of all pairs, while one layer needs at most
-1 / SHARE of the GPU's memory for it (every layer keeps its bias for the backward pass); beyond that
-Triton kernels, or blocks where these cannot be used. The paths have not been compared on a GPU. The
-choice depends on sizes alone, so that all layers, steps and processes of a training make the same.
+A CPU uses blocks. CUDA uses the plain way, with the bias of all pairs, if one layer needs at most
+1 / SHARE of the GPU's memory for it: every layer keeps its bias for the backward pass. For larger
+sizes CUDA uses Triton kernels, or blocks if Triton cannot be used. The paths have not been compared
+on a GPU. The choice depends on sizes only, so all layers, steps and processes choose the same.
 """
 
 import logging
@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from qgs_locus.kernels.attention_bias import AttentionBias
 
 AttentionKernel: TypeAlias = Literal["auto", "plain", "blocks", "triton"]
-"""plain: torch's attention with the bias of all pairs. blocks: torch, block by block."""
+"""Ways to compute attention.
+
+plain: torch's attention with the bias of all pairs. blocks: torch, block by block.
+"""
 
 SHARE = 16
 
@@ -28,11 +31,14 @@ SHARE = 16
 def chosen_kernel(
     q_BhNd: Tensor, bias: "AttentionBias", kernel: AttentionKernel
 ) -> AttentionKernel:
-    """One that is not "auto". ValueError for "triton" where it cannot compute this."""
+    """Return the kernel to use, which is never "auto".
+
+    Raises ValueError for "triton" if Triton cannot compute this attention.
+    """
     if kernel == "triton" and not fits_triton(q_BhNd, bias):
         raise ValueError(
-            "Triton kernels need triton 3.5, a GPU, LocusGS's bias, tokens "
-            "without gradient, heads of at most 256 channels, and no float64"
+            "Triton kernels cannot compute this attention: they need triton 3.5, a GPU, LocusGS's "
+            "bias, tokens without gradient, heads of at most 256 channels, and no float64"
         )
     if kernel != "auto":
         return kernel
@@ -41,29 +47,29 @@ def chosen_kernel(
     if plain_bytes(q_BhNd, bias) * SHARE <= torch.cuda.mem_get_info(q_BhNd.device)[1]:
         return "plain"
     found = "triton" if fits_triton(q_BhNd, bias) else "blocks"
-    _log_once(f"attention with a bias goes through {found}: that of all pairs is too large")
+    _log_once(f"attention with a bias uses {found}: the bias of all pairs needs too much memory")
     return found
 
 
 def plain_bytes(q_BhNd: Tensor, bias: "AttentionBias") -> int:
-    """Memory of the plain way without q, k and v: the bias, and its gradient for each head."""
+    """Return the bytes that the plain way needs for the bias and its gradient per head."""
     scenes, heads, queries, _ = q_BhNd.shape
     read = q_BhNd.element_size()
     each = bias.queries.element_size()
-    # Attention reads a copy in the dtype of the queries.
+    # Attention also reads a copy in the dtype of the queries.
     if q_BhNd.dtype != bias.queries.dtype:
         each += read
-    # Torch makes the gradient of the mask for each head.
+    # Torch computes the gradient of the mask for each head.
     if torch.is_grad_enabled() and (bias.queries.requires_grad or bias.tokens.requires_grad):
         each += heads * read
     return scenes * queries * bias.tokens.shape[2] * each
 
 
 def fits_triton(q_BhNd: Tensor, bias: "AttentionBias") -> bool:
-    """Whether the Triton kernels are installed and can compute this."""
+    """Return whether the Triton kernels are installed and can compute this attention."""
     # The interpreter runs the kernels on a CPU, which tests do.
     there = q_BhNd.device.type == "cuda" or os.environ.get("TRITON_INTERPRET") == "1"
-    # Blocks of wider heads fit into no registers.
+    # Blocks of wider heads do not fit into registers.
     return (
         there
         and triton_version() >= (3, 5)
@@ -76,7 +82,7 @@ def fits_triton(q_BhNd: Tensor, bias: "AttentionBias") -> bool:
 
 @cache
 def triton_version() -> tuple[int, ...]:
-    """Major and minor; () where triton is not installed."""
+    """Return (major, minor), or () if triton is not installed."""
     if find_spec("triton") is None:
         return ()
     return tuple(map(int, import_module("triton").__version__.split(".")[:2]))

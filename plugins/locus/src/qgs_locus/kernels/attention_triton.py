@@ -1,15 +1,16 @@
-"""Attention with a bias that is a function, in Triton: numbers of a pair stay in registers.
+"""Attention with a computed bias in Triton: the numbers of a pair stay in registers.
 
-As FlashAttention-2 (arXiv 2307.08691): one kernel loops over the tokens of a block of queries for
-the result, one for the gradients of the queries, and one over the queries of a block of tokens for
-those of keys and values. The bias and all sums are in float32. Each number is summed by one program
-in one order, so results have the same bits each time.
+There are three kernels, as in FlashAttention-2 (arXiv 2307.08691). Two loop over all tokens for a
+block of queries: one for the result, one for the gradients of the queries. The third loops over all
+queries for a block of tokens, for the gradients of keys and values. The bias and all sums are in
+float32. One program sums each number in a fixed order, so results are the same bit for bit.
 
-The bias is `RayBias` of `qgs_locus.ray_bias`. It reads five numbers of a query, x, y, z,
-gamma / (2 sigma^2), gamma * bias_min, and six of a token, m and d. Its functions get pointers
-(n, 1) to the first of queries, (1, m) to the first of tokens; `step` leads to a token's next one.
+The bias is `RayBias` of `qgs_locus.ray_bias`. A query has five numbers: x, y, z,
+gamma / (2 sigma^2), gamma * bias_min. A token has six: m and d. The functions of the bias get
+pointers (n, 1) and (1, m) to the first number of each query and token. `step` is the distance from
+one number of a token to its next.
 
-Axes: as `qgs_locus.kernels.attention_bias`; W: the least power of two from d on.
+Axes: as in `qgs_locus.kernels.attention_bias`. W is the least power of two that is at least d.
 """
 
 from typing import Any
@@ -27,7 +28,7 @@ G = tl.constexpr(6)
 
 @jit
 def _moment(queries, tokens, step):
-    """mu x d - m, (n, m) each."""
+    """Return the three coordinates of mu x d - m, each (n, m)."""
     x = tl.load(queries)
     y = tl.load(queries + 1)
     z = tl.load(queries + 2)
@@ -42,7 +43,7 @@ def _moment(queries, tokens, step):
 
 @jit
 def _bias(queries, tokens, step):
-    """max(-factor |mu x d - m|^2, lower), (n, m)."""
+    """Return max(-factor |mu x d - m|^2, lower), (n, m)."""
     e0, e1, e2 = _moment(queries, tokens, step)
     bias = -tl.load(queries + 3) * (e0 * e0 + e1 * e1 + e2 * e2)
     lower = tl.load(queries + 4)
@@ -51,9 +52,9 @@ def _bias(queries, tokens, step):
 
 @jit
 def _bias_gradients(queries, tokens, step, gradient, sums):
-    """The five `sums` (n,), with gradients of the queries' numbers added, given that of the bias.
+    """Return the five `sums` (n,) plus the gradients of the queries' five numbers.
 
-    With e = mu x d - m, the gradient of |e|^2 to mu is 2 d x e.
+    gradient: of the bias (n, m). With e = mu x d - m, the gradient of |e|^2 to mu is 2 d x e.
     """
     e0, e1, e2 = _moment(queries, tokens, step)
     d0 = tl.load(tokens + 3 * step)
@@ -64,7 +65,7 @@ def _bias_gradients(queries, tokens, step, gradient, sums):
     distance_sq = e0 * e0 + e1 * e1 + e2 * e2
     at_bound = -factor * distance_sq <= lower
     inside = tl.where(at_bound, 0.0, gradient)
-    # gradient - inside would be fused with the product in `gradient`, and leave its rounding error.
+    # Not gradient - inside: the compiler would fuse it, and leave a rounding error.
     to_bound = tl.where(at_bound, gradient, 0.0)
     to_center = -2 * factor * inside
     return (
@@ -78,14 +79,17 @@ def _bias_gradients(queries, tokens, step, gradient, sums):
 
 @jit
 def _load(x, scene, head, rows, count, width, WIDTH: tl.constexpr):
-    """Rows of a head of x (B, h, count, width), a tensor and its strides: (rows, W), 0 outside."""
+    """Load rows of a head: (rows, W), 0 outside.
+
+    x: a tensor (B, h, count, width) and its strides.
+    """
     at, inside = _at(x, scene, head, rows, count, width, WIDTH)
     return tl.load(at, mask=inside, other=0.0)
 
 
 @jit
 def _store(x, scene, head, rows, count, width, values, WIDTH: tl.constexpr):
-    """Write what `_load` would read, unless x is None."""
+    """Write rows to where `_load` reads them, unless x is None."""
     if x is not None:
         at, inside = _at(x, scene, head, rows, count, width, WIDTH)
         tl.store(at, values.to(x[0].dtype.element_ty), mask=inside)
@@ -102,7 +106,7 @@ def _at(x, scene, head, rows, count, width, WIDTH: tl.constexpr):
 
 @jit
 def _logits(q, k, queries, tokens, m, M, scale):
-    """q k / sqrt(d) + b, (n, m); -inf outside."""
+    """Return q k / sqrt(d) + b, (n, m); -inf outside."""
     products = tl.dot(q, tl.trans(k), input_precision="ieee") * scale
     return tl.where((m < M)[None, :], products + _bias(queries, tokens, M), float("-inf"))
 
@@ -112,7 +116,7 @@ def _forward(
     q, k, v, read_q, read_k, out, lse, heads, N, M, width, scale,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """The result, and the log-sum-exp of each query (B, h, N)."""
+    """Write the result, and the log-sum-exp of each query (B, h, N)."""
     # Offsets exceed 2^31 for large batches.
     each = tl.program_id(1).to(tl.int64)
     scene = each // heads
@@ -129,7 +133,7 @@ def _forward(
         of_v = _load(v, scene, head, m, M, width, WIDTH)
         tokens = read_k + scene * G * M + tl.minimum(m, M - 1)[None, :]
         logits = _logits(of_q, of_k, queries, tokens, m, M, scale)
-        # The running maximum keeps exp in range; sums so far shrink by how much it rose.
+        # The running maximum keeps exp in range. When it rises, earlier sums are scaled down.
         above = tl.maximum(greatest, tl.max(logits, 1))
         p = tl.exp(logits - above[:, None])
         shrunk = tl.exp(greatest - above)
@@ -145,7 +149,7 @@ def _backward_queries(
     q, k, v, read_q, read_k, g, lse, rowsum, dq, of_bias, heads, N, M, width, scale,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of q, and of what the bias reads of queries by heads, (B, h, N, F); or None."""
+    """Write gradients of q, and of the bias's queries per head (B, h, N, F); None skips one."""
     each = tl.program_id(1).to(tl.int64)
     scene = each // heads
     head = each % heads
@@ -181,7 +185,10 @@ def _backward_tokens(
     q, k, v, read_q, read_k, g, lse, rowsum, dk, dv, heads, N, M, width, scale,
     BLOCK_N: tl.constexpr, BLOCK_M: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of k and v, or None. Queries outside have log-sum-exp inf, so weights of 0."""
+    """Write gradients of k and v; None skips one.
+
+    Queries outside have log-sum-exp inf, so their weights are 0.
+    """
     each = tl.program_id(1).to(tl.int64)
     scene = each // heads
     head = each % heads
@@ -210,8 +217,10 @@ def _backward_tokens(
 
 
 class TritonAttention(torch.autograd.Function):
-    """See `biased_attention`. queries (B, N, F) and tokens (B, G, M): what the bias reads, float32;
-    tokens get no gradient.
+    """Autograd function of `biased_attention` in Triton.
+
+    queries: (B, N, F) and tokens: (B, G, M), the numbers of the bias, float32. Tokens get no
+    gradient.
     """
 
     @staticmethod
@@ -220,7 +229,7 @@ class TritonAttention(torch.autograd.Function):
     ) -> Tensor:
         out = torch.empty_like(q)
         lse = q.new_empty(q.shape[:3], dtype=torch.float32)
-        # Kernels step through rows of these without strides.
+        # Kernels assume that rows of these are contiguous.
         saved = q, k, v, queries.contiguous(), tokens.contiguous()
         _launch(_forward, *saved, out, lse)
         ctx.save_for_backward(*saved, out, lse)
@@ -240,18 +249,18 @@ class TritonAttention(torch.autograd.Function):
             _launch(_backward_queries, *given, dq, by_head)
         if dk is not None or dv is not None:
             _launch(_backward_tokens, *given, dk, dv)
-        # By head first: adding in the kernel would need atomics, whose order changes the bits.
+        # Summed over heads here: atomics in the kernel would add in a changing order.
         summed = None if by_head is None else by_head.unflatten(0, q.shape[:2]).sum(1)
         return dq, dk, dv, summed, None
 
 
 def _launch(kernel: Any, *tensors: Any) -> None:
-    """Run a kernel for each head and block; tensors (B, h, ., d) go with their strides."""
+    """Run a kernel for each head and block; tensors (B, h, ., d) are passed with strides."""
     q, k = tensors[:2]
     (scenes, heads, N, width), M = q.shape, k.shape[2]
     sizes = _blocks(q)
     over = (M, "BLOCK_M") if kernel is _backward_tokens else (N, "BLOCK_N")
-    # One program a block and head; the tokens' kernel divides the tokens instead.
+    # One program per block and head. Blocks are of queries, or of tokens in the third kernel.
     grid = -(-over[0] // sizes[over[1]]), scenes * heads
     arguments = [(x, x.stride()) if x is not None and x.ndim == 4 else x for x in tensors]
     with torch.cuda.device_of(q):
@@ -259,11 +268,11 @@ def _launch(kernel: Any, *tensors: Any) -> None:
 
 
 def _blocks(q: Tensor) -> dict[str, int]:
-    """Queries and tokens of a block, and its threads: what nearly fits into 255 registers each.
+    """Return sizes of a block, and its warps, that nearly fit into 255 registers per thread.
 
-    Products in float32 run outside the matrix units, where loading ahead takes registers.
+    Products in float32 do not use the matrix units; there, loading ahead costs registers.
     """
-    # The least that `tl.dot` takes.
+    # `tl.dot` needs at least 16.
     width = max(triton.next_power_of_2(q.shape[-1]), 16)
     exact = q.dtype == torch.float32
     wide = width > 128

@@ -1,6 +1,6 @@
 """Numba kernels of `RayBias`: one pass over the rays of each query, in registers.
 
-Queries are rows (x, y, z, gamma / (2 sigma^2), gamma * bias_min); tokens have six rows, m and d.
+Each query is a row (x, y, z, gamma / (2 sigma^2), gamma * bias_min). Tokens have six rows: m and d.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ _TWO = np.float32(2)
 
 @kernel
 def write(queries, tokens, out):
-    """max(-factor |mu x d - m|^2, lower)."""
+    """Write max(-factor |mu x d - m|^2, lower) to `out`."""
     m0 = tokens[0]
     m1 = tokens[1]
     m2 = tokens[2]
@@ -32,13 +32,13 @@ def write(queries, tokens, out):
             e1 = z * d0[j] - x * d2[j] - m1[j]
             e2 = x * d1[j] - y * d0[j] - m2[j]
             bias = -factor * (e0 * e0 + e1 * e1 + e2 * e2)
-            # Not max(): where the bias is NaN it must stay, so that training sees it.
+            # Not max(): a NaN must stay, so that training sees it.
             row[j] = lower if bias <= lower else bias
 
 
 @kernel
 def gradients(queries, tokens, gradient, out):
-    """Gradients of the queries: with e = mu x d - m, that of |e|^2 to mu is 2 d x e."""
+    """Write gradients of the queries to `out`: with e = mu x d - m, d|e|^2 / dmu is 2 d x e."""
     m0 = tokens[0]
     m1 = tokens[1]
     m2 = tokens[2]
@@ -58,7 +58,7 @@ def gradients(queries, tokens, gradient, out):
             e1 = z * d0[j] - x * d2[j] - m1[j]
             e2 = x * d1[j] - y * d0[j] - m2[j]
             distance_sq = e0 * e0 + e1 * e1 + e2 * e2
-            # At the clamp the gradient goes to the bound, which holds gamma.
+            # At the clamp the gradient goes to the bound, which contains gamma.
             inside = _ZERO if -factor * distance_sq <= lower else row[j]
             of_x += inside * (d1[j] * e2 - d2[j] * e1)
             of_y += inside * (d2[j] * e0 - d0[j] * e2)

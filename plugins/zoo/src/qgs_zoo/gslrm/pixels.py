@@ -1,7 +1,7 @@
-"""`gslrm/transformer`: patches of colours and rays, one linear layer, a plain transformer.
+"""`gslrm/transformer`: plain transformer over patches of colours and rays, after a linear layer.
 
-`gslrm/pixels`, `gslrm/pixel_head`, `gslrm/along_rays`: a query for each image token, Gaussians of
-its pixels, means along their rays.
+`gslrm/pixels`, `gslrm/pixel_head`, `gslrm/along_rays`: a query for each image token, a Gaussian for
+each of its pixels, and means on the rays of the pixels.
 """
 
 from collections.abc import Iterable
@@ -35,11 +35,11 @@ from qgs.types import GaussianAttributes, ImageMemory, QueryState, Views
 from qgs_zoo.parts import PIXEL_ENCODING, pixel_rays, self_attention
 
 CHANNELS = 9
-"""Per pixel: 2 RGB - 1, moment o x d and unit direction d of its ray (paper, section 3.1)."""
+"""Channels per pixel: 2 RGB - 1, moment o x d, unit direction d of its ray (section 3.1)."""
 
 
 class Block(nn.Module):
-    """Pre-norm self-attention and MLP (exact GELU), no biases: (B, M, D) -> (B, M, D)."""
+    """Pre-norm self-attention and MLP (exact GELU) without biases: (B, M, D) -> (B, M, D)."""
 
     def __init__(self, width: int, heads: int, mlp_ratio: float) -> None:
         super().__init__()
@@ -58,9 +58,9 @@ class Block(nn.Module):
 
 
 class Transformer(PatchEncoder):
-    """A token for each patch of all views, through blocks of self-attention over all of them.
+    """Encoder with self-attention over the patches of all views together.
 
-    Its memory has features, rays and the grid, but neither keys nor values: GS-LRM has no decoder.
+    Its memory has features, rays and the grid, but no keys and values: GS-LRM has no decoder.
     """
 
     name = "transformer"
@@ -70,10 +70,10 @@ class Transformer(PatchEncoder):
         depth: int = Field(default=24, ge=0, le=256)
         """Number of blocks."""
         mlp_ratio: float = Field(default=4.0, ge=1)
-        """Hidden width of the MLPs (rounded down) over the model's width."""
+        """Hidden width of the MLPs, as a multiple of the model's width (rounded down)."""
         init_std: float = Field(default=0.02, gt=0)
-        """Standard deviation of the normal distribution that all weights of linear layers start
-        from."""
+        """Standard deviation of the initial weights of linear layers, which are normally
+        distributed."""
 
     config: Config
 
@@ -84,22 +84,22 @@ class Transformer(PatchEncoder):
         self.blocks = nn.ModuleList(
             Block(dims.width, dims.heads, config.mlp_ratio) for _ in range(config.depth)
         )
-        # The paper starts all linear layers alike, without a scale for the depth.
+        # The paper initialises all linear layers alike, without a factor for the depth.
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.normal_(module.weight, std=config.init_std)
 
     def forward(self, views: Views) -> ImageMemory:
-        """Features (B, M, D), before any last norm, which belongs to the head.
+        """Return features (B, M, D) before the last norm, which belongs to the head.
 
-        Raises ValueError when the patch does not divide the images.
+        Raises ValueError if the patch size does not divide the images.
         """
         patch = self.config.patch_size
         grid = self.grid(views)
         plucker_BV6HW = plucker_rays(views.cameras)
         pixels_BV9HW = torch.cat([2 * views.images - 1, plucker_BV6HW], 2)
         x_BMC = rearrange(pixels_BV9HW, "b v c (h p) (w q) -> b (v h w) (p q c)", p=patch, q=patch)
-        # Rays stand beside the colours of each pixel, so that positions need no embedding.
+        # The rays of each pixel are inputs, so positions need no embedding.
         x_BMD = self.norm(self.embedding(x_BMC))
         for block in self.blocks:
             x_BMD = block(x_BMD)
@@ -112,14 +112,14 @@ PATCH_FIELD: Fields = {PATCH: FieldSpec((4, 3), frame="world", encoding=PIXEL_EN
 
 
 class PixelQueries(Queries):
-    """A query for each image token, with its features, that knows the rays of its patch."""
+    """Queries for all image tokens, with the token's features and the rays of its patch."""
 
     name = "pixels"
     reads = memory_fields("features", "grid")
     writes = PATCH_FIELD
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
-        """Features (B, M, D) of the tokens, `gslrm.patch` (B, M, 4, 3)."""
+        """Return the features (B, M, D) of the tokens and `gslrm.patch` (B, M, 4, 3)."""
         assert memory.grid is not None
         _, rows, columns = memory.grid
         fields = {PATCH: pixel_rays(views.cameras, rows, columns)}
@@ -128,17 +128,16 @@ class PixelQueries(Queries):
 
 @full_precision
 def patch_rays_at(patch_BN43: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """World-frame origins (B, N, 1, 3) of K = `count` rays, and directions (B, N, K, 3).
+    """Return world-frame origins (B, N, 1, 3) and directions (B, N, K, 3) of K = `count` rays.
 
-    Directions have length 1 along the axis of their camera.
-
-    They go through the centres of a grid of K equal cells of the patch, row by row, as nearly
-    square as K allows: through those of its pixels where K is their number.
+    Directions have z = 1 in the frame of their camera. The rays go through the centres of a grid of
+    K equal cells of the patch, row by row. Cells are as nearly square as K allows. If K is the
+    number of pixels of the patch, the cells are its pixels.
     """
     origin_BN3, corner_BN3, across_BN3, down_BN3 = patch_BN43.unbind(-2)
     index_K = torch.arange(count, device=patch_BN43.device)
-    # The divisor next to the square root: K cells as nearly square as K allows. It stays a tensor,
-    # since torch.compile would make a graph for each K that Python divides.
+    # The largest divisor of K up to its root makes the most nearly square cells. It stays a tensor:
+    # torch.compile would make a graph for each K that Python divides.
     n_K = index_K + 1
     rows = torch.where((count % n_K == 0) & (n_K * n_K <= count), n_K, 1).amax()
     columns = count // rows
@@ -151,10 +150,10 @@ def patch_rays_at(patch_BN43: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 class AlongRays(Centers):
-    """mean = o + t d on the ray of the Gaussian's pixel, t = (1 - w) near + w far.
+    """Means at o + t d on the ray of the Gaussian's pixel, with t = (1 - w) near + w far.
 
-    w is the sigmoid of the mean of the three raw offsets; d is a unit vector, or for `measure:
-    depth` one of length 1 along the camera's axis. K Gaussians of a query stand on the rays of
+    w is the sigmoid of the mean of the three raw offsets. d is a unit vector; with `measure: depth`
+    it has z = 1 in the camera's frame. The K Gaussians of a query lie on the rays of
     `patch_rays_at`.
     """
 
@@ -163,11 +162,12 @@ class AlongRays(Centers):
 
     class Config(ComponentConfig):
         near: float = Field(default=0.0, ge=0)
-        """Least distance from the camera, world units."""
+        """Least distance from the camera, world units. 0 is the camera's centre."""
         far: float = Field(default=500.0, gt=0)
-        """Largest distance from the camera, world units (500 for scenes, in the paper)."""
+        """Largest distance from the camera, world units (500 for scenes in the paper)."""
         measure: Literal["distance", "depth"] = "distance"
-        """Whether t counts along the ray, or along the camera's axis (gs-lrm-unofficial)."""
+        """Measure t along the ray ("distance"), or along the camera's axis ("depth",
+        gs-lrm-unofficial)."""
 
     config: Config
 
@@ -179,36 +179,36 @@ class AlongRays(Centers):
 
     @full_precision
     def forward(self, offsets: Tensor, state: QueryState) -> Tensor:
-        """(B, N, K, 3) -> (B, N, K, 3)."""
+        """Return means (B, N, K, 3) for raw offsets (B, N, K, 3)."""
         config = self.config
         origins, directions = patch_rays_at(state[PATCH], offsets.shape[2])
         if config.measure == "distance":
             directions = F.normalize(directions, dim=-1)
-        # A sigmoid keeps every Gaussian between near and far: none starts behind its camera.
+        # The sigmoid keeps every Gaussian between near and far, so none is behind its camera.
         w_BNK1 = offsets.mean(-1, keepdim=True).sigmoid()
         return origins + ((1 - w_BNK1) * config.near + w_BNK1 * config.far) * directions
 
 
 class PixelHead(Head):
-    """LayerNorm, then D -> K (3 or 1 + 11) linear, both without biases."""
+    """Head with a LayerNorm, then a linear layer D -> K (3 or 1 + 11), both without biases."""
 
     name = "pixel_head"
 
     class Config(ComponentConfig):
         gaussians_per_query: int = Field(default=64, ge=1)
-        """K, the Gaussians of each token: one per pixel where it is the square of the encoder's
-        `patch_size`, fewer or more on an even grid otherwise."""
+        """K, the number of Gaussians of each token. The square of the encoder's `patch_size` gives
+        one per pixel. Other numbers give fewer or more, on an even grid."""
         position_channels: Literal[1, 3] = 3
-        """Raw numbers that place a Gaussian on its ray; of three the mean counts (paper: 1).
-        With 1, centres other than `gslrm/along_rays` get three equal offsets."""
+        """Number of raw numbers that place a Gaussian on its ray (paper: 1). With 3, their mean
+        counts. With 1, centres other than `gslrm/along_rays` get three equal offsets."""
         scale_bias: float = -2.3
-        """Added to the logarithm of scales, world units."""
+        """Number added to the logarithm of scales, world units."""
         scale_limit: float | None = -1.2
-        """Largest logarithm of a scale, world units; null for none."""
+        """Largest logarithm of a scale, world units. Null means no limit."""
         opacity_bias: float = -2.0
-        """Added to the opacity logit."""
+        """Number added to the opacity logit."""
         init_std: float = Field(default=0.02, gt=0)
-        """Standard deviation of the normal distribution that the weights start from."""
+        """Standard deviation of the initial weights, which are normally distributed."""
 
     config: Config
 
@@ -221,18 +221,18 @@ class PixelHead(Head):
         nn.init.normal_(self.linear.weight, std=config.init_std)
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Weight decay on the linear layer too (paper); a head has none by default."""
+        """Add weight decay to the linear layer (paper); other heads have none by default."""
         return parameter.ndim != 1
 
     def forward(self, state: QueryState) -> GaussianAttributes:
-        """(B, N, D) -> attributes of (B, N, K) Gaussians, float32 or better."""
+        """Return attributes of (B, N, K) Gaussians from features (B, N, D), float32 or better."""
         raw_BNC = at_least_float32(self.linear(self.norm(state.features)))
         raw_BNKC = rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(self.channels))
-        # Gaussian by Gaussian, as the weights of the public code are ordered.
+        # Rows are ordered Gaussian by Gaussian, as in the weights of the public code.
         position, rgb, scale, rotation, opacity = raw_BNKC.split(self.channels, -1)
         scale = scale + self.config.scale_bias
         if self.config.scale_limit is not None:
-            # Without a bound one Gaussian can cover an image and stop the others from learning.
+            # Without a limit one Gaussian can cover an image and stop the others from learning.
             scale = scale.clamp_max(self.config.scale_limit)
         return GaussianAttributes(
             offsets=position.expand(*position.shape[:-1], 3),

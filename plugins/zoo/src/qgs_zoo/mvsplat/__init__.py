@@ -21,7 +21,7 @@ _SMALL = DepthSplatEncoder.Config(
     regressor=8,
 )
 
-_BIASES = "instance norms take biases of the CNN away again: they are stored and learn nothing"
+_BIASES = "instance norms remove the biases of the CNN: these are stored and learn nothing"
 
 plugin = Plugin(
     name="mvsplat",
@@ -49,15 +49,15 @@ plugin = Plugin(
     ),
     exemptions={
         MVSplatEncoder: {
-            "compiles": "the sweep takes the other photos one after another, for the memory that "
-            "all at once would take: each number of photos has a graph of its own",
+            "compiles": "the sweep reads the other photos one after another, to save memory: each "
+            "number of photos has its own graph",
             "parameters_learn": _BIASES,
             "tokens_are_those_of_the_grid": "before training, instance norms over whole maps and "
-            "the softmax over depths spread what a pixel shows over its image",
+            "the softmax over depths spread a change of a pixel over its image",
         },
         DepthSplatEncoder: {
-            "parameters_learn": f"{_BIASES}; and zeros start behind each other, in the blocks and "
-            "at the end of a U-Net and of a correction, and each takes a step to open",
+            "parameters_learn": f"{_BIASES}; and layers that start at zero follow each other, in "
+            "the blocks and at the end of a U-Net and of a correction: each needs a step to open",
         },
     },
 )

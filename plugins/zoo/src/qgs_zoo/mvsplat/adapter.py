@@ -1,4 +1,4 @@
-"""Colours and rotations of the pixelSplat family: e3nn's harmonics, turned, in our basis."""
+"""Colours and rotations of the pixelSplat family, converted to the basis of qgs."""
 
 import math
 from functools import cache
@@ -13,26 +13,26 @@ from qgs.geometry.transforms import quat_product, unit
 from qgs.precision import full_precision
 
 SH_DEGREE = 3
-"""Largest degree that the rasteriser of the released code and ours read."""
+"""Largest degree that the rasterisers of the released code and of qgs read."""
 QUAT_EPS = 1e-8
 
 
 def coefficients(degree: int) -> int:
-    """Harmonics of degrees 0 to `degree`."""
+    """Return the number of harmonics of degrees 0 to `degree`."""
     return (degree + 1) ** 2
 
 
 def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
-    """Real harmonics of degrees 0 to `degree` at unit `directions` (..., 3): (..., K).
+    """Return real harmonics (..., K) of degrees 0 to `degree` at unit `directions` (..., 3).
 
-    Each degree l has its functions in e3nn's order, m from -l to l about the axis y, with azimuth
-    from z to x, so that degree 1 is (x, y, z); orthonormal but for a factor for all.
+    The functions of each degree l are in e3nn's order: m from -l to l about the axis y, with
+    azimuth from z to x. So degree 1 is (x, y, z). They are orthonormal up to one common factor.
     """
     x, y, z = directions.unbind(-1)
-    # cos and sin of m times the azimuth by the angle sum, without an angle.
+    # cos and sin of m times the azimuth, by angle addition, without computing an angle.
     cosine = [torch.ones_like(x)]
     sine = [torch.zeros_like(x)]
-    # Of m times the azimuth, times sin^m of the angle to the pole.
+    # Both are multiplied by sin^m of the angle to the pole.
     for _ in range(degree):
         c = cosine[-1]
         s = sine[-1]
@@ -40,7 +40,7 @@ def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
         sine = [*sine, z * s + x * c]
     found: dict[tuple[int, int], Tensor] = {}
     for m in range(degree + 1):
-        # Associated Legendre functions over sin^m, by their recurrence in l.
+        # Associated Legendre functions divided by sin^m, by their recurrence in l.
         legendre = [torch.zeros_like(y), torch.full_like(y, math.prod(range(1, 2 * m, 2)))]
         for n in range(m + 1, degree + 1):
             following = (2 * n - 1) * y * legendre[-1] - (n + m - 1) * legendre[-2]
@@ -54,11 +54,11 @@ def e3nn_harmonics(directions: Tensor, degree: int) -> Tensor:
 
 
 def _fitted(degree: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Directions all around (64, 3), the pseudo-inverse of the harmonics there, change of basis."""
+    """Return 64 directions, the pseudo-inverse of the harmonics there, and the change of basis."""
     generator = torch.Generator().manual_seed(0)
     double = {"dtype": torch.float64, "device": "cpu"}
     around = F.normalize(torch.randn(64, 3, generator=generator, **double), dim=-1)
-    # The family's rasteriser evaluates the functions of 3DGS at (z, x, y) of a direction.
+    # The rasteriser of the family evaluates the functions of 3DGS at (z, x, y) of a direction.
     cycle = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], **double)
     count = coefficients(min(degree, SH_DEGREE))
     change = torch.eye(coefficients(degree), **double)
@@ -66,8 +66,8 @@ def _fitted(degree: int) -> tuple[Tensor, Tensor, Tensor]:
     return around, torch.linalg.pinv(e3nn_harmonics(around, degree)), change
 
 
-# Made at import: a first pass may be one on shapes alone (the FLOPs of `qgs bench`) or in inference
-# mode, and tensors of it must not stay for others.
+# Computed at import. The first pass may run on shapes only (the FLOPs of `qgs bench`) or in
+# inference mode, and later passes must not get its tensors.
 with torch.inference_mode(False):
     _FITTED = {degree: _fitted(degree) for degree in (1, 2, 3, 4)}
 
@@ -84,10 +84,11 @@ def _fixed(degree: int, device: torch.device) -> tuple[Tensor, ...]:
 
 @full_precision
 def turn_of_harmonics(rotation: Tensor, degree: int) -> Tensor:
-    """Wigner matrices (..., K, K) of e3nn's basis: coefficients in a world turned by (..., 3, 3).
+    """Return the Wigner matrices (..., K, K) of rotations (..., 3, 3) in e3nn's basis.
 
-    By least squares in float64 from values at directions all around, which is exact, and keeps the
-    digits that Euler angles of small tilts lose in the released code.
+    They map coefficients to those of the turned function. They are fitted in float64 to values at
+    directions all around. The fit is exact. The Euler angles of the released code lose digits for
+    small tilts.
     """
     directions, inverse, _ = _fixed(degree, rotation.device)
     turned = torch.einsum("...ij,sj->...si", rotation.double(), directions)
@@ -96,30 +97,30 @@ def turn_of_harmonics(rotation: Tensor, degree: int) -> Tensor:
 
 
 def band_mask(degree: int, like: Tensor) -> Tensor:
-    """What the family multiplies raw coefficients (K) with: 1, then .1 / 4^l in degree l."""
-    # Higher degrees start small (pixelSplat), so that colours begin without direction.
+    """Return the family's factors of raw coefficients (K): 1, then .1 / 4^l in degree l."""
+    # Higher degrees start small (pixelSplat): at first colours hardly depend on the direction.
     each = [1.0, *(0.1 * 0.25**n for n in range(1, degree + 1))]
     return constant([x for n, x in enumerate(each) for _ in range(2 * n + 1)], like)
 
 
 @full_precision
 def world_harmonics(rotation: Tensor, degree: int) -> Tensor:
-    """(..., K, K): from raw coefficients in a camera's frame to ours in the world.
+    """Return matrices (..., K, K) from raw camera-frame coefficients to those of qgs in the world.
 
-    rotation: camera to world (..., 3, 3). degree: those above SH_DEGREE stay in e3nn's basis. The
-    turn comes before the change of basis, and they do not commute: the family turns in e3nn's
-    basis, but its rasteriser has other signs there; published weights expect that order, and the
-    world that they were trained in (`views.frame: given`).
+    rotation: camera to world (..., 3, 3). Degrees above SH_DEGREE stay in e3nn's basis. The turn
+    comes before the change of basis, and the two do not commute. The family turns in e3nn's basis,
+    but its rasteriser uses other signs. Published weights expect this order, and the world in which
+    they were trained (`views.frame: given`).
     """
     turn = turn_of_harmonics(rotation, degree) * band_mask(degree, rotation)
     return _fixed(degree, rotation.device)[2].to(rotation) @ turn
 
 
 def camera_quaternions(raw_xyzw: Tensor) -> Tensor:
-    """Raw quaternions (..., 4), x y z w, over their length; a zero one stays zero."""
+    """Divide raw quaternions (..., 4), x y z w, by their lengths; zeros stay zero."""
     return raw_xyzw / (raw_xyzw.norm(dim=-1, keepdim=True) + QUAT_EPS)
 
 
 def world_quaternions(camera_xyzw: Tensor, turn_wxyz: Tensor) -> Tensor:
-    """Unit quaternions (..., 4), w x y z, in the world; a zero one is no rotation at all."""
+    """Return unit quaternions (..., 4), w x y z, in the world; a zero one means no rotation."""
     return F.normalize(quat_product(turn_wxyz, unit(camera_xyzw.roll(1, -1))), dim=-1)

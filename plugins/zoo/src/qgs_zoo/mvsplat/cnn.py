@@ -1,4 +1,4 @@
-"""The CNN of GMFlow and UniMatch in front of the multi-view transformer: features at 1/4 or 1/8."""
+"""CNN of GMFlow and UniMatch before the multi-view transformer, with features at 1/4 or 1/8."""
 
 from typing import NamedTuple
 
@@ -19,7 +19,10 @@ class Stages(NamedTuple):
 
 
 class ResidualBlock(nn.Module):
-    """relu(skip(x) + relu(norm(conv(relu(norm(conv x)))))): (N, C, H, W) -> (N, C', H/s, W/s)."""
+    """Residual block relu(skip(x) + relu(norm(conv(relu(norm(conv x)))))).
+
+    It maps (N, C, H, W) to (N, C', H/s, W/s).
+    """
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
@@ -33,19 +36,19 @@ class ResidualBlock(nn.Module):
         skip_NCHW = x_NCHW
         if self.downsample is not None:
             weight, bias = self.downsample.parameters()
-            # Published files have this bias, but the norm takes it away again: times zero it learns
-            # nothing, where it would learn from rounding alone.
+            # Published files have this bias, but the norm removes it. Times zero it learns nothing;
+            # otherwise it would learn from rounding errors.
             skip_NCHW = F.instance_norm(F.conv2d(x_NCHW, weight, 0 * bias, self.stride))
         x_NCHW = F.relu(F.instance_norm(self.conv1(x_NCHW)))
-        # The branch is rectified before the sum as well (released code).
+        # The branch has a ReLU before the sum too (released code).
         return F.relu(skip_NCHW + F.relu(F.instance_norm(self.conv2(x_NCHW))))
 
 
 class CNN(nn.Module):
-    """7x7 convolution to half size, three stages of two residual blocks, 1x1 convolution.
+    """CNN: 7x7 convolution to half size, three stages of two residual blocks, 1x1 convolution.
 
-    strides: of the second and of the third stage. widths: of all stages. Instance norms
-    have neither parameters nor running statistics, so that training and evaluation agree.
+    strides: of the second and third stage. widths: of the three stages. Instance norms have neither
+    parameters nor running statistics, so that training and evaluation agree.
     """
 
     def __init__(
@@ -63,7 +66,7 @@ class CNN(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, images_N3HW: Tensor) -> Stages:
-        """The maps of images that are normalised."""
+        """Return the maps of normalised images."""
         # All stages are returned: the upsamplers take the finer ones.
         first = self.layer1(F.relu(F.instance_norm(self.conv1(images_N3HW))))
         second = self.layer2(first)

@@ -1,6 +1,6 @@
 """DepthSplat (Xu et al., arXiv 2410.13862): depth from a plane sweep and a pretrained ViT.
 
-Modules have the names of the released weights. Levels: 0, 1, 2 are 1/2, 1/4, 1/8 of the images.
+Modules have the names of the released weights. Levels 0, 1, 2 are 1/2, 1/4, 1/8 of the images.
 """
 
 from collections.abc import Sequence
@@ -39,36 +39,36 @@ Width: TypeAlias = Annotated[int, Field(ge=1)]
 Block: TypeAlias = Annotated[int, Field(ge=0)]
 
 GAUSSIAN_CHANNELS = 1 + 2 + 3 + 4
-"""Raw opacity, place in the pixel, scale, quaternion; harmonics follow."""
+"""Channels of a raw Gaussian: opacity, place in the pixel, scale, quaternion. Harmonics follow."""
 
 
 class DepthSplatConfig(ComponentConfig):
-    """DepthSplatConfig of the networks: by default of the small model on RealEstate10K."""
+    """Sizes of the networks. The defaults are those of the small model on RealEstate10K."""
 
     features: int = Field(default=128, ge=32, multiple_of=32)
-    """Channels of the multi-view features and of the first cost volume's networks; half as many in
-    the second's."""
+    """Channels of the multi-view features and of the networks of the first cost volume. The
+    networks of the second have half as many."""
     cnn: tuple[Width, Width, Width] = WIDTHS
     """Channels of the three stages of the CNN."""
     candidates: int = Field(default=128, ge=16, multiple_of=8)
-    """Inverse depths of the first sweep, evenly between those of `far` and `near`; the second has a
-    quarter."""
+    """Number of depths in the first sweep, evenly spaced in inverse depth from `far` to `near`. The
+    second sweep has a quarter as many."""
     scales: Literal[1, 2] = 1
-    """Sweeps: the second has twice the resolution, around the depths of the first."""
+    """Number of sweeps. A second one has twice the resolution, around the depths of the first."""
     stride: Literal[4, 8] = 4
-    """Pixels a side of a feature of the first sweep."""
+    """Pixels along the side of a feature of the first sweep."""
     neighbours: int = Field(default=2, ge=1)
-    """Views that each view is matched with where there are more than three: the nearest."""
+    """Number of nearest views with which each view is matched if there are more than three."""
     vit: VitConfig
-    """DINOv2's sizes and weights; `{}` for a ViT-S that starts from random numbers."""
+    """Sizes and weights of DINOv2. `{}` is a ViT-S with random initial weights."""
     blocks: tuple[Block, Block, Block, Block] = Field(default=(2, 5, 8, 11), validate_default=True)
-    """Blocks of the ViT whose tokens are read, 0 for the first; ViT-L: 4, 11, 17, 23."""
+    """Indices of the ViT blocks whose tokens are read; 0 is the first. ViT-L: 4, 11, 17, 23."""
     dpt: tuple[Width, Width, Width, Width] = (48, 96, 192, 384)
-    """Channels of both DPT heads at 1/2, 1/4, 1/8 and 1/16; ViT-B: 96, 192, 384, 768; ViT-L: 128,
+    """Channels of both DPT heads at 1/2, 1/4, 1/8 and 1/16. ViT-B: 96, 192, 384, 768. ViT-L: 128,
     256, 512, 1024."""
     full_features: int = Field(default=64, ge=4, multiple_of=4)
-    """Channels of full-size features, twice those of the DPT head that corrects depths; ViT-B: 96,
-    ViT-L: 128."""
+    """Channels of the full-size features. The DPT head that corrects depths has half as many.
+    ViT-B: 96, ViT-L: 128."""
     regressor: int = Field(default=64, ge=1)
     """Channels between the two networks that predict Gaussians."""
 
@@ -80,13 +80,13 @@ class DepthSplatConfig(ComponentConfig):
         depth = info.data["vit"].depth if "vit" in info.data else blocks[-1] + 1
         if list(blocks) != sorted(set(blocks)) or blocks[-1] >= depth:
             raise OptionError(
-                f"blocks must ascend and be less than the depth of the ViT, {depth}, got {blocks}",
-                "write such as [2, 5, 8, 11]",
+                f"blocks must ascend and stay below the depth of the ViT, {depth}, got {blocks}",
+                "write four block numbers, such as [2, 5, 8, 11]",
             )
         return blocks
 
     def level(self, scale: int) -> int:
-        """Of the cost volume of a scale, 0 for 1/2."""
+        """Return the level of the cost volume of a scale; 0 is 1/2."""
         return self.stride.bit_length() - 2 - scale
 
     @property
@@ -101,9 +101,9 @@ class DepthSplatConfig(ComponentConfig):
 
 
 class Depths(NamedTuple):
-    """What the depth predictor gives.
+    """Results of the depth predictor.
 
-    depths: camera-frame z in world units (B, V, H, W) of each scale, the last corrected.
+    depths: camera-frame z in world units (B, V, H, W) of each scale; only the last is corrected.
     confidence: largest probability of the last sweep (B V, 1, H, W). maps: of the ViT, (B V, C,
     H/8, W/8). joined: other features, for a DPT head.
     """
@@ -115,7 +115,7 @@ class Depths(NamedTuple):
 
 
 class Pyramid(nn.Module):
-    """Maps of each scale: the first as it is, the second of half the channels, twice the size."""
+    """Maps of two scales: the input, and one with half the channels and twice the size."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -128,29 +128,33 @@ class Pyramid(nn.Module):
 
 
 def nearest_neighbours(c2w_BV44: Tensor, count: int) -> Tensor:
-    """The views (B, V, J) that each view is matched with.
+    """Return the views (B, V, J) with which each view is matched.
 
-    All others in ascending order up to three views; of more the `count` nearest, nearest first.
+    With up to three views, these are all others in ascending order. With more, they are the `count`
+    nearest, nearest first.
     """
     scenes, views = c2w_BV44.shape[:2]
     if views <= 3:
         return cyclic_neighbours(scenes, views, c2w_BV44.device).sort(-1).values
     centre_BV3 = at_least_float32(c2w_BV44[..., :3, 3])
     order_BVV = torch.cdist(centre_BV3, centre_BV3).argsort(-1)
-    # The first is taken for the view itself without a look (released code): of two cameras at one
-    # place it may be the other one.
+    # The first is assumed to be the view itself (released code). If two cameras are at the same
+    # place, it may be the other one.
     return order_BVV[..., 1 : count + 1]
 
 
 def bounds(sweep: Sweep) -> tuple[Tensor, Tensor]:
-    """Least and largest inverse depth (B V, 1, 1), of `far` and `near`."""
+    """Return the least and largest inverse depth (B V, 1, 1), from `far` and `near`."""
     least, most = (1 / x.flatten()[:, None, None] for x in (sweep.far, sweep.near))
     return least, most
 
 
 @full_precision
 def finer_candidates(coarse_N1hw: Tensor, sweep: Sweep, first: int, count: int) -> Tensor:
-    """Inverse depths (N, D, 2h, 2w) around those of the first scale, which had `first`."""
+    """Return inverse depths (N, D, 2h, 2w) around those of the first scale.
+
+    first: number of candidates of the first scale. count: D.
+    """
     height, width = coarse_N1hw.shape[-2:]
     # No gradient: the first scale learns from its own depth.
     centre_N1hw = resized(coarse_N1hw.detach(), (2 * height, 2 * width))
@@ -158,13 +162,13 @@ def finer_candidates(coarse_N1hw: Tensor, sweep: Sweep, first: int, count: int) 
     step = (most - least) / (first - 1) / 2
     low_N1hw = (centre_N1hw - count // 2 * step).clamp(least, most)
     high_N1hw = (centre_N1hw + (count // 2 - 1) * step).clamp(least, most)
-    # Linear between clamped ends: near a bound the steps shrink, and the centre is none of them.
+    # Linear between clamped ends: near a bound, steps shrink and the centre is not a candidate.
     part_D11 = torch.linspace(0, 1, count, device=centre_N1hw.device).to(centre_N1hw)[:, None, None]
     return low_N1hw + part_D11 * (high_N1hw - low_N1hw)
 
 
 class DepthPredictor(nn.Module):
-    """Images and cameras to depths of all pixels."""
+    """Network from images and cameras to depths of all pixels."""
 
     def __init__(self, sizes: DepthSplatConfig) -> None:
         super().__init__()
@@ -195,13 +199,13 @@ class DepthPredictor(nn.Module):
         self.upsampler = dpt_head(sizes, depth=True)
 
     def candidates(self, scale: int) -> int:
-        """How many depths the sweep of a scale tries."""
+        """Return the number of depths in the sweep of a scale."""
         return self.sizes.candidates // 4**scale
 
     def forward(
         self, images_BV3HW: Tensor, cameras: Cameras, near_BV: Tensor, far_BV: Tensor
     ) -> Depths:
-        """near, far: camera-frame z in world units."""
+        """Return the depths. near, far: camera-frame z in world units."""
         size = images_BV3HW.shape[-2:]
         shape = images_BV3HW.shape[:2]
         normalized_N3HW = imagenet_normalised(images_BV3HW).flatten(0, 1)
@@ -213,16 +217,16 @@ class DepthPredictor(nn.Module):
         x_NChw = self.transformer(x_BVChw, neighbours_BVJ).flatten(0, 1)
         maps = self.vit_maps(normalized_N3HW)
         mono_NChw = maps[-1]
-        # The ViT's maps have 1/8 of the size; features for matching may have 1/4.
+        # The ViT's maps are at 1/8; features for matching may be at 1/4.
         if self.sizes.stride == 4:
             mono_NChw = resized(mono_NChw, x_NChw.shape[-2:])
         several = self.sizes.scales > 1
         multi = self.mv_pyramid(x_NChw) if several else [x_NChw]
         mono = self.mono_pyramid(mono_NChw) if several else [mono_NChw]
         coarse, confidence_N1hw = self.match(cnn, multi, mono, sweep)
-        # Inverse depth joins here, depth itself where Gaussians are predicted (released code).
+        # Inverse depth joins here; depth joins where Gaussians are predicted (released code).
         joined = self.beside(cnn, multi, coarse[-1])
-        # Inverse depths of far things differ by less than half precision tells.
+        # Half precision cannot resolve the inverse depths of distant surfaces.
         correction_N1HW = at_least_float32(self.upsampler(maps, joined))
         full = [resized(x, size) for x in coarse]
         full[-1] = (full[-1] + correction_N1HW).clamp(*(x[:, None] for x in bounds(sweep)))
@@ -233,7 +237,7 @@ class DepthPredictor(nn.Module):
     def match(
         self, cnn: Stages, multi: Sequence[Tensor], mono: Sequence[Tensor], sweep: Sweep
     ) -> tuple[list[Tensor], Tensor]:
-        """Inverse depth (B V, 1, h, w) of each scale, largest probability of the last."""
+        """Return inverse depths (B V, 1, h, w) of all scales, largest probability of the last."""
         # `list[Tensor]()` would break the graph of torch.compile.
         found: list[Tensor] = []
         views = sweep.near.shape[1]
@@ -253,7 +257,7 @@ class DepthPredictor(nn.Module):
                 poses_BVJ44,
                 sweep.neighbours,
             )
-            # The order is that of the published weights.
+            # Published weights expect this order.
             seen = [cost_BVDhw.flatten(0, 1), cnn.second if scale else cnn.features, own, features]
             seen = torch.cat(seen, 1)
             refined = self.regressor[scale](seen, views) + self.regressor_residual[scale](seen)
@@ -262,10 +266,10 @@ class DepthPredictor(nn.Module):
         return found, confidence
 
     def vit_maps(self, images_N3HW: Tensor) -> list[Tensor]:
-        """Tokens of the chosen blocks as maps (N, C, H/8, W/8)."""
+        """Return the tokens of the chosen blocks as maps (N, C, H/8, W/8)."""
         height, width = images_N3HW.shape[-2:]
         grid = (height // PATCH, width // PATCH)
-        # The ViT takes patches of 14: the image shrinks to as many as are whole.
+        # The ViT has patches of 14: the image shrinks to whole patches.
         small = resized(images_N3HW, (grid[0] * PATCH, grid[1] * PATCH))
         tokens = self.pretrained(small, self.sizes.blocks)
         maps = (x_NPC.mT.unflatten(2, grid) for x_NPC in tokens)
@@ -274,8 +278,8 @@ class DepthPredictor(nn.Module):
     def beside(
         self, cnn: Stages, multi: Sequence[Tensor], depth: Tensor | None = None
     ) -> list[tuple[list[Tensor], list[Tensor]]]:
-        """What joins the ViT's maps at 1/2, 1/4, 1/8: before and behind their own channels."""
-        # The release has the order CNN, ViT, transformer, depth. Where its CNN ends at 1/4, nothing
+        """Return the maps that join the ViT's at 1/2, 1/4, 1/8: before and after its channels."""
+        # The order of the release: CNN, ViT, transformer, depth. If its CNN ends at 1/4, nothing
         # joins at 1/8.
         found: list[tuple[list[Tensor], list[Tensor]]] = [([], []) for _ in range(LEVELS)]
         stages = (cnn.first, cnn.second, cnn.features)
@@ -283,15 +287,15 @@ class DepthPredictor(nn.Module):
             found[level][0].append(x)
         levels = [*map(self.sizes.level, range(len(multi))), self.sizes.finest]
         for x, level in zip([*multi, depth], levels, strict=True):
-            # At 1/2 the release has the ViT's own map last instead.
+            # At 1/2 the release puts the ViT's own map last instead.
             if x is not None:
                 found[level][level > 0].append(x)
         return found
 
 
 def dpt_head(sizes: DepthSplatConfig, depth: bool) -> DptHead:
-    """A head that reads CNN, transformer and ViT; with `depth` one that also gets and gives it."""
-    # Channels that join at each level, to size the projections.
+    """Make a head that reads CNN, transformer and ViT; with `depth`, it reads and corrects it."""
+    # Channels that join at each level, for the sizes of the projections.
     others = [0] * LEVELS
     for width, level in zip((*sizes.cnn[:2], sizes.features), sizes.cnn_levels, strict=True):
         others[level] += width
@@ -303,9 +307,9 @@ def dpt_head(sizes: DepthSplatConfig, depth: bool) -> DptHead:
 
 
 class DepthSplat(nn.Module):
-    """Images and cameras to depths and raw Gaussians of all pixels.
+    """Network from images and cameras to depths and raw Gaussians of all pixels.
 
-    harmonics: coefficients per colour.
+    harmonics: number of coefficients per colour.
     """
 
     def __init__(self, sizes: DepthSplatConfig, harmonics: int) -> None:
@@ -317,7 +321,7 @@ class DepthSplat(nn.Module):
         self.gaussian_regressor = two_convolutions(features + 5, hidden, hidden, "zeros")
         raw = GAUSSIAN_CHANNELS + 3 * harmonics
         self.gaussian_head = two_convolutions(hidden + features + 4, raw, raw, "replicate")
-        # Scales and harmonics start from their offsets alone.
+        # Scales and harmonics start at their constant offsets.
         with torch.no_grad():
             for parameter in self.gaussian_head[2].parameters():
                 parameter[3:6] = 0
@@ -326,11 +330,11 @@ class DepthSplat(nn.Module):
     def forward(
         self, images_BV3HW: Tensor, cameras: Cameras, near_BV: Tensor, far_BV: Tensor
     ) -> tuple[list[Tensor], Tensor]:
-        """Depths (B, V, H, W) of each scale, raw Gaussians (B, V, 10 + 3 K, H, W)."""
+        """Return depths (B, V, H, W) of each scale, raw Gaussians (B, V, 10 + 3 K, H, W)."""
         found = self.depth_predictor(images_BV3HW, cameras, near_BV, far_BV)
         features_NFHW = self.feature_upsampler(found.maps, found.joined)
         images_N3HW = images_BV3HW.flatten(0, 1)
-        # Depth itself, up to `far`, not its inverse (released code).
+        # Depth, up to `far`, not its inverse (released code).
         depth_N1HW = found.depths[-1].flatten(0, 1)[:, None]
         seen = torch.cat([images_N3HW, depth_N1HW, found.confidence, features_NFHW], 1)
         hidden = self.gaussian_regressor(seen)

@@ -1,4 +1,4 @@
-"""`mvsplat/depthsplat`: DepthSplat's networks as an encoder, a token for each pixel."""
+"""`mvsplat/depthsplat`: DepthSplat's networks as an encoder with a token for each pixel."""
 
 from collections.abc import Iterable
 
@@ -17,20 +17,20 @@ from qgs_zoo.mvsplat.sweep import DepthRange, SweepEncoder
 
 
 class DepthSplatEncoder(SweepEncoder):
-    """Every pixel's depth and raw Gaussian, from a plane sweep and a pretrained ViT.
+    """Encoder that predicts a depth and a raw Gaussian per pixel: a plane sweep and a ViT.
 
-    The memory has a token for each pixel. Its D numbers, the model's width, are those of
-    `CHANNELS` of `pixels.py` and harmonics, to whose constant the pixel's colour is added: 38 for
-    degree 2 (published). A wider model has zeros behind them.
+    The ViT is pretrained. The memory has a token for each pixel with D numbers, the model's width:
+    those of `CHANNELS` of `pixels.py`, then harmonics. The pixel's colour is added to the constant
+    harmonic. D is 38 for degree 2 (published). A wider model has zeros after them.
     """
 
     name = "depthsplat"
 
     class Config(DepthSplatConfig, DepthRange):
         coarse_depth: bool = False
-        """Whether the last of the D numbers is the logarithm of the first sweep's depth, for
-        `mvsplat/exchange`; of two scales, in a model wider than the other numbers (published:
-        39)."""
+        """Store the logarithm of the first sweep's depth in the last of the D numbers, for
+        `mvsplat/exchange`. It needs two scales, and a model wider than the other numbers
+        (published: 39)."""
 
     config: Config
 
@@ -44,7 +44,7 @@ class DepthSplatEncoder(SweepEncoder):
             reason = f"a model of width {width} has no room for a coarse depth"
             yield Problem("coarse_depth", reason, f"set model.width to {width + 1}")
         if config.features % (32 * config.scales):
-            reason = f"{config.features} features make no heads of 32 channels in both scales"
+            reason = f"{config.features} features do not split into heads of 32 in both scales"
             yield Problem("features", reason, "write a multiple of 64")
         yield from super().problems(config, context)
 
@@ -61,7 +61,7 @@ class DepthSplatEncoder(SweepEncoder):
         self.network.depth_predictor.pretrained.load(self.config.vit.weights)
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Weight decay on everything (released code)."""
+        """Return True: all parameters have weight decay (released code)."""
         return True
 
     def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
@@ -70,13 +70,13 @@ class DepthSplatEncoder(SweepEncoder):
         first = GAUSSIAN_CHANNELS
         gaussian = raw_BVCHW[:, :, :first]
         sh_BV3KHW = raw_BVCHW[:, :, first:].unflatten(2, (3, -1))
-        # The colour of the pixel goes into the constant: an untrained network copies the photo.
+        # The pixel's colour is added to the constant: an untrained network copies the photo.
         constant = sh_BV3KHW[:, :, :, :1] + ((views.images - 0.5) / SH_C0)[:, :, :, None]
         sh_BV3KHW = torch.cat([constant, sh_BV3KHW[:, :, :, 1:]], 3)
-        # As logarithms, the range of depths fits the range of features.
+        # Logarithms of depths have about the range of features.
         logs = [depth[:, :, None].log() for depth in depths]
         numbers = torch.cat([logs[-1], gaussian, sh_BV3KHW.flatten(2, 3)], 2)
-        # At the end of the numbers, where `mvsplat/exchange` finds it.
+        # It is the last number, where `mvsplat/exchange` expects it.
         coarse = logs[:1] if self.config.coarse_depth else []
         left = self.dims.width - numbers.shape[2] - len(coarse)
         return torch.cat([F.pad(numbers, (0, 0, 0, 0, 0, left)), *coarse], 2)

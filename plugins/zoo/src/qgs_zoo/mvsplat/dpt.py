@@ -1,7 +1,7 @@
-"""DPT heads (Ranftl et al., arXiv 2103.13413) of DepthSplat: a ViT's tokens to full-size maps.
+"""DPT heads (Ranftl et al., arXiv 2103.13413) of DepthSplat, from ViT tokens to full-size maps.
 
-Four maps of a ViT become four resolutions, 1/2 to 1/16; other features join them at 1/2, 1/4 and
-1/8; the coarse ones are added to the fine ones step by step.
+Four maps of a ViT are resized to four resolutions, 1/2 to 1/16. Other features join them at 1/2,
+1/4 and 1/8. Coarse maps are then added to finer ones, step by step.
 """
 
 from collections.abc import Sequence
@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from qgs_zoo.mvsplat.unet import resized, two_convolutions, zeroed
 
 LEVELS = 3
-"""Resolutions at which other features join: 1/2, 1/4, 1/8."""
+"""Number of resolutions at which other features join: 1/2, 1/4, 1/8."""
 
 
 class ResidualUnit(nn.Module):
-    """x + conv(relu(conv(relu x))), 3 x 3: (X, F, h, w) -> (X, F, h, w)."""
+    """Residual unit x + conv(relu(conv(relu x))), 3 x 3: (X, F, h, w) -> (X, F, h, w)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -28,7 +28,7 @@ class ResidualUnit(nn.Module):
 
 
 class Fusion(nn.Module):
-    """Adds a map to the coarser ones so far and brings their sum to the next size."""
+    """Sum of a map and all coarser ones, resized to the next size."""
 
     def __init__(self, channels: int, coarsest: bool) -> None:
         super().__init__()
@@ -37,16 +37,19 @@ class Fusion(nn.Module):
         self.resConfUnit2 = ResidualUnit(channels)
 
     def forward(self, coarse: Tensor | None, skip: Tensor, size: Sequence[int]) -> Tensor:
-        """coarse: None for the coarsest map, which `skip` then is. (X, F, *size)."""
+        """Return the resized sum (X, F, *size).
+
+        coarse: sum of the coarser maps; None if `skip` is the coarsest map.
+        """
         if self.resConfUnit1 is not None and coarse is not None:
             skip = coarse + self.resConfUnit1(skip)
-        # The release resizes first. A 1 x 1 convolution commutes with weights that sum to 1, and
-        # has a quarter of the pixels here.
+        # The release resizes first. The weights of resizing sum to 1, so it commutes with a 1 x 1
+        # convolution, which has a quarter of the pixels here.
         return resized(self.out_conv(self.resConfUnit2(skip)), size)
 
 
 class Scratch(nn.Module):
-    """The part of a head behind its joined maps, under its published names."""
+    """Part of a head after its joined maps, with the published parameter names."""
 
     def __init__(self, channels: Sequence[int], features: int, ends_in_depth: bool) -> None:
         super().__init__()
@@ -58,7 +61,7 @@ class Scratch(nn.Module):
         self.output_conv = _to_depth(features) if ends_in_depth else None
 
     def forward(self, maps: Sequence[Tensor]) -> Tensor:
-        """Maps of 1/2 to 1/16, fine ones first, to a full-size map (X, F or 1, H, W)."""
+        """Return a full-size map (X, F or 1, H, W) from maps of 1/2 to 1/16, finest first."""
         path = None
         # From coarse to fine: each fusion doubles the size.
         for number in range(len(maps), 0, -1):
@@ -71,7 +74,7 @@ class Scratch(nn.Module):
 
 
 def _to_depth(features: int) -> nn.Sequential:
-    """A correction of depth, 0 at the start."""
+    """Return layers that predict a correction of depth, which is 0 at first."""
     return nn.Sequential(
         *two_convolutions(features, features // 2, 16, "replicate"),
         nn.GELU(),
@@ -80,10 +83,10 @@ def _to_depth(features: int) -> nn.Sequential:
 
 
 class DptHead(nn.Module):
-    """Four maps of a ViT at 1/8, with other features, to one map of full size.
+    """Head from four maps of a ViT at 1/8, and other features, to one full-size map.
 
-    width: channels of the ViT's maps. channels: those of the four resolutions. features: F.
-    joined: channels that join at 1/2, 1/4 and 1/8, all others together.
+    width: channels of the ViT's maps. channels: of the four resolutions. features: F. joined: total
+    channels of the other features at 1/2, 1/4 and 1/8.
     """
 
     def __init__(
@@ -105,7 +108,7 @@ class DptHead(nn.Module):
                 nn.Conv2d(c16, c16, 3, 2, 1),
             ]
         )
-        # One stands also where nothing joins: there it maps its own features alone.
+        # One exists even if nothing joins: it then maps the features of the ViT alone.
         self.concat_projects = nn.ModuleList(
             nn.Conv2d(own + other, own, 1)
             for own, other in zip(channels[:LEVELS], joined, strict=True)
@@ -117,9 +120,9 @@ class DptHead(nn.Module):
         maps: Sequence[Tensor],  # four of (X, C, H/8, W/8)
         joined: Sequence[tuple[Sequence[Tensor], Sequence[Tensor]]],
     ) -> Tensor:
-        """(X, F, H, W), or (X, 1, H, W) of a head that ends in depth.
+        """Return (X, F, H, W), or (X, 1, H, W) if the head ends in depth.
 
-        joined: maps at 1/2, 1/4, 1/8, those before and those behind the head's own channels.
+        joined: for 1/2, 1/4 and 1/8, the maps before and the maps after the head's own channels.
         """
         own = [
             resize(project(x))

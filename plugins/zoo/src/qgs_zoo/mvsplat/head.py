@@ -1,4 +1,4 @@
-"""`mvsplat/gaussians`, `mvsplat/depthsplat_gaussians`: activations of the numbers of each pixel."""
+"""`mvsplat/gaussians`, `mvsplat/depthsplat_gaussians`: heads that activate each pixel's numbers."""
 
 from abc import abstractmethod
 from collections.abc import Iterable
@@ -29,20 +29,20 @@ from qgs_zoo.mvsplat.pixels import (
 
 SCALE_FACTOR = 0.1
 SCALE_SHIFT = 4.0
-"""Taken off a raw scale of DepthSplat, so that scales start at softplus(-4) = 0.018."""
+"""Number subtracted from DepthSplat's raw scales, which then start at softplus(-4) = 0.018."""
 
 
 class PixelHead(Head):
-    """One Gaussian for each query of `mvsplat/pixels`; it has no parameters."""
+    """Head without parameters that makes one Gaussian of each query of `mvsplat/pixels`."""
 
     writes: ClassVar[Fields] = {"gaussians.sh": GAUSSIAN_FIELDS["gaussians.sh"]}
 
     @abstractmethod
     def scales(self, raw: Tensor, log_depth: Tensor, state: QueryState) -> Tensor:
-        """World units (B, N, 1, 3)."""
+        """Return scales (B, N, 1, 3), world units."""
 
     def opacities(self, p: Tensor) -> Tensor:
-        """Of the sigmoids p of the logits."""
+        """Return opacities from the sigmoids p of the logits."""
         return p
 
     @property
@@ -63,7 +63,7 @@ class PixelHead(Head):
             scales=self.scales(scale, log_depth, state),
             quats=world_quaternions(camera_quaternions(rotation), state[TURN][:, :, None]),
             opacities=self.opacities(logit[..., 0].sigmoid()),
-            # Zeros are grey in MVSplat; DepthSplat's have the colour of the photo in them already.
+            # Zeros are grey in MVSplat; DepthSplat has already added the colour of the photo.
             colors=0.5 + SH_C0 * sh[..., 0, :],
             sh=sh[..., 1:, :].clone(),
         )
@@ -72,8 +72,8 @@ class PixelHead(Head):
 class RayHead(PixelHead):
     """MVSplat's activations.
 
-    Scales are (min + (max - min) sigmoid) * t * .1 * (1 / fx + 1 / fy), focal lengths in pixels:
-    a sum over both axes, no mean. The opacity p is that of a sigmoid, then
+    Scales are (min + (max - min) sigmoid) * t * .1 * (1 / fx + 1 / fy), with focal lengths in
+    pixels; both axes are summed, not averaged. With p the sigmoid of the logit, opacities are
     (1 - (1 - p)^e + p^(1 / e)) / 2 with e = 2^opacity_exponent.
     """
 
@@ -83,19 +83,21 @@ class RayHead(PixelHead):
 
     class Config(ComponentConfig):
         scale_min: float = Field(default=0.5, gt=0)
-        """Least standard deviation, tenths of the size that two pixels have at its depth."""
+        """Least standard deviation, in tenths of the width plus the height of a pixel at the
+        Gaussian's depth."""
         scale_max: float = Field(default=15.0, gt=0)
-        """Largest standard deviation, likewise."""
+        """Largest standard deviation, in the same unit."""
         opacity_exponent: float = Field(default=0.0, ge=-10, le=10)
-        """Exponent of the opacity map as a power of 2; 0 for none (published)."""
+        """Base-2 logarithm of the exponent e of the opacity map. 0 leaves opacities unchanged
+        (published)."""
 
     config: Config
 
     def scales(self, raw: Tensor, log_depth: Tensor, state: QueryState) -> Tensor:
-        # Between scale_min and scale_max pixels at the Gaussian's own depth.
+        # From scale_min to scale_max, in pixels at the Gaussian's own depth.
         least = self.config.scale_min
         factor = least + (self.config.scale_max - least) * raw.sigmoid()
-        # The lengths of the steps across and down a pixel, at depth 1.
+        # Width plus height of a pixel at depth 1.
         size = SCALE_FACTOR * state[PIXEL][:, :, 2:].norm(dim=-1).sum(-1)[..., None, None]
         return factor * depths(log_depth) * size
 
@@ -104,7 +106,7 @@ class RayHead(PixelHead):
 
 
 class WorldHead(PixelHead):
-    """DepthSplat's: scales are softplus(x - 4), whatever the depth and the size of a pixel."""
+    """DepthSplat's activations: scales are softplus(x - 4), for any depth and size of a pixel."""
 
     name = "depthsplat_gaussians"
     reads: ClassVar[Fields] = {TURN: PIXEL_FIELDS[TURN]}
@@ -113,7 +115,7 @@ class WorldHead(PixelHead):
         scale_min: float = Field(default=1e-10, gt=0)
         """Least standard deviation, world units."""
         scale_max: float = Field(default=3.0, gt=0)
-        """Largest standard deviation, world units; 0.1 in the demos at 512 x 960."""
+        """Largest standard deviation, world units. The demos at 512 x 960 use 0.1."""
 
     config: Config
 
@@ -122,7 +124,7 @@ class WorldHead(PixelHead):
 
 
 def harmonics_of(features_BND: Tensor) -> Tensor:
-    """Coefficients (B, N, K, 3) in the numbers of pixels, of degrees that are rendered."""
+    """Return the coefficients (B, N, K, 3) of rendered degrees from the numbers of pixels."""
     degree = degree_of(features_BND.shape[-1])
     first = sum(CHANNELS)
     sh_BNC = numbers_of(features_BND)[..., first : first + 3 * coefficients(degree)]
@@ -131,13 +133,13 @@ def harmonics_of(features_BND: Tensor) -> Tensor:
 
 
 def mapped_opacity(p: Tensor, exponent: float) -> Tensor:
-    """Opacities of probabilities; those themselves for an exponent of 0."""
+    """Return opacities for probabilities p; an exponent of 0 gives p itself."""
     if exponent == 0:
         return p
-    # The mean of two curves, which is p for an exponent of 0, that of the published weights. The
-    # released code has the map from pixelSplat, where it sharpens opacities while training.
+    # The mean of two curves, which is p for an exponent of 0 (published weights). The released code
+    # took the map from pixelSplat, which uses it to sharpen opacities during training.
     power = 2.0**exponent
     inside = (p > 0) & (p < 1)
-    # 0 and 1 stay as they are; there the slope of the map may be infinite.
+    # 0 and 1 stay as they are, because the slope of the map may be infinite there.
     q = torch.where(inside, p, 0.5)
     return torch.where(inside, 0.5 * (1 - (1 - q) ** power + q ** (1 / power)), p)

@@ -25,11 +25,11 @@ from qgs_zoo.mvsplat.unet import OverViews, UNet, conv3, group_norm, resized, tw
 from qgs_zoo.mvsplat.windows import WindowTransformer, with_positions
 
 FACTOR = 4
-"""Size of an image over that of its features."""
+"""Side of an image over the side of its feature map."""
 
 
 class Backbone(nn.Module):
-    """Features of all views at 1/4 of the images, of the CNN and of the transformer behind it."""
+    """CNN and transformer that compute features of all views at 1/4 of the image size."""
 
     def __init__(self, width: int, stages: tuple[int, int, int]) -> None:
         super().__init__()
@@ -37,18 +37,18 @@ class Backbone(nn.Module):
         self.transformer = WindowTransformer(width)
 
     def forward(self, images_BV3HW: Tensor, neighbours_BVJ: Tensor) -> tuple[Tensor, Tensor]:
-        """Both (B, V, D, H/4, W/4)."""
+        """Return features of the CNN and of the transformer, each (B, V, D, H/4, W/4)."""
         normalized = imagenet_normalised(images_BV3HW).flatten(0, 1)
         cnn = self.backbone(normalized).features.unflatten(0, images_BV3HW.shape[:2])
         return cnn, self.transformer(with_positions(cnn), neighbours_BVJ)
 
 
 class MVSplatEncoder(SweepEncoder):
-    """Every pixel's depth and raw Gaussian, from features of all views and a plane sweep.
+    """Encoder that predicts a depth and a raw Gaussian per pixel with a plane sweep.
 
-    The memory has a token for each pixel, or square of them. Its D numbers, the model's width, are
-    those of `qgs_zoo.mvsplat.pixels.CHANNELS` and harmonics: 86 for degree 4 (published). Views are
-    compared in their order; a single view is compared with itself.
+    The memory has a token for each pixel, or for each square of pixels. A token has D numbers (the
+    model's width): those of `qgs_zoo.mvsplat.pixels.CHANNELS`, then harmonics. D is 86 for degree 4
+    (published). Views are compared in their order; a single view is compared with itself.
     """
 
     name = "mvsplat"
@@ -57,23 +57,23 @@ class MVSplatEncoder(SweepEncoder):
         cnn_widths: tuple[int, int, int] = WIDTHS
         """Channels of the three stages of the CNN."""
         features: int = Field(default=128, ge=4, multiple_of=4)
-        """Width of the features that the sweep compares."""
+        """Channels of the features that the sweep compares."""
         stride: Literal[1, 2, 4] = 1
-        """Pixels along the side of the square that has a Gaussian: 1 for one per pixel
-        (published)."""
+        """Side, in pixels, of the square that each Gaussian stands for. 1 gives one Gaussian per
+        pixel (published)."""
         candidates: int = Field(default=128, ge=2)
-        """Depths that the plane sweep compares, evenly in inverse depth from `near` to `far`."""
+        """Number of depths in the plane sweep, evenly spaced in inverse depth, `near` to `far`."""
         cost_width: int = Field(default=128, ge=32, multiple_of=32)
         """Channels of the U-Net over the cost volume."""
         cost_levels: int = Field(default=3, ge=1, le=6)
-        """Levels of that U-Net; the lowest has attention over all views."""
+        """Levels of the U-Net over the cost volume. The lowest has attention over all views."""
         depth_width: int = Field(default=32, ge=32, multiple_of=32)
         """Channels of the U-Net that refines depths at full size."""
         depth_levels: int = Field(default=5, ge=1, le=8)
-        """Levels of that U-Net; the lowest has attention over all views."""
+        """Levels of the U-Net that refines depths. The lowest has attention over all views."""
         cost_volume: bool = True
-        """Whether views are compared; false has zeros in place of correlations, so that depths
-        come from features alone, with as many parameters (the paper's ablation)."""
+        """Compare views. With false, zeros replace the correlations, so that depths come from
+        features alone, with the same parameters (the paper's ablation)."""
 
     config: Config
 
@@ -96,7 +96,7 @@ class MVSplatEncoder(SweepEncoder):
 
 
 class Sweep(NamedTuple):
-    """What the plane sweep reads of cameras (B, V): neighbours (B, V, J), near and far (B, V)."""
+    """Cameras (B, V), neighbours (B, V, J), and least and largest depths (B, V) of a sweep."""
 
     cameras: Cameras
     neighbours: Tensor
@@ -105,7 +105,7 @@ class Sweep(NamedTuple):
 
 
 class DepthPredictor(nn.Module):
-    """From features at 1/4 to depths and raw Gaussians at full size."""
+    """Network from features at 1/4 of the image size to depths and raw Gaussians at full size."""
 
     def __init__(self, config: MVSplatEncoder.Config, numbers: int) -> None:
         super().__init__()
@@ -125,7 +125,7 @@ class DepthPredictor(nn.Module):
         self.stride = config.stride
         scale = FACTOR // config.stride
         upscale = nn.Upsample(scale_factor=scale, mode="bilinear", align_corners=True)
-        # GELU comes behind the resizing, not in front of it.
+        # GELU comes after the resizing, not before it.
         self.upsampler = nn.Sequential(conv3(2 * width, width), upscale, nn.GELU())
         self.proj_feature = conv3(width, fine)
         self.refine_unet = OverViews(
@@ -138,14 +138,14 @@ class DepthPredictor(nn.Module):
     def forward(
         self, images_BV3HW: Tensor, cnn_BVDhw: Tensor, features_BVDhw: Tensor, sweep: Sweep
     ) -> Tensor:
-        """(B, V, C, H, W): logarithm of the depth, opacity logit, raw Gaussian."""
+        """Return (B, V, C, H, W): logarithm of the depth, opacity logit, raw Gaussian."""
         views = images_BV3HW.shape[1]
-        # These networks see images in [0, 1]; only the CNN's are normalised.
+        # These networks see images in [0, 1]; only the CNN sees normalised ones.
         images_N3HW = images_BV3HW.flatten(0, 1)
         cnn_NDhw = cnn_BVDhw.flatten(0, 1)
         features_NDhw = features_BVDhw.flatten(0, 1)
         disparity_N1hw, confidence_N1hw = self.match(features_BVDhw, sweep)
-        # Fewer Gaussians than pixels: colours are means over their squares.
+        # With fewer Gaussians than pixels, colours are means over squares.
         if self.stride > 1:
             images_N3HW = F.avg_pool2d(images_N3HW, self.stride)
         size = images_N3HW.shape[2:]
@@ -161,7 +161,7 @@ class DepthPredictor(nn.Module):
         return torch.cat([log_depth, logit_N1HW, raw], 1).unflatten(0, (-1, views))
 
     def match(self, features_BVDhw: Tensor, sweep: Sweep) -> tuple[Tensor, Tensor]:
-        """Inverse depth and largest probability (B V, 1, h, w) of the candidates at 1/4."""
+        """Return inverse depth and largest candidate probability (B V, 1, h, w) at 1/4 size."""
         count = self.regressor_residual.out_channels
         candidates_BVD = inverse_depth_candidates(sweep.near, sweep.far, count)
         size = features_BVDhw.shape[3:]
@@ -176,7 +176,7 @@ class DepthPredictor(nn.Module):
             )
         matched = torch.cat([volume_BVDhw, features_BVDhw], 2).flatten(0, 1)
         refined = self.corr_refine_net(matched, features_BVDhw.shape[1])
-        # The network corrects the volume, so that matches survive an untrained U-Net.
+        # The network only corrects the volume, so that matches survive an untrained U-Net.
         refined = refined + self.regressor_residual(matched)
         logits_NDhw = self.depth_head_lowres(refined)
         return expected_disparity(logits_NDhw, candidates_BVD.flatten(0, 1)[..., None, None])
@@ -184,9 +184,9 @@ class DepthPredictor(nn.Module):
 
 @full_precision
 def expected_disparity(logits_NDhw: Tensor, candidates_NDhw: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean of candidates under the softmax of logits, and its largest probability."""
+    """Return the mean of candidates under softmax(logits), and the largest probability."""
     probability = logits_NDhw.softmax(1)
-    # A mean over candidates, not the best one: it has a gradient, and lies between them.
+    # A mean, not the best candidate: it has a gradient and can lie between candidates.
     disparity = (probability * candidates_NDhw).sum(1, keepdim=True)
     return disparity, probability.amax(1, keepdim=True)
 
@@ -195,7 +195,7 @@ def expected_disparity(logits_NDhw: Tensor, candidates_NDhw: Tensor) -> tuple[Te
 def refined_log_depth(
     disparity_N1HW: Tensor, change_N1HW: Tensor, near_BV: Tensor, far_BV: Tensor
 ) -> Tensor:
-    """Logarithm of the depth (B V, 1, H, W), between near and far."""
+    """Return the logarithm of the depth (B V, 1, H, W), clamped to [near, far]."""
     # Inverse depth grows towards the camera.
     least, most = (1 / x.flatten()[:, None, None, None] for x in (far_BV, near_BV))
     fine = (disparity_N1HW + change_N1HW).clamp(least, most)

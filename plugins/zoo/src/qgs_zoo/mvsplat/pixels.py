@@ -1,4 +1,4 @@
-"""`mvsplat/pixels`, `mvsplat/on_rays`: a query for each pixel, means on the rays through it."""
+"""`mvsplat/pixels`, `mvsplat/on_rays`: a query for each pixel, and means on its rays."""
 
 from collections.abc import Iterable
 from typing import Literal
@@ -28,43 +28,46 @@ PIXEL_FIELDS: Fields = {
     PIXEL: FieldSpec((4, 3), frame="world", encoding=PIXEL_ENCODING),
     TURN: FieldSpec((4,), frame="world", encoding="unit quaternion w x y z, camera to world"),
 }
-"""The rays through a pixel, and the rotation of its camera."""
+"""Rays through a pixel, and the rotation of its camera."""
 RAY_FIELD: Fields = {PIXEL: PIXEL_FIELDS[PIXEL]}
 
 CHANNELS = (1, 1, 2, 3, 4)
-"""Per pixel: logarithm of the depth (world units), opacity logit, raw place in the pixel, raw
-scales, raw quaternion x y z w in the camera's frame; behind them harmonics, colour by colour."""
+"""Numbers per pixel: log of the depth (world units), opacity logit, raw place in the pixel, raw
+scales, raw quaternion x y z w in the camera's frame. Harmonics follow, colour by colour."""
 LOG_DEPTH = 20.0
-"""Bound of the logarithm of a depth, so that any features give a finite place and a scale."""
+"""Bound of the logarithm of a depth, so that any features give finite places and scales."""
 
 
 WIDTHS = {sum(CHANNELS) + 3 * coefficients(degree): degree for degree in (1, 2, 3, 4)}
-"""Widths of a model, and the degree of harmonics that they have room for."""
+"""Degree of harmonics for which a model of each width has room."""
 
 
 def degree_of(width: int) -> int:
-    """Degree of the harmonics in the numbers of a pixel, D = `width`; those beyond are not read."""
+    """Return the degree of harmonics in the D = `width` numbers of a pixel.
+
+    Numbers after these harmonics are not read.
+    """
     return max([1, *(degree for least, degree in WIDTHS.items() if least <= width)])
 
 
 def numbers_of(features_BND: Tensor) -> Tensor:
-    """The numbers of pixels: features, with zeros for what a narrow model has no room for."""
+    """Return features as numbers of pixels; a narrow model is padded with zeros."""
     return F.pad(features_BND, (0, max(0, min(WIDTHS) - features_BND.shape[-1])))
 
 
 def width_problems(context: RecipeContext) -> Iterable[Problem]:
-    """A model too narrow for the numbers of a pixel."""
+    """Report a model that is too narrow for the numbers of a pixel."""
     least = min(WIDTHS)
     if context.dims.width < least:
-        reason = f"the model is {context.dims.width} wide, but a pixel has {least} numbers or more"
+        reason = f"the model is {context.dims.width} wide, but a pixel has at least {least} numbers"
         fix = f"set model.width to one of {[*WIDTHS]}, for harmonics of degree 1, 2, 3, 4"
         yield Problem("", reason, fix)
 
 
 class PixelQueries(Queries):
-    """A query for each pixel, which knows the rays through its pixel and its camera's rotation.
+    """Queries for all pixels, with the rays through the pixel and the rotation of its camera.
 
-    Its features are the encoder's numbers, harmonics turned into the world.
+    Their features are the encoder's numbers, with harmonics turned into the world.
     """
 
     name = "pixels"
@@ -77,7 +80,7 @@ class PixelQueries(Queries):
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
         assert memory.grid is not None
-        # Harmonics are predicted in the camera's axes and painted in the world's.
+        # Harmonics are predicted in the camera's axes and rendered in the world's.
         features = in_world(memory.features, views.cameras.c2w[..., :3, :3])
         _, rows, columns = memory.grid
         return QueryState(features, pixel_fields(views.cameras, rows, columns))
@@ -85,7 +88,7 @@ class PixelQueries(Queries):
 
 @full_precision
 def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
-    """Numbers of pixels, ordered by view, with their harmonics turned into the world."""
+    """Return numbers of pixels, ordered by view, with harmonics turned into the world."""
     numbers_BMC = numbers_of(features_BMD)
     degree = degree_of(features_BMD.shape[-1])
     views = rotation_BV33.shape[1]
@@ -99,16 +102,16 @@ def in_world(features_BMD: Tensor, rotation_BV33: Tensor) -> Tensor:
 
 
 def pixel_fields(cameras: Cameras, rows: int, columns: int) -> dict[str, Tensor]:
-    """PIXEL_FIELDS of images (B, V) seen as rows x columns pixels: (B, V*rows*columns, ...)."""
+    """Return PIXEL_FIELDS (B, V*rows*columns, ...) of images (B, V) of rows x columns pixels."""
     turn = quaternions(cameras.c2w[..., :3, :3]).repeat_interleave(rows * columns, 1)
     return {PIXEL: pixel_rays(cameras, rows, columns), TURN: turn}
 
 
 class OnRays(Centers):
-    """mean = o + t d; d goes through the place of the Gaussian in its pixel.
+    """Means at o + t d, with d the ray through the Gaussian's place in its pixel.
 
-    Offsets are two raw numbers, whose sigmoids are that place from the upper left corner, and the
-    logarithm of t in world units.
+    Offsets are two raw numbers and the logarithm of t in world units. The sigmoids of the raw
+    numbers are the place, from the upper left corner of the pixel.
     """
 
     name = "on_rays"
@@ -116,8 +119,9 @@ class OnRays(Centers):
 
     class Config(ComponentConfig):
         measure: Literal["distance", "depth"] = "distance"
-        """Whether t counts along the ray (MVSplat), or along the camera's axis (DepthSplat). In
-        MVSplat it was found as a depth by the plane sweep; its weights expect the difference."""
+        """Measure t along the ray ("distance", MVSplat), or along the camera's axis ("depth",
+        DepthSplat). MVSplat's sweep finds a depth but uses it as a distance; its weights expect
+        this."""
 
     config: Config
 
@@ -129,14 +133,17 @@ class OnRays(Centers):
 
 
 def ray_directions(place_BNK2: Tensor, pixel_BN43: Tensor, unit: bool) -> Tensor:
-    """Of rays through raw places in pixels (B, N, K, 3): of length 1, or of z = 1."""
+    """Return directions (B, N, K, 3) of rays through raw places in pixels.
+
+    unit: with length 1; otherwise with z = 1.
+    """
     _, corner, across, down = pixel_BN43[:, :, None].unbind(-2)
-    # Inside its own pixel, wherever the raw numbers lie.
+    # The sigmoid keeps places inside their pixel.
     u, v = place_BNK2.sigmoid()[..., None].unbind(-2)
     directions = corner + u * across + v * down
     return F.normalize(directions, dim=-1) if unit else directions
 
 
 def depths(log_depth: Tensor) -> Tensor:
-    """Depths, world units, of their logarithms."""
+    """Return depths, world units, from their logarithms."""
     return log_depth.clamp(-LOG_DEPTH, LOG_DEPTH).exp()

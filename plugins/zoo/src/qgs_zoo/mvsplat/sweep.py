@@ -1,6 +1,6 @@
-"""The plane sweep: how well the features of a view agree with those of others at each depth.
+"""Plane sweep: correlation of a view's features with those of other views at each depth.
 
-And what both encoders share: the range of depths, sizes of images, a token for each pixel.
+This file also has the base of both encoders: range of depths, image sizes, a token per pixel.
 """
 
 import math
@@ -28,15 +28,18 @@ from qgs.types import Cameras, ImageMemory, Views
 from qgs_zoo.mvsplat.pixels import width_problems
 
 MIN_DEPTH = 1e-3
-"""Bound of z in another camera, world units: points behind it land far outside of its image."""
+"""Least z in another camera, world units: points behind it project far outside its image."""
 MAX_SAMPLES = 1 << 24
 """Numbers that are sampled at once (64 MiB in float32)."""
 PAIRS = 40
-"""Pixels for each candidate up to which all pairs of pixels are correlated."""
+"""Largest number of pixels per candidate for which all pairs of pixels are correlated."""
 
 
 def cyclic_neighbours(scenes: int, views: int, device: torch.device) -> Tensor:
-    """The views (B, V, V - 1) that follow each view, around; a single view is its own neighbour."""
+    """Return the views (B, V, V - 1) after each view, cyclically.
+
+    A single view is its own neighbour.
+    """
     view = torch.arange(views, device=device)
     # A single view is compared with itself.
     step = torch.arange(1, max(views, 2), device=device)
@@ -45,7 +48,7 @@ def cyclic_neighbours(scenes: int, views: int, device: torch.device) -> Tensor:
 
 @full_precision
 def inverse_depth_candidates(near_BV: Tensor, far_BV: Tensor, count: int) -> Tensor:
-    """(B, V, D), linear from 1/far to 1/near, both included."""
+    """Return inverse depths (B, V, D), linear from 1/far to 1/near, both included."""
     step_D = torch.linspace(0, 1, count, device=near_BV.device).to(near_BV)
     least = 1 / far_BV[..., None]
     return least + step_D * (1 / near_BV[..., None] - least)
@@ -53,27 +56,27 @@ def inverse_depth_candidates(near_BV: Tensor, far_BV: Tensor, count: int) -> Ten
 
 @full_precision
 def relative_poses(c2w_BV44: Tensor, neighbours_BVJ: Tensor) -> Tensor:
-    """From the camera of each view to those of its neighbours: (B, V, J, 4, 4)."""
+    """Return poses (B, V, J, 4, 4) from the camera of each view to those of its neighbours."""
     scenes = torch.arange(len(c2w_BV44), device=c2w_BV44.device)[:, None, None]
     return c2w_BV44[scenes, neighbours_BVJ].inverse() @ c2w_BV44[:, :, None]
 
 
 @full_precision
 def feature_lenses(cameras: Cameras, size: Sequence[int]) -> Tensor:
-    """Intrinsics (B, V, 4) of cameras whose images are of `size`, (H, W)."""
+    """Return the intrinsics (B, V, 4) of cameras for images resized to `size`, (H, W)."""
     scale = (size[1] / cameras.size[1], size[0] / cameras.size[0])
     return cameras.intrinsics * constant([*scale, *scale], cameras.intrinsics)
 
 
 @full_precision
 def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
-    """Where pixels of a view at given depths stand in another: (N, D, h, w, 2), for `grid_sample`.
+    """Return positions (N, D, h, w, 2) in another view of pixels at depths, for `grid_sample`.
 
-    depth_NDhw: camera-frame z, world units, sizes of 1 are expanded over h, w: use h, w of the map.
+    depth_NDhw: camera-frame z, world units, with the height and width of the feature map.
     """
     height, width = depth_NDhw.shape[-2:]
     fx, fy, cx, cy = (x[:, None, None] for x in lens_N4.unbind(-1))
-    # Pixels count from 0 without the half that rays have; published weights expect the difference.
+    # Pixel centres are whole numbers here, without the half of rays: published weights expect it.
     x_w = torch.arange(width, device=depth_NDhw.device).to(depth_NDhw)
     y_h1 = torch.arange(height, device=depth_NDhw.device).to(depth_NDhw)[:, None]
     ray = ((x_w - cx) / fx).expand(-1, height, -1), ((y_h1 - cy) / fy).expand(-1, -1, width)
@@ -81,17 +84,17 @@ def warp_grid(depth_NDhw: Tensor, lens_N4: Tensor, pose_N44: Tensor) -> Tensor:
     turned_Nhw3 = torch.einsum("nij,nhwj->nhwi", pose_N44[:, :3, :3], ray_Nhw3)
     point = turned_Nhw3[:, None] * depth_NDhw[..., None] + pose_N44[:, None, None, None, :3, 3]
     x, y, depth = point.unbind(-1)
-    # Only the divisor is bounded (released code): behind the camera the centre is scaled as well.
+    # Only the divisor is bounded (released code): behind the camera the centre is scaled too.
     z = depth.clamp_min(MIN_DEPTH)
-    # The lens of the view itself stands for that of the other as well (released code): views with
-    # other lenses are warped wrongly, as the weights expect.
+    # The lens of this view is used for the other view too (released code). For views with different
+    # lenses this is wrong, but the weights expect it.
     u = (fx[:, None] * x + cx[:, None] * depth) / z
     v = (fy[:, None] * y + cy[:, None] * depth) / z
     return torch.stack([2 * u / (width - 1) - 1, 2 * v / (height - 1) - 1], -1)
 
 
 def warped(features_NCHW: Tensor, grid_NDhw2: Tensor) -> Tensor:
-    """Features of another view at the places of a grid: (N, C, D, h, w), zeros outside."""
+    """Return features (N, C, D, h, w) of another view at the places of a grid; 0 outside."""
     flat = grid_NDhw2.flatten(1, 2).to(features_NCHW)
     sampled = F.grid_sample(features_NCHW, flat, "bilinear", "zeros", align_corners=True)
     return sampled.unflatten(2, grid_NDhw2.shape[1:3])
@@ -104,9 +107,10 @@ def cost_volume(
     poses_BVJ44: Tensor,
     neighbours_BVJ: Tensor,
 ) -> Tensor:
-    """Mean correlation with the neighbours (B, V, D, h, w): <f, f'> / sqrt(C), 0 outside.
+    """Return the mean correlation <f, f'> / sqrt(C) with the neighbours, (B, V, D, h, w).
 
-    inverse_depth_BVDhw: candidates, world units; h and w may be 1 for one set for all pixels.
+    Features outside of a neighbour count as 0. inverse_depth_BVDhw: candidates, 1 / world units; h
+    and w may be 1, for the same candidates in all pixels.
     """
     scenes, views, channels, height, width = features_BVChw.shape
     depth_NDhw = (1 / inverse_depth_BVDhw.detach()).flatten(0, 1)
@@ -114,13 +118,13 @@ def cost_volume(
     own_NChw = features_BVChw.flatten(0, 1)
     lens_N4 = lens_BV4.flatten(0, 1)
     batch = torch.arange(scenes, device=features_BVChw.device)[:, None]
-    # Two ways with one result: which is faster depends on pixels and candidates.
+    # Two ways with the same result; the faster one depends on pixels and candidates.
     correlate = _of_all_pairs if height * width <= PAIRS * depth_NDhw.shape[1] else _of_warped
     total_NDhw = depth_NDhw.new_zeros(())
     for index in range(neighbours_BVJ.shape[-1]):
         other_NChw = features_BVChw[batch, neighbours_BVJ[..., index]].flatten(0, 1)
         pose_N44 = poses_BVJ44[:, :, index].flatten(0, 1)
-        # The sweep moves features, it does not learn where to look.
+        # Cameras and depths get no gradient: only the features learn from the sweep.
         total_NDhw = total_NDhw + correlate(
             own_NChw, other_NChw, depth_NDhw, lens_N4.detach(), pose_N44.detach()
         )
@@ -129,22 +133,22 @@ def cost_volume(
 
 
 def _of_warped(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
-    """Correlations (N, D, h, w) with warped features, some candidates at a time."""
+    """Correlate with warped features, some candidates at a time: (N, D, h, w)."""
 
     def part(own: Tensor, other: Tensor, depth_Nkhw: Tensor) -> Tensor:
         sampled_NCkhw = warped(other, warp_grid(depth_Nkhw, lens, pose))
         return torch.einsum("nchw,nckhw->nkhw", own, sampled_NCkhw)
 
-    # Parts keep the memory of sampled features bounded.
+    # Parts bound the memory of sampled features.
     parts = depth.split(max(1, MAX_SAMPLES // own.numel()), 1)
     return torch.cat(_each(part, [(own, other, depth_Nkhw) for depth_Nkhw in parts]), 1)
 
 
 def _of_all_pairs(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose: Tensor) -> Tensor:
-    """The same: all pairs of pixels are correlated, then a map of each pixel is sampled.
+    """Compute the same as `_of_warped`: correlate all pairs of pixels, then sample the maps.
 
-    Warping is linear in the features, so that it may follow the product. A map has one channel, and
-    all of it is a matrix product, which is faster while there are few pixels for each candidate.
+    Warping is linear in the features, so it can follow the product. A map has one channel, and all
+    maps are one matrix product. This is faster if there are few pixels per candidate.
     """
     count, _, height, width = own.shape
     grid_NPD2 = warp_grid(depth, lens, pose).permute(0, 2, 3, 1, 4).flatten(1, 2)
@@ -163,7 +167,7 @@ def _of_all_pairs(own: Tensor, other: Tensor, depth: Tensor, lens: Tensor, pose:
 
 
 def _each(part: Callable[..., Tensor], given: Sequence[tuple[Tensor, ...]]) -> list[Tensor]:
-    """`part` of each; of several the samples are made again backward, so that one's take memory."""
+    """Return `part` of each; to save memory, several are computed again in the backward pass."""
     if len(given) == 1:
         return [part(*given[0])]
     return [
@@ -173,13 +177,13 @@ def _each(part: Callable[..., Tensor], given: Sequence[tuple[Tensor, ...]]) -> l
 
 
 class DepthRange(ComponentConfig):
-    """Where a plane sweep looks."""
+    """Range of depths of a plane sweep."""
 
     near: float = Field(gt=0)
-    """Least depth, world units; as published, with poses as they are: 1 for MVSplat, 0.5 for
+    """Least depth, world units. Published, for poses as given: 1 for MVSplat, 0.5 for
     DepthSplat."""
     far: float = Field(gt=0)
-    """Largest depth, world units; as published 100, for DepthSplat on DL3DV 200."""
+    """Largest depth, world units. Published: 100, and 200 for DepthSplat on DL3DV."""
 
     @field_validator("far")
     @classmethod
@@ -194,10 +198,10 @@ class DepthRange(ComponentConfig):
 
 
 class SweepEncoder(Encoder):
-    """Encoder whose memory has a token for each pixel, or square of them, at depths in a range."""
+    """Encoder with a token for each pixel, or square of pixels, at depths in a range."""
 
-    # Views are matched in their order; with three or more, the mask of shifted windows falls on
-    # keys in their order (released code).
+    # Views are matched in their order. With three or more, the mask of shifted windows depends on
+    # the order too (released code).
     ordered_views = True
     writes = memory_fields("features", "grid")
     Config: type[DepthRange]
@@ -206,11 +210,14 @@ class SweepEncoder(Encoder):
     @classmethod
     @abstractmethod
     def multiple(cls, config: DepthRange) -> int:
-        """What sides of images are multiples of, in pixels: for windows and levels of U-Nets."""
+        """Return the number of pixels of which image sides must be multiples.
+
+        Windows and the levels of U-Nets need it.
+        """
 
     @abstractmethod
     def predict(self, views: Views, near_BV: Tensor, far_BV: Tensor) -> Tensor:
-        """Numbers of every pixel (B, V, C, H, W), for depths between `near` and `far`."""
+        """Return the numbers of every pixel (B, V, C, H, W), for depths from `near` to `far`."""
 
     @classmethod
     def problems(cls, config: DepthRange, context: RecipeContext) -> Iterable[Problem]:
@@ -220,20 +227,23 @@ class SweepEncoder(Encoder):
         if size and any(side % multiple for side in size):
             nearest = [max(round(side / multiple), 1) * multiple for side in size]
             reason = (
-                f"images of {size[0]} x {size[1]} (H x W) are no multiples of {multiple} pixels"
+                f"images of {size[0]} x {size[1]} (H x W) are not multiples of {multiple} pixels"
             )
             yield Problem("", reason, f"set data.image_size to {nearest}")
 
     def forward(self, views: Views) -> ImageMemory:
-        """Raises ValueError for images that the U-Nets and windows do not divide."""
+        """Return the memory with one token per pixel.
+
+        Raises ValueError for images that the U-Nets and windows do not divide.
+        """
         height, width = views.cameras.size
         multiple = self.multiple(self.config)
         if height % multiple or width % multiple:
             raise ValueError(
-                f"images of {height} x {width} (H x W) are no multiples of {multiple} pixels; "
+                f"images of {height} x {width} (H x W) are not multiples of {multiple} pixels; "
                 "resize or crop the views"
             )
-        # One range for all views: data do not say one.
+        # One range for all views, because data sets do not give one.
         ends = (self.config.near, self.config.far)
         near_BV, far_BV = (views.cameras.c2w.new_full(views.cameras.shape, end) for end in ends)
         numbers_BVCHW = self.predict(views, near_BV, far_BV)

@@ -1,7 +1,8 @@
-"""Supervision of both of DepthSplat's depths: Gaussians of all other numbers at either of them.
+"""Supervision of both depths of DepthSplat: the same Gaussians, placed at either depth.
 
-`mvsplat/exchange` is a decoder layer that exchanges the depths, so that layer 1 has the coarse and
-layer 2 the final depth; `mvsplat/decayed` weighs them. `mvsplat/depth_error` measures depths.
+The decoder layer `mvsplat/exchange` exchanges the depths: the Gaussians of layer 1 have the coarse
+depth, those of layer 2 the final one. `mvsplat/decayed` weighs the layers. `mvsplat/depth_error`
+measures depths.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,33 +17,33 @@ from qgs.types import ImageMemory, QueryState
 
 
 class Exchange(DecoderLayer):
-    """Exchanges the first and the last number of a query: its depth and the other one.
+    """Decoder layer that exchanges a query's first and last number: its depth and the other one.
 
-    The encoder gives both with `coarse_depth`. An even number of layers ends with the final depth.
+    The encoder needs `coarse_depth: true`. An even number of layers ends with the final depth.
     """
 
     name = "exchange"
     reads_layer_scale = False
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
-        """The memory is passed on."""
-        # The depth in use stands first, the other one last.
+        """Exchange the numbers, and return the memory unchanged."""
+        # The depth in use is first, the other one last.
         own, rest, other = state.features.tensor_split([1, state.features.shape[-1] - 1], -1)
         return state.replace(features=torch.cat([other, rest, own], -1)), memory
 
 
 class DecayedSupervision(LayerSupervision):
-    """The last of S supervised layers weighs 1, each before `decay` times the next, over their sum.
+    """Supervision in which each layer weighs `decay` times the next; weights add up to 1.
 
-    The released code does not divide by the sum, 1.9 for two depths: Adam does not see a factor of
-    all gradients, but clipping does.
+    The released code does not divide by the sum, which is 1.9 for two depths. A common factor of
+    all gradients does not matter to Adam, but it does to clipping.
     """
 
     name = "decayed"
 
     class Config(LayerSupervision.Config):
         decay: float = Field(default=0.9, gt=0, le=1)
-        """Weight of a layer over that of the next one."""
+        """Weight of a layer divided by the weight of the next one."""
 
     config: Config
 
@@ -53,7 +54,7 @@ class DecayedSupervision(LayerSupervision):
 
 
 class DepthError(Metric):
-    """AbsRel, mean of |z - true z| / true z over pixels whose depth is known: 0 is the surface."""
+    """AbsRel: mean of |z - true z| / true z over pixels with a known depth."""
 
     name = "depth_error"
     definition = "|rendered - true| / true camera-frame z, mean over known pixels of all views"
@@ -61,10 +62,10 @@ class DepthError(Metric):
     column = Column("AbsRel", "lower")
 
     def forward(self, given: MetricInput) -> Tensor:
-        """One number for each pixel with a true depth; where nothing is rendered it is 1."""
+        """Return one number for each pixel with a true depth; 1 if nothing is rendered there."""
         assert given.depth is not None
         assert given.true_depth is not None
-        # Zero stands for no measurement.
+        # Zero means that there is no measurement.
         known = given.true_depth > 0
         true = given.true_depth[known]
         return (given.depth[known] - true).abs() / true

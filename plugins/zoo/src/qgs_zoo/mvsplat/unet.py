@@ -1,5 +1,7 @@
-"""Small convolutional networks, and the U-Net of latent diffusion without its time, whose attention
-joins the tokens of all views."""
+"""Small convolutional networks, and a U-Net with attention over the tokens of all views.
+
+The U-Net is that of latent diffusion without the time.
+"""
 
 from collections.abc import Sequence
 from typing import Any, Literal, TypeAlias
@@ -15,36 +17,36 @@ Padding: TypeAlias = Literal["zeros", "replicate"]
 
 
 def conv3(inputs: int, outputs: int, padding: Padding = "zeros") -> nn.Conv2d:
-    """A 3x3 convolution that keeps height and width."""
+    """Make a 3x3 convolution that keeps height and width."""
     return nn.Conv2d(inputs, outputs, 3, padding=1, padding_mode=padding)
 
 
 def two_convolutions(
     inputs: int, hidden: int, outputs: int, padding: Padding = "zeros"
 ) -> nn.Sequential:
-    """3x3 convolution, GELU, 3x3 convolution."""
+    """Make a 3x3 convolution, GELU and a 3x3 convolution."""
     return nn.Sequential(conv3(inputs, hidden, padding), nn.GELU(), conv3(hidden, outputs, padding))
 
 
 def zeroed(module: nn.Module) -> nn.Module:
-    """`module` with parameters that start at zero, so that what it adds is nothing at first."""
+    """Set all parameters of `module` to zero, so that it adds nothing at first, and return it."""
     for parameter in module.parameters():
         nn.init.zeros_(parameter)
     return module
 
 
 def resized(x_BCHW: Tensor, size: Sequence[int]) -> Tensor:
-    """Bilinear, with the centres of the corner pixels in the same places (align_corners)."""
+    """Resize bilinearly, with the centres of corner pixels in place (align_corners)."""
     return F.interpolate(x_BCHW, tuple(size), mode="bilinear", align_corners=True)
 
 
 def group_norm(width: int) -> nn.GroupNorm:
-    """8 groups, 4 for a width that is no multiple of 8."""
+    """Make a norm with 8 groups, or 4 if `width` is not a multiple of 8."""
     return nn.GroupNorm(8 if width % 8 == 0 else 4, width)
 
 
 class OverViews(nn.Sequential):
-    """A sequence that passes V, the views in (B V, C, H, W), on to its U-Nets and attentions."""
+    """Sequence that passes the number of views to its U-Nets and attentions."""
 
     def forward(self, x_NCHW: Tensor, views: int) -> Tensor:
         for module in self:
@@ -54,7 +56,7 @@ class OverViews(nn.Sequential):
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions and a skip; a norm in front of each (`pre_norm`) or behind each."""
+    """Two convolutions and a skip, with a norm before each (`pre_norm`) or after each."""
 
     def __init__(self, inputs: int, outputs: int, pre_norm: bool) -> None:
         super().__init__()
@@ -62,7 +64,7 @@ class ResidualBlock(nn.Module):
         second = conv3(outputs, outputs)
         if pre_norm:
             self.in_layers = nn.Sequential(group_norm(inputs), nn.SiLU(), first)
-            # The identity stands where the release has a dropout of 0, which counts in the names.
+            # The identity replaces a dropout of 0 of the release, so that parameter names match.
             last: Any = (group_norm(outputs), nn.SiLU(), nn.Identity(), zeroed(second))
         else:
             self.in_layers = nn.Sequential(first, group_norm(outputs), nn.SiLU())
@@ -76,7 +78,7 @@ class ResidualBlock(nn.Module):
 
 
 class ViewAttention(nn.Module):
-    """Attention over the tokens of all views of a scene, in heads of 32 channels, no positions."""
+    """Attention over the tokens of all views, with heads of 32 channels and no positions."""
 
     def __init__(self, width: int, pre_norm: bool) -> None:
         super().__init__()
@@ -87,10 +89,10 @@ class ViewAttention(nn.Module):
         zeroed(self.proj_out if pre_norm else self.norm)
 
     def forward(self, x_NCHW: Tensor, views: int) -> Tensor:
-        """(B V, C, H, W) -> (B V, C, H, W)."""
+        """Return maps (B V, C, H, W) that have read all `views` views of their scene."""
         x_NCT = x_NCHW.flatten(2)
         raw_NCT = self.qkv(self.norm(x_NCT) if self.pre_norm else x_NCT)
-        # The rows of `qkv` are ordered head by head: q, k and v of the first, of the second, ...
+        # Rows of `qkv` are ordered head by head: q, k, v of the first head, then of the second ...
         pattern = "(b v) (h three d) t -> three b h (v t) d"
         q, k, v = rearrange(raw_NCT, pattern, v=views, three=3, d=HEAD_WIDTH)
         read = F.scaled_dot_product_attention(q, k, v)
@@ -100,7 +102,7 @@ class ViewAttention(nn.Module):
 
 
 class Downsample(nn.Module):
-    """A 3x3 convolution of stride 2."""
+    """Convolution 3x3 with stride 2."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -111,7 +113,7 @@ class Downsample(nn.Module):
 
 
 class Upsample(nn.Module):
-    """Nearest neighbours to twice the size, and a 3x3 convolution."""
+    """Resizing to twice the size (nearest neighbours), then a 3x3 convolution."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -122,10 +124,10 @@ class Upsample(nn.Module):
 
 
 class UNet(nn.Module):
-    """One residual block per level down, two per level up: (B V, C, H, W) -> the same shape.
+    """U-Net with one residual block per level down and two per level up.
 
-    Attention stands behind the residual blocks of the lowest level alone. H and W are multiples of
-    2 ** (levels - 1).
+    It maps (B V, C, H, W) to the same shape. Only the residual blocks of the lowest level are
+    followed by attention. H and W must be multiples of 2 ** (levels - 1).
     """
 
     def __init__(self, width: int, levels: int, pre_norm: bool) -> None:
@@ -155,7 +157,7 @@ class UNet(nn.Module):
             self.out = nn.Sequential(final, group_norm(width), nn.SiLU())
 
     def forward(self, x_NCHW: Tensor, views: int) -> Tensor:
-        """Maps of `views` views of each scene, one scene after another."""
+        """Return maps like `x_NCHW`, which has `views` views of each scene, scene by scene."""
         skips = []
         for module in self.input_blocks:
             x_NCHW = module(x_NCHW, views)

@@ -1,4 +1,4 @@
-"""The multi-view transformer of GMFlow and UniMatch: attention in 2 x 2 windows of all views."""
+"""Multi-view transformer of GMFlow and UniMatch: attention in 2 x 2 windows of all views."""
 
 import math
 
@@ -9,21 +9,21 @@ from torch import Tensor, nn
 
 LAYERS = 6
 SPLIT = 2
-"""Windows along each side of the map, whatever its size."""
+"""Number of windows along each side of a map of any size."""
 EXPANSION = 4
 TEMPERATURE = 10_000.0
 MASKED = -100.0
-"""Added to logits between parts of a shifted window that are no neighbours (Swin)."""
+"""Number added to logits between parts of a shifted window that are not adjacent (Swin)."""
 
 
 def positions(width: int, rows: int, columns: int, device: torch.device) -> Tensor:
-    """Sine embedding (D, rows, columns) of the places in one window (DETR), y before x."""
+    """Return the sine embedding (D, rows, columns) of places in a window (DETR), y before x."""
     half = width // 2
     index_C = torch.arange(half, device=device)
     frequency_C = TEMPERATURE ** (-2 * (index_C // 2) / half)
 
     def embedded(count: int) -> Tensor:
-        # Places count from 1, and the small number keeps them just below 2 pi (DETR).
+        # Places count from 1. The small number keeps angles just below 2 pi (DETR).
         places = torch.arange(1, count + 1, device=device) / (count + 1e-6) * 2 * math.pi
         angle_NC = places[:, None] * frequency_C
         return torch.where(index_C % 2 == 0, angle_NC.sin(), angle_NC.cos())
@@ -34,17 +34,17 @@ def positions(width: int, rows: int, columns: int, device: torch.device) -> Tens
 
 
 def with_positions(x_BVCHW: Tensor) -> Tensor:
-    """Features plus `positions`, which count inside each of the windows."""
+    """Return features plus the `positions` inside each window."""
     width, height, columns = x_BVCHW.shape[2:]
-    # Positions repeat in each window: attention sees no more than one.
+    # Positions repeat in each window, because attention sees one window at a time.
     window = positions(width, height // SPLIT, columns // SPLIT, x_BVCHW.device).to(x_BVCHW)
     return x_BVCHW + window.repeat(1, SPLIT, SPLIT)
 
 
 def shift_mask(height: int, width: int, device: torch.device) -> Tensor:
-    """(4, L, L), added to the logits of windows of a map that was rolled by half a window.
+    """Return numbers (4, L, L) for the logits of windows of a map rolled by half a window.
 
-    MASKED between pixels that the roll brought together, 0 between neighbours.
+    They are MASKED between parts that only the roll made adjacent, and 0 otherwise.
     """
 
     def pieces(size: int) -> Tensor:
@@ -59,23 +59,24 @@ def shift_mask(height: int, width: int, device: torch.device) -> Tensor:
 
 
 def in_windows(x_BVHWC: Tensor, shift: tuple[int, int]) -> Tensor:
-    """(B, V, H, W, C) rolled by minus `shift`, cut into windows: (B, V, 4, L, C)."""
+    """Roll (B, V, H, W, C) by minus `shift` and cut it into windows (B, V, 4, L, C)."""
     if any(shift):
         x_BVHWC = x_BVHWC.roll((-shift[0], -shift[1]), (2, 3))
     return rearrange(x_BVHWC, "n v (a h) (b w) c -> n v (a b) (h w) c", a=SPLIT, b=SPLIT)
 
 
 def out_of_windows(x_BVWLC: Tensor, size: tuple[int, int], shift: tuple[int, int]) -> Tensor:
-    """The inverse of `in_windows`, of a map of `size`."""
+    """Invert `in_windows` for a map of `size`."""
     pattern = "n v (a b) (h w) c -> n v (a h) (b w) c"
     x_BVHWC = rearrange(x_BVWLC, pattern, a=SPLIT, b=SPLIT, h=size[0] // SPLIT)
     return x_BVHWC.roll(shift, (2, 3)) if any(shift) else x_BVHWC
 
 
 class Attention(nn.Module):
-    """x + LN(merge(attention)), one head without biases; with `mlp` x + LN(MLP([x, that])).
+    """Attention with one head and no biases: x + message, with message = LN(merge(attention)).
 
-    No norm in front. `mlp` is x -> W2 gelu(W1 x), widths 2 D, 8 D, D, without biases.
+    With `mlp`, it is x + LN(MLP([x, message])). The MLP is W2 gelu(W1 x) with widths 2 D, 8 D, D
+    and no biases. There is no norm before attention.
     """
 
     def __init__(self, width: int, mlp: bool) -> None:
@@ -102,16 +103,16 @@ class Attention(nn.Module):
         neighbours_BVJ: Tensor | None,
         mask: Tensor | None,
     ) -> Tensor:
-        """x (B, V, 4, L, C), each view reading `source` of itself or of its neighbours."""
+        """Return x (B, V, 4, L, C) after each view read `source` of itself or its neighbours."""
         q = self.q_proj(x_BVWLC)
         k = self.k_proj(source_BVWLC)
         v = self.v_proj(source_BVWLC)
         if neighbours_BVJ is not None:
             k, v = (_of_neighbours(x, neighbours_BVJ) for x in (k, v))
-            # Published weights expect this: keys are ordered by pixels, then views, but the mask is
-            # repeated view by view, so that with three and more views it falls on other keys.
+            # Published weights expect this order. Keys are ordered by pixels, then views, but the
+            # mask is repeated view by view: with three or more views it applies to other keys.
             mask = None if mask is None else mask.repeat(1, 1, neighbours_BVJ.shape[-1])
-        # In four axes, the windows as heads: with five, torch takes a slower way.
+        # Four axes, with windows as heads: with five, torch uses a slower kernel.
         q, k, v = (x.flatten(0, 1) for x in (q, k, v))
         mask = None if mask is None else mask[None].to(q)
         read = F.scaled_dot_product_attention(q, k, v, mask)
@@ -122,13 +123,13 @@ class Attention(nn.Module):
 
 
 def _of_neighbours(x_BVWLC: Tensor, neighbours_BVJ: Tensor) -> Tensor:
-    """Windows of the neighbours of each view, the view changing fastest: (B, V, 4, L J, C)."""
+    """Return windows of each view's neighbours (B, V, 4, L J, C); the view changes fastest."""
     scenes = torch.arange(len(x_BVWLC), device=x_BVWLC.device)[:, None, None]
     return rearrange(x_BVWLC[scenes, neighbours_BVJ], "n v j w l c -> n v w (l j) c")
 
 
 class Layer(nn.Module):
-    """Self-attention without an MLP, then cross-attention to other views with one."""
+    """Self-attention without an MLP, then cross-attention to other views with an MLP."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -137,19 +138,22 @@ class Layer(nn.Module):
 
     def forward(self, x_BVWLC: Tensor, neighbours_BVJ: Tensor, mask: Tensor | None) -> Tensor:
         own = self.self_attn(x_BVWLC, x_BVWLC, None, mask)
-        # Keys are the other views as they came into the layer; only the query has read itself.
+        # Keys are the other views before this layer; only the query has read itself.
         return self.cross_attn_ffn(own, x_BVWLC, neighbours_BVJ, mask)
 
 
 class WindowTransformer(nn.Module):
-    """Six layers over the maps of all views; in every second one windows are shifted by half."""
+    """Six layers over the maps of all views; every second one shifts windows by half a window."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.layers = nn.ModuleList(Layer(width) for _ in range(LAYERS))
 
     def forward(self, x_BVCHW: Tensor, neighbours_BVJ: Tensor) -> Tensor:
-        """Maps (B, V, C, H, W), with positions; `neighbours_BVJ` are the views that each reads."""
+        """Return maps (B, V, C, H, W) from maps with positions.
+
+        neighbours_BVJ: the views that each view reads.
+        """
         size = (x_BVCHW.shape[-2], x_BVCHW.shape[-1])
         shifted = (size[0] // SPLIT // 2, size[1] // SPLIT // 2)
         mask = shift_mask(*size, x_BVCHW.device)
