@@ -1,4 +1,4 @@
-"""Parts that several systems share: attention, rays of pixels, rotations, files of weights."""
+"""Parts that several systems share: attention, rays of pixels, rotations, weight files."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -15,20 +15,20 @@ from qgs.tokengs.blocks import merge_heads, split_heads
 from qgs.types import Cameras
 
 PIXEL_ENCODING = "camera centre; directions of z = 1: upper left corner, step across, step down"
-"""Of the rays of all points of a pixel or patch (B, N, 4, 3), which are affine in the place."""
+"""Encoding of the rays of a pixel or patch (B, N, 4, 3), which are affine in the place."""
 
 
 def self_attention(qkv_BTX: Tensor, heads: int, mask: Tensor | None = None) -> Tensor:
-    """softmax(q k / sqrt(d)) v (B, T, D) of queries, keys and values side by side (B, T, 3 D)."""
+    """Return softmax(q k / sqrt(d)) v (B, T, D) for concatenated q, k and v (B, T, 3 D)."""
     q_BhTd, k_BhTd, v_BhTd = (split_heads(part, heads) for part in qkv_BTX.chunk(3, -1))
     return merge_heads(F.scaled_dot_product_attention(q_BhTd, k_BhTd, v_BhTd, attn_mask=mask))
 
 
 @full_precision
 def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
-    """Rays of images (B, V) cut into rows x columns parts: (B, V * rows * columns, 4, 3).
+    """Return the rays of images (B, V) cut into rows x columns parts.
 
-    See PIXEL_ENCODING.
+    They are (B, V * rows * columns, 4, 3), encoded as in PIXEL_ENCODING.
     """
     height, width = cameras.size
     c2w = cameras.c2w
@@ -39,7 +39,7 @@ def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
     y_BVRC1 = repeat((upper - cy) / fy, "b v r -> b v r c 1", c=columns)
     right, down, ahead = (x_BV3[:, :, None, None] for x_BV3 in c2w[..., :3, :3].unbind(-1))
     corner = x_BVRC1 * right + y_BVRC1 * down + ahead
-    # Steps of one part.
+    # Steps across and down one part.
     across = right * (width / columns / fx)[..., None, None]
     below = down * (height / rows / fy)[..., None, None]
     origin = c2w[:, :, None, None, :3, 3]
@@ -49,9 +49,10 @@ def pixel_rays(cameras: Cameras, rows: int, columns: int) -> Tensor:
 
 @full_precision
 def quaternions(rotations: Tensor) -> Tensor:
-    """Unit quaternions w x y z (..., 4), up to sign, of rotation matrices (..., 3, 3)."""
+    """Return unit quaternions w x y z (..., 4), up to sign, of rotations (..., 3, 3)."""
     a, b, c, d, e, f, g, h, i = rotations.flatten(-2).unbind(-1)
-    # 4 q q^T: every row is the quaternion times four of its numbers; the longest loses no digits.
+    # 4 q q^T: each row is the quaternion times 4 times one of its numbers. The row with the
+    # largest diagonal entry is the most precise.
     outer = [
         1 + a + e + i, h - f, c - g, d - b,
         h - f, 1 + a - e - i, d + b, c + g,
@@ -65,43 +66,43 @@ def quaternions(rotations: Tensor) -> Tensor:
 
 
 def load_weights(file: str, fill: Callable[[Mapping[str, Tensor]], object], remedy: str) -> None:
-    """Call `fill` with the tensors of a file that the user has; none are shipped or downloaded.
+    """Call `fill` with the tensors of a weight file of the user; nothing is downloaded.
 
-    file: of safetensors, or of torch, whose tensors may stand below `model` or `state_dict`.
-    Raises MissingExtraError with the `remedy` where it is not there or `fill` cannot take it.
+    file: safetensors, or torch, where tensors may be under `model` or `state_dict`. Raises
+    MissingExtraError with the `remedy` if the file is missing or `fill` fails.
     """
     path = Path(file).expanduser()
     try:
         if path.suffix == ".safetensors":
             tensors = load_file(path)
         else:
-            # No code of strangers.
+            # Never run code from a file.
             tensors = torch.load(path, map_location="cpu", weights_only=True)
             for key in ("model", "state_dict"):
                 tensors = tensors.get(key, tensors)
         fill(tensors)
     except Exception as error:
-        # Whatever torch and safetensors raise about an absent, a damaged or another file.
+        # torch and safetensors raise many errors for missing, damaged and other files.
         what = f"cannot read weights of {path.name} ({type(error).__name__}: {error})"
         raise MissingExtraError(f"{what}; {remedy}") from error
 
 
 def mean_outcome(outcomes: Sequence[Outcome], **terms: Tensor) -> Outcome:
-    """The mean of `outcomes` of equally many losses, plus `terms`: 0-d, weighted, named.
+    """Return the mean of `outcomes`, plus `terms`, which are weighted and 0-d.
 
-    Raises ValueError for a term that is named as one of the outcomes'.
+    All outcomes have the same losses. Raises ValueError if a loss has the name of a term.
     """
     first = outcomes[0]
     share = 1 / len(outcomes)
-    # One of two equal names would be lost from the log.
+    # Of two equal names, the log would lose one.
     if taken := sorted(first.terms.keys() & terms.keys()):
         raise ValueError(f"the recipe's losses have terms {taken} already; rename the others")
     judged = {n: share * _sum(o.terms[n] for o in outcomes) for n in first.terms}
     signs = {n: share * _sum(o.signs[n] for o in outcomes) for n in first.signs}
-    # One collapsed pass is a sign that a mean would hide.
+    # The maximum, because a mean would hide a single collapsed pass.
     signs["deviation"] = torch.stack([o.signs["deviation"] for o in outcomes]).amax()
     total = share * _sum(o.total for o in outcomes) + _sum(terms.values())
-    # Numbers for the log; their graph would hold the memory of the step.
+    # Detached for the log: a graph would keep the memory of the step.
     detached = {n: term.detach() for n, term in terms.items()}
     return Outcome(total, judged | detached, signs)
 

@@ -1,7 +1,7 @@
 """`c3g/joint`: a decoder layer in which image tokens and queries attend to each other.
 
-`c3g/head`: from a query to its Gaussian, one by default (C3G). Axes: T = M + N tokens, those of the
-images first.
+`c3g/head`: head from a query to its Gaussians, one by default (C3G). Axes: T = M + N tokens, image
+tokens first.
 """
 
 import torch
@@ -19,10 +19,10 @@ from qgs_zoo.parts import self_attention
 
 
 class JointLayer(DecoderLayer):
-    """Self-attention over [image tokens; queries], then an MLP; both change (C3G).
+    """Decoder layer with self-attention over [image tokens; queries], then an MLP (C3G).
 
-    x + Attention(LayerNorm(x)), then x + MLP(LayerNorm(x)). There is no LayerScale.
-    Keys, values and rays of the memory stay.
+    It computes x + Attention(LayerNorm(x)), then x + MLP(LayerNorm(x)), without LayerScale. Image
+    tokens and queries both change. Keys, values and rays of the memory stay.
     """
 
     name = "joint"
@@ -31,9 +31,9 @@ class JointLayer(DecoderLayer):
 
     class Config(ComponentConfig):
         mlp_ratio: float = Field(default=2.0, ge=1)
-        """Hidden width of the MLP (rounded down) over the model's width."""
+        """Hidden width of the MLP, as a multiple of the model's width (rounded down)."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Added to the variance by every LayerNorm."""
+        """Number that every LayerNorm adds to the variance."""
 
     config: Config
 
@@ -47,12 +47,12 @@ class JointLayer(DecoderLayer):
         self.mlp = Mlp(width, int(config.mlp_ratio * width), width)
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Weight decay on all (C3G release)."""
+        """Return True: all parameters have weight decay (C3G release)."""
         return True
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
-        """Queries and image tokens that have read each other; nobody reads a masked query."""
-        # Image tokens stand first, so that slices tell them from queries.
+        """Return queries and image tokens that have read each other, but no masked query."""
+        # Image tokens come first, so that slices separate them from queries.
         tokens = memory.features.shape[1]
         x_BTD = torch.cat([memory.features, state.features], 1)
         x_BTD = x_BTD + self.attention(self.norm(x_BTD), state.mask)
@@ -62,34 +62,34 @@ class JointLayer(DecoderLayer):
         return state.replace(features=queries_BND), memory.replace(features=tokens_BMD)
 
     def attention(self, x_BTD: Tensor, mask_BN: Tensor | None) -> Tensor:
-        """softmax(q k / sqrt(d)) v over all tokens but masked queries, (B, T, D)."""
-        # Without a mask torch takes its fastest kernel.
+        """Return softmax(q k / sqrt(d)) v (B, T, D) over all tokens except masked queries."""
+        # Without a mask torch uses its fastest kernel.
         mask_B11T = None
         if mask_BN is not None:
             images = x_BTD.shape[1] - mask_BN.shape[1]
             mask_B11T = F.pad(mask_BN, (images, 0), value=True)[:, None, None]
-        # Queries that the mask leaves out still read: only nobody reads them.
+        # Masked queries still read other tokens, but no token reads them.
         return self.proj(self_attention(self.qkv(x_BTD), self.dims.heads, mask_B11T))
 
 
 CHANNELS = (3, 1, 3, 4, 3)
-"""Per Gaussian: position, opacity, scale, rotation, harmonic of degree 0 (C3G release)."""
+"""Channels per Gaussian: position, opacity, scale, rotation, harmonic of degree 0 (release)."""
 
 
 class C3GHead(Head):
-    """LayerNorm, then D -> K * 14 linear and the published activations in float32."""
+    """Head with LayerNorm, a linear layer D -> K * 14 and the published activations."""
 
     name = "head"
 
     class Config(ComponentConfig):
         gaussians_per_query: int = Field(default=1, ge=1)
-        """K, the Gaussians decoded from each query."""
+        """K, the number of Gaussians decoded from each query."""
         scale_unit: float = Field(default=0.001, gt=0)
-        """What the softplus of a raw scale is multiplied by, world units."""
+        """Factor of the softplus of raw scales, world units."""
         quat_eps: float = Field(default=1e-8, gt=0)
-        """Least length that a raw quaternion is divided by."""
+        """Lower bound of the length by which a raw quaternion is divided."""
         norm_eps: float = Field(default=NORM_EPS, gt=0)
-        """Added to the variance by the LayerNorm."""
+        """Number that the LayerNorm adds to the variance."""
 
     config: Config
 
@@ -99,23 +99,23 @@ class C3GHead(Head):
         self.linear = nn.Linear(dims.width, config.gaussians_per_query * sum(CHANNELS))
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """Weight decay on all (C3G release)."""
+        """Return True: all parameters have weight decay (C3G release)."""
         return True
 
     def forward(self, state: QueryState) -> GaussianAttributes:
-        """(B, N, D) -> attributes of (B, N, K) Gaussians."""
+        """Return attributes of (B, N, K) Gaussians from features (B, N, D)."""
         raw_BNC = self.linear(self.norm(state.features))
-        # All K Gaussians of a query come from one linear layer, channel by channel.
+        # One linear layer gives all K Gaussians of a query, Gaussian by Gaussian.
         return self.activate(rearrange(raw_BNC, "b n (k c) -> b n k c", c=sum(CHANNELS)))
 
     def activate(self, raw_BNKC: Tensor) -> GaussianAttributes:
-        """Raw channels (B, N, K, 14) to attributes, in float32 or better."""
+        """Return attributes from raw channels (B, N, K, 14), in float32 or better."""
         offsets, opacity, scale, rotation, sh = at_least_float32(raw_BNKC).split(CHANNELS, -1)
         return GaussianAttributes(
             offsets=offsets,
             scales=self.config.scale_unit * F.softplus(scale),
             quats=F.normalize(rotation, dim=-1, eps=self.config.quat_eps),
             opacities=torch.sigmoid(opacity[..., 0]),
-            # The release renders a harmonic of degree 0 and clips what it shows.
+            # The release renders a harmonic of degree 0 and clips the colour.
             colors=(0.5 + SH_C0 * sh).clamp(0, 1),
         )

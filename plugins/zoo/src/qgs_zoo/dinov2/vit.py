@@ -1,8 +1,8 @@
-"""DINOv2's vision transformer (Oquab et al., arXiv 2304.07193) under the names of its weights.
+"""DINOv2's vision transformer (Oquab et al., arXiv 2304.07193), with its parameter names.
 
-No register tokens, no mask token, MLPs with GELU: ViT-S, B and L with patches of 14. Written from
-facts of facebookresearch/dinov2 (Apache-2.0), without its code. `dinov2/multiview_vit` has its
-tokens beside rays, then ViT blocks over all views together.
+It covers ViT-S, B and L with patches of 14, MLPs with GELU, no register tokens and no mask token.
+It follows facebookresearch/dinov2 (Apache-2.0) without its code. `dinov2/multiview_vit` adds its
+tokens to embedded rays, and runs ViT blocks over all views together.
 """
 
 import math
@@ -24,24 +24,24 @@ from qgs_zoo.parts import load_weights, self_attention
 PATCH = 14
 """Side of a patch, pixels."""
 GRID = 37
-"""Patches a side of the images that the positions were trained on, 518 x 518."""
+"""Patches along a side of the images on which positions were trained, 518 x 518."""
 EPS = 1e-6
-"""Added to the variance by every LayerNorm."""
+"""Number that every LayerNorm adds to the variance."""
 SHIFT = 0.1
-"""Added to the number of patches a side before positions are resized (DINOv2 release)."""
+"""Number added to the patches along a side before positions are resized (DINOv2 release)."""
 
 
 class VitConfig(ComponentConfig):
-    """Sizes of the transformer: ViT-S by default."""
+    """Sizes and weights of the transformer; the defaults are those of ViT-S."""
 
     width: int = Field(default=384, ge=1)
-    """384 for ViT-S, 768 for ViT-B, 1024 for ViT-L."""
+    """Width of tokens: 384 for ViT-S, 768 for ViT-B, 1024 for ViT-L."""
     depth: int = Field(default=12, ge=1, le=256)
-    """Number of blocks: 12, or 24 for ViT-L."""
+    """Number of blocks: 12 for ViT-S and ViT-B, 24 for ViT-L."""
     heads: int = Field(default=6, ge=1)
-    """Attention heads: 6, 12 or 16, each of 64 channels."""
+    """Number of attention heads, each of 64 channels: 6, 12, 16 for ViT-S, B, L."""
     weights: str | None = None
-    """File of pretrained weights, .safetensors, .pth or .pt; null starts from random numbers."""
+    """File of pretrained weights: .safetensors, .pth or .pt. Null starts with random weights."""
 
     @field_validator("heads")
     @classmethod
@@ -85,7 +85,7 @@ class Block(nn.Module):
 
 
 class PatchEmbed(nn.Module):
-    """14 x 14 convolution with stride 14: (X, 3, 14 h, 14 w) -> (X, h w, C)."""
+    """Convolution 14 x 14 with stride 14: (X, 3, 14 h, 14 w) -> (X, h w, C)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -96,9 +96,9 @@ class PatchEmbed(nn.Module):
 
 
 class DinoV2(nn.Module):
-    """Images (X, 3, 14 h, 14 w), normalised by ImageNet's statistics, to tokens of their patches.
+    """Transformer from images (X, 3, 14 h, 14 w) to tokens of their patches.
 
-    X counts images: none sees another.
+    Images are normalised by ImageNet's statistics. Each of the X images is processed alone.
     """
 
     def __init__(self, width: int, depth: int, heads: int) -> None:
@@ -110,17 +110,17 @@ class DinoV2(nn.Module):
         self.norm = nn.LayerNorm(width, EPS)
         nn.init.normal_(self.cls_token, std=1e-6)
         nn.init.trunc_normal_(self.pos_embed, std=0.02)
-        # As the release starts; a checkpoint or the file of weights replaces all of it.
+        # The initial weights of the release; a checkpoint or weight file replaces all of them.
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.trunc_normal_(module.weight, std=0.02)
                 nn.init.zeros_(module.bias)
 
     def forward(self, images: Tensor, blocks: Collection[int]) -> list[Tensor]:
-        """Tokens (X, h w, C) after each of the `blocks` (0 is the first), after the last norm.
+        """Return tokens (X, h w, C) after each of the `blocks`; 0 is the first.
 
-        Every map passes the norm that training put behind the last block (DINOv2 release). Blocks
-        behind the last one of `blocks` are not run.
+        All of them pass the norm that follows the last block (DINOv2 release). Blocks after the
+        last one of `blocks` are not run.
         """
         grid = images.shape[-2] // PATCH, images.shape[-1] // PATCH
         x_XPC = self.patch_embed(images)
@@ -135,31 +135,32 @@ class DinoV2(nn.Module):
         return found
 
     def positions(self, rows: int, columns: int) -> Tensor:
-        """Embeddings (1, 1 + rows*columns, C), class token first, of a grid of another size."""
+        """Return embeddings (1, 1 + rows*columns, C) of a grid of any size, class token first."""
         if rows == columns == GRID:
             return self.pos_embed
-        # The class token has a position of its own, which is no place.
+        # The class token has its own embedding, which is not a place.
         own_1PC = self.pos_embed[:, 1:]
         map_1CGG = rearrange(own_1PC.float(), "x (g k) c -> x c g k", g=GRID)
-        # The release gives the factor, not the size: source coordinates step by 37 / (n + 0.1),
-        # and pretrained weights expect positions that are off by that much.
+        # The release passes the factor, not the size: source coordinates step by 37 / (n + 0.1).
+        # Pretrained weights expect this small error.
         factor = ((rows + SHIFT) / GRID, (columns + SHIFT) / GRID)
         resized_1Chw = F.interpolate(map_1CGG, scale_factor=factor, mode="bicubic")
         resized_1PC = resized_1Chw.flatten(2).mT.to(own_1PC.dtype)
         return torch.cat([self.pos_embed[:, :1], resized_1PC], 1)
 
     def load(self, file: str | None) -> None:
-        """Read pretrained weights from a file that the user has; None leaves what there is.
+        """Read pretrained weights from a file; None keeps the present weights.
 
-        Names are the hub's, or follow a prefix: `pretrained.` is that of Depth Anything V2. Other
-        tensors of the file are not read. Raises MissingExtraError for a file that does not fit.
+        Names are those of the hub, or these after a prefix, such as `pretrained.` of Depth Anything
+        V2. Other tensors of the file are ignored. Raises MissingExtraError for a file that does not
+        fit.
         """
         if file is not None:
             load_weights(
                 file,
                 self._fill,
-                "download DINOv2's, such as dinov2_vits14_pretrain.pth, and name the file in the "
-                "option `weights`, with its `width`, `depth` and `heads`",
+                "download weights of DINOv2, such as dinov2_vits14_pretrain.pth, and set `weights` "
+                "to the file and `width`, `depth` and `heads` to its sizes",
             )
 
     def _fill(self, weights: Mapping[str, Tensor]) -> None:
@@ -167,14 +168,14 @@ class DinoV2(nn.Module):
         mark = "patch_embed.proj.weight"
         prefix = next((n.removesuffix(mark) for n in weights if n.endswith(mark)), None)
         if prefix is None:
-            raise ValueError(f"there is no {mark}")
-        # The mask token and registers of a file have no place here.
+            raise ValueError(f"the file has no tensor {mark}")
+        # A mask token and registers in the file are ignored.
         found: dict[str, Any] = {n: weights[prefix + n] for n in own if prefix + n in weights}
         self.load_state_dict(found)
 
 
 class Tokens(nn.Module):
-    """Normalised images (X, 3, H, W) to tokens (X, H/P*W/P, D): DINOv2, linear, LayerNorm."""
+    """DINOv2, linear layer and LayerNorm: images (X, 3, H, W) to tokens (X, H/P*W/P, D)."""
 
     def __init__(self, config: VitConfig, width: int, patch_size: int) -> None:
         super().__init__()
@@ -185,7 +186,7 @@ class Tokens(nn.Module):
         self.norm = nn.LayerNorm(width, NORM_EPS)
 
     def forward(self, images_X3HW: Tensor) -> Tensor:
-        # Each patch of the model becomes 14 x 14 pixels, so that tokens of both share a grid.
+        # Each patch of the model becomes 14 x 14 pixels, so that both have the same grid of tokens.
         size = [side // self.patch_size * PATCH for side in images_X3HW.shape[-2:]]
         if list(images_X3HW.shape[-2:]) != size:
             images_X3HW = F.interpolate(images_X3HW, size, mode="bilinear", antialias=True)
@@ -193,19 +194,19 @@ class Tokens(nn.Module):
 
 
 class DinoMultiViewViT(MultiViewViT):
-    """`qgs/multiview_vit` whose colours are embedded by a pretrained DINOv2, one photo at a time.
+    """Encoder `qgs/multiview_vit` in which DINOv2 embeds the colours, one photo at a time.
 
-    Photos are resized so that a patch has DINOv2's 14 x 14 pixels: patches of 16 of 256 x 256
-    photos are those of 224 x 224 ones.
+    Photos are resized so that each patch has DINOv2's 14 x 14 pixels. For example, 256 x 256 photos
+    with patches of 16 are resized to 224 x 224.
     """
 
     name = "multiview_vit"
 
     class Config(MultiViewViT.Config):
         patch_size: int = Field(default=16, ge=1)
-        """Side of a patch, pixels of the photos; must divide both sides of the image."""
+        """Side of a patch, in pixels of the photos. It must divide both sides of the image."""
         vit: VitConfig
-        """DINOv2's sizes and weights; `{}` for a ViT-S that starts from random numbers."""
+        """Sizes and weights of DINOv2. `{}` is a ViT-S with random initial weights."""
 
     config: Config
 

@@ -1,4 +1,4 @@
-"""GlobalSplat for qgs: scene tokens in two streams, candidates merged by gates, two passes."""
+"""GlobalSplat for qgs: scene tokens in two streams, gated candidates, and two passes."""
 
 from qgs.contracts import Plugin
 from qgs_zoo.globalsplat.encoder import PosedPatches
@@ -30,11 +30,11 @@ plugin = Plugin(
     ),
     exemptions={
         Round: {
-            "masked_queries_are_not_read": "what a mask leaves out here are not places without a "
-            "query, but tokens that decode nothing: registers, which the others read"
+            "masked_queries_are_not_read": "masked tokens are not missing queries here, but "
+            "registers, which decode nothing and which all tokens read"
         },
         PosedPatches.Config(): {  # type: ignore[reportUnhashable]  # frozen, which pyright misses
-            "view_permutation": "its registers are of no view, so that its memory has no grid to "
+            "view_permutation": "its registers belong to no view, so its memory has no grid to "
             "permute by; its patches are permuted with their views, as without registers"
         },
     },

@@ -1,4 +1,4 @@
-"""`globalsplat/patches`: patches, their rays and their cameras, side by side, without a network."""
+"""`globalsplat/patches`: tokens of patches, their rays and their cameras, without attention."""
 
 import math
 from typing import Any
@@ -16,31 +16,33 @@ from qgs.tokengs import Mlp
 from qgs.types import Cameras, ImageMemory, Views
 
 REGISTER_STD = 0.02
-"""Standard deviation of the normal distribution that the registers start from."""
+"""Standard deviation of the initial registers, which are normally distributed."""
 
 
 class PosedPatches(PatchEncoder):
-    """A token of each patch: its colours beside its rays, to which its camera is added.
+    """Encoder with a token for each patch, in which embedded colours and rays are concatenated.
 
-    The features are `rgb_width` + `ray_width` wide, whatever the width of the model. Learned
-    registers, which are of no patch, stand behind the patches.
+    An embedding of the camera is added to that of the rays. Features are `rgb_width` + `ray_width`
+    wide, for any width of the model. Learned registers, which belong to no patch, follow the
+    patches.
     """
 
     name = "patches"
 
     class Config(PatchEncoder.Config):
-        """Defaults are GlobalSplat's; the size of a patch is ours."""
+        """Options with GlobalSplat's defaults, except for the patch size."""
 
         rgb_width: int = Field(default=512, ge=1)
-        """Channels of a token that are made of the patch's colours."""
+        """Number of channels of a token that embed the patch's colours."""
         ray_width: int = Field(default=256, ge=1)
-        """Channels of a token that are made of the patch's Plücker rays and of the camera."""
+        """Number of channels of a token that embed the patch's Plücker rays and the camera."""
         lens_width: int = Field(default=64, ge=1)
-        """Numbers that are made of focal lengths and principal point."""
+        """Width of the embedding of focal lengths and principal point."""
         bands: int = Field(default=4, ge=0)
-        """Frequencies of the encoding of a camera's position, which has the position itself too."""
+        """Number of frequencies in the encoding of a camera's position. 0 encodes the position
+        alone, which is always included."""
         registers: int = Field(default=4, ge=0)
-        """Learned tokens behind those of the patches."""
+        """Number of learned tokens after those of the patches. 0 means none."""
 
     config: Config
 
@@ -48,7 +50,7 @@ class PosedPatches(PatchEncoder):
         super().__init__(config, dims)
         rgb = config.rgb_width
         ray = config.ray_width
-        # Without biases, as LayerNorm follows in every stream.
+        # No biases, because a LayerNorm follows in every stream.
         side: Any = {"kernel_size": config.patch_size, "stride": config.patch_size, "bias": False}
         self.rgb_embedding = nn.Conv2d(3, rgb, **side)
         self.ray_embedding = nn.Conv2d(6, ray, **side)
@@ -59,16 +61,16 @@ class PosedPatches(PatchEncoder):
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Features of their own width, and a grid where there are no registers behind it."""
+        """Return features with their own width, and a grid if there are no registers."""
         features = {"memory.features": FieldSpec((config.rgb_width + config.ray_width,))}
         return features if config.registers else {**features, **memory_fields("grid")}
 
     def forward(self, views: Views) -> ImageMemory:
-        """The memory, with a grid where there are no registers."""
+        """Return the memory, with a grid if there are no registers."""
         grid = self.grid(views)
         rgb_BVPC = _tokens(self.rgb_embedding, 2 * views.images - 1)
         ray_BVPC = _tokens(self.ray_embedding, plucker_rays(views.cameras))
-        # A camera is the same for all its patches: added once for each view.
+        # A camera is the same for all its patches, so it is embedded once per view.
         camera_BVC = torch.cat(
             [self.lens_mlp(lens(views.cameras)), place(views.cameras, self.config.bands)], -1
         )
@@ -81,24 +83,24 @@ class PosedPatches(PatchEncoder):
 
 
 def _tokens(embedding: nn.Conv2d, images: Tensor) -> Tensor:
-    """(B, V, C, H, W) -> (B, V, patches, width)."""
+    """Embed images (B, V, C, H, W) as tokens (B, V, patches, width)."""
     x_XDHW = embedding(images.flatten(0, 1))
     return rearrange(x_XDHW, "(b v) d h w -> b v (h w) d", b=len(images))
 
 
 @full_precision
 def lens(cameras: Cameras) -> Tensor:
-    """(..., 4): log of the focal lengths, then the principal point, in sides of the image."""
+    """Return (..., 4): log of focal lengths, then principal point, in sides of the image."""
     height, width = cameras.size
     sides = constant([width, height], cameras.intrinsics)
     focal, principal = (cameras.intrinsics / sides.repeat(2)).chunk(2, -1)
-    # Logarithms: focal lengths of phones and telephotos differ by factors.
+    # Logarithms, because focal lengths of phones and telephotos differ by factors.
     return torch.cat([focal.log(), principal], -1)
 
 
 @full_precision
 def place(cameras: Cameras, bands: int) -> Tensor:
-    """(..., 3 + 6 bands): the centre x, then sin and cos of 2^k pi x for k = 0 .. bands - 1."""
+    """Return (..., 3 + 6 bands): centre x, then sin, cos of 2^k pi x for k = 0 .. bands - 1."""
     center = cameras.c2w[..., :3, 3]
     octaves = 2 ** torch.arange(bands, dtype=center.dtype, device=center.device)
     angles = (math.pi * octaves[:, None] * center[..., None, :]).flatten(-2)

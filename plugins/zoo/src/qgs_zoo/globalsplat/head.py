@@ -1,4 +1,4 @@
-"""`globalsplat/merging_head`: from two streams to Gaussians, candidates merged by gates.
+"""`globalsplat/merging_head`: head from two streams to candidates, merged into Gaussians.
 
 Axes: B scenes, N tokens, C candidates of a token, G Gaussians of a token.
 """
@@ -28,16 +28,17 @@ from qgs_zoo.globalsplat.streams import TEXTURE, TEXTURE_FIELD
 from qgs_zoo.parts import quaternions
 
 CHANNELS = (3, 3, 6, 1)
-"""Of geometry, per candidate: position, log scale, rotation, opacity; then the gate."""
+"""Geometry channels per candidate: position, log scale, rotation, opacity. The gate follows."""
 
 
 class MergingHead(Head):
-    """Candidates of every token, whose blocks a softmax gate merges into K = 2^level Gaussians.
+    """Head whose candidates are merged, block by block, into K = 2^level Gaussians per token.
 
-    Geometry decodes position, log scale, 6D rotation, opacity and gate; texture the coefficients of
-    spherical harmonics. Blocks are averaged: positions, rotations, coefficients, log scales, to
-    which log(size of the block) / 3 is added, and logs of transmittance, which opacities are.
-    Between two whole levels both are shown, with logs of transmittance scaled by their shares.
+    Geometry decodes position, log scale, 6D rotation, opacity and gate. Texture decodes the
+    coefficients of spherical harmonics. A softmax of gates averages each block: positions,
+    rotations, coefficients, log scales and logs of transmittance, which stand for opacities. Then
+    log(size of the block) / 3 is added to log scales. Between two whole levels, both levels are
+    rendered, with logs of transmittance scaled by their shares.
     """
 
     name = "merging_head"
@@ -46,23 +47,24 @@ class MergingHead(Head):
 
     class Config(ComponentConfig):
         candidates: int = Field(default=16, ge=1)
-        """Candidates of each token, a power of two."""
+        """Number of candidates of each token, a power of two."""
         level: float = Field(default=3.0, ge=0)
-        """s: each token gives 2^s Gaussians; between whole numbers, those of both neighbours."""
+        """s: each token gives 2^s Gaussians. Between whole numbers, the Gaussians of both
+        neighbouring levels are blended."""
         sh_degree: int = Field(default=3, ge=0, le=3)
-        """Degree of the spherical harmonics; 0 for colours that are the same from anywhere."""
+        """Degree of the spherical harmonics. 0 means colours that do not depend on direction."""
         init_std: float = Field(default=0.02, gt=0)
-        """Standard deviation of the truncated normal that the weights start from."""
+        """Standard deviation of the initial weights, from a truncated normal distribution."""
         position_std: float | None = Field(default=None, gt=0)
-        """The same for the weights that make positions; null for `init_std`."""
+        """Standard deviation of the initial weights of positions. Null means `init_std`."""
         scale_bias: float = -2.0
-        """Added to raw log scales."""
+        """Number added to raw log scales."""
         scale_min: float = Field(default=1e-4, gt=0)
-        """Scales of candidates are at least 1/e of it, world units."""
+        """Scales of candidates are at least 1/e times this, world units."""
         scale_max: float = Field(default=0.05, gt=0)
-        """Scales of candidates are at most e^2 times it, world units."""
+        """Scales of candidates are at most e^2 times this, world units."""
         opacity_bias: float = -5.0
-        """Added to the opacity logits."""
+        """Number added to the opacity logits."""
 
     config: Config
 
@@ -78,7 +80,7 @@ class MergingHead(Head):
             nn.init.zeros_(linear.bias)
             nn.init.trunc_normal_(linear.weight, std=config.init_std)
         if config.position_std is not None:
-            # Positions may start wider apart than scales and opacities do.
+            # Positions may start with a wider spread than scales and opacities.
             rows_C3D = torch.empty(config.candidates, CHANNELS[0], dims.width)
             nn.init.trunc_normal_(rows_C3D, std=config.position_std)
             with torch.no_grad():
@@ -91,25 +93,25 @@ class MergingHead(Head):
             reason = f"must be a power of two, got {config.candidates}"
             yield Problem("candidates", reason, f"write {2**most}")
         if config.level > most:
-            reason = f"2^{config.level:g} Gaussians cannot be merged of {config.candidates}"
+            reason = f"{config.candidates} candidates cannot form 2^{config.level:g} Gaussians"
             yield Problem("level", reason, f"write at most {most}, or raise `candidates`")
         if config.scale_min >= config.scale_max:
-            reason = f"it is not below `scale_max`, {config.scale_max:g}"
-            yield Problem("scale_min", reason, "write a smaller one")
+            reason = f"must be below `scale_max`, which is {config.scale_max:g}"
+            yield Problem("scale_min", reason, f"write a number below {config.scale_max:g}")
 
     @classmethod
     def fields_written(cls, config: Config) -> Fields:
-        """Harmonics, unless their degree is 0."""
+        """Return the field of harmonics, or no field if their degree is 0."""
         sh = "gaussians.sh"
         return {sh: GAUSSIAN_FIELDS[sh]} if config.sh_degree else {}
 
     @property
     def gaussians_per_query(self) -> int:
-        """K at the present level; during a blend that of both its levels."""
+        """K at the current level; during a blend, the sum over both levels."""
         return sum(count for count, _ in stages(self.config.level))
 
     def forward(self, state: QueryState) -> GaussianAttributes:
-        """Candidates, merged, and what they are of Gaussians."""
+        """Return attributes of the Gaussians merged from the candidates of all tokens."""
         each = (self.config.candidates, -1)
         geometry = self.geometry(self.geometry_norm(state.features)).unflatten(-1, each)
         texture = self.texture(self.texture_norm(state[TEXTURE])).unflatten(-1, each)
@@ -117,7 +119,10 @@ class MergingHead(Head):
 
     @full_precision
     def activate(self, geometry: Tensor, texture: Tensor) -> GaussianAttributes:
-        """Raw channels (B, N, C, 14) and (B, N, C, 48) to attributes, in float32 or better."""
+        """Return attributes from raw channels (B, N, C, 14) and (B, N, C, 3 (degree + 1)^2).
+
+        They are float32 or better.
+        """
         gates = geometry[..., -1]
         candidates = torch.cat([self.bounded(geometry[..., :-1]), texture], -1)
         parts = []
@@ -132,20 +137,20 @@ class MergingHead(Head):
         return self._attributes(torch.cat(parts, 2))
 
     def bounded(self, raw: Tensor) -> Tensor:
-        """Raw candidates (..., 13), with what is merged: log scales and logs of transmittance."""
+        """Turn raw candidates (..., 13) into bounded log scales and logs of transmittance."""
         place, log_scale, rotation, opacity = raw.split(CHANNELS, -1)
         config = self.config
         low = math.log(config.scale_min) - 1
         high = math.log(config.scale_max) + 2
         log_scale = (log_scale + config.scale_bias).clamp(low, high)
-        # Zeros would be no rotation; this starts every candidate at the identity.
+        # Zeros are not a rotation; with this, every candidate starts at the identity.
         rotation = rotation + constant([1, 0, 0, 0, 1, 0], rotation)
-        # Logs of transmittance add up where Gaussians overlap; opacities do not.
+        # Where Gaussians overlap, logs of transmittance add up, but opacities do not.
         clear = -F.softplus(opacity + config.opacity_bias)
         return torch.cat([place, log_scale, rotation, clear], -1)
 
     def _attributes(self, x_BNKX: Tensor) -> GaussianAttributes:
-        """Of merged candidates."""
+        """Return the attributes of merged candidates."""
         offsets, log_scale, rotation, clear, texture = x_BNKX.split(
             (*CHANNELS, 3 * self.coefficients), -1
         )
@@ -161,29 +166,32 @@ class MergingHead(Head):
 
 
 LEAST_LENGTH = 1e-4
-"""What a vector is divided by at least when it is made a unit one."""
+"""Least length by which a vector is divided when it is normalised."""
 
 
 @full_precision
 def merged(candidates: Tensor, gates: Tensor, count: int) -> Tensor:
-    """Blocks of C / count candidates, averaged by the softmax of their gates.
+    """Average blocks of C / count candidates with the softmax of their gates.
 
     candidates: (..., C, X). gates: (..., C). Returns (..., count, X).
     """
-    # Gates compete within their block alone, so that blocks stay independent.
+    # Gates compete only within their block, so that blocks stay independent.
     weights = gates.unflatten(-1, (count, -1)).softmax(-1)
     return (weights[..., None] * candidates.unflatten(-2, (count, -1))).sum(-2)
 
 
 def growth(candidates: int, count: int) -> float:
-    """Added to the log scales of `count` Gaussians merged of `candidates`: they fill one volume."""
+    """Return the number added to log scales so that merged Gaussians keep the total volume.
+
+    `candidates` candidates are merged into `count` Gaussians.
+    """
     return math.log(candidates / count) / 3
 
 
 def stages(level: float) -> list[tuple[int, float]]:
-    """Numbers of Gaussians that are shown at s = `level`, and the share of each.
+    """Return the numbers of Gaussians that are rendered at s = `level`, with their shares.
 
-    2^s with the share 1 for a whole s; else those of both neighbours, blended.
+    A whole s gives 2^s with share 1. Other s give the numbers of both neighbouring levels.
     """
     low = math.floor(level)
     share = level - low
@@ -192,10 +200,10 @@ def stages(level: float) -> list[tuple[int, float]]:
 
 @full_precision
 def rotation_6d(vectors: Tensor) -> Tensor:
-    """Unit quaternions (..., 4), w x y z, of the rotations whose first two columns are nearest.
+    """Return unit quaternions (..., 4), w x y z, of rotations given by their first two columns.
 
-    vectors: (..., 6), two columns, orthonormalised in their order (Zhou et al. 2019). Where they do
-    not tell a rotation (zeros, parallel ones) the quaternion is a unit one still.
+    vectors: (..., 6), two columns, which are orthonormalised in order (Zhou et al. 2019). If they
+    define no rotation (zeros, parallel columns), the quaternion still has unit length.
     """
     first, second = vectors.split(3, -1)
     first = F.normalize(first, dim=-1, eps=LEAST_LENGTH)

@@ -1,6 +1,6 @@
-"""`globalsplat/frustum`, `globalsplat/regularisers`: Gaussians in sight, few, small.
+"""`globalsplat/frustum`, `globalsplat/regularisers`: losses for visible, few and small Gaussians.
 
-`globalsplat/two_passes`: two predictions of one scene, from different photos, should agree.
+`globalsplat/two_passes`: objective by which predictions from different photos should agree.
 """
 
 import math
@@ -28,16 +28,16 @@ from qgs_zoo.parts import mean_outcome
 
 
 class Frustum(Loss):
-    """Mean over Gaussians of `beyond_frusta` of the input cameras."""
+    """Mean of `beyond_frusta` over Gaussians, with the frusta of the input cameras."""
 
     name = "frustum"
     renderings = "none"
 
     class Config(Loss.Config):
         weight: float = Field(default=0.01, ge=0)
-        """Factor of the term in the objective."""
+        """Weight of the loss in the objective."""
         softness: float = Field(default=0.05, gt=0)
-        """Distance to a border of a view within which it is felt, world units."""
+        """Distance from a border of a view at which the loss starts to act, world units."""
         near: float = Field(default=0.05, ge=0)
         """Camera-frame z of the near plane, world units."""
 
@@ -52,7 +52,7 @@ class Frustum(Loss):
 
 
 class Regularisers(Loss):
-    """Mean opacity and mean scale (as in Kheradmand et al. 2024, 3DGS as MCMC)."""
+    """Mean opacity and mean scale as losses (Kheradmand et al. 2024, 3DGS as MCMC)."""
 
     name = "regularisers"
     scheduled = frozenset({"weight", "opacity_weight", "scale_weight"})
@@ -60,16 +60,16 @@ class Regularisers(Loss):
 
     class Config(Loss.Config):
         opacity_weight: float = Field(default=0.01, ge=0)
-        """Factor of the mean opacity."""
+        """Weight of the mean opacity."""
         scale_weight: float = Field(default=0.01, ge=0)
-        """Factor of the mean scale, world units."""
+        """Weight of the mean scale, world units."""
 
     config: Config
 
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> dict[str, Tensor]:
-        """Terms `mean_opacity`, `mean_scale`."""
+        """Return the terms `mean_opacity` and `mean_scale`."""
         gaussians = prediction.gaussians
         # Means, not sums: the number of Gaussians changes with the level.
         opacity = mean_of_gaussians(gaussians.opacities, prediction)
@@ -82,16 +82,17 @@ class Regularisers(Loss):
 
 @full_precision
 def beyond_frusta(points: Tensor, cameras: Cameras, softness: float, near: float) -> Tensor:
-    """How far points (B, P, 3) are outside of all views, (B, P), world units, smooth, at least 0.
+    """Return the smooth distances (B, P) >= 0 of points (B, P, 3) from all views, world units.
 
-    A view is five half-spaces, its four borders and the near plane. Per view, softplus of the
-    distance beyond each, added up; then the soft minimum over views, -t log mean exp(-x / t). It
-    has a gradient everywhere, behind a camera too, and divides by no depth.
+    A view is the intersection of five half-spaces: four borders and the near plane. Each view sums
+    the softplus of the distance beyond each. The result is the soft minimum over views,
+    -t log mean exp(-x / t). It has a gradient everywhere, also behind a camera, and never divides
+    by a depth.
     """
     x, y, z = to_camera(points, cameras).unbind(-1)
     fx, fy, cx, cy = cameras.intrinsics[..., None, :].unbind(-1)
     height, width = cameras.size
-    # Signed distances to planes through the camera's centre, so that nothing is divided by depth.
+    # Signed distances to planes through the camera's centre: no division by depth.
     borders = [(x, fx, cx), (-x, fx, width - cx), (y, fy, cy), (-y, fy, height - cy)]
     inside = [(focal * side + c * z) / torch.hypot(focal, c) for side, focal, c in borders]
     depths = torch.stack([*inside, z - near])  # positive inside
@@ -105,37 +106,37 @@ FIX = "raise views.inputs, or choose `objective: {type: qgs/one_pass}`"
 
 
 class TwoPasses(Objective):
-    """Two predictions, each from every other inner view and both end views, judged and compared.
+    """Objective of two predictions, each from both end views and every other view between them.
 
-    Their renderings from the target cameras are compared in alpha and depth; each is pulled to the
-    other one, which stands still meanwhile.
+    Both get the recipe's losses. Their renderings from the target cameras are also compared in
+    alpha and depth. Each is pulled towards the other, which is held fixed.
     """
 
     name = "two_passes"
     scheduled = frozenset({"alpha_weight", "depth_weight"})
 
     class Config(ComponentConfig):
-        """Defaults are GlobalSplat's."""
+        """Options with GlobalSplat's defaults."""
 
         alpha_weight: float = Field(default=1e-3, ge=0)
-        """Factor of the difference of the alphas."""
+        """Weight of the difference of the alphas."""
         depth_weight: float = Field(default=1e-2, ge=0)
-        """Factor of the difference of the depths, world units."""
+        """Weight of the difference of the depths, world units."""
 
     config: Config
 
     @classmethod
     def problems(cls, config: ComponentConfig, context: RecipeContext) -> Iterable[Problem]:
-        """Fewer input views than two different passes need."""
+        """Report too few input views for two different passes."""
         if context.inputs is not None and context.inputs < LEAST_VIEWS:
             reason = (
-                f"it needs at least {LEAST_VIEWS} input views, got {context.inputs}: its passes "
-                "share the first and the last, and would both be the same"
+                f"it needs at least {LEAST_VIEWS} input views, got {context.inputs}: both passes "
+                "use the first and the last view, so they would be the same"
             )
             yield Problem("", reason, FIX)
 
     def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
-        """Adds the terms `alpha_consistency` and `depth_consistency`."""
+        """Return the mean outcome, with the terms `alpha_consistency`, `depth_consistency`."""
         count = inputs.images.shape[1]
         outcomes = list[Outcome]()
         renderings = list[Rendering]()
@@ -143,7 +144,7 @@ class TwoPasses(Objective):
             some = inputs.select(subset(count, part))
             prediction = passes.predict(some)
             outcomes.append(passes.judge(prediction, targets, some))
-            # Both are drawn from the target cameras, which neither pass has seen.
+            # Both are rendered from the target cameras, which neither pass has seen.
             renderings.append(passes.render(prediction.gaussians, targets.cameras))
         one, other = renderings
         return mean_outcome(
@@ -154,16 +155,17 @@ class TwoPasses(Objective):
 
 
 def subset(count: int, part: int) -> list[int]:
-    """The first and the last of `count` views, and every other one between them."""
+    """Return the first and the last of `count` views, and every other one between them."""
     return [0, *range(1 + part, count - 1, 2), count - 1]
 
 
 @full_precision
 def disagreement(one: Tensor, other: Tensor) -> Tensor:
-    """Mean |one - other|, 0-d; each side gets half of the gradient, with the other one held.
+    """Return the mean |one - other|, 0-d, as two halves in which one side gets no gradient.
 
-    The symmetric stop-gradient of the paper, averaged; a sum would give the whole gradient.
+    This is the symmetric stop-gradient of the paper. It is averaged; a sum would double the
+    gradient.
     """
-    # Without holding one side both would drift to the blurred mean.
+    # If neither side were held fixed, both would drift to the blurred mean.
     held = (one - other.detach()).abs().mean(), (other - one.detach()).abs().mean()
     return (held[0] + held[1]) / 2

@@ -1,5 +1,7 @@
-"""`globalsplat/slots`, `globalsplat/round`: tokens as two streams, geometry and texture, which read
-the photos and are then mixed."""
+"""`globalsplat/slots`, `globalsplat/round`: tokens in two streams, geometry and texture.
+
+Both streams read the photos and are then mixed.
+"""
 
 from collections.abc import Iterable
 
@@ -24,29 +26,29 @@ from qgs.tokengs.encoder import EncoderBlock, keys_and_values
 from qgs.types import ImageMemory, QueryState
 
 TEXTURE = "globalsplat.texture"
-"""State field (B, N, D): the stream of texture; that of geometry are the features."""
+"""State field (B, N, D) of the stream of texture. The stream of geometry is the features."""
 
 TEXTURE_FIELD: Fields = {TEXTURE: FieldSpec(("D",))}
 
 
 class SlotQueries(LearnedQueries):
-    """N learned tokens; the last `extra` decode no Gaussians, the mask leaves them out.
+    """N learned tokens, of which the last `extra` are masked and decode no Gaussians.
 
-    Geometry = Linear(LayerNorm(token)), texture = another Linear(LayerNorm(token)).
+    Geometry is Linear(LayerNorm(token)). Texture is another Linear(LayerNorm(token)).
     """
 
     name = "slots"
     writes = TEXTURE_FIELD
 
     class Config(ComponentConfig):
-        """Defaults are GlobalSplat's."""
+        """Options with GlobalSplat's defaults."""
 
         count: int = Field(default=2057, ge=1)
         """N, the number of all tokens."""
         extra: int = Field(default=9, ge=0)
-        """Tokens among them that decode no Gaussians (4 auxiliary, 1 of scale, 4 registers)."""
+        """Number of tokens that decode no Gaussians (4 auxiliary, 1 of scale, 4 registers)."""
         std: float = Field(default=0.02, gt=0)
-        """Standard deviation of the normal distribution that the tokens start from."""
+        """Standard deviation of the initial tokens, which are normally distributed."""
 
     config: Config
 
@@ -61,15 +63,15 @@ class SlotQueries(LearnedQueries):
 
     @classmethod
     def problems(cls, config: Config, context: RecipeContext) -> Iterable[Problem]:
-        """No token that decodes Gaussians."""
+        """Report options with which no token decodes Gaussians."""
         if config.extra >= config.count:
             reason = f"all {config.count} tokens are extra ones, which decode no Gaussians"
             yield Problem("extra", reason, f"write at most {config.count - 1}, or raise `count`")
 
     def start(self, batch_size: int) -> QueryState:
-        """The two streams of all tokens, the same in every scene."""
+        """Return the two streams of all tokens, which are the same in every scene."""
         tokens_ND = self.slots if self.extra is None else torch.cat([self.slots, self.extra])
-        # A state field stays float32 under autocast, as features need not.
+        # A state field must stay float32 under autocast; features need not.
         streams = (self.geometry(tokens_ND), at_least_float32(self.texture(tokens_ND)))
         geometry_BND, texture_BND = (x.expand(batch_size, -1, -1) for x in streams)
         return QueryState(
@@ -84,33 +86,33 @@ class SlotQueries(LearnedQueries):
 
 
 class Round(DecoderLayer):
-    """Each stream: cross-attention, MLP, ViT blocks over the tokens; then a mixer of both.
+    """Decoder layer: cross-attention, MLP and ViT blocks in each stream, then a mixer of both.
 
-    `decoder.layer_scale` is that of cross-attention, MLP and mixer (GlobalSplat: 1e-3). Tokens that
-    the mask leaves out decode no Gaussians, but all tokens read them: they are registers.
+    `decoder.layer_scale` applies to cross-attention, MLP and mixer (GlobalSplat: 1e-3). Masked
+    tokens decode no Gaussians, but all tokens read them, as registers.
     """
 
     name = "round"
     writes = TEXTURE_FIELD
 
     class Config(ComponentConfig):
-        """Defaults are GlobalSplat's."""
+        """Options with GlobalSplat's defaults."""
 
         memory_width: int | None = Field(default=None, ge=1)
-        """Width of the image memory's features where the encoder has one of its own (of
-        globalsplat/patches, rgb_width + ray_width); null for features of the model's width."""
+        """Width of the image memory's features, if the encoder has its own width
+        (globalsplat/patches: rgb_width + ray_width). Null means the model's width."""
         blocks: int = Field(default=2, ge=0)
-        """ViT blocks of each stream."""
+        """Number of ViT blocks in each stream."""
         block_layer_scale: float = Field(default=0.01, gt=0)
         """Initial value of every LayerScale factor of the ViT blocks."""
         mlp_ratio: float = Field(default=4.0, ge=1)
-        """Hidden width (rounded down) of the streams' MLPs over the model's width."""
+        """Hidden width of the streams' MLPs, as a multiple of the model's width (rounded down)."""
 
     def __init__(self, config: Config, parts: LayerParts) -> None:
         super().__init__(config, parts)
         dims = parts.dims
         layer_scale = parts.layer_scale
-        # Two sets of weights: shape and colour look for different things in the photos.
+        # Two sets of weights: shape and colour need different information from the photos.
         self.geometry = Stream(config, dims, layer_scale)
         self.texture = Stream(config, dims, layer_scale)
         self.geometry_norm = nn.LayerNorm(dims.width)
@@ -120,14 +122,14 @@ class Round(DecoderLayer):
 
     @classmethod
     def fields_read(cls, config: Config) -> Fields:
-        """Features of the memory, as wide as the options say, and the stream of texture."""
+        """Return the memory's features, with the width of the options, and the texture stream."""
         return {"memory.features": FieldSpec((config.memory_width or "D",)), **TEXTURE_FIELD}
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
-        """One round; the memory is passed on."""
+        """Run one round; the memory stays unchanged."""
         geometry_BND = self.geometry(state.features, memory.features)
         texture_BND = self.texture(state[TEXTURE], memory.features)
-        # The mixer alone lets the streams see each other.
+        # Only in the mixer do the streams see each other.
         both = [self.geometry_norm(geometry_BND), self.texture_norm(texture_BND)]
         update = self.mixer_scale(self.mixer(torch.cat(both, -1)))
         to_geometry_BND, to_texture_BND = update.chunk(2, -1)
@@ -136,9 +138,12 @@ class Round(DecoderLayer):
 
 
 class Stream(nn.Module):
-    """(x (B, N, D), memory (B, M, C)) -> x: pre-norm, each update scaled and added."""
+    """One stream of a round: x (B, N, D) and memory (B, M, C) to x.
 
-    # Adds the same to all logits of a query.
+    It is pre-norm. Each update is scaled and added.
+    """
+
+    # This bias adds the same number to all logits of a query.
     unlearned = ("k_norm.bias",)
 
     def __init__(self, config: Round.Config, dims: ModelDims, layer_scale: float) -> None:
@@ -160,7 +165,7 @@ class Stream(nn.Module):
         )
 
     def forward(self, x_BND: Tensor, memory_BMC: Tensor) -> Tensor:
-        """The stream after its reading, its MLP and its blocks."""
+        """Return the stream after cross-attention, MLP and blocks."""
         keys, values = keys_and_values(self.memory_norm(memory_BMC), self.kv_proj, self.k_norm)
         x_BND = x_BND + self.cross_scale(self.cross_attention(x_BND, keys, values))
         x_BND = x_BND + self.mlp_scale(self.mlp(self.norm(x_BND)))

@@ -1,9 +1,8 @@
-"""`lpips/vgg16`, a loss and a metric: LPIPS with a VGG-16 (Zhang et al., 2018, arXiv 1801.03924).
+"""`lpips/vgg16`, a loss and a metric: LPIPS with VGG-16 (Zhang et al., 2018, arXiv 1801.03924).
 
-It is version 0.1 of the release.
-
-The `lpips` package supplies the learned weights of the layers. Its own network is not imported: it
-takes VGG-16 from torchvision, whose wheels work with CUDA builds of torch only.
+It is version 0.1 of the release. The learned weights of the layers come from the `lpips` package.
+Its network is not imported, because it needs torchvision, whose wheels work only with CUDA builds
+of torch.
 """
 
 from collections.abc import Iterable, Mapping
@@ -30,10 +29,10 @@ from qgs.precision import full_precision
 from qgs.types import LayerPrediction, Rendering, Views
 from qgs_zoo.parts import load_weights
 
-# torchvision's VGG-16 in torch's cache.
+# The file of torchvision's VGG-16 in torch's cache.
 _VGG_FILE = "vgg16-397923af.pth"
 _BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
-"""Convolutions of VGG-16 by torchvision's numbers; a 2x2 max pooling stands between blocks."""
+"""Torchvision's numbers of VGG-16's convolutions; a 2x2 max pooling is between blocks."""
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 _EPS = 1e-10
@@ -41,20 +40,20 @@ SMALLEST_SIDE = 2 ** (len(_BLOCKS) - 1)
 
 
 class PerceptualDistance(nn.Module):
-    """LPIPS of images against the truth, with fixed weights; `load` reads them."""
+    """LPIPS of images against the truth, with fixed weights, which `load` reads."""
 
     @full_precision
     def forward(self, images: Tensor, truth: Tensor) -> Tensor:
-        """(X,), 0 for equal ones, of images (X, 3, H, W) in [0, 1]; with a gradient in `images`.
+        """Return LPIPS (X,) of images (X, 3, H, W) in [0, 1]; equal images give 0.
 
-        Raises ValueError when a side is shorter than 16 pixels.
+        Only `images` get a gradient. Raises ValueError if a side is shorter than 16 pixels.
         """
         if min(images.shape[-2:]) < SMALLEST_SIDE:
             raise ValueError(
                 f"LPIPS needs images of at least {SMALLEST_SIDE} pixels a side, got "
                 f"{images.shape[-2]}x{images.shape[-1]}"
             )
-        # The photos are given: half of the network's gradients are never needed.
+        # The truth is fixed, so it needs no gradients.
         with torch.no_grad():
             wanted = self._features(truth)
         total = images.new_zeros(len(images))
@@ -63,24 +62,24 @@ class PerceptualDistance(nn.Module):
         return total
 
     def _features(self, images: Tensor) -> list[Tensor]:
-        """The outputs of the blocks, each pixel's channels of length 1."""
+        """Return the outputs of the blocks; the channels of each pixel have length 1."""
         x = images * 2 - 1
         shift, scale = (x.new_tensor(values)[:, None, None] for values in (_SHIFT, _SCALE))
         x = (x - shift) / scale
         found = []
         for index, block in enumerate(self.blocks):
             x = block(F.max_pool2d(x, 2) if index else x)
-            # Unit length for each pixel, so that no channel counts for its size.
+            # Unit length for each pixel, so that the size of activations does not count.
             found.append(x / (x.norm(dim=1, keepdim=True) + _EPS))
         return found
 
     def load(self, weights: str | None) -> None:
-        """Read the weights; nothing is downloaded.
+        """Read the weights from files; nothing is downloaded.
 
-        weights: file of VGG-16 (safetensors, or torchvision's); None for the one in torch's cache.
-        Raises MissingExtraError where they are not there or do not fit.
+        weights: file of VGG-16 (safetensors, or torchvision's); None uses the one in torch's cache.
+        Raises MissingExtraError if files are missing or do not fit.
         """
-        # Found, not imported: the package imports torchvision.
+        # The package is only located: importing it would import torchvision.
         package = find_spec("lpips")
         if package is None or not package.submodule_search_locations:
             raise MissingExtraError(
@@ -116,16 +115,16 @@ def _layers(vgg: Mapping[str, Tensor], number: int) -> tuple[nn.Conv2d, nn.ReLU]
 
 
 class LpipsLoss(Loss):
-    """Mean LPIPS of the views, of VGG-16 (TokenGS 2026.6); nothing is downloaded."""
+    """Mean LPIPS of the views with VGG-16 (TokenGS 2026.6); nothing is downloaded."""
 
     name = "vgg16"
     renderings = "each"
 
     class Config(Loss.Config):
         weight: float = Field(default=0.5, ge=0)
-        """Factor of the term in the objective."""
+        """Weight of the loss in the objective."""
         weights: str | None = None
-        """File of VGG-16 weights (safetensors, or torchvision's vgg16-397923af.pth); null takes
+        """File of VGG-16 weights (safetensors, or torchvision's vgg16-397923af.pth). Null uses
         the one in torch's cache."""
 
     config: Config
@@ -144,14 +143,17 @@ class LpipsLoss(Loss):
     def term(
         self, prediction: LayerPrediction, rendering: Rendering, target: Views, inputs: Views
     ) -> Tensor:
-        """Raises ValueError for images below 16 pixels a side."""
+        """Return the mean LPIPS.
+
+        Raises ValueError if a side of the images is shorter than 16 pixels.
+        """
         images = rendering.rgb.flatten(0, 1)
         truth = target.images.flatten(0, 1)
         return self.network(images, truth).mean()
 
 
 class Lpips(Metric):
-    """LPIPS, distance of each view to the truth in features of VGG-16; nothing is downloaded."""
+    """LPIPS: distance of each view from the truth in VGG-16 features; nothing is downloaded."""
 
     name = "vgg16"
     definition = "VGG-16, version 0.1, images in [-1, 1]"
@@ -162,7 +164,7 @@ class Lpips(Metric):
         """Options of LPIPS."""
 
         weights: str | None = None
-        """File of VGG-16 weights (safetensors, or torchvision's vgg16-397923af.pth); null takes
+        """File of VGG-16 weights (safetensors, or torchvision's vgg16-397923af.pth). Null uses
         the one in torch's cache."""
 
     config: Config
@@ -172,15 +174,18 @@ class Lpips(Metric):
         self.network = PerceptualDistance()
 
     def load_pretrained(self) -> None:
-        """See `Component`."""
+        """Read the weights of VGG-16 and of LPIPS."""
         self.network.load(self.config.weights)
 
     def forward(self, given: MetricInput) -> Tensor:
-        """(1, T). Raises ValueError when a side is shorter than 16 pixels."""
+        """Return LPIPS (1, T) of each target view.
+
+        Raises ValueError if a side is shorter than 16 pixels.
+        """
         return self.distance(given.images, given.targets.images)
 
     @torch.no_grad()
     def distance(self, images: Tensor, truth: Tensor) -> Tensor:
-        """LPIPS of images (..., 3, H, W), clipped to [0, 1] -> (...), 0 for equal ones."""
+        """Return LPIPS (...) of images (..., 3, H, W) clipped to [0, 1]; equal images give 0."""
         pairs = zip(*(x.clamp(0, 1).flatten(0, -4).split(1) for x in (images, truth)), strict=True)
         return torch.cat([self.network(*pair) for pair in pairs]).reshape(images.shape[:-3])

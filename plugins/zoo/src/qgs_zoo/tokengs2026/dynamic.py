@@ -1,4 +1,7 @@
-"""Queries of moving scenes: static, and dynamic for the requested time (TokenGS 2026.6)."""
+"""Queries for moving scenes: static ones, and dynamic ones for the requested time.
+
+They are those of TokenGS 2026.6.
+"""
 
 from collections.abc import Iterable
 
@@ -26,27 +29,28 @@ from qgs_zoo.parts import mean_outcome
 from qgs_zoo.tokengs2026.multiscale import TimeEmbedding, without_times
 
 MOVES = "dynamic.moves"
-"""Field (B, N), bool: True for dynamic queries, which stand for the requested time."""
+"""Field (B, N), bool: True for dynamic queries, which depend on the requested time."""
 _FIELDS: Fields = {MOVES: FieldSpec((), torch.bool)}
 
 
 class DynamicQueries(Queries):
-    """N learned vectors; to the last of them, the dynamic ones, the requested time is added."""
+    """N learned queries; the last ones are dynamic: the requested time is added to them."""
 
     name = "dynamic"
     reads_cameras = False
 
     class Config(ComponentConfig):
         count: int = Field(default=1280, ge=1)
-        """N, the number of queries, static and dynamic (TokenGS: 1024 and 256)."""
+        """N, the number of static and dynamic queries (TokenGS: 1024 and 256)."""
         dynamic: int = Field(default=256, ge=0)
-        """Number of dynamic queries, the last of the N; with 0 all queries get the time."""
+        """Number of dynamic queries, which are the last of the N. With 0, all queries get the
+        time."""
         std: float = Field(default=0.02, ge=0)
-        """Standard deviation of the normal distribution that the features start from."""
+        """Standard deviation of the initial features, which are normally distributed."""
         time_channels: int = Field(default=2, ge=0, multiple_of=2)
-        """Channels that the requested time is embedded with; 0 for none."""
+        """Number of channels that encode the requested time. 0 ignores the time."""
         patch_size: int = Field(default=8, ge=1)
-        """Side of the patches that embed the time; the release takes the encoder's."""
+        """Side of the patches that embed the time. The release uses that of the encoder."""
 
     config: Config
 
@@ -66,7 +70,7 @@ class DynamicQueries(Queries):
         if config.dynamic >= config.count:
             yield Problem(
                 "dynamic",
-                f"{config.dynamic} dynamic queries leave none of {config.count} to be static",
+                f"{config.dynamic} dynamic queries of {config.count} leave no static ones",
                 f"set dynamic to {config.count - 1} or less, or raise count",
             )
 
@@ -75,7 +79,7 @@ class DynamicQueries(Queries):
         return _FIELDS if config.dynamic else {}
 
     def forward(self, memory: ImageMemory, views: Views) -> QueryState:
-        """With dynamic ones, the field `dynamic.moves` (B, N).
+        """Return the queries, with the field `dynamic.moves` (B, N) if some are dynamic.
 
         Raises ValueError for views without a target time.
         """
@@ -83,13 +87,13 @@ class DynamicQueries(Queries):
         batch = len(memory.features)
         parts: list[Tensor] = [self.features, *([self.dynamic] if config.dynamic else [])]
         x_BND = torch.cat(parts).expand(batch, -1, -1)
-        # Moving queries stand last, as in the released weights.
+        # Dynamic queries come last, as in the released weights.
         first = len(self.features) if config.dynamic else 0
         moves_N = torch.arange(config.count, device=x_BND.device) >= first
         if config.time_channels:
             if views.target_time is None:
                 raise ValueError(
-                    "tokengs2026/dynamic queries need the requested time: compare with photos of "
+                    "tokengs2026/dynamic queries need the requested time: use target photos of "
                     "one time, give the input views a target_time (B, 1), or set "
                     "model.queries.time_channels to 0"
                 )
@@ -98,7 +102,7 @@ class DynamicQueries(Queries):
 
 
 class BlockCausalSelfAttention(ContentSelfAttention):
-    """Dynamic queries read all queries, static ones the static ones alone."""
+    """Self-attention in which dynamic queries read all, and static ones only static ones."""
 
     name = "block_causal"
     reads = _FIELDS
@@ -111,28 +115,29 @@ class BlockCausalSelfAttention(ContentSelfAttention):
 
 
 class DynamicObjective(Objective):
-    """One pass; its losses, plus those of the Gaussians of dynamic queries rendered alone."""
+    """Objective of one pass: its losses, plus losses of the dynamic Gaussians rendered alone."""
 
     name = "dynamic"
     reads = _FIELDS
     scheduled = frozenset({"weight"})
-    # Input photos show other moments than the reconstructed one.
+    # Input photos show other times than the reconstructed one.
     judges_inputs = False
 
     class Config(ComponentConfig):
         weight: float = Field(default=0.3, ge=0)
-        """Weight of the second losses (TokenGS: 0.3 for 5,000 steps, then to 0 over 10,000)."""
+        """Weight of the losses of dynamic Gaussians; 0 skips them. TokenGS has 0.3 for 5,000 steps,
+        then a decay to 0 over 10,000."""
 
     config: Config
 
     def forward(self, inputs: Views, targets: Views, passes: Passes) -> Outcome:
-        """All losses of the whole prediction, and the term `dynamic`."""
+        """Return the losses of the whole prediction, and the term `dynamic`."""
         prediction = passes.predict(inputs)
         whole = passes.judge(prediction, targets, inputs)
         added = torch.zeros_like(whole.total)
         if self.config.weight:
             layers = {number: _alone(layer) for number, layer in prediction.layers.items()}
-            # The static scene is judged by the whole, the moving part once more alone.
+            # The whole prediction covers the static scene; the moving part is judged again alone.
             last = layers[max(layers)]
             alone = Prediction(last.gaussians, last.state, layers)
             added = self.config.weight * passes.judge(alone, targets, inputs).total
@@ -140,7 +145,7 @@ class DynamicObjective(Objective):
 
 
 def _alone(layer: LayerPrediction) -> LayerPrediction:
-    """Dynamic queries of a layer and their Gaussians; which these are is equal in all scenes."""
+    """Return the dynamic queries of a layer and their Gaussians, the same ones in all scenes."""
     moves_N = layer.state[MOVES][0]
     each = layer.gaussians.count // len(moves_N)
     of_gaussians = moves_N.repeat_interleave(each)
@@ -151,8 +156,8 @@ def _alone(layer: LayerPrediction) -> LayerPrediction:
 
 
 def _readable(state: QueryState) -> Tensor:
-    """(B, N, N): True where the query of the row may read that of the column."""
+    """Return (B, N, N): True if the query of the row may read the query of the column."""
     moves_BN = state[MOVES]
-    # Static queries read static ones alone, so that they are the same at all times.
+    # Static queries read only static ones, so that they are the same at all times.
     readable_BNN = moves_BN[:, :, None] | ~moves_BN[:, None]
     return readable_BNN if state.mask is None else readable_BNN & state.mask[:, None]

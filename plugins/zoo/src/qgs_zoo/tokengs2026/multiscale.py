@@ -1,6 +1,6 @@
-"""`tokengs2026/multiscale_vit`, `tokengs2026/latent_bottleneck`: several blocks of a ViT are read.
+"""`tokengs2026/multiscale_vit`, `tokengs2026/latent_bottleneck`: readouts of several ViT blocks.
 
-Keys and values are theirs, or of learned latents that stand for the photos (TokenGS 2026.6).
+Keys and values come from the blocks, or from learned latents that read the blocks (TokenGS 2026.6).
 
 Axes: T channels of times, L latents, C = S D the width of the image tokens' features.
 """
@@ -32,7 +32,10 @@ from qgs.types import ImageMemory, Views
 
 @full_precision
 def time_features(times: Tensor, channels: int) -> Tensor:
-    """Times (...) -> (..., T): cos, then sin, of t exp(-ln(10000) i / (T/2)), i = 0 … T/2 - 1."""
+    """Encode times (...) as (..., T): cos, then sin, of t exp(-ln(10000) i / (T/2)).
+
+    i runs from 0 to T/2 - 1.
+    """
     half = channels // 2
     rates = torch.exp(-math.log(10_000) / half * torch.arange(half, device=times.device).to(times))
     angles = times[..., None] * rates
@@ -40,24 +43,24 @@ def time_features(times: Tensor, channels: int) -> Tensor:
 
 
 def without_times(channels: int, context: RecipeContext) -> Iterator[Problem]:
-    """A problem of the option `time_channels` if the data of the recipe have no times."""
+    """Report `time_channels` if the data of the recipe have no times."""
     if channels and context.inputs is not None and not context.times:
         yield Problem(
             "time_channels",
             f"the data of this recipe have no times: `time_channels: {channels}` reads them",
-            "set time_channels to 0, or take qgs/photos (each frame of a transforms file with its "
-            "'time') or datasets/chunks packed from them",
+            "set time_channels to 0, or use qgs/photos with a 'time' for each frame of the "
+            "transforms file, or datasets/chunks packed from such photos",
         )
 
 
 class TimeEmbedding(nn.Module):
-    """Times (B, V) -> (B, V, D), zeros at first.
+    """Embedding of times (B, V) as (B, V, D), which is zero at first.
 
-    A convolution of P x P pixels that are all equal, because the release embeds a map of times.
+    It is a convolution of P x P equal pixels, because the release embeds a map of times.
     """
 
     def __init__(self, channels: int, width: int, patch_size: int) -> None:
-        """channels: T, even."""
+        """Make the embedding. channels: T, even."""
         super().__init__()
         self.proj = nn.Conv2d(channels, width, kernel_size=patch_size, stride=patch_size)
         for parameter in self.proj.parameters():
@@ -70,23 +73,23 @@ class TimeEmbedding(nn.Module):
 
 
 class MultiscaleReadout(PatchViT):
-    """Features of an image token: the outputs of S chosen blocks, each with a norm of its own.
+    """Encoder whose features are the outputs of S chosen blocks, each with its own norm.
 
-    Unlike the default encoder it can embed the times of photos.
+    Unlike the default encoder, it can embed the times of photos.
     """
 
     class Config(PatchViT.Config):
         blocks: tuple[int, ...] = Field(default=(1, 2, 3), min_length=1)
-        """Numbers of the blocks that are read, ascending; 1 is the first, and `depth` the last."""
+        """Numbers of the blocks that are read, ascending. 1 is the first; the last is `depth`."""
         time_channels: int = Field(default=0, ge=0, multiple_of=2)
-        """Channels that the time of a photo is embedded with; 0 for photos without times."""
+        """Number of channels that encode the time of a photo. 0 ignores times."""
 
         @field_validator("blocks")
         @classmethod
         def _ascending(cls, blocks: tuple[int, ...]) -> tuple[int, ...]:
             if list(blocks) != sorted(set(blocks)) or blocks[0] < 1:
                 raise OptionError(
-                    f"blocks must ascend from 1 without repeats, got {list(blocks)}",
+                    f"blocks must be ascending numbers from 1 without repeats, got {list(blocks)}",
                     f"write {sorted({max(number, 1) for number in blocks})}",
                 )
             return blocks
@@ -108,7 +111,7 @@ class MultiscaleReadout(PatchViT):
         yield from super().problems(config, context)
         yield from without_times(config.time_channels, context)
         last = config.blocks[-1]
-        # Blocks behind the last one that is read would learn nothing.
+        # Blocks after the last one that is read would learn nothing.
         if last != config.depth:
             what = "does not exist" if last > config.depth else "leaves the blocks after it unread"
             yield Problem(
@@ -118,36 +121,39 @@ class MultiscaleReadout(PatchViT):
             )
 
     def embed(self, views: Views, plucker: Tensor) -> Tensor:
-        """Embeddings of colours, rays and times, added: (B, M, D).
+        """Return the sum of the embeddings of colours, rays and times, (B, M, D).
 
-        Raises ValueError for views without times if these are embedded.
+        Raises ValueError for views without times if times are embedded.
         """
         x_BMD = super().embed(views, plucker)
         if not self.config.time_channels:
             return x_BMD
         if views.times is None:
             raise ValueError(
-                "this encoder reads the times of photos and these have none: give each frame "
-                "of their transforms file a 'time' and pack chunks again, give the views times "
+                "this encoder reads the times of photos, but they have none: give each frame "
+                "of the transforms file a 'time' and pack chunks again, give the views times "
                 "(B, V), or set model.encoder.time_channels to 0"
             )
         times_BVD = self.time_embedding(views.times)
         return x_BMD + times_BVD.repeat_interleave(x_BMD.shape[1] // times_BVD.shape[1], 1)
 
     def features(self, views: Views, plucker: Tensor) -> Tensor:
-        """Views and Plücker maps as in `embed` -> (B, M, S D), the first chosen block first."""
+        """Return features (B, M, S D), the first chosen block first.
+
+        views, plucker: as in `embed`.
+        """
         x_BMD = self.embed(views, plucker)
         outputs = []
         for number, block in enumerate(self.blocks, start=1):
             x_BMD = block(x_BMD)
             if number in self.read:
-                # Each depth has a norm of its own: their sizes differ.
+                # Each block has its own norm, because the sizes of outputs differ.
                 outputs.append(self.norms[len(outputs)](x_BMD))
         return torch.cat(outputs, -1)
 
 
 class MultiscaleViT(MultiscaleReadout):
-    """Keys and values of every image token from several blocks of a ViT."""
+    """Encoder with keys and values of every image token from several blocks of a ViT."""
 
     name = "multiscale_vit"
 
@@ -164,7 +170,10 @@ class MultiscaleViT(MultiscaleReadout):
         return {**MEMORY_FIELDS, "memory.features": wide}
 
     def forward(self, views: Views) -> ImageMemory:
-        """Features (B, M, S D); raises ValueError when the patch does not divide the images."""
+        """Return features (B, M, S D).
+
+        Raises ValueError if the patch size does not divide the images.
+        """
         grid = self.grid(views)
         plucker_BV6HW = plucker_rays(views.cameras)
         x_BMC = self.features(views, plucker_BV6HW)
@@ -174,7 +183,7 @@ class MultiscaleViT(MultiscaleReadout):
 
 
 class LatentBlock(nn.Module):
-    """Cross-attention to given keys and values, self-attention, MLP; each scaled and added."""
+    """Cross-attention to given keys and values, self-attention, MLP, each scaled and added."""
 
     def __init__(
         self, width: int, heads: int, mlp_ratio: float, layer_scale: float, norm_eps: float
@@ -196,28 +205,28 @@ class LatentBlock(nn.Module):
 
 
 class LatentBottleneck(MultiscaleReadout):
-    """L learned latents read several blocks of a ViT; the memory is made of them alone.
+    """Encoder whose memory consists of L learned latents that read several blocks of a ViT.
 
-    It has neither rays nor a grid, and as many tokens for two photos as for six.
+    The memory has no rays and no grid. It has the same size for any number of photos.
     """
 
     name = "latent_bottleneck"
     tunable = True
     writes = memory_fields("features", "keys", "values")
-    # Adds the same to all logits of a latent.
+    # This bias adds the same number to all logits of a latent.
     unlearned = ("feature_k_norm.bias",)
 
     class Config(MultiscaleReadout.Config):
         depth: int = Field(default=12, ge=1, le=256)
         """Number of ViT blocks."""
         blocks: tuple[int, ...] = Field(default=(6, 8, 10, 12), min_length=1)
-        """Numbers of the blocks that are read, ascending; 1 is the first, and `depth` the last."""
+        """Numbers of the blocks that are read, ascending. 1 is the first; the last is `depth`."""
         latents: int = Field(ge=1)
         """L, the number of latents (TokenGS: 4096)."""
         latent_std: float = Field(default=0.02, ge=0)
-        """Standard deviation of the normal distribution that the latents start from."""
+        """Standard deviation of the initial latents, which are normally distributed."""
         latent_depth: int = Field(default=12, ge=1, le=256)
-        """Number of blocks over the latents; their MLPs and LayerScale are as of the ViT's."""
+        """Number of blocks over the latents. MLPs and LayerScale have the sizes of the ViT's."""
 
     def __init__(self, config: Config, dims: ModelDims) -> None:
         super().__init__(config, dims)
@@ -234,15 +243,15 @@ class LatentBottleneck(MultiscaleReadout):
         self.k_norm = nn.LayerNorm(width // dims.heads, eps)
 
     def decays(self, name: str, parameter: nn.Parameter) -> bool:
-        """No weight decay on the latents (TokenGS release)."""
+        """Leave the latents out of weight decay (TokenGS release)."""
         return name != "latents" and super().decays(name, parameter)
 
     def forward(self, views: Views) -> ImageMemory:
-        """The latents (B, L, D) that have read all views, and their keys and values.
+        """Return the latents (B, L, D) that have read all views, and their keys and values.
 
-        Raises ValueError when the patch does not divide the images.
+        Raises ValueError if the patch size does not divide the images.
         """
-        # It refuses images that the patch does not divide.
+        # Called only for this error.
         self.grid(views)
         x_BMC = self.features(views, plucker_rays(views.cameras))
         k_BhMd, v_BhMd = keys_and_values(x_BMC, self.feature_kv_proj, self.feature_k_norm)
@@ -252,8 +261,8 @@ class LatentBottleneck(MultiscaleReadout):
         return self._memory(x_BLD)
 
     def project(self, features: Tensor, memory: ImageMemory) -> ImageMemory:
-        """The memory of other latents (B, L, D)."""
-        # Tuning at test time changes the latents and makes keys of them anew.
+        """Return the memory of other latents (B, L, D)."""
+        # Tuning at test time changes the latents, and then needs new keys and values.
         return self._memory(features)
 
     def _memory(self, latents: Tensor) -> ImageMemory:
