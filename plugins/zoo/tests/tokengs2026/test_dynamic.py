@@ -79,7 +79,7 @@ def model():
 
 
 def test_views_without_times_are_refused(model):
-    with pytest.raises(ValueError, match=r"reads the times of photos .*time_channels to 0"):
+    with pytest.raises(ValueError, match=r"reads the times of photos, .*time_channels to 0"):
         model(views(target=torch.zeros(2, 1)))
     with pytest.raises(ValueError, match=r"requested time: .* target_time \(B, 1\)"):
         model(views(torch.zeros(2, 2)))
