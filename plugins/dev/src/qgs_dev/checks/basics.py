@@ -79,12 +79,10 @@ def check_runs(case: Case) -> None:
     """Require that a forward pass on ordinary inputs returns the type that the slot prescribes."""
     output = Trial(case)()
     kind = OUTPUTS.get(case.slot, Tensor)
-    returned = type(output).__name__
-    expect(isinstance(output, kind), f"it returns {returned} instead of {kind.__name__}")
+    expect(isinstance(output, kind), f"it returns {type(output).__name__}, not {kind.__name__}")
     if case.slot in WITH_MEMORY:
         kinds = [type(part).__name__ for part in output]
-        right = kinds == ["QueryState", "ImageMemory"]
-        expect(right, f"it returns {kinds} instead of QueryState and ImageMemory")
+        expect(kinds == ["QueryState", "ImageMemory"], f"it returns {kinds}, not state and memory")
     if isinstance(output, Mapping):
         odd = [name for name, term in output.items() if not isinstance(term, Tensor)]
         expect_none(odd, "not a tensor")
@@ -248,8 +246,8 @@ def _expect_strict_options(case: Case) -> None:
     wrong = f"{names[0]}_x" if names else "no_such_option"
     config, message = _decoded(case, {**options, wrong: 1})
     expect(config is None, f"the unknown option `{wrong}` is accepted")
-    suggested = not names or f"did you mean `{names[0]}`" in message
-    expect(suggested, f"the message for `{wrong}` does not suggest `{names[0]}`: {message}")
+    close = not names or f"did you mean `{names[0]}`" in message
+    expect(close, f"the message for `{wrong}` does not suggest the right name: {message}")
     for model in _configs_in(type(case.config)):
         strict = model.model_config.get("extra") == "forbid"
         expect(strict, f"{model.__qualname__} accepts any option; derive it from ComponentConfig")

@@ -169,8 +169,7 @@ def check_writes_equal_provides(case: Case) -> None:
             expect(passed, f"in {mode} it changes the features; a refinement must pass them on")
         for name, spec in case.writes.items():
             right = output[name].dtype == spec.dtype
-            found = described(output[name])
-            expect(right, f"in {mode} `{name}` is {found}, but declared as {spec}")
+            expect(right, f"in {mode} `{name}` is {described(output[name])}, declared as {spec}")
 
 
 def _same(one: Tensor, other: Tensor) -> bool:
