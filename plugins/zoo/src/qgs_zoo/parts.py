@@ -108,5 +108,4 @@ def mean_outcome(outcomes: Sequence[Outcome], **terms: Tensor) -> Outcome:
 
 
 def _sum(terms: Iterable[Tensor]) -> Tensor:
-    summands = [*terms]
-    return torch.stack(summands).sum() if summands else torch.zeros(())
+    return torch.stack([*terms]).sum()

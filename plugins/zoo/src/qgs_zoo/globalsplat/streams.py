@@ -74,15 +74,11 @@ class SlotQueries(LearnedQueries):
         # A state field must stay float32 under autocast; features need not.
         streams = (self.geometry(tokens_ND), at_least_float32(self.texture(tokens_ND)))
         geometry_BND, texture_BND = (x.expand(batch_size, -1, -1) for x in streams)
-        return QueryState(
-            features=geometry_BND, fields={TEXTURE: texture_BND}, mask=self._mask(batch_size)
-        )
-
-    def _mask(self, batch_size: int) -> Tensor | None:
-        if self.extra is None:
-            return None
-        places = torch.arange(self.config.count, device=self.slots.device)
-        return (places < len(self.slots)).expand(batch_size, -1)
+        mask_BN = None
+        if self.extra is not None:
+            places = torch.arange(self.config.count, device=self.slots.device)
+            mask_BN = (places < len(self.slots)).expand(batch_size, -1)
+        return QueryState(geometry_BND, {TEXTURE: texture_BND}, mask_BN)
 
 
 class Round(DecoderLayer):
