@@ -20,7 +20,7 @@ class TensorContainer:
 
     def __repr__(self) -> str:
         """Return shapes, types and devices, without values."""
-        # Numbers of a million Gaussians help nobody.
+        # Values of a million Gaussians would not help.
         parts = [f"{n}: {tuple(x.shape)} {x.dtype} {x.device}" for n, x in named_tensors(self)]
         lines = "\n  ".join(["", *parts])
         return f"{type(self).__name__}({lines}\n)"
@@ -44,7 +44,7 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: Any) -> Any:
     if not isinstance(value, TensorContainer | Mapping | list | tuple):
         return value
     items = list(_items(value))
-    # A part that stays itself keeps what it caches.
+    # An unchanged part keeps its cache.
     mapped = [(name, map_tensors(function, item)) for name, item in items]
     if all(new is old for (_, new), (_, old) in zip(mapped, items, strict=True)):
         return value

@@ -118,12 +118,12 @@ def verdict(trained: Domain, found: Domain) -> str:
         return "the checkpoint does not record the views on which this model was trained"
     if outside := trained.differences(found):
         return (
-            f"the views lie outside what this model was trained on: {', '.join(outside.values())}. "
-            f"Expect a worse result than inside: {REMEDY}"
+            f"the views lie outside the range of the training: {', '.join(outside.values())}. "
+            f"Expect a worse result; {REMEDY}"
         )
     return (
-        "the cameras lie within what this model was trained on, in distance, direction, depth and "
-        "field of view; what they show may still be new to it"
+        "the cameras lie within the range of the training, in distance, direction, depth and field "
+        "of view; the content of the photos may still be new to the model"
     )
 
 

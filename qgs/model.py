@@ -106,7 +106,7 @@ class QueryGaussianModel(nn.Module):
                     "none; give Views with cameras, or use an encoder that does not read them "
                     "(reads_cameras)"
                 )
-            # The other parts read only what photos have too.
+            # Photos have all other fields that are read.
             views = cast(Views, views)
         memory = self.encoder(views)
         # Tuning at test time brings its own state.

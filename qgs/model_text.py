@@ -70,7 +70,7 @@ def _types(model: Any, slot: str) -> list[str]:
     tree = model.recipe["model"]
     places = [tree]
     if slot in LAYER_SLOTS:
-        # A layer has a component of its own, or else that of all layers.
+        # A layer has its own component, or else the common one.
         decoder = tree["decoder"]
         own = decoder.get("layers", {})
         places = [decoder | own.get(str(index), {}) for index in range(len(model.decoder))]

@@ -237,7 +237,7 @@ class GaussianAttributes(TensorContainer):
 
     offsets: (B, N, K, 3) raw, before any activation; a `centers` component turns them into means.
     scales: (B, N, K, 3) positive, world units. quats: (B, N, K, 4) unit, w x y z.
-    opacities: (B, N, K) in (0, 1). colors: (B, N, K, 3) RGB in [0, 1], beside `sh` of any value.
+    opacities: (B, N, K) in (0, 1). colors: (B, N, K, 3) RGB in [0, 1], even if `sh` is set.
     sh: (B, N, K, C, 3), features: (B, N, K, F), see `Gaussians`; None for none.
     """
 
@@ -291,7 +291,7 @@ class Gaussians(TensorContainer):
 
         def kept(x: Tensor) -> Tensor:
             index = chosen
-            # `take_along_dim` wants as many axes as x has.
+            # `take_along_dim` needs the same number of axes as x.
             while index.ndim < x.ndim:
                 index = index[..., None]
             return x.take_along_dim(index, chosen.ndim - 1)

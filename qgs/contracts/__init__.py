@@ -1,4 +1,4 @@
-"""The contracts: one abstract class per slot, and what all components share."""
+"""The contracts: one abstract class per slot, and the common base of components."""
 
 from qgs.contracts.component import (
     Component,

@@ -10,7 +10,7 @@ import torch
 from pydantic import BaseModel, ConfigDict
 
 
-# A ValueError, since pydantic turns these into problems of the option.
+# A ValueError, because pydantic turns those into problems of the option.
 class OptionError(ValueError):
     """Error for validators of a Config.
 
@@ -33,14 +33,14 @@ class ComponentConfig(BaseModel):
     """Component that has these options. None for the settings of a section of a recipe."""
 
     model_config = ConfigDict(
-        # Checkpoints and hashes hold the options: nothing may change them behind their back.
+        # Checkpoints and hashes contain the options, so they must not change later.
         frozen=True,
-        # `count: "8"` is a mistake of whoever wrote it, not an 8.
+        # `count: "8"` is probably a mistake, so it is not read as 8.
         strict=True,
         extra="forbid",
-        # NaN would pass every limit, and end in a loss that is NaN.
+        # NaN would pass every limit and make the loss NaN.
         allow_inf_nan=False,
-        # The JSON Schema shows them in editors, `qgs list` in the terminal.
+        # Editors show them through the JSON Schema, terminals through `qgs list`.
         use_attribute_docstrings=True,
     )
 
@@ -103,7 +103,7 @@ class Problem:
 
     option: str
     reason: str
-    # The same problem may have other fixes where other components are installed.
+    # The fix may differ with the installed components, so it does not count for equality.
     fix: str = field(compare=False)
 
 
@@ -161,15 +161,15 @@ class Component(metaclass=ABCMeta):
     def __init_subclass__(cls, **options: Any) -> None:
         """Give every class a Config of its own, with a reference to the class."""
         super().__init_subclass__(**options)
-        # Options tell their component, so that no two may share a Config.
+        # A Config stores its component, so components must not share one.
         inherited = cls.Config
         if inherited.__qualname__ != f"{cls.__qualname__}.Config":
             own: dict[str, Any] = {"__qualname__": f"{cls.__qualname__}.Config"}
             own["__module__"] = cls.__module__
-            # It has no options of its own; looking for their docstrings would take 15 ms.
+            # It has no own options, and a search for their docstrings would take 15 ms.
             own["model_config"] = ConfigDict(use_attribute_docstrings=False)
             cls.Config = type("Config", (inherited,), own)
-            cls.Config.model_config["use_attribute_docstrings"] = True  # for what inherits from it
+            cls.Config.model_config["use_attribute_docstrings"] = True  # for subclasses
         cls.Config.__component__ = cls
 
     @classmethod
@@ -209,7 +209,7 @@ class ModelComponent(Component, torch.nn.Module):
         By default it applies to all but 1-d parameters: biases, norms, LayerScale (LocusGS
         release).
         """
-        # Pulled towards 0, a norm or a LayerScale would silence its layer.
+        # A norm or LayerScale that decays to 0 would switch off its layer.
         return parameter.ndim != 1
 
     def adapted(self, learned: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

@@ -31,7 +31,7 @@ class Scene(ABC):
     held_out: Sequence[int] = ()
     """Frames that training never sees. Evaluation can use them as targets."""
     missing: Sequence[str] = ()
-    """Listed images that do not exist. They are no frames, so later frames move up."""
+    """Listed images that do not exist. They do not count as frames, so later frames move up."""
     times: Tensor | None = None
     """Times (F,) of the frames, float64, in any unit. None for a static scene."""
 
@@ -116,7 +116,7 @@ class SceneSource(Component):
     @classmethod
     def trains_on(cls, root: UPath, path: UPath) -> bool:
         """Return whether training data at `root` is or contains `path`, a scene; both absolute."""
-        # Sources whose scenes are files below the root say more.
+        # Sources with scenes in files below the root override this.
         return path == root
 
     @classmethod
@@ -128,7 +128,7 @@ class SceneSource(Component):
         trained: the options of the training data, of any source. Options that also hold for `path`
         are copied from it.
         """
-        # Of the trained data, only how photos look goes for others as well.
+        # Only the look of photos also holds for other data.
         options: dict[str, object] = {"path": path, "image_size": image_size}
         background = getattr(trained, "background", None)
         if background is not None and "background" in cls.Config.model_fields:
@@ -141,7 +141,7 @@ class SceneSource(Component):
 
     def names(self, split: Split) -> Sequence[str]:
         """Return the names of `scenes(split)`; override it to avoid opening the scenes."""
-        # Correct for any source, and slow where opening a scene reads files.
+        # Correct for any source, but slow if opening a scene reads files.
         return [scene.name for scene in self.scenes(split)]
 
     def groups(self, split: Split) -> Sequence[Sequence[int]]:

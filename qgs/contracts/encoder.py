@@ -71,8 +71,10 @@ class Encoder(ModelComponent):
         `project(memory.features, memory)` must give an equal memory. Raises NotImplementedError
         unless the encoder is `tunable`.
         """
-        # Recipes that would come here are refused: see `tunable`.
-        raise NotImplementedError(f"{type(self).__name__} makes no memory of other features")
+        # Recipes that need it are refused, see `tunable`.
+        raise NotImplementedError(
+            f"{type(self).__name__} cannot recompute a memory from other features"
+        )
 
 
 class PatchEncoder(Encoder):

@@ -36,13 +36,13 @@ class Column:
 
     def best(self, values: Iterable[float | None]) -> float | None:
         """Return the best of `values`; None if there is none."""
-        # A method without Gaussians has no value of metrics that need them.
+        # A method without Gaussians has no values for metrics that need them.
         known = [value for value in values if value is not None]
         return (max if self.better == "higher" else min)(known, default=None)
 
     def beats(self, value: float | None, other: float | None) -> bool:
         """Return whether `value` is better than `other`, in the digits that tables show."""
-        # 14.463 and 14.457 both read 14.46: a sentence that ranks them would puzzle its reader
+        # 14.463 and 14.457 both show as 14.46; ranking them would confuse readers
         if other is None or self.shown(value) == self.shown(other):
             return False
         return self.best((value, other)) == value

@@ -56,7 +56,7 @@ class Optimizer(Component):
     def __init__(self, config: OptimizerConfig, training: TrainingConfig | None = None) -> None:
         """Store the options and `training`, which has the budget of steps and seconds."""
         self.config = config
-        # Without a recipe, such as in a test of a component.
+        # For use without a recipe, as in tests of a component.
         self.training = training or TrainingConfig()
 
     def check(self) -> None:

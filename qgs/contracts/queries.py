@@ -80,7 +80,7 @@ def _resized(values: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Return the first `count` items of `values`, or all of them and then noisy copies in turn."""
     if count <= len(values):
         return values[:count]
-    # In turn, so that every learned query has as many descendants as the others.
+    # In turn, so that all learned queries get equally many copies.
     copied = values[torch.arange(len(values), count) % len(values)]
     # Exact copies would have equal gradients, and stay copies.
     noise = torch.randn(copied.shape, generator=generator, dtype=copied.dtype)

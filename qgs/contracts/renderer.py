@@ -37,7 +37,7 @@ class RendererConfig(ComponentConfig):
     @classmethod
     def _far_is_behind_near(cls, far: float, info: ValidationInfo) -> float:
         near = info.data.get("near")
-        # A `near` that is refused itself is not among the data.
+        # If `near` is invalid itself, the data lack it.
         if near is not None and far <= near:
             raise OptionError(
                 f"far must be more than near, got near {near:g} and far {far:g}",
@@ -103,7 +103,7 @@ def check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
             f"Gaussians of {len(means)} scenes cannot be rendered from cameras of "
             f"{cameras.shape[0]} scenes; both need the same batch size"
         )
-    # Torch would say so somewhere inside of a kernel.
+    # Torch would raise its error deep inside a kernel.
     if means.device != cameras.c2w.device:
         raise ValueError(
             f"Gaussians are on {means.device}, cameras on {cameras.c2w.device}; "

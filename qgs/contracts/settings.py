@@ -45,7 +45,7 @@ class ViewsConfig(ComponentConfig):
     @field_validator("gap")
     @classmethod
     def _gap_is_ordered(cls, gap: tuple[int, int]) -> tuple[int, int]:
-        # Here and not by limits, so that the fix can name the numbers in order.
+        # Not by limits of the field, so that the fix can give the numbers in order.
         low, high = gap
         if not 1 <= low <= high:
             raise OptionError(
@@ -101,7 +101,7 @@ class TrainingConfig(ComponentConfig):
         parts = processes * self.accumulate
         scenes, left = divmod(self.batch_size, parts)
         if left:
-            # The multiples below and above; 0 scenes are no batch.
+            # The multiples below and above; a batch needs at least one scene.
             below = max(scenes, 1)
             near = f"{below * parts} or {(below + 1) * parts}"
             raise ValueError(

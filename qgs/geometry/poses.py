@@ -92,6 +92,6 @@ def look_at_depth(c2w: Tensor) -> Tensor:
 @full_precision
 def mirrored(c2w: Tensor) -> Tensor:
     """Return poses of the scene mirrored in x: R' = F R F, t' = F t with F = diag(-1, 1, 1)."""
-    # Both sides: a mirrored rotation alone would be no rotation.
+    # On both sides, because a matrix mirrored once is not a rotation.
     flip = torch.diag(constant([-1.0, 1.0, 1.0, 1.0], c2w))
     return flip @ c2w @ flip

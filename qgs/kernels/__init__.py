@@ -17,7 +17,7 @@ def kernel(function: Callable[..., Any]) -> Any:
         # No branch on a division by zero.
         "error_model": "numpy",
         "fastmath": {"contract", "reassoc", "arcp", "nsz"},
-        # kernels from the cache share what they call, and may run another's build of it
+        # cached kernels share the functions they call, and might use another kernel's build
         "forceinline": True,
     }
     try:

@@ -115,7 +115,7 @@ def view_visibility(
         views = [cameras[:, view, None] for view in range(cameras.shape[1])]
         excess = torch.stack([_image_excess(points, view, *options) for view in views], 1)
         nearest = excess.argmin(1)
-    # A second pass for the nearest view alone is the one with a graph.
+    # Only the second pass, for the nearest view, has a graph.
     scene = torch.arange(len(nearest), device=nearest.device)[:, None]
     excess = _image_excess(points, cameras[scene, nearest], *options)
     return excess if clamp is None else excess.clamp_max(clamp)
@@ -140,7 +140,7 @@ def _image_excess(
     # LocusGS replaces small z of either sign by a positive one: a release's choice.
     if z_guard is not None:
         z = torch.where(z.abs() < z_guard, z_guard, z)
-    # Divide by 1 there and put the value in after: where() alone would pass on NaN gradients.
+    # Divide by 1 there and insert the value later: where() alone would pass NaN gradients.
     at_zero = z.abs() < _TINY_Z
     focal = cameras.intrinsics[..., :2]
     principal = cameras.intrinsics[..., 2:]

@@ -45,7 +45,7 @@ def build_model(recipe: Recipe, device: torch.device | str | None) -> QueryGauss
     """
     on_meta = device is not None and torch.device(device).type == "meta"
     with (
-        # Composing a model must not change what a script draws after it.
+        # Composing a model must not change random numbers that a script draws later.
         torch.random.fork_rng(devices=()),
         torch.device("meta" if on_meta else "cpu"),
         OnMeta() if on_meta else nullcontext(),
@@ -184,7 +184,7 @@ def rate_factors(module: nn.Module, optimizer: Chosen) -> dict[str, float]:
         fits = partial(matches, pattern, below=True)
         named = [name for name in factors if any(map(fits, paths[name]))]
         factors |= dict.fromkeys(named, factor)
-        # What is trained holds the model as `model`, a recipe its parts in the section `model`.
+        # The trained module has the model as `model`, a recipe its parts in the section `model`.
         wanted = pattern.removeprefix("model.").split(".")
         if not named and (module is not model or wanted[0] != "losses"):
             known = {".".join(path[: len(wanted)]) for below in paths.values() for path in below}

@@ -23,7 +23,7 @@ def at_their_causes(
     """Yield the problems `found` in `written` at their causes; merge those with the same cause."""
     blames: dict[RecipeProblem, RecipeProblem] = {}
     left = found
-    # Only a recipe that is refused is read once more for each layer.
+    # Only a refused recipe is read again for each layer.
     with suppress(RecipeError):
         while left and written.under is not None:
             older = draft_of(written.under, Problems(), plugins)
@@ -36,7 +36,7 @@ def at_their_causes(
     caused: dict[RecipeProblem, list[RecipeProblem]] = {}
     for problem in found:
         blame = blames.get(problem, problem)
-        # Whoever wrote both sees the contradiction where it is; a plug-in's failure is its own.
+        # Within one file, both lines are visible. A plug-in's failure has no other cause.
         if blame.file == problem.file or problem.cause:
             yield problem
         else:
@@ -79,7 +79,7 @@ def _options(over: MapNode, above: KeyPath = ()) -> Iterator[tuple[KeyPath, Any,
     first = ("plugins", "type", *KINDS)
     for key, value, origin in sorted(over.entries(), key=lambda entry: entry[0] not in first):
         path = (*above, key)
-        # A swap replaces another as a whole.
+        # A swap replaces an older swap completely.
         if isinstance(value, MapNode) and value and above != ("swap",):
             yield from _options(value, path)
         else:

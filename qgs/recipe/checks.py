@@ -67,7 +67,7 @@ def _check_options(chosen: Chosen, context: RecipeContext, problems: Problems) -
         found: dict[Problem, None] = {}
         for options in (config, *chosen.later):
             found |= dict.fromkeys(component.problems(options, context))
-    # What code of a plugin raises.
+    # Code of a plugin may raise anything.
     except Exception as error:
         called = f"`{called}` of `{chosen.type}`"
         report_failure(chosen, called, error, chosen.installed, problems)
@@ -106,7 +106,7 @@ def _without_idle_sublayers(draft: Draft, problems: Problems) -> Parts:
 
 
 def _report_idle(idle: Chosen, reason: str, problems: Problems) -> None:
-    # What is a default is nobody's mistake.
+    # A default is not a mistake of the user.
     if idle.node:
         fix = f"remove it, or write `{idle.slot}: null` to drop an inherited one"
         problems.add(idle.origin, idle.source, reason, fix)
@@ -116,7 +116,7 @@ def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, 
     """Yield path, reason and fix of settings that contradict the components."""
     settings = draft.settings
     encoder: Any = parts["model", "encoder"]
-    # Tuning fits what an encoder can make keys and values of anew.
+    # Tuning fits features, so the encoder must recompute keys and values from them.
     if settings.evaluation.tuning == "latents" and not encoder.component.tunable:
         known: dict[str, Any] = draft.registry.components("encoder")
         others = " or ".join(f"`{name}`" for name in sorted(known) if known[name].tunable)
@@ -137,7 +137,7 @@ def _contradictions(draft: Draft, parts: Parts) -> Iterator[tuple[KeyPath, str, 
     if ("data",) in parts and not any(path[0] == "losses" for path in parts):
         reason = "a recipe with data needs at least one loss to train"
         yield ("losses",), reason, "add one under `losses`, or drop the data with `data: null`"
-    # A resolved recipe writes the default out, which must stay valid.
+    # Resolved recipes contain the default, which must stay valid.
     default = DecoderSettings().layer_scale
     layers: list[Any] = [parts[layer_place(index, "layer")] for index in range(draft.dims.depth)]
     read = any(layer.component.reads_layer_scale for layer in layers)
@@ -156,7 +156,7 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
     """Report fields that are read before they are written, or with another specification."""
     state: dict[str, tuple[FieldSpec, Chosen]] = {}
     for turns, decodes in _execution_order(parts, depth):
-        # What is decoded of a layer is not there for the next one.
+        # The next layer does not see fields that are decoded from this one.
         fields = dict(state) if decodes else state
         for chosen in turns:
             needed = chosen.component.fields_read(chosen.config)
@@ -174,7 +174,7 @@ def check_flow(parts: Parts, depth: int, registry: Registry, problems: Problems)
                     fix = f"change options of `{chosen.type}` or `{writer.type}` until both agree"
                     problems.add(chosen.origin, chosen.source, reason, fix)
             provided = chosen.component.fields_written(chosen.config)
-            # Who changes a field that was never written has not provided it.
+            # A component that changes an unwritten field does not provide it.
             fields |= {n: (spec, chosen) for n, spec in provided.items() if n not in missing}
 
 
@@ -202,7 +202,7 @@ def _unmet(missing: Fields, reader: Chosen, parts: Parts, registry: Registry) ->
         late = [part for part in parts.values() if name in _offered(part.component, part.config)]
         if late:
             reason += f"; `{late[0].type}` at {late[0].shown_path} provides {name} too late"
-    # Whoever replaced a component that provided them finds the line here.
+    # The line helps users who replaced a component that provided the fields.
     now = {part.slot: f"`{part.type}`, {part.chosen_at}" for part in parts.values()}
     known = [
         f"`{kind}` in the slot `{slot}` (now {now.get(slot, 'empty')})"
@@ -234,7 +234,7 @@ def idle_fields(parts: Mapping[KeyPath, Chosen]) -> Iterator[str]:
     """Yield a sentence for each learnable field of the queries that only refinements read."""
     read = set[str]()
     for path, part in parts.items():
-        # A refinement reads what it updates, which alone makes no use of it.
+        # A refinement reads the fields that it updates; that alone does not use them.
         if path[:-1] != DECODER and not issubclass(part.component, Refinement):
             read.update(part.component.fields_read(part.config))
     queries = parts["model", "queries"]

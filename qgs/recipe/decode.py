@@ -148,12 +148,12 @@ def _why_no_component(name: object, slot: str, registry: Registry) -> tuple[str,
         return f"`type` must name a component of the slot `{slot}`, got {brief(name)}", choice
     plugin, slash, _ = name.partition("/")
     if slash and plugin not in registry.plugins:
-        # It may be one of a plug-in that cannot be used, which is a problem by itself.
+        # It may belong to an unusable plug-in, which is already reported.
         if not registry.complete:
             return None
         reason = f"`{name}` belongs to the plugin `{plugin}`, which this recipe does not use"
         return reason, f"add `plugins: [{plugin}]`; plugins of a base recipe stay"
-    # The same name may stand in several slots, such as `qgs/none`.
+    # Several slots may have the same name, such as `qgs/none`.
     for other in SLOTS:
         if name in registry.components(other):
             return f"`{name}` belongs in the slot `{other}`, not in `{slot}`", choice
@@ -194,7 +194,7 @@ def report(
     if fault["type"] == "extra_forbidden":
         section, _, option = shown.rpartition(".")
         reason = f"there is no option `{option}` here"
-        # A key that stands somewhere else is no typing error: name its section.
+        # A key of another section is not a typing error, so name that section.
         homes = {known.rpartition(".")[2]: known for known in reversed(options)}
         near = nearest(option, homes)
         split = [known.rpartition(".") for known in options]

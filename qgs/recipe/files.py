@@ -48,7 +48,7 @@ def merge(base: MapNode, over: MapNode, path: KeyPath = ()) -> MapNode:
             del merged[key]
             continue
         if below == ("plugins",) and isinstance(old, list) and isinstance(value, list):
-            # A file names the plug-ins that it needs and leaves those of its base.
+            # A file adds its plug-ins to those of its base.
             added = [item for item in items_of(value, origin) if item[0] not in old]
             value = ListNode([*items_of(old, base.origins[key]), *added])
         elif isinstance(old, MapNode) and isinstance(value, MapNode):
@@ -123,12 +123,12 @@ def _read(file: Path, trees: _Trees, problems: Problems, at: Origin | None = Non
         with open_file(file) as opened:
             text = opened.read().decode("utf-8")
     except FileNotFoundError:
-        # A file that extends itself would be a poor advice.
+        # Do not suggest a file that would extend itself.
         neighbours = [x.stem for x in file.parent.glob("*.yaml") if x.resolve() not in trees]
         if near := nearest(file.stem, neighbours):
             fix = f"did you mean `{file.parent / near}.yaml`?"
         problems.stop(at, option, f"{file} does not exist", fix)
-    # ValueError: no name that a file can have, or no UTF-8.
+    # ValueError: an impossible file name, or text that is not UTF-8.
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         problems.stop(at, option, f"{file} cannot be read: {why}", fix)
@@ -147,7 +147,7 @@ def _with_bases(node: MapNode, folder: Path, trees: _Trees, problems: Problems) 
             reason = "`extends` must be a recipe file or a list of recipe files"
             fix = "write `extends: base.yaml`, relative to this file"
             problems.stop(origin, "extends", reason, fix)
-        # `..` must not follow links: a recipe names its base as it is written.
+        # `..` must not follow links: the path of a base is read as written.
         file = found_recipe(Path(os.path.normpath(folder / name)), name)
         place = Path(os.path.realpath(file))
         if place in (above := [path for path, tree in trees.items() if tree is None]):

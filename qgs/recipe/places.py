@@ -43,7 +43,7 @@ def layer_place(index: int, slot: str) -> KeyPath:
 
 def expand(tree: MapNode, depth: int, problems: Problems) -> dict[KeyPath, Place]:
     """Return all places of `tree`, in the order of a recipe."""
-    # A layer with an index beyond the depth is often one of a base that was deeper.
+    # A layer with an index beyond the depth often comes from a deeper base recipe.
     layers = tree.child(*DECODER, "layers").without(*map(str, range(depth)))
     for key, _, origin in layers.entries():
         reason = f"there is no layer `{key}` in a decoder of depth {depth}"
@@ -71,7 +71,7 @@ def _place(tree: MapNode, path: KeyPath) -> Place:
         template = _place(tree, (*DECODER, name))
         if node is None:
             return replace(template, path=path)
-        # Only what is written for this layer changes; the rest is the template's.
+        # Options written for this layer win over the template.
         if isinstance(node, MapNode) and isinstance(template.node, MapNode):
             node = merge(template.node, node, path)
     origin = parent.origin_of(name)
@@ -115,7 +115,7 @@ def apply_swaps(
 
 def matches(pattern: str, path: KeyPath, *, below: bool = False) -> bool:
     """Return whether `pattern` matches `path` or, if `below`, a path above it."""
-    # `model.` may be left out, so `*.renderer` is no place of the model.
+    # `model.` is optional, so `*.renderer` matches no place of the model.
     wanted = pattern.removeprefix("model.").split(".")
     shown = path[1:] if path[0] == "model" else path
     fits = len(shown) >= len(wanted) if below else len(shown) == len(wanted)

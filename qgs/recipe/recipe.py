@@ -192,12 +192,12 @@ def spell_out(draft: Draft, parts: Mapping[KeyPath, Chosen]) -> _Spelled:
             yield from _spelled(path, values, draft.tree.child(*path), _DEFAULT)
     yield _plugins(draft, {part.installed.plugin.name for part in shown.values()})
     for name, section in SECTIONS.items():
-        # Without a `null` the default metric would come back when the recipe is read again.
+        # Without `null` the default metric would return when the recipe is read again.
         staying = section.defaults if section.defaults_stay else ()
         for key in staying:
             if (name, key) not in parts:
                 yield (name, key), None, draft.tree.child(name).origin_of(key)
-        # An empty section is not a missing one, which stands for the defaults.
+        # An empty section differs from a missing one, which gets the defaults.
         if section.named and not staying and not any(path[0] == name for path in parts):
             yield (name,), {}, draft.tree.origins.get(name, _DEFAULT)
 

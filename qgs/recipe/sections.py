@@ -37,7 +37,7 @@ class ModelSettings(ComponentConfig):
     @field_validator("heads")
     @classmethod
     def _divides_the_width(cls, heads: int, info: ValidationInfo) -> int:
-        # A width that is refused itself is not among the data.
+        # If the width is invalid itself, the data lack it.
         width = info.data.get("width", heads)
         if width % heads:
             reason = f"{heads} heads do not divide the width {width}"
@@ -110,7 +110,7 @@ _BY_INDEX: Any = Field(
 Layout: Any = create_model(
     "Layout",
     __base__=RecipeSettings,
-    # Components by pattern of the places that they take; null drops an inherited swap.
+    # Components by pattern of the places that they replace; null drops an inherited swap.
     swap=(dict[str, Any], {}),
     model=_section(
         ModelSettings,
@@ -130,7 +130,7 @@ def decode_settings(tree: MapNode, problems: Problems) -> tuple[MapNode, Any]:
     """Return `tree` without invalid values and null sections, and its Layout; add problems."""
     settings, faults = validated(Layout, tree)
     for fault in faults:
-        # A section that is null leaves the default one.
+        # A null section means the default one.
         if fault["input"] is not None or fault["type"] not in ("model_type", "dict_type"):
             report(fault, Layout, tree, (), problems)
     sound = deepcopy(tree)
@@ -141,7 +141,7 @@ def decode_settings(tree: MapNode, problems: Problems) -> tuple[MapNode, Any]:
             for fault in faults
         ]
         if not any(faulty):
-            # A fault of the whole, such as text that no JSON holds, leaves nothing to check.
+            # After a fault of the whole, such as text invalid in JSON, nothing is left to check.
             problems.raise_any()
         for keys in filter(None, faulty):
             # Two faults may lie in one list.
@@ -177,14 +177,14 @@ def draft_of(written: MapNode, problems: Problems, plugins: Sequence[Plugin]) ->
 
     plugins: plugins that the recipe may name without being installed.
     """
-    # Under what is written: `losses: {}` has none, a recipe without `losses` the default ones.
+    # `losses: {}` means no losses, a recipe without `losses` gets the defaults.
     sound, settings = decode_settings(written, problems)
     tree = _with_defaults(sound)
     registry = load_plugins(settings.plugins or (), tree, problems, plugins)
     expanded = expand(tree, settings.model.decoder.depth, problems)
     places = apply_swaps(tree.child("swap"), expanded, problems)
     found = [decode_place(place, registry, problems) for place in places.values()]
-    # Components that are not known cannot be checked beside each other.
+    # Unknown components cannot be checked together.
     problems.raise_any()
     return Draft(tree, settings, registry, {part.path: part for part in found if part})
 

@@ -65,7 +65,7 @@ SLOTS = {
         Slot(contracts.ViewSampler, "qgs/span"),
     )
 }
-# In the order in which their parameters are drawn: another one makes other models of a seed.
+# In the order of parameter initialisation: another order changes the model of a seed.
 AFTER_LAYERS = ("feedback", "head", "centers", "supervision", "renderer")
 MODEL_SLOTS = ("encoder", "queries", *AFTER_LAYERS)
 SECTIONS = {
@@ -77,7 +77,7 @@ SECTIONS = {
 
 def slot_at(path: KeyPath) -> Slot | None:
     """Return the slot at a place of a recipe; None for a place without a component."""
-    # That of a section stands first, that of a part of the model last.
+    # A section's slot is the first key, the slot of a part of the model the last.
     return next((SLOTS[key] for key in (*path[:1], *path[-1:]) if key in SLOTS), None)
 
 

@@ -14,7 +14,7 @@ from qgs.recipe.errors import Origin, Problems
 
 KeyPath: TypeAlias = tuple[str, ...]
 
-# A few lines of aliases can stand for billions of nodes: limits hold for the tree written out.
+# A few lines of aliases can expand to billions of nodes, so limits count expanded nodes.
 MAX_DEPTH = 64
 MAX_NODES = 20_000
 
@@ -113,7 +113,7 @@ def from_plain(value: Mapping[str, Any], origin: Origin) -> MapNode:
             return ListNode((read(item), origin) for item in plain)
         return plain
 
-    # JSON refuses what contains itself, and what is no plain value.
+    # JSON refuses cyclic values, and values that are not plain.
     return read(json.loads(json.dumps(value, default=os.fspath)))
 
 
@@ -194,7 +194,7 @@ def load_text(
     try:
         root = _composed(text)
         return None if root is None else _read(root, origin, count(1))
-    # Python's stack ends while PyYAML composes, before `_read` counts levels.
+    # Python's stack may overflow while PyYAML composes, before `_read` counts levels.
     except (yaml.YAMLError, RecursionError) as error:
         reason = f"this is not valid YAML of a recipe: {getattr(error, 'problem', error)}"
         fix = "correct the line; check indentation (spaces, no tabs), brackets, quotes and `: `"

@@ -121,7 +121,7 @@ class _Splat(torch.autograd.Function):
         batch, views, count, _ = rows.shape
         projection, blending = _limits(ctx.config, size)
         chunks, stripes = _parts(rows, size)
-        # Each stripe adds up gradients of its own, in a fixed order whatever the threads.
+        # Each stripe sums its own gradients, in an order that does not depend on threads.
         grads = np.zeros((batch, views, len(stripes), count, kernels.GRADIENTS), np.float32)
         given = slopes[0].contiguous().numpy()
         of_inputs = [torch.empty_like(tensor) for tensor in saved[1:5]]

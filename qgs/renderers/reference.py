@@ -31,7 +31,7 @@ def project(
     """
     centres = to_camera(gaussians.means, cameras)  # (B, V, G, 3)
     in_range = (centres[..., 2] >= near) & (centres[..., 2] <= far)
-    # Placeholders where nothing is drawn: a NaN there would reach every gradient through 0 * NaN.
+    # Placeholders for undrawn Gaussians: a NaN would reach every gradient through 0 * NaN.
     centres = torch.where(in_range[..., None], centres, constant([0.0, 0.0, 1.0], centres))
     rotations = quat_to_matrix(F.normalize(gaussians.quats, dim=-1))
     in_world = rotations * gaussians.scales[..., None, :]  # R S, (B, G, 3, 3)

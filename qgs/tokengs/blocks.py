@@ -27,7 +27,7 @@ class LayerScale(nn.Module):
 
     def __init__(self, width: int, init: float) -> None:
         super().__init__()
-        # A small start lets updates grow as they learn, which deep decoders need to train at all.
+        # Deep decoders only train if updates start small and grow.
         self.gamma = nn.Parameter(torch.full((width,), init))
 
     def forward(self, update: Tensor) -> Tensor:  # (..., D)
@@ -103,7 +103,7 @@ class SelfAttentionCore(nn.Module):
         q_BhTd, k_BhTd, _ = self.project(x_BTD)
         bias_B1QT = None
         if mask is not None:
-            # As a bias, since pictures show what is added to the logits.
+            # As a bias, because pictures show the bias on the logits.
             each = mask[:, None].expand(-1, x_BTD.shape[1], -1) if mask.ndim == 2 else mask
             bias_B1QT = torch.where(each[:, None, queries], 0.0, -torch.inf)
         return attention_weights(q_BhTd[:, :, queries], k_BhTd, bias_B1QT)

@@ -60,7 +60,7 @@ class CrossSelfMlp(DecoderLayer):
         self.feed_forward_scale = LayerScale(width, layer_scale)
 
     def forward(self, state: QueryState, memory: ImageMemory) -> tuple[QueryState, ImageMemory]:
-        # Each part reads what the part before it wrote: first the photos, then the other queries.
+        # Each part reads the output of the part before: first the photos, then other queries.
         x_BND = state.features + self.cross_scale(self.cross_attention(state, memory))
         # self-attention reads fields too.
         state = state.replace(features=x_BND)

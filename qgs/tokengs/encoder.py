@@ -141,7 +141,7 @@ def _larger(kernel: Tensor, side: int) -> Tensor:
     if kernel.ndim != 4 or not kernel.numel() or side % kernel.shape[-1]:
         return kernel
     factor = side // kernel.shape[-1]
-    # Divided, so that the sum over more pixels is the mean of what the small patches gave.
+    # Divided, so that the sum over more pixels equals the mean over small patches.
     return repeat(kernel / factor**2, "d c h w -> d c (h fh) (w fw)", fh=factor, fw=factor)
 
 
