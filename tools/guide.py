@@ -73,7 +73,7 @@ def _cross_reference(found: re.Match[str]) -> str:
 
 
 def _link(name: str, up: str) -> str:
-    """A link to the module that has `name`, labelled with the rest of it."""
+    """Return a link to the module that has `name`, labelled with the rest of the name."""
     module = name
     while not inspect.ismodule(found := resolve_name(module)):
         module = module.rpartition(".")[0]
@@ -86,7 +86,7 @@ def _file(found: Any) -> str:
 
 
 def _entry(name: str, options: str | None) -> str:
-    """A link from docs/api/ to the file of `name`, with the first paragraph of its docstring."""
+    """Return a link from docs/api/ to the file of `name`, with its docstring's first paragraph."""
     found = resolve_name(name)
     line = f"[`{name}`](../../{_file(found)}): {summary_of(found)}"
     return line + (f"\n<!-- {options} -->" if options else "")
@@ -99,7 +99,7 @@ def _part(name: str, text: str) -> str:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Called by mkdocs for each page."""
+    """Fill a page; mkdocs calls this for each one."""
     return filled(markdown)
 
 

@@ -37,7 +37,7 @@ class Row:
 
 
 def compared(golden: GoldenFile) -> list[Row]:
-    """A row for every tensor of a file that is no input and no weight, and for those it lacks."""
+    """Return a row for every tensor to compare, and for those that the file lacks."""
     found = loss_tensors(golden) if golden.is_of_losses else golden_tensors(golden)
     expected = golden.expected()
     rows = [_row(name, found.get(name), tensor) for name, tensor in expected.items()]

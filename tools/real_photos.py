@@ -1,4 +1,4 @@
-"""How models do on photos of real scenes, over many windows, with the scale that search finds.
+"""Scores of models on real photos, over many windows, at the scale that the search finds.
 
     python tools/real_photos.py PHOTOS ... [--model rooms/locus-64 ...]
         [--distances .5 1 2] [--refine 10] [--windows 12] [--out JSON]

@@ -20,7 +20,7 @@ TEMPLATE = Path(__file__).with_name("rooms.svg.jinja")
 GAP = 14
 ROW = 104
 ACROSS = 182
-"""From the left of a room to that of the next."""
+"""Distance from the left edge of a room to that of the next."""
 COLUMNS = 7
 
 

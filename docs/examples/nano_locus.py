@@ -98,7 +98,7 @@ def patches(p: Weights, name: str, images: Tensor) -> Tensor:  # (B*V, C, H, W) 
 
 
 def encode(p: Weights, images: Tensor, c2w: Tensor, intrinsics: Tensor) -> Sequence[Tensor]:
-    """A ViT over all views; its keys, values (B, h, M, D/h) and patch rays serve all layers."""
+    """Run a ViT over all views; return keys and values (B, h, M, D/h) and patch rays."""
     plucker = plucker_map(c2w, intrinsics, *images.shape[-2:]).flatten(0, 1)
     mean, std = torch.tensor([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]])[..., None, None]
     x = patches(p, "encoder.rgb_embedding", ((images - mean) / std).flatten(0, 1))
@@ -172,7 +172,7 @@ def decode(p: Weights, x: Tensor, mu: Tensor, rho: Tensor) -> Gaussians:
 
 
 def forward(p: Weights, *views: Tensor) -> list[tuple[Tensor, Gaussians]]:
-    """views: images, c2w, intrinsics. After each layer: centres (B, N, 3) and Gaussians."""
+    """Return centres (B, N, 3) and Gaussians after each layer. views: images, c2w, intrinsics."""
     k, v, rays = encode(p, *views)
     features = p.need("queries.features", QUERIES, WIDTH)
     box = torch.rand(QUERIES, 3) + torch.tensor([-0.5, -0.5, 0.5])  # before the first camera
@@ -255,7 +255,7 @@ def out_of_view(points: Tensor, c2w: Tensor, intrinsics: Tensor, size: tuple[int
 
 
 def loss(p: Weights, inputs: Sequence[Tensor], targets: Sequence[Tensor]) -> Tensor:
-    """inputs and targets: images (B, V, 3, H, W), c2w, intrinsics."""
+    """Return the loss. inputs and targets: images (B, V, 3, H, W), c2w, intrinsics."""
     truth, c2w, intrinsics = targets
     size = tuple(truth.shape[-2:])
     layers = forward(p, *inputs)
@@ -277,7 +277,7 @@ def loss(p: Weights, inputs: Sequence[Tensor], targets: Sequence[Tensor]) -> Ten
 
 # ---- Data and the loop: qgs/data/samples.py, qgs/train/training.py ----
 def blobs(views: int, size: int = 32) -> list[Tensor]:
-    """A scene of 40 random blobs from cameras side by side; the first is the world's frame."""
+    """Draw 40 random blobs from cameras side by side; the first one is the world's frame."""
     g = {
         "means": torch.rand(40, 3) * 1.6 + torch.tensor([-0.8, -0.8, 1]),
         "scales": torch.rand(40, 3) * 0.15 + 0.03,

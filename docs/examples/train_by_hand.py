@@ -23,7 +23,7 @@ from qgs.recipe import Recipe, resolve
 
 
 def loss_of(model: qgs.QueryGaussianModel, losses: dict[str, Loss], batch: Batch) -> Tensor:
-    """The recipe's losses, summed over the supervised layers with their weights."""
+    """Sum the recipe's losses over the supervised layers, with their weights."""
     # In training mode the model decodes Gaussians after every supervised layer, not the last only.
     prediction = model(batch.inputs)
     total = torch.zeros(())
@@ -37,7 +37,7 @@ def loss_of(model: qgs.QueryGaussianModel, losses: dict[str, Loss], batch: Batch
 
 
 def train(recipe: Recipe, steps: int) -> qgs.QueryGaussianModel:
-    """`steps` of AdamW at a constant rate after a short warm-up."""
+    """Train for `steps` of AdamW at a constant rate after a short warm-up."""
     torch.manual_seed(recipe.seed)
     model = recipe.build_model().train()
     losses = recipe.build_losses()

@@ -25,7 +25,7 @@ JUNK = [*TABLES["junk"], "x" * 100_000, [0] * 10_000]
 """Values where others belong."""
 
 Use = Callable[[], str]
-"""What is done with a case; returns how it ended. Raises what a user must not see."""
+"""Function that uses a case and returns how that ended. It raises what a user must never see."""
 
 
 class FaultError(Exception):

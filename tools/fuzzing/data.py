@@ -39,7 +39,7 @@ def opened(folder: Path) -> SceneSource:
 
 
 def write_nerfstudio(folder: Path, photos: Any) -> None:
-    """With masks and depth maps."""
+    """Write nerfstudio's format with masks and depth maps."""
     formats.write_nerfstudio(folder, photos)
     (folder / "mask.png").write_bytes(formats.encoded(np.full(SIZE, 255, np.uint8)))
     np.save(folder / "depth.npy", np.ones(SIZE, np.float32))
@@ -49,7 +49,7 @@ def write_nerfstudio(folder: Path, photos: Any) -> None:
 
 
 def write_cameras(folder: Path, photos: Any) -> None:
-    """As a project's own listing: poses and lenses have other names there."""
+    """Write a project's own listing, which has other names for poses and lenses."""
     formats.write_nerfstudio(folder, photos, K=photos.intrinsics)
     listing = folder / "transforms.json"
     text = listing.read_text().replace("transform_matrix", "c2w")

@@ -35,7 +35,7 @@ from qgs.contracts import LayerParts, ModelDims
 from qgs.types import ImageMemory, Views
 
 DIMS = {1: ModelDims(38, 1, 0), 2: ModelDims(39, 1, 2)}
-"""Of models of one scale, and of two with both depths."""
+"""Sizes by number of scales; a model of two scales outputs both depths."""
 
 OUTPUTS = """
 features_cnn.0                        depth_predictor.backbone.conv2
@@ -65,7 +65,7 @@ features_mono.1   mono_pyramid.stages.1
 
 
 def encoder_of(golden: GoldenFile) -> DepthSplatEncoder:
-    """The encoder with the options and the weights of a file."""
+    """Return the encoder with the options and the weights of a file."""
     shapes = {f"encoder.{name}": shape for name, shape in golden.config["state_dict"]}
     options = depthsplat_encoder(shapes)
     del options["type"]
@@ -142,7 +142,7 @@ def watch(kept: Recorder, encoder: DepthSplatEncoder, size: tuple[int, int]) -> 
 
 
 def swept(found: dict[str, Tensor], predictor: DepthPredictor, views: Views, sweep: Sweep) -> None:
-    """What the sweeps compute between modules."""
+    """Add to `found` what the sweeps compute between modules."""
     shape = sweep.near.shape
     poses = relative_poses(sweep.cameras.c2w, sweep.neighbours)
     counts = [predictor.candidates(scale) for scale in range(predictor.sizes.scales)]

@@ -11,7 +11,10 @@ from torch import Tensor
 WEIGHTS = "weights."
 EXPECTED = "expected."
 LOADER = ("crop.", "patch.")
-"""Of a release's data loader, not read: it crops photos to whole pixels, sources here do not."""
+"""Prefixes of a release's data loader.
+
+They are not read: it crops photos to whole pixels, sources here do not.
+"""
 
 
 @dataclass
@@ -24,22 +27,22 @@ class GoldenFile:
 
     @property
     def is_of_losses(self) -> bool:
-        """Whether it holds loss terms, rather than tensors of a model."""
+        """True for a file of loss terms, false for tensors of a model."""
         return any(name.startswith(EXPECTED) for name in self.tensors)
 
     def input(self, name: str) -> Tensor:
-        """A tensor to compute from, in float32."""
+        """Return a tensor to compute from, in float32."""
         self.read.add(name)
         tensor = self.tensors[name]
         return tensor.float() if tensor.is_floating_point() else tensor
 
     def weights(self) -> dict[str, Tensor]:
-        """The published state dict."""
+        """Return the published state dict."""
         names = [name for name in self.tensors if name.startswith(WEIGHTS)]
         return {name.removeprefix(WEIGHTS): self.input(name) for name in names}
 
     def expected(self) -> dict[str, Tensor]:
-        """The tensors to compare: all but inputs and weights."""
+        """Return the tensors to compare: all but inputs and weights."""
         return {name: value for name, value in self.tensors.items() if name not in self.read}
 
     def promised(self) -> list[str]:

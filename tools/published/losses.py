@@ -25,11 +25,11 @@ CLAMPS = {"noclamp": None, "clamp1": 1.0, "clamp0p25": 0.25}
 """Thresholds of visibility."""
 
 Given = tuple[LayerPrediction, Rendering, Views]
-"""What a loss judges, B scenes."""
+"""Input of a loss: prediction, rendering and views of B scenes."""
 
 
 def read_inputs(golden: GoldenFile) -> Given:
-    """The inputs of a loss file; outside its mask the truth is white, as in both releases."""
+    """Read the inputs of a loss file; outside its mask the truth is white, as in both releases."""
     points = golden.input("points")
     images = golden.input("images_gt")
     size = (images.shape[-2], images.shape[-1])
@@ -47,7 +47,7 @@ def read_inputs(golden: GoldenFile) -> Given:
 
 
 def value(loss: Loss, given: Given) -> Tensor:
-    """The only term of `loss`."""
+    """Return the only term of `loss`."""
     (term,) = loss(*given, given[2]).values()
     return term
 

@@ -93,7 +93,7 @@ def golden_tensors(golden: GoldenFile) -> dict[str, Tensor]:
 
 
 def recipe_of(golden: GoldenFile) -> dict[str, Any]:
-    """The recipe of the model that a file was computed with; raises as `golden_tensors` does."""
+    """Return the recipe of a file's model; raise what `golden_tensors` raises."""
     constants = {name: golden.config[name] for name in ("geo_sigma",) if name in golden.config}
     recipe = RECIPES[golden.config["kind"]](golden.config["options"] | constants)
     weights = golden.weights()
@@ -128,7 +128,7 @@ def watch(kept: Recorder, model: QueryGaussianModel) -> None:
 
 
 def of_views(views: Views, model: QueryGaussianModel) -> dict[str, Tensor]:
-    """What an encoder makes of photos, cameras and times before its network."""
+    """Return the input of the encoder's network: photos, rays and times."""
     origins, directions = camera_rays(views.cameras)
     found = {
         "images": imagenet_normalised(views.images),
@@ -146,7 +146,7 @@ def of_views(views: Views, model: QueryGaussianModel) -> dict[str, Tensor]:
 def of_state(
     model: QueryGaussianModel, memory: ImageMemory, state: QueryState, number: int
 ) -> dict[str, Tensor]:
-    """The state after `number` layers, and the bias of the next one."""
+    """Return the state after `number` layers, and the bias of the next layer."""
     found = {f"tokens.{number}": state.features}
     queries = model.queries
     if isinstance(queries, AnchoredQueries):

@@ -38,7 +38,7 @@ delta_disparity_and_density_logit   depth_predictor.to_disparity
 
 
 def encoder_of(golden: GoldenFile) -> MVSplatEncoder:
-    """The encoder with the options and the weights of a file."""
+    """Return the encoder with the options and the weights of a file."""
     options = golden.config["options"]
     config = MVSplatEncoder.Config(
         candidates=options["num_depth_candidates"],

@@ -61,7 +61,7 @@ def only(options: Options, expected: Options) -> None:
 
 
 def model_of(options: Options, *tables: str) -> dict[str, Any]:
-    """The model's part of a recipe, as far as `tables` tell it."""
+    """Return the model's part of a recipe, as far as `tables` tell it."""
     model: dict[str, Any] = {}
     for line in "".join(tables).split("\n"):
         if line:
@@ -75,7 +75,7 @@ def model_of(options: Options, *tables: str) -> dict[str, Any]:
 
 
 def tokengs_recipe(options: Options) -> dict[str, Any]:
-    """The recipe of the model that TokenGS builds from `options`."""
+    """Return the recipe of the model that TokenGS builds from `options`."""
     multiscale, latent = (options.get(name) for name in OF_2026_6)
     moving, timed = (options.get(name, 0) for name in OF_MOTION)
     model = model_of(options, BOTH, TOKENGS, LATENT if latent else "")
@@ -112,7 +112,7 @@ def tokengs_recipe(options: Options) -> dict[str, Any]:
 
 
 def locusgs_recipe(options: Options) -> dict[str, Any]:
-    """The recipe of the model that LocusGS builds from `options`.
+    """Return the recipe of the model that LocusGS builds from `options`.
 
     `geo_sigma`, a constant of the release, may stand among the options.
     """

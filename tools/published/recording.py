@@ -1,4 +1,4 @@
-"""What modules compute on the way, by name."""
+"""Recorder of what modules compute, by name."""
 
 from collections.abc import Callable
 
@@ -15,18 +15,18 @@ class Recorder:
         self.found: dict[str, Tensor] = {}
 
     def output(self, name: str, module: nn.Module, shaped: Change | None = None) -> None:
-        """What a module returns."""
+        """Record what a module returns."""
         change = shaped or self.shaped
         module.register_forward_hook(lambda _, __, out: self.found.update({name: change(out)}))
 
     def input(self, name: str, module: nn.Module, channels: slice = slice(None)) -> None:
-        """What a module is given."""
+        """Record what a module is given."""
         module.register_forward_pre_hook(
             lambda _, given: self.found.update({name: self.shaped(given[0][:, channels])})
         )
 
     def outputs(self, root: nn.Module, text: str) -> None:
-        """Those of modules: a name and the path of a module below `root` a line."""
+        """Record outputs; each line of `text` is a name and a module's path below `root`."""
         for line in text.strip().splitlines():
             name, path = line.split()
             self.output(name, root.get_submodule(path))

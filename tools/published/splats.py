@@ -1,4 +1,4 @@
-"""What golden files of MVSplat and DepthSplat share, and their files of cases."""
+"""Parts that golden files of MVSplat and DepthSplat share, and their files of cases."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -42,7 +42,7 @@ def lens_of(k: Tensor, size: tuple[int, int] = (1, 1)) -> Tensor:
 
 
 def weights_of(golden: GoldenFile) -> dict[str, Tensor]:
-    """The state dict under its published names, without the prefix of checkpoints."""
+    """Return the state dict under its published names, without the prefix of checkpoints."""
     rule = golden.config["weights"]
     # Sums of the weights, with which whoever recorded the file checked the rule.
     golden.read.add("weights_check")
@@ -55,12 +55,12 @@ def weights_of(golden: GoldenFile) -> dict[str, Tensor]:
 
 
 def of_views(views: int) -> Recorder:
-    """A recorder of modules with scenes and views in one axis, which become two."""
+    """Return a recorder for modules with scenes and views in one axis, which become two."""
     return Recorder(lambda x: x.detach().unflatten(0, (-1, views)))
 
 
 def watch_transformer(kept: Recorder, transformer: Any, size: Sequence[int], last: str) -> None:
-    """The stream before and behind each attention in windows; `last` names the result."""
+    """Record the stream before and behind each attention in windows; `last` names the result."""
     transformer.register_forward_pre_hook(
         lambda _, given: kept.found.update({"transformer.0": given[0]})
     )
@@ -84,7 +84,7 @@ def watch_unet(kept: Recorder, name: str, unet: Any) -> None:
 
 
 def warps(views: Views, poses_BVJ44: Tensor, low: Sequence[int], inverse_BVD: Tensor) -> Tensor:
-    """Where pixels of maps of size `low` stand in neighbours, (B, V, J, D, h, w, 2)."""
+    """Return the places of pixels of maps of size `low` in neighbours, (B, V, J, D, h, w, 2)."""
     pairs = poses_BVJ44.shape[:3]
     lens = feature_lenses(views.cameras, low)[:, :, None].expand(*pairs, 4)
     depth = (1 / inverse_BVD)[:, :, None, :, None, None].expand(*pairs, -1, *low)

@@ -135,7 +135,7 @@ def view(
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Turn a reconstruction in the browser, pick a query, see its anchor and what it reads.
+    """Show a reconstruction in the browser: turn it, pick a query, see its anchor and attention.
 
     Anchors are shown layer by layer, and the input photos can be changed.
     """
@@ -222,10 +222,10 @@ def demo(
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Trained models on rooms unseen in training, or on your photos; writes report.html.
+    """Compare trained models on unseen rooms or on your photos, and write report.html.
 
-    Photos without camera poses, and videos, get them first (qgs poses). With --train the
-    tiny TokenGS and LocusGS, or the named recipes, are trained on the same rooms and compared.
+    For videos and photos without camera poses, poses are made first (qgs poses). --train
+    trains the tiny TokenGS and LocusGS, or the named recipes, on the same rooms instead.
     """
     if train and models:
         raise ValueError("--model names trained models; leave out --train, or name recipes")
@@ -256,7 +256,7 @@ def report(
     threads: Threads = None,
     device: Device = "auto",
 ) -> None:
-    """Evaluate trained models and show their scenes side by side; writes report.html."""
+    """Evaluate trained models, and write report.html with their scenes side by side."""
     if (size, scale) != (None, None) and photos is None:
         raise ValueError("--size and --scale are for photos: give --photos, or leave them out")
     from qgs_viewer.compare import compare_models

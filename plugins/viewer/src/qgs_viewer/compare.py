@@ -1,4 +1,4 @@
-"""From models or recipes that a user names to a written report."""
+"""Reports on the models or recipes that a user names."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -23,7 +23,10 @@ ON_PHOTOS = {
     64: ("worlds/landmark-64", "worlds/locus-64", "worlds/tokengs-64"),
     128: ("worlds/landmark-128", "rooms/landmark-128", "rooms/locus-128"),
 }
-"""By pixels, on a user's photos; the first's training decides which photos are inputs."""
+"""Default models for a user's photos, by pixels.
+
+The first one's training decides which photos are inputs.
+"""
 # The recipes that `qgs demo --train` trains.
 RECIPES = ("recipes/tiny/tokengs.yaml", "recipes/tiny/locus.yaml")
 

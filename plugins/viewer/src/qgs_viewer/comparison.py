@@ -46,8 +46,8 @@ OF_THE_METHOD = (
     "views.scale",
     "views.scale_factor",
 )
-"""Options in them that may differ: how a method trains, tuning, which nobody does here, and the
-unit of a model's world, which no score depends on."""
+"""Options that may differ between compared recipes: the method's training, tuning (not used here),
+and the unit of a model's world (no score depends on it)."""
 
 
 # Cost above the best window's up to which a window is shown.

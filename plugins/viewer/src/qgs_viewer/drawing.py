@@ -33,8 +33,9 @@ SOLID = 0.1
 
 @dataclass(frozen=True)
 class Choice:
-    """What is shown. query: the picked one. layer: of supports and attention, 0 the start.
+    """Choice of what the viewer shows.
 
+    query: the picked one. layer: of supports and attention, 0 is the start.
     others: how Gaussians of other queries look. patches: number of lines to those that are read.
     """
 

@@ -1,4 +1,4 @@
-"""From what a user names to a scene: a PLY, a finished reconstruction, a model with photos."""
+"""Scenes that a user names: a PLY, a finished reconstruction, or a model with photos."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,6 @@ from qgs.types import Cameras
 from qgs.wording import listed
 from qgs_viewer.placement import Placement
 from qgs_viewer.query_scene import NEUTRAL, QueryScene, explained
-from qgs_viewer.remarks import summary
 
 PLY = "gaussians.ply"
 CAMERAS = "cameras.json"
@@ -148,7 +147,7 @@ def open_model(
     seen = Domain()
     seen.see(sample.inputs.cameras, sample.targets.cameras)
     notes = [
-        summary(scales) if scales else "",
+        *(f"{scale.text}; --scale sets another" for scale in scales),
         f"inputs {listed(map(shown.frame_name, sample.input_frames))}" if photos else "",
         verdict(trained, seen),
         *(scale.poor for scale in scales),
@@ -205,7 +204,7 @@ class FinishedScene(Scene):
         return to_tensor(np.stack(pictures))
 
     def label(self, frame: int) -> str:
-        """The photo's file, or its number in the scene, not its place in cameras.json."""
+        """Return the photo's file, or its number in the scene (not its place in cameras.json)."""
         view = self._views[frame]
         return str(view.get("photo") or f"frame {view['frame']}")
 

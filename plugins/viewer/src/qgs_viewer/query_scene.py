@@ -54,12 +54,12 @@ class QueryScene:
 
     @property
     def queries(self) -> int:
-        """How many queries there are to pick; 0 without a model."""
+        """Number of queries to pick from; 0 without a model."""
         return self.inside.states[0].features.shape[1] if self.inside else 0
 
     @property
     def depth(self) -> int:
-        """How many decoder layers there are; 0 without a model."""
+        """Number of decoder layers; 0 without a model."""
         return self.inside.model.depth if self.inside else 0
 
     def refuse_missing(self, query: int | None) -> None:
@@ -85,7 +85,7 @@ class QueryScene:
 
     @property
     def has_anchors(self) -> bool:
-        """Whether the queries have a place in space."""
+        """True if the queries have a place in space."""
         return self.support(0) is not None
 
     def support(self, layer: int) -> SpatialSupport | None:

@@ -3,37 +3,30 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from qgs.reconstruction.scale import FoundScale
 from qgs.wording import counted, listed
 
 if TYPE_CHECKING:
     from qgs_viewer.comparison import Model
 
 
-def summary(found: Collection[FoundScale]) -> str:
-    """Return one line on the scales of one or several windows."""
-    text = next(iter(found)).text
-    if len(found) > 1:
-        ordered = sorted(scale.factor for scale in found)
-        mean = sum(scale.psnr for scale in found) / len(found)
-        text = (
-            f"scale {ordered[0]:.3g} to {ordered[-1]:.3g}, found on the inputs and photos beside "
-            f"them in {len(found)} windows: {mean:.1f} dB"
-        )
-        if poor := sum(bool(scale.poor) for scale in found):
-            text += f", no scale fits {counted(poor, 'window')}"
-    return f"{text}; --scale sets another"
-
-
 def scale_remarks(models: Sequence[Model]) -> Iterator[str]:
-    """Yield a sentence for each model whose scales were searched."""
+    """Yield one sentence on all models whose scales were searched, if there are any."""
+    parts = []
     for model in models:
         if found := model.search.found.values():
-            yield f"{model.name}: {summary(found)}."
+            factors = sorted(scale.factor for scale in found)
+            ends = dict.fromkeys(f"{factor:.3g}" for factor in (factors[0], factors[-1]))
+            mean = sum(scale.psnr for scale in found) / len(found)
+            poor = sum(bool(scale.poor) for scale in found)
+            fault = f", no scale fits {counted(poor, 'window')}" if poor else ""
+            parts.append(f"{model.name} {' to '.join(ends)} ({mean:.1f} dB{fault})")
+    if parts:
+        found_scales = "; ".join(parts)
+        yield f"Scales found by rendering photos: {found_scales}. --scale sets another."
 
 
 def remarks(models: Sequence[Model]) -> list[str]:
@@ -60,7 +53,7 @@ def chosen_windows(model: Model) -> Iterator[str]:
             judged = listed(score.names.get(frame, frame) for frame in targets)
             texts.append(f"{given} ({judged})")
         windows = "; ".join(texts)
-        yield f"{score.scene}, inputs (held-out photos that are judged): {windows}"
+        yield f"{score.scene}, inputs (photos that are judged): {windows}"
 
 
 def next_commands(

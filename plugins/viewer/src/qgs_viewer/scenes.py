@@ -1,4 +1,4 @@
-"""What models make of the scenes that pages and figures show."""
+"""Reconstructions of the scenes that pages and figures show."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

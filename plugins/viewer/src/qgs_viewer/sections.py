@@ -74,14 +74,14 @@ class Section:
 
     @property
     def words(self) -> Mapping[str, str]:
-        """Its `title` and `text`, and what is said where no model has data for it: `empty`."""
+        """Texts of the section: `title`, `text`, and `empty` for models without data for it."""
         file = files("qgs_viewer") / "template" / "sections.toml"
         return tomllib.loads(file.read_text(encoding="utf-8"))[self.name]
 
 
 @dataclass(frozen=True)
 class Detail:
-    """How sections show models.
+    """Settings of sections that show models.
 
     side: pixels on the longer side of pictures. query: the one to show; by default notable ones.
     """
@@ -91,7 +91,7 @@ class Detail:
 
 
 def scene_to_turn(models: Shown) -> Section:
-    """The first scene as every model makes it, each with a page to turn it."""
+    """Show every model's first scene, each with a page to turn it."""
     tiles = []
     for model in models:
         camera = images.finer(model.target_camera, Detail.side)
@@ -105,7 +105,7 @@ def scene_to_turn(models: Shown) -> Section:
 
 
 def queries(models: Shown, detail: Detail) -> Section:
-    """The Gaussians of notable queries of each model, seen from the first target view."""
+    """Show the Gaussians of notable queries of each model, seen from the first target view."""
     tiles = []
     for model in models:
         camera = images.finer(model.target_camera, detail.side)
@@ -140,7 +140,7 @@ def anchors(models: Shown, detail: Detail) -> Section:
 
 
 def attention(models: Shown, detail: Detail) -> Section:
-    """What one query of each model reads in the input views: content, geometry, both."""
+    """Show what one query of each model reads in the input views: by content, geometry and both."""
     rows = {}
     for model in models:
         (query,) = model.notable(1, model.target_camera, detail.query)
@@ -165,7 +165,7 @@ def training_curves(models: Shown, detail: Detail) -> Section:
 
 
 def novel_views(models: Shown, detail: Detail) -> Section:
-    """The middle target of three scenes: inputs, truth, renders, their error and depth."""
+    """Show the middle target of three scenes: inputs, truth, renders, their error and depth."""
     rows: dict[str, Sequence[Tile | None]] = {}
     for place, sample in enumerate(models[0].samples[:NOVEL_SCENES]):
         scene = pictured_scene(models, place, [len(sample.target_frames) // 2])
