@@ -1,1 +1,1 @@
-"""From a camera to a scene: formats, checks, poses, refinement."""
+"""Photo formats, checks of data, camera poses and refinement of scenes."""

@@ -45,12 +45,12 @@ class ChunksConfig(SceneSource.Config):
     """Folder or fsspec URL with train/ and test/, relative to the working directory. Chunks at a
     URL are read whole, by every process and worker: copy them to a local disk to train."""
     holdout: int = Field(default=0, ge=0)
-    """Every n-th frame of a scene is kept for evaluation, from frame n // 2 on; 0 keeps those that
-    `qgs data pack` took over from its source, which other chunks have none of."""
+    """Keep every n-th frame of a scene for evaluation, from frame n // 2 on. 0 keeps the
+    frames that `qgs data pack` copied from its source; other chunks have none."""
     max_scenes: int = Field(default=0, ge=0)
-    """Only the first scenes of each split; 0 for all."""
+    """Number of first scenes to use from each split. 0 uses all."""
     min_frames: int = Field(default=0, ge=0)
-    """Leave out scenes with fewer frames, which opens every chunk once at the start; 0 for none."""
+    """Leave out scenes with fewer frames; this opens every chunk once at the start. 0 keeps all."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """RGB in [0, 1] behind transparent pixels."""
 

@@ -80,8 +80,9 @@ class Dl3dvSource(LazySource):
 
     @classmethod
     def recognises(cls, path: UPath) -> bool:
-        """Return whether there are archives, or folders named by a hash or laid out as DL3DV's
-        benchmark, also in folders such as 1K.
+        """Return whether there are archives or scene folders, also in folders such as 1K.
+
+        Scene folders are named by a hash, or have the layout of DL3DV's benchmark.
 
         A folder of photos that lists them itself is left to `qgs/photos`.
         """

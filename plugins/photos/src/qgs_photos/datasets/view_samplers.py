@@ -29,8 +29,7 @@ from qgs.data.view_samplers import (
 from qgs.domain import Domain
 
 _SHARE = 0.5
-"""Share of the photos among which a sample looks for its inputs, so that a photo does not always
-have the same."""
+"""Share of the photos from which a sample chooses its inputs, so that a photo's inputs vary."""
 _JUDGED = 4
 """Photos on which a scene without held-out ones is judged."""
 
@@ -53,7 +52,10 @@ class Bounded(ViewSampler):
         max_gap: int = Field(default=192, ge=1)
         """Largest number, after the warm-up; a scene may allow less."""
         margin: int = Field(default=0, ge=0)
-        """Frames from a target to the first and the last input, at least."""
+        """Least number of frames between a target and the first or last input.
+
+        0: the inputs may be targets.
+        """
         warm_up_steps: int = Field(default=150_000, ge=0)
         """Optimiser steps in which the gap goes from its initial bounds to the final ones."""
         initial_min_gap: int = Field(default=25, ge=1)
@@ -142,8 +144,8 @@ class Farthest(Bounded):
 
     class Config(Bounded.Config):
         fewest: int = Field(default=2, ge=2)
-        """Least number of inputs in training, where `views.inputs` is the largest. Evaluation has
-        that one always."""
+        """Least number of inputs in training; `views.inputs` is the largest. Evaluation always uses
+        `views.inputs`."""
 
     config: Config
 
@@ -202,7 +204,7 @@ class Overlapping(ViewSampler):
 
     class Config(ComponentConfig):
         apart: tuple[float, float] = (0.5, 2.0)
-        """Bounds of the factor in training."""
+        """Bounds of the factor of distances and angles in training."""
 
         @field_validator("apart")
         @classmethod

@@ -30,7 +30,7 @@ FEWEST = 20
 
 @dataclass(frozen=True)
 class Options:
-    """How thorough a check is: the options of `qgs data check`; format may also be PLUGIN/NAME."""
+    """Options of `qgs data check`; format may also be PLUGIN/NAME."""
 
     geometry: int = 20
     headers_only: bool = False

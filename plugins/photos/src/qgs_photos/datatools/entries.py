@@ -24,7 +24,10 @@ _KEPT_FORMATS = {"JPEG", "MPO", "PNG"}
 
 @dataclass(frozen=True)
 class Encoding:
-    """How images are rewritten. resized: all, as delivered. jpeg: quality; None for PNG."""
+    """Settings of rewritten images.
+
+    resized: rewrite all, as delivered. jpeg: quality; None for PNG.
+    """
 
     resized: bool = False
     jpeg: int | None = None

@@ -1,4 +1,4 @@
-"""What a check finds: faults with scene, frames and remedy, one line each, and a row a scene."""
+"""Findings of a check: one line for each fault, one row for each scene."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -85,7 +85,7 @@ def _joined(findings: Sequence[Finding], key: Callable[[Finding], Any]) -> list[
 
 @dataclass(frozen=True)
 class SceneReport:
-    """What was found in a scene.
+    """Findings and measurements of a scene.
 
     split: empty where the format has none. numbered: photos that a reader has as frames.
     pose_problems: frames whose pose is wrong. epipolar: median distance of matches to epipolar

@@ -1,4 +1,4 @@
-"""Whether a scene's cameras agree with its photos: points that pairs of neighbours share."""
+"""Agreement of a scene's cameras with its photos, by points that pairs of neighbours share."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -41,15 +41,15 @@ _ADVICE = (
 )
 
 Features: TypeAlias = tuple[np.ndarray, np.ndarray]
-"""Of one photo: points (P, 2) x, y in pixels, and SIFT's descriptors (P, 128)."""
+"""Features of one photo: points (P, 2) x, y in pixels, and SIFT's descriptors (P, 128)."""
 Pairs: TypeAlias = Sequence[tuple[tuple[int, int], float]]
-"""Two frames, and the median distance of their matches from where the poses want them, of the
-diagonal."""
+"""Two frames, and the median distance of their matches from the place that the poses predict, as a
+share of the diagonal."""
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """How well the poses of a scene explain its photos.
+    """Measurement of how well the poses of a scene explain its photos.
 
     unjudged: why there are no `pairs`. diagonal: of the files, in pixels.
     """

@@ -20,7 +20,7 @@ from qgs_photos.datatools.entries import ChunkEntry, Encoding, chunk_entry, enco
 
 CHUNK_BYTES = 100 * 2**20
 SETTINGS = "packing.json"
-"""What decides the result of a packing that is not finished."""
+"""File with the settings that decide the result of an unfinished packing."""
 
 Places: TypeAlias = Mapping[str, tuple[Split, int]]
 """Scenes by name: the split of the source that has each, and its index there."""
@@ -110,7 +110,7 @@ def _packed_before(folder: UPath) -> dict[str, str]:
 
 @dataclass
 class Packed:
-    """What a packing did: scenes by split; `resumed` of them were packed before.
+    """Result of a packing: scenes by split; `resumed` of them were packed before.
 
     frames, kept: images written now, and those whose bytes stayed. left_out: scenes that could not
     be read, with the reason.

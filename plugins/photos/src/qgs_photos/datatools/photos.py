@@ -64,7 +64,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Decoded:
-    """What decoding a photo gave. size: (H, W), None for none. digest: of the bytes.
+    """Result of decoding a photo. size: (H, W), None for none. digest: of the bytes.
 
     errors, warnings: reasons with remedies. empty_mask: whether its mask leaves out everything,
     None without one.
