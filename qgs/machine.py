@@ -1,4 +1,4 @@
-"""This machine: memory, and what does not fit into it; cores, and work on all of them."""
+"""Memory and cores of this machine: sizes that do not fit, work on all cores."""
 
 import os
 import sys
@@ -48,7 +48,7 @@ def _numbers(table: Path) -> dict[str, int]:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether Python, NumPy or torch ran out of memory, on any device."""
+    """Return whether Python, NumPy or torch ran out of memory, on any device."""
     words = str(error).lower()
     from_torch = "can't allocate memory" in words or "out of memory" in words
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and from_torch)

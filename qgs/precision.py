@@ -16,11 +16,11 @@ HALF = (torch.float16, torch.bfloat16)
 
 
 Precision: TypeAlias = Literal["float32", "bf16"]
-"""Of `training.precision` and `qgs bench`. Weights stay float32."""
+"""Precision of a model's computation (`training.precision`, `qgs bench`). Weights stay float32."""
 
 
 def autocast(precision: Precision, device: str) -> torch.autocast:
-    """The context in which a model computes in `precision`; geometry leaves it by itself.
+    """Return the context in which a model computes in `precision`; geometry leaves it by itself.
 
     bfloat16 has float32's exponents, so that no gradients need scaling.
     """

@@ -47,7 +47,7 @@ def similarity_map(x: Tensor, y: Tensor, padding: Padding, correction: float = 1
 
 @full_precision
 def mean_ssim(images: Tensor, truth: Tensor, padding: Padding) -> Tensor:
-    """The mean of `similarity_map`, 0-d; on a CPU by a kernel, in a tenth of the time."""
+    """Return the mean of `similarity_map`, 0-d; on a CPU by a kernel, in a tenth of the time."""
     # A subclass, as torch makes to count or trace without numbers, cannot become an array.
     plain = type(images) is type(truth) is Tensor and images.is_cpu
     single = images.dtype == truth.dtype == torch.float32

@@ -47,7 +47,7 @@ class _Shown:
 
 
 def show_safely() -> None:
-    """From here on, whatever this process prints is `shown`; Rich still colours and draws."""
+    """Pass everything that this process prints from now on through `shown`; Rich still colours."""
     import rich.text
 
     # Of all texts that it draws.

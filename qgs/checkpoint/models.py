@@ -24,7 +24,7 @@ from qgs.terminal import without_secrets
 from qgs.wording import did_you_mean, warn_once
 
 CHECKPOINT = "checkpoint.safetensors"
-"""In a run folder: the latest good weights."""
+"""Name of the latest good weights in a run folder."""
 LARGEST = 20 * 10**9
 """Most bytes of a download."""
 PATIENCE = 60.0

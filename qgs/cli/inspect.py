@@ -13,7 +13,7 @@ RecipeFile: TypeAlias = Annotated[Path, typer.Argument(help="Recipe file.")]
 
 
 def compose(recipe: RecipeFile, overrides: Overrides = None) -> None:
-    """The resolved recipe, where each value comes from, and parameters per component.
+    """Print the resolved recipe, the origin of each value, and parameters per component.
 
     The recipe goes to standard output and is valid YAML; the parameters go to standard error.
     """
@@ -43,7 +43,7 @@ def recipes(
         typer.Option(help="Folder to copy it to, with what it extends; never overwrites."),
     ] = None,
 ) -> None:
-    """The recipes that come with qgs; every command takes their names.
+    """List the recipes that come with qgs, or show one. Every command takes their names.
 
     A file of that name in the working directory comes first.
     """

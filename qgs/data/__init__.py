@@ -1,4 +1,4 @@
-"""Where scenes come from, and how views are drawn from them."""
+"""Sources of scenes, and how views are drawn from them."""
 
 from qgs.contracts import Component
 from qgs.data.photos.source import PhotosSource

@@ -1,4 +1,4 @@
-"""Which photos of a scene become inputs: photos that overlap, as far apart as in training.
+"""Choice of input photos: photos that overlap, as far apart as in training.
 
 Distances are compared with the depth of what the photos show, from cameras alone or by matching
 photos. Source: A Space-Sweep Approach to True Multi-Image Matching (Collins 1996), with planes

@@ -1,4 +1,4 @@
-"""Which source opens a path, and opening it for a trained model."""
+"""Choice of the source that opens a path, also for a trained model."""
 
 from collections.abc import Mapping
 from typing import Any

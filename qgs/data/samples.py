@@ -1,4 +1,4 @@
-"""From a scene to what a model sees: which views, in which coordinates, mirrored or not.
+"""Samples of scenes as a model sees them: views, coordinates, mirroring.
 
 Source: TokenGS release (pose normalisation, mirroring).
 Everything here is a pure function of its arguments and of the random generator it is given.
@@ -60,7 +60,7 @@ class Batch:
     input_frames: tuple[Frames, ...]
     target_frames: tuple[Frames, ...]
     left_out: tuple[str, ...] = ()
-    """What was to be in it and could not be made: scene, frame and reason."""
+    """Samples that could not be made: scene, frame and reason."""
 
 
 def make_sample(

@@ -1,4 +1,4 @@
-"""What sources of scenes share: lists opened on demand, a cache."""
+"""Parts that sources of scenes share: lists opened on demand, a cache."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence

@@ -161,7 +161,7 @@ class SampleStream(Dataset[Batch | Exception]):
         return replace(batch, left_out=tuple(left_out))
 
     def __getitem__(self, numbers: Sequence[int]) -> Batch | Exception:
-        """As `batch`, for a worker, which returns failures."""
+        """Return `batch(numbers)` in a worker, or the failure as an exception."""
         try:
             return self.batch(numbers)
         except Exception as error:

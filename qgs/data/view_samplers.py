@@ -1,4 +1,4 @@
-"""Which frames of a scene are held out, and which a training sample shows: the sampler `qgs/span`.
+"""Held-out frames of a scene, and the sampler `qgs/span` of training views.
 
 Source: TokenGS release (gap, targets from the span of the inputs).
 """

@@ -1,4 +1,4 @@
-"""Which views an evaluation compares: drawn by seed, or named by an index file."""
+"""Views that an evaluation compares: drawn by seed, or named by an index file."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ EvaluationIndex: TypeAlias = Mapping[str, IndexEntry | None]
 """Scene name to its frames; None for a scene that is listed but not judged."""
 
 ViewsOf: TypeAlias = Callable[[Scene, Frames, Frames], ViewsConfig]
-"""From a scene, input and target frames to the settings with which their sample is made."""
+"""Function of a scene, input and target frames; it returns the settings of their sample."""
 
 GIVEN = "frames as context and as target"
 """Words for `given_targets`: a score on them means nothing, the nearest input view is perfect."""

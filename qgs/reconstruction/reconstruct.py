@@ -1,4 +1,4 @@
-"""From photos and a model to a reconstruction in one call: inputs, scale, forward pass, remarks."""
+"""Reconstruction from photos and a model in one call: inputs, scale, forward pass, remarks."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -32,9 +32,9 @@ MOST = 16
 BASELINES = (0.06, 0.25)
 """Baselines where those of the training are unknown."""
 BELOW = 2.0
-"""How far the search goes below the least baseline of the training."""
+"""Factor by which the search goes below the least baseline of the training."""
 ABOVE = 4.0
-"""How far the search goes above the largest baseline of the training."""
+"""Factor by which the search goes above the largest baseline of the training."""
 NEAREST = 0.8
 """Least depth that cameras look at where that of the training is unknown."""
 REACH = 6.0
@@ -44,7 +44,7 @@ PENALTY = 5.0
 POOR = 14.0
 """dB of the judged photos below which no scale fits: then novel views have 12 dB in the mean."""
 PIXELS = 2**18
-"""Of inputs in one forward pass, which bounds memory."""
+"""Most pixels of inputs in one forward pass; this limits memory."""
 
 
 @dataclass(frozen=True)

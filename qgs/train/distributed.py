@@ -21,8 +21,10 @@ from accelerate.utils import (
 )
 
 TIMEOUT = timedelta(hours=24)
-"""How long processes wait while one evaluates or saves. NCCL's default of 10 minutes would end such
-runs; a process that died is noticed by the launcher, which ends the others."""
+"""Time that processes wait while one evaluates or saves.
+
+NCCL's default of 10 minutes would end such runs. The launcher notices a process that died, and ends
+the others."""
 
 _PARALLEL = (DistributedType.NO, DistributedType.MULTI_CPU, DistributedType.MULTI_GPU)
 

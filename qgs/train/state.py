@@ -1,4 +1,4 @@
-"""What a run counts and keeps to go on: steps, random states, moments, averaged weights."""
+"""State that a run saves to continue: steps, random states, moments, averaged weights."""
 
 import math
 import time

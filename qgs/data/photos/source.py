@@ -53,17 +53,17 @@ class PhotosConfig(SceneSource.Config):
     relative to the working directory, or an fsspec URL. Photos without cameras and videos need
     `qgs poses` first."""
     format: str = "auto"
-    """How cameras are listed: nerfstudio, or a format of a plug-in, such as colmap; auto is the
-    first that a folder holds."""
+    """Format of the camera listing: nerfstudio, or a format of a plug-in, such as colmap. auto uses
+    the first format that the folder has."""
     images: str | None = None
-    """Folder of photos to read instead of the listed one, such as images_4."""
+    """Folder of photos to read, such as images_4. null reads the listed photos."""
     outside: bool = False
     """Read photos outside of the folder too, by absolute paths or `..`; links are followed."""
     holdout: int = Field(default=8, ge=0)
-    """Every n-th frame is kept for evaluation, from frame n // 2 on, or the middle one of fewer; 0
-    for none. A listing's own split goes first."""
+    """Hold out every n-th frame for evaluation, from frame n // 2 on; with fewer frames, the middle
+    one. 0 holds out none. A split in the listing replaces this."""
     max_frames: int = Field(default=0, ge=0)
-    """Only the first frames of a listing; 0 for all."""
+    """Number of first frames to read from a listing. 0 reads all."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """RGB in [0, 1] behind transparent pixels."""
     depth_unit: float = Field(default=1e-3, gt=0)
