@@ -8,7 +8,7 @@ import typer
 
 def convert(
     source: Annotated[
-        Path, typer.Argument(metavar="IN", help="PLY of qgs or of any 3DGS program.")
+        Path, typer.Argument(metavar="IN", help="PLY of any 3DGS program, .splat or .spz.")
     ],
     out: Annotated[
         Path,

@@ -4,6 +4,8 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import IO, TypeVar
 
@@ -23,7 +25,7 @@ TURN = "poses must be of the stored pixels; `mogrify -auto-orient` turns pixels 
 
 _EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "HSV")
 # Of photos; others, such as EPS, would start programs.
-_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "DIB", "GIF", "PPM", "JPEG2000", "TGA")
+_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "DIB", "GIF", "PPM", "JPEG2000", "TGA", "AVIF")
 # They take 2 GB with transparency; the largest phones make 108 million.
 _MOST_PIXELS = 120_000_000
 # A tag of EXIF.
@@ -187,16 +189,28 @@ def _decoded(file: IO[bytes]) -> Image.Image:
     return image
 
 
+@cache
+def _formats() -> tuple[str, ...]:
+    """Return _FORMATS, and HEIC where pillow-heif is installed."""
+    try:
+        import_module("pillow_heif").register_heif_opener()
+    except ImportError:
+        return _FORMATS
+    return (*_FORMATS, "HEIF")
+
+
 @contextmanager
 def opened_image(file: IO[bytes]) -> Iterator[Image.Image]:
     """Open an image of a format of photos, not yet decoded. Raises OSError, in the block too."""
     try:
-        with Image.open(file, formats=_FORMATS) as image:
+        with Image.open(file, formats=_formats()) as image:
             if image.width * image.height > _MOST_PIXELS:
                 raise OSError(f"it has {image.width} x {image.height} pixels: scale it down")
             yield image
     except UnidentifiedImageError as error:
-        raise OSError("its header is none of a known image format") from error
+        raise OSError(
+            "its header is none of a known image format; HEIC needs `pip install pillow-heif`"
+        ) from error
     except (OSError, MemoryError):
         raise
     # Decoders raise anything on damaged files.

@@ -4,7 +4,7 @@ from upath import UPath
 
 from qgs.paths import listing
 
-_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".avif", ".heic", ".heif")
 
 
 def image_files(folder: UPath) -> list[UPath]:

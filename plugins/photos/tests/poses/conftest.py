@@ -34,14 +34,14 @@ def walk(images, tmp_path_factory):
     photos[1].transpose(Image.Transpose.ROTATE_90).save(folder / "1.jpg", quality=95, exif=exif)
     Image.fromarray(257 * np.array(photos[2].convert("L"), np.uint16)).save(folder / "2.png")
     photos[3].convert("CMYK").save(folder / "3.tif")
-    photos[4].save(folder / "4.webp", quality=95)
+    photos[4].save(folder / "4.avif", quality=95)
     photos[5].convert("RGBA").save(folder.parent / "5.png")
     (folder / "5.png").symlink_to(folder.parent / "5.png")
     noise = np.random.default_rng(7).integers(0, 255, images[0].shape, np.uint8)
     Image.fromarray(noise).save(folder / "other.png")
     Image.fromarray(noise).save(folder / "broken.png")
     cut(folder / "broken.png", 0.5)
-    for name in ("empty.jpg", "a.HEIC", "._0.jpg"):
+    for name in ("empty.jpg", "a.DNG", "._0.jpg"):
         (folder / name).touch()
     (folder / "folder.jpg").mkdir()
     return folder

@@ -42,7 +42,7 @@ def record_in(folder):
 
 def test_photos_get_the_poses_they_were_taken_with(made, shots, walk):
     folder, poses = made
-    names = ["0 Fo’to #{} %20 'ä'.JPG", "1.jpg", "2.png", "3.tif.png", "4.webp.png", "5.png"]
+    names = ["0 Fo’to #{} %20 'ä'.JPG", "1.jpg", "2.png", "3.tif.png", "4.avif.png", "5.png"]
     assert poses.posed == names
     assert poses.without == ["other.png"]
     assert poses.faulty.keys() == {"broken.png", "empty.jpg"}
@@ -50,7 +50,7 @@ def test_photos_get_the_poses_they_were_taken_with(made, shots, walk):
     assert_close(folder, shots)
     counts, remark, *_, advice = poses.summary
     assert counts == f"{PHOTOS} of {PHOTOS + 1} photos have poses"
-    assert "a.HEIC" in remark
+    assert "a.DNG" in remark
     assert "other.png; to get more" in advice
     assert "3.tif" in record_in(folder)["source"]
     assert {file.name for file in folder.iterdir()} == {"images", "poses.json", "sparse"}

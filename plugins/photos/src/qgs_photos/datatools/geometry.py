@@ -11,6 +11,7 @@ from kornia.feature import match_smnn
 from kornia.geometry.ransac import RANSAC
 from skimage.feature import SIFT
 
+from qgs.data.images import TURN
 from qgs.wording import counted
 from qgs_photos.datatools.findings import Finding, Severity
 from qgs_photos.datatools.photos import DecodedScene
@@ -238,7 +239,11 @@ def geometry_findings(scene: DecodedScene, geometry: Geometry) -> Iterator[Findi
             f"up to {TOLERANCE * geometry.diagonal:.1f}"
         )
         every = range(len(scene.photos))
-        yield scene.finding(every, reason, _ADVICE, severity(geometry.fraction))
+        advice = _ADVICE
+        # of other shapes both readings are understood
+        if any(p.listed.turns for p in scene.photos) and len({*(scene.decoded[0].size or ())}) == 1:
+            advice = f"these are square and turned by EXIF: {TURN}"
+        yield scene.finding(every, reason, advice, severity(geometry.fraction))
 
 
 def frames_above(values: Pairs, limit: float) -> dict[int, float]:

@@ -19,7 +19,7 @@ from qgs_photos.image_files import image_files
 LEAST = 3
 # Pixels of a side.
 SMALLEST = 64
-_FOREIGN = (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".avif", ".jxl")
+_FOREIGN = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".jxl")
 # Kinds that browsers, viewers and COLMAP read; others are written as PNG.
 _PLAIN = ("JPEG", "MPO", "PNG")
 _ORIENTATION, _SUB, _MAKE, _MODEL = 0x0112, 0x8769, 0x010F, 0x0110
