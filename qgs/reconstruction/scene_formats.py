@@ -115,18 +115,13 @@ def save_splat(gaussians: Gaussians, path: str | Path) -> None:
     covering = scene.scales.prod(-1) * scene.opacities
     scene = scene[covering.argsort(descending=True, stable=True)]
 
-    def as_bytes(values: Tensor) -> Tensor:
-        return values.round().clamp(0, 255).byte()
-
     # Source: github.com/antimatter15/splat, convert.py.
-    columns = [
-        scene.means.view(torch.uint8),
-        scene.scales.view(torch.uint8),
-        as_bytes(torch.cat([scene.colors, scene.opacities[:, None]], 1) * 255),
-        as_bytes(F.normalize(scene.quats, dim=-1) * 128 + 128),
-    ]
+    numbers = torch.cat([scene.means, scene.scales], 1).view(torch.uint8)
+    rgba = torch.cat([scene.colors, scene.opacities[:, None]], 1) * 255
+    rest = torch.cat([rgba, F.normalize(scene.quats, dim=-1) * 128 + 128], 1)
+    rows = torch.cat([numbers, rest.round().clamp(0, 255).byte()], 1)
     with replacing(path) as temporary:
-        temporary.write_bytes(torch.cat(columns, 1).numpy().tobytes())
+        temporary.write_bytes(rows.numpy().tobytes())
 
 
 def load_ply(path: str | Path) -> Gaussians:
