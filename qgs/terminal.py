@@ -18,17 +18,17 @@ _TOKEN = (
 
 
 def without_secrets(text: str) -> str:
-    """`text` whose URLs have *** for users with their passwords, and for tokens and signatures."""
+    """Return `text` with *** for users, passwords, tokens and signatures in URLs."""
     return re.sub(_TOKEN, r"\1***", re.sub(_USER, "***@", text))
 
 
 def shown(text: str) -> str:
-    r"""`text` `without_secrets`; control and bidirectional characters as \x1b, \u202e."""
+    r"""Return `text` `without_secrets`; control and bidirectional characters as \x1b, \u202e."""
     return re.sub(_RAW, lambda found: ascii(found[0])[1:-1], without_secrets(text))
 
 
 class _Shown:
-    """A text stream that writes what is `shown`. rich_proxied_file: for Rich, which adds codes."""
+    """Text stream that writes `shown` text. rich_proxied_file: for Rich, which adds codes."""
 
     def __init__(self, stream: TextIO) -> None:
         self.rich_proxied_file = stream

@@ -30,7 +30,7 @@ from qgs.version import __version__
 from qgs.wording import listed
 
 FORMAT_VERSION = 3
-"""Raised when the metadata of checkpoints change."""
+"""Number of the format; it rises when the metadata of checkpoints change."""
 
 _RECIPE = "qgs.recipe"
 _FORMAT = "qgs.format_version"

@@ -26,7 +26,7 @@ from qgs.wording import did_you_mean, warn_once
 CHECKPOINT = "checkpoint.safetensors"
 """Name of the latest good weights in a run folder."""
 LARGEST = 20 * 10**9
-"""Most bytes of a download."""
+"""Largest download, in bytes."""
 PATIENCE = 60.0
 """Seconds that a server may stay silent."""
 

@@ -26,7 +26,7 @@ _PICKLES = {b"PK\x03\x04": "a PyTorch (zip) file", b"\x80": "a Python pickle"}
 
 
 class CheckpointError(ValueError):
-    """A file without usable weights; the message names the file, the fault and the remedy."""
+    """Error: a file has no usable weights; the message names the file, the fault and the remedy."""
 
 
 class TensorFile:

@@ -18,10 +18,10 @@ GROUP = "qgs.commands"
 
 
 class CommandGroup(TyperGroup):
-    """Our own commands, then those of installed distributions, which never hide one of ours."""
+    """Commands of the core, then those of distributions, which never hide one of the core."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Names, our own first."""
+        """Return the names, those of the core first."""
         # In our order, not by the alphabet: what a newcomer needs first stands first.
         own = super().list_commands(ctx)
         return [*own, *sorted({entry.name for entry in installed(GROUP)} - {*own})]
@@ -42,7 +42,7 @@ class CommandGroup(TyperGroup):
 
 
 def offered_command(name: str, offers: list[EntryPoint]) -> Any:
-    """Import the command `name` of a distribution; one that cannot be used says why when called."""
+    """Import the command `name` of a distribution. An unusable one says why when it is called."""
     try:
         (entry,) = offers
         offered = entry.load()

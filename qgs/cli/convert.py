@@ -17,12 +17,13 @@ def convert(
         ),
     ],
     count: Annotated[
-        int | None, typer.Option(min=1, help="Keep this many, the most opaque; default: all.")
+        int | None,
+        typer.Option(min=1, help="Keep only this many, the most opaque. Default: all."),
     ] = None,
 ) -> None:
-    """Write Gaussians as PLY, .splat or in a plugin's format.
+    """Write Gaussians to another file: PLY, .splat or a plugin's format.
 
-    With --count the most opaque ones alone.
+    --count keeps only the most opaque Gaussians.
     """
     from qgs.files import refuse_existing
     from qgs.reconstruction.scene_formats import load_ply, save_gaussians

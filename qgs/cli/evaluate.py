@@ -29,8 +29,8 @@ def evaluate(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder; default: RUN/evaluation; RUN/evaluation-N for other settings; "
-            "evaluation_NAME here for a shipped model or a URL."
+            help="Folder for the results. Default: RUN/evaluation, RUN/evaluation-N with changed "
+            "settings, evaluation_NAME for a shipped model or a URL."
         ),
     ] = None,
     strict: Annotated[

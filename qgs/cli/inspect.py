@@ -36,11 +36,11 @@ def compose(recipe: RecipeFile, overrides: Overrides = None) -> None:
 
 def recipes(
     name: Annotated[
-        str | None, typer.Argument(help="One of them, such as tiny/locus.yaml; shows its text.")
+        str | None, typer.Argument(help="Recipe to show, such as tiny/locus.yaml.")
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder to copy it to, with what it extends; never overwrites."),
+        typer.Option(help="Folder to copy the recipe and its bases to. Never overwrites."),
     ] = None,
 ) -> None:
     """List the recipes that come with qgs, or show one. Every command takes their names.

@@ -13,46 +13,46 @@ Overrides: TypeAlias = Annotated[
     typer.Option("--set", help="Change an option of the recipe, such as model.queries.count=128."),
 ]
 Threads: TypeAlias = Annotated[
-    int | None, typer.Option(min=1, help="CPU threads; all cores if not given.")
+    int | None, typer.Option(min=1, help="CPU threads. Default: all cores.")
 ]
 Device: TypeAlias = Annotated[
-    str, typer.Option(help="auto, cpu or cuda; auto takes CUDA where gsplat is installed.")
+    str, typer.Option(help="auto, cpu or cuda. auto uses CUDA if gsplat is installed.")
 ]
 Size: TypeAlias = Annotated[
     str | None,
     typer.Option(
         metavar="HxW",
-        help="Height and width of the photos; default: whole photos, the shorter side as in the "
+        help="Height and width of the photos. Default: whole photos, the shorter side from the "
         "recipe's data.image_size.",
     ),
 ]
 Inputs: TypeAlias = Annotated[
-    int | None, typer.Option(min=1, help="Number of input views; default: the recipe's.")
+    int | None, typer.Option(min=1, help="Number of input views. Default: that of the recipe.")
 ]
 Frames: TypeAlias = Annotated[
     str | None,
-    typer.Option(help="Input photos, by number or file name, such as 0,8,x.jpg; default: spread."),
+    typer.Option(help="Input photos by number or name: 0,8,x.jpg. Default: well placed ones."),
 ]
 SceneName: TypeAlias = Annotated[
-    str | None, typer.Option("--scene", help="Name of the scene, where there are several.")
+    str | None, typer.Option("--scene", help="Scene to use, if there are several.")
 ]
 ViewsSettings: TypeAlias = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Change an option of the recipe's `views`; repeatable."),
+    typer.Option("--set", help="Change an option of the recipe's `views`. Repeatable."),
 ]
 Scale: TypeAlias = Annotated[
     float | None,
     typer.Option(
-        help="Scale of the cameras' positions; default: the one at which the model renders the "
-        "inputs and photos between them best."
+        help="Scale of the cameras' positions. Default: search for the scale at which the model "
+        "renders the photos best."
     ),
 ]
 Tune: TypeAlias = Annotated[
     str | None,
     typer.Option(
         metavar="[WHAT:]STEPS",
-        help="Fit the queries to the input photos first, for STEPS steps, or with latents:STEPS "
-        "the features of the photos; 0 for none.",
+        help="Fit the queries to the input photos first, for STEPS steps; latents:STEPS fits the "
+        "photos' features instead. 0: no fitting.",
     ),
 ]
 

@@ -1,4 +1,4 @@
-"""`qgs reconstruct`: from a checkpoint and a folder of photos to Gaussians and pictures."""
+"""`qgs reconstruct`: Gaussians and pictures from a checkpoint and a folder of photos."""
 
 from __future__ import annotations
 
@@ -38,8 +38,7 @@ def reconstruct(
     holdout: Annotated[
         str | None,
         typer.Option(
-            help="Photos to compare with, or none; default: held-out ones (every eighth) near the "
-            "inputs."
+            help="Photos to score, or none. Default: held-out ones (every eighth) near the inputs."
         ),
     ] = None,
     tune: Tune = None,
@@ -56,9 +55,11 @@ def reconstruct(
 ) -> None:
     """Reconstruct a scene: PLY, renders beside photos, depth, an orbit, cameras.
 
-    Of a folder that the model was trained on, held-out photos are compared with where there are.
-    For other photos the scale of the world is the one at which the model renders them best.
-    `qgs refine OUT PHOTOS` then fits the Gaussians to all photos, `qgs video OUT` films them.
+    Photos that were held out from training are rendered and scored, if there
+    are some. For photos of your own, the scale of the world is searched.
+
+    Then `qgs refine OUT PHOTOS` fits the Gaussians to all photos, and
+    `qgs video OUT` films them.
     """
     _refuse_unusable(out, overwrite)
 
@@ -87,7 +88,7 @@ def reconstruct(
 
 
 def _refuse_unusable(out: Path, overwrite: bool) -> None:
-    """Raise an error now, not after the work, where `out` cannot be written."""
+    """Raise an error before the work where `out` cannot be written."""
     # Before anything heavy is imported: the answer is known already.
     if not overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
         raise FileExistsError(f"{out} is not empty: choose another --out, or add --overwrite")

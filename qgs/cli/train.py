@@ -30,11 +30,12 @@ def train(
 ) -> None:
     """Train a model, then evaluate it on views it never saw.
 
-    Ctrl-C and SIGTERM finish the step, save, and end with 128 + the signal's number. With --resume
-    the same command goes on from there, or from the last save if the process was killed, as if it
-    had never been interrupted. On 8 GPUs:
+    Ctrl-C and SIGTERM finish the step, save, and exit with 128 + the signal.
+    The same command with --resume continues from there, or from the last save
+    if the process was killed. The result is that of a run without a stop.
 
-    \b
+    On 8 GPUs:
+
         torchrun --standalone --nproc-per-node=8 -m qgs train RECIPE --out RUN
     """
     # Here, so that the help of all commands needs no torch.
@@ -69,7 +70,7 @@ def train(
 
 
 def _report(result: TrainingResult, console: Console) -> None:
-    """Say what training made, and how to go on."""
+    """Print what the training wrote, and how to continue."""
     before = "was already finished: " if result.resumed_at == result.steps else ""
     made = f"{result.steps} steps in {result.seconds:.0f} s, {result.folder.checkpoint}"
     console.print(f"{before}{made}")

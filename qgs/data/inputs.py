@@ -24,15 +24,15 @@ from qgs.geometry.transforms import to_camera, to_pixels
 from qgs.types import Cameras
 
 Window: TypeAlias = tuple[Frames, Frames]
-"""Input frames, and novel frames that are compared with."""
+"""Input frames, and novel frames to compare with."""
 NOVEL = 6
-"""Views that are compared with by default, at most."""
+"""Most views to compare with by default."""
 BASELINE = (0.06, 0.25)
 """Range of baselines per depth where those of the training are unknown."""
 TURN = 20.0
 """Largest turn in degrees where that of the training is unknown."""
 VARIED = 20.0
-"""Baselines of a training that vary by more than this factor say nothing about the best."""
+"""Factor of a training's baselines above which they say nothing about the best one."""
 
 # Time grows with the square of the number of frames that are considered.
 _MOST = 300
@@ -168,7 +168,7 @@ class Frusta:
         return np.linalg.norm(start - along.clip(0, 1)[:, None] * way, axis=-1)
 
     def _filled(self, first: int, last: int, near: Sequence[int], inputs: int) -> Frames:
-        """Return the ends, and the nearest frames to even steps between them, in this order."""
+        """Return both ends, then the frames nearest to even steps between them."""
         if inputs == 1:
             return (first,)
         chosen = [first]

@@ -218,7 +218,7 @@ def _flipped(images: Tensor) -> Tensor:
 
 
 def collate(samples: Sequence[Sample]) -> Batch:
-    """Stack samples of equal view counts and image size. ValueError where only some have times."""
+    """Stack samples of equal view counts and image size; ValueError where only some have times."""
     # Models that read times need them in every sample of a batch.
     still = [sample.scene for sample in samples if sample.inputs.times is None]
     if 0 < len(still) < len(samples):

@@ -31,15 +31,15 @@ from qgs.wording import one_line
 MEASURED = 512
 """Samples whose cameras `trained_domain` measures."""
 MAX_REPLACED = 10
-"""Scenes that are tried instead of one that fails; then training stops."""
+"""Most scenes that are tried instead of a failing one; after them training stops."""
 
 
 class SampleError(ValueError):
-    """A training sample that cannot be made; the message names the scene."""
+    """Error: a training sample cannot be made; the message names the scene."""
 
 
 class WorkerError(ChildProcessError):
-    """A process that decodes data was killed."""
+    """Error: a process that decodes data was killed."""
 
 
 def training_batches(
@@ -219,7 +219,7 @@ class SampleStream(Dataset[Batch | Exception]):
 def _from_thread(
     stream: SampleStream, numbers: Iterator[Sequence[int]]
 ) -> Generator[Batch, None, None]:
-    """Yield batches of these samples, each made while the one before is in use."""
+    """Yield batches of these samples; make each one while the previous one is in use."""
     with ThreadPoolExecutor(1, thread_name_prefix="qgs-loader") as pool:
         pending = pool.submit(stream.batch, next(numbers))
         for following in numbers:

@@ -89,7 +89,7 @@ def evaluate(
 def _remarks(
     evaluation: Evaluation, model: QueryGaussianModel, recipe: Recipe, seen: Domain
 ) -> list[str]:
-    """Return sentences on how far the model can be expected to do well, and on how it did."""
+    """Return remarks on the views' distance from the training's range and on the result."""
     remarks: list[str] = []
     if model.trained_on is not None:
         remarks.append(verdict(model.trained_on, seen))
@@ -105,7 +105,7 @@ def _remarks(
 
 
 class Measures:
-    """The metrics of a recipe. columns: name of every value to how it is shown.
+    """Metrics of a recipe. columns: name of every value to its display.
 
     Making one finds what is wrong with the metrics before any scene is scored: raises ValueError
     when two values have one name.

@@ -18,14 +18,17 @@ FrameList: TypeAlias = Annotated[list[Annotated[int, Field(strict=True)]], Field
 
 
 class IndexEntry(BaseModel):
-    """Frames of one scene, as positions in its list of frames; what else a file says is ignored."""
+    """Frames of one scene, as positions in its list of frames.
+
+    Other keys of the file are ignored.
+    """
 
     model_config = ConfigDict(frozen=True)
 
     context: FrameList
     """The input frames; the first sets the model's frame."""
     target: FrameList
-    """The frames that are judged."""
+    """The target frames."""
 
 
 EvaluationIndex: TypeAlias = Mapping[str, IndexEntry | None]
@@ -35,7 +38,10 @@ ViewsOf: TypeAlias = Callable[[Scene, Frames, Frames], ViewsConfig]
 """Function of a scene, input and target frames; it returns the settings of their sample."""
 
 GIVEN = "frames as context and as target"
-"""Words for `given_targets`: a score on them means nothing, the nearest input view is perfect."""
+"""Words for `given_targets`.
+
+Their scores mean nothing: the nearest input view is the target itself.
+"""
 
 
 def given_targets(inputs: Iterable[int], targets: Iterable[int]) -> tuple[int, ...]:
@@ -73,7 +79,7 @@ def read_index(path: str | None) -> EvaluationIndex | None:
 
 @dataclass
 class EvaluationPlan:
-    """The scenes of a test split that are judged, and on which views; never mirrored.
+    """Scenes of a test split to judge, with their views; never mirrored.
 
     With `evaluation.index`, its scenes and frames. Without one, of the first `evaluation.scenes`
     scenes: the windows of `sampler`, else of a scene with held-out frames `held_out_windows`,

@@ -1,4 +1,4 @@
-"""Evaluation protocols: exactly what decides the numbers, named and hashed."""
+"""Evaluation protocols: all settings that decide the scores, named and hashed."""
 
 import hashlib
 import json
@@ -94,7 +94,7 @@ def protocol_of(
 def _data_and_views(
     recipe: Recipe, index: EvaluationIndex | None, scenes: Sequence[str]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return what decides the photos, and which of them are compared.
+    """Return the settings that decide the photos, and which of them are compared.
 
     With an index the kind of data, its split, and options at their defaults are left out, so that
     one data set in two formats has one protocol.

@@ -47,7 +47,7 @@ class SceneScore:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All scenes and what they amount to; the same weights and recipe give the same numbers.
+    """Scores of all scenes and their means. The same weights and recipe give the same numbers.
 
     columns: by name of the value. scores: of the judged scenes. missing: the other scenes of the
     protocol, and why they have none. gaussians: of a scene, the most of any. incomplete: values
@@ -131,7 +131,7 @@ class Evaluation:
         return len(self.scores) + len(self.missing)
 
     def _rows(self) -> list[list[str]]:
-        """Return the means of all methods, and over how many scenes."""
+        """Return the means of all methods, and their numbers of scenes."""
         judged = f"{len(self.scores)} of {self._wanted}" if self.missing else str(self._wanted)
         rows = [["method", *(column.title for column in self.columns.values()), "scenes"]]
         for method in METHODS:
@@ -164,7 +164,7 @@ class Evaluation:
         return text.getvalue()
 
     def _notes(self) -> Iterator[str]:
-        """Yield what table.md says below the table, a line each."""
+        """Yield the lines below the table in table.md."""
         content = self.protocol.content
         height, width = content["image_size"]
         counts = set[int]()

@@ -45,7 +45,7 @@ def tuning_loss(recipe: Recipe) -> Photometric:
 def tune(
     model: QueryGaussianModel, views: Views, recipe: Recipe
 ) -> tuple[Gaussians, dict[str, Any]]:
-    """Fit what the model holds of the scenes `views` (B, V) to these views; weights stay.
+    """Fit the queries or latents of scenes to their `views` (B, V). The weights stay.
 
     evaluation.tuning of the recipe: "queries", all features and floating fields of the initial
     state, so LocusGS's anchors too; or "latents", the features of the image memory; the encoder

@@ -161,7 +161,7 @@ def _over_time(
 
 
 def _remarks(result: Reconstruction, scene: Scene) -> list[str]:
-    """Return what a user must know of photos and result."""
+    """Return the remarks for the user on photos and result."""
     sample = result.sample
     found = Domain()
     found.see(sample.inputs.cameras, sample.targets.cameras)

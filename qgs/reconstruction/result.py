@@ -20,7 +20,7 @@ from qgs.reconstruction.scale import FoundScale
 from qgs.types import Cameras, Gaussians, Rendering
 
 KINDS = ("input", "novel", "seen in training")
-"""A compared view of a folder that the model was trained on is novel if it was held out."""
+"""Kinds of views. In a folder that the model was trained on, only held-out views are novel."""
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,11 @@ from qgs.types import Views
 from qgs.wording import listed
 
 FURTHER = 2
-"""Photos that are judged with the inputs, at most."""
+"""Most photos that are judged with the inputs."""
 STEP = 1.6
 """Ratio of neighbouring factors at first."""
 MOST = 16
-"""Factors that are tried before the search goes finer."""
+"""Most factors that are tried before the search refines."""
 BASELINES = (0.06, 0.25)
 """Baselines where those of the training are unknown."""
 BELOW = 2.0
@@ -40,9 +40,9 @@ NEAREST = 0.8
 REACH = 6.0
 """The search brings what cameras look at to REACH times the least depth."""
 PENALTY = 5.0
-"""dB for each e-fold by which depths are below those of the training, for inputs alone."""
+"""Penalty in dB per e-fold by which depths are below those of the training; for inputs alone."""
 POOR = 14.0
-"""dB of the judged photos below which no scale fits: then novel views have 12 dB in the mean."""
+"""PSNR in dB of the judged photos below which no scale fits; novel views then average 12 dB."""
 PIXELS = 2**18
 """Most pixels of inputs in one forward pass; this limits memory."""
 
@@ -150,7 +150,7 @@ def further_photos(scene: Scene, inputs: Frames, compared: Frames) -> Frames:
 
 
 def search_range(trained: Domain, scene: Scene, frames: Frames) -> tuple[float, float, float]:
-    """Return the ends of a search, and the factor from which on depths are as in training.
+    """Return both ends of the search, and the least factor at which depths are as in training.
 
     The last is 0 where the depth that the cameras look at is unknown.
     """

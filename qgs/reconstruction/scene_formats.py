@@ -34,7 +34,7 @@ WRITER_GROUP = "qgs.scene_writers"
 """Entry points of functions (gaussians, path): the name is the suffix that they write, undotted."""
 
 OPACITY_EPS = 1e-6
-"""Opacities are kept this far from 0 and 1, where the logit is infinite."""
+"""Least distance of a stored opacity from 0 and 1, where the logit is infinite."""
 SCALE_MIN = 1e-12
 """Smallest scale stored, world units: the logarithm of 0 is infinite."""
 

@@ -110,7 +110,7 @@ def whole_size(scene: Scene, multiple: int | None) -> Size:
 
 
 def size_multiple(recipe: Recipe) -> int | None:
-    """Return what sides of the model's images are multiples of; None if their size is fixed."""
+    """Return the divisor of both sides of the model's images; None if their size is fixed."""
     # The part is known without building a model.
     part = recipe.parts["model", "encoder"]
     assert issubclass(part.component, Encoder)

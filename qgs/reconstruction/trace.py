@@ -1,4 +1,4 @@
-"""Looking inside a model while it runs, for chosen layers and queries only.
+"""Recording of states and attention while a model runs, for chosen layers and queries.
 
 with qgs.trace(model, layers=[1, 4], queries=[3, 17]) as trace:
     prediction = model(views)
@@ -48,7 +48,7 @@ class Trace:
         self._current = 0
 
     def _start(self, module: nn.Module, args: Any) -> None:
-        """Forget the pass before, when the model begins."""
+        """Forget the previous pass when the model begins."""
         self.layers.clear()
         self.grid = None
         self._current = 0

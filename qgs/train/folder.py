@@ -57,11 +57,11 @@ compared by its types. `training.accumulate` may change too: a step sees the sam
 
 
 class OtherRunError(ValueError):
-    """A run cannot be continued with this recipe, these processes or this data."""
+    """Error: a run cannot continue with this recipe, these processes or this data."""
 
 
 class RunFolder:
-    """The files of a run, whether they exist yet or not.
+    """Files of a run, existing or not.
 
     checkpoint: the latest good weights; checkpoint_ema: their moving average, where a recipe asks
     for it; state: everything that continues the run; evaluation: where `qgs eval` writes.
@@ -127,7 +127,7 @@ class RunFolder:
             file.write("".join(json.dumps(record) + "\n" for record in records))
 
     def history(self) -> list[dict[str, float]]:
-        """Return all records so far, one per optimiser step; of one left out, finite numbers."""
+        """Return all records so far, one per optimiser step."""
         return read_records(self.history_file)
 
     def cut_records(self, step: int) -> None:
@@ -138,7 +138,7 @@ class RunFolder:
                 write_text(path, "".join(json.dumps(record) + "\n" for record in kept))
 
     def close(self) -> None:
-        """Leave the folder to others."""
+        """Unlock the folder."""
         if self._lock.is_locked:
             # While it is held: whoever comes next makes a lock file of its own.
             Path(self._lock.lock_file).unlink(missing_ok=True)
@@ -147,7 +147,7 @@ class RunFolder:
 
 @dataclass
 class Saver:
-    """Writes the checkpoint and the state of a run; of several processes, the main one writes.
+    """Writer of the checkpoint and the state of a run; only the main process writes.
 
     stateful: what continues the run, beside the weights, by name. Each has `state()`, which returns
     a State, and `load_state(state)`, which restores it. "ema" has a checkpoint too.
@@ -184,7 +184,7 @@ class Saver:
         wait_for_everyone()
 
     def restore(self, states: Mapping[str, State]) -> None:
-        """Bring the weights and all that is stateful back; raises CheckpointError."""
+        """Restore the weights and all stateful parts; raises CheckpointError."""
         load_weights(self.model, states.get("weights", {}), self.folder.state)
         for name, one in self.stateful.items():
             try:

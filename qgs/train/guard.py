@@ -1,4 +1,4 @@
-"""Ends of a run by itself: a model that died, and steps that are not finite."""
+"""Automatic ends of a run: collapsed models and steps that are not finite."""
 
 import logging
 import math
@@ -31,10 +31,10 @@ FLAT = 1 / 255
 """Mean deviation from the background of a rendering that shows nothing else."""
 
 NO_GRADIENT = 1e-8
-"""Gradient norm of a model that learns nothing any more."""
+"""Gradient norm below which a model no longer learns."""
 
 LOSS_OF_QUALITY = 1.0
-"""dB below the best PSNR so far, means of some ten steps, at which weights are no longer good."""
+"""Drop below the best running mean of PSNR, in dB, at which weights no longer count as good."""
 
 MAX_SKIPPED = 10
 """Steps in a row that may be skipped; after them training stops."""
@@ -62,24 +62,24 @@ NONFINITE_CAUSES = (
 
 
 class TrainingError(RuntimeError):
-    """Training stopped by itself; the message says why, what is kept and what to do."""
+    """Error that stops a training; the message says why, what is kept and what to do."""
 
 
 class CollapseError(TrainingError):
-    """The model died; the last good weights are kept."""
+    """Error: the model collapsed; the last good weights are kept."""
 
 
 class NonFiniteError(TrainingError):
-    """A step gave NaN or infinity; the run is saved as it was before that step."""
+    """Error: a step gave NaN or infinity; the run is saved as it was before that step."""
 
 
 class OutOfMemoryError(TrainingError):
-    """A step found no memory; the message says what is kept and what takes less."""
+    """Error: a step ran out of memory; the message says what is kept and what needs less."""
 
 
 @dataclass
 class Guard:
-    """Stops a run that is dead or not finite, and sees that good weights are kept.
+    """Guard that stops a collapsed or non-finite run and keeps good weights.
 
     All processes must call each of its methods together; `step` counts finished optimiser steps.
     What saves raises CollapseError for weights that are not finite.
@@ -129,7 +129,7 @@ class Guard:
         )
 
     def watch(self, step: int, numbers: Mapping[str, float]) -> None:
-        """Take note of the numbers of `step`, a finite one; copy the weights if good and due.
+        """Record the finite numbers of `step`; copy the weights if they are good and a copy is due.
 
         Raises CollapseError when the last steps, a whole window of them, were dead, and for weights
         to copy that are not finite.
@@ -198,7 +198,7 @@ class Guard:
 
 @dataclass
 class SignsOfLife:
-    """The signs of life of the latest steps. dead: steps in a row without any, for `symptom`.
+    """Signs of life of the latest steps. dead: steps in a row without any, because of `symptom`.
 
     A step is dead when nothing is drawn (mean alpha under EMPTY_ALPHA), when no gradient is left,
     or when the images have gone back to the plain background after showing more.
@@ -209,7 +209,7 @@ class SignsOfLife:
     has_drawn: bool = False
 
     def observe(self, numbers: Mapping[str, float]) -> None:
-        """Take note of a step: "alpha" and "deviation" of its renderings, "gradient" (norm)."""
+        """Record a step: "alpha" and "deviation" of its renderings, "gradient" (norm)."""
         self.symptom = ""
         if numbers["alpha"] < EMPTY_ALPHA:
             self.symptom = f"the renderings are empty (mean alpha {numbers['alpha']:.1e})"
@@ -249,7 +249,7 @@ class GoodWeights:
         return self.copies[0]
 
     def observe(self, numbers: Mapping[str, float]) -> None:
-        """Take note of a step's "psnr", in dB."""
+        """Record a step's "psnr", in dB."""
         # PSNR of one batch depends on its scenes: compare running means.
         psnr = numbers["psnr"]
         self.psnr = psnr if self.psnr is None else self.psnr + (psnr - self.psnr) / 10
@@ -323,7 +323,7 @@ def first_bad_tensor(
 
 
 class _Watch:
-    """Describes the first tensor that is not finite, in the order in which a step computes."""
+    """Description of the first tensor that is not finite, in the order of computation."""
 
     def __init__(self, batches: Sequence[Batch]) -> None:
         self.found = ""

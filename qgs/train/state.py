@@ -77,7 +77,7 @@ class Counters:
         return max(self.step / self.config.steps, of_seconds)
 
     def every(self, steps: int) -> bool:
-        """Return whether this step is one of every `steps`; none is where that is 0."""
+        """Return whether this step is a multiple of `steps`; never for 0."""
         return bool(steps) and self.step % steps == 0
 
     def read(self, measured: Mapping[str, Tensor]) -> dict[str, float]:
@@ -96,7 +96,7 @@ class Counters:
         return dict(zip(measured, numbers, strict=True))
 
     def state(self) -> dict[str, Any]:
-        """Return the counts, and what must not change for them to mean the same."""
+        """Return the counts, and the facts on which their meaning depends."""
         return {
             "step": self.step,
             "seconds": self.seconds,
@@ -105,7 +105,7 @@ class Counters:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Count on from `state`.
+        """Continue counting from `state`.
 
         Raises OtherRunError unless steps see the same data in number and order as before.
         """
@@ -207,5 +207,5 @@ class MovingAverage(AveragedModel):
         return unique_tensors(self.module)
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Go on from the averages in `state`; raises CheckpointError where they do not fit."""
+        """Continue from the averages in `state`; raises CheckpointError where they do not fit."""
         load_weights(self.module, state, "the moving average")

@@ -34,7 +34,7 @@ class Tracker(ABC):
 
     @abstractmethod
     def __init__(self, run: Path, options: Mapping[str, Any], step: int):
-        """Start, or go on after `step` steps of the run in the folder `run`.
+        """Start tracking, or continue it after `step` steps of the run in the folder `run`.
 
         options: of its recipe, by dotted path.
         """
@@ -48,7 +48,7 @@ class Tracker(ABC):
         return
 
     def close(self) -> None:
-        """Bring what was logged to its place."""
+        """Finish writing what was logged."""
         return
 
 
@@ -90,7 +90,7 @@ class Trackers:
         self.tell(lambda tracker: tracker.close())
 
     def tell(self, act: Callable[[Tracker], None]) -> None:
-        """Have each tracker take something."""
+        """Call a method of each tracker."""
         for name, tracker in list(self._open.items()):
             # A service may be down, and a distribution may raise anything.
             try:

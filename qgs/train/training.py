@@ -108,7 +108,7 @@ def train(
 
 
 class Trainer:
-    """One run: what it is made of, and the loop.
+    """One run: its parts and its loop.
 
     Making one opens the data and draws the first batch, but touches no file of a new run; its
     folder is made after the first step, when nothing is missing any more.
@@ -154,7 +154,7 @@ class Trainer:
         self._resources.close()
 
     def _build_model(self, initial: bool) -> None:
-        """Build the model, what computes its gradients, and torch's optimiser.
+        """Build the model, the training pass, and torch's optimiser.
 
         Notes what is odd about them. initial: load `init_from`.
         """
@@ -177,7 +177,7 @@ class Trainer:
         self.average = MovingAverage(self.model, self.config.ema) if self.config.ema else None
 
     def _build_watchers(self, source: SceneSource) -> None:
-        """Make what counts, watches, saves and judges."""
+        """Make the counters, the guard, the saver and the trackers."""
         recipe = self.recipe
         # Only the main process writes checkpoints, which carry the range of the training views.
         if self.accelerator.is_main_process:
@@ -205,7 +205,7 @@ class Trainer:
         self.saver.stateful = stateful
 
     def _open_data(self, source: SceneSource) -> Generator[Batch, None, None]:
-        """Return the batches from the first that the run has not seen yet."""
+        """Return the batches, starting with the first one that the run has not seen."""
         processes = self.accelerator.num_processes
         return training_batches(
             source,
@@ -250,7 +250,7 @@ class Trainer:
         )
 
     def _one_step(self, progress: TrainingProgress, stop: StopRequest) -> None:
-        """Make one optimiser step: gradients, new weights, a record; then what is due after it."""
+        """Make one optimiser step and record it; then evaluate and save if due."""
         counters = self.counters
         batches = self.feed.batches
         numbers = self._compute(batches, stop)
@@ -285,7 +285,7 @@ class Trainer:
             self._evaluate(stop)
 
     def _compute(self, batches: Sequence[Batch], stop: StopRequest) -> dict[str, float]:
-        """Leave the gradients of `batches`, and fetch the next ones; return the step's numbers."""
+        """Compute the gradients of `batches` and fetch the next ones; return the step's numbers."""
         step = self.counters.step
         rate = self.optimizer.learning_rate(step, self.counters.seconds)
         for group in self.torch_optimizer.param_groups:
@@ -320,7 +320,7 @@ class Trainer:
         progress.show(counters.step, record["loss"], record["psnr"], counters.used)
 
     def _evaluate(self, stop: StopRequest) -> None:
-        """Judge the weights; a failure is logged, and ends no training."""
+        """Evaluate the weights. A failure is logged and does not end the training."""
         started = time.perf_counter()
         step = self.counters.step
         used = [torch.cuda.current_device()] if torch.cuda.is_initialized() else []

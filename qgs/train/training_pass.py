@@ -19,7 +19,7 @@ from qgs.recipe import Recipe
 from qgs.types import Cameras, Gaussians, LayerPrediction, Prediction, Rendering, Views
 
 RECORDED = {"step", "seconds", "lr", "loss", "psnr", "alpha", "deviation", "gradient", "skipped"}
-"""Names of a record of history.jsonl that no term may have."""
+"""Names in a record of history.jsonl that no loss term may have."""
 
 
 class TrainingPass(nn.Module):
@@ -143,7 +143,7 @@ def compute_gradients(
     config: TrainingConfig,
     batches: Sequence[Batch],
 ) -> dict[str, Tensor]:
-    """Leave the gradients of the mean loss of `batches`, clipped; return what was measured, 0-d.
+    """Compute the clipped gradients of the mean loss of `batches`; return 0-d measurements.
 
     training_pass: as accelerate wraps it. "gradient" is the norm before clipping, over all
     processes; the rest is of this one. Nothing waits for the device.

@@ -127,7 +127,7 @@ class PhotoReader(ABC):
     """A format that lists posed photos; subclasses are entry points of `GROUP`, which name it."""
 
     listing: ClassVar[str]
-    """The file that lists the photos, below the folder, for messages."""
+    """Path of the listing below the folder, for messages."""
 
     @classmethod
     def recognises(cls, folder: UPath) -> bool:

@@ -70,7 +70,6 @@ def study(
     The whole study is checked before training. To continue after a stop, repeat
     the command. OUT/table.md has the answer, OUT/results.json the numbers.
 
-    \b
         study: 1
         base: tiny/locus.yaml
         variants:
@@ -82,7 +81,6 @@ def study(
         hypotheses:
           - mine > locus
 
-    \b
         qgs study mine_study.yaml --out studies/mine --workers 2
 
     A variant changes `base` or names a recipe file. docs/studies.md explains all keys.
