@@ -165,9 +165,8 @@ def _finite(scene: Gaussians) -> Tensor:
 
 
 def _of_splat(path: Path) -> Gaussians:
-    rows = torch.from_numpy(np.fromfile(path, np.uint8)).view(-1, 32)
-    means, scales = rows[:, :24].contiguous().view(torch.float32).split(3, 1)
-    rgba, quats = rows[:, 24:].float().split(4, 1)
+    rows = np.frombuffer(path.read_bytes(), "3f4,3f4,4u1,4u1")
+    means, scales, rgba, quats = (torch.tensor(rows[f"f{part}"]).float() for part in range(4))
     return Gaussians(means, scales, quats - 128, rgba[:, 3] / 255, rgba[:, :3] / 255)
 
 
