@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from upath import UPath
 
+from qgs.data.photos.finding import located
 from qgs.data.photos.nerfstudio import Nerfstudio
 from qgs.data.photos.reader import (
     Listing,
@@ -11,8 +12,7 @@ from qgs.data.photos.reader import (
     PhotoReader,
     existing,
     installed_readers,
-    refuse_outside,
-    refuse_problems,
+    sound_frames,
 )
 from qgs.paths import is_local, listing
 from qgs.wording import listed, warn_once
@@ -48,11 +48,14 @@ def with_cameras(path: UPath) -> UPath:
     return next(filter(None, made), path)
 
 
-def read_listing(folder: UPath, format: str = "auto", images: str | None = None) -> Listing:
+def read_listing(
+    folder: UPath, format: str = "auto", images: str | None = None, outside: bool = False
+) -> Listing:
     """Read the photos that `folder` lists in `format`, or in the first of `readers` that it holds.
 
-    images: another folder of photos, such as images_4. Raises FileNotFoundError for no folder or no
-    listing, ValueError for a listing that cannot be read.
+    images: another folder of photos, such as images_4. Files are where they are found, see
+    `located`. Raises FileNotFoundError for no folder or no listing, ValueError for a listing that
+    cannot be read, and for files outside of the folder but where `outside` allows them.
     """
     known = readers()
     listings = ", ".join(f"{reader.listing} ({name})" for name, reader in known.items())
@@ -80,6 +83,9 @@ def read_listing(folder: UPath, format: str = "auto", images: str | None = None)
             f"{held[0]}; in a recipe, data.format: {held[1]} reads the other"
         )
     found = known[held[0] if format == "auto" else format].read(folder, images)
+    if images is not None and not (folder / images).is_dir():
+        raise FileNotFoundError(f"{folder / images} does not exist: correct `images`")
+    found = located(found, found.folder or folder, images, outside)
     still = [frame.name for frame in found.frames if frame.time is None and not frame.problems]
     if still and len({frame.time is None for frame in found.frames}) > 1:
         raise ValueError(
@@ -97,10 +103,8 @@ def present_frames(
     What is left out is logged. Raises FileNotFoundError when fewer than two images or a mask do not
     exist, ValueError for poses and intrinsics that cannot be right.
     """
-    found = read_listing(folder, format, images)
     # A listing of a stranger must not name other files of this machine.
-    if not outside:
-        refuse_outside(folder, found)
+    found = read_listing(folder, format, images, outside)
     frames = [frame for frame in found.frames if frame.split != "unused"]
     count = len(frames)
     if count < len(found.frames):
@@ -112,7 +116,7 @@ def present_frames(
     present = [frame for frame in frames if frame.path in there]
     missing = [str(frame.path) for frame in frames if frame.path not in there]
     # Before the count: a wrong listing explains missing images.
-    refuse_problems(found.file, present if len(present) > 1 else frames)
+    sound = sound_frames(found.file, present if len(present) > 1 else frames)
     if len(present) < 2:
         raise FileNotFoundError(
             f"{found.file} names {count} images, but {len(present)} exist and 2 are needed: add "
@@ -120,11 +124,11 @@ def present_frames(
         )
     if missing:
         warn_once(f"{len(missing)} of {count} images of {folder} are missing: {listed(missing, 3)}")
-    masks = [frame.mask for frame in present if frame.mask is not None]
+    masks = [frame.mask for frame in sound if frame.mask is not None]
     absent = sorted({*map(str, masks)} - {*map(str, existing(masks))})
     if absent:
         raise FileNotFoundError(
             f"{found.file} names {len(masks)} masks, but {len(absent)} do not exist: "
             f"{listed(absent, 3)}. Add them, or remove their 'mask_path'"
         )
-    return present, missing
+    return sound, missing

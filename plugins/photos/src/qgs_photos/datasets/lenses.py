@@ -7,6 +7,7 @@ from functools import lru_cache
 from typing import Self
 
 import numpy as np
+import pycolmap
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -25,9 +26,9 @@ class BendingLens(Lens):
     def distorted(self, points: Tensor) -> Tensor:
         """Return where the lens puts points (..., 2) of the plane z = 1."""
 
-    @abstractmethod
     def sees(self, points: Tensor) -> Tensor:
         """Return whether points (..., 2) lie before where the function turns back."""
+        return points.norm(dim=-1) < _reach(self)
 
     def undistorted(
         self, pixels: np.ndarray, intrinsics: Intrinsics, nearest: bool = False
@@ -79,10 +80,6 @@ class RadialTangential(BendingLens):
         v = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
         return torch.stack([u, v], -1)
 
-    def sees(self, points: Tensor) -> Tensor:
-        """Return whether points (..., 2) lie before where the radial polynomial turns back."""
-        return (points * points).sum(-1) < _turn(self.k1, self.k2, self.k3)
-
     def turned(self) -> Self:
         """See `Lens`."""
         # (p2, p1) is a vector in the image.
@@ -106,13 +103,36 @@ class Fisheye(BendingLens):
         bent = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
         return points * torch.where(radius > 0, bent / radius, 1.0)
 
-    def sees(self, points: Tensor) -> Tensor:
-        """Return whether points (..., 2) lie before where the polynomial of angles turns back."""
-        return points.norm(dim=-1).atan().square() < _turn(self.k1, self.k2, self.k3, self.k4)
-
     def turned(self) -> Self:
         """See `Lens`: it is the same all around."""
         return self
+
+
+@dataclass(frozen=True)
+class ColmapLens(BendingLens):
+    """Any of COLMAP's lenses, by pycolmap.
+
+    parameters: as COLMAP orders them, with focal lengths of 1 and the principal point at 0. turns:
+    clockwise quarters from its camera to this one.
+    """
+
+    model: str
+    parameters: tuple[float, ...]
+    turns: int = 0
+
+    def distorted(self, points: Tensor) -> Tensor:
+        """See `BendingLens`."""
+        camera = pycolmap.Camera(model=self.model, width=1, height=1, params=self.parameters)
+        # a quarter clockwise makes (-y, x) of (x, y)
+        plane = torch.view_as_complex(points.double().contiguous()).numpy() * (-1j) ** self.turns
+        flat = plane.ravel()
+        bent = camera.img_from_cam(np.stack([flat.real, flat.imag, np.ones(len(flat))], -1))
+        turned = (bent @ [1, 1j]).reshape(plane.shape) * 1j**self.turns
+        return torch.view_as_real(torch.from_numpy(turned)).to(points)
+
+    def turned(self) -> Self:
+        """See `Lens`."""
+        return replace(self, turns=self.turns + 1)
 
 
 def bending(lens: BendingLens) -> BendingLens | None:
@@ -120,16 +140,15 @@ def bending(lens: BendingLens) -> BendingLens | None:
     return lens if isinstance(lens, Fisheye) or any(vars(lens).values()) else None
 
 
-def _turn(*coefficients: float) -> float:
-    """Return the least t > 0, or inf, at which r (1 + k1 t + k2 t^2 + ...) stops growing with r.
+@lru_cache(maxsize=4096)
+def _reach(lens: BendingLens) -> float:
+    """Return the distance from the middle up to which `lens` shows what is farther out farther out.
 
-    t = r^2. Beyond it the polynomial shows the same photo again, mirrored.
+    Behind it, it shows the same again, mirrored. inf for none up to 84 degrees.
     """
-    slope = [1.0, *((2 * i + 3) * k for i, k in enumerate(coefficients))]
-    # Numerical roots of a real polynomial have small imaginary parts.
-    roots = np.roots(slope[::-1])
-    real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
-    return float(real.min()) if len(real) else math.inf
+    radii = torch.linspace(0, 10, 20_001).double()
+    rising = lens.distorted(torch.stack([radii, torch.zeros_like(radii)], -1))[:, 0].diff() > 0
+    return math.inf if rising.all() else float(radii[rising.logical_not().nonzero()[0, 0]])
 
 
 def _in_photo(
